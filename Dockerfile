@@ -1,0 +1,21 @@
+# Debian 13 packages dolfinx 0.9. The first stage alone is the environment that .ci/in-env uses.
+FROM debian:trixie-slim AS env
+COPY .ci/packages.txt .ci/check-blas /usr/local/share/magshell/
+RUN apt-get update \
+ && DEBIAN_FRONTEND=noninteractive apt-get install -y --no-install-recommends \
+        $(sed 's/#.*//' /usr/local/share/magshell/packages.txt) \
+ && rm -rf /var/lib/apt/lists/* \
+ && /usr/local/share/magshell/check-blas
+ENV OMPI_ALLOW_RUN_AS_ROOT=1 OMPI_ALLOW_RUN_AS_ROOT_CONFIRM=1 OMPI_MCA_btl=self,sm OMP_NUM_THREADS=1
+
+FROM env
+COPY . /usr/src/magshell
+RUN python3 -m pip install --no-deps --no-index --no-build-isolation --no-cache-dir \
+        --break-system-packages /usr/src/magshell
+# Kernels are compiled here once; whatever user runs the image may read them and add others.
+ENV XDG_CACHE_HOME=/var/cache/magshell MPLCONFIGDIR=/var/cache/magshell/matplotlib HOME=/tmp
+RUN magshell info --compile \
+ && mkdir -p /work "$MPLCONFIGDIR" \
+ && chmod -R a+rwX /work "$XDG_CACHE_HOME"
+WORKDIR /work
+ENTRYPOINT ["magshell"]

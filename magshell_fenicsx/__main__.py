@@ -1,0 +1,3 @@
+from magshell_fenicsx.cli import app
+
+app()

@@ -1,0 +1,78 @@
+"""The whole case: its sections and what they must have in common."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal, Self
+
+from pydantic import Field, ValidationError, model_validator
+
+from magshell_fenicsx.case.base import Section
+from magshell_fenicsx.case.boundary import BoundarySection
+from magshell_fenicsx.case.fields import MagneticSection
+from magshell_fenicsx.case.loading import IndentationSection, LoadingSection
+from magshell_fenicsx.case.messages import explain
+from magshell_fenicsx.case.shell import ShellSection
+from magshell_fenicsx.case.source import CaseError, Source, override, read_source
+
+
+class MeshSection(Section):
+    """Discretisation."""
+
+    degree: int = Field(default=4, ge=2, le=5)
+    refinement: float = Field(default=1.0, ge=0.1, le=20, description="divides every element size")
+    penalty: float | None = Field(default=None, gt=0, description="sigma of the interior penalty")
+
+
+class Case(Section):
+    """A validated case file."""
+
+    shell: ShellSection
+    boundary: BoundarySection
+    magnetic: MagneticSection | None = None
+    loading: LoadingSection | None = None
+    mesh: MeshSection = MeshSection()
+    symmetry: Literal["auto", "none", "half"] = "auto"
+
+    @model_validator(mode="after")
+    def _sections_fit(self) -> Self:
+        edge, other = ("equator", "rim") if self.shell.geometry == "hemisphere" else ("rim", "equator")
+        if getattr(self.boundary, other) is not None:
+            raise ValueError(f"boundary.{other}: a {self.shell.geometry} has no such edge, only {edge}")
+        if getattr(self.boundary, edge) in (None, "free"):
+            raise ValueError(f"boundary.{edge}: must be clamped or simply supported, else the shell is not held")
+        if self.magnetic and self.magnetic.lambda_m is None and self.shell.youngs_modulus is None:
+            raise ValueError("shell.youngs_modulus is needed to turn flux densities into lambda_m")
+        if isinstance(self.loading, IndentationSection):
+            polar = self.loading.at.polar
+            if self.shell.geometry == "disc" and polar:
+                raise ValueError("loading.at.polar: a disc is loaded at its centre, polar: 0")
+            if not 0 <= polar < 89:
+                raise ValueError(f"loading.at.polar: {polar:g} is not on the shell, away from its edge: allowed 0 to 89")
+        return self
+
+    @property
+    def lambda_m(self) -> float:
+        """|Br||Ba|/(mu_0 E); 0 without a field."""
+        return self.magnetic.amplitude(self.shell.youngs_modulus) if self.magnetic else 0.0
+
+    @classmethod
+    def load(cls, file: str | Path, settings: Sequence[str] = ()) -> "Case":
+        """Read a case file, with `key.path=value` settings in place of its own.
+
+        Raises
+        ------
+        CaseError
+            One message with every mistake: file, line, key, value, what is allowed.
+        """
+        source = read_source(Path(file))
+        for setting in settings:
+            override(source, setting)
+        return cls.from_source(source)
+
+    @classmethod
+    def from_source(cls, source: Source) -> "Case":
+        """Validate plain data; see `load`."""
+        try:
+            return cls.model_validate(source.data)
+        except ValidationError as e:
+            raise CaseError("\n".join(explain(error, source, cls) for error in e.errors())) from None

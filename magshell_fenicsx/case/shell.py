@@ -1,0 +1,53 @@
+"""The shell: geometry, thickness, material, defect."""
+
+from math import pi, sqrt
+from typing import Literal, Self
+
+from pydantic import Field, model_validator
+
+from magshell_fenicsx.case.base import Length, Pressure, Section
+from magshell_fenicsx.case.defects import DimpleSection
+
+
+class ShellSection(Section):
+    """Either radius_to_thickness, or radius and thickness with units."""
+
+    geometry: Literal["hemisphere", "disc"]
+    radius_to_thickness: float | None = Field(default=None, ge=10, le=1e5)
+    radius: Length | None = Field(default=None, gt=0)
+    thickness: Length | None = Field(default=None, gt=0)
+    youngs_modulus: Pressure | None = Field(default=None, gt=0)
+    poisson_ratio: float = Field(gt=-1, le=0.5)
+    defect: DimpleSection | None = None
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        lengths = [self.radius, self.thickness]
+        if self.radius_to_thickness is not None:
+            if lengths != [None, None]:
+                raise ValueError("give radius_to_thickness, or radius and thickness, not both")
+        elif None in lengths:
+            raise ValueError("give radius_to_thickness, or both radius and thickness")
+        elif not 10 <= self.R_over_h <= 1e5:
+            raise ValueError(f"radius/thickness is {self.R_over_h:.4g}; a thin shell needs 10 to 1e5")
+        if self.defect and self.geometry != "hemisphere":
+            raise ValueError("a dimple needs geometry: hemisphere")
+        if self.defect and self.dimple_half_width >= 0.9 * pi / 2:
+            raise ValueError(
+                f"the dimple's half-width phi_o is {self.dimple_half_width * 180 / pi:.1f} degrees at this R/h "
+                f"and poisson_ratio; it must stay below 81"
+            )
+        return self
+
+    @property
+    def R_over_h(self) -> float:
+        if self.radius_to_thickness is not None:
+            return self.radius_to_thickness
+        assert self.radius and self.thickness
+        return self.radius / self.thickness
+
+    @property
+    def dimple_half_width(self) -> float:
+        """phi_o (rad)."""
+        assert self.defect
+        return self.defect.width / (sqrt(12 * (1 - self.poisson_ratio**2)) * self.R_over_h) ** 0.5

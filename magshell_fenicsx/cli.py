@@ -1,0 +1,84 @@
+"""The command line; a thin user of the Python API."""
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from mpi4py import MPI
+
+from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.source import CaseError
+
+app = typer.Typer(
+    help="Thin magnetic shells: deformation, indentation, buckling.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    add_completion=False,
+)
+CaseFile = Annotated[Path, typer.Argument(metavar="CASE.yaml", help="the case file")]
+Settings = Annotated[list[str] | None, typer.Option("--set", metavar="KEY.PATH=VALUE", help="replace a key of the case")]
+
+INVALID, STOPPED = 2, 3
+
+
+def _say(line: str) -> None:
+    if MPI.COMM_WORLD.rank == 0:
+        print(line, flush=True)
+
+
+def _fail(message: str, code: int) -> None:
+    if MPI.COMM_WORLD.rank == 0:
+        print(message, file=sys.stderr, flush=True)
+    raise typer.Exit(code)
+
+
+@app.command()
+def run(
+    case: CaseFile,
+    set_: Settings = None,
+    out: Annotated[Path | None, typer.Option(help="output folder; default results/<case name>/")] = None,
+) -> None:
+    """Solve a case and write path.csv, summary.json, fields and pictures."""
+    from magshell_fenicsx.mesh.patch import MeshError
+    from magshell_fenicsx.run import run as run_case
+
+    folder = out or Path("results") / case.stem
+    try:
+        result = run_case(Case.load(case, set_ or []), folder, say=_say)
+    except (CaseError, MeshError) as e:
+        return _fail(str(e), INVALID)
+    if result.knockdown is not None:
+        _say(f"knockdown factor k_d = {result.knockdown:.9g}")
+    _say(f"results in {folder}/")
+    if result.stopped:
+        _fail(f"stopped early: {result.stopped}", STOPPED)
+
+
+@app.command()
+def check(case: CaseFile, set_: Settings = None) -> None:
+    """Validate a case; print what would be built and what is left out."""
+    from magshell_fenicsx.plan import describe
+
+    try:
+        _say(describe(Case.load(case, set_ or [])))
+    except CaseError as e:
+        _fail(str(e), INVALID)
+
+
+@app.command()
+def info(
+    compile_: Annotated[bool, typer.Option("--compile", help="compile every kernel of degrees 3 and 4 now")] = False,
+) -> None:
+    """Versions, the BLAS in use, the kernel cache."""
+    from magshell_fenicsx.environment import fast_blas, kernel_cache, versions
+    from magshell_fenicsx.precompile import precompile
+
+    for name, number in versions().items():
+        _say(f"{name:18} {number}")
+    _say(f"{'blas':18} {fast_blas() or 'reference (slow: install OpenBLAS)'}")
+    _say(f"{'ranks':18} {MPI.COMM_WORLD.size}")
+    _say(f"{'kernel cache':18} {kernel_cache()}")
+    if compile_:
+        for degree in (3, 4):
+            _say(f"compiled degree {degree} in {precompile(degree):.1f} s")

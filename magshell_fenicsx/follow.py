@@ -1,0 +1,168 @@
+"""The history of a case: the field first, then the load; every accepted point, and what stopped it."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from magshell_fenicsx.case.loading import IndentationSection, PressureSection
+from magshell_fenicsx.scene import Scene
+from magshell_fenicsx.solve.events import locate
+from magshell_fenicsx.solve.path import Path, PathStopped, Point, StepOptions
+from magshell_fenicsx.solve.system import State
+
+Label = Literal["start", "field", "step", "target", "fold", "bifurcation"]
+MOST_POINTS = 1000
+
+
+@dataclass(frozen=True)
+class Record:
+    """A point of the history and how it came about.
+
+    Attributes
+    ----------
+    label
+        "field": while the field grows; "step": on the way; "target": asked for;
+        "fold" and "bifurcation": a located instability.
+    amplitude
+        The amplitude that varied ("" at the start).
+    """
+
+    label: Label
+    amplitude: str
+    point: Point
+
+
+class Stopped(RuntimeError):
+    """The history ended before its target; the message says where and why."""
+
+
+def follow(scene: Scene) -> Iterator[Record]:
+    """Run through the history of a scene.
+
+    Raises
+    ------
+    Stopped
+        If the path is lost, or the field alone makes the shell unstable.
+    """
+    state = scene.unloaded()
+    factors = scene.newton.factor_at(state)
+    yield Record("start", "", Point(state, 0.0, 0.0 * state.u, 0.0, factors.negative_pivots, 0, 1))
+    if scene.model.loads.magnetic:
+        for record in _field(scene, state):
+            yield record
+            state = record.point.state
+    loading = scene.case.loading
+    if isinstance(loading, PressureSection):
+        yield from _pressure(scene, loading, state)
+    elif isinstance(loading, IndentationSection):
+        yield from _indentation(scene, loading, state)
+
+
+def _field(scene: Scene, state: State) -> Iterator[Record]:
+    target = scene.case.lambda_m
+    path = Path(scene.newton, "lambda_m", "load", StepOptions(abs(target) / 2, abs(target), abs(target) * 1e-4))
+    here = path.start(state)
+    try:
+        for point, _ in path.towards(here, [target]):
+            if point.negative_pivots:
+                raise Stopped(
+                    f"the field alone makes the shell unstable: between lambda_m = {here.s:.6g} and {point.s:.6g} "
+                    f"the number of unstable directions becomes {point.negative_pivots}"
+                )
+            here = point
+            yield Record("field", "lambda_m", point)
+    except PathStopped as e:
+        raise Stopped(f"the field step stopped at lambda_m = {e.point.s:.6g} of {target:g}: {e}") from None
+
+
+def _pressure(scene: Scene, loading: PressureSection, state: State) -> Iterator[Record]:
+    volume = -scene.model.system.potential(state.u, "pressure")
+    unit = scene.plan.material.classical_pressure / scene.plan.material.h / scene.model.multiplicity
+    if loading.control == "load":
+        path = Path(scene.newton, "pressure", "load", StepOptions(0.1, 0.2, 1e-6))
+        start, end = path.start(state), loading.pressure or np.inf
+    else:
+        path = Path(scene.newton, "pressure", "conjugate", StepOptions(1.0, 1.0, 1.0))
+        start = path.start(state)
+        first = abs(0.1 / start.dmu)  # as long as a tenth of p_c is at the start
+        path.options = StepOptions(first, 5 * first, 1e-5 * first)
+        end = -unit * loading.volume_change if loading.volume_change is not None else np.inf
+    if loading.until == "limit":
+        yield from _until_limit(path, start)
+        return
+    targets = np.linspace(start.s, end, loading.points + 1)[1:]
+    yield from _through(path, start, targets.tolist())
+
+
+def _indentation(scene: Scene, loading: IndentationSection, state: State) -> Iterator[Record]:
+    h, model = scene.plan.material.h, scene.model
+    if loading.control == "load":
+        assert loading.force is not None
+        size = abs(loading.force) / loading.points
+        path = Path(scene.newton, "force", "load", StepOptions(size, size, 1e-5 * size))
+        targets = np.linspace(0, loading.force, loading.points + 1)[1:]
+    else:
+        assert loading.depth is not None
+        unit = model.force_unit * h  # of -Pi_F = F w at F R/(2 pi D) = 1, w = h
+        path = Path(scene.newton, "force", "conjugate", StepOptions(unit, 2 * unit, 1e-3 * unit))
+        targets = unit * np.linspace(0, loading.depth, loading.points + 1)[1:]
+    start = path.start(state)
+    # the field may have moved the point past the first targets already
+    forward = [t for t in targets if (t - start.s) * targets[-1] > 0]
+    yield from _through(path, start, forward)
+
+
+def _until_limit(path: Path, start: Point) -> Iterator[Record]:
+    """Accepted points up to the first instability, which is the last record."""
+    here = start
+    try:
+        for count, (point, _) in enumerate(path.towards(start, [np.inf])):
+            if point.negative_pivots > start.negative_pivots:
+                found = locate(path, here, point)
+                yield Record(found.kind, path.name, found.point)
+                return
+            if count >= MOST_POINTS:
+                raise Stopped(f"no instability found in {MOST_POINTS} steps; {_where(path, point)}")
+            here = point
+            yield Record("step", path.name, point)
+    except PathStopped as e:
+        raise Stopped(_why(path, e, None)) from None
+
+
+def _through(path: Path, start: Point, targets: list[float]) -> Iterator[Record]:
+    """Accepted points through all targets, with the first instability on the way located."""
+    before, here = None, start
+    try:
+        for point, reached in path.towards(start, targets):
+            if here.negative_pivots == 0 < point.negative_pivots and path.control == "conjugate":
+                found = locate(path, here, point)
+                yield Record(found.kind, path.name, found.point)
+            before, here = here, point
+            yield Record("target" if reached else "step", path.name, point)
+    except PathStopped as e:
+        raise Stopped(_why(path, e, before)) from None
+
+
+def _where(path: Path, point: Point) -> str:
+    return f"the last point has {path.name} = {point.state.mu[path.name]:.6g}"
+
+
+def _why(path: Path, stop: PathStopped, before: Point | None) -> str:
+    """What the user reads when a path is lost, with the fold in the control named if it is one."""
+    here = stop.point
+    said = f"{_where(path, here)}: {stop}"
+    if path.control == "load":
+        return f"load control stopped; {said}. Past a limit point only displacement or volume control can follow"
+    if before is None or before.dmu == here.dmu:
+        return f"the controlled path stopped; {said}"
+    # near a fold in the controlled s, (ds/dmu)^2 falls linearly to zero with s
+    a, b = before.dmu**-2, here.dmu**-2
+    ahead = b * (here.s - before.s) / (a - b) if a > b else np.inf
+    if 0 < ahead / (here.s - before.s) < 10:
+        return (
+            f"the path turns back in the controlled displacement, {ahead / here.s:.2%} beyond the last point: "
+            f"a fold that displacement control cannot pass; {said}"
+        )
+    return f"the controlled path stopped; {said}"

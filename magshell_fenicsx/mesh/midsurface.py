@@ -1,0 +1,111 @@
+"""The mid-surface: an affine dolfinx mesh and, apart from it, the placement r0.
+
+The kernels see only the affine mesh, so their Jacobian is constant and one compiled
+kernel serves every shape; the shape itself is the vector field r0, interpolated at
+the nodes of the displacement's own element, so that rigid motions are exact.
+"""
+
+from dataclasses import dataclass
+
+import basix
+import basix.ufl
+import numpy as np
+from dolfinx import fem, mesh
+from dolfinx.io import gmshio
+from mpi4py import MPI
+from numpy.typing import NDArray
+
+from magshell_fenicsx.mesh.patch import MeshError, PatchMesh, check_orientation
+
+
+@dataclass(frozen=True)
+class Midsurface:
+    """A mid-surface on all ranks.
+
+    Attributes
+    ----------
+    mesh
+        Affine triangles (topological dimension 2 in space), with one layer of ghosts.
+    edges
+        Name -> facets (local numbers) of that boundary edge.
+    points
+        Name -> (3,) position of a vertex.
+    """
+
+    mesh: mesh.Mesh
+    edges: dict[str, NDArray[np.int32]]
+    points: dict[str, NDArray[np.float64]]
+    _patch: PatchMesh
+
+    def placement(self, V: fem.FunctionSpace) -> fem.Function:
+        """The undeformed placement r0 in the Lagrange space `V` (vector valued)."""
+        patch, tdim = self._patch, self.mesh.topology.dim
+        order = {3: 1, 6: 2, 10: 3}[patch.cells.shape[1]]
+        geometry = basix.create_element(
+            basix.ElementFamily.P, basix.CellType.triangle, order, basix.LagrangeVariant.equispaced
+        )
+        to_dolfinx = gmshio.cell_perm_array(mesh.CellType.triangle, patch.cells.shape[1])
+        nodes = np.asarray(V.element.interpolation_points())
+        values = geometry.tabulate(0, nodes)[0, :, :, 0]
+        cell_map = self.mesh.topology.index_map(tdim)
+        local = self.mesh.topology.original_cell_index[: cell_map.size_local + cell_map.num_ghosts]
+        cells = patch.cells[local]
+        chart = np.einsum("qk,ckd->cqd", values, patch.nodes[cells[:, to_dolfinx]])
+        r0 = fem.Function(V, name="r0")
+        r0.x.array.reshape(-1, 3)[V.dofmap.list] = patch.embedding(chart.reshape(-1, chart.shape[-1])).reshape(
+            *chart.shape[:2], 3
+        )
+        r0.x.scatter_forward()
+        return r0
+
+
+def distribute(patch: PatchMesh | None, comm: MPI.Comm) -> Midsurface:
+    """Make the mid-surface on all ranks from the triangulation on rank 0.
+
+    Raises
+    ------
+    MeshError
+        On every rank, if the normals of the triangulation disagree.
+    """
+    error = None
+    if comm.rank == 0:
+        assert patch is not None
+        try:
+            check_orientation(patch)
+        except MeshError as e:
+            error = e
+    error = comm.bcast(error)
+    if error:
+        raise error
+    patch = comm.bcast(patch)  # the chart of a surface is small; each rank picks its own cells
+    assert patch is not None
+    vertices, corners = np.unique(patch.cells[:, :3], return_inverse=True)
+    corners = corners.reshape(-1, 3).astype(np.int64)
+    xyz = patch.embedding(patch.nodes[vertices])
+    first = comm.rank == 0
+    element = basix.ufl.element("Lagrange", "triangle", 1, shape=(3,))
+    domain = mesh.create_mesh(
+        comm,
+        corners if first else corners[:0],
+        xyz if first else xyz[:0],
+        element,
+        mesh.create_cell_partitioner(mesh.GhostMode.shared_facet),
+    )
+    position = {name: patch.embedding(x[None])[0] for name, x in patch.points.items()}
+    return Midsurface(domain, _named_facets(domain, patch, vertices), position, patch)
+
+
+def _named_facets(domain: mesh.Mesh, patch: PatchMesh, vertices: NDArray[np.int64]) -> dict[str, NDArray[np.int32]]:
+    """Find the facets of each named edge by the vertex numbers of the triangulation."""
+    domain.topology.create_connectivity(1, 2)
+    domain.topology.create_connectivity(1, 0)
+    facets = mesh.exterior_facet_indices(domain.topology)
+    ends = mesh.entities_to_geometry(domain, 1, facets)
+    numbers = np.sort(vertices[domain.geometry.input_global_indices[ends]], axis=1)
+    found = {}
+    for name, pairs in patch.edges.items():
+        wanted = {tuple(pair) for pair in np.sort(pairs, axis=1).tolist()}
+        found[name] = np.array(
+            [f for f, ends in zip(facets, numbers.tolist(), strict=True) if tuple(ends) in wanted], dtype=np.int32
+        )
+    return found

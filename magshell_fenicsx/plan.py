@@ -1,0 +1,194 @@
+"""From a case to what must be built for it, without building anything.
+
+The plan decides the mirror plane, the mesh grading and the loads; `magshell check`
+prints it, `Scene` builds it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import atan2, cos, degrees, hypot, pi, radians, sin, sqrt
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.fields import Direction
+from magshell_fenicsx.case.loading import IndentationSection, PressureSection
+from magshell_fenicsx.case.source import CaseError
+from magshell_fenicsx.mesh.disc import triangulate_disc
+from magshell_fenicsx.mesh.grading import Disc, Ring, Size, smallest
+from magshell_fenicsx.mesh.patch import Embedding
+from magshell_fenicsx.mesh.sphere import Dimple, SphereEmbedding, direction, flat
+from magshell_fenicsx.shell.parameters import Condition, Force, Loads, Magnetisation, Material
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Everything that a scene is built from, dimensionless (lengths in R).
+
+    Attributes
+    ----------
+    half
+        Model the half y >= 0 of a frame turned about e3 by `azimuth` (rad).
+    chart_radius
+        Radius of the disc that is triangulated: pi/2 for the hemisphere, 1 for the disc.
+    included, left_out
+        What the model has and lacks, for people.
+    """
+
+    material: Material
+    loads: Loads
+    conditions: dict[str, Condition]
+    half: bool
+    azimuth: float
+    chart_radius: float
+    circle: float | None
+    embedding: Embedding
+    points: dict[str, NDArray[np.float64]]
+    size: Size
+    included: list[str]
+    left_out: list[str]
+
+
+def make_plan(case: Case) -> Plan:
+    """Plan a case.
+
+    Raises
+    ------
+    CaseError
+        If a half shell is asked for and there is no mirror plane.
+    """
+    shell, loading, magnetic = case.shell, case.loading, case.magnetic
+    material = Material(shell.poisson_ratio, 1 / shell.R_over_h)
+    field_on = magnetic is not None and case.lambda_m != 0
+    indentation = loading if isinstance(loading, IndentationSection) else None
+    directions = [magnetic.remanent, magnetic.applied] if magnetic and field_on else []
+    azimuth = common_azimuth([*directions, *([indentation.at] if indentation else [])])
+    if case.symmetry == "half" and azimuth is None:
+        raise CaseError("symmetry: half: the fields and the load have no common mirror plane through e3")
+    half = azimuth is not None and case.symmetry != "none"
+    turn = azimuth if half and azimuth is not None else 0.0
+
+    def turned(d: Direction) -> NDArray[np.float64]:
+        return direction(radians(d.polar), radians(d.azimuth) - turn)
+
+    defect = Dimple(shell.defect.amplitude * material.h, shell.dimple_half_width) if shell.defect else None
+    hemisphere = shell.geometry == "hemisphere"
+    points = {"pole": np.zeros(2)}
+    force = None
+    if indentation:
+        at, theta = radians(indentation.at.polar), radians(indentation.at.azimuth) - turn
+        chart = at * np.array([cos(theta), sin(theta)])
+        if half:
+            chart[1] = 0.0
+        name = "load" if at else "pole"
+        points[name] = chart
+        force = Force(name, indentation.patch * material.h)
+    conditions: dict[str, Condition] = {"rim": (case.boundary.equator if hemisphere else case.boundary.rim) or "free"}
+    if half:
+        conditions["symmetry"] = "symmetry"
+    loads = Loads(
+        pressure=isinstance(loading, PressureSection),
+        force=force,
+        magnetic=Magnetisation(turned(magnetic.remanent), turned(magnetic.applied)) if magnetic and field_on else None,
+    )
+    included, left_out = _account(case, loads, half, azimuth)
+    return Plan(
+        material=material,
+        loads=loads,
+        conditions=conditions,
+        half=half,
+        azimuth=turn,
+        chart_radius=pi / 2 if hemisphere else 1.0,
+        circle=defect.phi_o if defect else None,
+        embedding=SphereEmbedding(defect) if hemisphere else flat,
+        points=points,
+        size=_grading(case, material.h, defect, points),
+        included=included,
+        left_out=left_out,
+    )
+
+
+def common_azimuth(directions: Sequence[Direction]) -> float | None:
+    """Azimuth (rad) of the plane through e3 that holds all directions; None if there is none.
+
+    0 if every direction is along e3.
+    """
+    horizontal = [direction(radians(d.polar), radians(d.azimuth))[:2] for d in directions]
+    tilted = [v for v in horizontal if hypot(*v) > 1e-12]
+    if not tilted:
+        return 0.0
+    x, y = tilted[0]
+    if any(abs(x * v[1] - y * v[0]) > 1e-10 * hypot(x, y) * hypot(*v) for v in tilted):
+        return None
+    return atan2(y, x)
+
+
+def _grading(case: Case, h: float, defect: Dimple | None, points: dict[str, NDArray[np.float64]]) -> Size:
+    """Element sizes for 1e-4 in k_d and 1e-3 in F at degree 4, in units of the shell's length sqrt(Rh)."""
+    length, refine, growth = sqrt(h), case.mesh.refinement, 0.4
+    loading = case.loading
+    if case.shell.geometry == "disc":
+        features: list[Size] = []
+        largest = 0.25
+    else:
+        features = [Ring(pi / 2, 1.4 * length / refine, growth)]
+        # without a dimple the sphere buckles anywhere, in waves of about 3.6 sqrt(Rh)
+        largest = 1.2 * length if defect is None and isinstance(loading, PressureSection) else 0.35
+    if defect:
+        features.append(Disc((0.0, 0.0), defect.phi_o + 0.7 * length, 0.45 * length / refine, growth))
+    if isinstance(loading, IndentationSection):
+        x, y = points.get("load", points["pole"])
+        depth = abs(loading.depth) if loading.depth else 10.0
+        dent = sqrt(2 * depth * h) + 0.5 * length  # mirror buckling: the ridge's radius grows like sqrt(2 R w)
+        features.append(Disc((x, y), dent, length / refine, growth))
+        # finer than h the point force's logarithmic stretch would be resolved, which has no limit
+        centre = max(loading.patch * h / 2, h) if loading.patch else h
+        features.append(Disc((x, y), loading.patch * h, centre, growth))
+    return smallest(features, largest / refine)
+
+
+def _account(case: Case, loads: Loads, half: bool, azimuth: float | None) -> tuple[list[str], list[str]]:
+    included = [f"{'half' if half else 'full'} shell", "membrane and bending energy"]
+    left_out = []
+    if loads.magnetic:
+        included.append(f"magnetic energy (full), lambda_m = {case.lambda_m:g}")
+    else:
+        left_out.append("magnetic energy: " + ("lambda_m is zero" if case.magnetic else "no magnetic section"))
+    if loads.pressure:
+        included.append("live pressure")
+    else:
+        left_out.append("pressure: not loaded by it (the volume is only reported)")
+    if loads.force:
+        where = f"on a patch of radius {loads.force.patch / (1 / case.shell.R_over_h):g} h" if loads.force.patch else "at a point"
+        included.append(f"force {where}")
+    else:
+        left_out.append("force: none")
+    if half:
+        left_out.append(
+            f"the other half: mirror plane through e3 at azimuth {degrees(azimuth or 0.0):g} degrees "
+            "(modes antisymmetric to it are not seen; symmetry: none sees them)"
+        )
+    return included, left_out
+
+
+def describe(case: Case) -> str:
+    """What `magshell check` prints: dimensionless numbers, what is built, what is left out."""
+    plan = make_plan(case)
+    numbers = {
+        "R/h": 1 / plan.material.h,
+        "nu": plan.material.nu,
+        "p_c/E": plan.material.classical_pressure,
+        "lambda_m": case.lambda_m,
+        "Lambda_m = lambda_m R/h": case.lambda_m / plan.material.h,
+    }
+    nodes, cells, _ = triangulate_disc(
+        plan.chart_radius, plan.size, half=plan.half, circle=plan.circle, points=plan.points
+    )
+    corners, k = len(np.unique(cells[:, :3])), case.mesh.degree
+    sides = corners + len(cells) - 1  # Euler's formula for a disc
+    unknowns = 3 * (corners + (k - 1) * sides + (k - 1) * (k - 2) // 2 * len(cells))
+    lines = [f"{name} = {value:.6g}" for name, value in numbers.items()]
+    lines.append(f"mesh: {len(cells)} cells of degree {k}, {unknowns} unknowns")
+    lines += ["built:", *(f"  {item}" for item in plan.included), "left out:", *(f"  {item}" for item in plan.left_out)]
+    return "\n".join(lines)

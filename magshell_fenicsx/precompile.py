@@ -1,0 +1,28 @@
+"""Compile every kernel ahead of time, for images and clusters without a compiler at run time."""
+
+import time
+
+from mpi4py import MPI
+
+from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.source import Source
+from magshell_fenicsx.scene import Scene
+
+EVERYTHING = {
+    "shell": {"geometry": "hemisphere", "radius_to_thickness": 20, "poisson_ratio": 0.3},
+    "boundary": {"equator": "clamped"},
+    "magnetic": {"lambda_m": 1e-3},
+}
+LOADINGS = (
+    {"kind": "pressure"},
+    {"kind": "indentation", "at": {"polar": 45}, "depth": 1, "patch": 5},
+)
+
+
+def precompile(degree: int) -> float:
+    """Compile all kernels of a degree; the seconds that it took."""
+    start = time.perf_counter()
+    for loading in LOADINGS:
+        data = {**EVERYTHING, "loading": loading, "mesh": {"refinement": 0.5, "degree": degree}}
+        Scene(Case.from_source(Source("precompile", data)), MPI.COMM_WORLD)
+    return time.perf_counter() - start

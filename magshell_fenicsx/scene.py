@@ -1,0 +1,78 @@
+"""The composition root: from a case, build the mid-surface, the model and its solver."""
+
+import time
+
+from mpi4py import MPI
+
+from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.mesh.disc import triangulate_disc
+from magshell_fenicsx.mesh.midsurface import Midsurface, distribute
+from magshell_fenicsx.mesh.patch import PatchMesh
+from magshell_fenicsx.plan import Plan, make_plan
+from magshell_fenicsx.shell.model import ShellModel
+from magshell_fenicsx.solve.newton import BorderedNewton
+from magshell_fenicsx.solve.system import State
+
+
+class Scene:
+    """A case ready to be solved.
+
+    Attributes
+    ----------
+    case, plan
+        What was asked for, and what was made of it.
+    model, newton
+        The shell as a system of terms, and the solver of its bordered systems.
+    setup_s
+        Seconds of building, without compiling kernels.
+    """
+
+    def __init__(self, case: Case, comm: MPI.Comm = MPI.COMM_WORLD) -> None:
+        start = time.perf_counter()
+        self.case, self.plan, self.comm = case, make_plan(case), comm
+        self.model = ShellModel(
+            build_midsurface(self.plan, comm),
+            self.plan.material,
+            case.mesh.degree,
+            self.plan.conditions,
+            self.plan.loads,
+            case.mesh.penalty,
+        )
+        self.newton = BorderedNewton(self.model.system)
+        self.setup_s = time.perf_counter() - start - self.model.kernels.seconds
+
+    @property
+    def cells(self) -> int:
+        return int(self.model.midsurface.mesh.topology.index_map(2).size_global)
+
+    def unloaded(self) -> State:
+        """The undeformed shell with all amplitudes zero."""
+        amplitudes = {t.amplitude for t in self.model.system.terms if t.amplitude}
+        return State(self.model.zero(), dict.fromkeys(sorted(amplitudes), 0.0))
+
+    def observe(self, state: State) -> dict[str, float]:
+        """The physical columns of a table row: loads, displacements over h, volume, energy."""
+        model, h = self.model, self.plan.material.h
+        pole = model.deflection(state.u, "pole") / h
+        energies = model.system.energies(state.u)
+        return {
+            "p_over_pc": state.mu.get("pressure", 0.0),
+            "lambda_m": state.mu.get("lambda_m", 0.0),
+            "force": state.mu.get("force", 0.0),
+            "w_over_h": model.loaded_deflection(state.u) / h if model.loads.force else pole,
+            "w_pole_over_h": pole,
+            "volume_change": model.volume_change(state.u),
+            "energy": model.multiplicity
+            * sum(energies[t.name] * (state.mu[t.amplitude] if t.amplitude else 1.0) for t in model.system.terms),
+        }
+
+
+def build_midsurface(plan: Plan, comm: MPI.Comm) -> Midsurface:
+    """Triangulate on rank 0, distribute to all."""
+    patch = None
+    if comm.rank == 0:
+        nodes, cells, edges = triangulate_disc(
+            plan.chart_radius, plan.size, half=plan.half, circle=plan.circle, points=plan.points
+        )
+        patch = PatchMesh(nodes, cells, plan.embedding, edges, plan.points)
+    return distribute(patch, comm)

@@ -1,0 +1,54 @@
+"""Energy densities of the shell as plain functions of jets: the one source of the physics.
+
+All in units of E h per undeformed area (lengths in R), so that the membrane energy is
+of order one; `h` is then h/R. An energy is the integral of density times area_ratio(r0).
+"""
+
+import ufl
+from ufl.core.expr import Expr
+
+from magshell_fenicsx.shell import kinematics as kin
+from magshell_fenicsx.shell.kinematics import Jet
+
+
+def koiter(S: Expr, up: Expr, nu: Expr) -> Expr:
+    """(1 - nu) S:S + nu tr^2 S with indices raised by the undeformed metric `up`."""
+    T = kin.mixed(S, up)
+    return (1 - nu) * ufl.tr(ufl.dot(T, T)) + nu * ufl.tr(T) ** 2
+
+
+def bending_stiffness(h: Expr, nu: Expr) -> Expr:
+    """D/(E h R^2)."""
+    return h**2 / (12 * (1 - nu**2))
+
+
+def membrane(r0: Jet, u: Jet, nu: Expr) -> Expr:
+    """Stretching density, paper Eq. (eqn:energy), first term."""
+    return koiter(kin.membrane_strain(r0, u), kin.inverse_metric(r0), nu) / (2 * (1 - nu**2))
+
+
+def bending(r0: Jet, u: Jet, nu: Expr, h: Expr) -> Expr:
+    """Bending density, paper Eq. (eqn:energy), second term."""
+    K = kin.curvature_change(r0, u)
+    return bending_stiffness(h, nu) / 2 * koiter(K, kin.inverse_metric(r0), nu)
+
+
+def normal_moment(r0: Jet, u: Jet, nu1: Expr, nu2: Expr, nu: Expr, h: Expr) -> Expr:
+    """M_nunu = D [(1 - nu) K_nunu + nu tr K] for the unit conormal nu^1, nu^2."""
+    K = kin.curvature_change(r0, u)
+    K_nunu = K[0, 0] * nu1**2 + 2 * K[0, 1] * nu1 * nu2 + K[1, 1] * nu2**2
+    trace = ufl.tr(kin.mixed(K, kin.inverse_metric(r0)))
+    return bending_stiffness(h, nu) * ((1 - nu) * K_nunu + nu * trace)
+
+
+def magnetic(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:
+    """-Ba . (F - F0) Br, F = a_i (x) a0^i + n (x) n0; paper Eq. (eq:magenergy) without its constant."""
+    up1, up2 = kin.dual_basis(r0)
+    n, n0 = kin.normal(r0 + u), kin.normal(r0)
+    return -ufl.dot(Ba, u.r1 * ufl.dot(up1, Br) + u.r2 * ufl.dot(up2, Br) + (n - n0) * ufl.dot(n0, Br))
+
+
+def volume(r0: Jet, u: Jet) -> Expr:
+    """(r . n dω - r0 . n0 dω0)/3 per flat area (already includes the area ratio)."""
+    r = r0 + u
+    return (ufl.dot(r.r, kin.area_vector(r)) - ufl.dot(r0.r, kin.area_vector(r0))) / 3

@@ -1,0 +1,130 @@
+"""The shell as a system of terms: only those that its loads and edges call for.
+
+Lengths in R, energies in E h R^2. Amplitudes: "pressure" is p/p_c, "force" is
+F R/(2 pi D), "lambda_m" is lambda_m.
+"""
+
+from collections.abc import Mapping
+
+import numpy as np
+from dolfinx import fem
+from numpy.typing import NDArray
+
+from magshell_fenicsx.mesh.midsurface import Midsurface
+from magshell_fenicsx.shell.parameters import MIRROR_NORMAL, Condition, Force, Loads, Material, default_penalty
+from magshell_fenicsx.shell.point_load import patch_entries, point_entries, vertex_normal
+from magshell_fenicsx.shell.terms import TermFactory
+from magshell_fenicsx.solve.kernels import KernelLog
+from magshell_fenicsx.solve.problem import FiniteElementSystem
+from magshell_fenicsx.solve.system import Vector
+from magshell_fenicsx.solve.terms import LinearTerm, Term
+
+
+class ShellModel:
+    """A Koiter shell on a mid-surface.
+
+    Parameters
+    ----------
+    midsurface
+        Mesh and placement.
+    degree
+        Of displacement and placement, 2 to 5.
+    conditions
+        Edge name -> condition; edges that are not named are free.
+    sigma
+        Penalty of the C0 interior penalty form; None takes `default_penalty`.
+
+    Attributes
+    ----------
+    system
+        What the solvers see.
+    multiplicity
+        2 for a half model, whose integrals and forces are those of one half; else 1.
+    kernels
+        Names and compile time of the forms in use.
+    """
+
+    def __init__(
+        self,
+        midsurface: Midsurface,
+        material: Material,
+        degree: int,
+        conditions: Mapping[str, Condition],
+        loads: Loads,
+        sigma: float | None = None,
+    ) -> None:
+        self.midsurface, self.material, self.degree, self.loads = midsurface, material, degree, loads
+        self.multiplicity = 2 if "symmetry" in conditions.values() else 1
+        self.kernels = KernelLog()
+        self.V = V = fem.functionspace(midsurface.mesh, ("Lagrange", degree, (3,)))
+        self.r0, self.u = midsurface.placement(V), fem.Function(V, name="u")
+        self.sigma = default_penalty(degree) if sigma is None else sigma
+        factory = TermFactory(self.r0, self.u, material, self.sigma, degree, self.kernels)
+        interior = factory.interior_edges()
+        terms: list[Term] = [factory.membrane(), factory.bending(), interior]
+        held = []
+
+        def facets(condition: Condition) -> NDArray[np.int32]:
+            found = [midsurface.edges[name] for name, c in conditions.items() if c == condition]
+            return np.unique(np.concatenate(found)).astype(np.int32) if found else np.empty(0, np.int32)
+
+        if "clamped" in conditions.values():
+            terms.append(factory.clamped_edges(facets("clamped")))
+            held.append(_held(V, facets("clamped")))
+        if "simply supported" in conditions.values():
+            held.append(_held(V, facets("simply supported")))
+        if "symmetry" in conditions.values():
+            terms.append(factory.mirror_edges(facets("symmetry")))
+            held.append(_held_in_mirror(V, facets("symmetry")))
+        if loads.magnetic:
+            terms.append(factory.magnetic(loads.magnetic))
+        if loads.pressure:
+            terms.append(factory.pressure())
+        self.normals = {name: vertex_normal(self.r0, x) for name, x in midsurface.points.items()}
+        if loads.force:
+            terms.append(self._force(loads.force))
+        self.system = FiniteElementSystem(self.u, terms, held, interior, material.h)
+        self._volume = self.kernels.compile("volume energy", factory.volume_change())
+        self._probes = {name: point_entries(V, x, -self.normals[name]) for name, x in midsurface.points.items()}
+
+    def zero(self) -> Vector:
+        """The undeformed displacement."""
+        return np.zeros(self.system.size)
+
+    def volume_change(self, u: Vector) -> float:
+        """Delta V/R^3 of the whole shell."""
+        self.system.set(u)
+        return self.multiplicity * float(self.system.comm.allreduce(fem.assemble_scalar(self._volume)))
+
+    def deflection(self, u: Vector, point: str) -> float:
+        """w/R = -u . n0 at a named vertex."""
+        dofs, entries = self._probes[point]
+        return float(self.system.comm.allreduce(float(entries @ u[dofs])))
+
+    def loaded_deflection(self, u: Vector) -> float:
+        """w/R conjugate to the force: at its point, or averaged over its patch."""
+        return -self.system.potential(u, "force") / self.force_unit
+
+    @property
+    def force_unit(self) -> float:
+        """The force F R/(2 pi D) = 1 on the modelled part, over E h R."""
+        return 2 * np.pi * self.material.bending_stiffness / self.multiplicity
+
+    def _force(self, force: Force) -> LinearTerm:
+        x, inward = self.midsurface.points[force.point], -self.normals[force.point]
+        if force.patch:
+            entries = patch_entries(self.r0, x, force.patch, inward, self.degree, self.kernels)
+        else:
+            entries = point_entries(self.V, x, inward)
+        return LinearTerm("force", entries[0], self.force_unit * entries[1], self.u, "force")
+
+
+def _held(V: fem.FunctionSpace, facets: NDArray[np.int32]) -> fem.DirichletBC:
+    """u = 0 on an edge."""
+    return fem.dirichletbc(np.zeros(3), fem.locate_dofs_topological(V, 1, facets), V)
+
+
+def _held_in_mirror(V: fem.FunctionSpace, facets: NDArray[np.int32]) -> fem.DirichletBC:
+    """u . m = 0 on the mirror plane."""
+    normal = V.sub(int(np.argmax(MIRROR_NORMAL)))
+    return fem.dirichletbc(0.0, fem.locate_dofs_topological(normal, 1, facets), normal)

@@ -1,0 +1,93 @@
+"""Terms on one finite-element space, as the system that the solvers see."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from dolfinx import fem
+from dolfinx.fem import petsc as fem_petsc
+from dolfinx.la import InsertMode
+from numpy.typing import NDArray
+from petsc4py import PETSc
+
+from magshell_fenicsx.solve import assembly
+from magshell_fenicsx.solve.system import Amplitudes, Vector
+from magshell_fenicsx.solve.terms import FormTerm, Term
+from magshell_fenicsx.solve.timing import Stopwatch
+
+
+class FiniteElementSystem:
+    """Sum of terms for a displacement u that vanishes at `clamped`.
+
+    Parameters
+    ----------
+    u
+        The displacement that the terms were written with; it is overwritten.
+    clamped
+        Homogeneous Dirichlet conditions.
+    pattern
+        The term with the widest coupling: its tangent's sparsity is that of the sum.
+    length
+        See `System`.
+    """
+
+    def __init__(
+        self, u: fem.Function, terms: Sequence[Term], clamped: list[fem.DirichletBC], pattern: FormTerm, length: float
+    ) -> None:
+        V = u.function_space
+        self.u, self.terms, self.clamped, self.length = u, terms, clamped, length
+        self.comm = V.mesh.comm
+        self.size = V.dofmap.index_map.size_local * V.dofmap.index_map_bs
+        self.dofs = V.dofmap.index_map.size_global * V.dofmap.index_map_bs
+        self.assembly = Stopwatch()
+        fixed = [bc.dof_indices()[0] for bc in clamped]
+        fixed_dofs = np.unique(np.concatenate(fixed)) if fixed else np.empty(0, dtype=np.int32)
+        self._fixed = fixed_dofs[fixed_dofs < self.size]
+        self._b = fem.Function(V)
+        self._K = fem_petsc.create_matrix(pattern.tangent_form)
+        self._K.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+
+    def set(self, u: Vector) -> None:
+        """Put a displacement into the Function that the terms see."""
+        self.u.x.array[: self.size] = u
+        self.u.x.scatter_forward()
+
+    def residual(self, u: Vector, mu: Amplitudes) -> Vector:
+        return self._gradient(u, [(t, _factor(t, mu)) for t in self.terms])
+
+    def load(self, u: Vector, name: str) -> Vector:
+        return self._gradient(u, [(t, 1.0) for t in self.terms if t.amplitude == name])
+
+    def potential(self, u: Vector, name: str) -> float:
+        self.set(u)
+        return float(self.comm.allreduce(sum(t.energy() for t in self.terms if t.amplitude == name)))
+
+    def energies(self, u: Vector) -> dict[str, float]:
+        """Each term's potential, without its amplitude."""
+        self.set(u)
+        return {t.name: float(self.comm.allreduce(t.energy())) for t in self.terms}
+
+    def tangent(self, u: Vector, mu: Amplitudes) -> PETSc.Mat:
+        with self.assembly:
+            self.set(u)
+            self._K.zeroEntries()
+            for t in self.terms:
+                if factor := _factor(t, mu):
+                    t.add_tangent(self._K, factor, self.clamped)
+            assembly.finish_matrix(self._K, self.u.function_space, self.clamped)
+        return self._K
+
+    def _gradient(self, u: Vector, weighted: list[tuple[Term, float]]) -> NDArray[np.float64]:
+        with self.assembly:
+            self.set(u)
+            b = self._b.x.array
+            b[:] = 0
+            for term, factor in weighted:
+                if factor:
+                    term.add_residual(b, factor)
+            self._b.x.scatter_reverse(InsertMode.add)
+            b[self._fixed] = 0
+            return b[: self.size].copy()
+
+
+def _factor(term: Term, mu: Amplitudes) -> float:
+    return 1.0 if term.amplitude is None else mu[term.amplitude]

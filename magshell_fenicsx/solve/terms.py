@@ -1,0 +1,74 @@
+"""A potential Pi(u) with its amplitude: energy, residual and tangent."""
+
+from typing import Protocol
+
+import numpy as np
+import ufl
+from dolfinx import fem
+from numpy.typing import NDArray
+from petsc4py import PETSc
+
+from magshell_fenicsx.solve import assembly
+from magshell_fenicsx.solve.kernels import KernelLog
+
+
+class Term(Protocol):
+    """What a problem sums; `amplitude` names the load factor mu of mu Pi(u), or is None for 1."""
+
+    name: str
+    amplitude: str | None
+
+    def energy(self) -> float:
+        """Pi(u) on this rank's part."""
+
+    def add_residual(self, b: NDArray[np.float64], factor: float) -> None:
+        """Add factor dPi/du to the local vector (ghosts included)."""
+
+    def add_tangent(self, K: PETSc.Mat, factor: float, clamped: list[fem.DirichletBC]) -> None:
+        """Add factor d2Pi/du2."""
+
+
+class FormTerm:
+    """A potential given by its UFL energy; both derivatives are automatic."""
+
+    def __init__(
+        self, name: str, energy: ufl.Form, u: fem.Function, log: KernelLog, amplitude: str | None = None
+    ) -> None:
+        self.name, self.amplitude = name, amplitude
+        self._factor = fem.Constant(u.function_space.mesh, 1.0)
+        V = u.function_space
+        gradient = ufl.derivative(energy, u, ufl.TestFunction(V))
+        hessian = ufl.derivative(gradient, u, ufl.TrialFunction(V))
+        self._energy = log.compile(f"{name} energy", energy)
+        self._residual = log.compile(f"{name} residual", self._factor * gradient)
+        self.tangent_form = log.compile(f"{name} tangent", self._factor * hessian)
+
+    def energy(self) -> float:
+        return float(fem.assemble_scalar(self._energy))
+
+    def add_residual(self, b: NDArray[np.float64], factor: float) -> None:
+        self._factor.value = factor
+        assembly.add_vector(b, self._residual)
+
+    def add_tangent(self, K: PETSc.Mat, factor: float, clamped: list[fem.DirichletBC]) -> None:
+        self._factor.value = factor
+        assembly.add_matrix(K, self.tangent_form, clamped)
+
+
+class LinearTerm:
+    """A dead load, Pi(u) = -l . u: `entries` of l at local, owned degrees of freedom."""
+
+    def __init__(
+        self, name: str, dofs: NDArray[np.int32], entries: NDArray[np.float64], u: fem.Function, amplitude: str
+    ) -> None:
+        self.name, self.amplitude = name, amplitude
+        self._dofs, self._entries, self._u = dofs, entries, u
+
+    def energy(self) -> float:
+        return -float(self._entries @ self._u.x.array[self._dofs])
+
+    def add_residual(self, b: NDArray[np.float64], factor: float) -> None:
+        b[self._dofs] -= factor * self._entries
+
+    def add_tangent(self, K: PETSc.Mat, factor: float, clamped: list[fem.DirichletBC]) -> None:
+        """A dead load has no tangent."""
