@@ -6,12 +6,11 @@
 0.32624
 """
 
-__version__ = "0.1.0"
-
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.follow import Record, Stopped, follow
 from magshell_fenicsx.run import Result, run
 from magshell_fenicsx.scene import Scene
+from magshell_fenicsx.version import __version__
 
-__all__ = ["Case", "CaseError", "Record", "Result", "Scene", "Stopped", "follow", "run"]
+__all__ = ["Case", "CaseError", "Record", "Result", "Scene", "Stopped", "__version__", "follow", "run"]

@@ -17,7 +17,9 @@ app = typer.Typer(
     add_completion=False,
 )
 CaseFile = Annotated[Path, typer.Argument(metavar="CASE.yaml", help="the case file")]
-Settings = Annotated[list[str] | None, typer.Option("--set", metavar="KEY.PATH=VALUE", help="replace a key of the case")]
+Settings = Annotated[
+    list[str] | None, typer.Option("--set", metavar="KEY.PATH=VALUE", help="replace a key of the case")
+]
 
 INVALID, STOPPED = 2, 3
 
@@ -27,10 +29,10 @@ def _say(line: str) -> None:
         print(line, flush=True)
 
 
-def _fail(message: str, code: int) -> None:
+def _failure(message: str, code: int) -> typer.Exit:
     if MPI.COMM_WORLD.rank == 0:
         print(message, file=sys.stderr, flush=True)
-    raise typer.Exit(code)
+    return typer.Exit(code)
 
 
 @app.command()
@@ -47,12 +49,12 @@ def run(
     try:
         result = run_case(Case.load(case, set_ or []), folder, say=_say)
     except (CaseError, MeshError) as e:
-        return _fail(str(e), INVALID)
+        raise _failure(str(e), INVALID) from None
     if result.knockdown is not None:
         _say(f"knockdown factor k_d = {result.knockdown:.9g}")
     _say(f"results in {folder}/")
     if result.stopped:
-        _fail(f"stopped early: {result.stopped}", STOPPED)
+        raise _failure(f"stopped early: {result.stopped}", STOPPED)
 
 
 @app.command()
@@ -63,7 +65,7 @@ def check(case: CaseFile, set_: Settings = None) -> None:
     try:
         _say(describe(Case.load(case, set_ or [])))
     except CaseError as e:
-        _fail(str(e), INVALID)
+        raise _failure(str(e), INVALID) from None
 
 
 @app.command()

@@ -9,7 +9,7 @@ import ufl
 from dolfinx.jit import get_options
 from petsc4py import PETSc
 
-from magshell_fenicsx import __version__
+from magshell_fenicsx.version import __version__
 
 FAST_BLAS = re.compile(r"/lib(openblas|mkl_rt|mkl_core|blis|flexiblas|armpl)[^/]*$", re.MULTILINE)
 

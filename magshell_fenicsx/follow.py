@@ -78,22 +78,21 @@ def _field(scene: Scene, state: State) -> Iterator[Record]:
 
 
 def _pressure(scene: Scene, loading: PressureSection, state: State) -> Iterator[Record]:
-    volume = -scene.model.system.potential(state.u, "pressure")
-    unit = scene.plan.material.classical_pressure / scene.plan.material.h / scene.model.multiplicity
+    material = scene.plan.material
     if loading.control == "load":
         path = Path(scene.newton, "pressure", "load", StepOptions(0.1, 0.2, 1e-6))
-        start, end = path.start(state), loading.pressure or np.inf
+        start, end = path.start(state), loading.pressure
     else:
         path = Path(scene.newton, "pressure", "conjugate", StepOptions(1.0, 1.0, 1.0))
-        start = path.start(state)
+        start, end = path.start(state), loading.volume_change
         first = abs(0.1 / start.dmu)  # as long as a tenth of p_c is at the start
-        path.options = StepOptions(first, 5 * first, 1e-5 * first)
-        end = -unit * loading.volume_change if loading.volume_change is not None else np.inf
-    if loading.until == "limit":
+        path.options = StepOptions(first, 2 * first, 1e-5 * first)
+        if end is not None:
+            end *= -material.classical_pressure / material.h / scene.model.multiplicity
+    if end is None:
         yield from _until_limit(path, start)
-        return
-    targets = np.linspace(start.s, end, loading.points + 1)[1:]
-    yield from _through(path, start, targets.tolist())
+    else:
+        yield from _through(path, start, _divided(start.s, end, loading.points))
 
 
 def _indentation(scene: Scene, loading: IndentationSection, state: State) -> Iterator[Record]:
@@ -102,16 +101,21 @@ def _indentation(scene: Scene, loading: IndentationSection, state: State) -> Ite
         assert loading.force is not None
         size = abs(loading.force) / loading.points
         path = Path(scene.newton, "force", "load", StepOptions(size, size, 1e-5 * size))
-        targets = np.linspace(0, loading.force, loading.points + 1)[1:]
+        targets = _divided(0.0, loading.force, loading.points)
     else:
         assert loading.depth is not None
         unit = model.force_unit * h  # of -Pi_F = F w at F R/(2 pi D) = 1, w = h
         path = Path(scene.newton, "force", "conjugate", StepOptions(unit, 2 * unit, 1e-3 * unit))
-        targets = unit * np.linspace(0, loading.depth, loading.points + 1)[1:]
+        targets = _divided(0.0, unit * loading.depth, loading.points)
     start = path.start(state)
     # the field may have moved the point past the first targets already
     forward = [t for t in targets if (t - start.s) * targets[-1] > 0]
     yield from _through(path, start, forward)
+
+
+def _divided(start: float, end: float, points: int) -> list[float]:
+    """`points` equidistant targets, the last of them `end`."""
+    return [float(t) for t in np.linspace(start, end, points + 1)[1:]]
 
 
 def _until_limit(path: Path, start: Point) -> Iterator[Record]:

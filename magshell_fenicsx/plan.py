@@ -74,13 +74,11 @@ def make_plan(case: Case) -> Plan:
 
     defect = Dimple(shell.defect.amplitude * material.h, shell.dimple_half_width) if shell.defect else None
     hemisphere = shell.geometry == "hemisphere"
-    points = {"pole": np.zeros(2)}
+    points: dict[str, NDArray[np.float64]] = {"pole": np.zeros(2)}
     force = None
     if indentation:
         at, theta = radians(indentation.at.polar), radians(indentation.at.azimuth) - turn
-        chart = at * np.array([cos(theta), sin(theta)])
-        if half:
-            chart[1] = 0.0
+        chart = at * np.array([cos(theta), 0.0 if half else sin(theta)])
         name = "load" if at else "pole"
         points[name] = chart
         force = Force(name, indentation.patch * material.h)
@@ -160,8 +158,8 @@ def _account(case: Case, loads: Loads, half: bool, azimuth: float | None) -> tup
     else:
         left_out.append("pressure: not loaded by it (the volume is only reported)")
     if loads.force:
-        where = f"on a patch of radius {loads.force.patch / (1 / case.shell.R_over_h):g} h" if loads.force.patch else "at a point"
-        included.append(f"force {where}")
+        patch = loads.force.patch * case.shell.R_over_h
+        included.append(f"force on a patch of radius {patch:g} h" if patch else "force at a point")
     else:
         left_out.append("force: none")
     if half:
@@ -182,9 +180,7 @@ def describe(case: Case) -> str:
         "lambda_m": case.lambda_m,
         "Lambda_m = lambda_m R/h": case.lambda_m / plan.material.h,
     }
-    nodes, cells, _ = triangulate_disc(
-        plan.chart_radius, plan.size, half=plan.half, circle=plan.circle, points=plan.points
-    )
+    _, cells, _ = triangulate_disc(plan.chart_radius, plan.size, half=plan.half, circle=plan.circle, points=plan.points)
     corners, k = len(np.unique(cells[:, :3])), case.mesh.degree
     sides = corners + len(cells) - 1  # Euler's formula for a disc
     unknowns = 3 * (corners + (k - 1) * sides + (k - 1) * (k - 2) // 2 * len(cells))

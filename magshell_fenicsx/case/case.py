@@ -47,7 +47,7 @@ class Case(Section):
             if self.shell.geometry == "disc" and polar:
                 raise ValueError("loading.at.polar: a disc is loaded at its centre, polar: 0")
             if not 0 <= polar < 89:
-                raise ValueError(f"loading.at.polar: {polar:g} is not on the shell, away from its edge: allowed 0 to 89")
+                raise ValueError(f"loading.at.polar: {polar:g} is not on the shell: allowed 0 to 89")
         return self
 
     @property

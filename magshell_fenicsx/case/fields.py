@@ -46,5 +46,8 @@ class MagneticSection(Section):
         """lambda_m = |Br||Ba|/(mu_0 E)."""
         if self.lambda_m is not None:
             return self.lambda_m
-        assert self.remanent.flux_density is not None and self.applied.flux_density is not None and youngs_modulus
-        return self.remanent.flux_density * self.applied.flux_density / (MU_0 * youngs_modulus)
+        Br, Ba = self.remanent.flux_density, self.applied.flux_density
+        assert Br is not None
+        assert Ba is not None
+        assert youngs_modulus
+        return Br * Ba / (MU_0 * youngs_modulus)

@@ -43,11 +43,12 @@ class ShellSection(Section):
     def R_over_h(self) -> float:
         if self.radius_to_thickness is not None:
             return self.radius_to_thickness
-        assert self.radius and self.thickness
+        assert self.radius
+        assert self.thickness
         return self.radius / self.thickness
 
     @property
     def dimple_half_width(self) -> float:
         """phi_o (rad)."""
         assert self.defect
-        return self.defect.width / (sqrt(12 * (1 - self.poisson_ratio**2)) * self.R_over_h) ** 0.5
+        return self.defect.width / sqrt(sqrt(12 * (1 - self.poisson_ratio**2)) * self.R_over_h)

@@ -14,7 +14,7 @@ class CaseError(ValueError):
     """The user's input cannot be used; the message says what and where."""
 
 
-class _Loader(yaml.SafeLoader):
+class _Loader(yaml.SafeLoader):  # type: ignore[misc]
     """YAML 1.1 reads 1e-3 as a string; here it is a number, as in YAML 1.2."""
 
 

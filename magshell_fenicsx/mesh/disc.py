@@ -65,6 +65,9 @@ def triangulate_disc(
         lines = number[gmsh.model.mesh.getElementsByType(LINE4)[1].astype(np.int64)].reshape(-1, 4)[:, :2]
     finally:
         gmsh.finalize()
+    # gmsh's inner node misses the quadratic part of a curved edge by 2 % of its sagitta's scale, and with it
+    # an order of convergence in h; this place reproduces quadratics (Lenoir, SIAM J. Numer. Anal. 23, 1986)
+    nodes[cells[:, 9]] = nodes[cells[:, 3:9]].sum(axis=1) / 4 - nodes[cells[:, :3]].sum(axis=1) / 6
     on_rim = np.isclose(np.hypot(*nodes[lines].transpose(2, 0, 1)), radius, rtol=1e-9).all(axis=1)
     edges = {"rim": lines[on_rim]}
     if half:

@@ -104,8 +104,7 @@ def _named_facets(domain: mesh.Mesh, patch: PatchMesh, vertices: NDArray[np.int6
     numbers = np.sort(vertices[domain.geometry.input_global_indices[ends]], axis=1)
     found = {}
     for name, pairs in patch.edges.items():
-        wanted = {tuple(pair) for pair in np.sort(pairs, axis=1).tolist()}
-        found[name] = np.array(
-            [f for f, ends in zip(facets, numbers.tolist(), strict=True) if tuple(ends) in wanted], dtype=np.int32
-        )
+        wanted = {(a, b) for a, b in np.sort(pairs, axis=1)}
+        inside = [(a, b) in wanted for a, b in numbers]
+        found[name] = facets[np.array(inside, dtype=bool)]
     return found

@@ -27,11 +27,6 @@ class Dimple:
         return np.where(phi < self.phi_o, -self.delta * (1 - (phi / self.phi_o) ** 2) ** 2, 0.0)
 
 
-def dimple_half_width(phi_bar_o: float, radius_to_thickness: float, nu: float) -> float:
-    """phi_o (rad) of the dimensionless width phi_bar_o = phi_o (sqrt(12 (1 - nu^2)) R/h)^(1/2)."""
-    return phi_bar_o / (np.sqrt(12 * (1 - nu**2)) * radius_to_thickness) ** 0.5
-
-
 def direction(polar: float, azimuth: float) -> Array:
     """Unit vector at an angle `polar` from e3 and `azimuth` from e1 (rad)."""
     return np.array([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)])

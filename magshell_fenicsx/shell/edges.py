@@ -24,9 +24,7 @@ def edge_density(M: Expr, J: Expr, width: Expr, nu: Expr, h: Expr, sigma: Expr) 
 
 def fold_jump(plus: Jet, minus: Jet, nu_plus: tuple[Expr, Expr], nu_minus: tuple[Expr, Expr]) -> Expr:
     """-[n] . {r_nu}, nu out of '+', [n] = n- - n+."""
-    r_nu = (
-        plus.r1 * nu_plus[0] + plus.r2 * nu_plus[1] - minus.r1 * nu_minus[0] - minus.r2 * nu_minus[1]
-    ) / 2
+    r_nu = (plus.r1 * nu_plus[0] + plus.r2 * nu_plus[1] - minus.r1 * nu_minus[0] - minus.r2 * nu_minus[1]) / 2
     return -ufl.dot(kin.normal(minus) - kin.normal(plus), r_nu)
 
 

@@ -1,5 +1,6 @@
 """Direct factorisation of the symmetric tangent, its inertia, and a count of the work."""
 
+import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
@@ -50,10 +51,11 @@ class Factorisation:
 
     def solve(self, rhs: Vector) -> Vector:
         """K^-1 rhs with the latest factors."""
-        assert self._pc is not None and self._rhs is not None
+        assert self._pc is not None
+        assert self._rhs is not None
         self._rhs.setArray(rhs)
         self._pc.apply(self._rhs, self._solution)
-        return self._solution.array.copy()
+        return np.array(self._solution.array_r)
 
     def _new_pc(self, K: PETSc.Mat) -> PETSc.PC:
         pc = PETSc.PC().create(self._comm)

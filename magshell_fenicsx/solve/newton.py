@@ -73,6 +73,7 @@ class BorderedNewton:
         self.options = options or NewtonOptions()
         self.factorisation = Factorisation(system.comm)
         self.iterations = 0
+        self._factored: State | None = None
         comm = system.comm
         self._last = comm.rank == comm.size - 1
         n = system.size + self._last
@@ -86,9 +87,9 @@ class BorderedNewton:
         snes.setJacobian(self._jacobian, J)
         snes.setConvergenceTest(self._test)
         snes.setType("newtonls")
-        options = PETSc.Options("magshell_")
-        if not options.hasName("snes_linesearch_type"):
-            options["snes_linesearch_type"] = "basic"  # full steps; the path shortens its own when they fail
+        given = PETSc.Options("magshell_")
+        if not given.hasName("snes_linesearch_type"):
+            given["snes_linesearch_type"] = "basic"  # full steps; the path shortens its own when they fail
         snes.setTolerances(max_it=self.options.max_iterations)
         ksp = snes.getKSP()
         ksp.setType("preonly")
@@ -109,8 +110,10 @@ class BorderedNewton:
         return Outcome(guess.with_(u, name, mu), reason > 0, iterations, _REASONS.get(reason, f"SNES reason {reason}"))
 
     def factor_at(self, state: State) -> Factorisation:
-        """Factor the tangent at a state."""
-        self.factorisation.factor(self.system.tangent(state.u, state.mu))
+        """Factor the tangent at a state, unless its factors are at hand."""
+        if self._factored is not state:
+            self.factorisation.factor(self.system.tangent(state.u, state.mu))
+            self._factored = state
         return self.factorisation
 
     def _function(self, snes: PETSc.SNES, x: PETSc.Vec, f: PETSc.Vec) -> None:
@@ -170,7 +173,8 @@ class BorderedNewton:
         rate = step / steps[-2]  # remaining error of a linearly converging sequence: step rate/(1 - rate)
         if rate < 1 and step * rate / (1 - rate) <= o.tolerance:
             return Reason.CONVERGED_SNORM_RELATIVE
-        if rate > 0.5 and step <= 1e4 * o.tolerance and self._progress.residuals[-1] > 0.5 * self._progress.residuals[-2]:
+        stalled = rate > 0.5 and self._progress.residuals[-1] > 0.5 * self._progress.residuals[-2]
+        if stalled and step <= 1e4 * o.tolerance:
             return Reason.CONVERGED_SNORM_RELATIVE  # rounding: neither steps nor residuals shrink further
         if iteration >= o.max_iterations:
             return Reason.DIVERGED_MAX_IT

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from math import sqrt
 from typing import Literal
 
 import numpy as np
@@ -145,7 +146,7 @@ class Path:
 
     def _cosine(self, a: Point, b: Point) -> float:
         comm = self.system.comm
-        return dot(comm, a.du, b.du) / np.sqrt(dot(comm, a.du, a.du) * dot(comm, b.du, b.du))
+        return dot(comm, a.du, b.du) / sqrt(dot(comm, a.du, a.du) * dot(comm, b.du, b.du))
 
     def _row(self, s: float) -> Row:
         return GivenLoad(s) if self.control == "load" else GivenConjugate(self.system, self.name, s)

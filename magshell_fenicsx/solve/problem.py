@@ -86,7 +86,7 @@ class FiniteElementSystem:
                     term.add_residual(b, factor)
             self._b.x.scatter_reverse(InsertMode.add)
             b[self._fixed] = 0
-            return b[: self.size].copy()
+            return np.array(b[: self.size])
 
 
 def _factor(term: Term, mu: Amplitudes) -> float:

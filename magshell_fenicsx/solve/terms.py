@@ -15,8 +15,11 @@ from magshell_fenicsx.solve.kernels import KernelLog
 class Term(Protocol):
     """What a problem sums; `amplitude` names the load factor mu of mu Pi(u), or is None for 1."""
 
-    name: str
-    amplitude: str | None
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def amplitude(self) -> str | None: ...
 
     def energy(self) -> float:
         """Pi(u) on this rank's part."""

@@ -1,0 +1,56 @@
+"""Small shells that several tests share."""
+
+from collections.abc import Callable, Mapping
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+from magshell_fenicsx.mesh.disc import triangulate_disc
+from magshell_fenicsx.mesh.midsurface import Midsurface, distribute
+from magshell_fenicsx.mesh.patch import PatchMesh
+from magshell_fenicsx.mesh.sphere import Dimple, SphereEmbedding, flat
+from magshell_fenicsx.shell.model import ShellModel
+from magshell_fenicsx.shell.parameters import Condition, Loads, Magnetisation, Material
+
+CASES = Path(__file__).parents[1] / "cases"
+TILTED = Magnetisation(np.array([0.6, 0.0, 0.8]), np.array([0.0, 0.28, 0.96]))
+
+
+def hemisphere(size: float = 0.5, *, half: bool = False, dimple: Dimple | None = None) -> Midsurface:
+    """A coarse hemisphere; the size holds everywhere."""
+    points = {"pole": np.zeros(2), "load": np.array([np.pi / 4, 0.0])}
+    circle = dimple.phi_o if dimple else None
+    nodes, cells, edges = triangulate_disc(np.pi / 2, lambda x: size, half=half, circle=circle, points=points)
+    return distribute(PatchMesh(nodes, cells, SphereEmbedding(dimple), edges, points), MPI.COMM_SELF)
+
+
+def disc(size: float, *, half: bool = False) -> Midsurface:
+    """A flat disc of radius 1."""
+    points = {"pole": np.zeros(2)}
+    nodes, cells, edges = triangulate_disc(1.0, lambda x: size, half=half, points=points)
+    return distribute(PatchMesh(nodes, cells, flat, edges, points), MPI.COMM_SELF)
+
+
+@pytest.fixture(scope="session")
+def shell() -> Callable[..., ShellModel]:
+    """Makes (once each) a coarse dimpled hemisphere with every load."""
+
+    @cache
+    def make(degree: int, half: bool = False, held: bool = True) -> ShellModel:
+        edges: Mapping[str, Condition] = {"rim": "clamped"} if held else {}
+        if half:
+            edges = {**edges, "symmetry": "symmetry"}
+        surface = hemisphere(half=half, dimple=Dimple(0.05, 0.5))
+        return ShellModel(surface, Material(0.3, 0.05), degree, edges, Loads(pressure=True, magnetic=TILTED))
+
+    return make
+
+
+def random_displacement(model: ShellModel, size: float, seed: int = 0) -> Any:
+    """Random nodal values; edges open and curvatures jump, unlike in any smooth field."""
+    rng = np.random.default_rng(seed)
+    return size * rng.standard_normal(model.system.size)

@@ -1,0 +1,64 @@
+"""Systems with one or two unknowns whose paths are known."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from magshell_fenicsx.solve.system import Amplitudes, Vector
+
+
+@dataclass
+class Toy:
+    """Pi(u) = Pi_0(u) - mu u[0], from the gradient and the Hessian of Pi_0."""
+
+    gradient: Callable[[Vector], Vector]
+    hessian: Callable[[Vector], Vector]
+    size: int
+    length: float = 1.0
+    comm = MPI.COMM_SELF
+
+    def __post_init__(self) -> None:
+        self.K = PETSc.Mat().createAIJ([self.size, self.size], comm=self.comm)
+        self.K.setUp()
+        self.K.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+
+    def residual(self, u: Vector, mu: Amplitudes) -> Vector:
+        return self.gradient(u) + mu["load"] * self.load(u, "load")
+
+    def load(self, u: Vector, name: str) -> Vector:
+        column = np.zeros(self.size)
+        column[0] = -1.0
+        return column
+
+    def potential(self, u: Vector, name: str) -> float:
+        return -float(u[0])
+
+    def tangent(self, u: Vector, mu: Amplitudes) -> PETSc.Mat:
+        self.K.setValues(range(self.size), range(self.size), self.hessian(u))
+        self.K.assemble()
+        return self.K
+
+
+def snap_through() -> Toy:
+    """Shallow arch, load = u^3 - 3 u^2 + 2 u: folds at u = 1 -+ 1/sqrt(3), load +-2/(3 sqrt(3))."""
+    return Toy(lambda u: u**3 - 3 * u**2 + 2 * u, lambda u: np.array([3 * u**2 - 6 * u + 2]), 1)
+
+
+def pitchfork(imperfection: float = 0.0) -> Toy:
+    """u[0] shortens a column that bends by v = u[1] once u[0] passes 1: bifurcation at load 1.
+
+    Pi_0 = u^2/2 + (1 - u) v^2/2 + v^4/4 - imperfection v.
+    """
+
+    def gradient(x: Vector) -> Vector:
+        u, v = x
+        return np.array([u - v**2 / 2, (1 - u) * v + v**3 - imperfection])
+
+    def hessian(x: Vector) -> Vector:
+        u, v = x
+        return np.array([[1.0, -v], [-v, 1 - u + 3 * v**2]])
+
+    return Toy(gradient, hessian, 2)
