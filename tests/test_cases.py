@@ -1,0 +1,89 @@
+"""Every case file runs, and one physical number of each is asserted.
+
+References: "axisymmetric" is an independent solver of the meridian's equations, nine digits;
+"mixed" is an independent hybridised Hellan-Herrmann-Johnson discretisation, two meshes within 2e-4.
+"""
+
+from functools import cache
+
+import pytest
+from conftest import CASES
+
+from magshell_fenicsx import Case, Result, run
+
+
+@cache
+def result(file: str, *settings: str) -> Result:
+    return run(Case.load(CASES / file, settings))
+
+
+def force_at(found: Result, depth: float) -> float:
+    (row,) = [row for row in found.rows if row["label"] == "target" and abs(float(row["w_over_h"]) - depth) < 1e-6]
+    return float(row["force"])
+
+
+def test_every_case_is_run_here() -> None:
+    import inspect
+    import sys
+
+    source = inspect.getsource(sys.modules[__name__])
+    assert [file.name for file in CASES.rglob("*.yaml") if file.name not in source] == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("R_over_h", "lambda_m", "k_d"),
+    [(90, 0, 0.326233289), (90, 0.00184, 0.552053778), (90, -0.00184, 0.120723848), (78.75, 0, 0.326944309)],
+)
+def test_dimple_buckling(R_over_h: float, lambda_m: float, k_d: float) -> None:
+    """Axisymmetric reference, 2e-4."""
+    settings = (f"shell.radius_to_thickness={R_over_h}", f"magnetic.lambda_m={lambda_m}")
+    found = result("dimple_buckling.yaml", *settings)
+    assert found.knockdown == pytest.approx(k_d, rel=2e-4)
+    assert [point["kind"] for point in found.limit_points] == ["fold"]
+
+
+def test_pole_indentation() -> None:
+    """Axisymmetric reference: F R/(2 pi D) = 2.9615563 and 5.6202235 at w/h = 1.5 and 6."""
+    found = result("pole_indentation.yaml")
+    assert force_at(found, 1.5) == pytest.approx(2.9615563, rel=1e-3)
+    assert force_at(found, 6.0) == pytest.approx(5.6202235, rel=1e-3)
+
+
+def test_clamped_plate() -> None:
+    """w0 = p R^4/(64 D) (Timoshenko)."""
+    found = result("clamped_plate.yaml")
+    R_over_h, nu = 50, 0.3
+    pressure = 1e-5 * 2 / (3 * (1 - nu**2)) ** 0.5 / R_over_h**2
+    w0_over_h = pressure * 12 * (1 - nu**2) * R_over_h**4 / 64
+    assert found.rows[-1]["w_pole_over_h"] == pytest.approx(w0_over_h, rel=1e-4)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("lambda_m", "forces"),
+    [
+        (0.00184, {1: 3.0565, 5: 8.2762, 10: 15.1470, 15: 21.603, 20: 27.528}),
+        (0.0, {1: 2.4144, 5: 5.0324, 10: 7.8400, 15: 10.151, 20: 11.691}),
+    ],
+)
+def test_indentation(lambda_m: float, forces: dict[float, float]) -> None:
+    """Mixed reference, 0.3 %; all twenty points converge."""
+    found = result("indentation.yaml", f"magnetic.lambda_m={lambda_m}")
+    assert found.stopped is None
+    assert sum(row["label"] == "target" for row in found.rows) == 20
+    for depth, force in forces.items():
+        assert force_at(found, depth) == pytest.approx(force, rel=3e-3)
+
+
+@pytest.mark.slow
+def test_indentation_against_the_field_stops_at_the_fold_in_displacement() -> None:
+    """Mixed reference: 1.7949 and 1.3149 at w/h = 1 and 5, the force peaks at 2.10, w turns back at 5.9."""
+    found = result("indentation.yaml", "magnetic.lambda_m=-0.00184")
+    assert force_at(found, 1) == pytest.approx(1.7949, rel=3e-3)
+    assert force_at(found, 5) == pytest.approx(1.3149, rel=3e-3)
+    assert [(p["amplitude"], p["kind"]) for p in found.limit_points] == [("force", "fold")]
+    assert found.limit_points[0]["value"] == pytest.approx(2.10, abs=0.01)
+    assert found.stopped
+    assert "the path turns back in the controlled displacement" in found.stopped
+    assert found.rows[-1]["w_over_h"] == pytest.approx(5.9, abs=0.1)

@@ -1,0 +1,99 @@
+"""Exit codes, messages and files of the command line."""
+
+import json
+from pathlib import Path
+
+import pytest
+from command import magshell, read_path
+from conftest import CASES
+
+PLATE = CASES / "clamped_plate.yaml"
+COLUMNS = (
+    "point,label,amplitude,p_over_pc,lambda_m,force,w_over_h,w_from_field_over_h,w_pole_over_h,volume_change,energy,"
+    "negative_pivots,iterations,factorisations,wall_s"
+)
+
+
+def test_run_writes_everything(tmp_path: Path) -> None:
+    out = tmp_path / "deep" / "folder"
+    done = magshell("run", PLATE, "--out", out)
+    assert done.returncode == 0, done.stderr
+    assert (out / "path.csv").read_text(encoding="utf-8").splitlines()[0] == COLUMNS
+    summary = json.loads((out / "summary.json").read_text(encoding="utf-8"))
+    assert summary["case"]["shell"]["geometry"] == "disc"
+    assert summary["knockdown"] is None
+    assert summary["limit_points"] == []
+    assert summary["mesh"].keys() == {"cells", "dofs", "degree"}
+    assert summary["timing"].keys() == {"jit_s", "setup_s", "assembly_s", "factor_s", "total_s"}
+    assert summary["blas"] != "reference"
+    assert not any("magnetic" in name for name in summary["model"]["kernels"])
+    rows = len(read_path(out))
+    assert len(list((out / "fields").glob("*.vtu"))) == rows
+    assert (out / "fields" / "path.pvd").read_text(encoding="utf-8").count("DataSet") == rows
+    for picture in ("shell.png", "curve.png"):
+        assert (out / picture).stat().st_size > 10_000
+    # a second run replaces the first
+    assert magshell("run", PLATE, "--out", out).returncode == 0
+    assert len(read_path(out)) == rows
+
+
+def test_fields_hold_the_displacement(tmp_path: Path) -> None:
+    """Points of the .vtu are r0 + u, and w/h is -u . n0."""
+    import numpy as np
+    import pyvista
+
+    assert magshell("run", PLATE, "--out", tmp_path / "out").returncode == 0
+    grid = pyvista.read(tmp_path / "out" / "fields" / "point_0001.vtu")
+    u = grid.point_data["u_over_h"] / 50
+    assert grid.points == pytest.approx(grid.point_data["r0"] + u, abs=1e-7)
+    assert grid.point_data["w_over_h"] == pytest.approx(-u[:, 2] * 50, abs=1e-9)
+    assert np.linalg.norm(grid.point_data["n0"], axis=1) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("ranks", [0, 2])
+def test_invalid_case_is_one_message_and_leaves_nothing(tmp_path: Path, ranks: int) -> None:
+    out = tmp_path / "out"
+    done = magshell("run", PLATE, "--set", "shell.poisson_ratio=0.7", "--out", out, ranks=ranks)
+    assert done.returncode == 2
+    assert done.stderr.count("shell.poisson_ratio: 0.7: must be less than or equal to 0.5") == 1
+    assert "Traceback" not in done.stderr
+    assert not out.exists()
+
+
+@pytest.mark.parametrize("out", ["/dev/null/x", "/proc/none"])
+def test_unwritable_out(out: str) -> None:
+    done = magshell("run", PLATE, "--out", out)
+    assert done.returncode == 2
+    assert done.stderr.startswith(f"--out {out}: cannot be written: ")
+    assert len(done.stderr.splitlines()) == 1
+
+
+def test_missing_file_and_no_case() -> None:
+    done = magshell("run", "nowhere.yaml")
+    assert (done.returncode, done.stderr) == (2, "nowhere.yaml: cannot be read: No such file or directory\n")
+    assert magshell("run").returncode == 2
+
+
+def test_stopping_early_is_told_and_keeps_the_points(tmp_path: Path) -> None:
+    """Load control cannot pass the limit point of the dimpled shell."""
+    settings = ["loading={kind: pressure, control: load, until: target, pressure: 0.5, points: 2}"]
+    settings += ["mesh.degree=3", "mesh.refinement=0.6"]
+    done = magshell("run", CASES / "dimple_buckling.yaml", *(f"--set={s}" for s in settings), "--out", tmp_path / "out")
+    assert done.returncode == 3
+    assert "load control stopped" in done.stderr
+    rows = read_path(tmp_path / "out")
+    assert 0.32 < float(rows[-1]["p_over_pc"]) < 0.34
+    assert "load control" in json.loads((tmp_path / "out" / "summary.json").read_text(encoding="utf-8"))["stopped"]
+
+
+def test_check_tells_what_is_left_out() -> None:
+    done = magshell("check", CASES / "dimple_buckling.yaml")
+    assert done.returncode == 0
+    assert "magnetic energy: lambda_m is zero" in done.stdout
+    assert "R/h = 90" in done.stdout
+
+
+def test_info() -> None:
+    done = magshell("info")
+    assert done.returncode == 0
+    assert "openblas" in done.stdout
