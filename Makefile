@@ -17,7 +17,8 @@ export HELP
 help:
 	@echo "$$HELP"
 
-run check: ; $(if $(CASE),,$(error name a case: make $@ CASE=cases/dimple_buckling.yaml))\
+run check:
+	@$(if $(CASE),,$(error name a case: make $@ CASE=cases/dimple_buckling.yaml))
 	$(ENV) $(if $(N),mpirun -n $(N)) magshell $@ $(CASE) $(if $(OUT),--out $(OUT)) $(ARGS)
 
 test: lint
@@ -27,8 +28,8 @@ fast: lint
 	$(ENV) python3 -m pytest -m 'not slow'
 
 lint:
-	$(ENV) ruff check .
-	$(ENV) ruff format --check .
+	$(ENV) ruff check --exclude .env .
+	$(ENV) ruff format --check --exclude .env .
 	$(ENV) mypy magshell_fenicsx
 
 image:

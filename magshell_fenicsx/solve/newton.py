@@ -164,7 +164,8 @@ class BorderedNewton:
             return Reason.CONVERGED_ITERATING
         steps = self._progress.steps
         step = steps[-1]
-        if not isfinite(step) or step > o.largest_step:
+        growing = iteration > 2 and step > 2 * steps[-2]
+        if not isfinite(step) or step > o.largest_step or growing:
             return Reason.DIVERGED_DTOL
         if step <= o.tolerance:
             return Reason.CONVERGED_SNORM_RELATIVE
