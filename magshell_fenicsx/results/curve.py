@@ -1,0 +1,64 @@
+"""The load-displacement or pressure-volume curve as a picture."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+
+from magshell_fenicsx.results.table import Row
+
+AXES = {
+    "force": ("w_over_h", "force", r"displacement at the load  $w/h$", r"force  $FR/(2\pi D)$"),
+    "pressure": ("volume_change", "p_over_pc", r"change of volume  $-\Delta V/R^3$", r"pressure  $p/p_\mathrm{c}$"),
+    "lambda_m": ("w_pole_over_h", "lambda_m", r"displacement of the pole  $w/h$", r"field  $\lambda_\mathrm{m}$"),
+}
+
+FINE = 16  # drawn pieces between two points
+
+
+def _smooth(x: Sequence[float], y: Sequence[float]) -> NDArray[np.float64]:
+    """A cubic spline through the points along their scaled chord, (2, FINE (n - 1) + 1)."""
+    xy = np.array([x, y])
+    scale = np.ptp(xy, axis=1)
+    steps = np.hypot(*(np.diff(xy, axis=1) / np.where(scale > 0, scale, 1)[:, None]))
+    chord = np.concatenate([[0], np.cumsum(np.maximum(steps, 1e-12))])
+    fine = np.interp(np.arange(FINE * (len(chord) - 1) + 1) / FINE, np.arange(len(chord)), chord)
+    return np.asarray(CubicSpline(chord, xy, axis=1)(fine))
+
+
+def draw_curve(rows: Sequence[Row], amplitude: str, title: str, file: Path) -> None:
+    """Draw the part of the path in which `amplitude` varied; instabilities are marked.
+
+    Stable parts are solid, unstable ones dashed.
+    """
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    x_key, y_key, x_label, y_label = AXES[amplitude]
+    sign = -1.0 if x_key == "volume_change" else 1.0
+    first = max(i for i, row in enumerate(rows) if row["amplitude"] != amplitude or row is rows[0])
+    part = rows[0 if amplitude == "lambda_m" else first :]
+    x = [sign * float(row[x_key]) for row in part]
+    y = [float(row[y_key]) for row in part]
+    figure, axes = plt.subplots(figsize=(4.6, 3.4), layout="constrained")
+    smooth_x, smooth_y = _smooth(x, y)
+    for i in range(1, len(part)):
+        unstable = int(part[i]["negative_pivots"]) > 0 and part[i]["label"] not in ("fold", "bifurcation")
+        piece = slice((i - 1) * FINE, i * FINE + 1)
+        axes.plot(smooth_x[piece], smooth_y[piece], color="C0", linestyle=(0, (2, 1.2)) if unstable else "-")
+    shown = [i for i, row in enumerate(part) if row["label"] in ("target", "step", "field")]
+    axes.plot([x[i] for i in shown], [y[i] for i in shown], ".", color="C0", markersize=4)
+    for i, row in enumerate(part):
+        if row["label"] in ("fold", "bifurcation"):
+            axes.plot(x[i], y[i], "o", color="C3", markersize=6, label=f"{row['label']} at {y[i]:.5g}")
+    axes.set(xlabel=x_label, ylabel=y_label)
+    axes.set_title(title, fontsize=9)
+    axes.axhline(0, color="0.8", linewidth=0.8, zorder=0)
+    if axes.get_legend_handles_labels()[1]:
+        axes.legend(frameon=False)
+    figure.savefig(file, dpi=200)
+    plt.close(figure)
