@@ -88,7 +88,9 @@ def make_plan(case: Case) -> Plan:
     loads = Loads(
         pressure=isinstance(loading, PressureSection),
         force=force,
-        magnetic=Magnetisation(turned(magnetic.remanent), turned(magnetic.applied)) if magnetic and field_on else None,
+        magnetic=Magnetisation(turned(magnetic.remanent), turned(magnetic.applied), magnetic.energy)
+        if magnetic and field_on
+        else None,
     )
     included, left_out = _account(case, loads, half, azimuth)
     return Plan(
@@ -150,7 +152,7 @@ def _account(case: Case, loads: Loads, half: bool, azimuth: float | None) -> tup
     included = [f"{'half' if half else 'full'} shell", "membrane and bending energy"]
     left_out = []
     if loads.magnetic:
-        included.append(f"magnetic energy (full), lambda_m = {case.lambda_m:g}")
+        included.append(f"magnetic energy ({loads.magnetic.energy}), lambda_m = {case.lambda_m:g}")
     else:
         left_out.append("magnetic energy: " + ("lambda_m is zero" if case.magnetic else "no magnetic section"))
     if loads.pressure:

@@ -51,10 +51,14 @@ class Scene:
         return State(self.model.zero(), dict.fromkeys(sorted(amplitudes), 0.0))
 
     def observe(self, state: State) -> dict[str, float]:
-        """The physical columns of a table row: loads, displacements over h, volume, energy."""
+        """The physical columns of a table row: loads, displacements over h, volume, energies over E h R^2."""
         model, h = self.model, self.plan.material.h
         pole = model.deflection(state.u, "pole") / h
-        energies = model.system.energies(state.u)
+        potentials = model.system.energies(state.u)
+        energies = {
+            t.name: model.multiplicity * potentials[t.name] * (state.mu[t.amplitude] if t.amplitude else 1.0)
+            for t in model.system.terms
+        }
         return {
             "p_over_pc": state.mu.get("pressure", 0.0),
             "lambda_m": state.mu.get("lambda_m", 0.0),
@@ -62,8 +66,11 @@ class Scene:
             "w_over_h": model.loaded_deflection(state.u) / h if model.loads.force else pole,
             "w_pole_over_h": pole,
             "volume_change": model.volume_change(state.u),
-            "energy": model.multiplicity
-            * sum(energies[t.name] * (state.mu[t.amplitude] if t.amplitude else 1.0) for t in model.system.terms),
+            "energy": sum(energies.values()),
+            "stretching": energies["membrane"],
+            "bending": sum(v for name, v in energies.items() if name == "bending" or name.endswith("edges")),
+            "magnetic": sum(energies.get(name, 0.0) for name in ("magnetic", "U1", "Uq", "Utau", "couple")),
+            **{name: energies.get(name, 0.0) for name in ("U1", "Uq", "Utau")},
         }
 
 

@@ -1,6 +1,7 @@
 """Small shells that several tests share."""
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from magshell_fenicsx.mesh.midsurface import Midsurface, distribute
 from magshell_fenicsx.mesh.patch import PatchMesh
 from magshell_fenicsx.mesh.sphere import Dimple, SphereEmbedding, flat
 from magshell_fenicsx.shell.model import ShellModel
-from magshell_fenicsx.shell.parameters import Condition, Loads, Magnetisation, Material
+from magshell_fenicsx.shell.parameters import Condition, Loads, MagneticEnergy, Magnetisation, Material
 
 CASES = Path(__file__).parents[1] / "cases"
 TILTED = Magnetisation(np.array([0.6, 0.0, 0.8]), np.array([0.0, 0.28, 0.96]))
@@ -40,12 +41,14 @@ def shell() -> Callable[..., ShellModel]:
     """Makes (once each) a coarse dimpled hemisphere with every load."""
 
     @cache
-    def make(degree: int, half: bool = False, held: bool = True) -> ShellModel:
+    def make(degree: int, half: bool = False, held: bool = True, energy: MagneticEnergy = "full") -> ShellModel:
         edges: Mapping[str, Condition] = {"rim": "clamped"} if held else {}
         if half:
             edges = {**edges, "symmetry": "symmetry"}
         surface = hemisphere(half=half, dimple=Dimple(0.05, 0.5))
-        return ShellModel(surface, Material(0.3, 0.05), degree, edges, Loads(pressure=True, magnetic=TILTED))
+        return ShellModel(
+            surface, Material(0.3, 0.05), degree, edges, Loads(pressure=True, magnetic=replace(TILTED, energy=energy))
+        )
 
     return make
 

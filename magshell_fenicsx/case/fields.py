@@ -26,7 +26,7 @@ class FluxVector(Direction):
 class MagneticSection(Section):
     """lambda_m, or both flux densities (and shell.youngs_modulus)."""
 
-    energy: Literal["full"] = "full"
+    energy: Literal["full", "first", "torque", "second", "second_consistent"] = "full"
     lambda_m: float | None = Field(default=None, ge=-10, le=10)
     remanent: FluxVector = FluxVector()
     applied: FluxVector = FluxVector()

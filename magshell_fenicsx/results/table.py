@@ -20,6 +20,12 @@ COLUMNS = (
     "iterations",
     "factorisations",
     "wall_s",
+    "stretching",
+    "bending",
+    "magnetic",
+    "U1",
+    "Uq",
+    "Utau",
 )
 Row = dict[str, float | int | str]
 

@@ -48,6 +48,46 @@ def magnetic(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:
     return -ufl.dot(Ba, u.r1 * ufl.dot(up1, Br) + u.r2 * ufl.dot(up2, Br) + (n - n0) * ufl.dot(n0, Br))
 
 
+def magnetic_first(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:
+    """U1, linear in u: in-plane forces and a pressure; paper Eq. (eq:terms)."""
+    up1, up2 = kin.dual_basis(r0)
+    n0 = kin.normal(r0)
+    tangential = Ba - ufl.dot(Ba, n0) * n0
+    return -ufl.dot(tangential, u.r1 * ufl.dot(up1, Br) + u.r2 * ufl.dot(up2, Br))
+
+
+def magnetic_torque(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:
+    """Uq, quadratic in the rotation q_i = n0 . u,_i: rotational springs; paper Eq. (eq:terms)."""
+    n0 = kin.normal(r0)
+    q = _rotation(r0, u)
+    return ufl.dot(q, q) * ufl.dot(n0, Ba) * ufl.dot(n0, Br) / 2
+
+
+def magnetic_tau(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:
+    """Utau: torques from the surface gradient of u, q^c U_ac with a the derivative; paper Eq. (eq:terms)."""
+    up1, up2 = kin.dual_basis(r0)
+    q = _rotation(r0, u)
+    turned = ufl.dot(q, u.r1) * ufl.dot(up1, Ba) + ufl.dot(q, u.r2) * ufl.dot(up2, Ba)
+    return -turned * ufl.dot(kin.normal(r0), Br)
+
+
+def magnetic_couple(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:
+    """The other term linear in u, zero where Br is parallel to Ba; not in the paper's U1 and U2.
+
+    With it, U1 + Uq + Utau is the second-order Taylor polynomial of the full energy.
+    """
+    n0 = kin.normal(r0)
+    q = _rotation(r0, u)
+    return ufl.dot(q, Ba) * ufl.dot(n0, Br) - ufl.dot(n0, Ba) * ufl.dot(q, Br)
+
+
+def _rotation(r0: Jet, u: Jet) -> Expr:
+    """q^i a0_i with q_i = n0 . u,_i, tangent to the undeformed surface."""
+    up1, up2 = kin.dual_basis(r0)
+    n0 = kin.normal(r0)
+    return ufl.dot(n0, u.r1) * up1 + ufl.dot(n0, u.r2) * up2
+
+
 def volume(r0: Jet, u: Jet) -> Expr:
     """(r . n dω - r0 . n0 dω0)/3 per flat area (already includes the area ratio)."""
     r = r0 + u

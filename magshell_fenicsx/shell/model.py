@@ -77,7 +77,7 @@ class ShellModel:
             terms.append(factory.mirror_edges(facets("symmetry")))
             held.append(_held_in_mirror(V, facets("symmetry")))
         if loads.magnetic:
-            terms.append(factory.magnetic(loads.magnetic))
+            terms += factory.magnetic(loads.magnetic)
         if loads.pressure:
             terms.append(factory.pressure())
         self.normals = {name: vertex_normal(self.r0, x) for name, x in midsurface.points.items()}

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Condition = Literal["clamped", "simply supported", "free", "symmetry"]
+MagneticEnergy = Literal["full", "first", "torque", "second", "second_consistent"]
 MIRROR_NORMAL = np.array([0.0, 1.0, 0.0])  # half models are the part y >= 0
 
 
@@ -46,10 +47,19 @@ class Force:
 
 @dataclass(frozen=True)
 class Magnetisation:
-    """Directions (3,) of the remanent and of the applied flux density, unit vectors."""
+    """What is magnetised and how it is modelled.
+
+    Attributes
+    ----------
+    remanent, applied
+        Directions (3,) of the flux densities, unit vectors.
+    energy
+        The full energy, or which of the paper's approximations takes its place.
+    """
 
     remanent: NDArray[np.float64]
     applied: NDArray[np.float64]
+    energy: MagneticEnergy = "full"
 
 
 @dataclass(frozen=True)

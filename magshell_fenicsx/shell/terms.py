@@ -1,5 +1,6 @@
 """The densities as terms: each compiled once, and only when a scene calls for it."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,9 +11,23 @@ from ufl.core.expr import Expr
 
 from magshell_fenicsx.shell import densities, edges
 from magshell_fenicsx.shell import kinematics as kin
-from magshell_fenicsx.shell.parameters import MIRROR_NORMAL, Magnetisation, Material
+from magshell_fenicsx.shell.kinematics import Jet
+from magshell_fenicsx.shell.parameters import MIRROR_NORMAL, MagneticEnergy, Magnetisation, Material
 from magshell_fenicsx.solve.kernels import KernelLog
 from magshell_fenicsx.solve.terms import FormTerm
+
+Density = Callable[[Jet, Jet, Expr, Expr], Expr]
+FIRST: dict[str, Density] = {"U1": densities.magnetic_first}
+TORQUE: dict[str, Density] = {"Uq": densities.magnetic_torque}
+SECOND: dict[str, Density] = {**FIRST, **TORQUE, "Utau": densities.magnetic_tau}
+MAGNETIC_TERMS: dict[MagneticEnergy, dict[str, Density]] = {
+    "full": {"magnetic": densities.magnetic},
+    "first": FIRST,
+    "torque": TORQUE,
+    "second": SECOND,
+    "second_consistent": {**SECOND, "couple": densities.magnetic_couple},
+}
+LINEAR = ("U1", "couple")
 
 
 @dataclass(frozen=True)
@@ -45,10 +60,13 @@ class TermFactory:
         density = edges.symmetric(*self._jets(), self._domain, *self._nu_h(), self._constant(self.sigma), m)
         return self._term("mirror edges", density * self._ds(facets))
 
-    def magnetic(self, field: Magnetisation) -> FormTerm:
-        """Amplitude lambda_m."""
+    def magnetic(self, field: Magnetisation) -> list[FormTerm]:
+        """The terms of the chosen energy; all have the amplitude lambda_m."""
         Br, Ba = self._constant(field.remanent), self._constant(field.applied)
-        return self._cells("magnetic", densities.magnetic(*self._jets(), Br, Ba), "lambda_m")
+        return [
+            self._cells(name, density(*self._jets(), Br, Ba), "lambda_m", linear=name in LINEAR)
+            for name, density in MAGNETIC_TERMS[field.energy].items()
+        ]
 
     def pressure(self) -> FormTerm:
         """Amplitude p/p_c; potential p Delta V, of a live pressure."""
@@ -83,9 +101,9 @@ class TermFactory:
         tags = mesh.meshtags(self._domain, 1, facets, np.ones_like(facets))
         return ufl.Measure("ds", domain=self._domain, subdomain_data=tags, metadata=self._edge_rule())(1)
 
-    def _cells(self, name: str, density: Expr, amplitude: str | None = None) -> FormTerm:
+    def _cells(self, name: str, density: Expr, amplitude: str | None = None, *, linear: bool = False) -> FormTerm:
         energy = density * kin.area_ratio(kin.jet(self.r0, self._domain)) * self._dx()
-        return self._term(name, energy, amplitude)
+        return FormTerm(name, energy, self.u, self.log, amplitude, linear=linear)
 
     def _term(self, name: str, energy: ufl.Form, amplitude: str | None = None) -> FormTerm:
         return FormTerm(name, energy, self.u, self.log, amplitude)

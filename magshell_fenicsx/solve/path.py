@@ -146,7 +146,8 @@ class Path:
 
     def _cosine(self, a: Point, b: Point) -> float:
         comm = self.system.comm
-        return dot(comm, a.du, b.du) / sqrt(dot(comm, a.du, a.du) * dot(comm, b.du, b.du))
+        lengths = sqrt(dot(comm, a.du, a.du) * dot(comm, b.du, b.du))
+        return dot(comm, a.du, b.du) / lengths if lengths else 1.0  # an amplitude may move nothing
 
     def _row(self, s: float) -> Row:
         return GivenLoad(s) if self.control == "load" else GivenConjugate(self.system, self.name, s)

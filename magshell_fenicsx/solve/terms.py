@@ -32,19 +32,31 @@ class Term(Protocol):
 
 
 class FormTerm:
-    """A potential given by its UFL energy; both derivatives are automatic."""
+    """A potential given by its UFL energy; both derivatives are automatic.
+
+    `linear` says that the energy is linear in u, so that it has no tangent.
+    """
 
     def __init__(
-        self, name: str, energy: ufl.Form, u: fem.Function, log: KernelLog, amplitude: str | None = None
+        self,
+        name: str,
+        energy: ufl.Form,
+        u: fem.Function,
+        log: KernelLog,
+        amplitude: str | None = None,
+        *,
+        linear: bool = False,
     ) -> None:
         self.name, self.amplitude = name, amplitude
         self._factor = fem.Constant(u.function_space.mesh, 1.0)
         V = u.function_space
         gradient = ufl.derivative(energy, u, ufl.TestFunction(V))
-        hessian = ufl.derivative(gradient, u, ufl.TrialFunction(V))
         self._energy = log.compile(f"{name} energy", energy)
         self._residual = log.compile(f"{name} residual", self._factor * gradient)
-        self.tangent_form = log.compile(f"{name} tangent", self._factor * hessian)
+        self.tangent_form: fem.Form | None = None
+        if not linear:
+            hessian = ufl.derivative(gradient, u, ufl.TrialFunction(V))
+            self.tangent_form = log.compile(f"{name} tangent", self._factor * hessian)
 
     def energy(self) -> float:
         return float(fem.assemble_scalar(self._energy))
@@ -54,8 +66,9 @@ class FormTerm:
         assembly.add_vector(b, self._residual)
 
     def add_tangent(self, K: PETSc.Mat, factor: float, clamped: list[fem.DirichletBC]) -> None:
-        self._factor.value = factor
-        assembly.add_matrix(K, self.tangent_form, clamped)
+        if self.tangent_form is not None:
+            self._factor.value = factor
+            assembly.add_matrix(K, self.tangent_form, clamped)
 
 
 class LinearTerm:

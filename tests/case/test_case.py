@@ -66,7 +66,7 @@ def test_physical_input_gives_the_dimensionless_numbers(file: Path) -> None:
         ("boundary.rim=clamped", "no such edge, only equator"),
         ("boundary.equator=free", "not held"),
         ("magnetic.lambda_m=a lot", "'a lot'"),
-        ("magnetic.energy=secnd", "must be 'full'"),
+        ("magnetic.energy=secnd", "must be 'full', 'first'"),
         ("magnetic.remanent.flux_density=60 mT", "not both"),
         ("magnetic={remanent: {flux_density: 1 T}, applied: {flux_density: 1 T}}", "youngs_modulus is needed"),
         ("magnetic={remanent: {flux_density: 0 T}, applied: {flux_density: 1 T}}", "length zero"),

@@ -13,7 +13,19 @@ from magshell_fenicsx.solve.problem import FiniteElementSystem
 from magshell_fenicsx.solve.terms import FormTerm
 
 Shells = Callable[..., ShellModel]
-TERMS = ["membrane", "bending", "interior edges", "clamped edges", "mirror edges", "magnetic", "pressure"]
+TERMS = [
+    "membrane",
+    "bending",
+    "interior edges",
+    "clamped edges",
+    "mirror edges",
+    "magnetic",
+    "pressure",
+    "U1",
+    "Uq",
+    "Utau",
+    "couple",
+]
 DEGREES = [2, 3, pytest.param(4, marks=pytest.mark.slow), pytest.param(5, marks=pytest.mark.slow)]
 
 
@@ -56,7 +68,7 @@ def check(system: FiniteElementSystem, u: np.ndarray, mu: dict[str, float]) -> N
 @pytest.mark.parametrize("degree", DEGREES)
 @pytest.mark.parametrize("name", TERMS)
 def test_term_alone(shell: Shells, degree: int, name: str) -> None:
-    model = shell(degree, half=name == "mirror edges")
+    model = shell(degree, half=name == "mirror edges", energy="full" if name in TERMS[:-4] else "second_consistent")
     u = random_displacement(model, 2e-3 / degree**2)
     check(alone(model, name), u, {"lambda_m": 1.0, "pressure": 1.0})
 
