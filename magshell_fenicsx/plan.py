@@ -15,10 +15,11 @@ from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.fields import Direction
 from magshell_fenicsx.case.loading import IndentationSection, PressureSection
 from magshell_fenicsx.case.source import CaseError
-from magshell_fenicsx.mesh.disc import triangulate_disc
 from magshell_fenicsx.mesh.grading import Disc, Ring, Size, smallest
 from magshell_fenicsx.mesh.patch import Embedding
+from magshell_fenicsx.mesh.shapes import DiscShape, Shape, StripShape
 from magshell_fenicsx.mesh.sphere import Dimple, SphereEmbedding, direction, flat
+from magshell_fenicsx.mesh.triangulation import triangulate
 from magshell_fenicsx.shell.parameters import Condition, Force, Loads, Magnetisation, Material
 
 
@@ -30,8 +31,9 @@ class Plan:
     ----------
     half
         Model the half y >= 0 of a frame turned about e3 by `azimuth` (rad).
-    chart_radius
-        Radius of the disc that is triangulated: pi/2 for the hemisphere, 1 for the disc.
+    shape, size, points, embedding
+        What is triangulated, and how it is put into space. The point "pole" is the one whose
+        displacement is reported: the pole, the disc's centre, the strip's tip.
     included, left_out
         What the model has and lacks, for people.
     """
@@ -41,8 +43,7 @@ class Plan:
     conditions: dict[str, Condition]
     half: bool
     azimuth: float
-    chart_radius: float
-    circle: float | None
+    shape: Shape
     embedding: Embedding
     points: dict[str, NDArray[np.float64]]
     size: Size
@@ -64,8 +65,10 @@ def make_plan(case: Case) -> Plan:
     indentation = loading if isinstance(loading, IndentationSection) else None
     directions = [magnetic.remanent, magnetic.applied] if magnetic and field_on else []
     azimuth = common_azimuth([*directions, *([indentation.at] if indentation else [])])
+    if shell.geometry == "strip" and azimuth is not None and abs(sin(azimuth)) > 1e-12:
+        azimuth = None  # the strip's own mirror plane is y = 0
     if case.symmetry == "half" and azimuth is None:
-        raise CaseError("symmetry: half: the fields and the load have no common mirror plane through e3")
+        raise CaseError("symmetry: half: the shell, the fields and the load have no common mirror plane through e3")
     half = azimuth is not None and case.symmetry != "none"
     turn = azimuth if half and azimuth is not None else 0.0
 
@@ -74,7 +77,7 @@ def make_plan(case: Case) -> Plan:
 
     defect = Dimple(shell.defect.amplitude * material.h, shell.dimple_half_width) if shell.defect else None
     hemisphere = shell.geometry == "hemisphere"
-    points: dict[str, NDArray[np.float64]] = {"pole": np.zeros(2)}
+    points: dict[str, NDArray[np.float64]] = {"pole": np.array([float(shell.geometry == "strip"), 0.0])}
     force = None
     if indentation:
         at, theta = radians(indentation.at.polar), radians(indentation.at.azimuth) - turn
@@ -82,7 +85,15 @@ def make_plan(case: Case) -> Plan:
         name = "load" if at else "pole"
         points[name] = chart
         force = Force(name, indentation.patch * material.h)
-    conditions: dict[str, Condition] = {"rim": (case.boundary.equator if hemisphere else case.boundary.rim) or "free"}
+    shape: Shape
+    if shell.width is not None:
+        shape = StripShape(shell.width, half)
+    else:
+        shape = DiscShape(pi / 2 if hemisphere else 1.0, half, defect.phi_o if defect else None)
+    # the equator is the rim of the chart
+    conditions: dict[str, Condition] = {
+        "rim" if name == "equator" else name: condition for name, condition in case.boundary.conditions().items()
+    }
     if half:
         conditions["symmetry"] = "symmetry"
     loads = Loads(
@@ -99,8 +110,7 @@ def make_plan(case: Case) -> Plan:
         conditions=conditions,
         half=half,
         azimuth=turn,
-        chart_radius=pi / 2 if hemisphere else 1.0,
-        circle=defect.phi_o if defect else None,
+        shape=shape,
         embedding=SphereEmbedding(defect) if hemisphere else flat,
         points=points,
         size=_grading(case, material.h, defect, points),
@@ -128,9 +138,9 @@ def _grading(case: Case, h: float, defect: Dimple | None, points: dict[str, NDAr
     """Element sizes for 1e-4 in k_d and 1e-3 in F at degree 4, in units of the shell's length sqrt(Rh)."""
     length, refine, growth = sqrt(h), case.mesh.refinement, 0.4
     loading = case.loading
-    if case.shell.geometry == "disc":
+    if case.shell.geometry != "hemisphere":
         features: list[Size] = []
-        largest = 0.25
+        largest = min(0.25, 0.5 * (case.shell.width or 1.0))
     else:
         features = [Ring(pi / 2, 1.4 * length / refine, growth)]
         # without a dimple the sphere buckles anywhere, in waves of about 3.6 sqrt(Rh)
@@ -182,7 +192,7 @@ def describe(case: Case) -> str:
         "lambda_m": case.lambda_m,
         "Lambda_m = lambda_m R/h": case.lambda_m / plan.material.h,
     }
-    _, cells, _ = triangulate_disc(plan.chart_radius, plan.size, half=plan.half, circle=plan.circle, points=plan.points)
+    cells = triangulate(plan.shape, plan.size, plan.points, plan.embedding).cells
     corners, k = len(np.unique(cells[:, :3])), case.mesh.degree
     sides = corners + len(cells) - 1  # Euler's formula for a disc
     unknowns = 3 * (corners + (k - 1) * sides + (k - 1) * (k - 2) // 2 * len(cells))

@@ -20,6 +20,7 @@ from magshell_fenicsx.results.surface import SurfaceGatherer, completed, turned
 from magshell_fenicsx.results.table import PathTable, Row
 from magshell_fenicsx.results.vtu import FieldSeries
 from magshell_fenicsx.scene import Scene
+from magshell_fenicsx.solve.system import State
 
 Say = Callable[[str], None]
 VALUE_COLUMN = {"pressure": "p_over_pc", "force": "force", "lambda_m": "lambda_m"}
@@ -33,11 +34,14 @@ class Result:
     ----------
     rows
         One mapping per accepted point, with the columns of path.csv.
+    last
+        The displacement and the amplitudes at the last point.
     stopped
         Why the run ended before its target; None if it reached it.
     """
 
     scene: Scene
+    last: State
     rows: list[Row] = field(default_factory=list)
     stopped: str | None = None
 
@@ -81,7 +85,8 @@ def run(
     """
     start = time.perf_counter()
     folder = _prepare(Path(out), comm) if out is not None else None
-    result = Result(scene := Scene(case, comm))
+    scene = Scene(case, comm)
+    result = Result(scene, scene.unloaded())
     say = say if comm.rank == 0 else lambda line: None
     say(f"{', '.join(scene.plan.included)}: {scene.cells} cells, {scene.model.system.dofs} unknowns")
     if fast_blas() is None:
@@ -106,6 +111,7 @@ def run(
                 "wall_s": round(time.perf_counter() - start, 3),
             }
             result.rows.append(row)
+            result.last = record.point.state
             say(_line(row))
             if files:
                 files.write(row, record)
@@ -215,7 +221,7 @@ def _prepare(out: Path, comm: MPI.Comm) -> Path:
 
 def _line(row: Row) -> str:
     return (
-        f"{row['point']:4d} {row['label']:>11}  lambda_m {row['lambda_m']:+.5f}  p/pc {row['p_over_pc']:.6f}  "
+        f"{row['point']:4d} {row['label']:>11}  lambda_m {row['lambda_m']:+.4e}  p/pc {row['p_over_pc']:.6f}  "
         f"FR/2piD {row['force']:9.5f}  w/h {row['w_over_h']:8.4f}  pole {row['w_pole_over_h']:8.4f}  "
         f"unstable {row['negative_pivots']}  it {row['iterations']}"
     )

@@ -5,9 +5,8 @@ import time
 from mpi4py import MPI
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.mesh.disc import triangulate_disc
 from magshell_fenicsx.mesh.midsurface import Midsurface, distribute
-from magshell_fenicsx.mesh.patch import PatchMesh
+from magshell_fenicsx.mesh.triangulation import triangulate
 from magshell_fenicsx.plan import Plan, make_plan
 from magshell_fenicsx.shell.model import ShellModel
 from magshell_fenicsx.solve.newton import BorderedNewton
@@ -78,8 +77,5 @@ def build_midsurface(plan: Plan, comm: MPI.Comm) -> Midsurface:
     """Triangulate on rank 0, distribute to all."""
     patch = None
     if comm.rank == 0:
-        nodes, cells, edges = triangulate_disc(
-            plan.chart_radius, plan.size, half=plan.half, circle=plan.circle, points=plan.points
-        )
-        patch = PatchMesh(nodes, cells, plan.embedding, edges, plan.points)
+        patch = triangulate(plan.shape, plan.size, plan.points, plan.embedding)
     return distribute(patch, comm)

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from magshell_fenicsx.mesh.disc import triangulate_disc
 from magshell_fenicsx.mesh.midsurface import Midsurface, distribute
-from magshell_fenicsx.mesh.patch import PatchMesh
+from magshell_fenicsx.mesh.shapes import DiscShape
 from magshell_fenicsx.mesh.sphere import Dimple, SphereEmbedding, flat
+from magshell_fenicsx.mesh.triangulation import triangulate
 from magshell_fenicsx.shell.model import ShellModel
 from magshell_fenicsx.shell.parameters import Condition, Loads, MagneticEnergy, Magnetisation, Material
 
@@ -25,15 +25,14 @@ def hemisphere(size: float = 0.5, *, half: bool = False, dimple: Dimple | None =
     """A coarse hemisphere; the size holds everywhere."""
     points = {"pole": np.zeros(2), "load": np.array([np.pi / 4, 0.0])}
     circle = dimple.phi_o if dimple else None
-    nodes, cells, edges = triangulate_disc(np.pi / 2, lambda x: size, half=half, circle=circle, points=points)
-    return distribute(PatchMesh(nodes, cells, SphereEmbedding(dimple), edges, points), MPI.COMM_SELF)
+    shape = DiscShape(np.pi / 2, half, circle)
+    return distribute(triangulate(shape, lambda x: size, points, SphereEmbedding(dimple)), MPI.COMM_SELF)
 
 
 def disc(size: float, *, half: bool = False) -> Midsurface:
     """A flat disc of radius 1."""
     points = {"pole": np.zeros(2)}
-    nodes, cells, edges = triangulate_disc(1.0, lambda x: size, half=half, points=points)
-    return distribute(PatchMesh(nodes, cells, flat, edges, points), MPI.COMM_SELF)
+    return distribute(triangulate(DiscShape(1.0, half), lambda x: size, points, flat), MPI.COMM_SELF)
 
 
 @pytest.fixture(scope="session")

@@ -87,3 +87,20 @@ def test_indentation_against_the_field_stops_at_the_fold_in_displacement() -> No
     assert found.stopped
     assert "the path turns back in the controlled displacement" in found.stopped
     assert found.rows[-1]["w_over_h"] == pytest.approx(5.9, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("polar", "shortening", "deflection"),
+    [(0.0, 0.32894, 0.66996), (-60.0, 0.67087, 0.80901)],
+)
+def test_magnetic_strip(polar: float, shortening: float, deflection: float) -> None:
+    """Hard-magnetic elastica, q = 12 lambda_m (L/h)^2 = 4, field at 90 and 150 degrees to the axis.
+
+    The inextensible rod's boundary value problem, five digits; the strip also stretches by
+    O(lambda_m) = 3e-5, a tenth of the tolerance.
+    """
+    found = result("magnetic_strip.yaml", f"magnetic.applied.polar={polar}")
+    model, u = found.scene.model, found.last.u
+    moved = model.displacement(u, "pole")
+    assert -moved[0] == pytest.approx(shortening, abs=1e-3 * shortening)
+    assert moved[2] == pytest.approx(deflection, abs=1e-3 * deflection)

@@ -7,7 +7,7 @@ from typing import Literal, Self
 from pydantic import Field, ValidationError, model_validator
 
 from magshell_fenicsx.case.base import Section
-from magshell_fenicsx.case.boundary import BoundarySection
+from magshell_fenicsx.case.boundary import EDGES, BoundarySection
 from magshell_fenicsx.case.fields import MagneticSection
 from magshell_fenicsx.case.loading import IndentationSection, LoadingSection
 from magshell_fenicsx.case.messages import explain
@@ -35,17 +35,19 @@ class Case(Section):
 
     @model_validator(mode="after")
     def _sections_fit(self) -> Self:
-        edge, other = ("equator", "rim") if self.shell.geometry == "hemisphere" else ("rim", "equator")
-        if getattr(self.boundary, other) is not None:
-            raise ValueError(f"boundary.{other}: a {self.shell.geometry} has no such edge, only {edge}")
-        if getattr(self.boundary, edge) in (None, "free"):
-            raise ValueError(f"boundary.{edge}: must be clamped or simply supported, else the shell is not held")
+        geometry, conditions = self.shell.geometry, self.boundary.conditions()
+        edges = EDGES[geometry]
+        for name in conditions:
+            if name not in edges:
+                raise ValueError(f"boundary.{name}: a {geometry} has no such edge, only {', '.join(edges)}")
+        if not any(conditions.get(name, "free") != "free" for name in edges):
+            raise ValueError(f"boundary.{edges[0]}: must be clamped or simply supported, else the shell is not held")
         if self.magnetic and self.magnetic.lambda_m is None and self.shell.youngs_modulus is None:
             raise ValueError("shell.youngs_modulus is needed to turn flux densities into lambda_m")
         if isinstance(self.loading, IndentationSection):
             polar = self.loading.at.polar
-            if self.shell.geometry == "disc" and polar:
-                raise ValueError("loading.at.polar: a disc is loaded at its centre, polar: 0")
+            if geometry != "hemisphere" and polar:
+                raise ValueError(f"loading.at.polar: a {geometry} is loaded at its centre or tip, polar: 0")
             if not 0 <= polar < 89:
                 raise ValueError(f"loading.at.polar: {polar:g} is not on the shell: allowed 0 to 89")
         return self

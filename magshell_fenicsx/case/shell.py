@@ -10,15 +10,16 @@ from magshell_fenicsx.case.defects import DimpleSection
 
 
 class ShellSection(Section):
-    """Either radius_to_thickness, or radius and thickness with units."""
+    """Either radius_to_thickness, or radius and thickness with units; a strip's radius is its length."""
 
-    geometry: Literal["hemisphere", "disc"]
+    geometry: Literal["hemisphere", "disc", "strip"]
     radius_to_thickness: float | None = Field(default=None, ge=10, le=1e5)
     radius: Length | None = Field(default=None, gt=0)
     thickness: Length | None = Field(default=None, gt=0)
     youngs_modulus: Pressure | None = Field(default=None, gt=0)
     poisson_ratio: float = Field(gt=-1, le=0.5)
     defect: DimpleSection | None = None
+    width: float | None = Field(default=None, gt=0, le=10, description="of the strip, over its length")
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -30,6 +31,8 @@ class ShellSection(Section):
             raise ValueError("give radius_to_thickness, or both radius and thickness")
         elif not 10 <= self.R_over_h <= 1e5:
             raise ValueError(f"radius/thickness is {self.R_over_h:.4g}; a thin shell needs 10 to 1e5")
+        if (self.width is None) == (self.geometry == "strip"):
+            raise ValueError("width (over the length) belongs to geometry: strip, and only to it")
         if self.defect and self.geometry != "hemisphere":
             raise ValueError("a dimple needs geometry: hemisphere")
         if self.defect and self.dimple_half_width >= 0.9 * pi / 2:

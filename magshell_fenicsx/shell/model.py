@@ -85,7 +85,8 @@ class ShellModel:
             terms.append(self._force(loads.force))
         self.system = FiniteElementSystem(self.u, terms, held, interior, material.h)
         self._volume = self.kernels.compile("volume energy", factory.volume_change())
-        self._probes = {name: point_entries(V, x, -self.normals[name]) for name, x in midsurface.points.items()}
+        # dofs of a vertex on the rank that owns it
+        self._probes = {name: point_entries(V, x, np.ones(3))[0] for name, x in midsurface.points.items()}
 
     def zero(self) -> Vector:
         """The undeformed displacement."""
@@ -98,8 +99,12 @@ class ShellModel:
 
     def deflection(self, u: Vector, point: str) -> float:
         """w/R = -u . n0 at a named vertex."""
-        dofs, entries = self._probes[point]
-        return float(self.system.comm.allreduce(float(entries @ u[dofs])))
+        return -float(self.displacement(u, point) @ self.normals[point])
+
+    def displacement(self, u: Vector, point: str) -> NDArray[np.float64]:
+        """u/R (3,) at a named vertex."""
+        here = u[self._probes[point]].reshape(-1, 3).sum(axis=0)
+        return np.asarray(self.system.comm.allreduce(here))
 
     def loaded_deflection(self, u: Vector) -> float:
         """w/R conjugate to the force: at its point, or averaged over its patch."""

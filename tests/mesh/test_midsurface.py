@@ -9,17 +9,16 @@ from conftest import hemisphere
 from dolfinx import fem
 from mpi4py import MPI
 
-from magshell_fenicsx.mesh.disc import triangulate_disc
 from magshell_fenicsx.mesh.midsurface import distribute
 from magshell_fenicsx.mesh.patch import MeshError, PatchMesh, check_orientation
+from magshell_fenicsx.mesh.shapes import DiscShape
 from magshell_fenicsx.mesh.sphere import Dimple, SphereEmbedding, flat
+from magshell_fenicsx.mesh.triangulation import triangulate
 from magshell_fenicsx.shell import kinematics as kin
 
 
 def patch(size: float = 0.5) -> PatchMesh:
-    points = {"pole": np.zeros(2)}
-    nodes, cells, edges = triangulate_disc(1.0, lambda x: size, half=False, points=points)
-    return PatchMesh(nodes, cells, flat, edges, points)
+    return triangulate(DiscShape(1.0, half=False), lambda x: size, {"pole": np.zeros(2)}, flat)
 
 
 @pytest.mark.parametrize("degree", [2, 3, 4, 5])
@@ -48,8 +47,8 @@ def test_area_converges(degree: int, order: int) -> None:
 def test_edges_follow_the_rim_of_the_dimple() -> None:
     """Vertices and edge nodes lie on the circle phi = phi_o: no triangle straddles it."""
     dimple = Dimple(0.05, 0.5)
-    nodes, cells, _ = triangulate_disc(np.pi / 2, lambda x: 0.3, half=False, circle=0.5, points={"pole": np.zeros(2)})
-    phi = np.hypot(*nodes.T)[cells[:, :9]]
+    mesh = triangulate(DiscShape(np.pi / 2, False, 0.5), lambda x: 0.3, {"pole": np.zeros(2)}, flat)
+    phi = np.hypot(*mesh.nodes.T)[mesh.cells[:, :9]]
     inside, outside = phi < dimple.phi_o - 1e-9, phi > dimple.phi_o + 1e-9
     assert not (inside.any(axis=1) & outside.any(axis=1)).any()
     assert inside.any()
