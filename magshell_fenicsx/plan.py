@@ -12,15 +12,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.fields import Direction
+from magshell_fenicsx.case.expressions import formula
+from magshell_fenicsx.case.fields import Direction, MagneticSection, layer_average
 from magshell_fenicsx.case.loading import IndentationSection, PressureSection
+from magshell_fenicsx.case.shell import ShellSection
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.mesh.grading import Disc, Ring, Size, smallest
 from magshell_fenicsx.mesh.patch import Embedding
 from magshell_fenicsx.mesh.shapes import DiscShape, Shape, StripShape
-from magshell_fenicsx.mesh.sphere import Dimple, SphereEmbedding, direction, flat
+from magshell_fenicsx.mesh.sphere import Dimple, SphereEmbedding, flat
 from magshell_fenicsx.mesh.triangulation import triangulate
 from magshell_fenicsx.shell.parameters import Condition, Force, Loads, Magnetisation, Material
+from magshell_fenicsx.shell.patterns import Components, InsideAndOutside, Pattern, radial, tangential
 
 
 @dataclass(frozen=True)
@@ -63,17 +66,17 @@ def make_plan(case: Case) -> Plan:
     material = Material(shell.poisson_ratio, 1 / shell.R_over_h)
     field_on = magnetic is not None and case.lambda_m != 0
     indentation = loading if isinstance(loading, IndentationSection) else None
-    directions = [magnetic.remanent, magnetic.applied] if magnetic and field_on else []
+    directions = [*magnetic.remanent.directions(), magnetic.applied] if magnetic and field_on else []
     azimuth = common_azimuth([*directions, *([indentation.at] if indentation else [])])
+    of_position = field_on and magnetic and (magnetic.remanent.kind == "expression" or magnetic.applied.gradient)
+    if of_position and (case.symmetry != "half" or azimuth):
+        azimuth = None  # only the user knows whether it is symmetric to the plane y = 0
     if shell.geometry == "strip" and azimuth is not None and abs(sin(azimuth)) > 1e-12:
         azimuth = None  # the strip's own mirror plane is y = 0
     if case.symmetry == "half" and azimuth is None:
         raise CaseError("symmetry: half: the shell, the fields and the load have no common mirror plane through e3")
     half = azimuth is not None and case.symmetry != "none"
     turn = azimuth if half and azimuth is not None else 0.0
-
-    def turned(d: Direction) -> NDArray[np.float64]:
-        return direction(radians(d.polar), radians(d.azimuth) - turn)
 
     defect = Dimple(shell.defect.amplitude * material.h, shell.dimple_half_width) if shell.defect else None
     hemisphere = shell.geometry == "hemisphere"
@@ -99,9 +102,7 @@ def make_plan(case: Case) -> Plan:
     loads = Loads(
         pressure=isinstance(loading, PressureSection),
         force=force,
-        magnetic=Magnetisation(turned(magnetic.remanent), turned(magnetic.applied), magnetic.energy)
-        if magnetic and field_on
-        else None,
+        magnetic=_magnetisation(magnetic, shell, turn) if magnetic and field_on else None,
     )
     included, left_out = _account(case, loads, half, azimuth)
     return Plan(
@@ -119,12 +120,34 @@ def make_plan(case: Case) -> Plan:
     )
 
 
+def _magnetisation(magnetic: MagneticSection, shell: ShellSection, turn: float) -> Magnetisation:
+    """The field section in the model's frame."""
+    section, gradient = magnetic.remanent, magnetic.applied.gradient
+    remanent: NDArray[np.float64] | Pattern
+    if section.kind == "radial":
+        remanent = radial
+    elif section.kind == "tangential":
+        remanent = tangential
+    elif section.components:
+        remanent = Components([formula(text) for text in section.components])
+    elif section.layers:
+        remanent = layer_average(section.layers, turn)
+    elif section.patches:
+        rest = section.patches["rest"].vector(turn)
+        inside = section.patches.get("dimple")
+        remanent = InsideAndOutside(shell.dimple_half_width, inside.vector(turn), rest) if inside else rest
+    else:
+        remanent = section.vector(turn)
+    applied = magnetic.applied.uniform * magnetic.applied.vector(turn)
+    return Magnetisation(remanent, applied, magnetic.energy, np.array(gradient) if gradient else None)
+
+
 def common_azimuth(directions: Sequence[Direction]) -> float | None:
     """Azimuth (rad) of the plane through e3 that holds all directions; None if there is none.
 
     0 if every direction is along e3.
     """
-    horizontal = [direction(radians(d.polar), radians(d.azimuth))[:2] for d in directions]
+    horizontal = [d.vector()[:2] for d in directions]
     tilted = [v for v in horizontal if hypot(*v) > 1e-12]
     if not tilted:
         return 0.0

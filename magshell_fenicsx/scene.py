@@ -68,7 +68,9 @@ class Scene:
             "energy": sum(energies.values()),
             "stretching": energies["membrane"],
             "bending": sum(v for name, v in energies.items() if name == "bending" or name.endswith("edges")),
-            "magnetic": sum(energies.get(name, 0.0) for name in ("magnetic", "U1", "Uq", "Utau", "couple")),
+            "magnetic": sum(
+                energies.get(name, 0.0) for name in ("magnetic", "magnetic gradient", "U1", "Uq", "Utau", "couple")
+            ),
             **{name: energies.get(name, 0.0) for name in ("U1", "Uq", "Utau")},
         }
 

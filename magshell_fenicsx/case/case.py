@@ -42,6 +42,8 @@ class Case(Section):
                 raise ValueError(f"boundary.{name}: a {geometry} has no such edge, only {', '.join(edges)}")
         if not any(conditions.get(name, "free") != "free" for name in edges):
             raise ValueError(f"boundary.{edges[0]}: must be clamped or simply supported, else the shell is not held")
+        if self.magnetic and "dimple" in (self.magnetic.remanent.patches or {}) and self.shell.defect is None:
+            raise ValueError("magnetic.remanent.patches: the shell has no dimple")
         if self.magnetic and self.magnetic.lambda_m is None and self.shell.youngs_modulus is None:
             raise ValueError("shell.youngs_modulus is needed to turn flux densities into lambda_m")
         if isinstance(self.loading, IndentationSection):

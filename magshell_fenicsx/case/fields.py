@@ -1,13 +1,24 @@
 """The magnetisation and the applied field."""
 
 from math import pi
-from typing import Literal, Self
+from typing import Annotated, Literal, Self
 
-from pydantic import Field, model_validator
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import AfterValidator, Field, model_validator
 
 from magshell_fenicsx.case.base import FluxDensity, Section
+from magshell_fenicsx.case.expressions import formula
 
 MU_0 = 4e-7 * pi  # T m/A
+
+
+def _checked(text: str) -> str:
+    formula(text)
+    return text
+
+
+Formula = Annotated[str, AfterValidator(_checked)]
 
 
 class Direction(Section):
@@ -16,11 +27,75 @@ class Direction(Section):
     polar: float = 0.0
     azimuth: float = 0.0
 
+    def vector(self, turn: float = 0.0) -> NDArray[np.float64]:
+        """The unit vector (3,) in a frame that is turned by `turn` (rad) about e3."""
+        polar, azimuth = np.radians(self.polar), np.radians(self.azimuth) - turn
+        return np.array([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)])
 
-class FluxVector(Direction):
-    """A direction, with its magnitude where lambda_m is not given."""
 
-    flux_density: FluxDensity | None = Field(default=None)
+class Layer(Direction):
+    """A layer of the thickness, magnetised in one direction."""
+
+    fraction: float = Field(gt=0, le=1, description="of the thickness")
+
+
+class RemanentSection(Direction):
+    """The remanent flux density; `polar` and `azimuth` belong to the uniform one.
+
+    radial: along the normal. tangential: along the meridians, away from e3. expression: components as
+    formulas of the undeformed position x, y, z over R. patches: a direction per named patch, "dimple"
+    (within its rim) and "rest". layers: averaged over the thickness.
+    """
+
+    kind: Literal["uniform", "radial", "tangential", "expression", "patches", "layers"] = "uniform"
+    flux_density: FluxDensity | None = None
+    components: list[Formula] | None = Field(default=None, min_length=3, max_length=3)
+    patches: dict[Literal["dimple", "rest"], Direction] | None = None
+    layers: list[Layer] | None = Field(default=None, min_length=1)
+
+    @model_validator(mode="after")
+    def _keys_of_the_kind(self) -> Self:
+        belongs = {"components": "expression", "patches": "patches", "layers": "layers"}
+        for key, kind in belongs.items():
+            if (getattr(self, key) is not None) != (self.kind == kind):
+                raise ValueError(f"{key} belongs to kind: {kind}, and must be given there; the kind is {self.kind}")
+        if self.kind != "uniform" and {"polar", "azimuth"} & self.model_fields_set:
+            raise ValueError(f"polar and azimuth belong to kind: uniform; the kind is {self.kind}")
+        if self.patches and "rest" not in self.patches:
+            raise ValueError("patches needs the patch rest")
+        if self.layers:
+            if abs(sum(layer.fraction for layer in self.layers) - 1) > 1e-6:
+                raise ValueError("the fractions of the layers must add up to 1")
+            if np.linalg.norm(layer_average(self.layers)) < 1e-9:
+                raise ValueError("the layers cancel: their average is a remanence of length zero")
+        return self
+
+    def directions(self) -> list[Direction]:
+        """All directions that a mirror plane must hold; radial and tangential patterns allow every plane."""
+        if self.kind == "uniform":
+            return [self]
+        return [*(self.patches or {}).values(), *(self.layers or [])]
+
+
+def layer_average(layers: list[Layer], turn: float = 0.0) -> NDArray[np.float64]:
+    """Average (3,) of the layers' unit vectors over the thickness: all that B0 keeps of them."""
+    return np.asarray(np.sum([layer.fraction * layer.vector(turn) for layer in layers], axis=0))
+
+
+class AppliedSection(Direction):
+    """The applied flux density, uniform or linear in space: |Ba| (uniform b + gradient . r/R)."""
+
+    flux_density: FluxDensity | None = None
+    uniform: float = Field(default=1.0, description="factor of the uniform part")
+    gradient: list[list[float]] | None = Field(default=None, min_length=3, max_length=3)
+
+    @model_validator(mode="after")
+    def _square(self) -> Self:
+        if self.gradient and any(len(row) != 3 for row in self.gradient):
+            raise ValueError("gradient is three rows of three numbers")
+        if self.uniform == 0 and not self.gradient:
+            raise ValueError("uniform: 0 needs a gradient")
+        return self
 
 
 class MagneticSection(Section):
@@ -28,8 +103,8 @@ class MagneticSection(Section):
 
     energy: Literal["full", "first", "torque", "second", "second_consistent"] = "full"
     lambda_m: float | None = Field(default=None, ge=-10, le=10)
-    remanent: FluxVector = FluxVector()
-    applied: FluxVector = FluxVector()
+    remanent: RemanentSection = RemanentSection()
+    applied: AppliedSection = AppliedSection()
 
     @model_validator(mode="after")
     def _one_amplitude(self) -> Self:
@@ -40,6 +115,8 @@ class MagneticSection(Section):
             raise ValueError("give lambda_m, or remanent.flux_density and applied.flux_density")
         if self.remanent.flux_density == 0:
             raise ValueError("a remanence of length zero is no magnetisation: leave the section out")
+        if self.applied.gradient and self.energy != "full":
+            raise ValueError("the approximate energies are of uniform fields; a gradient needs energy: full")
         return self
 
     def amplitude(self, youngs_modulus: float | None) -> float:

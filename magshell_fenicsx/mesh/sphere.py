@@ -27,11 +27,6 @@ class Dimple:
         return np.where(phi < self.phi_o, -self.delta * (1 - (phi / self.phi_o) ** 2) ** 2, 0.0)
 
 
-def direction(polar: float, azimuth: float) -> Array:
-    """Unit vector at an angle `polar` from e3 and `azimuth` from e1 (rad)."""
-    return np.array([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)])
-
-
 @dataclass(frozen=True)
 class SphereEmbedding:
     """Chart (x, y) -> the sphere of radius 1, with its defect: r0 = (1 + w0) e_r."""

@@ -48,6 +48,11 @@ def magnetic(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:
     return -ufl.dot(Ba, u.r1 * ufl.dot(up1, Br) + u.r2 * ufl.dot(up2, Br) + (n - n0) * ufl.dot(n0, Br))
 
 
+def magnetic_gradient(r0: Jet, u: Jet, Br: Expr, G: Expr) -> Expr:
+    """The part of Ba = G r: -(G r) . F Br at the deformed position, without its value at u = 0."""
+    return magnetic(r0, u, Br, ufl.dot(G, r0.r + u.r)) - ufl.dot(ufl.dot(G, u.r), Br)
+
+
 def magnetic_first(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:
     """U1, linear in u: in-plane forces and a pressure; paper Eq. (eq:terms)."""
     up1, up2 = kin.dual_basis(r0)

@@ -6,6 +6,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from magshell_fenicsx.shell.patterns import Pattern
+
 Condition = Literal["clamped", "simply supported", "free", "symmetry"]
 MagneticEnergy = Literal["full", "first", "torque", "second", "second_consistent"]
 MIRROR_NORMAL = np.array([0.0, 1.0, 0.0])  # half models are the part y >= 0
@@ -52,14 +54,17 @@ class Magnetisation:
     Attributes
     ----------
     remanent, applied
-        Directions (3,) of the flux densities, unit vectors.
+        The flux densities over their magnitudes: vectors (3,), or a pattern for the remanent one.
+    gradient
+        (3, 3) of the applied flux density, which is applied + gradient . r; None if uniform.
     energy
         The full energy, or which of the paper's approximations takes its place.
     """
 
-    remanent: NDArray[np.float64]
+    remanent: NDArray[np.float64] | Pattern
     applied: NDArray[np.float64]
     energy: MagneticEnergy = "full"
+    gradient: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True)

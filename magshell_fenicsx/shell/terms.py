@@ -13,6 +13,7 @@ from magshell_fenicsx.shell import densities, edges
 from magshell_fenicsx.shell import kinematics as kin
 from magshell_fenicsx.shell.kinematics import Jet
 from magshell_fenicsx.shell.parameters import MIRROR_NORMAL, MagneticEnergy, Magnetisation, Material
+from magshell_fenicsx.shell.patterns import pattern_field
 from magshell_fenicsx.solve.kernels import KernelLog
 from magshell_fenicsx.solve.terms import FormTerm
 
@@ -62,11 +63,17 @@ class TermFactory:
 
     def magnetic(self, field: Magnetisation) -> list[FormTerm]:
         """The terms of the chosen energy; all have the amplitude lambda_m."""
-        Br, Ba = self._constant(field.remanent), self._constant(field.applied)
-        return [
+        pattern = field.remanent
+        Br = pattern_field(pattern, self.r0) if callable(pattern) else self._constant(pattern)
+        Ba = self._constant(field.applied)
+        terms = [
             self._cells(name, density(*self._jets(), Br, Ba), "lambda_m", linear=name in LINEAR)
             for name, density in MAGNETIC_TERMS[field.energy].items()
         ]
+        if field.gradient is not None:
+            density = densities.magnetic_gradient(*self._jets(), Br, self._constant(field.gradient))
+            terms.append(self._cells("magnetic gradient", density, "lambda_m"))
+        return terms
 
     def pressure(self) -> FormTerm:
         """Amplitude p/p_c; potential p Delta V, of a live pressure."""

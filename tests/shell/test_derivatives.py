@@ -8,7 +8,8 @@ import scipy.sparse
 from conftest import hemisphere, random_displacement
 
 from magshell_fenicsx.shell.model import ShellModel
-from magshell_fenicsx.shell.parameters import Force, Loads, Material
+from magshell_fenicsx.shell.parameters import Force, Loads, Magnetisation, Material
+from magshell_fenicsx.shell.patterns import tangential
 from magshell_fenicsx.solve.problem import FiniteElementSystem
 from magshell_fenicsx.solve.terms import FormTerm
 
@@ -80,6 +81,16 @@ def test_terms_together(shell: Shells, degree: int, half: bool) -> None:
     u = random_displacement(model, 2e-3 / degree**2)
     u[model.system._fixed] = 0
     check(model.system, u, {"lambda_m": 0.02, "pressure": 0.3})
+
+
+def test_field_gradient_and_pattern() -> None:
+    """Br varying over the surface in a field linear in space."""
+    G = np.array([[-0.5, 0.2, 0.1], [0.2, -0.7, 0.3], [0.1, 0.3, 1.2]])
+    field = Magnetisation(tangential, np.array([0.0, 0.6, 0.8]), "full", G)
+    model = ShellModel(hemisphere(), Material(0.3, 0.05), 3, {}, Loads(magnetic=field))
+    u = random_displacement(model, 2e-4)
+    for name in ("magnetic", "magnetic gradient"):
+        check(alone(model, name), u, {"lambda_m": 1.0})
 
 
 @pytest.mark.parametrize("amplitude", ["lambda_m", "pressure"])

@@ -1,0 +1,63 @@
+"""Magnetisations that vary over the surface, as functions of the undeformed position and normal."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from dolfinx import fem
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+# (cells, nodes, 3) positions r0 and normals n0 -> (cells, nodes, 3) vectors
+Pattern = Callable[[Array, Array], Array]
+
+
+def radial(r0: Array, n0: Array) -> Array:
+    """Along the normal."""
+    return n0
+
+
+def tangential(r0: Array, n0: Array) -> Array:
+    """Along the meridians, away from e3; zero where the normal is along e3."""
+    down = n0[..., 2:3] * n0 - np.array([0.0, 0.0, 1.0])
+    length = np.linalg.norm(down, axis=-1, keepdims=True)
+    return np.where(length > 1e-9, down / np.maximum(length, 1e-300), 0.0)
+
+
+@dataclass(frozen=True)
+class Components:
+    """Three functions of x, y, z."""
+
+    of_position: list[Callable[[Array, Array, Array], Array]]
+
+    def __call__(self, r0: Array, n0: Array) -> Array:
+        return np.stack([f(*np.moveaxis(r0, -1, 0)) for f in self.of_position], axis=-1)
+
+
+@dataclass(frozen=True)
+class InsideAndOutside:
+    """One vector within the colatitude `phi_o` (rad), another in the rest; the rim separates cells."""
+
+    phi_o: float
+    inside: Array
+    outside: Array
+
+    def __call__(self, r0: Array, n0: Array) -> Array:
+        centre = r0.mean(axis=1, keepdims=True)
+        phi = np.arctan2(np.hypot(centre[..., 0], centre[..., 1]), centre[..., 2])
+        return np.broadcast_to(np.where(phi[..., None] < self.phi_o, self.inside, self.outside), r0.shape)
+
+
+def pattern_field(pattern: Pattern, r0: fem.Function) -> fem.Function:
+    """The pattern at the nodes of every cell, free to jump from cell to cell."""
+    V = r0.function_space
+    element = V.element.basix_element
+    values = element.tabulate(1, element.points)
+    nodes = r0.x.array.reshape(-1, 3)[V.dofmap.list]
+    a1, a2 = np.einsum("dvk,cki->dcvi", values[1:, :, :, 0], nodes)
+    m = np.cross(a1, a2)
+    n0 = m / np.linalg.norm(m, axis=-1, keepdims=True)
+    Q = fem.functionspace(V.mesh, ("DG", element.degree, (3,)))
+    field = fem.Function(Q, name="Br")
+    field.x.array.reshape(-1, 3)[Q.dofmap.list] = pattern(nodes, n0)
+    return field
