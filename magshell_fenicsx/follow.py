@@ -1,7 +1,7 @@
 """The history of a case: the field first, then the load; every accepted point, and what stopped it."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -27,11 +27,16 @@ class Record:
         "fold" and "bifurcation": a located instability.
     amplitude
         The amplitude that varied ("" at the start).
+    mode
+        Of an instability that a reduced model excludes: "antisymmetric" to the mirror plane of a
+        half shell, or "m = 7" waves around an axisymmetric one. Such a record comes last, at its
+        place on the path.
     """
 
     label: Label
     amplitude: str
     point: Point
+    mode: str = ""
 
 
 class Stopped(RuntimeError):
@@ -61,9 +66,9 @@ def follow(scene: Scene) -> Iterator[Record]:
 
 
 def _field(scene: Scene, state: State) -> Iterator[Record]:
-    target = scene.case.lambda_m
+    target, points = scene.case.lambda_m, []
     path = Path(scene.newton, "lambda_m", "load", StepOptions(abs(target) / 2, abs(target), abs(target) * 1e-4))
-    here = path.start(state)
+    points.append(here := path.start(state))
     try:
         for point, _ in path.towards(here, [target]):
             if point.negative_pivots:
@@ -71,8 +76,13 @@ def _field(scene: Scene, state: State) -> Iterator[Record]:
                     f"the field alone makes the shell unstable: between lambda_m = {here.s:.6g} and {point.s:.6g} "
                     f"the number of unstable directions becomes {point.negative_pivots}"
                 )
-            here = point
+            points.append(here := point)
             yield Record("field", "lambda_m", point)
+        for record in _excluded(scene, path, points):
+            yield record
+            raise Stopped(
+                f"the field alone makes the shell unstable ({record.mode}) at lambda_m = {record.point.s:.6g}"
+            )
     except PathStopped as e:
         raise Stopped(f"the field step stopped at lambda_m = {e.point.s:.6g} of {target:g}: {e}") from None
 
@@ -90,9 +100,9 @@ def _pressure(scene: Scene, loading: PressureSection, state: State) -> Iterator[
         if end is not None:
             end *= -material.classical_pressure / material.h / scene.model.multiplicity
     if end is None:
-        yield from _until_limit(path, start)
+        yield from _until_limit(scene, path, start)
     else:
-        yield from _through(path, start, _divided(start.s, end, loading.points))
+        yield from _through(scene, path, start, _divided(start.s, end, loading.points))
 
 
 def _indentation(scene: Scene, loading: IndentationSection, state: State) -> Iterator[Record]:
@@ -110,7 +120,7 @@ def _indentation(scene: Scene, loading: IndentationSection, state: State) -> Ite
     start = path.start(state)
     # the field may have moved the point past the first targets already
     forward = [t for t in targets if (t - start.s) * targets[-1] > 0]
-    yield from _through(path, start, forward)
+    yield from _through(scene, path, start, forward)
 
 
 def _divided(start: float, end: float, points: int) -> list[float]:
@@ -118,35 +128,53 @@ def _divided(start: float, end: float, points: int) -> list[float]:
     return [float(t) for t in np.linspace(start, end, points + 1)[1:]]
 
 
-def _until_limit(path: Path, start: Point) -> Iterator[Record]:
-    """Accepted points up to the first instability, which is the last record."""
-    here = start
+def _until_limit(scene: Scene, path: Path, start: Point) -> Iterator[Record]:
+    """Accepted points up to the first instability."""
+    points, options = [start], path.options
     try:
-        for count, (point, _) in enumerate(path.towards(start, [np.inf])):
-            if point.negative_pivots > start.negative_pivots:
-                found = locate(path, here, point)
-                yield Record(found.kind, path.name, found.point)
-                return
-            if count >= MOST_POINTS:
-                raise Stopped(f"no instability found in {MOST_POINTS} steps; {_where(path, point)}")
-            here = point
-            yield Record("step", path.name, point)
+        while True:
+            for point, _ in path.towards(points[-1], [np.inf]):
+                if point.negative_pivots > start.negative_pivots:
+                    break
+                if len(points) > MOST_POINTS:
+                    raise Stopped(f"no instability found in {MOST_POINTS} steps; {_where(path, point)}")
+                points.append(point)
+                yield Record("step", path.name, point)
+            try:
+                found = locate(path, points[-1], point)
+                break
+            except PathStopped:  # the step had left the branch: come nearer in shorter ones
+                path.options = replace(path.options, first=abs(point.s - points[-1].s) / 4)
+                if path.options.first < options.smallest:
+                    raise
     except PathStopped as e:
         raise Stopped(_why(path, e, None)) from None
+    yield Record(found.kind, path.name, found.point)
+    yield from _excluded(scene, path, [*points, found.point])
 
 
-def _through(path: Path, start: Point, targets: list[float]) -> Iterator[Record]:
+def _through(scene: Scene, path: Path, start: Point, targets: list[float]) -> Iterator[Record]:
     """Accepted points through all targets, with the first instability on the way located."""
-    before, here = None, start
+    before, here, points = None, start, [start]
     try:
         for point, reached in path.towards(start, targets):
             if here.negative_pivots == 0 < point.negative_pivots and path.control == "conjugate":
                 found = locate(path, here, point)
                 yield Record(found.kind, path.name, found.point)
             before, here = here, point
+            points.append(point)
             yield Record("target" if reached else "step", path.name, point)
+        yield from _excluded(scene, path, points)
     except PathStopped as e:
         raise Stopped(_why(path, e, before)) from None
+
+
+def _excluded(scene: Scene, path: Path, points: list[Point]) -> Iterator[Record]:
+    """The first instability among the modes that a reduced model does not see, if there is one."""
+    modes = scene.model.excluded_modes()
+    if modes is not None and (found := modes.first_instability(path, points)):
+        mode, point = found
+        yield Record("bifurcation", path.name, point, mode)
 
 
 def _where(path: Path, point: Point) -> str:

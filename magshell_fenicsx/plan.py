@@ -200,7 +200,7 @@ def _account(case: Case, loads: Loads, half: bool, azimuth: float | None) -> tup
     if half:
         left_out.append(
             f"the other half: mirror plane through e3 at azimuth {degrees(azimuth or 0.0):g} degrees "
-            "(modes antisymmetric to it are not seen; symmetry: none sees them)"
+            "(modes antisymmetric to it are looked for at the end of each path)"
         )
     return included, left_out
 

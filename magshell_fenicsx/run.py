@@ -55,6 +55,7 @@ class Result:
                 "p_over_pc": row["p_over_pc"],
                 "w_pole_over_h": row["w_pole_over_h"],
                 "kind": row["label"],
+                "mode": row["mode"],
             }
             for row in self.rows
             if row["label"] in ("fold", "bifurcation")
@@ -62,8 +63,8 @@ class Result:
 
     @property
     def knockdown(self) -> float | None:
-        """k_d: p/p_c at the first instability under pressure; None if there is none."""
-        return next((float(p["value"]) for p in self.limit_points if p["amplitude"] == "pressure"), None)
+        """k_d: the lowest p/p_c of an instability under pressure; None if there is none."""
+        return min((float(p["value"]) for p in self.limit_points if p["amplitude"] == "pressure"), default=None)
 
 
 def run(
@@ -109,6 +110,7 @@ def run(
                 "iterations": record.point.iterations,
                 "factorisations": record.point.factorisations,
                 "wall_s": round(time.perf_counter() - start, 3),
+                "mode": record.mode,
             }
             result.rows.append(row)
             result.last = record.point.state

@@ -26,6 +26,7 @@ COLUMNS = (
     "U1",
     "Uq",
     "Utau",
+    "mode",
 )
 Row = dict[str, float | int | str]
 

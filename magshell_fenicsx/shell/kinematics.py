@@ -21,12 +21,19 @@ class Jet:
     r12: Expr
     r22: Expr
 
+    def parts(self) -> list[Expr]:
+        """The six vectors."""
+        return [getattr(self, f.name) for f in fields(self)]
+
     def __add__(self, other: "Jet") -> "Jet":
-        return Jet(*(getattr(self, f.name) + getattr(other, f.name) for f in fields(self)))
+        return Jet(*(a + b for a, b in zip(self.parts(), other.parts(), strict=True)))
+
+    def __sub__(self, other: "Jet") -> "Jet":
+        return Jet(*(a - b for a, b in zip(self.parts(), other.parts(), strict=True)))
 
     def side(self, sign: str) -> "Jet":
         """The same on one side ('+' or '-') of an edge."""
-        return Jet(*(getattr(self, f.name)(sign) for f in fields(self)))
+        return Jet(*(a(sign) for a in self.parts()))
 
 
 def cell_frame(mesh: ufl.Mesh) -> tuple[Expr, Expr]:

@@ -11,6 +11,7 @@ from dolfinx import fem
 from numpy.typing import NDArray
 
 from magshell_fenicsx.mesh.midsurface import Midsurface
+from magshell_fenicsx.shell.antisymmetric import AntisymmetricModes, held_against_mirror
 from magshell_fenicsx.shell.parameters import MIRROR_NORMAL, Condition, Force, Loads, Material, default_penalty
 from magshell_fenicsx.shell.point_load import patch_entries, point_entries, vertex_normal
 from magshell_fenicsx.shell.terms import TermFactory
@@ -62,7 +63,7 @@ class ShellModel:
         factory = TermFactory(self.r0, self.u, material, self.sigma, degree, self.kernels)
         interior = factory.interior_edges()
         terms: list[Term] = [factory.membrane(), factory.bending(), interior]
-        held = []
+        held, mirror = [], []
 
         def facets(condition: Condition) -> NDArray[np.int32]:
             found = [midsurface.edges[name] for name, c in conditions.items() if c == condition]
@@ -75,7 +76,7 @@ class ShellModel:
             held.append(_held(V, facets("simply supported")))
         if "symmetry" in conditions.values():
             terms.append(factory.mirror_edges(facets("symmetry")))
-            held.append(_held_in_mirror(V, facets("symmetry")))
+            mirror.append(_held_in_mirror(V, facets("symmetry")))
         if loads.magnetic:
             terms += factory.magnetic(loads.magnetic)
         if loads.pressure:
@@ -83,10 +84,19 @@ class ShellModel:
         self.normals = {name: vertex_normal(self.r0, x) for name, x in midsurface.points.items()}
         if loads.force:
             terms.append(self._force(loads.force))
-        self.system = FiniteElementSystem(self.u, terms, held, interior, material.h)
+        self.system = FiniteElementSystem(self.u, terms, held + mirror, interior, material.h)
+        self._factory, self._interior, self._held, self._mirror = factory, interior, held, facets("symmetry")
         self._volume = self.kernels.compile("volume energy", factory.volume_change())
         # dofs of a vertex on the rank that owns it
         self._probes = {name: point_entries(V, x, np.ones(3))[0] for name, x in midsurface.points.items()}
+
+    def excluded_modes(self) -> AntisymmetricModes | None:
+        """The modes that a half model does not see; None for a whole one. Compiles a kernel."""
+        if self.multiplicity == 1:
+            return None
+        edges = self._factory.antisymmetric_edges(self._mirror)
+        held = self._held + held_against_mirror(self.V, self._mirror)
+        return AntisymmetricModes(self.system, edges, held, self._interior)
 
     def zero(self) -> Vector:
         """The undeformed displacement."""

@@ -11,6 +11,7 @@ from ufl.core.expr import Expr
 
 from magshell_fenicsx.shell import densities, edges
 from magshell_fenicsx.shell import kinematics as kin
+from magshell_fenicsx.shell.antisymmetric import HessianTerm, antisymmetric_edge
 from magshell_fenicsx.shell.kinematics import Jet
 from magshell_fenicsx.shell.parameters import MIRROR_NORMAL, MagneticEnergy, Magnetisation, Material
 from magshell_fenicsx.shell.patterns import pattern_field
@@ -60,6 +61,16 @@ class TermFactory:
         m = self._constant(MIRROR_NORMAL)
         density = edges.symmetric(*self._jets(), self._domain, *self._nu_h(), self._constant(self.sigma), m)
         return self._term("mirror edges", density * self._ds(facets))
+
+    def antisymmetric_edges(self, facets: NDArray[np.int32]) -> HessianTerm:
+        """The mirror plane's edges under antisymmetric displacements."""
+        V = self.u.function_space
+        m, v = self._constant(MIRROR_NORMAL), fem.Function(V)
+        jets = (*self._jets(), kin.jet(v, self._domain))
+        density = antisymmetric_edge(*jets, self._domain, *self._nu_h(), self._constant(self.sigma), m)
+        gradient = ufl.derivative(density * self._ds(facets), v, ufl.TestFunction(V))
+        hessian = ufl.derivative(gradient, v, ufl.TrialFunction(V))
+        return HessianTerm("antisymmetric edges", self.log.compile("antisymmetric edges tangent", hessian))
 
     def magnetic(self, field: Magnetisation) -> list[FormTerm]:
         """The terms of the chosen energy; all have the amplitude lambda_m."""

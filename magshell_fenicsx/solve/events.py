@@ -1,12 +1,21 @@
 """Locating the first instability between two points of a path: a fold or a bifurcation."""
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, Protocol
 
 import numpy as np
+from mpi4py import MPI
 
+from magshell_fenicsx.solve.factor import Factorisation
 from magshell_fenicsx.solve.path import Path, PathStopped, Point
 from magshell_fenicsx.solve.system import State, dot
+
+
+class Stability(Protocol):
+    """A tangent whose inertia tells stability."""
+
+    def factor_at(self, state: State) -> Factorisation:
+        """Factor the tangent at a state."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +52,7 @@ def locate(path: Path, stable: Point, unstable: Point, tolerance: float = 1e-8) 
         low, high = (low, middle) if middle.negative_pivots > stable.negative_pivots else (middle, high)
     if low.dmu * high.dmu < 0:
         return Instability(work.add_to(_fold(path, low, high, tolerance, work)), "fold")
-    return Instability(work.add_to(_bifurcation(path, low, high, tolerance, work)), "bifurcation")
+    return Instability(locate_bifurcation(path, low, high, path.newton, tolerance), "bifurcation")
 
 
 @dataclass
@@ -90,21 +99,37 @@ def _stationary(low: Point, high: Point, name: str) -> float:
     return low.s + L * min(max(t, 1e-3), 1 - 1e-3)
 
 
-def _bifurcation(path: Path, low: Point, high: Point, tolerance: float, work: _Work) -> Point:
-    """Zero of the eigenvalue that changes sign, by the Illinois variant of regula falsi."""
-    a, b = critical_eigenvalue(path, low), critical_eigenvalue(path, high)
-    stable = low.negative_pivots
-    side = 0
+def locate_bifurcation(
+    path: Path, stable: Point, unstable: Point, stability: Stability, tolerance: float = 1e-8
+) -> Point:
+    """Where the eigenvalue that changes sign is zero, by the Illinois variant of regula falsi.
+
+    Parameters
+    ----------
+    stability
+        Whose tangent is watched: the path's own, or that of modes which the model excludes.
+    tolerance
+        Of the amplitude, relative.
+
+    Raises
+    ------
+    PathStopped
+        If Newton fails between two points that it had found.
+    """
+    low, high, work, side = stable, unstable, _Work(), 0
+    comm = path.system.comm
+    a, pivots = critical_eigenvalue(stability, low.state, comm)
+    b, _ = critical_eigenvalue(stability, high.state, comm)
     while True:
         t = a / (a - b) if a > 0 > b else 0.5
         point = work.solve(path, low.s + t * (high.s - low.s), low, high)
-        value = critical_eigenvalue(path, point)
+        value, unstable_now = critical_eigenvalue(stability, point.state, comm)
         mu = point.state.mu[path.name]
         slope = (b - a) / (high.s - low.s)
         error = abs(value / slope * point.dmu) if a > 0 > b else np.inf
-        if error <= tolerance * abs(mu) or abs((high.s - low.s) * point.dmu) <= tolerance * abs(mu):
-            return point
-        if point.negative_pivots > stable:
+        if min(error, abs((high.s - low.s) * point.dmu)) <= tolerance * abs(mu):
+            return work.add_to(point)
+        if unstable_now > pivots:
             high, b = point, value
             a = a / 2 if side == 1 else a
             side = 1
@@ -114,16 +139,15 @@ def _bifurcation(path: Path, low: Point, high: Point, tolerance: float, work: _W
             side = -1
 
 
-def critical_eigenvalue(path: Path, point: Point, iterations: int = 12) -> float:
-    """Eigenvalue of the tangent nearest to zero, by inverse iteration."""
-    factors = path.newton.factor_at(point.state)
-    comm = path.system.comm
-    v, value = point.du + path.system.length * 1e-3 * np.sin(np.arange(point.du.size) + comm.rank), 0.0
+def critical_eigenvalue(stability: Stability, state: State, comm: MPI.Comm, iterations: int = 12) -> tuple[float, int]:
+    """Eigenvalue of the tangent nearest to zero, by inverse iteration, and the negative pivots."""
+    factors = stability.factor_at(state)
+    v, value = np.sin(1.0 + np.arange(state.u.size) + comm.rank), 0.0
     for _ in range(iterations):
         v = v / np.sqrt(dot(comm, v, v))
         w = factors.solve(v)
         value, v = 1 / dot(comm, v, w), w
-    return value
+    return value, factors.negative_pivots
 
 
 def _between(path: Path, s: float, low: Point, high: Point) -> State:
