@@ -15,7 +15,7 @@ from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.environment import fast_blas, versions
 from magshell_fenicsx.follow import Record, Stopped, follow
 from magshell_fenicsx.results.curve import draw_curve
-from magshell_fenicsx.results.picture import draw_shell
+from magshell_fenicsx.results.picture import draw_loads, draw_shell
 from magshell_fenicsx.results.surface import SurfaceGatherer, completed, turned
 from magshell_fenicsx.results.table import PathTable, Row
 from magshell_fenicsx.results.vtu import FieldSeries
@@ -193,6 +193,8 @@ class _Files:
         whole = turned(completed(surface) if plan.half else surface, plan.azimuth)
         title = _title(result)
         draw_shell(whole, plan.material.h, title, self._folder / "shell.png")
+        if whole.fields:
+            draw_loads(whole, plan.material.h, title, self._folder / "magnetic_loads.png")
         if last.amplitude:
             draw_curve(result.rows, last.amplitude, title, self._folder / "curve.png")
 
@@ -209,7 +211,7 @@ def _prepare(out: Path, comm: MPI.Comm) -> Path:
     if comm.rank == 0:
         try:
             out.mkdir(parents=True, exist_ok=True)
-            for name in ("path.csv", "summary.json", "shell.png", "curve.png"):
+            for name in ("path.csv", "summary.json", "shell.png", "curve.png", "magnetic_loads.png"):
                 (out / name).unlink(missing_ok=True)
             shutil.rmtree(out / "fields", ignore_errors=True)
             (out / "path.csv").touch()

@@ -8,8 +8,10 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
+import pyvista
 
 from magshell_fenicsx.results.surface import Surface
+from magshell_fenicsx.results.vtu import unstructured_grid
 
 
 @contextmanager
@@ -46,14 +48,15 @@ def screen() -> Iterator[None]:
         server.wait()
 
 
+def smooth_surface(surface: Surface, h: float) -> pyvista.PolyData:
+    """The deformed surface in flat triangles, each curved one divided."""
+    return unstructured_grid(surface, h).extract_surface(nonlinear_subdivision=4).clean(tolerance=1e-7)
+
+
 def draw_shell(surface: Surface, h: float, title: str, file: Path) -> None:
     """Draw the deformed mid-surface with its colour bar, seen so that the deepest place shows."""
-    import pyvista
-
-    from magshell_fenicsx.results.vtu import unstructured_grid
-
     pyvista.OFF_SCREEN = True
-    smooth = unstructured_grid(surface, h).extract_surface(nonlinear_subdivision=4).clean(tolerance=1e-7)
+    smooth = smooth_surface(surface, h)
     with screen():
         plotter = pyvista.Plotter(off_screen=True, window_size=(1200, 1000))
         limit = float(np.abs(surface.w).max() / h) or 1.0
@@ -76,5 +79,35 @@ def draw_shell(surface: Surface, h: float, title: str, file: Path) -> None:
         ]
         plotter.camera.zoom(1.3)
         plotter.show_axes()
+        plotter.screenshot(file)
+        plotter.close()
+
+
+LOADS = {
+    "p_mag": "magnetic pressure p_mag",
+    "f_mag": "in-plane force |f_mag|",
+    "k": "stiffness of rotational springs k",
+    "tau": "torque |tau(u)|",
+}
+
+
+def draw_loads(surface: Surface, h: float, title: str, file: Path) -> None:
+    """Draw the magnetic energy read as loads, one panel each, on the deformed shell."""
+    pyvista.OFF_SCREEN = True
+    smooth = smooth_surface(surface, h)
+    shown = [name for name in LOADS if name in surface.fields]
+    with screen():
+        plotter = pyvista.Plotter(off_screen=True, shape=(2, 2), window_size=(1600, 1300), border=False)
+        for i, name in enumerate(shown):
+            plotter.subplot(i // 2, i % 2)
+            values = smooth.point_data[name]
+            panel = smooth.copy()
+            panel.point_data[LOADS[name]] = np.linalg.norm(values, axis=1) if values.ndim == 2 else values
+            bar = {"title": LOADS[name], "n_labels": 4, "fmt": "%.3g", "color": "black"}
+            plotter.add_mesh(panel, scalars=LOADS[name], cmap="viridis", smooth_shading=True, scalar_bar_args=bar)
+            plotter.camera_position = [(2.2, -3.6, 3.2), (0, 0, 0.35), (0, 0, 1)]
+        plotter.subplot(0, 0)
+        plotter.add_text(title, font_size=9, color="black")
+        plotter.set_background("white")
         plotter.screenshot(file)
         plotter.close()

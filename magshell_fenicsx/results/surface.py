@@ -1,6 +1,6 @@
 """The deformed mid-surface gathered on rank 0, for pictures and for ParaView."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import basix
 import basix.ufl
@@ -9,10 +9,12 @@ from dolfinx import fem, mesh
 from dolfinx.cpp.io import perm_vtk
 from numpy.typing import NDArray
 
+from magshell_fenicsx.results.interpretation import SurfaceGeometry, magnetic_loads
 from magshell_fenicsx.shell.model import ShellModel
 from magshell_fenicsx.solve.system import Vector
 
 LAGRANGE_TRIANGLE = 69  # VTK's number of the triangle of arbitrary order
+Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -25,15 +27,18 @@ class Surface:
         (n, 3) undeformed placement, displacement, undeformed normal.
     cells
         (m, k) node numbers of triangles of the displacement's degree, in VTK's order.
+    fields
+        Name -> (n,) or (n, 3): the magnetic loads, where the field is uniform.
     """
 
-    r0: NDArray[np.float64]
-    u: NDArray[np.float64]
-    n0: NDArray[np.float64]
+    r0: Array
+    u: Array
+    n0: Array
     cells: NDArray[np.int64]
+    fields: dict[str, Array]
 
     @property
-    def w(self) -> NDArray[np.float64]:
+    def w(self) -> Array:
         """Inward normal displacement -u . n0 over R, (n,)."""
         return np.asarray(-np.einsum("ij,ij->i", self.u, self.n0))
 
@@ -52,55 +57,80 @@ class SurfaceGatherer:
         self._V = fem.functionspace(domain, element)
         self._field = fem.Function(self._V)
         self._r0 = self._nodes(model.r0)
+        self._derivatives = model.V.element.basix_element.tabulate(2, self._V.element.interpolation_points())
         map_ = self._V.dofmap.index_map
-        owned = domain.topology.index_map(2).size_local
-        local = self._V.dofmap.list[:owned]
+        self._owned = domain.topology.index_map(2).size_local
+        local = self._V.dofmap.list[: self._owned]
         numbers = map_.local_to_global(local.ravel().astype(np.int32)).reshape(local.shape)
+        self._size, self._numbers = map_.size_global, self.comm.gather(numbers)
         cells = self.comm.gather(numbers[:, np.argsort(perm_vtk(mesh.CellType.triangle, local.shape[1]))])
-        normals = self.comm.gather((numbers, self._cell_normals(owned)))
-        if self.comm.rank == 0:
-            self._cells = np.concatenate(cells)
-            total = np.zeros((map_.size_global, 3))
-            for where, n in normals:
-                np.add.at(total, where, n)
-            self._n0 = total / np.linalg.norm(total, axis=1)[:, None]
+        self._cells = np.concatenate(cells) if self.comm.rank == 0 else numbers
+        n0 = self._averaged(self._geometry().n0)
+        self._n0 = n0 / np.linalg.norm(n0, axis=1)[:, None]
 
     def gather(self, u: Vector) -> Surface | None:
         """The surface with a displacement, on rank 0; None elsewhere."""
-        self._model.system.set(u)
-        nodes = self._nodes(self._model.u)
-        return Surface(self._r0, nodes, self._n0, self._cells) if self.comm.rank == 0 else None
+        model = self._model
+        model.system.set(u)
+        nodes, fields = self._nodes(model.u), {}
+        field = model.loads.magnetic
+        if field and field.gradient is None:
+            g = self._geometry()
+            values = magnetic_loads(g, field, self._at_nodes(model.r0)[0], model.material.h)
+            fields = {name: self._averaged(value) for name, value in values.items()}
+        return Surface(self._r0, nodes, self._n0, self._cells, fields) if self.comm.rank == 0 else None
 
-    def _nodes(self, f: fem.Function) -> NDArray[np.float64]:
+    def _nodes(self, f: fem.Function) -> Array:
         """Values at the owned nodes of all ranks, in global order, on rank 0."""
         self._field.interpolate(f)
         owned = self._field.x.array.reshape(-1, 3)[: self._V.dofmap.index_map.size_local]
         parts = self.comm.gather(owned.copy())
         return np.concatenate(parts) if self.comm.rank == 0 else owned
 
-    def _cell_normals(self, owned: int) -> NDArray[np.float64]:
-        """Undeformed normal at each node of each owned cell, (cells, nodes, 3)."""
-        V = self._model.V
-        gradients = V.element.basix_element.tabulate(1, self._V.element.interpolation_points())[1:, :, :, 0]
-        nodes = self._model.r0.x.array.reshape(-1, 3)[V.dofmap.list[:owned]]
-        a1, a2 = np.einsum("dvk,cki->dcvi", gradients, nodes)
-        m = np.cross(a1, a2)
-        return np.asarray(m / np.linalg.norm(m, axis=2)[:, :, None])
+    def _at_nodes(self, f: fem.Function) -> Array:
+        """Value, f,_1, f,_2, f,_11, f,_12, f,_22 in reference coordinates at each node of each owned cell."""
+        coefficients = f.x.array.reshape(-1, 3)[self._model.V.dofmap.list[: self._owned]]
+        return np.asarray(np.einsum("dvk,cki->dcvi", self._derivatives[:, :, :, 0], coefficients))
+
+    def _geometry(self) -> SurfaceGeometry:
+        r = self._at_nodes(self._model.r0)
+        m = np.cross(r[1], r[2])
+        n0 = m / np.linalg.norm(m, axis=-1)[..., None]
+        b11, b12, b22 = np.einsum("dcvi,cvi->dcv", r[3:], n0)
+        b0 = np.stack([np.stack([b11, b12], -1), np.stack([b12, b22], -1)], -2)
+        du = np.moveaxis(self._at_nodes(self._model.u)[1:3], 0, -2)
+        return SurfaceGeometry(np.moveaxis(r[1:3], 0, -2), n0, b0, du)
+
+    def _averaged(self, values: Array) -> Array:
+        """Mean over the cells that share a node, in global order, on rank 0."""
+        parts = self.comm.gather(values)
+        if self.comm.rank:
+            return values
+        total, count = np.zeros((self._size, *values.shape[2:])), np.zeros(self._size)
+        for where, part in zip(self._numbers, parts, strict=True):
+            np.add.at(total, where, part)
+            np.add.at(count, where, 1.0)
+        return total / count.reshape(-1, *[1] * (total.ndim - 1))
 
 
 def turned(surface: Surface, azimuth: float) -> Surface:
     """The surface turned about e3 (rad): from the model's frame back to the user's."""
     Q = np.array([[np.cos(azimuth), np.sin(azimuth), 0], [-np.sin(azimuth), np.cos(azimuth), 0], [0, 0, 1]])
-    return Surface(surface.r0 @ Q, surface.u @ Q, surface.n0 @ Q, surface.cells)
+    fields = {name: f @ Q if f.ndim == 2 else f for name, f in surface.fields.items()}
+    return replace(surface, r0=surface.r0 @ Q, u=surface.u @ Q, n0=surface.n0 @ Q, fields=fields)
 
 
 def completed(surface: Surface) -> Surface:
-    """A half surface (y >= 0) with its mirror image; mirrored cells keep their outward side by VTK's own flag."""
+    """A half surface (y >= 0) with its mirror image; seen from outside, its triangles run the other way round."""
     flip = np.array([1.0, -1.0, 1.0])
-    count = len(surface.r0)
+
+    def both(f: Array) -> Array:
+        return np.concatenate([f, flip * f if f.ndim == 2 else f])
+
     return Surface(
-        np.concatenate([surface.r0, flip * surface.r0]),
-        np.concatenate([surface.u, flip * surface.u]),
-        np.concatenate([surface.n0, flip * surface.n0]),
-        np.concatenate([surface.cells, surface.cells + count]),
+        both(surface.r0),
+        both(surface.u),
+        both(surface.n0),
+        np.concatenate([surface.cells, surface.cells + len(surface.r0)]),
+        {name: both(f) for name, f in surface.fields.items()},
     )

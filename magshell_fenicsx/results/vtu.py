@@ -9,7 +9,7 @@ from magshell_fenicsx.results.surface import LAGRANGE_TRIANGLE, Surface
 
 
 def unstructured_grid(surface: Surface, h: float) -> pyvista.UnstructuredGrid:
-    """The deformed surface with u/h, w/h, r0 and n0 at its nodes; lengths in R."""
+    """The deformed surface with u/h, w/h, r0, n0 and the magnetic loads at its nodes; lengths in R."""
     count = surface.cells.shape[1]
     cells = np.column_stack([np.full(len(surface.cells), count), surface.cells])
     kinds = np.full(len(surface.cells), LAGRANGE_TRIANGLE, dtype=np.uint8)
@@ -18,6 +18,8 @@ def unstructured_grid(surface: Surface, h: float) -> pyvista.UnstructuredGrid:
     grid.point_data["w_over_h"] = surface.w / h
     grid.point_data["r0"] = surface.r0
     grid.point_data["n0"] = surface.n0
+    for name, values in surface.fields.items():
+        grid.point_data[name] = values
     return grid
 
 
