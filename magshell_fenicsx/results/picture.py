@@ -103,7 +103,7 @@ def draw_loads(surface: Surface, h: float, title: str, file: Path) -> None:
             values = smooth.point_data[name]
             panel = smooth.copy()
             panel.point_data[LOADS[name]] = np.linalg.norm(values, axis=1) if values.ndim == 2 else values
-            bar = {"title": LOADS[name], "n_labels": 4, "fmt": "%.3g", "color": "black"}
+            bar = {"title": LOADS[name] + "\n", "n_labels": 4, "fmt": "%.3g", "color": "black"}
             plotter.add_mesh(panel, scalars=LOADS[name], cmap="viridis", smooth_shading=True, scalar_bar_args=bar)
             plotter.camera_position = [(2.2, -3.6, 3.2), (0, 0, 0.35), (0, 0, 1)]
         plotter.subplot(0, 0)
