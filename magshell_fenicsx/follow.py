@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from magshell_fenicsx.case.loading import IndentationSection, PressureSection
+from magshell_fenicsx.case.loading import FieldSection, IndentationSection, PressureSection
 from magshell_fenicsx.scene import Scene
 from magshell_fenicsx.solve.events import locate
 from magshell_fenicsx.solve.path import Path, PathStopped, Point, StepOptions
@@ -54,11 +54,14 @@ def follow(scene: Scene) -> Iterator[Record]:
     state = scene.unloaded()
     factors = scene.newton.factor_at(state)
     yield Record("start", "", Point(state, 0.0, 0.0 * state.u, 0.0, factors.negative_pivots, 0, 1))
+    loading = scene.case.loading
+    if isinstance(loading, FieldSection):
+        yield from _field_as_load(scene, loading, state)
+        return
     if scene.model.loads.magnetic:
         for record in _field(scene, state):
             yield record
             state = record.point.state
-    loading = scene.case.loading
     if isinstance(loading, PressureSection):
         yield from _pressure(scene, loading, state)
     elif isinstance(loading, IndentationSection):
@@ -66,25 +69,53 @@ def follow(scene: Scene) -> Iterator[Record]:
 
 
 def _field(scene: Scene, state: State) -> Iterator[Record]:
-    target, points = scene.case.lambda_m, []
+    """The field, up to lambda_m; where it makes the shell unstable, the critical field is located."""
+    target = scene.case.lambda_m
     path = Path(scene.newton, "lambda_m", "load", StepOptions(abs(target) / 2, abs(target), abs(target) * 1e-4))
-    points.append(here := path.start(state))
+    points, trouble = [path.start(state)], False
     try:
-        for point, _ in path.towards(here, [target]):
-            if point.negative_pivots:
-                raise Stopped(
-                    f"the field alone makes the shell unstable: between lambda_m = {here.s:.6g} and {point.s:.6g} "
-                    f"the number of unstable directions becomes {point.negative_pivots}"
-                )
-            points.append(here := point)
+        for point, _ in path.towards(points[0], [target]):
+            if trouble := point.negative_pivots > 0:
+                break
+            points.append(point)
             yield Record("field", "lambda_m", point)
-        for record in _excluded(scene, path, points):
-            yield record
-            raise Stopped(
-                f"the field alone makes the shell unstable ({record.mode}) at lambda_m = {record.point.s:.6g}"
-            )
-    except PathStopped as e:
-        raise Stopped(f"the field step stopped at lambda_m = {e.point.s:.6g} of {target:g}: {e}") from None
+    except PathStopped:
+        trouble = True
+    instability = None
+    if trouble:
+        for instability in _to_critical_field(scene, points[-1].state):
+            yield instability
+    else:
+        for instability in _excluded(scene, path, points):
+            yield instability
+    if instability is not None:
+        raise Stopped(
+            f"the field alone makes the shell unstable: critical field lambda_m = "
+            f"{instability.point.state.mu['lambda_m']:.9g} of {target:g} ({instability.mode or instability.label})"
+        )
+
+
+def _to_critical_field(scene: Scene, state: State) -> Iterator[Record]:
+    """From a stable state under part of the field to the first instability in lambda_m."""
+    target = scene.case.lambda_m
+    path = Path(scene.newton, "lambda_m", "conjugate", StepOptions(1.0, 1.0, 1.0))
+    start = path.start(state)
+    first = abs(0.1 * target / start.dmu)
+    path.options = StepOptions(first, 2 * first, 1e-5 * first)
+    yield from _until_limit(scene, path, start, float(np.copysign(np.inf, target)))
+
+
+def _field_as_load(scene: Scene, loading: FieldSection, state: State) -> Iterator[Record]:
+    target = scene.case.lambda_m
+    part = abs(target) / loading.points
+    path = Path(scene.newton, "lambda_m", "load", StepOptions(part, part, 1e-5 * part))
+    if loading.until == "target":
+        yield from _through(scene, path, path.start(state), _divided(0.0, target, loading.points))
+        return
+    if loading.control == "conjugate":
+        yield from _to_critical_field(scene, state)
+    else:
+        yield from _until_limit(scene, path, path.start(state), float(np.copysign(np.inf, target)))
 
 
 def _pressure(scene: Scene, loading: PressureSection, state: State) -> Iterator[Record]:
@@ -128,12 +159,12 @@ def _divided(start: float, end: float, points: int) -> list[float]:
     return [float(t) for t in np.linspace(start, end, points + 1)[1:]]
 
 
-def _until_limit(scene: Scene, path: Path, start: Point) -> Iterator[Record]:
-    """Accepted points up to the first instability."""
+def _until_limit(scene: Scene, path: Path, start: Point, end: float = np.inf) -> Iterator[Record]:
+    """Accepted points in the direction of `end` up to the first instability."""
     points, options = [start], path.options
     try:
         while True:
-            for point, _ in path.towards(points[-1], [np.inf]):
+            for point, _ in path.towards(points[-1], [end]):
                 if point.negative_pivots > start.negative_pivots:
                     break
                 if len(points) > MOST_POINTS:

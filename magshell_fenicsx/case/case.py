@@ -9,7 +9,7 @@ from pydantic import Field, ValidationError, model_validator
 from magshell_fenicsx.case.base import Section
 from magshell_fenicsx.case.boundary import EDGES, BoundarySection
 from magshell_fenicsx.case.fields import MagneticSection
-from magshell_fenicsx.case.loading import IndentationSection, LoadingSection
+from magshell_fenicsx.case.loading import FieldSection, IndentationSection, LoadingSection
 from magshell_fenicsx.case.messages import explain
 from magshell_fenicsx.case.shell import ShellSection
 from magshell_fenicsx.case.source import CaseError, Source, override, read_source
@@ -46,6 +46,8 @@ class Case(Section):
             raise ValueError("magnetic.remanent.patches: the shell has no dimple")
         if self.magnetic and self.magnetic.lambda_m is None and self.shell.youngs_modulus is None:
             raise ValueError("shell.youngs_modulus is needed to turn flux densities into lambda_m")
+        if isinstance(self.loading, FieldSection) and not self.lambda_m:
+            raise ValueError("loading.kind: field needs magnetic.lambda_m, not zero, for its target or direction")
         if isinstance(self.loading, IndentationSection):
             polar = self.loading.at.polar
             if geometry != "hemisphere" and polar:

@@ -48,4 +48,23 @@ class IndentationSection(Section):
         return self
 
 
-LoadingSection = Annotated[PressureSection | IndentationSection, Field(discriminator="kind")]
+class FieldSection(Section):
+    """The field itself is the load: lambda_m from zero, with its instabilities located.
+
+    `until: target` ends at magnetic.lambda_m; `until: limit` goes on in its direction to the first
+    instability. control: conjugate follows the path through a fold of lambda_m.
+    """
+
+    kind: Literal["field"]
+    control: Literal["conjugate", "load"] = "conjugate"
+    until: Literal["limit", "target"] = "target"
+    points: int = Field(default=10, ge=1, le=10000)
+
+    @model_validator(mode="after")
+    def _target_is_a_load(self) -> Self:
+        if self.until == "target" and self.control != "load":
+            raise ValueError("until: target needs control: load, for its target is lambda_m")
+        return self
+
+
+LoadingSection = Annotated[PressureSection | IndentationSection | FieldSection, Field(discriminator="kind")]

@@ -105,7 +105,7 @@ def draw_loads(surface: Surface, h: float, title: str, file: Path) -> None:
             panel.point_data[LOADS[name]] = np.linalg.norm(values, axis=1) if values.ndim == 2 else values
             bar = {"title": LOADS[name] + "\n", "n_labels": 4, "fmt": "%.3g", "color": "black"}
             plotter.add_mesh(panel, scalars=LOADS[name], cmap="viridis", smooth_shading=True, scalar_bar_args=bar)
-            plotter.camera_position = [(2.2, -3.6, 3.2), (0, 0, 0.35), (0, 0, 1)]
+            plotter.camera_position = [(2.2, -3.6, 3.0), (0, 0, 0.15), (0, 0, 1)]
         plotter.subplot(0, 0)
         plotter.add_text(title, font_size=9, color="black")
         plotter.set_background("white")

@@ -1,0 +1,1 @@
+"""Axisymmetric scenes on their meridian, and the circumferential waves that it excludes."""

@@ -1,0 +1,102 @@
+"""The meridian of a surface of revolution: an interval mesh and, apart from it, the placement r0."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from math import sqrt
+
+import basix.ufl
+import numpy as np
+from dolfinx import fem, mesh
+from mpi4py import MPI
+from numpy.typing import NDArray
+
+from magshell_fenicsx.mesh.patch import Embedding
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Meridian:
+    """A meridian, the whole of it on every rank: it is too small to be worth sharing.
+
+    Attributes
+    ----------
+    mesh
+        Interval mesh over the parameter s, the distance from the origin of the chart.
+    axis, rim
+        Facets (local numbers) of the point on the axis and of the outer end.
+    embedding
+        Chart (n, 2) -> surface (n, 3), of revolution about e3.
+    """
+
+    mesh: mesh.Mesh
+    axis: NDArray[np.int32]
+    rim: NDArray[np.int32]
+    embedding: Embedding
+
+    def placement(self, V: fem.FunctionSpace) -> fem.Function:
+        """(rho, z) in the Lagrange space `V` of two components, so that axial motions are exact."""
+        s = V.tabulate_dof_coordinates()[:, 0]
+        r0 = fem.Function(V, name="r0")
+        r0.x.array[:] = self.embedding(np.column_stack([s, 0 * s]))[:, [0, 2]].ravel()
+        return r0
+
+
+def make_meridian(embedding: Embedding, vertices: Array) -> Meridian:
+    """Mesh the meridian; `vertices` (n,) ascend from 0 on the axis."""
+    numbers = np.arange(len(vertices), dtype=np.int64)
+    element = basix.ufl.element("Lagrange", "interval", 1, shape=(1,))
+    domain = mesh.create_mesh(
+        MPI.COMM_SELF, np.column_stack([numbers[:-1], numbers[1:]]), vertices[:, None].astype(np.float64), element
+    )
+    axis, rim = (
+        mesh.locate_entities_boundary(domain, 0, lambda x, end=end: np.isclose(x[0], end))
+        for end in (vertices[0], vertices[-1])
+    )
+    return Meridian(domain, axis, rim, embedding)
+
+
+def graded_vertices(end: float, circle: float | None, h: float, *, refinement: float = 1.0) -> Array:
+    """Vertices for 1e-7 in k_d at degree 4: cells of a fraction of sqrt(h), finer on the axis.
+
+    Parameters
+    ----------
+    end
+        Value of the parameter at the outer edge.
+    circle
+        Where the curvature jumps, the rim of a dimple: a vertex is put there.
+    h
+        Thickness over R.
+
+    Notes
+    -----
+    A point force bends the shell like s^2 log s. On the axis the cells shrink to a thickness
+    whatever the refinement: the logarithmic stretch under an ideal point has no limit.
+    """
+    largest, smallest, growth = 0.2 * sqrt(h) / refinement, h, 0.3 / refinement
+
+    def size(s: Array) -> Array:
+        return np.minimum(smallest + growth * s, largest)
+
+    corners = [0.0, end] if circle is None or circle >= end else [0.0, circle, end]
+    return _equidistributed(corners, size)
+
+
+def _equidistributed(corners: Sequence[float], size: Callable[[Array], Array]) -> Array:
+    """Vertices at the corners and, between them, with cells proportional to the size that is asked for."""
+    pieces = []
+    for a, b in pairwise(corners):
+        s = np.linspace(a, b, 20001)
+        counted = np.concatenate([[0.0], np.cumsum(np.diff(s) / size((s[:-1] + s[1:]) / 2))])
+        cells = int(np.ceil(counted[-1]))
+        piece = np.interp(np.linspace(0, counted[-1], cells + 1), counted, s)
+        piece[[0, -1]] = a, b
+        pieces.append(piece[:-1])
+    return np.concatenate([*pieces, corners[-1:]])
+
+
+def held_at(V: fem.FunctionSpace, facets: NDArray[np.int32], component: int) -> fem.DirichletBC:
+    """A component is zero at an end of the meridian."""
+    part = V.sub(component)
+    return fem.dirichletbc(0.0, fem.locate_dofs_topological(part, 0, facets), part)
