@@ -11,6 +11,7 @@ from math import atan2, cos, degrees, hypot, pi, radians, sin, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
+from magshell_fenicsx.axisymmetric.meridian import graded_vertices
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.expressions import formula
 from magshell_fenicsx.case.fields import Direction, MagneticSection, layer_average
@@ -32,6 +33,8 @@ class Plan:
 
     Attributes
     ----------
+    axisymmetric
+        Model the meridian.
     half
         Model the half y >= 0 of a frame turned about e3 by `azimuth` (rad).
     shape, size, points, embedding
@@ -44,6 +47,7 @@ class Plan:
     material: Material
     loads: Loads
     conditions: dict[str, Condition]
+    axisymmetric: bool
     half: bool
     azimuth: float
     shape: Shape
@@ -75,7 +79,11 @@ def make_plan(case: Case) -> Plan:
         azimuth = None  # the strip's own mirror plane is y = 0
     if case.symmetry == "half" and azimuth is None:
         raise CaseError("symmetry: half: the shell, the fields and the load have no common mirror plane through e3")
-    half = azimuth is not None and case.symmetry != "none"
+    reason = _not_axisymmetric(case)
+    if reason and case.symmetry == "axisymmetric":
+        raise CaseError(f"symmetry: axisymmetric: {reason}")
+    axisymmetric = reason is None and case.symmetry in ("auto", "axisymmetric")
+    half = azimuth is not None and not axisymmetric and case.symmetry in ("auto", "half")
     turn = azimuth if half and azimuth is not None else 0.0
 
     defect = Dimple(shell.defect.amplitude * material.h, shell.dimple_half_width) if shell.defect else None
@@ -104,11 +112,14 @@ def make_plan(case: Case) -> Plan:
         force=force,
         magnetic=_magnetisation(magnetic, shell, turn) if magnetic and field_on else None,
     )
-    included, left_out = _account(case, loads, half, azimuth)
+    included, left_out = _account(
+        case, loads, "meridian" if axisymmetric else "half shell" if half else "full shell", azimuth
+    )
     return Plan(
         material=material,
         loads=loads,
         conditions=conditions,
+        axisymmetric=axisymmetric,
         half=half,
         azimuth=turn,
         shape=shape,
@@ -118,6 +129,25 @@ def make_plan(case: Case) -> Plan:
         included=included,
         left_out=left_out,
     )
+
+
+def _not_axisymmetric(case: Case) -> str | None:
+    """What keeps a case from being a meridian turned about e3; None if nothing does."""
+    if case.shell.geometry == "strip":
+        return "a strip is no surface of revolution"
+    if isinstance(case.loading, IndentationSection) and case.loading.at.polar:
+        return "the force is not at the pole"
+    magnetic = case.magnetic
+    if magnetic is None or not case.lambda_m:
+        return None
+    if any(hypot(*d.vector()[:2]) > 1e-12 for d in (*magnetic.remanent.directions(), magnetic.applied)):
+        return "a field is not along e3"
+    if magnetic.remanent.kind == "expression":
+        return "only the user knows whether the remanence's formula is"
+    gradient = np.array(magnetic.applied.gradient or np.zeros((3, 3)))
+    if np.abs(gradient - np.diag([gradient[0, 0], gradient[0, 0], gradient[2, 2]])).max() > 1e-12:
+        return "the gradient of the applied field is not diag(a, a, b)"
+    return None
 
 
 def _magnetisation(magnetic: MagneticSection, shell: ShellSection, turn: float) -> Magnetisation:
@@ -181,8 +211,8 @@ def _grading(case: Case, h: float, defect: Dimple | None, points: dict[str, NDAr
     return smallest(features, largest / refine)
 
 
-def _account(case: Case, loads: Loads, half: bool, azimuth: float | None) -> tuple[list[str], list[str]]:
-    included = [f"{'half' if half else 'full'} shell", "membrane and bending energy"]
+def _account(case: Case, loads: Loads, model: str, azimuth: float | None) -> tuple[list[str], list[str]]:
+    included = [model, "membrane and bending energy"]
     left_out = []
     if loads.magnetic:
         included.append(f"magnetic energy ({loads.magnetic.energy}), lambda_m = {case.lambda_m:g}")
@@ -197,7 +227,9 @@ def _account(case: Case, loads: Loads, half: bool, azimuth: float | None) -> tup
         included.append(f"force on a patch of radius {patch:g} h" if patch else "force at a point")
     else:
         left_out.append("force: none")
-    if half:
+    if model == "meridian":
+        left_out.append("waves around the axis (they are looked for at the end of each path)")
+    if model == "half shell":
         left_out.append(
             f"the other half: mirror plane through e3 at azimuth {degrees(azimuth or 0.0):g} degrees "
             "(modes antisymmetric to it are looked for at the end of each path)"
@@ -215,11 +247,25 @@ def describe(case: Case) -> str:
         "lambda_m": case.lambda_m,
         "Lambda_m = lambda_m R/h": case.lambda_m / plan.material.h,
     }
-    cells = triangulate(plan.shape, plan.size, plan.points, plan.embedding).cells
-    corners, k = len(np.unique(cells[:, :3])), case.mesh.degree
-    sides = corners + len(cells) - 1  # Euler's formula for a disc
-    unknowns = 3 * (corners + (k - 1) * sides + (k - 1) * (k - 2) // 2 * len(cells))
+    cells, unknowns = _count(case, plan)
     lines = [f"{name} = {value:.6g}" for name, value in numbers.items()]
-    lines.append(f"mesh: {len(cells)} cells of degree {k}, {unknowns} unknowns")
+    lines.append(f"mesh: {cells} cells of degree {case.mesh.degree}, {unknowns} unknowns")
     lines += ["built:", *(f"  {item}" for item in plan.included), "left out:", *(f"  {item}" for item in plan.left_out)]
     return "\n".join(lines)
+
+
+def _count(case: Case, plan: Plan) -> tuple[int, int]:
+    """Cells and unknowns of the mesh."""
+    k = case.mesh.degree
+    if plan.axisymmetric:
+        return (count := len(meridian_vertices(plan, case.mesh.refinement)) - 1), 2 * (k * count + 1)
+    cells = triangulate(plan.shape, plan.size, plan.points, plan.embedding).cells
+    corners = len(np.unique(cells[:, :3]))
+    sides = corners + len(cells) - 1  # Euler's formula for a disc
+    return len(cells), 3 * (corners + (k - 1) * sides + (k - 1) * (k - 2) // 2 * len(cells))
+
+
+def meridian_vertices(plan: Plan, refinement: float) -> NDArray[np.float64]:
+    """Vertices of the meridian's mesh, in the chart."""
+    assert isinstance(plan.shape, DiscShape)
+    return graded_vertices(plan.shape.radius, plan.shape.circle, plan.material.h, refinement=refinement)

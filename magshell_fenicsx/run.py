@@ -16,7 +16,7 @@ from magshell_fenicsx.environment import fast_blas, versions
 from magshell_fenicsx.follow import Record, Stopped, follow
 from magshell_fenicsx.results.curve import draw_curve
 from magshell_fenicsx.results.picture import draw_loads, draw_shell
-from magshell_fenicsx.results.surface import SurfaceGatherer, completed, turned
+from magshell_fenicsx.results.surface import completed, gatherer, turned
 from magshell_fenicsx.results.table import PathTable, Row
 from magshell_fenicsx.results.vtu import FieldSeries
 from magshell_fenicsx.scene import Scene
@@ -170,7 +170,7 @@ class _Files:
 
     def __init__(self, folder: Path, scene: Scene) -> None:
         self._folder, self._scene = folder, scene
-        self._gatherer = SurfaceGatherer(scene.model)
+        self._gatherer = gatherer(scene.model, scene.comm)
         self._first = scene.comm.rank == 0
         if self._first:
             self._table = PathTable(folder / "path.csv")

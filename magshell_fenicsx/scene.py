@@ -4,10 +4,12 @@ import time
 
 from mpi4py import MPI
 
+from magshell_fenicsx.axisymmetric.meridian import make_meridian
+from magshell_fenicsx.axisymmetric.model import MeridianModel
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.mesh.midsurface import Midsurface, distribute
 from magshell_fenicsx.mesh.triangulation import triangulate
-from magshell_fenicsx.plan import Plan, make_plan
+from magshell_fenicsx.plan import Plan, make_plan, meridian_vertices
 from magshell_fenicsx.shell.model import ShellModel
 from magshell_fenicsx.solve.newton import BorderedNewton
 from magshell_fenicsx.solve.system import State
@@ -29,20 +31,18 @@ class Scene:
     def __init__(self, case: Case, comm: MPI.Comm = MPI.COMM_WORLD) -> None:
         start = time.perf_counter()
         self.case, self.plan, self.comm = case, make_plan(case), comm
-        self.model = ShellModel(
-            build_midsurface(self.plan, comm),
-            self.plan.material,
-            case.mesh.degree,
-            self.plan.conditions,
-            self.plan.loads,
-            case.mesh.penalty,
-        )
+        self.model: ShellModel | MeridianModel
+        if self.plan.axisymmetric:
+            self.model = build_meridian_model(case, self.plan)
+        else:
+            self.model = build_model(case, self.plan, comm)
         self.newton = BorderedNewton(self.model.system)
         self.setup_s = time.perf_counter() - start - self.model.kernels.seconds
 
     @property
     def cells(self) -> int:
-        return int(self.model.midsurface.mesh.topology.index_map(2).size_global)
+        topology = self.model.V.mesh.topology
+        return int(topology.index_map(topology.dim).size_global)
 
     def unloaded(self) -> State:
         """The undeformed shell with all amplitudes zero."""
@@ -73,6 +73,19 @@ class Scene:
             ),
             **{name: energies.get(name, 0.0) for name in ("U1", "Uq", "Utau")},
         }
+
+
+def build_model(case: Case, plan: Plan, comm: MPI.Comm) -> ShellModel:
+    """The whole shell or half of it, on all ranks together."""
+    surface = build_midsurface(plan, comm)
+    return ShellModel(surface, plan.material, case.mesh.degree, plan.conditions, plan.loads, case.mesh.penalty)
+
+
+def build_meridian_model(case: Case, plan: Plan) -> MeridianModel:
+    """The meridian, whole on every rank."""
+    meridian = make_meridian(plan.embedding, meridian_vertices(plan, case.mesh.refinement))
+    condition = plan.conditions["rim"]
+    return MeridianModel(meridian, plan.material, case.mesh.degree, condition, plan.loads, case.mesh.penalty)
 
 
 def build_midsurface(plan: Plan, comm: MPI.Comm) -> Midsurface:

@@ -30,29 +30,75 @@ def test_every_case_is_run_here() -> None:
     assert [file.name for file in CASES.rglob("*.yaml") if file.name not in source] == []
 
 
-@pytest.mark.slow
+DIMPLED = [
+    (90, 0, "full", 0.326233289),
+    (90, 0.00184, "full", 0.552053778),
+    (90, -0.00184, "full", 0.120723848),
+    (78.75, 0, "full", 0.326944309),
+    (90, 0.00184, "second", 0.537770729),
+    (90, 0.00184, "first", 0.336890384),
+    (90, 0.00184, "torque", 0.536061699),
+]
+
+
 @pytest.mark.parametrize(
-    ("R_over_h", "lambda_m", "k_d"),
-    [(90, 0, 0.326233289), (90, 0.00184, 0.552053778), (90, -0.00184, 0.120723848), (78.75, 0, 0.326944309)],
+    ("symmetry", "tolerance"), [("auto", 1e-6), pytest.param("half", 2e-4, marks=pytest.mark.slow)]
 )
-def test_dimple_buckling(R_over_h: float, lambda_m: float, k_d: float) -> None:
-    """Axisymmetric reference, 2e-4."""
-    settings = (f"shell.radius_to_thickness={R_over_h}", f"magnetic.lambda_m={lambda_m}")
-    found = result("dimple_buckling.yaml", *settings)
-    assert found.knockdown == pytest.approx(k_d, rel=2e-4)
+@pytest.mark.parametrize(("R_over_h", "lambda_m", "energy", "k_d"), DIMPLED)
+def test_dimple_buckling(
+    R_over_h: float, lambda_m: float, energy: str, k_d: float, symmetry: str, tolerance: float
+) -> None:
+    """Axisymmetric reference, nine digits; `auto` takes the meridian."""
+    found = result(
+        "dimple_buckling.yaml",
+        f"shell.radius_to_thickness={R_over_h}",
+        f"magnetic.lambda_m={lambda_m}",
+        f"magnetic.energy={energy}",
+        f"symmetry={symmetry}",
+    )
+    assert found.knockdown == pytest.approx(k_d, rel=tolerance)
     assert [point["kind"] for point in found.limit_points] == ["fold"]
 
 
-def test_pole_indentation() -> None:
+def test_field_beyond_the_critical_one_has_no_knockdown() -> None:
+    """Axisymmetric reference: the field alone buckles the shell at lambda_m = -0.0033554."""
+    found = result("dimple_buckling.yaml", "magnetic.lambda_m=-0.005")
+    assert found.knockdown is None
+    assert found.stopped
+    assert "the field alone makes the shell unstable" in found.stopped
+    assert [point["amplitude"] for point in found.limit_points] == ["lambda_m"]
+    assert found.limit_points[0]["value"] == pytest.approx(-0.0033554, rel=1e-4)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("remanent", "applied"), [(45, 45), (0, 45)])
+def test_half_and_full_shell_agree(remanent: float, applied: float) -> None:
+    """Tilted coplanar fields."""
+    field = f"magnetic={{lambda_m: 0.00184, remanent: {{polar: {remanent}}}, applied: {{polar: {applied}}}}}"
+    half, full = (result("dimple_buckling.yaml", field, f"symmetry={s}") for s in ("half", "none"))
+    assert half.knockdown == pytest.approx(full.knockdown, rel=1e-4)
+
+
+@pytest.mark.slow
+def test_waves_come_before_the_fold() -> None:
+    """Axisymmetric reference: R/h = 300, lambda_m = +0.00184: 28 waves at 1.0145, the fold at 1.093385."""
+    found = result("dimple_buckling.yaml", "shell.radius_to_thickness=300", "magnetic.lambda_m=0.00184")
+    assert [(p["kind"], p["mode"]) for p in found.limit_points] == [("fold", ""), ("bifurcation", "m = 28")]
+    assert found.limit_points[0]["value"] == pytest.approx(1.093385, rel=1e-6)
+    assert found.knockdown == pytest.approx(1.0145, rel=2e-3)
+
+
+@pytest.mark.parametrize("symmetry", ["auto", "half"])
+def test_pole_indentation(symmetry: str) -> None:
     """Axisymmetric reference: F R/(2 pi D) = 2.9615563 and 5.6202235 at w/h = 1.5 and 6."""
-    found = result("pole_indentation.yaml")
+    found = result("pole_indentation.yaml", f"symmetry={symmetry}")
     assert force_at(found, 1.5) == pytest.approx(2.9615563, rel=1e-3)
     assert force_at(found, 6.0) == pytest.approx(5.6202235, rel=1e-3)
 
 
 def test_clamped_plate() -> None:
     """w0 = p R^4/(64 D) (Timoshenko)."""
-    found = result("clamped_plate.yaml")
+    found = result("clamped_plate.yaml", "symmetry=half")
     R_over_h, nu = 50, 0.3
     pressure = 1e-5 * 2 / (3 * (1 - nu**2)) ** 0.5 / R_over_h**2
     w0_over_h = pressure * 12 * (1 - nu**2) * R_over_h**4 / 64

@@ -16,7 +16,12 @@ REFERENCE = {0.0: 0.326233289, 0.00184: 0.552053778, -0.00184: 0.120723848}
 
 def error(lambda_m: float, degree: int, refinement: float) -> tuple[int, int, float]:
     """Cells, unknowns and relative error of k_d."""
-    settings = [f"magnetic.lambda_m={lambda_m}", f"mesh.degree={degree}", f"mesh.refinement={refinement}"]
+    settings = [
+        f"magnetic.lambda_m={lambda_m}",
+        f"mesh.degree={degree}",
+        f"mesh.refinement={refinement}",
+        "symmetry=half",
+    ]
     found = run(Case.load(CASE, settings))
     assert found.knockdown is not None
     return found.scene.cells, found.scene.model.system.dofs, found.knockdown / REFERENCE[lambda_m] - 1

@@ -10,7 +10,9 @@ import ufl
 from conftest import hemisphere
 from dolfinx import fem
 
-from magshell_fenicsx.results.surface import SurfaceGatherer
+from magshell_fenicsx import Case, Scene
+from magshell_fenicsx.case.source import Source
+from magshell_fenicsx.results.surface import SurfaceGatherer, gatherer
 from magshell_fenicsx.shell import kinematics as kin
 from magshell_fenicsx.shell.model import ShellModel
 from magshell_fenicsx.shell.parameters import Loads, Magnetisation, Material
@@ -33,6 +35,20 @@ def test_closed_forms_on_the_sphere() -> None:
     assert surface.fields["k"] == pytest.approx(-(cos**2), abs=1e-5)
     assert surface.fields["f_mag"] == pytest.approx(-3 * H * cos[:, None] * in_plane, abs=1e-2 * H)
     assert surface.fields["tau"] == pytest.approx(np.zeros_like(n), abs=1e-14)
+
+
+def test_closed_forms_on_the_meridian() -> None:
+    """The same from the meridian model, turned around the axis."""
+    shell = {"geometry": "hemisphere", "radius_to_thickness": 20, "poisson_ratio": 0.3}
+    data = {"shell": shell, "boundary": {"equator": "clamped"}, "magnetic": {"lambda_m": 1e-3}}
+    scene = Scene(Case.from_source(Source("meridian", data)))
+    surface = gatherer(scene.model, scene.comm).gather(scene.model.zero())
+    assert surface is not None
+    cos = surface.n0[:, 2]
+    in_plane = UP - cos[:, None] * surface.n0
+    assert surface.fields["p_mag"] == pytest.approx(H * (1 - cos**2), abs=1e-4 * H)
+    assert surface.fields["k"] == pytest.approx(-(cos**2), abs=1e-5)
+    assert surface.fields["f_mag"] == pytest.approx(-3 * H * cos[:, None] * in_plane, abs=4e-3 * H)
 
 
 def test_torque_of_a_swelling_sphere() -> None:

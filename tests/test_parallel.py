@@ -8,7 +8,8 @@ from conftest import CASES
 
 COARSE = ["--set=mesh.degree=3", "--set=mesh.refinement=0.5"]
 SCENES = {
-    "half shell, force": ("pole_indentation.yaml", []),
+    "half shell, force": ("pole_indentation.yaml", ["--set=symmetry=half"]),
+    "meridian": ("pole_indentation.yaml", []),
     "full shell, field, pressure": (
         "dimple_buckling.yaml",
         ["--set=magnetic={lambda_m: 1e-3, remanent: {polar: 45}, applied: {polar: 45, azimuth: 90}}"],

@@ -1,10 +1,12 @@
 """The surface that a meridian sweeps, as flat triangles for pictures and for ParaView."""
 
 import numpy as np
+from dolfinx import fem
 from numpy.typing import NDArray
 
 from magshell_fenicsx.axisymmetric.model import MeridianModel
 from magshell_fenicsx.axisymmetric.pattern import cell_normals
+from magshell_fenicsx.results.interpretation import SurfaceGeometry
 from magshell_fenicsx.solve.system import Vector
 
 Array = NDArray[np.float64]
@@ -22,7 +24,7 @@ class Revolution:
     """
 
     def __init__(self, model: MeridianModel, sectors: int = 96) -> None:
-        V = model.V
+        self._model, V = model, model.V
         self._vertices = np.argsort(V.tabulate_dof_coordinates()[:, 0])[:: model.degree]
         theta = np.arange(sectors) * 2 * np.pi / sectors
         self._e_rho = np.column_stack([np.cos(theta), np.sin(theta), 0 * theta])
@@ -36,9 +38,43 @@ class Revolution:
         """The displacement of the nodes, (n, 3) over R."""
         return self._turned(u.reshape(-1, 2))
 
+    def geometry(self) -> tuple[SurfaceGeometry, Array]:
+        """Bases, curvature and slopes of u at the vertices, and r0 (n, 3), along (e_rho, e_theta, e_z) at theta = 0."""
+        r, u = self._jets(self._model.r0), self._jets(self._model.u)
+        rho = r[0, :, 0]
+        zero = np.zeros_like(rho)
+        a = np.stack([self._lifted(r[1]), np.column_stack([zero, rho, zero])], axis=1)
+        m = np.cross(a[:, 0], a[:, 1])
+        n0: Array = m / np.linalg.norm(m, axis=1)[:, None]
+        b11, b22 = np.einsum("vi,vi->v", n0, self._lifted(r[2])), -n0[:, 0] * rho
+        b0 = np.stack([np.column_stack([b11, zero]), np.column_stack([zero, b22])], axis=1)
+        du = np.stack([self._lifted(u[1]), np.column_stack([zero, u[0, :, 0], zero])], axis=1)
+        return SurfaceGeometry(a, n0, b0, du), self._lifted(r[0])
+
+    def repeated(self, along: Array) -> Array:
+        """A scalar (vertices,) at the pole and on the circles."""
+        return np.concatenate([along[:1], np.repeat(along[1:], len(self._e_rho))])
+
+    def _jets(self, f: fem.Function) -> Array:
+        """f, f' and f'' at the vertices, (3, vertices, 2), each from the cell below; a little off the pole."""
+        V = f.function_space
+        order = np.argsort(V.tabulate_dof_coordinates()[V.dofmap.list].mean(axis=1)[:, 0])
+        nodes = f.x.array.reshape(-1, 2)[V.dofmap.list[order]]
+        table = V.element.basix_element.tabulate(2, np.array([[1e-3], [1.0]]))[:, :, :, 0]
+        values = np.einsum("dvk,cki->dcvi", table, nodes)
+        return np.concatenate([values[:, :1, 0], values[:, :, 1]], axis=1)
+
+    @staticmethod
+    def _lifted(v: Array) -> Array:
+        """(n, 2) along (e_rho, e_z) -> (n, 3) along (e_rho, e_theta, e_z)."""
+        return np.insert(v, 1, 0.0, axis=1)
+
     def _turned(self, nodal: Array) -> Array:
         """(rho, z) components at the meridian's nodes -> vectors at the pole and on the circles."""
-        along = nodal[self._vertices]
+        return self.turned(nodal[self._vertices])
+
+    def turned(self, along: Array) -> Array:
+        """(rho, z) components at the vertices -> vectors at the pole and on the circles."""
         circles = along[1:, None, :1] * self._e_rho + along[1:, None, 1:] * np.array([0.0, 0.0, 1.0])
         return np.concatenate([[[0.0, 0.0, along[0, 1]]], circles.reshape(-1, 3)])
 

@@ -31,7 +31,7 @@ class Case(Section):
     magnetic: MagneticSection | None = None
     loading: LoadingSection | None = None
     mesh: MeshSection = MeshSection()
-    symmetry: Literal["auto", "none", "half"] = "auto"
+    symmetry: Literal["auto", "none", "half", "axisymmetric"] = "auto"
 
     @model_validator(mode="after")
     def _sections_fit(self) -> Self:

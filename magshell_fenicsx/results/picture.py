@@ -77,7 +77,8 @@ def draw_shell(surface: Surface, h: float, title: str, file: Path) -> None:
             (0, 0, 0.45),
             (0, 0, 1),
         ]
-        plotter.camera.zoom(1.3)
+        plotter.reset_camera()
+        plotter.camera.zoom(1.15)
         plotter.show_axes()
         plotter.screenshot(file)
         plotter.close()
@@ -106,6 +107,7 @@ def draw_loads(surface: Surface, h: float, title: str, file: Path) -> None:
             bar = {"title": LOADS[name] + "\n", "n_labels": 4, "fmt": "%.3g", "color": "black"}
             plotter.add_mesh(panel, scalars=LOADS[name], cmap="viridis", smooth_shading=True, scalar_bar_args=bar)
             plotter.camera_position = [(2.2, -3.6, 3.0), (0, 0, 0.15), (0, 0, 1)]
+            plotter.reset_camera()
         plotter.subplot(0, 0)
         plotter.add_text(title, font_size=9, color="black")
         plotter.set_background("white")

@@ -7,13 +7,16 @@ import basix.ufl
 import numpy as np
 from dolfinx import fem, mesh
 from dolfinx.cpp.io import perm_vtk
+from mpi4py import MPI
 from numpy.typing import NDArray
 
+from magshell_fenicsx.axisymmetric.model import MeridianModel
+from magshell_fenicsx.axisymmetric.revolution import Revolution
 from magshell_fenicsx.results.interpretation import SurfaceGeometry, magnetic_loads
 from magshell_fenicsx.shell.model import ShellModel
 from magshell_fenicsx.solve.system import Vector
 
-LAGRANGE_TRIANGLE = 69  # VTK's number of the triangle of arbitrary order
+TRIANGLE, LAGRANGE_TRIANGLE = 5, 69  # VTK's numbers of the flat triangle and of that of any order
 Array = NDArray[np.float64]
 
 
@@ -111,6 +114,33 @@ class SurfaceGatherer:
             np.add.at(total, where, part)
             np.add.at(count, where, 1.0)
         return total / count.reshape(-1, *[1] * (total.ndim - 1))
+
+
+class RevolvedGatherer:
+    """The surface that a meridian sweeps, as flat triangles."""
+
+    def __init__(self, model: MeridianModel, comm: MPI.Comm) -> None:
+        self.comm, self._model, self._swept = comm, model, Revolution(model)
+
+    def gather(self, u: Vector) -> Surface | None:
+        """The surface with a displacement, on rank 0; None elsewhere."""
+        if self.comm.rank:
+            return None
+        model, swept = self._model, self._swept
+        model.system.set(u)
+        fields, field = {}, model.loads.magnetic
+        if field and field.gradient is None:
+            geometry, r0 = swept.geometry()
+            values = magnetic_loads(geometry, field, r0, model.material.h)
+            fields = {
+                name: swept.turned(v[:, [0, 2]]) if v.ndim == 2 else swept.repeated(v) for name, v in values.items()
+            }
+        return Surface(swept.r0, swept.displacement(u), swept.n0, swept.cells, fields)
+
+
+def gatherer(model: ShellModel | MeridianModel, comm: MPI.Comm) -> SurfaceGatherer | RevolvedGatherer:
+    """What gathers the surface of a model."""
+    return RevolvedGatherer(model, comm) if isinstance(model, MeridianModel) else SurfaceGatherer(model)
 
 
 def turned(surface: Surface, azimuth: float) -> Surface:

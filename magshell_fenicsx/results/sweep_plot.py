@@ -68,9 +68,12 @@ def _curves(plot: Any, points: Sequence[SweepPoint], outcomes: Sequence[Outcome]
 
 
 def loaded(curve: Sequence["Row"], amplitude: str) -> list["Row"]:
-    """The part of a curve in which an amplitude varied, from the point before on."""
+    """The part of a curve in which an amplitude varied, from the point before on.
+
+    Instabilities of modes that the model excludes come last in a run, not in their order: they are left out.
+    """
     first = next((i for i, row in enumerate(curve) if row["amplitude"] == amplitude), len(curve))
-    return list(curve[max(first - 1, 0) :]) if first < len(curve) else []
+    return [row for row in curve[max(first - 1, 0) :] if not row["mode"]] if first < len(curve) else []
 
 
 def _label(point: SweepPoint, without: Axis | None) -> str:

@@ -5,14 +5,14 @@ from pathlib import Path
 import numpy as np
 import pyvista
 
-from magshell_fenicsx.results.surface import LAGRANGE_TRIANGLE, Surface
+from magshell_fenicsx.results.surface import LAGRANGE_TRIANGLE, TRIANGLE, Surface
 
 
 def unstructured_grid(surface: Surface, h: float) -> pyvista.UnstructuredGrid:
     """The deformed surface with u/h, w/h, r0, n0 and the magnetic loads at its nodes; lengths in R."""
     count = surface.cells.shape[1]
     cells = np.column_stack([np.full(len(surface.cells), count), surface.cells])
-    kinds = np.full(len(surface.cells), LAGRANGE_TRIANGLE, dtype=np.uint8)
+    kinds = np.full(len(surface.cells), TRIANGLE if count == 3 else LAGRANGE_TRIANGLE, dtype=np.uint8)
     grid = pyvista.UnstructuredGrid(cells.ravel(), kinds, surface.r0 + surface.u)
     grid.point_data["u_over_h"] = surface.u / h
     grid.point_data["w_over_h"] = surface.w / h
