@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
+from scipy.interpolate import PchipInterpolator
 
 from magshell_fenicsx.results.table import Row
 
@@ -19,13 +19,13 @@ FINE = 16  # drawn pieces between two points
 
 
 def _smooth(x: Sequence[float], y: Sequence[float]) -> NDArray[np.float64]:
-    """A cubic spline through the points along their scaled chord, (2, FINE (n - 1) + 1)."""
+    """A smooth curve through the points, without overshoot, along their scaled chord: (2, FINE (n - 1) + 1)."""
     xy = np.array([x, y])
     scale = np.ptp(xy, axis=1)
     steps = np.hypot(*(np.diff(xy, axis=1) / np.where(scale > 0, scale, 1)[:, None]))
     chord = np.concatenate([[0], np.cumsum(np.maximum(steps, 1e-12))])
     fine = np.interp(np.arange(FINE * (len(chord) - 1) + 1) / FINE, np.arange(len(chord)), chord)
-    return np.asarray(CubicSpline(chord, xy, axis=1)(fine))
+    return np.asarray(PchipInterpolator(chord, xy, axis=1)(fine))
 
 
 def draw_curve(rows: Sequence[Row], amplitude: str, title: str, file: Path) -> None:

@@ -8,7 +8,7 @@ from mpi4py import MPI
 
 from magshell_fenicsx.solve.factor import Factorisation
 from magshell_fenicsx.solve.path import Path, PathStopped, Point
-from magshell_fenicsx.solve.system import State, dot
+from magshell_fenicsx.solve.system import State, Vector, dot
 
 
 class Stability(Protocol):
@@ -118,18 +118,19 @@ def locate_bifurcation(
     """
     low, high, work, side = stable, unstable, _Work(), 0
     comm = path.system.comm
-    a, pivots = critical_eigenvalue(stability, low.state, comm)
-    b, _ = critical_eigenvalue(stability, high.state, comm)
+    first = critical_mode(stability, low.state, comm)
+    a, b = first.eigenvalue, critical_mode(stability, high.state, comm).eigenvalue
     while True:
         t = a / (a - b) if a > 0 > b else 0.5
         point = work.solve(path, low.s + t * (high.s - low.s), low, high)
-        value, unstable_now = critical_eigenvalue(stability, point.state, comm)
+        mode = critical_mode(stability, point.state, comm)
+        value = mode.eigenvalue
         mu = point.state.mu[path.name]
         slope = (b - a) / (high.s - low.s)
         error = abs(value / slope * point.dmu) if a > 0 > b else np.inf
         if min(error, abs((high.s - low.s) * point.dmu)) <= tolerance * abs(mu):
             return work.add_to(point)
-        if unstable_now > pivots:
+        if mode.negative_pivots > first.negative_pivots:
             high, b = point, value
             a = a / 2 if side == 1 else a
             side = 1
@@ -139,15 +140,24 @@ def locate_bifurcation(
             side = -1
 
 
-def critical_eigenvalue(stability: Stability, state: State, comm: MPI.Comm, iterations: int = 12) -> tuple[float, int]:
-    """Eigenvalue of the tangent nearest to zero, by inverse iteration, and the negative pivots."""
+@dataclass(frozen=True)
+class CriticalMode:
+    """Eigenpair of a tangent whose eigenvalue is nearest to zero; `negative_pivots` of the same tangent."""
+
+    eigenvalue: float
+    vector: Vector
+    negative_pivots: int
+
+
+def critical_mode(stability: Stability, state: State, comm: MPI.Comm, iterations: int = 12) -> CriticalMode:
+    """The eigenpair nearest to zero, by inverse iteration; the vector has length one."""
     factors = stability.factor_at(state)
     v, value = np.sin(1.0 + np.arange(state.u.size) + comm.rank), 0.0
     for _ in range(iterations):
         v = v / np.sqrt(dot(comm, v, v))
         w = factors.solve(v)
         value, v = 1 / dot(comm, v, w), w
-    return value, factors.negative_pivots
+    return CriticalMode(value, v / np.sqrt(dot(comm, v, v)), factors.negative_pivots)
 
 
 def _between(path: Path, s: float, low: Point, high: Point) -> State:
