@@ -6,8 +6,10 @@ from typing import Literal
 
 import numpy as np
 
-from magshell_fenicsx.case.loading import FieldSection, IndentationSection, PressureSection
+from magshell_fenicsx.case.loading import FieldSection, IndentationSection, PressureSection, RotationSection
 from magshell_fenicsx.scene import Scene
+from magshell_fenicsx.shell.antisymmetric import AntisymmetricModes
+from magshell_fenicsx.solve.along import Along
 from magshell_fenicsx.solve.events import locate
 from magshell_fenicsx.solve.path import Path, PathStopped, Point, StepOptions
 from magshell_fenicsx.solve.system import State
@@ -66,6 +68,8 @@ def follow(scene: Scene) -> Iterator[Record]:
         yield from _pressure(scene, loading, state)
     elif isinstance(loading, IndentationSection):
         yield from _indentation(scene, loading, state)
+    elif isinstance(loading, RotationSection):
+        yield from _rotation(scene, loading, state)
 
 
 def _field(scene: Scene, state: State) -> Iterator[Record]:
@@ -152,6 +156,30 @@ def _indentation(scene: Scene, loading: IndentationSection, state: State) -> Ite
     # the field may have moved the point past the first targets already
     forward = [t for t in targets if (t - start.s) * targets[-1] > 0]
     yield from _through(scene, path, start, forward)
+
+
+def _rotation(scene: Scene, loading: RotationSection, state: State) -> Iterator[Record]:
+    magnetic = scene.case.magnetic
+    assert magnetic is not None
+    total = float(np.arccos(magnetic.applied.vector() @ loading.to.vector()))
+    modes, system = scene.model.excluded_modes(), scene.newton.system
+    for angle in _divided(0.0, total, loading.points):
+        end = {name: scene.case.lambda_m * f(angle) for name, f in (("lambda_m", np.cos), ("lambda_across", np.sin))}
+        scene.newton.system = chord = Along(
+            system, "turn", state.mu, {name: value - state.mu[name] for name, value in end.items()}
+        )
+        path = Path(scene.newton, "turn", "load", StepOptions(1.0, 1.0, 1e-4))
+        here = path.start(State(state.u, {**state.mu, "turn": 0.0}))
+        try:
+            for point, reached in path.towards(here, [1.0]):
+                state = State(point.state.u, chord.expand(point.state.mu))
+                yield Record("target" if reached else "step", "angle", replace(point, state=state))
+        except PathStopped as e:
+            raise Stopped(f"the turning field stopped before {np.degrees(angle):.4g} degrees: {e}") from None
+        finally:
+            scene.newton.system = system
+        if isinstance(modes, AntisymmetricModes) and modes.factor_at(state).negative_pivots:
+            raise Stopped(f"an antisymmetric instability lies before {np.degrees(angle):.4g} degrees of the field")
 
 
 def _divided(start: float, end: float, points: int) -> list[float]:

@@ -15,7 +15,7 @@ from magshell_fenicsx.axisymmetric.meridian import graded_vertices
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.expressions import formula
 from magshell_fenicsx.case.fields import Direction, MagneticSection, layer_average
-from magshell_fenicsx.case.loading import IndentationSection, PressureSection
+from magshell_fenicsx.case.loading import IndentationSection, PressureSection, RotationSection
 from magshell_fenicsx.case.shell import ShellSection
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.mesh.grading import Disc, Ring, Size, smallest
@@ -71,6 +71,8 @@ def make_plan(case: Case) -> Plan:
     field_on = magnetic is not None and case.lambda_m != 0
     indentation = loading if isinstance(loading, IndentationSection) else None
     directions = [*magnetic.remanent.directions(), magnetic.applied] if magnetic and field_on else []
+    to = loading.to if isinstance(loading, RotationSection) else None
+    directions += [to] if to else []
     azimuth = common_azimuth([*directions, *([indentation.at] if indentation else [])])
     of_position = field_on and magnetic and (magnetic.remanent.kind == "expression" or magnetic.applied.gradient)
     if of_position and (case.symmetry != "half" or azimuth):
@@ -110,7 +112,7 @@ def make_plan(case: Case) -> Plan:
     loads = Loads(
         pressure=isinstance(loading, PressureSection),
         force=force,
-        magnetic=_magnetisation(magnetic, shell, turn) if magnetic and field_on else None,
+        magnetic=_magnetisation(magnetic, shell, turn, to) if magnetic and field_on else None,
     )
     included, left_out = _account(
         case, loads, "meridian" if axisymmetric else "half shell" if half else "full shell", azimuth
@@ -137,6 +139,8 @@ def _not_axisymmetric(case: Case) -> str | None:
         return "a strip is no surface of revolution"
     if isinstance(case.loading, IndentationSection) and case.loading.at.polar:
         return "the force is not at the pole"
+    if isinstance(case.loading, RotationSection):
+        return "the field turns"
     magnetic = case.magnetic
     if magnetic is None or not case.lambda_m:
         return None
@@ -150,7 +154,7 @@ def _not_axisymmetric(case: Case) -> str | None:
     return None
 
 
-def _magnetisation(magnetic: MagneticSection, shell: ShellSection, turn: float) -> Magnetisation:
+def _magnetisation(magnetic: MagneticSection, shell: ShellSection, turn: float, to: Direction | None) -> Magnetisation:
     """The field section in the model's frame."""
     section, gradient = magnetic.remanent, magnetic.applied.gradient
     remanent: NDArray[np.float64] | Pattern
@@ -168,8 +172,11 @@ def _magnetisation(magnetic: MagneticSection, shell: ShellSection, turn: float) 
         remanent = InsideAndOutside(shell.dimple_half_width, inside.vector(turn), rest) if inside else rest
     else:
         remanent = section.vector(turn)
-    applied = magnetic.applied.uniform * magnetic.applied.vector(turn)
-    return Magnetisation(remanent, applied, magnetic.energy, np.array(gradient) if gradient else None)
+    applied, across = magnetic.applied.uniform * magnetic.applied.vector(turn), None
+    if to is not None:
+        across = to.vector(turn) - (to.vector(turn) @ applied) * applied
+        across /= np.linalg.norm(across)
+    return Magnetisation(remanent, applied, magnetic.energy, np.array(gradient) if gradient else None, across)
 
 
 def common_azimuth(directions: Sequence[Direction]) -> float | None:

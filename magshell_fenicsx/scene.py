@@ -1,6 +1,8 @@
 """The composition root: from a case, build the mid-surface, the model and its solver."""
 
 import time
+from collections import defaultdict
+from math import atan2, copysign, degrees, hypot
 
 from mpi4py import MPI
 
@@ -53,14 +55,16 @@ class Scene:
         """The physical columns of a table row: loads, displacements over h, volume, energies over E h R^2."""
         model, h = self.model, self.plan.material.h
         pole = model.deflection(state.u, "pole") / h
-        potentials = model.system.energies(state.u)
-        energies = {
-            t.name: model.multiplicity * potentials[t.name] * (state.mu[t.amplitude] if t.amplitude else 1.0)
-            for t in model.system.terms
-        }
+        potentials, energies = model.system.energies(state.u), defaultdict[str, float](float)
+        for t in model.system.terms:
+            amplitude = state.mu[t.amplitude] if t.amplitude else 1.0
+            energies[t.name.removesuffix(" across")] += model.multiplicity * amplitude * potentials[t.name]
+        along, across = state.mu.get("lambda_m", 0.0), state.mu.get("lambda_across", 0.0)
+        sense = copysign(1.0, self.case.lambda_m)
         return {
             "p_over_pc": state.mu.get("pressure", 0.0),
-            "lambda_m": state.mu.get("lambda_m", 0.0),
+            "lambda_m": sense * hypot(along, across) if across else along,
+            "field_angle": degrees(atan2(sense * across, sense * along)) if across else 0.0,
             "force": state.mu.get("force", 0.0),
             "w_over_h": model.loaded_deflection(state.u) / h if model.loads.force else pole,
             "w_pole_over_h": pole,
@@ -68,10 +72,8 @@ class Scene:
             "energy": sum(energies.values()),
             "stretching": energies["membrane"],
             "bending": sum(v for name, v in energies.items() if name == "bending" or name.endswith("edges")),
-            "magnetic": sum(
-                energies.get(name, 0.0) for name in ("magnetic", "magnetic gradient", "U1", "Uq", "Utau", "couple")
-            ),
-            **{name: energies.get(name, 0.0) for name in ("U1", "Uq", "Utau")},
+            "magnetic": sum(energies[name] for name in ("magnetic", "magnetic gradient", "U1", "Uq", "Utau", "couple")),
+            **{name: energies[name] for name in ("U1", "Uq", "Utau")},
         }
 
 

@@ -150,3 +150,16 @@ def test_magnetic_strip(polar: float, shortening: float, deflection: float) -> N
     moved = model.displacement(u, "pole")
     assert -moved[0] == pytest.approx(shortening, abs=1e-3 * shortening)
     assert moved[2] == pytest.approx(deflection, abs=1e-3 * deflection)
+
+
+def test_turning_field_ends_where_the_tilted_one_does() -> None:
+    """Turning the field from 150 to 90 degrees and applying it at 90 degrees give the same strip."""
+    turning = "loading={kind: rotation, to: {polar: 0}, points: 4}"
+    found = result("magnetic_strip.yaml", "magnetic.applied.polar=-60", turning)
+    straight = result("magnetic_strip.yaml", "magnetic.applied.polar=0.0")
+    row = found.rows[-1]
+    assert (row["label"], row["amplitude"]) == ("target", "angle")
+    assert row["field_angle"] == pytest.approx(60.0)
+    assert row["lambda_m"] == pytest.approx(found.scene.case.lambda_m)
+    for key in ("w_pole_over_h", "magnetic", "bending"):
+        assert row[key] == pytest.approx(straight.rows[-1][key], rel=1e-7)

@@ -9,7 +9,7 @@ from pydantic import Field, ValidationError, model_validator
 from magshell_fenicsx.case.base import Section
 from magshell_fenicsx.case.boundary import EDGES, BoundarySection
 from magshell_fenicsx.case.fields import MagneticSection
-from magshell_fenicsx.case.loading import FieldSection, IndentationSection, LoadingSection
+from magshell_fenicsx.case.loading import FieldSection, IndentationSection, LoadingSection, RotationSection
 from magshell_fenicsx.case.messages import explain
 from magshell_fenicsx.case.shell import ShellSection
 from magshell_fenicsx.case.source import CaseError, Source, override, read_source
@@ -48,6 +48,13 @@ class Case(Section):
             raise ValueError("shell.youngs_modulus is needed to turn flux densities into lambda_m")
         if isinstance(self.loading, FieldSection) and not self.lambda_m:
             raise ValueError("loading.kind: field needs magnetic.lambda_m, not zero, for its target or direction")
+        if isinstance(self.loading, RotationSection):
+            if not self.magnetic or not self.lambda_m:
+                raise ValueError("loading.kind: rotation needs a field: magnetic.lambda_m, not zero")
+            if self.magnetic.applied.gradient:
+                raise ValueError("loading.kind: rotation is of a uniform field, without gradient")
+            if abs(self.magnetic.applied.vector() @ self.loading.to.vector()) > 1 - 1e-9:
+                raise ValueError("loading.to: must be neither parallel nor opposite to magnetic.applied")
         if isinstance(self.loading, IndentationSection):
             polar = self.loading.at.polar
             if geometry != "hemisphere" and polar:

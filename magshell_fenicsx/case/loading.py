@@ -67,4 +67,17 @@ class FieldSection(Section):
         return self
 
 
-LoadingSection = Annotated[PressureSection | IndentationSection | FieldSection, Field(discriminator="kind")]
+class RotationSection(Section):
+    """The applied field, at its full magnitude, turns on the shortest way to another direction.
+
+    The requested points are equal angles apart; between two of them the field moves along the chord.
+    """
+
+    kind: Literal["rotation"]
+    to: Direction
+    points: int = Field(default=12, ge=1, le=10000)
+
+
+LoadingSection = Annotated[
+    PressureSection | IndentationSection | FieldSection | RotationSection, Field(discriminator="kind")
+]

@@ -12,6 +12,7 @@ from magshell_fenicsx.results.table import Row
 AXES = {
     "force": ("w_over_h", "force", r"displacement at the load  $w/h$", r"force  $FR/(2\pi D)$"),
     "pressure": ("volume_change", "p_over_pc", r"change of volume  $-\Delta V/R^3$", r"pressure  $p/p_\mathrm{c}$"),
+    "angle": ("field_angle", "w_pole_over_h", "angle of the field  (degrees)", r"displacement of the pole  $w/h$"),
     "lambda_m": ("w_pole_over_h", "lambda_m", r"displacement of the pole  $w/h$", r"field  $\lambda_\mathrm{m}$"),
 }
 

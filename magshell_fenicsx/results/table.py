@@ -27,6 +27,7 @@ COLUMNS = (
     "Uq",
     "Utau",
     "mode",
+    "field_angle",
 )
 Row = dict[str, float | int | str]
 

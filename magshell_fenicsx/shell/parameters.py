@@ -57,6 +57,9 @@ class Magnetisation:
         The flux densities over their magnitudes: vectors (3,), or a pattern for the remanent one.
     gradient
         (3, 3) of the applied flux density, which is applied + gradient . r; None if uniform.
+    across
+        Unit vector (3,) normal to `applied` that the field turns towards, with the amplitude
+        "lambda_across"; None if it does not turn.
     energy
         The full energy, or which of the paper's approximations takes its place.
     """
@@ -65,6 +68,7 @@ class Magnetisation:
     applied: NDArray[np.float64]
     energy: MagneticEnergy = "full"
     gradient: NDArray[np.float64] | None = None
+    across: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True)

@@ -73,12 +73,15 @@ class TermFactory:
         return HessianTerm("antisymmetric edges", self.log.compile("antisymmetric edges tangent", hessian))
 
     def magnetic(self, field: Magnetisation) -> list[FormTerm]:
-        """The terms of the chosen energy; all have the amplitude lambda_m."""
+        """The terms of the chosen energy, linear in the applied field, with the amplitude lambda_m."""
         pattern = field.remanent
         Br = pattern_field(pattern, self.r0) if callable(pattern) else self._constant(pattern)
-        Ba = self._constant(field.applied)
+        directions = [("lambda_m", "", field.applied)]
+        if field.across is not None:
+            directions.append(("lambda_across", " across", field.across))
         terms = [
-            self._cells(name, density(*self._jets(), Br, Ba), "lambda_m", linear=name in LINEAR)
+            self._cells(name + suffix, density(*self._jets(), Br, self._constant(Ba)), amplitude, linear=name in LINEAR)
+            for amplitude, suffix, Ba in directions
             for name, density in MAGNETIC_TERMS[field.energy].items()
         ]
         if field.gradient is not None:
