@@ -143,6 +143,7 @@ def summary(result: Result, total_s: float) -> dict[str, Any]:
             "included": scene.plan.included,
             "left_out": scene.plan.left_out,
             "kernels": model.kernels.names,
+            "forms": len(model.kernels.names),
             "penalty": model.sigma,
         },
         "stopped": result.stopped,

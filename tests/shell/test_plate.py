@@ -55,6 +55,17 @@ def test_deflection(size: float, degree: int) -> None:
     assert solve(size, degree)[0] < 1e-4
 
 
+@pytest.mark.parametrize("degree", [3, 4])
+def test_simply_supported_edge(degree: int) -> None:
+    """w0 = (5 + nu)/(64 (1 + nu)) p R^4/D: Timoshenko, art. 17; no bending term acts at the edge."""
+    model = ShellModel(disc(0.2), MATERIAL, degree, {"rim": "simply supported"}, Loads(pressure=True))
+    h, nu, D = MATERIAL.h, MATERIAL.nu, MATERIAL.bending_stiffness * MATERIAL.h
+    p = 1e-4 * h * 64 * D * (1 + nu) / (5 + nu)
+    start = State(model.zero(), {"pressure": 0.0})
+    found = BorderedNewton(model.system).solve(start, "pressure", GivenLoad(p / MATERIAL.classical_pressure))
+    assert model.deflection(found.state.u, "pole") == pytest.approx(1e-4 * h, rel=1e-4)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("degree", [2, 3, 4])
 def test_order_of_convergence(degree: int) -> None:
