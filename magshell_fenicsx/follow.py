@@ -12,7 +12,7 @@ from magshell_fenicsx.shell.antisymmetric import AntisymmetricModes
 from magshell_fenicsx.solve.along import Along
 from magshell_fenicsx.solve.events import locate
 from magshell_fenicsx.solve.path import Path, PathStopped, Point, StepOptions
-from magshell_fenicsx.solve.system import State
+from magshell_fenicsx.solve.system import State, max_abs
 
 Label = Literal["start", "field", "step", "target", "fold", "bifurcation"]
 MOST_POINTS = 1000
@@ -86,12 +86,9 @@ def _field(scene: Scene, state: State) -> Iterator[Record]:
     except PathStopped:
         trouble = True
     instability = None
-    if trouble:
-        for instability in _to_critical_field(scene, points[-1].state):
-            yield instability
-    else:
-        for instability in _excluded(scene, path, points):
-            yield instability
+    search = _to_critical_field(scene, points[-1].state) if trouble else _excluded(scene, path, points)
+    for instability in search:
+        yield instability
     if instability is not None:
         raise Stopped(
             f"the field alone makes the shell unstable: critical field lambda_m = "
@@ -101,12 +98,14 @@ def _field(scene: Scene, state: State) -> Iterator[Record]:
 
 def _to_critical_field(scene: Scene, state: State) -> Iterator[Record]:
     """From a stable state under part of the field to the first instability in lambda_m."""
-    target = scene.case.lambda_m
-    path = Path(scene.newton, "lambda_m", "conjugate", StepOptions(1.0, 1.0, 1.0))
-    start = path.start(state)
-    first = abs(0.1 * target / start.dmu)
-    path.options = StepOptions(first, 2 * first, 1e-5 * first)
-    yield from _until_limit(scene, path, start, float(np.copysign(np.inf, target)))
+    target, system = scene.case.lambda_m, scene.newton.system
+    part = 0.1 * abs(target)
+    path = Path(scene.newton, "lambda_m", "load", StepOptions(part, part, 1e-5 * part))
+    if max_abs(system.comm, system.load(state.u, "lambda_m")) > 0:  # else the field does no work to control by
+        path = Path(scene.newton, "lambda_m", "conjugate", path.options)
+        first = part / abs(path.start(state).dmu)
+        path.options = StepOptions(first, 2 * first, 1e-5 * first)
+    yield from _until_limit(scene, path, path.start(state), float(np.copysign(np.inf, target)))
 
 
 def _field_as_load(scene: Scene, loading: FieldSection, state: State) -> Iterator[Record]:
@@ -115,11 +114,10 @@ def _field_as_load(scene: Scene, loading: FieldSection, state: State) -> Iterato
     path = Path(scene.newton, "lambda_m", "load", StepOptions(part, part, 1e-5 * part))
     if loading.until == "target":
         yield from _through(scene, path, path.start(state), _divided(0.0, target, loading.points))
-        return
-    if loading.control == "conjugate":
-        yield from _to_critical_field(scene, state)
-    else:
+    elif loading.control == "load":
         yield from _until_limit(scene, path, path.start(state), float(np.copysign(np.inf, target)))
+    else:
+        yield from _to_critical_field(scene, state)
 
 
 def _pressure(scene: Scene, loading: PressureSection, state: State) -> Iterator[Record]:

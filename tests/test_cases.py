@@ -6,6 +6,7 @@ References: "axisymmetric" is an independent solver of the meridian's equations,
 
 from functools import cache
 
+import numpy as np
 import pytest
 from conftest import CASES
 
@@ -163,3 +164,11 @@ def test_turning_field_ends_where_the_tilted_one_does() -> None:
     assert row["lambda_m"] == pytest.approx(found.scene.case.lambda_m)
     for key in ("w_pole_over_h", "magnetic", "bending"):
         assert row[key] == pytest.approx(straight.rows[-1][key], rel=1e-7)
+
+
+def test_strip_against_its_field_buckles() -> None:
+    """Field antiparallel to the magnetisation: straight until q = pi^2/4, there a bifurcation (elastica)."""
+    found = result("magnetic_strip.yaml", "magnetic.applied.polar=-90.0", "loading={kind: field, until: limit}")
+    (limit,) = found.limit_points
+    assert limit["kind"] == "bifurcation"
+    assert 12 * limit["value"] * 100**2 == pytest.approx(np.pi**2 / 4, rel=1e-4)

@@ -50,7 +50,7 @@ def screen() -> Iterator[None]:
 
 def smooth_surface(surface: Surface, h: float) -> pyvista.PolyData:
     """The deformed surface in flat triangles, each curved one divided."""
-    return unstructured_grid(surface, h).extract_surface(nonlinear_subdivision=4).clean(tolerance=1e-7)
+    return unstructured_grid(surface, h).extract_surface(nonlinear_subdivision=4)
 
 
 def draw_shell(surface: Surface, h: float, title: str, file: Path) -> None:

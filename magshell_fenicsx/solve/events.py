@@ -10,6 +10,8 @@ from magshell_fenicsx.solve.factor import Factorisation
 from magshell_fenicsx.solve.path import Path, PathStopped, Point
 from magshell_fenicsx.solve.system import State, Vector, dot
 
+MOST_STEPS = 60  # bisection alone halves a bracket so often that nothing is left of it
+
 
 class Stability(Protocol):
     """A tangent whose inertia tells stability."""
@@ -77,7 +79,7 @@ class _Work:
 def _fold(path: Path, low: Point, high: Point, tolerance: float, work: _Work) -> Point:
     """Zero of dmu/ds: stationary point of the cubic through both ends, repeated."""
     name = path.name
-    while True:
+    for _ in range(MOST_STEPS):
         s = _stationary(low, high, name)
         point = work.solve(path, s, low, high)
         mu = point.state.mu[name]
@@ -86,6 +88,7 @@ def _fold(path: Path, low: Point, high: Point, tolerance: float, work: _Work) ->
         if abs(point.dmu**2 / (2 * curvature)) <= tolerance * abs(mu):
             return point
         low, high = (point, high) if point.dmu * low.dmu > 0 else (low, point)
+    return point
 
 
 def _stationary(low: Point, high: Point, name: str) -> float:
@@ -120,7 +123,7 @@ def locate_bifurcation(
     comm = path.system.comm
     first = critical_mode(stability, low.state, comm)
     a, b = first.eigenvalue, critical_mode(stability, high.state, comm).eigenvalue
-    while True:
+    for _ in range(MOST_STEPS):
         t = a / (a - b) if a > 0 > b else 0.5
         point = work.solve(path, low.s + t * (high.s - low.s), low, high)
         mode = critical_mode(stability, point.state, comm)
@@ -138,6 +141,7 @@ def locate_bifurcation(
             low, a = point, value
             b = b / 2 if side == -1 else b
             side = -1
+    return work.add_to(point)
 
 
 @dataclass(frozen=True)

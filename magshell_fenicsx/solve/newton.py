@@ -7,6 +7,7 @@ One factorisation of K and two back-solves make a Newton step, whatever the last
 The unknown vector is u with mu appended on the last rank.
 """
 
+import weakref
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -59,6 +60,34 @@ class _Progress:
     factored: bool = False
 
 
+class _Border:
+    """What PETSc calls back; it does not keep the solver, and with it the factors, alive."""
+
+    def __init__(self, newton: "BorderedNewton") -> None:
+        self._newton = weakref.ref(newton)
+
+    @property
+    def newton(self) -> "BorderedNewton":
+        newton = self._newton()
+        assert newton is not None
+        return newton
+
+    def function(self, snes: PETSc.SNES, x: PETSc.Vec, f: PETSc.Vec) -> None:
+        self.newton._function(x, f)
+
+    def jacobian(self, snes: PETSc.SNES, x: PETSc.Vec, J: PETSc.Mat, P: PETSc.Mat) -> None:
+        self.newton._jacobian(x, J)
+
+    def test(self, snes: PETSc.SNES, iteration: int, norms: tuple[float, float, float]) -> Any:
+        return self.newton._test(iteration, norms[2])
+
+    def apply(self, pc: PETSc.PC, f: PETSc.Vec, y: PETSc.Vec) -> None:
+        self.newton._apply(f, y)
+
+    def mult(self, J: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        self.newton._mult(x, y)
+
+
 class BorderedNewton:
     """Solves R(u, mu) = 0 with one more row; reusable for every amplitude and row of a system.
 
@@ -79,13 +108,14 @@ class BorderedNewton:
         n = system.size + self._last
         self._x = PETSc.Vec().createMPI((n, PETSc.DETERMINE), comm=comm)
         f = self._x.duplicate()
-        J = PETSc.Mat().createPython(((n, PETSc.DETERMINE), (n, PETSc.DETERMINE)), context=self, comm=comm)
+        me = _Border(self)
+        J = PETSc.Mat().createPython(((n, PETSc.DETERMINE), (n, PETSc.DETERMINE)), context=me, comm=comm)
         J.setUp()
         self._snes = snes = PETSc.SNES().create(comm)
         snes.setOptionsPrefix("magshell_")
-        snes.setFunction(self._function, f)
-        snes.setJacobian(self._jacobian, J)
-        snes.setConvergenceTest(self._test)
+        snes.setFunction(me.function, f)
+        snes.setJacobian(me.jacobian, J)
+        snes.setConvergenceTest(me.test)
         snes.setType("newtonls")
         given = PETSc.Options("magshell_")
         if not given.hasName("snes_linesearch_type"):
@@ -94,7 +124,7 @@ class BorderedNewton:
         ksp = snes.getKSP()
         ksp.setType("preonly")
         ksp.getPC().setType("python")
-        ksp.getPC().setPythonContext(self)
+        ksp.getPC().setPythonContext(me)
         ksp.setNormType(PETSc.KSP.NormType.NONE)
         snes.setFromOptions()
 
@@ -116,13 +146,13 @@ class BorderedNewton:
             self._factored = state
         return self.factorisation
 
-    def _function(self, snes: PETSc.SNES, x: PETSc.Vec, f: PETSc.Vec) -> None:
+    def _function(self, x: PETSc.Vec, f: PETSc.Vec) -> None:
         u, mu = self._split(x)
         R = self.system.residual(u, {**self._guess.mu, self._name: mu})
         self._progress.residuals.append(np.sqrt(dot(self.system.comm, R, R)))
         self._join(R, self._row.residual(u, mu), f)
 
-    def _jacobian(self, snes: PETSc.SNES, x: PETSc.Vec, J: PETSc.Mat, P: PETSc.Mat) -> None:
+    def _jacobian(self, x: PETSc.Vec, J: PETSc.Mat) -> None:
         u, mu = self._split(x)
         norms, known = self._progress.residuals, self._progress.factored
         if not known or norms[-1] > self.options.contraction * norms[-2]:
@@ -132,7 +162,7 @@ class BorderedNewton:
         self._c, self._d = self._row.gradient(u)
         J.assemble()
 
-    def apply(self, pc: PETSc.PC, f: PETSc.Vec, y: PETSc.Vec) -> None:
+    def _apply(self, f: PETSc.Vec, y: PETSc.Vec) -> None:
         """The Newton step (SNES subtracts it): block elimination with the factors at hand."""
         comm, solve = self.system.comm, self.factorisation.solve
         R, g = self._split(f)
@@ -146,7 +176,7 @@ class BorderedNewton:
         self._progress.steps.append(max_abs(comm, du) / self.system.length)
         self._join(du, dmu, y)
 
-    def mult(self, J: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
+    def _mult(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """The bordered matrix times a vector, for SNES's line searches and monitors."""
         du, dmu = self._split(x)
         K = self.factorisation.matrix
@@ -156,9 +186,9 @@ class BorderedNewton:
         g = self._d * dmu + (dot(self.system.comm, self._c, du) if self._c is not None else 0.0)
         self._join(w.array + dmu * self._column, g, y)
 
-    def _test(self, snes: PETSc.SNES, iteration: int, norms: tuple[float, float, float]) -> Any:
+    def _test(self, iteration: int, norm: float) -> Any:
         Reason, o = PETSc.SNES.ConvergedReason, self.options
-        if not isfinite(norms[2]):
+        if not isfinite(norm):
             return Reason.DIVERGED_FNORM_NAN
         if iteration == 0:
             return Reason.CONVERGED_ITERATING

@@ -1,5 +1,8 @@
 """Paths of toys whose folds and bifurcations are known in closed form."""
 
+import gc
+import weakref
+
 import numpy as np
 import pytest
 from solve.toys import Toy, pitchfork, snap_through
@@ -87,3 +90,13 @@ def test_targets_are_met_exactly() -> None:
     path, start = path_of(snap_through(), "conjugate", StepOptions(0.07, 0.3, 1e-6))
     reached = [point.s for point, flag in path.towards(start, [0.25, 0.5, 1.75]) if flag]
     assert reached == [0.25, 0.5, 1.75]
+
+
+def test_a_solver_is_released_with_its_factors() -> None:
+    """PETSc calls back into the solver but must not keep it: sweeps make hundreds."""
+    newton = BorderedNewton(snap_through())
+    newton.solve(State(np.zeros(1), {"load": 0.0}), "load", GivenLoad(0.1))
+    gone = weakref.ref(newton)
+    del newton
+    gc.collect()
+    assert gone() is None
