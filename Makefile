@@ -4,6 +4,7 @@ ENV := .ci/in-env
 define HELP
 make run CASE=cases/dimple_buckling.yaml [OUT=dir] [N=ranks] [ARGS="--set a=b"]
 make check CASE=...   validate a case, print what would be built
+make figures          the paper's figures into results/figures/: 45 minutes on one core, N=ranks share it
 make test             lint and all tests
 make fast             lint and the tests that are not marked slow
 make lint             ruff and mypy
@@ -12,7 +13,7 @@ make clean            remove caches and compiled kernels; keeps .env/root and re
 endef
 export HELP
 
-.PHONY: help run check test fast lint image clean
+.PHONY: help run check figures test fast lint image clean
 
 help:
 	@echo "$$HELP"
@@ -20,6 +21,9 @@ help:
 run check:
 	@$(if $(CASE),,$(error name a case: make $@ CASE=cases/dimple_buckling.yaml))
 	$(ENV) $(if $(N),mpirun -n $(N)) magshell $@ $(CASE) $(if $(OUT),--out $(OUT)) $(ARGS)
+
+figures:
+	$(ENV) $(if $(N),mpirun -n $(N)) python3 -m magshell_fenicsx.figures $(ARGS)
 
 test: lint
 	$(ENV) python3 -m pytest

@@ -58,6 +58,31 @@ def run(
 
 
 @app.command()
+def sweep(
+    case: CaseFile,
+    over: Annotated[
+        list[str],
+        typer.Option(
+            metavar="KEY.PATH=START:STOP:COUNT", help="or =VALUE,VALUE; repeat for a product, tie keys with +"
+        ),
+    ],
+    set_: Settings = None,
+    out: Annotated[Path | None, typer.Option(help="output folder; default results/<case name>_sweep/")] = None,
+) -> None:
+    """Run a case over ranges of its keys; points that are in the folder already are kept."""
+    from magshell_fenicsx.sweep.sweep import sweep as run_sweep
+
+    folder = out or Path("results") / f"{case.stem}_sweep"
+    try:
+        done = run_sweep(case, over, set_ or [], folder)
+    except CaseError as e:
+        raise _failure(str(e), INVALID) from None
+    _say(f"results in {folder}/")
+    if done.stopped:
+        raise _failure(f"{done.stopped} of {len(done.points)} points stopped early; sweep.csv says why", STOPPED)
+
+
+@app.command()
 def check(case: CaseFile, set_: Settings = None) -> None:
     """Validate a case; print what would be built and what is left out."""
     from magshell_fenicsx.plan import describe

@@ -25,10 +25,10 @@ ALL = f"{PAPER},second_consistent"
 COLOURS = {0.0: "black", 0.00184: "tab:red", -0.00184: "tab:blue"}
 NAMES = {
     "full": "full",
-    "second": r"second order $\mathcal{U}^2_\mathrm{m}$",
-    "first": r"first order $\mathcal{U}^1_\mathrm{m}$",
-    "torque": r"torque $\mathcal{U}^q_\mathrm{m}$",
-    "second_consistent": "second order with the couple",
+    "second": r"second order  $\mathcal{U}_\mathrm{m}^{\,2}$",
+    "first": r"first order  $\mathcal{U}_\mathrm{m}^{\,1}$",
+    "torque": r"torque  $\mathcal{U}_\mathrm{m}^{\,q}$",
+    "second_consistent": "second order, consistent",
 }
 MARKED: dict[str, dict[str, Any]] = {
     "full": {"linestyle": "-"},
@@ -114,7 +114,7 @@ def knockdowns(done: Sweep) -> list[dict[str, Any]]:
         if point.case.lambda_m:
             found = sweep_row(outcome)
             change = outcome.knockdown - none if outcome.knockdown is not None and none is not None else None
-            kept = {key: found[key] for key in ("w_pole_over_h", "kind", "stopped", "dofs", "wall_s")}
+            kept = {key: found[key] for key in ("w_pole_over_h", "kind", "mode", "stopped", "dofs", "wall_s")}
             rows.append({**point.values, "k_d": outcome.knockdown, "delta_k_d": change, **kept})
     return rows
 
@@ -146,12 +146,18 @@ def draw(figure: Figure, rows: Sequence[dict[str, Any]], x: str, y: str, file: P
         line = [row for row in rows if (row[FIELD], row[ENERGY]) == (field, energy) and row[y] is not None]
         xy = [float(row[x]) for row in line], [row[y] for row in line]
         axes.plot(*xy, color=COLOURS[float(field)], **styles[energy])
+        if line[-1].get("label") == "step":
+            axes.plot(xy[0][-1], xy[1][-1], "x", color=COLOURS[float(field)], markersize=5)
     shown = {float(field) for field, _ in groups}
     legend = [
-        Line2D([], [], color=c, label=rf"$\lambda_\mathrm{{m}}$ = {f:g}") for f, c in COLOURS.items() if f in shown
+        Line2D([], [], color=c, label=rf"$\lambda_\mathrm{{m}} = {f:+g}$" if f else "no field")
+        for f, c in COLOURS.items()
+        if f in shown
     ]
     used = {energy for _, energy in groups}
     legend += [Line2D([], [], color="0.3", label=NAMES[e], **style) for e, style in styles.items() if e in used]
+    if not figure.along:
+        legend.append(Line2D([], [], color="0.3", linestyle="", marker="x", label="the displacement turns back"))
     picture.legend(handles=legend, loc="outside right upper", frameon=False, fontsize=9)
     change = r"change of the knockdown factor  $\Delta k_\mathrm{d}$"
     axes.set(xlabel=figure.x_label, ylabel=change if figure.along else r"force  $FR/(2\pi D)$")

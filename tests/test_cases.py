@@ -172,3 +172,22 @@ def test_strip_against_its_field_buckles() -> None:
     (limit,) = found.limit_points
     assert limit["kind"] == "bifurcation"
     assert 12 * limit["value"] * 100**2 == pytest.approx(np.pi**2 / 4, rel=1e-4)
+
+
+@pytest.mark.slow
+def test_figure_of_coplanar_fields() -> None:
+    """figures/coplanar.yaml at angle zero: axisymmetric reference, on the figures' coarse mesh."""
+    assert result("figures/coplanar.yaml").knockdown == pytest.approx(0.552053778, rel=3e-4)
+
+
+@pytest.mark.slow
+def test_figure_of_non_coplanar_fields() -> None:
+    """figures/noncoplanar.yaml at azimuth zero has parallel fields: the half shell of the default mesh, 0.4915468."""
+    assert result("figures/noncoplanar.yaml").knockdown == pytest.approx(0.4915468, rel=5e-4)
+
+
+@pytest.mark.slow
+def test_figure_of_indentation() -> None:
+    """figures/indentation.yaml: mixed reference at w/h = 5."""
+    found = result("figures/indentation.yaml", "loading.depth=5", "loading.points=5")
+    assert force_at(found, 5) == pytest.approx(8.2762, rel=3e-3)

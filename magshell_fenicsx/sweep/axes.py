@@ -1,0 +1,100 @@
+"""What `--over` says: the keys of a case that vary together, and their values."""
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from magshell_fenicsx.case.source import CaseError
+
+FORMS = "write it as key.path=start:stop:count or key.path=value,value,..."
+
+
+@dataclass(frozen=True)
+class Axis:
+    """One direction of a sweep.
+
+    Attributes
+    ----------
+    keys
+        Keys that take the same value; more than one are tied.
+    values
+        As they would stand in the case file.
+    """
+
+    keys: tuple[str, ...]
+    values: tuple[str, ...]
+
+    @property
+    def name(self) -> str:
+        """The keys as `--over` has them."""
+        return "+".join(self.keys)
+
+    @property
+    def numbers(self) -> list[float] | None:
+        """The values as numbers; None if one of them is a word."""
+        try:
+            return [float(value) for value in self.values]
+        except ValueError:
+            return None
+
+
+def parse_axes(texts: Sequence[str]) -> list[Axis]:
+    """Read all `--over` of a command line.
+
+    Raises
+    ------
+    CaseError
+        If one is not of the form, or a key is swept twice.
+    """
+    axes = [parse_axis(text) for text in texts]
+    keys = [key for axis in axes for key in axis.keys]
+    for key in keys:
+        if keys.count(key) > 1:
+            raise CaseError(f"--over: {key} is swept twice; keys that vary together are tied with +")
+    return axes
+
+
+def parse_axis(text: str) -> Axis:
+    """Read one `--over`.
+
+    Examples
+    --------
+    >>> parse_axis("a.x+a.y=0:90:3")
+    Axis(keys=('a.x', 'a.y'), values=('0', '45', '90'))
+    >>> parse_axis("magnetic.energy=full,first").values
+    ('full', 'first')
+    """
+    path, equals, values = text.partition("=")
+    keys = tuple(key.strip() for key in path.split("+"))
+    if not equals or not all(re.fullmatch(r"\w+(\.\w+)*", key) for key in keys):
+        raise CaseError(f"--over {text}: {FORMS}; keys that vary together are tied with +")
+    return Axis(keys, _range(text, values) if ":" in values else _list(text, values))
+
+
+def _range(text: str, values: str) -> tuple[str, ...]:
+    """start:stop:count, equidistant with both ends."""
+    try:
+        first, last, number = values.split(":")
+        start, stop, count = float(first), float(last), int(number)
+    except ValueError:
+        raise CaseError(f"--over {text}: {values} is not start:stop:count (two numbers and a whole number)") from None
+    if not (math.isfinite(start) and math.isfinite(stop)):
+        raise CaseError(f"--over {text}: start and stop must be finite")
+    if not 2 <= count <= MOST_POINTS:
+        raise CaseError(f"--over {text}: count is {count}; allowed 2 to {MOST_POINTS}")
+    return tuple(f"{value:.12g}" for value in np.linspace(start, stop, count))
+
+
+def _list(text: str, values: str) -> tuple[str, ...]:
+    items = tuple(value.strip() for value in values.split(","))
+    if not all(items):
+        raise CaseError(f"--over {text}: a value is missing; {FORMS}")
+    if re.search(r"[\[\]{}]", values):
+        raise CaseError(f"--over {text}: only numbers and words can be swept, not sections or lists")
+    return items
+
+
+MOST_POINTS = 10_000

@@ -1,0 +1,74 @@
+"""What a sweep keeps of a run, and its file."""
+
+import json
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from mpi4py import MPI
+
+from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.mesh.patch import MeshError
+from magshell_fenicsx.results.table import Row
+from magshell_fenicsx.run import run
+
+CURVE = ("label", "amplitude", "p_over_pc", "lambda_m", "force", "w_over_h", "w_pole_over_h", "volume_change", "mode")
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The outcome of one point.
+
+    Attributes
+    ----------
+    knockdown
+        k_d; None if there is no instability under pressure.
+    limit
+        The first limit point (the one of k_d) as in summary.json; None if there is none.
+    stopped
+        Why the run ended before its target; None if it reached it.
+    curve
+        Every accepted point, with the columns of `CURVE`.
+    """
+
+    knockdown: float | None
+    limit: dict[str, Any] | None
+    stopped: str | None
+    dofs: int | None
+    wall_s: float
+    curve: list[Row]
+
+
+def compute(case: Case) -> Outcome:
+    """Run a case on this rank alone."""
+    start = time.perf_counter()
+    try:
+        found = run(case, comm=MPI.COMM_SELF)
+    except MeshError as e:
+        return Outcome(None, None, str(e), None, time.perf_counter() - start, [])
+    limits = sorted(found.limit_points, key=lambda p: p["amplitude"] != "pressure" or p["value"] != found.knockdown)
+    return Outcome(
+        knockdown=found.knockdown,
+        limit=next(iter(limits), None),
+        stopped=found.stopped,
+        dofs=found.scene.model.system.dofs,
+        wall_s=round(time.perf_counter() - start, 3),
+        curve=[{key: row[key] for key in CURVE} for row in found.rows],
+    )
+
+
+def save(outcome: Outcome, case: Case, file: Path) -> None:
+    """Write a point's file; a killed sweep leaves the whole of it or nothing."""
+    content = {"case": case.model_dump(mode="json", exclude_none=True), "outcome": asdict(outcome)}
+    unfinished = file.with_suffix(f".{MPI.COMM_WORLD.rank}")
+    unfinished.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    unfinished.replace(file)
+
+
+def load(file: Path) -> Outcome | None:
+    """Read a point's file; None if there is none that can be used."""
+    try:
+        return Outcome(**json.loads(file.read_text(encoding="utf-8"))["outcome"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None

@@ -1,0 +1,118 @@
+"""A case over ranges of its keys: points dealt out to the ranks, what is there already kept."""
+
+import sys
+import traceback
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from mpi4py import MPI
+
+from magshell_fenicsx.case.source import CaseError
+from magshell_fenicsx.results.sweep_plot import draw_sweep
+from magshell_fenicsx.sweep.axes import Axis, parse_axes
+from magshell_fenicsx.sweep.deal import deal
+from magshell_fenicsx.sweep.outcome import Outcome, compute, load, save
+from magshell_fenicsx.sweep.points import SweepPoint, make_points
+from magshell_fenicsx.sweep.table import write_curves, write_sweep
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """A finished sweep: its points in product order, and what came of each."""
+
+    axes: list[Axis]
+    points: list[SweepPoint]
+    outcomes: list[Outcome]
+
+    @property
+    def stopped(self) -> int:
+        """Number of points that ended before their target."""
+        return sum(outcome.stopped is not None for outcome in self.outcomes)
+
+
+def _print(line: str) -> None:
+    print(line, flush=True)
+
+
+def sweep(
+    file: Path | str,
+    over: Sequence[str],
+    settings: Sequence[str] = (),
+    out: Path | str = "results/sweep",
+    comm: MPI.Intracomm = MPI.COMM_WORLD,
+    say: Callable[[str], None] = _print,
+) -> Sweep:
+    """Run a case at all points of a product; collective, every rank is a worker.
+
+    Parameters
+    ----------
+    over
+        `key.path=start:stop:count` or `key.path=value,value`; keys tied with `+`.
+    out
+        Folder of sweep.csv, sweep.png and points/; points that are there are kept.
+    say
+        Called with one line per finished point, on the rank that finished it.
+
+    Raises
+    ------
+    CaseError
+        Before anything is computed: if a point is no valid case, or `out` cannot be written.
+    """
+    axes = parse_axes(over)
+    points = make_points(Path(file), axes, settings)
+    folder = _prepare(Path(out), comm)
+    files = [folder / "points" / f"{point.key}.json" for point in points]
+    missing: list[int] = comm.bcast(_missing(points, files) if comm.rank == 0 else None)
+    if comm.rank == 0:
+        say(f"{len(points)} points, {len(missing)} to compute on {comm.size} rank{'s' if comm.size > 1 else ''}")
+    try:
+        for number in deal(len(missing), comm):
+            point, result = points[missing[number]], files[missing[number]]
+            outcome = compute(point.case)
+            save(outcome, point.case, result)
+            say(f"{number + 1:4d}/{len(missing)}  {point.label}: {_said(outcome)}, {outcome.wall_s:.1f} s")
+    except BaseException:
+        if comm.size == 1:
+            raise
+        traceback.print_exc()
+        sys.stderr.flush()
+        comm.Abort(1)  # the others would wait for this rank for ever
+    comm.Barrier()
+    outcomes = [found for result in files if (found := load(result))]
+    assert len(outcomes) == len(points)
+    if comm.rank == 0:
+        write_sweep(points, outcomes, folder / "sweep.csv")
+        write_curves(points, outcomes, folder / "curves.csv")
+        draw_sweep(axes, points, outcomes, folder / "sweep.png")
+    comm.Barrier()
+    return Sweep(axes, points, outcomes)
+
+
+def _missing(points: Sequence[SweepPoint], files: Sequence[Path]) -> list[int]:
+    """Numbers of the points to compute; of equal points the first."""
+    first = {point.key: i for i, point in reversed(list(enumerate(points)))}
+    return sorted(i for i in first.values() if load(files[i]) is None)
+
+
+def _prepare(out: Path, comm: MPI.Intracomm) -> Path:
+    error = None
+    if comm.rank == 0:
+        try:
+            (out / "points").mkdir(parents=True, exist_ok=True)
+            (out / "sweep.csv").touch()
+        except OSError as e:
+            error = f"--out {out}: cannot be written: {e.strerror}"
+    error = comm.bcast(error)
+    if error:
+        raise CaseError(error)
+    return out
+
+
+def _said(outcome: Outcome) -> str:
+    found = "no limit point"
+    if outcome.knockdown is not None:
+        found = f"k_d = {outcome.knockdown:.6f}"
+    elif outcome.limit:
+        found = f"{outcome.limit['kind']} at {outcome.limit['amplitude']} = {outcome.limit['value']:.6g}"
+    return f"{found}, stopped early: {outcome.stopped}" if outcome.stopped else found
