@@ -28,7 +28,8 @@ def test_every_case_is_run_here() -> None:
     import sys
 
     source = inspect.getsource(sys.modules[__name__])
-    assert [file.name for file in CASES.rglob("*.yaml") if file.name not in source] == []
+    cases = [file.relative_to(CASES).as_posix() for file in CASES.rglob("*.yaml")]
+    assert [case for case in cases if f'"{case}"' not in source] == []
 
 
 DIMPLED = [

@@ -5,6 +5,7 @@ import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 from mpi4py import MPI
 
@@ -61,7 +62,7 @@ def compute(case: Case) -> Outcome:
 def save(outcome: Outcome, case: Case, file: Path) -> None:
     """Write a point's file; a killed sweep leaves the whole of it or nothing."""
     content = {"case": case.model_dump(mode="json", exclude_none=True), "outcome": asdict(outcome)}
-    unfinished = file.with_suffix(f".{MPI.COMM_WORLD.rank}")
+    unfinished = file.with_suffix(f".{uuid4().hex}")  # two sweeps may write to one folder
     unfinished.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
     unfinished.replace(file)
 
