@@ -11,10 +11,10 @@ from typing import Any
 from mpi4py import MPI
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.environment import fast_blas, versions
 from magshell_fenicsx.follow import Record, Stopped, follow
 from magshell_fenicsx.results.curve import draw_curve
+from magshell_fenicsx.results.folder import prepare_folder
 from magshell_fenicsx.results.picture import draw_loads, draw_shell
 from magshell_fenicsx.results.surface import completed, gatherer, turned
 from magshell_fenicsx.results.table import PathTable, Row
@@ -85,7 +85,7 @@ def run(
         If the case has a fault that shows only now, or `out` cannot be written.
     """
     start = time.perf_counter()
-    folder = _prepare(Path(out), comm) if out is not None else None
+    folder = prepare_folder(Path(out), comm, _emptied) if out is not None else None
     scene = Scene(case, comm)
     result = Result(scene, scene.unloaded())
     say = say if comm.rank == 0 else lambda line: None
@@ -200,28 +200,13 @@ class _Files:
             draw_curve(result.rows, last.amplitude, title, self._folder / "curve.png")
 
 
-def _prepare(out: Path, comm: MPI.Comm) -> Path:
-    """Make the folder and take old results out of it.
-
-    Raises
-    ------
-    CaseError
-        If it cannot be made or written to.
-    """
-    error = None
-    if comm.rank == 0:
-        try:
-            out.mkdir(parents=True, exist_ok=True)
-            for name in ("path.csv", "summary.json", "shell.png", "curve.png", "magnetic_loads.png"):
-                (out / name).unlink(missing_ok=True)
-            shutil.rmtree(out / "fields", ignore_errors=True)
-            (out / "path.csv").touch()
-        except OSError as e:
-            error = f"--out {out}: cannot be written: {e.strerror}"
-    error = comm.bcast(error)
-    if error:
-        raise CaseError(error)
-    return out
+def _emptied(out: Path) -> None:
+    """Make the folder and take an earlier run's files out of it."""
+    out.mkdir(parents=True, exist_ok=True)
+    for name in ("path.csv", "summary.json", "shell.png", "curve.png", "magnetic_loads.png"):
+        (out / name).unlink(missing_ok=True)
+    shutil.rmtree(out / "fields", ignore_errors=True)
+    (out / "path.csv").touch()
 
 
 def _line(row: Row) -> str:

@@ -3,8 +3,6 @@
 from dataclasses import dataclass
 from typing import Protocol
 
-import numpy as np
-
 from magshell_fenicsx.solve.system import System, Vector
 
 
@@ -44,7 +42,3 @@ class GivenConjugate:
 
     def gradient(self, u: Vector) -> tuple[Vector | None, float]:
         return -self.system.load(u, self.name), 0.0
-
-
-def isfinite(*values: float) -> bool:
-    return bool(np.isfinite(values).all())

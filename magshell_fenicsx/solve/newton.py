@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from petsc4py import PETSc
 
-from magshell_fenicsx.solve.control import Row, isfinite
+from magshell_fenicsx.solve.control import Row
 from magshell_fenicsx.solve.factor import Factorisation
 from magshell_fenicsx.solve.system import State, System, Vector, dot, max_abs
 
@@ -188,14 +188,14 @@ class BorderedNewton:
 
     def _test(self, iteration: int, norm: float) -> Any:
         Reason, o = PETSc.SNES.ConvergedReason, self.options
-        if not isfinite(norm):
+        if not np.isfinite(norm):
             return Reason.DIVERGED_FNORM_NAN
         if iteration == 0:
             return Reason.CONVERGED_ITERATING
         steps = self._progress.steps
         step = steps[-1]
         growing = iteration > 2 and step > 2 * steps[-2]
-        if not isfinite(step) or step > o.largest_step or growing:
+        if not np.isfinite(step) or step > o.largest_step or growing:
             return Reason.DIVERGED_DTOL
         if step <= o.tolerance:
             return Reason.CONVERGED_SNORM_RELATIVE

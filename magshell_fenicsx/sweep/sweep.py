@@ -8,7 +8,7 @@ from pathlib import Path
 
 from mpi4py import MPI
 
-from magshell_fenicsx.case.source import CaseError
+from magshell_fenicsx.results.folder import prepare_folder
 from magshell_fenicsx.results.sweep_plot import draw_sweep
 from magshell_fenicsx.sweep.axes import Axis, parse_axes
 from magshell_fenicsx.sweep.deal import deal
@@ -61,7 +61,7 @@ def sweep(
     """
     axes = parse_axes(over)
     points = make_points(Path(file), axes, settings)
-    folder = _prepare(Path(out), comm)
+    folder = prepare_folder(Path(out), comm, _ready)
     files = [folder / "points" / f"{point.key}.json" for point in points]
     missing: list[int] = comm.bcast(_missing(points, files) if comm.rank == 0 else None)
     if comm.rank == 0:
@@ -95,18 +95,9 @@ def _missing(points: Sequence[SweepPoint], files: Sequence[Path]) -> list[int]:
     return sorted(i for i in first.values() if load(files[i]) is None)
 
 
-def _prepare(out: Path, comm: MPI.Intracomm) -> Path:
-    error = None
-    if comm.rank == 0:
-        try:
-            (out / "points").mkdir(parents=True, exist_ok=True)
-            (out / "sweep.csv").touch()
-        except OSError as e:
-            error = f"--out {out}: cannot be written: {e.strerror}"
-    error = comm.bcast(error)
-    if error:
-        raise CaseError(error)
-    return out
+def _ready(out: Path) -> None:
+    (out / "points").mkdir(parents=True, exist_ok=True)
+    (out / "sweep.csv").touch()
 
 
 def _said(outcome: Outcome) -> str:
