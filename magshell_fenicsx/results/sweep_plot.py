@@ -50,6 +50,8 @@ def _knockdowns(plot: Any, axes: Sequence[Axis], points: Sequence[SweepPoint], o
     for (label, line), style in zip(lines.items(), cycle(STYLES), strict=False):
         plot.plot(*zip(*line, strict=True), style, marker=".", label=label) if line else None
     unit = UNITS.get(along.keys[0].split(".")[-1])
+    if along.numbers:
+        plot.locator_params(axis="x", nbins=5)  # long numbers would touch
     plot.set_xlabel(" = ".join(short(key) for key in along.keys) + (f"  ({unit})" if unit else ""))
     plot.set_ylabel(r"knockdown factor  $k_\mathrm{d}$")
 
