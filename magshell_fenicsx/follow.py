@@ -160,7 +160,7 @@ def _rotation(scene: Scene, loading: RotationSection, state: State) -> Iterator[
     magnetic = scene.case.magnetic
     assert magnetic is not None
     total = float(np.arccos(magnetic.applied.vector() @ loading.to.vector()))
-    modes, system = scene.model.excluded_modes(), scene.newton.system
+    modes, system = scene.model.excluded_modes, scene.newton.system
     for angle in _divided(0.0, total, loading.points):
         end = {name: scene.case.lambda_m * f(angle) for name, f in (("lambda_m", np.cos), ("lambda_across", np.sin))}
         scene.newton.system = chord = Along(
@@ -228,8 +228,12 @@ def _through(scene: Scene, path: Path, start: Point, targets: list[float]) -> It
 
 def _excluded(scene: Scene, path: Path, points: list[Point]) -> Iterator[Record]:
     """The first instability among the modes that a reduced model does not see, if there is one."""
-    modes = scene.model.excluded_modes()
-    if modes is not None and (found := modes.first_instability(path, points)):
+    modes = scene.model.excluded_modes
+    try:
+        found = modes.first_instability(path, points) if modes else None
+    except PathStopped as e:
+        raise Stopped(f"a mode that the reduced model excludes is unstable, but where is not known: {e}") from None
+    if found:
         mode, point = found
         yield Record("bifurcation", path.name, point, mode)
 

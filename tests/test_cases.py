@@ -11,6 +11,8 @@ import pytest
 from conftest import CASES
 
 from magshell_fenicsx import Case, Result, run
+from magshell_fenicsx.axisymmetric.instability import ExcludedWaves
+from magshell_fenicsx.solve.path import Path, PathStopped, Point
 
 
 @cache
@@ -60,6 +62,20 @@ def test_dimple_buckling(
     )
     assert found.knockdown == pytest.approx(k_d, rel=tolerance)
     assert [point["kind"] for point in found.limit_points] == ["fold"]
+    kernels = found.scene.model.kernels.names
+    assert len(kernels) == len(set(kernels)), "a kernel was made twice"
+
+
+def test_excluded_mode_that_cannot_be_located_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Newton failing while an excluded instability is located stops the run with a message, not a traceback."""
+
+    def lost(self: ExcludedWaves, path: Path, points: list[Point]) -> None:
+        raise PathStopped("the iteration diverged", points[-1])
+
+    monkeypatch.setattr(ExcludedWaves, "first_instability", lost)
+    found = run(Case.load(CASES / "pole_indentation.yaml"))
+    assert found.stopped
+    assert "excludes is unstable" in found.stopped
 
 
 def test_field_beyond_the_critical_one_has_no_knockdown() -> None:

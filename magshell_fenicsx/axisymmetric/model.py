@@ -4,6 +4,8 @@ Lengths in R, energies in E h R^2, of the whole shell. Amplitudes as in `ShellMo
 "pressure" is p/p_c, "force" is F R/(2 pi D), "lambda_m" is lambda_m.
 """
 
+from functools import cached_property
+
 import numpy as np
 import ufl
 from dolfinx import fem
@@ -86,6 +88,7 @@ class MeridianModel:
         volume = 2 * np.pi * factory.volume_change(jets.revolved(self.u))
         self._volume = self.kernels.compile("volume energy", volume)
 
+    @cached_property
     def excluded_modes(self) -> ExcludedWaves:
         """The waves around the axis, which an axisymmetric model does not see. Compiles kernels."""
         return ExcludedWaves(Waves(self.system, self.energies, self.meridian, self.condition, self.kernels))

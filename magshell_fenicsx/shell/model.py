@@ -5,6 +5,7 @@ F R/(2 pi D), "lambda_m" is lambda_m.
 """
 
 from collections.abc import Mapping
+from functools import cached_property
 
 import numpy as np
 from dolfinx import fem
@@ -90,6 +91,7 @@ class ShellModel:
         # dofs of a vertex on the rank that owns it
         self._probes = {name: point_entries(V, x, np.ones(3))[0] for name, x in midsurface.points.items()}
 
+    @cached_property
     def excluded_modes(self) -> AntisymmetricModes | None:
         """The modes that a half model does not see; None for a whole one. Compiles a kernel."""
         if self.multiplicity == 1:

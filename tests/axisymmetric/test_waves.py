@@ -38,7 +38,7 @@ def second_variation(K: Any, v: Array) -> float:
 
 def on_the_meridian(m: int, mu: dict[str, float], R_over_h: float) -> float:
     model = hemisphere(R_over_h, 0.3, LOADS, refinement=4, sigma=0.0)
-    waves = model.excluded_modes().waves
+    waves = model.excluded_modes.waves
     phi = waves.V.tabulate_dof_coordinates()[:, 0]
     U, V, W = wave(phi, m)
     u = np.column_stack(displacement(model.V.tabulate_dof_coordinates()[:, 0])).ravel()
@@ -84,7 +84,7 @@ def test_agrees_with_the_full_shell(m: int) -> None:
 def test_rigid_motions_are_neutral() -> None:
     """Of the undeformed shell translation and rotation; of a deformed one translation, exactly."""
     model = hemisphere(20, 0.3, Loads(), condition="free")
-    waves = model.excluded_modes().waves
+    waves = model.excluded_modes.waves
     rho, z = model.r0.x.array.reshape(-1, 2).T
     zero = 0 * rho
     translation, rotation = (np.column_stack(c).ravel() for c in ([zero, zero - 1, zero], [zero, -z, -rho]))
@@ -104,7 +104,7 @@ def test_rigid_motions_are_neutral() -> None:
 def test_known_waves(R_over_h: float, lambda_m: float, wave_number: int, p_over_pc: float) -> None:
     """An independent axisymmetric solver with its own circumferential modes; before the axisymmetric fold."""
     model = dimpled(R_over_h, lambda_m)
-    waves, found = model.excluded_modes().waves, buckle(model, lambda_m)
+    waves, found = model.excluded_modes.waves, buckle(model, lambda_m)
     first = first_circumferential_instability(waves, found.path, found.points)
     assert first is not None
     m, point = first
@@ -118,17 +118,17 @@ def test_no_wave_before_the_fold() -> None:
     """R/h = 90: the paper's knockdown is the axisymmetric fold."""
     model = dimpled(90, 0.00184)
     found = buckle(model, 0.00184)
-    assert first_circumferential_instability(model.excluded_modes().waves, found.path, found.points) is None
+    assert first_circumferential_instability(model.excluded_modes.waves, found.path, found.points) is None
 
 
 def test_perfect_hemisphere_buckles_in_waves_at_its_edge() -> None:
     """The full shell's tangent (44 589 unknowns) has its first two negative pivots between 0.8405 and 0.8418."""
     model = hemisphere(90, 0.5, Loads(pressure=True))
     found = buckle(model, 0.0)
-    first = first_circumferential_instability(model.excluded_modes().waves, found.path, found.points)
+    first = first_circumferential_instability(model.excluded_modes.waves, found.path, found.points)
     assert first is not None
     assert first[0] == 14
     assert first[1].state.mu["pressure"] == pytest.approx(0.84111, rel=1e-4)
-    named = model.excluded_modes().first_instability(found.path, found.points)
+    named = model.excluded_modes.first_instability(found.path, found.points)
     assert named is not None
     assert named[0] == "m = 14"
