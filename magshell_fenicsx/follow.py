@@ -1,21 +1,29 @@
 """The history of a case: the field first, then the load; every accepted point, and what stopped it."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 
-from magshell_fenicsx.case.loading import FieldSection, IndentationSection, PressureSection, RotationSection
+from magshell_fenicsx.case.loading import (
+    FieldSection,
+    IndentationSection,
+    PathSection,
+    PressureSection,
+    RotationSection,
+)
 from magshell_fenicsx.scene import Scene
 from magshell_fenicsx.shell.antisymmetric import AntisymmetricModes
 from magshell_fenicsx.solve.along import Along
-from magshell_fenicsx.solve.events import locate
-from magshell_fenicsx.solve.path import Path, PathStopped, Point, StepOptions
-from magshell_fenicsx.solve.system import State, max_abs
+from magshell_fenicsx.solve.branch import Branching, branching
+from magshell_fenicsx.solve.path import Control, Path, PathStopped, Point, StepOptions
+from magshell_fenicsx.solve.system import State
+from magshell_fenicsx.solve.walk import MOST_STEPS, Goal, Quantity, Walk
 
 Label = Literal["start", "field", "step", "target", "fold", "bifurcation"]
-MOST_POINTS = 1000
+CONTROLS: dict[str, Control] = {"volume": "conjugate", "displacement": "conjugate", "load": "load", "arc": "arc"}
+LONGEST = 50.0  # step by arc length, over the first
 
 
 @dataclass(frozen=True)
@@ -31,14 +39,19 @@ class Record:
         The amplitude that varied ("" at the start).
     mode
         Of an instability that a reduced model excludes: "antisymmetric" to the mirror plane of a
-        half shell, or "m = 7" waves around an axisymmetric one. Such a record comes last, at its
-        place on the path.
+        half shell, or "m = 7" waves around an axisymmetric one. They are looked for at the first
+        instability of the model itself, before which such a record comes, and at the end.
+        Of a bifurcation in the model itself: "symmetric" if the load changes alike in both
+        directions of the branch (a pitchfork), or "asymmetric".
+    branch
+        0 on the path itself, 1 and 2 in the two directions of the branch at its first bifurcation.
     """
 
     label: Label
     amplitude: str
     point: Point
     mode: str = ""
+    branch: int = 0
 
 
 class Stopped(RuntimeError):
@@ -54,8 +67,8 @@ def follow(scene: Scene) -> Iterator[Record]:
         If the path is lost, or the field alone makes the shell unstable.
     """
     state = scene.unloaded()
-    factors = scene.newton.factor_at(state)
-    yield Record("start", "", Point(state, 0.0, 0.0 * state.u, 0.0, factors.negative_pivots, 0, 1))
+    pivots = scene.newton.factor_at(state).negative_pivots
+    yield Record("start", "", Point(state, 0.0, 0.0 * state.u, 0.0, pivots, pivots, 0, 1))
     loading = scene.case.loading
     if isinstance(loading, FieldSection):
         yield from _field_as_load(scene, loading, state)
@@ -73,22 +86,13 @@ def follow(scene: Scene) -> Iterator[Record]:
 
 
 def _field(scene: Scene, state: State) -> Iterator[Record]:
-    """The field, up to lambda_m; where it makes the shell unstable, the critical field is located."""
-    target = scene.case.lambda_m
-    path = Path(scene.newton, "lambda_m", "load", StepOptions(abs(target) / 2, abs(target), abs(target) * 1e-4))
-    points, trouble = [path.start(state)], False
-    try:
-        for point, _ in path.towards(points[0], [target]):
-            if trouble := point.negative_pivots > 0:
-                break
-            points.append(point)
-            yield Record("field", "lambda_m", point)
-    except PathStopped:
-        trouble = True
-    instability = None
-    search = _to_critical_field(scene, points[-1].state) if trouble else _excluded(scene, path, points)
-    for instability in search:
-        yield instability
+    """The field, up to lambda_m; where it makes the shell unstable, the critical field."""
+    target, instability = scene.case.lambda_m, None
+    path, start = _begin(scene, "lambda_m", "arc", state, target / 2, target)
+    for record in _followed(scene, path, start, Goal("limit", [target])):
+        located = record.label in ("fold", "bifurcation")
+        instability = instability or (record if located else None)
+        yield record if located else replace(record, label="field")
     if instability is not None:
         raise Stopped(
             f"the field alone makes the shell unstable: critical field lambda_m = "
@@ -96,64 +100,41 @@ def _field(scene: Scene, state: State) -> Iterator[Record]:
         )
 
 
-def _to_critical_field(scene: Scene, state: State) -> Iterator[Record]:
-    """From a stable state under part of the field to the first instability in lambda_m."""
-    target, system = scene.case.lambda_m, scene.newton.system
-    part = 0.1 * abs(target)
-    path = Path(scene.newton, "lambda_m", "load", StepOptions(part, part, 1e-5 * part))
-    if max_abs(system.comm, system.load(state.u, "lambda_m")) > 0:  # else the field does no work to control by
-        path = Path(scene.newton, "lambda_m", "conjugate", path.options)
-        first = part / abs(path.start(state).dmu)
-        path.options = StepOptions(first, 2 * first, 1e-5 * first)
-    yield from _until_limit(scene, path, path.start(state), float(np.copysign(np.inf, target)))
-
-
 def _field_as_load(scene: Scene, loading: FieldSection, state: State) -> Iterator[Record]:
     target = scene.case.lambda_m
-    part = abs(target) / loading.points
-    path = Path(scene.newton, "lambda_m", "load", StepOptions(part, part, 1e-5 * part))
-    if loading.until == "target":
-        yield from _through(scene, path, path.start(state), _divided(0.0, target, loading.points))
-    elif loading.control == "load":
-        yield from _until_limit(scene, path, path.start(state), float(np.copysign(np.inf, target)))
-    else:
-        yield from _to_critical_field(scene, state)
+    path, start = _begin(scene, "lambda_m", CONTROLS[loading.control], state, target / loading.points, target)
+    targets = _divided(0.0, target, loading.points) if loading.until == "target" else []
+    yield from _followed(scene, path, start, _goal(loading, targets, "load", target), branches=loading)
 
 
 def _pressure(scene: Scene, loading: PressureSection, state: State) -> Iterator[Record]:
-    material = scene.plan.material
-    if loading.control == "load":
-        path = Path(scene.newton, "pressure", "load", StepOptions(0.1, 0.2, 1e-6))
-        start, end = path.start(state), loading.pressure
-    else:
-        path = Path(scene.newton, "pressure", "conjugate", StepOptions(1.0, 1.0, 1.0))
-        start, end = path.start(state), loading.volume_change
-        first = abs(0.1 / start.dmu)  # as long as a tenth of p_c is at the start
-        path.options = StepOptions(first, 2 * first, 1e-5 * first)
-        if end is not None:
-            end *= -material.classical_pressure / material.h / scene.model.multiplicity
-    if end is None:
-        yield from _until_limit(scene, path, start)
-    else:
-        yield from _through(scene, path, start, _divided(start.s, end, loading.points))
+    path, start = _begin(scene, "pressure", CONTROLS[loading.control], state, 0.1)
+    targets: list[float] = []
+    if loading.pressure is not None:
+        targets = _divided(0.0, loading.pressure, loading.points)
+    elif loading.volume_change is not None:
+        unit = -scene.plan.material.classical_pressure / scene.plan.material.h / scene.model.multiplicity
+        now = -scene.newton.system.potential(state.u, "pressure")
+        targets = _divided(now, loading.volume_change * unit, loading.points)
+    quantity: Quantity = "load" if loading.pressure is not None else "conjugate"
+    yield from _followed(scene, path, start, _goal(loading, targets, quantity), branches=loading)
 
 
 def _indentation(scene: Scene, loading: IndentationSection, state: State) -> Iterator[Record]:
-    h, model = scene.plan.material.h, scene.model
-    if loading.control == "load":
-        assert loading.force is not None
-        size = abs(loading.force) / loading.points
-        path = Path(scene.newton, "force", "load", StepOptions(size, size, 1e-5 * size))
-        targets = _divided(0.0, loading.force, loading.points)
-    else:
-        assert loading.depth is not None
-        unit = model.force_unit * h  # of -Pi_F = F w at F R/(2 pi D) = 1, w = h
-        path = Path(scene.newton, "force", "conjugate", StepOptions(unit, 2 * unit, 1e-3 * unit))
-        targets = _divided(0.0, unit * loading.depth, loading.points)
-    start = path.start(state)
-    # the field may have moved the point past the first targets already
-    forward = [t for t in targets if (t - start.s) * targets[-1] > 0]
-    yield from _through(scene, path, start, forward)
+    unit = scene.model.force_unit * scene.plan.material.h  # of -Pi_F = F w at F R/(2 pi D) = 1, w = h
+    asked = next((value for value in (loading.force, loading.depth) if value is not None), 1.0)
+    quantity: Quantity = "conjugate" if loading.force is None else "load"
+    first = asked / loading.points if loading.control == "load" else float(np.copysign(1.0, asked))
+    path, start = _begin(scene, "force", CONTROLS[loading.control], state, first)
+    if loading.control == "displacement":
+        path.options = StepOptions(unit, 2 * unit, 1e-3 * unit)
+    targets: list[float] = []
+    if loading.until == "target":
+        end = asked if quantity == "load" else unit * asked
+        # the field may have moved the point past the first targets already
+        now = 0.0 if quantity == "load" else -scene.newton.system.potential(state.u, "force")
+        targets = [t for t in _divided(0.0, end, loading.points) if (t - now) * end > 0]
+    yield from _followed(scene, path, start, _goal(loading, targets, quantity, asked), branches=loading)
 
 
 def _rotation(scene: Scene, loading: RotationSection, state: State) -> Iterator[Record]:
@@ -166,16 +147,18 @@ def _rotation(scene: Scene, loading: RotationSection, state: State) -> Iterator[
         scene.newton.system = chord = Along(
             system, "turn", state.mu, {name: value - state.mu[name] for name, value in end.items()}
         )
-        path = Path(scene.newton, "turn", "load", StepOptions(1.0, 1.0, 1e-4))
-        here = path.start(State(state.u, {**state.mu, "turn": 0.0}))
+        label: Label = "start"
         try:
-            for point, reached in path.towards(here, [1.0]):
+            path, start = _begin(scene, "turn", "arc", State(state.u, {**state.mu, "turn": 0.0}), 1.0)
+            for label, point in Walk(path, start, Goal("limit", [1.0])):
                 state = State(point.state.u, chord.expand(point.state.mu))
-                yield Record("target" if reached else "step", "angle", replace(point, state=state))
+                yield Record(label, "angle", replace(point, state=state))
         except PathStopped as e:
             raise Stopped(f"the turning field stopped before {np.degrees(angle):.4g} degrees: {e}") from None
         finally:
             scene.newton.system = system
+        if label != "target":
+            raise Stopped(f"the turning field makes the shell unstable before {np.degrees(angle):.4g} degrees: {label}")
         if isinstance(modes, AntisymmetricModes) and modes.factor_at(state).negative_pivots:
             raise Stopped(f"an antisymmetric instability lies before {np.degrees(angle):.4g} degrees of the field")
 
@@ -185,70 +168,108 @@ def _divided(start: float, end: float, points: int) -> list[float]:
     return [float(t) for t in np.linspace(start, end, points + 1)[1:]]
 
 
-def _until_limit(scene: Scene, path: Path, start: Point, end: float = np.inf) -> Iterator[Record]:
-    """Accepted points in the direction of `end` up to the first instability."""
-    points, options = [start], path.options
+def _begin(
+    scene: Scene, name: str, control: Control, state: State, first: float, scale: float = 1.0
+) -> tuple[Path, Point]:
+    """A path from a state; its first step changes the amplitude by about `first`."""
+    path = Path(scene.newton, name, control, StepOptions(1.0, 1.0, 1.0), abs(scale), scene.journal)
+    start = path.start(state, first)
+    step = abs(first / start.dmu)
+    path.options = StepOptions(step, (LONGEST if control == "arc" else 2) * step, 1e-5 * step)
+    return path, start
+
+
+def _goal(loading: PathSection, targets: Sequence[float], quantity: Quantity, sense: float = 1.0) -> Goal:
+    steps = loading.points if loading.until == "points" else MOST_STEPS
+    return Goal(loading.until, targets, quantity, steps, sense)
+
+
+def _followed(
+    scene: Scene, path: Path, start: Point, goal: Goal, branches: PathSection | None = None
+) -> Iterator[Record]:
+    """A walk, what the reduced model excludes on it, and the branches if they are asked for."""
+    walk, crossing, lost = Walk(path, start, goal), None, ""
+    excluded, checked = None, start
     try:
-        while True:
-            for point, _ in path.towards(points[-1], [end]):
-                if point.negative_pivots > start.negative_pivots:
-                    break
-                if len(points) > MOST_POINTS:
-                    raise Stopped(f"no instability found in {MOST_POINTS} steps; {_where(path, point)}")
-                points.append(point)
-                yield Record("step", path.name, point)
-            try:
-                found = locate(path, points[-1], point)
-                break
-            except PathStopped:  # the step had left the branch: come nearer in shorter ones
-                path.options = replace(path.options, first=abs(point.s - points[-1].s) / 4)
-                if path.options.first < options.smallest:
-                    raise
+        for label, point in walk:
+            mode = ""
+            if label in ("fold", "bifurcation") and checked is start:  # which came first?
+                checked, excluded = point, _excluded(scene, path, [*walk.points, point])
+                if excluded:
+                    yield excluded
+            if label == "bifurcation":
+                here = branching(_by_arc(scene, path), point)
+                crossing = crossing or here
+                mode = ("symmetric" if here.symmetric else "asymmetric") if here else ""
+            yield Record(label, path.name, point, mode)
     except PathStopped as e:
-        raise Stopped(_why(path, e, None)) from None
-    yield Record(found.kind, path.name, found.point)
-    yield from _excluded(scene, path, [*points, found.point])
+        lost = _why(path, e, walk.points)
+        if path.control == "load" and (found := _fold_ahead(scene, path, walk.points)):
+            yield found
+            lost = f"load control cannot pass the fold at {path.name} = {found.point.state.mu[path.name]:.9g}; {lost}"
+    if not excluded and checked is not walk.points[-1]:
+        excluded = _excluded(scene, path, walk.points)
+        if excluded:
+            yield excluded
+    if lost:
+        raise Stopped(lost)
+    if branches and branches.branches and crossing:
+        yield from _branches(scene, path, crossing, goal, branches.points)
 
 
-def _through(scene: Scene, path: Path, start: Point, targets: list[float]) -> Iterator[Record]:
-    """Accepted points through all targets, with the first instability on the way located."""
-    before, here, points = None, start, [start]
+def _branches(scene: Scene, path: Path, crossing: Branching, goal: Goal, steps: int) -> Iterator[Record]:
+    """Both directions of a branch, to the same target as the path or for a number of steps."""
+    lost = []
+    if goal.until != "target":
+        goal = Goal("points", steps=steps)
+    for number, start in enumerate(crossing.starts, 1):
+        by_arc = _by_arc(scene, path)
+        walk = Walk(by_arc, start, goal)
+        yield Record("step", path.name, start, branch=number)
+        try:
+            for label, point in walk:
+                yield Record(label, path.name, point, branch=number)
+        except PathStopped as e:
+            lost.append(f"branch {number}: {_why(by_arc, e, walk.points)}")
+    if lost:
+        raise Stopped("; ".join(lost))
+
+
+def _by_arc(scene: Scene, path: Path) -> Path:
+    """The same path by arc length, in steps as long as the one off it at a bifurcation."""
+    scale = path.metric.scale
+    return Path(scene.newton, path.name, "arc", StepOptions(0.1, LONGEST * 0.1, 1e-6), scale, scene.journal)
+
+
+def _fold_ahead(scene: Scene, path: Path, points: list[Point]) -> Record | None:
+    """The fold that ended a path under load control, by arc length from its last point."""
+    onward = points[-1].s - points[-2].s if len(points) > 1 else 1.0
+    by_arc, start = _begin(scene, path.name, "arc", points[-1].state, onward, path.metric.scale)
     try:
-        for point, reached in path.towards(start, targets):
-            if here.negative_pivots == 0 < point.negative_pivots and path.control == "conjugate":
-                found = locate(path, here, point)
-                yield Record(found.kind, path.name, found.point)
-            before, here = here, point
-            points.append(point)
-            yield Record("target" if reached else "step", path.name, point)
-        yield from _excluded(scene, path, points)
-    except PathStopped as e:
-        raise Stopped(_why(path, e, before)) from None
+        *_, (label, point) = Walk(by_arc, start, Goal("limit", steps=20))
+    except PathStopped:
+        return None
+    return Record(label, path.name, point) if label == "fold" else None
 
 
-def _excluded(scene: Scene, path: Path, points: list[Point]) -> Iterator[Record]:
+def _excluded(scene: Scene, path: Path, points: list[Point]) -> Record | None:
     """The first instability among the modes that a reduced model does not see, if there is one."""
     modes = scene.model.excluded_modes
     try:
         found = modes.first_instability(path, points) if modes else None
     except PathStopped as e:
         raise Stopped(f"a mode that the reduced model excludes is unstable, but where is not known: {e}") from None
-    if found:
-        mode, point = found
-        yield Record("bifurcation", path.name, point, mode)
+    return Record("bifurcation", path.name, found[1], found[0]) if found else None
 
 
-def _where(path: Path, point: Point) -> str:
-    return f"the last point has {path.name} = {point.state.mu[path.name]:.6g}"
-
-
-def _why(path: Path, stop: PathStopped, before: Point | None) -> str:
+def _why(path: Path, stop: PathStopped, points: list[Point]) -> str:
     """What the user reads when a path is lost, with the fold in the control named if it is one."""
     here = stop.point
-    said = f"{_where(path, here)}: {stop}"
+    said = f"the last point has {path.name} = {here.state.mu[path.name]:.6g}: {stop}"
     if path.control == "load":
-        return f"load control stopped; {said}. Past a limit point only displacement or volume control can follow"
-    if before is None or before.dmu == here.dmu:
+        return f"load control stopped; {said}. Past a limit point only control: arc or by displacement can follow"
+    before = points[-2] if len(points) > 1 else here
+    if path.control == "arc" or before.dmu == here.dmu:
         return f"the controlled path stopped; {said}"
     # near a fold in the controlled s, (ds/dmu)^2 falls linearly to zero with s
     a, b = before.dmu**-2, here.dmu**-2
@@ -256,6 +277,6 @@ def _why(path: Path, stop: PathStopped, before: Point | None) -> str:
     if 0 < ahead / (here.s - before.s) < 10:
         return (
             f"the path turns back in the controlled displacement, {ahead / here.s:.2%} beyond the last point: "
-            f"a fold that displacement control cannot pass; {said}"
+            f"a fold that displacement control cannot pass, but control: arc can; {said}"
         )
     return f"the controlled path stopped; {said}"

@@ -13,6 +13,7 @@ from magshell_fenicsx.mesh.midsurface import Midsurface, distribute
 from magshell_fenicsx.mesh.triangulation import triangulate
 from magshell_fenicsx.plan import Plan, make_plan, meridian_vertices
 from magshell_fenicsx.shell.model import ShellModel
+from magshell_fenicsx.solve.journal import Journal, NoJournal
 from magshell_fenicsx.solve.newton import BorderedNewton
 from magshell_fenicsx.solve.system import State
 
@@ -26,6 +27,8 @@ class Scene:
         What was asked for, and what was made of it.
     model, newton
         The shell as a system of terms, and the solver of its bordered systems.
+    journal
+        Keeps what the solver finds, for a run that is interrupted; set by whoever runs the scene.
     setup_s
         Seconds of building, without compiling kernels.
     """
@@ -39,6 +42,7 @@ class Scene:
         else:
             self.model = build_model(case, self.plan, comm)
         self.newton = BorderedNewton(self.model.system)
+        self.journal: Journal = NoJournal()
         self.setup_s = time.perf_counter() - start - self.model.kernels.seconds
 
     @property

@@ -57,11 +57,12 @@ def first_circumferential_instability(waves: Waves, path: Path, points: Sequence
     if after == 0:
         return min(candidates, key=lambda m: waves.critical_eigenvalue(high.state, m)), high
     low = points[after - 1]
+    high = path.seen_from(low, high)
     found = {low.s: low, high.s: high}
 
     def margins(s: float) -> dict[int, float]:
         if s not in found:
-            point = path.at(s, path.predict(s, low, high))
+            point = path.at(s, path.between(s, low, high), low)
             if isinstance(point, str):
                 raise PathStopped(f"locating a circumferential instability: {point}", low)
             found[s] = point

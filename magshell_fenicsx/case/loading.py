@@ -1,5 +1,6 @@
-"""The mechanical load, applied after the field, and how it is controlled."""
+"""The mechanical load, applied after the field, how it is controlled, and where its path ends."""
 
+from collections.abc import Mapping
 from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
@@ -7,34 +8,65 @@ from pydantic import Field, model_validator
 from magshell_fenicsx.case.base import Section
 from magshell_fenicsx.case.fields import Direction
 
+Until = Literal["limit", "bifurcation", "target", "points"]
+Wanted = Mapping[str, tuple[str, ...]]  # control -> the targets that it can have
 
-class PressureSection(Section):
+
+class PathSection(Section):
+    """What every load that is followed along a path has in common.
+
+    `until: limit` ends at the first instability, `bifurcation` at the first bifurcation (through folds),
+    `target` at the target, in `points` equal parts (by arc length: rows at these parts), `points` after
+    that many steps by arc length. `branches: true` follows both directions of the branch at the first
+    bifurcation too, to the target or for `points` steps.
+    """
+
+    until: Until
+    points: int = Field(default=10, ge=1, le=10000)
+    branches: bool = False
+
+    def _check(self, control: str, until: Until, targets: Mapping[str, float | None], wanted: Wanted) -> None:
+        """One target that fits the control with `until: target`, none elsewhere."""
+        given, fitting = [key for key, value in targets.items() if value is not None], wanted[control]
+        for key in given:
+            if not targets[key]:
+                raise ValueError(f"{key} is a target and must not be zero")
+        if until == "target" and (len(given) != 1 or given[0] not in fitting):
+            names = " or ".join(fitting) or "another control"
+            raise ValueError(f"until: target with control: {control} needs {names} (and nothing else) as target")
+        if until in ("limit", "bifurcation") and given:
+            raise ValueError(f"{given[0]} is a target: it goes with until: target")
+        if until == "points" and control != "arc":
+            raise ValueError("until: points counts steps by arc length: it goes with control: arc")
+
+
+class PressureSection(PathSection):
     """Live pressure, p > 0 from outside."""
 
     kind: Literal["pressure"]
-    control: Literal["volume", "load"] = "volume"
-    until: Literal["limit", "target"] = "limit"
+    control: Literal["volume", "load", "arc"] = "volume"
+    until: Until = "limit"
     pressure: float | None = Field(default=None, description="target p/p_c", ge=-1e3, le=1e3)
     volume_change: float | None = Field(default=None, description="target Delta V/R^3", ge=-5, le=5)
-    points: int = Field(default=10, ge=1, le=10000)
 
     @model_validator(mode="after")
     def _target_fits_control(self) -> Self:
-        wanted = {"load": "pressure", "volume": "volume_change"}[self.control]
-        given = [key for key in ("pressure", "volume_change") if getattr(self, key) is not None]
-        if self.until == "target" and given != [wanted]:
-            raise ValueError(f"until: target with control: {self.control} needs {wanted} (and nothing else) as target")
-        if self.until == "limit" and given:
-            raise ValueError(f"{given[0]} is a target: it goes with until: target")
+        wanted = {"load": ("pressure",), "volume": ("volume_change",), "arc": ("pressure", "volume_change")}
+        targets = {"pressure": self.pressure, "volume_change": self.volume_change}
+        self._check(self.control, self.until, targets, wanted)
         return self
 
 
-class IndentationSection(Section):
-    """A dead force along the undeformed normal at one point."""
+class IndentationSection(PathSection):
+    """A dead force along the undeformed normal at one point.
+
+    With `until: points` a depth may be given that the mesh shall be fine enough for.
+    """
 
     kind: Literal["indentation"]
     at: Direction
-    control: Literal["displacement", "load"] = "displacement"
+    control: Literal["displacement", "load", "arc"] = "displacement"
+    until: Until = "target"
     depth: float | None = Field(default=None, description="target w/h at the load", ge=-1e4, le=1e4)
     force: float | None = Field(default=None, description="target F R/(2 pi D)", ge=-1e6, le=1e6)
     points: int = Field(default=20, ge=1, le=10000)
@@ -42,28 +74,26 @@ class IndentationSection(Section):
 
     @model_validator(mode="after")
     def _target_fits_control(self) -> Self:
-        wanted, other = ("depth", "force") if self.control == "displacement" else ("force", "depth")
-        if not getattr(self, wanted) or getattr(self, other) is not None:
-            raise ValueError(f"control: {self.control} needs {wanted} (not zero), and no {other}")
+        wanted = {"load": ("force",), "displacement": ("depth",), "arc": ("depth", "force")}
+        self._check(self.control, self.until, {"depth": self.depth, "force": self.force}, wanted)
         return self
 
 
-class FieldSection(Section):
+class FieldSection(PathSection):
     """The field itself is the load: lambda_m from zero, with its instabilities located.
 
-    `until: target` ends at magnetic.lambda_m; `until: limit` goes on in its direction to the first
-    instability. control: conjugate follows the path through a fold of lambda_m.
+    `until: target` ends at magnetic.lambda_m, the others go on in its direction. By default the path
+    is followed by arc length, through folds of lambda_m.
     """
 
     kind: Literal["field"]
-    control: Literal["conjugate", "load"] = "conjugate"
-    until: Literal["limit", "target"] = "target"
-    points: int = Field(default=10, ge=1, le=10000)
+    control: Literal["load", "arc"] = "arc"
+    until: Until = "target"
 
     @model_validator(mode="after")
-    def _target_is_a_load(self) -> Self:
-        if self.until == "target" and self.control != "load":
-            raise ValueError("until: target needs control: load, for its target is lambda_m")
+    def _steps_are_by_arc_length(self) -> Self:
+        if self.until == "points" and self.control != "arc":
+            raise ValueError("until: points counts steps by arc length: it goes with control: arc")
         return self
 
 

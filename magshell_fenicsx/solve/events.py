@@ -1,5 +1,6 @@
-"""Locating the first instability between two points of a path: a fold or a bifurcation."""
+"""Locating the instabilities between two points of a path: folds and bifurcations."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Literal, Protocol
 
@@ -11,6 +12,7 @@ from magshell_fenicsx.solve.path import Path, PathStopped, Point
 from magshell_fenicsx.solve.system import State, Vector, dot
 
 MOST_STEPS = 60  # bisection alone halves a bracket so often that nothing is left of it
+MOST_HALVINGS = 12  # of a step that holds several instabilities; what is left counts as one
 
 
 class Stability(Protocol):
@@ -34,8 +36,8 @@ class Instability:
     kind: Literal["fold", "bifurcation"]
 
 
-def locate(path: Path, stable: Point, unstable: Point, tolerance: float = 1e-8) -> Instability:
-    """The first singular point between two points with different inertia.
+def instabilities(path: Path, low: Point, high: Point, tolerance: float = 1e-8) -> Iterator[Instability]:
+    """All singular points between two successive points that their inertia and tangents tell, in order.
 
     Parameters
     ----------
@@ -47,48 +49,94 @@ def locate(path: Path, stable: Point, unstable: Point, tolerance: float = 1e-8) 
     PathStopped
         If Newton fails between two points that it had found.
     """
-    low, high = stable, unstable
-    work = _Work()
-    while low.dmu * high.dmu < 0 and high.negative_pivots - low.negative_pivots > 1:
-        middle = work.solve(path, (low.s + high.s) / 2, low, high)
-        low, high = (low, middle) if middle.negative_pivots > stable.negative_pivots else (middle, high)
-    if low.dmu * high.dmu < 0:
-        return Instability(work.add_to(_fold(path, low, high, tolerance, work)), "fold")
-    return Instability(locate_bifurcation(path, low, high, path.newton, tolerance), "bifurcation")
+    search = _Search(path, low, tolerance)
+    yield from search.between(low, path.seen_from(low, high), MOST_HALVINGS)
 
 
 @dataclass
-class _Work:
-    """Iterations and factorisations spent while locating."""
+class _Search:
+    """Work between two points, the first of which is the base of every solve.
 
+    `iterations` and `factorisations` are those since the last located point.
+    """
+
+    path: Path
+    base: Point
+    tolerance: float
     iterations: int = 0
     factorisations: int = 0
 
-    def solve(self, path: Path, s: float, low: Point, high: Point) -> Point:
-        found = path.at(s, _between(path, s, low, high))
+    def between(self, low: Point, high: Point, halvings: int) -> Iterator[Instability]:
+        change = abs(high.negative_pivots - low.negative_pivots)
+        turned = low.dmu * high.dmu < 0
+        if change == 0 and not turned:
+            return
+        single = change == 1 or not halvings
+        if single and turned:
+            yield Instability(self.told(self.fold(low, high)), "fold")
+        elif single:
+            yield Instability(self.told(self.bifurcation(low, high, self.path.newton)), "bifurcation")
+        else:
+            middle = self.solve((low.s + high.s) / 2, low, high)
+            yield from self.between(low, middle, halvings - 1)
+            yield from self.between(middle, high, halvings - 1)
+
+    def solve(self, s: float, low: Point, high: Point) -> Point:
+        found = self.path.at(s, self.path.between(s, low, high), self.base)
         if isinstance(found, str):
             raise PathStopped(f"locating an instability: {found}", low)
         self.iterations += found.iterations
         self.factorisations += found.factorisations
         return found
 
-    def add_to(self, point: Point) -> Point:
-        return replace(point, iterations=self.iterations, factorisations=self.factorisations)
+    def told(self, point: Point) -> Point:
+        spent = replace(point, iterations=self.iterations, factorisations=self.factorisations)
+        self.iterations = self.factorisations = 0
+        return spent
 
+    def fold(self, low: Point, high: Point) -> Point:
+        """Zero of dmu/ds: stationary point of the cubic through both ends, repeated."""
+        name = self.path.name
+        for _ in range(MOST_STEPS):
+            s = _stationary(low, high, name)
+            point = self.solve(s, low, high)
+            mu = point.state.mu[name]
+            other = high if point.dmu * low.dmu > 0 else low
+            curvature = (other.dmu - point.dmu) / (other.s - point.s)
+            if abs(point.dmu**2 / (2 * curvature)) <= self.tolerance * abs(mu):
+                return point
+            low, high = (point, high) if point.dmu * low.dmu > 0 else (low, point)
+        return point
 
-def _fold(path: Path, low: Point, high: Point, tolerance: float, work: _Work) -> Point:
-    """Zero of dmu/ds: stationary point of the cubic through both ends, repeated."""
-    name = path.name
-    for _ in range(MOST_STEPS):
-        s = _stationary(low, high, name)
-        point = work.solve(path, s, low, high)
-        mu = point.state.mu[name]
-        other = high if point.dmu * low.dmu > 0 else low
-        curvature = (other.dmu - point.dmu) / (other.s - point.s)
-        if abs(point.dmu**2 / (2 * curvature)) <= tolerance * abs(mu):
-            return point
-        low, high = (point, high) if point.dmu * low.dmu > 0 else (low, point)
-    return point
+    def bifurcation(self, low: Point, high: Point, stability: Stability) -> Point:
+        """Where the eigenvalue that changes sign is zero, by the Illinois variant of regula falsi.
+
+        It ends when two successive guesses agree to the tolerance's power 3/4 (the order of the method
+        is 1.44): the eigenvalue itself drowns in rounding before it is zero.
+        """
+        path, comm, side = self.path, self.path.system.comm, 0
+        first = critical_mode(stability, low.state, comm)
+        a, b = first.eigenvalue, critical_mode(stability, high.state, comm).eigenvalue
+        agreed, last = self.tolerance**0.75, np.inf
+        for _ in range(MOST_STEPS):
+            # the eigenvalue nearest to zero need not be the one that changes sign
+            t = a / (a - b) if a * b < 0 else 0.5
+            point = self.solve(low.s + t * (high.s - low.s), low, high)
+            mu = point.state.mu[path.name]
+            if abs(point.s - last) * abs(point.dmu) <= agreed * abs(mu) and a * b < 0:
+                return point
+            if abs(high.s - low.s) * abs(point.dmu) <= self.tolerance * abs(mu):
+                return point
+            last, mode = point.s, critical_mode(stability, point.state, comm)
+            if mode.negative_pivots != first.negative_pivots:
+                high, b = point, mode.eigenvalue
+                a = a / 2 if side == 1 else a
+                side = 1
+            else:
+                low, a = point, mode.eigenvalue
+                b = b / 2 if side == -1 else b
+                side = -1
+        return point
 
 
 def _stationary(low: Point, high: Point, name: str) -> float:
@@ -105,12 +153,12 @@ def _stationary(low: Point, high: Point, name: str) -> float:
 def locate_bifurcation(
     path: Path, stable: Point, unstable: Point, stability: Stability, tolerance: float = 1e-8
 ) -> Point:
-    """Where the eigenvalue that changes sign is zero, by the Illinois variant of regula falsi.
+    """Where a tangent other than the path's own becomes singular, between two successive points.
 
     Parameters
     ----------
     stability
-        Whose tangent is watched: the path's own, or that of modes which the model excludes.
+        Whose tangent is watched: that of modes which the model excludes.
     tolerance
         Of the amplitude, relative.
 
@@ -119,29 +167,8 @@ def locate_bifurcation(
     PathStopped
         If Newton fails between two points that it had found.
     """
-    low, high, work, side = stable, unstable, _Work(), 0
-    comm = path.system.comm
-    first = critical_mode(stability, low.state, comm)
-    a, b = first.eigenvalue, critical_mode(stability, high.state, comm).eigenvalue
-    for _ in range(MOST_STEPS):
-        t = a / (a - b) if a > 0 > b else 0.5
-        point = work.solve(path, low.s + t * (high.s - low.s), low, high)
-        mode = critical_mode(stability, point.state, comm)
-        value = mode.eigenvalue
-        mu = point.state.mu[path.name]
-        slope = (b - a) / (high.s - low.s)
-        error = abs(value / slope * point.dmu) if a > 0 > b else np.inf
-        if min(error, abs((high.s - low.s) * point.dmu)) <= tolerance * abs(mu):
-            return work.add_to(point)
-        if mode.negative_pivots > first.negative_pivots:
-            high, b = point, value
-            a = a / 2 if side == 1 else a
-            side = 1
-        else:
-            low, a = point, value
-            b = b / 2 if side == -1 else b
-            side = -1
-    return work.add_to(point)
+    search = _Search(path, stable, tolerance)
+    return search.told(search.bifurcation(stable, path.seen_from(stable, unstable), stability))
 
 
 @dataclass(frozen=True)
@@ -162,14 +189,3 @@ def critical_mode(stability: Stability, state: State, comm: MPI.Comm, iterations
         w = factors.solve(v)
         value, v = 1 / dot(comm, v, w), w
     return CriticalMode(value, v / np.sqrt(dot(comm, v, v)), factors.negative_pivots)
-
-
-def _between(path: Path, s: float, low: Point, high: Point) -> State:
-    """Hermite cubic through both ends, as first guess."""
-    L = high.s - low.s
-    t = (s - low.s) / L
-    h00, h10, h01, h11 = 2 * t**3 - 3 * t**2 + 1, t**3 - 2 * t**2 + t, 3 * t**2 - 2 * t**3, t**3 - t**2
-    u = h00 * low.state.u + h01 * high.state.u + L * (h10 * low.du + h11 * high.du)
-    mu_low, mu_high = low.state.mu[path.name], high.state.mu[path.name]
-    mu = h00 * mu_low + h01 * mu_high + L * (h10 * low.dmu + h11 * high.dmu)
-    return low.state.with_(u, path.name, float(mu))

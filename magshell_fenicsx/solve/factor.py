@@ -66,6 +66,8 @@ class Factorisation:
         pc.setFactorSetUpSolverType()
         F = pc.getFactorMatrix()
         F.setMumpsIcntl(24, 1)  # null pivots are reported, without it there is no inertia
+        F.setMumpsCntl(3, -1e-100)  # but only true zeros count as null: else the null vector would be lost at a fold,
+        F.setMumpsCntl(5, 1e-17)  # and those are made tiny, for the same reason
         if self._comm.size > 1:
             F.setMumpsIcntl(13, 1)  # the root front too must be counted, so it is not left to ScaLAPACK
         F.setMumpsIcntl(14, 50)

@@ -1,17 +1,18 @@
-"""Following an equilibrium path by load or by conjugate displacement, with adaptive steps."""
+"""Following an equilibrium path by load, by conjugate displacement or by arc length, with adaptive steps."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from math import sqrt
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 
-from magshell_fenicsx.solve.control import GivenConjugate, GivenLoad, Row
+from magshell_fenicsx.solve.control import GivenConjugate, GivenLoad, Hyperplane, Metric, Row
+from magshell_fenicsx.solve.journal import Journal, NoJournal
 from magshell_fenicsx.solve.newton import BorderedNewton
 from magshell_fenicsx.solve.system import State, Vector, dot
 
-Control = Literal["load", "conjugate"]
+Control = Literal["load", "conjugate", "arc"]
+SEEN = 1e-6  # a displacement that counts, in lengths of the system
 
 
 @dataclass(frozen=True)
@@ -21,11 +22,13 @@ class Point:
     Attributes
     ----------
     s
-        The controlled quantity: mu, or the conjugate displacement -Pi_i(u).
+        The controlled quantity: mu, the conjugate displacement -Pi_i(u), or the arc length.
     du, dmu
         Tangent of the path, d(u, mu)/ds.
     negative_pivots
         Number of unstable directions at fixed amplitudes.
+    negative_pivots_held
+        The same with the conjugate displacement held instead of the amplitude.
     iterations, factorisations
         Work since the point before.
     """
@@ -35,8 +38,13 @@ class Point:
     du: Vector
     dmu: float
     negative_pivots: int
+    negative_pivots_held: int
     iterations: int = 0
     factorisations: int = 0
+
+    def per(self, rate: float) -> "Point":
+        """The same with its tangent over `rate`."""
+        return replace(self, du=np.asarray(self.du / rate), dmu=self.dmu / rate)
 
 
 @dataclass(frozen=True)
@@ -49,9 +57,13 @@ class StepOptions:
         Step lengths in units of s.
     easy, hard
         Newton iterations below which a step grows, and above which it shrinks.
+    straight
+        Cosine between the tangents of successive points above which a step grows.
     turn
         Least cosine between the tangents of successive points; a sharper turn is
         taken for a jump to another branch and tried again with a smaller step.
+    gap
+        Largest part of a step that the tangents at its ends may leave unexplained, likewise.
     """
 
     first: float
@@ -59,7 +71,9 @@ class StepOptions:
     smallest: float
     easy: int = 6
     hard: int = 12
+    straight: float = 0.9
     turn: float = 0.5
+    gap: float = 0.5
 
 
 class PathStopped(RuntimeError):
@@ -78,26 +92,68 @@ class Path:
     name
         The amplitude that varies.
     control
-        "load": s is the amplitude; "conjugate": s is the displacement conjugate to it.
+        What s is. "load": the amplitude; "conjugate": the displacement conjugate to it;
+        "arc": the arc length in a `Metric`, along the tangent of the point before.
+    scale
+        An amplitude that counts as of order one in the arc length.
+    journal
+        Keeps every result of `at`, and gives back those of an interrupted run.
     """
 
-    def __init__(self, newton: BorderedNewton, name: str, control: Control, options: StepOptions) -> None:
+    def __init__(
+        self,
+        newton: BorderedNewton,
+        name: str,
+        control: Control,
+        options: StepOptions,
+        scale: float = 1.0,
+        journal: Journal | None = None,
+    ) -> None:
         self.newton, self.name, self.control, self.options = newton, name, control, options
         self.system = newton.system
+        self.metric = Metric(newton.system, scale)
+        self._journal = journal or NoJournal()
 
-    def start(self, state: State) -> Point:
-        """The point of a state that is in equilibrium already."""
-        factors = self.newton.factorisation.count
-        s = state.mu[self.name] if self.control == "load" else -self.system.potential(state.u, self.name)
-        return self._point(state, s, iterations=0, factors_before=factors)
+    def start(self, state: State, sense: float = 1.0) -> Point:
+        """The point of a state that is in equilibrium already.
 
-    def at(self, s: float, guess: State) -> Point | str:
-        """Solve for the point at `s`, or say why that failed."""
-        factors = self.newton.factorisation.count
-        outcome = self.newton.solve(guess, self.name, self._row(s))
-        if not outcome.converged:
-            return outcome.reason
-        return self._point(outcome.state, s, outcome.iterations, factors)
+        Parameters
+        ----------
+        sense
+            Of the arc length: the sign of dmu/ds.
+        """
+        du, softness, pivots = self._response(state)
+        if self.control == "load":
+            s, rate = state.mu[self.name], 1.0
+        elif self.control == "conjugate":
+            s, rate = -self.system.potential(state.u, self.name), softness
+        else:
+            s, rate = 0.0, float(np.copysign(self.metric.norm(du, 1.0), sense))
+        return Point(state, s, du, 1.0, pivots, pivots - (softness < 0)).per(rate)
+
+    def at(self, s: float, guess: State, base: Point) -> Point | str:
+        """Solve for the point at `s`, or say why that failed.
+
+        Parameters
+        ----------
+        base
+            The point whose tangent arc length is measured along.
+        """
+        if self.control == "load":
+            return self.solve(GivenLoad(s), s, guess)
+        if self.control == "conjugate":
+            return self.solve(GivenConjugate(self.system, self.name, s), s, guess)
+        row = Hyperplane(self.metric, self.name, base.state, (base.du, base.dmu), s - base.s)
+        return self.solve(row, s, guess)
+
+    def solve(self, row: Row, s: float, guess: State) -> Point | str:
+        """Solve for the point on which a row holds, or say why that failed; the tangent is per unit of the row."""
+        known = self._journal.replay()
+        if known is not None:
+            return known
+        found = self._solve(row, s, guess)
+        self._journal.record(found)
+        return found
 
     def towards(self, start: Point, targets: Sequence[float]) -> Iterator[tuple[Point, bool]]:
         """Accepted points through every target in turn; the flag tells the targets.
@@ -120,7 +176,8 @@ class Path:
                     if step < self.options.smallest:
                         raise PathStopped(found, here)
                     continue
-                if found.iterations <= self.options.easy:
+                straight = self._cosine(here, found) > self.options.straight
+                if found.iterations <= self.options.easy and straight:
                     step = min(max(step, 1.5 * length), self.options.largest)
                 elif found.iterations >= self.options.hard:
                     step = 0.6 * length
@@ -138,26 +195,70 @@ class Path:
             mu += weight * (before.state.mu[self.name] - here.state.mu[self.name] + b * here.dmu)
         return here.state.with_(u, self.name, mu)
 
+    def between(self, s: float, low: Point, high: Point) -> State:
+        """Hermite cubic through two points, as first guess."""
+        L, name = high.s - low.s, self.name
+        t = (s - low.s) / L
+        h00, h10, h01, h11 = 2 * t**3 - 3 * t**2 + 1, t**3 - 2 * t**2 + t, 3 * t**2 - 2 * t**3, t**3 - t**2
+        u = h00 * low.state.u + h01 * high.state.u + L * (h10 * low.du + h11 * high.du)
+        mu = h00 * low.state.mu[name] + h01 * high.state.mu[name] + L * (h10 * low.dmu + h11 * high.dmu)
+        return low.state.with_(u, name, float(mu))
+
+    def seen_from(self, base: Point, point: Point) -> Point:
+        """The point with its tangent per unit of s as measured at `base`."""
+        if self.control != "arc":
+            return point
+        return point.per(self.metric.inner((base.du, base.dmu), (point.du, point.dmu)))
+
     def _try(self, s: float, before: Point | None, here: Point) -> Point | str:
-        found = self.at(s, self.predict(s, before, here))
-        if isinstance(found, Point) and self._cosine(found, here) < self.options.turn:
+        found = self.at(s, self.predict(s, before, here), here)
+        if isinstance(found, str):
+            return found
+        if trouble := self._jumped(here, found):
+            return trouble
+        if self.control != "arc":
+            return found
+        return found.per(self.metric.norm(found.du, found.dmu))
+
+    def _jumped(self, here: Point, found: Point) -> str | None:
+        """Why a step is not trusted: its ends do not look like ends of one smooth arc."""
+        length = found.s - here.s
+        if abs(found.negative_pivots - here.negative_pivots) > 1 and abs(length) > self.options.first / 8:
+            return "the step passed several instabilities, or jumped to another branch"
+        chord = found.state.u - here.state.u
+        gap, whole = self._size(chord - length / 2 * (here.du + found.du)), self._size(chord)
+        if self._cosine(here, found) < self.options.turn or gap > max(self.options.gap * whole, SEEN):
             return "the path turns sharply, or the step jumped to another branch"
-        return found
+        return None
+
+    def _size(self, v: Vector) -> float:
+        return self.metric.norm(v, 0.0)
 
     def _cosine(self, a: Point, b: Point) -> float:
-        comm = self.system.comm
-        lengths = sqrt(dot(comm, a.du, a.du) * dot(comm, b.du, b.du))
-        return dot(comm, a.du, b.du) / lengths if lengths else 1.0  # an amplitude may move nothing
+        """Between the displacements of two tangents; 1 if the amplitude moves nothing there."""
+        lengths = self._size(a.du) * self._size(b.du)
+        if lengths < SEEN**2:
+            return 1.0
+        return self.metric.weight * dot(self.system.comm, a.du, b.du) / lengths
 
-    def _row(self, s: float) -> Row:
-        return GivenLoad(s) if self.control == "load" else GivenConjugate(self.system, self.name, s)
+    def _solve(self, row: Row, s: float, guess: State) -> Point | str:
+        before = self.newton.factorisation.count
+        outcome = self.newton.solve(guess, self.name, row)
+        if not outcome.converged:
+            return outcome.reason
+        x, softness, pivots = self._response(outcome.state)
+        c, d = row.gradient(outcome.state.u)
+        dmu = 1 / (d if c is None else d + dot(self.system.comm, c, x))
+        spent = self.newton.factorisation.count - before
+        return Point(outcome.state, s, dmu * x, dmu, pivots, pivots - (softness < 0), outcome.iterations, spent)
 
-    def _point(self, state: State, s: float, iterations: int, factors_before: int) -> Point:
-        factors = self.newton.factor_at(state)
+    def _response(self, state: State) -> tuple[Vector, float, int]:
+        """du/dmu at equilibrium, the conjugate displacement's dq/dmu, and the negative pivots.
+
+        Holding q instead of mu takes one unstable direction away where dq/dmu < 0 (Haynsworth's
+        inertia additivity: dq/dmu = R_mu . K^-1 R_mu is minus the Schur complement).
+        """
         load = self.system.load(state.u, self.name)
-        du = -factors.solve(load)
-        dmu = 1.0
-        if self.control == "conjugate":
-            dmu = -1.0 / dot(self.system.comm, load, du)
-            du = dmu * du
-        return Point(state, s, du, dmu, factors.negative_pivots, iterations, factors.count - factors_before)
+        factors = self.newton.factor_at(state)
+        x = -factors.solve(load)
+        return x, -dot(self.system.comm, load, x), factors.negative_pivots

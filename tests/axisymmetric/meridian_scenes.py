@@ -8,7 +8,7 @@ from magshell_fenicsx.axisymmetric.meridian import graded_vertices, make_meridia
 from magshell_fenicsx.axisymmetric.model import MeridianModel
 from magshell_fenicsx.mesh.sphere import Dimple, SphereEmbedding
 from magshell_fenicsx.shell.parameters import Condition, Force, Loads, Magnetisation, Material
-from magshell_fenicsx.solve.events import Instability, locate
+from magshell_fenicsx.solve.events import Instability, instabilities
 from magshell_fenicsx.solve.newton import BorderedNewton
 from magshell_fenicsx.solve.path import Path, Point, StepOptions
 from magshell_fenicsx.solve.system import State
@@ -66,7 +66,7 @@ def buckle(model: MeridianModel, lambda_m: float) -> Buckling:
     path.options = StepOptions(first, 2 * first, 1e-5 * first)
     for point, _ in path.towards(points[0], [np.inf]):
         if point.negative_pivots:
-            found = locate(path, points[-1], point)
+            found = next(instabilities(path, points[-1], point))
             return Buckling(path, [*points, found.point], found)
         points.append(point)
     raise AssertionError("towards infinity there is always a next point")

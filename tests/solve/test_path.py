@@ -8,7 +8,7 @@ import pytest
 from solve.toys import Toy, pitchfork, snap_through
 
 from magshell_fenicsx.solve.control import GivenConjugate, GivenLoad
-from magshell_fenicsx.solve.events import locate
+from magshell_fenicsx.solve.events import instabilities
 from magshell_fenicsx.solve.newton import BorderedNewton
 from magshell_fenicsx.solve.path import Control, Path, PathStopped, Point, StepOptions
 from magshell_fenicsx.solve.system import State
@@ -57,7 +57,7 @@ def test_fold_is_located(step: float) -> None:
         if high.negative_pivots:
             break
         low = high
-    found = locate(path, low, high, tolerance=1e-12)
+    (found,) = instabilities(path, low, high, tolerance=1e-12)
     assert found.kind == "fold"
     assert found.point.state.mu["load"] == pytest.approx(2 / (3 * np.sqrt(3)), rel=1e-10)
     assert found.point.s == pytest.approx(1 - 1 / np.sqrt(3), abs=1e-5)
@@ -70,7 +70,7 @@ def test_bifurcation_is_located(control: Control) -> None:
         if high.negative_pivots:
             break
         low = high
-    found = locate(path, low, high)
+    (found,) = instabilities(path, low, high)
     assert found.kind == "bifurcation"
     assert found.point.state.mu["load"] == pytest.approx(1.0, rel=1e-8)
     assert found.point.state.u[1] == pytest.approx(0.0, abs=1e-12)

@@ -62,3 +62,25 @@ def pitchfork(imperfection: float = 0.0) -> Toy:
         return np.array([[1.0, -v], [-v, 1 - u + 3 * v**2]])
 
     return Toy(gradient, hessian, 2)
+
+
+def snap_back(k: float, c: float) -> Toy:
+    """The arch behind a spring, and a column: q = u[0] is loaded, x = u[1] snaps through, v = u[2] bends.
+
+    Pi_0 = k (q - x)^2/2 + x^4/4 - x^3 + x^2 + (c - x) v^2/2 + v^4/4. With f = x^3 - 3x^2 + 2x:
+    load = f(x) and q = x + f/k where v = 0; folds in the load at x = 1 -+ 1/sqrt(3); folds in q, for
+    k < 1, at x = 1 -+ sqrt((1 - k)/3); a pitchfork at x = c, beyond which v^2 = x - c and
+    load = f(x) - (x - c)/2.
+    """
+
+    def gradient(u: Vector) -> Vector:
+        q, x, v = u
+        f = x**3 - 3 * x**2 + 2 * x
+        return np.array([k * (q - x), -k * (q - x) + f - v**2 / 2, (c - x) * v + v**3])
+
+    def hessian(u: Vector) -> Vector:
+        _, x, v = u
+        slope = 3 * x**2 - 6 * x + 2
+        return np.array([[k, -k, 0.0], [-k, k + slope, -v], [0.0, -v, c - x + 3 * v**2]])
+
+    return Toy(gradient, hessian, 3)

@@ -1,0 +1,77 @@
+"""The branches that cross a path at a bifurcation."""
+
+from dataclasses import dataclass
+from math import copysign
+
+import numpy as np
+
+from magshell_fenicsx.solve.along import PUSH, Pushed
+from magshell_fenicsx.solve.control import Hyperplane
+from magshell_fenicsx.solve.events import critical_mode
+from magshell_fenicsx.solve.path import Path, Point
+from magshell_fenicsx.solve.system import State, Vector, max_abs
+
+SIZES = 0.5, 2.0, 8.0  # of the first step off the path, in the system's length
+SEEN = 1e-4  # relative change of the amplitude that is no rounding error
+ODD = 0.1  # an asymmetric branch changes the amplitude this much more in one direction than in the other
+
+
+@dataclass(frozen=True)
+class Branching:
+    """Both directions of the branch at a bifurcation.
+
+    Attributes
+    ----------
+    symmetric
+        The amplitude rises, or falls, in both directions alike (a pitchfork).
+    starts
+        A point in each direction, its tangent leading away; arc length counts from it.
+    """
+
+    symmetric: bool
+    starts: tuple[Point, Point]
+
+
+def branching(path: Path, bifurcation: Point) -> Branching | None:
+    """Step off a path at a located bifurcation, along the null vector; None if Newton fails there.
+
+    Parameters
+    ----------
+    path
+        Controlled by arc length.
+    """
+    metric, name, state = path.metric, path.name, bifurcation.state
+    mode = critical_mode(path.newton, state, path.system.comm).vector
+    mode = np.asarray(mode * path.system.length / max_abs(path.system.comm, mode))
+    found = None
+    for size in SIZES:
+        starts = [_step_off(path, state, mode, signed) for signed in (size, -size)]
+        if starts[0] is None or starts[1] is None:
+            return found
+        rises = [point.state.mu[name] - state.mu[name] for point in starts if point]
+        symmetric = abs(rises[0] - rises[1]) <= ODD * abs(rises[0] + rises[1])
+        found = Branching(symmetric, (starts[0], starts[1]))
+        if max(map(abs, rises)) > SEEN * abs(state.mu[name]):
+            break
+    return found
+
+
+def _step_off(path: Path, state: State, mode: Vector, size: float) -> Point | None:
+    """The point of the branch at a distance along the null vector, its tangent leading away.
+
+    First the shell is pushed there along the null vector at the same amplitude, which is no singular
+    problem (the Lyapunov-Schmidt reduction); then the push is taken away and the amplitude given free.
+    """
+    metric, name, newton = path.metric, path.name, path.newton
+    row = Hyperplane(metric, name, state, (mode, 0.0), size * metric.inner((mode, 0.0), (mode, 0.0)))
+    newton.system = Pushed(path.system, mode)
+    try:
+        pushed = newton.solve(State(state.u + size * mode, {**state.mu, PUSH: 0.0}), PUSH, row)
+    finally:
+        newton.system = path.system
+    if not pushed.converged:
+        return None
+    found = path.solve(row, 0.0, State(pushed.state.u, state.mu))
+    if isinstance(found, str):
+        return None
+    return found.per(copysign(metric.norm(found.du, found.dmu), size))
