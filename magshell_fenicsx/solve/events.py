@@ -12,6 +12,7 @@ from magshell_fenicsx.solve.path import Path, PathStopped, Point
 from magshell_fenicsx.solve.system import State, Vector, dot
 
 MOST_STEPS = 60  # bisection alone halves a bracket so often that nothing is left of it
+FLAT = 0.01  # slope of the amplitude, over that at the step's start, that means a fold
 MOST_HALVINGS = 12  # of a step that holds several instabilities; what is left counts as one
 
 
@@ -75,7 +76,10 @@ class _Search:
         if single and turned:
             yield Instability(self.told(self.fold(low, high)), "fold")
         elif single:
-            yield Instability(self.told(self.bifurcation(low, high, self.path.newton)), "bifurcation")
+            point = self.bifurcation(low, high, self.path.newton)
+            if abs(point.dmu) < FLAT * abs(low.dmu):
+                raise PathStopped("the step passed a fold and left the branch", low)
+            yield Instability(self.told(point), "bifurcation")
         else:
             middle = self.solve((low.s + high.s) / 2, low, high)
             yield from self.between(low, middle, halvings - 1)

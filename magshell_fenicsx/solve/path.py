@@ -9,7 +9,7 @@ import numpy as np
 from magshell_fenicsx.solve.control import GivenConjugate, GivenLoad, Hyperplane, Metric, Row
 from magshell_fenicsx.solve.journal import Journal, NoJournal
 from magshell_fenicsx.solve.newton import BorderedNewton
-from magshell_fenicsx.solve.system import State, Vector, dot
+from magshell_fenicsx.solve.system import State, Vector, dot, max_abs
 
 Control = Literal["load", "conjugate", "arc"]
 SEEN = 1e-6  # a displacement that counts, in lengths of the system
@@ -73,7 +73,7 @@ class StepOptions:
     hard: int = 12
     straight: float = 0.9
     turn: float = 0.5
-    gap: float = 0.5
+    gap: float = 0.1
 
 
 class PathStopped(RuntimeError):
@@ -226,7 +226,8 @@ class Path:
         if abs(found.negative_pivots - here.negative_pivots) > 1 and abs(length) > self.options.first / 8:
             return "the step passed several instabilities, or jumped to another branch"
         chord = found.state.u - here.state.u
-        gap, whole = self._size(chord - length / 2 * (here.du + found.du)), self._size(chord)
+        unexplained = chord - length / 2 * (here.du + found.du)
+        gap, whole = (max_abs(self.system.comm, v) / self.system.length for v in (unexplained, chord))
         if self._cosine(here, found) < self.options.turn or gap > max(self.options.gap * whole, SEEN):
             return "the path turns sharply, or the step jumped to another branch"
         return None
