@@ -78,8 +78,9 @@ def test_bifurcation_is_located(control: Control) -> None:
 
 def test_imperfection_turns_the_pitchfork_into_a_stable_path() -> None:
     """The path bends away from the bifurcation: no instability, v^2 -> u - 1."""
-    path, start = path_of(pitchfork(imperfection=0.01), "conjugate", StepOptions(0.1, 0.2, 1e-6))
-    point = start
+    path, straight = path_of(pitchfork(imperfection=0.01), "conjugate", StepOptions(0.1, 0.2, 1e-6))
+    bent = path.newton.solve(straight.state, "load", GivenLoad(0.0))
+    point = start = path.start(bent.state)
     for point, _ in path.towards(start, [3.0]):
         assert point.negative_pivots == 0
     u, v = point.state.u
