@@ -3,12 +3,15 @@
     R(u) + mu R_mu(u) = 0      K du + R_mu dmu = -R
     g(u, mu)          = 0      c.du + d    dmu = -g
 
-One factorisation of K and two back-solves make a Newton step, whatever the last row.
+One factorisation of K and two back-solves make a Newton step, whatever the last row. The bordered
+matrix is kept while the residual falls, with Broyden's update on top (C. T. Kelley, Iterative
+Methods for Linear and Nonlinear Equations, SIAM 1995, algorithm brsol).
 The unknown vector is u with mu appended on the last rank.
 """
 
 import weakref
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -17,6 +20,10 @@ from petsc4py import PETSc
 from magshell_fenicsx.solve.control import Row
 from magshell_fenicsx.solve.factor import Factorisation
 from magshell_fenicsx.solve.system import State, System, Vector, dot, max_abs
+
+MOST_REFINEMENTS = 3
+DIFFERENCE = 1e-3  # lengths, of the differences that stand for K times a vector
+LEAST_REST = 0.3  # of a step: an update that would lengthen it more is not trusted
 
 
 @dataclass(frozen=True)
@@ -31,6 +38,8 @@ class NewtonOptions:
         Iterations after which a step is given up.
     contraction
         Factors are kept while an iteration lowers the residual at least by this factor.
+    fresh
+        Lengths between where factors were made and a solution whose tangent and inertia they still tell.
     largest_step
         An iteration that moves u by more than this many lengths is a divergence.
     """
@@ -38,6 +47,7 @@ class NewtonOptions:
     tolerance: float = 1e-9
     max_iterations: int = 25
     contraction: float = 0.3
+    fresh: float = 0.05
     largest_step: float = 1e4
 
 
@@ -51,13 +61,61 @@ class Outcome:
     reason: str
 
 
+@dataclass(frozen=True)
+class Response:
+    """The tangent of a path at a solution, per unit of its row.
+
+    Attributes
+    ----------
+    softness
+        dq/dmu of the conjugate displacement q.
+    """
+
+    du: Vector
+    dmu: float
+    softness: float
+    negative_pivots: int
+
+
 @dataclass
 class _Progress:
-    """Sizes of the successive steps and residuals of one solve."""
+    """Sizes of the successive steps and residuals of one solve, and the steps since its matrix was made."""
 
     steps: list[float] = field(default_factory=list)
     residuals: list[float] = field(default_factory=list)
-    factored: bool = False
+    taken: list[tuple[Vector, float]] = field(default_factory=list)
+    matrix: "_Bordered | None" = None
+
+
+class _Bordered:
+    """The bordered matrix at a state, by block elimination with the factors of K."""
+
+    def __init__(self, newton: "BorderedNewton", state: State, name: str, row: Row) -> None:
+        self._comm, self._factors = newton.system.comm, newton.factor_at(state)
+        self._c, self._d = row.gradient(state.u)
+        self.column = newton.system.load(state.u, name)
+        self._x2 = self._factors.solve(self.column)
+        self._weight = dot(self._comm, self._x2, self._x2)  # of dmu: the displacement that it makes
+
+    def solve(self, f: Vector, g: float) -> tuple[Vector, float]:
+        """(du, dmu) with K du + R_mu dmu = f and c.du + d dmu = g."""
+        x1 = self._factors.solve(f)
+        pull = 0.0, 0.0
+        if self._c is not None:
+            pull = dot(self._comm, self._c, x1), dot(self._comm, self._c, self._x2)
+        dmu = (g - pull[0]) / (self._d - pull[1])
+        return x1 - dmu * self._x2, dmu
+
+    def inner(self, a: tuple[Vector, float], b: tuple[Vector, float]) -> float:
+        return dot(self._comm, a[0], b[0]) + self._weight * a[1] * b[1]
+
+    def times(self, du: Vector, dmu: float) -> tuple[Vector, float]:
+        K = self._factors.matrix
+        v, w = K.createVecs()
+        v.setArray(du)
+        K.mult(v, w)
+        g = self._d * dmu + (dot(self._comm, self._c, du) if self._c is not None else 0.0)
+        return w.array + dmu * self.column, g
 
 
 class _Border:
@@ -146,6 +204,35 @@ class BorderedNewton:
             self._factored = state
         return self.factorisation
 
+    def response(self, state: State, name: str, row: Row, *, exact: bool = False) -> Response:
+        """The path's tangent at a solution: K du + R_mu dmu = 0, c.du + d dmu = 1.
+
+        Where the factors at hand were made near by, they serve, with the tangent mended by iterative
+        refinement against differences of the residual; `exact` factors K at the solution itself.
+        """
+        comm, near = self.system.comm, self._factored
+        moved = np.inf if near is None else max_abs(comm, state.u - near.u) / self.system.length
+        fresh = moved <= self.options.fresh and not exact
+        matrix = _Bordered(self, near if fresh and near else state, name, row)
+        du, dmu = matrix.solve(0.0 * state.u, 1.0)
+        load, (c, d) = self.system.load(state.u, name), row.gradient(state.u)
+        for _ in range(MOST_REFINEMENTS if moved and fresh else 0):
+            defect = 1.0 - d * dmu - (dot(comm, c, du) if c is not None else 0.0)
+            more, dmore = matrix.solve(-self._stiffness(state, du) - dmu * load, defect)
+            du, dmu = du + more, dmu + dmore
+            if max_abs(comm, more) <= 1e-3 * max_abs(comm, du):
+                break
+        return Response(du, dmu, -dot(comm, load, du) / dmu, self.factorisation.negative_pivots)
+
+    def _stiffness(self, state: State, du: Vector) -> Vector:
+        """K du by central differences of the residual."""
+        size = max_abs(self.system.comm, du)
+        if size == 0.0:
+            return du
+        small = DIFFERENCE * self.system.length / size
+        ahead, behind = (self.system.residual(state.u + sign * small * du, state.mu) for sign in (1, -1))
+        return np.asarray((ahead - behind) / (2 * small))
+
     def _function(self, x: PETSc.Vec, f: PETSc.Vec) -> None:
         u, mu = self._split(x)
         R = self.system.residual(u, {**self._guess.mu, self._name: mu})
@@ -153,38 +240,37 @@ class BorderedNewton:
         self._join(R, self._row.residual(u, mu), f)
 
     def _jacobian(self, x: PETSc.Vec, J: PETSc.Mat) -> None:
-        u, mu = self._split(x)
-        norms, known = self._progress.residuals, self._progress.factored
-        if not known or norms[-1] > self.options.contraction * norms[-2]:
-            self.factor_at(self._guess.with_(u, self._name, mu))
-            self._progress.factored = True
-        self._column = self.system.load(u, self._name)
-        self._c, self._d = self._row.gradient(u)
+        progress = self._progress
+        norms = progress.residuals
+        if progress.matrix is None or norms[-1] > self.options.contraction * norms[-2]:
+            u, mu = self._split(x)
+            progress.matrix = _Bordered(self, self._guess.with_(u, self._name, mu), self._name, self._row)
+            progress.taken.clear()
         J.assemble()
 
     def _apply(self, f: PETSc.Vec, y: PETSc.Vec) -> None:
-        """The Newton step (SNES subtracts it): block elimination with the factors at hand."""
-        comm, solve = self.system.comm, self.factorisation.solve
-        R, g = self._split(f)
-        if self._c is None:
-            dmu = g / self._d
-            du = solve(R - dmu * self._column)
-        else:
-            x1, x2 = solve(R), solve(self._column)
-            dmu = (g - dot(comm, self._c, x1)) / (self._d - dot(comm, self._c, x2))
-            du = x1 - dmu * x2
-        self._progress.steps.append(max_abs(comm, du) / self.system.length)
+        """The step (SNES subtracts it) with the matrix at hand and Broyden's update of it."""
+        progress, matrix = self._progress, self._progress.matrix
+        assert matrix is not None
+        du, dmu = matrix.solve(*self._split(f))
+        taken = progress.taken
+        for before, after in pairwise(taken):
+            part = matrix.inner(before, (du, dmu)) / matrix.inner(before, before)
+            du, dmu = du + part * after[0], dmu + part * after[1]
+        if taken:
+            rest = 1 - matrix.inner(taken[-1], (du, dmu)) / matrix.inner(taken[-1], taken[-1])
+            if rest > LEAST_REST:
+                du, dmu = du / rest, dmu / rest
+            else:
+                taken.clear()
+        taken.append((du, dmu))
+        progress.steps.append(max_abs(self.system.comm, du) / self.system.length)
         self._join(du, dmu, y)
 
     def _mult(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """The bordered matrix times a vector, for SNES's line searches and monitors."""
-        du, dmu = self._split(x)
-        K = self.factorisation.matrix
-        v, w = K.createVecs()
-        v.setArray(du)
-        K.mult(v, w)
-        g = self._d * dmu + (dot(self.system.comm, self._c, du) if self._c is not None else 0.0)
-        self._join(w.array + dmu * self._column, g, y)
+        assert self._progress.matrix is not None
+        self._join(*self._progress.matrix.times(*self._split(x)), y)
 
     def _test(self, iteration: int, norm: float) -> Any:
         Reason, o = PETSc.SNES.ConvergedReason, self.options

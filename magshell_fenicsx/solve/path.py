@@ -8,7 +8,7 @@ import numpy as np
 
 from magshell_fenicsx.solve.control import GivenConjugate, GivenLoad, Hyperplane, Metric, Row
 from magshell_fenicsx.solve.journal import Journal, NoJournal
-from magshell_fenicsx.solve.newton import BorderedNewton
+from magshell_fenicsx.solve.newton import BorderedNewton, Response
 from magshell_fenicsx.solve.system import State, Vector, dot, max_abs
 
 Control = Literal["load", "conjugate", "arc"]
@@ -56,7 +56,7 @@ class StepOptions:
     first, largest, smallest
         Step lengths in units of s.
     easy, hard
-        Newton iterations below which a step grows, and above which it shrinks.
+        Factorisations up to which a step grows, and from which it shrinks.
     straight
         Cosine between the tangents of successive points above which a step grows.
     turn
@@ -69,8 +69,8 @@ class StepOptions:
     first: float
     largest: float
     smallest: float
-    easy: int = 6
-    hard: int = 12
+    easy: int = 1
+    hard: int = 3
     straight: float = 0.9
     turn: float = 0.5
     gap: float = 0.1
@@ -122,14 +122,20 @@ class Path:
         sense
             Of the arc length: the sign of dmu/ds.
         """
-        du, softness, pivots = self._response(state)
+        response = self.newton.response(state, self.name, GivenLoad(0.0), exact=True)
         if self.control == "load":
             s, rate = state.mu[self.name], 1.0
         elif self.control == "conjugate":
-            s, rate = -self.system.potential(state.u, self.name), softness
+            s, rate = -self.system.potential(state.u, self.name), response.softness
         else:
-            s, rate = 0.0, float(np.copysign(self.metric.norm(du, 1.0), sense))
-        return Point(state, s, du, 1.0, pivots, pivots - (softness < 0)).per(rate)
+            s, rate = 0.0, float(np.copysign(self.metric.norm(response.du, 1.0), sense))
+        return self._point(state, s, response).per(rate)
+
+    def exact(self, point: Point) -> Point:
+        """The point with the inertia of its own tangent, not of one near by."""
+        pivots = self.newton.factor_at(point.state).negative_pivots
+        held = pivots - (point.negative_pivots - point.negative_pivots_held)
+        return replace(point, negative_pivots=pivots, negative_pivots_held=held)
 
     def at(self, s: float, guess: State, base: Point) -> Point | str:
         """Solve for the point at `s`, or say why that failed.
@@ -177,9 +183,9 @@ class Path:
                         raise PathStopped(found, here)
                     continue
                 straight = self._cosine(here, found) > self.options.straight
-                if found.iterations <= self.options.easy and straight:
+                if found.factorisations <= self.options.easy and straight:
                     step = min(max(step, 1.5 * length), self.options.largest)
-                elif found.iterations >= self.options.hard:
+                elif found.factorisations >= self.options.hard:
                     step = 0.6 * length
                 before, here = here, found
                 yield here, here.s == target
@@ -214,6 +220,8 @@ class Path:
         found = self.at(s, self.predict(s, before, here), here)
         if isinstance(found, str):
             return found
+        if found.negative_pivots != here.negative_pivots or found.dmu * here.dmu < 0:
+            found = self.exact(found)
         if trouble := self._jumped(here, found):
             return trouble
         if self.control != "arc":
@@ -247,19 +255,15 @@ class Path:
         outcome = self.newton.solve(guess, self.name, row)
         if not outcome.converged:
             return outcome.reason
-        x, softness, pivots = self._response(outcome.state)
-        c, d = row.gradient(outcome.state.u)
-        dmu = 1 / (d if c is None else d + dot(self.system.comm, c, x))
+        found = self._point(outcome.state, s, self.newton.response(outcome.state, self.name, row))
         spent = self.newton.factorisation.count - before
-        return Point(outcome.state, s, dmu * x, dmu, pivots, pivots - (softness < 0), outcome.iterations, spent)
+        return replace(found, iterations=outcome.iterations, factorisations=spent)
 
-    def _response(self, state: State) -> tuple[Vector, float, int]:
-        """du/dmu at equilibrium, the conjugate displacement's dq/dmu, and the negative pivots.
+    @staticmethod
+    def _point(state: State, s: float, response: Response) -> Point:
+        """Holding q instead of mu takes one unstable direction away where dq/dmu < 0.
 
-        Holding q instead of mu takes one unstable direction away where dq/dmu < 0 (Haynsworth's
-        inertia additivity: dq/dmu = R_mu . K^-1 R_mu is minus the Schur complement).
+        This is Haynsworth's inertia additivity: dq/dmu = R_mu . K^-1 R_mu is minus the Schur complement.
         """
-        load = self.system.load(state.u, self.name)
-        factors = self.newton.factor_at(state)
-        x = -factors.solve(load)
-        return x, -dot(self.system.comm, load, x), factors.negative_pivots
+        pivots = response.negative_pivots
+        return Point(state, s, response.du, response.dmu, pivots, pivots - (response.softness < 0))
