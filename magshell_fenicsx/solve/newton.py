@@ -21,7 +21,9 @@ from magshell_fenicsx.solve.control import Row
 from magshell_fenicsx.solve.factor import Factorisation
 from magshell_fenicsx.solve.system import State, System, Vector, dot, max_abs
 
-MOST_REFINEMENTS = 3
+Direction = tuple[Vector, float]  # (du, dmu)
+MOST_REFINEMENTS = 4
+REFINED = 1e-4  # relative error of a tangent
 DIFFERENCE = 1e-3  # lengths, of the differences that stand for K times a vector
 LEAST_REST = 0.3  # of a step: an update that would lengthen it more is not trusted
 
@@ -83,8 +85,12 @@ class _Progress:
 
     steps: list[float] = field(default_factory=list)
     residuals: list[float] = field(default_factory=list)
-    taken: list[tuple[Vector, float]] = field(default_factory=list)
+    taken: list[Direction] = field(default_factory=list)
     matrix: "_Bordered | None" = None
+
+
+def _sum(a: Direction, factor: float, b: Direction) -> Direction:
+    return a[0] + factor * b[0], a[1] + factor * b[1]
 
 
 class _Bordered:
@@ -97,7 +103,7 @@ class _Bordered:
         self._x2 = self._factors.solve(self.column)
         self._weight = dot(self._comm, self._x2, self._x2)  # of dmu: the displacement that it makes
 
-    def solve(self, f: Vector, g: float) -> tuple[Vector, float]:
+    def solve(self, f: Vector, g: float) -> Direction:
         """(du, dmu) with K du + R_mu dmu = f and c.du + d dmu = g."""
         x1 = self._factors.solve(f)
         pull = 0.0, 0.0
@@ -106,10 +112,10 @@ class _Bordered:
         dmu = (g - pull[0]) / (self._d - pull[1])
         return x1 - dmu * self._x2, dmu
 
-    def inner(self, a: tuple[Vector, float], b: tuple[Vector, float]) -> float:
+    def inner(self, a: Direction, b: Direction) -> float:
         return dot(self._comm, a[0], b[0]) + self._weight * a[1] * b[1]
 
-    def times(self, du: Vector, dmu: float) -> tuple[Vector, float]:
+    def times(self, du: Vector, dmu: float) -> Direction:
         K = self._factors.matrix
         v, w = K.createVecs()
         v.setArray(du)
@@ -207,22 +213,43 @@ class BorderedNewton:
     def response(self, state: State, name: str, row: Row, *, exact: bool = False) -> Response:
         """The path's tangent at a solution: K du + R_mu dmu = 0, c.du + d dmu = 1.
 
-        Where the factors at hand were made near by, they serve, with the tangent mended by iterative
-        refinement against differences of the residual; `exact` factors K at the solution itself.
+        Where the factors at hand were made near by, they serve, with the tangent refined against
+        differences of the residual; `exact` factors K at the solution itself.
         """
         comm, near = self.system.comm, self._factored
         moved = np.inf if near is None else max_abs(comm, state.u - near.u) / self.system.length
         fresh = moved <= self.options.fresh and not exact
         matrix = _Bordered(self, near if fresh and near else state, name, row)
-        du, dmu = matrix.solve(0.0 * state.u, 1.0)
-        load, (c, d) = self.system.load(state.u, name), row.gradient(state.u)
-        for _ in range(MOST_REFINEMENTS if moved and fresh else 0):
-            defect = 1.0 - d * dmu - (dot(comm, c, du) if c is not None else 0.0)
-            more, dmore = matrix.solve(-self._stiffness(state, du) - dmu * load, defect)
-            du, dmu = du + more, dmu + dmore
-            if max_abs(comm, more) <= 1e-3 * max_abs(comm, du):
-                break
+        tangent = matrix.solve(0.0 * state.u, 1.0)
+        load = self.system.load(state.u, name)
+        if moved and fresh:
+            refined = self._refined(matrix, tangent, state, load, row)
+            if refined is None:
+                return self.response(state, name, row, exact=True)
+            tangent = refined
+        du, dmu = tangent
         return Response(du, dmu, -dot(comm, load, du) / dmu, self.factorisation.negative_pivots)
+
+    def _refined(self, matrix: "_Bordered", t: Direction, state: State, load: Vector, row: Row) -> Direction | None:
+        """The tangent at a state from that of a matrix near by, by generalised conjugate residuals; None if too far."""
+        comm, (c, d) = self.system.comm, row.gradient(state.u)
+
+        def times(t: Direction) -> Direction:
+            g = d * t[1] + (dot(comm, c, t[0]) if c is not None else 0.0)
+            return matrix.solve(self._stiffness(state, t[0]) + t[1] * load, g)
+
+        z, known = _sum(t, -1.0, times(t)), list[tuple[Direction, Direction, float]]()
+        for _ in range(MOST_REFINEMENTS):
+            if max_abs(comm, z[0]) <= REFINED * max_abs(comm, t[0]):
+                return t
+            p, q = z, times(z)
+            for before, image, square in known:
+                part = matrix.inner(image, q) / square
+                p, q = _sum(p, -part, before), _sum(q, -part, image)
+            known.append((p, q, matrix.inner(q, q)))
+            part = matrix.inner(z, q) / known[-1][2]
+            t, z = _sum(t, part, p), _sum(z, -part, q)
+        return None
 
     def _stiffness(self, state: State, du: Vector) -> Vector:
         """K du by central differences of the residual."""
@@ -256,11 +283,11 @@ class BorderedNewton:
         taken = progress.taken
         for before, after in pairwise(taken):
             part = matrix.inner(before, (du, dmu)) / matrix.inner(before, before)
-            du, dmu = du + part * after[0], dmu + part * after[1]
+            du, dmu = _sum((du, dmu), part, after)
         if taken:
             rest = 1 - matrix.inner(taken[-1], (du, dmu)) / matrix.inner(taken[-1], taken[-1])
             if rest > LEAST_REST:
-                du, dmu = du / rest, dmu / rest
+                du, dmu = _sum((du, dmu), 1 / rest - 1, (du, dmu))
             else:
                 taken.clear()
         taken.append((du, dmu))
@@ -300,7 +327,7 @@ class BorderedNewton:
     def _join(self, u: Vector, mu: float, x: PETSc.Vec) -> None:
         x.setArray(np.append(u, mu) if self._last else u)
 
-    def _split(self, x: PETSc.Vec) -> tuple[Vector, float]:
+    def _split(self, x: PETSc.Vec) -> Direction:
         local = x.array_r
         mu = self.system.comm.bcast(float(local[-1]) if self._last else None, root=self.system.comm.size - 1)
         return local[: self.system.size].copy(), mu

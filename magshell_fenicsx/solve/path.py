@@ -191,15 +191,11 @@ class Path:
                 yield here, here.s == target
 
     def predict(self, s: float, before: Point | None, here: Point) -> State:
-        """Quadratic through the last two points with the last tangent (linear at the start)."""
-        a = s - here.s
-        u, mu = here.state.u + a * here.du, here.state.mu[self.name] + a * here.dmu
+        """Cubic through the last two points with their tangents (linear at the start)."""
         if before is not None:
-            b = here.s - before.s
-            weight = (a / b) ** 2
-            u = u + weight * (before.state.u - here.state.u + b * here.du)
-            mu += weight * (before.state.mu[self.name] - here.state.mu[self.name] + b * here.dmu)
-        return here.state.with_(u, self.name, mu)
+            return self.between(s, before, here)
+        a = s - here.s
+        return here.state.with_(here.state.u + a * here.du, self.name, here.state.mu[self.name] + a * here.dmu)
 
     def between(self, s: float, low: Point, high: Point) -> State:
         """Hermite cubic through two points, as first guess."""
