@@ -23,7 +23,7 @@ from magshell_fenicsx.solve.system import State, System, Vector, dot, max_abs
 
 Direction = tuple[Vector, float]  # (du, dmu)
 MOST_REFINEMENTS = 4
-REFINED = 1e-4  # relative error of a tangent
+REFINED, SIGN = 1e-4, 1e-2  # relative errors of a tangent's du and dmu
 DIFFERENCE = 1e-3  # lengths, of the differences that stand for K times a vector
 LEAST_REST = 0.3  # of a step: an update that would lengthen it more is not trusted
 
@@ -240,7 +240,7 @@ class BorderedNewton:
 
         z, known = _sum(t, -1.0, times(t)), list[tuple[Direction, Direction, float]]()
         for _ in range(MOST_REFINEMENTS):
-            if max_abs(comm, z[0]) <= REFINED * max_abs(comm, t[0]):
+            if max_abs(comm, z[0]) <= REFINED * max_abs(comm, t[0]) and abs(z[1]) <= SIGN * abs(t[1]):
                 return t
             p, q = z, times(z)
             for before, image, square in known:

@@ -69,8 +69,8 @@ class StepOptions:
     first: float
     largest: float
     smallest: float
-    easy: int = 1
-    hard: int = 3
+    easy: int = 2
+    hard: int = 4
     straight: float = 0.9
     turn: float = 0.5
     gap: float = 0.1
@@ -131,12 +131,6 @@ class Path:
             s, rate = 0.0, float(np.copysign(self.metric.norm(response.du, 1.0), sense))
         return self._point(state, s, response).per(rate)
 
-    def exact(self, point: Point) -> Point:
-        """The point with the inertia of its own tangent, not of one near by."""
-        pivots = self.newton.factor_at(point.state).negative_pivots
-        held = pivots - (point.negative_pivots - point.negative_pivots_held)
-        return replace(point, negative_pivots=pivots, negative_pivots_held=held)
-
     def at(self, s: float, guess: State, base: Point) -> Point | str:
         """Solve for the point at `s`, or say why that failed.
 
@@ -145,12 +139,7 @@ class Path:
         base
             The point whose tangent arc length is measured along.
         """
-        if self.control == "load":
-            return self.solve(GivenLoad(s), s, guess)
-        if self.control == "conjugate":
-            return self.solve(GivenConjugate(self.system, self.name, s), s, guess)
-        row = Hyperplane(self.metric, self.name, base.state, (base.du, base.dmu), s - base.s)
-        return self.solve(row, s, guess)
+        return self.solve(self._row(s, base), s, guess)
 
     def solve(self, row: Row, s: float, guess: State) -> Point | str:
         """Solve for the point on which a row holds, or say why that failed; the tangent is per unit of the row."""
@@ -217,7 +206,7 @@ class Path:
         if isinstance(found, str):
             return found
         if found.negative_pivots != here.negative_pivots or found.dmu * here.dmu < 0:
-            found = self.exact(found)
+            found = self._exact(found, self._row(s, here))
         if trouble := self._jumped(here, found):
             return trouble
         if self.control != "arc":
@@ -254,6 +243,18 @@ class Path:
         found = self._point(outcome.state, s, self.newton.response(outcome.state, self.name, row))
         spent = self.newton.factorisation.count - before
         return replace(found, iterations=outcome.iterations, factorisations=spent)
+
+    def _exact(self, point: Point, row: Row) -> Point:
+        """The point with the tangent and the inertia of its own K, not of one near by."""
+        found = self._point(point.state, point.s, self.newton.response(point.state, self.name, row, exact=True))
+        return replace(found, iterations=point.iterations, factorisations=point.factorisations + 1)
+
+    def _row(self, s: float, base: Point) -> Row:
+        if self.control == "load":
+            return GivenLoad(s)
+        if self.control == "conjugate":
+            return GivenConjugate(self.system, self.name, s)
+        return Hyperplane(self.metric, self.name, base.state, (base.du, base.dmu), s - base.s)
 
     @staticmethod
     def _point(state: State, s: float, response: Response) -> Point:
