@@ -15,6 +15,8 @@ class Factorisation:
     ----------
     count, stopwatch
         Factorisations done and the time spent on them.
+    solving
+        Time spent on solving with the factors.
     matrix
         The matrix last factored.
     negative_pivots
@@ -23,7 +25,7 @@ class Factorisation:
 
     def __init__(self, comm: MPI.Comm) -> None:
         self.count, self.negative_pivots = 0, 0
-        self.stopwatch = Stopwatch()
+        self.stopwatch, self.solving = Stopwatch(), Stopwatch()
         self._comm = comm
         self._pc: PETSc.PC | None = None
         self._rhs: PETSc.Vec | None = None
@@ -45,17 +47,20 @@ class Factorisation:
         if self._pc is None:
             self._pc = self._new_pc(K)
             self._rhs, self._solution = K.createVecs()
+        self._pc.setReusePreconditioner(False)
         self._pc.setOperators(K)
         self._pc.setUp()
+        self._pc.setReusePreconditioner(True)  # a solve must not factor anew when K was assembled again
         self.negative_pivots = self._pc.getFactorMatrix().getInertia()[0]
 
     def solve(self, rhs: Vector) -> Vector:
         """K^-1 rhs with the latest factors."""
         assert self._pc is not None
         assert self._rhs is not None
-        self._rhs.setArray(rhs)
-        self._pc.apply(self._rhs, self._solution)
-        return np.array(self._solution.array_r)
+        with self.solving:
+            self._rhs.setArray(rhs)
+            self._pc.apply(self._rhs, self._solution)
+            return np.array(self._solution.array_r)
 
     def _new_pc(self, K: PETSc.Mat) -> PETSc.PC:
         pc = PETSc.PC().create(self._comm)
