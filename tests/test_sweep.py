@@ -11,6 +11,8 @@ from conftest import CASES
 
 from magshell_fenicsx import CaseError, figures
 from magshell_fenicsx.figures import FIGURES
+from magshell_fenicsx.run import run
+from magshell_fenicsx.sweep import chain
 from magshell_fenicsx.sweep import sweep as module
 from magshell_fenicsx.sweep.axes import parse_axes
 from magshell_fenicsx.sweep.points import SweepPoint, make_points
@@ -33,13 +35,12 @@ def read(file: Path) -> list[dict[str, str]]:
 def computed(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """Pressures of the cases that a sweep really computes, in order."""
     done: list[float] = []
-    compute = module.compute
 
-    def counted(case):  # type: ignore[no-untyped-def]
+    def counted(case, comm):  # type: ignore[no-untyped-def]
         done.append(case.loading.pressure)
-        return compute(case)
+        return run(case, comm=comm)
 
-    monkeypatch.setattr(module, "compute", counted)
+    monkeypatch.setattr(chain, "run", counted)
     return done
 
 
@@ -180,6 +181,8 @@ def test_table_tells_knockdowns_and_reasons(tmp_path: Path) -> None:
     for row, k_d in ((none, 0.326233289), (positive, 0.552053778)):
         assert float(row["k_d"]) == float(row["p_over_pc"]) == pytest.approx(k_d, rel=3e-4)
         assert row["kind"] == "fold"
+        assert row["found"] in ("path", "fold")
+        assert int(row["factorisations"]) > 0
         assert row["stopped"] == ""
         assert int(row["dofs"]) > 100
         assert float(row["wall_s"]) > 0

@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from magshell_fenicsx.results.curve import AXES
-from magshell_fenicsx.sweep.axes import Axis
+from magshell_fenicsx.results.summary import OWN_MODES
+from magshell_fenicsx.sweep.axes import Axis, along
 from magshell_fenicsx.sweep.outcome import Outcome
 from magshell_fenicsx.sweep.points import SweepPoint, short
 
@@ -40,19 +41,19 @@ def draw_sweep(axes: Sequence[Axis], points: Sequence[SweepPoint], outcomes: Seq
 
 def _knockdowns(plot: Any, axes: Sequence[Axis], points: Sequence[SweepPoint], outcomes: Sequence[Outcome]) -> None:
     """k_d against the last axis with numbers; points without k_d are left out."""
-    along = next((axis for axis in reversed(axes) if axis.numbers), axes[-1])
+    axis = along(axes) or axes[-1]
     lines: dict[str, list[tuple[float | str, float]]] = {}
     for point, outcome in zip(points, outcomes, strict=True):
-        line = lines.setdefault(_label(point, along), [])
+        line = lines.setdefault(_label(point, axis), [])
         if outcome.knockdown is not None:
-            x = point.values[along.keys[0]]
-            line.append((float(x) if along.numbers else x, outcome.knockdown))
+            x = point.values[axis.keys[0]]
+            line.append((float(x) if axis.numbers else x, outcome.knockdown))
     for (label, line), style in zip(lines.items(), cycle(STYLES), strict=False):
         plot.plot(*zip(*line, strict=True), style, marker=".", label=label) if line else None
-    unit = UNITS.get(along.keys[0].split(".")[-1])
-    if along.numbers:
+    unit = UNITS.get(axis.keys[0].split(".")[-1])
+    if axis.numbers:
         plot.locator_params(axis="x", nbins=5)  # long numbers would touch
-    plot.set_xlabel(" = ".join(short(key) for key in along.keys) + (f"  ({unit})" if unit else ""))
+    plot.set_xlabel(" = ".join(short(key) for key in axis.keys) + (f"  ({unit})" if unit else ""))
     plot.set_ylabel(r"knockdown factor  $k_\mathrm{d}$")
 
 
@@ -72,10 +73,11 @@ def _curves(plot: Any, points: Sequence[SweepPoint], outcomes: Sequence[Outcome]
 def loaded(curve: Sequence["Row"], amplitude: str) -> list["Row"]:
     """The part of a curve in which an amplitude varied, from the point before on.
 
-    Instabilities of modes that the model excludes come last in a run, not in their order: they are left out.
+    Instabilities of modes that the model excludes are not in their order in a run: they are left out, as branches are.
     """
     first = next((i for i, row in enumerate(curve) if row["amplitude"] == amplitude), len(curve))
-    return [row for row in curve[max(first - 1, 0) :] if not row["mode"]] if first < len(curve) else []
+    part = curve[max(first - 1, 0) :] if first < len(curve) else []
+    return [row for row in part if row["mode"] in OWN_MODES and not row["branch"]]
 
 
 def _label(point: SweepPoint, without: Axis | None) -> str:

@@ -41,6 +41,11 @@ class Axis:
             return None
 
 
+def along(axes: Sequence[Axis]) -> Axis | None:
+    """The last axis with numbers: curves are drawn and folds are followed along it."""
+    return next((axis for axis in reversed(axes) if axis.numbers), None)
+
+
 def parse_axes(texts: Sequence[str]) -> list[Axis]:
     """Read all `--over` of a command line.
 

@@ -1,20 +1,28 @@
 """What a sweep keeps of a run, and its file."""
 
 import json
-import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 from uuid import uuid4
 
-from mpi4py import MPI
-
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.results.table import Row
-from magshell_fenicsx.run import run
+from magshell_fenicsx.run import Result
 
-CURVE = ("label", "amplitude", "p_over_pc", "lambda_m", "force", "w_over_h", "w_pole_over_h", "volume_change", "mode")
+CURVE = (
+    "label",
+    "amplitude",
+    "p_over_pc",
+    "lambda_m",
+    "force",
+    "w_over_h",
+    "w_pole_over_h",
+    "volume_change",
+    "mode",
+    "branch",
+)
+Found = Literal["path", "fold"]
 
 
 @dataclass(frozen=True)
@@ -31,6 +39,11 @@ class Outcome:
         Why the run ended before its target; None if it reached it.
     curve
         Every accepted point, with the columns of `CURVE`.
+    found
+        "path": by a run of its own; "fold": the fold of the point before was followed, and the curve
+        has only that.
+    factorisations
+        Of the model's tangent, attempts that failed included; without the modes that it excludes.
     """
 
     knockdown: float | None
@@ -39,23 +52,22 @@ class Outcome:
     dofs: int | None
     wall_s: float
     curve: list[Row]
+    found: Found
+    factorisations: int
 
 
-def compute(case: Case) -> Outcome:
-    """Run a case on this rank alone."""
-    start = time.perf_counter()
-    try:
-        found = run(case, comm=MPI.COMM_SELF)
-    except MeshError as e:
-        return Outcome(None, None, str(e), None, time.perf_counter() - start, [])
-    limits = sorted(found.limit_points, key=lambda p: p["amplitude"] != "pressure" or p["value"] != found.knockdown)
+def outcome_of(result: Result, found: Found, factorisations: int, wall_s: float) -> Outcome:
+    """What is kept of a run, or of a fold in the form of one."""
+    limits = sorted(result.limit_points, key=lambda p: p["amplitude"] != "pressure" or p["value"] != result.knockdown)
     return Outcome(
-        knockdown=found.knockdown,
+        knockdown=result.knockdown,
         limit=next(iter(limits), None),
-        stopped=found.stopped,
-        dofs=found.scene.model.system.dofs,
-        wall_s=round(time.perf_counter() - start, 3),
-        curve=[{key: row[key] for key in CURVE} for row in found.rows],
+        stopped=result.stopped,
+        dofs=result.scene.model.system.dofs,
+        wall_s=round(wall_s, 3),
+        curve=[{key: row[key] for key in CURVE} for row in result.rows],
+        found=found,
+        factorisations=factorisations,
     )
 
 

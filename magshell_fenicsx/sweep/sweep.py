@@ -11,8 +11,9 @@ from mpi4py import MPI
 from magshell_fenicsx.results.folder import prepare_folder
 from magshell_fenicsx.results.sweep_plot import draw_sweep
 from magshell_fenicsx.sweep.axes import Axis, parse_axes
+from magshell_fenicsx.sweep.chain import make_chains, run_chain
 from magshell_fenicsx.sweep.deal import deal
-from magshell_fenicsx.sweep.outcome import Outcome, compute, load, save
+from magshell_fenicsx.sweep.outcome import Outcome, load, save
 from magshell_fenicsx.sweep.points import SweepPoint, make_points
 from magshell_fenicsx.sweep.table import write_curves, write_sweep
 
@@ -42,8 +43,13 @@ def sweep(
     out: Path | str = "results/sweep",
     comm: MPI.Intracomm = MPI.COMM_WORLD,
     say: Callable[[str], None] = _print,
+    *,
+    full_paths: bool = False,
 ) -> Sweep:
     """Run a case at all points of a product; collective, every rank is a worker.
+
+    Where the result is a knockdown (`loading: {kind: pressure, until: limit}`), one path is followed
+    to its fold and then the fold along the last axis with numbers; see `Continuation`.
 
     Parameters
     ----------
@@ -53,6 +59,8 @@ def sweep(
         Folder of sweep.csv, sweep.png and points/; points that are there are kept.
     say
         Called with one line per finished point, on the rank that finished it.
+    full_paths
+        Follow a path of its own at every point.
 
     Raises
     ------
@@ -66,12 +74,13 @@ def sweep(
     missing: list[int] = comm.bcast(_missing(points, files) if comm.rank == 0 else None)
     if comm.rank == 0:
         say(f"{len(points)} points, {len(missing)} to compute on {comm.size} rank{'s' if comm.size > 1 else ''}")
+    chains = make_chains(axes, points, missing, full_paths=full_paths)
     try:
-        for number in deal(len(missing), comm):
-            point, result = points[missing[number]], files[missing[number]]
-            outcome = compute(point.case)
-            save(outcome, point.case, result)
-            say(f"{number + 1:4d}/{len(missing)}  {point.label}: {_said(outcome)}, {outcome.wall_s:.1f} s")
+        for chain in deal(len(chains), comm):
+            for number, outcome in run_chain(chains[chain]):
+                save(outcome, points[number].case, files[number])
+                place = f"{missing.index(number) + 1:4d}/{len(missing)}"
+                say(f"{place}  {points[number].label}: {_said(outcome)}, {outcome.wall_s:.1f} s")
     except BaseException:
         if comm.size == 1:
             raise
@@ -103,7 +112,7 @@ def _ready(out: Path) -> None:
 def _said(outcome: Outcome) -> str:
     found = "no limit point"
     if outcome.knockdown is not None:
-        found = f"k_d = {outcome.knockdown:.6f}"
+        found = f"k_d = {outcome.knockdown:.6f} ({outcome.found})"
     elif outcome.limit:
         found = f"{outcome.limit['kind']} at {outcome.limit['amplitude']} = {outcome.limit['value']:.6g}"
     return f"{found}, stopped early: {outcome.stopped}" if outcome.stopped else found

@@ -17,6 +17,8 @@ COLUMNS = (
     "amplitude",
     "value",
     "stopped",
+    "found",
+    "factorisations",
     "dofs",
     "wall_s",
     "point",
@@ -39,6 +41,8 @@ def sweep_row(outcome: Outcome) -> dict[str, Any]:
         "k_d": outcome.knockdown,
         **{key: limit.get(key) for key in ("p_over_pc", "w_pole_over_h", "kind", "mode", "amplitude", "value")},
         "stopped": outcome.stopped,
+        "found": outcome.found,
+        "factorisations": outcome.factorisations,
         "dofs": outcome.dofs,
         "wall_s": outcome.wall_s,
     }

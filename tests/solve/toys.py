@@ -42,24 +42,37 @@ class Toy:
         return self.K
 
 
-def snap_through() -> Toy:
-    """Shallow arch, load = u^3 - 3 u^2 + 2 u: folds at u = 1 -+ 1/sqrt(3), load +-2/(3 sqrt(3))."""
-    return Toy(lambda u: u**3 - 3 * u**2 + 2 * u, lambda u: np.array([3 * u**2 - 6 * u + 2]), 1)
+def snap_through(p: float = 0.0, length: float = 1.0) -> Toy:
+    """Shallow arch, load = x^3 - 3 x^2 + (2 + p) x with u = length x.
+
+    For p < 1 there are folds at x = 1 -+ sqrt((1 - p)/3); for p = 0 the load is +-2/(3 sqrt(3)) there.
+    """
+
+    def gradient(u: Vector) -> Vector:
+        x = u / length
+        return x**3 - 3 * x**2 + (2 + p) * x
+
+    def hessian(u: Vector) -> Vector:
+        x = u / length
+        return (3 * x**2 - 6 * x + 2 + p) / length
+
+    return Toy(gradient, hessian, 1, length)
 
 
-def pitchfork(imperfection: float = 0.0) -> Toy:
+def pitchfork(imperfection: float = 0.0, stiffening: float = 1.0) -> Toy:
     """u[0] shortens a column that bends by v = u[1] once u[0] passes 1: bifurcation at load 1.
 
-    Pi_0 = u^2/2 + (1 - u) v^2/2 + v^4/4 - imperfection v.
+    Pi_0 = u^2/2 + (1 - u) v^2/2 + stiffening v^4/4 - imperfection v. With the stiffening -1/2,
+    (1 - load) v - v^3 = imperfection: Koiter's fold at load = 1 - 3 (imperfection/2)^(2/3).
     """
 
     def gradient(x: Vector) -> Vector:
         u, v = x
-        return np.array([u - v**2 / 2, (1 - u) * v + v**3 - imperfection])
+        return np.array([u - v**2 / 2, (1 - u) * v + stiffening * v**3 - imperfection])
 
     def hessian(x: Vector) -> Vector:
         u, v = x
-        return np.array([[1.0, -v], [-v, 1 - u + 3 * v**2]])
+        return np.array([[1.0, -v], [-v, 1 - u + 3 * stiffening * v**2]])
 
     return Toy(gradient, hessian, 2)
 
