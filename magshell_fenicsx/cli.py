@@ -30,8 +30,9 @@ def _say(line: str) -> None:
 
 
 def _failure(message: str, code: int) -> typer.Exit:
-    if MPI.COMM_WORLD.rank == 0:
-        print(message, file=sys.stderr, flush=True)
+    if MPI.COMM_WORLD.rank:
+        return typer.Exit()  # at the first rank that fails mpirun ends the job, and may lose the message
+    print(message, file=sys.stderr, flush=True)
     return typer.Exit(code)
 
 
@@ -40,16 +41,28 @@ def run(
     case: CaseFile,
     set_: Settings = None,
     out: Annotated[Path | None, typer.Option(help="output folder; default results/<case name>/")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="go on with the run that was interrupted there")] = False,
+    time_limit: Annotated[
+        float | None, typer.Option(min=0, metavar="SECONDS", help="stop then, so that the run can be resumed")
+    ] = None,
 ) -> None:
     """Solve a case and write path.csv, summary.json, fields and pictures."""
     from magshell_fenicsx.mesh.patch import MeshError
+    from magshell_fenicsx.results.files import AlreadyComplete
+    from magshell_fenicsx.results.folder import DiskError
     from magshell_fenicsx.run import run as run_case
 
     folder = out or Path("results") / case.stem
     try:
-        result = run_case(Case.load(case, set_ or []), folder, say=_say)
+        settings = set_ or []
+        result = run_case(Case.load(case, settings), folder, say=_say, resume=resume, time_limit=time_limit)
     except (CaseError, MeshError) as e:
         raise _failure(str(e), INVALID) from None
+    except DiskError as e:
+        raise _failure(f"stopped early: {e}", STOPPED) from None
+    except AlreadyComplete as e:
+        _say(f"complete already: {e.summary['points']} points; results in {folder}/")
+        return
     if result.knockdown is not None:
         _say(f"knockdown factor k_d = {result.knockdown:.9g}")
     _say(f"results in {folder}/")

@@ -10,7 +10,7 @@ from conftest import CASES
 PLATE = CASES / "clamped_plate.yaml"
 COLUMNS = (
     "point,label,amplitude,p_over_pc,lambda_m,force,w_over_h,w_from_field_over_h,w_pole_over_h,volume_change,energy,"
-    "negative_pivots,iterations,factorisations,wall_s,stretching,bending,magnetic,U1,Uq,Utau,mode,field_angle"
+    "negative_pivots,iterations,factorisations,wall_s,stretching,bending,magnetic,U1,Uq,Utau,mode,field_angle,branch"
 )
 
 
@@ -29,6 +29,7 @@ def test_run_writes_everything(tmp_path: Path) -> None:
     kernels = summary["model"]["kernels"]
     assert not any("magnetic" in name for name in kernels)
     assert summary["model"]["forms"] == len(kernels)
+    assert not (out / "checkpoint").exists()
     rows = len(read_path(out))
     assert len(list((out / "fields").glob("*.vtu"))) == rows
     assert (out / "fields" / "path.pvd").read_text(encoding="utf-8").count("DataSet") == rows

@@ -1,11 +1,18 @@
 """The folder that results go to."""
 
-from collections.abc import Callable
+import fcntl
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from mpi4py import MPI
 
 from magshell_fenicsx.case.source import CaseError
+
+
+class DiskError(RuntimeError):
+    """A file could not be written; the message says which and why."""
 
 
 def prepare_folder(out: Path, comm: MPI.Comm, make: Callable[[Path], None]) -> Path:
@@ -26,3 +33,57 @@ def prepare_folder(out: Path, comm: MPI.Comm, make: Callable[[Path], None]) -> P
     if error:
         raise CaseError(error)
     return out
+
+
+@contextmanager
+def held_folder(out: Path, comm: MPI.Comm, make: bool) -> Iterator[None]:
+    """Keep other runs out of a folder inside `with`: ranks outlive a killed mpirun, for instance.
+
+    Parameters
+    ----------
+    make
+        Whether to make the folder, where there is none.
+
+    Raises
+    ------
+    CaseError
+        On every rank, if the folder cannot be made, or a run is writing to it.
+    """
+    number: list[int] = []
+
+    def hold(folder: Path) -> None:
+        if make:
+            folder.mkdir(parents=True, exist_ok=True)
+        number.append(os.open(folder, os.O_RDONLY))
+        try:
+            fcntl.flock(number[0], fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise BlockingIOError(0, "another run is writing to it") from None
+        except OSError:
+            pass  # a file system without locks
+
+    try:
+        prepare_folder(out, comm, hold)
+        yield
+    finally:
+        for n in number:
+            os.close(n)
+
+
+def by_first(comm: MPI.Comm, write: Callable[[], None]) -> None:
+    """Let rank 0 write, and tell all ranks if it cannot: a rank that left alone would keep the others waiting.
+
+    Raises
+    ------
+    DiskError
+        On every rank, if the disk is full for instance.
+    """
+    error = None
+    if comm.rank == 0:
+        try:
+            write()
+        except OSError as e:
+            error = f"{e.filename or 'the results'} cannot be written: {e.strerror or e}"
+    error = comm.bcast(error)
+    if error:
+        raise DiskError(error)

@@ -1,8 +1,12 @@
 """path.csv: one row per accepted point, on disk before the next point is sought."""
 
 import csv
-import os
+import io
+from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
+
+from magshell_fenicsx.results.durable import AppendedFile
 
 COLUMNS = (
     "point",
@@ -28,22 +32,51 @@ COLUMNS = (
     "Utau",
     "mode",
     "field_angle",
+    "branch",
 )
 Row = dict[str, float | int | str]
 
 
 class PathTable:
-    """Writes rows as they come."""
+    """Writes rows as they come, after those of an interrupted run.
+
+    Attributes
+    ----------
+    kept
+        The whole rows that the file had; what comes after them, torn by a kill, is cut off.
+    """
 
     def __init__(self, file: Path) -> None:
-        self._stream = file.open("w", newline="", encoding="utf-8")
-        self._writer = csv.DictWriter(self._stream, COLUMNS)
-        self._writer.writeheader()
+        lines = file.read_bytes().decode().splitlines(keepends=True) if file.exists() else []
+        self.kept: list[dict[str, str]] = []
+        header = _line(COLUMNS)
+        length = len(header) if lines[:1] == [header] else 0
+        for line in lines[1:] if length else []:
+            values = next(csv.reader([line]))
+            if not line.endswith("\n") or values[0] != str(len(self.kept)) or len(values) != len(COLUMNS):
+                break
+            self.kept.append(dict(zip(COLUMNS, values, strict=True)))
+            length += len(line.encode())
+        self._file = AppendedFile(file, length)
+        if not length:
+            self._file.append(header.encode())
 
     def write(self, row: Row) -> None:
-        self._writer.writerow({key: repr(v) if isinstance(v, float) else v for key, v in row.items()})
-        self._stream.flush()
-        os.fsync(self._stream.fileno())
+        """Add a row, unless the file has it.
+
+        Raises
+        ------
+        OSError
+            If the disk is full; the file ends with a whole row then.
+        """
+        if int(row["point"]) >= len(self.kept):
+            self._file.append(_line(repr(v) if isinstance(v := row[key], float) else v for key in COLUMNS).encode())
 
     def close(self) -> None:
-        self._stream.close()
+        self._file.close()
+
+
+def _line(values: Iterable[Any]) -> str:
+    stream = io.StringIO()
+    csv.writer(stream).writerow(values)
+    return stream.getvalue()

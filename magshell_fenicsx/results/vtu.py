@@ -4,7 +4,9 @@ from pathlib import Path
 
 import numpy as np
 import pyvista
+from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter  # type: ignore[import-untyped]
 
+from magshell_fenicsx.results.durable import write_whole
 from magshell_fenicsx.results.surface import LAGRANGE_TRIANGLE, TRIANGLE, Surface
 
 
@@ -24,19 +26,53 @@ def unstructured_grid(surface: Surface, h: float) -> pyvista.UnstructuredGrid:
 
 
 class FieldSeries:
-    """Writes `point_NNNN.vtu` files and keeps `path.pvd` complete after each."""
+    """Writes `point_NNNN.vtu` files and keeps `path.pvd` complete after each, also after an interrupted run.
+
+    Attributes
+    ----------
+    kept
+        Number of points from the first on whose files are there.
+    """
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self._names: list[tuple[int, str]] = []
         folder.mkdir(exist_ok=True)
+        self.kept = 0
+        while (folder / _name(self.kept)).exists():
+            self.kept += 1
+        self._numbers = list(range(self.kept))
+        if self.kept:
+            self._write_list()
 
     def write(self, number: int, surface: Surface, h: float) -> None:
-        name = f"point_{number:04d}.vtu"
-        unstructured_grid(surface, h).save(self._folder / name)
-        self._names.append((number, name))
-        rows = "\n".join(f'    <DataSet timestep="{n}" part="0" file="{f}"/>' for n, f in self._names)
-        (self._folder / "path.pvd").write_text(
+        """Write a point's file.
+
+        Raises
+        ------
+        OSError
+            If the disk is full; there is no such file then.
+        """
+        write_whole(self._folder / _name(number), _vtu(unstructured_grid(surface, h)))
+        self._numbers.append(number)
+        self._write_list()
+
+    def _write_list(self) -> None:
+        rows = "\n".join(f'    <DataSet timestep="{n}" part="0" file="{_name(n)}"/>' for n in self._numbers)
+        content = (
             '<?xml version="1.0"?>\n<VTKFile type="Collection" version="0.1">\n  <Collection>\n'
             f"{rows}\n  </Collection>\n</VTKFile>\n"
         )
+        write_whole(self._folder / "path.pvd", content.encode())
+
+
+def _name(number: int) -> str:
+    return f"point_{number:04d}.vtu"
+
+
+def _vtu(grid: pyvista.UnstructuredGrid) -> bytes:
+    """The file's content; VTK itself would pass over a full disk."""
+    writer = vtkXMLUnstructuredGridWriter()
+    writer.SetInputData(grid)
+    writer.WriteToOutputStringOn()
+    writer.Write()
+    return str(writer.GetOutputString()).encode()

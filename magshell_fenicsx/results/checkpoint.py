@@ -1,0 +1,161 @@
+"""DIR/checkpoint: the case, then every result of the solver, each on disk before the next is sought.
+
+Written by rank 0 alone and in one file, so that a full disk stops all ranks together: ADIOS2 (2.10, through
+adios4dolfinx 0.9.3) raises on one rank in `Close` then, and the others wait for it for ever.
+"""
+
+import json
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from dolfinx import fem
+from mpi4py import MPI
+
+from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.source import CaseError
+from magshell_fenicsx.results.durable import AppendedFile, write_whole
+from magshell_fenicsx.results.folder import by_first
+from magshell_fenicsx.results.frames import framed, read_frame
+from magshell_fenicsx.results.ordering import Array, Ordering
+from magshell_fenicsx.solve.path import Point
+from magshell_fenicsx.solve.system import State
+from magshell_fenicsx.version import __version__
+
+NAME = "checkpoint"
+
+
+def begin_checkpoint(file: Path, case: Case) -> None:
+    """Write an empty checkpoint."""
+    write_whole(file, framed(_identity(case)))
+
+
+def check_resumable(file: Path, case: Case) -> None:
+    """See that a checkpoint is one of this case and version.
+
+    Raises
+    ------
+    CaseError
+        If there is none, or it is of another.
+    """
+    try:
+        with file.open("rb") as stream:
+            head = read_frame(stream)
+    except FileNotFoundError:
+        head = None
+    if head is None:
+        raise CaseError(f"--resume: {file.parent} holds no checkpoint; run without --resume")
+    refuse_other(json.loads(head), case, file.parent)
+
+
+def refuse_other(saved: dict[str, Any], case: Case, folder: Path) -> None:
+    """See that what was saved is of this case and version.
+
+    Raises
+    ------
+    CaseError
+        With the first difference.
+    """
+    now = json.loads(_identity(case))
+    if saved != now:
+        raise CaseError(f"--resume: {folder} is of another run: {_difference(saved, now)}; run without --resume")
+
+
+class Checkpoint:
+    """The journal of a run in its folder; every rank calls, rank 0 reads and writes.
+
+    Parameters
+    ----------
+    file
+        As `begin_checkpoint` or an earlier run left it; an entry torn by a kill is cut off.
+    V
+        The displacement's space.
+    comm
+        Of all ranks of the program.
+
+    Attributes
+    ----------
+    replayed
+        Number of results that were taken from the file.
+    """
+
+    def __init__(self, file: Path, V: fem.FunctionSpace, comm: MPI.Comm) -> None:
+        self._file, self._comm, self.replayed = file, comm, 0
+        self._writing: AppendedFile | None = None
+        places = None
+        if comm.rank == 0:
+            self._reading = file.open("rb")
+            read_frame(self._reading)
+            content = read_frame(self._reading)
+            places = None if content is None else np.frombuffer(content).reshape(-1, 3)
+        self._ordering = Ordering(V, comm, places)
+        self._replaying = comm.bcast(places is not None)
+        if not self._replaying:
+            self._append(self._ordering.places.tobytes())
+
+    def replay(self) -> Point | str | None:
+        """The next result of the file; None from its end on."""
+        if not self._replaying:
+            return None
+        content = self._comm.bcast(read_frame(self._reading) if self._comm.rank == 0 else None)
+        if content is None:
+            self._replaying = False
+            return None
+        self.replayed += 1
+        return self._decoded(content)
+
+    def record(self, found: Point | str) -> None:
+        """Put a result on disk."""
+        if isinstance(found, str):
+            self._append(json.dumps({"failure": found}).encode())
+            return
+        u, du = (self._ordering.gather(v) for v in (found.state.u, found.du))
+        self._append(_encoded(found, u, du))
+
+    def close(self) -> None:
+        if self._comm.rank == 0:
+            self._reading.close()
+            if self._writing:
+                self._writing.close()
+
+    def remove(self) -> None:
+        """Take the file away: the run is complete."""
+        if self._comm.rank == 0:
+            self._file.unlink()
+        self._comm.Barrier()
+
+    def _append(self, content: bytes) -> None:
+        def write() -> None:
+            if self._writing is None:  # what comes after the last whole entry is torn
+                self._writing = AppendedFile(self._file, self._reading.tell())
+            self._writing.append(framed(content))
+
+        by_first(self._comm, write)
+
+    def _decoded(self, content: bytes) -> Point | str:
+        text, _, data = content.partition(b"\n")
+        known = json.loads(text)
+        if "failure" in known:
+            return str(known["failure"])
+        u, du = (self._ordering.scatter(v) for v in np.split(np.frombuffer(data), 2))
+        return Point(State(u, known.pop("mu")), du=du, **known)
+
+
+def _encoded(point: Point, u: Array, du: Array) -> bytes:
+    """A line of JSON with the numbers of a point, then both vectors."""
+    numbers = {f.name: getattr(point, f.name) for f in fields(point) if f.name not in ("state", "du")}
+    return json.dumps({**numbers, "mu": point.state.mu}).encode() + b"\n" + u.tobytes() + du.tobytes()
+
+
+def _identity(case: Case) -> bytes:
+    return json.dumps({"version": __version__, "case": case.model_dump(mode="json", exclude_none=True)}).encode()
+
+
+def _difference(there: Any, here: Any, key: str = "") -> str:
+    """The first key with different values, and both."""
+    if isinstance(there, dict) and isinstance(here, dict):
+        name = next(name for name in {**there, **here} if there.get(name) != here.get(name))
+        return _difference(there.get(name), here.get(name), f"{key}.{name}".removeprefix(".").removeprefix("case."))
+    said = ["nothing" if value is None else json.dumps(value) for value in (there, here)]
+    return f"{key} is {said[0]} there and {said[1]} here"

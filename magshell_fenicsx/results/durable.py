@@ -1,0 +1,72 @@
+"""Files that a kill, a crash or a full disk leaves readable."""
+
+import os
+from pathlib import Path
+
+
+def write_whole(file: Path, content: bytes) -> None:
+    """Write a file so that there is at every moment the whole of the old one or of the new one.
+
+    Raises
+    ------
+    OSError
+        With the file's name; the old file is as it was.
+    """
+    unfinished = file.with_name(file.name + ".unfinished")
+    try:
+        stream = AppendedFile(unfinished, 0)
+        try:
+            stream.append(content)
+        finally:
+            stream.close()
+        unfinished.replace(file)
+        sync_folder(file.parent)
+    except OSError as e:
+        unfinished.unlink(missing_ok=True)
+        raise OSError(e.errno, e.strerror, str(file)) from None
+
+
+def sync_folder(folder: Path) -> None:
+    """Put the names in a folder on disk."""
+    number = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(number)
+    finally:
+        os.close(number)
+
+
+class AppendedFile:
+    """A file that grows by whole pieces.
+
+    Parameters
+    ----------
+    length
+        Bytes of an existing file to keep; None keeps all.
+    """
+
+    def __init__(self, file: Path, length: int | None = None) -> None:
+        self._file = file
+        self._stream = file.open("ab", buffering=0)
+        self._length = self._stream.seek(0, os.SEEK_END) if length is None else length
+        self._stream.truncate(self._length)
+
+    def append(self, content: bytes) -> None:
+        """Add a piece and wait until it is on disk.
+
+        Raises
+        ------
+        OSError
+            With the file's name; the file is as long as it was.
+        """
+        left = memoryview(content)
+        try:
+            while left:
+                left = left[self._stream.write(left) :]
+            os.fsync(self._stream.fileno())
+        except OSError as e:
+            self._stream.truncate(self._length)
+            raise OSError(e.errno, e.strerror, str(self._file)) from None
+        self._length += len(content)
+
+    def close(self) -> None:
+        self._stream.close()

@@ -1,0 +1,208 @@
+"""The output folder of one run."""
+
+import json
+import math
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from shutil import rmtree
+from typing import Any
+
+from mpi4py import MPI
+
+from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.source import CaseError
+from magshell_fenicsx.results import checkpoint
+from magshell_fenicsx.results.curve import draw_curve
+from magshell_fenicsx.results.durable import sync_folder, write_whole
+from magshell_fenicsx.results.folder import by_first, prepare_folder
+from magshell_fenicsx.results.picture import draw_loads, draw_shell
+from magshell_fenicsx.results.summary import Result
+from magshell_fenicsx.results.surface import Surface, completed, gatherer, turned
+from magshell_fenicsx.results.table import PathTable, Row
+from magshell_fenicsx.results.vtu import FieldSeries
+from magshell_fenicsx.scene import Scene
+from magshell_fenicsx.solve.system import State
+
+LAST_FILES = ("summary.json", "shell.png", "curve.png", "magnetic_loads.png")
+COMPARED = ("p_over_pc", "lambda_m", "force", "w_over_h", "w_pole_over_h")
+
+
+class AlreadyComplete(Exception):
+    """There is nothing to resume; `summary` is what the finished run left."""
+
+    def __init__(self, summary: dict[str, Any]) -> None:
+        super().__init__(summary)
+        self.summary = summary
+
+
+def open_folder(out: Path, case: Case, comm: MPI.Comm, resume: bool) -> None:
+    """Make a folder ready for a new run, or see that a run in it can go on.
+
+    Raises
+    ------
+    CaseError
+        If the folder cannot be written, or has no run of this case to resume.
+    AlreadyComplete
+        If the run to be resumed is.
+    """
+    refused: list[CaseError | AlreadyComplete] = []
+
+    def make(folder: Path) -> None:
+        try:
+            (_resumed if resume else _emptied)(folder, case)
+        except (CaseError, AlreadyComplete) as e:
+            refused.append(e)
+
+    prepare_folder(out, comm, make)
+    if known := comm.bcast(refused):
+        raise known[0]
+
+
+def _emptied(out: Path, case: Case) -> None:
+    """Take an earlier run's files out of the folder."""
+    for name in (checkpoint.NAME, "path.csv", *LAST_FILES):
+        (out / name).unlink(missing_ok=True)
+    rmtree(out / "fields", ignore_errors=True)
+    checkpoint.begin_checkpoint(out / checkpoint.NAME, case)
+
+
+def _resumed(out: Path, case: Case) -> None:
+    """Take out what only the end of a run writes."""
+    file = out / checkpoint.NAME
+    if not file.exists() and (out / "summary.json").exists():
+        summary = json.loads((out / "summary.json").read_text(encoding="utf-8"))
+        if summary["stopped"] is None:
+            saved = {"version": summary["versions"]["magshell_fenicsx"], "case": summary["case"]}
+            checkpoint.refuse_other(saved, case, out)
+            raise AlreadyComplete(summary)
+    checkpoint.check_resumable(file, case)
+    for name in LAST_FILES:
+        (out / name).unlink(missing_ok=True)
+
+
+class RunFiles:
+    """Writes a run; every rank calls, rank 0 writes.
+
+    Raises
+    ------
+    DiskError
+        From every method, on every rank, if something cannot be written.
+
+    Attributes
+    ----------
+    journal
+        The checkpoint.
+    kept
+        Number of points of an interrupted run whose rows and fields are there.
+    elapsed
+        Seconds that the interrupted run took up to the last of them.
+    """
+
+    def __init__(self, folder: Path, scene: Scene) -> None:
+        self._folder, self._scene, self._comm = folder, scene, scene.comm
+        self.journal = checkpoint.Checkpoint(folder / checkpoint.NAME, scene.model.V, scene.comm)
+        self._gatherer = gatherer(scene.model, scene.comm)
+        by_first(self._comm, self._open)
+        there = (min(len(self._table.kept), self._fields.kept), self._table.kept) if self._first else None
+        self.kept, self._rows = self._comm.bcast(there)
+        self.elapsed = float(self._rows[-1]["wall_s"]) if self._rows else 0.0
+
+    @property
+    def _first(self) -> bool:
+        return self._comm.rank == 0
+
+    def _open(self) -> None:
+        self._table = PathTable(self._folder / "path.csv")
+        self._fields = FieldSeries(self._folder / "fields")
+        sync_folder(self._folder)
+
+    def write(self, row: Row, state: State) -> None:
+        """Write a point; of an interrupted run's points, what is missing.
+
+        Raises
+        ------
+        CaseError
+            If the point is not the one that the interrupted run had in its place.
+        """
+        number = int(row["point"])
+        if number < len(self._rows):
+            _same(row, self._rows[number])
+        if number < self.kept:
+            return
+        surface, plan = self._gatherer.gather(state.u), self._scene.plan
+
+        def write() -> None:
+            assert surface is not None
+            self._table.write(row)
+            self._fields.write(number, turned(surface, plan.azimuth), plan.material.h)
+
+        by_first(self._comm, write)
+
+    def summarise(self, content: dict[str, Any]) -> None:
+        """Write summary.json, which is safe before any picture is drawn."""
+        data = (json.dumps(content, indent=2) + "\n").encode()
+        by_first(self._comm, partial(write_whole, self._folder / "summary.json", data))
+
+    def draw(self, result: Result, say: Callable[[str], None]) -> None:
+        """Draw the last point and the curve; without a screen to draw on, say so."""
+        surface = self._gatherer.gather(result.last.u)
+
+        def write() -> None:
+            assert surface is not None
+            try:
+                self._draw(result, surface)
+            except RuntimeError as e:
+                say(f"warning: no pictures: {e}")
+
+        by_first(self._comm, write)
+
+    def close(self, complete: bool) -> None:
+        """Close the files; a complete run needs no checkpoint, which goes last."""
+        if self._first:
+            self._table.close()
+        self.journal.close()
+        if complete:
+            self.journal.remove()
+
+    def _draw(self, result: Result, surface: Surface) -> None:
+        plan, title = self._scene.plan, _title(result)
+        h, amplitude = plan.material.h, str(result.rows[-1]["amplitude"])
+        whole = turned(completed(surface) if plan.half else surface, plan.azimuth)
+        if amplitude:
+            self._picture("curve.png", lambda file: draw_curve(result.rows, amplitude, title, file))
+        self._picture("shell.png", lambda file: draw_shell(whole, h, title, file))
+        if whole.fields:
+            self._picture("magnetic_loads.png", lambda file: draw_loads(whole, h, title, file))
+
+    def _picture(self, name: str, draw: Callable[[Path], None]) -> None:
+        """Draw beside and rename: no half pictures."""
+        unfinished = self._folder / f"unfinished_{name}"
+        try:
+            draw(unfinished)
+            unfinished.replace(self._folder / name)
+        except OSError as e:
+            raise OSError(e.errno, e.strerror, str(self._folder / name)) from None
+        finally:
+            unfinished.unlink(missing_ok=True)
+
+
+def _same(row: Row, there: dict[str, str]) -> None:
+    """See that a point found again is the one in path.csv."""
+    same = row["label"] == there["label"] and all(
+        math.isclose(float(row[key]), float(there[key]), rel_tol=1e-6, abs_tol=1e-9) for key in COMPARED
+    )
+    if not same:
+        raise CaseError(f"--resume: point {row['point']} is another than in path.csv; run without --resume")
+
+
+def _title(result: Result) -> str:
+    case, row = result.scene.case, result.rows[-1]
+    said = [f"R/h = {case.shell.R_over_h:g}", f"nu = {case.shell.poisson_ratio:g}"]
+    if case.lambda_m:
+        said.append(f"lambda_m = {row['lambda_m']:g}")
+    if row["amplitude"] == "pressure":
+        said.append(f"p/pc = {row['p_over_pc']:.5g}")
+    if row["amplitude"] == "force":
+        said.append(f"w/h = {row['w_over_h']:.4g} at the load")
+    return ", ".join(said)

@@ -1,0 +1,34 @@
+"""A sequence of byte strings in one file, each with its length and checksum."""
+
+import struct
+import zlib
+from typing import BinaryIO
+
+HEAD = struct.Struct("<4sQI")  # mark, length, checksum of what follows
+MARK = b"MSF1"
+
+
+def framed(content: bytes) -> bytes:
+    """The bytes to append for one element.
+
+    Examples
+    --------
+    >>> import io
+    >>> file = io.BytesIO(framed(b"whole") + framed(b"torn by a kill")[:-1])
+    >>> read_frame(file), read_frame(file), file.tell()
+    (b'whole', None, 21)
+    """
+    return HEAD.pack(MARK, len(content), zlib.crc32(content)) + content
+
+
+def read_frame(stream: BinaryIO) -> bytes | None:
+    """The element at the stream's position; None, and no move, if there is no whole one."""
+    start = stream.tell()
+    head = stream.read(HEAD.size)
+    if len(head) == HEAD.size:
+        mark, length, checksum = HEAD.unpack(head)
+        content = stream.read(length) if mark == MARK else b""
+        if mark == MARK and len(content) == length and zlib.crc32(content) == checksum:
+            return content
+    stream.seek(start)
+    return None

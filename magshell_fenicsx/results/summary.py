@@ -1,0 +1,106 @@
+"""What a run found, and summary.json."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from magshell_fenicsx.environment import fast_blas, versions
+from magshell_fenicsx.results.table import Row
+from magshell_fenicsx.scene import Scene
+from magshell_fenicsx.solve.system import State
+
+VALUE_COLUMN = {"pressure": "p_over_pc", "force": "force", "lambda_m": "lambda_m", "angle": "field_angle"}
+OWN_MODES = ("", "symmetric", "asymmetric")  # of an instability within the model; others it excludes
+
+
+@dataclass
+class Result:
+    """What a run found.
+
+    Attributes
+    ----------
+    rows
+        One mapping per accepted point, with the columns of path.csv.
+    last
+        The displacement and the amplitudes at the last point.
+    stopped
+        Why the run ended before its target; None if it reached it.
+    replayed
+        Number of solves that were taken from a checkpoint.
+    """
+
+    scene: Scene
+    last: State
+    rows: list[Row] = field(default_factory=list)
+    stopped: str | None = None
+    replayed: int = 0
+
+    @property
+    def limit_points(self) -> list[dict[str, Any]]:
+        """The located instabilities."""
+        return [
+            {
+                "amplitude": row["amplitude"],
+                "value": row[VALUE_COLUMN[str(row["amplitude"])]],
+                "p_over_pc": row["p_over_pc"],
+                "w_pole_over_h": row["w_pole_over_h"],
+                "kind": row["label"],
+                "mode": row["mode"],
+                "branch": row["branch"],
+            }
+            for row in self.rows
+            if row["label"] in ("fold", "bifurcation")
+        ]
+
+    @property
+    def knockdown(self) -> float | None:
+        """k_d: p/p_c at the first instability under pressure; None if there is none.
+
+        Those that a reduced model excludes come last in a run, at their place on the path.
+        """
+        points = [p for p in self.limit_points if p["amplitude"] == "pressure" and not p["branch"]]
+        own = [p for p in points if p["mode"] in OWN_MODES][:1]
+        excluded = [p for p in points if p["mode"] not in OWN_MODES]
+        return min((float(p["value"]) for p in own + excluded), default=None)
+
+
+def summary(result: Result, total_s: float) -> dict[str, Any]:
+    """The content of summary.json."""
+    scene = result.scene
+    material, model, newton = scene.plan.material, scene.model, scene.newton
+    R_over_h = 1 / material.h
+    return {
+        "case": scene.case.model_dump(mode="json", exclude_none=True),
+        "dimensionless": {
+            "radius_to_thickness": R_over_h,
+            "poisson_ratio": material.nu,
+            "lambda_m": scene.case.lambda_m,
+            "Lambda_m": scene.case.lambda_m * R_over_h,
+            "pc_over_E": material.classical_pressure,
+            "energy_unit": "E h R^2",
+        },
+        "model": {
+            "included": scene.plan.included,
+            "left_out": scene.plan.left_out,
+            "kernels": model.kernels.names,
+            "forms": len(model.kernels.names),
+            "penalty": model.sigma,
+        },
+        "stopped": result.stopped,
+        "limit_points": result.limit_points,
+        "knockdown": result.knockdown,
+        "points": len(result.rows),
+        "mesh": {"cells": scene.cells, "dofs": model.system.dofs, "degree": model.degree},
+        "timing": {
+            "jit_s": model.kernels.seconds,
+            "setup_s": scene.setup_s,
+            "assembly_s": model.system.assembly.seconds,
+            "factor_s": newton.factorisation.stopwatch.seconds,
+            "total_s": total_s,
+        },
+        "replayed": result.replayed,
+        "factorisations": newton.factorisation.count,
+        "iterations": newton.iterations,
+        "ranks": scene.comm.size,
+        "blas": fast_blas() or "reference",
+        "versions": versions(),
+    }
