@@ -81,13 +81,16 @@ def sweep(
     ],
     set_: Settings = None,
     out: Annotated[Path | None, typer.Option(help="output folder; default results/<case name>_sweep/")] = None,
+    full_paths: Annotated[
+        bool, typer.Option("--full-paths", help="a path of its own at every point; no fold is followed")
+    ] = False,
 ) -> None:
     """Run a case over ranges of its keys; points that are in the folder already are kept."""
     from magshell_fenicsx.sweep.sweep import sweep as run_sweep
 
     folder = out or Path("results") / f"{case.stem}_sweep"
     try:
-        done = run_sweep(case, over, set_ or [], folder)
+        done = run_sweep(case, over, set_ or [], folder, full_paths=full_paths)
     except CaseError as e:
         raise _failure(str(e), INVALID) from None
     _say(f"results in {folder}/")

@@ -7,14 +7,18 @@ from pathlib import Path
 from mpi4py import MPI
 
 from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.loading import PathSection
 from magshell_fenicsx.environment import fast_blas
 from magshell_fenicsx.follow import Record, Stopped, follow
 from magshell_fenicsx.interrupt import Interrupted, Stoppable, Watch
+from magshell_fenicsx.report import report
 from magshell_fenicsx.results.files import RunFiles, open_folder
 from magshell_fenicsx.results.folder import DiskError, held_folder
 from magshell_fenicsx.results.summary import Result, summary
 from magshell_fenicsx.results.table import Row
 from magshell_fenicsx.scene import Scene
+from magshell_fenicsx.sensitivity import sensitivities
+from magshell_fenicsx.solve.fold import FoldLost, Guess, find_fold
 from magshell_fenicsx.solve.journal import NoJournal
 
 __all__ = ["Result", "run"]
@@ -81,16 +85,18 @@ def _run(case: Case, folder: Path | None, comm: MPI.Comm, say: Say, watch: Watch
         scene.journal = Stoppable(files.journal if files else NoJournal(), watch)
         try:
             _follow(result, files, say, start)
+            result.sensitivities = _sensitivities(result)
         except Stopped as e:
             result.stopped = str(e)
         except (Interrupted, DiskError) as e:
             interrupted, result.stopped = e, str(e)
-        if files:
+        if files and folder:
             result.replayed = files.journal.replayed
             try:
                 files.summarise(summary(result, time.perf_counter() - start))
                 if not interrupted:  # who interrupts does not wait for pictures
                     files.draw(result, say)
+                    report(result, folder, say)
             except DiskError as e:
                 interrupted = interrupted or e
             files.close(complete=not interrupted and not result.stopped)
@@ -98,6 +104,18 @@ def _run(case: Case, folder: Path | None, comm: MPI.Comm, say: Say, watch: Watch
         go_on = f"; what was found is in {folder}/, and --resume goes on from there" if folder else ""
         result.stopped = f"{interrupted}{go_on}"
     return result
+
+
+def _sensitivities(result: Result) -> dict[str, float]:
+    """Of the fold that the run ended at, if the case asks for them."""
+    scene, loading, last = result.scene, result.scene.case.loading, result.rows[-1]
+    if not (isinstance(loading, PathSection) and loading.sensitivities and last["label"] == "fold"):
+        return {}
+    try:
+        fold = find_fold(scene.newton, Guess(result.last), str(last["amplitude"]))
+    except FoldLost as e:
+        raise Stopped(f"the fold cannot be polished for its sensitivities: {e}") from None
+    return sensitivities(scene, fold)
 
 
 def _follow(result: Result, files: RunFiles | None, say: Say, start: float) -> None:
@@ -110,6 +128,8 @@ def _follow(result: Result, files: RunFiles | None, say: Say, start: float) -> N
         row = _row(record, len(result.rows), values, field_end, time.perf_counter() - start)
         result.rows.append(row)
         result.last = record.point.state
+        if record.label in ("fold", "bifurcation"):
+            result.singular[len(result.rows) - 1] = record.point.state
         if files:
             files.write(row, record.point.state)
         if not files or len(result.rows) > files.kept:
@@ -125,6 +145,7 @@ def _row(record: Record, number: int, values: dict[str, float], field_end: float
         **values,
         "w_from_field_over_h": values["w_over_h"] - field_end,
         "negative_pivots": point.negative_pivots,
+        "negative_pivots_held": point.negative_pivots_held,
         "iterations": point.iterations,
         "factorisations": point.factorisations,
         "wall_s": round(wall_s, 3),

@@ -74,7 +74,7 @@ class Waves:
         """The matrix of Q_m at an axisymmetric state; it is reused by the next call."""
         self._system.set(state.u)
         self._m.value = m
-        held = self._held_once if m == 1 else self._held
+        held = self.held(m)
         self._K.zeroEntries()
         for amplitude, form in self._forms:
             self._factor.value = 1.0 if amplitude is None else state.mu[amplitude]
@@ -82,6 +82,10 @@ class Waves:
                 assembly.add_matrix(self._K, form, held)
         assembly.finish_matrix(self._K, self.V, held)
         return self._K
+
+    def held(self, m: int) -> list[fem.DirichletBC]:
+        """What is held at the axis and at the rim: a wave m = 1 may move the axis across itself."""
+        return self._held_once if m == 1 else self._held
 
     def negative_pivots(self, state: State, m: int) -> int:
         """Number of unstable directions among the waves m."""

@@ -13,6 +13,7 @@ from magshell_fenicsx.case.loading import FieldSection, IndentationSection, Load
 from magshell_fenicsx.case.messages import explain
 from magshell_fenicsx.case.shell import ShellSection
 from magshell_fenicsx.case.source import CaseError, Source, override, read_source
+from magshell_fenicsx.case.stability import StabilitySection
 
 
 class MeshSection(Section):
@@ -31,6 +32,7 @@ class Case(Section):
     magnetic: MagneticSection | None = None
     loading: LoadingSection | None = None
     mesh: MeshSection = MeshSection()
+    stability: StabilitySection | None = None
     symmetry: Literal["auto", "none", "half", "axisymmetric"] = "auto"
 
     @model_validator(mode="after")

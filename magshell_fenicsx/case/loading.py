@@ -18,12 +18,14 @@ class PathSection(Section):
     `until: limit` ends at the first instability, `bifurcation` at the first bifurcation (through folds),
     `target` at the target, in `points` equal parts (by arc length: rows at these parts), `points` after
     that many steps by arc length. `branches: true` follows both directions of the branch at the first
-    bifurcation too, to the target or for `points` steps.
+    bifurcation too, to the target or for `points` steps. `sensitivities: true` derives the load at the
+    fold that ends the path by every other amplitude, the defect and the remanence of each patch.
     """
 
     until: Until
     points: int = Field(default=10, ge=1, le=10000)
     branches: bool = False
+    sensitivities: bool = False
 
     def _check(self, control: str, until: Until, targets: Mapping[str, float | None], wanted: Wanted) -> None:
         """One target that fits the control with `until: target`, none elsewhere."""

@@ -100,7 +100,8 @@ def _named_facets(domain: mesh.Mesh, patch: PatchMesh, vertices: NDArray[np.int6
     domain.topology.create_connectivity(1, 2)
     domain.topology.create_connectivity(1, 0)
     facets = mesh.exterior_facet_indices(domain.topology)
-    ends = mesh.entities_to_geometry(domain, 1, facets)
+    # a rank may have no part of any edge, and dolfinx divides by their number
+    ends = mesh.entities_to_geometry(domain, 1, facets) if len(facets) else np.empty((0, 2), dtype=np.int32)
     numbers = np.sort(vertices[domain.geometry.input_global_indices[ends]], axis=1)
     found = {}
     for name, pairs in patch.edges.items():

@@ -24,7 +24,10 @@ from magshell_fenicsx.results.vtu import FieldSeries
 from magshell_fenicsx.scene import Scene
 from magshell_fenicsx.solve.system import State
 
-LAST_FILES = ("summary.json", "shell.png", "curve.png", "magnetic_loads.png")
+LAST_FILES = (
+    *("summary.json", "shell.png", "curve.png", "magnetic_loads.png"),
+    *("instabilities.png", "stability.csv", "modes_*.png"),
+)
 COMPARED = ("p_over_pc", "lambda_m", "force", "w_over_h", "w_pole_over_h")
 
 
@@ -61,8 +64,9 @@ def open_folder(out: Path, case: Case, comm: MPI.Comm, resume: bool) -> None:
 
 def _emptied(out: Path, case: Case) -> None:
     """Take an earlier run's files out of the folder."""
-    for name in (checkpoint.NAME, "path.csv", *LAST_FILES):
+    for name in (checkpoint.NAME, "path.csv"):
         (out / name).unlink(missing_ok=True)
+    _remove_last_files(out)
     rmtree(out / "fields", ignore_errors=True)
     checkpoint.begin_checkpoint(out / checkpoint.NAME, case)
 
@@ -77,8 +81,13 @@ def _resumed(out: Path, case: Case) -> None:
             checkpoint.refuse_other(saved, case, out)
             raise AlreadyComplete(summary)
     checkpoint.check_resumable(file, case)
-    for name in LAST_FILES:
-        (out / name).unlink(missing_ok=True)
+    _remove_last_files(out)
+
+
+def _remove_last_files(out: Path) -> None:
+    for pattern in LAST_FILES:
+        for file in out.glob(pattern):
+            file.unlink()
 
 
 class RunFiles:

@@ -22,17 +22,23 @@ class Result:
         One mapping per accepted point, with the columns of path.csv.
     last
         The displacement and the amplitudes at the last point.
+    singular
+        The same at the located instabilities, by their row.
     stopped
         Why the run ended before its target; None if it reached it.
     replayed
         Number of solves that were taken from a checkpoint.
+    sensitivities
+        Of the amplitude at the fold that the run ended at, if the case asks for them; see `sensitivity`.
     """
 
     scene: Scene
     last: State
     rows: list[Row] = field(default_factory=list)
+    singular: dict[int, State] = field(default_factory=dict)
     stopped: str | None = None
     replayed: int = 0
+    sensitivities: dict[str, float] = field(default_factory=dict)
 
     @property
     def limit_points(self) -> list[dict[str, Any]]:
@@ -53,14 +59,9 @@ class Result:
 
     @property
     def knockdown(self) -> float | None:
-        """k_d: p/p_c at the first instability under pressure; None if there is none.
-
-        Those that a reduced model excludes come last in a run, at their place on the path.
-        """
-        points = [p for p in self.limit_points if p["amplitude"] == "pressure" and not p["branch"]]
-        own = [p for p in points if p["mode"] in OWN_MODES][:1]
-        excluded = [p for p in points if p["mode"] not in OWN_MODES]
-        return min((float(p["value"]) for p in own + excluded), default=None)
+        """k_d: p/p_c at the first instability under pressure; None if there is none."""
+        points = (p for p in self.limit_points if p["amplitude"] == "pressure" and not p["branch"])
+        return next((float(p["value"]) for p in points), None)
 
 
 def summary(result: Result, total_s: float) -> dict[str, Any]:
@@ -87,6 +88,7 @@ def summary(result: Result, total_s: float) -> dict[str, Any]:
         },
         "stopped": result.stopped,
         "limit_points": result.limit_points,
+        "sensitivities": result.sensitivities,
         "knockdown": result.knockdown,
         "points": len(result.rows),
         "mesh": {"cells": scene.cells, "dofs": model.system.dofs, "degree": model.degree},
@@ -95,6 +97,7 @@ def summary(result: Result, total_s: float) -> dict[str, Any]:
             "setup_s": scene.setup_s,
             "assembly_s": model.system.assembly.seconds,
             "factor_s": newton.factorisation.stopwatch.seconds,
+            "solve_s": newton.factorisation.solving.seconds,
             "total_s": total_s,
         },
         "replayed": result.replayed,

@@ -21,6 +21,7 @@ COLUMNS = (
     "volume_change",
     "energy",
     "negative_pivots",
+    "negative_pivots_held",
     "iterations",
     "factorisations",
     "wall_s",

@@ -52,7 +52,7 @@ class FieldSeries:
         OSError
             If the disk is full; there is no such file then.
         """
-        write_whole(self._folder / _name(number), _vtu(unstructured_grid(surface, h)))
+        write_whole(self._folder / _name(number), vtu_content(unstructured_grid(surface, h)))
         self._numbers.append(number)
         self._write_list()
 
@@ -69,7 +69,7 @@ def _name(number: int) -> str:
     return f"point_{number:04d}.vtu"
 
 
-def _vtu(grid: pyvista.UnstructuredGrid) -> bytes:
+def vtu_content(grid: pyvista.UnstructuredGrid) -> bytes:
     """The file's content; VTK itself would pass over a full disk."""
     writer = vtkXMLUnstructuredGridWriter()
     writer.SetInputData(grid)

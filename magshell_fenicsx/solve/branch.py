@@ -4,12 +4,13 @@ from dataclasses import dataclass
 from math import copysign
 
 import numpy as np
+from mpi4py import MPI
 
 from magshell_fenicsx.solve.along import PUSH, Pushed
 from magshell_fenicsx.solve.control import Hyperplane
 from magshell_fenicsx.solve.events import critical_mode
 from magshell_fenicsx.solve.path import Path, Point
-from magshell_fenicsx.solve.system import State, Vector, max_abs
+from magshell_fenicsx.solve.system import State, Vector
 
 SIZES = 0.5, 2.0, 8.0  # of the first step off the path, in the system's length
 SEEN = 1e-4  # relative change of the amplitude that is no rounding error
@@ -40,9 +41,9 @@ def branching(path: Path, bifurcation: Point) -> Branching | None:
     path
         Controlled by arc length.
     """
-    metric, name, state = path.metric, path.name, bifurcation.state
+    name, state = path.name, bifurcation.state
     mode = critical_mode(path.newton, state, path.system.comm).vector
-    mode = np.asarray(mode * path.system.length / max_abs(path.system.comm, mode))
+    mode = np.asarray(mode * path.system.length / _largest(path.system.comm, mode))
     found = None
     for size in SIZES:
         starts = [_step_off(path, state, mode, signed) for signed in (size, -size)]
@@ -54,6 +55,12 @@ def branching(path: Path, bifurcation: Point) -> Branching | None:
         if max(map(abs, rises)) > SEEN * abs(state.mu[name]):
             break
     return found
+
+
+def _largest(comm: MPI.Comm, v: Vector) -> float:
+    """The entry of largest magnitude, with its sign: the same on any number of ranks."""
+    here = float(v[np.argmax(np.abs(v))]) if v.size else 0.0
+    return float(max(comm.allgather(here), key=abs))
 
 
 def _step_off(path: Path, state: State, mode: Vector, size: float) -> Point | None:
