@@ -13,29 +13,33 @@ import numpy as np
 import ufl
 from dolfinx import fem
 from numpy.typing import NDArray
-from petsc4py import PETSc
 from ufl.core.expr import Expr
 
 from magshell_fenicsx.shell import densities
 from magshell_fenicsx.shell import kinematics as kin
 from magshell_fenicsx.shell.edges import edge_density
+from magshell_fenicsx.shell.energy import HessianTerm
 from magshell_fenicsx.shell.kinematics import Jet
 from magshell_fenicsx.shell.parameters import MIRROR_NORMAL
-from magshell_fenicsx.solve import assembly
 from magshell_fenicsx.solve.events import locate_bifurcation
 from magshell_fenicsx.solve.factor import Factorisation
 from magshell_fenicsx.solve.path import Path, Point
-from magshell_fenicsx.solve.problem import FiniteElementSystem
+from magshell_fenicsx.solve.problem import FiniteElementSystem, TangentAssembler
 from magshell_fenicsx.solve.system import State
 from magshell_fenicsx.solve.terms import FormTerm
 
 
-def antisymmetric_edge(r0: Jet, u: Jet, v: Jet, mesh: ufl.Mesh, nu: Expr, h: Expr, sigma: Expr, m: Expr) -> Expr:
-    """Half the energy of an edge between the half with u + v and the mirror image of that with u - v."""
-    nu1, nu2, stretch = kin.conormal(r0, ufl.FacetNormal(mesh), mesh)
+def antisymmetric_edge(
+    r0: Jet, u: Jet, v: Jet, m: Expr, width: Expr, nu: Expr, h: Expr, sigma: Expr, mirror: Expr
+) -> Expr:
+    """Half the energy of an edge between the half with u + v and the mirror image of that with u - v.
+
+    The other parameters are those of `edges.symmetric`.
+    """
+    nu1, nu2, stretch = kin.conormal(r0, m)
 
     def mirrored(a: Expr) -> Expr:
-        return a - 2 * ufl.dot(a, m) * m
+        return a - 2 * ufl.dot(a, mirror) * mirror
 
     def jump(here: Jet, there: Jet) -> Expr:
         outward, inward = (j.r1 * nu1 + j.r2 * nu2 for j in (here, there))
@@ -45,44 +49,36 @@ def antisymmetric_edge(r0: Jet, u: Jet, v: Jet, mesh: ufl.Mesh, nu: Expr, h: Exp
     sides = (u + v, u - v)
     J = jump(r0 + sides[0], r0 + sides[1]) - jump(r0, r0)
     M = sum(densities.normal_moment(r0, side, nu1, nu2, nu, h) for side in sides) / 2
-    width = ufl.CellVolume(mesh) / ufl.FacetArea(mesh)
     return edge_density(M, J, width, nu, h, sigma) * stretch / 2
 
 
-class HessianTerm:
-    """A term that contributes only a tangent: the Hessian in v, at v = 0, of an energy of u and v."""
-
-    amplitude = None
-
-    def __init__(self, name: str, hessian: fem.Form) -> None:
-        self.name, self._hessian = name, hessian
-
-    def energy(self) -> float:
-        return 0.0
-
-    def add_residual(self, b: NDArray[np.float64], factor: float) -> None:
-        """Symmetric states are in equilibrium with antisymmetric forces."""
-
-    def add_tangent(self, K: PETSc.Mat, factor: float, clamped: list[fem.DirichletBC]) -> None:
-        assembly.add_matrix(K, self._hessian, clamped)
-
-
 class AntisymmetricModes:
-    """The tangent of the modes that a half model excludes; a `solve.events.Stability`."""
+    """The tangent of the modes that a half model excludes; a `solve.events.Stability`.
+
+    Attributes
+    ----------
+    system
+        Whose tangent it is.
+    """
 
     def __init__(
-        self, system: FiniteElementSystem, edges: HessianTerm, elsewhere: list[fem.DirichletBC], pattern: FormTerm
+        self,
+        system: FiniteElementSystem,
+        edges: HessianTerm,
+        elsewhere: list[fem.DirichletBC],
+        pattern: FormTerm,
+        assembler: TangentAssembler | None,
     ) -> None:
         terms = [edges if t.name == "mirror edges" else t for t in system.terms]
         V = system.u.function_space
-        self._system = FiniteElementSystem(system.u, terms, elsewhere, pattern, system.length)
+        self.system = FiniteElementSystem(system.u, terms, elsewhere, pattern, system.length, assembler)
         self._factorisation = Factorisation(V.mesh.comm)
         self._factored: State | None = None
 
     def factor_at(self, state: State) -> Factorisation:
         """Factor the tangent of the antisymmetric modes at a symmetric state."""
         if self._factored is not state:
-            self._factorisation.factor(self._system.tangent(state.u, state.mu))
+            self._factorisation.factor(self.system.tangent(state.u, state.mu))
             self._factored = state
         return self._factorisation
 

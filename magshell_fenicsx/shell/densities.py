@@ -97,3 +97,8 @@ def volume(r0: Jet, u: Jet) -> Expr:
     """(r . n dω - r0 . n0 dω0)/3 per flat area (already includes the area ratio)."""
     r = r0 + u
     return (ufl.dot(r.r, kin.area_vector(r)) - ufl.dot(r0.r, kin.area_vector(r0))) / 3
+
+
+def pressure(r0: Jet, u: Jet, unit: Expr) -> Expr:
+    """Pi/p of a live pressure in that unit; per area of the coordinates as `volume`."""
+    return unit * volume(r0, u)

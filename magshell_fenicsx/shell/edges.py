@@ -16,6 +16,8 @@ from magshell_fenicsx.shell import densities
 from magshell_fenicsx.shell import kinematics as kin
 from magshell_fenicsx.shell.kinematics import Jet
 
+Sides = tuple[Jet, Jet]
+
 
 def edge_density(M: Expr, J: Expr, width: Expr, nu: Expr, h: Expr, sigma: Expr) -> Expr:
     """{M} J + sigma D/(2 h_e) J^2."""
@@ -28,38 +30,42 @@ def fold_jump(plus: Jet, minus: Jet, nu_plus: tuple[Expr, Expr], nu_minus: tuple
     return -ufl.dot(kin.normal(minus) - kin.normal(plus), r_nu)
 
 
-def interior(r0: Jet, u: Jet, mesh: ufl.Mesh, nu: Expr, h: Expr, sigma: Expr) -> Expr:
-    """Energy of an interior edge per flat length."""
-    facet_normal = ufl.FacetNormal(mesh)
-    nu1, nu2, stretch = kin.conormal(r0, facet_normal, mesh)
-    conormals = {s: (nu1(s), nu2(s)) for s in "+-"}
-    M = sum(densities.normal_moment(r0.side(s), u.side(s), *conormals[s], nu, h) for s in "+-") / 2
-    r = r0 + u
-    J = fold_jump(r.side("+"), r.side("-"), conormals["+"], conormals["-"]) - fold_jump(
-        r0.side("+"), r0.side("-"), conormals["+"], conormals["-"]
-    )
-    width = ufl.avg(ufl.CellVolume(mesh)) / ufl.avg(ufl.FacetArea(mesh))
-    return edge_density(M, J, width, nu, h, sigma) * ufl.avg(stretch)
+def interior(r0: Sides, u: Sides, m: tuple[Expr, Expr], width: Expr, nu: Expr, h: Expr, sigma: Expr) -> Expr:
+    """Energy of an interior edge per length of its parameter.
 
-
-def clamped(r0: Jet, u: Jet, mesh: ufl.Mesh, nu: Expr, h: Expr, sigma: Expr) -> Expr:
-    """Energy of a clamped edge per flat length: the outer normal is held at n0."""
-    nu1, nu2, stretch = kin.conormal(r0, ufl.FacetNormal(mesh), mesh)
-    r = r0 + u
-    J = -ufl.dot(kin.normal(r0) - kin.normal(r), r.r1 * nu1 + r.r2 * nu2)
-    M = densities.normal_moment(r0, u, nu1, nu2, nu, h)
-    width = ufl.CellVolume(mesh) / ufl.FacetArea(mesh)
+    Parameters
+    ----------
+    r0, u
+        Jets on both sides, '+' first.
+    m
+        Covectors of the edge on both sides; see `kinematics.conormal`.
+    width
+        h_e: half the height of the flat triangles over the edge, averaged.
+    """
+    conormals = [kin.conormal(j, covector) for j, covector in zip(r0, m, strict=True)]
+    nus = [(nu1, nu2) for nu1, nu2, _ in conormals]
+    M = sum(densities.normal_moment(r0[i], u[i], *nus[i], nu, h) for i in range(2)) / 2
+    J = fold_jump(r0[0] + u[0], r0[1] + u[1], *nus) - fold_jump(*r0, *nus)
+    stretch = (conormals[0][2] + conormals[1][2]) / 2
     return edge_density(M, J, width, nu, h, sigma) * stretch
 
 
-def symmetric(r0: Jet, u: Jet, mesh: ufl.Mesh, nu: Expr, h: Expr, sigma: Expr, m: Expr) -> Expr:
-    """Energy of an edge on a mirror plane with normal m per flat length: half of an interior edge's."""
-    nu1, nu2, stretch = kin.conormal(r0, ufl.FacetNormal(mesh), mesh)
+def clamped(r0: Jet, u: Jet, m: Expr, width: Expr, nu: Expr, h: Expr, sigma: Expr) -> Expr:
+    """Energy of a clamped edge per length of its parameter: the outer normal is held at n0."""
+    nu1, nu2, stretch = kin.conormal(r0, m)
+    r = r0 + u
+    J = -ufl.dot(kin.normal(r0) - kin.normal(r), r.r1 * nu1 + r.r2 * nu2)
+    M = densities.normal_moment(r0, u, nu1, nu2, nu, h)
+    return edge_density(M, J, width, nu, h, sigma) * stretch
+
+
+def symmetric(r0: Jet, u: Jet, m: Expr, width: Expr, nu: Expr, h: Expr, sigma: Expr, mirror: Expr) -> Expr:
+    """Energy of an edge on a mirror plane with that normal per length of its parameter: half of an interior edge's."""
+    nu1, nu2, stretch = kin.conormal(r0, m)
 
     def mirror_jump(j: Jet) -> Expr:
-        return 2 * ufl.dot(kin.normal(j), m) * ufl.dot(m, j.r1 * nu1 + j.r2 * nu2)
+        return 2 * ufl.dot(kin.normal(j), mirror) * ufl.dot(mirror, j.r1 * nu1 + j.r2 * nu2)
 
     J = mirror_jump(r0 + u) - mirror_jump(r0)
     M = densities.normal_moment(r0, u, nu1, nu2, nu, h)
-    width = ufl.CellVolume(mesh) / ufl.FacetArea(mesh)
     return edge_density(M, J, width, nu, h, sigma) * stretch / 2

@@ -1,7 +1,8 @@
 """Differential geometry of a placement, in UFL, as plain functions of point quantities.
 
-Everything is written in an orthonormal frame t_1, t_2 of the flat cell: a placement
-enters by its value and its first and second derivatives there, its *jet*.
+A placement enters by its value and its first and second derivatives, its *jet*. Every
+expression is covariant under linear changes of the coordinates: finite-element forms take
+an orthonormal frame t_1, t_2 of the flat cell, the fast tangent those of the reference cell.
 """
 
 from dataclasses import dataclass, fields
@@ -12,7 +13,7 @@ from ufl.core.expr import Expr
 
 @dataclass(frozen=True)
 class Jet:
-    """Value, first and second derivatives of a vector field along the cell's frame; each (3,)."""
+    """Value, first and second derivatives of a vector field in coordinates of the cell; each (3,)."""
 
     r: Expr
     r1: Expr
@@ -124,22 +125,27 @@ def mixed(S: Expr, up: Expr) -> Expr:
     return ufl.dot(up, S)
 
 
-def conormal(r0: Jet, facet_normal: Expr, mesh: ufl.Mesh) -> tuple[Expr, Expr, Expr]:
+def facet_covector(mesh: ufl.Mesh) -> Expr:
+    """Outward unit normal of the flat cell's edge in the cell's frame, (2,)."""
+    t1, t2 = cell_frame(mesh)
+    outward = ufl.FacetNormal(mesh)
+    return ufl.as_vector([ufl.dot(outward, t1), ufl.dot(outward, t2)])
+
+
+def conormal(r0: Jet, m: Expr) -> tuple[Expr, Expr, Expr]:
     """Undeformed outward unit conormal of a cell's edge and the edge's length ratio.
 
     Parameters
     ----------
-    facet_normal
-        Outward unit normal of the flat cell's edge in the cell's plane. As a covector
-        it annihilates the edge, whatever the placement, and only needs scaling.
+    m
+        (2,) covector that is zero along the edge, whatever the placement, and positive outward.
+        The edge's length is told per length of (-m_2, m_1), which is along the edge.
 
     Returns
     -------
     nu_1, nu_2, stretch
-        nu^i (contravariant, so that r_nu = r,_i nu^i) and ds0 over the flat length.
+        nu^i (contravariant, so that r_nu = r,_i nu^i) and ds0 over the edge's parameter.
     """
-    t1, t2 = cell_frame(mesh)
-    m = ufl.as_vector([ufl.dot(facet_normal, t1), ufl.dot(facet_normal, t2)])
     up = inverse_metric(r0)
     nu = ufl.dot(up, m) / ufl.sqrt(ufl.dot(m, ufl.dot(up, m)))
     along = r0.r2 * m[0] - r0.r1 * m[1]

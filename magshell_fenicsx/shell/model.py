@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.mesh.midsurface import Midsurface
 from magshell_fenicsx.shell.antisymmetric import AntisymmetricModes, held_against_mirror
+from magshell_fenicsx.shell.fast_tangent import FastTangent, fits, make_sites
 from magshell_fenicsx.shell.parameters import MIRROR_NORMAL, Condition, Force, Loads, Material, default_penalty
 from magshell_fenicsx.shell.point_load import patch_entries, point_entries, vertex_normal
 from magshell_fenicsx.shell.terms import TermFactory
@@ -85,7 +86,10 @@ class ShellModel:
         self.normals = {name: vertex_normal(self.r0, x) for name, x in midsurface.points.items()}
         if loads.force:
             terms.append(self._force(loads.force))
-        self.system = FiniteElementSystem(self.u, terms, held + mirror, interior, material.h)
+        # lists that would fill the memory leave the tangent to the terms' own forms
+        self._sites = make_sites(self.r0, degree, terms, self.kernels) if fits(V) else None
+        fast = FastTangent(self.u, self._sites, held + mirror) if self._sites else None
+        self.system = FiniteElementSystem(self.u, terms, held + mirror, interior, material.h, fast)
         self._factory, self._interior, self._held, self._mirror = factory, interior, held, facets("symmetry")
         self._volume = self.kernels.compile("volume energy", factory.volume_change())
         # dofs of a vertex on the rank that owns it
@@ -98,7 +102,11 @@ class ShellModel:
             return None
         edges = self._factory.antisymmetric_edges(self._mirror)
         held = self._held + held_against_mirror(self.V, self._mirror)
-        return AntisymmetricModes(self.system, edges, held, self._interior)
+        fast = None
+        if self._sites:
+            sites = self._sites + make_sites(self.r0, self.degree, [edges], self.kernels)
+            fast = FastTangent(self.u, sites, held)
+        return AntisymmetricModes(self.system, edges, held, self._interior, fast)
 
     def zero(self) -> Vector:
         """The undeformed displacement."""

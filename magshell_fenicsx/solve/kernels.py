@@ -3,8 +3,11 @@
 import time
 from dataclasses import dataclass, field
 
+import numpy as np
 import ufl
 from dolfinx import fem
+from mpi4py import MPI
+from ufl.core.expr import Expr
 
 # -O1 compiles the tangents five times faster than -O2 and runs 15 % slower; -ffast-math halves the run time.
 # No -march: the cache may be shared by unlike machines, and it gains nothing here.
@@ -25,3 +28,12 @@ class KernelLog:
         self.seconds += time.perf_counter() - start
         self.names.append(name)
         return form
+
+    def compile_expression(self, name: str, expression: Expr, comm: MPI.Comm) -> fem.Expression:
+        """Compile an expression of cell-wise constants, or load it from the cache; collective."""
+        start = time.perf_counter()
+        anywhere = np.full((1, 1), 0.5)
+        compiled = fem.Expression(expression, anywhere, comm, jit_options=JIT_OPTIONS)
+        self.seconds += time.perf_counter() - start
+        self.names.append(name)
+        return compiled

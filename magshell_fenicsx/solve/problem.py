@@ -1,6 +1,7 @@
 """Terms on one finite-element space, as the system that the solvers see."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Protocol
 
 import numpy as np
 from dolfinx import fem
@@ -13,6 +14,13 @@ from magshell_fenicsx.solve import assembly
 from magshell_fenicsx.solve.system import Amplitudes, Vector
 from magshell_fenicsx.solve.terms import FormTerm, Term
 from magshell_fenicsx.solve.timing import Stopwatch
+
+
+class TangentAssembler(Protocol):
+    """A way to the tangent other than the terms' own forms."""
+
+    def tangent(self, factors: Mapping[str, float]) -> PETSc.Mat:
+        """The matrix of the terms with these factors, by name, at the u that they were written with."""
 
 
 class FiniteElementSystem:
@@ -28,10 +36,18 @@ class FiniteElementSystem:
         The term with the widest coupling: its tangent's sparsity is that of the sum.
     length
         See `System`.
+    assembler
+        Makes the tangent with the same conditions, instead of the terms' forms.
     """
 
     def __init__(
-        self, u: fem.Function, terms: Sequence[Term], clamped: list[fem.DirichletBC], pattern: FormTerm, length: float
+        self,
+        u: fem.Function,
+        terms: Sequence[Term],
+        clamped: list[fem.DirichletBC],
+        pattern: FormTerm,
+        length: float,
+        assembler: TangentAssembler | None = None,
     ) -> None:
         V = u.function_space
         self.u, self.terms, self.clamped, self.length = u, terms, clamped, length
@@ -43,8 +59,12 @@ class FiniteElementSystem:
         fixed_dofs = np.unique(np.concatenate(fixed)) if fixed else np.empty(0, dtype=np.int32)
         self._fixed = fixed_dofs[fixed_dofs < self.size]
         self._b = fem.Function(V)
-        self._K = fem_petsc.create_matrix(pattern.tangent_form)
-        self._K.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+        self._assembler = assembler
+        if assembler is None:
+            for term in terms:
+                term.compile_tangent()
+            self._K = fem_petsc.create_matrix(pattern.tangent_form)
+            self._K.setOption(PETSc.Mat.Option.SYMMETRIC, True)
 
     def set(self, u: Vector) -> None:
         """Put a displacement into the Function that the terms see."""
@@ -69,12 +89,14 @@ class FiniteElementSystem:
     def tangent(self, u: Vector, mu: Amplitudes) -> PETSc.Mat:
         with self.assembly:
             self.set(u)
+            if self._assembler:
+                return self._assembler.tangent({t.name: _factor(t, mu) for t in self.terms})
             self._K.zeroEntries()
             for t in self.terms:
                 if factor := _factor(t, mu):
                     t.add_tangent(self._K, factor, self.clamped)
             assembly.finish_matrix(self._K, self.u.function_space, self.clamped)
-        return self._K
+            return self._K
 
     def _gradient(self, u: Vector, weighted: list[tuple[Term, float]]) -> NDArray[np.float64]:
         with self.assembly:

@@ -1,5 +1,6 @@
 """A potential Pi(u) with its amplitude: energy, residual and tangent."""
 
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -27,6 +28,9 @@ class Term(Protocol):
     def add_residual(self, b: NDArray[np.float64], factor: float) -> None:
         """Add factor dPi/du to the local vector (ghosts included)."""
 
+    def compile_tangent(self) -> None:
+        """Compile what `add_tangent` takes."""
+
     def add_tangent(self, K: PETSc.Mat, factor: float, clamped: list[fem.DirichletBC]) -> None:
         """Add factor d2Pi/du2."""
 
@@ -35,6 +39,11 @@ class FormTerm:
     """A potential given by its UFL energy; both derivatives are automatic.
 
     `linear` says that the energy is linear in u, so that it has no tangent.
+
+    Attributes
+    ----------
+    tangent_form
+        None for a linear energy. It takes long to compile and is compiled when it is first asked for.
     """
 
     def __init__(
@@ -47,16 +56,19 @@ class FormTerm:
         *,
         linear: bool = False,
     ) -> None:
-        self.name, self.amplitude = name, amplitude
+        self.name, self.amplitude, self.linear = name, amplitude, linear
         self._factor = fem.Constant(u.function_space.mesh, 1.0)
-        V = u.function_space
-        gradient = ufl.derivative(energy, u, ufl.TestFunction(V))
+        self._u, self._log = u, log
+        self._gradient = ufl.derivative(energy, u, ufl.TestFunction(u.function_space))
         self._energy = log.compile(f"{name} energy", energy)
-        self._residual = log.compile(f"{name} residual", self._factor * gradient)
-        self.tangent_form: fem.Form | None = None
-        if not linear:
-            hessian = ufl.derivative(gradient, u, ufl.TrialFunction(V))
-            self.tangent_form = log.compile(f"{name} tangent", self._factor * hessian)
+        self._residual = log.compile(f"{name} residual", self._factor * self._gradient)
+
+    @cached_property
+    def tangent_form(self) -> fem.Form | None:
+        if self.linear:
+            return None
+        hessian = ufl.derivative(self._gradient, self._u, ufl.TrialFunction(self._u.function_space))
+        return self._log.compile(f"{self.name} tangent", self._factor * hessian)
 
     def energy(self) -> float:
         return float(fem.assemble_scalar(self._energy))
@@ -64,6 +76,9 @@ class FormTerm:
     def add_residual(self, b: NDArray[np.float64], factor: float) -> None:
         self._factor.value = factor
         assembly.add_vector(b, self._residual)
+
+    def compile_tangent(self) -> None:
+        _ = self.tangent_form
 
     def add_tangent(self, K: PETSc.Mat, factor: float, clamped: list[fem.DirichletBC]) -> None:
         if self.tangent_form is not None:
@@ -85,6 +100,9 @@ class LinearTerm:
 
     def add_residual(self, b: NDArray[np.float64], factor: float) -> None:
         b[self._dofs] -= factor * self._entries
+
+    def compile_tangent(self) -> None:
+        """A dead load has no tangent."""
 
     def add_tangent(self, K: PETSc.Mat, factor: float, clamped: list[fem.DirichletBC]) -> None:
         """A dead load has no tangent."""

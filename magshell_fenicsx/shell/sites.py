@@ -1,0 +1,174 @@
+"""Where terms live: the Hessians of their densities at points, contracted in batches.
+
+The densities are covariant, so the jets are taken in reference coordinates: the tables of the
+shape functions are then the same for all cells.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import fields
+from functools import reduce
+from itertools import combinations_with_replacement, product
+from operator import or_
+from typing import Any
+
+import numpy as np
+import ufl
+from dolfinx import fem
+from mpi4py import MPI
+from numpy.typing import NDArray
+from ufl.core.expr import Expr
+
+from magshell_fenicsx.shell.energy import Density, HessianTerm, ShellTerm
+from magshell_fenicsx.shell.kinematics import Jet
+from magshell_fenicsx.solve.batches import Batch
+from magshell_fenicsx.solve.contraction import Blocks, Contraction
+from magshell_fenicsx.solve.kernels import KernelLog
+from magshell_fenicsx.solve.points import Pair, Pairs, Points, point_hessian
+from magshell_fenicsx.solve.reference import PARTS
+
+PointTerm = ShellTerm | HessianTerm
+Array = NDArray[np.float64]
+NAMES = tuple(f.name for f in fields(Jet))  # in the order of `reference.Table`
+RANK = (2, 0, 0, 1, 1, 1)  # pairs of first derivatives come first: the terms' pairs are then neighbours
+
+
+class Site:
+    """Where some terms live together: the cells, the interior edges, or some boundary edges.
+
+    Parameters
+    ----------
+    batches
+        Those of this rank, perhaps none.
+    sides
+        2 for interior edges.
+    """
+
+    def __init__(
+        self, r0: fem.Function, batches: list[Batch], sides: int, terms: Sequence[PointTerm], log: KernelLog
+    ) -> None:
+        V = r0.function_space
+        self.batches, self._dofs, self._sides = batches, V.dofmap.list, sides
+        self._points = Points(max([1, *(batch.size for batch in batches)]))
+        self._u, self._r0 = (self._points.field(3 * PARTS * sides) for _ in range(2))
+        self._geometry = self._points.field(2 * sides + 1)
+        self._placements = [self._jets(batch, r0.x.array) for batch in batches]
+        self._kernels = {term.name: Kernel(term, self._points, batches) for term in terms}
+        for kernel in self._kernels.values():
+            kernel.compile(self._u, self._r0, self._geometry, sides, log, V.mesh.comm)
+        self.coupling = batches if sides == 2 else []
+        pairs = reduce(or_, (kernel.pairs for kernel in self._kernels.values()))
+        pairs = Pairs(tuple(sorted(pairs.same, key=_neighbours)), pairs.cross)
+        self._coupled = pairs
+        self._contractions = {rule: Contraction(rule, pairs) for rule in {batch.rule for batch in batches}}
+
+    def add(self, u: Array, factors: Mapping[str, float], same: Array, cross: Array) -> None:
+        """Add the terms' element matrices.
+
+        Parameters
+        ----------
+        u
+            (dofs,) with ghosts.
+        factors
+            By term; others are left out.
+        same
+            (local cells, 9, pairs of functions), see `same_cell_entries`.
+        cross
+            (interior edges, 9, functions^2) in the order of the batches; not used if there is one side.
+        """
+        kernels = [(kernel, factors[name]) for name, kernel in self._kernels.items() if factors.get(name)]
+        first = 0
+        for number, batch in enumerate(self.batches):
+            _fill(self._u, self._jets(batch, u))
+            _fill(self._r0, self._placements[number])
+            _fill(self._geometry, np.repeat(batch.geometry, len(batch.rule.weights), axis=0))
+            contraction, blocks = self._contractions[batch.rule], Blocks(batch, self._coupled)
+            for kernel, factor in kernels:
+                blocks.add(kernel.evaluate(number), factor, kernel.pairs)
+            for side, cells in enumerate(batch.cells):
+                same[cells] += contraction.same(blocks, side)
+            if self._sides == 2:
+                last = first + len(batch.cells[0])
+                cross[first:last] = contraction.cross(blocks)
+                first = last
+
+    def _jets(self, batch: Batch, field: Array) -> Array:
+        """(points, sides, 6, 3) of a field."""
+        nodes = field.reshape(-1, 3)
+        both = [t.jets(nodes[self._dofs[cells]]) for t, cells in zip(batch.rule.tables, batch.cells, strict=True)]
+        return np.stack(both, axis=2)
+
+
+class Kernel:
+    """The point Hessian of one term on a site."""
+
+    def __init__(self, term: PointTerm, points: Points, batches: list[Batch]) -> None:
+        self._term, self._points, self._batches = term, points, batches
+        self._parameters: list[fem.Constant | fem.Function] = []
+        self._varying: list[tuple[fem.Function, list[Array]]] = []
+        for parameter in term.density.parameters:
+            if isinstance(parameter, fem.Constant):
+                self._parameters.append(points.constant(parameter.value))
+            else:
+                here = points.field(3)
+                self._parameters.append(here)
+                self._varying.append((here, [_at_points(parameter, batch) for batch in batches]))
+
+    def compile(
+        self, u: fem.Function, r0: fem.Function, geometry: fem.Function, sides: int, log: KernelLog, comm: MPI.Comm
+    ) -> None:
+        """Collective."""
+        density, name = self._term.density, self._term.name
+        self.pairs = _pairs(density)
+        of_v = isinstance(self._term, HessianTerm)
+        z = self._points.field(3 * PARTS) if of_v else u
+        where: tuple[Expr | tuple[Expr, ...], ...] = ()
+        if sides == 2:
+            jets: list[Any] = [tuple(_jet(field, side) for side in range(2)) for field in (r0, u)]
+            m = tuple(ufl.as_vector([geometry[2 * side], geometry[2 * side + 1]]) for side in range(2))
+            where = (m, geometry[4])
+        else:
+            jets = [_jet(field, 0) for field in ((r0, u, z) if of_v else (r0, u))]
+            if density.facets is not None:
+                where = (ufl.as_vector([geometry[0], geometry[1]]), geometry[2])
+        W = density.of(*jets, *where, *self._parameters)
+        self._hessian = point_hessian(name, W, z, PARTS, self.pairs, log, comm, at_zero=of_v)
+
+    def evaluate(self, number: int) -> Array:
+        """The Hessian's parts at the points of a batch."""
+        for here, values in self._varying:
+            _fill(here, values[number])
+        return self._points.evaluate(self._hessian, self._batches[number].size)
+
+
+def _pairs(density: Density) -> Pairs:
+    """Those of the parts that the density depends on, without those in which it is linear."""
+    parts = [NAMES.index(name) for name in density.parts]
+    linear = [NAMES.index(name) for name in density.linear]
+
+    def coupled(pairs: Iterable[Pair]) -> tuple[Pair, ...]:
+        return tuple(p for p in pairs if not (p[0] in linear and p[1] in linear))
+
+    same = coupled((min(p), max(p)) for p in combinations_with_replacement(parts, 2))
+    return Pairs(same, coupled(product(parts, parts)) if density.sides == 2 else ())
+
+
+def _neighbours(pair: Pair) -> tuple[int, Pair]:
+    return max(RANK[pair[0]], RANK[pair[1]]), pair
+
+
+def _jet(field: fem.Function, side: int) -> Jet:
+    parts = range(side * PARTS, (side + 1) * PARTS)
+    return Jet(*(ufl.as_vector([field[3 * part + c] for c in range(3)]) for part in parts))
+
+
+def _at_points(field: fem.Function, batch: Batch) -> Array:
+    """(points, 3) of a field that varies over the cells."""
+    Q = field.function_space
+    values = Q.element.basix_element.tabulate(0, batch.rule.points[0])[0, :, :, 0]
+    nodal = field.x.array.reshape(-1, 3)[Q.dofmap.list[batch.cells[0]]]
+    return np.asarray(np.matmul(values, nodal))
+
+
+def _fill(field: fem.Function, values: Array) -> None:
+    """The first points' values; the rest of the field is not looked at."""
+    field.x.array[: values.size] = values.ravel()
