@@ -5,6 +5,8 @@ define HELP
 make run CASE=cases/dimple_buckling.yaml [OUT=dir] [N=ranks] [ARGS="--set a=b"]
 make check CASE=...   validate a case, print what would be built
 make figures          the paper's figures into results/figures/: 45 minutes on one core, N=ranks share it
+make extremes         shells far from the ordinary ones into docs/extremes/: 5 minutes
+make bench            error, time and memory of a fixed set into a JSON; ARGS="--compare OLD.json" for ratios
 make test             lint and all tests
 make fast             lint and the tests that are not marked slow
 make lint             ruff and mypy
@@ -13,7 +15,7 @@ make clean            remove caches and compiled kernels; keeps .env/root and re
 endef
 export HELP
 
-.PHONY: help run check figures test fast lint image clean
+.PHONY: help run check figures extremes bench test fast lint image clean
 
 help:
 	@echo "$$HELP"
@@ -24,6 +26,9 @@ run check:
 
 figures:
 	$(ENV) $(if $(N),mpirun -n $(N)) python3 -m magshell_fenicsx.figures $(ARGS)
+
+extremes bench:
+	$(ENV) $(if $(N),mpirun -n $(N)) python3 -m magshell_fenicsx.$@ $(ARGS)
 
 test: lint
 	$(ENV) python3 -m pytest

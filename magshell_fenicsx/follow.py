@@ -69,6 +69,10 @@ def follow(scene: Scene) -> Iterator[Record]:
     state = scene.unloaded()
     pivots = scene.newton.factor_at(state).negative_pivots
     yield Record("start", "", Point(state, 0.0, 0.0 * state.u, 0.0, pivots, pivots, 0, 1))
+    if pivots:
+        raise Stopped(
+            f"the undeformed shell is unstable in {pivots} directions: mesh.penalty is too small, or the mesh too coarse"
+        )
     loading = scene.case.loading
     if isinstance(loading, FieldSection):
         yield from _field_as_load(scene, loading, state)

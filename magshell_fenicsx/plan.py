@@ -18,8 +18,9 @@ from magshell_fenicsx.case.fields import Direction, MagneticSection, layer_avera
 from magshell_fenicsx.case.loading import IndentationSection, PressureSection, RotationSection
 from magshell_fenicsx.case.shell import ShellSection
 from magshell_fenicsx.case.source import CaseError
-from magshell_fenicsx.mesh.grading import Disc, Ring, Size, smallest
-from magshell_fenicsx.mesh.patch import Embedding
+from magshell_fenicsx.feasible import refuse_too_large, refuse_unbounded_fields, sample
+from magshell_fenicsx.mesh.grading import Disc, Feature, Grading, Ring
+from magshell_fenicsx.mesh.patch import Embedding, MeshError
 from magshell_fenicsx.mesh.shapes import DiscShape, Shape, StripShape
 from magshell_fenicsx.mesh.sphere import Dimple, SphereEmbedding, flat
 from magshell_fenicsx.mesh.triangulation import triangulate
@@ -53,7 +54,7 @@ class Plan:
     shape: Shape
     embedding: Embedding
     points: dict[str, NDArray[np.float64]]
-    size: Size
+    size: Grading
     included: list[str]
     left_out: list[str]
 
@@ -64,7 +65,7 @@ def make_plan(case: Case) -> Plan:
     Raises
     ------
     CaseError
-        If a half shell is asked for and there is no mirror plane.
+        If the symmetry that is asked for is not there, or what is asked for cannot be built.
     """
     shell, loading, magnetic = case.shell, case.loading, case.magnetic
     material = Material(shell.poisson_ratio, 1 / shell.R_over_h)
@@ -94,10 +95,18 @@ def make_plan(case: Case) -> Plan:
     force = None
     if indentation:
         at, theta = radians(indentation.at.polar), radians(indentation.at.azimuth) - turn
-        chart = at * np.array([cos(theta), 0.0 if half else sin(theta)])
         name = "load" if at else "pole"
-        points[name] = chart
+        if 0 < at < material.h:
+            raise CaseError(f"loading.at.polar: {indentation.at.polar:g}: 0, or more than a thickness from the pole")
+        if at:  # else at the pole, which is the tip of a strip
+            points[name] = at * np.array([cos(theta), 0.0 if half else sin(theta)])
         force = Force(name, indentation.patch * material.h)
+        room = pi / 2 - at if hemisphere else min(1.0, shell.width or 1.0)
+        if indentation.patch and not 0.3 <= indentation.patch <= room * shell.R_over_h:
+            raise CaseError(
+                f"loading.patch: {indentation.patch:g}: allowed are 0 for a point, or 0.3 to "
+                f"{room * shell.R_over_h:.4g}, where it reaches the edge"
+            )
     shape: Shape
     if shell.width is not None:
         shape = StripShape(shell.width, half)
@@ -114,6 +123,11 @@ def make_plan(case: Case) -> Plan:
         force=force,
         magnetic=_magnetisation(magnetic, shell, turn, to) if magnetic and field_on else None,
     )
+    size = _grading(case, material.h, defect, points)
+    embedding: Embedding = SphereEmbedding(defect) if hemisphere else flat
+    refuse_unbounded_fields(case, embedding(sample(shape)))
+    if not axisymmetric:
+        refuse_too_large(case, size, shape)
     included, left_out = _account(
         case, loads, "meridian" if axisymmetric else "half shell" if half else "full shell", azimuth
     )
@@ -125,9 +139,9 @@ def make_plan(case: Case) -> Plan:
         half=half,
         azimuth=turn,
         shape=shape,
-        embedding=SphereEmbedding(defect) if hemisphere else flat,
+        embedding=embedding,
         points=points,
-        size=_grading(case, material.h, defect, points),
+        size=size,
         included=included,
         left_out=left_out,
     )
@@ -172,10 +186,11 @@ def _magnetisation(magnetic: MagneticSection, shell: ShellSection, turn: float, 
         remanent = InsideAndOutside(shell.dimple_half_width, inside.vector(turn), rest) if inside else rest
     else:
         remanent = section.vector(turn)
-    applied, across = magnetic.applied.uniform * magnetic.applied.vector(turn), None
+    along = magnetic.applied.vector(turn)
+    applied, across = magnetic.applied.uniform * along, None
     if to is not None:
-        across = to.vector(turn) - (to.vector(turn) @ applied) * applied
-        across /= np.linalg.norm(across)
+        away = to.vector(turn) - (to.vector(turn) @ along) * along
+        across = magnetic.applied.uniform * away / np.linalg.norm(away)
     return Magnetisation(remanent, applied, magnetic.energy, np.array(gradient) if gradient else None, across)
 
 
@@ -194,12 +209,12 @@ def common_azimuth(directions: Sequence[Direction]) -> float | None:
     return atan2(y, x)
 
 
-def _grading(case: Case, h: float, defect: Dimple | None, points: dict[str, NDArray[np.float64]]) -> Size:
+def _grading(case: Case, h: float, defect: Dimple | None, points: dict[str, NDArray[np.float64]]) -> Grading:
     """Element sizes for 1e-4 in k_d and 1e-3 in F at degree 4, in units of the shell's length sqrt(Rh)."""
     length, refine, growth = sqrt(h), case.mesh.refinement, 0.4
     loading = case.loading
     if case.shell.geometry != "hemisphere":
-        features: list[Size] = []
+        features: list[Feature] = []
         largest = min(0.25, 0.5 * (case.shell.width or 1.0))
     else:
         features = [Ring(pi / 2, 1.4 * length / refine, growth)]
@@ -215,7 +230,7 @@ def _grading(case: Case, h: float, defect: Dimple | None, points: dict[str, NDAr
         # finer than h the point force's logarithmic stretch would be resolved, which has no limit
         centre = max(loading.patch * h / 2, h) if loading.patch else h
         features.append(Disc((x, y), loading.patch * h, centre, growth))
-    return smallest(features, largest / refine)
+    return Grading(features, largest / refine)
 
 
 def _account(case: Case, loads: Loads, model: str, azimuth: float | None) -> tuple[list[str], list[str]]:
@@ -266,7 +281,10 @@ def _count(case: Case, plan: Plan) -> tuple[int, int]:
     k = case.mesh.degree
     if plan.axisymmetric:
         return (count := len(meridian_vertices(plan, case.mesh.refinement)) - 1), 2 * (k * count + 1)
-    cells = triangulate(plan.shape, plan.size, plan.points, plan.embedding).cells
+    try:
+        cells = triangulate(plan.shape, plan.size, plan.points, plan.embedding).cells
+    except MeshError as e:
+        raise CaseError(str(e)) from None
     corners = len(np.unique(cells[:, :3]))
     sides = corners + len(cells) - 1  # Euler's formula for a disc
     return len(cells), 3 * (corners + (k - 1) * sides + (k - 1) * (k - 2) // 2 * len(cells))

@@ -10,6 +10,7 @@ from magshell_fenicsx.axisymmetric.meridian import make_meridian
 from magshell_fenicsx.axisymmetric.model import MeridianModel
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.mesh.midsurface import Midsurface, distribute
+from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.mesh.triangulation import triangulate
 from magshell_fenicsx.plan import Plan, make_plan, meridian_vertices
 from magshell_fenicsx.shell.model import ShellModel
@@ -96,7 +97,12 @@ def build_meridian_model(case: Case, plan: Plan) -> MeridianModel:
 
 def build_midsurface(plan: Plan, comm: MPI.Comm) -> Midsurface:
     """Triangulate on rank 0, distribute to all."""
-    patch = None
+    patch, error = None, None
     if comm.rank == 0:
-        patch = triangulate(plan.shape, plan.size, plan.points, plan.embedding)
+        try:
+            patch = triangulate(plan.shape, plan.size, plan.points, plan.embedding)
+        except MeshError as e:
+            error = e
+    if error := comm.bcast(error):
+        raise error
     return distribute(patch, comm)

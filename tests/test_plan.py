@@ -44,3 +44,22 @@ def test_what_is_not_needed_is_left_out() -> None:
     assert plan.loads.force is None
     assert plan.loads.pressure
     assert any("lambda_m is zero" in line for line in plan.left_out)
+
+
+def test_a_turning_field_keeps_its_magnitude() -> None:
+    """With `uniform: 2` both directions that it turns between are twice as long, and normal to each other."""
+    field = {"lambda_m": 1e-3, "applied": {"polar": 30, "uniform": 2}}
+    magnetic = make_plan(case(magnetic=field, loading={"kind": "rotation", "to": {"polar": 80}})).loads.magnetic
+    assert magnetic
+    assert magnetic.across is not None
+    assert [np.linalg.norm(magnetic.applied), np.linalg.norm(magnetic.across)] == pytest.approx([2, 2])
+    assert magnetic.applied @ magnetic.across == pytest.approx(0, abs=1e-12)
+
+
+def test_a_strip_is_loaded_at_its_tip() -> None:
+    """The point that is named the pole, where its displacement is reported too."""
+    shell = {"geometry": "strip", "radius_to_thickness": 100, "width": 0.1, "poisson_ratio": 0}
+    load = {"kind": "indentation", "at": {}, "depth": 1}
+    plan = make_plan(case(shell=shell, boundary={"root": "clamped"}, loading=load))
+    assert plan.loads.force
+    assert plan.points[plan.loads.force.point] == pytest.approx([1, 0])

@@ -1,11 +1,16 @@
 """What all sections of a case share: strict types, no unknown keys, numbers with units."""
 
+import re
 from typing import Annotated, Any
 
 import pint
 from pydantic import BaseModel, BeforeValidator, ConfigDict
 
 _units = pint.UnitRegistry()
+# one number, then units; pint itself would compute any formula, 9**9**9 included
+_NUMBER = r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)(e[-+]?[0-9]+)?"
+_UNIT = r"[^\W\d]+(\s*(\*\*|\^)\s*-?[0-9])?"
+_NUMBER_AND_UNITS = re.compile(rf"\s*{_NUMBER}[\s*]*{_UNIT}([\s*/]+{_UNIT})*\s*", re.IGNORECASE)
 
 
 class Section(BaseModel):
@@ -21,6 +26,8 @@ def _quantity(unit: str) -> Any:
         if not isinstance(value, str):
             raise ValueError(f'needs a unit, for example "{_EXAMPLES[unit]}"')
         try:
+            if not _NUMBER_AND_UNITS.fullmatch(value):
+                raise ValueError(value)
             quantity = _units.Quantity(value)
             return float(quantity.to(unit).magnitude)
         except pint.DimensionalityError as e:

@@ -21,7 +21,7 @@ class MeshSection(Section):
 
     degree: int = Field(default=4, ge=2, le=5)
     refinement: float = Field(default=1.0, ge=0.1, le=20, description="divides every element size")
-    penalty: float | None = Field(default=None, gt=0, description="sigma of the interior penalty")
+    penalty: float | None = Field(default=None, ge=1e-3, le=1e9, description="sigma of the interior penalty")
 
 
 class Case(Section):

@@ -12,4 +12,4 @@ class DimpleSection(Section):
 
     kind: Literal["dimple"]
     amplitude: float = Field(ge=0, le=50, description="delta/h")
-    width: float = Field(gt=0, le=50, description="phi_bar_o = phi_o (sqrt(12 (1 - nu^2)) R/h)^(1/2)")
+    width: float = Field(ge=0.05, le=50, description="phi_bar_o = phi_o (sqrt(12 (1 - nu^2)) R/h)^(1/2)")

@@ -48,7 +48,7 @@ class RemanentSection(Direction):
     """
 
     kind: Literal["uniform", "radial", "tangential", "expression", "patches", "layers"] = "uniform"
-    flux_density: FluxDensity | None = None
+    flux_density: FluxDensity | None = Field(default=None, ge=-1e3, le=1e3)
     components: list[Formula] | None = Field(default=None, min_length=3, max_length=3)
     patches: dict[Literal["dimple", "rest"], Direction] | None = None
     layers: list[Layer] | None = Field(default=None, min_length=1)
@@ -61,7 +61,7 @@ class RemanentSection(Direction):
                 raise ValueError(f"{key} belongs to kind: {kind}, and must be given there; the kind is {self.kind}")
         if self.kind != "uniform" and {"polar", "azimuth"} & self.model_fields_set:
             raise ValueError(f"polar and azimuth belong to kind: uniform; the kind is {self.kind}")
-        if self.patches and "rest" not in self.patches:
+        if self.patches is not None and "rest" not in self.patches:
             raise ValueError("patches needs the patch rest")
         if self.layers:
             if abs(sum(layer.fraction for layer in self.layers) - 1) > 1e-6:
@@ -85,9 +85,11 @@ def layer_average(layers: list[Layer], turn: float = 0.0) -> NDArray[np.float64]
 class AppliedSection(Direction):
     """The applied flux density, uniform or linear in space: |Ba| (uniform b + gradient . r/R)."""
 
-    flux_density: FluxDensity | None = None
-    uniform: float = Field(default=1.0, description="factor of the uniform part")
-    gradient: list[list[float]] | None = Field(default=None, min_length=3, max_length=3)
+    flux_density: FluxDensity | None = Field(default=None, ge=-1e3, le=1e3)
+    uniform: float = Field(default=1.0, ge=-1e3, le=1e3, description="factor of the uniform part")
+    gradient: list[list[Annotated[float, Field(ge=-1e3, le=1e3)]]] | None = Field(
+        default=None, min_length=3, max_length=3
+    )
 
     @model_validator(mode="after")
     def _square(self) -> Self:

@@ -9,6 +9,7 @@ from magshell_fenicsx.case.base import Section
 from magshell_fenicsx.case.fields import Direction
 
 Until = Literal["limit", "bifurcation", "target", "points"]
+LEAST_TARGET = 1e-9
 Wanted = Mapping[str, tuple[str, ...]]  # control -> the targets that it can have
 
 
@@ -31,8 +32,8 @@ class PathSection(Section):
         """One target that fits the control with `until: target`, none elsewhere."""
         given, fitting = [key for key, value in targets.items() if value is not None], wanted[control]
         for key in given:
-            if not targets[key]:
-                raise ValueError(f"{key} is a target and must not be zero")
+            if abs(targets[key] or 0.0) < LEAST_TARGET:
+                raise ValueError(f"{key} is a target and must not be zero (at least {LEAST_TARGET:g} in size)")
         if until == "target" and (len(given) != 1 or given[0] not in fitting):
             names = " or ".join(fitting) or "another control"
             raise ValueError(f"until: target with control: {control} needs {names} (and nothing else) as target")

@@ -11,7 +11,7 @@ from magshell_fenicsx.case.source import Location, Source, dotted
 
 def explain(error: Any, source: Source, case: type[BaseModel]) -> str:
     """One line for one of pydantic's errors."""
-    location = _without_tags(error["loc"], source.data)
+    location = _without_tag(error["loc"], case)
     value, kind = error["input"], error["type"]
     said = error["msg"].removeprefix("Value error, ").replace("Input should be", "must be")
     if about := re.match(r"([a-z_]+(\.[a-z_]+)+): ", said):  # a rule between sections names its own key
@@ -26,23 +26,28 @@ def explain(error: Any, source: Source, case: type[BaseModel]) -> str:
         return f"{place}: {key}: is missing"
     if kind.startswith("union_tag"):
         tags = [_tag(m) for m in _models(case.model_fields[key].annotation)]
-        return f"{place}: {key}.kind: {error['ctx'].get('tag', 'is missing')}; allowed: {', '.join(tags)}"
+        tag = error["ctx"].get("tag")
+        return f"{place}: {key}.kind: {'is missing' if tag is None else shown(tag)}; allowed: {', '.join(tags)}"
     if kind == "model_type":
-        return f"{place}: {key}: {value!r}: must be a section, with keys below it"
+        return f"{place}: {key}: {shown(value)}: must be a section, with keys below it"
     if isinstance(value, dict | BaseModel):
         return f"{place}: {key}: {said}"
-    return f"{place}: {key}: {value!r}: {said}"
+    return f"{place}: {key}: {shown(value)}: {said}"
 
 
-def _without_tags(loc: tuple[str | int, ...], data: Any) -> Location:
-    """Pydantic puts the tag of a union (`kind`) into the location: take it out."""
-    location: list[str | int] = []
-    for key in loc:
-        if isinstance(data, dict) and data.get("kind") == key and key not in data:
-            continue
-        location.append(key)
-        data = data.get(key) if isinstance(data, dict) else None
-    return tuple(location)
+def shown(value: Any) -> str:
+    """The value as it was written, on one line of bearable length."""
+    try:
+        text = repr(value)
+    except ValueError:  # Python prints no integers of thousands of digits
+        return "a number of thousands of digits"
+    return text if len(text) <= 80 else f"{text[:77]}..."
+
+
+def _without_tag(loc: Location, case: type[BaseModel]) -> Location:
+    """Pydantic puts the `kind` of a section that has several after its name: take it out."""
+    section = case.model_fields.get(str(loc[0])) if loc else None
+    return (loc[0], *loc[2:]) if section and len(_models(section.annotation)) > 1 else loc
 
 
 def _allowed_keys(location: Location, data: Any, case: type[BaseModel]) -> list[str]:
@@ -50,9 +55,9 @@ def _allowed_keys(location: Location, data: Any, case: type[BaseModel]) -> list[
     model = case
     for key in location:
         data = data[key]
-        models = _models(model.model_fields[str(key)].annotation)
-        of_kind = [m for m in models if "kind" in m.model_fields and data["kind"] == _tag(m)]
-        model = (of_kind or models)[0]
+        if key in model.model_fields:  # else it is one of a list or mapping of sections
+            models = _models(model.model_fields[str(key)].annotation)
+            model = next((m for m in models if len(models) > 1 and data["kind"] == _tag(m)), models[0])
     return list(model.model_fields)
 
 

@@ -16,7 +16,7 @@ class ShellSection(Section):
     radius_to_thickness: float | None = Field(default=None, ge=10, le=1e5)
     radius: Length | None = Field(default=None, gt=0)
     thickness: Length | None = Field(default=None, gt=0)
-    youngs_modulus: Pressure | None = Field(default=None, gt=0)
+    youngs_modulus: Pressure | None = Field(default=None, ge=1, le=1e13)
     poisson_ratio: float = Field(gt=-1, le=0.5)
     defect: DimpleSection | None = None
     width: float | None = Field(default=None, gt=0, le=10, description="of the strip, over its length")
@@ -40,6 +40,17 @@ class ShellSection(Section):
                 f"the dimple's half-width phi_o is {self.dimple_half_width * 180 / pi:.1f} degrees at this R/h "
                 f"and poisson_ratio; it must stay below 81"
             )
+        if self.defect and self.defect.amplitude > 0.5 * self.R_over_h:
+            depth = self.defect.amplitude / self.R_over_h
+            raise ValueError(f"the dimple is {depth:.2g} radii deep; it must stay below half a radius")
+        if self.defect and self.dimple_slope > 2:
+            raise ValueError(
+                f"the dimple's steepest slope is {self.dimple_slope:.3g}: too steep for a shell, at most 2"
+            )
+        if self.width is not None and self.width * self.R_over_h < 1:
+            raise ValueError(
+                f"the strip is narrower than its thickness; width must be at least {1 / self.R_over_h:.4g}"
+            )
         return self
 
     @property
@@ -55,3 +66,9 @@ class ShellSection(Section):
         """phi_o (rad)."""
         assert self.defect
         return self.defect.width / sqrt(sqrt(12 * (1 - self.poisson_ratio**2)) * self.R_over_h)
+
+    @property
+    def dimple_slope(self) -> float:
+        """Largest |dw0/dphi| over R, at phi_o/sqrt(3)."""
+        assert self.defect
+        return 8 / sqrt(27) * self.defect.amplitude / self.R_over_h / self.dimple_half_width

@@ -1,6 +1,7 @@
 """Reading a case file: YAML to plain data, with the line of every key kept for messages."""
 
 import re
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -8,6 +9,7 @@ from typing import Any
 import yaml
 
 Location = tuple[str | int, ...]
+LARGEST, MOST_ENTRIES, DEEPEST = 1_000_000, 10_000, 20  # bytes, keys and items, levels: far beyond any case
 
 
 class CaseError(ValueError):
@@ -32,7 +34,7 @@ class Source:
     Attributes
     ----------
     places
-        Location of a key -> "file:line" or the `--set` that gave it.
+        Location of a key or item -> "file:line" or the `--set` that gave it.
     """
 
     name: str
@@ -56,32 +58,53 @@ def read_source(file: Path) -> Source:
         If the file cannot be read, is no YAML mapping, or has a key twice.
     """
     try:
-        text = file.read_text(encoding="utf-8")
-        node = yaml.compose(text, Loader=_Loader)
+        with file.open("rb") as stream:
+            content = stream.read(LARGEST + 1)
+        text = content.decode("utf-8")
     except OSError as e:
         raise CaseError(f"{file}: cannot be read: {e.strerror}") from None
     except UnicodeDecodeError:
         raise CaseError(f"{file}: is not a text file in UTF-8") from None
-    except yaml.YAMLError as e:
-        mark = getattr(e, "problem_mark", None)
-        where = f"{file}:{mark.line + 1}" if mark else f"{file}"
-        raise CaseError(f"{where}: not valid YAML: {getattr(e, 'problem', None) or getattr(e, 'reason', e)}") from None
+    if len(content) > LARGEST:
+        raise CaseError(f"{file}: is larger than {LARGEST} bytes, too large for a case file")
     source = Source(str(file), {})
+    node = _parsed(source, lambda: yaml.compose(text, Loader=_Loader))
     if not isinstance(node, yaml.MappingNode):
         raise CaseError(f"{file}: a case file is a mapping of sections (shell, boundary, loading, ...)")
     _walk(node, (), source)
-    try:
-        source.data = _Loader(text).get_single_data()
-    except (yaml.YAMLError, ValueError) as e:
-        raise CaseError(f"{file}: not valid YAML: {e}") from None
+    data = _parsed(source, lambda: _Loader(text).get_single_data())
+    if not isinstance(data, dict):  # an explicit tag can make anything of a mapping
+        raise CaseError(f"{file}: a case file is a mapping of sections (shell, boundary, loading, ...)")
+    source.data = data
     return source
 
 
+def _parsed(source: Source, parse: Callable[[], Any]) -> Any:
+    """What PyYAML makes of a text, its many kinds of failure made one."""
+    try:
+        return parse()
+    except yaml.YAMLError as e:
+        mark = getattr(e, "problem_mark", None)
+        where = f"{source.name}:{mark.line + 1}" if mark else source.name
+        said = getattr(e, "problem", None) or getattr(e, "reason", e)
+        raise CaseError(f"{where}: not valid YAML: {said}") from None
+    except RecursionError:
+        raise CaseError(f"{source.name}: not valid YAML: it is nested too deeply") from None
+    except Exception as e:  # a value that its explicit tag (!!timestamp, !!int) does not fit: any kind
+        raise CaseError(f"{source.name}: not valid YAML: {type(e).__name__}: {e}") from None
+
+
 def _walk(node: yaml.Node, location: Location, source: Source) -> None:
+    """Note the places of all keys and items; refuse what would grow without end, as aliases can."""
+    if len(source.places) > MOST_ENTRIES or len(location) > DEEPEST:
+        raise CaseError(
+            f"{source.name}:{node.start_mark.line + 1}: more than {MOST_ENTRIES} entries, or deeper than {DEEPEST} "
+            "levels, are no case file (does an alias hold itself?)"
+        )
     if isinstance(node, yaml.MappingNode):
         for key, value in node.value:
             place = f"{source.name}:{key.start_mark.line + 1}"
-            if not isinstance(key, yaml.ScalarNode):
+            if not isinstance(key, yaml.ScalarNode) or not key.value.isprintable():
                 raise CaseError(f"{place}: a key must be a word")
             here = (*location, key.value)
             if here in source.places:
@@ -90,6 +113,7 @@ def _walk(node: yaml.Node, location: Location, source: Source) -> None:
             _walk(value, here, source)
     elif isinstance(node, yaml.SequenceNode):
         for i, value in enumerate(node.value):
+            source.places[*location, i] = f"{source.name}:{value.start_mark.line + 1}"
             _walk(value, (*location, i), source)
 
 
@@ -110,10 +134,9 @@ def override(source: Source, assignment: str) -> None:
         section = section.setdefault(key, {})
         if not isinstance(section, dict):
             raise CaseError(f"--set {assignment}: {key} is a value, not a section")
-    try:
-        section[keys[-1]] = yaml.load(text, Loader=_Loader)
-    except yaml.YAMLError as e:
-        raise CaseError(f"--set {assignment}: not a valid value: {getattr(e, 'problem', e)}") from None
+    given = Source(f"--set {assignment}", {})
+    _walk(_parsed(given, lambda: yaml.compose(text, Loader=_Loader)) or yaml.ScalarNode("", ""), (), given)
+    section[keys[-1]] = _parsed(given, lambda: yaml.load(text, Loader=_Loader))
     for length in range(1, len(keys) + 1):
         if length == len(keys) or tuple(keys[:length]) not in source.places:
             source.places[tuple(keys[:length])] = f"--set {assignment}"

@@ -2,11 +2,26 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from math import log1p, pi, sqrt
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from magshell_fenicsx.mesh.shapes import Shape
+
 Size = Callable[[NDArray[np.float64]], float]
+PER_AREA = 4 / sqrt(3)  # triangles of size one per unit area
+
+
+class Feature(Protocol):
+    """A place with small elements around it."""
+
+    def __call__(self, x: NDArray[np.float64]) -> float:
+        """Wanted element size at a point of the chart."""
+
+    def cells(self, reach: float) -> float:
+        """About how many elements it needs up to the distance `reach` from it."""
 
 
 @dataclass(frozen=True)
@@ -22,6 +37,13 @@ class Disc:
         distance = np.hypot(x[0] - self.centre[0], x[1] - self.centre[1])
         return float(self.size + self.growth * max(0.0, distance - self.radius))
 
+    def cells(self, reach: float) -> float:
+        """Integral of 2 pi t/(s + g max(0, t - a))^2 over t, a the radius or, if that is less, the reach."""
+        s, g, a = self.size, self.growth, min(self.radius, reach)
+        outer = g * (reach - a) / s
+        around = 2 * pi * (a / (s * g) * outer / (1 + outer) + (log1p(outer) - outer / (1 + outer)) / g**2)
+        return PER_AREA * (pi * a**2 / s**2 + around)
+
 
 @dataclass(frozen=True)
 class Ring:
@@ -34,7 +56,24 @@ class Ring:
     def __call__(self, x: NDArray[np.float64]) -> float:
         return float(self.size + self.growth * abs(np.hypot(x[0], x[1]) - self.radius))
 
+    def cells(self, reach: float) -> float:
+        """Of its inner side: the outer one lies beyond the edge."""
+        return PER_AREA * 2 * pi * self.radius * reach / (self.size * (self.size + self.growth * reach))
 
-def smallest(features: Sequence[Size], largest: float) -> Size:
+
+@dataclass(frozen=True)
+class Grading:
     """The size that satisfies every feature, and nowhere above `largest`."""
-    return lambda x: min([largest, *(feature(x) for feature in features)])
+
+    features: Sequence[Feature]
+    largest: float
+
+    def __call__(self, x: NDArray[np.float64]) -> float:
+        return min([self.largest, *(feature(x) for feature in self.features)])
+
+    def cells(self, shape: Shape) -> float:
+        """About how many triangles fill a shape; too many by the overlap of the features, at most by half."""
+        share = 0.5 if shape.half else 1.0  # features lie on the mirror line
+        around = share * sum(feature.cells(shape.reach) for feature in self.features)
+        inner, outer = PER_AREA * shape.area / self.largest**2, 2 * shape.reach / self.largest  # of a thin strip
+        return inner + outer + around

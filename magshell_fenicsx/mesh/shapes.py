@@ -1,6 +1,7 @@
 """The plane shapes that gmsh triangulates: the chart of the mid-surface, or one half of it."""
 
 from dataclasses import dataclass
+from math import pi
 from typing import Any, Protocol
 
 import numpy as np
@@ -11,7 +12,16 @@ Faces = list[tuple[int, int]]
 
 
 class Shape(Protocol):
-    """What a triangulation needs of a shape."""
+    """What a triangulation needs of a shape; `area` is that of the part modelled, `reach` its extent."""
+
+    @property
+    def area(self) -> float: ...
+
+    @property
+    def reach(self) -> float: ...
+
+    @property
+    def half(self) -> bool: ...
 
     def faces(self, occ: Any) -> Faces:
         """Make the shape's faces with gmsh's OpenCASCADE kernel; their common edges are followed."""
@@ -33,6 +43,14 @@ class DiscShape:
     radius: float
     half: bool
     circle: float | None = None
+
+    @property
+    def area(self) -> float:
+        return pi * self.radius**2 / (2 if self.half else 1)
+
+    @property
+    def reach(self) -> float:
+        return self.radius
 
     def faces(self, occ: Any) -> Faces:
         discs = [
@@ -56,6 +74,14 @@ class StripShape:
 
     width: float
     half: bool
+
+    @property
+    def area(self) -> float:
+        return self.width / (2 if self.half else 1)
+
+    @property
+    def reach(self) -> float:
+        return 1.0
 
     def faces(self, occ: Any) -> Faces:
         below = 0 if self.half else -self.width / 2

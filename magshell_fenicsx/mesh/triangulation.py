@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.mesh.grading import Size
-from magshell_fenicsx.mesh.patch import Embedding, PatchMesh
+from magshell_fenicsx.mesh.patch import Embedding, MeshError, PatchMesh
 from magshell_fenicsx.mesh.shapes import Shape
 
 ORDER, TRIANGLE10, LINE4 = 3, 21, 26  # gmsh's numbers of the cubic elements
@@ -23,6 +23,11 @@ def triangulate(shape: Shape, size: Size, points: Mapping[str, NDArray[np.float6
         Named points (2,) that must be vertices.
     embedding
         From the plane to the mid-surface.
+
+    Raises
+    ------
+    MeshError
+        If gmsh cannot mesh the shape.
     """
     import gmsh
 
@@ -45,6 +50,8 @@ def triangulate(shape: Shape, size: Size, points: Mapping[str, NDArray[np.float6
         nodes = xyz.reshape(-1, 3)[:, :2].copy()
         cells = number[gmsh.model.mesh.getElementsByType(TRIANGLE10)[1].astype(np.int64)].reshape(-1, 10)
         lines = number[gmsh.model.mesh.getElementsByType(LINE4)[1].astype(np.int64)].reshape(-1, 4)[:, :2]
+    except Exception as e:  # gmsh's own errors have no class of their own
+        raise MeshError(f"gmsh cannot mesh this surface: {e}") from None
     finally:
         gmsh.finalize()
     # gmsh's inner node misses the quadratic part of a curved edge by 2 % of its sagitta's scale, and with it
