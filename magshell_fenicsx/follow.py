@@ -71,7 +71,7 @@ def follow(scene: Scene) -> Iterator[Record]:
     yield Record("start", "", Point(state, 0.0, 0.0 * state.u, 0.0, pivots, pivots, 0, 1))
     if pivots:
         raise Stopped(
-            f"the undeformed shell is unstable in {pivots} directions: mesh.penalty is too small, or the mesh too coarse"
+            f"the undeformed shell is unstable in {pivots} directions: mesh.penalty is too small or the mesh too coarse"
         )
     loading = scene.case.loading
     if isinstance(loading, FieldSection):
