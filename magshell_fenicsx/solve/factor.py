@@ -93,9 +93,9 @@ class Factorisation:
 
 
 def _new_pc(K: PETSc.Mat, solver: str) -> PETSc.PC:
-    given = PETSc.Options(PREFIX)
-    # its other method factors indefinite matrices without a word
-    given["mat_cholmod_supernodal_switch"], given["mat_cholmod_print"] = 0.0, 0
+    if solver == "cholmod":  # its other method factors indefinite matrices without a word
+        given = PETSc.Options(PREFIX)
+        given["mat_cholmod_supernodal_switch"], given["mat_cholmod_print"] = 0.0, 0
     pc = PETSc.PC().create(K.comm)
     pc.setOptionsPrefix(PREFIX)
     pc.setOperators(K)
