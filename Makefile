@@ -27,8 +27,11 @@ run check:
 figures:
 	$(ENV) $(if $(N),mpirun -n $(N)) python3 -m magshell_fenicsx.figures $(ARGS)
 
-extremes bench:
-	$(ENV) $(if $(N),mpirun -n $(N)) python3 -m magshell_fenicsx.$@ $(ARGS)
+extremes:
+	$(ENV) $(if $(N),mpirun -n $(N)) python3 -m magshell_fenicsx.extremes $(ARGS)
+
+bench:
+	$(ENV) python3 -m magshell_fenicsx.bench $(ARGS)
 
 test: lint
 	$(ENV) python3 -m pytest

@@ -99,6 +99,44 @@ def sweep(
 
 
 @app.command()
+def study(
+    case: CaseFile,
+    over: Annotated[
+        list[str],
+        typer.Option(
+            metavar="KEY.PATH=VALUE,VALUE", help="or =START:STOP:COUNT; repeat for a product, tie keys with +"
+        ),
+    ],
+    result: Annotated[
+        str, typer.Option(metavar="NAME", help="knockdown, critical_field, force@w_over_h=10, energy@end, ...")
+    ],
+    set_: Settings = None,
+    reference: Annotated[float | None, typer.Option(help="that errors are relative to; default the finest run")] = None,
+    ranks: Annotated[str, typer.Option(metavar="N,N", help="numbers of MPI ranks to run each point on")] = "1",
+    repeat: Annotated[int, typer.Option(min=1, help="runs of each point, whose medians are told")] = 3,
+    out: Annotated[Path | None, typer.Option(help="output folder; default results/<case name>_study/")] = None,
+) -> None:
+    """Measure error against run time over meshes, degrees, models and ranks; runs that are in the folder are kept."""
+    from magshell_fenicsx.results.folder import DiskError
+    from magshell_fenicsx.study.study import parse_ranks
+    from magshell_fenicsx.study.study import study as run_study
+
+    folder = out or Path("results") / f"{case.stem}_study"
+    try:
+        numbers, settings = parse_ranks(ranks), set_ or []
+        done = run_study(
+            case, over, settings, result=result, reference=reference, ranks=numbers, repeat=repeat, out=folder
+        )
+    except CaseError as e:
+        raise _failure(str(e), INVALID) from None
+    except DiskError as e:
+        raise _failure(f"stopped early: {e}", STOPPED) from None
+    _say(f"results in {folder}/")
+    if done.without_result:
+        raise _failure(f"{done.without_result} of {len(done.rows)} runs gave no {result}; study.csv says why", STOPPED)
+
+
+@app.command()
 def check(case: CaseFile, set_: Settings = None) -> None:
     """Validate a case; print what would be built and what is left out."""
     from magshell_fenicsx.plan import describe

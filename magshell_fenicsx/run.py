@@ -95,8 +95,10 @@ def _run(case: Case, folder: Path | None, comm: MPI.Comm, say: Say, watch: Watch
             try:
                 files.summarise(summary(result, time.perf_counter() - start))
                 if not interrupted:  # who interrupts does not wait for pictures
-                    files.draw(result, say)
-                    report(result, folder, say)
+                    with result.output:
+                        files.draw(result, say)
+                        report(result, folder, say)
+                    files.summarise(summary(result, time.perf_counter() - start))  # with the time of the pictures
             except DiskError as e:
                 interrupted = interrupted or e
             files.close(complete=not interrupted and not result.stopped)
@@ -131,7 +133,8 @@ def _follow(result: Result, files: RunFiles | None, say: Say, start: float) -> N
         if record.label in ("fold", "bifurcation"):
             result.singular[len(result.rows) - 1] = record.point.state
         if files:
-            files.write(row, record.point.state)
+            with result.output:
+                files.write(row, record.point.state)
         if not files or len(result.rows) > files.kept:
             say(_line(row))
 

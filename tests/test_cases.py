@@ -5,7 +5,7 @@ References: "axisymmetric" is an independent solver of the meridian's equations,
 """
 
 import pathlib
-from functools import cache
+from functools import lru_cache
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ from magshell_fenicsx.axisymmetric.instability import ExcludedWaves
 from magshell_fenicsx.solve.path import Path, PathStopped, Point
 
 
-@cache
+@lru_cache(maxsize=2)
 def result(file: str, *settings: str) -> Result:
     return run(Case.load(CASES / file, settings))
 

@@ -3,7 +3,7 @@
 "axisymmetric": an independent solver of the meridian's equations, nine digits.
 """
 
-from functools import cache
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ from scipy.special import ellipk
 from magshell_fenicsx import Case, Result, run
 
 
-@cache
+@lru_cache(maxsize=2)
 def result(file: str, *settings: str) -> Result:
     return run(Case.load(CASES / file, settings))
 

@@ -7,6 +7,7 @@ from magshell_fenicsx.environment import fast_blas, versions
 from magshell_fenicsx.results.table import Row
 from magshell_fenicsx.scene import Scene
 from magshell_fenicsx.solve.system import State
+from magshell_fenicsx.solve.timing import Stopwatch
 
 VALUE_COLUMN = {"pressure": "p_over_pc", "force": "force", "lambda_m": "lambda_m", "angle": "field_angle"}
 OWN_MODES = ("", "symmetric", "asymmetric")  # of an instability within the model; others it excludes
@@ -39,6 +40,7 @@ class Result:
     stopped: str | None = None
     replayed: int = 0
     sensitivities: dict[str, float] = field(default_factory=dict)
+    output: Stopwatch = field(default_factory=Stopwatch)
 
     @property
     def limit_points(self) -> list[dict[str, Any]]:
@@ -97,6 +99,7 @@ def summary(result: Result, total_s: float) -> dict[str, Any]:
             "setup_s": scene.setup_s,
             "assembly_s": model.system.assembly.seconds,
             "factor_s": newton.factorisation.stopwatch.seconds,
+            "output_s": result.output.seconds,
             "solve_s": newton.factorisation.solving.seconds,
             "total_s": total_s,
         },

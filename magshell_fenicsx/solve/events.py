@@ -94,7 +94,8 @@ class _Search:
         return found
 
     def told(self, point: Point) -> Point:
-        spent = replace(point, iterations=self.iterations, factorisations=self.factorisations)
+        here = self.path.exact(point, self.base)
+        spent = replace(here, iterations=self.iterations, factorisations=self.factorisations + 1)
         self.iterations = self.factorisations = 0
         return spent
 

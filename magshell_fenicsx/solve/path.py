@@ -206,7 +206,7 @@ class Path:
         if isinstance(found, str):
             return found
         if found.negative_pivots != here.negative_pivots or found.dmu * here.dmu < 0:
-            found = self._exact(found, self._row(s, here))
+            found = self.exact(found, here)
         if trouble := self._jumped(here, found):
             return trouble
         if self.control != "arc":
@@ -244,8 +244,9 @@ class Path:
         spent = self.newton.factorisation.count - before
         return replace(found, iterations=outcome.iterations, factorisations=spent)
 
-    def _exact(self, point: Point, row: Row) -> Point:
+    def exact(self, point: Point, base: Point) -> Point:
         """The point with the tangent and the inertia of its own K, not of one near by."""
+        row = self._row(point.s, base)
         found = self._point(point.state, point.s, self.newton.response(point.state, self.name, row, exact=True))
         return replace(found, iterations=point.iterations, factorisations=point.factorisations + 1)
 
