@@ -47,6 +47,7 @@ def mass_matrix(product: fem.Form, held: list[fem.DirichletBC]) -> PETSc.Mat:
     Those then have no finite eigenvalue, whatever the tangent has on its diagonal there.
     """
     M = fem_petsc.create_matrix(product)
+    M.setOption(PETSc.Mat.Option.IGNORE_ZERO_ENTRIES, True)  # tangents have none of those that are held
     assembly.add_matrix(M, product, held)
     M.assemble()
     return M
