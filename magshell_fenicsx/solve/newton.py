@@ -24,7 +24,7 @@ from magshell_fenicsx.solve.system import State, System, Vector, dot, max_abs
 Direction = tuple[Vector, float]  # (du, dmu)
 MOST_REFINEMENTS = 4
 REFINED, SIGN = 1e-4, 1e-2  # relative errors of a tangent's du and dmu
-DIFFERENCE = 1e-3  # lengths, of the differences that stand for K times a vector
+DIFFERENCE = 1e-5  # lengths, of the differences that stand for K times a vector
 LEAST_REST = 0.3  # of a step: an update that would lengthen it more is not trusted
 
 
@@ -233,10 +233,11 @@ class BorderedNewton:
     def _refined(self, matrix: "_Bordered", t: Direction, state: State, load: Vector, row: Row) -> Direction | None:
         """The tangent at a state from that of a matrix near by, by generalised conjugate residuals; None if too far."""
         comm, (c, d) = self.system.comm, row.gradient(state.u)
+        R = self.system.residual(state.u, state.mu)
 
         def times(t: Direction) -> Direction:
             g = d * t[1] + (dot(comm, c, t[0]) if c is not None else 0.0)
-            return matrix.solve(self._stiffness(state, t[0]) + t[1] * load, g)
+            return matrix.solve(self._stiffness(state, R, t[0]) + t[1] * load, g)
 
         z, known = _sum(t, -1.0, times(t)), list[tuple[Direction, Direction, float]]()
         for _ in range(MOST_REFINEMENTS):
@@ -251,14 +252,13 @@ class BorderedNewton:
             t, z = _sum(t, part, p), _sum(z, -part, q)
         return None
 
-    def _stiffness(self, state: State, du: Vector) -> Vector:
-        """K du by central differences of the residual."""
+    def _stiffness(self, state: State, R: Vector, du: Vector) -> Vector:
+        """K du by a difference of the residual from R, that of the state."""
         size = max_abs(self.system.comm, du)
         if size == 0.0:
             return du
         small = DIFFERENCE * self.system.length / size
-        ahead, behind = (self.system.residual(state.u + sign * small * du, state.mu) for sign in (1, -1))
-        return np.asarray((ahead - behind) / (2 * small))
+        return np.asarray((self.system.residual(state.u + small * du, state.mu) - R) / small)
 
     def _function(self, x: PETSc.Vec, f: PETSc.Vec) -> None:
         u, mu = self._split(x)
