@@ -19,7 +19,7 @@ from magshell_fenicsx.case.loading import IndentationSection, PressureSection, R
 from magshell_fenicsx.case.shell import ShellSection
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.feasible import refuse_too_large, refuse_unbounded_fields, sample
-from magshell_fenicsx.mesh.grading import Disc, Feature, Grading, Ring
+from magshell_fenicsx.mesh.grading import Disc, Feature, Grading, Ring, Size
 from magshell_fenicsx.mesh.patch import Embedding, MeshError
 from magshell_fenicsx.mesh.shapes import DiscShape, Shape, StripShape
 from magshell_fenicsx.mesh.sphere import Dimple, SphereEmbedding, flat
@@ -54,7 +54,7 @@ class Plan:
     shape: Shape
     embedding: Embedding
     points: dict[str, NDArray[np.float64]]
-    size: Grading
+    size: Size
     included: list[str]
     left_out: list[str]
 
@@ -269,9 +269,12 @@ def describe(case: Case) -> str:
         "lambda_m": case.lambda_m,
         "Lambda_m = lambda_m R/h": case.lambda_m / plan.material.h,
     }
-    cells, unknowns = _count(case, plan)
     lines = [f"{name} = {value:.6g}" for name, value in numbers.items()]
-    lines.append(f"mesh: {cells} cells of degree {case.mesh.degree}, {unknowns} unknowns")
+    if case.mesh.tolerance is None:
+        cells, unknowns = _count(case, plan)
+        lines.append(f"mesh: {cells} cells of degree {case.mesh.degree}, {unknowns} unknowns")
+    else:
+        lines.append(f"mesh: found by the run, for a relative error of its result below {case.mesh.tolerance:g}")
     lines += ["built:", *(f"  {item}" for item in plan.included), "left out:", *(f"  {item}" for item in plan.left_out)]
     return "\n".join(lines)
 

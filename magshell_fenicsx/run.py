@@ -2,18 +2,23 @@
 
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from mpi4py import MPI
 
+from magshell_fenicsx.adapt.choice import Adapted
+from magshell_fenicsx.adapt.ending import NoResult
+from magshell_fenicsx.adapt.tolerance import adapted
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.loading import PathSection
 from magshell_fenicsx.environment import fast_blas
 from magshell_fenicsx.follow import Record, Stopped, follow
 from magshell_fenicsx.interrupt import Interrupted, Stoppable, Watch
 from magshell_fenicsx.report import report
-from magshell_fenicsx.results.files import RunFiles, open_folder
-from magshell_fenicsx.results.folder import DiskError, held_folder
+from magshell_fenicsx.results.durable import write_whole
+from magshell_fenicsx.results.files import MESH, RunFiles, open_folder
+from magshell_fenicsx.results.folder import DiskError, by_first, held_folder
 from magshell_fenicsx.results.summary import Result, summary
 from magshell_fenicsx.results.table import Row
 from magshell_fenicsx.scene import Scene
@@ -70,9 +75,10 @@ def run(
 
 def _run(case: Case, folder: Path | None, comm: MPI.Comm, say: Say, watch: Watch, start: float) -> Result:
     """Run a case in a folder that is ready; `start` in seconds of the clock."""
-    scene = Scene(case, comm)
-    result = Result(scene, scene.unloaded())
     say = say if comm.rank == 0 else lambda line: None
+    found = _mesh_for_tolerance(case, folder, comm, say)
+    scene = found.choice.scene(case, comm) if found else Scene(case, comm)
+    result = Result(scene, scene.unloaded(), adapted=found)
     say(f"{', '.join(scene.plan.included)}: {scene.cells} cells, {scene.model.system.dofs} unknowns")
     if fast_blas() is None:
         say("warning: PETSc uses the reference BLAS; install OpenBLAS to factor seven times faster")
@@ -108,6 +114,23 @@ def _run(case: Case, folder: Path | None, comm: MPI.Comm, say: Say, watch: Watch
     return result
 
 
+def _mesh_for_tolerance(case: Case, folder: Path | None, comm: MPI.Comm, say: Say) -> Adapted | None:
+    """The mesh for the case's tolerance, kept in the folder for a run that is resumed; None for the default mesh."""
+    if case.mesh.tolerance is None:
+        return None
+    file = folder / MESH if folder else None
+    if known := comm.bcast(file.read_bytes() if file and comm.rank == 0 and file.exists() else None):
+        return Adapted.from_json(case, known)
+    try:
+        found = adapted(case, comm, say)
+    except NoResult as e:
+        say(f"warning: the default mesh is taken, there is no result that the tolerance could be of: {e}")
+        return None
+    if file:
+        by_first(comm, partial(write_whole, file, found.to_json()))
+    return found
+
+
 def _sensitivities(result: Result) -> dict[str, float]:
     """Of the fold that the run ended at, if the case asks for them."""
     scene, loading, last = result.scene, result.scene.case.loading, result.rows[-1]
@@ -124,6 +147,7 @@ def _follow(result: Result, files: RunFiles | None, say: Say, start: float) -> N
     """The history of a scene, point by point."""
     scene, field_end = result.scene, 0.0
     for record in follow(scene):
+        result.history.add(record)
         values = scene.observe(record.point.state)
         if record.label in ("start", "field"):
             field_end = values["w_over_h"]

@@ -22,6 +22,11 @@ from magshell_fenicsx.solve.system import State
 class Scene:
     """A case ready to be solved.
 
+    Parameters
+    ----------
+    plan
+        What to make of the case; by default `make_plan` says.
+
     Attributes
     ----------
     case, plan
@@ -34,9 +39,9 @@ class Scene:
         Seconds of building, without compiling kernels.
     """
 
-    def __init__(self, case: Case, comm: MPI.Comm = MPI.COMM_WORLD) -> None:
+    def __init__(self, case: Case, comm: MPI.Comm = MPI.COMM_WORLD, plan: Plan | None = None) -> None:
         start = time.perf_counter()
-        self.case, self.plan, self.comm = case, make_plan(case), comm
+        self.case, self.plan, self.comm = case, plan or make_plan(case), comm
         self.model: ShellModel | MeridianModel
         if self.plan.axisymmetric:
             self.model = build_meridian_model(case, self.plan)

@@ -40,7 +40,7 @@ def transfer(source: Scene, target: Scene, u: Vector) -> Vector:
     matching = _matching(source, target)
     if matching is not None:
         return np.asarray(values[matching].ravel())
-    nodes, wanted, stretch = _all_nodes(source), _chart(target), _stretch(source, target)
+    nodes, wanted, stretch = _all_nodes(source), chart(target), _stretch(source, target)
     if stretch:
         moved = stretch.turn(_interpolated(nodes, values, stretch.place(wanted), stretch.source_rim), wanted)
     else:
@@ -74,7 +74,7 @@ def same_mesh(source: Scene, target: Scene) -> bool:
 
 def _matching(source: Scene, target: Scene) -> NDArray[np.int64] | None:
     """For each node of this rank its number among all nodes of the source; None, on all ranks, if the nodes differ."""
-    comm, nodes, wanted = source.model.system.comm, _all_nodes(source), _chart(target)
+    comm, nodes, wanted = source.model.system.comm, _all_nodes(source), chart(target)
     distance, number = cKDTree(nodes).query(wanted)
     equal = comm.allreduce(len(wanted)) == len(nodes) and comm.allreduce(distance.max(initial=0.0), MPI.MAX) < ROUNDING
     return np.asarray(number) if equal else None
@@ -140,10 +140,10 @@ def _stretch(source: Scene, target: Scene) -> _Stretch | None:
 
 def _all_nodes(scene: Scene) -> Array:
     """The nodes of all ranks in the chart."""
-    return np.concatenate(scene.model.system.comm.allgather(_chart(scene)))
+    return np.concatenate(scene.model.system.comm.allgather(chart(scene)))
 
 
-def _chart(scene: Scene) -> Array:
+def chart(scene: Scene) -> Array:
     """Coordinates (n, 1 or 2) of this rank's nodes in the chart, where a defect does not move them."""
     model = scene.model
     if isinstance(model, MeridianModel):

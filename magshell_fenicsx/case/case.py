@@ -22,6 +22,13 @@ class MeshSection(Section):
     degree: int = Field(default=4, ge=2, le=5)
     refinement: float = Field(default=1.0, ge=0.1, le=20, description="divides every element size")
     penalty: float | None = Field(default=None, ge=1e-3, le=1e9, description="sigma of the interior penalty")
+    tolerance: float | None = Field(default=None, ge=1e-6, le=0.1, description="relative, of the run's result")
+
+    @model_validator(mode="after")
+    def _tolerance_chooses_the_mesh(self) -> Self:
+        if self.tolerance is not None and self.model_fields_set & {"degree", "refinement"}:
+            raise ValueError("tolerance chooses degree and refinement: give it or them")
+        return self
 
 
 class Case(Section):

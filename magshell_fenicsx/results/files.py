@@ -28,6 +28,7 @@ LAST_FILES = (
     *("summary.json", "shell.png", "curve.png", "magnetic_loads.png"),
     *("instabilities.png", "stability.csv", "modes_*.png"),
 )
+MESH = "mesh.json"  # what was chosen for a tolerance
 COMPARED = ("p_over_pc", "lambda_m", "force", "w_over_h", "w_pole_over_h")
 
 
@@ -64,7 +65,7 @@ def open_folder(out: Path, case: Case, comm: MPI.Comm, resume: bool) -> None:
 
 def _emptied(out: Path, case: Case) -> None:
     """Take an earlier run's files out of the folder."""
-    for name in (checkpoint.NAME, "path.csv"):
+    for name in (checkpoint.NAME, "path.csv", MESH):
         (out / name).unlink(missing_ok=True)
     _remove_last_files(out)
     rmtree(out / "fields", ignore_errors=True)

@@ -3,6 +3,8 @@
 from dataclasses import dataclass, field
 from typing import Any
 
+from magshell_fenicsx.adapt.choice import Adapted
+from magshell_fenicsx.adapt.ending import History, NoResult
 from magshell_fenicsx.environment import fast_blas, versions
 from magshell_fenicsx.results.table import Row
 from magshell_fenicsx.scene import Scene
@@ -31,6 +33,10 @@ class Result:
         Number of solves that were taken from a checkpoint.
     sensitivities
         Of the amplitude at the fold that the run ended at, if the case asks for them; see `sensitivity`.
+    adapted
+        How the mesh was found, if the case has a tolerance.
+    history
+        What of the run `value` is taken from.
     """
 
     scene: Scene
@@ -41,6 +47,8 @@ class Result:
     replayed: int = 0
     sensitivities: dict[str, float] = field(default_factory=dict)
     output: Stopwatch = field(default_factory=Stopwatch)
+    adapted: Adapted | None = None
+    history: History = field(default_factory=History)
 
     @property
     def limit_points(self) -> list[dict[str, Any]]:
@@ -65,6 +73,14 @@ class Result:
         points = (p for p in self.limit_points if p["amplitude"] == "pressure" and not p["branch"])
         return next((float(p["value"]) for p in points), None)
 
+    @property
+    def value(self) -> float | None:
+        """The result that a tolerance is of; None if the run has none."""
+        try:
+            return self.history.ending(self.scene, self.stopped).value
+        except NoResult:
+            return None
+
 
 def summary(result: Result, total_s: float) -> dict[str, Any]:
     """The content of summary.json."""
@@ -72,7 +88,7 @@ def summary(result: Result, total_s: float) -> dict[str, Any]:
     material, model, newton = scene.plan.material, scene.model, scene.newton
     R_over_h = 1 / material.h
     return {
-        "case": scene.case.model_dump(mode="json", exclude_none=True),
+        "case": (result.adapted.asked if result.adapted else scene.case).model_dump(mode="json", exclude_none=True),
         "dimensionless": {
             "radius_to_thickness": R_over_h,
             "poisson_ratio": material.nu,
@@ -94,6 +110,7 @@ def summary(result: Result, total_s: float) -> dict[str, Any]:
         "knockdown": result.knockdown,
         "points": len(result.rows),
         "mesh": {"cells": scene.cells, "dofs": model.system.dofs, "degree": model.degree},
+        **({"tolerance": result.adapted.account(result.value)} if result.adapted else {}),
         "timing": {
             "jit_s": model.kernels.seconds,
             "setup_s": scene.setup_s,

@@ -125,7 +125,8 @@ def _row(scene: Scene, fold: Fold) -> Row:
 
 def _has_knockdown(case: Case) -> bool:
     loading = case.loading
-    return isinstance(loading, PressureSection) and loading.until == "limit" and not loading.branches
+    by_one_mesh = case.mesh.tolerance is None  # which else is another for each point
+    return by_one_mesh and isinstance(loading, PressureSection) and loading.until == "limit" and not loading.branches
 
 
 def _symmetry(case: Case) -> Symmetry:
