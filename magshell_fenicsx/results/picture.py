@@ -54,7 +54,7 @@ def screen() -> Iterator[None]:
 
 def smooth_surface(surface: Surface, h: float) -> pyvista.PolyData:
     """The deformed surface in flat triangles, each curved one divided."""
-    return unstructured_grid(surface, h).extract_surface(nonlinear_subdivision=4)
+    return unstructured_grid(surface, h).extract_surface(nonlinear_subdivision=2)
 
 
 def draw_shell(surface: Surface, h: float, title: str, file: Path) -> None:
