@@ -8,7 +8,7 @@ from pathlib import Path
 from magshell_fenicsx.case.stability import StabilitySection
 from magshell_fenicsx.results.durable import write_whole
 from magshell_fenicsx.results.folder import by_first
-from magshell_fenicsx.results.modes import caption, mode_file, mode_surface, mode_table, write_mode
+from magshell_fenicsx.results.modes import caption, mode_file, mode_surface, mode_table, wave_number, write_mode
 from magshell_fenicsx.results.picture import draw_modes
 from magshell_fenicsx.results.summary import OWN_MODES, VALUE_COLUMN, Result
 from magshell_fenicsx.results.surface import RevolvedGatherer, Surface, SurfaceGatherer, gatherer
@@ -54,7 +54,11 @@ class _Writer:
             row = self.result.rows[number]
             label = "" if row["mode"] in OWN_MODES else str(row["mode"])
             surface = self._write(number, str(row["label"]), state, label, shell.null_vector(state, label))
-            kind = f" ({row['mode']})" if row["mode"] else ""
+            told = str(row["mode"]) if row["mode"] else ""
+            if surface is not None and not label and (m := wave_number(surface)):
+                told = f"{told}, m = {m}".lstrip(", ")
+                self.say(f"the null vector at point {number} has {m} waves around e3")
+            kind = f" ({told})" if told else ""
             panels.append((surface, f"{row['label']}{kind}, {_where(row)}"))
         if panels:
             self._draw(panels, f"Null vectors at instabilities\n{_shell(self.result)}", "instabilities.png")

@@ -14,8 +14,8 @@ from conftest import CASES
 
 from magshell_fenicsx import Case, Record, Scene, follow, run
 from magshell_fenicsx.case.source import CaseError, Source
-from magshell_fenicsx.results.modes import mode_surface
-from magshell_fenicsx.results.surface import gatherer
+from magshell_fenicsx.results.modes import mode_surface, wave_number
+from magshell_fenicsx.results.surface import Surface, gatherer
 from magshell_fenicsx.stability import ShellModes
 
 # Clamped circular plate, k R of the modes with n nodal diameters: A. W. Leissa, Vibration of Plates,
@@ -254,3 +254,13 @@ def test_mistakes_in_the_section(setting: str, message: str) -> None:
     with pytest.raises(CaseError) as error:
         Case.load(CASES / "dimple_buckling.yaml", [setting])
     assert message in str(error.value)
+
+
+@pytest.mark.parametrize(("m", "counted"), [(0, None), (1, None), (5, 5), (28, 28)])
+def test_waves_around_the_axis_are_counted(m: int, counted: int | None) -> None:
+    around, down = np.linspace(0, 2 * np.pi, 400, endpoint=False), np.linspace(1, 1.5, 30)
+    theta, phi = (x.ravel() for x in np.meshgrid(around, down))
+    n0 = np.column_stack([np.sin(phi) * np.cos(theta), np.sin(phi) * np.sin(theta), np.cos(phi)])
+    w = np.cos(m * (theta - 0.3)) * np.exp(-50 * (phi - 1.3) ** 2)
+    surface = Surface(n0, 0 * n0, n0, np.empty((0, 3), dtype=np.int64), {"mode_w": w})
+    assert wave_number(surface) == counted

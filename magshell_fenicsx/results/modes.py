@@ -24,6 +24,7 @@ from magshell_fenicsx.solve.system import Vector
 
 Array = NDArray[np.float64]
 WAVES = "m = "
+RING, MOST_WAVES = 0.02, 80  # height over R of the circle that waves are counted on
 COLUMNS = ("point", "number", "mode", "eigenvalue")
 
 
@@ -156,3 +157,18 @@ def _revolved_wave(model: MeridianModel, u: Vector, m: int, vector: Vector) -> t
     v = np.stack([x, y, W * np.cos(m * theta)], axis=-1)
     at_nodes = np.concatenate([v[0, :1], v[1:].reshape(-1, 3)])  # all sectors meet in the pole
     return Surface(swept.r0, swept.displacement(u), swept.n0, swept.cells, {}), at_nodes
+
+
+def wave_number(surface: Surface) -> int | None:
+    """The number of waves around e3 of a mode, where it is largest; None if it is not mainly one of m >= 2, or flat."""
+    w, height = surface.fields["mode_w"], surface.r0[:, 2]
+    if np.ptp(height) < RING:
+        return None
+    ring = np.abs(height - height[np.argmax(np.abs(w))]) < RING
+    theta = np.arctan2(surface.r0[ring, 1], surface.r0[ring, 0])
+    left = []
+    for m in range(MOST_WAVES + 1):
+        basis = np.column_stack([np.cos(m * theta), np.sin(m * theta)])
+        left.append(float(np.sum((w[ring] - basis @ np.linalg.lstsq(basis, w[ring])[0]) ** 2)))
+    best = int(np.argmin(left))
+    return best if best >= 2 and left[best] < 0.1 * float(np.sum(w[ring] ** 2)) else None
