@@ -10,9 +10,9 @@ from magshell_fenicsx.results.durable import write_whole
 from magshell_fenicsx.results.folder import by_first
 from magshell_fenicsx.results.modes import caption, mode_file, mode_surface, mode_table, wave_number, write_mode
 from magshell_fenicsx.results.picture import draw_modes
-from magshell_fenicsx.results.summary import OWN_MODES, VALUE_COLUMN, Result
+from magshell_fenicsx.results.summary import VALUE_COLUMN, Result
 from magshell_fenicsx.results.surface import RevolvedGatherer, Surface, SurfaceGatherer, gatherer
-from magshell_fenicsx.results.table import Row
+from magshell_fenicsx.results.table import OWN_MODES, Row
 from magshell_fenicsx.solve.stability import ModesNotFound
 from magshell_fenicsx.solve.system import State, Vector
 from magshell_fenicsx.stability import ShellMode, ShellModes

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 
-from magshell_fenicsx.results.table import Row
+from magshell_fenicsx.results.table import OWN_MODES, Row
 
 AXES = {
     "force": ("w_over_h", "force", r"displacement at the load  $w/h$", r"force  $FR/(2\pi D)$"),
@@ -16,6 +16,7 @@ AXES = {
     "lambda_m": ("w_pole_over_h", "lambda_m", r"displacement of the pole  $w/h$", r"field  $\lambda_\mathrm{m}$"),
 }
 
+LOCATED = ("fold", "bifurcation")
 FINE = 16  # drawn pieces between two points
 
 
@@ -30,7 +31,7 @@ def _smooth(x: Sequence[float], y: Sequence[float]) -> NDArray[np.float64]:
 
 
 def draw_curve(rows: Sequence[Row], amplitude: str, title: str, file: Path) -> None:
-    """Draw the part of the path in which `amplitude` varied; instabilities are marked.
+    """Draw the part of the path in which `amplitude` varied, and its branches; instabilities are marked.
 
     Stable parts are solid, unstable ones dashed.
     """
@@ -43,19 +44,26 @@ def draw_curve(rows: Sequence[Row], amplitude: str, title: str, file: Path) -> N
     sign = -1.0 if x_key == "volume_change" else 1.0
     first = max(i for i, row in enumerate(rows) if row["amplitude"] != amplitude or row is rows[0])
     part = rows[0 if amplitude == "lambda_m" else first :]
-    x = [sign * float(row[x_key]) for row in part]
-    y = [float(row[y_key]) for row in part]
+
+    def place(row: Row) -> tuple[float, float]:
+        return sign * float(row[x_key]), float(row[y_key])
+
     figure, axes = plt.subplots(figsize=(4.6, 3.4), layout="constrained")
-    smooth_x, smooth_y = _smooth(x, y)
-    for i in range(1, len(part)):
-        unstable = int(part[i]["negative_pivots"]) > 0 and part[i]["label"] not in ("fold", "bifurcation")
-        piece = slice((i - 1) * FINE, i * FINE + 1)
-        axes.plot(smooth_x[piece], smooth_y[piece], color="C0", linestyle=(0, (2, 1.2)) if unstable else "-")
-    shown = [i for i, row in enumerate(part) if row["label"] in ("target", "step", "field")]
-    axes.plot([x[i] for i in shown], [y[i] for i in shown], ".", color="C0", markersize=4)
-    for i, row in enumerate(part):
-        if row["label"] in ("fold", "bifurcation"):
-            axes.plot(x[i], y[i], "o", color="C3", markersize=6, label=f"{row['label']} at {y[i]:.5g}")
+    for branch in sorted({int(row["branch"]) for row in part}):
+        line = [row for row in part if row["branch"] == branch and row["mode"] in OWN_MODES]
+        smooth_x, smooth_y = _smooth(*zip(*map(place, line), strict=True))
+        for i in range(1, len(line)):
+            unstable = int(line[i]["negative_pivots"]) > 0 and line[i]["label"] not in LOCATED
+            piece = slice((i - 1) * FINE, i * FINE + 1)
+            axes.plot(smooth_x[piece], smooth_y[piece], color="C0", linestyle=(0, (2, 1.2)) if unstable else "-")
+        for row in line:
+            if row["label"] in ("target", "step", "field"):
+                axes.plot(*place(row), ".", color="C0", markersize=4)
+    for row in part:
+        if row["label"] in LOCATED:
+            mode = f" ({row['mode']})" if row["mode"] else ""
+            said = f"{row['label']}{mode} at {row[y_key]:.5g}"
+            axes.plot(*place(row), "o", color="C3", markersize=6, label=said)
     axes.set(xlabel=x_label, ylabel=y_label)
     axes.set_title(title, fontsize=9)
     axes.axhline(0, color="0.8", linewidth=0.8, zorder=0)

@@ -12,7 +12,6 @@ from magshell_fenicsx.solve.system import State
 from magshell_fenicsx.solve.timing import Stopwatch
 
 VALUE_COLUMN = {"pressure": "p_over_pc", "force": "force", "lambda_m": "lambda_m", "angle": "field_angle"}
-OWN_MODES = ("", "symmetric", "asymmetric")  # of an instability within the model; others it excludes
 
 
 @dataclass

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from magshell_fenicsx.results.curve import AXES
-from magshell_fenicsx.results.summary import OWN_MODES
+from magshell_fenicsx.results.table import OWN_MODES
 from magshell_fenicsx.sweep.axes import Axis, along
 from magshell_fenicsx.sweep.outcome import Outcome
 from magshell_fenicsx.sweep.points import SweepPoint, short

@@ -36,6 +36,7 @@ COLUMNS = (
     "branch",
 )
 Row = dict[str, float | int | str]
+OWN_MODES = ("", "symmetric", "asymmetric")  # of an instability within the model; others it excludes
 
 
 class PathTable:

@@ -9,8 +9,7 @@ from typing import Any
 from scipy.interpolate import barycentric_interpolate
 
 from magshell_fenicsx.case.source import CaseError
-from magshell_fenicsx.results.summary import OWN_MODES
-from magshell_fenicsx.results.table import COLUMNS
+from magshell_fenicsx.results.table import COLUMNS, OWN_MODES
 
 WORDS = ("label", "amplitude", "mode")  # columns without numbers
 NUMBERS = tuple(column for column in COLUMNS if column not in WORDS)
