@@ -14,7 +14,6 @@ from magshell_fenicsx.case.loading import (
     RotationSection,
 )
 from magshell_fenicsx.scene import Scene
-from magshell_fenicsx.shell.antisymmetric import AntisymmetricModes
 from magshell_fenicsx.solve.along import Along
 from magshell_fenicsx.solve.branch import Branching, branching
 from magshell_fenicsx.solve.path import Control, Path, PathStopped, Point, StepOptions
@@ -163,7 +162,7 @@ def _rotation(scene: Scene, loading: RotationSection, state: State) -> Iterator[
             scene.newton.system = system
         if label != "target":
             raise Stopped(f"the turning field makes the shell unstable before {np.degrees(angle):.4g} degrees: {label}")
-        if isinstance(modes, AntisymmetricModes) and modes.factor_at(state).negative_pivots:
+        if modes and modes.is_unstable(state):
             raise Stopped(f"an antisymmetric instability lies before {np.degrees(angle):.4g} degrees of the field")
 
 

@@ -46,11 +46,7 @@ def transfer(source: Scene, target: Scene, u: Vector) -> Vector:
     else:
         scale = system.length / source.model.system.length
         moved = np.asarray(scale * _interpolated(nodes, values, wanted, np.inf))
-    found: Array = np.zeros_like(system.u.x.array)
-    found[: system.size] = moved.ravel()
-    for held in system.clamped:
-        held.set(found)
-    return found[: system.size]
+    return system.held(moved.ravel())
 
 
 def _interpolated(nodes: Array, values: Array, x: Array, rim: float) -> Array:

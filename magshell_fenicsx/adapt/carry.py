@@ -20,12 +20,7 @@ NEWTON_STEPS = 4  # for the place in a cell with a curved edge
 
 def carry(source: Scene, target: Scene, u: Vector) -> Vector:
     """A displacement of `source` in the unknowns of `target`, zero where that is held; collective."""
-    system = target.model.system
-    values: Array = np.zeros_like(system.u.x.array)
-    values[: system.size] = CellFields(source).at(gathered(source, u), chart(target)).ravel()
-    for held in system.clamped:
-        held.set(values)
-    return values[: system.size]
+    return target.model.system.held(CellFields(source).at(gathered(source, u), chart(target)).ravel())
 
 
 def gathered(scene: Scene, u: Vector) -> Array:

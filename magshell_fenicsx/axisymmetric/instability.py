@@ -8,6 +8,7 @@ from scipy.optimize import brentq
 
 from magshell_fenicsx.axisymmetric.waves import Waves
 from magshell_fenicsx.solve.path import Path, PathStopped, Point
+from magshell_fenicsx.solve.system import State
 
 
 @dataclass(frozen=True)
@@ -15,6 +16,10 @@ class ExcludedWaves:
     """What an axisymmetric model does not see."""
 
     waves: Waves
+
+    def is_unstable(self, state: State) -> bool:
+        """Whether some wave is unstable at an axisymmetric state."""
+        return bool(self.waves.unstable(state))
 
     def first_instability(self, path: Path, points: Sequence[Point]) -> tuple[str, Point] | None:
         """The first instability in waves around the axis, "m = 7" for instance; None if there is none."""

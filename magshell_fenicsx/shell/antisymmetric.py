@@ -82,6 +82,10 @@ class AntisymmetricModes:
             self._factored = state
         return self._factorisation
 
+    def is_unstable(self, state: State) -> bool:
+        """Whether an antisymmetric mode is unstable at a symmetric state."""
+        return self.factor_at(state).negative_pivots > 0
+
     def first_instability(self, path: Path, points: Sequence[Point]) -> tuple[str, Point] | None:
         """The first point of a path at which an antisymmetric mode becomes unstable.
 
@@ -95,7 +99,7 @@ class AntisymmetricModes:
         """
 
         def is_unstable(number: int) -> bool:
-            return self.factor_at(points[number].state).negative_pivots > 0
+            return self.is_unstable(points[number].state)
 
         if not is_unstable(len(points) - 1):
             return None

@@ -82,6 +82,13 @@ class Factorisation:
         self._pc, self.negative_pivots = self._mumps, self._mumps.getFactorMatrix().getInertia()[0]
         self._definite = self._comm.size == 1 and self.negative_pivots == 0
 
+    def times(self, x: Vector) -> Vector:
+        """K x with the matrix last factored."""
+        v, y = self.matrix.createVecs()
+        v.setArray(x)
+        self.matrix.mult(v, y)
+        return np.array(y.array_r)
+
     def solve(self, rhs: Vector) -> Vector:
         """K^-1 rhs with the latest factors."""
         assert self._pc is not None

@@ -116,12 +116,8 @@ class _Bordered:
         return dot(self._comm, a[0], b[0]) + self._weight * a[1] * b[1]
 
     def times(self, du: Vector, dmu: float) -> Direction:
-        K = self._factors.matrix
-        v, w = K.createVecs()
-        v.setArray(du)
-        K.mult(v, w)
         g = self._d * dmu + (dot(self._comm, self._c, du) if self._c is not None else 0.0)
-        return w.array + dmu * self.column, g
+        return self._factors.times(du) + dmu * self.column, g
 
 
 class _Border:

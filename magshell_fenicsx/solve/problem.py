@@ -71,6 +71,12 @@ class FiniteElementSystem:
         self.u.x.array[: self.size] = u
         self.u.x.scatter_forward()
 
+    def held(self, u: Vector) -> Vector:
+        """A displacement with zeros at the clamped degrees of freedom."""
+        u = np.array(u)
+        u[self._fixed] = 0
+        return u
+
     def residual(self, u: Vector, mu: Amplitudes) -> Vector:
         return self._gradient(u, [(t, _factor(t, mu)) for t in self.terms])
 

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 
 from magshell_fenicsx.scene import Scene
-from magshell_fenicsx.shell.antisymmetric import AntisymmetricModes
 from magshell_fenicsx.solve.fold import Fold, FoldLost, Guess, find_fold, predict_fold
 from magshell_fenicsx.solve.system import State, dot
 from magshell_fenicsx.transfer import transfer
@@ -64,14 +63,6 @@ def _check(scene: Scene, fold: Fold, last: Fold) -> None:
         raise FoldLost("another fold was found")
     if fold.value <= 0 or fold.curvature >= 0:
         raise FoldLost("the fold is not a maximum of the pressure")
-    if fold.unstable or _excluded_are_unstable(scene, fold.state):
-        raise FoldLost("another instability comes before the fold")
-
-
-def _excluded_are_unstable(scene: Scene, state: State) -> bool:
     modes = scene.model.excluded_modes
-    if modes is None:
-        return False
-    if isinstance(modes, AntisymmetricModes):
-        return modes.factor_at(state).negative_pivots > 0
-    return bool(modes.waves.unstable(state))
+    if fold.unstable or (modes and modes.is_unstable(fold.state)):
+        raise FoldLost("another instability comes before the fold")
