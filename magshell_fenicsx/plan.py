@@ -211,25 +211,28 @@ def common_azimuth(directions: Sequence[Direction]) -> float | None:
 
 def _grading(case: Case, h: float, defect: Dimple | None, points: dict[str, NDArray[np.float64]]) -> Grading:
     """Element sizes for 1e-4 in k_d and 1e-3 in F at degree 4, in units of the shell's length sqrt(Rh)."""
-    length, refine, growth = sqrt(h), case.mesh.refinement, 0.4
+    length, refine = sqrt(h), case.mesh.refinement
     loading = case.loading
+    indentation = loading if isinstance(loading, IndentationSection) else None
+    growth = 0.5 if indentation else 0.4
     if case.shell.geometry != "hemisphere":
         features: list[Feature] = []
         largest = min(0.25, 0.5 * (case.shell.width or 1.0))
     else:
-        features = [Ring(pi / 2, 1.4 * length / refine, growth)]
+        # the equator is far from a dent
+        features = [Ring(pi / 2, (2.0 if indentation else 1.4) * length / refine, growth)]
         # without a dimple the sphere buckles anywhere, in waves of about 3.6 sqrt(Rh)
         largest = 1.2 * length if defect is None and isinstance(loading, PressureSection) else 0.35
     if defect:
         features.append(Disc((0.0, 0.0), defect.phi_o + 0.7 * length, 0.45 * length / refine, growth))
-    if isinstance(loading, IndentationSection):
+    if indentation:
         x, y = points.get("load", points["pole"])
-        depth = abs(loading.depth) if loading.depth else 10.0
+        depth = abs(indentation.depth) if indentation.depth else 10.0
         dent = sqrt(2 * depth * h) + 0.5 * length  # mirror buckling: the ridge's radius grows like sqrt(2 R w)
         features.append(Disc((x, y), dent, length / refine, growth))
         # finer than h the point force's logarithmic stretch would be resolved, which has no limit
-        centre = max(loading.patch * h / 2, h) if loading.patch else h
-        features.append(Disc((x, y), loading.patch * h, centre, growth))
+        centre = max(indentation.patch * h / 2, h) if indentation.patch else h
+        features.append(Disc((x, y), indentation.patch * h, centre, growth))
     return Grading(features, largest / refine)
 
 

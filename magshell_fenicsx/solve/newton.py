@@ -23,7 +23,7 @@ from magshell_fenicsx.solve.system import State, System, Vector, dot, max_abs
 
 Direction = tuple[Vector, float]  # (du, dmu)
 MOST_REFINEMENTS = 4
-REFINED, SIGN = 1e-4, 1e-2  # relative errors of a tangent's du and dmu
+REFINED, SIGN = 1e-3, 1e-2  # relative errors of a tangent's du and dmu
 DIFFERENCE = 1e-5  # lengths, of the differences that stand for K times a vector
 LEAST_REST = 0.3  # of a step: an update that would lengthen it more is not trusted
 
@@ -48,7 +48,7 @@ class NewtonOptions:
 
     tolerance: float = 1e-9
     max_iterations: int = 25
-    contraction: float = 0.3
+    contraction: float = 0.6
     fresh: float = 0.05
     largest_step: float = 1e4
 
@@ -97,20 +97,25 @@ class _Bordered:
     """The bordered matrix at a state, by block elimination with the factors of K."""
 
     def __init__(self, newton: "BorderedNewton", state: State, name: str, row: Row) -> None:
+        self.state, self.row = state, row
         self._comm, self._factors = newton.system.comm, newton.factor_at(state)
         self._c, self._d = row.gradient(state.u)
         self.column = newton.system.load(state.u, name)
         self._x2 = self._factors.solve(self.column)
+        self._schur = self._d - (dot(self._comm, self._c, self._x2) if self._c is not None else 0.0)
         self._weight = dot(self._comm, self._x2, self._x2)  # of dmu: the displacement that it makes
 
     def solve(self, f: Vector, g: float) -> Direction:
         """(du, dmu) with K du + R_mu dmu = f and c.du + d dmu = g."""
         x1 = self._factors.solve(f)
-        pull = 0.0, 0.0
-        if self._c is not None:
-            pull = dot(self._comm, self._c, x1), dot(self._comm, self._c, self._x2)
-        dmu = (g - pull[0]) / (self._d - pull[1])
+        pull = dot(self._comm, self._c, x1) if self._c is not None else 0.0
+        dmu = (g - pull) / self._schur
         return x1 - dmu * self._x2, dmu
+
+    @property
+    def tangent(self) -> Direction:
+        """The same for f = 0 and g = 1."""
+        return np.asarray(-self._x2 / self._schur), 1 / self._schur
 
     def inner(self, a: Direction, b: Direction) -> float:
         return dot(self._comm, a[0], b[0]) + self._weight * a[1] * b[1]
@@ -163,6 +168,7 @@ class BorderedNewton:
         self.factorisation = Factorisation(system.comm)
         self.iterations = 0
         self._factored: State | None = None
+        self._progress = _Progress()
         comm = system.comm
         self._last = comm.rank == comm.size - 1
         n = system.size + self._last
@@ -215,9 +221,8 @@ class BorderedNewton:
         comm, near = self.system.comm, self._factored
         moved = np.inf if near is None else max_abs(comm, state.u - near.u) / self.system.length
         fresh = moved <= self.options.fresh and not exact
-        matrix = _Bordered(self, near if fresh and near else state, name, row)
-        tangent = matrix.solve(0.0 * state.u, 1.0)
-        load = self.system.load(state.u, name)
+        matrix = self._bordered(near if fresh and near else state, name, row)
+        tangent, load = matrix.tangent, self.system.load(state.u, name)
         if moved and fresh:
             refined = self._refined(matrix, tangent, state, load, row)
             if refined is None:
@@ -225,6 +230,13 @@ class BorderedNewton:
             tangent = refined
         du, dmu = tangent
         return Response(du, dmu, -dot(comm, load, du) / dmu, self.factorisation.negative_pivots)
+
+    def _bordered(self, state: State, name: str, row: Row) -> "_Bordered":
+        """The bordered matrix at a state, that of the last solve if it was made there for the same row."""
+        last = self._progress.matrix
+        if last and last.row is row and last.state is state is self._factored:
+            return last
+        return _Bordered(self, state, name, row)
 
     def _refined(self, matrix: "_Bordered", t: Direction, state: State, load: Vector, row: Row) -> Direction | None:
         """The tangent at a state from that of a matrix near by, by generalised conjugate residuals; None if too far."""
