@@ -47,7 +47,7 @@ def compare(symmetry: str, R_over_h: float, **mesh: Any) -> tuple[str, float, in
     surface = scene(symmetry, R_over_h, **mesh)
     *_, before, found = [r for r in follow(surface) if r.mode != "antisymmetric"]
     state = before.point.state if found.label == "fold" else found.point.state
-    mode = critical_mode(surface.newton, state, surface.comm)
+    mode = critical_mode(surface.newton, state)
     return (
         waves.mode,
         waves.point.state.mu["pressure"],

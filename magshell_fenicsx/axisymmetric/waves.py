@@ -20,6 +20,7 @@ from magshell_fenicsx.axisymmetric.meridian import Meridian, held_at
 from magshell_fenicsx.shell.parameters import Condition
 from magshell_fenicsx.solve import assembly
 from magshell_fenicsx.solve.factor import Factorisation
+from magshell_fenicsx.solve.inverse import nearest_to_zero
 from magshell_fenicsx.solve.kernels import KernelLog
 from magshell_fenicsx.solve.problem import FiniteElementSystem
 from magshell_fenicsx.solve.system import State
@@ -97,14 +98,10 @@ class Waves:
         found = {m: self.negative_pivots(state, m) for m in range(1, (largest or self.largest) + 1)}
         return {m: count for m, count in found.items() if count}
 
-    def critical_eigenvalue(self, state: State, m: int, iterations: int = 12) -> float:
-        """Eigenvalue of Q_m's matrix nearest to zero, by inverse iteration; negative where Q_m is unstable."""
+    def critical_eigenvalue(self, state: State, m: int) -> float:
+        """Eigenvalue of Q_m's matrix nearest to zero; negative where Q_m is unstable."""
         unstable = self.negative_pivots(state, m) > 0
-        v, value = np.sin(np.arange(self._K.size[0]) + 1.0), 0.0
-        for _ in range(iterations):
-            v = v / np.linalg.norm(v)
-            w = self._factorisation.solve(v)
-            value, v = 1 / float(v @ w), w
+        value, _ = nearest_to_zero(self._factorisation)
         return -abs(value) if unstable else abs(value)
 
     def _second(self, e: Energy) -> ufl.Form:

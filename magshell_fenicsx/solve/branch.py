@@ -42,7 +42,7 @@ def branching(path: Path, bifurcation: Point) -> Branching | None:
         Controlled by arc length.
     """
     name, state = path.name, bifurcation.state
-    mode = critical_mode(path.newton, state, path.system.comm).vector
+    mode = critical_mode(path.newton, state).vector
     mode = np.asarray(mode * path.system.length / _largest(path.system.comm, mode))
     found = None
     for size in SIZES:

@@ -5,11 +5,11 @@ from dataclasses import dataclass, replace
 from typing import Literal, Protocol
 
 import numpy as np
-from mpi4py import MPI
 
 from magshell_fenicsx.solve.factor import Factorisation
+from magshell_fenicsx.solve.inverse import nearest_to_zero
 from magshell_fenicsx.solve.path import Path, PathStopped, Point
-from magshell_fenicsx.solve.system import State, Vector, dot
+from magshell_fenicsx.solve.system import State, Vector
 
 MOST_STEPS = 60  # bisection alone halves a bracket so often that nothing is left of it
 FLAT = 0.01  # slope of the amplitude, over that at the step's start, that means a fold
@@ -119,9 +119,9 @@ class _Search:
         It ends when two successive guesses agree to the tolerance's power 3/4 (the order of the method
         is 1.44): the eigenvalue itself drowns in rounding before it is zero.
         """
-        path, comm, side = self.path, self.path.system.comm, 0
-        first = critical_mode(stability, low.state, comm)
-        a, b = first.eigenvalue, critical_mode(stability, high.state, comm).eigenvalue
+        path, side = self.path, 0
+        first = critical_mode(stability, low.state)
+        a, b = first.eigenvalue, critical_mode(stability, high.state).eigenvalue
         agreed, last = self.tolerance**0.75, np.inf
         for _ in range(MOST_STEPS):
             # the eigenvalue nearest to zero need not be the one that changes sign
@@ -132,7 +132,7 @@ class _Search:
                 return point
             if abs(high.s - low.s) * abs(point.dmu) <= self.tolerance * abs(mu):
                 return point
-            last, mode = point.s, critical_mode(stability, point.state, comm)
+            last, mode = point.s, critical_mode(stability, point.state)
             if mode.negative_pivots != first.negative_pivots:
                 high, b = point, mode.eigenvalue
                 a = a / 2 if side == 1 else a
@@ -185,12 +185,7 @@ class CriticalMode:
     negative_pivots: int
 
 
-def critical_mode(stability: Stability, state: State, comm: MPI.Comm, iterations: int = 12) -> CriticalMode:
-    """The eigenpair nearest to zero, by inverse iteration; the vector has length one."""
+def critical_mode(stability: Stability, state: State) -> CriticalMode:
+    """The eigenpair nearest to zero; the vector has length one."""
     factors = stability.factor_at(state)
-    v, value = np.sin(1.0 + np.arange(state.u.size) + comm.rank), 0.0
-    for _ in range(iterations):
-        v = v / np.sqrt(dot(comm, v, v))
-        w = factors.solve(v)
-        value, v = 1 / dot(comm, v, w), w
-    return CriticalMode(value, v / np.sqrt(dot(comm, v, v)), factors.negative_pivots)
+    return CriticalMode(*nearest_to_zero(factors), factors.negative_pivots)

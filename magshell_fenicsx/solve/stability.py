@@ -14,7 +14,8 @@ from slepc4py import SLEPc
 
 from magshell_fenicsx.solve import assembly
 from magshell_fenicsx.solve.factor import Factorisation
-from magshell_fenicsx.solve.system import Vector, dot
+from magshell_fenicsx.solve.inverse import nearest_to_zero
+from magshell_fenicsx.solve.system import Vector
 
 TOLERANCE = 1e-10  # of an eigenvalue, relative to its distance from the shift
 MARGIN = 1e-6  # eigenvalues closer than this, relative likewise, are taken for one that is multiple
@@ -93,16 +94,11 @@ def lowest_modes(K: PETSc.Mat, M: PETSc.Mat, count: int) -> list[Mode]:
     raise ModesNotFound(f"{missed} eigenvalues below {above:g} stay hidden from Lanczos")
 
 
-def null_vector(K: PETSc.Mat, iterations: int = 12) -> Vector:
-    """The direction that a nearly singular symmetric K resists least, of length one; by inverse iteration."""
-    comm = K.comm.tompi4py()
-    factorisation = Factorisation(comm)
+def null_vector(K: PETSc.Mat) -> Vector:
+    """The direction that a nearly singular symmetric K resists least, of length one."""
+    factorisation = Factorisation(K.comm.tompi4py())
     factorisation.factor(K)
-    v = np.sin(1.0 + np.arange(*K.getOwnershipRange()))
-    for _ in range(iterations):
-        v = factorisation.solve(v)
-        v /= np.sqrt(dot(comm, v, v))
-    return v
+    return nearest_to_zero(factorisation)[1]
 
 
 class _Slices:

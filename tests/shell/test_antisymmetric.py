@@ -54,8 +54,7 @@ def test_waves_come_in_pairs() -> None:
     assert modes is not None
     states = [record.point.state for record in follow(scene) if record.label == "target"]
     seen, excluded = (
-        [critical_mode(stability, state, scene.comm).eigenvalue for state in states]
-        for stability in (scene.newton, modes)
+        [critical_mode(stability, state).eigenvalue for state in states] for stability in (scene.newton, modes)
     )
     assert excluded == pytest.approx(seen, rel=0.03)
     assert seen[2] < 0.4 * seen[1]
