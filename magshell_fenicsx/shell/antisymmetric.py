@@ -71,7 +71,9 @@ class AntisymmetricModes:
     ) -> None:
         terms = [edges if t.name == "mirror edges" else t for t in system.terms]
         V = system.u.function_space
-        self.system = FiniteElementSystem(system.u, terms, elsewhere, pattern, system.length, assembler)
+        self.system = FiniteElementSystem(
+            system.u, terms, elsewhere, pattern, system.length, assembler, system.gradients
+        )
         self._factorisation = Factorisation(V.mesh.comm)
         self._factored: State | None = None
 

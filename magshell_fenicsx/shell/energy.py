@@ -1,6 +1,6 @@
 """A term of the shell: its density as a function of point quantities, and the form made from it."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TypeAlias
@@ -13,6 +13,7 @@ from petsc4py import PETSc
 from ufl.core.expr import Expr
 
 from magshell_fenicsx.shell import kinematics as kin
+from magshell_fenicsx.shell.kinematics import Jet
 from magshell_fenicsx.solve import assembly
 from magshell_fenicsx.solve.kernels import KernelLog
 from magshell_fenicsx.solve.terms import FormTerm
@@ -26,7 +27,7 @@ MOVED = ("r", *FIRST)
 
 @dataclass(frozen=True)
 class Density:
-    """An energy as a function of point quantities: the one source of its form and of its point Hessians.
+    """An energy as a function of point quantities: the one source of its form and of its derivatives at points.
 
     Attributes
     ----------
@@ -53,11 +54,36 @@ class Density:
     facets: NDArray[np.int32] | None = None
     sides: int = 1
 
+    @property
+    def on_edges(self) -> bool:
+        return self.facets is not None or self.sides == 2
+
+    def at(
+        self,
+        jets: Sequence[Sequence[Jet]],
+        edge: tuple[Sequence[Expr], Expr] | None,
+        parameters: Sequence[Parameter],
+    ) -> Expr:
+        """Its value.
+
+        Parameters
+        ----------
+        jets
+            Of r0, u and what else it takes, each on every side.
+        edge
+            The covector on every side and the width; None on cells.
+        parameters
+            In place of its own.
+        """
+        arguments = [*jets, *(edge[:1] if edge else ())]
+        sided = [tuple(each) if self.sides == 2 else each[0] for each in arguments]
+        return self.of(*sided, *(edge[1:] if edge else ()), *parameters)
+
 
 def per_area(density: Callable[..., Expr]) -> Callable[..., Expr]:
     """A density per undeformed area, per area of the coordinates."""
 
-    def of(r0: kin.Jet, u: kin.Jet, *parameters: Expr) -> Expr:
+    def of(r0: Jet, u: Jet, *parameters: Expr) -> Expr:
         return density(r0, u, *parameters) * kin.area_ratio(r0)
 
     return of
@@ -114,6 +140,9 @@ class HessianTerm:
 
     def energy(self) -> float:
         return 0.0
+
+    def compile_residual(self) -> None:
+        """There is none."""
 
     def add_residual(self, b: NDArray[np.float64], factor: float) -> None:
         """Symmetric states are in equilibrium with antisymmetric forces."""

@@ -16,6 +16,7 @@ from magshell_fenicsx.shell.antisymmetric import AntisymmetricModes, held_agains
 from magshell_fenicsx.shell.fast_tangent import FastTangent, fits, make_sites
 from magshell_fenicsx.shell.parameters import MIRROR_NORMAL, Condition, Force, Loads, Material, default_penalty
 from magshell_fenicsx.shell.point_load import patch_entries, point_entries, vertex_normal
+from magshell_fenicsx.shell.residual import FastResidual
 from magshell_fenicsx.shell.terms import TermFactory
 from magshell_fenicsx.solve.kernels import KernelLog
 from magshell_fenicsx.solve.problem import FiniteElementSystem
@@ -89,7 +90,8 @@ class ShellModel:
         # lists that would fill the memory leave the tangent to the terms' own forms
         self._sites = make_sites(self.r0, degree, terms, self.kernels) if fits(V) else None
         fast = FastTangent(self.u, self._sites, held + mirror) if self._sites else None
-        self.system = FiniteElementSystem(self.u, terms, held + mirror, interior, material.h, fast)
+        gradients = FastResidual(self.r0, self.u, degree, terms, self.kernels)
+        self.system = FiniteElementSystem(self.u, terms, held + mirror, interior, material.h, fast, gradients)
         self._factory, self._interior, self._held, self._mirror = factory, interior, held, facets("symmetry")
         self._volume = self.kernels.compile("volume energy", factory.volume_change())
         # dofs of a vertex on the rank that owns it

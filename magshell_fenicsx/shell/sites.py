@@ -9,16 +9,14 @@ from dataclasses import fields
 from functools import reduce
 from itertools import combinations_with_replacement, product
 from operator import or_
-from typing import Any
 
 import numpy as np
 import ufl
 from dolfinx import fem
 from mpi4py import MPI
 from numpy.typing import NDArray
-from ufl.core.expr import Expr
 
-from magshell_fenicsx.shell.energy import Density, HessianTerm, ShellTerm
+from magshell_fenicsx.shell.energy import Density, HessianTerm, Parameter, ShellTerm
 from magshell_fenicsx.shell.kinematics import Jet
 from magshell_fenicsx.solve.batches import Batch
 from magshell_fenicsx.solve.contraction import Blocks, Contraction
@@ -78,9 +76,9 @@ class Site:
         kernels = [(kernel, factors[name]) for name, kernel in self._kernels.items() if factors.get(name)]
         first = 0
         for number, batch in enumerate(self.batches):
-            _fill(self._u, self._jets(batch, u))
-            _fill(self._r0, self._placements[number])
-            _fill(self._geometry, np.repeat(batch.geometry, len(batch.rule.weights), axis=0))
+            fill(self._u, self._jets(batch, u))
+            fill(self._r0, self._placements[number])
+            fill(self._geometry, np.repeat(batch.geometry, len(batch.rule.weights), axis=0))
             contraction, blocks = self._contractions[batch.rule], Blocks(batch, self._coupled)
             for kernel, factor in kernels:
                 blocks.add(kernel.evaluate(number), factor, kernel.pairs)
@@ -103,15 +101,11 @@ class Kernel:
 
     def __init__(self, term: PointTerm, points: Points, batches: list[Batch]) -> None:
         self._term, self._points, self._batches = term, points, batches
-        self._parameters: list[fem.Constant | fem.Function] = []
-        self._varying: list[tuple[fem.Function, list[Array]]] = []
-        for parameter in term.density.parameters:
-            if isinstance(parameter, fem.Constant):
-                self._parameters.append(points.constant(parameter.value))
-            else:
-                here = points.field(3)
-                self._parameters.append(here)
-                self._varying.append((here, [_at_points(parameter, batch) for batch in batches]))
+        self._parameters, varying = parameters_at(points, term.density)
+        self._varying = [
+            (here, [at_points(field, batch.rule.points[0], batch.cells[0]) for batch in batches])
+            for here, field in varying
+        ]
 
     def compile(
         self, u: fem.Function, r0: fem.Function, geometry: fem.Function, sides: int, log: KernelLog, comm: MPI.Comm
@@ -121,22 +115,15 @@ class Kernel:
         self.pairs = _pairs(density)
         of_v = isinstance(self._term, HessianTerm)
         z = self._points.field(3 * PARTS) if of_v else u
-        where: tuple[Expr | tuple[Expr, ...], ...] = ()
-        if sides == 2:
-            jets: list[Any] = [tuple(_jet(field, side) for side in range(2)) for field in (r0, u)]
-            m = tuple(ufl.as_vector([geometry[2 * side], geometry[2 * side + 1]]) for side in range(2))
-            where = (m, geometry[4])
-        else:
-            jets = [_jet(field, 0) for field in ((r0, u, z) if of_v else (r0, u))]
-            if density.facets is not None:
-                where = (ufl.as_vector([geometry[0], geometry[1]]), geometry[2])
-        W = density.of(*jets, *where, *self._parameters)
+        jets = [[_jet(field, side) for side in range(sides)] for field in ((r0, u, z) if of_v else (r0, u))]
+        m = [ufl.as_vector([geometry[2 * side], geometry[2 * side + 1]]) for side in range(sides)]
+        W = density.at(jets, (m, geometry[2 * sides]) if density.on_edges else None, self._parameters)
         self._hessian = point_hessian(name, W, z, PARTS, self.pairs, log, comm, at_zero=of_v)
 
     def evaluate(self, number: int) -> Array:
         """The Hessian's parts at the points of a batch."""
         for here, values in self._varying:
-            _fill(here, values[number])
+            fill(here, values[number])
         return self._points.evaluate(self._hessian, self._batches[number].size)
 
 
@@ -161,14 +148,21 @@ def _jet(field: fem.Function, side: int) -> Jet:
     return Jet(*(ufl.as_vector([field[3 * part + c] for c in range(3)]) for part in parts))
 
 
-def _at_points(field: fem.Function, batch: Batch) -> Array:
-    """(points, 3) of a field that varies over the cells."""
+def parameters_at(points: Points, density: Density) -> tuple[list[Parameter], list[tuple[fem.Function, fem.Function]]]:
+    """A density's parameters at points; those that vary, to be filled, are told with the fields that they stand for."""
+    here = [points.constant(p.value) if isinstance(p, fem.Constant) else points.field(3) for p in density.parameters]
+    pairs = zip(here, density.parameters, strict=True)
+    return here, [(there, p) for there, p in pairs if isinstance(p, fem.Function)]
+
+
+def at_points(field: fem.Function, X: Array, cells: NDArray[np.int32]) -> Array:
+    """(cells * points, 3) of a field that varies over the cells, at reference points (points, 2)."""
     Q = field.function_space
-    values = Q.element.basix_element.tabulate(0, batch.rule.points[0])[0, :, :, 0]
-    nodal = field.x.array.reshape(-1, 3)[Q.dofmap.list[batch.cells[0]]]
-    return np.asarray(np.matmul(values, nodal))
+    values = Q.element.basix_element.tabulate(0, X)[0, :, :, 0]
+    nodal = field.x.array.reshape(-1, 3)[Q.dofmap.list[cells]]
+    return np.asarray(np.matmul(values, nodal)).reshape(-1, 3)
 
 
-def _fill(field: fem.Function, values: Array) -> None:
+def fill(field: fem.Function, values: Array) -> None:
     """The first points' values; the rest of the field is not looked at."""
     field.x.array[: values.size] = values.ravel()

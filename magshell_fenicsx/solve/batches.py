@@ -65,6 +65,17 @@ def cell_batches(V: fem.FunctionSpace, degree: int) -> list[Batch]:
 
 def interior_batches(V: fem.FunctionSpace, degree: int) -> list[Batch]:
     """The owned interior edges."""
+    cells, edges, backwards = interior_edges(V)
+    return list(_edge_batches(V, degree, cells, np.column_stack([edges, backwards])))
+
+
+def boundary_batches(V: fem.FunctionSpace, degree: int, facets: NDArray[np.int32]) -> list[Batch]:
+    """Those of some boundary edges that this rank owns."""
+    return list(_edge_batches(V, degree, *boundary_edges(V, facets)))
+
+
+def interior_edges(V: fem.FunctionSpace) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.bool_]]:
+    """The owned interior edges: cells (n, 2), number in each cell (n, 2), whether the cells run along them unlike."""
     topology = V.mesh.topology
     topology.create_connectivity(1, 2)
     links = topology.connectivity(1, 2)
@@ -72,18 +83,17 @@ def interior_batches(V: fem.FunctionSpace, degree: int) -> list[Batch]:
     cells = links.array[links.offsets[facets][:, None] + np.arange(2)]
     edges = np.column_stack([_local_edges(V, facets, cells[:, side]) for side in range(2)])
     starts = [_corner(V, cells[:, side], edges[:, side]) for side in range(2)]
-    kinds = np.column_stack([edges, starts[0] != starts[1]])
-    return list(_edge_batches(V, degree, cells, kinds))
+    return cells, edges, starts[0] != starts[1]
 
 
-def boundary_batches(V: fem.FunctionSpace, degree: int, facets: NDArray[np.int32]) -> list[Batch]:
-    """Those of some boundary edges that this rank owns."""
+def boundary_edges(V: fem.FunctionSpace, facets: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Those of some boundary edges that this rank owns: cells (n, 1), number in the cell (n, 1)."""
     topology = V.mesh.topology
     topology.create_connectivity(1, 2)
     links = topology.connectivity(1, 2)
     facets = facets[facets < topology.index_map(1).size_local]
     cells = links.array[links.offsets[facets]]
-    return list(_edge_batches(V, degree, cells[:, None], _local_edges(V, facets, cells)[:, None]))
+    return cells[:, None], _local_edges(V, facets, cells)[:, None]
 
 
 def same_cell_entries(V: fem.FunctionSpace) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
@@ -125,7 +135,7 @@ def _edge_batches(
         covectors = np.concatenate([edge_covector(int(edge)) for edge in kind[:sides]])
         for part in _chunks(np.flatnonzero((kinds == kind).all(axis=1)).astype(np.int32), len(w)):
             both = tuple(np.ascontiguousarray(side) for side in cells[part].T)
-            width = _width(V, both, int(kind[0]))
+            width = edge_width(V, both, np.full(len(part), kind[0]))
             geometry = np.column_stack([np.tile(covectors, (len(part), 1)), width])
             yield Batch(both, rule, geometry)
 
@@ -148,10 +158,11 @@ def _corner(V: fem.FunctionSpace, cells: NDArray[np.int32], edges: NDArray[np.in
     return np.asarray(V.mesh.geometry.dofmap[cells, first])
 
 
-def _width(V: fem.FunctionSpace, cells: tuple[NDArray[np.int32], ...], edge: int) -> NDArray[np.float64]:
-    """Flat area of the cells, averaged over the sides, over the flat length of the edge."""
+def edge_width(
+    V: fem.FunctionSpace, cells: tuple[NDArray[np.int32], ...], edges: NDArray[np.int32]
+) -> NDArray[np.float64]:
+    """Flat area of the cells, averaged over the sides, over the flat length of their edge (its number on side 0)."""
     corners = [V.mesh.geometry.x[V.mesh.geometry.dofmap[side]] for side in cells]
     areas = [np.linalg.norm(np.cross(x[:, 1] - x[:, 0], x[:, 2] - x[:, 0]), axis=1) / 2 for x in corners]
-    start, end = EDGES[edge]
-    length = np.linalg.norm(corners[0][:, end] - corners[0][:, start], axis=1)
-    return np.asarray(sum(areas) / len(areas) / length)
+    start, end = (corners[0][np.arange(len(edges)), ends] for ends in np.array(EDGES)[edges].T)
+    return np.asarray(sum(areas) / len(areas) / np.linalg.norm(end - start, axis=1))

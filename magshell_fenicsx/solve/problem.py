@@ -23,6 +23,21 @@ class TangentAssembler(Protocol):
         """The matrix of the terms with these factors, by name, at the u that they were written with."""
 
 
+class ResidualAssembler(Protocol):
+    """A way to the residual other than the terms' own forms.
+
+    Attributes
+    ----------
+    names
+        Of the terms that it serves.
+    """
+
+    names: frozenset[str]
+
+    def add(self, b: NDArray[np.float64], factors: Mapping[str, float]) -> None:
+        """Add the gradients of the terms with these factors, by name, at the u that they were written with."""
+
+
 class FiniteElementSystem:
     """Sum of terms for a displacement u that vanishes at `clamped`.
 
@@ -38,6 +53,8 @@ class FiniteElementSystem:
         See `System`.
     assembler
         Makes the tangent with the same conditions, instead of the terms' forms.
+    gradients
+        Makes the residual, instead of the terms' forms.
     """
 
     def __init__(
@@ -48,6 +65,7 @@ class FiniteElementSystem:
         pattern: FormTerm,
         length: float,
         assembler: TangentAssembler | None = None,
+        gradients: ResidualAssembler | None = None,
     ) -> None:
         V = u.function_space
         self.u, self.terms, self.clamped, self.length = u, terms, clamped, length
@@ -59,7 +77,10 @@ class FiniteElementSystem:
         fixed_dofs = np.unique(np.concatenate(fixed)) if fixed else np.empty(0, dtype=np.int32)
         self._fixed = fixed_dofs[fixed_dofs < self.size]
         self._b = fem.Function(V)
-        self._assembler = assembler
+        self._assembler, self.gradients = assembler, gradients
+        self._own_residual = [t for t in terms if gradients is None or t.name not in gradients.names]
+        for term in self._own_residual:
+            term.compile_residual()
         if assembler is None:
             for term in terms:
                 term.compile_tangent()
@@ -78,10 +99,10 @@ class FiniteElementSystem:
         return u
 
     def residual(self, u: Vector, mu: Amplitudes) -> Vector:
-        return self._gradient(u, [(t, _factor(t, mu)) for t in self.terms])
+        return self._gradient(u, {t.name: _factor(t, mu) for t in self.terms})
 
     def load(self, u: Vector, name: str) -> Vector:
-        return self._gradient(u, [(t, 1.0) for t in self.terms if t.amplitude == name])
+        return self._gradient(u, {t.name: 1.0 for t in self.terms if t.amplitude == name})
 
     def potential(self, u: Vector, name: str) -> float:
         self.set(u)
@@ -104,13 +125,15 @@ class FiniteElementSystem:
             assembly.finish_matrix(self._K, self.u.function_space, self.clamped)
             return self._K
 
-    def _gradient(self, u: Vector, weighted: list[tuple[Term, float]]) -> NDArray[np.float64]:
+    def _gradient(self, u: Vector, factors: Mapping[str, float]) -> NDArray[np.float64]:
         with self.assembly:
             self.set(u)
             b = self._b.x.array
             b[:] = 0
-            for term, factor in weighted:
-                if factor:
+            if self.gradients:
+                self.gradients.add(b, factors)
+            for term in self._own_residual:
+                if factor := factors.get(term.name):
                     term.add_residual(b, factor)
             self._b.x.scatter_reverse(InsertMode.add)
             b[self._fixed] = 0

@@ -25,6 +25,9 @@ class Term(Protocol):
     def energy(self) -> float:
         """Pi(u) on this rank's part."""
 
+    def compile_residual(self) -> None:
+        """Compile what `add_residual` takes."""
+
     def add_residual(self, b: NDArray[np.float64], factor: float) -> None:
         """Add factor dPi/du to the local vector (ghosts included)."""
 
@@ -42,8 +45,8 @@ class FormTerm:
 
     Attributes
     ----------
-    tangent_form
-        None for a linear energy. It takes long to compile and is compiled when it is first asked for.
+    residual_form, tangent_form
+        Compiled when they are first asked for; no tangent for a linear energy.
     """
 
     def __init__(
@@ -61,7 +64,10 @@ class FormTerm:
         self._u, self._log = u, log
         self._gradient = ufl.derivative(energy, u, ufl.TestFunction(u.function_space))
         self._energy = log.compile(f"{name} energy", energy)
-        self._residual = log.compile(f"{name} residual", self._factor * self._gradient)
+
+    @cached_property
+    def residual_form(self) -> fem.Form:
+        return self._log.compile(f"{self.name} residual", self._factor * self._gradient)
 
     @cached_property
     def tangent_form(self) -> fem.Form | None:
@@ -73,9 +79,12 @@ class FormTerm:
     def energy(self) -> float:
         return float(fem.assemble_scalar(self._energy))
 
+    def compile_residual(self) -> None:
+        _ = self.residual_form
+
     def add_residual(self, b: NDArray[np.float64], factor: float) -> None:
         self._factor.value = factor
-        assembly.add_vector(b, self._residual)
+        assembly.add_vector(b, self.residual_form)
 
     def compile_tangent(self) -> None:
         _ = self.tangent_form
@@ -97,6 +106,9 @@ class LinearTerm:
 
     def energy(self) -> float:
         return -float(self._entries @ self._u.x.array[self._dofs])
+
+    def compile_residual(self) -> None:
+        """A sum of entries."""
 
     def add_residual(self, b: NDArray[np.float64], factor: float) -> None:
         b[self._dofs] -= factor * self._entries
