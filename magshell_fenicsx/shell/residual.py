@@ -8,7 +8,7 @@ from dolfinx import fem
 from numpy.typing import NDArray
 
 from magshell_fenicsx.shell.energy import CURVED, Density, ShellTerm, cell_quadrature, edge_quadrature
-from magshell_fenicsx.shell.gradients import PointGradient, in_own_coordinates
+from magshell_fenicsx.shell.gradients import FRAME, PointGradient, in_own_coordinates
 from magshell_fenicsx.shell.kinematics import Jet
 from magshell_fenicsx.shell.sites import NAMES, at_points
 from magshell_fenicsx.solve.batches import boundary_edges, edge_width, interior_edges
@@ -64,7 +64,7 @@ class FastResidual:
 
     def add(self, b: Array, factors: Mapping[str, float]) -> None:
         """Add it to the local vector (ghosts included), at the present u."""
-        nodal = np.take(self._u.x.array.reshape(-1, 3), self._nodes, axis=0).reshape(len(self._nodes), -1)
+        nodal = np.take(self._u.x.array.reshape(-1, 3), self._nodes, axis=0).reshape(-1, 3 * self._nodes.shape[1])
         elements = np.zeros_like(nodal)
         for site in self._sites:
             site.add(nodal, factors, elements)
@@ -114,7 +114,7 @@ class _Edges:
         self._rows, self._gradients = [], []
         for term in terms:
             rows, geometry = _where(V, term.density, frames, each)
-            known = placement[rows].reshape(len(rows), -1)
+            known = placement[rows].reshape(len(rows), 3 * len(CURVED) * term.density.sides)
 
             def values(field: fem.Function, rows: NDArray[np.intp] = rows) -> Array:
                 return at_points(field, X, cells)[rows[:, 0]]
@@ -134,9 +134,10 @@ class _Edges:
         self._back[:] = 0
         for gradient, rows, factor in active:
             for chunk in gradient.chunks:
-                here, room = rows[chunk].ravel(), gradient.room(chunk)
-                np.take(self._there, here, axis=0, out=room.reshape(len(here), -1), mode="clip")
-                self._back[here] = factor * gradient.evaluate(chunk).reshape(len(here), -1)
+                here, size = rows[chunk].ravel(), 3 * len(CURVED)
+                room = gradient.room(chunk).reshape(-1, size)
+                np.take(self._there, here, axis=0, out=room, mode="clip")
+                self._back[here] = factor * gradient.evaluate(chunk).reshape(-1, size)
         elements += self._sheet.at_nodes(self._back)
 
 
@@ -164,5 +165,5 @@ def _where(V: fem.FunctionSpace, density: Density, frames: Array, each: int) -> 
     first, second = np.array([edge_covector(edge) for edge in range(3)])[edges].transpose(2, 0, 1)
     m = np.stack([area * p * first, area * (q * first + s * second)], axis=2)  # as long as the edge
     width = edge_width(V, tuple(cells.T), edges[:, 0])
-    sides = [frames[cells].reshape(len(cells), -1), m.reshape(len(cells), -1), width[:, None]]
+    sides = [frames[cells].reshape(-1, FRAME * density.sides), m.reshape(-1, 2 * density.sides), width[:, None]]
     return rows.reshape(-1, density.sides), np.repeat(np.concatenate(sides, axis=1), each, axis=0)

@@ -29,7 +29,7 @@ class Sheet:
 
     def at_points(self, nodal: Array, out: Array) -> None:
         """Fill as many numbers, in any shape, from nodal vectors (cells, functions * 3)."""
-        np.matmul(nodal, self._there, out=out.reshape(len(nodal), -1))
+        np.matmul(nodal, self._there, out=out.reshape(-1, self._there.shape[1]))
 
     def at_nodes(self, gradients: Array) -> Array:
         """(cells, functions * 3): the weighted sum over points of gradients, in any shape."""
