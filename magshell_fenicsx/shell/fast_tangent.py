@@ -1,26 +1,19 @@
 """The tangent without compiled tangent forms, from the point Hessians of the terms' own densities."""
 
 from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 
 import numpy as np
 from dolfinx import fem
-from mpi4py import MPI
+from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from magshell_fenicsx.shell.energy import HessianTerm, ShellTerm, cell_quadrature, edge_quadrature
 from magshell_fenicsx.shell.sites import Site
-from magshell_fenicsx.solve.batches import (
-    boundary_batches,
-    cell_batches,
-    cross_entries,
-    interior_batches,
-    same_cell_entries,
-)
+from magshell_fenicsx.solve.batches import boundary_batches, cell_batches, interior_batches
 from magshell_fenicsx.solve.kernels import KernelLog
-from magshell_fenicsx.solve.scatter import ListedMatrix
+from magshell_fenicsx.solve.scatter import BlockMatrix
 from magshell_fenicsx.solve.terms import Term
-
-MOST_ENTRIES = 100_000_000  # a rank's list takes 50 bytes an entry while it is set up, 25 later
 
 
 class FastTangent:
@@ -39,27 +32,23 @@ class FastTangent:
     def __init__(self, u: fem.Function, sites: Sequence[Site], clamped: list[fem.DirichletBC]) -> None:
         V = u.function_space
         self._u, self._sites = u, sites
-        listed = [same_cell_entries(V), *(cross_entries(V, batch) for site in sites for batch in site.coupling)]
-        rows, columns = (np.concatenate([x.ravel() for x in part]) for part in zip(*listed, strict=True))
-        self._matrix = ListedMatrix(V, rows, columns, clamped)
-        functions, same = V.dofmap.list.shape[1], listed[0][0]
-        self._same = self._matrix.entries[: same.size].reshape(same.shape)
-        self._cross = self._matrix.entries[same.size :].reshape(-1, 9, functions**2)
-        a, b = np.triu_indices(functions)
-        self._diagonal = np.flatnonzero(a == b)
+        self._matrix = BlockMatrix(V, [batch.cells for site in sites for batch in site.coupling], clamped)
+        cells, functions = V.dofmap.list.shape
+        self._same = np.empty((cells, 9, functions * (functions + 1) // 2))
 
     def tangent(self, factors: Mapping[str, float]) -> PETSc.Mat:
         """The assembled matrix, at the present u; it is reused by the next call. Collective."""
-        same = self._same
-        same[:] = 0
+        self._same[:] = 0
+        self._matrix.clear()
+        first = 0
         for site in self._sites:
-            site.add(self._u.x.array, factors, same, self._cross)
-        symmetric, skew = same[:, 3:6], same[:, 6:]
-        difference = symmetric - skew  # K_cd at b, a
-        symmetric += skew  # K_cd at a, b
-        skew[:] = difference
-        same[:, :3, self._diagonal] /= 2  # they are their own transposes
+            site.add(self._u.x.array, factors, self._same, partial(self._couple, first))
+            first += len(site.coupling)
+        self._matrix.add_cells(self._same)
         return self._matrix.assemble()
+
+    def _couple(self, first: int, batch: int, K: NDArray[np.float64]) -> None:
+        self._matrix.add_coupling(first + batch, K)
 
 
 def make_sites(r0: fem.Function, degree: int, terms: Iterable[Term], log: KernelLog) -> list[Site]:
@@ -78,12 +67,3 @@ def make_sites(r0: fem.Function, degree: int, terms: Iterable[Term], log: Kernel
             batches = boundary_batches(V, edge_quadrature(degree), term.density.facets)
             sites.append(Site(r0, batches, 1, [term], log))
     return sites
-
-
-def fits(V: fem.FunctionSpace) -> bool:
-    """Whether the lists of entries are short enough on every rank; collective."""
-    topology = V.mesh.topology
-    cells = len(V.dofmap.list)
-    functions = V.dofmap.list.shape[1]
-    entries = 9 * functions**2 * (cells + 2 * topology.index_map(1).size_local)
-    return bool(V.mesh.comm.allreduce(entries, MPI.MAX) <= MOST_ENTRIES)

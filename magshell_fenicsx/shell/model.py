@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.mesh.midsurface import Midsurface
 from magshell_fenicsx.shell.antisymmetric import AntisymmetricModes, held_against_mirror
-from magshell_fenicsx.shell.fast_tangent import FastTangent, fits, make_sites
+from magshell_fenicsx.shell.fast_tangent import FastTangent, make_sites
 from magshell_fenicsx.shell.parameters import MIRROR_NORMAL, Condition, Force, Loads, Material, default_penalty
 from magshell_fenicsx.shell.point_load import patch_entries, point_entries, vertex_normal
 from magshell_fenicsx.shell.residual import FastResidual
@@ -87,9 +87,8 @@ class ShellModel:
         self.normals = {name: vertex_normal(self.r0, x) for name, x in midsurface.points.items()}
         if loads.force:
             terms.append(self._force(loads.force))
-        # lists that would fill the memory leave the tangent to the terms' own forms
-        self._sites = make_sites(self.r0, degree, terms, self.kernels) if fits(V) else None
-        fast = FastTangent(self.u, self._sites, held + mirror) if self._sites else None
+        self._sites = make_sites(self.r0, degree, terms, self.kernels)
+        fast = FastTangent(self.u, self._sites, held + mirror)
         gradients = FastResidual(self.r0, self.u, degree, terms, self.kernels)
         self.system = FiniteElementSystem(self.u, terms, held + mirror, interior, material.h, fast, gradients)
         self._factory, self._interior, self._held, self._mirror = factory, interior, held, facets("symmetry")
@@ -104,10 +103,8 @@ class ShellModel:
             return None
         edges = self._factory.antisymmetric_edges(self._mirror)
         held = self._held + held_against_mirror(self.V, self._mirror)
-        fast = None
-        if self._sites:
-            sites = self._sites + make_sites(self.r0, self.degree, [edges], self.kernels)
-            fast = FastTangent(self.u, sites, held)
+        sites = self._sites + make_sites(self.r0, self.degree, [edges], self.kernels)
+        fast = FastTangent(self.u, sites, held)
         return AntisymmetricModes(self.system, edges, held, self._interior, fast)
 
     def zero(self) -> Vector:

@@ -4,7 +4,7 @@ The densities are covariant, so the jets are taken in reference coordinates: the
 shape functions are then the same for all cells.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import fields
 from functools import reduce
 from itertools import combinations_with_replacement, product
@@ -59,7 +59,7 @@ class Site:
         self._coupled = pairs
         self._contractions = {rule: Contraction(rule, pairs) for rule in {batch.rule for batch in batches}}
 
-    def add(self, u: Array, factors: Mapping[str, float], same: Array, cross: Array) -> None:
+    def add(self, u: Array, factors: Mapping[str, float], same: Array, couple: Callable[[int, Array], None]) -> None:
         """Add the terms' element matrices.
 
         Parameters
@@ -69,12 +69,11 @@ class Site:
         factors
             By term; others are left out.
         same
-            (local cells, 9, pairs of functions), see `same_cell_entries`.
-        cross
-            (interior edges, 9, functions^2) in the order of the batches; not used if there is one side.
+            (local cells, 9, pairs of functions), see `BlockMatrix.add_cells`.
+        couple
+            Takes the number of each batch of interior edges and what couples the cells there.
         """
         kernels = [(kernel, factors[name]) for name, kernel in self._kernels.items() if factors.get(name)]
-        first = 0
         for number, batch in enumerate(self.batches):
             fill(self._u, self._jets(batch, u))
             fill(self._r0, self._placements[number])
@@ -85,9 +84,7 @@ class Site:
             for side, cells in enumerate(batch.cells):
                 same[cells] += contraction.same(blocks, side)
             if self._sides == 2:
-                last = first + len(batch.cells[0])
-                cross[first:last] = contraction.cross(blocks)
-                first = last
+                couple(number, contraction.cross(blocks))
 
     def _jets(self, batch: Batch, field: Array) -> Array:
         """(points, sides, 6, 3) of a field."""

@@ -1,4 +1,4 @@
-"""Cells and edges in batches that share their reference tables, and where their entries go in a matrix."""
+"""Cells and edges in batches that share their reference tables."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -7,7 +7,6 @@ import numpy as np
 from dolfinx import fem
 from numpy.typing import NDArray
 
-from magshell_fenicsx.solve.points import COMPONENTS, SKEW
 from magshell_fenicsx.solve.reference import EDGES, Table, cell_rule, edge_covector, edge_rule
 
 POINTS = 2048  # at most, in a batch: its Hessians stay within a few megabytes
@@ -94,32 +93,6 @@ def boundary_edges(V: fem.FunctionSpace, facets: NDArray[np.int32]) -> tuple[NDA
     facets = facets[facets < topology.index_map(1).size_local]
     cells = links.array[links.offsets[facets]]
     return cells[:, None], _local_edges(V, facets, cells)[:, None]
-
-
-def same_cell_entries(V: fem.FunctionSpace) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Rows and columns (cells, 9, pairs a <= b) of the local cells' matrices.
-
-    Of the components, the first 6 are those of `COMPONENTS` (K_cd at a, b) and the last 3 the
-    off-diagonal ones with a and b exchanged (-1 where a = b).
-    """
-    dofs = 3 * V.dofmap.list
-    a, b = np.triu_indices(dofs.shape[1])
-    here, there = dofs[:, None, a], dofs[:, None, b]
-    c, d = (np.array(x, dtype=np.int32)[:, None] for x in zip(*COMPONENTS, strict=True))
-    rows, columns = here + c, there + d
-    c, d = (np.array(x, dtype=np.int32)[:, None] for x in zip(*SKEW, strict=True))
-    other_rows, other_columns = np.where(a == b, -1, there + c), np.where(a == b, -1, here + d)
-    return np.concatenate([rows, other_rows], axis=1), np.concatenate([columns, other_columns], axis=1)
-
-
-def cross_entries(V: fem.FunctionSpace, batch: Batch) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Rows and columns (edges, 9, functions^2) of what couples the two sides of edges."""
-    here, there = (3 * V.dofmap.list[cells][:, None] for cells in batch.cells)
-    functions = here.shape[2]
-    c, d = (x.astype(np.int32).ravel()[:, None] for x in np.mgrid[:3, :3])
-    rows = np.repeat(here, functions, axis=2) + c
-    columns = np.tile(there, (1, 1, functions)) + d
-    return rows, columns
 
 
 def _edge_batches(

@@ -12,7 +12,6 @@ from petsc4py import PETSc
 
 from magshell_fenicsx import Case, Scene, follow
 from magshell_fenicsx.case.source import Source
-from magshell_fenicsx.shell import fast_tangent
 from magshell_fenicsx.shell.fast_tangent import FastTangent, make_sites
 from magshell_fenicsx.shell.model import ShellModel
 from magshell_fenicsx.shell.parameters import Condition, Loads, Magnetisation, Material
@@ -118,22 +117,6 @@ def test_matrix_is_reused_and_follows_state_and_amplitudes(shell: Shells) -> Non
     assert abs(csr(K) - first).max() == 0
     assert K.isSymmetricKnown() == (True, True)
     assert abs(first - first.T).max() <= 1e-14 * abs(first).max()
-
-
-def test_forms_take_over_where_lists_are_too_long(monkeypatch: pytest.MonkeyPatch) -> None:
-    models = []
-    for most in (fast_tangent.MOST_ENTRIES, 1000):
-        monkeypatch.setattr(fast_tangent, "MOST_ENTRIES", most)
-        models.append(
-            ShellModel(
-                hemisphere(0.8, half=True), Material(0.3, 0.05), 2, {"symmetry": "symmetry"}, Loads(magnetic=TILTED)
-            )
-        )
-    u = random_displacement(models[0], 1e-3)
-    for systems in ([m.system for m in models], [m.excluded_modes.system for m in models if m.excluded_modes]):
-        K, reference = (csr(system.tangent(u, MU)) for system in systems)
-        assert abs(K - reference).max() <= 1e-12 * abs(reference).max()
-    assert [any(name.endswith("tangent") for name in m.kernels.names) for m in models] == [False, True]
 
 
 HALF_SHELL = {
