@@ -43,7 +43,8 @@ class BlockMatrix:
         held = np.zeros((nodes.size_local + nodes.num_ghosts, 3), dtype=bool)
         for bc in clamped:
             held.ravel()[bc.dof_indices()[0]] = True
-        self._pattern = pattern = Pattern(nodes, self._free_pairs(held.all(axis=1)), comm)
+        self._wholly = np.array(held.all(axis=1))
+        self._pattern = pattern = Pattern(nodes, self._free_pairs(), comm)
         self._blocks = pattern.blocks(*_pairs(self._cells, self._cells))
         self._coupling_blocks = [
             np.stack([pattern.blocks(*_pairs(here, there)), pattern.blocks(*_pairs(there, here))], axis=1)
@@ -107,11 +108,11 @@ class BlockMatrix:
         entities, functions = arrays[0].shape
         add(values, starts, self._pattern.owned, entities, functions, *map(pointer, arrays))
 
-    def _free_pairs(self, wholly_held: NDArray[np.bool_]) -> Iterator[tuple[Ints, Ints]]:
+    def _free_pairs(self) -> Iterator[tuple[Ints, Ints]]:
         """Pairs of nodes with a block: a clamped node has but its own."""
         for rows, columns in self._together():
             i, j = _pairs(rows, columns)
-            free = ~(wholly_held[i] | wholly_held[j])
+            free = ~(self._wholly[i] | self._wholly[j])
             yield i[free], j[free]
 
     def _together(self) -> Iterable[tuple[Ints, Ints]]:
@@ -122,9 +123,9 @@ class BlockMatrix:
 
     def _held_entries(self, held: NDArray[np.bool_]) -> tuple[Longs, Longs]:
         """The entries of this rank in rows and columns that are held, and those of them that are its diagonal."""
-        some, own = held.any(axis=1), np.arange(self._pattern.owned, dtype=np.int32)
+        some, own = np.array(held.any(axis=1)), np.arange(self._pattern.owned, dtype=np.int32)
         keys = [own[some[own]] * (len(held) + np.int64(1))]
-        for i, j in self._free_pairs(held.all(axis=1)):
+        for i, j in self._free_pairs():
             touched = some[i] | some[j]
             keys.append(np.unique(i[touched] * np.int64(len(held)) + j[touched]))
         i, j = (x.astype(np.int32) for x in np.divmod(np.unique(np.concatenate(keys)), len(held)))

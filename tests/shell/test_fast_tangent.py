@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 import pytest
 import scipy.sparse
-from conftest import TILTED, hemisphere, random_displacement
+from conftest import hemisphere, random_displacement
 from petsc4py import PETSc
 
 from magshell_fenicsx import Case, Scene, follow
