@@ -3,10 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from mpi4py import MPI
 from numpy.typing import NDArray
-from scipy.interpolate import RBFInterpolator
-from scipy.spatial import cKDTree
 
 from magshell_fenicsx.axisymmetric.model import MeridianModel
 from magshell_fenicsx.mesh.sphere import SphereEmbedding
@@ -58,7 +57,9 @@ def _interpolated(nodes: Array, values: Array, x: Array, rim: float) -> Array:
     for here, wanted in (inside, outside):
         if wanted.any():
             neighbours = NEIGHBOURS[nodes.shape[1]]
-            field = RBFInterpolator(nodes[here], values[here], neighbors=neighbours, kernel="quintic", degree=3)
+            field = scipy.interpolate.RBFInterpolator(
+                nodes[here], values[here], neighbors=neighbours, kernel="quintic", degree=3
+            )
             found[wanted] = field(x[wanted])
     return found
 
@@ -71,7 +72,7 @@ def same_mesh(source: Scene, target: Scene) -> bool:
 def _matching(source: Scene, target: Scene) -> NDArray[np.int64] | None:
     """For each node of this rank its number among all nodes of the source; None, on all ranks, if the nodes differ."""
     comm, nodes, wanted = source.model.system.comm, _all_nodes(source), chart(target)
-    distance, number = cKDTree(nodes).query(wanted)
+    distance, number = scipy.spatial.cKDTree(nodes).query(wanted)
     equal = comm.allreduce(len(wanted)) == len(nodes) and comm.allreduce(distance.max(initial=0.0), MPI.MAX) < ROUNDING
     return np.asarray(number) if equal else None
 

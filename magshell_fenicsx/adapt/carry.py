@@ -6,8 +6,8 @@ chart: to a higher degree on the same mesh a displacement is carried without any
 
 import basix
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from magshell_fenicsx.scene import Scene
 from magshell_fenicsx.solve.system import Vector
@@ -46,7 +46,7 @@ class CellFields:
         dim, bs = x.shape[1], scene.model.V.dofmap.bs
         self.nodes = gathered(scene, np.pad(x, ((0, 0), (0, bs - dim))).ravel())[..., :dim]
         self._element: basix.finite_element.FiniteElement = scene.model.V.element.basix_element
-        self._near = cKDTree(self.centres)
+        self._near = scipy.spatial.cKDTree(self.centres)
 
     @property
     def centres(self) -> Array:

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from magshell_fenicsx.mesh.grading import Size
 
@@ -34,8 +34,8 @@ class Sampled:
         return float(np.exp(weight @ np.log(self.sizes[near]) / weight.sum()))
 
     @cached_property
-    def _tree(self) -> cKDTree:
-        return cKDTree(self.points)
+    def _tree(self) -> "scipy.spatial.cKDTree":
+        return scipy.spatial.cKDTree(self.points)
 
 
 def equidistributed(
@@ -69,5 +69,5 @@ def equidistributed(
 
 def _smoothed(centres: Array, wish: Array) -> Array:
     """Geometric mean of a cell and its neighbours."""
-    near = cKDTree(centres).query(centres, NEIGHBOURS + 2)[1]
+    near = scipy.spatial.cKDTree(centres).query(centres, NEIGHBOURS + 2)[1]
     return np.asarray(np.exp(np.log(wish)[near].mean(axis=1)))

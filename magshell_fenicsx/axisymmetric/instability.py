@@ -4,7 +4,7 @@ from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from scipy.optimize import brentq
+import scipy
 
 from magshell_fenicsx.axisymmetric.waves import Waves
 from magshell_fenicsx.solve.path import Path, PathStopped, Point
@@ -73,6 +73,6 @@ def first_circumferential_instability(waves: Waves, path: Path, points: Sequence
             found[s] = point
         return {m: waves.critical_eigenvalue(found[s].state, m) for m in candidates}
 
-    root = brentq(lambda s: min(margins(s).values()), low.s, high.s, xtol=1e-7 * abs(high.s - low.s))
+    root = scipy.optimize.brentq(lambda s: min(margins(s).values()), low.s, high.s, xtol=1e-7 * abs(high.s - low.s))
     last = margins(root)
     return min(last, key=lambda m: last[m]), found[root]

@@ -1,16 +1,26 @@
 """What all sections of a case share: strict types, no unknown keys, numbers with units."""
 
 import re
-from typing import Annotated, Any
+from functools import cache
+from typing import TYPE_CHECKING, Annotated, Any
 
-import pint
 from pydantic import BaseModel, BeforeValidator, ConfigDict
 
-_units = pint.UnitRegistry()
+if TYPE_CHECKING:
+    import pint
+
 # one number, then units; pint itself would compute any formula, 9**9**9 included
 _NUMBER = r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)(e[-+]?[0-9]+)?"
 _UNIT = r"[^\W\d]+(\s*(\*\*|\^)\s*-?[0-9])?"
 _NUMBER_AND_UNITS = re.compile(rf"\s*{_NUMBER}[\s*]*{_UNIT}([\s*/]+{_UNIT})*\s*", re.IGNORECASE)
+
+
+@cache
+def _units() -> "pint.UnitRegistry":
+    """Made for the first number with a unit: most cases have none, and pint takes long to import."""
+    import pint
+
+    return pint.UnitRegistry()
 
 
 class Section(BaseModel):
@@ -25,10 +35,12 @@ def _quantity(unit: str) -> Any:
     def convert(value: Any) -> float:
         if not isinstance(value, str):
             raise ValueError(f'needs a unit, for example "{_EXAMPLES[unit]}"')
+        import pint
+
         try:
             if not _NUMBER_AND_UNITS.fullmatch(value):
                 raise ValueError(value)
-            quantity = _units.Quantity(value)
+            quantity = _units().Quantity(value)
             return float(quantity.to(unit).magnitude)
         except pint.DimensionalityError as e:
             raise ValueError(f"is not convertible to {unit}: it has the dimension {e.dim1}") from None

@@ -1,10 +1,10 @@
 """Nodal values in an order that does not depend on the number of ranks."""
 
 import numpy as np
+import scipy
 from dolfinx import fem
 from mpi4py import MPI
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.solve.system import Vector
@@ -40,16 +40,25 @@ class Ordering:
         self._within, self._comm = V.mesh.comm, comm
         self._values = V.dofmap.index_map_bs
         mine = V.tabulate_dof_coordinates()[: V.dofmap.index_map.size_local]
-        present = np.concatenate(self._within.allgather(mine))
+        present = self._within.allgather(mine)
         known = comm.bcast(known)
-        self.places = present if known is None else known
-        distance, self._mine = cKDTree(self.places).query(mine)
-        parts = self._within.allgather(self._mine)
-        one_to_one = np.array_equal(np.sort(np.concatenate(parts)), np.arange(len(self.places)))
-        close = np.all(distance < CLOSE * np.abs(self.places).max())
+        if known is None:
+            self.places: Array = np.concatenate(present)
+            first = sum(len(part) for part in present[: self._within.rank])
+            self._mine: NDArray[np.int64] = first + np.arange(len(mine))
+        else:
+            self.places, self._mine = known, self._found(known, mine, comm)
+        self._parts = self._within.allgather(self._mine)
+
+    def _found(self, known: Array, mine: Array, comm: MPI.Comm) -> NDArray[np.int64]:
+        """The numbers of this rank's places among the known ones."""
+        distance, number = scipy.spatial.cKDTree(known).query(mine)
+        parts = self._within.allgather(number)
+        one_to_one = np.array_equal(np.sort(np.concatenate(parts)), np.arange(len(known)))
+        close = np.all(distance < CLOSE * np.abs(known).max())
         if not comm.allreduce(bool(one_to_one and close), MPI.LAND):
             raise CaseError("--resume: the mesh is not that of the checkpoint; run without --resume")
-        self._parts = parts
+        return np.asarray(number)
 
     def gather(self, u: Vector) -> Array:
         """All values of a displacement (n, components), on every rank that is rank 0 of its space; else empty."""
