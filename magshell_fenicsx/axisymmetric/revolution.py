@@ -39,8 +39,8 @@ class Revolution:
         return self._turned(u.reshape(-1, 2))
 
     def geometry(self) -> tuple[SurfaceGeometry, Array]:
-        """Bases, curvature and slopes of u at the vertices, and r0 (n, 3), along (e_rho, e_theta, e_z) at theta = 0."""
-        r, u = self._jets(self._model.r0), self._jets(self._model.u)
+        """Bases and curvature at the vertices, and r0 (n, 3), along (e_rho, e_theta, e_z) at theta = 0."""
+        r = self._jets(self._model.r0)
         rho = r[0, :, 0]
         zero = np.zeros_like(rho)
         a = np.stack([self._lifted(r[1]), np.column_stack([zero, rho, zero])], axis=1)
@@ -48,8 +48,13 @@ class Revolution:
         n0: Array = m / np.linalg.norm(m, axis=1)[:, None]
         b11, b22 = np.einsum("vi,vi->v", n0, self._lifted(r[2])), -n0[:, 0] * rho
         b0 = np.stack([np.column_stack([b11, zero]), np.column_stack([zero, b22])], axis=1)
-        du = np.stack([self._lifted(u[1]), np.column_stack([zero, u[0, :, 0], zero])], axis=1)
-        return SurfaceGeometry(a, n0, b0, du), self._lifted(r[0])
+        return SurfaceGeometry(a, n0, b0), self._lifted(r[0])
+
+    def slopes(self) -> Array:
+        """u,_1 and u,_2 of the model's present u there, (n, 2, 3)."""
+        u = self._jets(self._model.u)
+        zero = np.zeros(u.shape[1])
+        return np.stack([self._lifted(u[1]), np.column_stack([zero, u[0, :, 0], zero])], axis=1)
 
     def repeated(self, along: Array) -> Array:
         """A scalar (vertices,) at the pole and on the circles."""

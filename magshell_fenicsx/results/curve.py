@@ -1,11 +1,12 @@
 """The load-displacement or pressure-volume curve as a picture."""
 
+import io
 from collections.abc import Sequence
-from pathlib import Path
+from itertools import groupby
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.interpolate import PchipInterpolator
 
 from magshell_fenicsx.results.table import OWN_MODES, Row
 
@@ -27,18 +28,19 @@ def _smooth(x: Sequence[float], y: Sequence[float]) -> NDArray[np.float64]:
     steps = np.hypot(*(np.diff(xy, axis=1) / np.where(scale > 0, scale, 1)[:, None]))
     chord = np.concatenate([[0], np.cumsum(np.maximum(steps, 1e-12))])
     fine = np.interp(np.arange(FINE * (len(chord) - 1) + 1) / FINE, np.arange(len(chord)), chord)
-    return np.asarray(PchipInterpolator(chord, xy, axis=1)(fine))
+    return np.asarray(scipy.interpolate.PchipInterpolator(chord, xy, axis=1)(fine))
 
 
-def draw_curve(rows: Sequence[Row], amplitude: str, title: str, file: Path) -> None:
+def draw_curve(rows: Sequence[Row], amplitude: str, title: str) -> bytes:
     """Draw the part of the path in which `amplitude` varied, and its branches; instabilities are marked.
 
     Stable parts are solid, unstable ones dashed.
-    """
-    import matplotlib
 
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
+    Returns
+    -------
+    A PNG file.
+    """
+    from matplotlib.figure import Figure
 
     x_key, y_key, x_label, y_label = AXES[amplitude]
     sign = -1.0 if x_key == "volume_change" else 1.0
@@ -48,17 +50,18 @@ def draw_curve(rows: Sequence[Row], amplitude: str, title: str, file: Path) -> N
     def place(row: Row) -> tuple[float, float]:
         return sign * float(row[x_key]), float(row[y_key])
 
-    figure, axes = plt.subplots(figsize=(4.6, 3.4), layout="constrained")
+    figure = Figure(figsize=(4.6, 3.4), dpi=200, layout="constrained")
+    axes = figure.subplots()
     for branch in sorted({int(row["branch"]) for row in part}):
         line = [row for row in part if row["branch"] == branch and row["mode"] in OWN_MODES]
         smooth_x, smooth_y = _smooth(*zip(*map(place, line), strict=True))
-        for i in range(1, len(line)):
-            unstable = int(line[i]["negative_pivots"]) > 0 and line[i]["label"] not in LOCATED
-            piece = slice((i - 1) * FINE, i * FINE + 1)
-            axes.plot(smooth_x[piece], smooth_y[piece], color="C0", linestyle=(0, (2, 1.2)) if unstable else "-")
-        for row in line:
-            if row["label"] in ("target", "step", "field"):
-                axes.plot(*place(row), ".", color="C0", markersize=4)
+        unstable = [int(row["negative_pivots"]) > 0 and row["label"] not in LOCATED for row in line]
+        for dashed, pieces in groupby(range(1, len(line)), key=unstable.__getitem__):
+            i, *others = pieces
+            piece = slice((i - 1) * FINE, (i + len(others)) * FINE + 1)
+            axes.plot(smooth_x[piece], smooth_y[piece], color="C0", linestyle=(0, (2, 1.2)) if dashed else "-")
+        dots = [place(row) for row in line if row["label"] in ("target", "step", "field")]
+        axes.plot([x for x, _ in dots], [y for _, y in dots], ".", color="C0", markersize=4)
     for row in part:
         if row["label"] in LOCATED:
             mode = f" ({row['mode']})" if row["mode"] else ""
@@ -69,5 +72,6 @@ def draw_curve(rows: Sequence[Row], amplitude: str, title: str, file: Path) -> N
     axes.axhline(0, color="0.8", linewidth=0.8, zorder=0)
     if axes.get_legend_handles_labels()[1]:
         axes.legend(frameon=False)
-    figure.savefig(file, dpi=200)
-    plt.close(figure)
+    content = io.BytesIO()
+    figure.savefig(content, format="png")
+    return content.getvalue()

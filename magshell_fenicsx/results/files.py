@@ -16,7 +16,7 @@ from magshell_fenicsx.results import checkpoint
 from magshell_fenicsx.results.curve import draw_curve
 from magshell_fenicsx.results.durable import sync_folder, write_whole
 from magshell_fenicsx.results.folder import by_first, prepare_folder
-from magshell_fenicsx.results.picture import draw_loads, draw_shell
+from magshell_fenicsx.results.picture import draw_deformed
 from magshell_fenicsx.results.summary import Result
 from magshell_fenicsx.results.surface import Surface, completed, gatherer, turned
 from magshell_fenicsx.results.table import PathTable, Row
@@ -177,24 +177,14 @@ class RunFiles:
 
     def _draw(self, result: Result, surface: Surface) -> None:
         plan, title = self._scene.plan, _title(result)
-        h, amplitude = plan.material.h, str(result.rows[-1]["amplitude"])
+        amplitude = str(result.rows[-1]["amplitude"])
         whole = turned(completed(surface) if plan.half else surface, plan.azimuth)
         if amplitude:
-            self._picture("curve.png", lambda file: draw_curve(result.rows, amplitude, title, file))
-        self._picture("shell.png", lambda file: draw_shell(whole, h, title, file))
-        if whole.fields:
-            self._picture("magnetic_loads.png", lambda file: draw_loads(whole, h, title, file))
-
-    def _picture(self, name: str, draw: Callable[[Path], None]) -> None:
-        """Draw beside and rename: no half pictures."""
-        unfinished = self._folder / f"unfinished_{name}"
-        try:
-            draw(unfinished)
-            unfinished.replace(self._folder / name)
-        except OSError as e:
-            raise OSError(e.errno, e.strerror, str(self._folder / name)) from None
-        finally:
-            unfinished.unlink(missing_ok=True)
+            write_whole(self._folder / "curve.png", draw_curve(result.rows, amplitude, title))
+        shell, loads = draw_deformed(whole, plan.material.h, title)
+        write_whole(self._folder / "shell.png", shell)
+        if loads:
+            write_whole(self._folder / "magnetic_loads.png", loads)
 
 
 def _same(row: Row, there: dict[str, str]) -> None:
@@ -208,11 +198,11 @@ def _same(row: Row, there: dict[str, str]) -> None:
 
 def _title(result: Result) -> str:
     case, row = result.scene.case, result.rows[-1]
-    said = [f"R/h = {case.shell.R_over_h:g}", f"nu = {case.shell.poisson_ratio:g}"]
+    said = [f"$R/h$ = {case.shell.R_over_h:g}", rf"$\nu$ = {case.shell.poisson_ratio:g}"]
     if case.lambda_m:
-        said.append(f"lambda_m = {row['lambda_m']:g}")
+        said.append(rf"$\lambda_\mathrm{{m}}$ = {row['lambda_m']:g}")
     if row["amplitude"] == "pressure":
-        said.append(f"p/pc = {row['p_over_pc']:.5g}")
+        said.append(rf"$p/p_\mathrm{{c}}$ = {row['p_over_pc']:.5g}")
     if row["amplitude"] == "force":
-        said.append(f"w/h = {row['w_over_h']:.4g} at the load")
+        said.append(f"$w/h$ = {row['w_over_h']:.4g} at the load")
     return ", ".join(said)

@@ -14,32 +14,26 @@ from magshell_fenicsx.shell.parameters import Magnetisation
 Array = NDArray[np.float64]
 
 
-def magnetic_loads(g: "SurfaceGeometry", field: Magnetisation, r0: Array, h: float) -> dict[str, Array]:
-    """p_mag, k and tau at points r0 (..., 3), and f_mag where the remanence is uniform."""
+def magnetic_loads(
+    g: "SurfaceGeometry", field: Magnetisation, r0: Array, h: float
+) -> tuple[dict[str, Array], "Torque"]:
+    """At points r0 (..., 3) p_mag, k and, of a uniform remanence, f_mag; and the torque, which depends on u."""
     pattern = field.remanent
     Br = pattern(r0, g.n0) if callable(pattern) else np.broadcast_to(pattern, r0.shape)
     Ba = field.applied
-    loads = {
-        "p_mag": magnetic_pressure(g, Br, Ba, h),
-        "k": spring_stiffness(g, Br, Ba),
-        "tau": torque(g, Br, Ba),
-    }
+    loads = {"p_mag": magnetic_pressure(g, Br, Ba, h), "k": spring_stiffness(g, Br, Ba)}
     if not callable(pattern):
         loads["f_mag"] = in_plane_force(g, Br, Ba, h)
-    return loads
+    return loads, torque(g, Br, Ba)
 
 
 @dataclass(frozen=True)
 class SurfaceGeometry:
-    """Undeformed bases and curvature at points: a1, a2, n0 (..., 3), b0_ij (..., 2, 2).
-
-    `du` holds u,_1 and u,_2 (..., 2, 3).
-    """
+    """Undeformed bases and curvature at points: a1, a2 (..., 2, 3), n0 (..., 3), b0_ij (..., 2, 2)."""
 
     a: Array
     n0: Array
     b0: Array
-    du: Array
 
     @property
     def dual(self) -> Array:
@@ -73,8 +67,19 @@ def spring_stiffness(g: SurfaceGeometry, Br: Array, Ba: Array) -> Array:
     return np.asarray(-np.einsum("...i,...i->...", g.n0, Br) * np.einsum("...i,i->...", g.n0, Ba))
 
 
-def torque(g: SurfaceGeometry, Br: Array, Ba: Array) -> Array:
-    """tau_c = B0^ij (a0^a . e_j)(n0 . e_i) (u,_a . a0_c) as a vector (..., 3), a the derivative."""
-    turned = np.einsum("...ai,i,...aj->...j", g.dual, Ba, g.du)
-    tangent = turned - np.einsum("...i,...i->...", turned, g.n0)[..., None] * g.n0
-    return np.asarray(-np.einsum("...i,...i->...", g.n0, Br)[..., None] * tangent)
+@dataclass(frozen=True)
+class Torque:
+    """tau at points with normals n0 (..., 3); `along` holds -(n0 . Br)(a0^a . Ba), (..., 2)."""
+
+    n0: Array
+    along: Array
+
+    def __call__(self, du: Array) -> Array:
+        """tau_c = B0^ij (a0^a . e_j)(n0 . e_i) (u,_a . a0_c) as a vector (..., 3), of u,_1 and u,_2 (..., 2, 3)."""
+        turned = np.matmul(self.along[..., None, :], du)[..., 0, :]
+        return np.asarray(turned - np.sum(turned * self.n0, axis=-1, keepdims=True) * self.n0)
+
+
+def torque(g: SurfaceGeometry, Br: Array, Ba: Array) -> Torque:
+    """The torque as a function of the displacement's derivatives."""
+    return Torque(g.n0, -np.einsum("...i,...i->...", g.n0, Br)[..., None] * np.einsum("...ai,i->...a", g.dual, Ba))

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.axisymmetric.model import MeridianModel
 from magshell_fenicsx.axisymmetric.revolution import Revolution
-from magshell_fenicsx.results.interpretation import SurfaceGeometry, magnetic_loads
+from magshell_fenicsx.results.interpretation import SurfaceGeometry, Torque, magnetic_loads
 from magshell_fenicsx.shell.model import ShellModel
 from magshell_fenicsx.solve.system import Vector
 
@@ -47,73 +47,68 @@ class Surface:
 
 
 class SurfaceGatherer:
-    """Gathers displacements of one model; what does not change is gathered once."""
+    """Gathers displacements of one model; what does not change is computed and gathered once."""
 
     def __init__(self, model: ShellModel) -> None:
         self._model = model
-        domain, degree = model.V.mesh, model.degree
+        domain, degree, map_ = model.V.mesh, model.degree, model.V.dofmap.index_map
         self.comm = domain.comm
-        # VTK's nodes are equidistant, the displacement's are not
-        element = basix.ufl.element(
-            "Lagrange", "triangle", degree, lagrange_variant=basix.LagrangeVariant.equispaced, shape=(3,)
+        # VTK's nodes are equidistant, the displacement's are not; there are as many of them on edges and in cells
+        element = basix.create_element(
+            basix.ElementFamily.P, basix.CellType.triangle, degree, basix.LagrangeVariant.equispaced
         )
-        self._V = fem.functionspace(domain, element)
-        self._field = fem.Function(self._V)
-        self._r0 = self._nodes(model.r0)
-        self._derivatives = model.V.element.basix_element.tabulate(2, self._V.element.interpolation_points())
-        map_ = self._V.dofmap.index_map
+        self._table = model.V.element.basix_element.tabulate(2, element.points)[:, :, :, 0]
         self._owned = domain.topology.index_map(2).size_local
-        local = self._V.dofmap.list[: self._owned]
-        numbers = map_.local_to_global(local.ravel().astype(np.int32)).reshape(local.shape)
+        V = fem.functionspace(domain, basix.ufl.wrap_element(element))  # numbers nodes that two cells share alike
+        local = V.dofmap.list[: self._owned]
+        numbers = V.dofmap.index_map.local_to_global(local.ravel().astype(np.int32)).reshape(local.shape)
         self._size, self._numbers = map_.size_global, self.comm.gather(numbers)
         cells = self.comm.gather(numbers[:, np.argsort(perm_vtk(mesh.CellType.triangle, local.shape[1]))])
         self._cells = np.concatenate(cells) if self.comm.rank == 0 else numbers
-        n0 = self._averaged(self._geometry().n0)
-        self._n0 = n0 / np.linalg.norm(n0, axis=1)[:, None]
+        r = self._at_nodes(model.r0, 6)
+        g = _geometry(r)
+        n0 = self._averaged(g.n0)
+        self._r0, self._n0 = self._averaged(r[0]), n0 / np.linalg.norm(n0, axis=1)[:, None]
+        self._loads: dict[str, Array] = {}
+        self._torque: Torque | None = None
+        field = model.loads.magnetic
+        if field and field.gradient is None:
+            loads, self._torque = magnetic_loads(g, field, r[0], model.material.h)
+            self._loads = {name: self._averaged(value) for name, value in loads.items()}
 
     def gather(self, u: Vector) -> Surface | None:
         """The surface with a displacement, on rank 0; None elsewhere."""
-        model = self._model
-        model.system.set(u)
-        nodes, fields = self._nodes(model.u), {}
-        field = model.loads.magnetic
-        if field and field.gradient is None:
-            g = self._geometry()
-            values = magnetic_loads(g, field, self._at_nodes(model.r0)[0], model.material.h)
-            fields = {name: self._averaged(value) for name, value in values.items()}
+        self._model.system.set(u)
+        jet = self._at_nodes(self._model.u, 3)
+        nodes, fields = self._averaged(jet[0]), dict(self._loads)
+        if self._torque:
+            fields["tau"] = self._averaged(self._torque(np.moveaxis(jet[1:], 0, -2)))
         return Surface(self._r0, nodes, self._n0, self._cells, fields) if self.comm.rank == 0 else None
 
-    def _nodes(self, f: fem.Function) -> Array:
-        """Values at the owned nodes of all ranks, in global order, on rank 0."""
-        self._field.interpolate(f)
-        owned = self._field.x.array.reshape(-1, 3)[: self._V.dofmap.index_map.size_local]
-        parts = self.comm.gather(owned.copy())
-        return np.concatenate(parts) if self.comm.rank == 0 else owned
-
-    def _at_nodes(self, f: fem.Function) -> Array:
-        """Value, f,_1, f,_2, f,_11, f,_12, f,_22 in reference coordinates at each node of each owned cell."""
+    def _at_nodes(self, f: fem.Function, parts: int) -> Array:
+        """The first of f, f,_1, f,_2, f,_11, f,_12, f,_22 in reference coordinates at each owned cell's nodes."""
         coefficients = f.x.array.reshape(-1, 3)[self._model.V.dofmap.list[: self._owned]]
-        return np.asarray(np.einsum("dvk,cki->dcvi", self._derivatives[:, :, :, 0], coefficients))
-
-    def _geometry(self) -> SurfaceGeometry:
-        r = self._at_nodes(self._model.r0)
-        m = np.cross(r[1], r[2])
-        n0 = m / np.linalg.norm(m, axis=-1)[..., None]
-        b11, b12, b22 = np.einsum("dcvi,cvi->dcv", r[3:], n0)
-        b0 = np.stack([np.stack([b11, b12], -1), np.stack([b12, b22], -1)], -2)
-        du = np.moveaxis(self._at_nodes(self._model.u)[1:3], 0, -2)
-        return SurfaceGeometry(np.moveaxis(r[1:3], 0, -2), n0, b0, du)
+        return np.asarray(np.matmul(self._table[:parts, None], coefficients))
 
     def _averaged(self, values: Array) -> Array:
         """Mean over the cells that share a node, in global order, on rank 0."""
         parts = self.comm.gather(values)
         if self.comm.rank:
             return values
-        total, count = np.zeros((self._size, *values.shape[2:])), np.zeros(self._size)
-        for where, part in zip(self._numbers, parts, strict=True):
-            np.add.at(total, where, part)
-            np.add.at(count, where, 1.0)
-        return total / count.reshape(-1, *[1] * (total.ndim - 1))
+        where = np.concatenate([numbers.ravel() for numbers in self._numbers])
+        whole = np.concatenate(parts).reshape(len(where), -1)
+        count = np.bincount(where, minlength=self._size)
+        sums = [np.bincount(where, weights=column, minlength=self._size) for column in whole.T]
+        return (np.stack(sums, axis=1) / count[:, None]).reshape(-1, *values.shape[2:])
+
+
+def _geometry(r: Array) -> SurfaceGeometry:
+    """Bases and curvature of a jet (6, ..., 3)."""
+    m = np.cross(r[1], r[2])
+    n0: Array = m / np.linalg.norm(m, axis=-1)[..., None]
+    b11, b12, b22 = np.einsum("d...i,...i->d...", r[3:], n0)
+    b0 = np.stack([np.stack([b11, b12], -1), np.stack([b12, b22], -1)], -2)
+    return SurfaceGeometry(np.moveaxis(r[1:3], 0, -2), n0, b0)
 
 
 class RevolvedGatherer:
@@ -121,21 +116,26 @@ class RevolvedGatherer:
 
     def __init__(self, model: MeridianModel, comm: MPI.Comm) -> None:
         self.comm, self._model, self._swept = comm, model, Revolution(model)
+        self._loads: dict[str, Array] = {}
+        self._torque: Torque | None = None
+        field = model.loads.magnetic
+        if field and field.gradient is None:
+            geometry, r0 = self._swept.geometry()
+            loads, self._torque = magnetic_loads(geometry, field, r0, model.material.h)
+            self._loads = {name: self._around(values) for name, values in loads.items()}
 
     def gather(self, u: Vector) -> Surface | None:
         """The surface with a displacement, on rank 0; None elsewhere."""
         if self.comm.rank:
             return None
-        model, swept = self._model, self._swept
-        model.system.set(u)
-        fields, field = {}, model.loads.magnetic
-        if field and field.gradient is None:
-            geometry, r0 = swept.geometry()
-            values = magnetic_loads(geometry, field, r0, model.material.h)
-            fields = {
-                name: swept.turned(v[:, [0, 2]]) if v.ndim == 2 else swept.repeated(v) for name, v in values.items()
-            }
+        swept, fields = self._swept, dict(self._loads)
+        self._model.system.set(u)
+        if self._torque:
+            fields["tau"] = self._around(self._torque(swept.slopes()))
         return Surface(swept.r0, swept.displacement(u), swept.n0, swept.cells, fields)
+
+    def _around(self, values: Array) -> Array:
+        return self._swept.turned(values[:, [0, 2]]) if values.ndim == 2 else self._swept.repeated(values)
 
 
 def gatherer(model: ShellModel | MeridianModel, comm: MPI.Comm) -> SurfaceGatherer | RevolvedGatherer:

@@ -1,0 +1,143 @@
+"""Bare views of the deformed shell, drawn by VTK: no text, no colour bar."""
+
+import os
+import shutil
+import subprocess
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magshell_fenicsx.results.surface import Surface
+from magshell_fenicsx.results.vtu import unstructured_grid
+
+if TYPE_CHECKING:  # VTK takes long to import
+    import pyvista
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
+MARGIN = 10  # pixels around what is drawn
+
+
+@dataclass(frozen=True)
+class View:
+    """One view.
+
+    Attributes
+    ----------
+    smooth
+        See `smooth_surface`.
+    values
+        (points,) that it is coloured by.
+    limits
+        Values of the first and the last colour of `colours`, a map of matplotlib's.
+    camera
+        Direction (3,) from the shell to the eye; e3 is up.
+    size
+        Pixels of a side of the window.
+    """
+
+    smooth: "pyvista.PolyData"
+    values: Array
+    limits: tuple[float, float]
+    colours: str
+    camera: Array
+    size: int
+
+
+def smooth_surface(surface: Surface, h: float) -> "pyvista.PolyData":
+    """The deformed surface in flat triangles with normals, each curved one divided."""
+    smooth = unstructured_grid(surface, h).extract_surface(nonlinear_subdivision=2)
+    return smooth.compute_normals(cell_normals=False, split_vertices=False, consistent_normals=False)
+
+
+def rendered(views: Sequence[View]) -> list[Image]:
+    """An image (height, width, 3) of each, without the white around it.
+
+    Raises
+    ------
+    RuntimeError
+        If there is no screen to draw on.
+    """
+    import pyvista
+
+    pyvista.OFF_SCREEN = True
+    with screen():
+        plotter = pyvista.Plotter(off_screen=True)  # one for all: making it takes as long as a view
+        try:
+            plotter.set_background("white")
+            plotter.enable_anti_aliasing("fxaa")  # as good to look at as multisampling, in half of the time
+            return [_image(plotter, view) for view in views]
+        finally:
+            plotter.close()
+
+
+def _image(plotter: "pyvista.Plotter", view: View) -> Image:
+    shown = view.smooth.copy(deep=False)
+    shown.point_data["shown"] = view.values
+    actor = plotter.add_mesh(
+        shown,
+        scalars="shown",
+        clim=view.limits,
+        cmap=view.colours,
+        smooth_shading=True,
+        show_scalar_bar=False,
+        copy_mesh=False,
+        render=False,
+    )
+    plotter.render_window.SetSize(view.size, view.size)
+    plotter.camera.focal_point, plotter.camera.up = (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)
+    plotter.camera.position = view.camera
+    plotter.reset_camera(render=False)
+    image = np.array(plotter.screenshot(return_img=True))
+    plotter.remove_actor(actor, render=False)
+    drawn = (image != 255).any(axis=2)
+    rows, columns = (np.flatnonzero(drawn.any(axis=axis)) for axis in (1, 0))
+    (high, low), (left, right) = ((max(at[0] - MARGIN, 0), at[-1] + MARGIN) for at in (rows, columns))
+    return image[high:low, left:right]
+
+
+def axes_on_screen(camera: Array) -> Array:
+    """e1, e2, e3 to the right and up on a screen that is seen from `camera`, (3, 2)."""
+    towards = camera / np.linalg.norm(camera)
+    right = np.cross([0.0, 0.0, 1.0], towards)
+    right /= np.linalg.norm(right)
+    return np.column_stack([right, np.cross(towards, right)])
+
+
+@contextmanager
+def screen() -> Iterator[None]:
+    """A display to render on: the user's, or a virtual one while inside.
+
+    Raises
+    ------
+    RuntimeError
+        If there is neither a display nor Xvfb.
+    """
+    if os.environ.get("DISPLAY"):
+        yield
+        return
+    if shutil.which("Xvfb") is None:
+        raise RuntimeError("no display and no Xvfb to draw the deformed shell on")
+    read, write = os.pipe()
+    with_us = ["setpriv", "--pdeathsig", "TERM"] if shutil.which("setpriv") else []  # even if we are killed
+    server = subprocess.Popen(
+        [*with_us, "Xvfb", "-displayfd", str(write), "-screen", "0", "1600x1200x24", "-nolisten", "tcp"],
+        pass_fds=[write],
+        stderr=subprocess.DEVNULL,
+    )
+    os.close(write)
+    try:
+        with os.fdopen(read) as stream:
+            number = stream.readline().strip()
+        if not number:
+            raise RuntimeError("Xvfb did not start")
+        os.environ["DISPLAY"] = f":{number}"
+        yield
+    finally:
+        os.environ.pop("DISPLAY", None)
+        server.terminate()
+        server.wait()
