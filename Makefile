@@ -6,7 +6,9 @@ make run CASE=cases/dimple_buckling.yaml [OUT=dir] [N=ranks] [ARGS="--set a=b"]
 make check CASE=...   validate a case, print what would be built
 make figures          the paper's figures into results/figures/: 45 minutes on one core, N=ranks share it
 make extremes         shells far from the ordinary ones into docs/extremes/: 5 minutes
-make bench            error, time and memory of a fixed set into a JSON; ARGS="--compare OLD.json" for ratios
+make bench            error, time and memory of a fixed set into results/bench.json (OUT=file), and the ratios
+                      to docs/bench/bench.json: 10 minutes on an idle machine
+make studies          error against run time of two cases into docs/study/: 10 minutes
 make test             lint and all tests
 make fast             lint and the tests that are not marked slow
 make lint             ruff and mypy
@@ -15,7 +17,7 @@ make clean            remove caches and compiled kernels; keeps .env/root and re
 endef
 export HELP
 
-.PHONY: help run check figures extremes bench test fast lint image clean
+.PHONY: help run check figures extremes bench studies test fast lint image clean
 
 help:
 	@echo "$$HELP"
@@ -31,7 +33,22 @@ extremes:
 	$(ENV) $(if $(N),mpirun -n $(N)) python3 -m magshell_fenicsx.extremes $(ARGS)
 
 bench:
-	$(ENV) python3 -m magshell_fenicsx.bench $(ARGS)
+	$(ENV) python3 -m magshell_fenicsx.bench $(if $(OUT),--out $(OUT)) --compare docs/bench/bench.json $(ARGS)
+
+# $(call study,NAME,CASE and options): study.* of results/study_NAME to docs/study/NAME.*
+define study
+$(ENV) magshell study $(2) --repeat 1 --out results/study_$(1)
+for kind in csv png; do cp results/study_$(1)/study.$$kind docs/study/$(1).$$kind; done
+sed 's/study\.png/$(1).png/' results/study_$(1)/study.md > docs/study/$(1).md
+endef
+
+MESHES := --over mesh.degree=3,4,5 --over mesh.refinement=0.5,0.7,1,1.4
+
+studies:
+	$(call study,indentation,cases/indentation.yaml --result force@w_over_h=10 \
+		--set loading.depth=10 --set loading.points=10 $(MESHES))
+	$(call study,buckling,cases/dimple_buckling.yaml --result knockdown --reference 0.552053778 \
+		--set symmetry=half --set magnetic.lambda_m=0.00184 $(MESHES))
 
 test: lint
 	$(ENV) python3 -m pytest

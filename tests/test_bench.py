@@ -6,8 +6,11 @@ from typing import Any
 
 import pytest
 
-from magshell_fenicsx import bench
-from magshell_fenicsx.bench import CASES, HALF, ITEMS, K_D, BenchFailed, Item, compare, derived, main, measure_item
+from magshell_fenicsx.bench import measure
+from magshell_fenicsx.bench.__main__ import main
+from magshell_fenicsx.bench.items import CASES, HALF, ITEMS, K_D, Item
+from magshell_fenicsx.bench.measure import BenchFailed, measure_item
+from magshell_fenicsx.bench.report import compare, derived, table
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.plan import make_plan
 from magshell_fenicsx.study.scalar import parse_scalar
@@ -55,6 +58,24 @@ def test_ratios_within_a_benchmark() -> None:
     assert derived({"tangent 100 000": one}) == {}
 
 
+def test_growth_with_the_unknowns() -> None:
+    """Four times the unknowns and eight times the seconds: the power 3/2."""
+
+    def item(dofs: float, seconds: float) -> dict[str, Any]:
+        parts = dict.fromkeys(("tangent_cpu_s", "factor_cpu_s", "back_solve_cpu_s"), {"median": seconds})
+        return {"dofs": {"median": dofs}, **parts}
+
+    assert list(derived({"tangent 5 000": item(5e3, 1), "tangent 20 000": item(2e4, 8)}).values()) == [1.5]
+
+
+def test_table_has_the_medians_and_the_ratios() -> None:
+    """Columns without a number are empty."""
+    lines = table({**file(error=1.23e-4, peak_mb=512.4), "derived": {"a ratio": 0.5}}).splitlines()
+    row = next(line for line in lines if line.startswith("| x "))
+    assert [cell.strip() for cell in row.split("|") if cell.strip()] == ["x", "1.2e-04", "512"]
+    assert lines[-1] == "- a ratio: 0.5"
+
+
 def test_path_of_the_meridian() -> None:
     """k_d of the axisymmetric solver; the solve phase is a part of its process."""
     numbers = measure_item(Item("path", "dimple_buckling", ("mesh.refinement=0.5",), K_D, repeat=2))
@@ -99,6 +120,7 @@ def test_file_and_comparison(
     assert set(numbers) == {"process_wall_s", "process_cpu_s", "peak_mb"}
     assert numbers["peak_mb"]["median"] == numbers["peak_mb"]["all"][0] > 100
     assert found["machine"]["cpu"]
+    assert "| k_d meridian |" in (tmp_path / "b.md").read_text(encoding="utf-8")
     assert [line.split()[2] for line in capsys.readouterr().out.splitlines()[-3:]] == [*numbers]
 
 
@@ -115,6 +137,6 @@ def test_a_run_that_stops_is_no_benchmark(monkeypatch: pytest.MonkeyPatch) -> No
     settings = ("magnetic.lambda_m=-0.004", "mesh.refinement=0.5")
     with pytest.raises(BenchFailed, match="the field alone makes the shell unstable"):
         measure_item(Item("path", "dimple_buckling", settings, repeat=1))
-    monkeypatch.setattr(bench, "CASES", Path("/none"))
+    monkeypatch.setattr(measure, "CASES", Path("/none"))
     with pytest.raises(BenchFailed, match="exit code"):
         measure_item(Item("path", "dimple_buckling", repeat=1))

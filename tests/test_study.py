@@ -142,6 +142,17 @@ def test_errors_and_front_against_a_given_reference() -> None:
     assert [row["wall_s"] for row in rows] == [1.0, 2.0, 3.0]
 
 
+def test_front_of_single_ranks_is_by_cpu_time() -> None:
+    """Another program made the first wait: it is the fastest all the same. On two ranks waiting counts."""
+    runs, kept = made((0.51, 100, 5.0), (0.5005, 200, 2.0), (0.502, 300, 3.0))
+    for one, seconds in zip(kept, (1.0, 2.0, 3.0), strict=True):
+        for sample in one.samples:
+            sample["cpu_s"] = seconds
+    assert [row["pareto"] for row in make_rows(runs, Scalar("knockdown"), 0.5)[0]] == [True, True, False]
+    on_two = [Run(run.point, 2, run.measured) for run in runs]
+    assert [row["pareto"] for row in make_rows(on_two, Scalar("knockdown"), 0.5)[0]] == [False, True, False]
+
+
 def test_finest_run_is_the_reference_with_its_own_error() -> None:
     """k_d = 0.5 + 0.01 h^2 at h = 1, 1/2, 1/3; the run with most unknowns is the reference."""
     runs, _ = made((0.51, 100, 1.0), (0.5025, 200, 2.0), (0.5 + 0.01 / 9, 300, 3.0))

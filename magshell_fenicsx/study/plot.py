@@ -5,10 +5,11 @@ from itertools import cycle
 from pathlib import Path
 from typing import Any
 
-from magshell_fenicsx.study.rows import REFINEMENT, Row
+from magshell_fenicsx.study.rows import REFINEMENT, Row, clock
 from magshell_fenicsx.sweep.points import short
 
-AGAINST = {"wall_s": "wall time of the process (s)", "dofs": "unknowns", "peak_mb": "peak memory, all ranks (MB)"}
+CLOCKS = {"wall_s": "wall time of the process (s)", "cpu_s": "CPU time of the process (s)"}
+AGAINST = {"dofs": "unknowns", "peak_mb": "peak memory, all ranks (MB)"}
 PARTS = {
     "jit_s": "kernels (warm)",
     "setup_s": "set-up",
@@ -36,9 +37,10 @@ def draw_study(rows: Sequence[Row], keys: Sequence[str], title: str, own_error: 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    series = _series([row for row in rows if row["error"] and row["wall_s"]], keys)
+    spent = clock(rows)
+    series = _series([row for row in rows if row["error"] and row[spent]], keys)
     figure, panels = plt.subplots(2, 2, figsize=(9.6, 7.2), layout="constrained")
-    for axes, (quantity, label) in zip(panels.flat, AGAINST.items(), strict=False):
+    for axes, (quantity, label) in zip(panels.flat, {spent: CLOCKS[spent], **AGAINST}.items(), strict=False):
         _errors(axes, series, quantity, own_error)
         axes.set(xlabel=label, ylabel="relative error")
     _parts(panels[1, 1], series)
@@ -67,8 +69,8 @@ def _errors(axes: Any, series: dict[str, list[Row]], quantity: str, own_error: f
     for (label, rows), marker in zip(series.items(), cycle(MARKERS), strict=False):
         x, error = ([row[key] for row in rows] for key in (quantity, "error"))
         axes.plot(x, error, marker=marker, markersize=4, linewidth=1, label=label)
-    best = sorted((row["wall_s"], row["error"]) for rows in series.values() for row in rows if row["pareto"])
-    if quantity == "wall_s" and best:
+    best = sorted((row[quantity], row["error"]) for rows in series.values() for row in rows if row["pareto"])
+    if quantity in CLOCKS and best:
         x, error = map(list, zip(*best, strict=True))
         axes.step(x, error, where="post", color="0.6", linewidth=5, alpha=0.5, zorder=0, label="Pareto front")
         axes.plot(x, error, "o", markersize=9, fillstyle="none", color="0.3")
@@ -86,22 +88,22 @@ def _errors(axes: Any, series: dict[str, list[Row]], quantity: str, own_error: f
 
 
 def _parts(axes: Any, series: dict[str, list[Row]]) -> None:
-    """Where the time of the runs on the Pareto front goes."""
+    """Where the wall time of the runs on the Pareto front goes, as shares: the machine may have been busy."""
     rows = sorted((r for rows in series.values() for r in rows if r["pareto"]), key=lambda r: -r["error"])
     bottom = [0.0] * len(rows)
     places = range(len(rows))
     for i, (key, label) in enumerate(PARTS.items()):
         if all(row[key] is None for row in rows):
             continue
-        heights = [row[key] or 0.0 for row in rows]
+        heights = [(row[key] or 0.0) / row["wall_s"] for row in rows]
         axes.bar(places, heights, bottom=bottom, color=f"C{i}", label=label)
         bottom = [b + h for b, h in zip(bottom, heights, strict=True)]
     for end, colour, label in (
         ("total_s", "0.6", "the rest of the run"),
         ("wall_s", "0.85", "start and end of the process"),
     ):
-        rest = [max((row[end] or 0.0) - b, 0.0) for row, b in zip(rows, bottom, strict=True)]
+        rest = [max((row[end] or 0.0) / row["wall_s"] - b, 0.0) for row, b in zip(rows, bottom, strict=True)]
         axes.bar(places, rest, bottom=bottom, color=colour, label=label)
         bottom = [b + h for b, h in zip(bottom, rest, strict=True)]
     axes.set_xticks(places, [f"{row['error']:.0e}\n{row['dofs']}" for row in rows], fontsize=7)
-    axes.set(xlabel="error and unknowns of the runs on the Pareto front", ylabel="wall time (s)")
+    axes.set(xlabel="error and unknowns of the Pareto front's runs", ylabel="share of the wall time", ylim=(0, 1))

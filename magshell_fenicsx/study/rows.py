@@ -49,8 +49,10 @@ def make_rows(runs: Sequence[Run], scalar: Scalar, given: float | None) -> tuple
     for row in rows:
         if reference and row["result"] is not None:
             row["error"] = reference.error if row is finest else reference.error_of(row["result"])
+    spent = clock(rows)
+    comparable = [row for row in rows if row["error"] is not None and row[spent] is not None]
     for row in rows:
-        row["pareto"] = _comparable(row) and not any(_beats(other, row) for other in rows if _comparable(other))
+        row["pareto"] = row in comparable and not any(_beats(other, row, spent) for other in comparable)
     return rows, reference
 
 
@@ -85,11 +87,13 @@ def _estimated(finest: Row, runs: Sequence[Run], rows: Sequence[Row]) -> Referen
     return Reference(value, relative, order, f"finest run: degree {finest['degree']}, {finest['dofs']} dofs")
 
 
-def _comparable(row: Row) -> bool:
-    return row["error"] is not None and row["wall_s"] is not None
+def clock(rows: Sequence[Row]) -> str:
+    """The time to compare runs by: if all have one rank the CPU's, which no other work on the machine changes."""
+    alone = all(row["ranks"] == 1 for row in rows) and any(row["cpu_s"] is not None for row in rows)
+    return "cpu_s" if alone else "wall_s"
 
 
-def _beats(a: Row, b: Row) -> bool:
+def _beats(a: Row, b: Row, spent: str) -> bool:
     """Whether a is nowhere worse than b, and somewhere better."""
-    here, there = (a["wall_s"], a["error"]), (b["wall_s"], b["error"])
+    here, there = (a[spent], a["error"]), (b[spent], b["error"])
     return here != there and here[0] <= there[0] and here[1] <= there[1]
