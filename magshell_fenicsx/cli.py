@@ -1,5 +1,6 @@
 """The command line; a thin user of the Python API."""
 
+import gc
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -63,6 +64,7 @@ def run(
     except AlreadyComplete as e:
         _say(f"complete already: {e.summary['points']} points; results in {folder}/")
         return
+    gc.freeze()  # the process ends: to look for garbage once more takes longer than to import dolfinx
     if result.knockdown is not None:
         _say(f"knockdown factor k_d = {result.knockdown:.9g}")
     _say(f"results in {folder}/")

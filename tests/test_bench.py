@@ -62,7 +62,7 @@ def test_growth_with_the_unknowns() -> None:
     """Four times the unknowns and eight times the seconds: the power 3/2."""
 
     def item(dofs: float, seconds: float) -> dict[str, Any]:
-        parts = dict.fromkeys(("tangent_cpu_s", "factor_cpu_s", "back_solve_cpu_s"), {"median": seconds})
+        parts = {f"{part}_cpu_s": {"median": seconds} for part in ("tangent", "factor", "back_solve")}
         return {"dofs": {"median": dofs}, **parts}
 
     assert list(derived({"tangent 5 000": item(5e3, 1), "tangent 20 000": item(2e4, 8)}).values()) == [1.5]

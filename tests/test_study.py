@@ -146,8 +146,7 @@ def test_front_of_single_ranks_is_by_cpu_time() -> None:
     """Another program made the first wait: it is the fastest all the same. On two ranks waiting counts."""
     runs, kept = made((0.51, 100, 5.0), (0.5005, 200, 2.0), (0.502, 300, 3.0))
     for one, seconds in zip(kept, (1.0, 2.0, 3.0), strict=True):
-        for sample in one.samples:
-            sample["cpu_s"] = seconds
+        one.samples = [{**times, "cpu_s": seconds} for times in one.samples]
     assert [row["pareto"] for row in make_rows(runs, Scalar("knockdown"), 0.5)[0]] == [True, True, False]
     on_two = [Run(run.point, 2, run.measured) for run in runs]
     assert [row["pareto"] for row in make_rows(on_two, Scalar("knockdown"), 0.5)[0]] == [False, True, False]
