@@ -19,7 +19,7 @@ from magshell_fenicsx.study.reference import Reference
 from magshell_fenicsx.study.rows import COLUMNS, Row, Run, make_rows
 from magshell_fenicsx.study.sample import Measured, complete, load
 from magshell_fenicsx.study.scalar import Scalar, parse_scalar
-from magshell_fenicsx.study.table import said, write_table
+from magshell_fenicsx.study.table import repeated, said, write_table
 from magshell_fenicsx.sweep.axes import parse_axes
 from magshell_fenicsx.sweep.points import make_points
 from magshell_fenicsx.sweep.table import write_csv
@@ -148,9 +148,8 @@ def _write(done: Study, keys: Sequence[str], told: dict[str, Any], folder: Path)
     write_whole(folder / "study.json", (json.dumps(told, indent=1) + "\n").encode())
     write_csv(done.rows, (*keys, *COLUMNS), folder / "study.csv")
     write_table(done.rows, keys, told, folder / "study.md")
-    title = (
-        f"{told['result']} of {told['case']}\n{told['machine']['cpu']}, kernels compiled, medians of {told['repeat']}"
-    )
+    repeats = repeated(told["repeat"]).lower()
+    title = f"{told['result']} of {told['case']}\n{told['machine']['cpu']}, kernels compiled, {repeats}"
     own_error = done.reference.error if done.reference else None
     draw_study(done.rows, keys, title, own_error, folder / "study.png")
 

@@ -42,10 +42,21 @@ def write_table(rows: Sequence[Row], keys: Sequence[str], told: dict[str, Any], 
     table = "\n".join(f"| {' | '.join(line)} |" for line in lines)
     file.write_text(
         f"# {told['result']} of {told['case']}: error against run time\n\n"
-        f"{told['reference_said']} Medians of {told['repeat']} runs on {described(told['machine'])}.\n"
+        f"{told['reference_said']} {repeated(told['repeat'])} on {described(told['machine'])}.\n"
         f"{LEGEND}\n![](study.png)\n\n{table}\n",
         encoding="utf-8",
     )
+
+
+def repeated(repeat: int) -> str:
+    """How often each point was run.
+
+    Examples
+    --------
+    >>> repeated(1), repeated(3)
+    ('One run each', 'Medians of 3 runs')
+    """
+    return f"Medians of {repeat} runs" if repeat > 1 else "One run each"
 
 
 def said(reference: Reference | None) -> str:
