@@ -69,6 +69,7 @@ def draw_curve(rows: Sequence[Row], amplitude: str, title: str) -> bytes:
             axes.plot(*place(row), "o", color="C3", markersize=6, label=said)
     axes.set(xlabel=x_label, ylabel=y_label)
     axes.set_title(title, fontsize=9)
+    axes.locator_params(axis="x", nbins=6)
     axes.axhline(0, color="0.8", linewidth=0.8, zorder=0)
     if axes.get_legend_handles_labels()[1]:
         axes.legend(frameon=False)

@@ -23,6 +23,7 @@ LOADS = {
     "k": "stiffness of rotational springs $k$",
     "tau": r"torque $|\tau(u)|$",
 }
+CONSTANT = 1e-9  # difference of a load, over that of fields along the normal, that is none
 QUICKLY = {"compress_level": 3}  # a quarter larger than by default, in a third of the time
 FROM_THE_SIDE = np.array([2.2, -3.6, 2.85])
 SHOWN = 0.08  # lengths R that the largest displacement of a mode is drawn with
@@ -48,14 +49,17 @@ def draw_deformed(surface: Surface, h: float, title: str) -> tuple[bytes, bytes 
 
 def towards(place: Array) -> Array:
     """The direction (3,) from which a place (3,) of a shell shows: from above, to the side of it."""
-    heading = np.arctan2(place[1], place[0]) if np.hypot(*place[:2]) > 0.1 else -np.pi / 3
+    heading = np.arctan2(place[1], place[0]) if np.hypot(*place[:2]) > 0.1 else -0.5
     return np.array([4.2 * np.cos(heading - 0.5), 4.2 * np.sin(heading - 0.5), 2.75])
 
 
 def _load(smooth: "pyvista.PolyData", name: str) -> View:
     values = np.asarray(smooth.point_data[name])
     values = np.linalg.norm(values, axis=1) if values.ndim == 2 else values
-    return View(smooth, values, (float(values.min()), float(values.max())), "viridis", FROM_THE_SIDE, 700)
+    low, high = float(values.min()), float(values.max())
+    if high - low < CONSTANT:  # no pictures of rounding
+        low, high = low - 1, high + 1
+    return View(smooth, values, (low, high), "viridis", FROM_THE_SIDE, 700)
 
 
 def _shell(image: Image, view: View, title: str) -> bytes:
@@ -81,7 +85,7 @@ def _panels(images: Sequence[Image], views: Sequence[View], captions: Sequence[s
     for i, (image, view, caption) in enumerate(zip(images, views, captions, strict=True)):
         left, low = 40 + (i % 2) * (across + 40), (rows - 1 - i // 2) * (down + 110)
         figure.figimage(image, left, low + 100)
-        _colour_bar(figure, view, (left + 0.15 * across, low + 72, 0.7 * across, 18), caption, "horizontal")
+        _colour_bar(figure, view, (left + 0.15 * across, low + 46, 0.7 * across, 18), caption, "horizontal")
     return _png(figure)
 
 
@@ -106,7 +110,10 @@ def _colour_bar(
     axes = figure.add_axes((box[0] / size[0], box[1] / size[1], box[2] / size[0], box[3] / size[1]))
     colours = ScalarMappable(Normalize(*view.limits), view.colours)
     bar = figure.colorbar(colours, cax=axes, orientation=orientation, ticks=MaxNLocator(5, steps=[1, 2, 5, 10]))
-    bar.set_label(label, fontsize=10)
+    if orientation == "vertical":
+        bar.set_label(label, fontsize=10)
+    else:  # above: the ticks' common factor is below
+        bar.ax.set_title(label, fontsize=10, pad=5)
     bar.ax.tick_params(labelsize=9)
 
 

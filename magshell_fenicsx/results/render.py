@@ -55,7 +55,7 @@ def smooth_surface(surface: Surface, h: float) -> "pyvista.PolyData":
 
 
 def rendered(views: Sequence[View]) -> list[Image]:
-    """An image (height, width, 3) of each, without the white around it.
+    """An image (height, width, 3) of each, without the white around all those of its size.
 
     Raises
     ------
@@ -70,9 +70,20 @@ def rendered(views: Sequence[View]) -> list[Image]:
         try:
             plotter.set_background("white")
             plotter.enable_anti_aliasing("fxaa")  # as good to look at as multisampling, in half of the time
-            return [_image(plotter, view) for view in views]
+            images = [_image(plotter, view) for view in views]
         finally:
             plotter.close()
+    drawn = [(image != 255).any(axis=2) for image in images]
+    boxes = {size: _box([d for d in drawn if d.shape == (size, size)]) for size in {view.size for view in views}}
+    return [image[boxes[view.size]] for image, view in zip(images, views, strict=True)]
+
+
+def _box(drawn: Sequence[NDArray[np.bool_]]) -> tuple[slice, slice]:
+    """The part of some windows in which anything is drawn, with a margin."""
+    anywhere = np.any(drawn, axis=0)
+    rows, columns = (np.flatnonzero(anywhere.any(axis=axis)) for axis in (1, 0))
+    high, left = (max(at[0] - MARGIN, 0) for at in (rows, columns))
+    return slice(high, rows[-1] + MARGIN), slice(left, columns[-1] + MARGIN)
 
 
 def _image(plotter: "pyvista.Plotter", view: View) -> Image:
@@ -94,10 +105,7 @@ def _image(plotter: "pyvista.Plotter", view: View) -> Image:
     plotter.reset_camera(render=False)
     image = np.array(plotter.screenshot(return_img=True))
     plotter.remove_actor(actor, render=False)
-    drawn = (image != 255).any(axis=2)
-    rows, columns = (np.flatnonzero(drawn.any(axis=axis)) for axis in (1, 0))
-    (high, low), (left, right) = ((max(at[0] - MARGIN, 0), at[-1] + MARGIN) for at in (rows, columns))
-    return image[high:low, left:right]
+    return image
 
 
 def axes_on_screen(camera: Array) -> Array:
