@@ -214,13 +214,13 @@ def _grading(case: Case, h: float, defect: Dimple | None, points: dict[str, NDAr
     length, refine = sqrt(h), case.mesh.refinement
     loading = case.loading
     indentation = loading if isinstance(loading, IndentationSection) else None
-    growth = 0.5 if indentation else 0.4
+    growth = 0.6 if indentation else 0.4
     if case.shell.geometry != "hemisphere":
         features: list[Feature] = []
         largest = min(0.25, 0.5 * (case.shell.width or 1.0))
     else:
         # the equator is far from a dent
-        features = [Ring(pi / 2, (2.0 if indentation else 1.4) * length / refine, growth)]
+        features = [Ring(pi / 2, (2.8 if indentation else 1.4) * length / refine, growth)]
         # without a dimple the sphere buckles anywhere, in waves of about 3.6 sqrt(Rh)
         largest = 1.2 * length if defect is None and isinstance(loading, PressureSection) else 0.35
     if defect:
@@ -228,7 +228,7 @@ def _grading(case: Case, h: float, defect: Dimple | None, points: dict[str, NDAr
     if indentation:
         x, y = points.get("load", points["pole"])
         depth = abs(indentation.depth) if indentation.depth else 10.0
-        dent = sqrt(2 * depth * h) + 0.5 * length  # mirror buckling: the ridge's radius grows like sqrt(2 R w)
+        dent = 0.85 * sqrt(2 * depth * h) + 0.5 * length  # mirror buckling: the ridge's radius is about sqrt(2 R w)
         features.append(Disc((x, y), dent, length / refine, growth))
         # finer than h the point force's logarithmic stretch would be resolved, which has no limit
         centre = max(indentation.patch * h / 2, h) if indentation.patch else h
