@@ -2,9 +2,9 @@
 
     (a) the whole path on a coarse mesh of degree 3, its end there with the degree that goes with the tolerance
     (b) its end with one degree more: the change of the result estimates the error
-    (c) done if that is at most the tolerance and at least a sixth of it
+    (c) done if that is at most the tolerance and at least a fifth of it
     (d) else a mesh on which all cells have equal shares in the error (`indicator`), with as many of them
-        as make the error 0.4 of the tolerance; its end by Newton's method from that of (b); on with (b)
+        as make the error 0.55 of the tolerance; its end by Newton's method from that of (b); on with (b)
 
 The meridian, where cells cost nothing, is refined as a whole. There, and on a surface of a few cells, the error
 may be far below a loose tolerance.
@@ -27,7 +27,7 @@ DEGREES = ((3e-3, 3), (2e-4, 4), (0.0, 5))  # down to a tolerance: the degree wi
 CHEAP = 3  # degree of the path
 FIRST = (0.5, 1.0, 2.0)  # refinements of the first mesh: the next if the path is lost on the one before
 SAFETY = 1.25  # the richer solution has an error too
-AIM, LEAST = 0.4, 1 / 6  # estimated error over the tolerance
+AIM, LEAST = 0.55, 1 / 5  # estimated error over the tolerance
 MOST_ROUNDS = 6
 COARSEST, FINEST = 0.1, 20.0  # refinement of a meridian
 FEW = 50  # cells of a surface that are not worth making fewer
