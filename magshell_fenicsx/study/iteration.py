@@ -6,6 +6,9 @@ Every time is in wall seconds of the slowest rank and in CPU seconds of all rank
 
 import json
 import sys
+import time
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
@@ -13,7 +16,6 @@ from mpi4py import MPI
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.source import Source
 from magshell_fenicsx.scene import Scene
-from magshell_fenicsx.study.workload import timed
 
 CASE = {
     "shell": {
@@ -55,6 +57,15 @@ def measured(scene: Scene, repeats: int) -> dict[str, float]:
     error = rhs - factorisation.times(factorisation.solve(rhs))
     found["solve_error"] = float(np.sqrt(comm.allreduce(error @ error) / comm.allreduce(rhs @ rhs)))
     return found
+
+
+def timed(comm: MPI.Comm, do: Callable[[], Any]) -> tuple[float, float]:
+    """Wall seconds of the slowest rank and CPU seconds of all; collective."""
+    comm.Barrier()
+    wall, cpu = time.perf_counter(), time.process_time()
+    do()
+    wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+    return float(comm.allreduce(wall, MPI.MAX)), float(comm.allreduce(cpu))
 
 
 def main(repeats: str, degree: str, refinement: str) -> None:

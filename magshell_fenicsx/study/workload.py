@@ -7,23 +7,20 @@ of all ranks.
 
 import json
 import sys
-import time
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
-import numpy as np
 from mpi4py import MPI
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.follow import Stopped, follow
 from magshell_fenicsx.results.summary import Result
 from magshell_fenicsx.scene import Scene
+from magshell_fenicsx.study.iteration import measured, timed
 from magshell_fenicsx.study.scalar import parse_scalar
 
 Report = dict[str, Any]
 REPEATS = 5
-AMPLITUDES = {"lambda_m": 1e-3, "pressure": 0.1, "force": 0.1}  # for a tangent in which every term has a part
 
 
 def path(scene: Scene, results: list[str]) -> Report:
@@ -56,25 +53,9 @@ def path(scene: Scene, results: list[str]) -> Report:
     }
 
 
-def tangent(scene: Scene, results: list[str]) -> Report:
-    """The tangent, its factorisation and one back-solve, several times each."""
-    state, newton, comm = scene.unloaded(), scene.newton, scene.comm
-    rng = np.random.default_rng(comm.rank)
-    # far below an element's size: rough, but no element turns over
-    u = 1e-4 * newton.system.length * rng.standard_normal(state.u.size)
-    state = replace(state, u=u, mu={name: AMPLITUDES.get(name, 0.0) for name in state.mu})
-    rhs = rng.standard_normal(state.u.size)
-    times: dict[str, list[tuple[float, float]]] = {"tangent": [], "factor": [], "back_solve": []}
-    first = timed(comm, lambda: newton.factorisation.factor(newton.system.tangent(state.u, state.mu)))
-    for _ in range(REPEATS):
-        K = newton.system.tangent(state.u, state.mu)  # outside the times: of the ranks, none is ahead
-        times["tangent"].append(timed(comm, lambda: newton.system.tangent(state.u, state.mu)))
-        times["factor"].append(timed(comm, lambda K=K: newton.factorisation.factor(K)))  # type: ignore[misc]
-        times["back_solve"].append(timed(comm, lambda: newton.factorisation.solve(rhs)))
-    report: Report = {"first_wall_s": first[0], "first_cpu_s": first[1]}
-    for name, pairs in times.items():
-        report[f"{name}_wall_s"], report[f"{name}_cpu_s"] = (list(column) for column in zip(*pairs, strict=True))
-    return report
+def iteration(scene: Scene, results: list[str]) -> Report:
+    """The pieces of a Newton iteration, medians of several."""
+    return {**measured(scene, REPEATS)}
 
 
 def kernels(scene: Scene, results: list[str]) -> Report:
@@ -83,16 +64,7 @@ def kernels(scene: Scene, results: list[str]) -> Report:
     return {"kernels": len(scene.model.kernels.names)}
 
 
-KINDS: dict[str, Callable[[Scene, list[str]], Report]] = {"path": path, "tangent": tangent, "kernels": kernels}
-
-
-def timed(comm: MPI.Comm, do: Callable[[], Any]) -> tuple[float, float]:
-    """Wall seconds of the slowest rank and CPU seconds of all; collective."""
-    comm.Barrier()
-    wall, cpu = time.perf_counter(), time.process_time()
-    do()
-    wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
-    return float(comm.allreduce(wall, MPI.MAX)), float(comm.allreduce(cpu))
+KINDS: dict[str, Callable[[Scene, list[str]], Report]] = {"path": path, "iteration": iteration, "kernels": kernels}
 
 
 def main(kind: str, case: str, settings: str, results: str) -> None:
