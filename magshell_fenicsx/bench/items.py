@@ -14,7 +14,7 @@ INDENTATION = {f"force@w_over_h={w}": F for w, F in FORCES.items()}
 K_D = {"knockdown": 0.326233289}  # axisymmetric solver, nine digits
 FIELD_K_D = {"knockdown": 0.552053778}  # the same solver
 TILTED_K_D = {"knockdown": 0.49154026}  # our own of degree 5: no other solver is at hand
-COARSE, FINE = "mesh.refinement=0.8", "mesh.refinement=1.25"  # good for 2e-3 and 2e-4: see docs/bench
+COARSE, FINE = "mesh.refinement=0.75", "mesh.refinement=1.25"  # good for 2e-3 and 2e-4: see docs/bench
 TILTED = "magnetic={lambda_m: 0.00184, remanent: {polar: 45}, applied: {polar: 45}}"
 HALF = ("symmetry=half", "magnetic.lambda_m=0.00184")
 K_D_20_000, ONE_RANK, TWO_RANKS = "k_d 20 000", "iteration 100 000", "iteration 100 000, 2 ranks"
