@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.expressions import formula
 from magshell_fenicsx.case.messages import shown
+from magshell_fenicsx.case.solid import SolidSection
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.mesh.grading import Grading
 from magshell_fenicsx.mesh.shapes import Shape, StripShape
@@ -18,17 +19,22 @@ SMALLEST_FIELD, LARGEST_FIELD = 1e-12, 10.0  # of lambda_m: rounding, and a thou
 def refuse_too_large(case: Case, size: Grading, shape: Shape) -> None:
     """Estimate the unknowns before gmsh makes the mesh: of degree k, a triangle brings 3 k^2/2.
 
+    The body over it brings three hexahedra of degree 2 in each layer.
+
     Raises
     ------
     CaseError
         If they are more than `MOST_UNKNOWNS`.
     """
-    unknowns = 1.5 * case.mesh.degree**2 * size.cells(shape)
+    per_triangle = 1.5 * case.degree**2
+    if case.model == "solid":
+        per_triangle = 36 * (2 * (case.solid or SolidSection()).layers + 1)
+    unknowns = per_triangle * size.cells(shape)
     if unknowns > MOST_UNKNOWNS:
         raise CaseError(
             f"mesh: about {unknowns:.1e} unknowns at radius/thickness {case.shell.R_over_h:g}, at most "
             f"{MOST_UNKNOWNS:.0e} are built: lower mesh.refinement ({case.mesh.refinement:g}) or mesh.degree "
-            f"({case.mesh.degree}); with coplanar fields and loads, symmetry: half halves it"
+            f"({case.degree}); with coplanar fields and loads, symmetry: half halves it"
         )
 
 

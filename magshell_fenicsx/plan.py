@@ -17,6 +17,7 @@ from magshell_fenicsx.case.expressions import formula
 from magshell_fenicsx.case.fields import Direction, MagneticSection, layer_average
 from magshell_fenicsx.case.loading import IndentationSection, PressureSection, RotationSection
 from magshell_fenicsx.case.shell import ShellSection
+from magshell_fenicsx.case.solid import SolidSection
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.feasible import refuse_too_large, refuse_unbounded_fields, sample
 from magshell_fenicsx.mesh.grading import Disc, Feature, Grading, Ring, Size
@@ -26,6 +27,7 @@ from magshell_fenicsx.mesh.sphere import Dimple, SphereEmbedding, flat
 from magshell_fenicsx.mesh.triangulation import triangulate
 from magshell_fenicsx.shell.parameters import Condition, Force, Loads, Magnetisation, Material
 from magshell_fenicsx.shell.patterns import Components, InsideAndOutside, Pattern, radial, tangential
+from magshell_fenicsx.solid.material import NeoHookean
 
 
 @dataclass(frozen=True)
@@ -85,7 +87,7 @@ def make_plan(case: Case) -> Plan:
     reason = _not_axisymmetric(case)
     if reason and case.symmetry == "axisymmetric":
         raise CaseError(f"symmetry: axisymmetric: {reason}")
-    axisymmetric = reason is None and case.symmetry in ("auto", "axisymmetric")
+    axisymmetric = reason is None and case.symmetry in ("auto", "axisymmetric") and case.model == "shell"
     half = azimuth is not None and not axisymmetric and case.symmetry in ("auto", "half")
     turn = azimuth if half and azimuth is not None else 0.0
 
@@ -128,9 +130,8 @@ def make_plan(case: Case) -> Plan:
     refuse_unbounded_fields(case, embedding(sample(shape)))
     if not axisymmetric:
         refuse_too_large(case, size, shape)
-    included, left_out = _account(
-        case, loads, "meridian" if axisymmetric else "half shell" if half else "full shell", azimuth
-    )
+    model = "meridian" if axisymmetric else f"{'half' if half else 'full'} {case.model}"
+    included, left_out = _account(case, loads, model, azimuth)
     return Plan(
         material=material,
         loads=loads,
@@ -214,13 +215,14 @@ def _grading(case: Case, h: float, defect: Dimple | None, points: dict[str, NDAr
     length, refine = sqrt(h), case.mesh.refinement
     loading = case.loading
     indentation = loading if isinstance(loading, IndentationSection) else None
-    growth = 0.6 if indentation else 0.4
+    solid = case.model == "solid"  # of degree 2, which far from the ridge needs more than degree 4
+    growth = (0.5 if solid else 0.6) if indentation else 0.4
     if case.shell.geometry != "hemisphere":
         features: list[Feature] = []
         largest = min(0.25, 0.5 * (case.shell.width or 1.0))
     else:
         # the equator is far from a dent
-        features = [Ring(pi / 2, (2.8 if indentation else 1.4) * length / refine, growth)]
+        features = [Ring(pi / 2, ((2.0 if solid else 2.8) if indentation else 1.4) * length / refine, growth)]
         # without a dimple the sphere buckles anywhere, in waves of about 3.6 sqrt(Rh)
         largest = 1.2 * length if defect is None and isinstance(loading, PressureSection) else 0.35
     if defect:
@@ -228,7 +230,8 @@ def _grading(case: Case, h: float, defect: Dimple | None, points: dict[str, NDAr
     if indentation:
         x, y = points.get("load", points["pole"])
         depth = abs(indentation.depth) if indentation.depth else 10.0
-        dent = 0.85 * sqrt(2 * depth * h) + 0.5 * length  # mirror buckling: the ridge's radius is about sqrt(2 R w)
+        # mirror buckling: the ridge's radius is about sqrt(2 R w)
+        dent = (1.0 if solid else 0.85) * sqrt(2 * depth * h) + 0.5 * length
         features.append(Disc((x, y), dent, length / refine, growth))
         # finer than h the point force's logarithmic stretch would be resolved, which has no limit
         centre = max(indentation.patch * h / 2, h) if indentation.patch else h
@@ -237,14 +240,14 @@ def _grading(case: Case, h: float, defect: Dimple | None, points: dict[str, NDAr
 
 
 def _account(case: Case, loads: Loads, model: str, azimuth: float | None) -> tuple[list[str], list[str]]:
-    included = [model, "membrane and bending energy"]
+    included = [model, "membrane and bending energy" if case.model == "shell" else _elastic(case)]
     left_out = []
     if loads.magnetic:
         included.append(f"magnetic energy ({loads.magnetic.energy}), lambda_m = {case.lambda_m:g}")
     else:
         left_out.append("magnetic energy: " + ("lambda_m is zero" if case.magnetic else "no magnetic section"))
     if loads.pressure:
-        included.append("live pressure")
+        included.append("live pressure" if case.model == "shell" else "live pressure on the outer face")
     else:
         left_out.append("pressure: not loaded by it (the volume is only reported)")
     if loads.force:
@@ -254,12 +257,24 @@ def _account(case: Case, loads: Loads, model: str, azimuth: float | None) -> tup
         left_out.append("force: none")
     if model == "meridian":
         left_out.append("waves around the axis (they are looked for at the end of each path)")
-    if model == "half shell":
+    if model.startswith("half"):
         left_out.append(
             f"the other half: mirror plane through e3 at azimuth {degrees(azimuth or 0.0):g} degrees "
             "(modes antisymmetric to it are looked for at the end of each path)"
         )
     return included, left_out
+
+
+def neo_hookean(case: Case) -> NeoHookean:
+    """The solid's material."""
+    return NeoHookean.of(case.shell.poisson_ratio, (case.solid or SolidSection()).bulk_to_shear)
+
+
+def _elastic(case: Case) -> str:
+    material, layers = neo_hookean(case), (case.solid or SolidSection()).layers
+    ratio = material.bulk / material.shear
+    small_strains = f"E = {material.youngs_modulus:.5g}, nu = {material.nu:.5g} for small strains"
+    return f"neo-Hookean energy, kappa/mu = {ratio:.5g} ({small_strains}), {layers} layer{'s' * (layers > 1)}"
 
 
 def describe(case: Case) -> str:
@@ -275,7 +290,7 @@ def describe(case: Case) -> str:
     lines = [f"{name} = {value:.6g}" for name, value in numbers.items()]
     if case.mesh.tolerance is None:
         cells, unknowns = _count(case, plan)
-        lines.append(f"mesh: {cells} cells of degree {case.mesh.degree}, {unknowns} unknowns")
+        lines.append(f"mesh: {cells} cells of degree {case.degree}, {unknowns} unknowns")
     else:
         lines.append(f"mesh: found by the run, for a relative error of its result below {case.mesh.tolerance:g}")
     lines += ["built:", *(f"  {item}" for item in plan.included), "left out:", *(f"  {item}" for item in plan.left_out)]
@@ -284,7 +299,7 @@ def describe(case: Case) -> str:
 
 def _count(case: Case, plan: Plan) -> tuple[int, int]:
     """Cells and unknowns of the mesh."""
-    k = case.mesh.degree
+    k = case.degree
     if plan.axisymmetric:
         return (count := len(meridian_vertices(plan, case.mesh.refinement)) - 1), 2 * (k * count + 1)
     try:
@@ -293,6 +308,9 @@ def _count(case: Case, plan: Plan) -> tuple[int, int]:
         raise CaseError(str(e)) from None
     corners = len(np.unique(cells[:, :3]))
     sides = corners + len(cells) - 1  # Euler's formula for a disc
+    if case.model == "solid":  # three hexahedra a layer above each triangle
+        layers = (case.solid or SolidSection()).layers
+        return 3 * len(cells) * layers, 3 * (2 * layers + 1) * (corners + 3 * sides + 7 * len(cells))
     return len(cells), 3 * (corners + (k - 1) * sides + (k - 1) * (k - 2) // 2 * len(cells))
 
 

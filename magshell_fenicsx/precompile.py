@@ -18,13 +18,17 @@ SCENES = (
     ("axisymmetric", {"kind": "pressure"}),
     ("half", {"kind": "indentation", "at": {"polar": 45}, "depth": 1, "patch": 5}),
 )
+SOLIDS = SCENES[::2]  # of one degree
 
 
 def precompile(degree: int) -> float:
     """Compile all kernels of a degree; the seconds that it took."""
     start = time.perf_counter()
-    for symmetry, loading in SCENES:
-        data = {**EVERYTHING, "symmetry": symmetry, "loading": loading, "mesh": {"refinement": 0.5, "degree": degree}}
+    shells = [("shell", *scene, {"degree": degree}) for scene in SCENES]
+    solids = [("solid", *scene, {}) for scene in SOLIDS]
+    for model, symmetry, loading, mesh in [*shells, *solids]:
+        chosen = {"model": model, "symmetry": symmetry, "loading": loading, "mesh": {"refinement": 0.5, **mesh}}
+        data = {**EVERYTHING, **chosen}
         scene = Scene(Case.from_source(Source("precompile", data)), MPI.COMM_WORLD)
         scene.model.excluded_modes  # noqa: B018  (compiles theirs)
     return time.perf_counter() - start

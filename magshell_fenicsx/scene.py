@@ -2,18 +2,21 @@
 
 import time
 from collections import defaultdict
-from math import atan2, copysign, degrees, hypot
+from math import atan2, copysign, degrees, hypot, nan
 
 from mpi4py import MPI
 
 from magshell_fenicsx.axisymmetric.meridian import make_meridian
 from magshell_fenicsx.axisymmetric.model import MeridianModel
 from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.solid import SolidSection
+from magshell_fenicsx.mesh.hexahedra import sweep
 from magshell_fenicsx.mesh.midsurface import Midsurface, distribute
-from magshell_fenicsx.mesh.patch import MeshError
+from magshell_fenicsx.mesh.patch import MeshError, PatchMesh
 from magshell_fenicsx.mesh.triangulation import triangulate
-from magshell_fenicsx.plan import Plan, make_plan, meridian_vertices
+from magshell_fenicsx.plan import Plan, make_plan, meridian_vertices, neo_hookean
 from magshell_fenicsx.shell.model import ShellModel
+from magshell_fenicsx.solid.model import SolidModel
 from magshell_fenicsx.solve.journal import Journal, NoJournal
 from magshell_fenicsx.solve.newton import BorderedNewton
 from magshell_fenicsx.solve.system import State
@@ -42,9 +45,11 @@ class Scene:
     def __init__(self, case: Case, comm: MPI.Comm = MPI.COMM_WORLD, plan: Plan | None = None) -> None:
         start = time.perf_counter()
         self.case, self.plan, self.comm = case, plan or make_plan(case), comm
-        self.model: ShellModel | MeridianModel
+        self.model: ShellModel | MeridianModel | SolidModel
         if self.plan.axisymmetric:
             self.model = build_meridian_model(case, self.plan)
+        elif case.model == "solid":
+            self.model = build_solid_model(case, self.plan, comm)
         else:
             self.model = build_model(case, self.plan, comm)
         self.newton = BorderedNewton(self.model.system)
@@ -63,25 +68,28 @@ class Scene:
 
     def observe(self, state: State) -> dict[str, float]:
         """The physical columns of a table row: loads, displacements over h, volume, energies over E h R^2."""
-        model, h = self.model, self.plan.material.h
+        model, h, force = self.model, self.plan.material.h, self.model.loads.force
         pole = model.deflection(state.u, "pole") / h
         potentials, energies = model.system.energies(state.u), defaultdict[str, float](float)
         for t in model.system.terms:
             amplitude = state.mu[t.amplitude] if t.amplitude else 1.0
             energies[t.name.removesuffix(" across")] += model.multiplicity * amplitude * potentials[t.name]
         along, across = state.mu.get("lambda_m", 0.0), state.mu.get("lambda_across", 0.0)
-        sense = copysign(1.0, self.case.lambda_m)
+        sense, split = copysign(1.0, self.case.lambda_m), "membrane" in energies  # of which a solid knows nothing
         return {
             "p_over_pc": state.mu.get("pressure", 0.0),
             "lambda_m": sense * hypot(along, across) if across else along,
             "field_angle": degrees(atan2(sense * across, sense * along)) if across else 0.0,
             "force": state.mu.get("force", 0.0),
-            "w_over_h": model.loaded_deflection(state.u) / h if model.loads.force else pole,
+            "w_over_h": model.loaded_deflection(state.u) / h if force else pole,
             "w_pole_over_h": pole,
+            "w_point_over_h": model.deflection(state.u, force.point) / h if force else pole,
             "volume_change": model.volume_change(state.u),
             "energy": sum(energies.values()),
-            "stretching": energies["membrane"],
-            "bending": sum(v for name, v in energies.items() if name == "bending" or name.endswith("edges")),
+            "stretching": energies["membrane"] if split else nan,
+            "bending": sum(v for name, v in energies.items() if name == "bending" or name.endswith("edges"))
+            if split
+            else nan,
             "magnetic": sum(energies[name] for name in ("magnetic", "magnetic gradient", "U1", "Uq", "Utau", "couple")),
             **{name: energies[name] for name in ("U1", "Uq", "Utau")},
         }
@@ -100,8 +108,19 @@ def build_meridian_model(case: Case, plan: Plan) -> MeridianModel:
     return MeridianModel(meridian, plan.material, case.mesh.degree, condition, plan.loads, case.mesh.penalty)
 
 
+def build_solid_model(case: Case, plan: Plan, comm: MPI.Comm) -> SolidModel:
+    """The whole body or half of it, on all ranks together."""
+    body = sweep(_triangulated(plan, comm), plan.material.h, (case.solid or SolidSection()).layers, comm)
+    return SolidModel(body, plan.material, neo_hookean(case), plan.conditions, plan.loads)
+
+
 def build_midsurface(plan: Plan, comm: MPI.Comm) -> Midsurface:
     """Triangulate on rank 0, distribute to all."""
+    return distribute(_triangulated(plan, comm), comm)
+
+
+def _triangulated(plan: Plan, comm: MPI.Comm) -> PatchMesh | None:
+    """The triangulation on rank 0, None elsewhere; an error on all."""
     patch, error = None, None
     if comm.rank == 0:
         try:
@@ -110,4 +129,4 @@ def build_midsurface(plan: Plan, comm: MPI.Comm) -> Midsurface:
             error = e
     if error := comm.bcast(error):
         raise error
-    return distribute(patch, comm)
+    return patch

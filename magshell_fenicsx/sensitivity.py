@@ -14,6 +14,7 @@ from magshell_fenicsx.axisymmetric.energies import EnergyFactory
 from magshell_fenicsx.axisymmetric.model import MeridianModel
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.scene import Scene
+from magshell_fenicsx.shell.model import ShellModel
 from magshell_fenicsx.shell.parameters import Magnetisation
 from magshell_fenicsx.shell.patterns import Array, InsideAndOutside, Pattern
 from magshell_fenicsx.shell.terms import TermFactory
@@ -119,4 +120,5 @@ def _magnetic_terms(scene: Scene, field: Magnetisation) -> Sequence[FormTerm]:
             FormTerm(e.name, 2 * np.pi * e.of(u), model.u, log, e.amplitude, linear=e.linear)
             for e in factory.magnetic(field)
         ]
+    assert isinstance(model, ShellModel)  # the case refuses a solid's
     return TermFactory(model.r0, model.u, model.material, model.sigma, model.degree, log).magnetic(field)

@@ -9,11 +9,14 @@ from pydantic import Field, ValidationError, model_validator
 from magshell_fenicsx.case.base import Section
 from magshell_fenicsx.case.boundary import EDGES, BoundarySection
 from magshell_fenicsx.case.fields import MagneticSection
-from magshell_fenicsx.case.loading import FieldSection, IndentationSection, LoadingSection, RotationSection
+from magshell_fenicsx.case.loading import FieldSection, IndentationSection, LoadingSection, PathSection, RotationSection
 from magshell_fenicsx.case.messages import explain
 from magshell_fenicsx.case.shell import ShellSection
+from magshell_fenicsx.case.solid import SolidSection
 from magshell_fenicsx.case.source import CaseError, Source, override, read_source
 from magshell_fenicsx.case.stability import StabilitySection
+
+SOLID_DEGREE = 2
 
 
 class MeshSection(Section):
@@ -34,7 +37,9 @@ class MeshSection(Section):
 class Case(Section):
     """A validated case file."""
 
+    model: Literal["shell", "solid"] = "shell"
     shell: ShellSection
+    solid: SolidSection | None = None
     boundary: BoundarySection
     magnetic: MagneticSection | None = None
     loading: LoadingSection | None = None
@@ -71,6 +76,41 @@ class Case(Section):
             if not 0 <= polar < 89:
                 raise ValueError(f"loading.at.polar: {polar:g} is not on the shell: allowed 0 to 89")
         return self
+
+    @model_validator(mode="after")
+    def _what_a_solid_can(self) -> Self:
+        if self.model == "shell":
+            if self.solid:
+                raise ValueError("solid belongs to model: solid")
+            return self
+        magnetic, loading = self.magnetic, self.loading
+        if magnetic and magnetic.energy != "full":
+            raise ValueError(f"magnetic.energy: {magnetic.energy}: is of a shell; a solid has the full energy")
+        if magnetic and magnetic.remanent.kind != "uniform":
+            raise ValueError(f"magnetic.remanent.kind: {magnetic.remanent.kind}: a solid's remanence is uniform")
+        for name, condition in self.boundary.conditions().items():
+            if condition == "simply supported":
+                raise ValueError(f"boundary.{name}: simply supported: the face of a solid is clamped or free")
+        for key in self.mesh.model_fields_set & {"degree", "penalty", "tolerance"}:
+            if key != "degree" or self.mesh.degree != SOLID_DEGREE:
+                raise ValueError(f"mesh.{key}: is of a shell; a solid has degree {SOLID_DEGREE} and mesh.refinement")
+        if self.symmetry == "axisymmetric":
+            raise ValueError("symmetry: axisymmetric: a solid is whole or half")
+        if isinstance(loading, IndentationSection) and not loading.patch:
+            raise ValueError(
+                "loading.patch: 0: a point force sinks into a solid without limit; give the patch its radius over h "
+                "(of the paper's indenter, 0.2 mm at R = 25.2 mm, with R/h = 90: 0.714)"
+            )
+        if self.solid and "bulk_to_shear" in self.solid.model_fields_set and self.shell.poisson_ratio != 0.5:
+            raise ValueError("solid.bulk_to_shear: stands for shell.poisson_ratio: 0.5, which is another")
+        if isinstance(loading, PathSection) and loading.sensitivities:
+            raise ValueError("loading.sensitivities: are of a shell")
+        return self
+
+    @property
+    def degree(self) -> int:
+        """Of the displacement."""
+        return self.mesh.degree if self.model == "shell" else SOLID_DEGREE
 
     @property
     def lambda_m(self) -> float:

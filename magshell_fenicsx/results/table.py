@@ -34,6 +34,7 @@ COLUMNS = (
     "mode",
     "field_angle",
     "branch",
+    "w_point_over_h",
 )
 Row = dict[str, float | int | str]
 OWN_MODES = ("", "symmetric", "asymmetric")  # of an instability within the model; others it excludes

@@ -18,15 +18,13 @@ from ufl.core.expr import Expr
 from magshell_fenicsx.shell import densities
 from magshell_fenicsx.shell import kinematics as kin
 from magshell_fenicsx.shell.edges import edge_density
-from magshell_fenicsx.shell.energy import HessianTerm
 from magshell_fenicsx.shell.kinematics import Jet
 from magshell_fenicsx.shell.parameters import MIRROR_NORMAL
 from magshell_fenicsx.solve.events import locate_bifurcation
 from magshell_fenicsx.solve.factor import Factorisation
 from magshell_fenicsx.solve.path import Path, Point
-from magshell_fenicsx.solve.problem import FiniteElementSystem, TangentAssembler
+from magshell_fenicsx.solve.problem import FiniteElementSystem
 from magshell_fenicsx.solve.system import State
-from magshell_fenicsx.solve.terms import FormTerm
 
 
 def antisymmetric_edge(
@@ -58,23 +56,12 @@ class AntisymmetricModes:
     Attributes
     ----------
     system
-        Whose tangent it is.
+        Whose tangent it is, at the displacements of the half model.
     """
 
-    def __init__(
-        self,
-        system: FiniteElementSystem,
-        edges: HessianTerm,
-        elsewhere: list[fem.DirichletBC],
-        pattern: FormTerm,
-        assembler: TangentAssembler | None,
-    ) -> None:
-        terms = [edges if t.name == "mirror edges" else t for t in system.terms]
-        V = system.u.function_space
-        self.system = FiniteElementSystem(
-            system.u, terms, elsewhere, pattern, system.length, assembler, system.gradients
-        )
-        self._factorisation = Factorisation(V.mesh.comm)
+    def __init__(self, system: FiniteElementSystem) -> None:
+        self.system = system
+        self._factorisation = Factorisation(system.comm)
         self._factored: State | None = None
 
     def factor_at(self, state: State) -> Factorisation:

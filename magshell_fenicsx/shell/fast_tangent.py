@@ -1,7 +1,8 @@
 """The tangent without compiled tangent forms, from the point Hessians of the terms' own densities."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
+from typing import Protocol
 
 import numpy as np
 from dolfinx import fem
@@ -10,10 +11,28 @@ from petsc4py import PETSc
 
 from magshell_fenicsx.shell.energy import HessianTerm, ShellTerm, cell_quadrature, edge_quadrature
 from magshell_fenicsx.shell.sites import Site
-from magshell_fenicsx.solve.batches import boundary_batches, cell_batches, interior_batches
+from magshell_fenicsx.solve.batches import Batch, boundary_batches, cell_batches, interior_batches
 from magshell_fenicsx.solve.kernels import KernelLog
 from magshell_fenicsx.solve.scatter import BlockMatrix
 from magshell_fenicsx.solve.terms import Term
+
+Array = NDArray[np.float64]
+
+
+class TangentSite(Protocol):
+    """What `FastTangent` sums.
+
+    Attributes
+    ----------
+    coupling
+        Batches of entities that couple two cells.
+    """
+
+    @property
+    def coupling(self) -> Sequence[Batch]: ...
+
+    def add(self, u: Array, factors: Mapping[str, float], same: Array, couple: Callable[[int, Array], None]) -> None:
+        """Add element matrices, see `Site.add`."""
 
 
 class FastTangent:
@@ -29,7 +48,7 @@ class FastTangent:
         Homogeneous Dirichlet conditions.
     """
 
-    def __init__(self, u: fem.Function, sites: Sequence[Site], clamped: list[fem.DirichletBC]) -> None:
+    def __init__(self, u: fem.Function, sites: Sequence[TangentSite], clamped: list[fem.DirichletBC]) -> None:
         V = u.function_space
         self._u, self._sites = u, sites
         self._matrix = BlockMatrix(V, [batch.cells for site in sites for batch in site.coupling], clamped)
@@ -47,7 +66,7 @@ class FastTangent:
         self._matrix.add_cells(self._same)
         return self._matrix.assemble()
 
-    def _couple(self, first: int, batch: int, K: NDArray[np.float64]) -> None:
+    def _couple(self, first: int, batch: int, K: Array) -> None:
         self._matrix.add_coupling(first + batch, K)
 
 

@@ -105,7 +105,11 @@ class ShellModel:
         held = self._held + held_against_mirror(self.V, self._mirror)
         sites = self._sites + make_sites(self.r0, self.degree, [edges], self.kernels)
         fast = FastTangent(self.u, sites, held)
-        return AntisymmetricModes(self.system, edges, held, self._interior, fast)
+        terms = [edges if t.name == "mirror edges" else t for t in self.system.terms]
+        system = self.system
+        return AntisymmetricModes(
+            FiniteElementSystem(self.u, terms, held, self._interior, system.length, fast, system.gradients)
+        )
 
     def zero(self) -> Vector:
         """The undeformed displacement."""

@@ -1,0 +1,143 @@
+"""The body of a shell as a three-dimensional solid: a system of terms, with the interface of `ShellModel`.
+
+Lengths in R, energies in E h R^2, amplitudes as in `ShellModel`. Displacements are those of nodes in the middle
+of the thickness; the pressure, the volume and the loaded patch are of the outer face.
+"""
+
+from collections.abc import Mapping
+from functools import cached_property
+
+import numpy as np
+import ufl
+from dolfinx import fem
+from dolfinx.la import InsertMode
+from numpy.typing import NDArray
+
+from magshell_fenicsx.mesh.hexahedra import Body, quadratic
+from magshell_fenicsx.shell.antisymmetric import AntisymmetricModes
+from magshell_fenicsx.shell.fast_tangent import FastTangent
+from magshell_fenicsx.shell.parameters import MIRROR_NORMAL, Condition, Force, Loads, Material
+from magshell_fenicsx.shell.point_load import point_entries
+from magshell_fenicsx.solid.material import NeoHookean
+from magshell_fenicsx.solid.sites import make_sites
+from magshell_fenicsx.solid.terms import TermFactory
+from magshell_fenicsx.solve.kernels import KernelLog
+from magshell_fenicsx.solve.problem import FiniteElementSystem
+from magshell_fenicsx.solve.system import Vector
+from magshell_fenicsx.solve.terms import LinearTerm, Term
+
+
+class SolidModel:
+    """A neo-Hookean, hard-magnetic body around a mid-surface.
+
+    Parameters
+    ----------
+    conditions
+        Edge of the mid-surface -> "clamped", "symmetry" or "free", of the face above it.
+    loads
+        The remanence is uniform, its energy the full one; a force has a patch, on the outer face.
+
+    Attributes
+    ----------
+    system, multiplicity, kernels
+        As of `ShellModel`.
+    degree
+        Of the displacement: 2.
+    sigma
+        None: nothing is penalised.
+    """
+
+    degree = 2
+    sigma = None
+
+    def __init__(
+        self,
+        body: Body,
+        material: Material,
+        neo_hookean: NeoHookean,
+        conditions: Mapping[str, Condition],
+        loads: Loads,
+    ) -> None:
+        self.body, self.material, self.neo_hookean, self.loads = body, material, neo_hookean, loads
+        self.multiplicity = 2 if "symmetry" in conditions.values() else 1
+        self.kernels = KernelLog()
+        self.V = V = quadratic(body.mesh)
+        self.u, self.r0 = fem.Function(V, name="u"), fem.Function(V, name="r0")
+        self.r0.interpolate(lambda x: x)
+        self._factory = factory = TermFactory(body, self.u, neo_hookean, material.h, self.kernels)
+        self._pattern = factory.distortion()
+        self._terms: list[Term] = [self._pattern, factory.compression()]
+        if loads.magnetic:
+            self._terms += factory.magnetic(loads.magnetic)
+        if loads.pressure:
+            self._terms.append(factory.pressure(material.classical_pressure))
+        if loads.force:
+            self._terms.append(self._force(loads.force))
+        self._held = _held(V, [body.faces[n] for n, c in conditions.items() if c == "clamped"], range(3))
+        self._mirror = [body.faces[n] for n, c in conditions.items() if c == "symmetry"]
+        along = int(np.argmax(MIRROR_NORMAL))
+        self._sites = make_sites(body, self.r0, self._terms, self.kernels)
+        self.system = self._system(self._held + _held(V, self._mirror, [along]))
+        self._volume = self.kernels.compile("volume energy", factory.volume_change())
+        self._probes = {name: point_entries(V, x, np.ones(3))[0] for name, x in body.points.items()}
+
+    @cached_property
+    def excluded_modes(self) -> AntisymmetricModes | None:
+        """The modes that a half model does not see: moved freely across the mirror plane and not in it."""
+        if self.multiplicity == 1:
+            return None
+        in_plane = [i for i in range(3) if not MIRROR_NORMAL[i]]
+        return AntisymmetricModes(self._system(self._held + _held(self.V, self._mirror, in_plane)))
+
+    def zero(self) -> Vector:
+        """The undeformed displacement."""
+        return np.zeros(self.system.size)
+
+    def volume_change(self, u: Vector) -> float:
+        """Delta V/R^3 under the whole outer face."""
+        self.system.set(u)
+        return self.multiplicity * float(self.system.comm.allreduce(fem.assemble_scalar(self._volume)))
+
+    def deflection(self, u: Vector, point: str) -> float:
+        """w/R = -u . n0 at a named point in the middle of the thickness."""
+        return -float(self.displacement(u, point) @ self.body.normals[point])
+
+    def displacement(self, u: Vector, point: str) -> NDArray[np.float64]:
+        """u/R (3,) there."""
+        here = u[self._probes[point]].reshape(-1, 3).sum(axis=0)
+        return np.asarray(self.system.comm.allreduce(here))
+
+    def loaded_deflection(self, u: Vector) -> float:
+        """w/R conjugate to the force: averaged over its patch on the outer face."""
+        return -self.system.potential(u, "force") / self.force_unit
+
+    @property
+    def force_unit(self) -> float:
+        """The force F R/(2 pi D) = 1 on the modelled part, over E h R."""
+        return 2 * np.pi * self.material.bending_stiffness / self.multiplicity
+
+    def _system(self, held: list[fem.DirichletBC]) -> FiniteElementSystem:
+        fast = FastTangent(self.u, self._sites, held)
+        return FiniteElementSystem(self.u, self._terms, held, self._pattern, self.material.h, fast)
+
+    def _force(self, force: Force) -> LinearTerm:
+        """Averaged over the outer face with the weight (1 - d^2/radius^2)^2, d the distance from the loaded point."""
+        normal, domain = self.body.normals[force.point], self.V.mesh
+        values = self.body.points[force.point] + self.material.h / 2 * normal, force.patch, -normal
+        centre, a, along = (fem.Constant(domain, value) for value in values)
+        d = ufl.SpatialCoordinate(domain) - centre
+        inside = 1 - ufl.dot(d, d) / a**2
+        weight, ds = ufl.conditional(ufl.gt(inside, 0), inside**2, 0), self._factory.outer_measure()
+        total = domain.comm.allreduce(fem.assemble_scalar(self.kernels.compile("patch weight", weight * ds)))
+        form = self.kernels.compile("patch load", weight * ufl.dot(along, ufl.TestFunction(self.V)) * ds)
+        load = fem.assemble_vector(form)
+        load.scatter_reverse(InsertMode.add)
+        dofs = np.flatnonzero(load.array[: 3 * self.V.dofmap.index_map.size_local]).astype(np.int32)
+        return LinearTerm("force", dofs, self.force_unit * load.array[dofs] / total, self.u, "force")
+
+
+def _held(V: fem.FunctionSpace, faces: list[NDArray[np.int32]], components: range | list[int]) -> list[fem.DirichletBC]:
+    """Some components zero on some faces."""
+    facets = np.unique(np.concatenate(faces)).astype(np.int32) if faces else np.empty(0, np.int32)
+    spaces = [V.sub(i) for i in components] if faces else []
+    return [fem.dirichletbc(0.0, fem.locate_dofs_topological(W, 2, facets), W) for W in spaces]
