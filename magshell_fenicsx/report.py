@@ -8,10 +8,11 @@ from pathlib import Path
 from magshell_fenicsx.case.stability import StabilitySection
 from magshell_fenicsx.results.durable import write_whole
 from magshell_fenicsx.results.folder import by_first
+from magshell_fenicsx.results.gathering import Gatherer, gatherer
 from magshell_fenicsx.results.modes import caption, mode_file, mode_surface, mode_table, wave_number, write_mode
 from magshell_fenicsx.results.picture import draw_modes
 from magshell_fenicsx.results.summary import VALUE_COLUMN, Result
-from magshell_fenicsx.results.surface import RevolvedGatherer, Surface, SurfaceGatherer, gatherer
+from magshell_fenicsx.results.surface import Surface
 from magshell_fenicsx.results.table import OWN_MODES, Row
 from magshell_fenicsx.solve.stability import ModesNotFound
 from magshell_fenicsx.solve.system import State, Vector
@@ -46,7 +47,7 @@ class _Writer:
     result: Result
     folder: Path
     say: Say
-    gatherer: SurfaceGatherer | RevolvedGatherer
+    gatherer: Gatherer
 
     def null_vectors(self, shell: ShellModes) -> None:
         panels = []

@@ -20,10 +20,12 @@ from magshell_fenicsx.axisymmetric import jets
 from magshell_fenicsx.axisymmetric.model import MeridianModel
 from magshell_fenicsx.shell import kinematics as kin
 from magshell_fenicsx.shell.model import ShellModel
+from magshell_fenicsx.solid.model import SolidModel
 from magshell_fenicsx.solve.problem import FiniteElementSystem
 from magshell_fenicsx.solve.stability import lowest_modes, mass_matrix, null_vector
 from magshell_fenicsx.solve.system import State, Vector
 
+Model = ShellModel | MeridianModel | SolidModel
 EXCLUDED = ("antisymmetric", "m = ")  # what labels of modes begin with that a reduced model does not see
 
 
@@ -60,7 +62,7 @@ class _Family:
 class ShellModes:
     """Modes of a model at any of its states. Overwrites the model's tangent, on which a path relies."""
 
-    model: ShellModel | MeridianModel
+    model: Model
     _products: dict[str, fem.Form] = field(default_factory=dict)
 
     def lowest(self, state: State, count: int) -> list[ShellMode]:
@@ -100,7 +102,7 @@ class ShellModes:
         return self._products[name]
 
 
-def _families(model: ShellModel | MeridianModel) -> Iterator[_Family]:
+def _families(model: Model) -> Iterator[_Family]:
     """The modes that the model sees, then those that it excludes, whose kernels are compiled by then."""
 
     mass = "mass", _of_displacements(model)
@@ -118,7 +120,7 @@ def _families(model: ShellModel | MeridianModel) -> Iterator[_Family]:
         yield of("antisymmetric", model.excluded_modes.system)
 
 
-def _of_displacements(model: ShellModel | MeridianModel) -> ufl.Form:
+def _of_displacements(model: Model) -> ufl.Form:
     """The integral of u . v over the undeformed mid-surface of what is modelled."""
     product = ufl.dot(ufl.TrialFunction(model.V), ufl.TestFunction(model.V))
     return _integral(model, 2 * np.pi * product if isinstance(model, MeridianModel) else product)
@@ -131,8 +133,11 @@ def _of_waves(model: MeridianModel) -> ufl.Form:
     return _integral(model, np.pi * sum(ufl.dot(a.r, b.r) for a, b in (cosine, sine)))
 
 
-def _integral(model: ShellModel | MeridianModel, f: Expr) -> ufl.Form:
-    """Over the undeformed area; on a meridian per radian."""
+def _integral(model: Model, f: Expr) -> ufl.Form:
+    """Over the undeformed area, of a solid averaged over the thickness; on a meridian per radian."""
     domain, degree = model.V.mesh, model.degree
+    dx = ufl.Measure("dx", domain=domain, metadata={"quadrature_degree": 2 * degree + 2})
+    if isinstance(model, SolidModel):
+        return f / model.material.h * dx
     j0 = jets.revolved(model.r0) if isinstance(model, MeridianModel) else kin.jet(model.r0, domain)
-    return f * kin.area_ratio(j0) * ufl.Measure("dx", domain=domain, metadata={"quadrature_degree": 2 * degree + 2})
+    return f * kin.area_ratio(j0) * dx

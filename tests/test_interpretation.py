@@ -12,7 +12,8 @@ from dolfinx import fem
 
 from magshell_fenicsx import Case, Scene
 from magshell_fenicsx.case.source import Source
-from magshell_fenicsx.results.surface import SurfaceGatherer, gatherer
+from magshell_fenicsx.results.gathering import gatherer
+from magshell_fenicsx.results.surface import SurfaceGatherer
 from magshell_fenicsx.shell import kinematics as kin
 from magshell_fenicsx.shell.model import ShellModel
 from magshell_fenicsx.shell.parameters import Loads, Magnetisation, Material

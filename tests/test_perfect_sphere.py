@@ -12,7 +12,7 @@ import pytest
 
 from magshell_fenicsx import Case, Scene, follow
 from magshell_fenicsx.case.source import Source
-from magshell_fenicsx.results.surface import gatherer
+from magshell_fenicsx.results.gathering import gatherer
 from magshell_fenicsx.solve.events import critical_mode
 
 

@@ -14,8 +14,9 @@ from conftest import CASES
 
 from magshell_fenicsx import Case, Record, Scene, follow, run
 from magshell_fenicsx.case.source import CaseError, Source
+from magshell_fenicsx.results.gathering import gatherer
 from magshell_fenicsx.results.modes import mode_surface, wave_number
-from magshell_fenicsx.results.surface import Surface, gatherer
+from magshell_fenicsx.results.surface import Surface
 from magshell_fenicsx.stability import ShellModes
 
 # Clamped circular plate, k R of the modes with n nodal diameters: A. W. Leissa, Vibration of Plates,

@@ -16,9 +16,10 @@ from magshell_fenicsx.results import checkpoint
 from magshell_fenicsx.results.curve import draw_curve
 from magshell_fenicsx.results.durable import sync_folder, write_whole
 from magshell_fenicsx.results.folder import by_first, prepare_folder
+from magshell_fenicsx.results.gathering import gatherer
 from magshell_fenicsx.results.picture import draw_deformed
 from magshell_fenicsx.results.summary import Result
-from magshell_fenicsx.results.surface import Surface, completed, gatherer, turned
+from magshell_fenicsx.results.surface import Surface, completed, turned
 from magshell_fenicsx.results.table import PathTable, Row
 from magshell_fenicsx.results.vtu import FieldSeries
 from magshell_fenicsx.scene import Scene

@@ -17,9 +17,11 @@ from numpy.typing import NDArray
 from magshell_fenicsx.axisymmetric.model import MeridianModel
 from magshell_fenicsx.axisymmetric.revolution import Revolution
 from magshell_fenicsx.results.durable import write_whole
-from magshell_fenicsx.results.surface import RevolvedGatherer, Surface, SurfaceGatherer, completed, turned
+from magshell_fenicsx.results.gathering import Gatherer
+from magshell_fenicsx.results.surface import Surface, completed, turned
 from magshell_fenicsx.results.vtu import unstructured_grid, vtu_content
 from magshell_fenicsx.shell.model import ShellModel
+from magshell_fenicsx.solid.model import SolidModel
 from magshell_fenicsx.solve.system import Vector
 
 Array = NDArray[np.float64]
@@ -39,8 +41,8 @@ class Mode(Protocol):
 
 
 def mode_surface(
-    model: ShellModel | MeridianModel,
-    gatherer: SurfaceGatherer | RevolvedGatherer,
+    model: ShellModel | MeridianModel | SolidModel,
+    gatherer: Gatherer,
     u: Vector,
     label: str,
     vector: Vector,

@@ -51,7 +51,8 @@ class View:
 def smooth_surface(surface: Surface, h: float) -> "pyvista.PolyData":
     """The deformed surface in flat triangles with normals, each curved one divided."""
     smooth = unstructured_grid(surface, h).extract_surface(nonlinear_subdivision=2)
-    return smooth.compute_normals(cell_normals=False, split_vertices=False, consistent_normals=False)
+    body = surface.is_body  # which has edges that stay sharp
+    return smooth.compute_normals(cell_normals=False, split_vertices=body, feature_angle=60.0, consistent_normals=False)
 
 
 def rendered(views: Sequence[View]) -> list[Image]:

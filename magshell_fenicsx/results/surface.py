@@ -16,20 +16,21 @@ from magshell_fenicsx.results.interpretation import SurfaceGeometry, Torque, mag
 from magshell_fenicsx.shell.model import ShellModel
 from magshell_fenicsx.solve.system import Vector
 
-TRIANGLE, LAGRANGE_TRIANGLE = 5, 69  # VTK's numbers of the flat triangle and of that of any order
+TRIANGLE, LAGRANGE_TRIANGLE, LAGRANGE_HEXAHEDRON = 5, 69, 72  # VTK's numbers; the flat triangle, cells of any order
+HEXAHEDRON_NODES = 27
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Surface:
-    """Nodes of the whole mid-surface, in lengths of R.
+    """Nodes of the whole mid-surface, or of the whole body of a solid, in lengths of R.
 
     Attributes
     ----------
     r0, u, n0
         (n, 3) undeformed placement, displacement, undeformed normal.
     cells
-        (m, k) node numbers of triangles of the displacement's degree, in VTK's order.
+        (m, k) node numbers of triangles of the displacement's degree or of hexahedra, in VTK's order.
     fields
         Name -> (n,) or (n, 3): the magnetic loads, where the field is uniform.
     """
@@ -39,6 +40,11 @@ class Surface:
     n0: Array
     cells: NDArray[np.int64]
     fields: dict[str, Array]
+
+    @property
+    def is_body(self) -> bool:
+        """Whether its cells are hexahedra."""
+        return self.cells.shape[1] == HEXAHEDRON_NODES
 
     @property
     def w(self) -> Array:
@@ -136,11 +142,6 @@ class RevolvedGatherer:
 
     def _around(self, values: Array) -> Array:
         return self._swept.turned(values[:, [0, 2]]) if values.ndim == 2 else self._swept.repeated(values)
-
-
-def gatherer(model: ShellModel | MeridianModel, comm: MPI.Comm) -> SurfaceGatherer | RevolvedGatherer:
-    """What gathers the surface of a model."""
-    return RevolvedGatherer(model, comm) if isinstance(model, MeridianModel) else SurfaceGatherer(model)
 
 
 def turned(surface: Surface, azimuth: float) -> Surface:

@@ -6,19 +6,20 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from magshell_fenicsx.results.durable import write_whole
-from magshell_fenicsx.results.surface import LAGRANGE_TRIANGLE, TRIANGLE, Surface
+from magshell_fenicsx.results.surface import LAGRANGE_HEXAHEDRON, LAGRANGE_TRIANGLE, TRIANGLE, Surface
 
 if TYPE_CHECKING:  # VTK takes long to import
     import pyvista
 
 
 def unstructured_grid(surface: Surface, h: float) -> "pyvista.UnstructuredGrid":
-    """The deformed surface with u/h, w/h, r0, n0 and the magnetic loads at its nodes; lengths in R."""
+    """The deformed surface or body with u/h, w/h, r0, n0 and the magnetic loads at its nodes; lengths in R."""
     import pyvista
 
     count = surface.cells.shape[1]
     cells = np.column_stack([np.full(len(surface.cells), count), surface.cells])
-    kinds = np.full(len(surface.cells), TRIANGLE if count == 3 else LAGRANGE_TRIANGLE, dtype=np.uint8)
+    kind = TRIANGLE if count == 3 else LAGRANGE_HEXAHEDRON if surface.is_body else LAGRANGE_TRIANGLE
+    kinds = np.full(len(surface.cells), kind, dtype=np.uint8)
     grid = pyvista.UnstructuredGrid(cells.ravel(), kinds, surface.r0 + surface.u)
     grid.point_data["u_over_h"] = surface.u / h
     grid.point_data["w_over_h"] = surface.w / h

@@ -1,0 +1,28 @@
+"""What gathers a model's nodes on rank 0, for pictures and for ParaView."""
+
+from typing import Protocol
+
+from mpi4py import MPI
+
+from magshell_fenicsx.axisymmetric.model import MeridianModel
+from magshell_fenicsx.results.body import BodyGatherer
+from magshell_fenicsx.results.surface import RevolvedGatherer, Surface, SurfaceGatherer
+from magshell_fenicsx.shell.model import ShellModel
+from magshell_fenicsx.solid.model import SolidModel
+from magshell_fenicsx.solve.system import Vector
+
+
+class Gatherer(Protocol):
+    """Gathers displacements of one model; every rank calls."""
+
+    comm: MPI.Comm
+
+    def gather(self, u: Vector) -> Surface | None:
+        """The model's nodes with a displacement, on rank 0; None elsewhere."""
+
+
+def gatherer(model: ShellModel | MeridianModel | SolidModel, comm: MPI.Comm) -> Gatherer:
+    """What fits a model."""
+    if isinstance(model, MeridianModel):
+        return RevolvedGatherer(model, comm)
+    return BodyGatherer(model) if isinstance(model, SolidModel) else SurfaceGatherer(model)
