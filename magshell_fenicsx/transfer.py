@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.axisymmetric.model import MeridianModel
 from magshell_fenicsx.mesh.sphere import SphereEmbedding
 from magshell_fenicsx.scene import Scene
+from magshell_fenicsx.solid.model import SolidModel
 from magshell_fenicsx.solve.system import Vector
 
 Array = NDArray[np.float64]
@@ -141,11 +142,16 @@ def _all_nodes(scene: Scene) -> Array:
 
 
 def chart(scene: Scene) -> Array:
-    """Coordinates (n, 1 or 2) of this rank's nodes in the chart, where a defect does not move them."""
+    """Coordinates (n, 1 or 2) of this rank's nodes in the chart, where a defect does not move them.
+
+    Of a solid their places (n, 3): its displacements are carried to the same mesh only.
+    """
     model = scene.model
     if isinstance(model, MeridianModel):
         return np.asarray(model.V.tabulate_dof_coordinates()[:, :1])
     r0: Array = model.r0.x.array[: model.system.size].reshape(-1, 3)
+    if isinstance(model, SolidModel):
+        return r0
     if not isinstance(scene.plan.embedding, SphereEmbedding):
         return r0[:, :2]
     across = np.hypot(r0[:, 0], r0[:, 1])[:, None]

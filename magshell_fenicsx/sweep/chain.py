@@ -64,7 +64,9 @@ def make_chains(
 def _chains_of(line: list[int], key: str, points: Sequence[SweepPoint], missing: set[int]) -> list[Chain]:
     """The missing points of one line, as one chain if their folds can be followed."""
     wanted = [Link(n, float(points[n].values[key]), points[n].case) for n in line if n in missing]
-    if len(wanted) < 2 or not all(_has_knockdown(link.case) for link in wanted):
+    one_mesh = key.startswith("magnetic.")  # a solid's state is not carried to another
+    followed = all(_has_knockdown(link.case) and (one_mesh or link.case.model == "shell") for link in wanted)
+    if len(wanted) < 2 or not followed:
         return [[link] for link in wanted]
     common = min((_symmetry(points[number].case) for number in line), key=SYMMETRIES.index)
     chain = [replace(link, case=link.case.model_copy(update={"symmetry": common})) for link in wanted]
