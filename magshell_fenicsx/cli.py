@@ -139,6 +139,34 @@ def study(
 
 
 @app.command()
+def compare(
+    case: CaseFile,
+    set_: Settings = None,
+    shell: Annotated[str, typer.Option(metavar="R,R", help="refinements of the shell's mesh; the finest counts")] = "1",
+    solid: Annotated[str, typer.Option(metavar="R,R", help="of the solid's; three tell error against run time")] = "1",
+    out: Annotated[Path | None, typer.Option(help="output folder; default results/<case name>_compare/")] = None,
+) -> None:
+    """Run a case as a shell and as a solid; put curves, difference and run times side by side."""
+    from magshell_fenicsx.compare.compare import compare as run_comparison
+    from magshell_fenicsx.compare.compare import parse_refinements
+    from magshell_fenicsx.compare.runs import NothingLeft
+    from magshell_fenicsx.results.folder import DiskError
+
+    folder = out or Path("results") / f"{case.stem}_compare"
+    try:
+        refinements = parse_refinements(shell, solid)
+        done = run_comparison(case, set_ or [], refinements=refinements, out=folder, say=_say)
+    except CaseError as e:
+        raise _failure(str(e), INVALID) from None
+    except (DiskError, NothingLeft) as e:
+        raise _failure(f"stopped early: {e}", STOPPED) from None
+    difference = done.content["difference"]
+    if difference is not None:
+        _say(f"{done.content['result']}: the solid's is {100 * difference:+.3f} % from the shell's")
+    _say(f"results in {folder}/")
+
+
+@app.command()
 def check(case: CaseFile, set_: Settings = None) -> None:
     """Validate a case; print what would be built and what is left out."""
     from magshell_fenicsx.plan import describe
