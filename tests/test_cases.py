@@ -191,6 +191,36 @@ def test_strip_against_its_field_buckles() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(("lambda_m", "k_d"), [(0, 0.326233289), (0.00184, 0.552053778), (-0.00184, 0.120723848)])
+def test_solid_buckling(lambda_m: float, k_d: float) -> None:
+    """The axisymmetric shell's k_d; the solid's is above it, by a multiple of h/R (docs/solid) and by this mesh."""
+    found = result("solid_buckling.yaml", "mesh.refinement=0.7", f"magnetic.lambda_m={lambda_m}")
+    assert found.knockdown == pytest.approx(1.01 * k_d, rel=8e-3)
+    assert [(point["kind"], point["mode"]) for point in found.limit_points] == [("fold", "")]
+
+
+@pytest.mark.slow
+def test_solid_indentation() -> None:
+    """The shell under the same patch: the field alone moves the body's middle elsewhere (docs/solid), 5 % of F here."""
+    settings = ["loading.depth=2", "loading.points=2", "mesh.refinement=0.5"]
+    solid, shell = (result("solid_indentation.yaml", *settings, f"model={model}") for model in ("solid", "shell"))
+    for depth in (1.0, 2.0):
+        assert force_at(solid, depth) == pytest.approx(force_at(shell, depth), rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("polar", "shortening", "deflection"),
+    [(0.0, 0.32894, 0.66996), pytest.param(-60.0, 0.67087, 0.80901, marks=pytest.mark.slow)],
+)
+def test_magnetic_strip_as_a_solid(polar: float, shortening: float, deflection: float) -> None:
+    """The same elastica as of `test_magnetic_strip`; nu = 0, so that the strip bends like a rod."""
+    found = result("magnetic_strip.yaml", f"magnetic.applied.polar={polar}", "model=solid")
+    moved = found.scene.model.displacement(found.last.u, "pole")
+    assert -moved[0] == pytest.approx(shortening, rel=1e-3)
+    assert moved[2] == pytest.approx(deflection, rel=1e-3)
+
+
+@pytest.mark.slow
 def test_figure_of_coplanar_fields() -> None:
     """figures/coplanar.yaml at angle zero: axisymmetric reference, on the figures' coarse mesh."""
     assert result("figures/coplanar.yaml").knockdown == pytest.approx(0.552053778, rel=3e-4)

@@ -6,13 +6,18 @@ import pytest
 from command import magshell, read_path
 from conftest import CASES
 
-COARSE = ["--set=mesh.degree=3", "--set=mesh.refinement=0.5"]
+DEGREE = "--set=mesh.degree=3"
+COARSE = ["--set=mesh.refinement=0.5"]
 SCENES = {
-    "half shell, force": ("pole_indentation.yaml", ["--set=symmetry=half"]),
-    "meridian": ("pole_indentation.yaml", []),
+    "half shell, force": ("pole_indentation.yaml", [DEGREE, "--set=symmetry=half"]),
+    "meridian": ("pole_indentation.yaml", [DEGREE]),
+    "half solid, field, force": (
+        "solid_indentation.yaml",
+        ["--set=loading.depth=1", "--set=loading.points=1", "--set=mesh.refinement=0.3"],
+    ),
     "full shell, field, pressure": (
         "dimple_buckling.yaml",
-        ["--set=magnetic={lambda_m: 1e-3, remanent: {polar: 45}, applied: {polar: 45, azimuth: 90}}"],
+        [DEGREE, "--set=magnetic={lambda_m: 1e-3, remanent: {polar: 45}, applied: {polar: 45, azimuth: 90}}"],
     ),
 }
 COMPARED = ("p_over_pc", "lambda_m", "force", "w_over_h", "w_pole_over_h", "volume_change", "energy")

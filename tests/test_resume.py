@@ -21,7 +21,8 @@ INDENTATION, BUCKLING = CASES / "pole_indentation.yaml", CASES / "dimple_bucklin
 MERIDIAN = (BUCKLING, "--set=magnetic.lambda_m=0.00184", "--set=mesh.refinement=0.5")
 HALF = (INDENTATION, "--set=symmetry=half", "--set=mesh.degree=3", "--set=mesh.refinement=0.5")
 LONG = (INDENTATION, "--set=loading.points=30", "--set=mesh.refinement=0.5")
-CASE = {"meridian": MERIDIAN, "half": HALF, "long": LONG}
+SOLID = (CASES / "solid_buckling.yaml", "--set=shell.radius_to_thickness=20", "--set=mesh.refinement=0.3")
+CASE = {"meridian": MERIDIAN, "half": HALF, "long": LONG, "solid": SOLID}
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,7 @@ def whole(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
     return Whole(case, out, first, time.monotonic() - begun - first)
 
 
-@pytest.mark.parametrize("whole", ["meridian", "half"], indirect=True)
+@pytest.mark.parametrize("whole", ["meridian", "half", "solid"], indirect=True)
 def test_killed_twice(whole: Whole, tmp_path: Path) -> None:
     """kill -9 after three rows, resumed on two ranks, killed after two more, resumed on one."""
     out, seen = tmp_path / "out", b""
