@@ -21,7 +21,11 @@ INDENTATION, BUCKLING = CASES / "pole_indentation.yaml", CASES / "dimple_bucklin
 MERIDIAN = (BUCKLING, "--set=magnetic.lambda_m=0.00184", "--set=mesh.refinement=0.5")
 HALF = (INDENTATION, "--set=symmetry=half", "--set=mesh.degree=3", "--set=mesh.refinement=0.5")
 LONG = (INDENTATION, "--set=loading.points=30", "--set=mesh.refinement=0.5")
-SOLID = (CASES / "solid_buckling.yaml", "--set=shell.radius_to_thickness=20", "--set=mesh.refinement=0.3")
+SOLID = (
+    CASES / "solid_indentation.yaml",
+    *("--set=shell.radius_to_thickness=20", "--set=mesh.refinement=0.4"),
+    *("--set=loading.depth=3", "--set=loading.points=6"),
+)
 CASE = {"meridian": MERIDIAN, "half": HALF, "long": LONG, "solid": SOLID}
 
 
