@@ -15,7 +15,6 @@ AXES = {
     "force": ("w_point_over_h", "force"),
     "lambda_m": ("w_pole_over_h", "lambda_m"),
 }
-POINTS = 20
 
 
 @dataclass(frozen=True)
@@ -57,15 +56,14 @@ def loaded(run: ModelRun) -> list[dict[str, str]]:
 
 
 def places(runs: Sequence[ModelRun]) -> list[float]:
-    """Equidistant displacements that all runs come to, whole thicknesses where there are many.
+    """The whole thicknesses that all runs come to, or the last displacement below the first.
 
     None where a run has no targets: between the long steps of its own a curve is not known well enough.
     """
     if not all(any(row["label"] == "target" for row in loaded(run)) for run in runs):
         return []
     end = min(max(curve(run)[0]) for run in runs)
-    last = np.floor(end + 1e-6)
-    return [float(w) for w in (np.arange(1.0, last + 1) if last >= 5 else np.linspace(0, end, POINTS + 1)[1:])]
+    return [float(w) for w in range(1, int(end + 1e-6) + 1)] or [end]
 
 
 def differences(shell: ModelRun, solid: ModelRun) -> list[Difference]:

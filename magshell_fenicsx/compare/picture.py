@@ -5,7 +5,6 @@ from pathlib import Path
 
 from magshell_fenicsx.compare.curves import Difference, amplitude_of, curve
 from magshell_fenicsx.compare.runs import ModelRun
-from magshell_fenicsx.results.curve import smooth
 
 LABELS = {
     "pressure": (r"$w/h$ of the pole since the field", r"pressure  $p/p_\mathrm{c}$"),
@@ -31,7 +30,7 @@ def draw_comparison(
     figure = Figure(figsize=(4.4 * panels, 3.7), dpi=160, layout="constrained")
     x_label, y_label = LABELS[amplitude_of(shell)]
     first, *others = figure.subplots(1, panels, squeeze=False)[0]
-    first.plot(*smooth(*curve(shell)), color="C0", label=f"shell, {shell.dofs} unknowns")
+    first.plot(*curve(shell), ".-", color="C0", markersize=4, linewidth=1, label=f"shell, {shell.dofs} unknowns")
     first.plot(*curve(solid), "o", color="C3", markersize=4, fillstyle="none", label=f"solid, {solid.dofs} unknowns")
     first.set(xlabel=x_label, ylabel=y_label)
     first.legend(frameon=False, fontsize=8)

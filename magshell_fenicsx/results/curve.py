@@ -21,7 +21,7 @@ LOCATED = ("fold", "bifurcation")
 FINE = 16  # drawn pieces between two points
 
 
-def smooth(x: Sequence[float], y: Sequence[float]) -> NDArray[np.float64]:
+def _smooth(x: Sequence[float], y: Sequence[float]) -> NDArray[np.float64]:
     """A smooth curve through the points, without overshoot, along their scaled chord: (2, FINE (n - 1) + 1)."""
     xy = np.array([x, y])
     scale = np.ptp(xy, axis=1)
@@ -54,7 +54,7 @@ def draw_curve(rows: Sequence[Row], amplitude: str, title: str) -> bytes:
     axes = figure.subplots()
     for branch in sorted({int(row["branch"]) for row in part}):
         line = [row for row in part if row["branch"] == branch and row["mode"] in OWN_MODES]
-        smooth_x, smooth_y = smooth(*zip(*map(place, line), strict=True))
+        smooth_x, smooth_y = _smooth(*zip(*map(place, line), strict=True))
         unstable = [int(row["negative_pivots"]) > 0 and row["label"] not in LOCATED for row in line]
         for dashed, pieces in groupby(range(1, len(line)), key=unstable.__getitem__):
             i, *others = pieces
