@@ -193,9 +193,10 @@ def test_strip_against_its_field_buckles() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(("lambda_m", "k_d"), [(0, 0.326233289), (0.00184, 0.552053778), (-0.00184, 0.120723848)])
 def test_solid_buckling(lambda_m: float, k_d: float) -> None:
-    """The axisymmetric shell's k_d; the solid's is above it, by a multiple of h/R (docs/solid) and by this mesh."""
-    found = result("solid_buckling.yaml", "mesh.refinement=0.7", f"magnetic.lambda_m={lambda_m}")
-    assert found.knockdown == pytest.approx(1.01 * k_d, rel=8e-3)
+    """The axisymmetric shell's k_d; the solid's is above it, 0.8 %, 0.8 % and 1.3 % (docs/solid) and 0.3 % of mesh."""
+    found = result("solid_buckling.yaml", f"magnetic.lambda_m={lambda_m}")
+    assert found.knockdown is not None
+    assert 0.005 < found.knockdown / k_d - 1 < 0.018
     assert [(point["kind"], point["mode"]) for point in found.limit_points] == [("fold", "")]
 
 
