@@ -23,12 +23,23 @@ def refuse_too_large(case: Case, size: Grading, shape: Shape) -> None:
     CaseError
         If they are more than `MOST_UNKNOWNS`.
     """
-    unknowns = 1.5 * case.mesh.degree**2 * size.cells(shape)
+    refuse_too_many(case, size.cells(shape), "; with coplanar fields and loads, symmetry: half halves it")
+
+
+def refuse_too_many(case: Case, cells: float, hint: str = "") -> None:
+    """The same for a number of triangles that is known.
+
+    Raises
+    ------
+    CaseError
+        If the unknowns are more than `MOST_UNKNOWNS`.
+    """
+    unknowns = 1.5 * case.mesh.degree**2 * cells
     if unknowns > MOST_UNKNOWNS:
         raise CaseError(
             f"mesh: about {unknowns:.1e} unknowns at radius/thickness {case.shell.R_over_h:g}, at most "
             f"{MOST_UNKNOWNS:.0e} are built: lower mesh.refinement ({case.mesh.refinement:g}) or mesh.degree "
-            f"({case.mesh.degree}); with coplanar fields and loads, symmetry: half halves it"
+            f"({case.mesh.degree}){hint}"
         )
 
 
