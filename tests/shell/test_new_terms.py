@@ -60,6 +60,9 @@ SHELLS: dict[str, Callable[[], ShellModel]] = {
     "planes": lambda: ShellModel(
         panel(), MATERIAL, 3, {"bottom": "plane", "left": "plane", "top": Held((0, 1))}, Loads(pressure=True)
     ),
+    "two terms on an edge": lambda: ShellModel(
+        panel(), MATERIAL, 3, {"bottom": "plane"}, Loads(dead=(EdgeMoment("bottom", 0.01),))
+    ),
     "folded": lambda: ShellModel(box(1.8), MATERIAL, 3, {"left": "clamped"}, Loads()),
     "thickness": lambda: ShellModel(
         panel(),
