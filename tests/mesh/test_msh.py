@@ -70,7 +70,7 @@ LOADED = {
         "control": "load",
         "factor": 1,
         "points": 1,
-        "loads": [{"at": "A", "force": [-8e-4, 0, 0]}],
+        "loads": [{"at": "A", "force": [-2e-4, 0, 0]}],
     },
     "magnetic": {
         "lambda_m": 2e-4,
