@@ -112,7 +112,7 @@ def draw(title: str, curves: Mapping[str, tuple[Array, Array]]) -> bytes:
     for number, (name, (curve, reference)) in enumerate(curves.items()):
         axes.plot(*smooth(*curve.T), color=f"C{number}", label=name.replace("_", " "))
         axes.plot(*reference.T, "o", color=f"C{number}", markersize=3.5, markerfacecolor="none")
-    axes.plot([], [], "o", color="0.4", markersize=3.5, markerfacecolor="none", label="Sze, Liu and Lo (2004)")
+    axes.plot([], [], "o", color="0.4", markersize=3.5, markerfacecolor="none", label="published, or exact")
     axes.set(xlabel="displacement (the case's unit of length)", ylabel="load factor")
     axes.set_title(title.replace("_", " "), fontsize=9)
     axes.axhline(0, color="0.8", linewidth=0.8, zorder=0)
