@@ -216,7 +216,7 @@ def _dead(load: DeadLoadSection, shell: SurfaceSection) -> DeadLoad:
     if load.edge is not None:
         assert load.per_length is not None
         return EdgeForce(load.edge, np.array(load.per_length) / (E * t), total=False)
-    patch = None if load.on == "all" else load.on
+    patch = None if load.over == "all" else load.over
     if load.pressure is not None:
         return AreaForce(patch, load.pressure * R / (E * t))
     assert load.per_area is not None

@@ -61,4 +61,4 @@ def test_same_path(tmp_path: Path, scene: str) -> None:
         for key in [*COMPARED, *named]:  # a component that is zero by symmetry counts beside the others
             a, b = ([float(row[key]) for row in path] for path in (paths[0], other))
             scale = moved if key in named else max(map(abs, a))
-            assert b == pytest.approx(a, rel=0, abs=max(1e-8 * scale, 1e-15)), key
+            assert b == pytest.approx(a, rel=0, abs=max(1e-8 * scale, 1e-18)), key

@@ -87,13 +87,13 @@ class DeadLoadSection(Section):
     """One load, at a point of `points`, on an edge, or over the surface, in the units of the shell's numbers.
 
     On an edge: `force` in all, `per_length`, or `moment` per length about the edge's first tangent, which turns
-    with the edge. Over the surface (`on: all`, or a patch of a mesh): `per_area`, or `pressure` along the
+    with the edge. Over the surface (`over: all`, or a patch of a mesh): `per_area`, or `pressure` along the
     undeformed normal, positive from outside.
     """
 
     at: str | None = None
     edge: str | None = None
-    on: str | None = None
+    over: str | None = None
     force: Vector | None = None
     per_length: Vector | None = None
     moment: float | None = Field(default=None, ge=-1e30, le=1e30)
@@ -102,10 +102,12 @@ class DeadLoadSection(Section):
 
     @model_validator(mode="after")
     def _one_load_in_one_place(self) -> Self:
-        fitting = {"at": ("force",), "edge": ("force", "per_length", "moment"), "on": ("per_area", "pressure")}
+        fitting = {"at": ("force",), "edge": ("force", "per_length", "moment"), "over": ("per_area", "pressure")}
         places = [place for place in fitting if getattr(self, place) is not None]
         if len(places) != 1:
-            raise ValueError("a load is at a point, on an edge, or on a part of the surface: give one of at, edge, on")
+            raise ValueError(
+                "a load is at a point, on an edge, or on a part of the surface: give one of at, edge, over"
+            )
         quantities = {key for keys in fitting.values() for key in keys}
         given = sorted(key for key in quantities if getattr(self, key) is not None)
         if len(given) != 1 or given[0] not in fitting[places[0]]:

@@ -5,6 +5,7 @@ from collections.abc import Iterable
 import numpy as np
 from dolfinx import fem, mesh
 from numpy.typing import NDArray
+from petsc4py import PETSc
 
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.solve.problem import FiniteElementSystem
@@ -12,6 +13,7 @@ from magshell_fenicsx.solve.system import Amplitudes
 
 Array = NDArray[np.float64]
 STRAIGHT = 1e-6  # deviation of an edge from a plane, in lengths of R
+FREE = 1e-12  # of the squares that a rigid motion has where the shell is held, over the largest: rounding
 LOOSE = 1e-13  # of a rigid motion's energy, over the tangent's largest row
 
 
@@ -87,7 +89,7 @@ def refuse_loose(system: FiniteElementSystem, r0: fem.Function, amplitudes: Ampl
     rigid = motions.reshape(6, -1)
     stopped = rigid - np.array([system.held(v) for v in rigid])
     _, values, vectors = np.linalg.svd(system.comm.allreduce(stopped @ stopped.T))
-    free = vectors[values < 1e-18 * max(values.max(), 1.0)] @ rigid
+    free = vectors[values < FREE * max(values.max(), 1.0)] @ rigid
     if not len(free):
         return
     free /= np.sqrt(system.comm.allreduce((free**2).sum(axis=1)))[:, None]
@@ -99,7 +101,7 @@ def refuse_loose(system: FiniteElementSystem, r0: fem.Function, amplitudes: Ampl
         K.mult(given, out)
         energies.append(system.comm.allreduce(free @ out.array))
     values, vectors = np.linalg.eigh(np.array(energies))
-    if values[0] < LOOSE * K.norm(3):
+    if values[0] < LOOSE * K.norm(PETSc.NormType.INFINITY):
         said = vectors[:, 0] @ free
         shift = system.comm.allreduce(said.reshape(-1, 3).sum(axis=0)) / total
         moves = np.linalg.norm(shift) > 0.5 * np.sqrt(1 / total)
