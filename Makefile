@@ -5,6 +5,7 @@ define HELP
 make run CASE=cases/dimple_buckling.yaml [OUT=dir] [N=ranks] [ARGS="--set a=b"]
 make check CASE=...   validate a case, print what would be built
 make figures          the paper's figures into results/figures/: 45 minutes on one core, N=ranks share it
+make benchmarks       the nonlinear obstacle course into docs/benchmarks/: half an hour on one core
 make extremes         shells far from the ordinary ones into docs/extremes/: 5 minutes
 make bench            error, time and memory of a fixed set into results/bench.json (OUT=file), and the ratios
                       to docs/bench/bench.json: 10 minutes on an idle machine
@@ -17,7 +18,7 @@ make clean            remove caches and compiled kernels; keeps .env/root and re
 endef
 export HELP
 
-.PHONY: help run check figures extremes bench studies test fast lint image clean
+.PHONY: help run check figures benchmarks extremes bench studies test fast lint image clean
 
 help:
 	@echo "$$HELP"
@@ -28,6 +29,9 @@ run check:
 
 figures:
 	$(ENV) $(if $(N),mpirun -n $(N)) python3 -m magshell_fenicsx.figures $(ARGS)
+
+benchmarks:
+	$(ENV) python3 -m magshell_fenicsx.obstacles $(ARGS)
 
 extremes:
 	$(ENV) $(if $(N),mpirun -n $(N)) python3 -m magshell_fenicsx.extremes $(ARGS)

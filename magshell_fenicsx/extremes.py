@@ -131,11 +131,11 @@ def slivers(aspect: float, way: str) -> Line:
     start = time.perf_counter()
     case = Case.load(CASES / "slivers.yaml")
     plan, target = make_plan(case), case.lambda_m
-    assert case.shell.width
+    assert case.charted.width
     stretch = aspect if way == "along" else 1 / aspect
     # as many triangles along the strip as across, but for the stretch
-    size = 0.25 if way == "along" and aspect > 1 else min(0.05, 2 * case.shell.width / aspect)
-    shape = StripShape(case.shell.width * stretch, half=False)
+    size = 0.25 if way == "along" and aspect > 1 else min(0.05, 2 * case.charted.width / aspect)
+    shape = StripShape(case.charted.width * stretch, half=False)
     plan = replace(plan, shape=shape, size=Grading([], size), embedding=_Stretched(stretch))
     model = build_model(case, plan, MPI.COMM_WORLD)
     newton = BorderedNewton(model.system)

@@ -26,15 +26,26 @@ def refuse_too_large(case: Case, size: Grading, shape: Shape) -> None:
     CaseError
         If they are more than `MOST_UNKNOWNS`.
     """
+    refuse_too_many(case, size.cells(shape), "; with coplanar fields and loads, symmetry: half halves it")
+
+
+def refuse_too_many(case: Case, cells: float, hint: str = "") -> None:
+    """The same for a number of triangles that is known.
+
+    Raises
+    ------
+    CaseError
+        If the unknowns are more than `MOST_UNKNOWNS`.
+    """
     per_triangle = 1.5 * case.degree**2
     if case.model == "solid":
         per_triangle = 36 * (2 * (case.solid or SolidSection()).layers + 1)
-    unknowns = per_triangle * size.cells(shape)
+    unknowns = per_triangle * cells
     if unknowns > MOST_UNKNOWNS:
         raise CaseError(
             f"mesh: about {unknowns:.1e} unknowns at radius/thickness {case.shell.R_over_h:g}, at most "
             f"{MOST_UNKNOWNS:.0e} are built: lower mesh.refinement ({case.mesh.refinement:g}) or mesh.degree "
-            f"({case.degree}); with coplanar fields and loads, symmetry: half halves it"
+            f"({case.degree}){hint}"
         )
 
 

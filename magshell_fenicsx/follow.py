@@ -7,6 +7,7 @@ from typing import Literal
 import numpy as np
 
 from magshell_fenicsx.case.loading import (
+    DeadSection,
     FieldSection,
     IndentationSection,
     PathSection,
@@ -14,6 +15,7 @@ from magshell_fenicsx.case.loading import (
     RotationSection,
 )
 from magshell_fenicsx.scene import Scene
+from magshell_fenicsx.shell.model import ShellModel
 from magshell_fenicsx.solve.along import Along
 from magshell_fenicsx.solve.branch import Branching, branching
 from magshell_fenicsx.solve.path import Control, Path, PathStopped, Point, StepOptions
@@ -84,6 +86,8 @@ def follow(scene: Scene) -> Iterator[Record]:
         yield from _pressure(scene, loading, state)
     elif isinstance(loading, IndentationSection):
         yield from _indentation(scene, loading, state)
+    elif isinstance(loading, DeadSection):
+        yield from _dead(scene, loading, state)
     elif isinstance(loading, RotationSection):
         yield from _rotation(scene, loading, state)
 
@@ -137,6 +141,22 @@ def _indentation(scene: Scene, loading: IndentationSection, state: State) -> Ite
         # the field may have moved the point past the first targets already
         now = 0.0 if quantity == "load" else -scene.newton.system.potential(state.u, "force")
         targets = [t for t in _divided(0.0, end, loading.points) if (t - now) * end > 0]
+    yield from _followed(scene, path, start, _goal(loading, targets, quantity, asked), branches=loading)
+
+
+def _dead(scene: Scene, loading: DeadSection, state: State) -> Iterator[Record]:
+    assert isinstance(scene.model, ShellModel)
+    quantity: Quantity = "load" if loading.displacement is None else "conjugate"
+    asked = next((value for value in (loading.factor, loading.displacement) if value is not None), 1.0)
+    # a displacement is told as the work of the loads at it
+    end = asked if quantity == "load" else asked / scene.plan.length * scene.model.load_size
+    by_load = quantity == "load"
+    first = asked / loading.points if by_load else float(np.copysign(1e-3, asked))
+    path, start = _begin(scene, "load", CONTROLS[loading.control], state, first)
+    if loading.control == "displacement" and not by_load:
+        step = abs(end) / loading.points
+        path.options = StepOptions(step, 2 * step, 1e-4 * step)
+    targets = _divided(0.0, end, loading.points) if loading.until == "target" else []
     yield from _followed(scene, path, start, _goal(loading, targets, quantity, asked), branches=loading)
 
 

@@ -5,7 +5,6 @@ prints it, `Scene` builds it.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from math import atan2, cos, degrees, hypot, pi, radians, sin, sqrt
 
 import numpy as np
@@ -13,52 +12,23 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.axisymmetric.meridian import graded_vertices
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.expressions import formula
-from magshell_fenicsx.case.fields import Direction, MagneticSection, layer_average
+from magshell_fenicsx.case.fields import Direction
 from magshell_fenicsx.case.loading import IndentationSection, PressureSection, RotationSection
 from magshell_fenicsx.case.shell import ShellSection
 from magshell_fenicsx.case.solid import SolidSection
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.feasible import refuse_too_large, refuse_unbounded_fields, sample
-from magshell_fenicsx.mesh.grading import Disc, Feature, Grading, Ring, Size
+from magshell_fenicsx.magnetic_plan import magnetisation
+from magshell_fenicsx.mesh.grading import Disc, Feature, Grading, Ring
 from magshell_fenicsx.mesh.patch import Embedding, MeshError
 from magshell_fenicsx.mesh.shapes import DiscShape, Shape, StripShape
 from magshell_fenicsx.mesh.sphere import Dimple, SphereEmbedding, flat
-from magshell_fenicsx.mesh.triangulation import triangulate
-from magshell_fenicsx.shell.parameters import Condition, Force, Loads, Magnetisation, Material
-from magshell_fenicsx.shell.patterns import Components, InsideAndOutside, Pattern, radial, tangential
+from magshell_fenicsx.planned import Plan
+from magshell_fenicsx.shell.parameters import Force, Loads, Material
 from magshell_fenicsx.solid.material import NeoHookean
+from magshell_fenicsx.surface_plan import edge_conditions, plan_surface
 
-
-@dataclass(frozen=True)
-class Plan:
-    """Everything that a scene is built from, dimensionless (lengths in R).
-
-    Attributes
-    ----------
-    axisymmetric
-        Model the meridian.
-    half
-        Model the half y >= 0 of a frame turned about e3 by `azimuth` (rad).
-    shape, size, points, embedding
-        What is triangulated, and how it is put into space. The point "pole" is the one whose
-        displacement is reported: the pole, the disc's centre, the strip's tip.
-    included, left_out
-        What the model has and lacks, for people.
-    """
-
-    material: Material
-    loads: Loads
-    conditions: dict[str, Condition]
-    axisymmetric: bool
-    half: bool
-    azimuth: float
-    shape: Shape
-    embedding: Embedding
-    points: dict[str, NDArray[np.float64]]
-    size: Size
-    included: list[str]
-    left_out: list[str]
+__all__ = ["Plan", "describe", "make_plan"]
 
 
 def make_plan(case: Case) -> Plan:
@@ -69,6 +39,8 @@ def make_plan(case: Case) -> Plan:
     CaseError
         If the symmetry that is asked for is not there, or what is asked for cannot be built.
     """
+    if not isinstance(case.shell, ShellSection):
+        return plan_surface(case, case.shell)
     shell, loading, magnetic = case.shell, case.loading, case.magnetic
     material = Material(shell.poisson_ratio, 1 / shell.R_over_h)
     field_on = magnetic is not None and case.lambda_m != 0
@@ -115,15 +87,13 @@ def make_plan(case: Case) -> Plan:
     else:
         shape = DiscShape(pi / 2 if hemisphere else 1.0, half, defect.phi_o if defect else None)
     # the equator is the rim of the chart
-    conditions: dict[str, Condition] = {
-        "rim" if name == "equator" else name: condition for name, condition in case.boundary.conditions().items()
-    }
+    conditions = {"rim" if name == "equator" else name: c for name, c in edge_conditions(case.boundary).items()}
     if half:
         conditions["symmetry"] = "symmetry"
     loads = Loads(
         pressure=isinstance(loading, PressureSection),
         force=force,
-        magnetic=_magnetisation(magnetic, shell, turn, to) if magnetic and field_on else None,
+        magnetic=magnetisation(magnetic, shell, turn, to) if magnetic and field_on else None,
     )
     size = _grading(case, material.h, defect, points)
     embedding: Embedding = SphereEmbedding(defect) if hemisphere else flat
@@ -169,32 +139,6 @@ def _not_axisymmetric(case: Case) -> str | None:
     return None
 
 
-def _magnetisation(magnetic: MagneticSection, shell: ShellSection, turn: float, to: Direction | None) -> Magnetisation:
-    """The field section in the model's frame."""
-    section, gradient = magnetic.remanent, magnetic.applied.gradient
-    remanent: NDArray[np.float64] | Pattern
-    if section.kind == "radial":
-        remanent = radial
-    elif section.kind == "tangential":
-        remanent = tangential
-    elif section.components:
-        remanent = Components([formula(text) for text in section.components])
-    elif section.layers:
-        remanent = layer_average(section.layers, turn)
-    elif section.patches:
-        rest = section.patches["rest"].vector(turn)
-        inside = section.patches.get("dimple")
-        remanent = InsideAndOutside(shell.dimple_half_width, inside.vector(turn), rest) if inside else rest
-    else:
-        remanent = section.vector(turn)
-    along = magnetic.applied.vector(turn)
-    applied, across = magnetic.applied.uniform * along, None
-    if to is not None:
-        away = to.vector(turn) - (to.vector(turn) @ along) * along
-        across = magnetic.applied.uniform * away / np.linalg.norm(away)
-    return Magnetisation(remanent, applied, magnetic.energy, np.array(gradient) if gradient else None, across)
-
-
 def common_azimuth(directions: Sequence[Direction]) -> float | None:
     """Azimuth (rad) of the plane through e3 that holds all directions; None if there is none.
 
@@ -219,7 +163,7 @@ def _grading(case: Case, h: float, defect: Dimple | None, points: dict[str, NDAr
     growth = (0.5 if solid else 0.6) if indentation else 0.4
     if case.shell.geometry != "hemisphere":
         features: list[Feature] = []
-        largest = min(0.25, 0.5 * (case.shell.width or 1.0))
+        largest = min(0.25, 0.5 * (case.charted.width or 1.0))
     else:
         # the equator is far from a dent
         features = [Ring(pi / 2, ((2.0 if solid else 2.8) if indentation else 1.4) * length / refine, growth)]
@@ -303,11 +247,11 @@ def _count(case: Case, plan: Plan) -> tuple[int, int]:
     if plan.axisymmetric:
         return (count := len(meridian_vertices(plan, case.mesh.refinement)) - 1), 2 * (k * count + 1)
     try:
-        cells = triangulate(plan.shape, plan.size, plan.points, plan.embedding).cells
+        patch = plan.triangulated()
     except MeshError as e:
         raise CaseError(str(e)) from None
-    corners = len(np.unique(cells[:, :3]))
-    sides = corners + len(cells) - 1  # Euler's formula for a disc
+    cells, corners = patch.corners, len(np.unique(patch.corners))
+    sides = len(np.unique(np.sort(cells[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0))
     if case.model == "solid":  # three hexahedra a layer above each triangle
         layers = (case.solid or SolidSection()).layers
         return 3 * len(cells) * layers, 3 * (2 * layers + 1) * (corners + 3 * sides + 7 * len(cells))

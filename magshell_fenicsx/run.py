@@ -182,8 +182,10 @@ def _row(record: Record, number: int, values: dict[str, float], field_end: float
 
 
 def _line(row: Row) -> str:
+    factor = row.get("load_factor")
+    load = f"FR/2piD {row['force']:9.5f}" if factor is None else f"load factor {factor:9.5f}"
     return (
         f"{row['point']:4d} {row['label']:>11}  lambda_m {row['lambda_m']:+.4e}  p/pc {row['p_over_pc']:.6f}  "
-        f"FR/2piD {row['force']:9.5f}  w/h {row['w_over_h']:8.4f}  pole {row['w_pole_over_h']:8.4f}  "
+        f"{load}  w/h {row['w_over_h']:8.4f}  pole {row['w_pole_over_h']:8.4f}  "
         f"unstable {row['negative_pivots']}  it {row['iterations']}"
     )

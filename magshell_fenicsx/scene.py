@@ -9,13 +9,14 @@ from mpi4py import MPI
 from magshell_fenicsx.axisymmetric.meridian import make_meridian
 from magshell_fenicsx.axisymmetric.model import MeridianModel
 from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.shell import ShellSection
 from magshell_fenicsx.case.solid import SolidSection
 from magshell_fenicsx.mesh.hexahedra import sweep
 from magshell_fenicsx.mesh.midsurface import Midsurface, distribute
 from magshell_fenicsx.mesh.patch import MeshError, PatchMesh
-from magshell_fenicsx.mesh.triangulation import triangulate
 from magshell_fenicsx.plan import Plan, make_plan, meridian_vertices, neo_hookean
 from magshell_fenicsx.shell.model import ShellModel
+from magshell_fenicsx.shell.supports import refuse_loose
 from magshell_fenicsx.solid.model import SolidModel
 from magshell_fenicsx.solve.journal import Journal, NoJournal
 from magshell_fenicsx.solve.newton import BorderedNewton
@@ -52,6 +53,8 @@ class Scene:
             self.model = build_solid_model(case, self.plan, comm)
         else:
             self.model = build_model(case, self.plan, comm)
+            if not isinstance(case.shell, ShellSection):
+                refuse_loose(self.model.system, self.model.r0, self.unloaded().mu)
         self.newton = BorderedNewton(self.model.system)
         self.journal: Journal = NoJournal()
         self.setup_s = time.perf_counter() - start - self.model.kernels.seconds
@@ -81,7 +84,7 @@ class Scene:
             "lambda_m": sense * hypot(along, across) if across else along,
             "field_angle": degrees(atan2(sense * across, sense * along)) if across else 0.0,
             "force": state.mu.get("force", 0.0),
-            "w_over_h": model.loaded_deflection(state.u) / h if force else pole,
+            "w_over_h": model.loaded_deflection(state.u) / h if force or model.loads.dead else pole,
             "w_pole_over_h": pole,
             "w_point_over_h": model.deflection(state.u, force.point) / h if force else pole,
             "volume_change": model.volume_change(state.u),
@@ -92,13 +95,31 @@ class Scene:
             else nan,
             "magnetic": sum(energies[name] for name in ("magnetic", "magnetic gradient", "U1", "Uq", "Utau", "couple")),
             **{name: energies[name] for name in ("U1", "Uq", "Utau")},
+            **self._observe_points(state),
         }
+
+    @property
+    def extra_columns(self) -> tuple[str, ...]:
+        """What `observe` tells besides the columns of every run."""
+        named = tuple(f"{point}_u{axis}" for point in self.case.points for axis in "xyz")
+        return (*(["load_factor"] if self.plan.loads.dead else []), *named)
+
+    def _observe_points(self, state: State) -> dict[str, float]:
+        """The load factor, and the displacements of named points in the unit of the shell's lengths."""
+        found = {"load_factor": state.mu["load"]} if self.plan.loads.dead else {}
+        for point in self.case.points:
+            assert isinstance(self.model, ShellModel)
+            u = self.plan.length * self.model.displacement(state.u, point)
+            found |= {f"{point}_u{axis}": float(c) for axis, c in zip("xyz", u, strict=True)}
+        return found
 
 
 def build_model(case: Case, plan: Plan, comm: MPI.Comm) -> ShellModel:
     """The whole shell or half of it, on all ranks together."""
     surface = build_midsurface(plan, comm)
-    return ShellModel(surface, plan.material, case.mesh.degree, plan.conditions, plan.loads, case.mesh.penalty)
+    return ShellModel(
+        surface, plan.material, case.mesh.degree, plan.conditions, plan.loads, case.mesh.penalty, plan.thickness
+    )
 
 
 def build_meridian_model(case: Case, plan: Plan) -> MeridianModel:
@@ -124,7 +145,7 @@ def _triangulated(plan: Plan, comm: MPI.Comm) -> PatchMesh | None:
     patch, error = None, None
     if comm.rank == 0:
         try:
-            patch = triangulate(plan.shape, plan.size, plan.points, plan.embedding)
+            patch = plan.triangulated()
         except MeshError as e:
             error = e
     if error := comm.bcast(error):

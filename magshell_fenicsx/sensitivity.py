@@ -87,7 +87,7 @@ def _remanence_columns(scene: Scene, fold: Fold) -> dict[str, Vector]:
         return {}
     if not scene.case.shell.defect:
         return {"remanence": _magnetic_column(scene, fold, field)}
-    rim, one = scene.case.shell.dimple_half_width, np.ones(3)
+    rim, one = scene.case.charted.dimple_half_width, np.ones(3)
     patches = {"dimple": InsideAndOutside(rim, one, 0 * one), "rest": InsideAndOutside(rim, 0 * one, one)}
     return {
         f"remanence {name}": _magnetic_column(scene, fold, replace(field, remanent=_Within(field.remanent, patch)))

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from magshell_fenicsx.adapt.carry import carry
-from magshell_fenicsx.case.loading import IndentationSection, PathSection, PressureSection
+from magshell_fenicsx.case.loading import DeadSection, IndentationSection, PathSection, PressureSection
 from magshell_fenicsx.follow import Record, Stopped, follow
 from magshell_fenicsx.scene import Scene
 from magshell_fenicsx.solve.control import GivenConjugate, GivenLoad, Row
@@ -137,9 +137,10 @@ def _equilibrium(scene: Scene, guess: State, near: Ending) -> Ending | None:
 def _target(scene: Scene, record: Record) -> Ending:
     system, state, loading = scene.newton.system, record.point.state, scene.case.loading
     name = "lambda_across" if record.amplitude == "angle" else record.amplitude
-    given_load = not isinstance(loading, PressureSection | IndentationSection) or (
-        (loading.pressure if isinstance(loading, PressureSection) else loading.force) is not None
-    )
+    given = loading.pressure if isinstance(loading, PressureSection) else 0.0
+    if isinstance(loading, IndentationSection | DeadSection):
+        given = loading.force if isinstance(loading, IndentationSection) else loading.factor
+    given_load = given is not None
     held = None if given_load else -system.potential(state.u, name)
     return Ending("target", name, _value(system, state, name, held), state, record.point.du, held)
 

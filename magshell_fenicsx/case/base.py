@@ -1,6 +1,7 @@
 """What all sections of a case share: strict types, no unknown keys, numbers with units."""
 
 import re
+from collections.abc import Callable
 from functools import cache
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -35,19 +36,37 @@ def _quantity(unit: str) -> Any:
     def convert(value: Any) -> float:
         if not isinstance(value, str):
             raise ValueError(f'needs a unit, for example "{_EXAMPLES[unit]}"')
-        import pint
-
-        try:
-            if not _NUMBER_AND_UNITS.fullmatch(value):
-                raise ValueError(value)
-            quantity = _units().Quantity(value)
-            return float(quantity.to(unit).magnitude)
-        except pint.DimensionalityError as e:
-            raise ValueError(f"is not convertible to {unit}: it has the dimension {e.dim1}") from None
-        except Exception:  # pint raises many kinds for text that is no quantity
-            raise ValueError(f'is not a number with a unit such as "{_EXAMPLES[unit]}"') from None
+        return _converted(value, unit)
 
     return BeforeValidator(convert)
+
+
+def _converted(value: str, unit: str) -> float:
+    import pint
+
+    try:
+        if not _NUMBER_AND_UNITS.fullmatch(value):
+            raise ValueError(value)
+        quantity = _units().Quantity(value)
+        return float(quantity.to(unit).magnitude)
+    except pint.DimensionalityError as e:
+        raise ValueError(f"is not convertible to {unit}: it has the dimension {e.dim1}") from None
+    except Exception:  # pint raises many kinds for text that is no quantity
+        raise ValueError(f'is not a number with a unit such as "{_EXAMPLES[unit]}"') from None
+
+
+def in_units(unit: str, *, bare: bool = False) -> Callable[[Any], float]:
+    """A validator: text with a unit -> a float in `unit`; a number stays as it is.
+
+    With `bare`, the text is the unit alone, and is turned into its size.
+    """
+
+    def convert(value: Any) -> Any:
+        if isinstance(value, bool) or not isinstance(value, str):
+            return value
+        return _converted(f"1 {value}" if bare else value, unit)
+
+    return convert
 
 
 _EXAMPLES = {"metre": "25.2 mm", "pascal": "1.8 MPa", "tesla": "60 mT"}

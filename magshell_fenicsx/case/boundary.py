@@ -1,22 +1,49 @@
-"""Conditions on the named edges of a geometry."""
+"""Conditions on the named edges and points of a geometry."""
 
-from typing import Literal
+from typing import Annotated, Any, Literal, get_args
+
+from pydantic import BeforeValidator, Field, ValidationError
 
 from magshell_fenicsx.case.base import Section
 
 EDGES = {"hemisphere": ("equator",), "disc": ("rim",), "strip": ("root", "tip", "sides")}
-EdgeCondition = Literal["clamped", "simply supported", "free"]
+Axis = Literal["x", "y", "z"]
+EdgeCondition = Literal["clamped", "simply supported", "hinged", "symmetry", "free"]
+
+
+class HeldSection(Section):
+    """Some components of the displacement are zero; rotations are free."""
+
+    held: Annotated[list[Axis], Field(min_length=1, max_length=3)]
+
+    @property
+    def components(self) -> tuple[int, ...]:
+        return tuple(sorted({"xyz".index(axis) for axis in self.held}))
+
+
+def _condition(value: Any) -> Any:
+    """One message for a union."""
+    if isinstance(value, HeldSection) or (isinstance(value, str) and value in get_args(EdgeCondition)):
+        return value
+    if isinstance(value, dict) and set(value) == {"held"}:
+        try:
+            return HeldSection.model_validate(value)
+        except ValidationError:
+            pass
+    raise ValueError(f"must be {', '.join(get_args(EdgeCondition))}, or {{held: [x, y, z]}} with some of these")
 
 
 class BoundarySection(Section):
-    """Edges that are not named are free."""
+    """Edge or point -> condition; edges that are not named are free.
 
-    equator: EdgeCondition | None = None
-    rim: EdgeCondition | None = None
-    root: EdgeCondition | None = None
-    tip: EdgeCondition | None = None
-    sides: EdgeCondition | None = None
+    clamped: neither displacement nor rotation. hinged, or simply supported: no displacement. symmetry: a
+    mirror plane, which must be normal to e1, e2 or e3 (not on hemispheres, discs and strips: there
+    `symmetry: half`). held: some components of the displacement; a point of `points` can be held too.
+    """
 
-    def conditions(self) -> dict[str, EdgeCondition]:
-        """Named edge -> condition."""
-        return {name: condition for name, condition in self if condition is not None}
+    model_config = Section.model_config | {"extra": "allow"}
+    __pydantic_extra__: dict[str, Annotated[Any, BeforeValidator(_condition)]]
+
+    def conditions(self) -> dict[str, EdgeCondition | HeldSection]:
+        """Name -> condition."""
+        return dict(self.__pydantic_extra__ or {})

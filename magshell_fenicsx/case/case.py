@@ -2,19 +2,27 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, ValidationError, model_validator
 
 from magshell_fenicsx.case.base import Section
-from magshell_fenicsx.case.boundary import EDGES, BoundarySection
+from magshell_fenicsx.case.boundary import EDGES, BoundarySection, HeldSection
 from magshell_fenicsx.case.fields import MagneticSection
-from magshell_fenicsx.case.loading import FieldSection, IndentationSection, LoadingSection, PathSection, RotationSection
+from magshell_fenicsx.case.loading import (
+    DeadSection,
+    FieldSection,
+    IndentationSection,
+    LoadingSection,
+    PathSection,
+    RotationSection,
+)
 from magshell_fenicsx.case.messages import explain
 from magshell_fenicsx.case.shell import ShellSection
 from magshell_fenicsx.case.solid import SolidSection
 from magshell_fenicsx.case.source import CaseError, Source, override, read_source
 from magshell_fenicsx.case.stability import StabilitySection
+from magshell_fenicsx.case.surfaces import MeshSurface, Surface
 
 SOLID_DEGREE = 2
 
@@ -24,6 +32,7 @@ class MeshSection(Section):
 
     degree: int = Field(default=4, ge=2, le=5)
     refinement: float = Field(default=1.0, ge=0.1, le=20, description="divides every element size")
+    size: float | None = Field(default=None, gt=0, le=1e12, description="of elements, in the shell's lengths")
     penalty: float | None = Field(default=None, ge=1e-3, le=1e9, description="sigma of the interior penalty")
     tolerance: float | None = Field(default=None, ge=1e-6, le=0.1, description="relative, of the run's result")
 
@@ -34,13 +43,17 @@ class MeshSection(Section):
         return self
 
 
+Place = Annotated[list[float], Field(min_length=3, max_length=3)]
+
+
 class Case(Section):
     """A validated case file."""
 
     model: Literal["shell", "solid"] = "shell"
-    shell: ShellSection
+    shell: Annotated[ShellSection | Surface, Field(discriminator="geometry")]
     solid: SolidSection | None = None
     boundary: BoundarySection
+    points: dict[str, Place] = Field(default_factory=dict)
     magnetic: MagneticSection | None = None
     loading: LoadingSection | None = None
     mesh: MeshSection = MeshSection()
@@ -49,15 +62,6 @@ class Case(Section):
 
     @model_validator(mode="after")
     def _sections_fit(self) -> Self:
-        geometry, conditions = self.shell.geometry, self.boundary.conditions()
-        edges = EDGES[geometry]
-        for name in conditions:
-            if name not in edges:
-                raise ValueError(f"boundary.{name}: a {geometry} has no such edge, only {', '.join(edges)}")
-        if not any(conditions.get(name, "free") != "free" for name in edges):
-            raise ValueError(f"boundary.{edges[0]}: must be clamped or simply supported, else the shell is not held")
-        if self.magnetic and "dimple" in (self.magnetic.remanent.patches or {}) and self.shell.defect is None:
-            raise ValueError("magnetic.remanent.patches: the shell has no dimple")
         if self.magnetic and self.magnetic.lambda_m is None and self.shell.youngs_modulus is None:
             raise ValueError("shell.youngs_modulus is needed to turn flux densities into lambda_m")
         if isinstance(self.loading, FieldSection) and not self.lambda_m:
@@ -69,12 +73,65 @@ class Case(Section):
                 raise ValueError("loading.kind: rotation is of a uniform field, without gradient")
             if abs(self.magnetic.applied.vector() @ self.loading.to.vector()) > 1 - 1e-9:
                 raise ValueError("loading.to: must be neither parallel nor opposite to magnetic.applied")
+        if not isinstance(self.shell, ShellSection):
+            return self._any_surface(self.shell)
+        return self._charted(self.shell)
+
+    def _charted(self, shell: ShellSection) -> Self:
+        """Rules of hemispheres, discs and strips."""
+        geometry, conditions = shell.geometry, self.boundary.conditions()
+        edges = EDGES[geometry]
+        if self.points:
+            raise ValueError(f"points: are named on other geometries, not on a {geometry}")
+        if isinstance(self.loading, DeadSection):
+            raise ValueError(f"loading.kind: 'dead': not on a {geometry}; a plate or cap of the same shape takes it")
+        for name in conditions:
+            if name not in edges:
+                raise ValueError(f"boundary.{name}: a {geometry} has no such edge, only {', '.join(edges)}")
+        if not any(conditions.get(name, "free") != "free" for name in edges):
+            raise ValueError(f"boundary.{edges[0]}: must be clamped or simply supported, else the shell is not held")
+        for name, condition in conditions.items():
+            if condition == "symmetry" or isinstance(condition, HeldSection):
+                raise ValueError(f"boundary.{name}: a {geometry} is clamped, hinged (simply supported) or free there")
+        patches = self.magnetic.remanent.patches if self.magnetic else None
+        if patches is not None:
+            if unknown := set(patches) - {"dimple", "rest"}:
+                raise ValueError(f"magnetic.remanent.patches: {min(unknown)}: a {geometry} has only dimple and rest")
+            if "rest" not in patches:
+                raise ValueError("magnetic.remanent: patches needs the patch rest")
+            if "dimple" in patches and shell.defect is None:
+                raise ValueError("magnetic.remanent.patches: the shell has no dimple")
         if isinstance(self.loading, IndentationSection):
             polar = self.loading.at.polar
             if geometry != "hemisphere" and polar:
                 raise ValueError(f"loading.at.polar: a {geometry} is loaded at its centre or tip, polar: 0")
             if not 0 <= polar < 89:
                 raise ValueError(f"loading.at.polar: {polar:g} is not on the shell: allowed 0 to 89")
+        return self
+
+    def _any_surface(self, shell: Surface) -> Self:
+        """Rules of the other geometries."""
+        if isinstance(self.loading, IndentationSection):
+            raise ValueError(
+                f"loading.kind: 'indentation': not on a {shell.geometry}; kind: dead takes forces at points"
+            )
+        if self.symmetry not in ("auto", "none"):
+            raise ValueError(
+                f"symmetry: {self.symmetry}: not with a {shell.geometry}; give the edges of the part that is modelled "
+                "boundary: {name: symmetry}"
+            )
+        if self.mesh.tolerance is not None:
+            raise ValueError(f"mesh.tolerance: not with a {shell.geometry}; give degree, size and refinement")
+        if self.magnetic and self.magnetic.remanent.patches is not None and not isinstance(shell, MeshSurface):
+            raise ValueError("magnetic.remanent.kind: 'patches': have names only with geometry: mesh")
+        if isinstance(self.loading, PathSection) and self.loading.sensitivities:
+            raise ValueError(f"loading.sensitivities: not with a {shell.geometry}")
+        if isinstance(self.loading, DeadSection):
+            if shell.youngs_modulus is None:
+                raise ValueError("shell.youngs_modulus is needed for loads of kind: dead")
+            for load in self.loading.loads:
+                if load.at is not None and load.at not in self.points:
+                    raise ValueError(f"loading.loads: at: {load.at}: name it in points, with its place")
         return self
 
     @model_validator(mode="after")
@@ -84,6 +141,8 @@ class Case(Section):
                 raise ValueError("solid belongs to model: solid")
             return self
         magnetic, loading = self.magnetic, self.loading
+        if not isinstance(self.shell, ShellSection) or self.points:
+            raise ValueError("model: solid: of a hemisphere, disc or strip without named points")
         if magnetic and magnetic.energy != "full":
             raise ValueError(f"magnetic.energy: {magnetic.energy}: is of a shell; a solid has the full energy")
         if magnetic and magnetic.remanent.kind != "uniform":
@@ -113,6 +172,12 @@ class Case(Section):
         return self.mesh.degree if self.model == "shell" else SOLID_DEGREE
 
     @property
+    def charted(self) -> ShellSection:
+        """The shell, where it is a hemisphere, disc or strip."""
+        assert isinstance(self.shell, ShellSection)
+        return self.shell
+
+    @property
     def lambda_m(self) -> float:
         """|Br||Ba|/(mu_0 E); 0 without a field."""
         return self.magnetic.amplitude(self.shell.youngs_modulus) if self.magnetic else 0.0
@@ -129,6 +194,7 @@ class Case(Section):
         source = read_source(Path(file))
         for setting in settings:
             override(source, setting)
+        _beside(Path(file).parent, source.data)
         return cls.from_source(source)
 
     @classmethod
@@ -138,3 +204,10 @@ class Case(Section):
             return cls.model_validate(source.data)
         except ValidationError as e:
             raise CaseError("\n".join(explain(error, source, cls) for error in e.errors())) from None
+
+
+def _beside(folder: Path, data: Any) -> None:
+    """A mesh file is told from where the case file is."""
+    shell = data.get("shell")
+    if isinstance(shell, dict) and isinstance(shell.get("file"), str):
+        shell["file"] = str(folder.absolute() / shell["file"])

@@ -44,13 +44,13 @@ class RemanentSection(Direction):
 
     radial: along the normal. tangential: along the meridians, away from e3. expression: components as
     formulas of the undeformed position x, y, z over R. patches: a direction per named patch, "dimple"
-    (within its rim) and "rest". layers: averaged over the thickness.
+    (within its rim) of a hemisphere, those of a mesh, and "rest". layers: averaged over the thickness.
     """
 
     kind: Literal["uniform", "radial", "tangential", "expression", "patches", "layers"] = "uniform"
     flux_density: FluxDensity | None = Field(default=None, ge=-1e3, le=1e3)
     components: list[Formula] | None = Field(default=None, min_length=3, max_length=3)
-    patches: dict[Literal["dimple", "rest"], Direction] | None = None
+    patches: dict[str, Direction] | None = None
     layers: list[Layer] | None = Field(default=None, min_length=1)
 
     @model_validator(mode="after")
@@ -61,8 +61,6 @@ class RemanentSection(Direction):
                 raise ValueError(f"{key} belongs to kind: {kind}, and must be given there; the kind is {self.kind}")
         if self.kind != "uniform" and {"polar", "azimuth"} & self.model_fields_set:
             raise ValueError(f"polar and azimuth belong to kind: uniform; the kind is {self.kind}")
-        if self.patches is not None and "rest" not in self.patches:
-            raise ValueError("patches needs the patch rest")
         if self.layers:
             if abs(sum(layer.fraction for layer in self.layers) - 1) > 1e-6:
                 raise ValueError("the fractions of the layers must add up to 1")

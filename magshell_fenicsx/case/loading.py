@@ -10,6 +10,7 @@ from magshell_fenicsx.case.fields import Direction
 
 Until = Literal["limit", "bifurcation", "target", "points"]
 LEAST_TARGET = 1e-9
+Vector = Annotated[list[Annotated[float, Field(ge=-1e30, le=1e30)]], Field(min_length=3, max_length=3)]
 Wanted = Mapping[str, tuple[str, ...]]  # control -> the targets that it can have
 
 
@@ -82,6 +83,67 @@ class IndentationSection(PathSection):
         return self
 
 
+class DeadLoadSection(Section):
+    """One load, at a point of `points`, on an edge, or over the surface, in the units of the shell's numbers.
+
+    On an edge: `force` in all, `per_length`, or `moment` per length about the edge's first tangent, which turns
+    with the edge. Over the surface (`over: all`, or a patch of a mesh): `per_area`, or `pressure` along the
+    undeformed normal, positive from outside.
+    """
+
+    at: str | None = None
+    edge: str | None = None
+    over: str | None = None
+    force: Vector | None = None
+    per_length: Vector | None = None
+    moment: float | None = Field(default=None, ge=-1e30, le=1e30)
+    per_area: Vector | None = None
+    pressure: float | None = Field(default=None, ge=-1e30, le=1e30)
+
+    @model_validator(mode="after")
+    def _one_load_in_one_place(self) -> Self:
+        fitting = {"at": ("force",), "edge": ("force", "per_length", "moment"), "over": ("per_area", "pressure")}
+        places = [place for place in fitting if getattr(self, place) is not None]
+        if len(places) != 1:
+            raise ValueError(
+                "a load is at a point, on an edge, or on a part of the surface: give one of at, edge, over"
+            )
+        quantities = {key for keys in fitting.values() for key in keys}
+        given = sorted(key for key in quantities if getattr(self, key) is not None)
+        if len(given) != 1 or given[0] not in fitting[places[0]]:
+            raise ValueError(f"with {places[0]} goes one of {', '.join(fitting[places[0]])}")
+        value = getattr(self, given[0])
+        if not (any(value) if isinstance(value, list) else value):
+            raise ValueError(f"{given[0]}: is zero")
+        return self
+
+
+class DeadSection(PathSection):
+    """Loads that grow together, by a common factor; not on hemispheres, discs and strips.
+
+    A target is the `factor`, or the `displacement` of the loads along themselves (their work over the sum of
+    their sizes) in the units of the shell's lengths.
+    """
+
+    kind: Literal["dead"]
+    loads: list[DeadLoadSection] = Field(min_length=1, max_length=1000)
+    control: Literal["load", "displacement", "arc"] = "arc"
+    until: Until = "target"
+    factor: float | None = Field(default=None, ge=-1e9, le=1e9)
+    displacement: float | None = Field(default=None, ge=-1e9, le=1e9)
+    points: int = Field(default=20, ge=1, le=10000)
+
+    @model_validator(mode="after")
+    def _target_fits_control(self) -> Self:
+        wanted = {"load": ("factor",), "displacement": ("displacement",), "arc": ("factor", "displacement")}
+        self._check(self.control, self.until, {"factor": self.factor, "displacement": self.displacement}, wanted)
+        if any(load.moment is not None for load in self.loads) and (
+            self.control == "displacement" or self.displacement is not None
+        ):
+            raise ValueError("displacement: a moment has none; take control: arc or load with factor")
+        return self
+
+
 class FieldSection(PathSection):
     """The field itself is the load: lambda_m from zero, with its instabilities located.
 
@@ -112,5 +174,5 @@ class RotationSection(Section):
 
 
 LoadingSection = Annotated[
-    PressureSection | IndentationSection | FieldSection | RotationSection, Field(discriminator="kind")
+    PressureSection | IndentationSection | FieldSection | RotationSection | DeadSection, Field(discriminator="kind")
 ]

@@ -25,10 +25,11 @@ def explain(error: Any, source: Source, case: type[BaseModel]) -> str:
     if kind == "missing":
         return f"{place}: {key}: is missing"
     if kind.startswith("union_tag"):
-        tags = [_tag(m) for m in _models(case.model_fields[key].annotation)]
-        tag = error["ctx"].get("tag")
-        return f"{place}: {key}.kind: {'is missing' if tag is None else shown(tag)}; allowed: {', '.join(tags)}"
-    if kind == "model_type":
+        models = _models(case.model_fields[key].annotation)
+        tag, tags = error["ctx"].get("tag"), [tag for m in models for tag in _tags(m)]
+        said = "is missing" if tag is None else shown(tag)
+        return f"{place}: {key}.{_tag_key(models)}: {said}; allowed: {', '.join(tags)}"
+    if kind in ("model_type", "model_attributes_type"):
         return f"{place}: {key}: {shown(value)}: must be a section, with keys below it"
     if isinstance(value, dict | BaseModel):
         return f"{place}: {key}: {said}"
@@ -57,7 +58,7 @@ def _allowed_keys(location: Location, data: Any, case: type[BaseModel]) -> list[
         data = data[key]
         if key in model.model_fields:  # else it is one of a list or mapping of sections
             models = _models(model.model_fields[str(key)].annotation)
-            model = next((m for m in models if len(models) > 1 and data["kind"] == _tag(m)), models[0])
+            model = next((m for m in models if len(models) > 1 and data[_tag_key(models)] in _tags(m)), models[0])
     return list(model.model_fields)
 
 
@@ -68,6 +69,11 @@ def _models(annotation: Any) -> list[type[BaseModel]]:
     return [model for part in get_args(annotation) for model in _models(part)]
 
 
-def _tag(model: type[BaseModel]) -> str:
-    """The value of `kind` that selects a section class."""
-    return str(get_args(model.model_fields["kind"].annotation)[0])
+def _tag_key(models: list[type[BaseModel]]) -> str:
+    """The key that selects one of several section classes."""
+    return next(key for key in ("kind", "geometry") if all(key in m.model_fields for m in models))
+
+
+def _tags(model: type[BaseModel]) -> list[str]:
+    """The values of that key that select a section class."""
+    return [str(tag) for tag in get_args(model.model_fields[_tag_key([model])].annotation)]

@@ -6,6 +6,7 @@ the nodes of the displacement's own element, so that rigid motions are exact.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import basix
 import basix.ufl
@@ -16,6 +17,8 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from magshell_fenicsx.mesh.patch import MeshError, PatchMesh, check_orientation
+
+ORDERS = {3: 1, 6: 2, 10: 3}  # nodes of a triangle -> its order
 
 
 @dataclass(frozen=True)
@@ -39,17 +42,15 @@ class Midsurface:
 
     def placement(self, V: fem.FunctionSpace) -> fem.Function:
         """The undeformed placement r0 in the Lagrange space `V` (vector valued)."""
-        patch, tdim = self._patch, self.mesh.topology.dim
-        order = {3: 1, 6: 2, 10: 3}[patch.cells.shape[1]]
+        patch = self._patch
+        order = ORDERS[patch.cells.shape[1]]
         geometry = basix.create_element(
             basix.ElementFamily.P, basix.CellType.triangle, order, basix.LagrangeVariant.equispaced
         )
         to_dolfinx = gmshio.cell_perm_array(mesh.CellType.triangle, patch.cells.shape[1])
         nodes = np.asarray(V.element.interpolation_points())
         values = geometry.tabulate(0, nodes)[0, :, :, 0]
-        cell_map = self.mesh.topology.index_map(tdim)
-        local = self.mesh.topology.original_cell_index[: cell_map.size_local + cell_map.num_ghosts]
-        cells = patch.cells[local]
+        cells = patch.cells[self._original_cells]
         chart = np.einsum("qk,ckd->cqd", values, patch.nodes[cells[:, to_dolfinx]])
         r0 = fem.Function(V, name="r0")
         r0.x.array.reshape(-1, 3)[V.dofmap.list] = patch.embedding(chart.reshape(-1, chart.shape[-1])).reshape(
@@ -57,6 +58,22 @@ class Midsurface:
         )
         r0.x.scatter_forward()
         return r0
+
+    @property
+    def read(self) -> bool:
+        """Whether it was meshed elsewhere, and may be faceted or folded."""
+        return self._patch.nodes.shape[1] == 3
+
+    @cached_property
+    def patches(self) -> dict[str, NDArray[np.bool_]]:
+        """Name -> whether each cell of this rank, ghosts included, belongs to that part of the surface."""
+        return {name: inside[self._original_cells] for name, inside in self._patch.patches.items()}
+
+    @property
+    def _original_cells(self) -> NDArray[np.int64]:
+        """This rank's cells, ghosts included, in the numbers of the triangulation."""
+        cell_map = self.mesh.topology.index_map(self.mesh.topology.dim)
+        return np.asarray(self.mesh.topology.original_cell_index[: cell_map.size_local + cell_map.num_ghosts])
 
 
 def distribute(patch: PatchMesh | None, comm: MPI.Comm) -> Midsurface:
@@ -79,7 +96,7 @@ def distribute(patch: PatchMesh | None, comm: MPI.Comm) -> Midsurface:
         raise error
     patch = comm.bcast(patch)  # the chart of a surface is small; each rank picks its own cells
     assert patch is not None
-    vertices, corners = np.unique(patch.cells[:, :3], return_inverse=True)
+    vertices, corners = np.unique(patch.corners, return_inverse=True)
     corners = corners.reshape(-1, 3).astype(np.int64)
     xyz = patch.embedding(patch.nodes[vertices])
     first = comm.rank == 0

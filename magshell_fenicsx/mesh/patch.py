@@ -25,6 +25,11 @@ class PatchMesh:
         Name -> (e, 2) vertex pairs of that boundary edge.
     points
         Name -> (d,) coordinates of a vertex of the mesh.
+    one
+        (n,) the node that each is glued to (itself where it is not): the two have one place in space
+        and are one vertex; `edges` are told in these numbers. None where nothing is glued.
+    patches
+        Name -> (m,) whether each triangle belongs to that part of the surface.
     """
 
     nodes: NDArray[np.float64]
@@ -32,6 +37,14 @@ class PatchMesh:
     embedding: Embedding
     edges: dict[str, NDArray[np.int64]] = field(default_factory=dict)
     points: dict[str, NDArray[np.float64]] = field(default_factory=dict)
+    one: NDArray[np.int64] | None = None
+    patches: dict[str, NDArray[np.bool_]] = field(default_factory=dict)
+
+    @property
+    def corners(self) -> NDArray[np.int64]:
+        """(m, 3) vertices of the triangles, glued ones under one number."""
+        corners = self.cells[:, :3]
+        return corners if self.one is None else self.one[corners]
 
 
 class MeshError(ValueError):
@@ -47,7 +60,7 @@ def check_orientation(patch: PatchMesh) -> None:
         If two neighbours run through their common edge in the same direction, or
         if more than two triangles share an edge.
     """
-    corners = patch.cells[:, :3]
+    corners = patch.corners
     directed = np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])
     same_way, times = np.unique(directed, axis=0, return_counts=True)
     if (times > 1).any():

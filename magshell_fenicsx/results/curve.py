@@ -12,6 +12,7 @@ from magshell_fenicsx.results.table import OWN_MODES, Row
 
 AXES = {
     "force": ("w_over_h", "force", r"displacement at the load  $w/h$", r"force  $FR/(2\pi D)$"),
+    "load": ("w_over_h", "load_factor", r"displacement along the loads  $w/h$", "load factor"),
     "pressure": ("volume_change", "p_over_pc", r"change of volume  $-\Delta V/R^3$", r"pressure  $p/p_\mathrm{c}$"),
     "angle": ("field_angle", "w_pole_over_h", "angle of the field  (degrees)", r"displacement of the pole  $w/h$"),
     "lambda_m": ("w_pole_over_h", "lambda_m", r"displacement of the pole  $w/h$", r"field  $\lambda_\mathrm{m}$"),
@@ -21,7 +22,7 @@ LOCATED = ("fold", "bifurcation")
 FINE = 16  # drawn pieces between two points
 
 
-def _smooth(x: Sequence[float], y: Sequence[float]) -> NDArray[np.float64]:
+def smooth(x: Sequence[float], y: Sequence[float]) -> NDArray[np.float64]:
     """A smooth curve through the points, without overshoot, along their scaled chord: (2, FINE (n - 1) + 1)."""
     xy = np.array([x, y])
     scale = np.ptp(xy, axis=1)
@@ -54,7 +55,7 @@ def draw_curve(rows: Sequence[Row], amplitude: str, title: str) -> bytes:
     axes = figure.subplots()
     for branch in sorted({int(row["branch"]) for row in part}):
         line = [row for row in part if row["branch"] == branch and row["mode"] in OWN_MODES]
-        smooth_x, smooth_y = _smooth(*zip(*map(place, line), strict=True))
+        smooth_x, smooth_y = smooth(*zip(*map(place, line), strict=True))
         unstable = [int(row["negative_pivots"]) > 0 and row["label"] not in LOCATED for row in line]
         for dashed, pieces in groupby(range(1, len(line)), key=unstable.__getitem__):
             i, *others = pieces

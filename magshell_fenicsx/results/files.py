@@ -124,7 +124,7 @@ class RunFiles:
         return self._comm.rank == 0
 
     def _open(self) -> None:
-        self._table = PathTable(self._folder / "path.csv")
+        self._table = PathTable(self._folder / "path.csv", self._scene.extra_columns)
         self._fields = FieldSeries(self._folder / "fields")
         sync_folder(self._folder)
 

@@ -11,7 +11,13 @@ from magshell_fenicsx.scene import Scene
 from magshell_fenicsx.solve.system import State
 from magshell_fenicsx.solve.timing import Stopwatch
 
-VALUE_COLUMN = {"pressure": "p_over_pc", "force": "force", "lambda_m": "lambda_m", "angle": "field_angle"}
+VALUE_COLUMN = {
+    "pressure": "p_over_pc",
+    "force": "force",
+    "load": "load_factor",
+    "lambda_m": "lambda_m",
+    "angle": "field_angle",
+}
 
 
 @dataclass

@@ -2,7 +2,7 @@
 
 import csv
 import io
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -43,22 +43,28 @@ OWN_MODES = ("", "symmetric", "asymmetric")  # of an instability within the mode
 class PathTable:
     """Writes rows as they come, after those of an interrupted run.
 
+    Parameters
+    ----------
+    extra
+        Columns besides those of every run.
+
     Attributes
     ----------
     kept
         The whole rows that the file had; what comes after them, torn by a kill, is cut off.
     """
 
-    def __init__(self, file: Path) -> None:
+    def __init__(self, file: Path, extra: Sequence[str] = ()) -> None:
+        self._columns = (*COLUMNS, *extra)
         lines = file.read_bytes().decode().splitlines(keepends=True) if file.exists() else []
         self.kept: list[dict[str, str]] = []
-        header = _line(COLUMNS)
+        header = _line(self._columns)
         length = len(header) if lines[:1] == [header] else 0
         for line in lines[1:] if length else []:
             values = next(csv.reader([line]))
-            if not line.endswith("\n") or values[0] != str(len(self.kept)) or len(values) != len(COLUMNS):
+            if not line.endswith("\n") or values[0] != str(len(self.kept)) or len(values) != len(self._columns):
                 break
-            self.kept.append(dict(zip(COLUMNS, values, strict=True)))
+            self.kept.append(dict(zip(self._columns, values, strict=True)))
             length += len(line.encode())
         self._file = AppendedFile(file, length)
         if not length:
@@ -73,7 +79,9 @@ class PathTable:
             If the disk is full; the file ends with a whole row then.
         """
         if int(row["point"]) >= len(self.kept):
-            self._file.append(_line(repr(v) if isinstance(v := row[key], float) else v for key in COLUMNS).encode())
+            self._file.append(
+                _line(repr(v) if isinstance(v := row[key], float) else v for key in self._columns).encode()
+            )
 
     def close(self) -> None:
         self._file.close()

@@ -30,8 +30,25 @@ def fold_jump(plus: Jet, minus: Jet, nu_plus: tuple[Expr, Expr], nu_minus: tuple
     return -ufl.dot(kin.normal(minus) - kin.normal(plus), r_nu)
 
 
-def interior(r0: Sides, u: Sides, m: tuple[Expr, Expr], width: Expr, nu: Expr, h: Expr, sigma: Expr) -> Expr:
-    """Energy of an interior edge per length of its parameter.
+def fold_angle(plus: Jet, minus: Jet, m_plus: Expr) -> tuple[Expr, Expr]:
+    """Sine and cosine of the angle between the normals about the edge; its sign is that of `fold_jump`."""
+    along = kin.unit(plus.r2 * m_plus[0] - plus.r1 * m_plus[1])
+    n_plus, n_minus = kin.normal(plus), kin.normal(minus)
+    return -ufl.dot(ufl.cross(n_plus, n_minus), along), ufl.dot(n_plus, n_minus)
+
+
+def two_sided(
+    J: Expr,
+    r0: Sides,
+    u: Sides,
+    m: tuple[Expr, Expr],
+    width: Expr,
+    nu: Expr,
+    h: Expr,
+    sigma: Expr,
+    t: tuple[Expr, Expr] | None,
+) -> Expr:
+    """Energy of an interior edge with that jump per length of its parameter.
 
     Parameters
     ----------
@@ -41,13 +58,65 @@ def interior(r0: Sides, u: Sides, m: tuple[Expr, Expr], width: Expr, nu: Expr, h
         Covectors of the edge on both sides; see `kinematics.conormal`.
     width
         h_e: half the height of the flat triangles over the edge, averaged.
+    t
+        What multiplies the thickness h on both sides, each (1,); None for 1.
     """
     conormals = [kin.conormal(j, covector) for j, covector in zip(r0, m, strict=True)]
-    nus = [(nu1, nu2) for nu1, nu2, _ in conormals]
-    M = sum(densities.normal_moment(r0[i], u[i], *nus[i], nu, h) for i in range(2)) / 2
-    J = fold_jump(r0[0] + u[0], r0[1] + u[1], *nus) - fold_jump(*r0, *nus)
     stretch = (conormals[0][2] + conormals[1][2]) / 2
-    return edge_density(M, J, width, nu, h, sigma) * stretch
+    if t is None:
+        M = sum(densities.normal_moment(r0[i], u[i], *conormals[i][:2], nu, h) for i in range(2)) / 2
+        return edge_density(M, J, width, nu, h, sigma) * stretch
+    M = sum(t[i][0] * densities.normal_moment(r0[i], u[i], *conormals[i][:2], nu, t[i][0] * h) for i in range(2)) / 2
+    D = sum(t[i][0] * densities.bending_stiffness(t[i][0] * h, nu) for i in range(2)) / 2
+    return (M * J + sigma * D / (2 * width) * J**2) * stretch
+
+
+def interior(
+    r0: Sides,
+    u: Sides,
+    m: tuple[Expr, Expr],
+    width: Expr,
+    nu: Expr,
+    h: Expr,
+    sigma: Expr,
+    t: tuple[Expr, Expr] | None = None,
+) -> Expr:
+    """Energy of an interior edge between cells that meet smoothly, or nearly so; see `two_sided`."""
+    nus = [kin.conormal(j, covector)[:2] for j, covector in zip(r0, m, strict=True)]
+    J = fold_jump(r0[0] + u[0], r0[1] + u[1], *nus) - fold_jump(*r0, *nus)
+    return two_sided(J, r0, u, m, width, nu, h, sigma, t)
+
+
+def folded(
+    r0: Sides,
+    u: Sides,
+    m: tuple[Expr, Expr],
+    width: Expr,
+    nu: Expr,
+    h: Expr,
+    sigma: Expr,
+    t: tuple[Expr, Expr] | None = None,
+) -> Expr:
+    """The same across a fold of the undeformed surface: the jump is the change of the angle, whatever its size."""
+    sine0, cosine0 = fold_angle(*r0, m[0])
+    sine, cosine = fold_angle(r0[0] + u[0], r0[1] + u[1], m[0])
+    J = ufl.atan2(sine * cosine0 - cosine * sine0, cosine * cosine0 + sine * sine0)
+    return two_sided(J, r0, u, m, width, nu, h, sigma, t)
+
+
+def turning(r0: Jet, u: Jet, m: Expr, width: Expr, intensity: Expr, past: Expr) -> Expr:
+    """-Pi of a moment per length about the edge's first tangent: intensity times the angle of the normal.
+
+    The tangent runs with the surface on its left, so that a positive angle turns the normal outward. The
+    angle is that of the normal's part normal to the tangent; `past` (2,) holds cosine and sine of the turn
+    that it is told from, so that it may grow beyond pi.
+    """
+    along = r0.r2 * m[0] - r0.r1 * m[1]
+    length = ufl.sqrt(ufl.dot(along, along))
+    t0, n0, n = along / length, kin.normal(r0), kin.normal(r0 + u)
+    sine, cosine = ufl.dot(ufl.cross(n0, n), t0), ufl.dot(n0, n)
+    angle = ufl.atan2(sine * past[0] - cosine * past[1], cosine * past[0] + sine * past[1])
+    return -intensity * angle * length
 
 
 def clamped(r0: Jet, u: Jet, m: Expr, width: Expr, nu: Expr, h: Expr, sigma: Expr) -> Expr:

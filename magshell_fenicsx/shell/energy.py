@@ -36,7 +36,7 @@ class Density:
         (r0, u, m, width, *parameters), see `edges`; on interior edges the same with pairs of
         jets and covectors.
     parameters
-        Numbers, or fields that vary over the surface.
+        Numbers, or fields that vary over the surface; `of` takes a field on interior edges as a pair.
     parts
         The parts of the displacement's jet that it depends on.
     linear
@@ -73,11 +73,19 @@ class Density:
         edge
             The covector on every side and the width; None on cells.
         parameters
-            In place of its own.
+            In place of its own; where there are two sides, a vector that varies holds both, one after the other.
         """
         arguments = [*jets, *(edge[:1] if edge else ())]
         sided = [tuple(each) if self.sides == 2 else each[0] for each in arguments]
-        return self.of(*sided, *(edge[1:] if edge else ()), *parameters)
+        fields = [_halves(p) if self.sides == 2 and isinstance(p, fem.Function) else p for p in parameters]
+        return self.of(*sided, *(edge[1:] if edge else ()), *fields)
+
+
+def _halves(field: fem.Function) -> tuple[Expr, Expr]:
+    """A vector of the one side of an edge and then of the other, as two."""
+    size = field.ufl_shape[0] // 2
+    first, second = (ufl.as_vector([field[side * size + c] for c in range(size)]) for side in range(2))
+    return first, second
 
 
 def per_area(density: Callable[..., Expr]) -> Callable[..., Expr]:

@@ -5,6 +5,7 @@ F R/(2 pi D), "lambda_m" is lambda_m.
 """
 
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -12,12 +13,27 @@ from dolfinx import fem
 from numpy.typing import NDArray
 
 from magshell_fenicsx.mesh.midsurface import Midsurface
+from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.shell.antisymmetric import AntisymmetricModes, held_against_mirror
+from magshell_fenicsx.shell.dead_load import assemble_dead_loads
 from magshell_fenicsx.shell.fast_tangent import FastTangent, make_sites
-from magshell_fenicsx.shell.parameters import MIRROR_NORMAL, Condition, Force, Loads, Material, default_penalty
+from magshell_fenicsx.shell.folds import FOLD, largest_fold
+from magshell_fenicsx.shell.parameters import (
+    MIRROR_NORMAL,
+    Condition,
+    EdgeMoment,
+    Force,
+    Held,
+    Loads,
+    Material,
+    default_penalty,
+)
+from magshell_fenicsx.shell.patterns import by_patch
 from magshell_fenicsx.shell.point_load import patch_entries, point_entries, vertex_normal
 from magshell_fenicsx.shell.residual import FastResidual
+from magshell_fenicsx.shell.supports import held_at_vertex, held_on_facets, plane_of
 from magshell_fenicsx.shell.terms import TermFactory
+from magshell_fenicsx.shell.thickness import Thickness, thickness_field
 from magshell_fenicsx.solve.kernels import KernelLog
 from magshell_fenicsx.solve.problem import FiniteElementSystem
 from magshell_fenicsx.solve.system import Vector
@@ -34,9 +50,16 @@ class ShellModel:
     degree
         Of displacement and placement, 2 to 5.
     conditions
-        Edge name -> condition; edges that are not named are free.
+        Edge name -> condition; edges that are not named are free. A vertex can be held too.
     sigma
         Penalty of the C0 interior penalty form; None takes `default_penalty`.
+    thickness
+        What multiplies the thickness; None for 1.
+
+    Raises
+    ------
+    MeshError
+        On every rank, if the surface has no such edge, point or patch, or an edge lies in no plane of symmetry.
 
     Attributes
     ----------
@@ -46,6 +69,8 @@ class ShellModel:
         2 for a half model, whose integrals and forces are those of one half; else 1.
     kernels
         Names and compile time of the forms in use.
+    load_size
+        The sum of the sizes of the dead loads, over E h R; see `DeadLoads`.
     """
 
     def __init__(
@@ -56,15 +81,21 @@ class ShellModel:
         conditions: Mapping[str, Condition],
         loads: Loads,
         sigma: float | None = None,
+        thickness: Thickness | None = None,
     ) -> None:
+        _refuse_unknown(midsurface, conditions, loads)
+        if loads.magnetic and loads.magnetic.patches:
+            remanent = by_patch(loads.magnetic.patches, midsurface.patches)
+            loads = replace(loads, magnetic=replace(loads.magnetic, remanent=remanent))
         self.midsurface, self.material, self.degree, self.loads = midsurface, material, degree, loads
         self.multiplicity = 2 if "symmetry" in conditions.values() else 1
         self.kernels = KernelLog()
         self.V = V = fem.functionspace(midsurface.mesh, ("Lagrange", degree, (3,)))
         self.r0, self.u = midsurface.placement(V), fem.Function(V, name="u")
         self.sigma = default_penalty(degree) if sigma is None else sigma
-        factory = TermFactory(self.r0, self.u, material, self.sigma, degree, self.kernels)
-        interior = factory.interior_edges()
+        factor = thickness_field(thickness, self.r0, midsurface) if thickness else None
+        factory = TermFactory(self.r0, self.u, material, self.sigma, degree, self.kernels, factor)
+        interior = factory.interior_edges(folded=midsurface.read and largest_fold(self.r0, degree) > FOLD)
         terms: list[Term] = [factory.membrane(), factory.bending(), interior]
         held, mirror = [], []
 
@@ -80,6 +111,15 @@ class ShellModel:
         if "symmetry" in conditions.values():
             terms.append(factory.mirror_edges(facets("symmetry")))
             mirror.append(_held_in_mirror(V, facets("symmetry")))
+        for name, condition in conditions.items():
+            if isinstance(condition, Held) and name in midsurface.edges:
+                held += held_on_facets(V, midsurface.edges[name], condition.components)
+            elif isinstance(condition, Held):
+                held += held_at_vertex(V, midsurface.points[name], condition.components)
+            elif condition == "plane":
+                axis = plane_of(V, self.r0, midsurface.edges[name], name)
+                terms.append(factory.mirror_edges(midsurface.edges[name], np.eye(3)[axis], f"mirror edges {name}"))
+                held += held_on_facets(V, midsurface.edges[name], (axis,))
         if loads.magnetic:
             terms += factory.magnetic(loads.magnetic)
         if loads.pressure:
@@ -87,6 +127,16 @@ class ShellModel:
         self.normals = {name: vertex_normal(self.r0, x) for name, x in midsurface.points.items()}
         if loads.force:
             terms.append(self._force(loads.force))
+        self.load_size = 0.0
+        if loads.dead:
+            dead = assemble_dead_loads(loads.dead, self.r0, midsurface, degree, self.kernels)
+            self.load_size = dead.size
+            terms.append(LinearTerm("load", *dead.entries, self.u, "load"))
+            moments = [load for load in loads.dead if isinstance(load, EdgeMoment)]
+            terms += [
+                factory.edge_moment(f"moment {load.edge} {i}", midsurface.edges[load.edge], load.moment)
+                for i, load in enumerate(moments)
+            ]
         self._sites = make_sites(self.r0, degree, terms, self.kernels)
         fast = FastTangent(self.u, self._sites, held + mirror)
         gradients = FastResidual(self.r0, self.u, degree, terms, self.kernels)
@@ -130,7 +180,10 @@ class ShellModel:
         return np.asarray(self.system.comm.allreduce(here))
 
     def loaded_deflection(self, u: Vector) -> float:
-        """w/R conjugate to the force: at its point, or averaged over its patch."""
+        """w/R conjugate to the force: at its point, or averaged over its patch; of dead loads along themselves."""
+        if self.loads.dead:
+            work = -sum(v for name, v in self.system.energies(u).items() if name == "load")
+            return work / self.load_size if self.load_size else 0.0
         return -self.system.potential(u, "force") / self.force_unit
 
     @property
@@ -145,6 +198,19 @@ class ShellModel:
         else:
             entries = point_entries(self.V, x, inward)
         return LinearTerm("force", entries[0], self.force_unit * entries[1], self.u, "force")
+
+
+def _refuse_unknown(midsurface: Midsurface, conditions: Mapping[str, Condition], loads: Loads) -> None:
+    """See that every edge and point that is named is there."""
+    edges, points = sorted(midsurface.edges), sorted(set(midsurface.points) - {"pole"})
+    for name, condition in conditions.items():
+        allowed = [*edges, *(points if isinstance(condition, Held) else [])]
+        if name not in allowed:
+            raise MeshError(f"boundary.{name}: the surface has no such edge, only {', '.join(allowed) or 'none'}")
+    for load in loads.dead:
+        edge = getattr(load, "edge", None)
+        if edge is not None and edge not in edges:
+            raise MeshError(f"loading.loads: edge: {edge}: the surface has only {', '.join(edges) or 'none'}")
 
 
 def _held(V: fem.FunctionSpace, facets: NDArray[np.int32]) -> fem.DirichletBC:

@@ -1,5 +1,6 @@
 """What a shell is made of and what loads it, dimensionless."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -8,7 +9,16 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.shell.patterns import Pattern
 
-Condition = Literal["clamped", "simply supported", "free", "symmetry"]
+
+@dataclass(frozen=True)
+class Held:
+    """These components of the displacement are zero, rotations are free."""
+
+    components: tuple[int, ...]
+
+
+# "symmetry" is the mirror plane of a half model, "plane" one that belongs to the shell as it is described
+Condition = Literal["clamped", "simply supported", "free", "symmetry", "plane"] | Held
 MagneticEnergy = Literal["full", "first", "torque", "second", "second_consistent"]
 MIRROR_NORMAL = np.array([0.0, 1.0, 0.0])  # half models are the part y >= 0
 
@@ -62,6 +72,8 @@ class Magnetisation:
         "lambda_across"; None if it does not turn.
     energy
         The full energy, or which of the paper's approximations takes its place.
+    patches
+        Vectors (3,) on named patches of a mesh, in place of `remanent`; None without.
     """
 
     remanent: NDArray[np.float64] | Pattern
@@ -69,6 +81,46 @@ class Magnetisation:
     energy: MagneticEnergy = "full"
     gradient: NDArray[np.float64] | None = None
     across: NDArray[np.float64] | None = None
+    patches: Mapping[str, NDArray[np.float64]] | None = None
+
+
+@dataclass(frozen=True)
+class PointForce:
+    """A dead force (3,) over E h R at a named vertex."""
+
+    point: str
+    force: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class EdgeForce:
+    """A dead force (3,) on a named edge: per length over E h or, if `total`, in all over E h R."""
+
+    edge: str
+    force: NDArray[np.float64]
+    total: bool
+
+
+@dataclass(frozen=True)
+class EdgeMoment:
+    """A moment per length over E h R on a named edge; see `edges.turning`."""
+
+    edge: str
+    moment: float
+
+
+@dataclass(frozen=True)
+class AreaForce:
+    """A dead force (3,) per undeformed area over E h/R, on a patch, or on all.
+
+    A number in place of the vector is a pressure along the undeformed normal, positive from outside.
+    """
+
+    patch: str | None
+    force: NDArray[np.float64] | float
+
+
+DeadLoad = PointForce | EdgeForce | EdgeMoment | AreaForce
 
 
 @dataclass(frozen=True)
@@ -78,6 +130,7 @@ class Loads:
     pressure: bool = False
     force: Force | None = None
     magnetic: Magnetisation | None = None
+    dead: tuple[DeadLoad, ...] = ()
 
 
 def default_penalty(degree: int) -> float:

@@ -1,11 +1,13 @@
 """Magnetisations that vary over the surface, as functions of the undeformed position and normal."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from dolfinx import fem
 from numpy.typing import NDArray
+
+from magshell_fenicsx.mesh.patch import MeshError
 
 Array = NDArray[np.float64]
 # (cells, nodes, 3) positions r0 and normals n0 -> (cells, nodes, 3) vectors
@@ -46,6 +48,40 @@ class InsideAndOutside:
         centre = r0.mean(axis=1, keepdims=True)
         phi = np.arctan2(np.hypot(centre[..., 0], centre[..., 1]), centre[..., 2])
         return np.broadcast_to(np.where(phi[..., None] < self.phi_o, self.inside, self.outside), r0.shape)
+
+
+@dataclass(frozen=True)
+class ByPatch:
+    """A vector for each cell of this rank, ghosts included: (cells, 3)."""
+
+    vectors: Array
+
+    def __call__(self, r0: Array, n0: Array) -> Array:
+        return np.broadcast_to(self.vectors[: len(r0), None], r0.shape)  # owned cells come first
+
+
+def by_patch(vectors: Mapping[str, Array], patches: Mapping[str, NDArray[np.bool_]]) -> ByPatch:
+    """A vector (3,) for each named patch of a mesh, and one for the "rest"; zero without.
+
+    Parameters
+    ----------
+    patches
+        Name -> whether each cell of this rank belongs to it.
+
+    Raises
+    ------
+    MeshError
+        If there is no such patch.
+    """
+    cells = len(next(iter(patches.values()), []))
+    found = np.tile(vectors.get("rest", np.zeros(3)), (cells, 1))
+    for name, vector in vectors.items():
+        if name in patches:
+            found[patches[name]] = vector
+        elif name != "rest":
+            there = ", ".join(patches) or "none"
+            raise MeshError(f"magnetic.remanent.patches: {name}: the surface has no such patch, only {there}")
+    return ByPatch(found)
 
 
 def pattern_field(pattern: Pattern, r0: fem.Function) -> fem.Function:

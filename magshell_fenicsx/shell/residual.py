@@ -117,7 +117,7 @@ class _Edges:
             known = placement[rows].reshape(len(rows), 3 * len(CURVED) * term.density.sides)
 
             def values(field: fem.Function, rows: NDArray[np.intp] = rows) -> Array:
-                return at_points(field, X, cells)[rows[:, 0]]
+                return at_points(field, X, cells)[rows].reshape(len(rows), -1)
 
             self._rows.append(rows)
             self._gradients.append(PointGradient([term], CURVED, each, known, geometry, values, log, V.mesh.comm))
@@ -137,7 +137,7 @@ class _Edges:
                 here, size = rows[chunk].ravel(), 3 * len(CURVED)
                 room = gradient.room(chunk).reshape(-1, size)
                 np.take(self._there, here, axis=0, out=room, mode="clip")
-                self._back[here] = factor * gradient.evaluate(chunk).reshape(-1, size)
+                self._back[here] += factor * gradient.evaluate(chunk).reshape(-1, size)
         elements += self._sheet.at_nodes(self._back)
 
 

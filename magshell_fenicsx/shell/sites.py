@@ -99,10 +99,8 @@ class Kernel:
     def __init__(self, term: PointTerm, points: Points, batches: list[Batch]) -> None:
         self._term, self._points, self._batches = term, points, batches
         self._parameters, varying = parameters_at(points, term.density)
-        self._varying = [
-            (here, [at_points(field, batch.rule.points[0], batch.cells[0]) for batch in batches])
-            for here, field in varying
-        ]
+        sides = range(term.density.sides)
+        self._varying = [(here, [_on_sides(field, batch, sides) for batch in batches]) for here, field in varying]
 
     def compile(
         self, u: fem.Function, r0: fem.Function, geometry: fem.Function, sides: int, log: KernelLog, comm: MPI.Comm
@@ -146,18 +144,29 @@ def _jet(field: fem.Function, side: int) -> Jet:
 
 
 def parameters_at(points: Points, density: Density) -> tuple[list[Parameter], list[tuple[fem.Function, fem.Function]]]:
-    """A density's parameters at points; those that vary, to be filled, are told with the fields that they stand for."""
-    here = [points.constant(p.value) if isinstance(p, fem.Constant) else points.field(3) for p in density.parameters]
+    """A density's parameters at points; those that vary, to be filled, are told with the fields that they stand for.
+
+    Where there are two sides, such a vector holds that of the one and then that of the other.
+    """
+    here = [
+        points.constant(p.value) if isinstance(p, fem.Constant) else points.field(density.sides * p.ufl_shape[0])
+        for p in density.parameters
+    ]
     pairs = zip(here, density.parameters, strict=True)
     return here, [(there, p) for there, p in pairs if isinstance(p, fem.Function)]
 
 
 def at_points(field: fem.Function, X: Array, cells: NDArray[np.int32]) -> Array:
-    """(cells * points, 3) of a field that varies over the cells, at reference points (points, 2)."""
-    Q = field.function_space
+    """(cells * points, components) of a field that varies over the cells, at reference points (points, 2)."""
+    Q, size = field.function_space, field.ufl_shape[0]
     values = Q.element.basix_element.tabulate(0, X)[0, :, :, 0]
-    nodal = field.x.array.reshape(-1, 3)[Q.dofmap.list[cells]]
-    return np.asarray(np.matmul(values, nodal)).reshape(-1, 3)
+    nodal = field.x.array.reshape(-1, size)[Q.dofmap.list[cells]]
+    return np.asarray(np.matmul(values, nodal)).reshape(-1, size)
+
+
+def _on_sides(field: fem.Function, batch: Batch, sides: range) -> Array:
+    """(points, sides * components) on the edges, or in the cells, of a batch."""
+    return np.hstack([at_points(field, batch.rule.points[side], batch.cells[side]) for side in sides])
 
 
 def fill(field: fem.Function, values: Array) -> None:

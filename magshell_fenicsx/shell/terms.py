@@ -25,8 +25,10 @@ from magshell_fenicsx.shell.energy import (
     per_area,
 )
 from magshell_fenicsx.shell.kinematics import Jet
+from magshell_fenicsx.shell.moment import MomentTerm
 from magshell_fenicsx.shell.parameters import MIRROR_NORMAL, MagneticEnergy, Magnetisation, Material
 from magshell_fenicsx.shell.patterns import pattern_field
+from magshell_fenicsx.shell.thickness import thick
 from magshell_fenicsx.solve.kernels import KernelLog
 
 MagneticDensity = Callable[[Jet, Jet, Expr, Expr], Expr]
@@ -53,28 +55,46 @@ class TermFactory:
     sigma: float
     degree: int
     log: KernelLog
+    thickness: fem.Function | None = None
 
     def membrane(self) -> ShellTerm:
-        return self._cells("membrane", Density(per_area(densities.membrane), (self._constant(self.material.nu),)))
+        density = Density(per_area(densities.membrane), (self._constant(self.material.nu),))
+        return self._cells("membrane", self._thick(density, None))
 
     def bending(self) -> ShellTerm:
-        return self._cells("bending", Density(per_area(densities.bending), self._nu_h(), parts=CURVED))
+        return self._cells("bending", self._thick(Density(per_area(densities.bending), self._nu_h(), parts=CURVED), 1))
 
-    def interior_edges(self) -> ShellTerm:
-        density = Density(edges.interior, self._penalised(), CURVED, SECOND, sides=2)
+    def interior_edges(self, *, folded: bool = False) -> ShellTerm:
+        """With `folded`, for a surface whose cells meet at angles that are not small."""
+        parameters = self._penalised() if self.thickness is None else (*self._penalised(), self.thickness)
+        density = Density(edges.folded if folded else edges.interior, parameters, CURVED, SECOND, sides=2)
         r0, u = ((j.side("+"), j.side("-")) for j in self._jets())
         m = kin.facet_covector(self._domain)
         width = ufl.avg(ufl.CellVolume(self._domain)) / ufl.avg(ufl.FacetArea(self._domain))
-        energy = density.of(r0, u, (m("+"), m("-")), width, *density.parameters)
+        sided = [(p("+"), p("-")) if isinstance(p, fem.Function) else p for p in parameters]
+        energy = density.of(r0, u, (m("+"), m("-")), width, *sided)
         measure = ufl.dS(domain=self._domain, metadata=self._edge_rule())
         return ShellTerm("interior edges", density, energy * measure, self.u, self.log)
 
     def clamped_edges(self, facets: NDArray[np.int32]) -> ShellTerm:
-        return self._edges("clamped edges", Density(edges.clamped, self._penalised(), CURVED, SECOND, facets))
+        density = Density(edges.clamped, self._penalised(), CURVED, SECOND, facets)
+        return self._edges("clamped edges", self._thick(density, 1))
 
-    def mirror_edges(self, facets: NDArray[np.int32]) -> ShellTerm:
-        parameters = (*self._penalised(), self._constant(MIRROR_NORMAL))
-        return self._edges("mirror edges", Density(edges.symmetric, parameters, CURVED, SECOND, facets))
+    def mirror_edges(
+        self, facets: NDArray[np.int32], normal: NDArray[np.float64] = MIRROR_NORMAL, name: str = "mirror edges"
+    ) -> ShellTerm:
+        parameters = (*self._penalised(), self._constant(normal))
+        return self._edges(name, self._thick(Density(edges.symmetric, parameters, CURVED, SECOND, facets), 1))
+
+    def edge_moment(self, name: str, facets: NDArray[np.int32], intensity: float) -> MomentTerm:
+        """A moment per length about the edge's first tangent, with the amplitude "load"; in E h R."""
+        past = self._constant(np.array([1.0, 0.0]))
+        density = Density(edges.turning, (self._constant(intensity), past), facets=facets)
+        energy = density.of(*self._jets(), *self._edge_geometry(), *density.parameters) * self._ds(facets)
+        along = kin.conormal(self._jets()[0], self._edge_geometry()[0])[2]
+        length = self.log.compile(f"{name} length", along * self._ds(facets))
+        total = self._domain.comm.allreduce(fem.assemble_scalar(length))
+        return MomentTerm(name, density, energy, self.u, self.log, intensity * total)
 
     def antisymmetric_edges(self, facets: NDArray[np.int32]) -> HessianTerm:
         """The mirror plane's edges under antisymmetric displacements."""
@@ -94,7 +114,10 @@ class TermFactory:
             directions.append(("lambda_across", " across", field.across))
         terms = [
             self._cells(
-                name + suffix, Density(per_area(of), (Br, self._constant(Ba))), amplitude, linear=name in LINEAR
+                name + suffix,
+                self._thick(Density(per_area(of), (Br, self._constant(Ba))), None),
+                amplitude,
+                linear=name in LINEAR,
             )
             for amplitude, suffix, Ba in directions
             for name, of in MAGNETIC_TERMS[field.energy].items()
@@ -102,7 +125,7 @@ class TermFactory:
         if field.gradient is not None:
             parameters = (Br, self._constant(field.gradient))
             density = Density(per_area(densities.magnetic_gradient), parameters, parts=MOVED)
-            terms.append(self._cells("magnetic gradient", density, "lambda_m"))
+            terms.append(self._cells("magnetic gradient", self._thick(density, None), "lambda_m"))
         return terms
 
     def pressure(self) -> ShellTerm:
@@ -123,6 +146,10 @@ class TermFactory:
 
     def _constant(self, value: float | NDArray[np.float64]) -> fem.Constant:
         return fem.Constant(self._domain, value)
+
+    def _thick(self, density: Density, h_at: int | None) -> Density:
+        """The density with the thickness as it varies, if it does; `h_at` as of `thickness.thick`."""
+        return density if self.thickness is None else thick(density, self.thickness, h_at)
 
     def _nu_h(self) -> tuple[Parameter, Parameter]:
         return self._constant(self.material.nu), self._constant(self.material.h)

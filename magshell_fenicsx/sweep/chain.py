@@ -13,6 +13,7 @@ from mpi4py import MPI
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.loading import PressureSection
+from magshell_fenicsx.case.shell import ShellSection
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.plan import make_plan
 from magshell_fenicsx.results.table import Row
@@ -127,7 +128,8 @@ def _row(scene: Scene, fold: Fold) -> Row:
 
 def _has_knockdown(case: Case) -> bool:
     loading = case.loading
-    by_one_mesh = case.mesh.tolerance is None  # which else is another for each point
+    # with a tolerance the mesh is another for each point; states are carried over between charts that are known
+    by_one_mesh = case.mesh.tolerance is None and isinstance(case.shell, ShellSection)
     return by_one_mesh and isinstance(loading, PressureSection) and loading.until == "limit" and not loading.branches
 
 

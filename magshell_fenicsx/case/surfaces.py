@@ -1,0 +1,247 @@
+"""Any mid-surface: caps, cylinders, plates, rings, tori, profiles turned about e3, and a user's mesh.
+
+Lengths are plain numbers of one unit that the user chooses, or all have units and are then in metres;
+the same holds for Young's modulus, so that loads and results are in the user's units or in SI.
+"""
+
+from math import pi, radians
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+from pydantic import BeforeValidator, Field, model_validator
+
+from magshell_fenicsx.case.base import Section, in_units
+from magshell_fenicsx.case.defects import DimpleSection
+from magshell_fenicsx.case.expressions import formula
+from magshell_fenicsx.case.fields import Formula
+
+Measure = Annotated[float, BeforeValidator(in_units("metre")), Field(gt=0)]
+Modulus = Annotated[float, BeforeValidator(in_units("pascal")), Field(gt=0)]
+Range = Annotated[list[float], Field(min_length=2, max_length=2)]
+FULL_TURN = [0.0, 360.0]
+
+
+class SurfaceSection(Section):
+    """What all have in common.
+
+    `thickness_factor` multiplies the thickness: a formula of x, y, z over the reference length, or a
+    number for each named patch of a mesh.
+    """
+
+    thickness: Measure
+    youngs_modulus: Modulus | None = None
+    poisson_ratio: float = Field(gt=-1, le=0.5)
+    thickness_factor: Formula | dict[str, Annotated[float, Field(gt=0, le=100)]] | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _all_with_units_or_none(cls, data: Any) -> Any:
+        if isinstance(data, dict):
+            measured = [data[key] for key in MEASURES if key in data and isinstance(data[key], str | int | float)]
+            if len({isinstance(value, str) for value in measured}) > 1:
+                raise ValueError("give every length and youngs_modulus a unit, or none of them")
+        return data
+
+    @model_validator(mode="after")
+    def _thin(self) -> Self:
+        if not 3 <= self.R_over_h <= 1e6:
+            raise ValueError(f"the reference length is {self.R_over_h:.4g} thicknesses; a thin shell needs 3 to 1e6")
+        if isinstance(self.thickness_factor, dict) and not isinstance(self, MeshSurface):
+            raise ValueError("thickness_factor: patches have names only with geometry: mesh")
+        return self
+
+    @property
+    def reference(self) -> float:
+        """The length R that results and formulas are over."""
+        raise NotImplementedError
+
+    @property
+    def R_over_h(self) -> float:
+        return self.reference / self.thickness
+
+    @property
+    def defect(self) -> DimpleSection | None:
+        """Only hemispheres have one."""
+        return None
+
+
+MEASURES = ("thickness", "youngs_modulus", "radius", "length", "width", "inner_radius", "tube_radius")
+
+
+class RoundSection(SurfaceSection):
+    """Has a radius; `azimuth` (degrees) is the part that there is, closed where it is not given."""
+
+    radius: Measure
+    azimuth: Range | None = None
+
+    @model_validator(mode="after")
+    def _turns_once(self) -> Self:
+        first, last = self.azimuth or FULL_TURN
+        if not 1e-3 <= last - first <= 360:
+            raise ValueError(f"azimuth: from {first:g} to {last:g} degrees; it must grow, by at most 360")
+        return self
+
+    @property
+    def reference(self) -> float:
+        return self.radius
+
+    @property
+    def turn(self) -> tuple[float, float]:
+        """First and last azimuth (rad)."""
+        first, last = self.azimuth or FULL_TURN
+        return radians(first), radians(last)
+
+
+class CapSurface(RoundSection):
+    """Sphere from `polar` (degrees from e3) up to the pole or a `hole`; edges rim, hole and, of a part, left, right."""
+
+    geometry: Literal["cap"]
+    polar: float = Field(default=90.0, ge=1, le=179)
+    hole: float | None = Field(default=None, ge=0.1, description="polar angle of its edge")
+
+    @model_validator(mode="after")
+    def _hole_within(self) -> Self:
+        if self.hole is not None and self.hole >= self.polar - 0.1:
+            raise ValueError(f"hole: {self.hole:g}: must be smaller than polar, {self.polar:g}")
+        if self.hole is None and self.azimuth is not None:
+            raise ValueError("azimuth: a part of a cap needs a hole around the pole")
+        return self
+
+
+class CylinderSurface(RoundSection):
+    """Around e3 from z = 0 to `length`, or a panel of it; edges bottom, top and, of a panel, left, right."""
+
+    geometry: Literal["cylinder"]
+    length: Measure
+
+
+class PlateSurface(SurfaceSection):
+    """0 <= x <= length, 0 <= y <= width; edges left, right (along y), bottom, top."""
+
+    geometry: Literal["plate"]
+    length: Measure
+    width: Measure
+
+    @property
+    def reference(self) -> float:
+        return self.length
+
+
+class AnnulusSurface(RoundSection):
+    """Flat ring; with azimuth: [0, 360] it is slit. Edges inner, outer and, where it is not closed, left, right."""
+
+    geometry: Literal["annulus"]
+    inner_radius: Measure
+
+    @model_validator(mode="after")
+    def _inner_within(self) -> Self:
+        if self.inner_radius >= self.radius:
+            raise ValueError(f"inner_radius: {self.inner_radius:g}: must be smaller than radius, {self.radius:g}")
+        return self
+
+
+class TorusSurface(RoundSection):
+    """A tube around the circle of `radius`; `tube` (degrees, from outside towards e3) is the part of its section.
+
+    Edges left, right and, with tube, bottom, top.
+    """
+
+    geometry: Literal["torus"]
+    tube_radius: Measure
+    tube: Range | None = None
+
+    @model_validator(mode="after")
+    def _hole_in_it(self) -> Self:
+        first, last = self.tube or FULL_TURN
+        if not 1e-3 <= last - first <= 360:
+            raise ValueError(f"tube: from {first:g} to {last:g} degrees; it must grow, by at most 360")
+        inside = self.radius + self.tube_radius * np.cos(np.radians(np.linspace(first, last, 721))).min()
+        if inside <= 0:
+            raise ValueError(f"tube_radius: {self.tube_radius:g}: the tube reaches the axis; radius is {self.radius:g}")
+        return self
+
+
+class ProfileSection(Section):
+    """A smooth curve (r, z) through points, or r as a formula of z (in the case's lengths)."""
+
+    points: list[Range] | None = Field(default=None, min_length=2)
+    radius: Formula | None = None
+    heights: Range | None = Field(default=None, description="first and last z of the formula")
+
+    @model_validator(mode="after")
+    def _one_way(self) -> Self:
+        if (self.points is None) == (self.radius is None) or (self.radius is None) != (self.heights is None):
+            raise ValueError("give points, or radius (a formula of z) and heights")
+        r = self.curve[:, 0]
+        if not np.isfinite(self.curve).all() or r.max() <= 0 or (r[:-1] <= 0).any() or r[-1] < 0:
+            raise ValueError("r must be positive along the profile; only its end may lie on the axis, as a pole")
+        if (np.linalg.norm(np.diff(self.curve, axis=0), axis=1) == 0).any():
+            raise ValueError("two points that follow each other are the same")
+        return self
+
+    @property
+    def curve(self) -> np.ndarray[Any, np.dtype[np.float64]]:
+        """Points (n, 2) that the curve goes through."""
+        if self.points is not None:
+            return np.array(self.points)
+        assert self.radius is not None
+        assert self.heights is not None
+        z = np.linspace(self.heights[0], self.heights[1], 201, dtype=np.float64)
+        r = formula(self.radius)(0 * z, 0 * z, z)
+        return np.column_stack([np.where(np.abs(r) < 1e-12 * np.abs(r).max(), 0.0, r), z])
+
+
+class RevolutionSurface(SurfaceSection):
+    """A profile turned about e3; the normal points to the right of its direction (outside, if it goes up).
+
+    Edges bottom (its beginning), top (its end, if that is not the pole), left, right.
+    """
+
+    geometry: Literal["revolution"]
+    profile: ProfileSection
+    azimuth: Range | None = None
+
+    @property
+    def reference(self) -> float:
+        return float(self.profile.curve[:, 0].max())
+
+    @property
+    def turn(self) -> tuple[float, float]:
+        """First and last azimuth (rad)."""
+        first, last = self.azimuth or FULL_TURN
+        return radians(first), radians(last)
+
+    @model_validator(mode="after")
+    def _turns(self) -> Self:
+        first, last = self.turn
+        if not 0 < last - first <= 2 * pi:
+            raise ValueError("azimuth: it must grow, by at most 360")
+        if self.azimuth is not None and self.profile.curve[-1, 0] == 0:
+            raise ValueError("azimuth: a part of a surface with a pole cannot be built")
+        return self
+
+
+class MeshSurface(SurfaceSection):
+    """A .msh file: physical groups of surfaces are patches, those of curves are edges.
+
+    `radius` is the reference length; `unit` that of the file's coordinates, where lengths have units.
+    """
+
+    geometry: Literal["mesh"]
+    file: str
+    radius: Measure
+    unit: Annotated[float, BeforeValidator(in_units("metre", bare=True))] | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _unit_of_the_file(cls, data: Any) -> Any:
+        if isinstance(data, dict) and isinstance(data.get("thickness"), str) != ("unit" in data):
+            raise ValueError("unit (of the file's coordinates, such as mm) goes with lengths that have units")
+        return data
+
+    @property
+    def reference(self) -> float:
+        return self.radius
+
+
+Surface = CapSurface | CylinderSurface | PlateSurface | AnnulusSurface | TorusSurface | RevolutionSurface | MeshSurface

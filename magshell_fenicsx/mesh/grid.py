@@ -1,0 +1,96 @@
+"""A rectangular chart in crossed quadrilaterals, each cut into four triangles; opposite sides may be glued."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magshell_fenicsx.mesh.patch import Embedding, MeshError, PatchMesh
+
+Array = NDArray[np.float64]
+Side = tuple[str, int, int]  # name, axis across it, and which end of that axis
+CLOSE = 1e-9  # over the chart's extent
+
+
+@dataclass(frozen=True)
+class Grid:
+    """low <= (x, y) <= high.
+
+    Attributes
+    ----------
+    size
+        Largest side of a quadrilateral.
+    sides
+        Names of x = low, x = high, y = low and y = high.
+    glued
+        Whether the two ends of each axis are one line of the surface.
+    """
+
+    low: tuple[float, float]
+    high: tuple[float, float]
+    size: float
+    sides: tuple[str, str, str, str] = ("left", "right", "bottom", "top")
+    glued: tuple[bool, bool] = (False, False)
+
+    @property
+    def edges(self) -> tuple[str, ...]:
+        """Names of the edges that the surface has."""
+        return tuple(name for i, name in enumerate(self.sides) if not self.glued[i // 2])
+
+    @property
+    def corners(self) -> Array:
+        """(4, 2)."""
+        return np.array([[x, y] for x in (self.low[0], self.high[0]) for y in (self.low[1], self.high[1])])
+
+    @property
+    def cells(self) -> float:
+        """About how many triangles it is cut into."""
+        quadrilaterals = [max((b - a) / self.size, 1.0) for a, b in zip(self.low, self.high, strict=True)]
+        return 4 * quadrilaterals[0] * quadrilaterals[1]
+
+    def lines(self, axis: int, points: Sequence[Array]) -> Array:
+        """Coordinates of the grid lines across an axis: through every point, and no farther apart than the size."""
+        low, high = self.low[axis], self.high[axis]
+        given = np.unique([low, high, *(float(x[axis]) for x in points)])
+        given = given[np.concatenate([[True], np.diff(given) > CLOSE * (high - low)])]
+        given[-1] = high
+        parts = [max(int(np.ceil((b - a) / self.size - 1e-6)), 1) for a, b in pairwise(given)]
+        if self.glued[axis] and sum(parts) < 3:
+            parts = [max(n, -(-3 // len(parts))) for n in parts]  # fewer would fold onto themselves
+        inner = [np.linspace(a, b, n + 1)[1:] for a, b, n in zip(given[:-1], given[1:], parts, strict=True)]
+        return np.concatenate([given[:1], *inner])
+
+
+def grid_mesh(grid: Grid, points: Mapping[str, Array], embedding: Embedding) -> PatchMesh:
+    """Triangulate a grid, with the named points (2,) among its vertices.
+
+    Raises
+    ------
+    MeshError
+        If a point lies outside.
+    """
+    for name, x in points.items():
+        extent = np.subtract(grid.high, grid.low)
+        if (x < grid.low - CLOSE * extent).any() or (x > grid.high + CLOSE * extent).any():
+            raise MeshError(f"the point {name} is not on the surface")
+    x, y = (grid.lines(axis, list(points.values())) for axis in range(2))
+    n, m = len(x) - 1, len(y) - 1
+    vertices = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1)
+    centres = (vertices[:-1, :-1] + vertices[1:, 1:]) / 2
+    nodes = np.concatenate([vertices.reshape(-1, 2), centres.reshape(-1, 2)])
+    number = np.arange((n + 1) * (m + 1)).reshape(n + 1, m + 1)
+    centre = number.size + np.arange(n * m).reshape(n, m)
+    around = [number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]]
+    cells = np.concatenate(
+        [np.stack([around[i], around[(i + 1) % 4], centre], axis=-1).reshape(-1, 3) for i in range(4)]
+    )
+    one = np.arange(len(nodes))
+    if grid.glued[0]:
+        one[number[-1]] = one[number[0]]
+    if grid.glued[1]:
+        one[number[:, -1]] = one[number[:, 0]]
+    rows = dict(zip(grid.sides, (number[0], number[-1], number[:, 0], number[:, -1]), strict=True))
+    edges = {name: one[np.stack([rows[name][:-1], rows[name][1:]], axis=-1)] for name in grid.edges}
+    return PatchMesh(nodes, cells, embedding, edges, dict(points), one=one)

@@ -1,0 +1,131 @@
+"""Surfaces of revolution about e3, charted by (rho theta, s) or, up to their pole, by s (cos theta, sin theta).
+
+A profile is walked along s in the plane (r, z); the normal of the surface points to its right, r to the
+right and z upwards: a cylinder walked upwards has it outside.
+"""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+from scipy.optimize import minimize_scalar
+
+Array = NDArray[np.float64]
+
+
+class Profile(Protocol):
+    """A curve in the plane (r, z)."""
+
+    @property
+    def length(self) -> float:
+        """s runs from 0 to it."""
+
+    def __call__(self, s: Array) -> Array:
+        """(..., 2) places at s (...)."""
+
+    def foot(self, rz: Array) -> float:
+        """s of the place nearest to a point (2,)."""
+
+
+@dataclass(frozen=True)
+class Segment:
+    """A straight profile: cylinder, cone, ring."""
+
+    start: tuple[float, float]
+    end: tuple[float, float]
+
+    @property
+    def length(self) -> float:
+        return float(np.hypot(*np.subtract(self.end, self.start)))
+
+    def __call__(self, s: Array) -> Array:
+        return np.asarray(self.start + np.asarray(s)[..., None] / self.length * np.subtract(self.end, self.start))
+
+    def foot(self, rz: Array) -> float:
+        along = np.subtract(self.end, self.start) / self.length
+        return float(np.clip((rz - self.start) @ along, 0.0, self.length))
+
+
+@dataclass(frozen=True)
+class Arc:
+    """Part of a circle around (centre, 0), from the angle `start` to `end` (rad, from r towards z)."""
+
+    radius: float
+    start: float
+    end: float
+    centre: float = 0.0
+
+    @property
+    def length(self) -> float:
+        return self.radius * (self.end - self.start)
+
+    def __call__(self, s: Array) -> Array:
+        angle = self.start + np.asarray(s) / self.radius
+        return self.radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1) + [self.centre, 0.0]
+
+    def foot(self, rz: Array) -> float:
+        turn = np.arctan2(rz[1], rz[0] - self.centre) - self.start
+        beyond = 2 * np.pi - (self.end - self.start)
+        turn = (turn + beyond / 2) % (2 * np.pi) - beyond / 2  # whatever is nearer of the two ends
+        return float(np.clip(turn, 0.0, self.end - self.start) * self.radius)
+
+
+class Spline:
+    """A smooth profile through points (n, 2)."""
+
+    def __init__(self, points: Array) -> None:
+        steps = np.hypot(*np.diff(points, axis=0).T)
+        knots = np.concatenate([[0.0], np.cumsum(steps)])
+        self._curve, self.length = CubicSpline(knots, points), float(knots[-1])
+
+    def __call__(self, s: Array) -> Array:
+        return np.asarray(self._curve(s))
+
+    def foot(self, rz: Array) -> float:
+        coarse = np.linspace(0, self.length, 401, dtype=np.float64)
+        nearest = int(np.argmin(np.linalg.norm(self(coarse) - rz, axis=1)))
+        around = coarse[max(nearest - 1, 0)], coarse[min(nearest + 1, 400)]
+        found = minimize_scalar(
+            lambda s: np.sum((self(s) - rz) ** 2), bounds=around, method="bounded", options={"xatol": 1e-13}
+        )
+        ends = [float(found.x), *(float(s) for s in around)]
+        return min(ends, key=lambda s: float(np.sum((self(np.array(s)) - rz) ** 2)))
+
+
+@dataclass(frozen=True)
+class Revolved:
+    """Chart (rho theta, s) -> space."""
+
+    profile: Profile
+    rho: float
+
+    def __call__(self, chart: Array) -> Array:
+        theta, (r, z) = chart[:, 0] / self.rho, self.profile(chart[:, 1]).T
+        return np.column_stack([r * np.cos(theta), r * np.sin(theta), z])
+
+    def inverse(self, x: Array, first: float) -> Array:
+        """Chart (2,) of a point (3,), theta in [first, first + 2 pi)."""
+        theta = np.arctan2(x[1], x[0])
+        theta = first + (theta - first + 1e-9) % (2 * np.pi) - 1e-9
+        return np.array([theta * self.rho, self.profile.foot(np.array([np.hypot(x[0], x[1]), x[2]]))])
+
+
+@dataclass(frozen=True)
+class Capped:
+    """Chart t (cos theta, sin theta), t from the pole at the profile's end -> space."""
+
+    profile: Profile
+
+    def __call__(self, chart: Array) -> Array:
+        t = np.hypot(chart[:, 0], chart[:, 1])
+        r, z = self.profile(self.profile.length - t).T
+        direction = np.where(t[:, None] > 0, chart / np.maximum(t, 1e-300)[:, None], 0.0)
+        return np.column_stack([r[:, None] * direction, z])
+
+    def inverse(self, x: Array) -> Array:
+        """Chart (2,) of a point (3,)."""
+        rho = np.hypot(x[0], x[1])
+        t = self.profile.length - self.profile.foot(np.array([rho, x[2]]))
+        return t * x[:2] / rho if rho > 0 else np.zeros(2)

@@ -1,0 +1,111 @@
+"""What holds a shell: displacements that are zero, and whether it is held against rigid motions."""
+
+from collections.abc import Iterable
+
+import numpy as np
+from dolfinx import fem, mesh
+from numpy.typing import NDArray
+from petsc4py import PETSc
+
+from magshell_fenicsx.mesh.patch import MeshError
+from magshell_fenicsx.solve.problem import FiniteElementSystem
+from magshell_fenicsx.solve.system import Amplitudes
+
+Array = NDArray[np.float64]
+STRAIGHT = 1e-6  # deviation of an edge from a plane, in lengths of R
+FREE = 1e-12  # of the squares that a rigid motion has where the shell is held, over the largest: rounding
+LOOSE = 1e-13  # of a rigid motion's energy, over the tangent's largest row
+
+
+def held_on_facets(V: fem.FunctionSpace, facets: NDArray[np.int32], components: Iterable[int]) -> list[fem.DirichletBC]:
+    """Those components are zero on some edges."""
+    return [fem.dirichletbc(0.0, fem.locate_dofs_topological(V.sub(i), 1, facets), V.sub(i)) for i in components]
+
+
+def held_at_vertex(V: fem.FunctionSpace, x: Array, components: Iterable[int]) -> list[fem.DirichletBC]:
+    """Those components are zero at a vertex."""
+    V.mesh.topology.create_connectivity(0, 2)
+    near = mesh.locate_entities(V.mesh, 0, lambda y: np.linalg.norm(y.T - x, axis=1) < 1e-9)
+    return [fem.dirichletbc(0.0, fem.locate_dofs_topological(V.sub(i), 0, near), V.sub(i)) for i in components]
+
+
+def plane_of(V: fem.FunctionSpace, r0: fem.Function, facets: NDArray[np.int32], name: str) -> int:
+    """The axis that the plane of an edge is normal to; collective.
+
+    Raises
+    ------
+    MeshError
+        On every rank, if the edge lies in no plane normal to e1, e2 or e3, or in more than one.
+    """
+    dofs = fem.locate_dofs_topological(V, 1, facets)
+    here = r0.x.array.reshape(-1, 3)[dofs]
+    places = np.concatenate(V.mesh.comm.allgather(here))
+    flat = np.flatnonzero(np.ptp(places, axis=0) < STRAIGHT)
+    if len(flat) == 2:  # a straight edge: the plane is the one that the surface crosses at right angles
+        across = _conormal_axes(V, r0, facets)
+        flat = np.array([i for i in flat if abs(across[i]) > 0.9])
+    if len(flat) != 1:
+        raise MeshError(
+            f"boundary.{name}: symmetry: the edge must lie in a plane normal to x, y or z that the surface crosses at "
+            "right angles; turn the geometry so that it does"
+        )
+    return int(flat[0])
+
+
+def _conormal_axes(V: fem.FunctionSpace, r0: fem.Function, facets: NDArray[np.int32]) -> Array:
+    """Mean outward conormal (3,) of the flat cells at some edges; collective."""
+    domain = V.mesh
+    domain.topology.create_connectivity(1, 2)
+    domain.topology.create_connectivity(1, 0)
+    domain.topology.create_connectivity(2, 0)
+    total, owned = np.zeros(3), domain.topology.index_map(1).size_local
+    corners = domain.geometry.x[domain.geometry.dofmap]
+    for facet in facets[facets < owned]:
+        cell = domain.topology.connectivity(1, 2).links(facet)[0]
+        ends = domain.geometry.x[mesh.entities_to_geometry(domain, 1, np.array([facet], dtype=np.int32))[0]]
+        along = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
+        outward = ends.mean(axis=0) - corners[cell].mean(axis=0)
+        outward -= (outward @ along) * along
+        total += np.linalg.norm(ends[1] - ends[0]) * outward / np.linalg.norm(outward)
+    total = domain.comm.allreduce(total)
+    return np.asarray(total / np.linalg.norm(total))
+
+
+def refuse_loose(system: FiniteElementSystem, r0: fem.Function, amplitudes: Amplitudes) -> None:
+    """See that no rigid motion is left free; collective.
+
+    Raises
+    ------
+    MeshError
+        On every rank; the message tells the motion.
+    """
+    x = r0.x.array[: system.size].reshape(-1, 3)
+    total = system.comm.allreduce(len(x))
+    centre = system.comm.allreduce(x.sum(axis=0)) / total
+    motions = np.zeros((6, *x.shape))
+    for i, axis in enumerate(np.eye(3)):
+        motions[i, :, i] = 1.0
+        motions[3 + i] = np.cross(axis, x - centre)
+    rigid = motions.reshape(6, -1)
+    stopped = rigid - np.array([system.held(v) for v in rigid])
+    _, values, vectors = np.linalg.svd(system.comm.allreduce(stopped @ stopped.T))
+    free = vectors[values < FREE * max(values.max(), 1.0)] @ rigid
+    if not len(free):
+        return
+    free /= np.sqrt(system.comm.allreduce((free**2).sum(axis=1)))[:, None]
+    K = system.tangent(np.zeros(system.size), amplitudes)
+    out, energies = K.createVecLeft(), []
+    for v in free:
+        given = K.createVecRight()
+        given.array[:] = v
+        K.mult(given, out)
+        energies.append(system.comm.allreduce(free @ out.array))
+    values, vectors = np.linalg.eigh(np.array(energies))
+    if values[0] < LOOSE * K.norm(PETSc.NormType.INFINITY):
+        said = vectors[:, 0] @ free
+        shift = system.comm.allreduce(said.reshape(-1, 3).sum(axis=0)) / total
+        moves = np.linalg.norm(shift) > 0.5 * np.sqrt(1 / total)
+        raise MeshError(
+            "boundary: the shell is not held: it is free to "
+            + (f"move along ({', '.join(f'{c:.2g}' for c in shift / np.linalg.norm(shift))})" if moves else "turn")
+        )

@@ -1,0 +1,231 @@
+"""Meshes made elsewhere: what is read from them, and what is refused with the place named."""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import gmsh
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+from magshell_fenicsx import Case, Scene, run
+from magshell_fenicsx.case.source import Source
+from magshell_fenicsx.mesh.msh import MeshFile, read_msh
+from magshell_fenicsx.mesh.patch import MeshError, PatchMesh, check_orientation
+
+Script = Callable[[], None]
+
+
+@pytest.fixture
+def model() -> Iterator[Any]:
+    gmsh.initialize(interruptible=False)
+    gmsh.option.setNumber("General.Terminal", 0)
+    yield gmsh.model
+    gmsh.finalize()
+
+
+def panel(model: Any, order: int, size: float = 0.25) -> None:
+    """A quarter of a cylinder of radius 1 and length 1, in two patches, as a script of a user's makes it."""
+    geo, edges = model.geo, {}
+    axis = [geo.addPoint(0, 0, z) for z in (0, 0.5, 1)]
+    left = [geo.addPoint(1, 0, z) for z in (0, 0.5, 1)]
+    right = [geo.addPoint(0, 1, z) for z in (0, 0.5, 1)]
+    arcs = [geo.addCircleArc(a, c, b) for a, c, b in zip(left, axis, right, strict=True)]
+    up = [[geo.addLine(side[i], side[i + 1]) for i in range(2)] for side in (left, right)]
+    faces = []
+    for i in range(2):
+        loop = geo.addCurveLoop([arcs[i], up[1][i], -arcs[i + 1], -up[0][i]])
+        faces.append(geo.addSurfaceFilling([loop]))
+    geo.synchronize()
+    edges = {"bottom": [arcs[0]], "top": [arcs[2]], "left": up[0], "right": up[1], "middle": [arcs[1]]}
+    for name, tags in edges.items():
+        model.addPhysicalGroup(1, tags, name=name)
+    for name, face in zip(("lower", "upper"), faces, strict=True):
+        model.addPhysicalGroup(2, [face], name=name)
+    gmsh.option.setNumber("Mesh.MeshSizeMax", size)
+    model.mesh.generate(2)
+    model.mesh.setOrder(order)
+
+
+@pytest.mark.parametrize("order", [1, 2, 3])
+def test_patches_edges_and_points(model: Any, tmp_path: Path, order: int) -> None:
+    panel(model, order)
+    gmsh.write(str(tmp_path / "part.msh"))
+    patch = read_msh(MeshFile(tmp_path / "part.msh", 2.0), {"A": np.array([2.0, 0.0, 1.0])})
+    assert patch.cells.shape[1] == {1: 3, 2: 6, 3: 10}[order]
+    assert set(patch.edges) == {"bottom", "top", "left", "right"}  # "middle" is within the surface
+    assert patch.nodes[patch.edges["top"], 2] == pytest.approx(2.0)
+    assert (patch.patches["lower"] ^ patch.patches["upper"]).all()
+    assert patch.nodes[patch.cells[patch.patches["lower"]]][..., 2].max() == pytest.approx(1.0)
+    assert patch.points["A"] == pytest.approx([2, 0, 1])
+    assert np.hypot(*patch.nodes[:, :2].T) == pytest.approx(2.0, abs=1e-6)
+
+
+LOADED = {
+    "boundary": {"left": "symmetry", "right": "symmetry", "bottom": "clamped"},
+    "points": {"A": [1, 0, 1]},
+    "loading": {
+        "kind": "dead",
+        "control": "load",
+        "factor": 1,
+        "points": 1,
+        "loads": [{"at": "A", "force": [-2e-4, 0, 0]}],
+    },
+    "magnetic": {
+        "lambda_m": 2e-4,
+        "remanent": {"kind": "uniform", "polar": 90, "azimuth": 45},
+        "applied": {"polar": 0},
+    },
+    "mesh": {"degree": 3},
+}
+MATERIAL = {"thickness": 0.02, "youngs_modulus": 1, "poisson_ratio": 0.3}
+
+
+def deflection(data: dict[str, Any]) -> float:
+    result = run(Case.from_source(Source("test", data)))
+    assert result.stopped is None
+    return float(result.rows[-1]["A_ux"])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("order", "tolerance"), [(1, 0.03), (2, 3e-3), (3, 3e-3)])
+def test_same_answer_as_the_built_in_geometry(model: Any, tmp_path: Path, order: int, tolerance: float) -> None:
+    """A pinched clamped cylinder in a field; flat facets err by h^2, the others by the mesh."""
+    panel(model, order, 0.12)
+    gmsh.write(str(tmp_path / "part.msh"))
+    shell = {"geometry": "mesh", "file": str(tmp_path / "part.msh"), "radius": 1, **MATERIAL}
+    built_in = {"geometry": "cylinder", "radius": 1, "length": 1, "azimuth": [0, 90], **MATERIAL}
+    mesh = {"degree": 4, "size": 0.2}
+    reference = deflection({**LOADED, "shell": built_in, "mesh": mesh})
+    assert deflection({**LOADED, "shell": shell}) == pytest.approx(reference, rel=tolerance)
+
+
+@pytest.mark.slow
+def test_remanence_and_thickness_of_patches(model: Any, tmp_path: Path) -> None:
+    """By patch as by a formula of the place, to rounding: the patches meet at z = 0.5."""
+    panel(model, 2)
+    gmsh.write(str(tmp_path / "part.msh"))
+    shell = {"geometry": "mesh", "file": str(tmp_path / "part.msh"), "radius": 1, **MATERIAL}
+    by_name = {"kind": "patches", "patches": {"lower": {"polar": 90}, "rest": {"polar": 0}}}
+    by_place = {"kind": "expression", "components": ["(1 - sign(z - 0.5))/2", "0*x", "(1 + sign(z - 0.5))/2"]}
+    found = []
+    for remanent in (by_name, by_place):
+        magnetic = {"lambda_m": 2e-4, "remanent": remanent, "applied": {"polar": 45}}
+        found.append(Scene(Case.from_source(Source("test", {**LOADED, "shell": shell, "magnetic": magnetic}))))
+    u = 0.01 * np.sin(5 * found[0].model.r0.x.array[: found[0].model.system.size])
+    energies = [scene.model.system.energies(u)["magnetic"] for scene in found]
+    # at z = 0.5 itself the sign is 0: nodes there have the mean of the two, an error of the mesh's size
+    assert energies[0] == pytest.approx(energies[1], rel=0.2)
+    assert energies[0] != energies[1]
+
+
+def square(cells: list[list[int]], nodes: list[list[float]] | None = None) -> PatchMesh:
+    """Triangles on the unit square's corners and more."""
+    corners = nodes or [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0.5, 0.5, 1]]
+    return PatchMesh(np.array(corners, dtype=float), np.array(cells), lambda x: x)
+
+
+def written(cells: list[list[int]], nodes: list[list[float]], lines: list[list[int]], file: Path) -> None:
+    """A .msh file with these triangles, all its curves named rim."""
+    model = gmsh.model
+    for dim, kind, elements, name in ((2, 2, cells, "all"), (1, 1, lines, "rim")):
+        entity = model.addDiscreteEntity(dim, 1)
+        if dim == 2:
+            model.mesh.addNodes(2, entity, range(1, len(nodes) + 1), np.ravel(nodes))
+        if elements:
+            model.mesh.addElementsByType(entity, kind, [], (np.ravel(elements) + 1).tolist())
+            model.addPhysicalGroup(dim, [entity], name=name)
+    gmsh.write(str(file))
+
+
+CORNERS = [[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0.5, 0.5, 1]]
+FRAME = [[0, 1], [1, 2], [2, 3], [3, 0]]
+TWO = [[0, 1, 2], [0, 2, 3]]
+STRIP = [[np.cos(t) * (1 + s * np.cos(t / 2) / 2), np.sin(t) * (1 + s * np.cos(t / 2) / 2), s * np.sin(t / 2) / 2]
+         for t in np.linspace(0, 2 * np.pi, 12, endpoint=False) for s in (-1, 1)]  # fmt: skip
+MOEBIUS = [
+    cell
+    for i in range(12)
+    for a, b, c, d in [(2 * i, 2 * i + 1, (2 * i + 2) % 24, (2 * i + 3) % 24)]
+    for cell in ([[a, b, c], [b, d, c]] if i < 11 else [[a, b, 1], [b, 0, 1]])
+]
+WRONG = [
+    ([*TWO, [0, 4, 2]], CORNERS, FRAME, r"more than two triangles meet at the edge around \(0.5, 0.5, 0\)"),
+    (TWO, CORNERS, FRAME[:3], r"ends at the edge around \(0, 0.5, 0\), which belongs to no physical curve"),
+    (
+        [[0, 1, 2], [4, 5, 3]],
+        [*CORNERS[:4], [0, 0, 0], [1, 1, 0]],
+        FRAME,
+        r"two nodes at \((0, 0|1, 1), 0\), and its parts are not connected",
+    ),
+    ([*TWO, [1, 5, 6]], [*CORNERS, [2, 0, 0], [2, -1, 0]], [*FRAME, [1, 5], [5, 6], [6, 1]], "in several pieces"),
+    ([[0, 1, 2], [0, 2, 5]], [*CORNERS, [0.5, 0.5, 0]], [[0, 1], [1, 2], [2, 5], [5, 0]], r"\(0, 0, 0\) has no area"),
+    (MOEBIUS, STRIP, [], "only one side"),
+]
+
+
+@pytest.mark.parametrize(("cells", "nodes", "lines", "said"), WRONG)
+def test_unsound_meshes_are_refused(
+    model: Any, tmp_path: Path, cells: list[list[int]], nodes: list[list[float]], lines: list[list[int]], said: str
+) -> None:
+    written(cells, nodes, lines, tmp_path / "wrong.msh")
+    with pytest.raises(MeshError, match=said):
+        read_msh(MeshFile(tmp_path / "wrong.msh", 1.0), {})
+
+
+def test_triangles_the_other_way_round_are_turned(model: Any, tmp_path: Path) -> None:
+    cells = [[0, 1, 4], [2, 1, 4], [2, 3, 4], [3, 0, 4]]
+    written(cells, CORNERS, FRAME, tmp_path / "turned.msh")
+    patch = read_msh(MeshFile(tmp_path / "turned.msh", 1.0), {})
+    check_orientation(patch)
+    a, b, c = (patch.nodes[patch.cells[:, i]] for i in range(3))
+    assert (np.cross(b - a, c - a)[:, 2] > 0).all()
+
+
+@pytest.mark.parametrize("order", [2, 3])
+def test_curved_triangles_are_turned_with_their_nodes(model: Any, tmp_path: Path, order: int) -> None:
+    """The surface stays the same, its normal changes sides."""
+    panel(model, order, 0.5)
+    gmsh.write(str(tmp_path / "one.msh"))
+    patch = read_msh(MeshFile(tmp_path / "one.msh", 1.0), {})
+    model.mesh.reverse()
+    gmsh.write(str(tmp_path / "other.msh"))
+    other = read_msh(MeshFile(tmp_path / "other.msh", 1.0), {})
+    mine, theirs = (set(map(tuple, np.round(np.sort(p.nodes[p.cells].sum(axis=1)), 9))) for p in (patch, other))
+    assert mine == theirs
+
+
+def test_what_is_no_mesh_is_refused(model: Any, tmp_path: Path) -> None:
+    with pytest.raises(MeshError, match="there is no such mesh file"):
+        read_msh(MeshFile(tmp_path / "nowhere.msh", 1.0), {})
+    (tmp_path / "text.msh").write_text("hello", encoding="utf-8")
+    with pytest.raises(MeshError, match=r"gmsh cannot read it|there is no mesh"):
+        read_msh(MeshFile(tmp_path / "text.msh", 1.0), {})
+    entity = model.addDiscreteEntity(2, 1)
+    model.mesh.addNodes(2, entity, range(1, 5), np.ravel(CORNERS[:4]))
+    model.mesh.addElementsByType(entity, 3, [], [1, 2, 3, 4])
+    gmsh.write(str(tmp_path / "quads.msh"))
+    with pytest.raises(MeshError, match="Quadrilateral 4; allowed are triangles"):
+        read_msh(MeshFile(tmp_path / "quads.msh", 1.0), {})
+
+
+def test_named_point_must_be_a_vertex(model: Any, tmp_path: Path) -> None:
+    panel(model, 1)
+    gmsh.write(str(tmp_path / "part.msh"))
+    with pytest.raises(MeshError, match=r"the point A is no vertex of the mesh; the nearest, over R, is \(1, 0, 1\)"):
+        read_msh(MeshFile(tmp_path / "part.msh", 1.0), {"A": np.array([1.0, 0.0, 1.01])})
+
+
+def test_unknown_names_are_refused(model: Any, tmp_path: Path) -> None:
+    """By the scene, on every rank."""
+    panel(model, 1)
+    gmsh.write(str(tmp_path / "part.msh"))
+    shell = {"geometry": "mesh", "file": str(tmp_path / "part.msh"), "radius": 1, **MATERIAL}
+    for changed, said in (
+        ({"boundary": {"rim": "clamped"}}, "boundary.rim: the surface has no such edge, only bottom, left, right, top"),
+        ({"boundary": {"top": "hinged"}, "shell": {**shell, "thickness_factor": {"front": 2}}}, "no patch front"),
+        ({"boundary": {"top": {"held": ["z"]}}}, "the shell is not held"),
+    ):
+        with pytest.raises(MeshError, match=said):
+            Scene(Case.from_source(Source("test", {"shell": shell, "mesh": {"degree": 2}, **changed})), MPI.COMM_SELF)
