@@ -117,7 +117,7 @@ class _Edges:
             known = placement[rows].reshape(len(rows), 3 * len(CURVED) * term.density.sides)
 
             def values(field: fem.Function, rows: NDArray[np.intp] = rows) -> Array:
-                return at_points(field, X, cells)[rows].reshape(len(rows), -1)
+                return at_points(field, X, cells)[rows].reshape(len(rows), rows.shape[1] * field.ufl_shape[0])
 
             self._rows.append(rows)
             self._gradients.append(PointGradient([term], CURVED, each, known, geometry, values, log, V.mesh.comm))
