@@ -148,8 +148,8 @@ class Case(Section):
         if magnetic and magnetic.remanent.kind != "uniform":
             raise ValueError(f"magnetic.remanent.kind: {magnetic.remanent.kind}: a solid's remanence is uniform")
         for name, condition in self.boundary.conditions().items():
-            if condition == "simply supported":
-                raise ValueError(f"boundary.{name}: simply supported: the face of a solid is clamped or free")
+            if condition in ("simply supported", "hinged"):
+                raise ValueError(f"boundary.{name}: {condition}: the face of a solid is clamped or free")
         for key in self.mesh.model_fields_set & {"degree", "penalty", "tolerance"}:
             if key != "degree" or self.mesh.degree != SOLID_DEGREE:
                 raise ValueError(f"mesh.{key}: is of a shell; a solid has degree {SOLID_DEGREE} and mesh.refinement")

@@ -14,7 +14,7 @@ from magshell_fenicsx.case.loading import RotationSection
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.compare.curves import Difference, amplitude_of, differences, judged, places, time_at
 from magshell_fenicsx.compare.picture import draw_comparison
-from magshell_fenicsx.compare.runs import MODELS, ModelName, ModelRun, run_model
+from magshell_fenicsx.compare.runs import MODELS, ModelName, ModelRun, NothingLeft, run_model
 from magshell_fenicsx.results.durable import write_whole
 from magshell_fenicsx.results.folder import by_first, held_folder
 from magshell_fenicsx.sweep.table import write_csv
@@ -75,6 +75,8 @@ def compare(
                 done = run_model(file, settings, model, refinement, folder / f"{model}_{refinement:g}")
                 runs.setdefault(model, []).append(done)
                 say(f"{model} at refinement {refinement:g}: {done.dofs} unknowns, {done.cpu_s:.1f} s CPU")
+                if not amplitude_of(done):
+                    raise NothingLeft(f"the {model} did not leave its undeformed state: {done.summary['stopped']}")
         shell, solid = (runs[model][-1] for model in MODELS)
         if amplitude_of(shell) != amplitude_of(solid):
             ends = [amplitude_of(run) for run in (shell, solid)]
@@ -125,12 +127,9 @@ def _content(runs: dict[ModelName, list[ModelRun]], at: float | None, found: Seq
     told: dict[ModelName, list[dict[str, Any]]] = {}
     limits: dict[str, float | None] = {}
     seconds: dict[str, float | None] = {}
-    name = ""
+    name, judgements = judged([run for series in runs.values() for run in series], at)
     for model, series in runs.items():
-        values = []
-        for run in series:
-            name, value = judged(run, at)
-            values.append(value)
+        values, judgements = judgements[: len(series)], judgements[len(series) :]
         limit = extrapolated(values, [run.refinement for run in series])
         errors = [abs(v / limit - 1) if v is not None and limit else None for v in values]
         told[model] = [
@@ -175,7 +174,7 @@ def extrapolated(values: Sequence[float | None], refinements: Sequence[float]) -
         return None
     first, second = last[1] - last[0], last[2] - last[1]
     if first * second <= 0 or abs(second) >= abs(first):
-        return last[2]
+        return None
     a, b, c = refinements[-3:]
     # e(r) = C r^-p: solve (b^-p - c^-p)/(a^-p - b^-p) = second/first for p by bisection
     low, high = 0.1, 12.0

@@ -81,11 +81,13 @@ def load_at(run: ModelRun, w: float) -> float | None:
     return Scalar("", AXES[amplitude_of(run)][1], W, w).of(run.summary, loaded(run))
 
 
-def judged(run: ModelRun, at: float | None) -> tuple[str, float | None]:
-    """Name and value of the knockdown factor; of a run without one the load at a displacement, if one is given."""
-    if run.summary["knockdown"] is not None:
-        return "knockdown", float(run.summary["knockdown"])
-    return ("nothing", None) if at is None else (f"{AXES[amplitude_of(run)][1]} at w/h = {at:g}", load_at(run, at))
+def judged(runs: Sequence[ModelRun], at: float | None) -> tuple[str, list[float | None]]:
+    """What runs are compared by, and its values: k_d if all have one, else the load at a displacement."""
+    if all(run.summary["knockdown"] is not None for run in runs):
+        return "knockdown", [float(run.summary["knockdown"]) for run in runs]
+    if at is None:
+        return "nothing", [None for _ in runs]
+    return f"{AXES[amplitude_of(runs[0])][1]} at w/h = {at:g}", [load_at(run, at) for run in runs]
 
 
 def time_at(error: float, runs: Sequence[tuple[float, float]]) -> float | None:

@@ -19,7 +19,7 @@ from magshell_fenicsx.mesh.patch import Embedding, PatchMesh
 Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
 STEP = 1e-5  # of the differences that give the normal: their error is 1e-10
-INNER, OUTER = "inner", "outer"  # faces
+OUTER = "outer"  # face
 VERTICES = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
 SIDES = ((0, 1), (1, 2), (2, 0))  # of a triangle
 
@@ -33,7 +33,7 @@ class Body:
     mesh
         Hexahedra with geometry of degree 2; the third coordinate of their reference cell runs outwards.
     faces
-        Name -> facets (local numbers): "inner", "outer", and those above each named edge of the mid-surface.
+        Name -> facets (local numbers): "outer", and those above each named edge of the mid-surface.
     points, normals
         Name -> (3,) position of a node in the middle of the thickness, and the mid-surface's normal there.
     """
@@ -171,7 +171,7 @@ def _swept(quads: Numbers, layers: int) -> Numbers:
 
 
 def _named_faces(domain: mesh.Mesh, quads: _Quadrilaterals, levels: int) -> dict[str, NDArray[np.int32]]:
-    """Outer, inner and side faces, found by the numbers of their nodes."""
+    """Outer and side faces, found by the numbers of their nodes."""
     for pair in ((2, 3), (2, 0), (0, 3)):
         domain.topology.create_connectivity(*pair)
     facets = mesh.exterior_facet_indices(domain.topology)
@@ -181,7 +181,7 @@ def _named_faces(domain: mesh.Mesh, quads: _Quadrilaterals, levels: int) -> dict
     numbers = domain.geometry.input_global_indices[ends[:, 0]]
     corners = domain.topology.connectivity(2, 0).array.reshape(-1, 4)[facets]
     chart, level = np.divmod(numbers[corners], levels)
-    found = {OUTER: facets[(level == levels - 1).all(axis=1)], INNER: facets[(level == 0).all(axis=1)]}
+    found = {OUTER: facets[(level == levels - 1).all(axis=1)]}
     for name, pairs in quads.edges.items():
         wanted = {(a, b) for a, b in np.sort(pairs, axis=1)}
         above = [len(set(c)) == 2 and (min(c), max(c)) in wanted for c in chart]

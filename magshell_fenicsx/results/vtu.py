@@ -77,7 +77,7 @@ def _name(number: int) -> str:
 def vtu_content(grid: "pyvista.UnstructuredGrid") -> bytes:
     """The file's content; VTK itself would pass over a full disk.
 
-    Raw and compressed by LZ4, which takes no time: zlib takes ten times as long and saves a tenth more on curved surfaces.
+    Raw, compressed by LZ4, which takes no time: zlib takes ten times as long and saves a tenth more on curved surfaces.
     """
     from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter  # type: ignore[import-untyped]
 

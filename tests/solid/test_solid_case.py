@@ -24,6 +24,7 @@ BUCKLING, INDENTATION = CASES / "solid_buckling.yaml", CASES / "solid_indentatio
         (BUCKLING, "magnetic.energy=torque", "a solid has the full energy"),
         (BUCKLING, "magnetic.remanent={kind: radial}", "a solid's remanence is uniform"),
         (BUCKLING, "boundary.equator=simply supported", "clamped or free"),
+        (BUCKLING, "boundary.equator=hinged", "clamped or free"),
         (BUCKLING, "mesh.degree=4", "mesh.degree: is of a shell"),
         (BUCKLING, "mesh.penalty=4", "mesh.penalty: is of a shell"),
         (BUCKLING, "mesh.tolerance=0.01", "mesh.tolerance: is of a shell"),
