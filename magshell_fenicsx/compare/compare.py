@@ -162,7 +162,9 @@ def _content(runs: dict[ModelName, list[ModelRun]], at: float | None, found: Seq
 
 
 def extrapolated(values: Sequence[float | None], refinements: Sequence[float]) -> float | None:
-    """The limit of the last three values, whose error falls like a power of the refinement; None if they do not tell.
+    """The limit of the last three values, whose error falls like a power of the refinement; None for fewer.
+
+    It is the last of them where they do not tell a power.
 
     Examples
     --------
@@ -174,7 +176,7 @@ def extrapolated(values: Sequence[float | None], refinements: Sequence[float]) -
         return None
     first, second = last[1] - last[0], last[2] - last[1]
     if first * second <= 0 or abs(second) >= abs(first):
-        return None
+        return last[2]
     a, b, c = refinements[-3:]
     # e(r) = C r^-p: solve (b^-p - c^-p)/(a^-p - b^-p) = second/first for p by bisection
     low, high = 0.1, 12.0
