@@ -15,7 +15,7 @@ class Factorisation:
 
     A tangent that is expected to be positive definite is given to CHOLMOD on one rank, which takes half
     the time and, by succeeding, proves that there is no negative pivot. Else MUMPS makes LDL^T and
-    counts them.
+    counts them. After its first failure CHOLMOD is left alone: PETSc loses what a failure had allocated.
 
     Attributes
     ----------
@@ -80,7 +80,6 @@ class Factorisation:
             F.setMumpsIcntl(8, 0)  # unscaled: a tenth faster, the tangent's entries are of one size
         _renew(self._mumps, K)
         self._pc, self.negative_pivots = self._mumps, self._mumps.getFactorMatrix().getInertia()[0]
-        self._definite = self._comm.size == 1 and self.negative_pivots == 0
 
     def times(self, x: Vector) -> Vector:
         """K x with the matrix last factored."""
