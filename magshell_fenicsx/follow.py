@@ -95,8 +95,8 @@ def follow(scene: Scene) -> Iterator[Record]:
 def _field(scene: Scene, state: State) -> Iterator[Record]:
     """The field, up to lambda_m; where it makes the shell unstable, the critical field."""
     target, instability = scene.case.lambda_m, None
-    path, start = _begin(scene, "lambda_m", "arc", state, target / 2, target)
-    for record in _followed(scene, path, start, Goal("limit", [target])):
+    path, start = begin(scene, "lambda_m", "arc", state, target / 2, target)
+    for record in followed(scene, path, start, Goal("limit", [target])):
         located = record.label in ("fold", "bifurcation")
         instability = instability or (record if located else None)
         yield record if located else replace(record, label="field")
@@ -109,13 +109,13 @@ def _field(scene: Scene, state: State) -> Iterator[Record]:
 
 def _field_as_load(scene: Scene, loading: FieldSection, state: State) -> Iterator[Record]:
     target = scene.case.lambda_m
-    path, start = _begin(scene, "lambda_m", CONTROLS[loading.control], state, target / loading.points, target)
+    path, start = begin(scene, "lambda_m", CONTROLS[loading.control], state, target / loading.points, target)
     targets = _divided(0.0, target, loading.points) if loading.until == "target" else []
-    yield from _followed(scene, path, start, _goal(loading, targets, "load", target), branches=loading)
+    yield from followed(scene, path, start, _goal(loading, targets, "load", target), branches=loading)
 
 
 def _pressure(scene: Scene, loading: PressureSection, state: State) -> Iterator[Record]:
-    path, start = _begin(scene, "pressure", CONTROLS[loading.control], state, 0.1)
+    path, start = begin(scene, "pressure", CONTROLS[loading.control], state, 0.1)
     targets: list[float] = []
     if loading.pressure is not None:
         targets = _divided(0.0, loading.pressure, loading.points)
@@ -124,7 +124,7 @@ def _pressure(scene: Scene, loading: PressureSection, state: State) -> Iterator[
         now = -scene.newton.system.potential(state.u, "pressure")
         targets = _divided(now, loading.volume_change * unit, loading.points)
     quantity: Quantity = "load" if loading.pressure is not None else "conjugate"
-    yield from _followed(scene, path, start, _goal(loading, targets, quantity), branches=loading)
+    yield from followed(scene, path, start, _goal(loading, targets, quantity), branches=loading)
 
 
 def _indentation(scene: Scene, loading: IndentationSection, state: State) -> Iterator[Record]:
@@ -132,7 +132,7 @@ def _indentation(scene: Scene, loading: IndentationSection, state: State) -> Ite
     asked = next((value for value in (loading.force, loading.depth) if value is not None), 1.0)
     quantity: Quantity = "conjugate" if loading.force is None else "load"
     first = asked / loading.points if loading.control == "load" else float(np.copysign(1.0, asked))
-    path, start = _begin(scene, "force", CONTROLS[loading.control], state, first)
+    path, start = begin(scene, "force", CONTROLS[loading.control], state, first)
     if loading.control == "displacement":
         path.options = StepOptions(unit, 2 * unit, 1e-3 * unit)
     targets: list[float] = []
@@ -141,7 +141,7 @@ def _indentation(scene: Scene, loading: IndentationSection, state: State) -> Ite
         # the field may have moved the point past the first targets already
         now = 0.0 if quantity == "load" else -scene.newton.system.potential(state.u, "force")
         targets = [t for t in _divided(0.0, end, loading.points) if (t - now) * end > 0]
-    yield from _followed(scene, path, start, _goal(loading, targets, quantity, asked), branches=loading)
+    yield from followed(scene, path, start, _goal(loading, targets, quantity, asked), branches=loading)
 
 
 def _dead(scene: Scene, loading: DeadSection, state: State) -> Iterator[Record]:
@@ -152,12 +152,12 @@ def _dead(scene: Scene, loading: DeadSection, state: State) -> Iterator[Record]:
     end = asked if quantity == "load" else asked / scene.plan.length * scene.model.load_size
     by_load = quantity == "load"
     first = asked / loading.points if by_load else float(np.copysign(1e-3, asked))
-    path, start = _begin(scene, "load", CONTROLS[loading.control], state, first)
+    path, start = begin(scene, "load", CONTROLS[loading.control], state, first)
     if loading.control == "displacement" and not by_load:
         step = abs(end) / loading.points
         path.options = StepOptions(step, 2 * step, 1e-4 * step)
     targets = _divided(0.0, end, loading.points) if loading.until == "target" else []
-    yield from _followed(scene, path, start, _goal(loading, targets, quantity, asked), branches=loading)
+    yield from followed(scene, path, start, _goal(loading, targets, quantity, asked), branches=loading)
 
 
 def _rotation(scene: Scene, loading: RotationSection, state: State) -> Iterator[Record]:
@@ -172,7 +172,7 @@ def _rotation(scene: Scene, loading: RotationSection, state: State) -> Iterator[
         )
         label: Label = "start"
         try:
-            path, start = _begin(scene, "turn", "arc", State(state.u, {**state.mu, "turn": 0.0}), 1.0)
+            path, start = begin(scene, "turn", "arc", State(state.u, {**state.mu, "turn": 0.0}), 1.0)
             for label, point in Walk(path, start, Goal("limit", [1.0])):
                 state = State(point.state.u, chord.expand(point.state.mu))
                 yield Record(label, "angle", replace(point, state=state))
@@ -191,10 +191,13 @@ def _divided(start: float, end: float, points: int) -> list[float]:
     return [float(t) for t in np.linspace(start, end, points + 1)[1:]]
 
 
-def _begin(
+def begin(
     scene: Scene, name: str, control: Control, state: State, first: float, scale: float = 1.0
 ) -> tuple[Path, Point]:
-    """A path from a state; its first step changes the amplitude by about `first`."""
+    """A path from a state in equilibrium; its first step changes the amplitude by about `first`.
+
+    `scale` is as that of `Path`.
+    """
     path = Path(scene.newton, name, control, StepOptions(1.0, 1.0, 1.0), abs(scale), scene.journal)
     start = path.start(state, first)
     step = abs(first / start.dmu)
@@ -207,7 +210,7 @@ def _goal(loading: PathSection, targets: Sequence[float], quantity: Quantity, se
     return Goal(loading.until, targets, quantity, steps, sense)
 
 
-def _followed(
+def followed(
     scene: Scene, path: Path, start: Point, goal: Goal, branches: PathSection | None = None
 ) -> Iterator[Record]:
     """A walk, what the reduced model excludes on it, and the branches if they are asked for."""
@@ -267,7 +270,7 @@ def _by_arc(scene: Scene, path: Path) -> Path:
 def _fold_ahead(scene: Scene, path: Path, points: list[Point]) -> Record | None:
     """The fold that ended a path under load control, by arc length from its last point."""
     onward = points[-1].s - points[-2].s if len(points) > 1 else 1.0
-    by_arc, start = _begin(scene, path.name, "arc", points[-1].state, onward, path.metric.scale)
+    by_arc, start = begin(scene, path.name, "arc", points[-1].state, onward, path.metric.scale)
     try:
         *_, (label, point) = Walk(by_arc, start, Goal("limit", steps=20))
     except PathStopped:

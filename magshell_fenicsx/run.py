@@ -13,7 +13,7 @@ from magshell_fenicsx.adapt.tolerance import adapted
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.loading import PathSection
 from magshell_fenicsx.environment import fast_blas
-from magshell_fenicsx.follow import Record, Stopped, follow
+from magshell_fenicsx.follow import Stopped, follow
 from magshell_fenicsx.interrupt import Interrupted, Stoppable, Watch
 from magshell_fenicsx.report import report
 from magshell_fenicsx.results.durable import write_whole
@@ -21,6 +21,7 @@ from magshell_fenicsx.results.files import MESH, RunFiles, open_folder
 from magshell_fenicsx.results.folder import DiskError, by_first, held_folder
 from magshell_fenicsx.results.summary import Result, summary
 from magshell_fenicsx.results.table import Row
+from magshell_fenicsx.rows import RowMaker
 from magshell_fenicsx.scene import Scene
 from magshell_fenicsx.sensitivity import sensitivities
 from magshell_fenicsx.solve.fold import FoldLost, Guess, find_fold
@@ -145,13 +146,10 @@ def _sensitivities(result: Result) -> dict[str, float]:
 
 def _follow(result: Result, files: RunFiles | None, say: Say, start: float) -> None:
     """The history of a scene, point by point."""
-    scene, field_end = result.scene, 0.0
+    scene, made = result.scene, RowMaker(result.scene)
     for record in follow(scene):
         result.history.add(record)
-        values = scene.observe(record.point.state)
-        if record.label in ("start", "field"):
-            field_end = values["w_over_h"]
-        row = _row(record, len(result.rows), values, field_end, time.perf_counter() - start)
+        row = made.row(record, time.perf_counter() - start)
         result.rows.append(row)
         result.last = record.point.state
         if record.label in ("fold", "bifurcation"):
@@ -161,24 +159,6 @@ def _follow(result: Result, files: RunFiles | None, say: Say, start: float) -> N
                 files.write(row, record.point.state)
         if not files or len(result.rows) > files.kept:
             say(_line(row))
-
-
-def _row(record: Record, number: int, values: dict[str, float], field_end: float, wall_s: float) -> Row:
-    point = record.point
-    return {
-        "point": number,
-        "label": record.label,
-        "amplitude": record.amplitude,
-        **values,
-        "w_from_field_over_h": values["w_over_h"] - field_end,
-        "negative_pivots": point.negative_pivots,
-        "negative_pivots_held": point.negative_pivots_held,
-        "iterations": point.iterations,
-        "factorisations": point.factorisations,
-        "wall_s": round(wall_s, 3),
-        "mode": record.mode,
-        "branch": record.branch,
-    }
 
 
 def _line(row: Row) -> str:

@@ -2,6 +2,7 @@
 
 import time
 from collections import defaultdict
+from collections.abc import Sequence
 from math import atan2, copysign, degrees, hypot, nan
 
 from mpi4py import MPI
@@ -14,8 +15,10 @@ from magshell_fenicsx.case.solid import SolidSection
 from magshell_fenicsx.mesh.hexahedra import sweep
 from magshell_fenicsx.mesh.midsurface import Midsurface, distribute
 from magshell_fenicsx.mesh.patch import MeshError, PatchMesh
-from magshell_fenicsx.plan import Plan, make_plan, meridian_vertices, neo_hookean
+from magshell_fenicsx.own_plan import plan_with
+from magshell_fenicsx.plan import Plan, meridian_vertices, neo_hookean
 from magshell_fenicsx.shell.model import ShellModel
+from magshell_fenicsx.shell.own_term import OwnTerm
 from magshell_fenicsx.shell.supports import refuse_loose
 from magshell_fenicsx.solid.model import SolidModel
 from magshell_fenicsx.solve.journal import Journal, NoJournal
@@ -29,7 +32,9 @@ class Scene:
     Parameters
     ----------
     plan
-        What to make of the case; by default `make_plan` says.
+        What to make of the case; by default `plan_with` says.
+    terms
+        One's own energies, which a given plan has already (`Loads.own`).
 
     Attributes
     ----------
@@ -43,9 +48,16 @@ class Scene:
         Seconds of building, without compiling kernels.
     """
 
-    def __init__(self, case: Case, comm: MPI.Comm = MPI.COMM_WORLD, plan: Plan | None = None) -> None:
+    def __init__(
+        self,
+        case: Case,
+        comm: MPI.Comm = MPI.COMM_WORLD,
+        plan: Plan | None = None,
+        *,
+        terms: Sequence[OwnTerm] = (),
+    ) -> None:
         start = time.perf_counter()
-        self.case, self.plan, self.comm = case, plan or make_plan(case), comm
+        self.case, self.plan, self.comm = case, plan or plan_with(case, terms), comm
         self.model: ShellModel | MeridianModel | SolidModel
         if self.plan.axisymmetric:
             self.model = build_meridian_model(case, self.plan)
@@ -90,19 +102,21 @@ class Scene:
             "volume_change": model.volume_change(state.u),
             "energy": sum(energies.values()),
             "stretching": energies["membrane"] if split else nan,
-            "bending": sum(v for name, v in energies.items() if name == "bending" or name.endswith("edges"))
+            "bending": sum(v for name, v in energies.items() if name == "bending" or name.endswith(" edges"))
             if split
             else nan,
             "magnetic": sum(energies[name] for name in ("magnetic", "magnetic gradient", "U1", "Uq", "Utau", "couple")),
             **{name: energies[name] for name in ("U1", "Uq", "Utau")},
             **self._observe_points(state),
+            **{term.name: state.mu[term.name] for term in self.plan.loads.own},
         }
 
     @property
     def extra_columns(self) -> tuple[str, ...]:
         """What `observe` tells besides the columns of every run."""
         named = tuple(f"{point}_u{axis}" for point in self.case.points for axis in "xyz")
-        return (*(["load_factor"] if self.plan.loads.dead else []), *named)
+        own = (term.name for term in self.plan.loads.own)
+        return (*(["load_factor"] if self.plan.loads.dead else []), *named, *own)
 
     def _observe_points(self, state: State) -> dict[str, float]:
         """The load factor, and the displacements of named points in the unit of the shell's lengths."""

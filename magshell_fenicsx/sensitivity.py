@@ -13,12 +13,13 @@ from magshell_fenicsx.axisymmetric import jets
 from magshell_fenicsx.axisymmetric.energies import EnergyFactory
 from magshell_fenicsx.axisymmetric.model import MeridianModel
 from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.follow import Record
 from magshell_fenicsx.scene import Scene
 from magshell_fenicsx.shell.model import ShellModel
 from magshell_fenicsx.shell.parameters import Magnetisation
 from magshell_fenicsx.shell.patterns import Array, InsideAndOutside, Pattern
 from magshell_fenicsx.shell.terms import TermFactory
-from magshell_fenicsx.solve.fold import Fold, sensitivity
+from magshell_fenicsx.solve.fold import Fold, Guess, find_fold, sensitivity
 from magshell_fenicsx.solve.kernels import KernelLog
 from magshell_fenicsx.solve.system import State, Vector
 from magshell_fenicsx.solve.terms import FormTerm
@@ -28,6 +29,21 @@ DEFECT = "defect.amplitude"
 DEFECT_STEP = 1e-3  # in delta/h; central differences of a smooth residual
 
 
+def fold_at(scene: Scene, record: Record) -> Fold:
+    """The fold of a record that is labelled so, with its null vector; collective.
+
+    Raises
+    ------
+    ValueError
+        If it is none.
+    FoldLost
+        If Newton's method for the fold fails.
+    """
+    if record.label != "fold":
+        raise ValueError(f"this record is no fold, but a {record.label}")
+    return find_fold(scene.newton, Guess(record.point.state), record.amplitude)
+
+
 def sensitivities(scene: Scene, fold: Fold) -> dict[str, float]:
     """Derivatives of a fold's amplitude (p/p_c for pressure, so d k_d); collective.
 
@@ -35,7 +51,7 @@ def sensitivities(scene: Scene, fold: Fold) -> dict[str, float]:
     -------
     By name of what varies, the rest being fixed:
 
-    - every other amplitude of the scene ("lambda_m", "force", ...);
+    - every other amplitude of the scene ("lambda_m", "force", that of one's own term, ...);
     - "defect.amplitude": the dimple's depth delta/h;
     - "remanence dimple", "remanence rest": a relative change of the remanence of one patch, within the
       dimple's rim or outside it ("remanence" where there is no dimple). Their sum is lambda_m times
@@ -52,7 +68,7 @@ def _to_defect(scene: Scene, fold: Fold) -> float:
     """By central differences of the residual: the mesh does not depend on delta, only r0 on it does."""
 
     def out_of_balance(change: float) -> float:
-        other = Scene(deepened(scene.case, change), scene.comm)
+        other = Scene(deepened(scene.case, change), scene.comm, terms=scene.plan.loads.own)
         assert same_mesh(scene, other)
         u, phi = (transfer(scene, other, v) for v in (fold.state.u, fold.phi))
         moved = replace(fold, state=State(u, fold.state.mu), phi=phi)

@@ -19,6 +19,7 @@ from magshell_fenicsx.axisymmetric.pattern import pattern_field
 from magshell_fenicsx.shell import densities, edges
 from magshell_fenicsx.shell import kinematics as kin
 from magshell_fenicsx.shell.kinematics import Jet
+from magshell_fenicsx.shell.own_term import OwnTerm
 from magshell_fenicsx.shell.parameters import Magnetisation, Material
 from magshell_fenicsx.shell.terms import LINEAR, MAGNETIC_TERMS
 
@@ -106,6 +107,11 @@ class EnergyFactory:
         """Amplitude p/p_c; potential p Delta V, of a live pressure."""
         unit = self._constant(self.material.classical_pressure / self.material.h)
         return Energy("pressure", lambda u: unit * self.volume_change(u), "pressure")
+
+    def own(self, term: OwnTerm) -> Energy:
+        """One's own energy, with the amplitude of its name; it shares the symmetry."""
+        j0, parameters = self._j0, [self._constant(np.asarray(p, dtype=float)) for p in term.parameters]
+        return self._cells(term.name, lambda u: term.density(j0, u, *parameters), term.name, linear=term.linear)
 
     def volume_change(self, u: Jet) -> ufl.Form:
         """Delta V/R^3 per radian."""

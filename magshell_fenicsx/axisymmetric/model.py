@@ -75,6 +75,7 @@ class MeridianModel:
             self.energies += factory.magnetic(loads.magnetic)
         if loads.pressure:
             self.energies.append(factory.pressure())
+        self.energies += [factory.own(term) for term in loads.own]
         forms = {e.name: self._term(e) for e in self.energies}
         terms: list[Term] = list(forms.values())
         axis = fem.locate_dofs_topological(V, 0, meridian.axis)

@@ -3,6 +3,7 @@
 import io
 from collections.abc import Sequence
 from itertools import groupby
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
@@ -10,12 +11,16 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.results.table import OWN_MODES, Row
 
+if TYPE_CHECKING:  # takes long to import
+    from matplotlib.figure import Figure
+
+POLE = r"displacement of the pole  $w/h$"
 AXES = {
     "force": ("w_over_h", "force", r"displacement at the load  $w/h$", r"force  $FR/(2\pi D)$"),
     "load": ("w_over_h", "load_factor", r"displacement along the loads  $w/h$", "load factor"),
     "pressure": ("volume_change", "p_over_pc", r"change of volume  $-\Delta V/R^3$", r"pressure  $p/p_\mathrm{c}$"),
-    "angle": ("field_angle", "w_pole_over_h", "angle of the field  (degrees)", r"displacement of the pole  $w/h$"),
-    "lambda_m": ("w_pole_over_h", "lambda_m", r"displacement of the pole  $w/h$", r"field  $\lambda_\mathrm{m}$"),
+    "angle": ("field_angle", "w_pole_over_h", "angle of the field  (degrees)", POLE),
+    "lambda_m": ("w_pole_over_h", "lambda_m", POLE, r"field  $\lambda_\mathrm{m}$"),
 }
 
 LOCATED = ("fold", "bifurcation")
@@ -33,17 +38,21 @@ def smooth(x: Sequence[float], y: Sequence[float]) -> NDArray[np.float64]:
 
 
 def draw_curve(rows: Sequence[Row], amplitude: str, title: str) -> bytes:
+    """`curve_figure` as a PNG file."""
+    content = io.BytesIO()
+    curve_figure(rows, amplitude, title).savefig(content, format="png")
+    return content.getvalue()
+
+
+def curve_figure(rows: Sequence[Row], amplitude: str, title: str) -> "Figure":
     """Draw the part of the path in which `amplitude` varied, and its branches; instabilities are marked.
 
-    Stable parts are solid, unstable ones dashed.
-
-    Returns
-    -------
-    A PNG file.
+    Stable parts are solid, unstable ones dashed. One's own amplitude is drawn over the displacement of the pole.
     """
     from matplotlib.figure import Figure
 
-    x_key, y_key, x_label, y_label = AXES[amplitude]
+    own = ("w_pole_over_h", amplitude, POLE, amplitude.replace("_", " "))
+    x_key, y_key, x_label, y_label = AXES.get(amplitude, own)
     sign = -1.0 if x_key == "volume_change" else 1.0
     first = max(i for i, row in enumerate(rows) if row["amplitude"] != amplitude or row is rows[0])
     part = rows[0 if amplitude == "lambda_m" else first :]
@@ -74,6 +83,4 @@ def draw_curve(rows: Sequence[Row], amplitude: str, title: str) -> bytes:
     axes.axhline(0, color="0.8", linewidth=0.8, zorder=0)
     if axes.get_legend_handles_labels()[1]:
         axes.legend(frameon=False)
-    content = io.BytesIO()
-    figure.savefig(content, format="png")
-    return content.getvalue()
+    return figure

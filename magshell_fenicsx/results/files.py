@@ -177,7 +177,7 @@ class RunFiles:
             self.journal.remove()
 
     def _draw(self, result: Result, surface: Surface) -> None:
-        plan, title = self._scene.plan, _title(result)
+        plan, title = self._scene.plan, caption(result.scene.case, result.rows[-1])
         amplitude = str(result.rows[-1]["amplitude"])
         whole = turned(completed(surface) if plan.half else surface, plan.azimuth)
         if amplitude:
@@ -197,8 +197,8 @@ def _same(row: Row, there: dict[str, str]) -> None:
         raise CaseError(f"--resume: point {row['point']} is another than in path.csv; run without --resume")
 
 
-def _title(result: Result) -> str:
-    case, row = result.scene.case, result.rows[-1]
+def caption(case: Case, row: Row) -> str:
+    """What stands above the pictures of a point, with matplotlib's mathematics."""
     said = [f"$R/h$ = {case.shell.R_over_h:g}", rf"$\nu$ = {case.shell.poisson_ratio:g}"]
     if case.lambda_m:
         said.append(rf"$\lambda_\mathrm{{m}}$ = {row['lambda_m']:g}")

@@ -37,14 +37,24 @@ def draw_deformed(surface: Surface, h: float, title: str) -> tuple[bytes, bytes 
     Two PNG files; None where there are no loads.
     """
     smooth = smooth_surface(surface, h)
-    limit = float(np.abs(surface.w).max() / h) or 1.0
-    place = surface.r0[np.argmax(np.abs(surface.w))]
-    shell = View(smooth, smooth.point_data["w_over_h"], (-limit, limit), "RdBu_r", towards(place), 1200)
+    shell = _deformed(surface, smooth, h)
     shown = [name for name in LOADS if name in surface.fields]
     loads = [_load(smooth, name) for name in shown]
     images = rendered([shell, *loads])
-    picture = _shell(images[0], shell, title)
+    picture = _png(_shell(images[0], shell, title))
     return picture, _panels(images[1:], loads, [LOADS[name] for name in shown], title) if shown else None
+
+
+def deformed_figure(surface: Surface, h: float, title: str) -> "Figure":
+    """The first of the pictures of `draw_deformed`."""
+    view = _deformed(surface, smooth_surface(surface, h), h)
+    return _shell(rendered([view])[0], view, title)
+
+
+def _deformed(surface: Surface, smooth: "pyvista.PolyData", h: float) -> View:
+    limit = float(np.abs(surface.w).max() / h) or 1.0
+    place = surface.r0[np.argmax(np.abs(surface.w))]
+    return View(smooth, smooth.point_data["w_over_h"], (-limit, limit), "RdBu_r", towards(place), 1200)
 
 
 def towards(place: Array) -> Array:
@@ -62,7 +72,7 @@ def _load(smooth: "pyvista.PolyData", name: str) -> View:
     return View(smooth, values, (low, high), "viridis", FROM_THE_SIDE, 700)
 
 
-def _shell(image: Image, view: View, title: str) -> bytes:
+def _shell(image: Image, view: View, title: str) -> "Figure":
     width, height = image.shape[1] + 170, max(image.shape[0] + 60, 400)
     figure = _figure(width, height, title)
     figure.figimage(image, 20, (height - 40 - image.shape[0]) // 2)
@@ -73,7 +83,7 @@ def _shell(image: Image, view: View, title: str) -> bytes:
     for number, x, y in zip((1, 2, 3), *axes_on_screen(view.camera).T, strict=True):
         axes.annotate("", (x, y), (0, 0), arrowprops={"arrowstyle": "->", "shrinkA": 0, "shrinkB": 0})
         axes.text(1.3 * x, 1.3 * y, f"$e_{number}$", ha="center", va="center", fontsize=10)
-    return _png(figure)
+    return figure
 
 
 def _panels(images: Sequence[Image], views: Sequence[View], captions: Sequence[str], title: str) -> bytes:

@@ -124,6 +124,7 @@ class ShellModel:
             terms += factory.magnetic(loads.magnetic)
         if loads.pressure:
             terms.append(factory.pressure())
+        terms += [factory.own(term) for term in loads.own]
         self.normals = {name: vertex_normal(self.r0, x) for name, x in midsurface.points.items()}
         if loads.force:
             terms.append(self._force(loads.force))

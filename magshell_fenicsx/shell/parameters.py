@@ -7,6 +7,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from magshell_fenicsx.shell.own_term import OwnTerm
 from magshell_fenicsx.shell.patterns import Pattern
 
 
@@ -131,6 +132,7 @@ class Loads:
     force: Force | None = None
     magnetic: Magnetisation | None = None
     dead: tuple[DeadLoad, ...] = ()
+    own: tuple[OwnTerm, ...] = ()
 
 
 def default_penalty(degree: int) -> float:

@@ -26,6 +26,7 @@ from magshell_fenicsx.shell.energy import (
 )
 from magshell_fenicsx.shell.kinematics import Jet
 from magshell_fenicsx.shell.moment import MomentTerm
+from magshell_fenicsx.shell.own_term import OwnTerm
 from magshell_fenicsx.shell.parameters import MIRROR_NORMAL, MagneticEnergy, Magnetisation, Material
 from magshell_fenicsx.shell.patterns import pattern_field
 from magshell_fenicsx.shell.thickness import thick
@@ -132,6 +133,12 @@ class TermFactory:
         """Amplitude p/p_c; potential p Delta V, of a live pressure."""
         unit = self._constant(self.material.classical_pressure / self.material.h)
         return self._cells("pressure", Density(densities.pressure, (unit,), parts=MOVED), "pressure")
+
+    def own(self, term: OwnTerm) -> ShellTerm:
+        """One's own energy, with the amplitude of its name."""
+        parameters = tuple(self._constant(np.asarray(p, dtype=float)) for p in term.parameters)
+        density = Density(per_area(term.density), parameters, parts=term.parts)
+        return self._cells(term.name, density, term.name, linear=term.linear)
 
     def volume_change(self) -> ufl.Form:
         """Delta V/R^3 of the modelled part."""

@@ -1,0 +1,69 @@
+"""What a notebook shows of a scene: the deformed surface as arrays and for pyvista, and pictures without files.
+
+All of it is collective; what is made on rank 0 alone is None elsewhere.
+"""
+
+import io
+from collections.abc import Sequence
+from functools import partial
+from typing import TYPE_CHECKING
+
+from magshell_fenicsx.follow import Record
+from magshell_fenicsx.results.curve import curve_figure
+from magshell_fenicsx.results.files import caption
+from magshell_fenicsx.results.gathering import gatherer
+from magshell_fenicsx.results.picture import deformed_figure
+from magshell_fenicsx.results.render import smooth_surface
+from magshell_fenicsx.results.surface import Surface, completed, turned
+from magshell_fenicsx.rows import rows
+from magshell_fenicsx.scene import Scene
+
+if TYPE_CHECKING:  # take long to import
+    import pyvista
+    from matplotlib.figure import Figure
+
+
+def surface(scene: Scene, record: Record) -> Surface | None:
+    """The whole deformed mid-surface as NumPy arrays, lengths in R: `r0`, `u`, `n0`, `w`, `cells` and `fields`."""
+    plan, found = scene.plan, gatherer(scene.model, scene.comm).gather(record.point.state.u)
+    return turned(completed(found) if plan.half else found, plan.azimuth) if found else None
+
+
+def polydata(scene: Scene, record: Record) -> "pyvista.PolyData | None":
+    """The deformed mid-surface in flat triangles, for pyvista, with w_over_h, u_over_h, ... at its points.
+
+    `points` (n, 3) and `regular_faces` (m, 3) are the nodes in R and the triangles as NumPy arrays;
+    `plot(scalars="w_over_h")` shows it.
+    """
+    found = surface(scene, record)
+    return smooth_surface(found, scene.plan.material.h) if found else None
+
+
+def picture(scene: Scene, record: Record) -> "Figure | None":
+    """The deformed shell coloured by w/h, as in shell.png.
+
+    Raises
+    ------
+    RuntimeError
+        If there is no screen to draw on.
+    """
+    found, (row,) = surface(scene, record), rows(scene, [record])
+    return _in_line(deformed_figure(found, scene.plan.material.h, caption(scene.case, row))) if found else None
+
+
+def curve(scene: Scene, records: Sequence[Record], amplitude: str | None = None) -> "Figure":
+    """The path, as in curve.png; by default in the amplitude that varied last."""
+    found = rows(scene, records)
+    return _in_line(curve_figure(found, amplitude or records[-1].amplitude, caption(scene.case, found[-1])))
+
+
+def _in_line(figure: "Figure") -> "Figure":
+    """The same, which a notebook draws also if nobody has imported pyplot."""
+    figure._repr_png_ = partial(_png, figure)
+    return figure
+
+
+def _png(figure: "Figure") -> bytes:
+    content = io.BytesIO()
+    figure.savefig(content, format="png")
+    return content.getvalue()

@@ -1,0 +1,81 @@
+"""A path in any amplitude of a scene, from any state: what a notebook steps through."""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from magshell_fenicsx.follow import Record, Stopped, begin, followed
+from magshell_fenicsx.scene import Scene
+from magshell_fenicsx.solve.control import GivenLoad
+from magshell_fenicsx.solve.path import Control, StepOptions
+from magshell_fenicsx.solve.system import State
+from magshell_fenicsx.solve.walk import MOST_STEPS, Goal, Quantity, Until
+
+
+def trace(
+    scene: Scene,
+    name: str,
+    start: Record | State | None = None,
+    *,
+    control: Control = "arc",
+    until: Until = "limit",
+    targets: Sequence[float] = (),
+    quantity: Quantity = "load",
+    first: float | None = None,
+    steps: int = MOST_STEPS,
+) -> Iterator[Record]:
+    """Follow the equilibria of a scene while one amplitude varies and the others stay.
+
+    The first record is the start, brought into equilibrium by Newton's method at its own amplitudes.
+
+    Parameters
+    ----------
+    name
+        The amplitude: "pressure" (p/p_c), "force" (F R/(2 pi D)), "lambda_m", "load", or that of one's own term.
+    start
+        A point found before, or a state; by default the undeformed shell with all amplitudes zero.
+    control
+        "load": the amplitude is given; "conjugate": the displacement conjugate to it, -Pi_i(u), is
+        (`scene.model.system.potential` tells Pi_i); "arc": by arc length, through folds of both.
+    until
+        Where it ends, see `Goal`: "limit" at the first instability or at the last target, "bifurcation",
+        "target" at the last target, "points" after so many steps.
+    targets
+        Values that shall be met: of what is given or, by arc length, of `quantity`.
+    quantity
+        "load": the amplitude; "conjugate": -Pi_i(u). Only by arc length.
+    first
+        Change of the amplitude in the first step, whose sign is the direction. By default a tenth of the
+        way to the last target, where targets are of the amplitude.
+    steps
+        The most that are tried, or with "points" those that are asked for.
+
+    Raises
+    ------
+    ValueError
+        If the scene has no such amplitude, or nothing says how long the first step is.
+    Stopped
+        If the path is lost, or there is no equilibrium to start from.
+    """
+    state = start.point.state if isinstance(start, Record) else start or scene.unloaded()
+    if name not in state.mu:
+        raise ValueError(f"trace: {name}: the scene has no such amplitude, only {', '.join(state.mu) or 'none'}")
+    of_load = control == "load" or (control == "arc" and quantity == "load")
+    if until == "target" and not targets:
+        raise ValueError("trace: until='target' needs targets")
+    if first is None and targets and of_load:
+        first = (targets[-1] - state.mu[name]) / 10
+    if not first:
+        raise ValueError(f"trace: {name}: give first, the change of the amplitude in the first step, not zero")
+    rest = scene.newton.solve(state, name, GivenLoad(state.mu[name]))
+    if not rest.converged:
+        raise Stopped(f"there is no equilibrium to start from near the given state: {rest.reason}")
+    path, here = begin(scene, name, control, rest.state, first, first)
+    if not np.isfinite(path.options.first):
+        raise Stopped(f"{name} does no work on the first displacement that it causes: follow it by load or arc length")
+    if targets and control == "conjugate":
+        step = abs(targets[-1] - here.s) / 10
+        path.options = StepOptions(step, 2 * step, 1e-5 * step)
+    sense = float(np.copysign(1.0, first * here.dmu))
+    yield Record("start", "", here)
+    yield from followed(scene, path, here, Goal(until, targets, quantity, steps, sense))
