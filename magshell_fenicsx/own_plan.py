@@ -6,11 +6,11 @@ from dataclasses import replace
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.plan import Plan, make_plan
+from magshell_fenicsx.results.table import COLUMNS
 from magshell_fenicsx.shell.own_term import OwnTerm
 
-TAKEN = frozenset(
-    ["membrane", "bending", "stretching", "magnetic", "pressure", "force", "load", "U1", "Uq", "Utau", "couple", "energy", "turn", "push", "lambda_m", "lambda_across", "load_factor", "point", "label", "amplitude", "mode", "branch"]
-)
+AMPLITUDES = ("pressure", "force", "load", "load_factor", "turn", "push", "lambda_m", "lambda_across")
+ENERGIES = ("membrane", "couple")  # besides those with a column
 
 
 def plan_with(case: Case, terms: Sequence[OwnTerm]) -> Plan:
@@ -26,7 +26,7 @@ def plan_with(case: Case, terms: Sequence[OwnTerm]) -> Plan:
         raise CaseError("model: solid: one's own terms are energies of a mid-surface")
     names = [term.name for term in terms]
     for name in names:
-        if name in TAKEN or names.count(name) > 1:
+        if name in (*AMPLITUDES, *ENERGIES, *COLUMNS) or names.count(name) > 1:
             raise CaseError(f"terms: {name}: something else has this name already")
     plan = make_plan(case)
     if wrong := _not_sharing(plan, terms):

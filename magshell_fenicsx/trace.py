@@ -7,8 +7,8 @@ import numpy as np
 from magshell_fenicsx.follow import Record, Stopped, begin, followed
 from magshell_fenicsx.scene import Scene
 from magshell_fenicsx.solve.control import GivenLoad
-from magshell_fenicsx.solve.path import Control, StepOptions
-from magshell_fenicsx.solve.system import State
+from magshell_fenicsx.solve.path import SEEN, Control, StepOptions
+from magshell_fenicsx.solve.system import State, max_abs
 from magshell_fenicsx.solve.walk import MOST_STEPS, Goal, Quantity, Until
 
 
@@ -46,7 +46,7 @@ def trace(
         "load": the amplitude; "conjugate": -Pi_i(u). Only by arc length.
     first
         Change of the amplitude in the first step, whose sign is the direction. By default a tenth of the
-        way to the last target, where targets are of the amplitude.
+        way to the last target of what is given; by arc length towards conjugate displacements there is none.
     steps
         The most that are tried, or with "points" those that are asked for.
 
@@ -65,14 +65,18 @@ def trace(
         raise ValueError("trace: until='target' needs targets")
     if first is None and targets and of_load:
         first = (targets[-1] - state.mu[name]) / 10
+    if first is None and targets and control == "conjugate":
+        first = 1.0  # the targets say how long a step is
     if not first:
         raise ValueError(f"trace: {name}: give first, the change of the amplitude in the first step, not zero")
     rest = scene.newton.solve(state, name, GivenLoad(state.mu[name]))
     if not rest.converged:
         raise Stopped(f"there is no equilibrium to start from near the given state: {rest.reason}")
+    if control == "conjugate":
+        moved = scene.newton.response(rest.state, name, GivenLoad(0.0), exact=True).du
+        if max_abs(scene.newton.system.comm, moved) * abs(first) < SEEN * scene.newton.system.length:
+            raise Stopped(f"{name} moves nothing at the start, so nothing is conjugate to it: follow it by arc length")
     path, here = begin(scene, name, control, rest.state, first, first)
-    if not np.isfinite(path.options.first):
-        raise Stopped(f"{name} does no work on the first displacement that it causes: follow it by load or arc length")
     if targets and control == "conjugate":
         step = abs(targets[-1] - here.s) / 10
         path.options = StepOptions(step, 2 * step, 1e-5 * step)

@@ -202,7 +202,7 @@ def caption(case: Case, row: Row) -> str:
     said = [f"$R/h$ = {case.shell.R_over_h:g}", rf"$\nu$ = {case.shell.poisson_ratio:g}"]
     if case.lambda_m:
         said.append(rf"$\lambda_\mathrm{{m}}$ = {row['lambda_m']:g}")
-    if row["amplitude"] == "pressure":
+    if row["p_over_pc"]:
         said.append(rf"$p/p_\mathrm{{c}}$ = {row['p_over_pc']:.5g}")
     if row["amplitude"] == "force":
         said.append(f"$w/h$ = {row['w_over_h']:.4g} at the load")

@@ -13,7 +13,7 @@ from ufl.algorithms.apply_algebra_lowering import apply_algebra_lowering
 from ufl.constantvalue import Zero
 from ufl.core.expr import Expr
 
-from magshell_fenicsx.shell.energy import CURVED, SECOND
+from magshell_fenicsx.shell.energy import CURVED, FIRST, SECOND
 from magshell_fenicsx.shell.kinematics import Jet
 
 Array = NDArray[np.float64]
@@ -66,14 +66,17 @@ class OwnTerm:
     @cached_property
     def parts(self) -> tuple[str, ...]:
         """The parts of the displacement's jet that the density depends on."""
-        W, u = self._symbolic
-        found = extract_coefficients(W)
-        return tuple(name for name in ("r", *CURVED) if getattr(u, name).ufl_operands[0] in found)
+        return self._found_in(self._symbolic[2])
+
+    @cached_property
+    def placed_parts(self) -> tuple[str, ...]:
+        """Those of the placement's jet; the area of the surface takes the first derivatives anyway."""
+        return tuple(name for name in ("r", *CURVED) if name in (*FIRST, *self._found_in(self._symbolic[1])))
 
     @cached_property
     def linear(self) -> bool:
         """Whether the density is linear in the displacement: its second derivatives vanish identically."""
-        W, u = self._symbolic
+        W, _, u = self._symbolic
         parts = [getattr(u, name) for name in self.parts]
         return all(isinstance(expand_derivatives(ufl.diff(ufl.diff(W, a), b)), Zero) for a in parts for b in parts)
 
@@ -96,12 +99,16 @@ class OwnTerm:
         return all(self._same((r0, u), (flip * r0[order], flip * u[order])) for r0, u in _random_jets())
 
     @cached_property
-    def _symbolic(self) -> tuple[Expr, Jet]:
-        """The density, and the displacement's jet that it is written with."""
+    def _symbolic(self) -> tuple[Expr, Jet, Jet]:
+        """The density, and the jets of r0 and u that it is written with."""
         domain = ufl.Mesh(basix.ufl.element("Lagrange", "triangle", 1, shape=(2,)))
         V = ufl.FunctionSpace(domain, basix.ufl.element("DG", "triangle", 0, shape=(3,)))
         r0, u = (Jet(*(ufl.variable(ufl.Coefficient(V)) for _ in range(1 + len(CURVED)))) for _ in range(2))
-        return self._at(r0, u), u
+        return self._at(r0, u), r0, u
+
+    def _found_in(self, jet: Jet) -> tuple[str, ...]:
+        found = extract_coefficients(self._symbolic[0])
+        return tuple(name for name in ("r", *CURVED) if getattr(jet, name).ufl_operands[0] in found)
 
     def _at(self, r0: Jet, u: Jet) -> Expr:
         return ufl.as_ufl(self.density(r0, u, *(_as_expression(p) for p in self.parameters)))

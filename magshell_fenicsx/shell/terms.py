@@ -137,7 +137,8 @@ class TermFactory:
     def own(self, term: OwnTerm) -> ShellTerm:
         """One's own energy, with the amplitude of its name."""
         parameters = tuple(self._constant(np.asarray(p, dtype=float)) for p in term.parameters)
-        density = Density(per_area(term.density), parameters, parts=term.parts)
+        still = tuple(part for part in term.placed_parts if part not in term.parts)  # asked for of r0 alone
+        density = Density(per_area(term.density), parameters, parts=(*term.parts, *still), linear=still)
         return self._cells(term.name, density, term.name, linear=term.linear)
 
     def volume_change(self) -> ufl.Form:
