@@ -59,7 +59,7 @@ def curve(scene: Scene, records: Sequence[Record], amplitude: str | None = None)
 
 def _in_line(figure: "Figure") -> "Figure":
     """The same, which a notebook draws also if nobody has imported pyplot."""
-    figure._repr_png_ = partial(_png, figure)
+    figure._repr_png_ = partial(_png, figure)  # type: ignore[attr-defined]
     return figure
 
 

@@ -34,7 +34,8 @@ class Scene:
     plan
         What to make of the case; by default `plan_with` says.
     terms
-        One's own energies, which a given plan has already (`Loads.own`).
+        One's own energies, which a given plan has already (`Loads.own`). Their amplitudes are zero until a
+        state says otherwise, see `trace`.
 
     Attributes
     ----------

@@ -1,8 +1,10 @@
 """The examples in cases/notebooks run as scripts; one number of each, and what it is compared with."""
 
 import io
+import re
 import runpy
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -51,3 +53,16 @@ def test_indentation() -> None:
     assert found["shell"].w.max() / found["scene"].plan.material.h == pytest.approx(6, rel=1e-6)
     image = imread(io.BytesIO(found["picture"]._repr_png_()))  # what a notebook asks for
     assert np.ptp(image[..., :3], axis=2).max() > 0.4, "no colours"
+
+
+def test_readme(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its Python, block after block, as a reader would type it; knockdown: axisymmetric reference."""
+    (tmp_path / "cases").symlink_to(CASES)
+    monkeypatch.chdir(tmp_path)
+    text = (CASES.parent / "README.md").read_text(encoding="utf-8")
+    found: dict[str, Any] = {}
+    for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL):
+        exec(block, found)
+    assert found["table"]["p_over_pc"][-1] == pytest.approx(0.552053778, rel=1e-6)
+    assert found["end"].point.state.mu["pressure"] > 0.552 + 0.02
+    assert (tmp_path / "results/mine/curve.png").exists()

@@ -11,11 +11,13 @@ from test_fast_tangent import difference as tangent_difference
 from ufl.core.expr import Expr
 
 from magshell_fenicsx import Case, CaseError, Jet, OwnTerm, Scene
+from magshell_fenicsx.case.source import Source
 from magshell_fenicsx.own_plan import plan_with
+from magshell_fenicsx.plan import make_plan
 from magshell_fenicsx.shell import densities
 from magshell_fenicsx.shell import kinematics as kin
 from magshell_fenicsx.shell.model import ShellModel
-from magshell_fenicsx.shell.parameters import Loads, Material
+from magshell_fenicsx.shell.parameters import AreaForce, Loads, Material
 from magshell_fenicsx.solve.system import dot
 
 E1, E2, E3 = np.eye(3)
@@ -82,6 +84,13 @@ def test_far_floor_is_not_taken_for_linear() -> None:
     assert not term.linear
 
 
+def test_density_that_is_not_defined_everywhere() -> None:
+    """Has no symmetry that could be relied on."""
+    term = OwnTerm("own", lambda r0, u: ufl.ln(r0.r[2]) * u.r[2])
+    assert not term.turns
+    assert not term.mirrors
+
+
 @pytest.mark.parametrize("energy", ["magnetic", "magnetic_first", "magnetic_torque", "magnetic_tau", "magnetic_couple"])
 def test_symmetry_of_the_magnetic_densities(energy: str) -> None:
     """Fields along e3 turn and mirror; in the plane y = 0 they mirror; across it they do not."""
@@ -97,6 +106,7 @@ def test_symmetry_of_the_magnetic_densities(energy: str) -> None:
         ("a b", winkler, "identifier"),
         ("own", lambda r0, u: u.r, "shape"),
         ("own", lambda r0, u: ufl.dot(r0.r, r0.r), "does not depend"),
+        ("own", lambda r0, u: u.r[0] * ufl.SpatialCoordinate(hemisphere(0.8).mesh)[0], "jets and parameters alone"),
         ("own", lambda r0, u: densities.bending(r0, u, 0.3, 0.1), "u.r11, u.r12, u.r22"),
     ],
 )
@@ -147,6 +157,37 @@ def test_the_shells_own_pressure_as_ones_own(symmetry: str) -> None:
     assert np.abs(ours - theirs).max() < 1e-11 * np.abs(theirs).max()
     mu = {"own": -0.7, "pressure": 0.7}
     assert np.abs(system.residual(u, mu) - system.residual(u, dict.fromkeys(mu, 0.0))).max() < 1e-10
+
+
+def test_weight_is_a_dead_load_on_any_surface() -> None:
+    """On a cylinder: the column of the case file's own force per area."""
+    case = Case.from_source(
+        Source(
+            "cylinder",
+            {
+                "shell": {
+                    "geometry": "cylinder",
+                    "radius": 100,
+                    "length": 100,
+                    "azimuth": [0, 90],
+                    "thickness": 2,
+                    "youngs_modulus": 30.0e3,
+                    "poisson_ratio": 0.3,
+                },
+                "boundary": {"bottom": "clamped"},
+                "loading": {"kind": "dead", "loads": [{"over": "all", "per_area": [0.1, 0.2, -0.3]}], "factor": 1},
+                "mesh": {"size": 50, "degree": 3},
+            },
+        )
+    )
+    (dead,) = make_plan(case).loads.dead
+    assert isinstance(dead, AreaForce)
+    system = Scene(case, terms=[OwnTerm("own", weight, (dead.force,))]).model.system
+    u = system.held(1e-2 * np.random.default_rng(0).standard_normal(system.size))
+    ours, theirs = system.load(u, "own"), system.load(u, "load")
+    assert np.abs(theirs).max() > 0
+    assert np.abs(ours - theirs).max() < 1e-11 * np.abs(theirs).max()
+    assert system.potential(u, "own") == pytest.approx(system.potential(u, "load"), rel=1e-9)
 
 
 @pytest.mark.parametrize(
