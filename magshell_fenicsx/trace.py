@@ -26,7 +26,8 @@ def trace(
 ) -> Iterator[Record]:
     """Follow the equilibria of a scene while one amplitude varies and the others stay.
 
-    The first record is the start, brought into equilibrium by Newton's method at its own amplitudes.
+    The first record is the start, brought into equilibrium by Newton's method at its own amplitudes. As in `follow`,
+    the last may be an instability that a reduced model excludes (`Record.mode`) and that was passed on the way.
 
     Parameters
     ----------
@@ -76,7 +77,7 @@ def trace(
         moved = scene.newton.response(rest.state, name, GivenLoad(0.0), exact=True).du
         if max_abs(scene.newton.system.comm, moved) * abs(first) < SEEN * scene.newton.system.length:
             raise Stopped(f"{name} moves nothing at the start, so nothing is conjugate to it: follow it by arc length")
-    path, here = begin(scene, name, control, rest.state, first, first)
+    path, here = begin(scene, name, control, rest.state, first, 10 * first)
     if targets and control == "conjugate":
         step = abs(targets[-1] - here.s) / 10
         path.options = StepOptions(step, 2 * step, 1e-5 * step)
