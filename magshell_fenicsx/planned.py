@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from magshell_fenicsx.fits import refuse_unfit
 from magshell_fenicsx.mesh.grading import Size
 from magshell_fenicsx.mesh.grid import Grid, grid_mesh
 from magshell_fenicsx.mesh.msh import MeshFile, read_msh
@@ -57,8 +58,13 @@ class Plan:
         Raises
         ------
         MeshError
-            If there is none, or it cannot carry a shell.
+            If there is none, it cannot carry a shell, or it has not what the plan names.
         """
+        patch = self._made()
+        refuse_unfit(patch, self.conditions, self.loads, self.thickness)
+        return patch
+
+    def _made(self) -> PatchMesh:
         if isinstance(self.shape, MeshFile):
             return read_msh(self.shape, self.points)
         if isinstance(self.shape, Grid):

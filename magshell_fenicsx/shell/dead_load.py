@@ -53,7 +53,7 @@ def assemble_dead_loads(
             parts.append(forms.entries(ufl.dot(forms.constant(force), ufl.TestFunction(V)) * ds))
             size += float(np.linalg.norm(force)) * length
         elif isinstance(load, AreaForce):
-            inside = None if load.patch is None else patch_of(midsurface, load.patch)
+            inside = None if load.patch is None else patch_of(midsurface.patches, load.patch)
             dx = forms.area(inside)
             if isinstance(load.force, float):
                 along, strength = -kin.normal(forms.j0) * forms.constant(load.force), abs(load.force)

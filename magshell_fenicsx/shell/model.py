@@ -31,7 +31,14 @@ from magshell_fenicsx.shell.parameters import (
 from magshell_fenicsx.shell.patterns import by_patch
 from magshell_fenicsx.shell.point_load import patch_entries, point_entries, vertex_normal
 from magshell_fenicsx.shell.residual import FastResidual
-from magshell_fenicsx.shell.supports import held_at_vertex, held_on_facets, plane_of
+from magshell_fenicsx.shell.supports import (
+    STRAIGHT,
+    held_at_vertex,
+    held_on_facets,
+    open_to_pressure,
+    plane_of,
+    refuse_unknown,
+)
 from magshell_fenicsx.shell.terms import TermFactory
 from magshell_fenicsx.shell.thickness import Thickness, thickness_field
 from magshell_fenicsx.solve.kernels import KernelLog
@@ -59,7 +66,8 @@ class ShellModel:
     Raises
     ------
     MeshError
-        On every rank, if the surface has no such edge, point or patch, or an edge lies in no plane of symmetry.
+        On every rank, if the surface has no such edge, point or patch, an edge lies in no plane of symmetry, or
+        in one that is open to a live pressure.
 
     Attributes
     ----------
@@ -69,6 +77,8 @@ class ShellModel:
         2 for a half model, whose integrals and forces are those of one half; else 1.
     kernels
         Names and compile time of the forms in use.
+    thickness
+        h(x)/h, free to jump from cell to cell; None for 1.
     load_size
         The sum of the sizes of the dead loads, over E h R; see `DeadLoads`.
     """
@@ -83,9 +93,11 @@ class ShellModel:
         sigma: float | None = None,
         thickness: Thickness | None = None,
     ) -> None:
-        _refuse_unknown(midsurface, conditions, loads)
+        refuse_unknown(midsurface.edges, midsurface.points, conditions, loads)
         if loads.magnetic and loads.magnetic.patches:
-            remanent = by_patch(loads.magnetic.patches, midsurface.patches)
+            topology = midsurface.mesh.topology.index_map(2)
+            cells = topology.size_local + topology.num_ghosts
+            remanent = by_patch(loads.magnetic.patches, midsurface.patches, cells)
             loads = replace(loads, magnetic=replace(loads.magnetic, remanent=remanent))
         self.midsurface, self.material, self.degree, self.loads = midsurface, material, degree, loads
         self.multiplicity = 2 if "symmetry" in conditions.values() else 1
@@ -93,7 +105,7 @@ class ShellModel:
         self.V = V = fem.functionspace(midsurface.mesh, ("Lagrange", degree, (3,)))
         self.r0, self.u = midsurface.placement(V), fem.Function(V, name="u")
         self.sigma = default_penalty(degree) if sigma is None else sigma
-        factor = thickness_field(thickness, self.r0, midsurface) if thickness else None
+        self.thickness = factor = thickness_field(thickness, self.r0, midsurface) if thickness else None
         factory = TermFactory(self.r0, self.u, material, self.sigma, degree, self.kernels, factor)
         interior = factory.interior_edges(folded=midsurface.read and largest_fold(self.r0, degree) > FOLD)
         terms: list[Term] = [factory.membrane(), factory.bending(), interior]
@@ -117,8 +129,10 @@ class ShellModel:
             elif isinstance(condition, Held):
                 held += held_at_vertex(V, midsurface.points[name], condition.components)
             elif condition == "plane":
-                axis = plane_of(V, self.r0, midsurface.edges[name], name)
-                terms.append(factory.mirror_edges(midsurface.edges[name], np.eye(3)[axis], f"mirror edges {name}"))
+                axis, place = plane_of(V, self.r0, midsurface.edges[name], name)
+                if loads.pressure and abs(place) > STRAIGHT:
+                    raise MeshError(open_to_pressure(name))
+                terms.append(factory.mirror_edges(midsurface.edges[name], np.eye(3)[axis], f"{name} mirror edges"))
                 held += held_on_facets(V, midsurface.edges[name], (axis,))
         if loads.magnetic:
             terms += factory.magnetic(loads.magnetic)
@@ -181,10 +195,15 @@ class ShellModel:
         return np.asarray(self.system.comm.allreduce(here))
 
     def loaded_deflection(self, u: Vector) -> float:
-        """w/R conjugate to the force: at its point, or averaged over its patch; of dead loads along themselves."""
+        """w/R conjugate to the force: at its point, or averaged over its patch; of dead loads along themselves.
+
+        Moments alone have none: that of the pole.
+        """
+        if self.loads.dead and not self.load_size:
+            return self.deflection(u, "pole")
         if self.loads.dead:
             work = -sum(v for name, v in self.system.energies(u).items() if name == "load")
-            return work / self.load_size if self.load_size else 0.0
+            return work / self.load_size
         return -self.system.potential(u, "force") / self.force_unit
 
     @property
@@ -199,19 +218,6 @@ class ShellModel:
         else:
             entries = point_entries(self.V, x, inward)
         return LinearTerm("force", entries[0], self.force_unit * entries[1], self.u, "force")
-
-
-def _refuse_unknown(midsurface: Midsurface, conditions: Mapping[str, Condition], loads: Loads) -> None:
-    """See that every edge and point that is named is there."""
-    edges, points = sorted(midsurface.edges), sorted(set(midsurface.points) - {"pole"})
-    for name, condition in conditions.items():
-        allowed = [*edges, *(points if isinstance(condition, Held) else [])]
-        if name not in allowed:
-            raise MeshError(f"boundary.{name}: the surface has no such edge, only {', '.join(allowed) or 'none'}")
-    for load in loads.dead:
-        edge = getattr(load, "edge", None)
-        if edge is not None and edge not in edges:
-            raise MeshError(f"loading.loads: edge: {edge}: the surface has only {', '.join(edges) or 'none'}")
 
 
 def _held(V: fem.FunctionSpace, facets: NDArray[np.int32]) -> fem.DirichletBC:

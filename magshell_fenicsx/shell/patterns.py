@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.mesh.patch import MeshError
 
 Array = NDArray[np.float64]
+LARGEST = 1e6  # of a remanence's components
 # (cells, nodes, 3) positions r0 and normals n0 -> (cells, nodes, 3) vectors
 Pattern = Callable[[Array, Array], Array]
 
@@ -60,20 +61,21 @@ class ByPatch:
         return np.broadcast_to(self.vectors[: len(r0), None], r0.shape)  # owned cells come first
 
 
-def by_patch(vectors: Mapping[str, Array], patches: Mapping[str, NDArray[np.bool_]]) -> ByPatch:
+def by_patch(vectors: Mapping[str, Array], patches: Mapping[str, NDArray[np.bool_]], cells: int) -> ByPatch:
     """A vector (3,) for each named patch of a mesh, and one for the "rest"; zero without.
 
     Parameters
     ----------
     patches
         Name -> whether each cell of this rank belongs to it.
+    cells
+        How many there are.
 
     Raises
     ------
     MeshError
         If there is no such patch.
     """
-    cells = len(next(iter(patches.values()), []))
     found = np.tile(vectors.get("rest", np.zeros(3)), (cells, 1))
     for name, vector in vectors.items():
         if name in patches:
@@ -85,7 +87,13 @@ def by_patch(vectors: Mapping[str, Array], patches: Mapping[str, NDArray[np.bool
 
 
 def pattern_field(pattern: Pattern, r0: fem.Function) -> fem.Function:
-    """The pattern at the nodes of every cell, free to jump from cell to cell."""
+    """The pattern at the nodes of every cell, free to jump from cell to cell; collective.
+
+    Raises
+    ------
+    MeshError
+        On every rank, if it has no finite value somewhere.
+    """
     V = r0.function_space
     element = V.element.basix_element
     values = element.tabulate(1, element.points)
@@ -95,5 +103,13 @@ def pattern_field(pattern: Pattern, r0: fem.Function) -> fem.Function:
     n0 = m / np.linalg.norm(m, axis=-1, keepdims=True)
     Q = fem.functionspace(V.mesh, ("DG", element.degree, (3,)))
     field = fem.Function(Q, name="Br")
-    field.x.array.reshape(-1, 3)[Q.dofmap.list] = pattern(nodes, n0)
+    vectors = pattern(nodes, n0)
+    bad = nodes[~(np.abs(vectors) <= LARGEST).all(axis=-1)][:1].tolist()
+    if said := [place for places in V.mesh.comm.allgather(bad) for place in places]:
+        x, y, z = said[0]
+        raise MeshError(
+            f"magnetic.remanent: has no finite value (or one above {LARGEST:g}) at (x, y, z)/R = "
+            f"({x:.3g}, {y:.3g}, {z:.3g})"
+        )
+    field.x.array.reshape(-1, 3)[Q.dofmap.list] = vectors
     return field

@@ -1,6 +1,6 @@
 """What holds a shell: displacements that are zero, and whether it is held against rigid motions."""
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable, Mapping
 
 import numpy as np
 from dolfinx import fem, mesh
@@ -8,11 +8,13 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from magshell_fenicsx.mesh.patch import MeshError
+from magshell_fenicsx.shell.parameters import Condition, Held, Loads
 from magshell_fenicsx.solve.problem import FiniteElementSystem
 from magshell_fenicsx.solve.system import Amplitudes
 
 Array = NDArray[np.float64]
 STRAIGHT = 1e-6  # deviation of an edge from a plane, in lengths of R
+CROSSING = 0.9  # mean cosine between flat cells and the normal of the plane that the surface crosses
 FREE = 1e-12  # of the squares that a rigid motion has where the shell is held, over the largest: rounding
 LOOSE = 1e-13  # of a rigid motion's energy, over the tangent's largest row
 
@@ -29,8 +31,38 @@ def held_at_vertex(V: fem.FunctionSpace, x: Array, components: Iterable[int]) ->
     return [fem.dirichletbc(0.0, fem.locate_dofs_topological(V.sub(i), 0, near), V.sub(i)) for i in components]
 
 
-def plane_of(V: fem.FunctionSpace, r0: fem.Function, facets: NDArray[np.int32], name: str) -> int:
-    """The axis that the plane of an edge is normal to; collective.
+def refuse_unknown(
+    edges: Collection[str], points: Collection[str], conditions: Mapping[str, Condition], loads: Loads
+) -> None:
+    """See that every edge and point that is named is there.
+
+    Raises
+    ------
+    MeshError
+        With the name and those that there are.
+    """
+    named = sorted(set(points) - {"pole"})
+    for name, condition in conditions.items():
+        allowed = [*sorted(edges), *(named if isinstance(condition, Held) else [])]
+        if name not in allowed:
+            raise MeshError(f"boundary.{name}: the surface has no such edge, only {', '.join(allowed) or 'none'}")
+    for load in loads.dead:
+        edge = getattr(load, "edge", None)
+        if edge is not None and edge not in edges:
+            there = ", ".join(sorted(edges)) or "none"
+            raise MeshError(f"loading.loads: edge: {edge}: the surface has only {there}")
+
+
+def open_to_pressure(name: str) -> str:
+    """What is said of an edge where the energy p V of a live pressure would load the edge too."""
+    return (
+        f"loading.kind: pressure: the edge {name} must be held (clamped or hinged), or lie in a symmetry plane through "
+        "the origin; kind: dead with {over: all, pressure: ..} has no such limit (not on a strip)"
+    )
+
+
+def plane_of(V: fem.FunctionSpace, r0: fem.Function, facets: NDArray[np.int32], name: str) -> tuple[int, float]:
+    """The axis that the plane of an edge is normal to, and where on it the plane is, over R; collective.
 
     Raises
     ------
@@ -41,34 +73,35 @@ def plane_of(V: fem.FunctionSpace, r0: fem.Function, facets: NDArray[np.int32], 
     here = r0.x.array.reshape(-1, 3)[dofs]
     places = np.concatenate(V.mesh.comm.allgather(here))
     flat = np.flatnonzero(np.ptp(places, axis=0) < STRAIGHT)
-    if len(flat) == 2:  # a straight edge: the plane is the one that the surface crosses at right angles
-        across = _conormal_axes(V, r0, facets)
-        flat = np.array([i for i in flat if abs(across[i]) > 0.9])
+    # a straight edge lies in two planes, one in its own surface in none that this surface crosses
+    across = _conormal_axes(V, facets)
+    flat = flat[across[flat] > CROSSING]
     if len(flat) != 1:
         raise MeshError(
             f"boundary.{name}: symmetry: the edge must lie in a plane normal to x, y or z that the surface crosses at "
             "right angles; turn the geometry so that it does"
         )
-    return int(flat[0])
+    return int(flat[0]), float(places[:, flat[0]].mean())
 
 
-def _conormal_axes(V: fem.FunctionSpace, r0: fem.Function, facets: NDArray[np.int32]) -> Array:
-    """Mean outward conormal (3,) of the flat cells at some edges; collective."""
+def _conormal_axes(V: fem.FunctionSpace, facets: NDArray[np.int32]) -> Array:
+    """Mean size (3,) of the components of the flat cells' conormals at some edges; collective."""
     domain = V.mesh
     domain.topology.create_connectivity(1, 2)
     domain.topology.create_connectivity(1, 0)
     domain.topology.create_connectivity(2, 0)
-    total, owned = np.zeros(3), domain.topology.index_map(1).size_local
+    total, length, owned = np.zeros(3), 0.0, domain.topology.index_map(1).size_local
     corners = domain.geometry.x[domain.geometry.dofmap]
     for facet in facets[facets < owned]:
         cell = domain.topology.connectivity(1, 2).links(facet)[0]
         ends = domain.geometry.x[mesh.entities_to_geometry(domain, 1, np.array([facet], dtype=np.int32))[0]]
-        along = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
+        size = np.linalg.norm(ends[1] - ends[0])
+        along = (ends[1] - ends[0]) / size
         outward = ends.mean(axis=0) - corners[cell].mean(axis=0)
         outward -= (outward @ along) * along
-        total += np.linalg.norm(ends[1] - ends[0]) * outward / np.linalg.norm(outward)
-    total = domain.comm.allreduce(total)
-    return np.asarray(total / np.linalg.norm(total))
+        total += size * np.abs(outward) / np.linalg.norm(outward)
+        length += float(size)
+    return np.asarray(domain.comm.allreduce(total) / domain.comm.allreduce(length))
 
 
 def refuse_loose(system: FiniteElementSystem, r0: fem.Function, amplitudes: Amplitudes) -> None:

@@ -37,7 +37,7 @@ def thickness_field(thickness: Thickness, r0: fem.Function, midsurface: Midsurfa
     if thickness.of_position:
         values = np.array(thickness.of_position(*np.moveaxis(nodes, -1, 0)))
     for name, factor in (thickness.patches or {}).items():
-        values[patch_of(midsurface, name)] = factor
+        values[patch_of(midsurface.patches, name)] = factor
     bad = nodes[~((values > 1e-3) & (values < 1e3))][:1].tolist()
     if said := [place for places in V.mesh.comm.allgather(bad) for place in places]:
         x, y, z = said[0]
@@ -48,18 +48,18 @@ def thickness_field(thickness: Thickness, r0: fem.Function, midsurface: Midsurfa
     return field
 
 
-def patch_of(midsurface: Midsurface, name: str) -> NDArray[np.bool_]:
-    """Whether each cell of this rank belongs to a patch.
+def patch_of(patches: Mapping[str, NDArray[np.bool_]], name: str) -> NDArray[np.bool_]:
+    """Whether each cell belongs to a patch.
 
     Raises
     ------
     MeshError
         If there is no such patch.
     """
-    if name not in midsurface.patches:
-        there = ", ".join(midsurface.patches) or "none"
+    if name not in patches:
+        there = ", ".join(patches) or "none"
         raise MeshError(f"the surface has no patch {name}; it has {there}")
-    return midsurface.patches[name]
+    return patches[name]
 
 
 def thick(density: Density, t: fem.Function, h_at: int | None) -> Density:
