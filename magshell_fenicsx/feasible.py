@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.expressions import formula
 from magshell_fenicsx.case.messages import shown
+from magshell_fenicsx.case.shell import ShellSection
 from magshell_fenicsx.case.solid import SolidSection
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.mesh.grading import Grading
@@ -26,7 +27,9 @@ def refuse_too_large(case: Case, size: Grading, shape: Shape) -> None:
     CaseError
         If they are more than `MOST_UNKNOWNS`.
     """
-    refuse_too_many(case, size.cells(shape), "; with coplanar fields and loads, symmetry: half halves it")
+    charted = isinstance(case.shell, ShellSection)  # the others have their symmetry edges
+    hint = "; with coplanar fields and loads, symmetry: half halves it" if charted else ""
+    refuse_too_many(case, size.cells(shape), hint)
 
 
 def refuse_too_many(case: Case, cells: float, hint: str = "") -> None:

@@ -1,7 +1,6 @@
 """The plan of a case on any mid-surface: what is meshed, held and loaded, over the reference length R."""
 
 from math import pi, radians, sqrt
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,7 +88,7 @@ def plan_surface(case: Case, shell: Surface) -> Plan:
     return Plan(
         material=material,
         loads=loads,
-        conditions=_renamed(edge_conditions(case.boundary), shape),
+        conditions=edge_conditions(case.boundary),
         axisymmetric=False,
         half=False,
         azimuth=0.0,
@@ -128,12 +127,12 @@ def _size(case: Case, shell: Surface) -> float:
 def _chart(shell: Surface, size: float) -> tuple[Shape | Grid | MeshFile, Embedding]:
     R = shell.reference
     if isinstance(shell, MeshSurface):
-        return MeshFile(Path(shell.file), (shell.unit or 1.0) / R), in_space
+        return MeshFile(shell.path, (shell.unit or 1.0) / R), in_space
     if isinstance(shell, PlateSurface):
         return Grid((0.0, 0.0), (1.0, shell.width / R), size), flat
     profile, names = _profile(shell)
     if names[1] is None:
-        return DiscShape(profile.length, half=False), Capped(profile)
+        return DiscShape(profile.length, half=False, edge=names[0]), Capped(profile)
     first, last = shell.turn
     along = np.linspace(0, profile.length, 101, dtype=np.float64)
     rho = float(profile(along)[:, 0].max())
@@ -194,13 +193,6 @@ def _somewhere(shape: Shape | Grid) -> Array:
     if isinstance(shape, Grid):
         return np.array(shape.high) if not any(shape.glued) else np.array(shape.low)
     return np.zeros(2)
-
-
-def _renamed(conditions: dict[str, Condition], shape: Shape | Grid | MeshFile) -> dict[str, Condition]:
-    """The lower end of a surface with a pole is the rim of its chart."""
-    if isinstance(shape, DiscShape):
-        return {"rim" if name == "bottom" else name: c for name, c in conditions.items()}
-    return conditions
 
 
 def _dead(load: DeadLoadSection, shell: SurfaceSection) -> DeadLoad:

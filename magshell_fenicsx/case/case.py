@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Literal, Self
 
 from pydantic import Field, ValidationError, model_validator
 
@@ -85,6 +85,8 @@ class Case(Section):
             raise ValueError(f"points: are named on other geometries, not on a {geometry}")
         if isinstance(self.loading, DeadSection):
             raise ValueError(f"loading.kind: 'dead': not on a {geometry}; a plate or cap of the same shape takes it")
+        if self.mesh.size is not None:
+            raise ValueError(f"mesh.size: not on a {geometry}; mesh.refinement divides every element size")
         for name in conditions:
             if name not in edges:
                 raise ValueError(f"boundary.{name}: a {geometry} has no such edge, only {', '.join(edges)}")
@@ -119,6 +121,16 @@ class Case(Section):
             raise ValueError(
                 f"symmetry: {self.symmetry}: not with a {shell.geometry}; give the edges of the part that is modelled "
                 "boundary: {name: symmetry}"
+            )
+        if "pole" in self.points:
+            raise ValueError("points.pole: is taken, by the point that w_pole_over_h is of; choose another name")
+        if isinstance(shell, MeshSurface):
+            for key in sorted(self.mesh.model_fields_set & {"size", "refinement"}):
+                raise ValueError(f"mesh.{key}: not with geometry: mesh, whose elements are those of the file")
+        if self.magnetic and self.magnetic.lambda_m is None and not shell.with_units:
+            raise ValueError(
+                "magnetic: flux densities need shell.youngs_modulus in pascals: give youngs_modulus and lengths units, "
+                "or lambda_m"
             )
         if self.mesh.tolerance is not None:
             raise ValueError(f"mesh.tolerance: not with a {shell.geometry}; give degree, size and refinement")
@@ -182,6 +194,11 @@ class Case(Section):
         """|Br||Ba|/(mu_0 E); 0 without a field."""
         return self.magnetic.amplitude(self.shell.youngs_modulus) if self.magnetic else 0.0
 
+    @property
+    def outside(self) -> dict[str, str | None]:
+        """What is solved besides the case's own keys: the hash of its mesh file, if it has one."""
+        return {"mesh_file": self.shell.digest} if isinstance(self.shell, MeshSurface) else {}
+
     @classmethod
     def load(cls, file: str | Path, settings: Sequence[str] = ()) -> "Case":
         """Read a case file, with `key.path=value` settings in place of its own.
@@ -194,20 +211,12 @@ class Case(Section):
         source = read_source(Path(file))
         for setting in settings:
             override(source, setting)
-        _beside(Path(file).parent, source.data)
         return cls.from_source(source)
 
     @classmethod
     def from_source(cls, source: Source) -> "Case":
         """Validate plain data; see `load`."""
         try:
-            return cls.model_validate(source.data)
+            return cls.model_validate(source.data, context={"folder": source.folder})
         except ValidationError as e:
             raise CaseError("\n".join(explain(error, source, cls) for error in e.errors())) from None
-
-
-def _beside(folder: Path, data: Any) -> None:
-    """A mesh file is told from where the case file is."""
-    shell = data.get("shell")
-    if isinstance(shell, dict) and isinstance(shell.get("file"), str):
-        shell["file"] = str(folder.absolute() / shell["file"])

@@ -141,6 +141,8 @@ class DeadSection(PathSection):
             self.control == "displacement" or self.displacement is not None
         ):
             raise ValueError("displacement: a moment has none; take control: arc or load with factor")
+        if self.branches and any(load.moment is not None for load in self.loads):
+            raise ValueError("branches: not with a moment, whose potential counts the turns along one path")
         return self
 
 

@@ -35,11 +35,14 @@ class Source:
     ----------
     places
         Location of a key or item -> "file:line" or the `--set` that gave it.
+    folder
+        Where the files that it names are.
     """
 
     name: str
     data: dict[str, Any]
     places: dict[Location, str] = field(default_factory=dict)
+    folder: Path = field(default_factory=Path)
 
     def place(self, location: Location) -> str:
         """The place of a key, or of the innermost section around it."""
@@ -67,7 +70,7 @@ def read_source(file: Path) -> Source:
         raise CaseError(f"{file}: is not a text file in UTF-8") from None
     if len(content) > LARGEST:
         raise CaseError(f"{file}: is larger than {LARGEST} bytes, too large for a case file")
-    source = Source(str(file), {})
+    source = Source(str(file), {}, folder=file.parent)
     node = _parsed(source, lambda: yaml.compose(text, Loader=_Loader))
     if not isinstance(node, yaml.MappingNode):
         raise CaseError(f"{file}: a case file is a mapping of sections (shell, boundary, loading, ...)")

@@ -4,11 +4,13 @@ Lengths are plain numbers of one unit that the user chooses, or all have units a
 the same holds for Young's modulus, so that loads and results are in the user's units or in SI.
 """
 
-from math import pi, radians
+import hashlib
+from math import radians
+from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, Field, ModelWrapValidatorHandler, PrivateAttr, model_validator
 
 from magshell_fenicsx.case.base import Section, in_units
 from magshell_fenicsx.case.defects import DimpleSection
@@ -33,14 +35,19 @@ class SurfaceSection(Section):
     poisson_ratio: float = Field(gt=-1, le=0.5)
     thickness_factor: Formula | dict[str, Annotated[float, Field(gt=0, le=100)]] | None = None
 
-    @model_validator(mode="before")
+    _with_units: bool = PrivateAttr(default=False)
+
+    @model_validator(mode="wrap")
     @classmethod
-    def _all_with_units_or_none(cls, data: Any) -> Any:
+    def _all_with_units_or_none(cls, data: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
+        measured = [data[key] for key in MEASURES if key in data] if isinstance(data, dict) else []
+        kinds = {isinstance(value, str) for value in measured if isinstance(value, str | int | float)}
+        if len(kinds) > 1:
+            raise ValueError("give every length and youngs_modulus a unit, or none of them")
+        section = handler(data)
         if isinstance(data, dict):
-            measured = [data[key] for key in MEASURES if key in data and isinstance(data[key], str | int | float)]
-            if len({isinstance(value, str) for value in measured}) > 1:
-                raise ValueError("give every length and youngs_modulus a unit, or none of them")
-        return data
+            section._with_units = kinds == {True}
+        return section
 
     @model_validator(mode="after")
     def _thin(self) -> Self:
@@ -49,6 +56,11 @@ class SurfaceSection(Section):
         if isinstance(self.thickness_factor, dict) and not isinstance(self, MeshSurface):
             raise ValueError("thickness_factor: patches have names only with geometry: mesh")
         return self
+
+    @property
+    def with_units(self) -> bool:
+        """Whether lengths and Young's modulus were given units, and are in SI."""
+        return self._with_units
 
     @property
     def reference(self) -> float:
@@ -68,6 +80,12 @@ class SurfaceSection(Section):
 MEASURES = ("thickness", "youngs_modulus", "radius", "length", "width", "inner_radius", "tube_radius")
 
 
+def _refuse_overturned(azimuth: list[float] | None) -> None:
+    first, last = azimuth or FULL_TURN
+    if not 1e-3 <= last - first <= 360:
+        raise ValueError(f"azimuth: from {first:g} to {last:g} degrees; it must grow, by at most 360")
+
+
 class RoundSection(SurfaceSection):
     """Has a radius; `azimuth` (degrees) is the part that there is, closed where it is not given."""
 
@@ -76,9 +94,7 @@ class RoundSection(SurfaceSection):
 
     @model_validator(mode="after")
     def _turns_once(self) -> Self:
-        first, last = self.azimuth or FULL_TURN
-        if not 1e-3 <= last - first <= 360:
-            raise ValueError(f"azimuth: from {first:g} to {last:g} degrees; it must grow, by at most 360")
+        _refuse_overturned(self.azimuth)
         return self
 
     @property
@@ -213,9 +229,7 @@ class RevolutionSurface(SurfaceSection):
 
     @model_validator(mode="after")
     def _turns(self) -> Self:
-        first, last = self.turn
-        if not 0 < last - first <= 2 * pi:
-            raise ValueError("azimuth: it must grow, by at most 360")
+        _refuse_overturned(self.azimuth)
         if self.azimuth is not None and self.profile.curve[-1, 0] == 0:
             raise ValueError("azimuth: a part of a surface with a pole cannot be built")
         return self
@@ -224,13 +238,19 @@ class RevolutionSurface(SurfaceSection):
 class MeshSurface(SurfaceSection):
     """A .msh file: physical groups of surfaces are patches, those of curves are edges.
 
-    `radius` is the reference length; `unit` that of the file's coordinates, where lengths have units.
+    `radius` is the reference length; `unit` that of the file's coordinates, where lengths have units. The file
+    is told from the folder of the case (`Source.folder`).
     """
 
     geometry: Literal["mesh"]
     file: str
     radius: Measure
     unit: Annotated[float, BeforeValidator(in_units("metre", bare=True))] | None = None
+
+    _folder: Path = PrivateAttr(default_factory=Path)
+
+    def model_post_init(self, context: Any, /) -> None:
+        self._folder = Path((context or {}).get("folder", "")).absolute()
 
     @model_validator(mode="before")
     @classmethod
@@ -242,6 +262,19 @@ class MeshSurface(SurfaceSection):
     @property
     def reference(self) -> float:
         return self.radius
+
+    @property
+    def path(self) -> Path:
+        """Where the file is."""
+        return self._folder / self.file
+
+    @property
+    def digest(self) -> str | None:
+        """Hash of the file's content; None if it cannot be read."""
+        try:
+            return hashlib.sha256(self.path.read_bytes()).hexdigest()
+        except OSError:
+            return None
 
 
 Surface = CapSurface | CylinderSurface | PlateSurface | AnnulusSurface | TorusSurface | RevolutionSurface | MeshSurface

@@ -108,7 +108,9 @@ def _content(
         edges = {}
         for name, tags in _groups(1).items():
             lines = [_elements(file, 1, LINES, number, int(tag))[0] for tag in tags]
-            edges[name] = np.concatenate([part[:, :2] for each in lines for part in each])
+            pairs = [part[:, :2] for each in lines for part in each]
+            if pairs:  # a curve of the drawing may carry no elements
+                edges[name] = np.concatenate(pairs)
         return xyz.reshape(-1, 3).copy(), cells, patches, edges
 
 

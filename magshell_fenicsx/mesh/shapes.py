@@ -32,17 +32,20 @@ class Shape(Protocol):
 
 @dataclass(frozen=True)
 class DiscShape:
-    """A disc around the origin; edges "rim", and "symmetry" of the half with y >= 0.
+    """A disc around the origin; edges `edge`, and "symmetry" of the half with y >= 0.
 
     Attributes
     ----------
     circle
         Radius of an inner circle that edges follow (the rim of a dimple).
+    edge
+        Name of its outer edge.
     """
 
     radius: float
     half: bool
     circle: float | None = None
+    edge: str = "rim"
 
     @property
     def area(self) -> float:
@@ -62,7 +65,7 @@ class DiscShape:
         return list(occ.intersect(discs, [above])[0])
 
     def on_edges(self, x: Array) -> dict[str, NDArray[np.bool_]]:
-        edges = {"rim": np.isclose(np.hypot(x[:, 0], x[:, 1]), self.radius, rtol=1e-9)}
+        edges = {self.edge: np.isclose(np.hypot(x[:, 0], x[:, 1]), self.radius, rtol=1e-9)}
         if self.half:
             edges["symmetry"] = np.abs(x[:, 1]) < 1e-9 * self.radius
         return edges

@@ -11,7 +11,8 @@ from mpi4py import MPI
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.source import CaseError, Source
 from magshell_fenicsx.mesh.midsurface import Midsurface
-from magshell_fenicsx.plan import make_plan
+from magshell_fenicsx.mesh.patch import MeshError
+from magshell_fenicsx.plan import describe, make_plan
 from magshell_fenicsx.scene import build_midsurface
 from magshell_fenicsx.shell import kinematics as kin
 
@@ -55,7 +56,7 @@ SURFACES: list[tuple[dict[str, Any], float, set[str]]] = [
             "profile": {"points": [[r, -r * r] for r in np.linspace(1, 0, 41).tolist()]},
         },
         np.pi / 6 * (5**1.5 - 1),
-        {"rim"},
+        {"bottom"},
     ),
 ]
 
@@ -116,7 +117,12 @@ def test_named_points_are_vertices(shell: dict[str, Any], place: list[float]) ->
     assert np.linalg.norm(surface.mesh.geometry.x - x, axis=1).min() < 1e-9
 
 
-REFUSED = [
+DENSITIES = {"remanent": {"flux_density": "60 mT"}, "applied": {"flux_density": "50 mT"}}
+FILE = {**COMMON, "geometry": "mesh", "file": "part.msh", "radius": 1}
+DISC = {"geometry": "disc", "radius_to_thickness": 50, "poisson_ratio": 0.3}
+CAP = {"geometry": "cap", "radius": 1, "polar": 60}
+MOMENT = {"kind": "dead", "loads": [{"edge": "top", "moment": 1}], "factor": 1}
+REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"shell.geometry": "sphere"}, "shell.geometry: 'sphere'; allowed: hemisphere, disc, strip, cap"),
     ({"points": {"A": [1, 1, 1]}}, "points.A: is not on the surface; a place near it that is: [0.70710678"),
     ({"shell.radius": "1 mm"}, "give every length and youngs_modulus a unit, or none"),
@@ -132,6 +138,12 @@ REFUSED = [
     ({"symmetry": "half"}, "boundary: {name: symmetry}"),
     ({"mesh.tolerance": 1e-3}, "mesh.tolerance: not with a cylinder"),
     ({"shell.thickness_factor": "1 +"}, "is not a formula"),
+    ({"points": {"pole": [1, 0, 0]}}, "points.pole: is taken"),
+    ({"magnetic": DENSITIES}, "give youngs_modulus and lengths units, or lambda_m"),
+    ({"shell": FILE, "mesh.size": 0.1}, "mesh.size: not with geometry: mesh"),
+    ({"shell": FILE, "mesh.refinement": 2}, "mesh.refinement: not with geometry: mesh"),
+    ({"shell": DISC, "boundary": {"rim": "clamped"}, "mesh.size": 0.1}, "mesh.size: not on a disc"),
+    ({"loading": {**MOMENT, "branches": True}}, "branches: not with a moment"),
 ]
 
 
@@ -155,3 +167,96 @@ def test_units_are_turned_into_si() -> None:
     case = Case.from_source(Source("test", {"shell": shell, "boundary": {"bottom": "clamped"}}))
     assert case.shell.R_over_h == pytest.approx(50)
     assert make_plan(case).length == pytest.approx(0.025)
+
+
+def test_a_cap_is_not_told_to_take_half() -> None:
+    data = {"shell": {**COMMON, **CAP, "thickness": 1e-5}, "boundary": {"rim": "clamped"}, "mesh": {"refinement": 20}}
+    with pytest.raises(CaseError) as error:
+        make_plan(Case.from_source(Source("test", data)))
+    assert "unknowns" in str(error.value)
+    assert "symmetry: half" not in str(error.value)
+
+
+def test_flux_densities_of_a_shell_with_units() -> None:
+    """lambda_m = |Br||Ba|/(mu_0 E)."""
+    shell = {"geometry": "plate", "length": "1 cm", "width": "1 cm", "thickness": "0.1 mm", "poisson_ratio": 0.5}
+    data = {"shell": {**shell, "youngs_modulus": "1.8 MPa"}, "boundary": {"left": "clamped"}, "magnetic": DENSITIES}
+    assert Case.from_source(Source("test", data)).lambda_m == pytest.approx(0.06 * 0.05 / (4e-7 * np.pi * 1.8e6))
+
+
+@pytest.mark.parametrize("azimuth", [[2, 362], [-180, 180], [0, 360]])
+def test_a_profile_may_be_slit_anywhere(azimuth: list[float]) -> None:
+    shell = {"geometry": "revolution", "profile": {"points": [[2, 0], [1, 1]]}, "azimuth": azimuth}
+    assert {"left", "right"} < set(built(shell).edges)
+
+
+PARABOLOID = SURFACES[-1][0]
+NAMES = [
+    (PARABOLOID, {"boundary": {"rim": "clamped"}}, "boundary.rim: the surface has no such edge, only bottom"),
+    (PARABOLOID, {"boundary": {"bottom": "clamped"}, "loading": {**MOMENT}}, "edge: top: the surface has only bottom"),
+    (
+        CAP,
+        {"points": {"rim": [0, 0, 1]}, "boundary": {"rim": {"held": ["z"]}}},
+        "boundary.rim: is an edge and a point; give the point another name",
+    ),
+]
+
+
+@pytest.mark.parametrize(("shell", "sections", "said"), NAMES)
+def test_names_are_known_before_anything_is_solved(shell: dict[str, Any], sections: dict[str, Any], said: str) -> None:
+    """`magshell check` and `run` make the same triangulation."""
+    data = {"shell": {**COMMON, **shell, "youngs_modulus": 1}, "boundary": {}, "mesh": {"size": 0.4}, **sections}
+    with pytest.raises(MeshError, match=said):
+        make_plan(Case.from_source(Source("test", data))).triangulated()
+    with pytest.raises(CaseError, match=said):
+        describe(Case.from_source(Source("test", data)))
+
+
+def test_loads_on_the_edge_of_a_surface_with_a_pole() -> None:
+    load = {"kind": "dead", "loads": [{"edge": "bottom", "per_length": [0, 0, 1]}], "factor": 1}
+    data = {"shell": {**PARABOLOID, "youngs_modulus": 1}, "boundary": {"bottom": {"held": ["x", "y"]}}, "loading": load}
+    assert built(data["shell"], boundary=data["boundary"], loading=load).edges.keys() == {"bottom"}
+
+
+CYLINDER = {"geometry": "cylinder", "radius": 1, "length": 1}
+PLATE = {"geometry": "plate", "length": 1, "width": 1}
+SQUARE = dict.fromkeys(("left", "right", "bottom", "top"), "hinged")
+STRIP = {"geometry": "strip", "radius_to_thickness": 100, "width": 0.1, "poisson_ratio": 0}
+ROOT = {"root": "clamped"}
+OPEN: list[tuple[dict[str, Any], dict[str, Any], str]] = [
+    (CYLINDER, {"bottom": "clamped"}, "top"),
+    (CYLINDER, {"bottom": "clamped", "top": {"held": ["x", "y"]}}, "top"),
+    (PLATE, SQUARE | {"top": "free"}, "top"),
+    (STRIP, ROOT, "tip"),
+    (STRIP, {**ROOT, "tip": "clamped"}, "sides"),
+]
+CLOSED = [
+    (CYLINDER, {"bottom": "symmetry", "top": {"held": ["x", "y", "z"]}}),
+    (PLATE, SQUARE),
+    (PLATE, SQUARE | {"left": "symmetry"}),
+    (STRIP, {**ROOT, "tip": "clamped", "sides": "simply supported"}),
+    ({"geometry": "torus", "radius": 1, "tube_radius": 0.3}, {}),
+]
+
+
+def pressed(shell: dict[str, Any], boundary: dict[str, Any], model: str = "shell") -> Case:
+    common = {} if shell is STRIP else COMMON
+    data = {"shell": {**common, **shell}, "boundary": boundary, "loading": {"kind": "pressure"}, "model": model}
+    return Case.from_source(Source("test", data))
+
+
+@pytest.mark.parametrize(("shell", "boundary", "edge"), OPEN)
+def test_live_pressure_is_refused_on_open_edges(shell: dict[str, Any], boundary: dict[str, Any], edge: str) -> None:
+    """The variation of int x.n/3 has the line integral of dx.(x cross t)/3 on every edge that can move."""
+    with pytest.raises(MeshError, match=f"loading.kind: pressure: the edge {edge} must be held"):
+        make_plan(pressed(shell, boundary)).triangulated()
+
+
+@pytest.mark.parametrize(("shell", "boundary"), CLOSED)
+def test_live_pressure_where_edges_are_held(shell: dict[str, Any], boundary: dict[str, Any]) -> None:
+    assert len(make_plan(pressed(shell, boundary)).triangulated().cells)
+
+
+def test_live_pressure_on_an_open_strip_as_a_solid() -> None:
+    with pytest.raises(MeshError, match="pressure: the edge tip must be held"):
+        make_plan(pressed(STRIP, ROOT, "solid")).triangulated()
