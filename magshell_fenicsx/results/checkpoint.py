@@ -149,7 +149,8 @@ def _encoded(point: Point, u: Array, du: Array) -> bytes:
 
 
 def _identity(case: Case) -> bytes:
-    return json.dumps({"version": __version__, "case": case.model_dump(mode="json", exclude_none=True)}).encode()
+    data = {"version": __version__, "case": case.model_dump(mode="json", exclude_none=True), **case.outside}
+    return json.dumps(data).encode()
 
 
 def _difference(there: Any, here: Any, key: str = "") -> str:

@@ -79,7 +79,8 @@ def _resumed(out: Path, case: Case) -> None:
     if not file.exists() and (out / "summary.json").exists():
         summary = json.loads((out / "summary.json").read_text(encoding="utf-8"))
         if summary["stopped"] is None:
-            saved = {"version": summary["versions"]["magshell_fenicsx"], "case": summary["case"]}
+            kept = {key: summary[key] for key in ("case", "mesh_file") if key in summary}
+            saved = {"version": summary["versions"]["magshell_fenicsx"], **kept}
             checkpoint.refuse_other(saved, case, out)
             raise AlreadyComplete(summary)
     checkpoint.check_resumable(file, case)

@@ -94,6 +94,7 @@ def summary(result: Result, total_s: float) -> dict[str, Any]:
     R_over_h = 1 / material.h
     return {
         "case": (result.adapted.asked if result.adapted else scene.case).model_dump(mode="json", exclude_none=True),
+        **scene.case.outside,
         "dimensionless": {
             "radius_to_thickness": R_over_h,
             "poisson_ratio": material.nu,

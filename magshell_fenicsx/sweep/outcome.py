@@ -15,7 +15,9 @@ CURVE = (
     "amplitude",
     "p_over_pc",
     "lambda_m",
+    "field_angle",
     "force",
+    "load_factor",  # of dead loads only
     "w_over_h",
     "w_pole_over_h",
     "volume_change",
@@ -38,7 +40,7 @@ class Outcome:
     stopped
         Why the run ended before its target; None if it reached it.
     curve
-        Every accepted point, with the columns of `CURVE`.
+        Every accepted point, with those columns of `CURVE` that the run has.
     found
         "path": by a run of its own; "fold": the fold of the point before was followed, and the curve
         has only that.
@@ -65,7 +67,7 @@ def outcome_of(result: Result, found: Found, factorisations: int, wall_s: float)
         stopped=result.stopped,
         dofs=result.scene.model.system.dofs,
         wall_s=round(wall_s, 3),
-        curve=[{key: row[key] for key in CURVE} for row in result.rows],
+        curve=[{key: row[key] for key in CURVE if key in row} for row in result.rows],
         found=found,
         factorisations=factorisations,
     )

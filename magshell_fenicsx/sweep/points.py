@@ -76,7 +76,7 @@ def _point(source: Source, axes: Sequence[Axis], values: Sequence[str]) -> Sweep
 
 def identity(case: Case) -> str:
     """Hash of what is solved: of the resolved case, without a field that is zero, and of the version."""
-    data = case.model_dump(mode="json")
+    data = case.model_dump(mode="json") | case.outside
     if not case.lambda_m:
         del data["magnetic"]
     text = json.dumps([__version__, data], sort_keys=True)

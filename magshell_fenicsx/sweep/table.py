@@ -51,7 +51,8 @@ def sweep_row(outcome: Outcome) -> dict[str, Any]:
 def write_curves(points: Sequence[SweepPoint], outcomes: Sequence[Outcome], file: Path) -> None:
     """Write curves.csv."""
     rows = [{**point.values, **row} for point, outcome in zip(points, outcomes, strict=True) for row in outcome.curve]
-    write_csv(rows, (*points[0].values, *CURVE), file)
+    there = [key for key in CURVE if any(key in row for row in rows)]
+    write_csv(rows, (*points[0].values, *there), file)
 
 
 def write_csv(rows: Iterable[Mapping[str, Any]], columns: Sequence[str], file: Path) -> None:

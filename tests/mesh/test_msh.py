@@ -10,9 +10,15 @@ import pytest
 from mpi4py import MPI
 
 from magshell_fenicsx import Case, Scene, run
-from magshell_fenicsx.case.source import Source
+from magshell_fenicsx.case.source import CaseError, Source
 from magshell_fenicsx.mesh.msh import MeshFile, read_msh
 from magshell_fenicsx.mesh.patch import MeshError, PatchMesh, check_orientation
+from magshell_fenicsx.plan import describe, make_plan
+from magshell_fenicsx.results.files import AlreadyComplete
+from magshell_fenicsx.shell.patterns import ByPatch
+from magshell_fenicsx.sweep.axes import parse_axis
+from magshell_fenicsx.sweep.points import make_points
+from magshell_fenicsx.sweep.sweep import sweep
 
 Script = Callable[[], None]
 
@@ -229,3 +235,88 @@ def test_unknown_names_are_refused(model: Any, tmp_path: Path) -> None:
     ):
         with pytest.raises(MeshError, match=said):
             Scene(Case.from_source(Source("test", {"shell": shell, "mesh": {"degree": 2}, **changed})), MPI.COMM_SELF)
+
+
+def test_rest_of_a_mesh_without_patches(model: Any, tmp_path: Path) -> None:
+    """Is all of it."""
+    written([*TWO], CORNERS, FRAME, tmp_path / "part.msh")
+    model.removePhysicalGroups([(2, 1)])
+    gmsh.option.setNumber("Mesh.SaveAll", 1)
+    gmsh.write(str(tmp_path / "part.msh"))
+    magnetic = {"lambda_m": 1e-3, "remanent": {"kind": "patches", "patches": {"rest": {"polar": 0}}}}
+    shell = {"geometry": "mesh", "file": str(tmp_path / "part.msh"), "radius": 1, **MATERIAL}
+    data = {"shell": shell, "boundary": {"rim": "clamped"}, "magnetic": magnetic, "mesh": {"degree": 2}}
+    scene = Scene(Case.from_source(Source("test", data)), MPI.COMM_SELF)
+    assert not scene.model.midsurface.patches
+    assert isinstance(scene.model.loads.magnetic.remanent, ByPatch)  # type: ignore[union-attr]
+    assert scene.model.loads.magnetic.remanent.vectors == pytest.approx(np.tile([0, 0, 1], (2, 1)))  # type: ignore[union-attr]
+
+
+def test_a_curve_without_elements_is_no_edge(model: Any, tmp_path: Path) -> None:
+    written(TWO, CORNERS, FRAME, tmp_path / "part.msh")
+    model.addPhysicalGroup(1, [model.addDiscreteEntity(1, 2)], name="drawn")
+    gmsh.option.setNumber("Mesh.SaveAll", 1)
+    gmsh.write(str(tmp_path / "part.msh"))
+    assert set(read_msh(MeshFile(tmp_path / "part.msh", 1.0), {}).edges) == {"rim"}
+
+
+def test_unknown_patches_are_refused_when_checked(model: Any, tmp_path: Path) -> None:
+    written(TWO, CORNERS, FRAME, tmp_path / "part.msh")
+    shell = {"geometry": "mesh", "file": str(tmp_path / "part.msh"), "radius": 1, **MATERIAL}
+    load = {"kind": "dead", "loads": [{"over": "front", "pressure": 1}], "factor": 1}
+    by_name = {"lambda_m": 1e-3, "remanent": {"kind": "patches", "patches": {"front": {}}}}
+    for changed in (
+        {"shell": {**shell, "thickness_factor": {"front": 2}}},
+        {"loading": load},
+        {"magnetic": by_name},
+    ):
+        data = {"shell": shell, "boundary": {"rim": "clamped"}, **changed}
+        with pytest.raises(CaseError, match=r"no (such )?patch"):
+            describe(Case.from_source(Source("test", data)))
+
+
+CASE_FILE = """
+shell: {geometry: mesh, file: parts/part.msh, radius: 1, thickness: 0.02, youngs_modulus: 1, poisson_ratio: 0.3}
+boundary: {rim: clamped}
+loading: {kind: dead, control: load, loads: [{over: all, pressure: 1e-9}], factor: 1, points: 1}
+mesh: {degree: 2}
+"""
+
+
+@pytest.fixture
+def case_file(model: Any, tmp_path: Path) -> Path:
+    (tmp_path / "parts").mkdir()
+    written(TWO, CORNERS, FRAME, tmp_path / "parts" / "part.msh")
+    (tmp_path / "case.yaml").write_text(CASE_FILE, encoding="utf-8")
+    return tmp_path / "case.yaml"
+
+
+def test_a_mesh_file_is_beside_its_case(case_file: Path) -> None:
+    """Also in a sweep, from any folder; the path stays as it was written."""
+    points = make_points(case_file, [parse_axis("shell.poisson_ratio=0.2,0.3")])
+    for case in (Case.load(case_file), *(point.case for point in points)):
+        assert len(make_plan(case).triangulated().cells) == 2
+        assert case.model_dump()["shell"]["file"] == "parts/part.msh"
+
+
+def test_a_sweep_under_dead_loads(case_file: Path, tmp_path: Path) -> None:
+    done = sweep(case_file, ["shell.poisson_ratio=0.2,0.3"], [], tmp_path / "out")
+    assert not done.stopped
+    lines = (tmp_path / "out" / "curves.csv").read_text(encoding="utf-8").splitlines()
+    factors = [line.split(",")[lines[0].split(",").index("load_factor")] for line in lines[1:]]
+    assert [float(factor) for factor in factors if factor] == [0, 1, 0, 1]
+
+
+def test_another_mesh_in_the_same_file_is_another_problem(case_file: Path, tmp_path: Path) -> None:
+    def keys() -> list[str]:
+        return [point.key for point in make_points(case_file, [parse_axis("shell.poisson_ratio=0.2,0.3")])]
+
+    before = keys()
+    run(Case.load(case_file), tmp_path / "out")
+    with pytest.raises(AlreadyComplete):
+        run(Case.load(case_file), tmp_path / "out", resume=True)
+    with (case_file.parent / "parts" / "part.msh").open("a", encoding="utf-8") as file:
+        file.write("$Comments\nanother\n$EndComments\n")
+    with pytest.raises(CaseError, match="is of another run: mesh_file"):
+        run(Case.load(case_file), tmp_path / "out", resume=True)
+    assert not set(before) & set(keys())
