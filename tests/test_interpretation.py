@@ -87,3 +87,19 @@ def test_springs_of_a_radial_remanence() -> None:
     assert surface is not None
     assert "f_mag" not in surface.fields
     assert surface.fields["k"] == pytest.approx(-surface.r0[:, 2], abs=1e-5)
+
+
+def test_thickness_that_varies() -> None:
+    """p_mag = h b0:B0 with the thickness that is there; f_mag, whose divergence takes that of h too, is not told."""
+    pressures = []
+    for factor in ({}, {"thickness_factor": "1 + z"}):
+        shell = {"geometry": "cylinder", "radius": 1, "length": 1, "thickness": 0.02, "poisson_ratio": 0.3, **factor}
+        magnetic = {"lambda_m": 1e-3, "remanent": {"polar": 90}, "applied": {"polar": 90}}
+        data = {"shell": shell, "boundary": {"bottom": "clamped"}, "magnetic": magnetic}
+        scene = Scene(Case.from_source(Source("test", {**data, "mesh": {"degree": 2, "size": 0.5}})))
+        surface = SurfaceGatherer(scene.model).gather(scene.model.zero())  # type: ignore[arg-type]
+        assert surface
+        assert ("f_mag" in surface.fields) == (not factor)
+        pressures.append(surface.fields["p_mag"])
+    assert np.abs(pressures[0]).max() > 0.01
+    assert pressures[1] == pytest.approx(pressures[0] * (1 + surface.r0[:, 2]), abs=1e-12)

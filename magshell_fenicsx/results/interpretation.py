@@ -15,14 +15,20 @@ Array = NDArray[np.float64]
 
 
 def magnetic_loads(
-    g: "SurfaceGeometry", field: Magnetisation, r0: Array, h: float
+    g: "SurfaceGeometry", field: Magnetisation, r0: Array, h: float | Array
 ) -> tuple[dict[str, Array], "Torque"]:
-    """At points r0 (..., 3) p_mag, k and, of a uniform remanence, f_mag; and the torque, which depends on u."""
+    """At points r0 (..., 3) p_mag, k and, of a uniform remanence and thickness, f_mag; and the torque, of u.
+
+    Parameters
+    ----------
+    h
+        The thickness over R; where it varies, (...) at the points.
+    """
     pattern = field.remanent
     Br = pattern(r0, g.n0) if callable(pattern) else np.broadcast_to(pattern, r0.shape)
     Ba = field.applied
     loads = {"p_mag": magnetic_pressure(g, Br, Ba, h), "k": spring_stiffness(g, Br, Ba)}
-    if not callable(pattern):
+    if not callable(pattern) and isinstance(h, float):  # its divergence is of uniform vectors and thickness
         loads["f_mag"] = in_plane_force(g, Br, Ba, h)
     return loads, torque(g, Br, Ba)
 
@@ -42,7 +48,7 @@ class SurfaceGeometry:
         return np.asarray(np.einsum("...ab,...bi->...ai", np.linalg.inv(metric), self.a))
 
 
-def magnetic_pressure(g: SurfaceGeometry, Br: Array, Ba: Array, h: float) -> Array:
+def magnetic_pressure(g: SurfaceGeometry, Br: Array, Ba: Array, h: float | Array) -> Array:
     """p_mag = h b0:B0 with B0 = -Br (x) Ba, (...)."""
     b = np.einsum("...ab,...ai,...bj->...ij", g.b0, g.dual, g.dual)
     return np.asarray(-h * np.einsum("...ij,...i,j->...", b, Br, Ba))

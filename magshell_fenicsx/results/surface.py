@@ -63,7 +63,8 @@ class SurfaceGatherer:
         element = basix.create_element(
             basix.ElementFamily.P, basix.CellType.triangle, degree, basix.LagrangeVariant.equispaced
         )
-        self._table = model.V.element.basix_element.tabulate(2, element.points)[:, :, :, 0]
+        self._places = element.points
+        self._table = model.V.element.basix_element.tabulate(2, self._places)[:, :, :, 0]
         self._owned = domain.topology.index_map(2).size_local
         V = fem.functionspace(domain, basix.ufl.wrap_element(element))  # numbers nodes that two cells share alike
         local = V.dofmap.list[: self._owned]
@@ -79,7 +80,8 @@ class SurfaceGatherer:
         self._torque: Torque | None = None
         field = model.loads.magnetic
         if field and field.gradient is None:
-            loads, self._torque = magnetic_loads(g, field, r[0], model.material.h)
+            h = model.material.h if model.thickness is None else model.material.h * self._thickness(model.thickness)
+            loads, self._torque = magnetic_loads(g, field, r[0], h)
             self._loads = {name: self._averaged(value) for name, value in loads.items()}
 
     def gather(self, u: Vector) -> Surface | None:
@@ -95,6 +97,13 @@ class SurfaceGatherer:
         """The first of f, f,_1, f,_2, f,_11, f,_12, f,_22 in reference coordinates at each owned cell's nodes."""
         coefficients = f.x.array.reshape(-1, 3)[self._model.V.dofmap.list[: self._owned]]
         return np.asarray(np.matmul(self._table[:parts, None], coefficients))
+
+    def _thickness(self, factor: fem.Function) -> Array:
+        """h(x)/h at each owned cell's nodes."""
+        V = factor.function_space
+        element = V.element.basix_element
+        values = element.tabulate(0, self._places)[0, :, :, 0]
+        return np.asarray(factor.x.array[V.dofmap.list[: self._owned]] @ values.T)
 
     def _averaged(self, values: Array) -> Array:
         """Mean over the cells that share a node, in global order, on rank 0."""
