@@ -5,12 +5,14 @@ The published curves are of S4R on one mesh each, three decimals; for the cantil
 """
 
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from magshell_fenicsx import Case, Result, run
+from magshell_fenicsx import Case, Result, obstacles, run
 from magshell_fenicsx.obstacles import CASES, OBSTACLES, along_curve, at_equal_load, computed, hard_magnetic, published
+from magshell_fenicsx.results.obstacles_table import Line
 
 SLOW = pytest.mark.slow
 TABLES = {obstacle.case: obstacle for obstacle in OBSTACLES}
@@ -106,3 +108,19 @@ def test_hard_magnetic_cantilevers_are_run(which: str, tmp_path: object, monkeyp
     difference = np.interp(measured[:, 0], *curve.T) - measured[:, 1]
     assert np.abs(difference).max() < 0.1
     assert np.abs(difference).mean() < 0.04
+
+
+def test_the_table_is_of_all_benchmarks(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """A benchmark that is named alone leaves it; a name that there is not is refused (exit 2)."""
+    obstacle = OBSTACLES[0]
+    line = Line(obstacle.case, 1.0, 1, 1, 2, 1, {}, {}, obstacle.required, 0, "")
+    rows = [{"label": "", "branch": "0", "load_factor": str(t), "A_ux": str(t), "A_uz": str(t)} for t in (0, 1)]
+    monkeypatch.setattr(obstacles, "OUT", tmp_path)
+    monkeypatch.setattr(obstacles, "measured", lambda *_: (line, rows))
+    monkeypatch.setattr("sys.argv", ["obstacles", obstacle.case])
+    obstacles.main()
+    assert [file.name for file in tmp_path.iterdir()] == [f"{obstacle.case}.png"]
+    monkeypatch.setattr("sys.argv", ["obstacles", "cantilever"])
+    with pytest.raises(SystemExit) as ended:
+        obstacles.main()
+    assert ended.value.code == 2
