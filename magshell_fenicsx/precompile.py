@@ -1,4 +1,7 @@
-"""Compile every kernel ahead of time, for images and clusters without a compiler at run time."""
+"""Compile kernels ahead of time, for images and clusters without a compiler at run time: of hemispheres and solids.
+
+Other geometries have terms of their own (dead loads, mirror edges, thickness), compiled on the first run.
+"""
 
 import time
 
@@ -22,7 +25,7 @@ SOLIDS = SCENES[::2]  # of one degree
 
 
 def precompile(degree: int) -> float:
-    """Compile all kernels of a degree; the seconds that it took."""
+    """Compile the kernels of hemispheres and solids of a degree; the seconds that it took."""
     start = time.perf_counter()
     shells = [("shell", *scene, {"degree": degree}) for scene in SCENES]
     solids = [("solid", *scene, {}) for scene in SOLIDS]
