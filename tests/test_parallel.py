@@ -51,10 +51,11 @@ POINTS = ("_ux", "_uy", "_uz")  # of named points
 def test_same_path(tmp_path: Path, scene: str) -> None:
     """Every column to 1e-8 of its largest value; the same steps, pivots and iterations."""
     file, settings = SCENES[scene]
+    mesh = [] if file == "bracket.yaml" else COARSE  # a mesh from a file is as it is
     paths = []
     for ranks in (1, 2, 3):
         out = tmp_path / str(ranks)
-        done = magshell("run", CASES / file, *COARSE, *settings, "--out", out, ranks=ranks)
+        done = magshell("run", CASES / file, *mesh, *settings, "--out", out, ranks=ranks)
         assert done.returncode == 0, done.stderr
         paths.append(read_path(out))
     for other in paths[1:]:
