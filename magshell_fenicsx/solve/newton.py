@@ -326,7 +326,8 @@ class BorderedNewton:
         if rate < 1 and step * rate / (1 - rate) <= o.tolerance:
             return Reason.CONVERGED_SNORM_RELATIVE
         stalled = rate > 0.5 and self._progress.residuals[-1] > 0.5 * self._progress.residuals[-2]
-        if stalled and step <= 1e4 * o.tolerance:
+        own = len(self._progress.taken) == 1  # the step was made with the state's own matrix
+        if stalled and step <= (1e4 if own else 1e2) * o.tolerance:
             return Reason.CONVERGED_SNORM_RELATIVE  # rounding: neither steps nor residuals shrink further
         if iteration >= o.max_iterations:
             return Reason.DIVERGED_MAX_IT
