@@ -47,7 +47,10 @@ COMPARED = ("p_over_pc", "lambda_m", "force", "w_over_h", "w_pole_over_h", "volu
 POINTS = ("_ux", "_uy", "_uz")  # of named points
 
 
-@pytest.mark.parametrize("scene", SCENES)
+QUICK = ("half shell, force", "a moment")
+
+
+@pytest.mark.parametrize("scene", [s if s in QUICK else pytest.param(s, marks=pytest.mark.slow) for s in SCENES])
 def test_same_path(tmp_path: Path, scene: str) -> None:
     """Every column to 1e-8 of its largest value; the same steps, pivots and iterations."""
     file, settings = SCENES[scene]

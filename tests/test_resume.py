@@ -49,7 +49,7 @@ def whole(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
     return Whole(case, out, first, time.monotonic() - begun - first)
 
 
-@pytest.mark.parametrize("whole", ["meridian", "half", "solid"], indirect=True)
+@pytest.mark.parametrize("whole", ["meridian", "half", pytest.param("solid", marks=pytest.mark.slow)], indirect=True)
 def test_killed_twice(whole: Whole, tmp_path: Path) -> None:
     """kill -9 after three rows, resumed on two ranks, killed after two more, resumed on one."""
     out, seen = tmp_path / "out", b""
