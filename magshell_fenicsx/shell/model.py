@@ -146,7 +146,8 @@ class ShellModel:
         if loads.dead:
             dead = assemble_dead_loads(loads.dead, self.r0, midsurface, degree, self.kernels)
             self.load_size = dead.size
-            terms.append(LinearTerm("load", *dead.entries, self.u, "load"))
+            self._dead_load = LinearTerm("load", *dead.entries, self.u, "load")
+            terms.append(self._dead_load)
             moments = [load for load in loads.dead if isinstance(load, EdgeMoment)]
             terms += [
                 factory.edge_moment(f"moment {load.edge} {i}", midsurface.edges[load.edge], load.moment)
@@ -202,8 +203,8 @@ class ShellModel:
         if self.loads.dead and not self.load_size:
             return self.deflection(u, "pole")
         if self.loads.dead:
-            work = -sum(v for name, v in self.system.energies(u).items() if name == "load")
-            return work / self.load_size
+            self.system.set(u)
+            return -float(self.system.comm.allreduce(self._dead_load.energy())) / self.load_size
         return -self.system.potential(u, "force") / self.force_unit
 
     @property
