@@ -16,7 +16,7 @@ from magshell_fenicsx.shell import kinematics as kin
 from magshell_fenicsx.shell.kinematics import Jet
 from magshell_fenicsx.solve import assembly
 from magshell_fenicsx.solve.kernels import KernelLog
-from magshell_fenicsx.solve.terms import FormTerm
+from magshell_fenicsx.solve.terms import DensityTerm
 
 Parameter: TypeAlias = fem.Constant | fem.Function
 FIRST = ("r1", "r2")
@@ -107,22 +107,8 @@ def edge_quadrature(degree: int) -> int:
     return 2 * degree - 2
 
 
-class ShellTerm(FormTerm):
-    """A form with the density that it came from; see `FormTerm`."""
-
-    def __init__(
-        self,
-        name: str,
-        density: Density,
-        energy: ufl.Form,
-        u: fem.Function,
-        log: KernelLog,
-        amplitude: str | None = None,
-        *,
-        linear: bool = False,
-    ) -> None:
-        super().__init__(name, energy, u, log, amplitude, linear=linear)
-        self.density = density
+class ShellTerm(DensityTerm[Density]):
+    """A term of a shell."""
 
 
 class HessianTerm:

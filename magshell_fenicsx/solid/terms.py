@@ -14,7 +14,7 @@ from magshell_fenicsx.shell.parameters import Magnetisation
 from magshell_fenicsx.solid import densities
 from magshell_fenicsx.solid.material import NeoHookean
 from magshell_fenicsx.solve.kernels import KernelLog
-from magshell_fenicsx.solve.terms import FormTerm
+from magshell_fenicsx.solve.terms import DensityTerm
 
 WHOLE, REDUCED = 5, 3  # quadrature degrees: three and two points in each direction
 VALUE, GRADIENT, ON_FACE = (0,), (1, 2, 3), (0, 1, 2)  # parts of a displacement's jet: value, reference derivatives
@@ -42,22 +42,8 @@ class Density:
     on_face: bool = False
 
 
-class SolidTerm(FormTerm):
-    """A form with the density that it came from; see `FormTerm`."""
-
-    def __init__(
-        self,
-        name: str,
-        density: Density,
-        energy: ufl.Form,
-        u: fem.Function,
-        log: KernelLog,
-        amplitude: str | None = None,
-        *,
-        linear: bool = False,
-    ) -> None:
-        super().__init__(name, energy, u, log, amplitude, linear=linear)
-        self.density = density
+class SolidTerm(DensityTerm[Density]):
+    """A term of a solid."""
 
 
 @dataclass(frozen=True)

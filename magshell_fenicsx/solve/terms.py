@@ -1,7 +1,7 @@
 """A potential Pi(u) with its amplitude: energy, residual and tangent."""
 
 from functools import cached_property
-from typing import Protocol
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 import ufl
@@ -11,6 +11,8 @@ from petsc4py import PETSc
 
 from magshell_fenicsx.solve import assembly
 from magshell_fenicsx.solve.kernels import KernelLog
+
+Density = TypeVar("Density")  # whatever a form is made from
 
 
 class Term(Protocol):
@@ -93,6 +95,24 @@ class FormTerm:
         if self.tangent_form is not None:
             self._factor.value = factor
             assembly.add_matrix(K, self.tangent_form, clamped)
+
+
+class DensityTerm(FormTerm, Generic[Density]):
+    """A form with the density that it came from."""
+
+    def __init__(
+        self,
+        name: str,
+        density: Density,
+        energy: ufl.Form,
+        u: fem.Function,
+        log: KernelLog,
+        amplitude: str | None = None,
+        *,
+        linear: bool = False,
+    ) -> None:
+        super().__init__(name, energy, u, log, amplitude, linear=linear)
+        self.density = density
 
 
 class LinearTerm:
