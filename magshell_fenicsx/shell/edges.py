@@ -9,6 +9,8 @@ It is one energy: derived twice it gives a symmetric tangent. Every expression i
 invariant under exchange of '+' and '-'.
 """
 
+from typing import Any
+
 import ufl
 from ufl.core.expr import Expr
 
@@ -46,7 +48,7 @@ def two_sided(
     nu: Expr,
     h: Expr,
     sigma: Expr,
-    t: tuple[Expr, Expr] | None,
+    t: tuple[Expr, Expr] | None = None,
 ) -> Expr:
     """Energy of an interior edge with that jump per length of its parameter.
 
@@ -71,37 +73,19 @@ def two_sided(
     return (M * J + sigma * D / (2 * width) * J**2) * stretch
 
 
-def interior(
-    r0: Sides,
-    u: Sides,
-    m: tuple[Expr, Expr],
-    width: Expr,
-    nu: Expr,
-    h: Expr,
-    sigma: Expr,
-    t: tuple[Expr, Expr] | None = None,
-) -> Expr:
-    """Energy of an interior edge between cells that meet smoothly, or nearly so; see `two_sided`."""
+def interior(r0: Sides, u: Sides, m: tuple[Expr, Expr], *rest: Any) -> Expr:
+    """Energy of an interior edge between cells that meet smoothly, or nearly so; `rest` as in `two_sided`."""
     nus = [kin.conormal(j, covector)[:2] for j, covector in zip(r0, m, strict=True)]
     J = fold_jump(r0[0] + u[0], r0[1] + u[1], *nus) - fold_jump(*r0, *nus)
-    return two_sided(J, r0, u, m, width, nu, h, sigma, t)
+    return two_sided(J, r0, u, m, *rest)
 
 
-def folded(
-    r0: Sides,
-    u: Sides,
-    m: tuple[Expr, Expr],
-    width: Expr,
-    nu: Expr,
-    h: Expr,
-    sigma: Expr,
-    t: tuple[Expr, Expr] | None = None,
-) -> Expr:
+def folded(r0: Sides, u: Sides, m: tuple[Expr, Expr], *rest: Any) -> Expr:
     """The same across a fold of the undeformed surface: the jump is the change of the angle, whatever its size."""
     sine0, cosine0 = fold_angle(*r0, m[0])
     sine, cosine = fold_angle(r0[0] + u[0], r0[1] + u[1], m[0])
     J = ufl.atan2(sine * cosine0 - cosine * sine0, cosine * cosine0 + sine * sine0)
-    return two_sided(J, r0, u, m, width, nu, h, sigma, t)
+    return two_sided(J, r0, u, m, *rest)
 
 
 def turning(r0: Jet, u: Jet, m: Expr, width: Expr, intensity: Expr, past: Expr) -> Expr:
