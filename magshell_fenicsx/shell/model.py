@@ -18,6 +18,7 @@ from magshell_fenicsx.shell.antisymmetric import AntisymmetricModes, held_agains
 from magshell_fenicsx.shell.dead_load import assemble_dead_loads
 from magshell_fenicsx.shell.fast_tangent import FastTangent, make_sites
 from magshell_fenicsx.shell.folds import FOLD, largest_fold
+from magshell_fenicsx.shell.observed import Observed
 from magshell_fenicsx.shell.parameters import (
     MIRROR_NORMAL,
     Condition,
@@ -47,7 +48,7 @@ from magshell_fenicsx.solve.system import Vector
 from magshell_fenicsx.solve.terms import LinearTerm, Term
 
 
-class ShellModel:
+class ShellModel(Observed):
     """A Koiter shell on a mid-surface.
 
     Parameters
@@ -71,10 +72,8 @@ class ShellModel:
 
     Attributes
     ----------
-    system
-        What the solvers see.
-    multiplicity
-        2 for a half model, whose integrals and forces are those of one half; else 1.
+    system, multiplicity, normals
+        See `Observed`.
     kernels
         Names and compile time of the forms in use.
     thickness
@@ -158,9 +157,7 @@ class ShellModel:
         gradients = FastResidual(self.r0, self.u, degree, terms, self.kernels)
         self.system = FiniteElementSystem(self.u, terms, held + mirror, interior, material.h, fast, gradients)
         self._factory, self._interior, self._held, self._mirror = factory, interior, held, facets("symmetry")
-        self._volume = self.kernels.compile("volume energy", factory.volume_change())
-        # dofs of a vertex on the rank that owns it
-        self._probes = {name: point_entries(V, x, np.ones(3))[0] for name, x in midsurface.points.items()}
+        self.observe(self.kernels.compile("volume energy", factory.volume_change()), midsurface.points)
 
     @cached_property
     def excluded_modes(self) -> AntisymmetricModes | None:
@@ -177,24 +174,6 @@ class ShellModel:
             FiniteElementSystem(self.u, terms, held, self._interior, system.length, fast, system.gradients)
         )
 
-    def zero(self) -> Vector:
-        """The undeformed displacement."""
-        return np.zeros(self.system.size)
-
-    def volume_change(self, u: Vector) -> float:
-        """Delta V/R^3 of the whole shell."""
-        self.system.set(u)
-        return self.multiplicity * float(self.system.comm.allreduce(fem.assemble_scalar(self._volume)))
-
-    def deflection(self, u: Vector, point: str) -> float:
-        """w/R = -u . n0 at a named vertex."""
-        return -float(self.displacement(u, point) @ self.normals[point])
-
-    def displacement(self, u: Vector, point: str) -> NDArray[np.float64]:
-        """u/R (3,) at a named vertex."""
-        here = u[self._probes[point]].reshape(-1, 3).sum(axis=0)
-        return np.asarray(self.system.comm.allreduce(here))
-
     def loaded_deflection(self, u: Vector) -> float:
         """w/R conjugate to the force: at its point, or averaged over its patch; of dead loads along themselves.
 
@@ -205,12 +184,7 @@ class ShellModel:
         if self.loads.dead:
             self.system.set(u)
             return -float(self.system.comm.allreduce(self._dead_load.energy())) / self.load_size
-        return -self.system.potential(u, "force") / self.force_unit
-
-    @property
-    def force_unit(self) -> float:
-        """The force F R/(2 pi D) = 1 on the modelled part, over E h R."""
-        return 2 * np.pi * self.material.bending_stiffness / self.multiplicity
+        return super().loaded_deflection(u)
 
     def _force(self, force: Force) -> LinearTerm:
         x, inward = self.midsurface.points[force.point], -self.normals[force.point]

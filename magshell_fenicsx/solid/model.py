@@ -16,18 +16,17 @@ from numpy.typing import NDArray
 from magshell_fenicsx.mesh.hexahedra import Body, quadratic
 from magshell_fenicsx.shell.antisymmetric import AntisymmetricModes
 from magshell_fenicsx.shell.fast_tangent import FastTangent
+from magshell_fenicsx.shell.observed import Observed
 from magshell_fenicsx.shell.parameters import MIRROR_NORMAL, Condition, Force, Loads, Material
-from magshell_fenicsx.shell.point_load import point_entries
 from magshell_fenicsx.solid.material import NeoHookean
 from magshell_fenicsx.solid.sites import make_sites
 from magshell_fenicsx.solid.terms import TermFactory
 from magshell_fenicsx.solve.kernels import KernelLog
 from magshell_fenicsx.solve.problem import FiniteElementSystem
-from magshell_fenicsx.solve.system import Vector
 from magshell_fenicsx.solve.terms import LinearTerm, Term
 
 
-class SolidModel:
+class SolidModel(Observed):
     """A neo-Hookean, hard-magnetic body around a mid-surface.
 
     Parameters
@@ -39,7 +38,7 @@ class SolidModel:
 
     Attributes
     ----------
-    system, multiplicity, kernels
+    system, multiplicity, normals, kernels
         As of `ShellModel`.
     degree
         Of the displacement: 2.
@@ -59,6 +58,7 @@ class SolidModel:
         loads: Loads,
     ) -> None:
         self.body, self.material, self.neo_hookean, self.loads = body, material, neo_hookean, loads
+        self.normals = body.normals
         self.multiplicity = 2 if "symmetry" in conditions.values() else 1
         self.kernels = KernelLog()
         self.V = V = quadratic(body.mesh)
@@ -78,8 +78,7 @@ class SolidModel:
         along = int(np.argmax(MIRROR_NORMAL))
         self._sites = make_sites(body, self.r0, self._terms, self.kernels)
         self.system = self._system(self._held + _held(V, self._mirror, [along]))
-        self._volume = self.kernels.compile("volume energy", factory.volume_change())
-        self._probes = {name: point_entries(V, x, np.ones(3))[0] for name, x in body.points.items()}
+        self.observe(self.kernels.compile("volume energy", factory.volume_change()), body.points)
 
     @cached_property
     def excluded_modes(self) -> AntisymmetricModes | None:
@@ -88,33 +87,6 @@ class SolidModel:
             return None
         in_plane = [i for i in range(3) if not MIRROR_NORMAL[i]]
         return AntisymmetricModes(self._system(self._held + _held(self.V, self._mirror, in_plane)))
-
-    def zero(self) -> Vector:
-        """The undeformed displacement."""
-        return np.zeros(self.system.size)
-
-    def volume_change(self, u: Vector) -> float:
-        """Delta V/R^3 under the whole outer face."""
-        self.system.set(u)
-        return self.multiplicity * float(self.system.comm.allreduce(fem.assemble_scalar(self._volume)))
-
-    def deflection(self, u: Vector, point: str) -> float:
-        """w/R = -u . n0 at a named point in the middle of the thickness."""
-        return -float(self.displacement(u, point) @ self.body.normals[point])
-
-    def displacement(self, u: Vector, point: str) -> NDArray[np.float64]:
-        """u/R (3,) there."""
-        here = u[self._probes[point]].reshape(-1, 3).sum(axis=0)
-        return np.asarray(self.system.comm.allreduce(here))
-
-    def loaded_deflection(self, u: Vector) -> float:
-        """w/R conjugate to the force: averaged over its patch on the outer face."""
-        return -self.system.potential(u, "force") / self.force_unit
-
-    @property
-    def force_unit(self) -> float:
-        """The force F R/(2 pi D) = 1 on the modelled part, over E h R."""
-        return 2 * np.pi * self.material.bending_stiffness / self.multiplicity
 
     def _system(self, held: list[fem.DirichletBC]) -> FiniteElementSystem:
         fast = FastTangent(self.u, self._sites, held)
