@@ -1,5 +1,6 @@
 # Every target runs in the project's environment: .ci/in-env builds it on first use.
 ENV := .ci/in-env
+PYTEST := python3 -m pytest -n auto --maxprocesses 4 --dist worksteal  # a worker grows to some 3 GB
 
 define HELP
 make run CASE=cases/dimple_buckling.yaml [OUT=dir] [N=ranks] [ARGS="--set a=b"]
@@ -55,10 +56,10 @@ studies:
 		--set symmetry=half --set magnetic.lambda_m=0.00184 $(MESHES))
 
 test: lint
-	$(ENV) python3 -m pytest
+	$(ENV) $(PYTEST)
 
 fast: lint
-	$(ENV) python3 -m pytest -m 'not slow'
+	$(ENV) $(PYTEST) -m 'not slow'
 
 lint:
 	$(ENV) ruff check --exclude .env .
