@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pandas
 import pytest
 import ufl
 from command import read_path
@@ -140,6 +141,8 @@ def test_columns_are_those_of_the_table(tmp_path: Path) -> None:
     for name, values in found.items():
         assert values.shape == (len(written),)
         assert [str(value) for value in values.tolist()] == [row[name] for row in written], name
+    frame = pandas.read_csv(tmp_path / "path.csv", float_precision="round_trip", keep_default_na=False)
+    pandas.testing.assert_frame_equal(pandas.DataFrame(found), frame.drop(columns="wall_s"), check_exact=True)
 
 
 def test_surface_is_the_deformed_shell() -> None:

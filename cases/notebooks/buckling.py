@@ -13,6 +13,8 @@
 # %%
 from pathlib import Path
 
+import pandas
+
 import magshell_fenicsx as ms
 
 CASES = Path(__file__).parents[1] if "__file__" in globals() else Path("..")
@@ -30,11 +32,11 @@ for record in ms.follow(scene):
     print(f"{record.label:6} p/p_c = {record.point.state.mu['pressure']:.6f}")
 
 # %% [markdown]
-# The columns of path.csv as NumPy arrays; `pandas.DataFrame(table)` makes a frame of them.
+# The columns of path.csv as a frame of pandas; `ms.columns` itself gives NumPy arrays.
 
 # %%
-table = ms.columns(scene, records)
-print(table["p_over_pc"], table["w_pole_over_h"])
+table = pandas.DataFrame(ms.columns(scene, records))
+table[["label", "lambda_m", "p_over_pc", "w_pole_over_h", "volume_change"]]
 
 # %%
 ms.curve(scene, records)
