@@ -22,7 +22,7 @@ def refuse_unfit(
     MeshError
         With the name.
     """
-    refuse_unknown(patch.edges, patch.points, conditions, loads)
+    refuse_unknown(patch.edges, patch.points, patch.patches, conditions, loads)
     for name, condition in conditions.items():
         if isinstance(condition, Held) and name in patch.edges and name in patch.points:
             raise MeshError(f"boundary.{name}: is an edge and a point; give the point another name")

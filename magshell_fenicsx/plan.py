@@ -237,7 +237,8 @@ def describe(case: Case) -> str:
         lines.append(f"mesh: {cells} cells of degree {case.degree}, {unknowns} unknowns")
     else:
         lines.append(f"mesh: found by the run, for a relative error of its result below {case.mesh.tolerance:g}")
-    lines += ["built:", *(f"  {item}" for item in plan.included), "left out:", *(f"  {item}" for item in plan.left_out)]
+    left_out = plan.left_out or ["nothing"]
+    lines += ["built:", *(f"  {item}" for item in plan.included), "left out:", *(f"  {item}" for item in left_out)]
     return "\n".join(lines)
 
 

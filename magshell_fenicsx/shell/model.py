@@ -35,7 +35,7 @@ from magshell_fenicsx.shell.residual import FastResidual
 from magshell_fenicsx.shell.supports import (
     STRAIGHT,
     held_at_vertex,
-    held_on_facets,
+    held_on,
     open_to_pressure,
     plane_of,
     refuse_unknown,
@@ -58,7 +58,8 @@ class ShellModel(Observed):
     degree
         Of displacement and placement, 2 to 5.
     conditions
-        Edge name -> condition; edges that are not named are free. A vertex can be held too.
+        Edge name -> condition; edges that are not named are free. A vertex can be held too, and a patch clamped or
+        held: then all of it.
     sigma
         Penalty of the C0 interior penalty form; None takes `default_penalty`.
     thickness
@@ -92,7 +93,7 @@ class ShellModel(Observed):
         sigma: float | None = None,
         thickness: Thickness | None = None,
     ) -> None:
-        refuse_unknown(midsurface.edges, midsurface.points, conditions, loads)
+        refuse_unknown(midsurface.edges, midsurface.points, midsurface.patches, conditions, loads)
         if loads.magnetic and loads.magnetic.patches:
             topology = midsurface.mesh.topology.index_map(2)
             cells = topology.size_local + topology.num_ghosts
@@ -111,7 +112,9 @@ class ShellModel(Observed):
         held, mirror = [], []
 
         def facets(condition: Condition) -> NDArray[np.int32]:
-            found = [midsurface.edges[name] for name, c in conditions.items() if c == condition]
+            found = [
+                midsurface.edges[name] for name, c in conditions.items() if c == condition and name in midsurface.edges
+            ]
             return np.unique(np.concatenate(found)).astype(np.int32) if found else np.empty(0, np.int32)
 
         if "clamped" in conditions.values():
@@ -123,16 +126,20 @@ class ShellModel(Observed):
             terms.append(factory.mirror_edges(facets("symmetry")))
             mirror.append(_held_in_mirror(V, facets("symmetry")))
         for name, condition in conditions.items():
-            if isinstance(condition, Held) and name in midsurface.edges:
-                held += held_on_facets(V, midsurface.edges[name], condition.components)
+            components = condition.components if isinstance(condition, Held) else (0, 1, 2)
+            if name not in midsurface.edges and name in midsurface.patches:
+                cells = np.flatnonzero(midsurface.patches[name]).astype(np.int32)
+                held += held_on(V, 2, cells, components)
+            elif isinstance(condition, Held) and name in midsurface.edges:
+                held += held_on(V, 1, midsurface.edges[name], components)
             elif isinstance(condition, Held):
-                held += held_at_vertex(V, midsurface.points[name], condition.components)
+                held += held_at_vertex(V, midsurface.points[name], components)
             elif condition == "plane":
                 axis, place = plane_of(V, self.r0, midsurface.edges[name], name)
                 if loads.pressure and abs(place) > STRAIGHT:
                     raise MeshError(open_to_pressure(name))
                 terms.append(factory.mirror_edges(midsurface.edges[name], np.eye(3)[axis], f"{name} mirror edges"))
-                held += held_on_facets(V, midsurface.edges[name], (axis,))
+                held += held_on(V, 1, midsurface.edges[name], (axis,))
         if loads.magnetic:
             terms += factory.magnetic(loads.magnetic)
         if loads.pressure:

@@ -19,9 +19,10 @@ FREE = 1e-12  # of the squares that a rigid motion has where the shell is held, 
 LOOSE = 1e-13  # of a rigid motion's energy, over the tangent's largest row
 
 
-def held_on_facets(V: fem.FunctionSpace, facets: NDArray[np.int32], components: Iterable[int]) -> list[fem.DirichletBC]:
-    """Those components are zero on some edges."""
-    return [fem.dirichletbc(0.0, fem.locate_dofs_topological(V.sub(i), 1, facets), V.sub(i)) for i in components]
+def held_on(V: fem.FunctionSpace, dim: int, entities: NDArray[np.int32], axes: Iterable[int]) -> list[fem.DirichletBC]:
+    """Those components are zero on some edges (`dim` 1) or cells (2)."""
+    V.mesh.topology.create_connectivity(dim, 2)
+    return [fem.dirichletbc(0.0, fem.locate_dofs_topological(V.sub(i), dim, entities), V.sub(i)) for i in axes]
 
 
 def held_at_vertex(V: fem.FunctionSpace, x: Array, components: Iterable[int]) -> list[fem.DirichletBC]:
@@ -32,20 +33,26 @@ def held_at_vertex(V: fem.FunctionSpace, x: Array, components: Iterable[int]) ->
 
 
 def refuse_unknown(
-    edges: Collection[str], points: Collection[str], conditions: Mapping[str, Condition], loads: Loads
+    edges: Collection[str],
+    points: Collection[str],
+    patches: Collection[str],
+    conditions: Mapping[str, Condition],
+    loads: Loads,
 ) -> None:
-    """See that every edge and point that is named is there.
+    """See that every edge, point and patch that is held or loaded by its name is there.
 
     Raises
     ------
     MeshError
         With the name and those that there are.
     """
-    named = sorted(set(points) - {"pole"})
     for name, condition in conditions.items():
-        allowed = [*sorted(edges), *(named if isinstance(condition, Held) else [])]
+        allowed = set(edges)
+        allowed |= set(points) - {"pole"} if isinstance(condition, Held) else set()
+        allowed |= set(patches) if isinstance(condition, Held) or condition == "clamped" else set()
         if name not in allowed:
-            raise MeshError(f"boundary.{name}: the surface has no such edge, only {', '.join(allowed) or 'none'}")
+            there = ", ".join(sorted(allowed)) or "none"
+            raise MeshError(f"boundary.{name}: the surface has no such edge, only {there}")
     for load in loads.dead:
         edge = getattr(load, "edge", None)
         if edge is not None and edge not in edges:
@@ -140,5 +147,9 @@ def refuse_loose(system: FiniteElementSystem, r0: fem.Function, amplitudes: Ampl
         moves = np.linalg.norm(shift) > 0.5 * np.sqrt(1 / total)
         raise MeshError(
             "boundary: the shell is not held: it is free to "
-            + (f"move along ({', '.join(f'{c:.2g}' for c in shift / np.linalg.norm(shift))})" if moves else "turn")
+            + (
+                f"move along ({', '.join(f'{c + 0.0:.2g}' for c in np.round(shift / np.linalg.norm(shift), 3))})"
+                if moves
+                else "turn"
+            )
         )

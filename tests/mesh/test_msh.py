@@ -54,6 +54,29 @@ def panel(model: Any, order: int, size: float = 0.25) -> None:
     model.mesh.setOrder(order)
 
 
+@pytest.mark.parametrize("held", ["clamped", {"held": ["x", "y", "z"]}])
+def test_a_clamped_patch_is_a_clamped_edge_to_the_rest(model: Any, tmp_path: Path, held: Any) -> None:
+    """Upper half of a panel on its clamped lower half: the tip moves as that of a panel of half the length."""
+    panel(model, 3)
+    gmsh.write(str(tmp_path / "part.msh"))
+    loading = {"kind": "dead", "loads": [{"edge": "top", "force": [-1e-6, 0, 0]}], "factor": 1, "points": 1}
+    material = {"thickness": 0.02, "poisson_ratio": 0.3, "youngs_modulus": 1}
+    common = {"loading": loading, "points": {"tip": [1, 0, 1]}}
+    whole = {"geometry": "mesh", "file": str(tmp_path / "part.msh"), "radius": 1, **material}
+    found = run(Case.from_source(Source("part", {**common, "shell": whole, "boundary": {"lower": held}})))
+    lower = found.scene.model.r0.x.array.reshape(-1, 3)[: len(found.last.u) // 3, 2] < 0.5 - 1e-9
+    assert not found.last.u.reshape(-1, 3)[lower].any()
+    half = {"geometry": "cylinder", "radius": 1, "length": 0.5, "azimuth": [0, 90], **material}
+    mesh = {"size": 0.25}
+    points = {"tip": [1, 0, 0.5]}
+    alone = run(
+        Case.from_source(
+            Source("half", {**common, "points": points, "shell": half, "mesh": mesh, "boundary": {"bottom": "clamped"}})
+        )
+    )
+    assert found.rows[-1]["tip_ux"] == pytest.approx(alone.rows[-1]["tip_ux"], rel=2e-3)
+
+
 @pytest.mark.parametrize("order", [1, 2, 3])
 def test_patches_edges_and_points(model: Any, tmp_path: Path, order: int) -> None:
     panel(model, order)
@@ -229,7 +252,10 @@ def test_unknown_names_are_refused(model: Any, tmp_path: Path) -> None:
     gmsh.write(str(tmp_path / "part.msh"))
     shell = {"geometry": "mesh", "file": str(tmp_path / "part.msh"), "radius": 1, **MATERIAL}
     for changed, said in (
-        ({"boundary": {"rim": "clamped"}}, "boundary.rim: the surface has no such edge, only bottom, left, right, top"),
+        (
+            {"boundary": {"rim": "clamped"}},
+            "boundary.rim: the surface has no such edge, only bottom, left, lower, right, top, upper",
+        ),
         ({"boundary": {"top": "hinged"}, "shell": {**shell, "thickness_factor": {"front": 2}}}, "no patch front"),
         ({"boundary": {"top": {"held": ["z"]}}}, "the shell is not held"),
     ):

@@ -25,8 +25,8 @@ def scene(shell: dict[str, Any], boundary: dict[str, Any], points: dict[str, Any
     [
         (PLATE, {}, "free to"),
         (PLATE, {"left": "hinged"}, "free to"),  # turns about the hinge
-        (PLATE, {"left": "symmetry", "bottom": "symmetry"}, r"free to move along \(-?0, -?0, -?1\)"),
-        (PLATE, {"left": {"held": ["x", "z"]}, "right": {"held": ["z"]}}, r"free to move along \(-?0, -?1, -?0\)"),
+        (PLATE, {"left": "symmetry", "bottom": "symmetry"}, r"free to move along \(0, 0, -?1\)"),
+        (PLATE, {"left": {"held": ["x", "z"]}, "right": {"held": ["z"]}}, r"free to move along \(0, -?1, 0\)"),
         (PLATE, {"A": {"held": ["x", "y", "z"]}, "B": {"held": ["z"]}}, "free to"),
         (CYLINDER, {"bottom": {"held": ["z"]}}, "free to"),
     ],
