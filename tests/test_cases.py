@@ -177,6 +177,14 @@ def test_magnetic_strip(polar: float, shortening: float, deflection: float) -> N
     assert moved[2] == pytest.approx(deflection, abs=1e-3 * deflection)
 
 
+def test_gripper() -> None:
+    """Each arm is the same elastica on the hub's edge, from a mesh file in mm; stretching is O(lambda_m) = 4e-4."""
+    row = result("gripper.yaml").rows[-1]
+    assert row["label"] == "target"
+    assert -row["tip_ux"] / 3e-3 == pytest.approx(0.32894, rel=1.5e-3)
+    assert row["tip_uz"] / 3e-3 == pytest.approx(0.66996, rel=1.5e-3)
+
+
 def test_turning_field_ends_where_the_tilted_one_does() -> None:
     """Turning the field from 150 to 90 degrees and applying it at 90 degrees give the same strip."""
     turning = "loading={kind: rotation, to: {polar: 0}, points: 4}"
