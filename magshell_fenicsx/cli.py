@@ -178,6 +178,17 @@ def check(case: CaseFile, set_: Settings = None) -> None:
 
 
 @app.command()
+def schema(
+    markdown: Annotated[bool, typer.Option("--markdown", help="as a page to read, docs/case.md")] = False,
+) -> None:
+    """The JSON Schema of the case file, for editors."""
+    from magshell_fenicsx.case.reference import reference
+    from magshell_fenicsx.case.schema import schema_text
+
+    _say((reference() if markdown else schema_text()).removesuffix("\n"))
+
+
+@app.command()
 def info(
     compile_: Annotated[bool, typer.Option("--compile", help="compile every kernel of degrees 3 and 4 now")] = False,
 ) -> None:

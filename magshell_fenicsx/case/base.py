@@ -5,15 +5,15 @@ from collections.abc import Callable
 from functools import cache
 from typing import TYPE_CHECKING, Annotated, Any
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 if TYPE_CHECKING:
     import pint
 
 # one number, then units; pint itself would compute any formula, 9**9**9 included
-_NUMBER = r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)(e[-+]?[0-9]+)?"
+_NUMBER = r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?"
 _UNIT = r"[^\W\d]+(\s*(\*\*|\^)\s*-?[0-9])?"
-_NUMBER_AND_UNITS = re.compile(rf"\s*{_NUMBER}[\s*]*{_UNIT}([\s*/]+{_UNIT})*\s*", re.IGNORECASE)
+_NUMBER_AND_UNITS = re.compile(rf"\s*{_NUMBER}[\s*]*{_UNIT}([\s*/]+{_UNIT})*\s*")
 
 
 @cache
@@ -25,9 +25,19 @@ def _units() -> "pint.UnitRegistry":
 
 
 class Section(BaseModel):
-    """A section of the case file."""
+    """A section of the case file.
 
-    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
+    The docstring of a key is its line in docs/case.md and in the schema; what it is in stands in brackets at its end.
+    """
+
+    model_config = ConfigDict(
+        extra="forbid", strict=True, frozen=True, allow_inf_nan=False, use_attribute_docstrings=True
+    )
+
+
+def with_unit(unit: str) -> Any:
+    """What the schema says of text with a unit; names of units are checked by pint alone."""
+    return Annotated[str, Field(pattern=rf"^\s*{_NUMBER}[\s*]*[^\s\d*]", examples=[_EXAMPLES[unit]])]
 
 
 def _quantity(unit: str) -> Any:
@@ -38,7 +48,7 @@ def _quantity(unit: str) -> Any:
             raise ValueError(f'needs a unit, for example "{_EXAMPLES[unit]}"')
         return _converted(value, unit)
 
-    return BeforeValidator(convert)
+    return BeforeValidator(convert, json_schema_input_type=with_unit(unit))
 
 
 def _converted(value: str, unit: str) -> float:

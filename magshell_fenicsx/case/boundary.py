@@ -15,6 +15,7 @@ class HeldSection(Section):
     """Some components of the displacement are zero; rotations are free."""
 
     held: Annotated[list[Axis], Field(min_length=1, max_length=3)]
+    """The components that are zero"""
 
     @property
     def components(self) -> tuple[int, ...]:
@@ -43,7 +44,9 @@ class BoundarySection(Section):
     """
 
     model_config = Section.model_config | {"extra": "allow"}
-    __pydantic_extra__: dict[str, Annotated[Any, BeforeValidator(_condition)]]
+    __pydantic_extra__: dict[
+        str, Annotated[Any, BeforeValidator(_condition, json_schema_input_type=EdgeCondition | HeldSection)]
+    ]
 
     def conditions(self) -> dict[str, EdgeCondition | HeldSection]:
         """Name -> condition."""

@@ -28,13 +28,18 @@ SOLID_DEGREE = 2
 
 
 class MeshSection(Section):
-    """Discretisation."""
+    """The elements: C0 interior penalty on triangles; of hemispheres, graded towards dimple, load and edge."""
 
     degree: int = Field(default=4, ge=2, le=5)
-    refinement: float = Field(default=1.0, ge=0.1, le=20, description="divides every element size")
-    size: float | None = Field(default=None, gt=0, le=1e12, description="of elements, in the shell's lengths")
-    penalty: float | None = Field(default=None, ge=1e-3, le=1e9, description="sigma of the interior penalty")
-    tolerance: float | None = Field(default=None, ge=1e-6, le=0.1, description="relative, of the run's result")
+    """Degree k of the displacement. Degree 2 locks; a solid has degree 2 and no other"""
+    refinement: float = Field(default=1.0, ge=0.1, le=20)
+    """Divides every element size; not of a mesh file"""
+    size: float | None = Field(default=None, gt=0, le=1e12)
+    """Element size, by default 2 √(Rh), at most 0.35 R; of plates, annuli, ... alone [the shell's length]"""
+    penalty: float | None = Field(default=None, ge=1e-3, le=1e9)
+    """σ of the interior penalty; by default 5 k²"""
+    tolerance: float | None = Field(default=None, ge=1e-6, le=0.1)
+    """Relative error of the run's result; chooses degree and refinement, on hemispheres, discs and strips"""
 
     @model_validator(mode="after")
     def _tolerance_chooses_the_mesh(self) -> Self:
@@ -47,18 +52,29 @@ Place = Annotated[list[float], Field(min_length=3, max_length=3)]
 
 
 class Case(Section):
-    """A validated case file."""
+    """A shell, what holds it, its field and its load; validated."""
 
     model: Literal["shell", "solid"] = "shell"
+    """A thin shell, or the body of a hemisphere, disc or strip in three dimensions"""
     shell: Annotated[ShellSection | Surface, Field(discriminator="geometry")]
+    """Mid-surface, thickness and material"""
     solid: SolidSection | None = None
+    """Of `model: solid`"""
     boundary: BoundarySection
+    """What is held"""
     points: dict[str, Place] = Field(default_factory=dict)
+    """Name -> place of what is loaded, held or watched; not on hemispheres, discs, strips [the shell's length]"""
     magnetic: MagneticSection | None = None
+    """Remanence and applied field, which is applied before the load"""
     loading: LoadingSection | None = None
+    """The load after the field; without it the path ends with the field"""
     mesh: MeshSection = MeshSection()
+    """Elements"""
     stability: StabilitySection | None = None
+    """Lowest modes after the run"""
     symmetry: Literal["auto", "none", "half", "axisymmetric"] = "auto"
+    """The part that is modelled of a hemisphere, disc or strip: the smallest that the case allows (auto), all (none),
+    one side of a mirror plane through e3 (half), the meridian (axisymmetric)"""
 
     @model_validator(mode="after")
     def _sections_fit(self) -> Self:

@@ -8,8 +8,10 @@ from magshell_fenicsx.case.base import Section
 
 
 class DimpleSection(Section):
-    """w0 = -delta (1 - (phi/phi_o)^2)^2 at the pole."""
+    """w0 = -δ (1 - (φ/φo)²)² around the pole, within the colatitude φo."""
 
     kind: Literal["dimple"]
-    amplitude: float = Field(ge=0, le=50, description="delta/h")
-    width: float = Field(ge=0.05, le=50, description="phi_bar_o = phi_o (sqrt(12 (1 - nu^2)) R/h)^(1/2)")
+    amplitude: float = Field(ge=0, le=50)
+    """Depth δ [h]"""
+    width: float = Field(ge=0.05, le=50)
+    """Half-width φ̄o = φo (√(12(1 - ν²)) R/h)^(1/2)"""

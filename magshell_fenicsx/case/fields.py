@@ -18,14 +18,16 @@ def _checked(text: str) -> str:
     return text
 
 
-Formula = Annotated[str, AfterValidator(_checked)]
+Formula = Annotated[str, AfterValidator(_checked), Field(examples=["z*sqrt(x**2 + y**2)"])]
 
 
 class Direction(Section):
     """Angles in degrees: polar from e3, azimuth from e1 about e3."""
 
     polar: float = 0.0
+    """Angle from e3 [degree]"""
     azimuth: float = 0.0
+    """Angle from e1 about e3 [degree]"""
 
     def vector(self, turn: float = 0.0) -> NDArray[np.float64]:
         """The unit vector (3,) in a frame that is turned by `turn` (rad) about e3."""
@@ -36,11 +38,12 @@ class Direction(Section):
 class Layer(Direction):
     """A layer of the thickness, magnetised in one direction."""
 
-    fraction: float = Field(gt=0, le=1, description="of the thickness")
+    fraction: float = Field(gt=0, le=1)
+    """Of the thickness; all add up to one [h]"""
 
 
 class RemanentSection(Direction):
-    """The remanent flux density; `polar` and `azimuth` belong to the uniform one.
+    """The remanent flux density B^r; `polar` and `azimuth` belong to the uniform one.
 
     radial: along the normal. tangential: along the meridians, away from e3. expression: components as
     formulas of the undeformed position x, y, z over R. patches: a direction per named patch, "dimple"
@@ -48,10 +51,15 @@ class RemanentSection(Direction):
     """
 
     kind: Literal["uniform", "radial", "tangential", "expression", "patches", "layers"] = "uniform"
+    """How it varies in space"""
     flux_density: FluxDensity | None = Field(default=None, ge=-1e3, le=1e3)
+    """|B^r|, at most 1000 T; with that of `applied` in place of lambda_m"""
     components: list[Formula] | None = Field(default=None, min_length=3, max_length=3)
+    """Of kind: expression: arithmetic of x, y, z, pi and sin, cos, tan, exp, log, sqrt, abs, sign, arctan2 [|B^r|]"""
     patches: dict[str, Direction] | None = None
+    """Of kind: patches: name -> direction"""
     layers: list[Layer] | None = Field(default=None, min_length=1)
+    """Of kind: layers: those through the thickness"""
 
     @model_validator(mode="after")
     def _keys_of_the_kind(self) -> Self:
@@ -81,13 +89,19 @@ def layer_average(layers: list[Layer], turn: float = 0.0) -> NDArray[np.float64]
 
 
 class AppliedSection(Direction):
-    """The applied flux density, uniform or linear in space: |Ba| (uniform b + gradient . r/R)."""
+    """The applied flux density, uniform or linear in space: |B^a| (uniform b + gradient · r/R).
+
+    The unit vector b has the direction of polar and azimuth, r is the deformed place.
+    """
 
     flux_density: FluxDensity | None = Field(default=None, ge=-1e3, le=1e3)
-    uniform: float = Field(default=1.0, ge=-1e3, le=1e3, description="factor of the uniform part")
+    """|B^a|, at most 1000 T; with that of `remanent` in place of lambda_m"""
+    uniform: float = Field(default=1.0, ge=-1e3, le=1e3)
+    """Factor of the uniform part [|B^a|]"""
     gradient: list[list[Annotated[float, Field(ge=-1e3, le=1e3)]]] | None = Field(
         default=None, min_length=3, max_length=3
     )
+    """Three rows of three numbers; energy: full alone has it [|B^a|/R]"""
 
     @model_validator(mode="after")
     def _square(self) -> Self:
@@ -99,12 +113,20 @@ class AppliedSection(Direction):
 
 
 class MagneticSection(Section):
-    """lambda_m, or both flux densities (and shell.youngs_modulus)."""
+    """lambda_m, or both flux densities (and shell.youngs_modulus).
+
+    Energies: full, exact; first, torque and second are the paper's expansions in the displacement;
+    second_consistent has the couple too that they leave out. See docs/theory.md.
+    """
 
     energy: Literal["full", "first", "torque", "second", "second_consistent"] = "full"
+    """The full magnetic energy, or an expansion"""
     lambda_m: float | None = Field(default=None, ge=-10, le=10)
+    """λ_m = |B^r||B^a|/(μ0 E); negative: the field is reversed; 0: no magnetic term"""
     remanent: RemanentSection = RemanentSection()
+    """What is magnetised"""
     applied: AppliedSection = AppliedSection()
+    """The field"""
 
     @model_validator(mode="after")
     def _one_amplitude(self) -> Self:

@@ -8,7 +8,8 @@ from pydantic import Field, model_validator
 from magshell_fenicsx.case.base import Section
 from magshell_fenicsx.case.fields import Direction
 
-Until = Literal["limit", "bifurcation", "target", "points"]
+Until = Annotated[Literal["limit", "bifurcation", "target", "points"], Field(description="Where the path ends.")]
+Count = Annotated[int, Field(ge=1, le=10000, description="Equal parts to the target, or steps by arc length.")]
 LEAST_TARGET = 1e-9
 Vector = Annotated[list[Annotated[float, Field(ge=-1e30, le=1e30)]], Field(min_length=3, max_length=3)]
 Wanted = Mapping[str, tuple[str, ...]]  # control -> the targets that it can have
@@ -25,9 +26,11 @@ class PathSection(Section):
     """
 
     until: Until
-    points: int = Field(default=10, ge=1, le=10000)
+    points: Count = 10
     branches: bool = False
+    """Whether to follow both directions of the branch at the first bifurcation"""
     sensitivities: bool = False
+    """Derive the load at the fold that ends the path by all other amplitudes, the defect and each patch's remanence"""
 
     def _check(self, control: str, until: Until, targets: Mapping[str, float | None], wanted: Wanted) -> None:
         """One target that fits the control with `until: target`, none elsewhere."""
@@ -45,13 +48,16 @@ class PathSection(Section):
 
 
 class PressureSection(PathSection):
-    """Live pressure, p > 0 from outside."""
+    """Live pressure, which follows the surface; p > 0 from outside."""
 
     kind: Literal["pressure"]
     control: Literal["volume", "load", "arc"] = "volume"
+    """What is prescribed step by step: ΔV, p, or arc length, which passes every fold"""
     until: Until = "limit"
-    pressure: float | None = Field(default=None, description="target p/p_c", ge=-1e3, le=1e3)
-    volume_change: float | None = Field(default=None, description="target Delta V/R^3", ge=-5, le=5)
+    pressure: float | None = Field(default=None, ge=-1e3, le=1e3)
+    """Target p; with control: load or arc [p_c]"""
+    volume_change: float | None = Field(default=None, ge=-5, le=5)
+    """Target ΔV; with control: volume or arc [R³]"""
 
     @model_validator(mode="after")
     def _target_fits_control(self) -> Self:
@@ -62,19 +68,24 @@ class PressureSection(PathSection):
 
 
 class IndentationSection(PathSection):
-    """A dead force along the undeformed normal at one point.
+    """A dead force along the undeformed normal at one place of a hemisphere, disc (centre) or strip (tip).
 
-    With `until: points` a depth may be given that the mesh shall be fine enough for.
+    F > 0 pushes in. With `until: points` a depth may be given that the mesh shall be fine enough for.
     """
 
     kind: Literal["indentation"]
     at: Direction
+    """Where the force is; on a hemisphere polar is below 89"""
     control: Literal["displacement", "load", "arc"] = "displacement"
+    """What is prescribed step by step: w, F, or arc length, which passes every fold"""
     until: Until = "target"
-    depth: float | None = Field(default=None, description="target w/h at the load", ge=-1e4, le=1e4)
-    force: float | None = Field(default=None, description="target F R/(2 pi D)", ge=-1e6, le=1e6)
-    points: int = Field(default=20, ge=1, le=10000)
-    patch: float = Field(default=0.0, description="radius/h of the loaded patch, 0 for a point", ge=0, le=1000)
+    depth: float | None = Field(default=None, ge=-1e4, le=1e4)
+    """Target w under the load; with control: displacement or arc [h]"""
+    force: float | None = Field(default=None, ge=-1e6, le=1e6)
+    """Target F; with control: load or arc [2πD/R]"""
+    points: Count = 20
+    patch: float = Field(default=0.0, ge=0, le=1000)
+    """Radius of the patch that the force is spread over, from 0.3; 0 is a point [h]"""
 
     @model_validator(mode="after")
     def _target_fits_control(self) -> Self:
@@ -92,13 +103,21 @@ class DeadLoadSection(Section):
     """
 
     at: str | None = None
+    """A point of `points`"""
     edge: str | None = None
+    """An edge of the geometry"""
     over: str | None = None
+    """all, or a patch of a mesh"""
     force: Vector | None = None
+    """At a point, or in all on an edge [force]"""
     per_length: Vector | None = None
+    """On an edge [force/length]"""
     moment: float | None = Field(default=None, ge=-1e30, le=1e30)
+    """On an edge, about its tangent with the surface on its left; positive turns the normal outward [force]"""
     per_area: Vector | None = None
+    """Over the surface [force/length²]"""
     pressure: float | None = Field(default=None, ge=-1e30, le=1e30)
+    """Over the surface, against the undeformed normal [force/length²]"""
 
     @model_validator(mode="after")
     def _one_load_in_one_place(self) -> Self:
@@ -119,7 +138,7 @@ class DeadLoadSection(Section):
 
 
 class DeadSection(PathSection):
-    """Loads that grow together, by a common factor; not on hemispheres, discs and strips.
+    """Loads that keep their direction and grow by a common factor; not on hemispheres, discs and strips.
 
     A target is the `factor`, or the `displacement` of the loads along themselves (their work over the sum of
     their sizes) in the units of the shell's lengths.
@@ -127,11 +146,15 @@ class DeadSection(PathSection):
 
     kind: Literal["dead"]
     loads: list[DeadLoadSection] = Field(min_length=1, max_length=1000)
+    """At a factor of one"""
     control: Literal["load", "displacement", "arc"] = "arc"
+    """What is prescribed step by step: the factor, the displacement, or arc length, which passes every fold"""
     until: Until = "target"
     factor: float | None = Field(default=None, ge=-1e9, le=1e9)
+    """Target of the common factor; with control: load or arc"""
     displacement: float | None = Field(default=None, ge=-1e9, le=1e9)
-    points: int = Field(default=20, ge=1, le=10000)
+    """Target of the displacement along the loads; with control: displacement or arc [the shell's length]"""
+    points: Count = 20
 
     @model_validator(mode="after")
     def _target_fits_control(self) -> Self:
@@ -155,6 +178,7 @@ class FieldSection(PathSection):
 
     kind: Literal["field"]
     control: Literal["load", "arc"] = "arc"
+    """What is prescribed step by step: λ_m, or arc length, which passes its folds"""
     until: Until = "target"
 
     @model_validator(mode="after")
@@ -172,7 +196,9 @@ class RotationSection(Section):
 
     kind: Literal["rotation"]
     to: Direction
-    points: int = Field(default=12, ge=1, le=10000)
+    """Its last direction"""
+    points: Annotated[int, Field(ge=1, le=10000)] = 12
+    """Equal angles to it"""
 
 
 LoadingSection = Annotated[

@@ -5,6 +5,7 @@ import re
 from typing import Any, get_args
 
 from pydantic import BaseModel
+from pydantic.fields import FieldInfo
 
 from magshell_fenicsx.case.source import Location, Source, dotted
 
@@ -23,7 +24,7 @@ def explain(error: Any, source: Source, case: type[BaseModel]) -> str:
         hint = f"did you mean {near[0]}? " if near else ""
         return f"{place}: {key}: unknown key; {hint}allowed here: {', '.join(sorted(allowed))}"
     if kind == "missing":
-        return f"{place}: {key}: is missing"
+        return f"{place}: {key}: is missing{_meaning(location, source.data, case)}"
     if kind.startswith("union_tag"):
         models = _models(case.model_fields[key].annotation)
         tag, tags = error["ctx"].get("tag"), [tag for m in models for tag in _tags(m)]
@@ -33,7 +34,9 @@ def explain(error: Any, source: Source, case: type[BaseModel]) -> str:
         return f"{place}: {key}: {shown(value)}: must be a section, with keys below it"
     if isinstance(value, dict | BaseModel):
         return f"{place}: {key}: {said}"
-    return f"{place}: {key}: {shown(value)}: {said}"
+    says_all = kind in ("value_error", "literal_error")
+    meaning = "" if says_all else _meaning(location, source.data, case)
+    return f"{place}: {key}: {shown(value)}: {said}{meaning}"
 
 
 def shown(value: Any) -> str:
@@ -53,13 +56,29 @@ def _without_tag(loc: Location, case: type[BaseModel]) -> Location:
 
 def _allowed_keys(location: Location, data: Any, case: type[BaseModel]) -> list[str]:
     """Keys of the section at a location."""
-    model = case
+    return list(_found(location, data, case)[0].model_fields)
+
+
+def _meaning(location: Location, data: Any, case: type[BaseModel]) -> str:
+    """The first words on a key, in brackets."""
+    field = _found(location, data, case)[1]
+    words = re.split(r"[;:.,] | \[", field.description)[0] if field and field.description else ""
+    return f" ({' '.join(words.split())})" if words else ""
+
+
+def _found(location: Location, data: Any, case: type[BaseModel]) -> tuple[type[BaseModel], FieldInfo | None]:
+    """The innermost section at a location; and the last key, if it is one of a section."""
+    model, field = case, None
     for key in location:
-        data = data[key]
-        if key in model.model_fields:  # else it is one of a list or mapping of sections
-            models = _models(model.model_fields[str(key)].annotation)
-            model = next((m for m in models if len(models) > 1 and data[_tag_key(models)] in _tags(m)), models[0])
-    return list(model.model_fields)
+        if isinstance(data, dict):
+            data = data.get(key)
+        else:
+            data = data[key] if isinstance(data, list) and isinstance(key, int) else None
+        field = model.model_fields.get(str(key))  # None: of a list or mapping of sections, or a part of a union
+        if field and (models := _models(field.annotation)):
+            tag = data.get(_tag_key(models)) if len(models) > 1 and isinstance(data, dict) else None
+            model = next((m for m in models if tag is not None and tag in _tags(m)), models[0])
+    return model, field
 
 
 def _models(annotation: Any) -> list[type[BaseModel]]:

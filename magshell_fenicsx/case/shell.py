@@ -10,16 +10,27 @@ from magshell_fenicsx.case.defects import DimpleSection
 
 
 class ShellSection(Section):
-    """Either radius_to_thickness, or radius and thickness with units; a strip's radius is its length."""
+    """Either radius_to_thickness, or radius and thickness with units; a strip's radius is its length.
+
+    Edges: equator (hemisphere), rim (disc), root (x = 0), tip and sides (strip).
+    """
 
     geometry: Literal["hemisphere", "disc", "strip"]
+    """A hemisphere around e3, a flat disc or a flat strip along e1"""
     radius_to_thickness: float | None = Field(default=None, ge=10, le=1e5)
+    """R/h, in place of radius and thickness"""
     radius: Length | None = Field(default=None, gt=0)
+    """Radius R, between 10 and 1e5 thicknesses"""
     thickness: Length | None = Field(default=None, gt=0)
+    """Thickness h"""
     youngs_modulus: Pressure | None = Field(default=None, ge=1, le=1e13)
+    """Young's modulus E, 1 Pa to 1e13 Pa; only flux densities need it"""
     poisson_ratio: float = Field(gt=-1, le=0.5)
+    """Poisson's ratio ν"""
     defect: DimpleSection | None = None
-    width: float | None = Field(default=None, gt=0, le=10, description="of the strip, over its length")
+    """Of a hemisphere"""
+    width: float | None = Field(default=None, gt=0, le=10)
+    """Of a strip, which must have one [length of the strip]"""
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:

@@ -8,5 +8,7 @@ from magshell_fenicsx.case.base import Section
 class SolidSection(Section):
     """Hexahedra of degree 2 through the thickness, and the compressibility that stands for poisson_ratio: 0.5."""
 
-    layers: int = Field(default=1, ge=1, le=10, description="of elements through the thickness")
-    bulk_to_shear: float = Field(default=100.0, ge=10, le=1e5, description="kappa/mu in place of nu = 0.5")
+    layers: int = Field(default=1, ge=1, le=10)
+    """Elements through the thickness"""
+    bulk_to_shear: float = Field(default=100.0, ge=10, le=1e5)
+    """κ/μ, in place of ν = 0.5 and only there"""

@@ -13,5 +13,7 @@ class StabilitySection(Section):
     `at: end` is the last point of the path; `at: instabilities` every located fold and bifurcation.
     """
 
-    modes: int = Field(default=4, ge=1, le=50, description="the lowest ones are drawn and written as fields")
+    modes: int = Field(default=4, ge=1, le=50)
+    """How many of the lowest modes are drawn and written as fields"""
     at: Literal["end", "instabilities"] = "end"
+    """At which points of the path"""

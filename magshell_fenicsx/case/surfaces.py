@@ -12,28 +12,34 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import BeforeValidator, Field, ModelWrapValidatorHandler, PrivateAttr, model_validator
 
-from magshell_fenicsx.case.base import Section, in_units
+from magshell_fenicsx.case.base import Section, in_units, with_unit
 from magshell_fenicsx.case.defects import DimpleSection
 from magshell_fenicsx.case.expressions import formula
 from magshell_fenicsx.case.fields import Formula
 
-Measure = Annotated[float, BeforeValidator(in_units("metre")), Field(gt=0)]
-Modulus = Annotated[float, BeforeValidator(in_units("pascal")), Field(gt=0)]
+Positive = Annotated[float, Field(gt=0)]
+Measure = Annotated[
+    float, BeforeValidator(in_units("metre"), json_schema_input_type=Positive | with_unit("metre")), Field(gt=0)
+]
+Modulus = Annotated[
+    float, BeforeValidator(in_units("pascal"), json_schema_input_type=Positive | with_unit("pascal")), Field(gt=0)
+]
 Range = Annotated[list[float], Field(min_length=2, max_length=2)]
+Azimuth = Annotated[Range | None, Field(description="First and last, of a part; closed without [degree]")]
 FULL_TURN = [0.0, 360.0]
 
 
 class SurfaceSection(Section):
-    """What all have in common.
-
-    `thickness_factor` multiplies the thickness: a formula of x, y, z over the reference length, or a
-    number for each named patch of a mesh.
-    """
+    """What all have in common."""
 
     thickness: Measure
+    """Thickness h; R/h is 3 to 1e6 [length]"""
     youngs_modulus: Modulus | None = None
+    """Young's modulus E; dead loads and flux densities need it [force/length²]"""
     poisson_ratio: float = Field(gt=-1, le=0.5)
+    """Poisson's ratio ν"""
     thickness_factor: Formula | dict[str, Annotated[float, Field(gt=0, le=100)]] | None = None
+    """Multiplies h: a formula of x, y, z over R, or of a mesh patch -> number"""
 
     _with_units: bool = PrivateAttr(default=False)
 
@@ -90,7 +96,8 @@ class RoundSection(SurfaceSection):
     """Has a radius; `azimuth` (degrees) is the part that there is, closed where it is not given."""
 
     radius: Measure
-    azimuth: Range | None = None
+    """Reference length R, which formulas and dimensionless results are over [length]"""
+    azimuth: Azimuth = None
 
     @model_validator(mode="after")
     def _turns_once(self) -> Self:
@@ -113,7 +120,9 @@ class CapSurface(RoundSection):
 
     geometry: Literal["cap"]
     polar: float = Field(default=90.0, ge=1, le=179)
-    hole: float | None = Field(default=None, ge=0.1, description="polar angle of its edge")
+    """Angle of the rim from e3 [degree]"""
+    hole: float | None = Field(default=None, ge=0.1)
+    """Angle of the hole's edge from e3 [degree]"""
 
     @model_validator(mode="after")
     def _hole_within(self) -> Self:
@@ -129,6 +138,7 @@ class CylinderSurface(RoundSection):
 
     geometry: Literal["cylinder"]
     length: Measure
+    """Along e3 [length]"""
 
 
 class PlateSurface(SurfaceSection):
@@ -136,7 +146,9 @@ class PlateSurface(SurfaceSection):
 
     geometry: Literal["plate"]
     length: Measure
+    """Along e1; the reference length R, which formulas and dimensionless results are over [length]"""
     width: Measure
+    """Along e2 [length]"""
 
     @property
     def reference(self) -> float:
@@ -148,6 +160,7 @@ class AnnulusSurface(RoundSection):
 
     geometry: Literal["annulus"]
     inner_radius: Measure
+    """Smaller than the radius [length]"""
 
     @model_validator(mode="after")
     def _inner_within(self) -> Self:
@@ -164,7 +177,9 @@ class TorusSurface(RoundSection):
 
     geometry: Literal["torus"]
     tube_radius: Measure
+    """Of the tube's section [length]"""
     tube: Range | None = None
+    """First and last angle of the tube's section; all of it without [degree]"""
 
     @model_validator(mode="after")
     def _hole_in_it(self) -> Self:
@@ -181,8 +196,11 @@ class ProfileSection(Section):
     """A smooth curve (r, z) through points, or r as a formula of z (in the case's lengths)."""
 
     points: list[Range] | None = Field(default=None, min_length=2)
+    """(r, z) that a spline goes through; two make a straight line [the shell's length]"""
     radius: Formula | None = None
-    heights: Range | None = Field(default=None, description="first and last z of the formula")
+    """r as a formula of z [the shell's length]"""
+    heights: Range | None = None
+    """First and last z of the formula [the shell's length]"""
 
     @model_validator(mode="after")
     def _one_way(self) -> Self:
@@ -215,7 +233,8 @@ class RevolutionSurface(SurfaceSection):
 
     geometry: Literal["revolution"]
     profile: ProfileSection
-    azimuth: Range | None = None
+    """The curve; its largest r is the reference length R"""
+    azimuth: Azimuth = None
 
     @property
     def reference(self) -> float:
@@ -238,14 +257,16 @@ class RevolutionSurface(SurfaceSection):
 class MeshSurface(SurfaceSection):
     """A .msh file: physical groups of surfaces are patches, those of curves are edges.
 
-    `radius` is the reference length; `unit` that of the file's coordinates, where lengths have units. The file
-    is told from the folder of the case (`Source.folder`).
+    What a mesh must be, and how to make one: meshes/README.md.
     """
 
     geometry: Literal["mesh"]
     file: str
+    """Its path from the folder of the case; triangles of order 1 to 3"""
     radius: Measure
-    unit: Annotated[float, BeforeValidator(in_units("metre", bare=True))] | None = None
+    """Reference length R, which formulas and dimensionless results are over [length]"""
+    unit: Annotated[float, BeforeValidator(in_units("metre", bare=True), json_schema_input_type=str)] | None = None
+    """Unit of the file's coordinates, such as mm; goes with lengths that have units"""
 
     _folder: Path = PrivateAttr(default_factory=Path)
 

@@ -1,0 +1,145 @@
+"""The reference of the case file in Markdown, from its schema; docs/case.md is made by it."""
+
+import json
+import re
+from collections.abc import Iterator
+from typing import Any
+
+from magshell_fenicsx.case.schema import schema
+
+Schema = dict[str, Any]
+WHOLE = "The whole case"
+TAGS = ("geometry", "kind")
+HEAD = """\
+# The case file
+
+Every section and key, made from [case.schema.json](case.schema.json) by `magshell schema --markdown`. A case is YAML;
+an unknown key, a missing one or one out of bounds is refused with file and line. Rules between keys (which target
+goes with which control, for instance) stand in the text; `magshell check CASE.yaml` tells them all.
+
+An editor that knows the schema completes keys, explains them and marks mistakes while one types: see
+[howto.md](howto.md#let-the-editor-help).
+
+Any key can be given on the command line, `--set loading.points=40`, sections too: `--set "loading={kind: field}"`.
+
+**Units.** Dimensionless unless a unit stands in the table. On hemispheres, discs and strips a length, Young's modulus
+and a flux density are text with a unit: `25.2 mm`, `1.8 MPa`, `60 mT`. On all other geometries either all lengths and
+Young's modulus have units, and everything without one is then in SI (points in m, forces in N, per_length in N/m, a
+moment, which is per length, in N, per_area and pressure in Pa, mesh.size in m); or none has, and everything is in one's
+own units. A flux density has a unit everywhere.
+"""
+
+
+def reference() -> str:
+    """The whole page."""
+    whole = schema()
+    sections = whole["$defs"]
+    titles = {name: _title(paths, sections[name]) for name, paths in _places(whole, sections).items()}
+    parts = [HEAD, _section(WHOLE, whole, titles)]
+    parts += [_section(title, sections[name], titles) for name, title in titles.items()]
+    return "\n".join(parts)
+
+
+def _places(whole: Schema, sections: dict[str, Schema]) -> dict[str, list[str]]:
+    """Section -> the keys that it stands under, in the order of the file."""
+    found: dict[str, list[str]] = {}
+
+    def visit(part: Schema, path: str) -> None:
+        named = {"NAME": part["additionalProperties"]} if part.get("additionalProperties") else {}
+        for key, value in (part["properties"] | named).items():
+            for name in _references(value):
+                here = f"{path}{key}"
+                if here not in found.setdefault(name, []):
+                    found[name].append(here)
+                    visit(sections[name], f"{here}.")
+
+    visit(whole, "")
+    return found
+
+
+def _references(part: Any) -> Iterator[str]:
+    """Names of the sections in a part of the schema."""
+    for key, value in part.items() if isinstance(part, dict) else enumerate(part if isinstance(part, list) else []):
+        if key == "$ref":
+            yield value.rsplit("/", 1)[-1]
+        else:
+            yield from _references(value)
+
+
+def _title(paths: list[str], section: Schema) -> str:
+    for key in TAGS:
+        tags = section.get("properties", {}).get(key, {})
+        if (
+            values := [tags["const"]]
+            if "const" in tags
+            else tags.get("enum", [])
+            if key in section.get("required", [])
+            else []
+        ):
+            return f"{paths[0]}, {key}: {', '.join(values)}"
+    return ", ".join(paths)
+
+
+def _section(title: str, section: Schema, titles: dict[str, str]) -> str:
+    lines = ["", f"## {title}", "", section["description"], ""]
+    if section["properties"]:
+        lines += ["| key | allowed | unit | default | meaning |", "| --- | --- | --- | --- | --- |"]
+        required = section.get("required", [])
+        keys = sorted(section["properties"].items(), key=lambda item: item[0] not in TAGS)  # what tells it apart first
+        lines += [_row(key, value, key in required, titles) for key, value in keys]
+    else:
+        lines += [f"Allowed: {_allowed(section, titles)}."]
+    return "\n".join(lines) + "\n"
+
+
+def _row(key: str, part: Schema, required: bool, titles: dict[str, str]) -> str:
+    told = re.fullmatch(r"(.*?)(?: \[(.*)\])?", " ".join(part.get("description", "").split()))
+    assert told
+    known = part.get("default")
+    default = "**required**" if required else "" if isinstance(known, dict) or known is None else f"`{_plain(known)}`"
+    cells = (f"`{key}`", _allowed(part, titles), told[2] or "", default, told[1])
+    return f"| {' | '.join(cell.replace('|', '&#124;') for cell in cells)} |"
+
+
+def _allowed(part: Schema, titles: dict[str, str]) -> str:
+    """What a value may be, in words."""
+    if "$ref" in part:
+        title = titles[part["$ref"].rsplit("/", 1)[-1]]
+        return f"[{title.split(': ')[-1]}](#{_anchor(title)})"
+    for several in ("anyOf", "oneOf"):
+        if several in part:
+            words = [_allowed(one, titles) for one in part[several] if one.get("type") != "null"]
+            return (", " if several == "oneOf" else " or ").join(words)
+    if "const" in part or "enum" in part:
+        return ", ".join(f"`{_plain(value)}`" for value in part.get("enum", [part.get("const")]))
+    kind = part["type"]
+    if kind == "string":
+        return f"text such as `{part['examples'][0]}`" if "examples" in part else "text"
+    if kind == "boolean":
+        return "`true`, `false`"
+    if kind == "array":
+        few, most = part.get("minItems"), part.get("maxItems")
+        count = f"{few} × " if few == most and few else ""
+        return f"list of {count}{_allowed(part['items'], titles)}"
+    if kind == "object":
+        return f"name: {_allowed(part['additionalProperties'], titles)}"
+    return _bounded(part, {"number": "number", "integer": "whole number"}[kind])
+
+
+def _bounded(part: Schema, kind: str) -> str:
+    low = part.get("minimum", part.get("exclusiveMinimum"))
+    above, most = ("from" if "minimum" in part else "above"), part.get("maximum")
+    lower = "" if low is None else f", {above} {low:g}"
+    upper = "" if most is None else f" to {most:g}" if low is not None else f", to {most:g}"
+    return kind + lower + upper
+
+
+def _plain(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:g}"
+    return value if isinstance(value, str) else json.dumps(value)
+
+
+def _anchor(title: str) -> str:
+    """Of a heading, as GitHub makes it."""
+    return re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-")

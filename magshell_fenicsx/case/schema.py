@@ -1,0 +1,41 @@
+"""The JSON Schema of the case file, for editors; docs/case.schema.json is made by it."""
+
+import json
+from typing import Any
+
+from pydantic.json_schema import GenerateJsonSchema
+
+from magshell_fenicsx.case.case import Case
+
+_NOISE = {"title", "discriminator", "gt", "ge", "lt", "le"}  # the last are bounds of quantities, which are text
+
+
+class _Plain(GenerateJsonSchema):
+    """Keys keep their own names; what pydantic adds and JSON Schema does not know is left out."""
+
+    def generate(self, schema: Any, mode: Any = "validation") -> dict[str, Any]:
+        plain = super().generate(schema, mode)
+        assert isinstance(plain, dict)
+        return {"$schema": self.schema_dialect, "title": "magshell_fenicsx case", **_without_noise(plain)}
+
+
+def schema() -> dict[str, Any]:
+    """What a case file may hold, key by key; rules between keys are `Case`'s alone."""
+    return Case.model_json_schema(schema_generator=_Plain)
+
+
+def schema_text() -> str:
+    return json.dumps(schema(), indent=1, ensure_ascii=False) + "\n"
+
+
+def _without_noise(part: Any, *, names: bool = False) -> Any:
+    """`names`: the keys are those of the case, not words of JSON Schema."""
+    if isinstance(part, list):
+        return [_without_noise(item) for item in part]
+    if not isinstance(part, dict):
+        return part
+    kept = part if names else {key: value for key, value in part.items() if key not in _NOISE}
+    return {
+        key: value if key == "default" else _without_noise(value, names=key in ("properties", "$defs"))
+        for key, value in kept.items()
+    }
