@@ -51,7 +51,7 @@ def test_every_case_fits(file: Any) -> None:
         "boundary={equator: clamped}",
         "boundary={rim: {held: [x, z]}, left: symmetry, top: simply supported}",
         "magnetic={lambda_m: 1, remanent: {kind: expression, components: [x, '0', z**2]}}",
-        "magnetic={remanent: {flux_density: 60 mT}, applied: {flux_density: 5 T, gradient: [[1,0,0],[0,1,0],[0,0,-2]]}}",
+        "magnetic={remanent: {flux_density: 1 T}, applied: {flux_density: 5 T, gradient: [[1,0,0],[0,1,0],[0,0,-2]]}}",
         "magnetic={lambda_m: 1, remanent: {kind: layers, layers: [{fraction: 0.5}, {fraction: 0.5, polar: 9}]}}",
         "loading={kind: dead, loads: [{at: A, force: [1, 0, 0]}, {over: all, pressure: 2}], factor: 1}",
         "loading={kind: rotation, to: {polar: 90}}",
