@@ -86,7 +86,7 @@ class Case(Section):
             if not self.magnetic or not self.lambda_m:
                 raise ValueError("loading.kind: rotation needs a field: magnetic.lambda_m, not zero")
             if self.magnetic.applied.gradient:
-                raise ValueError("loading.kind: rotation is of a uniform field, without gradient")
+                raise ValueError("loading.kind: rotation needs a uniform field, without magnetic.applied.gradient")
             if abs(self.magnetic.applied.vector() @ self.loading.to.vector()) > 1 - 1e-9:
                 raise ValueError("loading.to: must be neither parallel nor opposite to magnetic.applied")
         if not isinstance(self.shell, ShellSection):
@@ -98,7 +98,7 @@ class Case(Section):
         geometry, conditions = shell.geometry, self.boundary.conditions()
         edges = EDGES[geometry]
         if self.points:
-            raise ValueError(f"points: are named on other geometries, not on a {geometry}")
+            raise ValueError(f"points: not on a {geometry}; all other geometries have named points")
         if isinstance(self.loading, DeadSection):
             raise ValueError(f"loading.kind: 'dead': not on a {geometry}; a plate or cap of the same shape takes it")
         if self.mesh.size is not None:
@@ -135,7 +135,7 @@ class Case(Section):
             )
         if self.symmetry not in ("auto", "none"):
             raise ValueError(
-                f"symmetry: {self.symmetry}: not with a {shell.geometry}; give the edges of the part that is modelled "
+                f"symmetry: {self.symmetry}: not with a {shell.geometry}; describe a part of it and give its edges "
                 "boundary: {name: symmetry}"
             )
         if "pole" in self.points:
@@ -151,7 +151,7 @@ class Case(Section):
         if self.mesh.tolerance is not None:
             raise ValueError(f"mesh.tolerance: not with a {shell.geometry}; give degree, size and refinement")
         if self.magnetic and self.magnetic.remanent.patches is not None and not isinstance(shell, MeshSurface):
-            raise ValueError("magnetic.remanent.kind: 'patches': have names only with geometry: mesh")
+            raise ValueError("magnetic.remanent.kind: 'patches': only a hemisphere and geometry: mesh have patches")
         if isinstance(self.loading, PathSection) and self.loading.sensitivities:
             raise ValueError(f"loading.sensitivities: not with a {shell.geometry}")
         if isinstance(self.loading, DeadSection):
@@ -170,9 +170,9 @@ class Case(Section):
             return self
         magnetic, loading = self.magnetic, self.loading
         if not isinstance(self.shell, ShellSection) or self.points:
-            raise ValueError("model: solid: of a hemisphere, disc or strip without named points")
+            raise ValueError("model: solid: needs a hemisphere, disc or strip, without named points")
         if magnetic and magnetic.energy != "full":
-            raise ValueError(f"magnetic.energy: {magnetic.energy}: is of a shell; a solid has the full energy")
+            raise ValueError(f"magnetic.energy: {magnetic.energy}: not of a solid, which has the full energy")
         if magnetic and magnetic.remanent.kind != "uniform":
             raise ValueError(f"magnetic.remanent.kind: {magnetic.remanent.kind}: a solid's remanence is uniform")
         for name, condition in self.boundary.conditions().items():
@@ -180,7 +180,9 @@ class Case(Section):
                 raise ValueError(f"boundary.{name}: {condition}: the face of a solid is clamped or free")
         for key in self.mesh.model_fields_set & {"degree", "penalty", "tolerance"}:
             if key != "degree" or self.mesh.degree != SOLID_DEGREE:
-                raise ValueError(f"mesh.{key}: is of a shell; a solid has degree {SOLID_DEGREE} and mesh.refinement")
+                raise ValueError(
+                    f"mesh.{key}: not of a solid, which has degree {SOLID_DEGREE}; mesh.refinement makes it finer"
+                )
         if self.symmetry == "axisymmetric":
             raise ValueError("symmetry: axisymmetric: a solid is whole or half")
         if isinstance(loading, IndentationSection) and not loading.patch:
@@ -189,9 +191,12 @@ class Case(Section):
                 "(of the paper's indenter, 0.2 mm at R = 25.2 mm, with R/h = 90: 0.714)"
             )
         if self.solid and "bulk_to_shear" in self.solid.model_fields_set and self.shell.poisson_ratio != 0.5:
-            raise ValueError("solid.bulk_to_shear: stands for shell.poisson_ratio: 0.5, which is another")
+            raise ValueError(
+                "solid.bulk_to_shear: takes the place of shell.poisson_ratio: 0.5; here that is "
+                f"{self.shell.poisson_ratio:g}, which says all"
+            )
         if isinstance(loading, PathSection) and loading.sensitivities:
-            raise ValueError("loading.sensitivities: are of a shell")
+            raise ValueError("loading.sensitivities: not of a solid")
         return self
 
     @property

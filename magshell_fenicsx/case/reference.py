@@ -105,7 +105,7 @@ def _allowed(part: Schema, titles: dict[str, str]) -> str:
     """What a value may be, in words."""
     if "$ref" in part:
         title = titles[part["$ref"].rsplit("/", 1)[-1]]
-        return f"[{title.split(': ')[-1]}](#{_anchor(title)})"
+        return f"[{title.split(': ')[-1]}](#{anchor(title)})"
     for several in ("anyOf", "oneOf"):
         if several in part:
             words = [_allowed(one, titles) for one in part[several] if one.get("type") != "null"]
@@ -140,6 +140,6 @@ def _plain(value: Any) -> str:
     return value if isinstance(value, str) else json.dumps(value)
 
 
-def _anchor(title: str) -> str:
+def anchor(title: str) -> str:
     """Of a heading, as GitHub makes it."""
     return re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-")

@@ -21,15 +21,15 @@ BUCKLING, INDENTATION = CASES / "solid_buckling.yaml", CASES / "solid_indentatio
     ("file", "setting", "said"),
     [
         (BUCKLING, "model=shel", "model: 'shel'"),
-        (BUCKLING, "magnetic.energy=torque", "a solid has the full energy"),
+        (BUCKLING, "magnetic.energy=torque", "not of a solid, which has the full energy"),
         (BUCKLING, "magnetic.remanent={kind: radial}", "a solid's remanence is uniform"),
         (BUCKLING, "boundary.equator=simply supported", "clamped or free"),
         (BUCKLING, "boundary.equator=hinged", "clamped or free"),
-        (BUCKLING, "mesh.degree=4", "mesh.degree: is of a shell"),
-        (BUCKLING, "mesh.penalty=4", "mesh.penalty: is of a shell"),
-        (BUCKLING, "mesh.tolerance=0.01", "mesh.tolerance: is of a shell"),
+        (BUCKLING, "mesh.degree=4", "mesh.degree: not of a solid"),
+        (BUCKLING, "mesh.penalty=4", "mesh.penalty: not of a solid"),
+        (BUCKLING, "mesh.tolerance=0.01", "mesh.tolerance: not of a solid"),
         (BUCKLING, "symmetry=axisymmetric", "a solid is whole or half"),
-        (BUCKLING, "loading.sensitivities=true", "loading.sensitivities: are of a shell"),
+        (BUCKLING, "loading.sensitivities=true", "loading.sensitivities: not of a solid"),
         (BUCKLING, "solid={layers: 0}", "solid.layers: 0: must be greater than or equal to 1"),
         (INDENTATION, "loading.patch=0", "a point force sinks into a solid without limit"),
     ],
@@ -43,7 +43,7 @@ def test_what_a_solid_cannot_is_refused(file: Path, setting: str, said: str) -> 
 def test_what_belongs_to_a_solid_is_refused_for_a_shell() -> None:
     with pytest.raises(CaseError, match="solid belongs to model: solid"):
         Case.load(BUCKLING, ["model=shell", "solid={layers: 2}"])
-    with pytest.raises(CaseError, match=r"stands for shell\.poisson_ratio: 0\.5"):
+    with pytest.raises(CaseError, match=r"place of shell\.poisson_ratio: 0\.5"):
         Case.load(BUCKLING, ["shell.poisson_ratio=0.4", "solid={bulk_to_shear: 50}"])
 
 

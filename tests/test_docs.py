@@ -1,0 +1,146 @@
+"""What the pages say is there: links, files, places in the code, cases, commands and their options."""
+
+import ast
+import re
+import shlex
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+import yaml
+from conftest import CASES
+from typer.main import get_command
+
+from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.reference import anchor
+from magshell_fenicsx.cli import app
+from magshell_fenicsx.plan import describe
+
+TOP = CASES.parent
+PAGES = [TOP / "README.md", TOP / "CONTRIBUTING.md", *sorted((TOP / "docs").rglob("*.md")), TOP / "meshes/README.md"]
+GUIDES = [TOP / name for name in ("README.md", "docs/howto.md", "docs/troubleshooting.md")]
+
+
+def text(page: Path) -> str:
+    return page.read_text(encoding="utf-8")
+
+
+def blocks(page: Path, language: str) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```", text(page), re.DOTALL | re.MULTILINE)
+
+
+def commands(page: Path) -> Iterator[list[str]]:
+    """Words of every indented command line with magshell or make."""
+    lines = re.sub(r"\\\n\s*", " ", text(page)).splitlines()
+    for line in lines:
+        if re.match(r"    (\S*in-env .*magshell |make )", line):
+            yield shlex.split(line, comments=True)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(TOP)))
+def test_links_lead_somewhere(page: Path) -> None:
+    for target in re.findall(r"\]\((?!http)([^)]+)\)", text(page)):
+        file, _, part = target.partition("#")
+        there = (page.parent / file).resolve() if file else page
+        assert there.exists(), target
+        if part:
+            assert part in [anchor(title) for title in re.findall(r"^#+ (.*)$", text(there), re.MULTILINE)], target
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(TOP)))
+def test_files_that_are_named_exist(page: Path) -> None:
+    for name in re.findall(r"\b(?:cases|meshes|docs|tests|magshell_fenicsx)/[\w./-]*\w\.\w+\b", text(page)):
+        assert (TOP / name).exists(), name
+
+
+def test_places_in_the_code() -> None:
+    """`file.py: name` of docs/theory.md."""
+    places = re.findall(r"`([\w/]+\.py): (\w+)`", text(TOP / "docs/theory.md"))
+    assert len(places) > 60
+    for file, name in places:
+        code = text(TOP / "magshell_fenicsx" / file)
+        assert re.search(rf"^\s*(def|class) {name}\b|^{name} = ", code, re.MULTILINE), f"{file}: {name}"
+
+
+CASE_BLOCKS = [(page, block) for page in PAGES for block in blocks(page, "yaml")]
+
+
+@pytest.mark.parametrize(
+    ("page", "block"), CASE_BLOCKS, ids=[f"{page.stem}{i}" for i, (page, _) in enumerate(CASE_BLOCKS)]
+)
+def test_yaml_is_a_case_that_can_be_built(page: Path, block: str, tmp_path: Path) -> None:
+    """And so is what stands behind a key as another value of it, `# key: {...}`, alone on its line."""
+    (tmp_path / "case.yaml").write_text(block, encoding="utf-8")
+    others = re.findall(r"^# (\w+): (\{.*?\}|\w+)(?:\s+#.*)?$", block, re.MULTILINE)
+    for setting in ["", *(f"{key}={value}" for key, value in others)]:
+        assert "built:" in describe(Case.load(tmp_path / "case.yaml", [setting] if setting else []))
+
+
+@pytest.mark.parametrize("page", GUIDES, ids=lambda page: str(page.relative_to(TOP)))
+def test_commands_are_understood(page: Path) -> None:
+    """Options are known to the command line, cases are there and take their settings."""
+    known = get_command(app).commands  # type: ignore[attr-defined]
+    for words in commands(page):
+        if words[0] == "make":
+            assert re.search(rf"^[\w ]*\b{words[1]}\b.*:", text(TOP / "Makefile"), re.MULTILINE), words
+            continue
+        name, *rest = words[words.index("magshell") + 1 :]
+        if name == "--help":
+            continue
+        options = {option for parameter in known[name].params for option in parameter.opts}
+        assert {word.partition("=")[0] for word in rest if word.startswith("--")} <= options, words
+        settings = [after for word, after in pairwise(rest) if word == "--set"]
+        for case in (word for word in rest if word.endswith(".yaml")):
+            assert Case.load(TOP / case, settings)
+
+
+def test_the_editor_line_leads_to_the_schema() -> None:
+    (line,) = re.findall(r"^# yaml-language-server: \$schema=(.*)$", text(TOP / "docs/howto.md"), re.MULTILINE)
+    assert yaml.safe_load(text(CASES / line))["title"] == "magshell_fenicsx case"
+
+
+def said(node: ast.AST) -> str:
+    """A text in the code, with … for what is filled in."""
+    if isinstance(node, ast.Constant):
+        return str(node.value)
+    if isinstance(node, ast.JoinedStr):
+        return "".join(said(part) for part in node.values)
+    return said(node.left) + said(node.right) if isinstance(node, ast.BinOp) else "…"
+
+
+def trees() -> Iterator[ast.AST]:
+    for file in (TOP / "magshell_fenicsx").rglob("*.py"):
+        if file.name not in ("scale.py", "native.py", "render.py"):  # of whoever works on the code
+            yield from ast.walk(ast.parse(text(file)))
+
+
+def words(message: str) -> str:
+    """Without what is filled in."""
+    return " ".join(re.sub(r"…|\n", " ", message).split())
+
+
+ON_THE_PAGE = {words(message) for message in re.findall(r"`([^`]+)`", text(TOP / "docs/troubleshooting.md"))}
+
+
+def test_messages_of_the_page_are_in_the_code() -> None:
+    """Every code span of the first column of its tables."""
+    spoken = {words(said(node)) for node in trees() if isinstance(node, ast.Constant | ast.JoinedStr | ast.BinOp)}
+    spoken |= {line.strip() for line in text(TOP / ".ci/in-env").splitlines()}
+    everything = "\n".join(spoken)
+    rows = re.findall(r"^\| (`.*?) \| ", text(TOP / "docs/troubleshooting.md"), re.MULTILINE)
+    messages = [message for row in rows for message in re.findall(r"`([^`]+)`", row)]
+    assert len(messages) > 100
+    assert [m for m in messages if not all(part in everything for part in map(words, m.split("…")) if part)] == []
+
+
+def test_messages_of_the_code_are_on_the_page() -> None:
+    """What is raised for a user, or said as a warning, but for what only passes on another message."""
+    raised = {
+        words(said(node.exc.args[0]))
+        for node in trees()
+        if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call) and node.exc.args
+    }
+    warned = {words(said(node)) for node in trees() if isinstance(node, ast.JoinedStr) and "warning: " in said(node)}
+    there = "\n".join(ON_THE_PAGE)
+    assert [message for message in raised | warned if len(message) > 12 and message not in there] == []
