@@ -15,10 +15,11 @@ from magshell_fenicsx.case.loading import PathSection
 from magshell_fenicsx.environment import fast_blas
 from magshell_fenicsx.follow import Stopped, follow
 from magshell_fenicsx.interrupt import Interrupted, Stoppable, Watch
-from magshell_fenicsx.report import report
+from magshell_fenicsx.modes_after import modes_after
 from magshell_fenicsx.results.durable import write_whole
 from magshell_fenicsx.results.files import MESH, RunFiles, open_folder
 from magshell_fenicsx.results.folder import DiskError, by_first, held_folder
+from magshell_fenicsx.results.report import write_report
 from magshell_fenicsx.results.summary import Result, summary
 from magshell_fenicsx.results.table import Row
 from magshell_fenicsx.rows import RowMaker
@@ -104,8 +105,9 @@ def _run(case: Case, folder: Path | None, comm: MPI.Comm, say: Say, watch: Watch
                 if not interrupted:  # who interrupts does not wait for pictures
                     with result.output:
                         files.draw(result, say)
-                        report(result, folder, say)
+                        modes_after(result, folder, say)
                     files.summarise(summary(result, time.perf_counter() - start))  # with the time of the pictures
+                by_first(comm, partial(write_report, folder))
             except DiskError as e:
                 interrupted = interrupted or e
             files.close(complete=not interrupted and not result.stopped)

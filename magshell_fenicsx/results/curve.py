@@ -9,7 +9,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from magshell_fenicsx.results.table import OWN_MODES, Row
+from magshell_fenicsx.results.table import LOCATED, OWN_MODES, Row
 
 if TYPE_CHECKING:  # takes long to import
     from matplotlib.figure import Figure
@@ -23,7 +23,6 @@ AXES = {
     "lambda_m": ("w_pole_over_h", "lambda_m", POLE, r"field  $\lambda_\mathrm{m}$"),
 }
 
-LOCATED = ("fold", "bifurcation")
 FINE = 16  # drawn pieces between two points
 
 

@@ -26,7 +26,7 @@ from magshell_fenicsx.scene import Scene
 from magshell_fenicsx.solve.system import State
 
 LAST_FILES = (
-    *("summary.json", "shell.png", "curve.png", "magnetic_loads.png"),
+    *("summary.json", "report.html", "shell.png", "curve.png", "magnetic_loads.png"),
     *("instabilities.png", "stability.csv", "modes_*.png"),
 )
 MESH = "mesh.json"  # what was chosen for a tolerance

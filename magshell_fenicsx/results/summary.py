@@ -5,19 +5,13 @@ from typing import Any
 
 from magshell_fenicsx.adapt.choice import Adapted
 from magshell_fenicsx.adapt.ending import History, NoResult
+from magshell_fenicsx.case.shell import ShellSection
+from magshell_fenicsx.case.surfaces import Surface
 from magshell_fenicsx.environment import fast_blas, versions
-from magshell_fenicsx.results.table import Row
+from magshell_fenicsx.results.table import VALUE_COLUMN, Row
 from magshell_fenicsx.scene import Scene
 from magshell_fenicsx.solve.system import State
 from magshell_fenicsx.solve.timing import Stopwatch
-
-VALUE_COLUMN = {
-    "pressure": "p_over_pc",
-    "force": "force",
-    "load": "load_factor",
-    "lambda_m": "lambda_m",
-    "angle": "field_angle",
-}
 
 
 @dataclass
@@ -103,6 +97,7 @@ def summary(result: Result, total_s: float) -> dict[str, Any]:
             "pc_over_E": material.classical_pressure,
             "energy_unit": "E h R^2",
         },
+        "dimensions": _dimensions(scene.case.shell),
         "model": {
             "included": scene.plan.included,
             "left_out": scene.plan.left_out,
@@ -133,3 +128,12 @@ def summary(result: Result, total_s: float) -> dict[str, Any]:
         "blas": fast_blas() or "reference",
         "versions": versions(),
     }
+
+
+def _dimensions(shell: ShellSection | Surface) -> dict[str, Any]:
+    """Of the shell, where the case has them: in SI, or all in units of its own."""
+    if isinstance(shell, ShellSection):
+        lengths, in_si = {"radius": shell.radius, "thickness": shell.thickness}, True
+    else:
+        lengths, in_si = {"radius": shell.reference, "thickness": shell.thickness}, shell.with_units
+    return {**lengths, "youngs_modulus": shell.youngs_modulus, "units": "SI" if in_si else "the case's own"}

@@ -37,6 +37,14 @@ COLUMNS = (
     "w_point_over_h",
 )
 Row = dict[str, float | int | str]
+VALUE_COLUMN = {  # by what varied: the column of its value
+    "pressure": "p_over_pc",
+    "force": "force",
+    "load": "load_factor",
+    "lambda_m": "lambda_m",
+    "angle": "field_angle",
+}
+LOCATED = ("fold", "bifurcation")
 OWN_MODES = ("", "symmetric", "asymmetric")  # of an instability within the model; others it excludes
 
 

@@ -11,9 +11,9 @@ from magshell_fenicsx.results.folder import by_first
 from magshell_fenicsx.results.gathering import Gatherer, gatherer
 from magshell_fenicsx.results.modes import caption, mode_file, mode_surface, mode_table, wave_number, write_mode
 from magshell_fenicsx.results.picture import draw_modes
-from magshell_fenicsx.results.summary import VALUE_COLUMN, Result
+from magshell_fenicsx.results.summary import Result
 from magshell_fenicsx.results.surface import Surface
-from magshell_fenicsx.results.table import OWN_MODES, Row
+from magshell_fenicsx.results.table import OWN_MODES, VALUE_COLUMN, Row
 from magshell_fenicsx.solve.stability import ModesNotFound
 from magshell_fenicsx.solve.system import State, Vector
 from magshell_fenicsx.stability import ShellMode, ShellModes
@@ -23,7 +23,7 @@ SYMBOLS = {"pressure": r"$p/p_\mathrm{c}$", "force": r"$FR/2\pi D$", "lambda_m":
 MOST_PANELS = 9
 
 
-def report(result: Result, folder: Path, say: Say) -> None:
+def modes_after(result: Result, folder: Path, say: Say) -> None:
     """Write fields/mode_*.vtu, instabilities.png and, if the case has a stability section, modes_*.png, stability.csv.
 
     Every rank calls, rank 0 writes. The run must be over: the model's tangent is overwritten.

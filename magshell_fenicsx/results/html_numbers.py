@@ -1,0 +1,51 @@
+"""Numbers as people read them, in HTML."""
+
+import math
+from collections.abc import Sequence
+
+from markupsafe import Markup
+
+LEAST, MOST = 1e-3, 1e6  # sizes that need no power of ten
+DIGITS = 6
+
+
+def number(value: float) -> Markup:
+    """A number with six significant digits at most.
+
+    Examples
+    --------
+    >>> number(0.32623330500000004), number(90.0), number(1.84e-05)
+    (Markup('0.326233'), Markup('90'), Markup('1.84 · 10<sup>−5</sup>'))
+    """
+    if value == 0 or LEAST <= abs(value) < MOST:
+        return _signed(f"{value:.{DIGITS}g}")
+    mantissa, _, exponent = f"{value:.{DIGITS - 1}e}".partition("e")
+    return _signed(mantissa.rstrip("0").rstrip(".")) + Markup(" · ") + power(int(exponent))
+
+
+def column(values: Sequence[float]) -> tuple[int, list[Markup]]:
+    """Numbers with one power of ten and equally many decimals, to stand below each other; nan stays empty.
+
+    Examples
+    --------
+    >>> column([0.0, -1.5e-06, 2.25e-05])
+    (-5, [Markup('0.000'), Markup('−0.150'), Markup('2.250')])
+    """
+    largest = max((abs(v) for v in values if math.isfinite(v)), default=0.0)
+    order = math.floor(math.log10(largest)) if largest else 0
+    exponent = 0 if LEAST <= largest < MOST or not largest else order
+    texts = [f"{v / 10.0**exponent:.{max(0, DIGITS - 1 - order + exponent)}f}" for v in values]
+    if largest and "." in texts[0]:
+        spare = min(len(t) - len(t.rstrip("0")) for t, v in zip(texts, values, strict=True) if math.isfinite(v))
+        texts = [t[: len(t) - spare].rstrip(".") for t in texts]
+    return exponent, [_signed(t) if math.isfinite(v) else Markup("") for t, v in zip(texts, values, strict=True)]
+
+
+def power(exponent: int) -> Markup:
+    """A power of ten."""
+    return Markup("10<sup>{}</sup>").format(_signed(str(exponent)))
+
+
+def _signed(text: str) -> Markup:
+    """With a minus as long as a plus, and none before zero."""
+    return Markup(text.removeprefix("-") if not text.strip("-0.") else text.replace("-", "−"))
