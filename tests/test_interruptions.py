@@ -87,7 +87,10 @@ def test_time_limit(tmp_path: Path, reference: Path) -> None:
     assert done.returncode == 3
     assert done.stderr == "stopped early: interrupted by the time limit of 0 s" + GOES_ON.format(out=tmp_path)
     assert [row["label"] for row in read_path(tmp_path)] == ["start"]
+    said = "The run stopped early, after 1 point: interrupted by the time limit of 0 s."
+    assert said in (tmp_path / "report.html").read_text(encoding="utf-8")
     check_goes_on(tmp_path, reference)
+    assert "stopped early" not in (tmp_path / "report.html").read_text(encoding="utf-8")
 
 
 def test_full_disk(tmp_path: Path) -> None:

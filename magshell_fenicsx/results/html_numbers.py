@@ -9,18 +9,19 @@ LEAST, MOST = 1e-3, 1e6  # sizes that need no power of ten
 DIGITS = 6
 
 
-def number(value: float) -> Markup:
-    """A number with six significant digits at most.
+def number(value: float, digits: int = DIGITS) -> Markup:
+    """A number with so many significant digits at most.
 
     Examples
     --------
-    >>> number(0.32623330500000004), number(90.0), number(1.84e-05)
-    (Markup('0.326233'), Markup('90'), Markup('1.84 · 10<sup>−5</sup>'))
+    >>> number(0.32623330500000004), number(90.0), number(1.84e-05), number(1e-4)
+    (Markup('0.326233'), Markup('90'), Markup('1.84 · 10<sup>−5</sup>'), Markup('10<sup>−4</sup>'))
     """
     if value == 0 or LEAST <= abs(value) < MOST:
-        return _signed(f"{value:.{DIGITS}g}")
-    mantissa, _, exponent = f"{value:.{DIGITS - 1}e}".partition("e")
-    return _signed(mantissa.rstrip("0").rstrip(".")) + Markup(" · ") + power(int(exponent))
+        return _signed(f"{value:.{digits}g}")
+    mantissa, _, exponent = f"{value:.{digits - 1}e}".partition("e")
+    short = mantissa.rstrip("0").rstrip(".")
+    return (Markup() if short == "1" else _signed(short) + Markup(" · ")) + power(int(exponent))
 
 
 def column(values: Sequence[float]) -> tuple[int, list[Markup]]:
@@ -29,7 +30,7 @@ def column(values: Sequence[float]) -> tuple[int, list[Markup]]:
     Examples
     --------
     >>> column([0.0, -1.5e-06, 2.25e-05])
-    (-5, [Markup('0.000'), Markup('−0.150'), Markup('2.250')])
+    (-5, [Markup('0.00'), Markup('−0.15'), Markup('2.25')])
     """
     largest = max((abs(v) for v in values if math.isfinite(v)), default=0.0)
     order = math.floor(math.log10(largest)) if largest else 0

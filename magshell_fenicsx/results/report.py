@@ -19,8 +19,8 @@ from magshell_fenicsx.results.verdict import Summary, bending_stiffness, located
 NAME, TEMPLATE = "report.html", "report_template.html"
 FOLDED = 30  # points from which on the table of the path is folded
 PICTURES = {  # in the order of the report
-    "curve.png": "The path: load over displacement. Unstable parts are dashed, instabilities are marked.",
-    "shell.png": "The deformed shell at the last point, coloured by the inward displacement w over the thickness h.",
+    "curve.png": "Load over displacement; dashed where the shell is unstable.",
+    "shell.png": "The deformed shell at the last point, coloured by the inward displacement w/h.",
     "animation.gif": "The shell along the path.",
     "magnetic_loads.png": "The magnetic energy read as loads on the deformed shell, at the last point.",
     "strains.png": "Strains of the mid-surface at the last point.",
@@ -154,5 +154,5 @@ def _how_to_estimate(case: dict[str, Any]) -> str:
         return "no result was found that mesh.tolerance could be of, and the default mesh was taken"
     if case["model"] == "shell" and case["shell"]["geometry"] in ADAPTED:
         return "give the case mesh: {tolerance: 1e-3} in place of degree and refinement"
-    finer = "mesh.degree one higher" if case["shell"]["geometry"] == "mesh" else "mesh.refinement=2"
+    finer = "mesh.degree one higher" if case["shell"]["geometry"] == "mesh" else "mesh.refinement twice as large"
     return f"run it again with {finer} and compare (mesh.tolerance is not offered for this geometry or model)"

@@ -20,17 +20,14 @@ def located(lines: Sequence[Line]) -> list[Line]:
 
 def verdict(summary: Summary, lines: Sequence[Line]) -> Markup:
     """The result, and where the run stopped early, why."""
-    first = next((line for line in located(lines) if line["branch"] == "0"), None)
-    said = [_instability(first, summary)] if first else []
-    if summary["stopped"]:
-        said.append(
-            Markup("The run stopped early, after {} point{}: {}.").format(
-                len(lines), "s" * (len(lines) != 1), summary["stopped"]
-            )
-        )
     until = (summary["case"].get("loading") or {}).get("until", "target")
-    if not first or until in ("target", "points"):
-        said.append(_end(summary, lines))
+    first = next((line for line in located(lines) if line["branch"] == "0"), None)
+    said = [_end(summary, lines)] if not first or until in ("target", "points") else []
+    if first:
+        said.append(_instability(first, summary))
+    if summary["stopped"]:
+        points = f"{len(lines)} point{'s' * (len(lines) != 1)}"
+        said.insert(0, Markup("The run stopped early, after {}: {}.").format(points, summary["stopped"]))
     return Markup(" ").join(said)
 
 
