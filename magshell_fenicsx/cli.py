@@ -48,6 +48,7 @@ def run(
     ] = None,
 ) -> None:
     """Solve a case and write path.csv, summary.json, fields and pictures."""
+    from magshell_fenicsx.live import live_line
     from magshell_fenicsx.mesh.patch import MeshError
     from magshell_fenicsx.results.files import AlreadyComplete
     from magshell_fenicsx.results.folder import DiskError
@@ -55,8 +56,9 @@ def run(
 
     folder = out or Path("results") / case.stem
     try:
-        settings = set_ or []
-        result = run_case(Case.load(case, settings), folder, say=_say, resume=resume, time_limit=time_limit)
+        read = Case.load(case, set_ or [])
+        with live_line(MPI.COMM_WORLD.size, _say) as (say, tell):
+            result = run_case(read, folder, say=say, tell=tell, resume=resume, time_limit=time_limit)
     except (CaseError, MeshError) as e:
         raise _failure(str(e), INVALID) from None
     except DiskError as e:

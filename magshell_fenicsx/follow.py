@@ -198,7 +198,7 @@ def begin(
 
     `scale` is as that of `Path`.
     """
-    path = Path(scene.newton, name, control, StepOptions(1.0, 1.0, 1.0), abs(scale), scene.journal)
+    path = Path(scene.newton, name, control, StepOptions(1.0, 1.0, 1.0), abs(scale), scene.journal, scene.progress)
     start = path.start(state, first)
     step = abs(first / start.dmu)
     path.options = StepOptions(step, (LONGEST if control == "arc" else 2) * step, 1e-5 * step)
@@ -264,7 +264,8 @@ def _branches(scene: Scene, path: Path, crossing: Branching, goal: Goal, steps: 
 def _by_arc(scene: Scene, path: Path) -> Path:
     """The same path by arc length, in steps as long as the one off it at a bifurcation."""
     scale = path.metric.scale
-    return Path(scene.newton, path.name, "arc", StepOptions(0.1, LONGEST * 0.1, 1e-6), scale, scene.journal)
+    options = StepOptions(0.1, LONGEST * 0.1, 1e-6)
+    return Path(scene.newton, path.name, "arc", options, scale, scene.journal, scene.progress)
 
 
 def _fold_ahead(scene: Scene, path: Path, points: list[Point]) -> Record | None:
@@ -281,6 +282,8 @@ def _fold_ahead(scene: Scene, path: Path, points: list[Point]) -> Record | None:
 def _excluded(scene: Scene, path: Path, points: list[Point]) -> Record | None:
     """The first instability among the modes that a reduced model does not see, if there is one."""
     modes = scene.model.excluded_modes
+    if modes:
+        scene.progress.doing("looking for modes that the model excludes")
     try:
         found = modes.first_instability(path, points) if modes else None
     except PathStopped as e:

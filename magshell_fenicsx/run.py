@@ -16,6 +16,7 @@ from magshell_fenicsx.environment import fast_blas
 from magshell_fenicsx.follow import Stopped, follow
 from magshell_fenicsx.interrupt import Interrupted, Stoppable, Watch
 from magshell_fenicsx.modes_after import modes_after
+from magshell_fenicsx.progress import RunProgress, waiting
 from magshell_fenicsx.results.durable import write_whole
 from magshell_fenicsx.results.files import MESH, RunFiles, open_folder
 from magshell_fenicsx.results.folder import DiskError, by_first, held_folder
@@ -39,6 +40,7 @@ def run(
     comm: MPI.Comm = MPI.COMM_WORLD,
     say: Say = lambda line: None,
     *,
+    tell: Say | None = None,
     resume: bool = False,
     time_limit: float | None = None,
 ) -> Result:
@@ -52,6 +54,8 @@ def run(
         Folder for path.csv, summary.json, fields and pictures; None writes nothing.
     say
         Called with one line of text per accepted point, on rank 0.
+    tell
+        Called with a line on what the run is at, which replaces the one before, on rank 0.
     resume
         Go on with the run that was interrupted in `out`.
     time_limit
@@ -68,17 +72,26 @@ def run(
     """
     start = time.perf_counter()
     watch = Watch(comm, start, time_limit, signals=out is not None)
+    say, tell = (say, tell or _nobody) if comm.rank == 0 else (_nobody, _nobody)
     if out is None:
-        return _run(case, None, comm, say, watch, start)
+        return _run(case, None, comm, say, tell, watch, start)
     with held_folder(Path(out), comm, make=not resume):
         open_folder(Path(out), case, comm, resume)
-        return _run(case, Path(out), comm, say, watch, start)
+        return _run(case, Path(out), comm, say, tell, watch, start)
 
 
-def _run(case: Case, folder: Path | None, comm: MPI.Comm, say: Say, watch: Watch, start: float) -> Result:
+def _nobody(line: str) -> None:
+    """Hears nothing."""
+
+
+def _run(case: Case, folder: Path | None, comm: MPI.Comm, say: Say, tell: Say, watch: Watch, start: float) -> Result:
     """Run a case in a folder that is ready; `start` in seconds of the clock."""
-    say = say if comm.rank == 0 else lambda line: None
-    found = _mesh_for_tolerance(case, folder, comm, say)
+
+    def doing(what: str) -> None:
+        tell(waiting(what, time.perf_counter() - start))
+
+    found = _mesh_for_tolerance(case, folder, comm, say, doing)
+    doing("mesh and kernels")
     scene = found.choice.scene(case, comm) if found else Scene(case, comm)
     result = Result(scene, scene.unloaded(), adapted=found)
     say(f"{', '.join(scene.plan.included)}: {scene.cells} cells, {scene.model.system.dofs} unknowns")
@@ -89,10 +102,11 @@ def _run(case: Case, folder: Path | None, comm: MPI.Comm, say: Say, watch: Watch
         start -= files.elapsed
         say(f"resuming after {files.kept} points")
     interrupted: RuntimeError | None = None
+    scene.progress = progress = RunProgress(scene, tell, start)
     with watch:
         scene.journal = Stoppable(files.journal if files else NoJournal(), watch)
         try:
-            _follow(result, files, say, start)
+            _follow(result, files, say, progress, start)
             result.sensitivities = _sensitivities(result)
         except Stopped as e:
             result.stopped = str(e)
@@ -103,6 +117,7 @@ def _run(case: Case, folder: Path | None, comm: MPI.Comm, say: Say, watch: Watch
             try:
                 files.summarise(summary(result, time.perf_counter() - start))
                 if not interrupted:  # who interrupts does not wait for pictures
+                    progress.doing("modes and pictures")
                     with result.output:
                         files.draw(result, say)
                         modes_after(result, folder, say)
@@ -117,7 +132,7 @@ def _run(case: Case, folder: Path | None, comm: MPI.Comm, say: Say, watch: Watch
     return result
 
 
-def _mesh_for_tolerance(case: Case, folder: Path | None, comm: MPI.Comm, say: Say) -> Adapted | None:
+def _mesh_for_tolerance(case: Case, folder: Path | None, comm: MPI.Comm, say: Say, doing: Say) -> Adapted | None:
     """The mesh for the case's tolerance, kept in the folder for a run that is resumed; None for the default mesh."""
     if case.mesh.tolerance is None:
         return None
@@ -125,7 +140,7 @@ def _mesh_for_tolerance(case: Case, folder: Path | None, comm: MPI.Comm, say: Sa
     if known := comm.bcast(file.read_bytes() if file and comm.rank == 0 and file.exists() else None):
         return Adapted.from_json(case, known)
     try:
-        found = adapted(case, comm, say)
+        found = adapted(case, comm, say, doing)
     except NoResult as e:
         say(f"warning: the default mesh is taken, there is no result that the tolerance could be of: {e}")
         return None
@@ -146,7 +161,7 @@ def _sensitivities(result: Result) -> dict[str, float]:
     return sensitivities(scene, fold)
 
 
-def _follow(result: Result, files: RunFiles | None, say: Say, start: float) -> None:
+def _follow(result: Result, files: RunFiles | None, say: Say, progress: RunProgress, start: float) -> None:
     """The history of a scene, point by point."""
     scene, made = result.scene, RowMaker(result.scene)
     for record in follow(scene):
@@ -159,7 +174,9 @@ def _follow(result: Result, files: RunFiles | None, say: Say, start: float) -> N
         if files:
             with result.output:
                 files.write(row, record.point.state)
-        if not files or len(result.rows) > files.kept:
+        known = files is not None and len(result.rows) <= files.kept
+        progress.accepted(row, known=known)
+        if not known:
             say(_line(row))
 
 

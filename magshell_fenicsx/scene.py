@@ -23,6 +23,7 @@ from magshell_fenicsx.shell.supports import refuse_loose
 from magshell_fenicsx.solid.model import SolidModel
 from magshell_fenicsx.solve.journal import Journal, NoJournal
 from magshell_fenicsx.solve.newton import BorderedNewton
+from magshell_fenicsx.solve.progress import NoProgress, Progress
 from magshell_fenicsx.solve.system import State
 
 
@@ -43,8 +44,9 @@ class Scene:
         What was asked for, and what was made of it.
     model, newton
         The shell as a system of terms, and the solver of its bordered systems.
-    journal
-        Keeps what the solver finds, for a run that is interrupted; set by whoever runs the scene.
+    journal, progress
+        Keeps what the solver finds, for a run that is interrupted; is told what the solver is at. Both are set by
+        whoever runs the scene.
     setup_s
         Seconds of building, without compiling kernels.
     """
@@ -70,6 +72,7 @@ class Scene:
                 refuse_loose(self.model.system, self.model.r0, self.unloaded().mu)
         self.newton = BorderedNewton(self.model.system)
         self.journal: Journal = NoJournal()
+        self.progress: Progress = NoProgress()
         self.setup_s = time.perf_counter() - start - self.model.kernels.seconds
 
     @property

@@ -36,7 +36,7 @@ Say = Callable[[str], None]
 Solved = tuple[Scene, Ending]
 
 
-def adapted(case: Case, comm: MPI.Comm, say: Say = lambda line: None) -> Adapted:
+def adapted(case: Case, comm: MPI.Comm, say: Say = lambda line: None, doing: Say = lambda what: None) -> Adapted:
     """Find a mesh on which the result of a case has an error below `mesh.tolerance`, relative; collective.
 
     The result is that of `Ending`: k_d or the critical amplitude at an instability; at the last target the load,
@@ -46,6 +46,8 @@ def adapted(case: Case, comm: MPI.Comm, say: Say = lambda line: None) -> Adapted
     ----------
     say
         Called with one line of text per round.
+    doing
+        Called with a few words on what is about to be done.
 
     Raises
     ------
@@ -54,12 +56,14 @@ def adapted(case: Case, comm: MPI.Comm, say: Say = lambda line: None) -> Adapted
     """
     tolerance = case.mesh.tolerance
     assert tolerance is not None
+    doing(f"a mesh for the tolerance {tolerance:g}: the path on a coarse one")
     choice, coarse = _first(case, comm)
     for degree in range(CHEAP + 1, _degree(tolerance) + 1):
         choice = Choice(degree, choice.refinement)
         coarse = _moved(case, choice, coarse)
     tried: list[tuple[Round, Choice]] = []
     while True:
+        doing(f"a mesh for the tolerance {tolerance:g}: round {len(tried) + 1}, degree {choice.degree}, estimating")
         fine = _moved(case, Choice(choice.degree + 1, choice.refinement, choice.size), coarse)
         here = _judged(choice, coarse, fine)
         tried.append((here, choice))
@@ -72,6 +76,7 @@ def adapted(case: Case, comm: MPI.Comm, say: Say = lambda line: None) -> Adapted
         another = _remeshed(choice, coarse, fine, AIM * tolerance / here.estimate)
         if another is None:
             break
+        doing(f"a mesh for the tolerance {tolerance:g}: round {len(tried) + 1}, degree {another.degree}, solving")
         choice, coarse = another, _moved(case, another, fine)
     within = [t for t in tried if t[0].estimate <= tolerance]
     best, choice = min(within, key=lambda t: t[0].dofs) if within else min(tried, key=lambda t: t[0].estimate)

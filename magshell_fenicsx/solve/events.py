@@ -72,6 +72,7 @@ class _Search:
         turned = low.dmu * high.dmu < 0
         if change == 0 and not turned:
             return
+        self.path.progress.doing("locating an instability")
         single = change == 1 or not halvings
         if single and turned:
             yield Instability(self.told(self.fold(low, high)), "fold")

@@ -9,6 +9,7 @@ import numpy as np
 from magshell_fenicsx.solve.control import GivenConjugate, GivenLoad, Hyperplane, Metric, Row
 from magshell_fenicsx.solve.journal import Journal, NoJournal
 from magshell_fenicsx.solve.newton import BorderedNewton, Response
+from magshell_fenicsx.solve.progress import NoProgress, Progress
 from magshell_fenicsx.solve.system import State, Vector, dot, max_abs
 
 Control = Literal["load", "conjugate", "arc"]
@@ -98,6 +99,8 @@ class Path:
         An amplitude that counts as of order one in the arc length.
     journal
         Keeps every result of `at`, and gives back those of an interrupted run.
+    progress
+        Is told of every step before it is tried.
     """
 
     def __init__(
@@ -108,11 +111,12 @@ class Path:
         options: StepOptions,
         scale: float = 1.0,
         journal: Journal | None = None,
+        progress: Progress | None = None,
     ) -> None:
         self.newton, self.name, self.control, self.options = newton, name, control, options
         self.system = newton.system
         self.metric = Metric(newton.system, scale)
-        self._journal = journal or NoJournal()
+        self._journal, self.progress = journal or NoJournal(), progress or NoProgress()
 
     def start(self, state: State, sense: float = 1.0) -> Point:
         """The point of a state that is in equilibrium already.
@@ -202,6 +206,7 @@ class Path:
         return point.per(self.metric.inner((base.du, base.dmu), (point.du, point.dmu)))
 
     def _try(self, s: float, before: Point | None, here: Point) -> Point | str:
+        self.progress.trying(here, s - here.s)
         found = self.at(s, self.predict(s, before, here), here)
         if isinstance(found, str):
             return found
