@@ -1,7 +1,7 @@
 """What all sections of a case share: strict types, no unknown keys, numbers with units."""
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import cache
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -79,7 +79,29 @@ def in_units(unit: str, *, bare: bool = False) -> Callable[[Any], float]:
     return convert
 
 
-_EXAMPLES = {"metre": "25.2 mm", "pascal": "1.8 MPa", "tesla": "60 mT"}
+def or_number(unit: str, number: Any = float) -> BeforeValidator:
+    """A validator: a number as it is, or text with a unit in `unit`; `number` is the type that the schema tells."""
+    return BeforeValidator(in_units(unit), json_schema_input_type=number | with_unit(unit))
+
+
+NAMES = {"at", "edge", "over", "kind", "control", "until", "radius"}  # text without being quantities
+
+
+def texts(part: Any, path: str = "") -> Iterator[str]:
+    """Where in plain data numbers stand as text, with a unit."""
+    for key, value in part.items() if isinstance(part, dict) else enumerate(part if isinstance(part, list) else []):
+        if isinstance(value, str) and key not in NAMES:
+            yield f"{path}{key}"
+        yield from texts(value, f"{path}{key}.")
+
+
+_EXAMPLES = {
+    "metre": "25.2 mm",
+    "pascal": "1.8 MPa",
+    "tesla": "60 mT",
+    "newton": "20 mN",
+    "newton/metre": "5 N/m",
+}
 Length = Annotated[float, _quantity("metre")]
 Pressure = Annotated[float, _quantity("pascal")]
 FluxDensity = Annotated[float, _quantity("tesla")]

@@ -2,11 +2,11 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, ModelWrapValidatorHandler, ValidationError, model_validator
 
-from magshell_fenicsx.case.base import Section
+from magshell_fenicsx.case.base import Section, or_number, texts
 from magshell_fenicsx.case.boundary import EDGES, BoundarySection, HeldSection
 from magshell_fenicsx.case.fields import MagneticSection
 from magshell_fenicsx.case.loading import (
@@ -34,7 +34,7 @@ class MeshSection(Section):
     """Degree k of the displacement. Degree 2 locks; a solid has degree 2 and no other"""
     refinement: float = Field(default=1.0, ge=0.1, le=20)
     """Divides every element size; not of a mesh file"""
-    size: float | None = Field(default=None, gt=0, le=1e12)
+    size: Annotated[float, or_number("metre"), Field(gt=0, le=1e12)] | None = None
     """Element size, by default 2 √(Rh), at most 0.35 R; of plates, annuli, ... alone [the shell's length]"""
     penalty: float | None = Field(default=None, ge=1e-3, le=1e9)
     """σ of the interior penalty; by default 5 k²"""
@@ -48,7 +48,7 @@ class MeshSection(Section):
         return self
 
 
-Place = Annotated[list[float], Field(min_length=3, max_length=3)]
+Place = Annotated[list[Annotated[float, or_number("metre")]], Field(min_length=3, max_length=3)]
 
 
 class Case(Section):
@@ -75,6 +75,17 @@ class Case(Section):
     symmetry: Literal["auto", "none", "half", "axisymmetric"] = "auto"
     """The part that is modelled of a hemisphere, disc or strip: the smallest that the case allows (auto), all (none),
     one side of a mirror plane through e3 (half), the meridian (axisymmetric)"""
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _units_go_with_those_of_the_shell(cls, data: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
+        section = handler(data)
+        if isinstance(data, dict) and not isinstance(section.shell, ShellSection) and not section.shell.with_units:
+            loads = section.loading if isinstance(section.loading, DeadSection) else None
+            parts = {"points": data.get("points"), "mesh": data.get("mesh"), "loading": loads and data.get("loading")}
+            for key in texts(parts):
+                raise ValueError(f"{key}: has a unit, but the shell's lengths have none: give all of them one, or none")
+        return section
 
     @model_validator(mode="after")
     def _sections_fit(self) -> Self:

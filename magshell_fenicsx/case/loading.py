@@ -5,13 +5,19 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from magshell_fenicsx.case.base import Section
+from magshell_fenicsx.case.base import Section, or_number
 from magshell_fenicsx.case.fields import Direction
 
 Until = Annotated[Literal["limit", "bifurcation", "target", "points"], Field(description="Where the path ends.")]
 Count = Annotated[int, Field(ge=1, le=10000, description="Equal parts to the target, or steps by arc length.")]
 LEAST_TARGET = 1e-9
-Vector = Annotated[list[Annotated[float, Field(ge=-1e30, le=1e30)]], Field(min_length=3, max_length=3)]
+Finite = Annotated[float, Field(ge=-1e30, le=1e30)]
+Moment = Annotated[float, or_number("newton", Finite), Field(ge=-1e30, le=1e30)]
+DeadPressure = Annotated[float, or_number("pascal", Finite), Field(ge=-1e30, le=1e30)]
+Three = Field(min_length=3, max_length=3)
+Force = Annotated[list[Moment], Three]
+PerLength = Annotated[list[Annotated[float, or_number("newton/metre", Finite), Field(ge=-1e30, le=1e30)]], Three]
+PerArea = Annotated[list[DeadPressure], Three]
 Wanted = Mapping[str, tuple[str, ...]]  # control -> the targets that it can have
 
 
@@ -108,15 +114,15 @@ class DeadLoadSection(Section):
     """An edge of the geometry"""
     over: str | None = None
     """all, or a patch of a mesh"""
-    force: Vector | None = None
+    force: Force | None = None
     """At a point, or in all on an edge [force]"""
-    per_length: Vector | None = None
+    per_length: PerLength | None = None
     """On an edge [force/length]"""
-    moment: float | None = Field(default=None, ge=-1e30, le=1e30)
+    moment: Moment | None = None
     """On an edge, about its tangent with the surface on its left; positive turns the normal outward [force]"""
-    per_area: Vector | None = None
+    per_area: PerArea | None = None
     """Over the surface [force/length²]"""
-    pressure: float | None = Field(default=None, ge=-1e30, le=1e30)
+    pressure: DeadPressure | None = None
     """Over the surface, against the undeformed normal [force/length²]"""
 
     @model_validator(mode="after")
@@ -152,7 +158,7 @@ class DeadSection(PathSection):
     until: Until = "target"
     factor: float | None = Field(default=None, ge=-1e9, le=1e9)
     """Target of the common factor; with control: load or arc"""
-    displacement: float | None = Field(default=None, ge=-1e9, le=1e9)
+    displacement: Annotated[float, or_number("metre"), Field(ge=-1e9, le=1e9)] | None = None
     """Target of the displacement along the loads; with control: displacement or arc [the shell's length]"""
     points: Count = 20
 

@@ -15,8 +15,9 @@ def explain(error: Any, source: Source, case: type[BaseModel]) -> str:
     location = _without_tag(error["loc"], case)
     value, kind = error["input"], error["type"]
     said = error["msg"].removeprefix("Value error, ").replace("Input should be", "must be")
-    if about := re.match(r"([a-z_]+(\.[a-z_]+)+): ", said):  # a rule between sections names its own key
-        location, said = tuple(about[1].split(".")), said[about.end() :]
+    if about := re.match(r"(\w+(\.\w+)+): ", said):  # a rule between sections names its own key
+        keys = about[1].split(".")
+        location, said = tuple(int(key) if key.isdigit() else key for key in keys), said[about.end() :]
     place, key = source.place(location), dotted(location) or "case"
     if kind == "extra_forbidden":
         allowed = _allowed_keys(location[:-1], source.data, case)

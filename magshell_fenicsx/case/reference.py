@@ -24,9 +24,8 @@ Any key can be given on the command line, `--set loading.points=40`, sections to
 
 **Units.** Dimensionless unless a unit stands in the table. On hemispheres, discs and strips a length, Young's modulus
 and a flux density are text with a unit: `25.2 mm`, `1.8 MPa`, `60 mT`. On all other geometries either all lengths and
-Young's modulus have units, and everything without one is then in SI (points in m, forces in N, per_length in N/m, a
-moment, which is per length, in N, per_area and pressure in Pa, mesh.size in m); or none has, and everything is in one's
-own units. A flux density has a unit everywhere.
+Young's modulus have units, and points, a profile, loads and mesh.size may have (without they are in m, N, N/m, Pa; a
+moment is per length, in N); or nothing has, and everything is in one's own units. A flux density has a unit everywhere.
 """
 
 

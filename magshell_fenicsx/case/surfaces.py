@@ -12,19 +12,16 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import BeforeValidator, Field, ModelWrapValidatorHandler, PrivateAttr, model_validator
 
-from magshell_fenicsx.case.base import Section, in_units, with_unit
+from magshell_fenicsx.case.base import Section, in_units, or_number, texts
 from magshell_fenicsx.case.defects import DimpleSection
 from magshell_fenicsx.case.expressions import formula
 from magshell_fenicsx.case.fields import Formula
 
 Positive = Annotated[float, Field(gt=0)]
-Measure = Annotated[
-    float, BeforeValidator(in_units("metre"), json_schema_input_type=Positive | with_unit("metre")), Field(gt=0)
-]
-Modulus = Annotated[
-    float, BeforeValidator(in_units("pascal"), json_schema_input_type=Positive | with_unit("pascal")), Field(gt=0)
-]
+Measure = Annotated[float, or_number("metre", Positive), Field(gt=0)]
+Modulus = Annotated[float, or_number("pascal", Positive), Field(gt=0)]
 Range = Annotated[list[float], Field(min_length=2, max_length=2)]
+Heights = Annotated[list[Annotated[float, or_number("metre")]], Field(min_length=2, max_length=2)]
 Azimuth = Annotated[Range | None, Field(description="First and last, of a part; closed without [degree]")]
 FULL_TURN = [0.0, 360.0]
 
@@ -48,7 +45,8 @@ class SurfaceSection(Section):
     def _all_with_units_or_none(cls, data: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
         measured = [data[key] for key in MEASURES if key in data] if isinstance(data, dict) else []
         kinds = {isinstance(value, str) for value in measured if isinstance(value, str | int | float)}
-        if len(kinds) > 1:
+        profile = data.get("profile") if isinstance(data, dict) else None
+        if len(kinds) > 1 or (kinds == {False} and [*texts(profile)]):
             raise ValueError("give every length and youngs_modulus a unit, or none of them")
         section = handler(data)
         if isinstance(data, dict):
@@ -195,11 +193,11 @@ class TorusSurface(RoundSection):
 class ProfileSection(Section):
     """A smooth curve (r, z) through points, or r as a formula of z (in the case's lengths)."""
 
-    points: list[Range] | None = Field(default=None, min_length=2)
+    points: list[Heights] | None = Field(default=None, min_length=2)
     """(r, z) that a spline goes through; two make a straight line [the shell's length]"""
     radius: Formula | None = None
     """r as a formula of z [the shell's length]"""
-    heights: Range | None = None
+    heights: Heights | None = None
     """First and last z of the formula [the shell's length]"""
 
     @model_validator(mode="after")

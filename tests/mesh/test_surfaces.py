@@ -144,6 +144,11 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"shell": FILE, "mesh.refinement": 2}, "mesh.refinement: not with geometry: mesh"),
     ({"shell": DISC, "boundary": {"rim": "clamped"}, "mesh.size": 0.1}, "mesh.size: not on a disc"),
     ({"loading": {**MOMENT, "branches": True}}, "branches: not with a moment"),
+    ({"points": {"A": [1, 0, "1 mm"]}}, "points.A.2: has a unit, but the shell's lengths have none"),
+    ({"mesh.size": "1 mm"}, "mesh.size: has a unit, but the shell's lengths have none"),
+    ({"loading": {**MOMENT, "loads": [{"edge": "top", "moment": "1 N"}]}}, "loads.0.moment: has a unit, but"),
+    ({"loading": {**MOMENT, "loads": [{"edge": "top", "moment": "1 Pa"}]}}, "is not convertible to newton"),
+    ({"shell": {**COMMON, "geometry": "revolution", "profile": {"points": [["1 m", 0], [2, 1]]}}}, "give every length"),
 ]
 
 
@@ -167,6 +172,32 @@ def test_units_are_turned_into_si() -> None:
     case = Case.from_source(Source("test", {"shell": shell, "boundary": {"bottom": "clamped"}}))
     assert case.shell.R_over_h == pytest.approx(50)
     assert make_plan(case).length == pytest.approx(0.025)
+
+
+def test_points_loads_and_sizes_may_have_units() -> None:
+    """The same plan as of numbers in SI."""
+    shell = {"geometry": "cylinder", "radius": "25 mm", "length": "5 cm", "thickness": "0.5 mm", "poisson_ratio": 0.5}
+    shell["youngs_modulus"] = "1 MPa"
+    loads = [
+        ({"at": "A", "force": ["2 mN", 0, 0]}, {"at": "A", "force": [2e-3, 0, 0]}),
+        ({"edge": "top", "per_length": [0, 0, "3 mN/mm"]}, {"edge": "top", "per_length": [0, 0, 3.0]}),
+        ({"edge": "top", "moment": "4 mN*m/m"}, {"edge": "top", "moment": 4e-3}),
+        ({"over": "all", "per_area": [0, 0, "5 kPa"]}, {"over": "all", "per_area": [0, 0, 5e3]}),
+        ({"over": "all", "pressure": "6 kPa"}, {"over": "all", "pressure": 6e3}),
+    ]
+
+    def plan(i: int, place: list[Any], size: Any) -> Any:
+        dead = {"kind": "dead", "loads": [load[i] for load in loads], "factor": 1}
+        data = {"shell": shell, "boundary": {"bottom": "clamped"}, "points": {"A": place}, "mesh": {"size": size}}
+        return make_plan(Case.from_source(Source("test", {**data, "loading": dead})))
+
+    texts, numbers = plan(0, ["25 mm", 0, "5 cm"], "5 mm"), plan(1, [0.025, 0, 0.05], 0.005)
+    for here, there in zip(texts.loads.dead, numbers.loads.dead, strict=True):
+        assert type(here) is type(there)
+        for value, other in zip(vars(here).values(), vars(there).values(), strict=True):
+            assert value == other if value is None or isinstance(value, str) else value == pytest.approx(other)
+    assert texts.points["A"] == pytest.approx(numbers.points["A"])
+    assert texts.shape == numbers.shape
 
 
 def test_a_cap_is_not_told_to_take_half() -> None:
