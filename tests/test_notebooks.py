@@ -55,11 +55,11 @@ def test_indentation() -> None:
     assert np.ptp(image[..., :3], axis=2).max() > 0.4, "no colours"
 
 
-def test_readme(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its Python, block after block, as a reader would type it; knockdown: axisymmetric reference."""
+def test_readme_and_howto(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Their Python, block after block, as a reader would type it; knockdown: axisymmetric reference."""
     (tmp_path / "cases").symlink_to(CASES)
     monkeypatch.chdir(tmp_path)
-    text = (CASES.parent / "README.md").read_text(encoding="utf-8")
+    text = "".join((CASES.parent / page).read_text(encoding="utf-8") for page in ("README.md", "docs/howto.md"))
     found: dict[str, Any] = {}
     for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL):
         exec(block, found)
