@@ -1,5 +1,6 @@
 """The live line: at the foot of a terminal and nowhere else, gone when the run is over."""
 
+import io
 import os
 import pty
 import re
@@ -11,12 +12,16 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from command import magshell
 from conftest import CASES
 
-from magshell_fenicsx.progress import Aim, time_left
+from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.live import LAUNCHERS, live_line
+from magshell_fenicsx.progress import Aim, RunProgress, time_left
 
 QUICK = (CASES / "pole_indentation.yaml", "--set=mesh.degree=3", "--set=mesh.refinement=0.5")
 
@@ -120,6 +125,45 @@ def test_stopped_while_a_mesh_is_found(tmp_path: Path, number: signal.Signals, c
     assert terminal.process.returncode == code
     assert not [line for line in terminal.screen if "tolerance" in line]
     assert terminal.screen[-1] == ""
+
+
+def test_a_narrow_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A line that wrapped could not be erased; what stays may wrap."""
+    screen = io.StringIO()
+    screen.isatty = lambda: True  # type: ignore[method-assign]
+    monkeypatch.setattr(sys, "stdout", screen)
+    monkeypatch.setenv("COLUMNS", "10")
+    monkeypatch.setenv("TERM", "xterm")
+    for name in LAUNCHERS:
+        monkeypatch.delenv(name, raising=False)
+    with live_line(1, print) as (say, tell):
+        assert tell
+        tell("0123456789")
+        say("0123456789")
+    assert screen.getvalue() == "\r\x1b[K0123456\r\x1b[K0123456789\n0123456\r\x1b[K"
+    with live_line(2, print) as (say, tell):
+        assert (say, tell) == (print, None)
+
+
+def test_time_left_of_a_resumed_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Known points took no time, so only new ones tell how long the rest takes; the field has no part in it."""
+    case = Case.load(CASES / "indentation.yaml")
+    plan = SimpleNamespace(material=SimpleNamespace(h=0.01))
+    told: list[str] = []
+    clock = iter(range(0, 1000, 10))
+    monkeypatch.setattr(time, "perf_counter", lambda: next(clock))
+    progress = RunProgress(SimpleNamespace(case=case, plan=plan), told.append, -30.0)  # type: ignore[arg-type]
+    here = SimpleNamespace(du=np.array([0.0, -0.5]))
+    row = {"lambda_m": 0.00092, "w_over_h": -0.03}
+    for label, w, known in (("field", -0.03, True), ("step", 8.0, True), ("step", 12.0, False), ("step", 14.0, False)):
+        progress.accepted({**row, "label": label, "w_over_h": w}, known=known)
+        progress.trying(here, 0.02)  # type: ignore[arg-type]
+    assert told == [
+        "1 point  lambda_m 0.00092 -> 0.00184  step 1 h  0:40",
+        "2 points  w/h 8 -> 20  step 1 h  1:00",
+        "3 points  w/h 12 -> 20  step 1 h  1:20, about 0:30 left",  # 4 of 12 took 20 s: 40 s, 10 s ago
+        "4 points  w/h 14 -> 20  step 1 h  1:40, about 0:30 left",
+    ]
 
 
 def test_where_a_path_leads() -> None:

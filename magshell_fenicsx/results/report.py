@@ -43,7 +43,7 @@ TIMES = {
 
 
 def write_report(folder: Path) -> None:
-    """Write report.html from summary.json, path.csv and the pictures of a run's folder, whatever of these there is.
+    """Write report.html from the summary.json, the path.csv and what pictures there are in a run's folder.
 
     Raises
     ------
@@ -142,10 +142,6 @@ def _instability(line: Line, summary: Summary) -> dict[str, Any]:
         "w": number(float(line["w_over_h"])),
         "pole": number(float(line["w_pole_over_h"])),
     }
-
-
-def _yaml(case: dict[str, Any]) -> str:
-    return str(yaml.safe_dump(case, sort_keys=False, allow_unicode=True, default_flow_style=None, width=110))
 
 
 def _how_to_estimate(case: dict[str, Any]) -> str:
