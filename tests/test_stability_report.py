@@ -257,9 +257,12 @@ def test_mistakes_in_the_section(setting: str, message: str) -> None:
     assert message in str(error.value)
 
 
-@pytest.mark.parametrize(("m", "counted"), [(0, None), (1, None), (5, 5), (28, 28)])
-def test_waves_around_the_axis_are_counted(m: int, counted: int | None) -> None:
-    around, down = np.linspace(0, 2 * np.pi, 400, endpoint=False), np.linspace(1, 1.5, 30)
+@pytest.mark.parametrize(
+    ("m", "turn", "counted"), [(0, 2, None), (1, 2, None), (5, 2, 5), (28, 2, 28), (5, 1, None), (5, 1.6, None)]
+)
+def test_waves_around_the_axis_are_counted(m: int, turn: float, counted: int | None) -> None:
+    """Not on a part of a shell that does not go around it."""
+    around, down = np.linspace(0, turn * np.pi, 400, endpoint=False), np.linspace(1, 1.5, 30)
     theta, phi = (x.ravel() for x in np.meshgrid(around, down))
     n0 = np.column_stack([np.sin(phi) * np.cos(theta), np.sin(phi) * np.sin(theta), np.cos(phi)])
     w = np.cos(m * (theta - 0.3)) * np.exp(-50 * (phi - 1.3) ** 2)

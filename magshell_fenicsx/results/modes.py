@@ -27,6 +27,7 @@ from magshell_fenicsx.solve.system import Vector
 Array = NDArray[np.float64]
 WAVES = "m = "
 RING, MOST_WAVES = 0.02, 80  # height over R of the circle that waves are counted on
+GAP = np.pi / 4  # between its nodes, in a mesh that could show a wave
 COLUMNS = ("point", "number", "mode", "eigenvalue")
 
 
@@ -162,12 +163,18 @@ def _revolved_wave(model: MeridianModel, u: Vector, m: int, vector: Vector) -> t
 
 
 def wave_number(surface: Surface) -> int | None:
-    """The number of waves around e3 of a mode, where it is largest; None if it is not mainly one of m >= 2, or flat."""
+    """The number of waves around e3 of a mode, where it is largest.
+
+    None if it is not mainly one of m >= 2, or the surface is flat, or does not go around e3 there.
+    """
     w, height = surface.fields["mode_w"], surface.r0[:, 2]
     if np.ptp(height) < RING:
         return None
     ring = np.abs(height - height[np.argmax(np.abs(w))]) < RING
     theta = np.arctan2(surface.r0[ring, 1], surface.r0[ring, 0])
+    turn = np.sort(theta)
+    if np.diff(turn, append=turn[0] + 2 * np.pi).max() > GAP:
+        return None
     left = []
     for m in range(MOST_WAVES + 1):
         basis = np.column_stack([np.cos(m * theta), np.sin(m * theta)])
