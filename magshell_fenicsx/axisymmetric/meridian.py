@@ -48,7 +48,10 @@ def make_meridian(embedding: Embedding, vertices: Array) -> Meridian:
     numbers = np.arange(len(vertices), dtype=np.int64)
     element = basix.ufl.element("Lagrange", "interval", 1, shape=(1,))
     domain = mesh.create_mesh(
-        MPI.COMM_SELF, np.column_stack([numbers[:-1], numbers[1:]]), vertices[:, None].astype(np.float64), element
+        MPI.COMM_SELF,
+        cells=np.column_stack([numbers[:-1], numbers[1:]]),
+        x=vertices[:, None].astype(np.float64),
+        e=element,
     )
     axis, rim = (
         mesh.locate_entities_boundary(domain, 0, lambda x, end=end: np.isclose(x[0], end))

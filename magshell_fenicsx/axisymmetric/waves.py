@@ -14,11 +14,11 @@ from dolfinx import fem
 from dolfinx.fem import petsc as fem_petsc
 from petsc4py import PETSc
 
+from magshell_fenicsx import compat
 from magshell_fenicsx.axisymmetric import jets
 from magshell_fenicsx.axisymmetric.energies import INTERIOR, Energy
 from magshell_fenicsx.axisymmetric.meridian import Meridian, held_at
 from magshell_fenicsx.shell.parameters import Condition
-from magshell_fenicsx.solve import assembly
 from magshell_fenicsx.solve.factor import Factorisation
 from magshell_fenicsx.solve.inverse import nearest_to_zero
 from magshell_fenicsx.solve.kernels import KernelLog
@@ -80,8 +80,8 @@ class Waves:
         for amplitude, form in self._forms:
             self._factor.value = 1.0 if amplitude is None else state.mu[amplitude]
             if self._factor.value:
-                assembly.add_matrix(self._K, form, held)
-        assembly.finish_matrix(self._K, self.V, held)
+                compat.add_matrix(self._K, form, held)
+        compat.finish_matrix(self._K, self.V, held)
         return self._K
 
     def held(self, m: int) -> list[fem.DirichletBC]:

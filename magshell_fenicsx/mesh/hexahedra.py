@@ -10,10 +10,11 @@ import basix
 import basix.ufl
 import numpy as np
 from dolfinx import fem, mesh
-from dolfinx.io import gmshio
+from dolfinx.cpp.io import perm_gmsh
 from mpi4py import MPI
 from numpy.typing import NDArray
 
+from magshell_fenicsx import compat
 from magshell_fenicsx.mesh.patch import Embedding, PatchMesh
 
 Array = NDArray[np.float64]
@@ -65,10 +66,10 @@ def sweep(patch: PatchMesh | None, h: float, layers: int, comm: MPI.Comm) -> Bod
     cells = _swept(quads.cells, layers)
     domain = mesh.create_mesh(
         comm,
-        cells if first else cells[:0],
-        X if first else X[:0],
-        basix.ufl.element("Lagrange", "hexahedron", 2, shape=(3,)),
-        mesh.create_cell_partitioner(mesh.GhostMode.shared_facet),
+        cells=cells if first else cells[:0],
+        x=X if first else X[:0],
+        e=basix.ufl.element("Lagrange", "hexahedron", 2, shape=(3,)),
+        partitioner=compat.shared_facets(),
     )
     chart = {name: x[None] for name, x in patch.points.items()}
     return Body(
@@ -93,7 +94,7 @@ def _split(patch: PatchMesh) -> _Quadrilaterals:
     geometry = basix.create_element(
         basix.ElementFamily.P, basix.CellType.triangle, order, basix.LagrangeVariant.equispaced
     )
-    to_dolfinx = gmshio.cell_perm_array(mesh.CellType.triangle, patch.cells.shape[1])
+    to_dolfinx = perm_gmsh(mesh.CellType.triangle, patch.cells.shape[1])
     values = geometry.tabulate(0, reference)[0, :, :, 0]
     corners = patch.cells[:, :3]
     vertices, corners = np.unique(corners, return_inverse=True)

@@ -12,10 +12,11 @@ import basix
 import basix.ufl
 import numpy as np
 from dolfinx import fem, mesh
-from dolfinx.io import gmshio
+from dolfinx.cpp.io import perm_gmsh
 from mpi4py import MPI
 from numpy.typing import NDArray
 
+from magshell_fenicsx import compat
 from magshell_fenicsx.mesh.patch import MeshError, PatchMesh, check_orientation
 
 ORDERS = {3: 1, 6: 2, 10: 3}  # nodes of a triangle -> its order
@@ -47,9 +48,8 @@ class Midsurface:
         geometry = basix.create_element(
             basix.ElementFamily.P, basix.CellType.triangle, order, basix.LagrangeVariant.equispaced
         )
-        to_dolfinx = gmshio.cell_perm_array(mesh.CellType.triangle, patch.cells.shape[1])
-        nodes = np.asarray(V.element.interpolation_points())
-        values = geometry.tabulate(0, nodes)[0, :, :, 0]
+        to_dolfinx = perm_gmsh(mesh.CellType.triangle, patch.cells.shape[1])
+        values = geometry.tabulate(0, compat.interpolation_points(V))[0, :, :, 0]
         cells = patch.cells[self._original_cells]
         chart = np.einsum("qk,ckd->cqd", values, patch.nodes[cells[:, to_dolfinx]])
         r0 = fem.Function(V, name="r0")
@@ -103,10 +103,10 @@ def distribute(patch: PatchMesh | None, comm: MPI.Comm) -> Midsurface:
     element = basix.ufl.element("Lagrange", "triangle", 1, shape=(3,))
     domain = mesh.create_mesh(
         comm,
-        corners if first else corners[:0],
-        xyz if first else xyz[:0],
-        element,
-        mesh.create_cell_partitioner(mesh.GhostMode.shared_facet),
+        cells=corners if first else corners[:0],
+        x=xyz if first else xyz[:0],
+        e=element,
+        partitioner=compat.shared_facets(),
     )
     position = {name: patch.embedding(x[None])[0] for name, x in patch.points.items()}
     return Midsurface(domain, _named_facets(domain, patch, vertices), position, patch)

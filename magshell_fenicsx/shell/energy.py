@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 from ufl.core.expr import Expr
 
+from magshell_fenicsx import compat
 from magshell_fenicsx.shell import kinematics as kin
 from magshell_fenicsx.shell.kinematics import Jet
-from magshell_fenicsx.solve import assembly
 from magshell_fenicsx.solve.kernels import KernelLog
 from magshell_fenicsx.solve.terms import DensityTerm
 
@@ -145,4 +145,4 @@ class HessianTerm:
         _ = self.tangent_form
 
     def add_tangent(self, K: PETSc.Mat, factor: float, clamped: list[fem.DirichletBC]) -> None:
-        assembly.add_matrix(K, self.tangent_form, clamped)
+        compat.add_matrix(K, self.tangent_form, clamped)

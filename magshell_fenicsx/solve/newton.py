@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from petsc4py import PETSc
 
+from magshell_fenicsx import compat
 from magshell_fenicsx.solve.control import Row
 from magshell_fenicsx.solve.factor import Factorisation
 from magshell_fenicsx.solve.system import State, System, Vector, dot, max_abs
@@ -310,7 +311,7 @@ class BorderedNewton:
     def _test(self, iteration: int, norm: float) -> Any:
         Reason, o = PETSc.SNES.ConvergedReason, self.options
         if not np.isfinite(norm):
-            return Reason.DIVERGED_FNORM_NAN
+            return compat.NOT_A_NUMBER
         if iteration == 0:
             return Reason.CONVERGED_ITERATING
         steps = self._progress.steps
@@ -344,7 +345,7 @@ class BorderedNewton:
 
 _REASONS = {
     PETSc.SNES.ConvergedReason.DIVERGED_MAX_IT: "too many iterations",
-    PETSc.SNES.ConvergedReason.DIVERGED_FNORM_NAN: "the residual is not a number",
+    compat.NOT_A_NUMBER: "the residual is not a number",
     PETSc.SNES.ConvergedReason.DIVERGED_DTOL: "the iteration diverged",
     PETSc.SNES.ConvergedReason.DIVERGED_LINEAR_SOLVE: "the tangent could not be factored",
 }

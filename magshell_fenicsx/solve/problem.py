@@ -10,7 +10,7 @@ from dolfinx.la import InsertMode
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
-from magshell_fenicsx.solve import assembly
+from magshell_fenicsx import compat
 from magshell_fenicsx.solve.system import Amplitudes, Vector
 from magshell_fenicsx.solve.terms import FormTerm, Term
 from magshell_fenicsx.solve.timing import Stopwatch
@@ -122,7 +122,7 @@ class FiniteElementSystem:
             for t in self.terms:
                 if factor := _factor(t, mu):
                     t.add_tangent(self._K, factor, self.clamped)
-            assembly.finish_matrix(self._K, self.u.function_space, self.clamped)
+            compat.finish_matrix(self._K, self.u.function_space, self.clamped)
             return self._K
 
     def _gradient(self, u: Vector, factors: Mapping[str, float]) -> NDArray[np.float64]:

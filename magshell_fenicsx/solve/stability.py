@@ -12,7 +12,7 @@ from dolfinx.fem import petsc as fem_petsc
 from petsc4py import PETSc
 from slepc4py import SLEPc
 
-from magshell_fenicsx.solve import assembly
+from magshell_fenicsx import compat
 from magshell_fenicsx.solve.factor import Factorisation
 from magshell_fenicsx.solve.inverse import nearest_to_zero
 from magshell_fenicsx.solve.system import Vector
@@ -49,7 +49,7 @@ def mass_matrix(product: fem.Form, held: list[fem.DirichletBC]) -> PETSc.Mat:
     """
     M = fem_petsc.create_matrix(product)
     M.setOption(PETSc.Mat.Option.IGNORE_ZERO_ENTRIES, True)  # tangents have none of those that are held
-    assembly.add_matrix(M, product, held)
+    compat.add_matrix(M, product, held)
     M.assemble()
     return M
 

@@ -9,7 +9,7 @@ from dolfinx import fem
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
-from magshell_fenicsx.solve import assembly
+from magshell_fenicsx import compat
 from magshell_fenicsx.solve.kernels import KernelLog
 
 Density = TypeVar("Density")  # whatever a form is made from
@@ -86,7 +86,7 @@ class FormTerm:
 
     def add_residual(self, b: NDArray[np.float64], factor: float) -> None:
         self._factor.value = factor
-        assembly.add_vector(b, self.residual_form)
+        compat.add_vector(b, self.residual_form)
 
     def compile_tangent(self) -> None:
         _ = self.tangent_form
@@ -94,7 +94,7 @@ class FormTerm:
     def add_tangent(self, K: PETSc.Mat, factor: float, clamped: list[fem.DirichletBC]) -> None:
         if self.tangent_form is not None:
             self._factor.value = factor
-            assembly.add_matrix(K, self.tangent_form, clamped)
+            compat.add_matrix(K, self.tangent_form, clamped)
 
 
 class DensityTerm(FormTerm, Generic[Density]):

@@ -1,12 +1,35 @@
-"""The calls into dolfinx's assembler that differ between its versions."""
+"""The calls into dolfinx and PETSc that differ between dolfinx 0.9, 0.10 and 0.11; nothing else knows a version."""
+
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
-from dolfinx import fem
+from dolfinx import fem, mesh
 from dolfinx.cpp.fem import pack_coefficients, pack_constants
 from dolfinx.cpp.fem.petsc import assemble_matrix as _assemble_matrix
 from dolfinx.cpp.fem.petsc import insert_diagonal
 from numpy.typing import NDArray
 from petsc4py import PETSc
+
+_Reason = PETSc.SNES.ConvergedReason
+NOT_A_NUMBER = (  # renamed by PETSc 3.25
+    _Reason.DIVERGED_FNORM_NAN if hasattr(_Reason, "DIVERGED_FNORM_NAN") else _Reason.DIVERGED_FUNCTION_NANORINF
+)
+
+
+def shared_facets() -> Callable[..., Any]:
+    """The partitioner for `create_mesh` that gives each rank one layer of ghosts."""
+    mode = mesh.GhostMode.shared_facet
+    try:
+        return mesh.create_cell_partitioner(mode)
+    except TypeError:
+        return mesh.create_cell_partitioner(mode, 2)  # cells at a facet, from dolfinx 0.11
+
+
+def interpolation_points(V: fem.FunctionSpace) -> NDArray[np.float64]:
+    """Where on the reference cell the nodes of a Lagrange space are; (n, dim)."""
+    points = V.element.interpolation_points  # a method in dolfinx 0.9
+    return np.asarray(points() if callable(points) else points)
 
 
 def add_vector(b: NDArray[np.float64], form: fem.Form) -> None:
