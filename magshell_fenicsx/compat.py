@@ -32,6 +32,21 @@ def interpolation_points(V: fem.FunctionSpace) -> NDArray[np.float64]:
     return np.asarray(points() if callable(points) else points)
 
 
+def corner_numbers(domain: mesh.Mesh) -> NDArray[np.int32]:
+    """Rows of `geometry.x` at each cell's nodes; (cells, nodes)."""
+    dofmaps = getattr(domain.geometry, "dofmaps", None)  # a list since dolfinx 0.11, which warns of `dofmap`
+    return np.asarray(dofmaps[0] if isinstance(dofmaps, list) else domain.geometry.dofmap)
+
+
+def evaluate(
+    expression: fem.Expression, domain: mesh.Mesh, cells: NDArray[np.int32], values: NDArray[np.float64]
+) -> None:
+    """Evaluate an expression of one point at some cells into a contiguous array (cells, components)."""
+    if hasattr(expression, "value_shape"):  # not in dolfinx 0.9, whose array is flat
+        values = values.reshape(len(cells), 1, *expression.value_shape)
+    expression.eval(domain, cells, values)
+
+
 def add_vector(b: NDArray[np.float64], form: fem.Form) -> None:
     """Add a linear form to a local vector with ghosts; nothing is communicated."""
     fem.assemble_vector(b, form)

@@ -50,7 +50,14 @@ class View:
 
 def smooth_surface(surface: Surface, h: float) -> "pyvista.PolyData":
     """The deformed surface in flat triangles with normals, each curved one divided."""
-    smooth = unstructured_grid(surface, h).extract_surface(nonlinear_subdivision=2)
+    import pyvista
+    from vtkmodules.vtkFiltersGeometry import vtkDataSetSurfaceFilter  # type: ignore[import-untyped]
+
+    divided = vtkDataSetSurfaceFilter()
+    divided.SetInputData(unstructured_grid(surface, h))
+    divided.SetNonlinearSubdivisionLevel(2)
+    divided.Update()
+    smooth = pyvista.PolyData(divided.GetOutput())
     body = surface.is_body  # which has edges that stay sharp
     return smooth.compute_normals(cell_normals=False, split_vertices=body, feature_angle=60.0, consistent_normals=False)
 

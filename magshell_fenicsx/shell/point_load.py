@@ -7,6 +7,7 @@ from dolfinx import fem
 from dolfinx.la import InsertMode
 from numpy.typing import NDArray
 
+from magshell_fenicsx import compat
 from magshell_fenicsx.shell import kinematics as kin
 from magshell_fenicsx.solve.kernels import KernelLog
 
@@ -52,6 +53,6 @@ def vertex_normal(r0: fem.Function, x: NDArray[np.float64]) -> NDArray[np.float6
     owned = V.mesh.topology.index_map(2).size_local
     nodes = r0.x.array.reshape(-1, 3)[V.dofmap.list[:owned]]
     a1, a2 = np.einsum("dvk,cki->dcvi", gradients, nodes)
-    near = np.linalg.norm(V.mesh.geometry.x[V.mesh.geometry.dofmap[:owned]] - x, axis=2) < 1e-9
+    near = np.linalg.norm(V.mesh.geometry.x[compat.corner_numbers(V.mesh)[:owned]] - x, axis=2) < 1e-9
     total = V.mesh.comm.allreduce(np.cross(a1[near], a2[near]).sum(axis=0))
     return np.asarray(total / np.linalg.norm(total))

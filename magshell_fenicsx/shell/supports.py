@@ -7,6 +7,7 @@ from dolfinx import fem, mesh
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
+from magshell_fenicsx import compat
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.shell.parameters import Condition, Held, Loads
 from magshell_fenicsx.solve.problem import FiniteElementSystem
@@ -98,7 +99,7 @@ def _conormal_axes(V: fem.FunctionSpace, facets: NDArray[np.int32]) -> Array:
     domain.topology.create_connectivity(1, 0)
     domain.topology.create_connectivity(2, 0)
     total, length, owned = np.zeros(3), 0.0, domain.topology.index_map(1).size_local
-    corners = domain.geometry.x[domain.geometry.dofmap]
+    corners = domain.geometry.x[compat.corner_numbers(domain)]
     for facet in facets[facets < owned]:
         cell = domain.topology.connectivity(1, 2).links(facet)[0]
         ends = domain.geometry.x[mesh.entities_to_geometry(domain, 1, np.array([facet], dtype=np.int32))[0]]

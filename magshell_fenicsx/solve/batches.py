@@ -7,6 +7,7 @@ import numpy as np
 from dolfinx import fem
 from numpy.typing import NDArray
 
+from magshell_fenicsx import compat
 from magshell_fenicsx.solve.reference import EDGES, Table, cell_rule, edge_covector, edge_rule
 
 POINTS = 2048  # at most, in a batch: its Hessians stay within a few megabytes
@@ -128,14 +129,14 @@ def _local_edges(V: fem.FunctionSpace, facets: NDArray[np.int32], cells: NDArray
 def _corner(V: fem.FunctionSpace, cells: NDArray[np.int32], edges: NDArray[np.int32]) -> NDArray[np.int32]:
     """The vertex at which an edge starts in a cell."""
     first = np.array(EDGES)[:, 0][edges]
-    return np.asarray(V.mesh.geometry.dofmap[cells, first])
+    return np.asarray(compat.corner_numbers(V.mesh)[cells, first])
 
 
 def edge_width(
     V: fem.FunctionSpace, cells: tuple[NDArray[np.int32], ...], edges: NDArray[np.int32]
 ) -> NDArray[np.float64]:
     """Flat area of the cells, averaged over the sides, over the flat length of their edge (its number on side 0)."""
-    corners = [V.mesh.geometry.x[V.mesh.geometry.dofmap[side]] for side in cells]
+    corners = [V.mesh.geometry.x[compat.corner_numbers(V.mesh)[side]] for side in cells]
     areas = [np.linalg.norm(np.cross(x[:, 1] - x[:, 0], x[:, 2] - x[:, 0]), axis=1) / 2 for x in corners]
     start, end = (corners[0][np.arange(len(edges)), ends] for ends in np.array(EDGES)[edges].T)
     return np.asarray(sum(areas) / len(areas) / np.linalg.norm(end - start, axis=1))

@@ -4,6 +4,8 @@ import numpy as np
 from dolfinx import mesh
 from numpy.typing import NDArray
 
+from magshell_fenicsx import compat
+
 Array = NDArray[np.float64]
 
 
@@ -12,7 +14,7 @@ def cell_frames(domain: mesh.Mesh) -> Array:
 
     With X, Y the reference coordinates and x along the first edge, d/dx = p d/dX and d/dy = q d/dX + s d/dY.
     """
-    corners = domain.geometry.x[domain.geometry.dofmap]
+    corners = domain.geometry.x[compat.corner_numbers(domain)]
     first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     length = np.linalg.norm(first, axis=1)
     along = first / length[:, None]

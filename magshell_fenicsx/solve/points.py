@@ -15,6 +15,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 from ufl.core.expr import Expr
 
+from magshell_fenicsx import compat
 from magshell_fenicsx.solve.kernels import KernelLog
 
 Pair = tuple[int, int]
@@ -44,7 +45,8 @@ class Points:
         if self._values.size < count * size:
             self._values = np.empty(self.capacity * size)
         values = self._values[: count * size].reshape(count, size)
-        return np.asarray(expression.eval(self._mesh, self._cells[:count], values))
+        compat.evaluate(expression, self._mesh, self._cells[:count], values)
+        return values
 
 
 @dataclass(frozen=True)
