@@ -1,6 +1,5 @@
 """The calls into dolfinx and PETSc that differ between dolfinx 0.9, 0.10 and 0.11; nothing else knows a version."""
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,7 @@ NOT_A_NUMBER = (  # renamed by PETSc 3.25
 )
 
 
-def shared_facets() -> Callable[..., Any]:
+def shared_facets() -> Any:
     """The partitioner for `create_mesh` that gives each rank one layer of ghosts."""
     mode = mesh.GhostMode.shared_facet
     try:
