@@ -8,8 +8,14 @@ from pydantic import Field, model_validator
 from magshell_fenicsx.case.base import Section, or_number
 from magshell_fenicsx.case.fields import Direction
 
-Until = Annotated[Literal["limit", "bifurcation", "target", "points"], Field(description="Where the path ends.")]
-Count = Annotated[int, Field(ge=1, le=10000, description="Equal parts to the target, or steps by arc length.")]
+Until = Annotated[
+    Literal["limit", "bifurcation", "target", "points"],
+    Field(
+        description="Where the path ends: at the first instability (limit), at the first bifurcation, through folds, "
+        "at the target, or after `points` steps by arc length"
+    ),
+]
+Count = Annotated[int, Field(ge=1, le=10000, description="Equal parts to the target, each a row; or steps")]
 LEAST_TARGET = 1e-9
 Finite = Annotated[float, Field(ge=-1e30, le=1e30)]
 Moment = Annotated[float, or_number("newton", Finite), Field(ge=-1e30, le=1e30)]
@@ -22,19 +28,12 @@ Wanted = Mapping[str, tuple[str, ...]]  # control -> the targets that it can hav
 
 
 class PathSection(Section):
-    """What every load that is followed along a path has in common.
-
-    `until: limit` ends at the first instability, `bifurcation` at the first bifurcation (through folds),
-    `target` at the target, in `points` equal parts (by arc length: rows at these parts), `points` after
-    that many steps by arc length. `branches: true` follows both directions of the branch at the first
-    bifurcation too, to the target or for `points` steps. `sensitivities: true` derives the load at the
-    fold that ends the path by every other amplitude, the defect and the remanence of each patch.
-    """
+    """What every load that is followed along a path has in common."""
 
     until: Until
     points: Count = 10
     branches: bool = False
-    """Whether to follow both directions of the branch at the first bifurcation"""
+    """Follow both directions of the branch at the first bifurcation too, to the target or for `points` steps"""
     sensitivities: bool = False
     """Derive the load at the fold that ends the path by all other amplitudes, the defect and each patch's remanence"""
 

@@ -66,16 +66,11 @@ def _references(part: Any) -> Iterator[str]:
 
 
 def _title(paths: list[str], section: Schema) -> str:
+    """The keys, and the values of what tells it from other sections under these."""
     for key in TAGS:
-        tags = section.get("properties", {}).get(key, {})
-        if (
-            values := [tags["const"]]
-            if "const" in tags
-            else tags.get("enum", [])
-            if key in section.get("required", [])
-            else []
-        ):
-            return f"{paths[0]}, {key}: {', '.join(values)}"
+        if key in section.get("required", []):
+            tag = section["properties"][key]
+            return f"{paths[0]}, {key}: {', '.join(tag.get('enum', [tag.get('const')]))}"
     return ", ".join(paths)
 
 

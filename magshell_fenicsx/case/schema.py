@@ -10,18 +10,10 @@ from magshell_fenicsx.case.case import Case
 _NOISE = {"title", "discriminator", "gt", "ge", "lt", "le"}  # the last are bounds of quantities, which are text
 
 
-class _Plain(GenerateJsonSchema):
-    """Keys keep their own names; what pydantic adds and JSON Schema does not know is left out."""
-
-    def generate(self, schema: Any, mode: Any = "validation") -> dict[str, Any]:
-        plain = super().generate(schema, mode)
-        assert isinstance(plain, dict)
-        return {"$schema": self.schema_dialect, "title": "magshell_fenicsx case", **_without_noise(plain)}
-
-
 def schema() -> dict[str, Any]:
     """What a case file may hold, key by key; rules between keys are `Case`'s alone."""
-    return Case.model_json_schema(schema_generator=_Plain)
+    head = {"$schema": GenerateJsonSchema.schema_dialect, "title": "magshell_fenicsx case"}
+    return {**head, **_without_noise(Case.model_json_schema())}
 
 
 def schema_text() -> str:
@@ -29,7 +21,7 @@ def schema_text() -> str:
 
 
 def _without_noise(part: Any, *, names: bool = False) -> Any:
-    """`names`: the keys are those of the case, not words of JSON Schema."""
+    """Without what pydantic adds and JSON Schema does not know; `names`: keys are those of the case, not its words."""
     if isinstance(part, list):
         return [_without_noise(item) for item in part]
     if not isinstance(part, dict):

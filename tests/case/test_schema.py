@@ -17,10 +17,14 @@ PLATE = "shell={geometry: plate, length: 1, width: 1, thickness: 0.01, poisson_r
 LENGTHS = "length: 1 m, width: 30 cm, thickness: 1e-2 m, youngs_modulus: 1.8 MPa"
 
 
-@pytest.mark.parametrize(("file", "made"), [("case.schema.json", schema_text), ("case.md", reference)])
-def test_committed_files_are_current(file: str, made: Any) -> None:
-    """Else: `magshell schema > docs/case.schema.json`, `magshell schema --markdown > docs/case.md`."""
-    assert (DOCS / file).read_text(encoding="utf-8") == made()
+def test_committed_schema_is_current() -> None:
+    """Else: magshell schema > docs/case.schema.json. Pydantic's versions differ in how they write 0.0."""
+    assert json.loads((DOCS / "case.schema.json").read_text(encoding="utf-8")) == json.loads(schema_text())
+
+
+def test_committed_page_is_current() -> None:
+    """Else: magshell schema --markdown > docs/case.md."""
+    assert (DOCS / "case.md").read_text(encoding="utf-8") == reference()
 
 
 def test_every_key_is_described() -> None:
