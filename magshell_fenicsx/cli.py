@@ -169,6 +169,26 @@ def compare(
 
 
 @app.command()
+def plot(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="a run's results, whole or interrupted")],
+    point: Annotated[int | None, typer.Option(metavar="N", help="draw this point, as shell_000N.png, ...")] = None,
+    animation: Annotated[bool, typer.Option("--animation", help="draw animation.gif too, of the path")] = False,
+) -> None:
+    """Make a run's pictures and report again, from its folder alone."""
+    from magshell_fenicsx.results.plot import plot as plot_again
+
+    if MPI.COMM_WORLD.rank:
+        return
+    try:
+        drawn = plot_again(folder, point, animation)
+    except CaseError as e:
+        raise _failure(str(e), INVALID) from None
+    except (RuntimeError, OSError) as e:
+        raise _failure(f"stopped early: {e}", STOPPED) from None
+    _say(f"{', '.join(drawn)} in {folder}/")
+
+
+@app.command()
 def check(case: CaseFile, set_: Settings = None) -> None:
     """Validate a case; print what would be built and what is left out."""
     from magshell_fenicsx.plan import describe

@@ -6,15 +6,16 @@ All of it is collective; what is made on rank 0 alone is None elsewhere.
 import io
 from collections.abc import Sequence
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from magshell_fenicsx.follow import Record
+from magshell_fenicsx.results.captions import caption
 from magshell_fenicsx.results.curve import curve_figure
-from magshell_fenicsx.results.files import caption
 from magshell_fenicsx.results.gathering import gatherer
-from magshell_fenicsx.results.picture import deformed_figure
+from magshell_fenicsx.results.picture import figures
 from magshell_fenicsx.results.render import smooth_surface
 from magshell_fenicsx.results.surface import Surface, completed, turned
+from magshell_fenicsx.results.table import Row
 from magshell_fenicsx.rows import rows
 from magshell_fenicsx.scene import Scene
 
@@ -24,8 +25,13 @@ if TYPE_CHECKING:  # take long to import
 
 
 def surface(scene: Scene, record: Record) -> Surface | None:
-    """The whole deformed mid-surface as NumPy arrays, lengths in R: `r0`, `u`, `n0`, `w`, `cells` and `fields`."""
-    plan, found = scene.plan, gatherer(scene.model, scene.comm).gather(record.point.state.u)
+    """The whole deformed mid-surface as NumPy arrays, lengths in R: `r0`, `u`, `n0`, `w`, `cells` and `fields`.
+
+    The fields are membrane strains `E` and bending moments over D/R `M`, their principal values `E_1`, `E_2`, `M_1`,
+    `M_2`, and those of the magnetic field: `Br`, `Ba`, `p_mag`, `f_mag`, `k`, `tau`; see `results.point_fields`.
+    """
+    plan, state = scene.plan, record.point.state
+    found = gatherer(scene.model, scene.comm).gather(state.u, state.mu)
     return turned(completed(found) if plan.half else found, plan.azimuth) if found else None
 
 
@@ -39,8 +45,12 @@ def polydata(scene: Scene, record: Record) -> "pyvista.PolyData | None":
     return smooth_surface(found, scene.plan.material.h) if found else None
 
 
-def picture(scene: Scene, record: Record) -> "Figure | None":
-    """The deformed shell coloured by w/h, as in shell.png.
+def picture(
+    scene: Scene,
+    record: Record,
+    of: Literal["shell", "strains", "moments", "fields", "magnetic_loads"] = "shell",
+) -> "Figure | None":
+    """One of the pictures of a run, as in shell.png, strains.png, ...; None also where there is nothing `of` that.
 
     Raises
     ------
@@ -48,13 +58,21 @@ def picture(scene: Scene, record: Record) -> "Figure | None":
         If there is no screen to draw on.
     """
     found, (row,) = surface(scene, record), rows(scene, [record])
-    return _in_line(deformed_figure(found, scene.plan.material.h, caption(scene.case, row))) if found else None
+    if found is None:
+        return None
+    drawn = figures(found, scene.plan.material.h, _caption(scene, row), [of])
+    return _in_line(drawn[of]) if drawn else None
 
 
 def curve(scene: Scene, records: Sequence[Record], amplitude: str | None = None) -> "Figure":
     """The path, as in curve.png; by default in the amplitude that varied last."""
     found = rows(scene, records)
-    return _in_line(curve_figure(found, amplitude or records[-1].amplitude, caption(scene.case, found[-1])))
+    return _in_line(curve_figure(found, amplitude or records[-1].amplitude, _caption(scene, found[-1])))
+
+
+def _caption(scene: Scene, row: Row) -> str:
+    material = scene.plan.material
+    return caption(material.h, material.nu, row, [term.name for term in scene.plan.loads.own])
 
 
 def _in_line(figure: "Figure") -> "Figure":

@@ -20,6 +20,7 @@ from magshell_fenicsx.progress import RunProgress, waiting
 from magshell_fenicsx.results.durable import write_whole
 from magshell_fenicsx.results.files import MESH, RunFiles, open_folder
 from magshell_fenicsx.results.folder import DiskError, by_first, held_folder
+from magshell_fenicsx.results.plot import draw
 from magshell_fenicsx.results.report import write_report
 from magshell_fenicsx.results.summary import Result, summary
 from magshell_fenicsx.results.table import Row
@@ -119,8 +120,8 @@ def _run(case: Case, folder: Path | None, comm: MPI.Comm, say: Say, tell: Say, w
                 if not interrupted:  # who interrupts does not wait for pictures
                     progress.doing("modes and pictures")
                     with result.output:
-                        files.draw(result, say)
                         modes_after(result, folder, say)
+                        by_first(comm, partial(_draw, folder, say))
                     files.summarise(summary(result, time.perf_counter() - start))  # with the time of the pictures
                 by_first(comm, partial(write_report, folder))
             except DiskError as e:
@@ -130,6 +131,14 @@ def _run(case: Case, folder: Path | None, comm: MPI.Comm, say: Say, tell: Say, w
         go_on = f"; what was found is in {folder}/, and --resume goes on from there" if folder else ""
         result.stopped = f"{interrupted}{go_on}"
     return result
+
+
+def _draw(folder: Path, say: Say) -> None:
+    """Draw what is in the folder; without a screen to draw on, say so."""
+    try:
+        draw(folder)
+    except RuntimeError as e:
+        say(f"warning: no pictures: {e}")
 
 
 def _mesh_for_tolerance(case: Case, folder: Path | None, comm: MPI.Comm, say: Say, doing: Say) -> Adapted | None:

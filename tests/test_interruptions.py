@@ -119,7 +119,7 @@ def test_full_disk_at_the_first_field(tmp_path: Path, reference: Path) -> None:
 
 def test_no_room_for_pictures(tmp_path: Path) -> None:
     """The summary is there without one, and resuming draws it."""
-    case = (CASES / "clamped_plate.yaml", "--set=mesh.degree=3", "--set=mesh.refinement=0.2")
+    case = (CASES / "clamped_plate.yaml", "--set=mesh.degree=3", "--set=mesh.refinement=0.1")
     run = start("run", *case, "--out", tmp_path, size_limit=70_000)
     said = run.communicate(timeout=60)[1]
     message = f"stopped early: {tmp_path}/shell.png cannot be written: File too large"

@@ -2,15 +2,23 @@
 
 import io
 import shutil
+from pathlib import Path
 
 import matplotlib.image
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
-from magshell_fenicsx.results.picture import draw_deformed, towards
+from magshell_fenicsx.results.captions import caption
+from magshell_fenicsx.results.layout import png
+from magshell_fenicsx.results.picture import PICTURES, _spread, figures, towards
 from magshell_fenicsx.results.render import MARGIN, View, axes_on_screen, rendered, smooth_surface
-from magshell_fenicsx.results.surface import Surface
+from magshell_fenicsx.results.surface import Surface, completed
+from magshell_fenicsx.results.table import Row
+from magshell_fenicsx.results.vtu import About, FieldSeries, point_file, read_vtu
 
+Array = NDArray[np.float64]
+on_a_screen = pytest.mark.skipif(shutil.which("Xvfb") is None, reason="no screen to draw on")
 SQUARE = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
 ABOVE = np.array([0.0, -1e-3, 1.0])
 
@@ -33,7 +41,7 @@ def test_a_place_is_seen_from_its_side() -> None:
         assert towards(place) @ place > 3 * np.linalg.norm(place)
 
 
-@pytest.mark.skipif(shutil.which("Xvfb") is None, reason="no screen to draw on")
+@on_a_screen
 def test_views_have_their_colours_and_no_white_around() -> None:
     """The last colour of the map is a red, the first a blue; sizes are those of each view."""
     smooth = smooth_surface(plate(0.0), 1.0)
@@ -51,15 +59,75 @@ def test_views_have_their_colours_and_no_white_around() -> None:
     assert len(blue) / len(red) == pytest.approx(500 / 300, rel=0.1)
 
 
-@pytest.mark.skipif(shutil.which("Xvfb") is None, reason="no screen to draw on")
-def test_loads_are_drawn_where_there_are_any() -> None:
-    shell, loads = draw_deformed(plate(0.1), 0.01, "title")
-    assert loads is None
+@on_a_screen
+def test_what_there_is_is_drawn() -> None:
     surface = plate(0.1)
+    assert list(figures(surface, 0.01, "title")) == ["shell"]
     surface.fields["p_mag"] = np.arange(4.0)
-    same, loads = draw_deformed(surface, 0.01, "title")
-    assert same == shell
-    assert loads is not None
-    height, width = matplotlib.image.imread(io.BytesIO(loads)).shape[:2]
+    surface.fields.update(dict.fromkeys(("E_1", "E_2", "M_1", "M_2"), np.arange(4.0)))
+    surface.fields.update({"Br": np.eye(4)[:, :3], "Ba": np.zeros((4, 3))})
+    drawn = figures(surface, 0.01, "title")
+    assert list(drawn) == list(PICTURES)
+    height, width = matplotlib.image.imread(io.BytesIO(png(drawn["moments"]))).shape[:2]
     assert width > 600
     assert height > 300
+    assert list(figures(surface, 0.01, "title", ["strains"])) == ["strains"]
+    said = [text.get_text() for text in drawn["fields"].texts]
+    assert any("remanence" in text for text in said)
+    assert not any("applied" in text for text in said)  # a field of length zero
+
+
+def limits(E_1: Array, E_2: Array) -> tuple[float, float]:
+    surface = plate(0.0)
+    surface.fields.update({"E_1": E_1, "E_2": E_2})
+    first, second = PICTURES["strains"].views(surface, smooth_surface(surface, 1.0), 1.0)
+    assert first.limits == second.limits
+    return first.limits
+
+
+def test_rounding_is_no_pattern() -> None:
+    """Strains that are zero are white, and those of one value one colour; colours are white at zero."""
+    noise = np.array([1.0, -1, 0.5, 0])
+    assert limits(1e-15 * noise, 1e-15 * noise) == (-1, 1)
+    low, high = limits(0.02 + 1e-12 * noise, 1e-15 * noise)
+    assert high == pytest.approx(0.02)
+    assert low == -high
+
+
+def test_arrows_are_apart() -> None:
+    r = np.random.default_rng(0).random((500, 3))
+    chosen = r[_spread(r, 0.3)]
+    distance = np.linalg.norm(chosen[:, None] - chosen, axis=2)
+    assert distance[~np.eye(len(chosen), dtype=bool)].min() >= 0.3
+    assert np.linalg.norm(r[:, None] - chosen, axis=2).min(axis=1).max() < 0.3
+
+
+def test_captions_tell_the_load() -> None:
+    row: Row = {"lambda_m": 0.0, "field_angle": 0.0, "p_over_pc": 0.0, "amplitude": "load", "load_factor": 0.5}
+    assert "load factor = 0.5, $w/h$ = 3" in caption(0.01, 0.3, row | {"w_over_h": 3.0})
+    row |= {"field_angle": 45.0, "amplitude": "force", "force": 2.5, "w_over_h": 7.0}
+    assert caption(0.01, 0.3, row).count("45") == 1
+    assert "$FR/2\\pi D$ = 2.5, $w/h$ = 7 at the load" in caption(0.01, 0.3, row)
+
+
+def test_fields_are_read_as_they_were_written(tmp_path: Path) -> None:
+    surface = plate(0.1)
+    T = np.random.default_rng(0).random((4, 3, 3))
+    surface.fields.update({"E": T + np.swapaxes(T, 1, 2), "k": np.arange(4.0), "Br": T[0, [0, 1, 2, 0]]})
+    mirror = np.array([0.6, 0.8, 0.0])
+    series = FieldSeries(tmp_path, About(0.01, 0.3, mirror))
+    series.write(0, surface)
+    same, about = read_vtu(tmp_path / point_file(0))
+    assert (about.h, about.nu, about.mirror.tolist()) == (0.01, 0.3, mirror.tolist())  # type: ignore[union-attr]
+    for one, other in ((same.r0, surface.r0), (same.u, surface.u), (same.cells, surface.cells)):
+        assert one == pytest.approx(other, abs=1e-15)
+    assert same.fields.keys() == surface.fields.keys()
+    for name, values in surface.fields.items():
+        assert (same.fields[name] == values).all()
+    whole = completed(same, mirror)
+    assert whole.fields["E"][4:] == pytest.approx(_mirrored(surface.fields["E"], mirror))
+
+
+def _mirrored(T: Array, m: Array) -> Array:
+    Q = np.eye(3) - 2 * np.outer(m, m)
+    return np.einsum("ai,nij,bj->nab", Q, T, Q)

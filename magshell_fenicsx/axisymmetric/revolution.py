@@ -6,10 +6,10 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.axisymmetric.model import MeridianModel
 from magshell_fenicsx.axisymmetric.pattern import cell_normals
-from magshell_fenicsx.results.interpretation import SurfaceGeometry
 from magshell_fenicsx.solve.system import Vector
 
 Array = NDArray[np.float64]
+OFF_POLE = 1e-3  # of the first cell
 
 
 class Revolution:
@@ -27,7 +27,9 @@ class Revolution:
         self._model, V = model, model.V
         self._vertices = np.argsort(V.tabulate_dof_coordinates()[:, 0])[:: model.degree]
         theta = np.arange(sectors) * 2 * np.pi / sectors
-        self._e_rho = np.column_stack([np.cos(theta), np.sin(theta), 0 * theta])
+        cos, sin, zero = np.cos(theta), np.sin(theta), 0 * theta
+        basis = np.array([[cos, sin, zero], [-sin, cos, zero], [zero, zero, zero + 1]])  # e_rho, e_theta, e_z
+        self._basis = np.moveaxis(basis, -1, 0)
         normals = np.zeros((len(model.r0.x.array) // 2, 3))
         np.add.at(normals, V.dofmap.list, cell_normals(model.r0))
         normals /= np.linalg.norm(normals, axis=1)[:, None]
@@ -38,49 +40,53 @@ class Revolution:
         """The displacement of the nodes, (n, 3) over R."""
         return self._turned(u.reshape(-1, 2))
 
-    def geometry(self) -> tuple[SurfaceGeometry, Array]:
-        """Bases and curvature at the vertices, and r0 (n, 3), along (e_rho, e_theta, e_z) at theta = 0."""
-        r = self._jets(self._model.r0)
-        rho = r[0, :, 0]
-        zero = np.zeros_like(rho)
-        a = np.stack([self._lifted(r[1]), np.column_stack([zero, rho, zero])], axis=1)
-        m = np.cross(a[:, 0], a[:, 1])
-        n0: Array = m / np.linalg.norm(m, axis=1)[:, None]
-        b11, b22 = np.einsum("vi,vi->v", n0, self._lifted(r[2])), -n0[:, 0] * rho
-        b0 = np.stack([np.column_stack([b11, zero]), np.column_stack([zero, b22])], axis=1)
-        return SurfaceGeometry(a, n0, b0), self._lifted(r[0])
+    def jets(self, f: fem.Function) -> Array:
+        """The jet of a field at the ends of all cells, along (e_rho, e_theta, e_z): (6, cells, 2, 3); see `jets`.
 
-    def slopes(self) -> Array:
-        """u,_1 and u,_2 of the model's present u there, (n, 2, 3)."""
-        u = self._jets(self._model.u)
-        zero = np.zeros(u.shape[1])
-        return np.stack([self._lifted(u[1]), np.column_stack([zero, u[0, :, 0], zero])], axis=1)
-
-    def repeated(self, along: Array) -> Array:
-        """A scalar (vertices,) at the pole and on the circles."""
-        return np.concatenate([along[:1], np.repeat(along[1:], len(self._e_rho))])
-
-    def _jets(self, f: fem.Function) -> Array:
-        """f, f' and f'' at the vertices, (3, vertices, 2), each from the cell below; a little off the pole."""
+        At the pole, where the surface has no second direction, a little off it.
+        """
         V = f.function_space
         order = np.argsort(V.tabulate_dof_coordinates()[V.dofmap.list].mean(axis=1)[:, 0])
         nodes = f.x.array.reshape(-1, 2)[V.dofmap.list[order]]
-        table = V.element.basix_element.tabulate(2, np.array([[1e-3], [1.0]]))[:, :, :, 0]
+        table = V.element.basix_element.tabulate(2, np.array([[0.0], [1.0], [OFF_POLE]]))[:, :, :, 0]
         values = np.einsum("dvk,cki->dcvi", table, nodes)
-        return np.concatenate([values[:, :1, 0], values[:, :, 1]], axis=1)
+        values[:, 0, 0] = values[:, 0, 2]
+        (U, W), (Us, Ws), (Uss, Wss) = np.moveaxis(values[:, :, :2], -1, 1)
+        o = np.zeros_like(U)
+        jet = [(U, o, W), (Us, o, Ws), (o, U, o), (Uss, o, Wss), (o, Us, o), (-U, o, o)]
+        return np.stack([np.stack(v, axis=-1) for v in jet])
 
-    @staticmethod
-    def _lifted(v: Array) -> Array:
-        """(n, 2) along (e_rho, e_z) -> (n, 3) along (e_rho, e_theta, e_z)."""
-        return np.insert(v, 1, 0.0, axis=1)
+    def around(self, ends: Array, weight: Array) -> Array:
+        """Values at the nodes, of those at the ends of all cells.
+
+        Parameters
+        ----------
+        ends
+            Scalars (cells, 2), vectors (cells, 2, 3) or tensors (cells, 2, 3, 3) along (e_rho, e_theta, e_z).
+        weight
+            (cells, 2) of a cell's value in the mean over the two that meet.
+        """
+        weight = weight.reshape(*weight.shape, *(1,) * (ends.ndim - 2))
+
+        def sums(values: Array) -> Array:
+            total: Array = np.concatenate([values[:, 0], values[-1:, 1]])
+            total[1:-1] += values[:-1, 1]
+            return total
+
+        at = sums(weight * ends) / sums(weight)
+        circles = at[1:, None]
+        if at.ndim == 1:
+            circles = np.repeat(circles, len(self._basis), axis=1)
+        elif at.ndim == 2:
+            circles, at = (circles[:, :, None] @ self._basis)[:, :, 0], at * [0.0, 0.0, 1.0]
+        else:
+            circles = np.swapaxes(self._basis, 1, 2) @ circles @ self._basis
+        return np.concatenate([at[:1], circles.reshape(-1, *at.shape[1:])])
 
     def _turned(self, nodal: Array) -> Array:
         """(rho, z) components at the meridian's nodes -> vectors at the pole and on the circles."""
-        return self.turned(nodal[self._vertices])
-
-    def turned(self, along: Array) -> Array:
-        """(rho, z) components at the vertices -> vectors at the pole and on the circles."""
-        circles = along[1:, None, :1] * self._e_rho + along[1:, None, 1:] * np.array([0.0, 0.0, 1.0])
+        along = nodal[self._vertices]
+        circles = along[1:, None, :1] * self._basis[:, 0] + along[1:, None, 1:] * self._basis[:, 2]
         return np.concatenate([[[0.0, 0.0, along[0, 1]]], circles.reshape(-1, 3)])
 
     @staticmethod

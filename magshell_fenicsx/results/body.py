@@ -1,5 +1,6 @@
 """The deformed solid gathered on rank 0: a `Surface` whose cells are hexahedra."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -26,7 +27,7 @@ class BodyGatherer:
         self._cells = self._on_first(numbers[:, to_vtk])
         self._r0, self._n0 = self._nodes(model.r0), self._nodes(_outwards(model.r0))
 
-    def gather(self, u: Vector) -> Surface | None:
+    def gather(self, u: Vector, mu: Mapping[str, float] | None = None) -> Surface | None:
         """The body with a displacement, on rank 0; None elsewhere."""
         self._model.system.set(u)
         nodes = self._nodes(self._model.u)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.results.table import LOCATED, OWN_MODES, Row
 
 if TYPE_CHECKING:  # takes long to import
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 POLE = r"displacement of the pole  $w/h$"
@@ -50,36 +51,50 @@ def curve_figure(rows: Sequence[Row], amplitude: str, title: str) -> "Figure":
     """
     from matplotlib.figure import Figure
 
-    own = ("w_pole_over_h", amplitude, POLE, amplitude.replace("_", " "))
-    x_key, y_key, x_label, y_label = AXES.get(amplitude, own)
-    sign = -1.0 if x_key == "volume_change" else 1.0
-    first = max(i for i, row in enumerate(rows) if row["amplitude"] != amplitude or row is rows[0])
-    part = rows[0 if amplitude == "lambda_m" else first :]
-
-    def place(row: Row) -> tuple[float, float]:
-        return sign * float(row[x_key]), float(row[y_key])
-
     figure = Figure(figsize=(4.6, 3.4), dpi=200, layout="constrained")
     axes = figure.subplots()
+    plot_curve(axes, rows, amplitude)
+    axes.set_title(title, fontsize=9)
+    return figure
+
+
+def varied(rows: Sequence[Row], amplitude: str) -> Sequence[Row]:
+    """The part of a path in which an amplitude varied last."""
+    first = max(i for i, row in enumerate(rows) if row["amplitude"] != amplitude or row is rows[0])
+    return rows[0 if amplitude == "lambda_m" else first :]
+
+
+def place(row: Row, amplitude: str) -> tuple[float, float]:
+    """Where a point is in the curve's axes."""
+    x_key, y_key, *_ = _axes(amplitude)
+    return (-1.0 if x_key == "volume_change" else 1.0) * float(row[x_key]), float(row[y_key])
+
+
+def _axes(amplitude: str) -> tuple[str, str, str, str]:
+    return AXES.get(amplitude, ("w_pole_over_h", amplitude, POLE, amplitude.replace("_", " ")))
+
+
+def plot_curve(axes: "Axes", rows: Sequence[Row], amplitude: str) -> None:
+    """The curve of `curve_figure` in axes that are there."""
+    _, y_key, x_label, y_label = _axes(amplitude)
+    part = varied(rows, amplitude)
     for branch in sorted({int(row["branch"]) for row in part}):
         line = [row for row in part if row["branch"] == branch and row["mode"] in OWN_MODES]
-        smooth_x, smooth_y = smooth(*zip(*map(place, line), strict=True))
+        smooth_x, smooth_y = smooth(*zip(*(place(row, amplitude) for row in line), strict=True))
         unstable = [int(row["negative_pivots"]) > 0 and row["label"] not in LOCATED for row in line]
         for dashed, pieces in groupby(range(1, len(line)), key=unstable.__getitem__):
             i, *others = pieces
             piece = slice((i - 1) * FINE, (i + len(others)) * FINE + 1)
             axes.plot(smooth_x[piece], smooth_y[piece], color="C0", linestyle=(0, (2, 1.2)) if dashed else "-")
-        dots = [place(row) for row in line if row["label"] in ("target", "step", "field")]
+        dots = [place(row, amplitude) for row in line if row["label"] in ("target", "step", "field")]
         axes.plot([x for x, _ in dots], [y for _, y in dots], ".", color="C0", markersize=4)
     for row in part:
         if row["label"] in LOCATED:
             mode = f" ({row['mode']})" if row["mode"] else ""
             said = f"{row['label']}{mode} at {row[y_key]:.5g}"
-            axes.plot(*place(row), "o", color="C3", markersize=6, label=said)
+            axes.plot(*place(row, amplitude), "o", color="C3", markersize=6, label=said)
     axes.set(xlabel=x_label, ylabel=y_label)
-    axes.set_title(title, fontsize=9)
     axes.locator_params(axis="x", nbins=6)
     axes.axhline(0, color="0.8", linewidth=0.8, zorder=0)
     if axes.get_legend_handles_labels()[1]:
         axes.legend(frameon=False)
-    return figure

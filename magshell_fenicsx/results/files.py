@@ -2,7 +2,6 @@
 
 import json
 import math
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from shutil import rmtree
@@ -13,22 +12,17 @@ from mpi4py import MPI
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.results import checkpoint
-from magshell_fenicsx.results.curve import draw_curve
 from magshell_fenicsx.results.durable import sync_folder, write_whole
 from magshell_fenicsx.results.folder import by_first, prepare_folder
 from magshell_fenicsx.results.gathering import gatherer
-from magshell_fenicsx.results.picture import draw_deformed
-from magshell_fenicsx.results.summary import Result
-from magshell_fenicsx.results.surface import Surface, completed, turned
+from magshell_fenicsx.results.surface import rotation, turned
 from magshell_fenicsx.results.table import PathTable, Row
-from magshell_fenicsx.results.vtu import FieldSeries
+from magshell_fenicsx.results.vtu import About, FieldSeries
 from magshell_fenicsx.scene import Scene
+from magshell_fenicsx.shell.parameters import MIRROR_NORMAL
 from magshell_fenicsx.solve.system import State
 
-LAST_FILES = (
-    *("summary.json", "report.html", "shell.png", "curve.png", "magnetic_loads.png"),
-    *("instabilities.png", "stability.csv", "modes_*.png"),
-)
+LAST_FILES = ("summary.json", "report.html", "stability.csv", "*.png", "animation.gif")
 MESH = "mesh.json"  # what was chosen for a tolerance
 COMPARED = ("p_over_pc", "lambda_m", "force", "w_over_h", "w_pole_over_h")
 
@@ -126,7 +120,10 @@ class RunFiles:
 
     def _open(self) -> None:
         self._table = PathTable(self._folder / "path.csv", self._scene.extra_columns)
-        self._fields = FieldSeries(self._folder / "fields")
+        plan = self._scene.plan
+        mirror = MIRROR_NORMAL @ rotation(plan.azimuth) if plan.half else None
+        about = About(plan.material.h, plan.material.nu, mirror)
+        self._fields = FieldSeries(self._folder / "fields", about)
         sync_folder(self._folder)
 
     def write(self, row: Row, state: State) -> None:
@@ -142,12 +139,12 @@ class RunFiles:
             _same(row, self._rows[number])
         if number < self.kept:
             return
-        surface, plan = self._gatherer.gather(state.u), self._scene.plan
+        surface = self._gatherer.gather(state.u, state.mu)
 
         def write() -> None:
             assert surface is not None
             self._table.write(row)
-            self._fields.write(number, turned(surface, plan.azimuth), plan.material.h)
+            self._fields.write(number, turned(surface, self._scene.plan.azimuth))
 
         by_first(self._comm, write)
 
@@ -155,19 +152,6 @@ class RunFiles:
         """Write summary.json, which is safe before any picture is drawn."""
         data = (json.dumps(content, indent=2) + "\n").encode()
         by_first(self._comm, partial(write_whole, self._folder / "summary.json", data))
-
-    def draw(self, result: Result, say: Callable[[str], None]) -> None:
-        """Draw the last point and the curve; without a screen to draw on, say so."""
-        surface = self._gatherer.gather(result.last.u)
-
-        def write() -> None:
-            assert surface is not None
-            try:
-                self._draw(result, surface)
-            except RuntimeError as e:
-                say(f"warning: no pictures: {e}")
-
-        by_first(self._comm, write)
 
     def close(self, complete: bool) -> None:
         """Close the files; a complete run needs no checkpoint, which goes last."""
@@ -177,17 +161,6 @@ class RunFiles:
         if complete:
             self.journal.remove()
 
-    def _draw(self, result: Result, surface: Surface) -> None:
-        plan, title = self._scene.plan, caption(result.scene.case, result.rows[-1])
-        amplitude = str(result.rows[-1]["amplitude"])
-        whole = turned(completed(surface) if plan.half else surface, plan.azimuth)
-        if amplitude:
-            write_whole(self._folder / "curve.png", draw_curve(result.rows, amplitude, title))
-        shell, loads = draw_deformed(whole, plan.material.h, title)
-        write_whole(self._folder / "shell.png", shell)
-        if loads:
-            write_whole(self._folder / "magnetic_loads.png", loads)
-
 
 def _same(row: Row, there: dict[str, str]) -> None:
     """See that a point found again is the one in path.csv."""
@@ -196,15 +169,3 @@ def _same(row: Row, there: dict[str, str]) -> None:
     )
     if not same:
         raise CaseError(f"--resume: point {row['point']} is another than in path.csv; run without --resume")
-
-
-def caption(case: Case, row: Row) -> str:
-    """What stands above the pictures of a point, with matplotlib's mathematics."""
-    said = [f"$R/h$ = {case.shell.R_over_h:g}", rf"$\nu$ = {case.shell.poisson_ratio:g}"]
-    if case.lambda_m:
-        said.append(rf"$\lambda_\mathrm{{m}}$ = {row['lambda_m']:g}")
-    if row["p_over_pc"]:
-        said.append(rf"$p/p_\mathrm{{c}}$ = {row['p_over_pc']:.5g}")
-    if row["amplitude"] == "force":
-        said.append(f"$w/h$ = {row['w_over_h']:.4g} at the load")
-    return ", ".join(said)

@@ -1,5 +1,6 @@
 """What gathers a model's nodes on rank 0, for pictures and for ParaView."""
 
+from collections.abc import Mapping
 from typing import Protocol
 
 from mpi4py import MPI
@@ -17,8 +18,8 @@ class Gatherer(Protocol):
 
     comm: MPI.Comm
 
-    def gather(self, u: Vector) -> Surface | None:
-        """The model's nodes with a displacement, on rank 0; None elsewhere."""
+    def gather(self, u: Vector, mu: Mapping[str, float] | None = None) -> Surface | None:
+        """The model's nodes with a displacement, and a field of these amplitudes, on rank 0; None elsewhere."""
 
 
 def gatherer(model: ShellModel | MeridianModel | SolidModel, comm: MPI.Comm) -> Gatherer:

@@ -19,7 +19,7 @@ from magshell_fenicsx.axisymmetric.revolution import Revolution
 from magshell_fenicsx.results.durable import write_whole
 from magshell_fenicsx.results.gathering import Gatherer
 from magshell_fenicsx.results.surface import Surface, completed, turned
-from magshell_fenicsx.results.vtu import unstructured_grid, vtu_content
+from magshell_fenicsx.results.vtu import About, vtu_content
 from magshell_fenicsx.shell.model import ShellModel
 from magshell_fenicsx.solid.model import SolidModel
 from magshell_fenicsx.solve.system import Vector
@@ -97,7 +97,7 @@ def mode_file(folder: Path, point: int, name: str, label: str) -> Path:
     return folder / "fields" / f"mode_{point:04d}_{name}{suffix}.vtu"
 
 
-def write_mode(file: Path, surface: Surface, h: float) -> None:
+def write_mode(file: Path, surface: Surface, about: About) -> None:
     """Write what `mode_surface` made; `Warp By Vector` in ParaView, with "mode", moves the shell.
 
     Raises
@@ -105,7 +105,7 @@ def write_mode(file: Path, surface: Surface, h: float) -> None:
     OSError
         If the disk is full; there is no such file then.
     """
-    write_whole(file, vtu_content(unstructured_grid(surface, h)))
+    write_whole(file, vtu_content(surface, about))
 
 
 def mode_table(found: Mapping[int, Sequence[Mode]]) -> bytes:
@@ -118,13 +118,13 @@ def mode_table(found: Mapping[int, Sequence[Mode]]) -> bytes:
     return text.getvalue().encode()
 
 
-def caption(number: int, mode: Mode) -> str:
+def mode_caption(number: int, mode: Mode) -> str:
     """Of a panel: number, label and eigenvalue, with matplotlib's mathematics.
 
     Examples
     --------
     >>> from types import SimpleNamespace
-    >>> caption(2, SimpleNamespace(label="m = 7", eigenvalue=-1.5e-6))
+    >>> mode_caption(2, SimpleNamespace(label="m = 7", eigenvalue=-1.5e-6))
     '2 ($m$ = 7):  $\\\\lambda = -1.5 \\\\times 10^{-6}$'
     """
     mantissa, _, exponent = f"{mode.eigenvalue:.4g}".partition("e")

@@ -23,6 +23,16 @@ MARGIN = 10  # pixels around what is drawn
 
 
 @dataclass(frozen=True)
+class Arrows:
+    """Arrows at places (n, 3), as vectors (n, 3), in one of matplotlib's colours; `radius` of the shafts."""
+
+    places: Array
+    vectors: Array
+    colour: str
+    radius: float
+
+
+@dataclass(frozen=True)
 class View:
     """One view.
 
@@ -38,6 +48,12 @@ class View:
         Direction (3,) from the shell to the eye; e3 is up.
     size
         Pixels of a side of the window.
+    caption
+        What the colours are.
+    arrows
+        That are drawn too.
+    bounds
+        (xmin, xmax, ymin, ...) that the window shows; None for those of what is drawn.
     """
 
     smooth: "pyvista.PolyData"
@@ -46,6 +62,9 @@ class View:
     colours: str
     camera: Array
     size: int
+    caption: str = ""
+    arrows: tuple[Arrows, ...] = ()
+    bounds: tuple[float, ...] | None = None
 
 
 def smooth_surface(surface: Surface, h: float) -> "pyvista.PolyData":
@@ -97,23 +116,39 @@ def _box(drawn: Sequence[NDArray[np.bool_]]) -> tuple[slice, slice]:
 def _image(plotter: "pyvista.Plotter", view: View) -> Image:
     shown = view.smooth.copy(deep=False)
     shown.point_data["shown"] = view.values
-    actor = plotter.add_mesh(
+    surface = plotter.add_mesh(
         shown,
         scalars="shown",
         clim=view.limits,
         cmap=view.colours,
         smooth_shading=True,
+        ambient=0.25,  # colours can be read on what turns away from the light too
+        diffuse=0.8,
         show_scalar_bar=False,
         copy_mesh=False,
         render=False,
     )
+    drawn = [surface, *(_arrows(plotter, arrows) for arrows in view.arrows)]
     plotter.render_window.SetSize(view.size, view.size)
     plotter.camera.focal_point, plotter.camera.up = (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)
     plotter.camera.position = view.camera
-    plotter.reset_camera(render=False)
+    plotter.reset_camera(render=False, bounds=view.bounds)
     image = np.array(plotter.screenshot(return_img=True))
-    plotter.remove_actor(actor, render=False)
+    for actor in drawn:
+        plotter.remove_actor(actor, render=False)
     return image
+
+
+def _arrows(plotter: "pyvista.Plotter", arrows: Arrows) -> "pyvista.Actor":
+    import pyvista
+    from matplotlib.colors import to_rgb
+
+    points, length = pyvista.PolyData(arrows.places), np.linalg.norm(arrows.vectors, axis=1).max()
+    points.point_data["v"] = arrows.vectors
+    thickness = arrows.radius / length  # of an arrow of length one, before it is scaled
+    shape = pyvista.Arrow(shaft_radius=thickness, tip_radius=2.5 * thickness, tip_length=0.35, shaft_resolution=12)
+    glyphs = points.glyph(orient="v", scale="v", geom=shape)
+    return plotter.add_mesh(glyphs, color=to_rgb(arrows.colour), ambient=0.35, smooth_shading=False, render=False)
 
 
 def axes_on_screen(camera: Array) -> Array:

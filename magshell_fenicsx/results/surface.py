@@ -1,10 +1,12 @@
 """The deformed mid-surface gathered on rank 0, for pictures and for ParaView."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import basix
 import basix.ufl
 import numpy as np
+import scipy
 from dolfinx import fem, mesh
 from dolfinx.cpp.io import perm_vtk
 from mpi4py import MPI
@@ -12,8 +14,9 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.axisymmetric.model import MeridianModel
 from magshell_fenicsx.axisymmetric.revolution import Revolution
-from magshell_fenicsx.results.interpretation import SurfaceGeometry, Torque, magnetic_loads
+from magshell_fenicsx.results.point_fields import PointFields
 from magshell_fenicsx.shell.model import ShellModel
+from magshell_fenicsx.shell.parameters import MIRROR_NORMAL
 from magshell_fenicsx.solve.system import Vector
 
 TRIANGLE, LAGRANGE_TRIANGLE, LAGRANGE_HEXAHEDRON = 5, 69, 72  # VTK's numbers; the flat triangle, cells of any order
@@ -32,7 +35,7 @@ class Surface:
     cells
         (m, k) node numbers of triangles of the displacement's degree or of hexahedra, in VTK's order.
     fields
-        Name -> (n,) or (n, 3): the magnetic loads, where the field is uniform.
+        Name -> (n,), (n, 3) or (n, 3, 3): see `point_fields.PointFields`; of a solid none.
     """
 
     r0: Array
@@ -69,34 +72,28 @@ class SurfaceGatherer:
         V = fem.functionspace(domain, basix.ufl.wrap_element(element))  # numbers nodes that two cells share alike
         local = V.dofmap.list[: self._owned]
         numbers = V.dofmap.index_map.local_to_global(local.ravel().astype(np.int32)).reshape(local.shape)
-        self._size, self._numbers = map_.size_global, self.comm.gather(numbers)
         cells = self.comm.gather(numbers[:, np.argsort(perm_vtk(mesh.CellType.triangle, local.shape[1]))])
         self._cells = np.concatenate(cells) if self.comm.rank == 0 else numbers
-        r = self._at_nodes(model.r0, 6)
-        g = _geometry(r)
-        n0 = self._averaged(g.n0)
+        r = self._at_nodes(model.r0)
+        factor = None if model.thickness is None else self._thickness(model.thickness)
+        self._fields = PointFields(r, model.material, model.loads.magnetic, factor)
+        self._mean = self._weighted_mean(numbers, map_.size_global)
+        n0 = self._averaged(self._fields.n0)
         self._r0, self._n0 = self._averaged(r[0]), n0 / np.linalg.norm(n0, axis=1)[:, None]
-        self._loads: dict[str, Array] = {}
-        self._torque: Torque | None = None
-        field = model.loads.magnetic
-        if field and field.gradient is None:
-            h = model.material.h if model.thickness is None else model.material.h * self._thickness(model.thickness)
-            loads, self._torque = magnetic_loads(g, field, r[0], h)
-            self._loads = {name: self._averaged(value) for name, value in loads.items()}
+        self._constant = {name: self._averaged(values) for name, values in self._fields.constant.items()}
 
-    def gather(self, u: Vector) -> Surface | None:
-        """The surface with a displacement, on rank 0; None elsewhere."""
+    def gather(self, u: Vector, mu: Mapping[str, float] | None = None) -> Surface | None:
+        """The surface with a displacement, and a field of these amplitudes, on rank 0; None elsewhere."""
         self._model.system.set(u)
-        jet = self._at_nodes(self._model.u, 3)
-        nodes, fields = self._averaged(jet[0]), dict(self._loads)
-        if self._torque:
-            fields["tau"] = self._averaged(self._torque(np.moveaxis(jet[1:], 0, -2)))
-        return Surface(self._r0, nodes, self._n0, self._cells, fields) if self.comm.rank == 0 else None
+        jet = self._at_nodes(self._model.u)
+        found = {name: self._averaged(values) for name, values in self._fields.of(jet, mu or {}).items()}
+        nodes = self._averaged(jet[0])
+        return Surface(self._r0, nodes, self._n0, self._cells, self._constant | found) if self.comm.rank == 0 else None
 
-    def _at_nodes(self, f: fem.Function, parts: int) -> Array:
-        """The first of f, f,_1, f,_2, f,_11, f,_12, f,_22 in reference coordinates at each owned cell's nodes."""
+    def _at_nodes(self, f: fem.Function) -> Array:
+        """f, f,_1, f,_2, f,_11, f,_12, f,_22 in reference coordinates at each owned cell's nodes."""
         coefficients = f.x.array.reshape(-1, 3)[self._model.V.dofmap.list[: self._owned]]
-        return np.asarray(np.matmul(self._table[:parts, None], coefficients))
+        return np.asarray(np.matmul(self._table[:, None], coefficients))
 
     def _thickness(self, factor: fem.Function) -> Array:
         """h(x)/h at each owned cell's nodes."""
@@ -105,25 +102,25 @@ class SurfaceGatherer:
         values = element.tabulate(0, self._places)[0, :, :, 0]
         return np.asarray(factor.x.array[V.dofmap.list[: self._owned]] @ values.T)
 
-    def _averaged(self, values: Array) -> Array:
-        """Mean over the cells that share a node, in global order, on rank 0."""
-        parts = self.comm.gather(values)
+    def _weighted_mean(self, numbers: NDArray[np.int64], size: int) -> scipy.sparse.csr_matrix | None:
+        """From the nodes of all cells to nodes in global order, on rank 0.
+
+        Second derivatives jump between cells: the mean over those that share a node is weighted by their areas.
+        """
+        parts = self.comm.gather((numbers.ravel(), self._fields.weight.ravel()))
         if self.comm.rank:
+            return None
+        where, weights = (np.concatenate(part) for part in zip(*parts, strict=True))
+        weights = weights / np.bincount(where, weights)[where]
+        return scipy.sparse.csr_matrix((weights, (where, np.arange(len(where)))), (size, len(where)))
+
+    def _averaged(self, values: Array) -> Array:
+        """Weighted mean over the cells that share a node, in global order, on rank 0."""
+        parts = self.comm.gather(values)
+        if self._mean is None:
             return values
-        where = np.concatenate([numbers.ravel() for numbers in self._numbers])
-        whole = np.concatenate(parts).reshape(len(where), -1)
-        count = np.bincount(where, minlength=self._size)
-        sums = [np.bincount(where, weights=column, minlength=self._size) for column in whole.T]
-        return (np.stack(sums, axis=1) / count[:, None]).reshape(-1, *values.shape[2:])
-
-
-def _geometry(r: Array) -> SurfaceGeometry:
-    """Bases and curvature of a jet (6, ..., 3)."""
-    m = np.cross(r[1], r[2])
-    n0: Array = m / np.linalg.norm(m, axis=-1)[..., None]
-    b11, b12, b22 = np.einsum("d...i,...i->d...", r[3:], n0)
-    b0 = np.stack([np.stack([b11, b12], -1), np.stack([b12, b22], -1)], -2)
-    return SurfaceGeometry(np.moveaxis(r[1:3], 0, -2), n0, b0)
+        whole = np.concatenate(parts)
+        return np.asarray(self._mean @ whole.reshape(self._mean.shape[1], -1)).reshape(-1, *values.shape[2:])
 
 
 class RevolvedGatherer:
@@ -131,46 +128,55 @@ class RevolvedGatherer:
 
     def __init__(self, model: MeridianModel, comm: MPI.Comm) -> None:
         self.comm, self._model, self._swept = comm, model, Revolution(model)
-        self._loads: dict[str, Array] = {}
-        self._torque: Torque | None = None
-        field = model.loads.magnetic
-        if field and field.gradient is None:
-            geometry, r0 = self._swept.geometry()
-            loads, self._torque = magnetic_loads(geometry, field, r0, model.material.h)
-            self._loads = {name: self._around(values) for name, values in loads.items()}
+        self._fields = PointFields(self._swept.jets(model.r0), model.material, model.loads.magnetic, None)
+        self._constant = self._around(self._fields.constant)
 
-    def gather(self, u: Vector) -> Surface | None:
-        """The surface with a displacement, on rank 0; None elsewhere."""
+    def gather(self, u: Vector, mu: Mapping[str, float] | None = None) -> Surface | None:
+        """The surface with a displacement, and a field of these amplitudes, on rank 0; None elsewhere."""
         if self.comm.rank:
             return None
-        swept, fields = self._swept, dict(self._loads)
         self._model.system.set(u)
-        if self._torque:
-            fields["tau"] = self._around(self._torque(swept.slopes()))
-        return Surface(swept.r0, swept.displacement(u), swept.n0, swept.cells, fields)
+        swept, found = self._swept, self._around(self._fields.of(self._swept.jets(self._model.u), mu or {}))
+        return Surface(swept.r0, swept.displacement(u), swept.n0, swept.cells, self._constant | found)
 
-    def _around(self, values: Array) -> Array:
-        return self._swept.turned(values[:, [0, 2]]) if values.ndim == 2 else self._swept.repeated(values)
+    def _around(self, fields: Mapping[str, Array]) -> dict[str, Array]:
+        return {name: self._swept.around(values, self._fields.weight) for name, values in fields.items()}
 
 
 def turned(surface: Surface, azimuth: float) -> Surface:
     """The surface turned about e3 (rad): from the model's frame back to the user's."""
-    Q = np.array([[np.cos(azimuth), np.sin(azimuth), 0], [-np.sin(azimuth), np.cos(azimuth), 0], [0, 0, 1]])
-    fields = {name: f @ Q if f.ndim == 2 else f for name, f in surface.fields.items()}
-    return replace(surface, r0=surface.r0 @ Q, u=surface.u @ Q, n0=surface.n0 @ Q, fields=fields)
+    return _moved(surface, rotation(azimuth))
 
 
-def completed(surface: Surface) -> Surface:
-    """A half surface (y >= 0) with its mirror image; seen from outside, its triangles run the other way round."""
-    flip = np.array([1.0, -1.0, 1.0])
+def rotation(azimuth: float) -> Array:
+    """What turns row vectors (n, 3) about e3 (rad)."""
+    return np.array([[np.cos(azimuth), np.sin(azimuth), 0], [-np.sin(azimuth), np.cos(azimuth), 0], [0, 0, 1]])
 
-    def both(f: Array) -> Array:
-        return np.concatenate([f, flip * f if f.ndim == 2 else f])
+
+def completed(surface: Surface, mirror: Array = MIRROR_NORMAL) -> Surface:
+    """A half surface with its image in the mirror plane of that unit normal (3,).
+
+    Seen from outside, the image's triangles run the other way round.
+    """
+    image = _moved(surface, np.eye(3) - 2 * np.outer(mirror, mirror))
+
+    def both(f: Array, other: Array) -> Array:
+        return np.concatenate([f, other])
 
     return Surface(
-        both(surface.r0),
-        both(surface.u),
-        both(surface.n0),
+        both(surface.r0, image.r0),
+        both(surface.u, image.u),
+        both(surface.n0, image.n0),
         np.concatenate([surface.cells, surface.cells + len(surface.r0)]),
-        {name: both(f) for name, f in surface.fields.items()},
+        {name: both(f, image.fields[name]) for name, f in surface.fields.items()},
     )
+
+
+def _moved(surface: Surface, Q: Array) -> Surface:
+    """Places and vectors v -> v Q, tensors T -> Q^T T Q."""
+
+    def moved(f: Array) -> Array:
+        return f if f.ndim == 1 else f @ Q if f.ndim == 2 else Q.T @ f @ Q
+
+    fields = {name: moved(f) for name, f in surface.fields.items()}
+    return replace(surface, r0=moved(surface.r0), u=moved(surface.u), n0=moved(surface.n0), fields=fields)

@@ -36,6 +36,7 @@ COLUMNS = (
     "branch",
     "w_point_over_h",
 )
+TEXTS = ("label", "amplitude", "mode")
 Row = dict[str, float | int | str]
 VALUE_COLUMN = {  # by what varied: the column of its value
     "pressure": "p_over_pc",
@@ -99,3 +100,14 @@ def _line(values: Iterable[Any]) -> str:
     stream = io.StringIO()
     csv.writer(stream).writerow(values)
     return stream.getvalue()
+
+
+def read_rows(file: Path) -> list[Row]:
+    """The whole rows of a path.csv, also of a run that was killed."""
+    text = file.read_text(encoding="utf-8")
+    rows = csv.DictReader(io.StringIO(text[: text.rfind("\n") + 1], newline=""))
+    return [{key: v if key in TEXTS else _number(v) for key, v in row.items()} for row in rows]
+
+
+def _number(text: str) -> float | int:
+    return int(text) if text.lstrip("-").isdigit() else float(text)

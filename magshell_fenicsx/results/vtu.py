@@ -1,19 +1,46 @@
-"""Fields for ParaView: one .vtu per saved point, with curved triangles, and a .pvd of all."""
+"""Fields for ParaView: one .vtu per saved point, with curved triangles, and a .pvd of all; read back for pictures."""
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
+from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.results.durable import write_whole
 from magshell_fenicsx.results.surface import LAGRANGE_HEXAHEDRON, LAGRANGE_TRIANGLE, TRIANGLE, Surface
 
 if TYPE_CHECKING:  # VTK takes long to import
     import pyvista
 
+Array = NDArray[np.float64]
+SYMMETRIC = ([0, 1, 2, 0, 1, 0], [0, 1, 2, 1, 2, 2])  # of a tensor: XX, YY, ZZ, XY, YZ, XZ, VTK's order
+FULL = [[0, 3, 5], [3, 1, 4], [5, 4, 2]]  # back
+OWN_DATA = ("u_over_h", "w_over_h", "r0", "n0")
+
+
+@dataclass(frozen=True)
+class About:
+    """What pictures need to know of a shell besides its points; in every file.
+
+    Attributes
+    ----------
+    h
+        The thickness over R.
+    nu
+        Poisson's ratio.
+    mirror
+        Unit normal (3,) of the plane that a half is completed by; None of a whole.
+    """
+
+    h: float
+    nu: float
+    mirror: Array | None = None
+
 
 def unstructured_grid(surface: Surface, h: float) -> "pyvista.UnstructuredGrid":
-    """The deformed surface or body with u/h, w/h, r0, n0 and the magnetic loads at its nodes; lengths in R."""
+    """The deformed surface or body with u/h, w/h, r0, n0 and its fields at its nodes; lengths in R."""
     import pyvista
 
     count = surface.cells.shape[1]
@@ -26,8 +53,30 @@ def unstructured_grid(surface: Surface, h: float) -> "pyvista.UnstructuredGrid":
     grid.point_data["r0"] = surface.r0
     grid.point_data["n0"] = surface.n0
     for name, values in surface.fields.items():
-        grid.point_data[name] = values
+        grid.point_data[name] = values if values.ndim < 3 else values[:, *SYMMETRIC]
     return grid
+
+
+def read_vtu(file: Path) -> tuple[Surface, About]:
+    """What `FieldSeries.write` wrote.
+
+    Raises
+    ------
+    CaseError
+        If an earlier version wrote it, without what pictures need.
+    """
+    import pyvista
+
+    grid = pyvista.read(file)
+    cells = grid.cells.reshape(-1, grid.cells[0] + 1)[:, 1:]
+    data = {name: np.asarray(grid.point_data[name]) for name in grid.point_data}
+    fields = {name: f[:, FULL] if f.shape[1:] == (6,) else f for name, f in data.items() if name not in OWN_DATA}
+    told = {name: np.asarray(grid.field_data[name]) for name in grid.field_data}
+    if "h_over_R" not in told:
+        raise CaseError(f"{file} is of an earlier version: run the case again")
+    about = About(float(told["h_over_R"][0]), float(told["poisson_ratio"][0]), told.get("mirror"))
+    r0 = data["r0"]
+    return Surface(r0, data["u_over_h"] * about.h, data["n0"], cells, fields), about
 
 
 class FieldSeries:
@@ -39,17 +88,17 @@ class FieldSeries:
         Number of points from the first on whose files are there.
     """
 
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
+    def __init__(self, folder: Path, about: About) -> None:
+        self._folder, self._about = folder, about
         folder.mkdir(exist_ok=True)
         self.kept = 0
-        while (folder / _name(self.kept)).exists():
+        while (folder / point_file(self.kept)).exists():
             self.kept += 1
         self._numbers = list(range(self.kept))
         if self.kept:
             self._write_list()
 
-    def write(self, number: int, surface: Surface, h: float) -> None:
+    def write(self, number: int, surface: Surface) -> None:
         """Write a point's file.
 
         Raises
@@ -57,12 +106,12 @@ class FieldSeries:
         OSError
             If the disk is full; there is no such file then.
         """
-        write_whole(self._folder / _name(number), vtu_content(unstructured_grid(surface, h)))
+        write_whole(self._folder / point_file(number), vtu_content(surface, self._about))
         self._numbers.append(number)
         self._write_list()
 
     def _write_list(self) -> None:
-        rows = "\n".join(f'    <DataSet timestep="{n}" part="0" file="{_name(n)}"/>' for n in self._numbers)
+        rows = "\n".join(f'    <DataSet timestep="{n}" part="0" file="{point_file(n)}"/>' for n in self._numbers)
         content = (
             '<?xml version="1.0"?>\n<VTKFile type="Collection" version="0.1">\n  <Collection>\n'
             f"{rows}\n  </Collection>\n</VTKFile>\n"
@@ -70,17 +119,22 @@ class FieldSeries:
         write_whole(self._folder / "path.pvd", content.encode())
 
 
-def _name(number: int) -> str:
+def point_file(number: int) -> str:
+    """The name of a point's file."""
     return f"point_{number:04d}.vtu"
 
 
-def vtu_content(grid: "pyvista.UnstructuredGrid") -> bytes:
+def vtu_content(surface: Surface, about: About) -> bytes:
     """The file's content; VTK itself would pass over a full disk.
 
     Raw, compressed by LZ4, which takes no time: zlib takes ten times as long and saves a tenth more on curved surfaces.
     """
     from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter  # type: ignore[import-untyped]
 
+    grid = unstructured_grid(surface, about.h)
+    grid.field_data["h_over_R"], grid.field_data["poisson_ratio"] = [about.h], [about.nu]
+    if about.mirror is not None:
+        grid.field_data["mirror"] = about.mirror
     writer = vtkXMLUnstructuredGridWriter()
     writer.SetInputData(grid)
     writer.SetDataModeToAppended()

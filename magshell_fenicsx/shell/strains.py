@@ -1,0 +1,126 @@
+"""Membrane strains, changes of curvature and bending moments at points, in NumPy, to be looked at.
+
+The tensors are those of the energy (`kinematics`, `densities`), on the undeformed surface:
+E_ij = (a_ij - a0_ij)/2, K_ij = b_ij - b0_ij and M_ij = D [(1 - nu) K_ij + nu tr K a0_ij], what the
+paper's energy (eqn:energy) gives for a change of K. The normal is outward and b = n . r,_ij, so a
+sphere has b = -a/R, and a positive moment flattens it: it stretches the inner face.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class TangentFrame:
+    """Undeformed points in an orthonormal frame each.
+
+    Attributes
+    ----------
+    jet
+        (6, ..., 3) r0, r0,_1, r0,_2, r0,_11, r0,_12, r0,_22 in coordinates of the surface, lengths in R.
+    t
+        (..., 2, 3) the frame, tangent to the surface.
+    n0
+        (..., 3) unit normal a0_1 x a0_2.
+    dual
+        (..., 2, 2) a0^a . t_i as [i, a].
+    in_frame, in_space
+        (..., 3, 3) and (..., 3, 3, 3): from S_11, S_12, S_22 in the coordinates to those in the frame, and from these
+        to a tensor in space.
+    area
+        (...) |a0_1 x a0_2|.
+    """
+
+    jet: Array
+    t: Array
+    n0: Array
+    dual: Array
+    in_frame: Array
+    in_space: Array
+    area: Array
+
+    @classmethod
+    def of(cls, jet: Array) -> "TangentFrame":
+        """The frame whose first vector is along r0,_1."""
+        m, area = _area_vector(jet)
+        n0 = m / area[..., None]
+        t1 = jet[1] / np.linalg.norm(jet[1], axis=-1, keepdims=True)
+        t = np.stack([t1, np.cross(n0, t1)], axis=-2)
+        basis = np.moveaxis(jet[1:3], 0, -2) @ np.swapaxes(t, -1, -2)  # a0_a . t_i as [a, i]
+        dual = np.linalg.inv(basis)
+        return cls(
+            jet,
+            t,
+            n0,
+            dual,
+            _of_symmetric(dual)[..., [0, 0, 1], [0, 1, 1], :],
+            _of_symmetric(np.swapaxes(t, -1, -2)),
+            area,
+        )
+
+    def membrane_strain(self, u: Array) -> Array:
+        """E_11, E_12, E_22 (..., 3) of a displacement's jet (6, ..., 3) over R, without the difference of two metrics."""
+
+        def E(i: int, j: int) -> Array:
+            return (_dot(self.jet[i], u[j]) + _dot(u[i], self.jet[j]) + _dot(u[i], u[j])) / 2
+
+        return _times(self.in_frame, np.stack([E(1, 1), E(1, 2), E(2, 2)], axis=-1))
+
+    def curvature_change(self, u: Array) -> Array:
+        """K_11, K_12, K_22 (..., 3) times R of a displacement's jet (6, ..., 3) over R."""
+        n = self.normal(u)
+        K = np.stack([_dot(n, u[ij]) + _dot(n - self.n0, self.jet[ij]) for ij in (3, 4, 5)], axis=-1)
+        return _times(self.in_frame, K)
+
+    def normal(self, u: Array) -> Array:
+        """The deformed unit normal (..., 3)."""
+        m, area = _area_vector(self.jet[:3] + u[:3])
+        return np.asarray(m / area[..., None])
+
+    def convected(self, v: Array, u: Array) -> Array:
+        """F v with F = a_i (x) a0^i + n (x) n0, of vectors (..., 3): how a remanence moves with the shell."""
+        along = np.einsum("...ia,...ij,...j->...a", self.dual, self.t, v)
+        moved = np.einsum("...a,a...j->...j", along, self.jet[1:3] + u[1:3])
+        return np.asarray(moved + _dot(self.n0, v)[..., None] * self.normal(u))
+
+    def tensor(self, S: Array) -> Array:
+        """S_11, S_12, S_22 (..., 3) in the frame as a tensor in space, (..., 3, 3)."""
+        return np.asarray(np.einsum("...ija,...a->...ij", self.in_space, S))
+
+
+def bending_moment(K: Array, nu: float) -> Array:
+    """M/D = (1 - nu) K + nu tr K, in the unit of K, of K_11, K_12, K_22 (..., 3) in an orthonormal frame."""
+    trace = K[..., :1] + K[..., 2:]
+    return np.asarray((1 - nu) * K + nu * trace * [1.0, 0.0, 1.0])
+
+
+def principal(S: Array) -> tuple[Array, Array]:
+    """The larger and the smaller eigenvalue (...) of S_11, S_12, S_22 (..., 3) in an orthonormal frame."""
+    mean, radius = (S[..., 0] + S[..., 2]) / 2, np.hypot((S[..., 0] - S[..., 2]) / 2, S[..., 1])
+    return mean + radius, mean - radius
+
+
+def _of_symmetric(A: Array) -> Array:
+    """B (..., n, n, 3) with A S A^T = B (S_11, S_12, S_22), of A (..., n, 2)."""
+    first, second = A[..., 0], A[..., 1]
+    mixed = first[..., :, None] * second[..., None, :]
+    one, two = (v[..., :, None] * v[..., None, :] for v in (first, second))
+    return np.stack([one, mixed + np.swapaxes(mixed, -1, -2), two], axis=-1)
+
+
+def _times(A: Array, S: Array) -> Array:
+    return np.asarray(np.einsum("...ij,...j->...i", A, S))
+
+
+def _dot(a: Array, b: Array) -> Array:
+    return np.asarray(np.einsum("...i,...i->...", a, b))
+
+
+def _area_vector(jet: Array) -> tuple[Array, Array]:
+    """a_1 x a_2 (..., 3) and its length (...)."""
+    m = np.cross(jet[1], jet[2])
+    return m, np.linalg.norm(m, axis=-1)
