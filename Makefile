@@ -11,11 +11,12 @@ make extremes         shells far from the ordinary ones into docs/extremes/: 5 m
 make bench            error, time and memory of a fixed set into results/bench.json (OUT=file), and the ratios
                       to docs/bench/bench.json: 10 minutes on an idle machine
 make studies          error against run time of two cases into docs/study/: 10 minutes
-make test             lint and all tests
+make test             lint and all tests; with ROOT=sid the tests that are not marked slow, on Debian unstable
+                      (LIMIT=seconds)
 make fast             lint and the tests that are not marked slow
 make lint             ruff and mypy
 make image            the Docker image magshell_fenicsx
-make clean            remove caches and compiled kernels; keeps .env/root and results
+make clean            remove caches and compiled kernels; keeps .env/root* and results
 endef
 export HELP
 
@@ -55,8 +56,8 @@ studies:
 	$(call study,buckling,cases/dimple_buckling.yaml --result knockdown --reference 0.552053778 \
 		--set symmetry=half --set magnetic.lambda_m=0.00184 $(MESHES))
 
-test: lint
-	$(ENV) $(PYTEST)
+test: $(if $(ROOT),,lint)
+	$(ENV) $(if $(LIMIT),timeout --signal=INT --kill-after=30 $(LIMIT)) $(PYTEST) $(if $(ROOT),-m 'not slow' tests/versions tests)
 
 fast: lint
 	$(ENV) $(PYTEST) -m 'not slow'
@@ -70,5 +71,5 @@ image:
 	docker build -t magshell_fenicsx .
 
 clean:
-	rm -rf .env/cache .env/tools .mypy_cache .ruff_cache .pytest_cache .hypothesis build *.egg-info
+	rm -rf .env/cache* .env/tools .mypy_cache .ruff_cache .pytest_cache .hypothesis build *.egg-info
 	find . -path ./.env -prune -o -name __pycache__ -exec rm -rf {} +
