@@ -110,11 +110,11 @@ def _composed(
     high, across = images[0].shape[:2]
     height = max(high + 40 + FOOT, 400)
     low = FOOT + (height - 40 - FOOT - high) // 2
-    figure = empty_figure(across + 560, height, "")
+    figure = empty_figure(across + 600, height, "")
     canvas = FigureCanvasAgg(figure)
     colour_bar(figure, view, (across + 30, 90, 16, height - 180), "vertical")
-    figure.text(15 / (across + 560), 12 / height, _scale(factor), fontsize=9)
-    axes = axes_in(figure, across + 190, 70, 350, height - 140)
+    figure.text(15 / (across + 600), 12 / height, _scale(factor), fontsize=9)
+    axes = axes_in(figure, across + 230, 70, 350, height - 140)
     amplitude = str(rows[-1]["amplitude"])
     marker = None
     if amplitude:
@@ -122,7 +122,7 @@ def _composed(
         (marker,) = axes.plot([], [], "o", color="k", markersize=8, animated=True)
     else:
         axes.set_axis_off()
-    title = figure.text(15 / (across + 560), 1 - 12 / height, "", fontsize=10, va="top", animated=True)
+    title = figure.text(15 / (across + 600), 1 - 12 / height, "", fontsize=10, va="top", animated=True)
     canvas.draw()
     still = canvas.copy_from_bbox(figure.bbox)
     frames = []

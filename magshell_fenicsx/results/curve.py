@@ -9,7 +9,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from magshell_fenicsx.results.table import LOCATED, OWN_MODES, Row
+from magshell_fenicsx.results.table import LOCATED, OWN_MODES, Row, pole_name
 
 if TYPE_CHECKING:  # takes long to import
     from matplotlib.axes import Axes
@@ -76,8 +76,9 @@ def _axes(amplitude: str) -> tuple[str, str, str, str]:
 
 def plot_curve(axes: "Axes", rows: Sequence[Row], amplitude: str) -> None:
     """The curve of `curve_figure` in axes that are there."""
-    _, y_key, x_label, y_label = _axes(amplitude)
     part = varied(rows, amplitude)
+    _, y_key, *labels = _axes(amplitude)
+    x_label, y_label = (label.replace("the pole", pole_name(part[0])) for label in labels)
     for branch in sorted({int(row["branch"]) for row in part}):
         line = [row for row in part if row["branch"] == branch and row["mode"] in OWN_MODES]
         smooth_x, smooth_y = smooth(*zip(*(place(row, amplitude) for row in line), strict=True))

@@ -2,7 +2,7 @@
 
 import csv
 import io
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +47,11 @@ VALUE_COLUMN = {  # by what varied: the column of its value
 }
 LOCATED = ("fold", "bifurcation")
 OWN_MODES = ("", "symmetric", "asymmetric")  # of an instability within the model; others it excludes
+
+
+def pole_name(row: Mapping[str, object]) -> str:
+    """Whose displacement `w_pole_over_h` is: the first named point's, where there is one."""
+    return next((key.removesuffix("_ux") for key in row if key.endswith("_ux")), "the pole")
 
 
 class PathTable:

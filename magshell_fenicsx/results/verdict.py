@@ -8,7 +8,7 @@ from markupsafe import Markup
 
 from magshell_fenicsx.results.html_numbers import number
 from magshell_fenicsx.results.report_path import Line, symbol
-from magshell_fenicsx.results.table import LOCATED, OWN_MODES, VALUE_COLUMN
+from magshell_fenicsx.results.table import LOCATED, OWN_MODES, VALUE_COLUMN, pole_name
 
 Summary = Mapping[str, Any]
 
@@ -84,4 +84,4 @@ def _displacement(line: Line) -> Markup:
     if line["amplitude"] in ("force", "load"):
         place = " at the load" if line["amplitude"] == "force" else ""
         return Markup("w/h = {}{}").format(number(float(line["w_over_h"])), place)
-    return Markup("w/h = {} at the pole").format(number(float(line["w_pole_over_h"])))
+    return Markup("w/h = {} at {}").format(number(float(line["w_pole_over_h"])), pole_name(line))
