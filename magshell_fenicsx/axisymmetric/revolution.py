@@ -41,7 +41,7 @@ class Revolution:
         return self._turned(u.reshape(-1, 2))
 
     def jets(self, f: fem.Function) -> Array:
-        """The jet of a field at the ends of all cells, along (e_rho, e_theta, e_z): (6, cells, 2, 3); see `jets`.
+        """The jet of a field at the ends of all cells, along (e_rho, e_theta, e_z): (6, cells, 2, 3).
 
         At the pole, where the surface has no second direction, a little off it.
         """

@@ -33,6 +33,6 @@ def caption(h: float, nu: float, row: Row, own: Sequence[str] = ()) -> str:
     if row["amplitude"] == "force":
         said.append(rf"$FR/2\pi D$ = {row['force']:.4g}, $w/h$ = {row['w_over_h']:.4g} at the load")
     if "load_factor" in row:
-        said.append(f"load factor = {row['load_factor']:.4g}, $w/h$ = {row['w_over_h']:.4g} along the loads")
+        said.append(f"load factor = {row['load_factor']:.4g}, $w/h$ = {row['w_over_h']:.4g}")
     said += [f"{name.replace('_', ' ')} = {row[name]:.4g}" for name in own if row[name]]
     return ", ".join(said)

@@ -15,6 +15,7 @@ from magshell_fenicsx.results import checkpoint
 from magshell_fenicsx.results.durable import sync_folder, write_whole
 from magshell_fenicsx.results.folder import by_first, prepare_folder
 from magshell_fenicsx.results.gathering import gatherer
+from magshell_fenicsx.results.picture import PICTURES
 from magshell_fenicsx.results.surface import rotation, turned
 from magshell_fenicsx.results.table import PathTable, Row
 from magshell_fenicsx.results.vtu import About, FieldSeries
@@ -22,7 +23,11 @@ from magshell_fenicsx.scene import Scene
 from magshell_fenicsx.shell.parameters import MIRROR_NORMAL
 from magshell_fenicsx.solve.system import State
 
-LAST_FILES = ("summary.json", "report.html", "stability.csv", "*.png", "animation.gif")
+DRAWN = (*PICTURES, "curve", "instabilities", "modes")
+LAST_FILES = (
+    *("summary.json", "report.html", "stability.csv", "animation.gif"),
+    *(f"{name}{end}.png" for name in DRAWN for end in ("", "_[0-9]*")),
+)
 MESH = "mesh.json"  # what was chosen for a tolerance
 COMPARED = ("p_over_pc", "lambda_m", "force", "w_over_h", "w_pole_over_h")
 

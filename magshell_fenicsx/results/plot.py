@@ -39,7 +39,7 @@ def plot(folder: Path, point: int | None = None, animation: bool = False) -> lis
     drawn = draw(folder, point)
     if animation:
         drawn.append(draw_animation(folder))
-    if (folder / "summary.json").exists():
+    if point is None and (folder / "summary.json").exists():
         write_report(folder)
         drawn.append("report.html")
     return drawn

@@ -63,7 +63,7 @@ class TangentFrame:
         )
 
     def membrane_strain(self, u: Array) -> Array:
-        """E_11, E_12, E_22 (..., 3) of a displacement's jet (6, ..., 3) over R, not by a difference of two metrics."""
+        """E_11, E_12, E_22 (..., 3) of a displacement's jet (6, ..., 3) over R; not as a difference of two metrics."""
 
         def E(i: int, j: int) -> Array:
             return (_dot(self.jet[i], u[j]) + _dot(u[i], self.jet[j]) + _dot(u[i], u[j])) / 2
