@@ -36,7 +36,7 @@ def test_run_writes_everything(tmp_path: Path) -> None:
     assert (out / "fields" / "path.pvd").read_text(encoding="utf-8").count("DataSet") == rows
     for picture in ("shell.png", "curve.png"):
         assert (out / picture).stat().st_size > 10_000
-    assert (out / "report.html").read_text(encoding="utf-8").count("data:image/png;base64,") == 2
+    assert (out / "report.html").read_text(encoding="utf-8").count("data:image/png;base64,") == 4
     # a second run replaces the first
     assert magshell("run", PLATE, "--out", out).returncode == 0
     assert len(read_path(out)) == rows
