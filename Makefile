@@ -6,7 +6,7 @@ define HELP
 make run CASE=cases/dimple_buckling.yaml [OUT=dir] [N=ranks] [ARGS="--set a=b"]
 make check CASE=...   validate a case, print what would be built
 make figures          the paper's figures into results/figures/: 45 minutes on one core, N=ranks share it
-make benchmarks       the nonlinear obstacle course into docs/benchmarks/: half an hour on one core
+make benchmarks       the nonlinear obstacle course into docs/benchmarks/: three quarters of an hour on one core
 make extremes         shells far from the ordinary ones into docs/extremes/: 5 minutes
 make bench            error, time and memory of a fixed set into results/bench.json (OUT=file), and the ratios
                       to docs/bench/bench.json: 10 minutes on an idle machine

@@ -46,6 +46,8 @@ class Obstacle:
         Largest difference along the curve, over the largest displacement.
     refinements
         Meshes, coarse to fine, as of `mesh.refinement`.
+    second
+        The curve of another code beside the published one, with the columns of path.csv.
     """
 
     case: str
@@ -53,6 +55,7 @@ class Obstacle:
     columns: dict[str, str]
     required: float
     refinements: tuple[float, ...] = (0.5, 1.0, 2.0)
+    second: str | None = None
 
 
 SHEAR = {"minus_u_tip": "-A_ux", "w_tip": "A_uz"}
@@ -74,7 +77,7 @@ OBSTACLES = [
         "pinched_cylinder_diaphragms",
         {"minus_w_A": "-A_ux", "u_B": "B_uy"},
         1e-2,
-        (0.5, 1.0, 1.4),
+        second="pinched_cylinder_calculix",
     ),
     Obstacle("pinched_semicylinder", "pinched_semicylinder", {"minus_w_A_isotropic": "-A_ux"}, 1e-2, (0.5, 1.0)),
     Obstacle("hinged_roof_12.7", "hinged_roof_12.7_isotropic", {"minus_w_C": "-C_ux"}, 1e-2),
@@ -88,11 +91,23 @@ def published(table: str, column: str) -> Array:
         return np.array([[float(row[column]), float(row["load_factor"])] for row in csv.DictReader(file)])
 
 
+def second_opinion(obstacle: Obstacle) -> dict[str, Array]:
+    """The same of another code, by column of the table; empty where there is none."""
+    if obstacle.second is None:
+        return {}
+    with (CASES / "reference" / f"{obstacle.second}.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    return {column: _curve(rows, ours) for column, ours in obstacle.columns.items()}
+
+
 def computed(rows: Sequence[Mapping[str, Any]], column: str) -> Array:
     """The same of a run's path, every accepted point of it."""
+    return _curve([row for row in rows if row["label"] != "bifurcation" and not int(row["branch"])], column)
+
+
+def _curve(rows: Sequence[Mapping[str, Any]], column: str) -> Array:
     sign, key = (-1.0, column[1:]) if column.startswith("-") else (1.0, column)
-    path = [row for row in rows if row["label"] != "bifurcation" and not int(row["branch"])]
-    return np.array([[sign * float(row[key]), float(row["load_factor"])] for row in path])
+    return np.array([[sign * float(row[key]), float(row["load_factor"])] for row in rows])
 
 
 def along_curve(curve: Array, reference: Array) -> float:
@@ -196,7 +211,7 @@ def main() -> None:
             column: (computed(rows, ours), published(obstacle.table, column))
             for column, ours in obstacle.columns.items()
         }
-        write_whole(OUT / f"{obstacle.case}.png", draw(obstacle.case, curves))
+        write_whole(OUT / f"{obstacle.case}.png", draw(obstacle.case, curves, second_opinion(obstacle)))
     if not names:
         write(lines, OUT / "obstacles.csv")
 

@@ -101,8 +101,8 @@ def write(lines: Sequence[Line], file: Path) -> None:
     file.with_suffix(".md").write_text(markdown(lines), encoding="utf-8")
 
 
-def draw(title: str, curves: Mapping[str, tuple[Array, Array]]) -> bytes:
-    """Computed curves (n, 2) of displacement and load factor, with the published points; a PNG file."""
+def draw(title: str, curves: Mapping[str, tuple[Array, Array]], second: Mapping[str, Array]) -> bytes:
+    """Computed curves (n, 2) of displacement and load factor, published points, another code's curves; a PNG file."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -112,7 +112,11 @@ def draw(title: str, curves: Mapping[str, tuple[Array, Array]]) -> bytes:
     for number, (name, (curve, reference)) in enumerate(curves.items()):
         axes.plot(*smooth(*curve.T), color=f"C{number}", label=name.replace("_", " "))
         axes.plot(*reference.T, "o", color=f"C{number}", markersize=3.5, markerfacecolor="none")
+        if name in second:
+            axes.plot(*second[name].T, "+", color=f"C{number}", markersize=4)
     axes.plot([], [], "o", color="0.4", markersize=3.5, markerfacecolor="none", label="published, or exact")
+    if second:
+        axes.plot([], [], "+", color="0.4", markersize=4, label="a second code")
     axes.set(xlabel="displacement (the case's unit of length)", ylabel="load factor")
     axes.set_title(title.replace("_", " "), fontsize=9)
     axes.axhline(0, color="0.8", linewidth=0.8, zorder=0)
