@@ -51,7 +51,7 @@ PROBLEMS = {
 
 
 def energy(p: Problem, U: fem.Function, kappa: float, full: float) -> list[ufl.Form]:
-    """The elastic energy with U = (u, v), one form a rule: FFCx 0.9 gets the sum of two on quadrilaterals wrong."""
+    """The elastic energy with U = (u, v), one form a rule: FFCx 0.9 makes a wrong kernel of their sum."""
     domain = U.function_space.mesh
     degree = U.function_space.element.basix_element.degree
     t = ufl.SpatialCoordinate(domain)[0] / p.R
