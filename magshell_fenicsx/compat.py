@@ -41,14 +41,10 @@ def evaluate(
     expression: fem.Expression, domain: mesh.Mesh, cells: NDArray[np.int32], values: NDArray[np.float64]
 ) -> None:
     """Evaluate an expression of one point at some cells into a contiguous array (cells, components)."""
-    if hasattr(expression, "value_shape"):  # not in dolfinx 0.9, whose array is flat
-        values = values.reshape(len(cells), 1, *expression.value_shape)
-    expression.eval(domain, cells, values)
-
-
-def add_vector(b: NDArray[np.float64], form: fem.Form) -> None:
-    """Add a linear form to a local vector with ghosts; nothing is communicated."""
-    fem.assemble_vector(b, form)
+    try:
+        expression.eval(domain, cells, values)  # flat in dolfinx 0.9
+    except TypeError:
+        expression.eval(domain, cells, values.reshape(len(cells), 1, *expression.ufl_expression.ufl_shape))
 
 
 def add_matrix(K: PETSc.Mat, form: fem.Form, clamped: list[fem.DirichletBC]) -> None:

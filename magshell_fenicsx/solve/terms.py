@@ -86,7 +86,7 @@ class FormTerm:
 
     def add_residual(self, b: NDArray[np.float64], factor: float) -> None:
         self._factor.value = factor
-        compat.add_vector(b, self.residual_form)
+        fem.assemble_vector(b, self.residual_form)
 
     def compile_tangent(self) -> None:
         _ = self.tangent_form
