@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 from conftest import CASES
-from json_schema import faults
+from jsonschema import Draft202012Validator
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.reference import reference
@@ -39,8 +39,9 @@ def test_every_key_is_described() -> None:
 
 @pytest.mark.parametrize("file", sorted(CASES.rglob("*.yaml")), ids=lambda file: file.stem)
 def test_every_case_fits(file: Any) -> None:
-    whole = json.loads((DOCS / "case.schema.json").read_text(encoding="utf-8"))
-    assert list(faults(read_source(file).data, whole, whole)) == []
+    committed = json.loads((DOCS / "case.schema.json").read_text(encoding="utf-8"))
+    Draft202012Validator.check_schema(committed)
+    Draft202012Validator(committed).validate(read_source(file).data)
 
 
 @pytest.mark.parametrize(
@@ -63,7 +64,7 @@ def test_every_case_fits(file: Any) -> None:
     ],
 )
 def test_forms_of_a_value_that_fit(setting: str) -> None:
-    assert misfits(setting) == []
+    assert fits(setting)
 
 
 @pytest.mark.parametrize(
@@ -90,12 +91,12 @@ def test_forms_of_a_value_that_fit(setting: str) -> None:
 )
 def test_mistakes_that_do_not_fit(setting: str) -> None:
     """`Case` refuses each too."""
-    assert misfits(setting) != []
+    assert not fits(setting)
     with pytest.raises(CaseError):
         Case.load(CASES / "dimple_buckling.yaml", [setting])
 
 
-def misfits(setting: str) -> list[str]:
-    source, whole = read_source(CASES / "dimple_buckling.yaml"), schema()
+def fits(setting: str) -> bool:
+    source = read_source(CASES / "dimple_buckling.yaml")
     override(source, setting)
-    return list(faults(source.data, whole, whole))
+    return bool(Draft202012Validator(schema()).is_valid(source.data))
