@@ -10,6 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from magshell_fenicsx.results.captions import caption
+from magshell_fenicsx.results.curve import curve_figure
 from magshell_fenicsx.results.layout import png
 from magshell_fenicsx.results.picture import PICTURES, _spread, figures, towards
 from magshell_fenicsx.results.render import MARGIN, View, axes_on_screen, rendered, smooth_surface
@@ -108,6 +109,21 @@ def test_captions_tell_the_load() -> None:
     row |= {"field_angle": 45.0, "amplitude": "force", "force": 2.5, "w_over_h": 7.0}
     assert caption(0.01, 0.3, row).count("45") == 1
     assert "$FR/2\\pi D$ = 2.5, $w/h$ = 7 at the load" in caption(0.01, 0.3, row)
+
+
+def test_names_are_no_mathematics() -> None:
+    """A point's name is drawn as it is written; as mathematics this one would end a run with a traceback."""
+    row: Row = {
+        "label": "field",
+        "amplitude": "lambda_m",
+        "mode": "",
+        "branch": 0,
+        "negative_pivots": 0,
+        "A$x_y^$_ux": 0.0,
+    }
+    figure = curve_figure([row | {"lambda_m": x, "w_pole_over_h": x} for x in (0.0, 1.0)], "lambda_m", "")
+    png(figure)
+    assert figure.axes[0].get_xlabel() == r"displacement of A\$x_y^\$  $w/h$"
 
 
 def test_fields_are_read_as_they_were_written(tmp_path: Path) -> None:

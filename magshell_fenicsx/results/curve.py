@@ -1,6 +1,5 @@
 """The load-displacement or pressure-volume curve as a picture."""
 
-import io
 from collections.abc import Sequence
 from itertools import groupby
 from typing import TYPE_CHECKING
@@ -37,13 +36,6 @@ def smooth(x: Sequence[float], y: Sequence[float]) -> NDArray[np.float64]:
     return np.asarray(scipy.interpolate.PchipInterpolator(chord, xy, axis=1)(fine))
 
 
-def draw_curve(rows: Sequence[Row], amplitude: str, title: str) -> bytes:
-    """`curve_figure` as a PNG file."""
-    content = io.BytesIO()
-    curve_figure(rows, amplitude, title).savefig(content, format="png")
-    return content.getvalue()
-
-
 def curve_figure(rows: Sequence[Row], amplitude: str, title: str) -> "Figure":
     """Draw the part of the path in which `amplitude` varied, and its branches; instabilities are marked.
 
@@ -78,7 +70,8 @@ def plot_curve(axes: "Axes", rows: Sequence[Row], amplitude: str) -> None:
     """The curve of `curve_figure` in axes that are there."""
     part = varied(rows, amplitude)
     _, y_key, *labels = _axes(amplitude)
-    x_label, y_label = (label.replace("the pole", pole_name(part[0])) for label in labels)
+    whose = pole_name(part[0]).replace("$", r"\$")  # as it is written, no mathematics
+    x_label, y_label = (label.replace("the pole", whose) for label in labels)
     for branch in sorted({int(row["branch"]) for row in part}):
         line = [row for row in part if row["branch"] == branch and row["mode"] in OWN_MODES]
         smooth_x, smooth_y = smooth(*zip(*(place(row, amplitude) for row in line), strict=True))
