@@ -1,3 +1,3 @@
-from magshell_fenicsx.cli import app
+from magshell_fenicsx.cli import main
 
-app()
+main()

@@ -1,7 +1,9 @@
 """The command line; a thin user of the Python API."""
 
 import gc
+import signal
 import sys
+import traceback
 from pathlib import Path
 from typing import Annotated
 
@@ -35,6 +37,19 @@ def _failure(message: str, code: int) -> typer.Exit:
         return typer.Exit()  # at the first rank that fails mpirun ends the job, and may lose the message
     print(message, file=sys.stderr, flush=True)
     return typer.Exit(code)
+
+
+def main() -> None:
+    """The program."""
+    signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # of `| head`, say; PETSc would report a crash
+    try:
+        app()
+    except Exception:
+        if MPI.COMM_WORLD.size == 1:
+            raise
+        traceback.print_exc()
+        sys.stderr.flush()
+        MPI.COMM_WORLD.Abort(1)  # the other ranks would wait for this one for ever
 
 
 @app.command()

@@ -1,6 +1,9 @@
 """Exit codes, messages and files of the command line."""
 
 import json
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -71,6 +74,35 @@ def test_unwritable_out(out: str) -> None:
     assert done.returncode == 2
     assert done.stderr.startswith(f"--out {out}: cannot be written: ")
     assert len(done.stderr.splitlines()) == 1
+
+
+def test_nobody_reads_what_is_said() -> None:
+    """As of `| head`: the end of any program, without a report by PETSc of a crash."""
+    command = [sys.executable, "-m", "magshell_fenicsx", "schema"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as said:
+        assert said.stdout
+        assert said.stderr
+        said.stdout.close()
+        assert said.stderr.read() == b""
+    assert said.returncode == -signal.SIGPIPE
+
+
+def test_a_bug_on_one_rank_ends_all(tmp_path: Path) -> None:
+    """The other waits for it in a collective call."""
+    program = """
+from magshell_fenicsx import cli
+def app():
+    if cli.MPI.COMM_WORLD.rank == 0:
+        raise AssertionError("a bug")
+    cli.MPI.COMM_WORLD.Barrier()
+cli.app = app
+cli.main()
+"""
+    (tmp_path / "program.py").write_text(program)
+    command = ["mpirun", "--map-by", ":OVERSUBSCRIBE", "-n", "2", sys.executable, str(tmp_path / "program.py")]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert done.returncode
+    assert "AssertionError: a bug" in done.stderr
 
 
 def test_missing_file_and_no_case() -> None:
