@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from magshell_fenicsx.results.report import write_report
+from magshell_fenicsx.results.report_path import path_table
 from magshell_fenicsx.results.table import COLUMNS
 
 SUMMARY: dict[str, Any] = {
@@ -142,6 +143,14 @@ def test_path_has_the_columns_that_vary(tmp_path: Path) -> None:
     heads = found.text[found.text.index("All 40 points") :].split("\n")[:4]
     assert "pointwhatvariedp/pcw/h" in "".join(heads).replace(" ", "")
     assert "details" not in page(tmp_path, rows[:5]).tags
+
+
+def test_columns_name_the_point() -> None:
+    """Whose displacement w_pole_over_h is: that of the first named point, whatever is in its name; else the pole's."""
+    fixed = {name: str(value) for name, value in START.items()}
+    rows = [fixed | {"w_over_h": str(i), "w_pole_over_h": str(i**2)} for i in range(3)]
+    assert "w/h, pole" in [column.head for column in path_table(rows, "")]
+    assert "w/h, A&lt;b&gt;" in [column.head for column in path_table([row | {"A<b>_ux": "0"} for row in rows], "")]
 
 
 def test_error_estimate_or_how_to_get_one(tmp_path: Path) -> None:

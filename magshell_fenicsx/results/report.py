@@ -12,7 +12,7 @@ from markupsafe import Markup
 
 from magshell_fenicsx.results.durable import write_whole
 from magshell_fenicsx.results.html_numbers import number
-from magshell_fenicsx.results.report_path import Line, path_table, symbol
+from magshell_fenicsx.results.report_path import Line, path_table, pole_head, symbol
 from magshell_fenicsx.results.table import VALUE_COLUMN
 from magshell_fenicsx.results.verdict import Summary, bending_stiffness, located, physical_units, value, verdict
 
@@ -75,6 +75,7 @@ def _content(folder: Path) -> dict[str, Any]:
         "groups": _groups(summary),
         "dimensions": _dimensions(summary),
         "pictures": list(_pictures(folder)),
+        "pole": pole_head(lines[0] if lines else {}),
         "instabilities": [_instability(line, summary) for line in located(lines)],
         "sensitivities": [(name, number(v)) for name, v in summary["sensitivities"].items()],
         "sensitive": symbol(VALUE_COLUMN[lines[-1]["amplitude"]]) if summary["sensitivities"] else "",

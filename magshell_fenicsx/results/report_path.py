@@ -1,12 +1,13 @@
 """The path as a table of a report: the columns of path.csv that vary, and what they are called."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import isclose
 
 from markupsafe import Markup
 
 from magshell_fenicsx.results.html_numbers import column, power
+from magshell_fenicsx.results.table import pole_name
 
 Line = Mapping[str, str]  # of path.csv
 WORDS = {"label": "what", "mode": "mode", "amplitude": "varied"}
@@ -27,7 +28,7 @@ NUMBERS = {
     "load_factor": ("load factor", ""),
     "w_over_h": ("w/h", ""),
     "w_from_field_over_h": ("w/h since the field", ""),
-    "w_pole_over_h": ("w/h, pole", ""),
+    "w_pole_over_h": ("w/h", ""),
     "w_point_over_h": ("w/h, point", ""),
     "volume_change": ("ΔV/R³", ""),
     "energy": ("energy", ENERGY),
@@ -57,6 +58,11 @@ def symbol(name: str) -> Markup:
     return Markup(NUMBERS[name][0]) if name in NUMBERS else Markup("{}").format(name.replace("_", " "))
 
 
+def pole_head(line: Line) -> Markup:
+    """What stands above w_pole_over_h: whose displacement it is."""
+    return Markup("{}, {}").format(symbol("w_pole_over_h"), pole_name(line).removeprefix("the "))
+
+
 def path_table(lines: Sequence[Line], length_unit: str) -> list[Column]:
     """The columns that vary, in the order of people's interest; a displacement that is another one is left out.
 
@@ -73,7 +79,10 @@ def path_table(lines: Sequence[Line], length_unit: str) -> list[Column]:
         again = name.startswith("w_") and any(_same(values, other) for key, other in found.items() if key[:2] == "w_")
         if name in ("point", "label") or (len(set(values)) > 1 and not again):
             found[name] = values
-    return [_column(name, values, length_unit) for name, values in found.items()]
+    table = {name: _column(name, values, length_unit) for name, values in found.items()}
+    if pole := table.get("w_pole_over_h"):
+        table["w_pole_over_h"] = replace(pole, head=pole_head(lines[0]))
+    return list(table.values())
 
 
 def _column(name: str, values: Sequence[str], length_unit: str) -> Column:
