@@ -2,8 +2,6 @@
 
 import io
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +11,7 @@ from PIL import Image
 import magshell_fenicsx as ms
 from magshell_fenicsx.case.source import CaseError, Source
 from magshell_fenicsx.results.picture import PICTURES
-from magshell_fenicsx.results.plot import draw, draw_animation
+from magshell_fenicsx.results.plot import draw, draw_animation, plot
 from magshell_fenicsx.results.table import read_rows
 
 pytestmark = pytest.mark.skipif(shutil.which("Xvfb") is None, reason="no screen to draw on")
@@ -65,17 +63,18 @@ def test_a_torn_row_is_no_point(run: Path, tmp_path: Path) -> None:
 def test_another_point(run: Path, tmp_path: Path) -> None:
     again = copied(run, tmp_path, "*.png")
     assert set(draw(again, 1)) == {f"{name}_0001.png" for name in PICTURES}
-    assert (pixels(again / "shell_0001.png") != pixels(run / "shell.png")[:1, :1]).any()
+    first, last = pixels(again / "shell_0001.png"), pixels(run / "shell.png")
+    assert first.shape != last.shape or (np.abs(first - last) > 8).sum() > 1000
     with pytest.raises(CaseError, match=r"--point 99: .* has points 0 to"):
         draw(again, 99)
 
 
-def test_nothing_there(tmp_path: Path) -> None:
-    """One line and the exit code of invalid input."""
-    command = [sys.executable, "-m", "magshell_fenicsx", "plot", str(tmp_path)]
-    said = subprocess.run(command, capture_output=True, text=True)
-    assert said.returncode == 2
-    assert said.stderr == f"{tmp_path} holds no run: it has no path.csv\n"
+@pytest.mark.parametrize("name", ["", "absent", "case.yaml"])
+def test_nothing_there(tmp_path: Path, name: str) -> None:
+    """An empty folder, none, or a file in its place: one line."""
+    (tmp_path / "case.yaml").touch()
+    with pytest.raises(CaseError, match=rf"{tmp_path / name} holds no run: it has no path\.csv"):
+        plot(tmp_path / name)
 
 
 def test_animation(run: Path, tmp_path: Path) -> None:

@@ -112,7 +112,7 @@ def _rows(folder: Path) -> list[Row]:
     """The rows of the points whose fields are there."""
     try:
         rows = read_rows(folder / "path.csv")
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         raise CaseError(f"{folder} holds no run: it has no path.csv") from None
     rows = [row for row in rows if _file(folder, row).exists()]
     if not rows:
