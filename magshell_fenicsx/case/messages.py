@@ -15,7 +15,7 @@ def explain(error: Any, source: Source, case: type[BaseModel]) -> str:
     location = _without_tag(error["loc"], case)
     value, kind = error["input"], error["type"]
     said = error["msg"].removeprefix("Value error, ").replace("Input should be", "must be")
-    if about := re.match(r"(\w+(\.\w+)+): ", said):  # a rule between sections names its own key
+    if about := re.match(r"(\w+(\.[^.:]+)+): ", said):  # a rule between sections names its own key
         keys = about[1].split(".")
         location, said = tuple(int(key) if key.isdigit() else key for key in keys), said[about.end() :]
     place, key = source.place(location), dotted(location) or "case"

@@ -145,6 +145,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"shell": DISC, "boundary": {"rim": "clamped"}, "mesh.size": 0.1}, "mesh.size: not on a disc"),
     ({"loading": {**MOMENT, "branches": True}}, "branches: not with a moment"),
     ({"points": {"A": [1, 0, "1 mm"]}}, "points.A.2: has a unit, but the shell's lengths have none"),
+    ({"points": {"A$ ö": [1, 0, "1 mm"]}}, "test: points.A$ ö.2: has a unit, but"),
     ({"mesh.size": "1 mm"}, "mesh.size: has a unit, but the shell's lengths have none"),
     ({"loading": {**MOMENT, "loads": [{"edge": "top", "moment": "1 N"}]}}, "loads.0.moment: has a unit, but"),
     ({"loading": {**MOMENT, "loads": [{"edge": "top", "moment": "1 Pa"}]}}, "is not convertible to newton"),
