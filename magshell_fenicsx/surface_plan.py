@@ -84,7 +84,7 @@ def plan_surface(case: Case, shell: Surface) -> Plan:
     if loads.magnetic:
         included.append(f"magnetic energy ({loads.magnetic.energy}), lambda_m = {case.lambda_m:g}")
     included += ["live pressure"] if loads.pressure else []
-    included += [f"{len(dead)} dead loads"] if dead else []
+    included += [f"{len(dead)} dead load{'s' * (len(dead) > 1)}"] if dead else []
     return Plan(
         material=material,
         loads=loads,

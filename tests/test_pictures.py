@@ -126,6 +126,14 @@ def test_names_are_no_mathematics() -> None:
     assert figure.axes[0].get_xlabel() == r"displacement of A\$x_y^\$  $w/h$"
 
 
+def test_moments_have_no_displacement_of_their_own() -> None:
+    """Their w_over_h is that of the first named point, and so says the curve."""
+    row: Row = {"label": "step", "amplitude": "load", "mode": "", "branch": 0, "negative_pivots": 0, "A_ux": 0.0}
+    for pole, said in ((1.0, "displacement of A  $w/h$"), (0.5, "displacement along the loads  $w/h$")):
+        path = [row | {"load_factor": x, "w_over_h": x, "w_pole_over_h": pole * x} for x in (0.0, 1.0)]
+        assert curve_figure(path, "load", "").axes[0].get_xlabel() == said
+
+
 def test_fields_are_read_as_they_were_written(tmp_path: Path) -> None:
     surface = plate(0.1)
     T = np.random.default_rng(0).random((4, 3, 3))

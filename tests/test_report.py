@@ -12,6 +12,7 @@ import pytest
 from magshell_fenicsx.results.report import write_report
 from magshell_fenicsx.results.report_path import path_table
 from magshell_fenicsx.results.table import COLUMNS
+from magshell_fenicsx.results.verdict import verdict
 
 SUMMARY: dict[str, Any] = {
     "case": {
@@ -113,6 +114,14 @@ def test_force_at_the_target_in_newtons(tmp_path: Path) -> None:
     case = SUMMARY["case"] | {"loading": {"kind": "indentation", "until": "target"}}
     text = page(tmp_path, rows, case=case, knockdown=None).text
     assert "The run reached its target: F R/(2πD) = 27.532 (0.0301385 N), w/h = 20 at the load." in text
+
+
+def test_displacement_along_the_loads(tmp_path: Path) -> None:
+    """Of moments alone, which have none, it is that of the pole."""
+    lines = [START | {"amplitude": "load", "load_factor": 1.0, "w_over_h": 2.0, "w_pole_over_h": w} for w in (2.0, 1.0)]
+    told = [verdict(SUMMARY | {"case": {}}, [{key: str(v) for key, v in line.items()}]) for line in lines]
+    assert told[0].endswith("load factor = 1, w/h = 2 at the pole.")
+    assert told[1].endswith("load factor = 1, w/h = 2 along the loads.")
 
 
 def test_critical_field_and_excluded_mode(tmp_path: Path) -> None:

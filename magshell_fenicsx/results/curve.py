@@ -70,6 +70,8 @@ def plot_curve(axes: "Axes", rows: Sequence[Row], amplitude: str) -> None:
     """The curve of `curve_figure` in axes that are there."""
     part = varied(rows, amplitude)
     _, y_key, *labels = _axes(amplitude)
+    if amplitude == "load" and all(row["w_over_h"] == row["w_pole_over_h"] for row in part):
+        labels[0] = POLE  # moments have no displacement along themselves
     whose = pole_name(part[0]).replace("$", r"\$")  # as it is written, no mathematics
     x_label, y_label = (label.replace("the pole", whose) for label in labels)
     for branch in sorted({int(row["branch"]) for row in part}):

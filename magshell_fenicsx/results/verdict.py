@@ -81,7 +81,7 @@ def _end(summary: Summary, lines: Sequence[Line]) -> Markup:
 
 
 def _displacement(line: Line) -> Markup:
-    if line["amplitude"] in ("force", "load"):
-        place = " at the load" if line["amplitude"] == "force" else ""
-        return Markup("w/h = {}{}").format(number(float(line["w_over_h"])), place)
+    place = {"force": "at the load", "load": "along the loads"}.get(line["amplitude"])
+    if place and line["w_over_h"] != line["w_pole_over_h"]:
+        return Markup("w/h = {} {}").format(number(float(line["w_over_h"])), place)
     return Markup("w/h = {} at {}").format(number(float(line["w_pole_over_h"])), pole_name(line))
