@@ -93,6 +93,7 @@ def test_time_limit(tmp_path: Path, reference: Path) -> None:
     assert "stopped early" not in (tmp_path / "report.html").read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_full_disk(tmp_path: Path) -> None:
     """Files may only become so large: one message, all ranks leave, nothing is torn."""
     out, whole = tmp_path / "out", tmp_path / "whole"
