@@ -69,6 +69,22 @@ def test_another_point(run: Path, tmp_path: Path) -> None:
         draw(again, 99)
 
 
+def test_a_turning_field(tmp_path: Path) -> None:
+    """Its amplitudes are NumPy's numbers, whose repr no reader of path.csv understands."""
+    sections = {
+        "shell": {"geometry": "strip", "radius_to_thickness": 100, "width": 0.1, "poisson_ratio": 0},
+        "boundary": {"root": "clamped"},
+        "magnetic": {"lambda_m": 3.3e-6, "remanent": {"polar": 90}, "applied": {"polar": 90}},
+        "loading": {"kind": "rotation", "to": {"polar": 0}, "points": 1},
+        "mesh": {"degree": 2, "refinement": 0.5},
+    }
+    ms.run(ms.Case.from_source(Source("test", sections)), tmp_path)
+    last = read_rows(tmp_path / "path.csv")[-1]
+    assert last["field_angle"] == pytest.approx(90)
+    assert isinstance(last["energy"], float)
+    assert (tmp_path / "curve.png").exists()
+
+
 @pytest.mark.parametrize("name", ["", "absent", "case.yaml"])
 def test_nothing_there(tmp_path: Path, name: str) -> None:
     """An empty folder, none, or a file in its place: one line."""

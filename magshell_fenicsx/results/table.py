@@ -94,7 +94,7 @@ class PathTable:
         """
         if int(row["point"]) >= len(self.kept):
             self._file.append(
-                _line(repr(v) if isinstance(v := row[key], float) else v for key in self._columns).encode()
+                _line(repr(float(v)) if isinstance(v := row[key], float) else v for key in self._columns).encode()
             )
 
     def close(self) -> None:
