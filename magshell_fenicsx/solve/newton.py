@@ -82,16 +82,12 @@ class Response:
 
 @dataclass
 class _Progress:
-    """Sizes of the successive steps and residuals of one solve, and the steps that update its matrix.
-
-    `own` tells whether the matrix is that of the state at hand, not a kept one.
-    """
+    """Sizes of the successive steps and residuals of one solve, and the steps since its matrix was made."""
 
     steps: list[float] = field(default_factory=list)
     residuals: list[float] = field(default_factory=list)
     taken: list[Direction] = field(default_factory=list)
     matrix: "_Bordered | None" = None
-    own: bool = False
 
 
 def _sum(a: Direction, factor: float, b: Direction) -> Direction:
@@ -282,8 +278,7 @@ class BorderedNewton:
     def _jacobian(self, x: PETSc.Vec, J: PETSc.Mat) -> None:
         progress = self._progress
         norms = progress.residuals
-        progress.own = progress.matrix is None or norms[-1] > self.options.contraction * norms[-2]
-        if progress.own:
+        if progress.matrix is None or norms[-1] > self.options.contraction * norms[-2]:
             u, mu = self._split(x)
             progress.matrix = _Bordered(self, self._guess.with_(u, self._name, mu), self._name, self._row)
             progress.taken.clear()
@@ -332,7 +327,8 @@ class BorderedNewton:
         if rate < 1 and step * rate / (1 - rate) <= o.tolerance:
             return Reason.CONVERGED_SNORM_RELATIVE
         stalled = rate > 0.5 and self._progress.residuals[-1] > 0.5 * self._progress.residuals[-2]
-        if stalled and step <= (1e4 if self._progress.own else 1e2) * o.tolerance:
+        own = len(self._progress.taken) == 1  # the step was made with the state's own matrix
+        if stalled and step <= (1e4 if own else 1e2) * o.tolerance:
             return Reason.CONVERGED_SNORM_RELATIVE  # rounding: neither steps nor residuals shrink further
         if iteration >= o.max_iterations:
             return Reason.DIVERGED_MAX_IT

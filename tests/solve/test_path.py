@@ -5,7 +5,6 @@ import weakref
 
 import numpy as np
 import pytest
-from petsc4py import PETSc
 from solve.toys import Toy, pitchfork, snap_through
 
 from magshell_fenicsx.solve.control import GivenConjugate, GivenLoad
@@ -102,14 +101,3 @@ def test_a_solver_is_released_with_its_factors() -> None:
     del newton
     gc.collect()
     assert gone() is None
-
-
-@pytest.mark.parametrize("own", [False, True])
-def test_only_the_states_own_matrix_excuses_a_stall(own: bool) -> None:
-    """Steps of 5e-6 lengths that shrink no more are rounding where Newton made them, not where a kept matrix did."""
-    newton = BorderedNewton(snap_through())
-    newton._progress.steps += [5e-6, 4.9e-6]
-    newton._progress.residuals += [1e-12, 1e-12]
-    newton._progress.taken.append((np.ones(1), 0.0))  # Broyden's update has just been dropped
-    newton._progress.own = own
-    assert newton._test(5, 1e-12) == (PETSc.SNES.ConvergedReason.CONVERGED_SNORM_RELATIVE if own else 0)
