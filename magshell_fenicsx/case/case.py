@@ -160,7 +160,7 @@ class Case(Section):
                 "or lambda_m"
             )
         if self.mesh.tolerance is not None:
-            raise ValueError(f"mesh.tolerance: not with a {shell.geometry}; give degree, size and refinement")
+            raise ValueError(f"mesh.tolerance: not with a {shell.geometry}; magshell study compares meshes and degrees")
         if self.magnetic and self.magnetic.remanent.patches is not None and not isinstance(shell, MeshSurface):
             raise ValueError("magnetic.remanent.kind: 'patches': only a hemisphere and geometry: mesh have patches")
         if isinstance(self.loading, PathSection) and self.loading.sensitivities:

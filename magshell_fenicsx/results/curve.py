@@ -23,6 +23,7 @@ AXES = {
     "lambda_m": ("w_pole_over_h", "lambda_m", POLE, r"field  $\lambda_\mathrm{m}$"),
 }
 
+NAMED = 5  # instabilities in the legend
 FINE = 16  # drawn pieces between two points
 
 
@@ -84,11 +85,13 @@ def plot_curve(axes: "Axes", rows: Sequence[Row], amplitude: str) -> None:
             axes.plot(smooth_x[piece], smooth_y[piece], color="C0", linestyle=(0, (2, 1.2)) if dashed else "-")
         dots = [place(row, amplitude) for row in line if row["label"] in ("target", "step", "field")]
         axes.plot([x for x, _ in dots], [y for _, y in dots], ".", color="C0", markersize=4)
-    for row in part:
-        if row["label"] in LOCATED:
-            mode = f" ({row['mode']})" if row["mode"] else ""
-            said = f"{row['label']}{mode} at {row[y_key]:.5g}"
-            axes.plot(*place(row, amplitude), "o", color="C3", markersize=6, label=said)
+    marked = [row for row in part if row["label"] in LOCATED]
+    for number, row in enumerate(marked, 1):
+        mode = f" ({row['mode']})" if row["mode"] else ""
+        said = f"{row['label']}{mode} at {row[y_key]:.5g}"
+        if number > NAMED:
+            said = f"and {len(marked) - NAMED} more" if number == NAMED + 1 else "_"  # which matplotlib leaves out
+        axes.plot(*place(row, amplitude), "o", color="C3", markersize=6, label=said)
     axes.set(xlabel=x_label, ylabel=y_label)
     axes.locator_params(axis="x", nbins=6)
     axes.axhline(0, color="0.8", linewidth=0.8, zorder=0)

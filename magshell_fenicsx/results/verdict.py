@@ -41,11 +41,14 @@ def value(line: Line, summary: Summary) -> Markup:
 
 
 def physical_units(summary: Summary) -> dict[str, tuple[float, str]]:
-    """What an amplitude of one is in SI, where the case has a thickness and a Young's modulus in units."""
-    dims, of = summary["dimensions"], summary["dimensionless"]
+    """What an amplitude of one is with its unit, where the case gives it: the field's by its flux density."""
+    dims, of, found = summary["dimensions"], summary["dimensionless"], {}
+    applied = ((summary["case"].get("magnetic") or {}).get("applied") or {}).get("flux_density")
+    if applied and of["lambda_m"]:
+        found["lambda_m"] = (1e3 * abs(applied / of["lambda_m"]), "mT")
     if dims["units"] != "SI" or not dims["youngs_modulus"]:
-        return {}
-    found = {"pressure": (of["pc_over_E"] * dims["youngs_modulus"], "Pa")}
+        return found
+    found["pressure"] = (of["pc_over_E"] * dims["youngs_modulus"], "Pa")
     if dims["thickness"]:
         found["force"] = (2 * pi * bending_stiffness(summary) / dims["radius"], "N")
     return found

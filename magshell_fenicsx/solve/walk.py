@@ -14,6 +14,7 @@ Label = Literal["step", "target", "fold", "bifurcation"]
 Until = Literal["limit", "bifurcation", "target", "points"]
 Quantity = Literal["load", "conjugate"]
 MOST_STEPS = 1000
+SAME = 1e-2  # distance along the path, in the system's lengths, below which two folds are one
 
 
 @dataclass(frozen=True)
@@ -53,6 +54,7 @@ class Walk:
 
     def __init__(self, path: Path, start: Point, goal: Goal) -> None:
         self.path, self.goal, self.points = path, goal, [start]
+        self._folds: list[Point] = []
 
     def __iter__(self) -> Iterator[tuple[Label, Point]]:
         """Points in order, each with what it is.
@@ -60,7 +62,7 @@ class Walk:
         Raises
         ------
         PathStopped
-            If the path is lost, or longer than it may be.
+            If the path is lost, comes back to where it was, or is longer than it may be.
         """
         options, shorter = self.path.options, None
         while True:
@@ -73,6 +75,8 @@ class Walk:
                     break
                 for label, found, ends in between:
                     yield label, found
+                    if label == "fold":
+                        self._refuse_loop(found)
                     if ends:
                         self.points.append(found)
                         return
@@ -87,6 +91,15 @@ class Walk:
             if shorter < options.smallest:
                 raise PathStopped("an instability cannot be located", self.points[-1])
             self.path.options = replace(options, first=shorter)
+
+    def _refuse_loop(self, fold: Point) -> None:
+        """See that a fold is none of those before: two in succession may be close, where a snap is being born."""
+        name, u = self.path.name, fold.state.u
+        mu = fold.state.mu[name]
+        for known in self._folds[:-1]:
+            if self.path.metric.norm(u - known.state.u, mu - known.state.mu[name]) < SAME:
+                raise PathStopped("the path has come back to this fold: a closed loop, which leads nowhere else", fold)
+        self._folds.append(fold)
 
     @property
     def _by_arc(self) -> bool:

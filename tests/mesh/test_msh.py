@@ -7,6 +7,7 @@ from typing import Any
 import gmsh
 import numpy as np
 import pytest
+from conftest import CASES
 from mpi4py import MPI
 
 from magshell_fenicsx import Case, Scene, run
@@ -52,6 +53,13 @@ def panel(model: Any, order: int, size: float = 0.25) -> None:
     gmsh.option.setNumber("Mesh.MeshSizeMax", size)
     model.mesh.generate(2)
     model.mesh.setOrder(order)
+
+
+def test_a_check_tells_what_was_read() -> None:
+    """Extent, names and the outer side of the gripper, whose normals are e3."""
+    told = describe(Case.load(CASES / "gripper.yaml"))
+    assert "extent over the radius: 7 x 7 x 0\nedges: outline; patches: hub, east, north, west, south" in told
+    assert "over the radius, is (0, 0, 1)" in told
 
 
 @pytest.mark.parametrize("held", ["clamped", {"held": ["x", "y", "z"]}])

@@ -168,6 +168,13 @@ def test_mistakes_are_named(changes: dict[str, Any], said: str) -> None:
     assert said in str(error.value)
 
 
+@pytest.mark.parametrize("boundary", [{}, {"top": "free"}])
+def test_a_check_sees_that_nothing_is_held(boundary: dict[str, str]) -> None:
+    shell = {"geometry": "cylinder", "radius": 1, "length": 2, **COMMON}
+    with pytest.raises(CaseError, match="boundary: nothing is held"):
+        describe(Case.from_source(Source("test", {"shell": shell, "boundary": boundary})))
+
+
 def test_units_are_turned_into_si() -> None:
     shell = {"geometry": "cylinder", "radius": "25 mm", "length": "5 cm", "thickness": "0.5 mm", "poisson_ratio": 0.5}
     case = Case.from_source(Source("test", {"shell": shell, "boundary": {"bottom": "clamped"}}))

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from solve.toys import pitchfork, snap_back
+from solve.toys import closed_loop, pitchfork, snap_back
 
 from magshell_fenicsx.solve.branch import branching
 from magshell_fenicsx.solve.newton import BorderedNewton
@@ -110,3 +110,13 @@ def test_asymmetric_branch_is_told() -> None:
         u, v = start.state.u
         assert v == pytest.approx(u - 1, abs=1e-8)
         assert start.state.mu["load"] == pytest.approx(u - v**2 / 2, abs=1e-8)
+
+
+def test_a_closed_loop_is_told() -> None:
+    """Four folds on the circle; the walk ends at the first of them, met again."""
+    path = Path(BorderedNewton(closed_loop()), "load", "arc", StepOptions(0.05, 0.1, 1e-7))
+    walk, folds = Walk(path, path.start(State(np.array([1.0, 0.0]), {"load": 0.0})), Goal("points", steps=900)), []
+    with pytest.raises(PathStopped, match="come back to this fold: a closed loop"):  # noqa: PT012
+        for label, point in walk:
+            folds += [point.state.mu["load"]] if label == "fold" else []
+    assert folds == pytest.approx([1, -1, 1, -1, 1], rel=1e-8)

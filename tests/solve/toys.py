@@ -77,6 +77,20 @@ def pitchfork(imperfection: float = 0.0, stiffening: float = 1.0) -> Toy:
     return Toy(gradient, hessian, 2)
 
 
+def closed_loop() -> Toy:
+    """Pi_0 = (u^2 - 1) v + v^3/3: equilibria on the circle u = cos t, v = sin t alone, at the load sin 2t."""
+
+    def gradient(x: Vector) -> Vector:
+        u, v = x
+        return np.array([2 * u * v, u**2 + v**2 - 1])
+
+    def hessian(x: Vector) -> Vector:
+        u, v = x
+        return np.array([[2 * v, 2 * u], [2 * u, 2 * v]])
+
+    return Toy(gradient, hessian, 2)
+
+
 def snap_back(k: float, c: float) -> Toy:
     """The arch behind a spring, and a column: q = u[0] is loaded, x = u[1] snaps through, v = u[2] bends.
 
