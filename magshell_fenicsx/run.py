@@ -23,7 +23,7 @@ from magshell_fenicsx.results.folder import DiskError, by_first, held_folder
 from magshell_fenicsx.results.plot import draw
 from magshell_fenicsx.results.report import write_report
 from magshell_fenicsx.results.summary import Result, summary
-from magshell_fenicsx.results.table import Row
+from magshell_fenicsx.results.table import LOCATED, Row
 from magshell_fenicsx.rows import RowMaker
 from magshell_fenicsx.scene import Scene
 from magshell_fenicsx.sensitivity import sensitivities
@@ -178,7 +178,7 @@ def _follow(result: Result, files: RunFiles | None, say: Say, progress: RunProgr
         row = made.row(record, time.perf_counter() - start)
         result.rows.append(row)
         result.last = record.point.state
-        if record.label in ("fold", "bifurcation"):
+        if record.label in LOCATED:
             result.singular[len(result.rows) - 1] = record.point.state
         if files:
             with result.output:

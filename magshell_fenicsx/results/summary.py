@@ -8,7 +8,7 @@ from magshell_fenicsx.adapt.ending import History, NoResult
 from magshell_fenicsx.case.shell import ShellSection
 from magshell_fenicsx.case.surfaces import Surface
 from magshell_fenicsx.environment import fast_blas, versions
-from magshell_fenicsx.results.table import VALUE_COLUMN, Row
+from magshell_fenicsx.results.table import LOCATED, VALUE_COLUMN, Row
 from magshell_fenicsx.scene import Scene
 from magshell_fenicsx.solve.system import State
 from magshell_fenicsx.solve.timing import Stopwatch
@@ -63,7 +63,7 @@ class Result:
                 "branch": row["branch"],
             }
             for row in self.rows
-            if row["label"] in ("fold", "bifurcation")
+            if row["label"] in LOCATED
         ]
 
     @property
