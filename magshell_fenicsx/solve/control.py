@@ -1,9 +1,12 @@
 """The last row of the bordered system: what is prescribed along a path."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from math import sqrt
 from typing import Protocol
+
+import numpy as np
 
 from magshell_fenicsx.solve.system import State, System, Vector, dot
 
@@ -68,6 +71,14 @@ class Metric:
     def norm(self, du: Vector, dmu: float) -> float:
         """Length of a direction."""
         return sqrt(self.inner((du, dmu), (du, dmu)))
+
+
+def projected(metric: Metric, a: tuple[Vector, float], span: Sequence[tuple[Vector, float]]) -> tuple[Vector, float]:
+    """The direction nearest to `a` among the combinations of others."""
+    gram = [[metric.inner(p, q) for q in span] for p in span]
+    parts = np.linalg.solve(gram, [metric.inner(p, a) for p in span])
+    du = np.sum([part * p[0] for part, p in zip(parts, span, strict=True)], axis=0)
+    return du, float(sum(part * p[1] for part, p in zip(parts, span, strict=True)))
 
 
 @dataclass(frozen=True)

@@ -2,10 +2,14 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Literal, Protocol
 
 import numpy as np
 
+from magshell_fenicsx.solve.bifurcation import BifurcationLost, find_bifurcation
+from magshell_fenicsx.solve.bordered import Direction
+from magshell_fenicsx.solve.control import projected
 from magshell_fenicsx.solve.factor import Factorisation
 from magshell_fenicsx.solve.inverse import nearest_to_zero
 from magshell_fenicsx.solve.path import Path, PathStopped, Point
@@ -13,6 +17,7 @@ from magshell_fenicsx.solve.system import State, Vector
 
 MOST_STEPS = 60  # bisection alone halves a bracket so often that nothing is left of it
 FLAT = 0.01  # slope of the amplitude, over that at the step's start, that means a fold
+MIDDLE = 0.5, 0.35, 0.65, 0.2, 0.8  # of a bracket, where a point between its ends is looked for
 MOST_HALVINGS = 12  # of a step that holds several instabilities; what is left counts as one
 
 
@@ -77,28 +82,95 @@ class _Search:
         if single and turned:
             yield Instability(self.told(self.fold(low, high)), "fold")
         elif single:
-            point = self.bifurcation(low, high, self.path.newton)
+            point = self.crossing(low, high) or self.bracketed(low, high)
             if abs(point.dmu) < FLAT * abs(low.dmu):
                 raise PathStopped("the step passed a fold and left the branch", low)
-            yield Instability(self.told(point), "bifurcation")
+            yield Instability(point, "bifurcation")
         else:
-            middle = self.solve((low.s + high.s) / 2, low, high)
+            middle = self.middle(low, high)
+            if middle is None:
+                raise PathStopped("several instabilities lie too close to each other", low)
             yield from self.between(low, middle, halvings - 1)
             yield from self.between(middle, high, halvings - 1)
 
     def solve(self, s: float, low: Point, high: Point) -> Point:
-        found = self.path.at(s, self.path.between(s, low, high), self.base)
+        found = self.try_at(s, low, high)
         if isinstance(found, str):
             raise PathStopped(f"locating an instability: {found}", low)
-        self.iterations += found.iterations
-        self.factorisations += found.factorisations
         return found
 
-    def told(self, point: Point) -> Point:
-        here = self.path.exact(point, self.base)
-        spent = replace(here, iterations=self.iterations, factorisations=self.factorisations + 1)
+    def try_at(self, s: float, low: Point, high: Point) -> Point | str:
+        found = self.path.at(s, self.path.between(s, low, high), self.base)
+        if not isinstance(found, str):
+            self.iterations += found.iterations
+            self.factorisations += found.factorisations
+        return found
+
+    def middle(self, low: Point, high: Point) -> Point | None:
+        """A point somewhere between two others, with its own inertia: rounding may hide some."""
+        for part in MIDDLE:
+            found = self.try_at(low.s + part * (high.s - low.s), low, high)
+            if not isinstance(found, str):
+                return self.path.exact(found, self.base)
+        return None
+
+    def crossing(self, low: Point, high: Point) -> Point | None:
+        """The bifurcation between two points, as the solution of a regular system; None if that is not found."""
+        path = self.path
+        modes = [critical_mode(path.newton, end.state) for end in (low, high)]
+        a, b = (mode.eigenvalue for mode in modes)
+        t = a / (a - b) if a * b < 0 else 0.5
+        guess = path.between(low.s + t * (high.s - low.s), low, high)
+        pivots = sorted(end.negative_pivots for end in (low, high))
+        for mode in sorted(modes, key=lambda mode: abs(mode.eigenvalue)):
+            found = path.recorded(partial(self._regular, guess, mode.vector, low, high))
+            if isinstance(found, str):
+                continue
+            if min(low.s, high.s) <= found.s <= max(low.s, high.s) and pivots[0] <= found.negative_pivots < pivots[1]:
+                return self.spent(found)
+        return None
+
+    def _regular(self, guess: State, phi: Vector, low: Point, high: Point) -> Point | str:
+        path = self.path
+        try:
+            found = find_bifurcation(path.newton, guess, phi, path.name)
+        except BifurcationLost as e:
+            return str(e)
+        self.iterations += found.iterations
+        self.factorisations += found.factorisations
+        # of both branches' tangents, the one that continues the path
+        state, along = found.state, self._slope(found.state, low, high)
+        direction = projected(path.metric, along, [(found.phi, 0.0), (-found.response, 1.0)])
+        point = path.on(state, direction, self.base, found.unstable)
+        return replace(point, error=found.error, load_error=found.load_error)
+
+    def _slope(self, state: State, low: Point, high: Point) -> Direction:
+        """The path's tangent near a state between two points, interpolated."""
+        name = self.path.name
+        t = (state.mu[name] - low.state.mu[name]) / (high.state.mu[name] - low.state.mu[name])
+        t = min(max(t, 0.0), 1.0)
+        return (1 - t) * low.du + t * high.du, (1 - t) * low.dmu + t * high.dmu
+
+    def bracketed(self, low: Point, high: Point) -> Point:
+        """The last point before an instability, by bisection as far as rounding lets inertia be trusted."""
+        name = self.path.name
+        for _ in range(MOST_STEPS):
+            width = abs(high.state.mu[name] - low.state.mu[name])
+            middle = self.middle(low, high) if width > self.tolerance * abs(low.state.mu[name]) else None
+            if middle is None:
+                break
+            low, high = (middle, high) if middle.negative_pivots == low.negative_pivots else (low, middle)
+        return replace(self.spent(low), load_error=abs(high.state.mu[name] - low.state.mu[name]))
+
+    def spent(self, point: Point) -> Point:
+        """The point with the work since the last located one."""
+        done = replace(point, iterations=self.iterations, factorisations=self.factorisations)
         self.iterations = self.factorisations = 0
-        return spent
+        return done
+
+    def told(self, point: Point) -> Point:
+        self.factorisations += 1
+        return replace(self.spent(self.path.exact(point, self.base)), load_error=point.load_error)
 
     def fold(self, low: Point, high: Point) -> Point:
         """Zero of dmu/ds: stationary point of the cubic through both ends, repeated."""
@@ -109,8 +181,9 @@ class _Search:
             mu = point.state.mu[name]
             other = high if point.dmu * low.dmu > 0 else low
             curvature = (other.dmu - point.dmu) / (other.s - point.s)
-            if abs(point.dmu**2 / (2 * curvature)) <= self.tolerance * abs(mu):
-                return point
+            rest = abs(point.dmu**2 / (2 * curvature))
+            if rest <= self.tolerance * abs(mu):
+                return replace(point, load_error=rest)
             low, high = (point, high) if point.dmu * low.dmu > 0 else (low, point)
         return point
 
@@ -129,10 +202,11 @@ class _Search:
             t = a / (a - b) if a * b < 0 else 0.5
             point = self.solve(low.s + t * (high.s - low.s), low, high)
             mu = point.state.mu[path.name]
-            if abs(point.s - last) * abs(point.dmu) <= agreed * abs(mu) and a * b < 0:
-                return point
-            if abs(high.s - low.s) * abs(point.dmu) <= self.tolerance * abs(mu):
-                return point
+            moved, width = abs(point.s - last) * abs(point.dmu), abs(high.s - low.s) * abs(point.dmu)
+            if moved <= agreed * abs(mu) and a * b < 0:
+                return replace(point, load_error=moved)
+            if width <= self.tolerance * abs(mu):
+                return replace(point, load_error=width)
             last, mode = point.s, critical_mode(stability, point.state)
             if mode.negative_pivots != first.negative_pivots:
                 high, b = point, mode.eigenvalue

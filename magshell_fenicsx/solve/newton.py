@@ -4,7 +4,7 @@
     g(u, mu)          = 0      c.du + d    dmu = -g
 
 One factorisation of K and two back-solves make a Newton step, whatever the last row. The bordered
-matrix is kept while the residual falls, with Broyden's update on top (C. T. Kelley, Iterative
+matrix is kept while the steps shrink, with Broyden's update on top (C. T. Kelley, Iterative
 Methods for Linear and Nonlinear Equations, SIAM 1995, algorithm brsol).
 The unknown vector is u with mu appended on the last rank.
 """
@@ -18,15 +18,16 @@ import numpy as np
 from petsc4py import PETSc
 
 from magshell_fenicsx import compat
+from magshell_fenicsx.solve.bordered import Bordered, Direction, plus
 from magshell_fenicsx.solve.control import Row
 from magshell_fenicsx.solve.factor import Factorisation
+from magshell_fenicsx.solve.iterates import Iterates, Step, Verdict
+from magshell_fenicsx.solve.refine import refined_tangent
 from magshell_fenicsx.solve.system import State, System, Vector, dot, max_abs
 
-Direction = tuple[Vector, float]  # (du, dmu)
-MOST_REFINEMENTS = 4
-REFINED, SIGN = 1e-3, 1e-2  # relative errors of a tangent's du and dmu
-DIFFERENCE = 1e-5  # lengths, of the differences that stand for K times a vector
 LEAST_REST = 0.3  # of a step: an update that would lengthen it more is not trusted
+MOTION = 1e-2  # part of the largest displacement that counts as a length, where it is longer than the system's
+HIDDEN = "rounding hides the solution: the tangent is nearly singular"
 
 
 @dataclass(frozen=True)
@@ -36,11 +37,12 @@ class NewtonOptions:
     Attributes
     ----------
     tolerance
-        Estimated remaining error of u, over the system's length.
+        Estimated error of u, over the system's length or, where that is longer, a hundredth of the
+        largest displacement: a strip of 1000 thicknesses that rolls up is not known to 1e-12 of its length.
     max_iterations
         Iterations after which a step is given up.
     contraction
-        Factors are kept while an iteration lowers the residual at least by this factor.
+        Factors are kept while a step is shorter than this part of the one before.
     fresh
         Lengths between where factors were made and a solution whose tangent and inertia they still tell.
     largest_step
@@ -56,12 +58,19 @@ class NewtonOptions:
 
 @dataclass(frozen=True)
 class Outcome:
-    """Where Newton ended, and what it took."""
+    """Where Newton ended, and what it took.
+
+    Attributes
+    ----------
+    error
+        Estimated error of u, over the system's length.
+    """
 
     state: State
     converged: bool
     iterations: int
     reason: str
+    error: float
 
 
 @dataclass(frozen=True)
@@ -82,48 +91,21 @@ class Response:
 
 @dataclass
 class _Progress:
-    """Sizes of the successive steps and residuals of one solve, and the steps since its matrix was made."""
+    """One solve.
 
-    steps: list[float] = field(default_factory=list)
-    residuals: list[float] = field(default_factory=list)
+    Attributes
+    ----------
+    taken
+        The steps since the matrix was made.
+    ahead
+        The step that the present iterate asks for.
+    """
+
+    iterates: Iterates = field(default_factory=Iterates)
+    verdict: Verdict = "go on"
     taken: list[Direction] = field(default_factory=list)
-    matrix: "_Bordered | None" = None
-
-
-def _sum(a: Direction, factor: float, b: Direction) -> Direction:
-    return a[0] + factor * b[0], a[1] + factor * b[1]
-
-
-class _Bordered:
-    """The bordered matrix at a state, by block elimination with the factors of K."""
-
-    def __init__(self, newton: "BorderedNewton", state: State, name: str, row: Row) -> None:
-        self.state, self.row = state, row
-        self._comm, self._factors = newton.system.comm, newton.factor_at(state)
-        self._c, self._d = row.gradient(state.u)
-        self.column = newton.system.load(state.u, name)
-        self._x2 = self._factors.solve(self.column)
-        self._schur = self._d - (dot(self._comm, self._c, self._x2) if self._c is not None else 0.0)
-        self._weight = dot(self._comm, self._x2, self._x2)  # of dmu: the displacement that it makes
-
-    def solve(self, f: Vector, g: float) -> Direction:
-        """(du, dmu) with K du + R_mu dmu = f and c.du + d dmu = g."""
-        x1 = self._factors.solve(f)
-        pull = dot(self._comm, self._c, x1) if self._c is not None else 0.0
-        dmu = (g - pull) / self._schur
-        return x1 - dmu * self._x2, dmu
-
-    @property
-    def tangent(self) -> Direction:
-        """The same for f = 0 and g = 1."""
-        return np.asarray(-self._x2 / self._schur), 1 / self._schur
-
-    def inner(self, a: Direction, b: Direction) -> float:
-        return dot(self._comm, a[0], b[0]) + self._weight * a[1] * b[1]
-
-    def times(self, du: Vector, dmu: float) -> Direction:
-        g = self._d * dmu + (dot(self._comm, self._c, du) if self._c is not None else 0.0)
-        return self._factors.times(du) + dmu * self.column, g
+    matrix: Bordered | None = None
+    ahead: Direction | None = None
 
 
 class _Border:
@@ -142,13 +124,13 @@ class _Border:
         self.newton._function(x, f)
 
     def jacobian(self, snes: PETSc.SNES, x: PETSc.Vec, J: PETSc.Mat, P: PETSc.Mat) -> None:
-        self.newton._jacobian(x, J)
+        J.assemble()
 
     def test(self, snes: PETSc.SNES, iteration: int, norms: tuple[float, float, float]) -> Any:
-        return self.newton._test(iteration, norms[2])
+        return self.newton._test(snes, norms[2])
 
     def apply(self, pc: PETSc.PC, f: PETSc.Vec, y: PETSc.Vec) -> None:
-        self.newton._apply(f, y)
+        self.newton._apply(y)
 
     def mult(self, J: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
         self.newton._mult(x, y)
@@ -197,14 +179,19 @@ class BorderedNewton:
 
     def solve(self, guess: State, name: str, row: Row) -> Outcome:
         """Find the equilibrium near `guess` on which `row` holds, with mu the amplitude `name`."""
-        self._guess, self._name, self._row, self._progress = guess, name, row, _Progress()
+        self._guess, self._name, self._row = guess, name, row
+        self._progress = progress = _Progress(Iterates(self.options.largest_step, self.options.max_iterations))
         self._join(guess.u, guess.mu[name], self._x)
         self._snes.solve(None, self._x)
         u, mu = self._split(self._x)
+        converged = self._snes.getConvergedReason() > 0
+        if converged and progress.ahead:  # it costs nothing more
+            u, mu = plus((u, mu), -1.0, progress.ahead)
         iterations = self._snes.getIterationNumber()
-        reason = self._snes.getConvergedReason()
         self.iterations += iterations
-        return Outcome(guess.with_(u, name, mu), reason > 0, iterations, _REASONS.get(reason, f"SNES reason {reason}"))
+        reason = _REASONS.get(progress.verdict, f"SNES reason {self._snes.getConvergedReason()}")
+        error = progress.iterates.steps[-1].size if progress.iterates.steps else np.inf
+        return Outcome(guess.with_(u, name, mu), converged, iterations, reason, error)
 
     def factor_at(self, state: State) -> Factorisation:
         """Factor the tangent at a state, unless its factors are at hand."""
@@ -225,114 +212,86 @@ class BorderedNewton:
         matrix = self._bordered(near if fresh and near else state, name, row)
         tangent, load = matrix.tangent, self.system.load(state.u, name)
         if moved and fresh:
-            refined = self._refined(matrix, tangent, state, load, row)
+            refined = refined_tangent(self.system, matrix, tangent, state, load, row)
             if refined is None:
                 return self.response(state, name, row, exact=True)
             tangent = refined
         du, dmu = tangent
         return Response(du, dmu, -dot(comm, load, du) / dmu, self.factorisation.negative_pivots)
 
-    def _bordered(self, state: State, name: str, row: Row) -> "_Bordered":
+    def _bordered(self, state: State, name: str, row: Row) -> Bordered:
         """The bordered matrix at a state, that of the last solve if it was made there for the same row."""
         last = self._progress.matrix
         if last and last.row is row and last.state is state is self._factored:
             return last
-        return _Bordered(self, state, name, row)
-
-    def _refined(self, matrix: "_Bordered", t: Direction, state: State, load: Vector, row: Row) -> Direction | None:
-        """The tangent at a state from that of a matrix near by, by generalised conjugate residuals; None if too far."""
-        comm, (c, d) = self.system.comm, row.gradient(state.u)
-        R = self.system.residual(state.u, state.mu)
-
-        def times(t: Direction) -> Direction:
-            g = d * t[1] + (dot(comm, c, t[0]) if c is not None else 0.0)
-            return matrix.solve(self._stiffness(state, R, t[0]) + t[1] * load, g)
-
-        z, known = _sum(t, -1.0, times(t)), list[tuple[Direction, Direction, float]]()
-        for _ in range(MOST_REFINEMENTS):
-            if max_abs(comm, z[0]) <= REFINED * max_abs(comm, t[0]) and abs(z[1]) <= SIGN * abs(t[1]):
-                return t
-            p, q = z, times(z)
-            for before, image, square in known:
-                part = matrix.inner(image, q) / square
-                p, q = _sum(p, -part, before), _sum(q, -part, image)
-            known.append((p, q, matrix.inner(q, q)))
-            part = matrix.inner(z, q) / known[-1][2]
-            t, z = _sum(t, part, p), _sum(z, -part, q)
-        return None
-
-    def _stiffness(self, state: State, R: Vector, du: Vector) -> Vector:
-        """K du by a difference of the residual from R, that of the state."""
-        size = max_abs(self.system.comm, du)
-        if size == 0.0:
-            return du
-        small = DIFFERENCE * self.system.length / size
-        return np.asarray((self.system.residual(state.u + small * du, state.mu) - R) / small)
+        return Bordered(self.system, self.factor_at(state), state, name, row)
 
     def _function(self, x: PETSc.Vec, f: PETSc.Vec) -> None:
         u, mu = self._split(x)
         R = self.system.residual(u, {**self._guess.mu, self._name: mu})
-        self._progress.residuals.append(np.sqrt(dot(self.system.comm, R, R)))
         self._join(R, self._row.residual(u, mu), f)
 
-    def _jacobian(self, x: PETSc.Vec, J: PETSc.Mat) -> None:
-        progress = self._progress
-        norms = progress.residuals
-        if progress.matrix is None or norms[-1] > self.options.contraction * norms[-2]:
-            u, mu = self._split(x)
-            progress.matrix = _Bordered(self, self._guess.with_(u, self._name, mu), self._name, self._row)
-            progress.taken.clear()
-        J.assemble()
+    def _test(self, snes: PETSc.SNES, norm: float) -> Any:
+        progress, o = self._progress, self.options
+        if not np.isfinite(norm):
+            return compat.NOT_A_NUMBER
+        u, mu = self._split(snes.getSolution())
+        f = self._split(snes.getFunction()[0])
+        state = self._guess.with_(u, self._name, mu)
+        progress.ahead = self._ahead(state, f)
+        length = self.system.length
+        scale = max(1.0, MOTION * max_abs(self.system.comm, u) / length)
+        progress.verdict = progress.iterates.judge(o.tolerance * scale, lambda: self._rounding(state, f[0]))
+        return _REASON_OF[progress.verdict]
 
-    def _apply(self, f: PETSc.Vec, y: PETSc.Vec) -> None:
-        """The step (SNES subtracts it) with the matrix at hand and Broyden's update of it."""
-        progress, matrix = self._progress, self._progress.matrix
+    def _ahead(self, state: State, f: Direction) -> Direction:
+        """The step that an iterate asks for (SNES subtracts it): with the matrix at hand, or one made here."""
+        progress, steps = self._progress, self._progress.iterates.steps
+        if progress.matrix is not None:
+            ahead = self._updated(progress.matrix.solve(*f))
+            size = progress.matrix.size(ahead)
+            if size <= self.options.contraction * steps[-1].size:
+                steps.append(Step(size, own=False))
+                return ahead
+        progress.matrix = matrix = Bordered(self.system, self.factor_at(state), state, self._name, self._row)
+        progress.taken.clear()
+        ahead = matrix.solve(*f)
+        steps.append(Step(matrix.size(ahead), own=True))
+        return ahead
+
+    def _updated(self, step: Direction) -> Direction:
+        """A step of the matrix at hand with Broyden's update."""
+        taken, matrix = self._progress.taken, self._progress.matrix
         assert matrix is not None
-        du, dmu = matrix.solve(*self._split(f))
-        taken = progress.taken
         for before, after in pairwise(taken):
-            part = matrix.inner(before, (du, dmu)) / matrix.inner(before, before)
-            du, dmu = _sum((du, dmu), part, after)
+            part = matrix.inner(before, step) / matrix.inner(before, before)
+            step = plus(step, part, after)
         if taken:
-            rest = 1 - matrix.inner(taken[-1], (du, dmu)) / matrix.inner(taken[-1], taken[-1])
+            rest = 1 - matrix.inner(taken[-1], step) / matrix.inner(taken[-1], taken[-1])
             if rest > LEAST_REST:
-                du, dmu = _sum((du, dmu), 1 / rest - 1, (du, dmu))
-            else:
-                taken.clear()
-        taken.append((du, dmu))
-        progress.steps.append(max_abs(self.system.comm, du) / self.system.length)
-        self._join(du, dmu, y)
+                return plus(step, 1 / rest - 1, step)
+            taken.clear()
+        return step
+
+    def _rounding(self, state: State, R: Vector) -> float:
+        """The error that rounding of the residual makes, by its change where u is rounded otherwise."""
+        matrix = self._progress.matrix
+        assert matrix is not None
+        side = np.random.default_rng(self.system.comm.rank).choice([-1.0, 1.0], state.u.size)
+        other = state.u + side * np.spacing(state.u)
+        change = self.system.residual(other, state.mu) - R
+        f = change - matrix.times(other - state.u, 0.0)[0]
+        return matrix.size(matrix.solve(f, 0.0))
+
+    def _apply(self, y: PETSc.Vec) -> None:
+        assert self._progress.ahead is not None
+        self._progress.taken.append(self._progress.ahead)
+        self._join(*self._progress.ahead, y)
 
     def _mult(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """The bordered matrix times a vector, for SNES's line searches and monitors."""
         assert self._progress.matrix is not None
         self._join(*self._progress.matrix.times(*self._split(x)), y)
-
-    def _test(self, iteration: int, norm: float) -> Any:
-        Reason, o = PETSc.SNES.ConvergedReason, self.options
-        if not np.isfinite(norm):
-            return compat.NOT_A_NUMBER
-        if iteration == 0:
-            return Reason.CONVERGED_ITERATING
-        steps = self._progress.steps
-        step = steps[-1]
-        growing = iteration > 2 and step > 2 * steps[-2]
-        if not np.isfinite(step) or step > o.largest_step or growing:
-            return Reason.DIVERGED_DTOL
-        if step <= o.tolerance:
-            return Reason.CONVERGED_SNORM_RELATIVE
-        if iteration == 1:
-            return Reason.CONVERGED_ITERATING
-        rate = step / steps[-2]  # remaining error of a linearly converging sequence: step rate/(1 - rate)
-        if rate < 1 and step * rate / (1 - rate) <= o.tolerance:
-            return Reason.CONVERGED_SNORM_RELATIVE
-        stalled = rate > 0.5 and self._progress.residuals[-1] > 0.5 * self._progress.residuals[-2]
-        own = len(self._progress.taken) == 1  # the step was made with the state's own matrix
-        if stalled and step <= (1e4 if own else 1e2) * o.tolerance:
-            return Reason.CONVERGED_SNORM_RELATIVE  # rounding: neither steps nor residuals shrink further
-        if iteration >= o.max_iterations:
-            return Reason.DIVERGED_MAX_IT
-        return Reason.CONVERGED_ITERATING
 
     def _join(self, u: Vector, mu: float, x: PETSc.Vec) -> None:
         x.setArray(np.append(u, mu) if self._last else u)
@@ -343,9 +302,16 @@ class BorderedNewton:
         return local[: self.system.size].copy(), mu
 
 
-_REASONS = {
-    PETSc.SNES.ConvergedReason.DIVERGED_MAX_IT: "too many iterations",
-    compat.NOT_A_NUMBER: "the residual is not a number",
-    PETSc.SNES.ConvergedReason.DIVERGED_DTOL: "the iteration diverged",
-    PETSc.SNES.ConvergedReason.DIVERGED_LINEAR_SOLVE: "the tangent could not be factored",
+_REASON_OF = {
+    "go on": PETSc.SNES.ConvergedReason.CONVERGED_ITERATING,
+    "converged": PETSc.SNES.ConvergedReason.CONVERGED_SNORM_RELATIVE,
+    "diverged": PETSc.SNES.ConvergedReason.DIVERGED_DTOL,
+    "rounding": PETSc.SNES.ConvergedReason.DIVERGED_INNER,
+    "too many": PETSc.SNES.ConvergedReason.DIVERGED_MAX_IT,
+}
+_REASONS: dict[str, str] = {
+    "converged": "converged",
+    "diverged": "the iteration diverged",
+    "rounding": HIDDEN,
+    "too many": "too many iterations",
 }

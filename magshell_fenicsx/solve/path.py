@@ -1,6 +1,6 @@
 """Following an equilibrium path by load, by conjugate displacement or by arc length, with adaptive steps."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -8,11 +8,12 @@ import numpy as np
 
 from magshell_fenicsx.solve.control import GivenConjugate, GivenLoad, Hyperplane, Metric, Row
 from magshell_fenicsx.solve.journal import Journal, NoJournal
-from magshell_fenicsx.solve.newton import BorderedNewton, Response
+from magshell_fenicsx.solve.newton import HIDDEN, BorderedNewton, Response
 from magshell_fenicsx.solve.progress import NoProgress, Progress
 from magshell_fenicsx.solve.system import State, Vector, dot, max_abs
 
 Control = Literal["load", "conjugate", "arc"]
+MOST_LEAPS = 3  # longer steps that are tried where rounding hides a point
 SEEN = 1e-6  # a displacement that counts, in lengths of the system
 
 
@@ -32,6 +33,10 @@ class Point:
         The same with the conjugate displacement held instead of the amplitude.
     iterations, factorisations
         Work since the point before.
+    error
+        Estimated error of u, over the system's length.
+    load_error
+        Of an instability: the estimated error of its amplitude.
     """
 
     state: State
@@ -42,6 +47,8 @@ class Point:
     negative_pivots_held: int
     iterations: int = 0
     factorisations: int = 0
+    error: float = 0.0
+    load_error: float = 0.0
 
     def per(self, rate: float) -> "Point":
         """The same with its tangent over `rate`."""
@@ -147,12 +154,41 @@ class Path:
 
     def solve(self, row: Row, s: float, guess: State) -> Point | str:
         """Solve for the point on which a row holds, or say why that failed; the tangent is per unit of the row."""
+        return self.recorded(lambda: self._solve(row, s, guess))
+
+    def recorded(self, find: Callable[[], Point | str]) -> Point | str:
+        """What is found, or what an interrupted run had found here."""
         known = self._journal.replay()
         if known is not None:
             return known
-        found = self._solve(row, s, guess)
+        found = find()
         self._journal.record(found)
         return found
+
+    def on(self, state: State, direction: tuple[Vector, float], base: Point, negative_pivots: int) -> Point:
+        """The point of a state on the path, with a tangent that has been found otherwise.
+
+        Parameters
+        ----------
+        direction
+            The tangent (du, dmu), of any length.
+        """
+        du, dmu = direction
+        load = self.system.load(state.u, self.name)
+        dq = -dot(self.system.comm, load, du)
+        rate = {"load": dmu, "conjugate": dq, "arc": self.metric.inner((base.du, base.dmu), direction)}[self.control]
+        softness = dq / dmu if dmu else np.inf
+        return self._point(state, self._s(state, base), Response(du, dmu, softness, negative_pivots)).per(rate)
+
+    def _s(self, state: State, base: Point) -> float:
+        """The controlled quantity at a state."""
+        mu = state.mu[self.name]
+        if self.control == "load":
+            return mu
+        if self.control == "conjugate":
+            return -self.system.potential(state.u, self.name)
+        chord = (state.u - base.state.u, mu - base.state.mu[self.name])
+        return base.s + self.metric.inner((base.du, base.dmu), chord)
 
     def towards(self, start: Point, targets: Sequence[float]) -> Iterator[tuple[Point, bool]]:
         """Accepted points through every target in turn; the flag tells the targets.
@@ -162,7 +198,7 @@ class Path:
         PathStopped
             If a step of the smallest length fails.
         """
-        before, here, step = None, start, self.options.first
+        before, here, step, leaps = None, start, self.options.first, 0
         for target in targets:
             while here.s != target:
                 way = target - here.s
@@ -171,10 +207,13 @@ class Path:
                 s = target if pieces == 1 else here.s + np.copysign(length, way)
                 found = self._try(s, before, here)
                 if isinstance(found, str):
-                    step = length / 2
+                    leaps += 1
+                    over = found == HIDDEN and leaps <= MOST_LEAPS  # past the singular tangent, not into it
+                    step = 2 * length if over else length / 2
                     if step < self.options.smallest:
                         raise PathStopped(found, here)
                     continue
+                leaps = 0
                 straight = self._cosine(here, found) > self.options.straight
                 if found.factorisations <= self.options.easy and straight:
                     step = min(max(step, 1.5 * length), self.options.largest)
@@ -247,13 +286,14 @@ class Path:
             return outcome.reason
         found = self._point(outcome.state, s, self.newton.response(outcome.state, self.name, row))
         spent = self.newton.factorisation.count - before
-        return replace(found, iterations=outcome.iterations, factorisations=spent)
+        return replace(found, iterations=outcome.iterations, factorisations=spent, error=outcome.error)
 
     def exact(self, point: Point, base: Point) -> Point:
         """The point with the tangent and the inertia of its own K, not of one near by."""
         row = self._row(point.s, base)
         found = self._point(point.state, point.s, self.newton.response(point.state, self.name, row, exact=True))
-        return replace(found, iterations=point.iterations, factorisations=point.factorisations + 1)
+        spent = point.factorisations + 1
+        return replace(found, iterations=point.iterations, factorisations=spent, error=point.error)
 
     def _row(self, s: float, base: Point) -> Row:
         if self.control == "load":
