@@ -35,6 +35,8 @@ class RowMaker:
             "wall_s": round(wall_s, 3),
             "mode": record.mode,
             "branch": record.branch,
+            "error_over_h": point.error,
+            "load_error": point.load_error,
         }
 
 

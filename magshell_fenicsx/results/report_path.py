@@ -38,6 +38,8 @@ NUMBERS = {
     "U1": ("U<sub>1</sub>", ENERGY),
     "Uq": ("U<sub>q</sub>", ENERGY),
     "Utau": ("U<sub>τ</sub>", ENERGY),
+    "error_over_h": ("error of u", "h"),
+    "load_error": ("error of the load", ""),
     "wall_s": ("time", "s"),
 }
 AMPLITUDES = {"pressure": "pressure", "force": "force", "load": "loads", "lambda_m": "field", "angle": "field angle"}

@@ -61,6 +61,7 @@ class Result:
                 "kind": row["label"],
                 "mode": row["mode"],
                 "branch": row["branch"],
+                "load_error": row["load_error"],
             }
             for row in self.rows
             if row["label"] in LOCATED

@@ -35,6 +35,8 @@ COLUMNS = (
     "field_angle",
     "branch",
     "w_point_over_h",
+    "error_over_h",
+    "load_error",
 )
 TEXTS = ("label", "amplitude", "mode")
 Row = dict[str, float | int | str]

@@ -1,12 +1,10 @@
-"""Systems with other amplitudes than those underneath: several moved together, or an auxiliary load."""
+"""A system with another amplitude than those underneath: several moved together."""
 
 from collections.abc import Mapping
 
 from petsc4py import PETSc
 
-from magshell_fenicsx.solve.system import Amplitudes, System, Vector, dot
-
-PUSH = "push"
+from magshell_fenicsx.solve.system import Amplitudes, System, Vector
 
 
 class Along:
@@ -42,29 +40,3 @@ class Along:
 
     def tangent(self, u: Vector, mu: Amplitudes) -> PETSc.Mat:
         return self._system.tangent(u, self.expand(mu))
-
-
-class Pushed:
-    """A system with one more amplitude, `PUSH`, of a dead load along a given direction.
-
-    Parameters
-    ----------
-    direction
-        The load's column is minus this.
-    """
-
-    def __init__(self, system: System, direction: Vector) -> None:
-        self.comm, self.size, self.length = system.comm, system.size, system.length
-        self._system, self._direction = system, direction
-
-    def residual(self, u: Vector, mu: Amplitudes) -> Vector:
-        return self._system.residual(u, mu) - mu[PUSH] * self._direction
-
-    def load(self, u: Vector, name: str) -> Vector:
-        return -self._direction if name == PUSH else self._system.load(u, name)
-
-    def potential(self, u: Vector, name: str) -> float:
-        return -dot(self.comm, self._direction, u) if name == PUSH else self._system.potential(u, name)
-
-    def tangent(self, u: Vector, mu: Amplitudes) -> PETSc.Mat:
-        return self._system.tangent(u, mu)

@@ -19,6 +19,9 @@ from petsc4py import PETSc
 from magshell_fenicsx.solve.newton import BorderedNewton
 from magshell_fenicsx.solve.system import Amplitudes, State, System, Vector, dot, max_abs
 
+TOLERANCE = 1e-9  # of u held along a direction, in lengths of the system
+MOST_TANGENTS, CONTRACTION = 8, 0.3
+ROUNDING = 1e-5  # in lengths: steps that are smaller and do not shrink are rounding
 DIFFERENCE = 1e-2  # in lengths, of u along v; only the speed of convergence depends on the error
 
 
@@ -81,6 +84,28 @@ class AugmentedTangent:
         """The null vector at a state close by, by one chord iteration of K v + g b = 0."""
         before, after = (times_tangent(self._system, state, self.v) for state in (old, new))
         return self.v - self.solve(after - before)[0]
+
+
+def held_along(newton: BorderedNewton, guess: State, b: Vector) -> tuple[State, float] | None:
+    """The equilibrium under a force along b that keeps the guess's place along b, and its estimated error.
+
+    None if Newton's method fails.
+
+    It is no singular problem where b is the null vector (the Lyapunov-Schmidt reduction).
+    """
+    system, u, tangent, last = newton.system, guess.u, AugmentedTangent(newton, guess, b), np.inf
+    tangents, own = 1, True
+    while True:
+        du, _ = tangent.solve(system.residual(u, guess.mu))
+        size = max_abs(system.comm, du) / system.length
+        if size <= TOLERANCE or (own and CONTRACTION * last < size <= ROUNDING):
+            return State(u - du, guess.mu), size
+        if not own and size > CONTRACTION * last:
+            tangent, tangents, own = AugmentedTangent(newton, State(u, guess.mu), b), tangents + 1, True
+            continue
+        if tangents > MOST_TANGENTS or not np.isfinite(size):
+            return None
+        u, last, own = u - du, size, False
 
 
 def third(system: System, state: State, v: Vector) -> Vector:

@@ -12,9 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from magshell_fenicsx.solve.along import PUSH, Pushed
-from magshell_fenicsx.solve.augmented import AugmentedTangent, first_difference, third
-from magshell_fenicsx.solve.control import Hyperplane, Metric
+from magshell_fenicsx.solve.augmented import AugmentedTangent, first_difference, held_along, third
 from magshell_fenicsx.solve.newton import BorderedNewton
 from magshell_fenicsx.solve.system import State, System, Vector, dot, max_abs
 
@@ -43,7 +41,7 @@ class Bifurcation:
     unstable
         Number of unstable directions besides `phi`.
     error
-        Estimated distance of u from the path at the amplitude found, over the system's length.
+        Estimated error of u beside its place along `phi`, over the system's length.
     load_error
         Estimated error of the amplitude: what rounding of the tangent leaves.
     iterations, factorisations
@@ -84,18 +82,26 @@ def find_bifurcation(newton: BorderedNewton, guess: State, phi: Vector, name: st
         if not steps[-1] <= LARGEST_STEP:
             raise BifurcationLost("Newton's method diverged on its way to a bifurcation")
         state = state.with_(state.u + du, name, state.mu[name] + dmu)
-        if steps[-1] > NEAR:
-            state = _settled(newton, state, tangent.v)
+        if steps[-1] > NEAR:  # off equilibrium, membrane stress that is not there spoils the tangent
+            state, _ = _settled(newton, state, tangent.v)
+    state, error = _settled(newton, state, tangent.v)
     return Bifurcation(
         state=state,
         phi=np.asarray(b / np.sqrt(dot(system.comm, b, b))),
         response=w_mu,
         unstable=tangent.unstable,
-        error=max_abs(system.comm, du + dmu * w_mu) / system.length,
+        error=error,
         load_error=max(changes[-2:]),
         iterations=len(steps),
         factorisations=newton.factorisation.count - before,
     )
+
+
+def _settled(newton: BorderedNewton, state: State, v: Vector) -> tuple[State, float]:
+    found = held_along(newton, state, v)
+    if found is None:
+        raise BifurcationLost("no equilibrium was found beside a bifurcation")
+    return found
 
 
 def _step(system: System, state: State, name: str, tangent: AugmentedTangent) -> tuple[Vector, float, Vector]:
@@ -111,22 +117,6 @@ def _step(system: System, state: State, name: str, tangent: AugmentedTangent) ->
     rest = [-tangent.g - dot(comm, cubic, w_R), -pull - dot(comm, mixed, w_R)]
     dmu, alpha = _solved(rows, rest)
     return alpha * v - w_R - dmu * w_mu, dmu, w_mu
-
-
-def _settled(newton: BorderedNewton, state: State, v: Vector) -> State:
-    """The equilibrium under a force along v that keeps its place along v.
-
-    Off equilibrium, membrane stress that is not there spoils the tangent.
-    """
-    system, pushed = newton.system, State(state.u, {**state.mu, PUSH: 0.0})
-    newton.system = Pushed(system, v)
-    try:
-        found = newton.solve(pushed, PUSH, Hyperplane(Metric(system, 1.0), PUSH, pushed, (v, 0.0), 0.0))
-    finally:
-        newton.system = system
-    if not found.converged:
-        raise BifurcationLost(f"beside a bifurcation: {found.reason}")
-    return State(found.state.u, state.mu)
 
 
 def _solved(rows: Sequence[Sequence[float]], rest: Sequence[float]) -> tuple[float, float]:

@@ -6,7 +6,6 @@ from magshell_fenicsx.solve.control import Row
 from magshell_fenicsx.solve.factor import Factorisation
 from magshell_fenicsx.solve.system import State, System, Vector, dot, max_abs
 
-MOST = 1e4  # lengths: the most that a unit of mu counts; it moves u by far more where K is nearly singular
 Direction = tuple[Vector, float]  # (du, dmu)
 
 
@@ -34,7 +33,7 @@ class Bordered:
     """
 
     def __init__(self, system: System, factors: Factorisation, state: State, name: str, row: Row) -> None:
-        self.state, self.row = state, row
+        self.state, self.row, self._mu = state, row, state.mu[name]
         self._comm, self._factors, self._length = system.comm, factors, system.length
         self._c, self._d = row.gradient(state.u)
         self.column = system.load(state.u, name)
@@ -43,8 +42,9 @@ class Bordered:
         self._weight = dot(self._comm, self._x2, self._x2)  # of dmu: the displacement that it makes
 
     def size(self, step: Direction) -> float:
-        """Of a step, in lengths of the system: that of du, or of the displacement that dmu makes."""
-        per_mu = min(max_abs(self._comm, self._x2) / self._length, MOST)
+        """Of a step: that of du in lengths of the system, or that of dmu, relative or by the displacement it makes."""
+        moved = max_abs(self._comm, self._x2) / self._length
+        per_mu = min(moved, 1 / abs(self._mu)) if self._mu else moved
         return max(max_abs(self._comm, step[0]) / self._length, abs(step[1]) * per_mu)
 
     def solve(self, f: Vector, g: float) -> Direction:

@@ -6,7 +6,7 @@ from math import copysign
 import numpy as np
 from mpi4py import MPI
 
-from magshell_fenicsx.solve.along import PUSH, Pushed
+from magshell_fenicsx.solve.augmented import held_along
 from magshell_fenicsx.solve.control import Hyperplane
 from magshell_fenicsx.solve.events import critical_mode
 from magshell_fenicsx.solve.path import Path, Point
@@ -66,19 +66,15 @@ def _largest(comm: MPI.Comm, v: Vector) -> float:
 def _step_off(path: Path, state: State, mode: Vector, size: float) -> Point | None:
     """The point of the branch at a distance along the null vector, its tangent leading away.
 
-    First the shell is pushed there along the null vector at the same amplitude, which is no singular
-    problem (the Lyapunov-Schmidt reduction); then the push is taken away and the amplitude given free.
+    First the shell is pushed there along the null vector at the same amplitude; then the push is taken away
+    and the amplitude given free.
     """
     metric, name, newton = path.metric, path.name, path.newton
     row = Hyperplane(metric, name, state, (mode, 0.0), size * metric.inner((mode, 0.0), (mode, 0.0)))
-    newton.system = Pushed(path.system, mode)
-    try:
-        pushed = newton.solve(State(state.u + size * mode, {**state.mu, PUSH: 0.0}), PUSH, row)
-    finally:
-        newton.system = path.system
-    if not pushed.converged:
+    pushed = held_along(newton, State(state.u + size * mode, state.mu), mode)
+    if pushed is None:
         return None
-    found = path.solve(row, 0.0, State(pushed.state.u, state.mu))
+    found = path.solve(row, 0.0, pushed[0])
     if isinstance(found, str):
         return None
     return found.per(copysign(metric.norm(found.du, found.dmu), size))

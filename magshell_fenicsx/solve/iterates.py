@@ -14,6 +14,7 @@ import numpy as np
 Verdict = Literal["go on", "converged", "diverged", "rounding", "too many"]
 FULL = 0.5  # a step as long as this part of the one before has not converged quadratically
 SMALL = 1e-3  # steps that small of full Newton iterations shrink, but for rounding
+PATIENCE, GAIN = 4, 0.1  # after so many matrices the steps must have shrunk to this part of the first
 ROUNDING = 10.0  # steps up to this many times the rounding error are taken for it
 
 
@@ -69,5 +70,7 @@ class Iterates:
         if stalled and step.size <= ROUNDING * rounding():
             return "rounding"
         if step.own and len(before) > 2 and step.size > 2 * full[-1]:
+            return "diverged"
+        if step.own and len(full) >= PATIENCE and step.size > GAIN * full[0]:
             return "diverged"
         return "too many" if len(before) >= self.most else "go on"

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from magshell_fenicsx import compat
+from magshell_fenicsx.solve.noise import Noise
 from magshell_fenicsx.solve.system import Amplitudes, Vector
 from magshell_fenicsx.solve.terms import FormTerm, Term
 from magshell_fenicsx.solve.timing import Stopwatch
@@ -72,7 +73,7 @@ class FiniteElementSystem:
         self.comm = V.mesh.comm
         self.size = V.dofmap.index_map.size_local * V.dofmap.index_map_bs
         self.dofs = V.dofmap.index_map.size_global * V.dofmap.index_map_bs
-        self.assembly = Stopwatch()
+        self.assembly, self.noise = Stopwatch(), Noise.from_environment()
         fixed = [bc.dof_indices()[0] for bc in clamped]
         fixed_dofs = np.unique(np.concatenate(fixed)) if fixed else np.empty(0, dtype=np.int32)
         self._fixed = fixed_dofs[fixed_dofs < self.size]
@@ -99,7 +100,12 @@ class FiniteElementSystem:
         return u
 
     def residual(self, u: Vector, mu: Amplitudes) -> Vector:
-        return self._gradient(u, {t.name: _factor(t, mu) for t in self.terms})
+        factors = {t.name: _factor(t, mu) for t in self.terms}
+        if self.noise is None:
+            return self._gradient(u, factors)
+        first = self.u.function_space.dofmap.index_map.local_range[0] * self.u.function_space.dofmap.index_map_bs
+        parts = [self._gradient(u, {name: factor}) for name, factor in factors.items()]
+        return np.asarray(np.sum([self.noise.on_vector(part, first) for part in parts], axis=0))
 
     def load(self, u: Vector, name: str) -> Vector:
         return self._gradient(u, {t.name: 1.0 for t in self.terms if t.amplitude == name})
@@ -116,14 +122,20 @@ class FiniteElementSystem:
     def tangent(self, u: Vector, mu: Amplitudes) -> PETSc.Mat:
         with self.assembly:
             self.set(u)
-            if self._assembler:
-                return self._assembler.tangent({t.name: _factor(t, mu) for t in self.terms})
-            self._K.zeroEntries()
-            for t in self.terms:
-                if factor := _factor(t, mu):
-                    t.add_tangent(self._K, factor, self.clamped)
-            compat.finish_matrix(self._K, self.u.function_space, self.clamped)
-            return self._K
+            factors = {t.name: _factor(t, mu) for t in self.terms}
+            K = self._assembler.tangent(factors) if self._assembler else self._of_forms(factors)
+            if self.noise:
+                self.noise.on_matrix(K)
+            return K
+
+    def _of_forms(self, factors: Mapping[str, float]) -> PETSc.Mat:
+        """The tangent from the terms' own forms."""
+        self._K.zeroEntries()
+        for t in self.terms:
+            if factor := factors[t.name]:
+                t.add_tangent(self._K, factor, self.clamped)
+        compat.finish_matrix(self._K, self.u.function_space, self.clamped)
+        return self._K
 
     def _gradient(self, u: Vector, factors: Mapping[str, float]) -> NDArray[np.float64]:
         with self.assembly:
