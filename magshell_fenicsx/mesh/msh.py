@@ -1,18 +1,18 @@
-"""Reading a surface that somebody else meshed: gmsh's .msh with triangles of order 1, 2 or 3."""
+"""A surface that somebody else meshed: gmsh's .msh with triangles of order 1, 2 or 3."""
 
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from magshell_fenicsx.mesh.msh_format import Block, Content, parsed
 from magshell_fenicsx.mesh.patch import MeshError, PatchMesh
 from magshell_fenicsx.mesh.soundness import border_edges, oriented, said_place
 
 Array = NDArray[np.float64]
-TRIANGLES, LINES, VERTEX = {2: 3, 9: 6, 21: 10}, {1: 2, 8: 3, 26: 4}, 15  # gmsh's types -> their nodes
+TRIANGLES, LINES = ("Triangle 3", "Triangle 6", "Triangle 10"), ("Line 2", "Line 3", "Line 4")
 NEAR = 1e-6  # of the extent, within which a named point is a vertex
 
 
@@ -85,80 +85,49 @@ def _content(
     file: MeshFile,
 ) -> tuple[Array, NDArray[np.int64], dict[str, NDArray[np.bool_]], dict[str, NDArray[np.int64]]]:
     """Nodes (n, 3), cells, patches and edges (vertex pairs)."""
-    import gmsh
-
     if not file.path.is_file():
         raise MeshError(f"{file.path}: there is no such mesh file")
-    with _session():
-        try:
-            gmsh.open(str(file.path))
-        except Exception as e:  # gmsh's own errors have no class of their own
-            raise MeshError(f"{file.path}: gmsh cannot read it: {e}") from None
-        tags, xyz, _ = gmsh.model.mesh.getNodes()
-        if not len(tags):
-            raise MeshError(f"{file.path}: there is no mesh in it")
-        number = np.full(int(tags.max()) + 1, -1, dtype=np.int64)
-        number[tags.astype(np.int64)] = np.arange(len(tags))
-        parts, where = _elements(file, 2, TRIANGLES, number)
-        if len({part.shape[1] for part in parts}) != 1:
-            raise MeshError(f"{file.path}: it has no triangles, or triangles of several orders")
-        cells = np.concatenate(parts)
-        entity = np.concatenate([np.full(len(part), tag) for part, tag in zip(parts, where, strict=True)])
-        patches = {name: np.isin(entity, tags) for name, tags in _groups(2).items()}
-        edges = {}
-        for name, tags in _groups(1).items():
-            lines = [_elements(file, 1, LINES, number, int(tag))[0] for tag in tags]
-            pairs = [part[:, :2] for each in lines for part in each]
-            if pairs:  # a curve of the drawing may carry no elements
-                edges[name] = np.concatenate(pairs)
-        return xyz.reshape(-1, 3).copy(), cells, patches, edges
-
-
-@contextmanager
-def _session() -> Iterator[None]:
-    """gmsh while inside; one that the caller has open keeps its own model."""
-    import gmsh
-
-    if not gmsh.isInitialized():
-        gmsh.initialize(interruptible=False)
-        try:
-            gmsh.option.setNumber("General.Terminal", 0)
-            yield
-        finally:
-            gmsh.finalize()
-        return
-    callers, before = gmsh.model.getCurrent(), set(gmsh.model.list())
     try:
-        yield
-    finally:
-        if gmsh.model.getCurrent() != callers or len(gmsh.model.list()) > len(before):
-            gmsh.model.remove()
-        gmsh.model.setCurrent(callers)
+        held = parsed(file.path.read_bytes())
+    except OSError as e:
+        raise MeshError(f"{file.path}: cannot be read: {e.strerror}") from None
+    except MeshError as e:
+        raise MeshError(f"{file.path}: {e}") from None
+    if not len(held.tags):
+        raise MeshError(f"{file.path}: there is no mesh in it")
+    faces = [block for block in held.blocks if block.dimension == 2]
+    if len({_cells(file, block, TRIANGLES).shape[1] for block in faces}) != 1:
+        raise MeshError(f"{file.path}: it has no triangles, or triangles of several orders")
+    cells = _places(file, held, np.concatenate([block.nodes for block in faces]))
+    entity = np.concatenate([np.full(len(block.nodes), block.entity) for block in faces])
+    patches = {name: np.isin(entity, sorted(entities)) for name, entities in _groups(held, 2).items()}
+    edges = {}
+    for name, entities in _groups(held, 1).items():
+        lines = [block for block in held.blocks if block.dimension == 1 and block.entity in entities]
+        if lines:  # a curve of the drawing may carry no elements
+            edges[name] = _places(file, held, np.concatenate([_cells(file, line, LINES)[:, :2] for line in lines]))
+    return held.places, cells, patches, edges
 
 
-def _elements(
-    file: MeshFile, dim: int, known: Mapping[int, int], number: NDArray[np.int64], tag: int = -1
-) -> tuple[list[NDArray[np.int64]], list[int]]:
-    """Node numbers (m, k) of the elements of each entity, and its tag."""
-    import gmsh
-
-    parts, where = [], []
-    for _, entity in gmsh.model.getEntities(dim) if tag < 0 else [(dim, tag)]:
-        for kind, _, nodes in zip(*gmsh.model.mesh.getElements(dim, entity), strict=True):
-            if kind not in known:
-                name = gmsh.model.mesh.getElementProperties(kind)[0]
-                raise MeshError(f"{file.path}: it has elements {name}; allowed are triangles of order 1, 2 and 3")
-            parts.append(number[nodes.astype(np.int64)].reshape(-1, known[kind]))
-            where.append(entity)
-    return parts, where
+def _cells(file: MeshFile, block: Block, known: Collection[str]) -> NDArray[np.int64]:
+    if block.name not in known:
+        raise MeshError(f"{file.path}: it has elements {block.name}; allowed are triangles of order 1, 2 and 3")
+    return block.nodes
 
 
-def _groups(dim: int) -> dict[str, NDArray[np.int64]]:
+def _places(file: MeshFile, held: Content, numbers: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Where the nodes of elements stand among all."""
+    order = np.argsort(held.tags)
+    found: NDArray[np.int64] = order[np.searchsorted(held.tags, numbers, sorter=order).clip(max=len(order) - 1)]
+    if (missing := held.tags[found] != numbers).any():
+        raise MeshError(f"{file.path}: it has elements with the node {numbers[missing][0]}, which is not there")
+    return found
+
+
+def _groups(held: Content, dim: int) -> dict[str, set[int]]:
     """Name of each physical group -> its entities; without a name, its number."""
-    import gmsh
-
-    groups = [tag for _, tag in gmsh.model.getPhysicalGroups(dim)]
-    return {
-        gmsh.model.getPhysicalName(dim, tag) or str(tag): gmsh.model.getEntitiesForPhysicalGroup(dim, tag)
-        for tag in groups
-    }
+    found: dict[int, set[int]] = {}
+    for (of, entity), groups in held.groups.items():
+        for group in groups if of == dim else ():
+            found.setdefault(group, set()).add(entity)
+    return {held.names.get((dim, group)) or str(group): found[group] for group in sorted(found)}

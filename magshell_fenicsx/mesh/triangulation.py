@@ -31,7 +31,7 @@ def triangulate(shape: Shape, size: Size, points: Mapping[str, NDArray[np.float6
     """
     import gmsh
 
-    gmsh.initialize(interruptible=False)
+    gmsh.initialize(readConfigFiles=False, interruptible=False)  # ~/.gmshrc may change meshes, and run commands
     try:
         gmsh.option.setNumber("General.Terminal", 0)
         for rule in ("MeshSizeExtendFromBoundary", "MeshSizeFromPoints", "MeshSizeFromCurvature"):

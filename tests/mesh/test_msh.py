@@ -237,7 +237,7 @@ def test_what_is_no_mesh_is_refused(model: Any, tmp_path: Path) -> None:
     with pytest.raises(MeshError, match="there is no such mesh file"):
         read_msh(MeshFile(tmp_path / "nowhere.msh", 1.0), {})
     (tmp_path / "text.msh").write_text("hello", encoding="utf-8")
-    with pytest.raises(MeshError, match=r"gmsh cannot read it|there is no mesh"):
+    with pytest.raises(MeshError, match="is no mesh of gmsh's, which begins with"):
         read_msh(MeshFile(tmp_path / "text.msh", 1.0), {})
     entity = model.addDiscreteEntity(2, 1)
     model.mesh.addNodes(2, entity, range(1, 5), np.ravel(CORNERS[:4]))

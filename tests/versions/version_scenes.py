@@ -1,7 +1,7 @@
 """Scenes whose numbers are those of the finite elements alone: no mesh of theirs is made by gmsh.
 
-half_disc.msh is the chart of a dimpled half hemisphere, as gmsh 4.13 triangulated it; another version of gmsh
-reads the same nodes. `python3 tests/versions/version_scenes.py` prints the numbers of the versions that it runs on.
+half_disc.msh is the chart of a dimpled half hemisphere, as gmsh 4.13 triangulated it.
+`python3 tests/versions/version_scenes.py` prints the numbers of the versions that it runs on.
 """
 
 import json
