@@ -12,9 +12,6 @@ from conftest import CASES
 from interrupted import check_fields, check_same_path, kill, start, wait_for_rows, wait_until, whole_lines
 from mpi4py import MPI
 
-from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.source import CaseError
-from magshell_fenicsx.results import checkpoint
 from magshell_fenicsx.results.folder import held_folder
 
 INDENTATION, BUCKLING = CASES / "pole_indentation.yaml", CASES / "dimple_buckling.yaml"
@@ -140,15 +137,6 @@ def test_another_case(tmp_path: Path, ranks: int) -> None:
     assert done.stderr.count(said) == 1
     assert "Traceback" not in done.stderr
     assert (tmp_path / "checkpoint").exists()
-
-
-def test_another_version(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    case = Case.load(BUCKLING)
-    checkpoint.begin_checkpoint(tmp_path / "checkpoint", case)
-    checkpoint.check_resumable(tmp_path / "checkpoint", case)
-    monkeypatch.setattr(checkpoint, "__version__", "9.9")
-    with pytest.raises(CaseError, match=r'version is ".*" there and "9.9" here'):
-        checkpoint.check_resumable(tmp_path / "checkpoint", case)
 
 
 def test_nothing_to_resume(tmp_path: Path) -> None:

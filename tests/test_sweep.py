@@ -2,6 +2,7 @@
 
 import csv
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -44,8 +45,8 @@ def computed(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     return done
 
 
-def plate(out: Path, *over: str, settings: tuple[str, ...] = ()) -> module.Sweep:
-    return module.sweep(PLATE, over or [PRESSURES], [*COARSE, *settings], out)
+def plate(out: Path, *over: str, settings: tuple[str, ...] = (), say: Callable[[str], None] = print) -> module.Sweep:
+    return module.sweep(PLATE, over or [PRESSURES], [*COARSE, *settings], out, say=say)
 
 
 def test_product_and_ties() -> None:

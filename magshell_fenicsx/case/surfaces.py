@@ -291,7 +291,7 @@ class MeshSurface(SurfaceSection):
     def digest(self) -> str | None:
         """Hash of the file's content; None if it cannot be read."""
         try:
-            return hashlib.sha256(self.path.read_bytes()).hexdigest()
+            return hashlib.sha256(self.path.read_bytes()).hexdigest() if self.path.is_file() else None
         except OSError:
             return None
 

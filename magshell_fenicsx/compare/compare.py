@@ -48,7 +48,7 @@ def compare(
 ) -> Comparison:
     """Run a case with both models; write compare.csv, compare.json and compare.png, and each run's own folder.
 
-    Every run is a process of its own. Runs of the same case that are in the folder are kept.
+    Every run is a process of its own. Runs of the same case and sources that are in the folder are kept.
 
     Parameters
     ----------
@@ -72,7 +72,7 @@ def compare(
         runs: dict[ModelName, list[ModelRun]] = {}
         for model in MODELS:
             for refinement in sorted(set(refinements[model])):
-                done = run_model(file, settings, model, refinement, folder / f"{model}_{refinement:g}")
+                done = run_model(file, settings, model, refinement, folder / f"{model}_{refinement:g}", say)
                 runs.setdefault(model, []).append(done)
                 say(f"{model} at refinement {refinement:g}: {done.dofs} unknowns, {done.cpu_s:.1f} s CPU")
                 if not amplitude_of(done):

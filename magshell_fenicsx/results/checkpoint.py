@@ -13,6 +13,7 @@ import numpy as np
 from dolfinx import fem
 from mpi4py import MPI
 
+from magshell_fenicsx import sources
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.results.durable import AppendedFile, write_whole
@@ -21,45 +22,67 @@ from magshell_fenicsx.results.frames import framed, read_frame
 from magshell_fenicsx.results.ordering import Array, Ordering
 from magshell_fenicsx.solve.path import Point
 from magshell_fenicsx.solve.system import State
-from magshell_fenicsx.version import __version__
 
 NAME = "checkpoint"
 
 
 def begin_checkpoint(file: Path, case: Case) -> None:
     """Write an empty checkpoint."""
-    write_whole(file, framed(_identity(case)))
+    write_whole(file, framed(json.dumps(identity(case)).encode()))
 
 
 def check_resumable(file: Path, case: Case) -> None:
-    """See that a checkpoint is one of this case and version.
+    """See that a checkpoint is one of this case and these sources.
 
     Raises
     ------
     CaseError
         If there is none, or it is of another.
     """
+    saved = begun_with(file)
+    if saved is None:
+        raise CaseError(f"--resume: {file.parent} holds no checkpoint; run without --resume")
+    refuse_other(saved, case, file.parent)
+
+
+def begun_with(file: Path) -> dict[str, Any] | None:
+    """The `identity` of the run that began a checkpoint; None if there is none."""
     try:
         with file.open("rb") as stream:
             head = read_frame(stream)
     except FileNotFoundError:
-        head = None
-    if head is None:
-        raise CaseError(f"--resume: {file.parent} holds no checkpoint; run without --resume")
-    refuse_other(json.loads(head), case, file.parent)
+        return None
+    return None if head is None else dict(json.loads(head))
+
+
+def identity(case: Case) -> dict[str, Any]:
+    """All that a run depends on: the case, the files that it names, the program."""
+    data = {"case": case.model_dump(mode="json", exclude_none=True), **case.outside, "sources": sources.ours()}
+    return dict(json.loads(json.dumps(data)))  # as it comes back from a file
+
+
+class OtherSources(CaseError):
+    """What is there was computed by other sources of this program."""
 
 
 def refuse_other(saved: dict[str, Any], case: Case, folder: Path) -> None:
-    """See that what was saved is of this case and version.
+    """See that what was saved is of this case and these sources.
 
     Raises
     ------
     CaseError
-        With the first difference.
+        With the first difference; `OtherSources` if the sources are all of it.
     """
-    now = json.loads(_identity(case))
-    if saved != now:
-        raise CaseError(f"--resume: {folder} is of another run: {_difference(saved, now)}; run without --resume")
+    now = identity(case)
+    there, here = saved.get("sources", saved.get("version")), now["sources"]
+    known = {key: value for key, value in saved.items() if key not in ("sources", "version")}
+    if known != {key: value for key, value in now.items() if key != "sources"}:
+        raise CaseError(f"--resume: {folder} is of another run: {_difference(known, now)}; run without --resume")
+    if there != here:
+        raise OtherSources(
+            f"--resume: {folder} was computed by other sources of magshell_fenicsx ({there}; these are {here}); "
+            "run without --resume, which computes it again"
+        )
 
 
 class Checkpoint:
@@ -146,11 +169,6 @@ def _encoded(point: Point, u: Array, du: Array) -> bytes:
     """A line of JSON with the numbers of a point, then both vectors."""
     numbers = {f.name: getattr(point, f.name) for f in fields(point) if f.name not in ("state", "du")}
     return json.dumps({**numbers, "mu": point.state.mu}).encode() + b"\n" + u.tobytes() + du.tobytes()
-
-
-def _identity(case: Case) -> bytes:
-    data = {"version": __version__, "case": case.model_dump(mode="json", exclude_none=True), **case.outside}
-    return json.dumps(data).encode()
 
 
 def _difference(there: Any, here: Any, key: str = "") -> str:

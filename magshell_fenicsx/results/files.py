@@ -2,7 +2,6 @@
 
 import json
 import math
-from functools import partial
 from pathlib import Path
 from shutil import rmtree
 from typing import Any
@@ -78,9 +77,8 @@ def _resumed(out: Path, case: Case) -> None:
     if not file.exists() and (out / "summary.json").exists():
         summary = json.loads((out / "summary.json").read_text(encoding="utf-8"))
         if summary["stopped"] is None:
-            kept = {key: summary[key] for key in ("case", "mesh_file") if key in summary}
-            saved = {"version": summary["versions"]["magshell_fenicsx"], **kept}
-            checkpoint.refuse_other(saved, case, out)
+            kept = {key: summary[key] for key in ("case", "mesh_file", "sources") if key in summary}
+            checkpoint.refuse_other({"version": summary["versions"]["magshell_fenicsx"], **kept}, case, out)
             raise AlreadyComplete(summary)
     checkpoint.check_resumable(file, case)
     _remove_last_files(out)
@@ -124,6 +122,8 @@ class RunFiles:
         return self._comm.rank == 0
 
     def _open(self) -> None:
+        begun = checkpoint.begun_with(self._folder / checkpoint.NAME) or {}
+        self._begun_with = {key: begun[key] for key in ("mesh_file", "sources") if key in begun}
         self._table = PathTable(self._folder / "path.csv", self._scene.extra_columns)
         plan = self._scene.plan
         mirror = MIRROR_NORMAL @ rotation(plan.azimuth) if plan.half else None
@@ -155,8 +155,12 @@ class RunFiles:
 
     def summarise(self, content: dict[str, Any]) -> None:
         """Write summary.json, which is safe before any picture is drawn."""
-        data = (json.dumps(content, indent=2) + "\n").encode()
-        by_first(self._comm, partial(write_whole, self._folder / "summary.json", data))
+
+        def write() -> None:  # files that were changed since are not those of this run
+            data = (json.dumps({**content, **self._begun_with}, indent=2) + "\n").encode()
+            write_whole(self._folder / "summary.json", data)
+
+        by_first(self._comm, write)
 
     def close(self, complete: bool) -> None:
         """Close the files; a complete run needs no checkpoint, which goes last."""

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Any
 
+from magshell_fenicsx import sources
 from magshell_fenicsx.adapt.choice import Adapted
 from magshell_fenicsx.adapt.ending import History, NoResult
 from magshell_fenicsx.case.shell import ShellSection
@@ -90,6 +91,7 @@ def summary(result: Result, total_s: float) -> dict[str, Any]:
     return {
         "case": (result.adapted.asked if result.adapted else scene.case).model_dump(mode="json", exclude_none=True),
         **scene.case.outside,
+        "sources": sources.ours(),
         "dimensionless": {
             "radius_to_thickness": R_over_h,
             "poisson_ratio": material.nu,

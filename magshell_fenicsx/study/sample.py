@@ -2,7 +2,7 @@
 
 import csv
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
@@ -52,16 +52,34 @@ class Measured:
         return median(values) if values else None
 
 
-def load(file: Path, machine: dict[str, Any]) -> Measured:
+Origin = Mapping[str, str | None]  # keys of summary.json that must have these values: sources, and of the mesh file
+
+
+def load(file: Path, machine: dict[str, Any], origin: Origin) -> Measured:
     """What an earlier study measured on this machine; nothing measured if there is nothing to use."""
+    kept = _read(file)
+    usable = kept and kept.machine == machine and not kept.failure and _is_of(origin, kept.summary)
+    return kept if kept and usable else Measured(machine)
+
+
+def of_others(file: Path, origin: Origin) -> bool:
+    """Whether there are measurements that cannot be used, because another program made them."""
+    kept = _read(file)
+    return kept is not None and kept.summary is not None and not _is_of(origin, kept.summary)
+
+
+def _read(file: Path) -> Measured | None:
     try:
-        kept = Measured(**json.loads(file.read_text(encoding="utf-8")))
+        return Measured(**json.loads(file.read_text(encoding="utf-8")))
     except (OSError, ValueError, TypeError):
-        return Measured(machine)
-    return kept if kept.machine == machine and not kept.failure else Measured(machine)
+        return None
 
 
-def complete(measured: Measured, arguments: Sequence[str], ranks: int, repeat: int, file: Path) -> None:
+def _is_of(origin: Origin, summary: Mapping[str, Any] | None) -> bool:
+    return summary is not None and all(summary.get(key) == value for key, value in origin.items())
+
+
+def complete(measured: Measured, arguments: Sequence[str], ranks: int, repeat: int, file: Path, origin: Origin) -> None:
     """Run until there are `repeat` samples; every run is on disk before the next.
 
     Parameters
@@ -76,6 +94,8 @@ def complete(measured: Measured, arguments: Sequence[str], ranks: int, repeat: i
     """
     while not measured.failure and len(measured.samples) < repeat:
         sample = _run(measured, arguments, ranks)
+        if measured.summary is not None and not _is_of(origin, measured.summary):
+            measured.failure = "the program or the mesh file was changed during the study"
         if measured.first is None:
             measured.first = sample
         elif not measured.failure:

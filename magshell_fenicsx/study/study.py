@@ -10,6 +10,7 @@ from typing import Any
 
 from mpi4py import MPI
 
+from magshell_fenicsx import sources
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.results.durable import write_whole
 from magshell_fenicsx.results.folder import by_first, held_folder
@@ -17,7 +18,7 @@ from magshell_fenicsx.study.machine import fingerprint
 from magshell_fenicsx.study.plot import draw_study
 from magshell_fenicsx.study.reference import Reference
 from magshell_fenicsx.study.rows import COLUMNS, Row, Run, make_rows
-from magshell_fenicsx.study.sample import Measured, complete, load
+from magshell_fenicsx.study.sample import Measured, complete, load, of_others
 from magshell_fenicsx.study.scalar import Scalar, parse_scalar
 from magshell_fenicsx.study.table import repeated, said, write_table
 from magshell_fenicsx.sweep.axes import parse_axes
@@ -65,7 +66,7 @@ def study(
     """Measure error and run time at all points of a product; writes study.csv, .json, .md and .png.
 
     Each run is a process of its own, one at a time: once to compile its kernels, then `repeat` times.
-    Runs that are in the folder and were measured on this machine are kept.
+    Runs that are in the folder and were measured on this machine, with these sources, are kept.
 
     Parameters
     ----------
@@ -93,13 +94,18 @@ def study(
     points, folder, machine, runs = make_points(Path(file), axes, settings), Path(out), fingerprint(), []
     with held_folder(folder, MPI.COMM_WORLD, make=True):
         by_first(MPI.COMM_WORLD, lambda: (folder / "points").mkdir(exist_ok=True))
-        for number, point in enumerate(points, 1):
+        files = {
+            (i, n): folder / "points" / f"{point.key}-{n}.json" for i, point in enumerate(points) for n in set(ranks)
+        }
+        origins = [{"sources": sources.ours(), **point.case.outside} for point in points]
+        if again := sum(of_others(file, origins[i]) for (i, _), file in files.items()):
+            say(f"{again} of {len(files)} again: what the folder has of them is of other sources of magshell_fenicsx")
+        for number, (point, origin) in enumerate(zip(points, origins, strict=True), 1):
             chosen = [*settings, *(f"{key}={value}" for key, value in point.values.items())]
             arguments = [str(file), *(word for setting in chosen for word in ("--set", setting))]
             for n in sorted(set(ranks)):
-                kept = folder / "points" / f"{point.key}-{n}.json"
-                run = Run(point, n, load(kept, machine))
-                complete(run.measured, arguments, n, repeat, kept)
+                run = Run(point, n, load(files[number - 1, n], machine, origin))
+                complete(run.measured, arguments, n, repeat, files[number - 1, n], origin)
                 runs.append(run)
                 say(f"{number:4d}/{len(points)}  {run.label}: {_said(run.measured, scalar)}")
         rows, against = make_rows(runs, scalar, reference)

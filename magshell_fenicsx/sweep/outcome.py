@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, Literal
 from uuid import uuid4
 
+from magshell_fenicsx import sources
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.results.table import Row
 from magshell_fenicsx.run import Result
@@ -75,15 +76,17 @@ def outcome_of(result: Result, found: Found, factorisations: int, wall_s: float)
 
 def save(outcome: Outcome, case: Case, file: Path) -> None:
     """Write a point's file; a killed sweep leaves the whole of it or nothing."""
-    content = {"case": case.model_dump(mode="json", exclude_none=True), "outcome": asdict(outcome)}
+    known = {"case": case.model_dump(mode="json", exclude_none=True), **case.outside, "sources": sources.ours()}
+    content = {**known, "outcome": asdict(outcome)}
     unfinished = file.with_suffix(f".{uuid4().hex}")  # two sweeps may write to one folder
     unfinished.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
     unfinished.replace(file)
 
 
 def load(file: Path) -> Outcome | None:
-    """Read a point's file; None if there is none that can be used."""
+    """Read a point's file; None if there is none that can be used, one of other sources for instance."""
     try:
-        return Outcome(**json.loads(file.read_text(encoding="utf-8"))["outcome"])
+        content = json.loads(file.read_text(encoding="utf-8"))
+        return Outcome(**content["outcome"]) if content["sources"] == sources.ours() else None
     except (OSError, ValueError, KeyError, TypeError):
         return None

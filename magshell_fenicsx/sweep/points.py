@@ -13,7 +13,6 @@ from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.source import CaseError, Source, override, read_source
 from magshell_fenicsx.plan import make_plan
 from magshell_fenicsx.sweep.axes import MOST_POINTS, Axis
-from magshell_fenicsx.version import __version__
 
 
 @dataclass(frozen=True)
@@ -25,7 +24,7 @@ class SweepPoint:
     values
         Swept key -> its value here, as text.
     key
-        Hash of the problem: equal problems have equal keys, in any sweep.
+        Hash of the problem: equal problems have equal keys, in any sweep, whatever program solves them.
     """
 
     values: dict[str, str]
@@ -75,12 +74,11 @@ def _point(source: Source, axes: Sequence[Axis], values: Sequence[str]) -> Sweep
 
 
 def identity(case: Case) -> str:
-    """Hash of what is solved: of the resolved case, without a field that is zero, and of the version."""
+    """Hash of what is solved: of the resolved case, without a field that is zero, and of its mesh file."""
     data = case.model_dump(mode="json") | case.outside
     if not case.lambda_m:
         del data["magnetic"]
-    text = json.dumps([__version__, data], sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
+    return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def short(key: str) -> str:

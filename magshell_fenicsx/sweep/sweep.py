@@ -8,14 +8,17 @@ from pathlib import Path
 
 from mpi4py import MPI
 
+from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.results.folder import prepare_folder
 from magshell_fenicsx.results.sweep_plot import draw_sweep
 from magshell_fenicsx.sweep.axes import Axis, parse_axes
 from magshell_fenicsx.sweep.chain import make_chains, run_chain
 from magshell_fenicsx.sweep.deal import deal
 from magshell_fenicsx.sweep.outcome import Outcome, load, save
-from magshell_fenicsx.sweep.points import SweepPoint, make_points
+from magshell_fenicsx.sweep.points import SweepPoint, identity, make_points
 from magshell_fenicsx.sweep.table import write_curves, write_sweep
+
+UNUSABLE = "of other sources of magshell_fenicsx, or damaged"
 
 
 @dataclass(frozen=True)
@@ -56,7 +59,7 @@ def sweep(
     over
         `key.path=start:stop:count` or `key.path=value,value`; keys tied with `+`.
     out
-        Folder of sweep.csv, sweep.png and points/; points that are there are kept.
+        Folder of sweep.csv, sweep.png and points/; points that are there are kept, if these sources computed them.
     say
         Called with one line per finished point, on the rank that finished it.
     full_paths
@@ -65,7 +68,7 @@ def sweep(
     Raises
     ------
     CaseError
-        Before anything is computed: if a point is no valid case, or `out` cannot be written.
+        Before anything is computed: if a point is no valid case, or `out` cannot be written. If the mesh file changes.
     """
     axes = parse_axes(over)
     points = make_points(Path(file), axes, settings)
@@ -74,10 +77,14 @@ def sweep(
     missing: list[int] = comm.bcast(_missing(points, files) if comm.rank == 0 else None)
     if comm.rank == 0:
         say(f"{len(points)} points, {len(missing)} to compute on {comm.size} rank{'s' if comm.size > 1 else ''}")
+        if again := sum(files[number].exists() for number in missing):
+            say(f"{again} of these again: what the folder has of them is {UNUSABLE}")
     chains = make_chains(axes, points, missing, full_paths=full_paths)
     try:
         for chain in deal(len(chains), comm):
             for number, outcome in run_chain(chains[chain]):
+                if identity(points[number].case) != points[number].key:
+                    raise CaseError(f"{file}: its mesh file was changed during the sweep; start it again")
                 save(outcome, points[number].case, files[number])
                 place = f"{missing.index(number) + 1:4d}/{len(missing)}"
                 say(f"{place}  {points[number].label}: {_said(outcome)}, {outcome.wall_s:.1f} s")
