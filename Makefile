@@ -1,6 +1,8 @@
 # Every target runs in the project's environment: .ci/in-env builds it on first use.
 ENV := .ci/in-env
 PYTEST := python3 -m pytest -n auto --maxprocesses 4 --dist worksteal  # a worker grows to some 3 GB
+# OPENBLAS_CORETYPE, on the command line or in the environment, must reach OpenBLAS in there
+CORE_TYPE = $(if $(OPENBLAS_CORETYPE),$(ENV) .ci/core-type $(OPENBLAS_CORETYPE))
 
 define HELP
 make run CASE=cases/dimple_buckling.yaml [OUT=dir] [N=ranks] [ARGS="--set a=b"]
@@ -14,6 +16,7 @@ make studies          error against run time of two cases into docs/study/: 10 m
 make test             lint and all tests; with ROOT=sid the tests that are not marked slow, on Debian unstable
                       (LIMIT=seconds)
 make fast             lint and the tests that are not marked slow
+                      (both: OPENBLAS_CORETYPE=Haswell, Nehalem, ... rounds as on another processor)
 make lint             ruff and mypy
 make image            the Docker image magshell_fenicsx
 make clean            remove caches and compiled kernels; keeps .env/root* and results
@@ -57,9 +60,11 @@ studies:
 		--set symmetry=half --set magnetic.lambda_m=0.00184 $(MESHES))
 
 test: $(if $(ROOT),,lint)
+	$(CORE_TYPE)
 	$(ENV) $(if $(LIMIT),timeout --signal=INT --kill-after=30 $(LIMIT)) $(PYTEST) $(if $(ROOT),-m 'not slow' tests/versions tests)
 
 fast: lint
+	$(CORE_TYPE)
 	$(ENV) $(PYTEST) -m 'not slow'
 
 lint:

@@ -1,0 +1,84 @@
+"""The tests can be run with the rounding of another processor, and CI does so."""
+
+import os
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+from conftest import CASES
+
+TOP = CASES.parent
+IN_ENV, CORE_TYPE = TOP / ".ci" / "in-env", TOP / ".ci" / "core-type"
+PRODUCT = """
+import numpy as np
+A = np.random.default_rng(1).standard_normal((200, 200))
+print((A @ A).tobytes().hex(), (A[0] @ A[1]).hex())
+"""
+
+
+def without(more: dict[str, str]) -> dict[str, str]:
+    """The environment, without what a make around these tests says of itself and of this."""
+    names = {"OPENBLAS_CORETYPE", "ROOT", "MAKEFLAGS", "MFLAGS", "MAKELEVEL", "MAKEOVERRIDES"}
+    return {key: value for key, value in os.environ.items() if key not in names} | more
+
+
+def said(*words: str | Path, core_type: str | None = None) -> subprocess.CompletedProcess[str]:
+    told = without({"OPENBLAS_CORETYPE": core_type} if core_type else {})
+    return subprocess.run(list(map(str, words)), capture_output=True, text=True, check=False, env=told, cwd=TOP)
+
+
+def test_the_choice_reaches_the_environment() -> None:
+    """And changes how products are rounded there."""
+    used, other = (said(IN_ENV, CORE_TYPE, *option).stdout.strip() for option in ((), ("--other",)))
+    assert used
+    assert other
+    assert other != used
+    assert said(IN_ENV, CORE_TYPE, core_type=other).stdout.strip() == other
+    assert said(IN_ENV, CORE_TYPE, other, core_type=other).returncode == 0
+    first, second = (said(IN_ENV, "python3", "-c", PRODUCT, core_type=each).stdout for each in (None, other))
+    assert first
+    assert second
+    assert first != second
+
+
+def test_a_choice_without_effect_is_an_error() -> None:
+    done = said(IN_ENV, CORE_TYPE, "Nonesuch", core_type="Nonesuch")
+    assert done.returncode == 1
+    assert re.fullmatch(r"core-type: OPENBLAS_CORETYPE=Nonesuch has no effect: .* computes for \w+\n", done.stderr)
+
+
+@pytest.mark.parametrize("target", ["test", "fast"])
+def test_make_looks_first(target: str) -> None:
+    """Before its tests; without a choice there is nothing to look for."""
+    lines = said("make", "-n", target, "OPENBLAS_CORETYPE=Nehalem").stdout.splitlines()
+    (check,) = (i for i, line in enumerate(lines) if line.split()[:3] == [".ci/in-env", ".ci/core-type", "Nehalem"])
+    assert "pytest" in lines[check + 1]
+    assert "core-type" not in said("make", "-n", target).stdout
+
+
+MAKE = """#!/bin/sh
+echo "$@" "${OPENBLAS_CORETYPE:-}" "ROOT=${ROOT:-}" >> calls
+[ "$1" != "$FAILS" ] || [ -n "$ROOT" ]
+"""
+
+
+@pytest.mark.parametrize("fails", ["", "test", "fast"])
+def test_ci_runs_both(tmp_path: Path, fails: str) -> None:
+    """What fails with another rounding fails the run; what comes after is not begun."""
+    (tmp_path / ".ci").mkdir()
+    shutil.copy(TOP / ".ci" / "run", tmp_path / ".ci" / "run")
+    for name, text in (("make", MAKE), (".ci/in-env", '#!/bin/sh\n[ "$1" = python3 ] && echo 0.11 || echo Nehalem\n')):
+        (tmp_path / name).write_text(text, encoding="utf-8")
+        (tmp_path / name).chmod(0o755)
+    told = without({"PATH": f"{tmp_path}:{os.environ['PATH']}", "FAILS": fails})
+    done = subprocess.run(
+        [tmp_path / ".ci" / "run"], env=told, cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    calls = [line.split() for line in (tmp_path / "calls").read_text(encoding="utf-8").splitlines()]
+    assert (done.returncode != 0) == bool(fails)
+    assert calls[0] == ["test", "ROOT="]
+    assert calls[1:2] == ([] if fails == "test" else [["fast", "OPENBLAS_CORETYPE=Nehalem", "ROOT="]])
+    assert len(calls) == {"": 3, "test": 1, "fast": 2}[fails]
+    assert ("the fast tests pass with dolfinx 0.11" in done.stdout) == (not fails)
