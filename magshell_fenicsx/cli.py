@@ -105,6 +105,7 @@ def sweep(
     ] = False,
 ) -> None:
     """Run a case over ranges of its keys; points that are in the folder already are kept."""
+    from magshell_fenicsx.results.folder import DiskError
     from magshell_fenicsx.sweep.sweep import sweep as run_sweep
 
     folder = out or Path("results") / f"{case.stem}_sweep"
@@ -112,6 +113,8 @@ def sweep(
         done = run_sweep(case, over, set_ or [], folder, full_paths=full_paths)
     except CaseError as e:
         raise _failure(str(e), INVALID) from None
+    except DiskError as e:
+        raise _failure(f"stopped early: {e}", STOPPED) from None
     _say(f"results in {folder}/")
     if done.stopped:
         raise _failure(f"{done.stopped} of {len(done.points)} points stopped early; sweep.csv says why", STOPPED)
@@ -191,6 +194,7 @@ def plot(
 ) -> None:
     """Make a run's pictures and report again, from its folder alone."""
     from magshell_fenicsx.results.plot import plot as plot_again
+    from magshell_fenicsx.results.render import NoScreen
 
     if MPI.COMM_WORLD.rank:
         return
@@ -198,7 +202,7 @@ def plot(
         drawn = plot_again(folder, point, animation)
     except CaseError as e:
         raise _failure(str(e), INVALID) from None
-    except (RuntimeError, OSError) as e:
+    except (NoScreen, OSError) as e:
         raise _failure(f"stopped early: {e}", STOPPED) from None
     _say(f"{', '.join(drawn)} in {folder}/")
 

@@ -11,6 +11,7 @@ from typing import Any
 
 from mpi4py import MPI
 
+from magshell_fenicsx.results.folder import by_first
 from magshell_fenicsx.results.sweep_plot import loaded
 from magshell_fenicsx.sweep.sweep import Sweep, sweep
 from magshell_fenicsx.sweep.table import sweep_row, write_csv
@@ -98,10 +99,13 @@ def make(name: str, out: Path = OUT) -> Sweep:
     """Compute a figure's sweep, then write its numbers and its picture; collective."""
     figure = FIGURES[name]
     done = sweep(CASES / figure.case, figure.over, out=out / name)
-    if MPI.COMM_WORLD.rank == 0:
+
+    def write() -> None:
         rows, y = (knockdowns(done), "delta_k_d") if figure.along else (curves(done), "force")
         write_csv(rows, list(rows[0]), out / f"{name}.csv")
         draw(figure, rows, figure.along or "w_over_h", y, out / f"{name}.png")
+
+    by_first(MPI.COMM_WORLD, write)
     return done
 
 

@@ -54,7 +54,7 @@ def picture(
 
     Raises
     ------
-    RuntimeError
+    NoScreen
         If there is no screen to draw on.
     """
     found, (row,) = surface(scene, record), rows(scene, [record])

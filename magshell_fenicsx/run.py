@@ -21,6 +21,7 @@ from magshell_fenicsx.results.durable import write_whole
 from magshell_fenicsx.results.files import MESH, RunFiles, open_folder
 from magshell_fenicsx.results.folder import DiskError, by_first, held_folder
 from magshell_fenicsx.results.plot import draw
+from magshell_fenicsx.results.render import NoScreen
 from magshell_fenicsx.results.report import write_report
 from magshell_fenicsx.results.summary import Result, summary
 from magshell_fenicsx.results.table import LOCATED, Row
@@ -137,7 +138,7 @@ def _draw(folder: Path, say: Say) -> None:
     """Draw what is in the folder; without a screen to draw on, say so."""
     try:
         draw(folder)
-    except RuntimeError as e:
+    except NoScreen as e:
         say(f"warning: no pictures: {e}")
 
 
@@ -146,7 +147,7 @@ def _mesh_for_tolerance(case: Case, folder: Path | None, comm: MPI.Comm, say: Sa
     if case.mesh.tolerance is None:
         return None
     file = folder / MESH if folder else None
-    if known := comm.bcast(file.read_bytes() if file and comm.rank == 0 and file.exists() else None):
+    if file and (known := by_first(comm, lambda: file.read_bytes() if file.exists() else b"", "cannot be read")):
         return Adapted.from_json(case, known)
     try:
         found = adapted(case, comm, say, doing)

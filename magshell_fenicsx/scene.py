@@ -12,9 +12,9 @@ from magshell_fenicsx.axisymmetric.model import MeridianModel
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.shell import ShellSection
 from magshell_fenicsx.case.solid import SolidSection
+from magshell_fenicsx.first import from_first
 from magshell_fenicsx.mesh.hexahedra import sweep
 from magshell_fenicsx.mesh.midsurface import Midsurface, distribute
-from magshell_fenicsx.mesh.patch import MeshError, PatchMesh
 from magshell_fenicsx.own_plan import plan_with
 from magshell_fenicsx.plan import Plan, meridian_vertices, neo_hookean
 from magshell_fenicsx.shell.model import ShellModel
@@ -149,23 +149,10 @@ def build_meridian_model(case: Case, plan: Plan) -> MeridianModel:
 
 def build_solid_model(case: Case, plan: Plan, comm: MPI.Comm) -> SolidModel:
     """The whole body or half of it, on all ranks together."""
-    body = sweep(_triangulated(plan, comm), plan.material.h, (case.solid or SolidSection()).layers, comm)
+    body = sweep(from_first(comm, plan.triangulated), plan.material.h, (case.solid or SolidSection()).layers, comm)
     return SolidModel(body, plan.material, neo_hookean(case), plan.conditions, plan.loads)
 
 
 def build_midsurface(plan: Plan, comm: MPI.Comm) -> Midsurface:
     """Triangulate on rank 0, distribute to all."""
-    return distribute(_triangulated(plan, comm), comm)
-
-
-def _triangulated(plan: Plan, comm: MPI.Comm) -> PatchMesh | None:
-    """The triangulation on rank 0, None elsewhere; an error on all."""
-    patch, error = None, None
-    if comm.rank == 0:
-        try:
-            patch = plan.triangulated()
-        except MeshError as e:
-            error = e
-    if error := comm.bcast(error):
-        raise error
-    return patch
+    return distribute(from_first(comm, plan.triangulated), comm)

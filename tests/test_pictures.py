@@ -1,6 +1,7 @@
 """Views of a shell: where its axes and its colours are."""
 
 import io
+import os
 import shutil
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from magshell_fenicsx.results.captions import caption
 from magshell_fenicsx.results.curve import curve_figure
 from magshell_fenicsx.results.layout import png
 from magshell_fenicsx.results.picture import PICTURES, _spread, figures, towards
-from magshell_fenicsx.results.render import MARGIN, View, axes_on_screen, rendered, smooth_surface
+from magshell_fenicsx.results.render import MARGIN, View, axes_on_screen, rendered, screen, smooth_surface
 from magshell_fenicsx.results.surface import Surface, completed
 from magshell_fenicsx.results.table import Row
 from magshell_fenicsx.results.vtu import About, FieldSeries, point_file, read_vtu
@@ -58,6 +59,15 @@ def test_views_have_their_colours_and_no_white_around() -> None:
     assert centre[0][0] > centre[0][2] + 50
     assert centre[1][2] > centre[1][0] + 50
     assert len(blue) / len(red) == pytest.approx(500 / 300, rel=0.1)
+
+
+@on_a_screen
+def test_a_display_that_is_gone_is_not_drawn_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As one that a closed ssh -X has left; VTK would end the process."""
+    monkeypatch.setenv("DISPLAY", ":7654")
+    with screen():
+        assert os.environ["DISPLAY"] != ":7654"
+    assert os.environ["DISPLAY"] == ":7654"
 
 
 @on_a_screen

@@ -54,10 +54,8 @@ class _Quadrilaterals:
     edges: dict[str, Numbers]
 
 
-def sweep(patch: PatchMesh | None, h: float, layers: int, comm: MPI.Comm) -> Body:
-    """Make the body on all ranks from the triangulation, known on rank 0."""
-    patch = comm.bcast(patch)  # the chart of a surface is small
-    assert patch is not None
+def sweep(patch: PatchMesh, h: float, layers: int, comm: MPI.Comm) -> Body:
+    """Make the body of all ranks from the triangulation, which each of them has: it is small."""
     quads, levels = _split(patch), 2 * layers + 1
     z = np.linspace(-h / 2, h / 2, levels)
     r, n = patch.embedding(quads.nodes), surface_normal(patch.embedding, quads.nodes)

@@ -17,7 +17,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from magshell_fenicsx import compat
-from magshell_fenicsx.mesh.patch import MeshError, PatchMesh, check_orientation
+from magshell_fenicsx.mesh.patch import PatchMesh, check_orientation
 
 ORDERS = {3: 1, 6: 2, 10: 3}  # nodes of a triangle -> its order
 
@@ -76,26 +76,15 @@ class Midsurface:
         return np.asarray(self.mesh.topology.original_cell_index[: cell_map.size_local + cell_map.num_ghosts])
 
 
-def distribute(patch: PatchMesh | None, comm: MPI.Comm) -> Midsurface:
-    """Make the mid-surface on all ranks from the triangulation on rank 0.
+def distribute(patch: PatchMesh, comm: MPI.Comm) -> Midsurface:
+    """Make the mid-surface of all ranks from the triangulation, which each of them has: it is small.
 
     Raises
     ------
     MeshError
         On every rank, if the normals of the triangulation disagree.
     """
-    error = None
-    if comm.rank == 0:
-        assert patch is not None
-        try:
-            check_orientation(patch)
-        except MeshError as e:
-            error = e
-    error = comm.bcast(error)
-    if error:
-        raise error
-    patch = comm.bcast(patch)  # the chart of a surface is small; each rank picks its own cells
-    assert patch is not None
+    check_orientation(patch)
     vertices, corners = np.unique(patch.corners, return_inverse=True)
     corners = corners.reshape(-1, 3).astype(np.int64)
     xyz = patch.embedding(patch.nodes[vertices])

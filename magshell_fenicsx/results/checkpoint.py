@@ -106,22 +106,24 @@ class Checkpoint:
     def __init__(self, file: Path, V: fem.FunctionSpace, comm: MPI.Comm) -> None:
         self._file, self._comm, self.replayed = file, comm, 0
         self._writing: AppendedFile | None = None
-        places = None
-        if comm.rank == 0:
-            self._reading = file.open("rb")
-            read_frame(self._reading)
-            content = read_frame(self._reading)
-            places = None if content is None else np.frombuffer(content).reshape(-1, 3)
+        places = by_first(comm, self._begin, "cannot be read")
         self._ordering = Ordering(V, comm, places)
-        self._replaying = comm.bcast(places is not None)
+        self._replaying = places is not None
         if not self._replaying:
             self._append(self._ordering.places.tobytes())
+
+    def _begin(self) -> Array | None:
+        """The places of the nodes, if they are there."""
+        self._reading = self._file.open("rb")
+        read_frame(self._reading)
+        content = read_frame(self._reading)
+        return None if content is None else np.frombuffer(content).reshape(-1, 3)
 
     def replay(self) -> Point | str | None:
         """The next result of the file; None from its end on."""
         if not self._replaying:
             return None
-        content = self._comm.bcast(read_frame(self._reading) if self._comm.rank == 0 else None)
+        content = by_first(self._comm, lambda: read_frame(self._reading), "cannot be read")
         if content is None:
             self._replaying = False
             return None
@@ -137,16 +139,16 @@ class Checkpoint:
         self._append(_encoded(found, u, du))
 
     def close(self) -> None:
-        if self._comm.rank == 0:
+        def close() -> None:
             self._reading.close()
             if self._writing:
                 self._writing.close()
 
+        by_first(self._comm, close)
+
     def remove(self) -> None:
         """Take the file away: the run is complete."""
-        if self._comm.rank == 0:
-            self._file.unlink()
-        self._comm.Barrier()
+        by_first(self._comm, self._file.unlink)
 
     def _append(self, content: bytes) -> None:
         def write() -> None:

@@ -49,17 +49,7 @@ def open_folder(out: Path, case: Case, comm: MPI.Comm, resume: bool) -> None:
     AlreadyComplete
         If the run to be resumed is.
     """
-    refused: list[CaseError | AlreadyComplete] = []
-
-    def make(folder: Path) -> None:
-        try:
-            (_resumed if resume else _emptied)(folder, case)
-        except (CaseError, AlreadyComplete) as e:
-            refused.append(e)
-
-    prepare_folder(out, comm, make)
-    if known := comm.bcast(refused):
-        raise known[0]
+    prepare_folder(out, comm, lambda folder: (_resumed if resume else _emptied)(folder, case))
 
 
 def _emptied(out: Path, case: Case) -> None:
@@ -112,16 +102,10 @@ class RunFiles:
         self._folder, self._scene, self._comm = folder, scene, scene.comm
         self.journal = checkpoint.Checkpoint(folder / checkpoint.NAME, scene.model.V, scene.comm)
         self._gatherer = gatherer(scene.model, scene.comm)
-        by_first(self._comm, self._open)
-        there = (min(len(self._table.kept), self._fields.kept), self._table.kept) if self._first else None
-        self.kept, self._rows = self._comm.bcast(there)
+        self.kept, self._rows = by_first(self._comm, self._open)
         self.elapsed = float(self._rows[-1]["wall_s"]) if self._rows else 0.0
 
-    @property
-    def _first(self) -> bool:
-        return self._comm.rank == 0
-
-    def _open(self) -> None:
+    def _open(self) -> tuple[int, list[dict[str, str]]]:
         begun = checkpoint.begun_with(self._folder / checkpoint.NAME) or {}
         self._begun_with = {key: begun[key] for key in ("mesh_file", "sources") if key in begun}
         self._table = PathTable(self._folder / "path.csv", self._scene.extra_columns)
@@ -130,6 +114,7 @@ class RunFiles:
         about = About(plan.material.h, plan.material.nu, mirror)
         self._fields = FieldSeries(self._folder / "fields", about)
         sync_folder(self._folder)
+        return min(len(self._table.kept), self._fields.kept), self._table.kept
 
     def write(self, row: Row, state: State) -> None:
         """Write a point; of an interrupted run's points, what is missing.
@@ -164,8 +149,7 @@ class RunFiles:
 
     def close(self, complete: bool) -> None:
         """Close the files; a complete run needs no checkpoint, which goes last."""
-        if self._first:
-            self._table.close()
+        by_first(self._comm, lambda: self._table.close())
         self.journal.close()
         if complete:
             self.journal.remove()

@@ -5,14 +5,18 @@ import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Literal, TypeVar
 
 from mpi4py import MPI
 
 from magshell_fenicsx.case.source import CaseError
+from magshell_fenicsx.first import from_first
+
+T = TypeVar("T")
 
 
 class DiskError(RuntimeError):
-    """A file could not be written; the message says which and why."""
+    """A file could not be written or read; the message says which and why."""
 
 
 def prepare_folder(out: Path, comm: MPI.Comm, make: Callable[[Path], None]) -> Path:
@@ -23,16 +27,15 @@ def prepare_folder(out: Path, comm: MPI.Comm, make: Callable[[Path], None]) -> P
     CaseError
         On every rank, if the folder cannot be made or written to.
     """
-    error = None
-    if comm.rank == 0:
+
+    def made() -> Path:
         try:
             make(out)
         except OSError as e:
-            error = f"--out {out}: cannot be written: {e.strerror}"
-    error = comm.bcast(error)
-    if error:
-        raise CaseError(error)
-    return out
+            raise CaseError(f"--out {out}: cannot be written: {e.strerror}") from None
+        return out
+
+    return from_first(comm, made)
 
 
 @contextmanager
@@ -70,20 +73,21 @@ def held_folder(out: Path, comm: MPI.Comm, make: bool) -> Iterator[None]:
             os.close(n)
 
 
-def by_first(comm: MPI.Comm, write: Callable[[], None]) -> None:
-    """Let rank 0 write, and tell all ranks if it cannot: a rank that left alone would keep the others waiting.
+def by_first(
+    comm: MPI.Comm, do: Callable[[], T], failed: Literal["cannot be written", "cannot be read"] = "cannot be written"
+) -> T:
+    """Let rank 0 write or read; what it gets, on every rank, or what it raises, see `from_first`. Collective.
 
     Raises
     ------
     DiskError
         On every rank, if the disk is full for instance.
     """
-    error = None
-    if comm.rank == 0:
+
+    def done() -> T:
         try:
-            write()
+            return do()
         except OSError as e:
-            error = f"{e.filename or 'the results'} cannot be written: {e.strerror or e}"
-    error = comm.bcast(error)
-    if error:
-        raise DiskError(error)
+            raise DiskError(f"{e.filename or 'the results'} {failed}: {e.strerror or e}") from e
+
+    return from_first(comm, done)

@@ -49,7 +49,7 @@ def figures(surface: Surface, h: float, title: str, names: Sequence[str] = ()) -
 
     Raises
     ------
-    RuntimeError
+    NoScreen
         If there is no screen to draw on.
     """
     smooth = smooth_surface(surface, h)

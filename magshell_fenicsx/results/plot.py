@@ -63,7 +63,7 @@ def draw(folder: Path, point: int | None = None) -> list[str]:
         If the folder has no run, or not this point.
     OSError
         If a file cannot be written.
-    RuntimeError
+    NoScreen
         If there is no screen to draw on.
     """
     rows = _rows(folder)

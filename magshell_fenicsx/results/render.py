@@ -1,5 +1,6 @@
 """Bare views of the deformed shell, drawn by VTK: no text, no colour bar."""
 
+import ctypes
 import os
 import shutil
 import subprocess
@@ -20,6 +21,10 @@ if TYPE_CHECKING:  # VTK takes long to import
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 MARGIN = 10  # pixels around what is drawn
+
+
+class NoScreen(RuntimeError):
+    """There is nothing to draw the shell on."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +91,7 @@ def rendered(views: Sequence[View]) -> list[Image]:
 
     Raises
     ------
-    RuntimeError
+    NoScreen
         If there is no screen to draw on.
     """
     import pyvista
@@ -161,18 +166,19 @@ def axes_on_screen(camera: Array) -> Array:
 
 @contextmanager
 def screen() -> Iterator[None]:
-    """A display to render on: the user's, or a virtual one while inside.
+    """A display to render on: the user's if it answers, or a virtual one while inside.
 
     Raises
     ------
-    RuntimeError
+    NoScreen
         If there is neither a display nor Xvfb.
     """
-    if os.environ.get("DISPLAY"):
+    given = os.environ.get("DISPLAY")
+    if given and _can_be_opened():
         yield
         return
     if shutil.which("Xvfb") is None:
-        raise RuntimeError("no display and no Xvfb to draw the deformed shell on")
+        raise NoScreen("no display and no Xvfb to draw the deformed shell on")
     read, write = os.pipe()
     with_us = ["setpriv", "--pdeathsig", "TERM"] if shutil.which("setpriv") else []  # even if we are killed
     server = subprocess.Popen(
@@ -185,10 +191,24 @@ def screen() -> Iterator[None]:
         with os.fdopen(read) as stream:
             number = stream.readline().strip()
         if not number:
-            raise RuntimeError("Xvfb did not start")
+            raise NoScreen("Xvfb did not start")
         os.environ["DISPLAY"] = f":{number}"
         yield
     finally:
         os.environ.pop("DISPLAY", None)
+        os.environ.update({"DISPLAY": given} if given else {})
         server.terminate()
         server.wait()
+
+
+def _can_be_opened() -> bool:
+    """Whether there is a server behind the display that is set: where there is none, VTK ends the process."""
+    try:
+        x11 = ctypes.CDLL("libX11.so.6")
+    except OSError:
+        return True  # VTK draws without it
+    x11.XOpenDisplay.restype, x11.XCloseDisplay.argtypes = ctypes.c_void_p, [ctypes.c_void_p]
+    display = x11.XOpenDisplay(None)
+    if display:
+        x11.XCloseDisplay(display)
+    return bool(display)

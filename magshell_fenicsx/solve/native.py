@@ -11,6 +11,8 @@ import cffi  # type: ignore[import-untyped]
 from dolfinx.jit import get_options
 from mpi4py import MPI
 
+from magshell_fenicsx.first import from_first
+
 OPTIONS = ["-O3", "-g0"]
 
 
@@ -25,14 +27,15 @@ def native(source: Path, declarations: str, comm: MPI.Comm) -> tuple[Any, Any]:
     text = "#include <stdint.h>\n" + source.read_text(encoding="utf-8")
     key = hashlib.sha256(repr((text, declarations, OPTIONS, sys.version, cffi.__version__)).encode()).hexdigest()[:16]
     name, folder = f"magshell_{source.stem}_{key}", Path(get_options()["cache_dir"])
-    error = None
-    if comm.rank == 0 and not (folder / f"{name}.so").is_file():
-        try:
-            _compile(name, folder, text, declarations)
-        except (OSError, cffi.VerificationError) as e:
-            error = str(e)
-    if error := comm.bcast(error):
-        raise RuntimeError(f"{source.name} cannot be compiled into {folder}: {error}")
+
+    def compiled() -> None:
+        if not (folder / f"{name}.so").is_file():
+            try:
+                _compile(name, folder, text, declarations)
+            except (OSError, cffi.VerificationError) as e:
+                raise RuntimeError(f"{source.name} cannot be compiled into {folder}: {e}") from None
+
+    from_first(comm, compiled)
     spec = importlib.util.spec_from_file_location(name, folder / f"{name}.so")
     assert spec is not None
     assert spec.loader is not None

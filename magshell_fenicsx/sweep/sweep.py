@@ -9,7 +9,7 @@ from pathlib import Path
 from mpi4py import MPI
 
 from magshell_fenicsx.case.source import CaseError
-from magshell_fenicsx.results.folder import prepare_folder
+from magshell_fenicsx.results.folder import by_first, prepare_folder
 from magshell_fenicsx.results.sweep_plot import draw_sweep
 from magshell_fenicsx.sweep.axes import Axis, parse_axes
 from magshell_fenicsx.sweep.chain import make_chains, run_chain
@@ -69,12 +69,14 @@ def sweep(
     ------
     CaseError
         Before anything is computed: if a point is no valid case, or `out` cannot be written. If the mesh file changes.
+    DiskError
+        If the tables of all points cannot be written.
     """
     axes = parse_axes(over)
     points = make_points(Path(file), axes, settings)
     folder = prepare_folder(Path(out), comm, _ready)
     files = [folder / "points" / f"{point.key}.json" for point in points]
-    missing: list[int] = comm.bcast(_missing(points, files) if comm.rank == 0 else None)
+    missing = by_first(comm, lambda: _missing(points, files), "cannot be read")
     if comm.rank == 0:
         say(f"{len(points)} points, {len(missing)} to compute on {comm.size} rank{'s' if comm.size > 1 else ''}")
         if again := sum(files[number].exists() for number in missing):
@@ -97,11 +99,13 @@ def sweep(
     comm.Barrier()
     outcomes = [found for result in files if (found := load(result))]
     assert len(outcomes) == len(points)
-    if comm.rank == 0:
+
+    def write() -> None:
         write_sweep(points, outcomes, folder / "sweep.csv")
         write_curves(points, outcomes, folder / "curves.csv")
         draw_sweep(axes, points, outcomes, folder / "sweep.png")
-    comm.Barrier()
+
+    by_first(comm, write)
     return Sweep(axes, points, outcomes)
 
 
