@@ -28,6 +28,7 @@ from magshell_fenicsx.results.table import LOCATED, Row
 from magshell_fenicsx.rows import RowMaker
 from magshell_fenicsx.scene import Scene
 from magshell_fenicsx.sensitivity import sensitivities
+from magshell_fenicsx.solve.factor import has_cholmod
 from magshell_fenicsx.solve.fold import FoldLost, Guess, find_fold
 from magshell_fenicsx.solve.journal import NoJournal
 
@@ -99,6 +100,8 @@ def _run(case: Case, folder: Path | None, comm: MPI.Comm, say: Say, tell: Say, w
     say(f"{', '.join(scene.plan.included)}: {scene.cells} cells, {scene.model.system.dofs} unknowns")
     if fast_blas() is None:
         say("warning: PETSc uses the reference BLAS; install OpenBLAS to factor seven times faster")
+    if comm.size == 1 and not has_cholmod():
+        say("warning: PETSc has no CHOLMOD, which factors tangents that are positive definite in half of the time")
     files = RunFiles(folder, scene) if folder else None
     if files and files.kept:
         start -= files.elapsed

@@ -8,6 +8,9 @@ from magshell_fenicsx.solve.system import Vector
 from magshell_fenicsx.solve.timing import Stopwatch
 
 PREFIX = "magshell_factor_"
+# PETSc's numbers of what CHOLMOD may end with where MUMPS goes on (petscerror.h)
+INDEFINITE, MISSING = 81, 92
+REFUSED = 76  # CHOLMOD itself: too large for its integers, or no memory, of which MUMPS decides
 
 
 class Factorisation:
@@ -15,7 +18,7 @@ class Factorisation:
 
     A tangent that is expected to be positive definite is given to CHOLMOD on one rank, which takes half
     the time and, by succeeding, proves that there is no negative pivot. Else MUMPS makes LDL^T and
-    counts them. After its first failure CHOLMOD is left alone: PETSc loses what a failure had allocated.
+    counts them. After its first failure CHOLMOD is left alone, and its memory given back.
 
     Attributes
     ----------
@@ -33,7 +36,7 @@ class Factorisation:
         self.count, self.negative_pivots = 0, 0
         self.stopwatch, self.solving = Stopwatch(), Stopwatch()
         self._comm = comm
-        self._cholmod: PETSc.PC | None = None
+        self._cholmod: _Definite | None = None
         self._mumps: PETSc.PC | None = None
         self._pc: PETSc.PC | None = None
         self._rhs: PETSc.Vec | None = None
@@ -45,7 +48,7 @@ class Factorisation:
         Raises
         ------
         PETSc.Error
-            If MUMPS fails, for want of memory for instance.
+            If MUMPS fails, for want of memory for instance, or CHOLMOD in a way that says nothing of the matrix.
         """
         with self.stopwatch:
             self.matrix = K
@@ -56,14 +59,17 @@ class Factorisation:
         self.count += 1
 
     def _factor_definite(self, K: PETSc.Mat) -> bool:
-        """Try CHOLMOD; False if K is not positive definite."""
-        self._cholmod = self._cholmod or _new_pc(K, "cholmod")
+        """Try CHOLMOD; False if K is not positive definite, or CHOLMOD cannot say."""
+        if self._cholmod is None or not self._cholmod.is_of(K):
+            self._cholmod = _Definite(K)
         try:
-            _renew(self._cholmod, K)
-        except PETSc.Error:
+            self._cholmod.factor()
+        except PETSc.Error as e:
             self._cholmod, self._definite = None, False
+            if e.ierr not in (INDEFINITE, MISSING, REFUSED):
+                raise
             return False
-        self._pc, self.negative_pivots = self._cholmod, 0
+        self._pc, self.negative_pivots = self._cholmod.pc, 0
         return True
 
     def _factor_any(self, K: PETSc.Mat) -> None:
@@ -96,6 +102,51 @@ class Factorisation:
             self._rhs.setArray(rhs)
             self._pc.apply(self._rhs, self._solution)
             return np.array(self._solution.array_r)
+
+
+def has_cholmod() -> bool:
+    """Whether PETSc was built with CHOLMOD."""
+    K = PETSc.Mat().createAIJ([1, 1], nnz=1, comm=MPI.COMM_SELF)
+    K.setValue(0, 0, 1.0)
+    K.assemble()
+    try:
+        _Definite(K).factor()
+    except PETSc.Error as e:
+        if e.ierr != MISSING:
+            raise
+        return False
+    return True
+
+
+class _Definite:
+    """CHOLMOD's factors of a matrix, by way of its upper triangle: of any other matrix PETSc copies that for
+    CHOLMOD each time, and loses the copy where CHOLMOD fails.
+    """
+
+    def __init__(self, K: PETSc.Mat) -> None:
+        self._K, self._entries = K, _entries(K)
+        self._upper = self._copied(PETSc.Mat())
+        self.pc = _new_pc(self._upper, "cholmod")
+
+    def is_of(self, K: PETSc.Mat) -> bool:
+        """Whether K is the same matrix, with the same entries."""
+        return K.handle == self._K.handle and _entries(K) == self._entries
+
+    def factor(self) -> None:
+        """Factor the matrix as it is now."""
+        self._copied(self._upper)
+        _renew(self.pc, self._upper)
+
+    def _copied(self, upper: PETSc.Mat) -> PETSc.Mat:
+        K = self._K
+        if K.getBlockSize() > 1:  # which the triangle would have too
+            K = PETSc.Mat().createAIJ(K.getSize(), csr=K.getValuesCSR(), comm=K.comm)
+        K.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+        return K.convert("seqsbaij", upper)
+
+
+def _entries(K: PETSc.Mat) -> float:
+    return float(K.getInfo()["nz_used"])
 
 
 def _new_pc(K: PETSc.Mat, solver: str) -> PETSc.PC:
