@@ -51,7 +51,12 @@ class _Writer:
         for number, state in self.result.singular.items():
             row = self.result.rows[number]
             label = "" if row["mode"] in OWN_MODES else str(row["mode"])
-            surface = self._write(number, str(row["label"]), state, label, shell.null_vector(state, label))
+            try:
+                vector = shell.null_vector(state, label)
+            except ModesNotFound as e:
+                self.say(f"warning: no modes of point {number}: {e}")
+                continue
+            surface = self._write(number, str(row["label"]), state, label, vector)
             if surface is not None and not label and (m := wave_number(surface)):
                 self.say(f"the null vector at point {number} has {m} waves around e3")
 

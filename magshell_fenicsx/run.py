@@ -30,6 +30,7 @@ from magshell_fenicsx.scene import Scene
 from magshell_fenicsx.sensitivity import sensitivities
 from magshell_fenicsx.solve.factor import has_cholmod
 from magshell_fenicsx.solve.fold import FoldLost, Guess, find_fold
+from magshell_fenicsx.solve.inverse import NoEigenpair
 from magshell_fenicsx.solve.journal import NoJournal
 
 __all__ = ["Result", "run"]
@@ -113,7 +114,7 @@ def _run(case: Case, folder: Path | None, comm: MPI.Comm, say: Say, tell: Say, w
         try:
             _follow(result, files, say, progress, start)
             result.sensitivities = _sensitivities(result)
-        except Stopped as e:
+        except (Stopped, NoEigenpair) as e:
             result.stopped = str(e)
         except (Interrupted, DiskError) as e:
             interrupted, result.stopped = e, str(e)

@@ -90,6 +90,11 @@ class ShellModes:
         ----------
         label
             `Record.mode` of the instability.
+
+        Raises
+        ------
+        ModesNotFound
+            See `solve.stability.null_vector`.
         """
         label = label if label.startswith(EXCLUDED) else ""
         family = next(family for family in _families(self.model) if family.label == label)

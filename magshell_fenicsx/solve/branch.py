@@ -9,6 +9,7 @@ from mpi4py import MPI
 from magshell_fenicsx.solve.augmented import held_along
 from magshell_fenicsx.solve.control import Hyperplane
 from magshell_fenicsx.solve.events import critical_mode
+from magshell_fenicsx.solve.inverse import NoEigenpair
 from magshell_fenicsx.solve.path import Path, Point
 from magshell_fenicsx.solve.system import State, Vector
 
@@ -34,7 +35,7 @@ class Branching:
 
 
 def branching(path: Path, bifurcation: Point) -> Branching | None:
-    """Step off a path at a located bifurcation, along the null vector; None if Newton fails there.
+    """Step off a path at a located bifurcation, along the null vector; None if that is not found or Newton fails there.
 
     Parameters
     ----------
@@ -42,7 +43,10 @@ def branching(path: Path, bifurcation: Point) -> Branching | None:
         Controlled by arc length.
     """
     name, state = path.name, bifurcation.state
-    mode = critical_mode(path.newton, state).vector
+    try:
+        mode = critical_mode(path.newton, state).vector
+    except NoEigenpair:
+        return None
     mode = np.asarray(mode * path.system.length / _largest(path.system.comm, mode))
     found = None
     for size in SIZES:

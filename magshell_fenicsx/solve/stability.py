@@ -14,7 +14,7 @@ from slepc4py import SLEPc
 
 from magshell_fenicsx import compat
 from magshell_fenicsx.solve.factor import Factorisation
-from magshell_fenicsx.solve.inverse import nearest_to_zero
+from magshell_fenicsx.solve.inverse import NoEigenpair, nearest_to_zero
 from magshell_fenicsx.solve.system import Vector
 
 TOLERANCE = 1e-10  # of an eigenvalue, relative to its distance from the shift
@@ -95,10 +95,19 @@ def lowest_modes(K: PETSc.Mat, M: PETSc.Mat, count: int) -> list[Mode]:
 
 
 def null_vector(K: PETSc.Mat) -> Vector:
-    """The direction that a nearly singular symmetric K resists least, of length one."""
+    """The direction that a nearly singular symmetric K resists least, of length one.
+
+    Raises
+    ------
+    ModesNotFound
+        See `nearest_to_zero`.
+    """
     factorisation = Factorisation(K.comm.tompi4py())
     factorisation.factor(K)
-    return nearest_to_zero(factorisation)[1]
+    try:
+        return nearest_to_zero(factorisation)[1]
+    except NoEigenpair as e:
+        raise ModesNotFound(str(e)) from None
 
 
 class _Slices:
