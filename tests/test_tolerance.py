@@ -8,6 +8,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import basix
 import numpy as np
 import pytest
 from command import magshell
@@ -15,11 +16,13 @@ from conftest import CASES
 from mpi4py import MPI
 
 from magshell_fenicsx import Case, CaseError, run
-from magshell_fenicsx.adapt.carry import carry
+from magshell_fenicsx.adapt.carry import CellFields, NotCarried, carry
 from magshell_fenicsx.adapt.choice import Adapted, Choice
 from magshell_fenicsx.adapt.ending import NoResult, by_path, from_near
 from magshell_fenicsx.adapt.size import equidistributed
 from magshell_fenicsx.adapt.tolerance import adapted
+from magshell_fenicsx.case.source import Source
+from magshell_fenicsx.scene import Scene
 
 FORCE = 15.14768
 KNOCKDOWN = {0.0: 0.326233289, 0.00184: 0.552053778, -0.00184: 0.120723848}
@@ -164,3 +167,34 @@ def test_in_parallel(ranks: int, tmp_path: Path) -> None:
     for there, here in zip(rounds, mesh.rounds, strict=True):
         assert there["result"] == pytest.approx(here.result, rel=1e-9)
         assert there["estimate"] == pytest.approx(here.estimate, rel=1e-6)
+
+
+def test_a_point_in_a_large_cell_beside_small_ones_is_found() -> None:
+    """Though the centres of a hundred small ones are nearer; each cell has its number as its value."""
+    large = np.array([[0.0, 0.0], [10.0, 0.0], [0.0, 10.0]])
+    along = np.linspace(2.0, 8.0, 101)[:-1]
+    small = [[[10 - t, t], [10 - t + 0.06, t], [10 - t, t + 0.06]] for t in along]
+    cells = CellFields(
+        np.array([large, *small]), basix.create_element(basix.ElementFamily.P, basix.CellType.triangle, 1)
+    )
+    values = np.tile(np.arange(101.0)[:, None, None], (1, 3, 1))
+    inside, beside = np.array([[4.9, 4.9], [1.0, 1.0]]), np.array([[-0.01, 5.0]])
+    found, xi, far = cells.places(inside)
+    assert cells.at(values, found, xi).ravel().tolist() == [0.0, 0.0]
+    assert far.tolist() == [0.0, 0.0]
+    assert cells.places(beside)[2] == pytest.approx([1e-3])
+
+
+def test_a_place_that_the_other_mesh_has_not_is_refused() -> None:
+    """Polynomials that are exact inside grow without limit outside."""
+
+    def cap(polar: float) -> Scene:
+        shell = {"geometry": "cap", "radius": 1.0, "thickness": 0.02, "polar": polar, "poisson_ratio": 0.3}
+        shell["youngs_modulus"] = 1.0
+        sections = {"shell": shell, "boundary": {"rim": "clamped"}, "mesh": {"degree": 2}}
+        return Scene(Case.from_source(Source("cap", sections | {"loading": {"kind": "pressure", "until": "limit"}})))
+
+    low, wide = cap(30), cap(60)
+    with pytest.raises(NotCarried, match="cells beside the other mesh"):
+        carry(low, wide, low.model.zero())
+    assert len(carry(wide, low, wide.model.zero())) == low.model.system.size

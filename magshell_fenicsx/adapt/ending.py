@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Literal
 
-from magshell_fenicsx.adapt.carry import carry
+from magshell_fenicsx.adapt.carry import NotCarried, carry
 from magshell_fenicsx.case.loading import DeadSection, IndentationSection, PathSection, PressureSection
 from magshell_fenicsx.follow import Record, Stopped, follow
 from magshell_fenicsx.scene import Scene
@@ -107,11 +107,13 @@ def from_near(scene: Scene, source: Scene, near: Ending) -> Ending:
     """
     if near.kind == "instability":
         return by_path(scene)
-    guess = State(carry(source, scene, near.state.u), dict(near.state.mu))
-    if near.kind == "fold":
-        found = _fold(scene, Guess(guess, carry(source, scene, near.tangent)), near.name)
-    else:
-        found = _equilibrium(scene, guess, near)
+    try:
+        u, tangent = (carry(source, scene, v) for v in (near.state.u, near.tangent))
+    except NotCarried:
+        return by_path(scene)
+    guess = State(u, dict(near.state.mu))
+    is_fold = near.kind == "fold"
+    found = _fold(scene, Guess(guess, tangent), near.name) if is_fold else _equilibrium(scene, guess, near)
     return found or by_path(scene)
 
 

@@ -33,7 +33,7 @@ def indicators(coarse: tuple[Scene, Ending], fine: tuple[Scene, Ending]) -> tupl
     Centres of the cells (n, 2) in the chart, in one order on any number of ranks, and their shares (n,).
     """
     (scene, low), (richer, high) = coarse, fine
-    cells, comm = CellFields(richer), richer.newton.system.comm
+    cells, comm = CellFields.of(richer), richer.newton.system.comm
     u, z = (carry(scene, richer, v) for v in (low.state.u, low.tangent))
     scale = dot(comm, z, high.tangent) / dot(comm, z, z)  # null vectors have no size of their own
     energy = _TangentEnergy(richer, cells, high.state.u)
