@@ -1,8 +1,10 @@
 """Formulas of position in a case file: checked at the door, evaluated with NumPy, no other code reached."""
 
 import ast
+import operator
 import sys
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,10 +12,17 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 FUNCTIONS = {name: getattr(np, name) for name in ("sin", "cos", "tan", "exp", "log", "sqrt", "abs", "sign", "arctan2")}
 NAMES = ("x", "y", "z", "pi")
-_ALLOWED = (
-    *(ast.Expression, ast.BinOp, ast.UnaryOp, ast.Call, ast.Name, ast.Load, ast.Constant),
-    *(ast.Add, ast.Sub, ast.Mult, ast.Div, ast.Pow, ast.USub, ast.UAdd),
-)
+_OPERATORS: dict[type[ast.AST], Callable[..., Any]] = {
+    ast.Add: operator.add,
+    ast.Sub: operator.sub,
+    ast.Mult: operator.mul,
+    ast.Div: operator.truediv,
+    ast.Pow: operator.pow,
+    ast.USub: operator.neg,
+    ast.UAdd: operator.pos,
+}
+_ALLOWED = (*(ast.Expression, ast.BinOp, ast.UnaryOp, ast.Call, ast.Name, ast.Load, ast.Constant), *_OPERATORS)
+_Step = tuple[Callable[..., Any], int] | np.float64 | str  # of a stack: a function of some values, a number, a name
 
 
 def formula(text: str) -> Callable[[Array, Array, Array], Array]:
@@ -28,7 +37,11 @@ def formula(text: str) -> Callable[[Array, Array, Array], Array]:
     try:
         tree = ast.parse(text, mode="eval")
         nodes = list(ast.walk(tree))
-    except (SyntaxError, ValueError, RecursionError, MemoryError):
+    except (RecursionError, MemoryError):
+        raise ValueError(f"{said!r} is too long: allowed are some thousand terms in a row") from None
+    except (SyntaxError, ValueError) as e:
+        if "nested parentheses" in str(e):
+            raise ValueError(f"{said!r}: allowed are 200 brackets within each other") from None
         raise ValueError(f"{said!r} is not a formula") from None
     called = {id(node.func) for node in nodes if isinstance(node, ast.Call)}
     for node in nodes:
@@ -42,25 +55,45 @@ def formula(text: str) -> Callable[[Array, Array, Array], Array]:
             known = name in FUNCTIONS and not node.keywords and len(node.args) == FUNCTIONS[name].nin
         if not known:
             raise ValueError(f"{said!r}: allowed are numbers, {', '.join(NAMES)}, + - * / **, {', '.join(FUNCTIONS)}")
-    numbers = _Numbers()
-    code = compile(ast.fix_missing_locations(numbers.visit(tree)), "<formula>", "eval")
+    steps = _steps(tree)
 
     def evaluate(x: Array, y: Array, z: Array) -> Array:
-        names = {**FUNCTIONS, **numbers.named, "x": x, "y": y, "z": z, "pi": np.pi, "__builtins__": {}}
-        with np.errstate(all="ignore"):  # a warning would look for builtins
-            return np.broadcast_to(np.asarray(eval(code, names), dtype=np.float64), x.shape)
+        names, stack = {"x": x, "y": y, "z": z, "pi": np.float64(np.pi)}, list[Any]()
+        with np.errstate(all="ignore"):
+            for step in steps:
+                if isinstance(step, tuple):
+                    function, count = step
+                    stack[-count:] = [function(*stack[-count:])]
+                else:
+                    stack.append(names[step] if isinstance(step, str) else step)
+        return np.broadcast_to(np.asarray(stack[0], dtype=np.float64), x.shape)
 
     return evaluate
 
 
-class _Numbers(ast.NodeTransformer):
-    """Names every number: as NumPy's they neither grow without end, as 9**9**9 does, nor turn complex."""
+def _steps(tree: ast.Expression) -> list[_Step]:
+    """What a stack does in turn: a sum of thousand terms is as many levels deep, too deep for recursion.
 
-    def __init__(self) -> None:
-        self.named: dict[str, np.float64] = {}
-
-    def visit_Constant(self, node: ast.Constant) -> ast.Name:
-        assert isinstance(node.value, int | float)
-        name = f"_{len(self.named)}"
-        self.named[name] = np.float64(min(node.value, sys.float_info.max))
-        return ast.Name(name, ast.Load())
+    Numbers are NumPy's: these neither grow without end, as 9**9**9 does, nor turn complex.
+    """
+    steps: list[_Step] = []
+    left: list[ast.AST] = [tree.body]
+    while left:  # the last operation first, and of its values the last first; then all backwards
+        node = left.pop()
+        if isinstance(node, ast.BinOp):
+            steps.append((_OPERATORS[type(node.op)], 2))
+            left += [node.left, node.right]
+        elif isinstance(node, ast.UnaryOp):
+            steps.append((_OPERATORS[type(node.op)], 1))
+            left.append(node.operand)
+        elif isinstance(node, ast.Call):
+            assert isinstance(node.func, ast.Name)
+            steps.append((FUNCTIONS[node.func.id], len(node.args)))
+            left += node.args
+        elif isinstance(node, ast.Name):
+            steps.append(node.id)
+        else:
+            assert isinstance(node, ast.Constant)
+            assert isinstance(node.value, int | float)
+            steps.append(np.float64(min(node.value, sys.float_info.max)))
+    return steps[::-1]

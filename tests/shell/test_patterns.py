@@ -76,3 +76,27 @@ def test_gradient_pulls_a_rigid_shell() -> None:
 def test_only_arithmetic_is_a_formula(text: str) -> None:
     with pytest.raises(ValueError, match=r"formula|allowed are numbers"):
         formula(text)
+
+
+def test_operations_are_those_of_python() -> None:
+    x, y, z = np.array([[0.3], [-0.7], [1.9]])
+    for text in ("2 - x - y", "z / x / 2", "2 ** x ** y", "-x ** 2", "arctan2(x, -y) - +sqrt(z)", "(x - y) * (z - 1)"):
+        names = {"x": x, "y": y, "z": z, "sqrt": np.sqrt, "arctan2": np.arctan2}
+        assert formula(text)(x, y, z) == eval(text, names)
+
+
+@pytest.mark.parametrize("terms", [900, 4000])
+def test_long_sums(terms: int) -> None:
+    """The terms i x of a series add up to n (n - 1)/2 x; a table of a field may be as long."""
+    found = formula(" + ".join(f"{i}*x" for i in range(terms)))(np.array([0.5]), np.zeros(1), np.zeros(1))
+    assert found == pytest.approx(terms * (terms - 1) / 4, rel=1e-12)
+    assert formula("-" * terms + "x")(np.ones(1), np.zeros(1), np.zeros(1)) == 1.0
+
+
+def test_brackets_within_each_other() -> None:
+    """As many as Python reads; more, or longer sums than it reads, are told for what they are."""
+    assert formula("(" * 199 + "x" + ")" * 199)(np.ones(1), np.zeros(1), np.zeros(1)) == 1.0
+    with pytest.raises(ValueError, match="allowed are 200 brackets within each other"):
+        formula("(" * 300 + "x" + ")" * 300)
+    with pytest.raises(ValueError, match="is too long: allowed are some thousand terms in a row"):
+        formula("+".join(["x"] * 300_000))
