@@ -89,9 +89,12 @@ class AugmentedTangent:
 def held_along(newton: BorderedNewton, guess: State, b: Vector) -> tuple[State, float] | None:
     """The equilibrium under a force along b that keeps the guess's place along b, and its estimated error.
 
-    None if Newton's method fails.
+    It is no singular problem where b is the null vector (the Lyapunov-Schmidt reduction). None if Newton's method fails.
 
-    It is no singular problem where b is the null vector (the Lyapunov-Schmidt reduction).
+    Raises
+    ------
+    LinAlgError
+        If the tangent is singular in another direction too.
     """
     system, u, tangent, last = newton.system, guess.u, AugmentedTangent(newton, guess, b), np.inf
     tangents, own = 1, True

@@ -66,16 +66,20 @@ def find_bifurcation(newton: BorderedNewton, guess: State, phi: Vector, name: st
     BifurcationLost
         If Newton's method diverges or takes too long.
     """
+    try:
+        return _found(newton, guess, phi, name)
+    except np.linalg.LinAlgError:
+        raise BifurcationLost("the tangent is singular in more than one direction") from None
+
+
+def _found(newton: BorderedNewton, guess: State, phi: Vector, name: str) -> Bifurcation:
     system, state, before = newton.system, guess, newton.factorisation.count
     b, steps, changes = phi, list[float](), list[float]()
     while not _done(steps):
         if len(steps) == MOST_ITERATIONS:
             raise BifurcationLost(f"Newton's method found no bifurcation in {MOST_ITERATIONS} iterations")
         tangent = AugmentedTangent(newton, state, b)
-        try:
-            du, dmu, w_mu = _step(system, state, name, tangent)
-        except np.linalg.LinAlgError:
-            raise BifurcationLost("the tangent is singular in more than one direction") from None
+        du, dmu, w_mu = _step(system, state, name, tangent)
         b = tangent.v
         steps.append(max_abs(system.comm, du) / system.length)
         changes.append(abs(dmu))

@@ -75,7 +75,10 @@ def _step_off(path: Path, state: State, mode: Vector, size: float) -> Point | No
     """
     metric, name, newton = path.metric, path.name, path.newton
     row = Hyperplane(metric, name, state, (mode, 0.0), size * metric.inner((mode, 0.0), (mode, 0.0)))
-    pushed = held_along(newton, State(state.u + size * mode, state.mu), mode)
+    try:
+        pushed = held_along(newton, State(state.u + size * mode, state.mu), mode)
+    except np.linalg.LinAlgError:  # singular in another direction too
+        return None
     if pushed is None:
         return None
     found = path.solve(row, 0.0, pushed[0])

@@ -11,7 +11,7 @@ from magshell_fenicsx.solve.bifurcation import BifurcationLost, find_bifurcation
 from magshell_fenicsx.solve.bordered import Direction
 from magshell_fenicsx.solve.control import projected
 from magshell_fenicsx.solve.factor import Factorisation
-from magshell_fenicsx.solve.inverse import nearest_to_zero
+from magshell_fenicsx.solve.inverse import NoEigenpair, nearest_to_zero
 from magshell_fenicsx.solve.path import Path, PathStopped, Point
 from magshell_fenicsx.solve.system import State, Vector
 
@@ -117,7 +117,10 @@ class _Search:
     def crossing(self, low: Point, high: Point) -> Point | None:
         """The bifurcation between two points, as the solution of a regular system; None if that is not found."""
         path = self.path
-        modes = [critical_mode(path.newton, end.state) for end in (low, high)]
+        try:
+            modes = [critical_mode(path.newton, end.state) for end in (low, high)]
+        except NoEigenpair:
+            return None
         a, b = (mode.eigenvalue for mode in modes)
         t = a / (a - b) if a * b < 0 else 0.5
         guess = path.between(low.s + t * (high.s - low.s), low, high)
@@ -245,10 +248,13 @@ def locate_bifurcation(
     Raises
     ------
     PathStopped
-        If Newton fails between two points that it had found.
+        If Newton fails between two points that it had found, or no eigenpair is found.
     """
     search = _Search(path, stable, tolerance)
-    return search.told(search.bifurcation(stable, path.seen_from(stable, unstable), stability))
+    try:
+        return search.told(search.bifurcation(stable, path.seen_from(stable, unstable), stability))
+    except NoEigenpair as e:
+        raise PathStopped(f"locating an instability: {e}", stable) from None
 
 
 @dataclass(frozen=True)
