@@ -27,6 +27,14 @@ def membrane(r0: Jet, u: Jet, nu: Expr) -> Expr:
     return koiter(kin.membrane_strain(r0, u), kin.inverse_metric(r0), nu) / (2 * (1 - nu**2))
 
 
+def prestress(r0: Jet, u: Jet, v: Jet, nu: Expr, E: Expr) -> Expr:
+    """S : (v_i . v_j)/2 with the membrane stress S of the strain E_11, E_12, E_22: what it adds to the energy of v."""
+    up = kin.inverse_metric(r0)
+    strain, square = kin.mixed(ufl.as_matrix([[E[0], E[1]], [E[1], E[2]]]), up), kin.mixed(kin.metric(v), up)
+    contracted = (1 - nu) * ufl.tr(ufl.dot(strain, square)) + nu * ufl.tr(strain) * ufl.tr(square)
+    return contracted / (2 * (1 - nu**2))
+
+
 def bending(r0: Jet, u: Jet, nu: Expr, h: Expr) -> Expr:
     """Bending density, paper Eq. (eqn:energy), second term."""
     K = kin.curvature_change(r0, u)

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import ufl
@@ -91,8 +91,8 @@ def _halves(field: fem.Function) -> tuple[Expr, Expr]:
 def per_area(density: Callable[..., Expr]) -> Callable[..., Expr]:
     """A density per undeformed area, per area of the coordinates."""
 
-    def of(r0: Jet, u: Jet, *parameters: Expr) -> Expr:
-        return density(r0, u, *parameters) * kin.area_ratio(r0)
+    def of(r0: Jet, *rest: Any) -> Expr:
+        return density(r0, *rest) * kin.area_ratio(r0)
 
     return of
 

@@ -9,7 +9,7 @@ from dolfinx import fem
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
-from magshell_fenicsx.shell.energy import HessianTerm, ShellTerm, cell_quadrature, edge_quadrature
+from magshell_fenicsx.shell.energy import Density, HessianTerm, ShellTerm, cell_quadrature, edge_quadrature
 from magshell_fenicsx.shell.sites import Site
 from magshell_fenicsx.solve.batches import Batch, boundary_batches, cell_batches, interior_batches
 from magshell_fenicsx.solve.kernels import KernelLog
@@ -17,6 +17,9 @@ from magshell_fenicsx.solve.scatter import BlockMatrix
 from magshell_fenicsx.solve.terms import Term
 
 Array = NDArray[np.float64]
+
+
+Weighted = tuple[float, Array]
 
 
 class TangentSite(Protocol):
@@ -55,12 +58,21 @@ class FastTangent:
         cells, functions = V.dofmap.list.shape
         self._same = np.empty((cells, 9, functions * (functions + 1) // 2))
 
-    def tangent(self, factors: Mapping[str, float]) -> PETSc.Mat:
-        """The assembled matrix, at the present u; it is reused by the next call. Collective."""
+    def tangent(self, factors: Mapping[str, float], stress: Sequence[Weighted] = ()) -> PETSc.Mat:
+        """The assembled matrix, at the present u; it is reused by the next call. Collective.
+
+        Parameters
+        ----------
+        stress
+            Displacements, ghosts included, with weights: the sum of their membrane strains makes the membrane
+            stress in place of the present strain.
+        """
         self._same[:] = 0
         self._matrix.clear()
         first = 0
         for site in self._sites:
+            if stress and isinstance(site, Site):
+                site.replace_strain(self._u.x.array, stress)
             site.add(self._u.x.array, factors, self._same, partial(self._couple, first))
             first += len(site.coupling)
         self._matrix.add_cells(self._same)
@@ -70,7 +82,9 @@ class FastTangent:
         self._matrix.add_coupling(first + batch, K)
 
 
-def make_sites(r0: fem.Function, degree: int, terms: Iterable[Term], log: KernelLog) -> list[Site]:
+def make_sites(
+    r0: fem.Function, degree: int, terms: Iterable[Term], log: KernelLog, prestress: Density | None = None
+) -> list[Site]:
     """The sites of some terms: all cells and all interior edges together, boundary edges term by term. Collective."""
     V = r0.function_space
     found = [t for t in terms if isinstance(t, ShellTerm | HessianTerm) and not t.linear]
@@ -78,7 +92,7 @@ def make_sites(r0: fem.Function, degree: int, terms: Iterable[Term], log: Kernel
     interior = [t for t in found if t.density.sides == 2]
     sites = []
     if cells:
-        sites.append(Site(r0, cell_batches(V, cell_quadrature(degree)), 1, cells, log))
+        sites.append(Site(r0, cell_batches(V, cell_quadrature(degree)), 1, cells, log, prestress))
     if interior:
         sites.append(Site(r0, interior_batches(V, edge_quadrature(degree)), 2, interior, log))
     for term in found:

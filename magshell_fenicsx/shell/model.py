@@ -159,7 +159,7 @@ class ShellModel(Observed):
                 factory.edge_moment(f"moment {load.edge} {i}", midsurface.edges[load.edge], load.moment)
                 for i, load in enumerate(moments)
             ]
-        self._sites = make_sites(self.r0, degree, terms, self.kernels)
+        self._sites = make_sites(self.r0, degree, terms, self.kernels, factory.prestress())
         fast = FastTangent(self.u, self._sites, held + mirror)
         gradients = FastResidual(self.r0, self.u, degree, terms, self.kernels)
         self.system = FiniteElementSystem(self.u, terms, held + mirror, interior, material.h, fast, gradients)

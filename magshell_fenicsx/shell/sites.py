@@ -42,7 +42,13 @@ class Site:
     """
 
     def __init__(
-        self, r0: fem.Function, batches: list[Batch], sides: int, terms: Sequence[PointTerm], log: KernelLog
+        self,
+        r0: fem.Function,
+        batches: list[Batch],
+        sides: int,
+        terms: Sequence[PointTerm],
+        log: KernelLog,
+        prestress: Density | None = None,
     ) -> None:
         V = r0.function_space
         self.batches, self._dofs, self._sides = batches, V.dofmap.list, sides
@@ -50,8 +56,12 @@ class Site:
         self._u, self._r0 = (self._points.field(3 * PARTS * sides) for _ in range(2))
         self._geometry = self._points.field(2 * sides + 1)
         self._placements = [self._jets(batch, r0.x.array) for batch in batches]
-        self._kernels = {term.name: Kernel(term, self._points, batches) for term in terms}
-        for kernel in self._kernels.values():
+        self._kernels = {
+            t.name: Kernel(t.name, t.density, self._points, batches, of_v=isinstance(t, HessianTerm)) for t in terms
+        }
+        self._prestress = Kernel("prestress", prestress, self._points, batches, of_v=True) if prestress else None
+        self._replaced = False
+        for kernel in [*self._kernels.values(), *([self._prestress] if self._prestress else [])]:
             kernel.compile(self._u, self._r0, self._geometry, sides, log, V.mesh.comm)
         self.coupling = batches if sides == 2 else []
         pairs = reduce(or_, (kernel.pairs for kernel in self._kernels.values()))
@@ -81,10 +91,22 @@ class Site:
             contraction, blocks = self._contractions[batch.rule], Blocks(batch, self._coupled)
             for kernel, factor in kernels:
                 blocks.add(kernel.evaluate(number), factor, kernel.pairs)
+            if self._replaced and self._prestress:
+                blocks.add(self._prestress.evaluate(number), 1.0, self._prestress.pairs)
             for side, cells in enumerate(batch.cells):
                 same[cells] += contraction.same(blocks, side)
             if self._sides == 2:
                 couple(number, contraction.cross(blocks))
+        self._replaced = False
+
+    def replace_strain(self, u: Array, by: Sequence[tuple[float, Array]]) -> None:
+        """Take the weighted sum of other displacements' membrane strains in place of that of u, in the next `add`."""
+        if self._prestress is None:
+            return
+        for number, (batch, r0) in enumerate(zip(self.batches, self._placements, strict=True)):
+            strains = [w * _strain(r0, self._jets(batch, v)) for w, v in (*by, (-1.0, u))]
+            self._prestress.vary(number, np.sum(strains, axis=0))
+        self._replaced = True
 
     def _jets(self, batch: Batch, field: Array) -> Array:
         """(points, sides, 6, 3) of a field."""
@@ -96,30 +118,45 @@ class Site:
 class Kernel:
     """The point Hessian of one term on a site."""
 
-    def __init__(self, term: PointTerm, points: Points, batches: list[Batch]) -> None:
-        self._term, self._points, self._batches = term, points, batches
-        self._parameters, varying = parameters_at(points, term.density)
-        sides = range(term.density.sides)
+    def __init__(self, name: str, density: Density, points: Points, batches: list[Batch], *, of_v: bool) -> None:
+        self._name, self._density, self._of_v = name, density, of_v
+        self._points, self._batches = points, batches
+        self._parameters, varying = parameters_at(points, density)
+        sides = range(density.sides)
         self._varying = [(here, [_on_sides(field, batch, sides) for batch in batches]) for here, field in varying]
 
     def compile(
         self, u: fem.Function, r0: fem.Function, geometry: fem.Function, sides: int, log: KernelLog, comm: MPI.Comm
     ) -> None:
         """Collective."""
-        density, name = self._term.density, self._term.name
+        density, name, of_v = self._density, self._name, self._of_v
         self.pairs = _pairs(density)
-        of_v = isinstance(self._term, HessianTerm)
         z = self._points.field(3 * PARTS) if of_v else u
         jets = [[_jet(field, side) for side in range(sides)] for field in ((r0, u, z) if of_v else (r0, u))]
         m = [ufl.as_vector([geometry[2 * side], geometry[2 * side + 1]]) for side in range(sides)]
         W = density.at(jets, (m, geometry[2 * sides]) if density.on_edges else None, self._parameters)
         self._hessian = point_hessian(name, W, z, PARTS, self.pairs, log, comm, at_zero=of_v)
 
+    def vary(self, number: int, values: Array) -> None:
+        """Give the first parameter that varies its values at the points of a batch."""
+        self._varying[0][1][number] = values
+
     def evaluate(self, number: int) -> Array:
         """The Hessian's parts at the points of a batch."""
         for here, values in self._varying:
             fill(here, values[number])
         return self._points.evaluate(self._hessian, self._batches[number].size)
+
+
+def _strain(r0: Array, u: Array) -> Array:
+    """(points, 3): E_11, E_12, E_22 from jets (..., 6, 3)."""
+    (a, b), (p, q) = (np.moveaxis(jets.reshape(-1, PARTS, 3)[:, 1:3], 1, 0) for jets in (r0, u))
+
+    def dot(x: Array, y: Array) -> Array:
+        return np.asarray(np.einsum("pc,pc->p", x, y))
+
+    E12 = (dot(a, q) + dot(p, b) + dot(p, q)) / 2
+    return np.stack([dot(a, p) + dot(p, p) / 2, E12, dot(b, q) + dot(q, q) / 2], axis=1)
 
 
 def _pairs(density: Density) -> Pairs:

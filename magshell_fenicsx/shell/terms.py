@@ -62,6 +62,11 @@ class TermFactory:
         density = Density(per_area(densities.membrane), (self._constant(self.material.nu),))
         return self._cells("membrane", self._thick(density, None))
 
+    def prestress(self) -> Density:
+        """The part of the tangent that membrane stress makes; its last parameter but the thickness is the strain."""
+        strain = fem.Function(fem.functionspace(self._domain, ("DG", 0, (3,))))
+        return self._thick(Density(per_area(densities.prestress), (self._constant(self.material.nu), strain)), None)
+
     def bending(self) -> ShellTerm:
         return self._cells("bending", self._thick(Density(per_area(densities.bending), self._nu_h(), parts=CURVED), 1))
 

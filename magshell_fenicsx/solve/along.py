@@ -1,10 +1,10 @@
 """A system with another amplitude than those underneath: several moved together."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from petsc4py import PETSc
 
-from magshell_fenicsx.solve.system import Amplitudes, System, Vector
+from magshell_fenicsx.solve.system import Amplitudes, System, Vector, Weighted
 
 
 class Along:
@@ -38,5 +38,5 @@ class Along:
     def potential(self, u: Vector, name: str) -> float:
         return sum(rate * self._system.potential(u, i) for i, rate in self._direction.items())
 
-    def tangent(self, u: Vector, mu: Amplitudes) -> PETSc.Mat:
-        return self._system.tangent(u, self.expand(mu))
+    def tangent(self, u: Vector, mu: Amplitudes, stress: Sequence[Weighted] = ()) -> PETSc.Mat:
+        return self._system.tangent(u, self.expand(mu), stress)

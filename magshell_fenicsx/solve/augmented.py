@@ -9,7 +9,7 @@ has g = 0 exactly where K is singular, and the gradient of g is -Pi'''(v, v, .) 
 Govaerts, Numerical methods for bifurcations of dynamical equilibria, SIAM 2000, ch. 4).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 
 import numpy as np
@@ -17,7 +17,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from magshell_fenicsx.solve.newton import BorderedNewton
-from magshell_fenicsx.solve.system import Amplitudes, State, System, Vector, dot, max_abs
+from magshell_fenicsx.solve.system import Amplitudes, State, System, Vector, Weighted, dot, followed, max_abs
 
 TOLERANCE = 1e-9  # of u held along a direction, in lengths of the system
 MOST_TANGENTS, CONTRACTION = 8, 0.3
@@ -37,8 +37,8 @@ class _Sprung:
         if system.comm.rank == owner:
             self.e[int(np.argmax(np.abs(shape)))] = 1.0
 
-    def tangent(self, u: Vector, mu: Amplitudes) -> PETSc.Mat:
-        K = self._system.tangent(u, mu)
+    def tangent(self, u: Vector, mu: Amplitudes, stress: Sequence[Weighted] = ()) -> PETSc.Mat:
+        K = self._system.tangent(u, mu, stress)
         first = K.getOwnershipRange()[0]
         here = [first + int(i) for i in np.flatnonzero(self.e)]
         itself = self.comm.allreduce(sum(abs(K.getValue(i, i)) for i in here))
@@ -56,11 +56,11 @@ class AugmentedTangent:
     by one more border.
     """
 
-    def __init__(self, newton: BorderedNewton, state: State, b: Vector) -> None:
+    def __init__(self, newton: BorderedNewton, state: State, b: Vector, stress: Sequence[Weighted] = ()) -> None:
         self._system = system = newton.system
         newton.system = sprung = _Sprung(system, b)
         try:
-            self._factors = newton.factor_at(State(state.u, state.mu))  # a state that nobody else asks for
+            self._factors = newton.factor_at(State(state.u, state.mu), stress)  # a state that nobody else asks for
         finally:
             newton.system = system
         self.unstable = self._factors.negative_pivots  # the spring has made phi stable
@@ -86,17 +86,20 @@ class AugmentedTangent:
         return self.v - self.solve(after - before)[0]
 
 
-def held_along(newton: BorderedNewton, guess: State, b: Vector) -> tuple[State, float] | None:
+def held_along(
+    newton: BorderedNewton, guess: State, b: Vector, stress: Sequence[Weighted] = ()
+) -> tuple[State, float] | None:
     """The equilibrium under a force along b that keeps the guess's place along b, and its estimated error.
 
-    It is no singular problem where b is the null vector (the Lyapunov-Schmidt reduction). None if Newton's method fails.
+    It is no singular problem where b is the null vector (the Lyapunov-Schmidt reduction).
+    None if Newton's method fails. `stress` is as that of `System.tangent`, of the guess.
 
     Raises
     ------
     LinAlgError
         If the tangent is singular in another direction too.
     """
-    system, u, tangent, last = newton.system, guess.u, AugmentedTangent(newton, guess, b), np.inf
+    system, u, tangent, last = newton.system, guess.u, AugmentedTangent(newton, guess, b, stress), np.inf
     tangents, own = 1, True
     while True:
         du, _ = tangent.solve(system.residual(u, guess.mu))
@@ -104,11 +107,11 @@ def held_along(newton: BorderedNewton, guess: State, b: Vector) -> tuple[State, 
         if size <= TOLERANCE or (own and CONTRACTION * last < size <= ROUNDING):
             return State(u - du, guess.mu), size
         if not own and size > CONTRACTION * last:
-            tangent, tangents, own = AugmentedTangent(newton, State(u, guess.mu), b), tangents + 1, True
+            tangent, tangents, own = AugmentedTangent(newton, State(u, guess.mu), b, stress), tangents + 1, True
             continue
         if tangents > MOST_TANGENTS or not np.isfinite(size):
             return None
-        u, last, own = u - du, size, False
+        u, last, own, stress = u - du, size, False, followed(u, -du)
 
 
 def third(system: System, state: State, v: Vector) -> Vector:
@@ -130,4 +133,7 @@ def first_difference(f: Callable[[Vector], Vector], system: System, u: Vector, v
 
 
 def _offset(system: System, v: Vector) -> float:
-    return DIFFERENCE * system.length / max_abs(system.comm, v)
+    size = max_abs(system.comm, v)
+    if size == 0.0:
+        raise np.linalg.LinAlgError("the bordered tangent is singular too")
+    return DIFFERENCE * system.length / size

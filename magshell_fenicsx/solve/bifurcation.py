@@ -14,13 +14,13 @@ import numpy as np
 
 from magshell_fenicsx.solve.augmented import AugmentedTangent, first_difference, held_along, third
 from magshell_fenicsx.solve.newton import BorderedNewton
-from magshell_fenicsx.solve.system import State, System, Vector, dot, max_abs
+from magshell_fenicsx.solve.system import State, System, Vector, Weighted, dot, followed, max_abs
 
 TOLERANCE = 1e-9  # of u, in lengths of the system
 MOST_ITERATIONS = 10
 LARGEST_STEP = 10.0  # in lengths; more is a divergence
 NEAR = 1e-5  # in lengths: after longer steps the state is brought back into equilibrium but for the force along v
-ROUNDING = 1e-5  # in lengths: steps that are smaller and do not shrink are rounding
+ROUNDING = 1e-2  # in lengths: steps that are smaller and do not shrink are the rounding of g
 
 
 class BifurcationLost(RuntimeError):
@@ -58,8 +58,12 @@ class Bifurcation:
     factorisations: int
 
 
-def find_bifurcation(newton: BorderedNewton, guess: State, phi: Vector, name: str) -> Bifurcation:
+def find_bifurcation(
+    newton: BorderedNewton, guess: State, phi: Vector, name: str, stress: Sequence[Weighted] = ()
+) -> Bifurcation:
     """The bifurcation in the amplitude `name` near a guess, whose null vector is near `phi`.
+
+    `stress` is as that of `System.tangent`, of the guess.
 
     Raises
     ------
@@ -67,7 +71,7 @@ def find_bifurcation(newton: BorderedNewton, guess: State, phi: Vector, name: st
         If Newton's method diverges or takes too long.
     """
     try:
-        return _found(newton, guess, phi, name)
+        return _found(newton, _settled(newton, guess, phi, stress)[0], phi, name)
     except np.linalg.LinAlgError:
         raise BifurcationLost("the tangent is singular in more than one direction") from None
 
@@ -85,9 +89,9 @@ def _found(newton: BorderedNewton, guess: State, phi: Vector, name: str) -> Bifu
         changes.append(abs(dmu))
         if not steps[-1] <= LARGEST_STEP:
             raise BifurcationLost("Newton's method diverged on its way to a bifurcation")
-        state = state.with_(state.u + du, name, state.mu[name] + dmu)
+        last, state = state.u, state.with_(state.u + du, name, state.mu[name] + dmu)
         if steps[-1] > NEAR:  # off equilibrium, membrane stress that is not there spoils the tangent
-            state, _ = _settled(newton, state, tangent.v)
+            state, _ = _settled(newton, state, tangent.v, followed(last, du))
     state, error = _settled(newton, state, tangent.v)
     return Bifurcation(
         state=state,
@@ -101,8 +105,8 @@ def _found(newton: BorderedNewton, guess: State, phi: Vector, name: str) -> Bifu
     )
 
 
-def _settled(newton: BorderedNewton, state: State, v: Vector) -> tuple[State, float]:
-    found = held_along(newton, state, v)
+def _settled(newton: BorderedNewton, state: State, v: Vector, stress: Sequence[Weighted] = ()) -> tuple[State, float]:
+    found = held_along(newton, state, v, stress)
     if found is None:
         raise BifurcationLost("no equilibrium was found beside a bifurcation")
     return found

@@ -1,6 +1,6 @@
 """Locating the instabilities between two points of a path: folds and bifurcations."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Literal, Protocol
@@ -13,7 +13,7 @@ from magshell_fenicsx.solve.control import projected
 from magshell_fenicsx.solve.factor import Factorisation
 from magshell_fenicsx.solve.inverse import NoEigenpair, nearest_to_zero
 from magshell_fenicsx.solve.path import Path, PathStopped, Point
-from magshell_fenicsx.solve.system import State, Vector
+from magshell_fenicsx.solve.system import State, Vector, Weighted
 
 MOST_STEPS = 60  # bisection alone halves a bracket so often that nothing is left of it
 FLAT = 0.01  # slope of the amplitude, over that at the step's start, that means a fold
@@ -126,17 +126,18 @@ class _Search:
         guess = path.between(low.s + t * (high.s - low.s), low, high)
         pivots = sorted(end.negative_pivots for end in (low, high))
         for mode in sorted(modes, key=lambda mode: abs(mode.eigenvalue)):
-            found = path.recorded(partial(self._regular, guess, mode.vector, low, high))
+            stress = [(1 - t, low.state.u), (t, high.state.u)]
+            found = path.recorded(partial(self._regular, guess, mode.vector, stress, low, high))
             if isinstance(found, str):
                 continue
             if min(low.s, high.s) <= found.s <= max(low.s, high.s) and pivots[0] <= found.negative_pivots < pivots[1]:
                 return self.spent(found)
         return None
 
-    def _regular(self, guess: State, phi: Vector, low: Point, high: Point) -> Point | str:
+    def _regular(self, guess: State, phi: Vector, stress: Sequence[Weighted], low: Point, high: Point) -> Point | str:
         path = self.path
         try:
-            found = find_bifurcation(path.newton, guess, phi, path.name)
+            found = find_bifurcation(path.newton, guess, phi, path.name, stress)
         except BifurcationLost as e:
             return str(e)
         self.iterations += found.iterations

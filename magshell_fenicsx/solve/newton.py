@@ -10,6 +10,7 @@ The unknown vector is u with mu appended on the last rank.
 """
 
 import weakref
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
@@ -23,7 +24,7 @@ from magshell_fenicsx.solve.control import Row
 from magshell_fenicsx.solve.factor import Factorisation
 from magshell_fenicsx.solve.iterates import Iterates, Step, Verdict
 from magshell_fenicsx.solve.refine import refined_tangent
-from magshell_fenicsx.solve.system import State, System, Vector, dot, max_abs
+from magshell_fenicsx.solve.system import State, System, Vector, Weighted, dot, followed, max_abs
 
 LEAST_REST = 0.3  # of a step: an update that would lengthen it more is not trusted
 MOTION = 1e-2  # part of the largest displacement that counts as a length, where it is longer than the system's
@@ -177,9 +178,13 @@ class BorderedNewton:
         ksp.setNormType(PETSc.KSP.NormType.NONE)
         snes.setFromOptions()
 
-    def solve(self, guess: State, name: str, row: Row) -> Outcome:
-        """Find the equilibrium near `guess` on which `row` holds, with mu the amplitude `name`."""
+    def solve(self, guess: State, name: str, row: Row, stress: Sequence[Weighted] = ()) -> Outcome:
+        """Find the equilibrium near `guess` on which `row` holds, with mu the amplitude `name`.
+
+        `stress` is as that of `System.tangent`, of the guess.
+        """
         self._guess, self._name, self._row = guess, name, row
+        self._stress: Sequence[Weighted] = stress
         self._progress = progress = _Progress(Iterates(self.options.largest_step, self.options.max_iterations))
         self._join(guess.u, guess.mu[name], self._x)
         self._snes.solve(None, self._x)
@@ -193,10 +198,10 @@ class BorderedNewton:
         error = progress.iterates.steps[-1].size if progress.iterates.steps else np.inf
         return Outcome(guess.with_(u, name, mu), converged, iterations, reason, error)
 
-    def factor_at(self, state: State) -> Factorisation:
+    def factor_at(self, state: State, stress: Sequence[Weighted] = ()) -> Factorisation:
         """Factor the tangent at a state, unless its factors are at hand."""
         if self._factored is not state:
-            self.factorisation.factor(self.system.tangent(state.u, state.mu))
+            self.factorisation.factor(self.system.tangent(state.u, state.mu, stress))
             self._factored = state
         return self.factorisation
 
@@ -253,7 +258,8 @@ class BorderedNewton:
             if size <= self.options.contraction * steps[-1].size:
                 steps.append(Step(size, own=False))
                 return ahead
-        progress.matrix = matrix = Bordered(self.system, self.factor_at(state), state, self._name, self._row)
+        factors = self.factor_at(state, self._stress)
+        progress.matrix = matrix = Bordered(self.system, factors, state, self._name, self._row)
         progress.taken.clear()
         ahead = matrix.solve(*f)
         steps.append(Step(matrix.size(ahead), own=True))
@@ -286,6 +292,11 @@ class BorderedNewton:
     def _apply(self, y: PETSc.Vec) -> None:
         assert self._progress.ahead is not None
         self._progress.taken.append(self._progress.ahead)
+        # the stress after the step is what follows linearly from before it (MIP Newton: Magisano, Leonetti, Garcea,
+        # Computer Methods in Applied Mechanics and Engineering 313, 2017)
+        du = self._progress.ahead[0]
+        u = self._split(self._snes.getSolution())[0]
+        self._stress = followed(u, -du)
         self._join(*self._progress.ahead, y)
 
     def _mult(self, x: PETSc.Vec, y: PETSc.Vec) -> None:

@@ -10,7 +10,7 @@ from magshell_fenicsx.solve.control import GivenConjugate, GivenLoad, Hyperplane
 from magshell_fenicsx.solve.journal import Journal, NoJournal
 from magshell_fenicsx.solve.newton import HIDDEN, BorderedNewton, Response
 from magshell_fenicsx.solve.progress import NoProgress, Progress
-from magshell_fenicsx.solve.system import State, Vector, dot, max_abs
+from magshell_fenicsx.solve.system import State, Vector, Weighted, dot, followed, max_abs
 
 Control = Literal["load", "conjugate", "arc"]
 MOST_LEAPS = 3  # longer steps that are tried where rounding hides a point
@@ -65,6 +65,8 @@ class StepOptions:
         Step lengths in units of s.
     easy, hard
         Factorisations up to which a step grows, and from which it shrinks.
+    few
+        Iterations up to which it grows too.
     straight
         Cosine between the tangents of successive points above which a step grows.
     turn
@@ -79,6 +81,7 @@ class StepOptions:
     smallest: float
     easy: int = 2
     hard: int = 4
+    few: int = 4
     straight: float = 0.9
     turn: float = 0.5
     gap: float = 0.1
@@ -150,11 +153,11 @@ class Path:
         base
             The point whose tangent arc length is measured along.
         """
-        return self.solve(self._row(s, base), s, guess)
+        return self.solve(self._row(s, base), s, guess, followed(base.state.u, (s - base.s) * base.du))
 
-    def solve(self, row: Row, s: float, guess: State) -> Point | str:
+    def solve(self, row: Row, s: float, guess: State, stress: Sequence[Weighted] = ()) -> Point | str:
         """Solve for the point on which a row holds, or say why that failed; the tangent is per unit of the row."""
-        return self.recorded(lambda: self._solve(row, s, guess))
+        return self.recorded(lambda: self._solve(row, s, guess, stress))
 
     def recorded(self, find: Callable[[], Point | str]) -> Point | str:
         """What is found, or what an interrupted run had found here."""
@@ -215,9 +218,10 @@ class Path:
                     continue
                 leaps = 0
                 straight = self._cosine(here, found) > self.options.straight
-                if found.factorisations <= self.options.easy and straight:
-                    step = min(max(step, 1.5 * length), self.options.largest)
-                elif found.factorisations >= self.options.hard:
+                o = self.options
+                if (found.factorisations <= o.easy or found.iterations <= o.few) and straight:
+                    step = min(max(step, 1.5 * length), o.largest)
+                elif found.factorisations >= o.hard:
                     step = 0.6 * length
                 before, here = here, found
                 yield here, here.s == target
@@ -279,9 +283,9 @@ class Path:
             return 1.0
         return self.metric.weight * dot(self.system.comm, a.du, b.du) / lengths
 
-    def _solve(self, row: Row, s: float, guess: State) -> Point | str:
+    def _solve(self, row: Row, s: float, guess: State, stress: Sequence[Weighted]) -> Point | str:
         before = self.newton.factorisation.count
-        outcome = self.newton.solve(guess, self.name, row)
+        outcome = self.newton.solve(guess, self.name, row, stress)
         if not outcome.converged:
             return outcome.reason
         found = self._point(outcome.state, s, self.newton.response(outcome.state, self.name, row))

@@ -12,7 +12,7 @@ from petsc4py import PETSc
 
 from magshell_fenicsx import compat
 from magshell_fenicsx.solve.noise import Noise
-from magshell_fenicsx.solve.system import Amplitudes, Vector
+from magshell_fenicsx.solve.system import Amplitudes, Vector, Weighted
 from magshell_fenicsx.solve.terms import FormTerm, Term
 from magshell_fenicsx.solve.timing import Stopwatch
 
@@ -20,8 +20,13 @@ from magshell_fenicsx.solve.timing import Stopwatch
 class TangentAssembler(Protocol):
     """A way to the tangent other than the terms' own forms."""
 
-    def tangent(self, factors: Mapping[str, float]) -> PETSc.Mat:
-        """The matrix of the terms with these factors, by name, at the u that they were written with."""
+    def tangent(
+        self, factors: Mapping[str, float], stress: Sequence[tuple[float, NDArray[np.float64]]] = ()
+    ) -> PETSc.Mat:
+        """The matrix of the terms with these factors, by name, at the u that they were written with.
+
+        `stress` is as that of `System.tangent`, of displacements with ghosts.
+        """
 
 
 class ResidualAssembler(Protocol):
@@ -93,6 +98,10 @@ class FiniteElementSystem:
         self.u.x.array[: self.size] = u
         self.u.x.scatter_forward()
 
+    def _with_ghosts(self, u: Vector) -> NDArray[np.float64]:
+        self.set(u)
+        return np.array(self.u.x.array)
+
     def held(self, u: Vector) -> Vector:
         """A displacement with zeros at the clamped degrees of freedom."""
         u = np.array(u)
@@ -119,11 +128,12 @@ class FiniteElementSystem:
         self.set(u)
         return {t.name: float(self.comm.allreduce(t.energy())) for t in self.terms}
 
-    def tangent(self, u: Vector, mu: Amplitudes) -> PETSc.Mat:
+    def tangent(self, u: Vector, mu: Amplitudes, stress: Sequence[Weighted] = ()) -> PETSc.Mat:
         with self.assembly:
+            whole = [(weight, self._with_ghosts(v)) for weight, v in stress]
             self.set(u)
             factors = {t.name: _factor(t, mu) for t in self.terms}
-            K = self._assembler.tangent(factors) if self._assembler else self._of_forms(factors)
+            K = self._assembler.tangent(factors, whole) if self._assembler else self._of_forms(factors)
             if self.noise:
                 self.noise.on_matrix(K)
             return K

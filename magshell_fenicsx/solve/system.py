@@ -1,6 +1,6 @@
 """What the solvers see: vectors, a matrix and named amplitudes; nothing of shells."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -11,6 +11,7 @@ from petsc4py import PETSc
 
 Vector = NDArray[np.float64]  # the owned part of a distributed vector
 Amplitudes = Mapping[str, float]
+Weighted = tuple[float, Vector]
 
 
 class System(Protocol):
@@ -37,8 +38,20 @@ class System(Protocol):
     def potential(self, u: Vector, name: str) -> float:
         """Pi_i(u), on every rank; -Pi_i is the displacement conjugate to the amplitude."""
 
-    def tangent(self, u: Vector, mu: Amplitudes) -> PETSc.Mat:
-        """d2Pi/du2, assembled; the matrix is reused by the next call."""
+    def tangent(self, u: Vector, mu: Amplitudes, stress: Sequence[Weighted] = ()) -> PETSc.Mat:
+        """d2Pi/du2, assembled; the matrix is reused by the next call.
+
+        Parameters
+        ----------
+        stress
+            Displacements with weights. A system may take the weighted sum of their stresses in place of that of u:
+            it follows a path linearly where the stress of a guess is spoilt by the guess's small errors.
+        """
+
+
+def followed(u: Vector, step: Vector) -> list[Weighted]:
+    """The stress that follows linearly from u along a step, as weighted displacements; strain is quadratic in u."""
+    return [(1.0, u), (0.5, u + step), (-0.5, u - step)]
 
 
 @dataclass(frozen=True)

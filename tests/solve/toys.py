@@ -1,13 +1,13 @@
 """Systems with one or two unknowns whose paths are known."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from magshell_fenicsx.solve.system import Amplitudes, Vector
+from magshell_fenicsx.solve.system import Amplitudes, Vector, Weighted
 
 
 @dataclass
@@ -36,7 +36,7 @@ class Toy:
     def potential(self, u: Vector, name: str) -> float:
         return -float(u[0])
 
-    def tangent(self, u: Vector, mu: Amplitudes) -> PETSc.Mat:
+    def tangent(self, u: Vector, mu: Amplitudes, stress: Sequence[Weighted] = ()) -> PETSc.Mat:
         self.K.setValues(range(self.size), range(self.size), self.hessian(u))
         self.K.assemble()
         return self.K
