@@ -1,7 +1,8 @@
 """The history of a case: the field first, then the load; every accepted point, and what stopped it."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -21,6 +22,7 @@ from magshell_fenicsx.solve.branch import Branching, branching
 from magshell_fenicsx.solve.path import Control, Path, PathStopped, Point, StepOptions
 from magshell_fenicsx.solve.system import State
 from magshell_fenicsx.solve.walk import MOST_STEPS, Goal, Quantity, Walk
+from magshell_fenicsx.solve.watch import Crossing
 
 Label = Literal["start", "field", "step", "target", "fold", "bifurcation"]
 CONTROLS: dict[str, Control] = {"volume": "conjugate", "displacement": "conjugate", "load": "load", "arc": "arc"}
@@ -40,12 +42,14 @@ class Record:
         The amplitude that varied ("" at the start).
     mode
         Of an instability that a reduced model excludes: "antisymmetric" to the mirror plane of a
-        half shell, or "m = 7" waves around an axisymmetric one. They are looked for at the first
-        instability of the model itself, before which such a record comes, and at the end.
+        half shell, or "m = 7" waves around an axisymmetric one. There such a mode becomes unstable,
+        or stable again.
         Of a bifurcation in the model itself: "symmetric" if the load changes alike in both
         directions of the branch (a pitchfork), or "asymmetric".
     branch
         0 on the path itself, 1 and 2 in the two directions of the branch at its first bifurcation.
+    excluded_pivots
+        Number of unstable directions that the model excludes; see `solve.watch.Watch`.
     """
 
     label: Label
@@ -53,6 +57,7 @@ class Record:
     point: Point
     mode: str = ""
     branch: int = 0
+    excluded_pivots: int = 0
 
 
 class Stopped(RuntimeError):
@@ -164,7 +169,7 @@ def _rotation(scene: Scene, loading: RotationSection, state: State) -> Iterator[
     magnetic = scene.case.magnetic
     assert magnetic is not None
     total = float(np.arccos(magnetic.applied.vector() @ loading.to.vector()))
-    modes, system = scene.model.excluded_modes, scene.newton.system
+    watch, system = scene.watch, scene.newton.system
     for angle in _divided(0.0, total, loading.points):
         end = {name: scene.case.lambda_m * f(angle) for name, f in (("lambda_m", np.cos), ("lambda_across", np.sin))}
         scene.newton.system = chord = Along(
@@ -173,17 +178,30 @@ def _rotation(scene: Scene, loading: RotationSection, state: State) -> Iterator[
         label: Label = "start"
         try:
             path, start = begin(scene, "turn", "arc", State(state.u, {**state.mu, "turn": 0.0}), 1.0)
+            watch.begin(path, start, partial(_expanded, chord))
             for label, point in Walk(path, start, Goal("limit", [1.0])):
-                state = State(point.state.u, chord.expand(point.state.mu))
-                yield Record(label, "angle", replace(point, state=state))
+                for found in _excluded(path, watch.pass_to(point, look=label != "step")):
+                    yield replace(found, amplitude="angle", point=_turned(chord, found.point))
+                here = _turned(chord, point)
+                state = here.state
+                yield Record(label, "angle", here, excluded_pivots=watch.unstable)
         except PathStopped as e:
             raise Stopped(f"the turning field stopped before {np.degrees(angle):.4g} degrees: {e}") from None
         finally:
             scene.newton.system = system
         if label != "target":
             raise Stopped(f"the turning field makes the shell unstable before {np.degrees(angle):.4g} degrees: {label}")
-        if modes and modes.is_unstable(state):
+        if watch.unstable:
             raise Stopped(f"an antisymmetric instability lies before {np.degrees(angle):.4g} degrees of the field")
+
+
+def _expanded(chord: Along, state: State) -> State:
+    """A state on the chord between two angles, with the amplitudes of the model."""
+    return State(state.u, chord.expand(state.mu))
+
+
+def _turned(chord: Along, point: Point) -> Point:
+    return replace(point, state=_expanded(chord, point.state))
 
 
 def _divided(start: float, end: float, points: int) -> list[float]:
@@ -214,29 +232,30 @@ def followed(
     scene: Scene, path: Path, start: Point, goal: Goal, branches: PathSection | None = None
 ) -> Iterator[Record]:
     """A walk, what the reduced model excludes on it, and the branches if they are asked for."""
-    walk, crossing, lost = Walk(path, start, goal), None, ""
-    excluded, checked = None, start
+    scene.progress.doing("looking for modes that the model excludes")
+    walk, crossing, lost, watch = Walk(path, start, goal), None, "", scene.watch
+    watch.begin(path, start)
     try:
         for label, point in walk:
-            mode = ""
-            if label in ("fold", "bifurcation") and checked is start:  # which came first?
-                checked, excluded = point, _excluded(scene, path, [*walk.points, point])
-                if excluded:
-                    yield excluded
+            mode, located = "", label in ("fold", "bifurcation")
+            yield from _excluded(path, watch.pass_to(point, look=located))
             if label == "bifurcation":
                 here = branching(_by_arc(scene, path), point)
                 crossing = crossing or here
                 mode = ("symmetric" if here.symmetric else "asymmetric") if here else ""
-            yield Record(label, path.name, point, mode)
+            yield Record(label, path.name, point, mode, excluded_pivots=watch.unstable)
     except PathStopped as e:
         lost = _why(path, e, walk.points)
-        if path.control == "load" and (found := _fold_ahead(scene, path, walk.points)):
+    yield from _excluded(path, watch.end())
+    if lost and path.control == "load":
+        for found in _fold_ahead(scene, path, walk.points):
             yield found
-            lost = f"load control cannot pass the fold at {path.name} = {found.point.state.mu[path.name]:.9g}; {lost}"
-    if not excluded and checked is not walk.points[-1]:
-        excluded = _excluded(scene, path, walk.points)
-        if excluded:
-            yield excluded
+            if found.label == "fold":
+                at = f"{path.name} = {found.point.state.mu[path.name]:.9g}"
+                lost = f"load control cannot pass the fold at {at}; {lost}"
+    if watch.unlocated:
+        why = f"a mode that the reduced model excludes is unstable, but where is not known: {watch.unlocated}"
+        lost = f"{lost}; {why}" if lost else why
     if lost:
         raise Stopped(lost)
     if branches and branches.branches and crossing:
@@ -245,18 +264,23 @@ def followed(
 
 def _branches(scene: Scene, path: Path, crossing: Branching, goal: Goal, steps: int) -> Iterator[Record]:
     """Both directions of a branch, to the same target as the path or for a number of steps."""
-    lost = []
+    lost, watch = [], scene.watch
     if goal.until != "target":
         goal = Goal("points", steps=steps)
     for number, start in enumerate(crossing.starts, 1):
         by_arc = _by_arc(scene, path)
         walk = Walk(by_arc, start, goal)
-        yield Record("step", path.name, start, branch=number)
+        watch.begin(by_arc, start, look=True)
+        yield Record("step", path.name, start, branch=number, excluded_pivots=watch.unstable)
         try:
             for label, point in walk:
-                yield Record(label, path.name, point, branch=number)
+                for found in _excluded(by_arc, watch.pass_to(point, look=label in ("fold", "bifurcation"))):
+                    yield replace(found, branch=number)
+                yield Record(label, path.name, point, branch=number, excluded_pivots=watch.unstable)
         except PathStopped as e:
             lost.append(f"branch {number}: {_why(by_arc, e, walk.points)}")
+        for found in _excluded(by_arc, watch.end()):
+            yield replace(found, branch=number)
     if lost:
         raise Stopped("; ".join(lost))
 
@@ -268,27 +292,24 @@ def _by_arc(scene: Scene, path: Path) -> Path:
     return Path(scene.newton, path.name, "arc", options, scale, scene.journal, scene.progress)
 
 
-def _fold_ahead(scene: Scene, path: Path, points: list[Point]) -> Record | None:
-    """The fold that ended a path under load control, by arc length from its last point."""
+def _fold_ahead(scene: Scene, path: Path, points: list[Point]) -> list[Record]:
+    """The fold that ended a path under load control, by arc length from its last point, and what comes before it."""
     onward = points[-1].s - points[-2].s if len(points) > 1 else 1.0
     by_arc, start = begin(scene, path.name, "arc", points[-1].state, onward, path.metric.scale)
+    scene.watch.begin(by_arc, start)
+    found: list[Record] = []
     try:
-        *_, (label, point) = Walk(by_arc, start, Goal("limit", steps=20))
+        for label, point in Walk(by_arc, start, Goal("limit", steps=20)):
+            found += _excluded(by_arc, scene.watch.pass_to(point, look=label == "fold"))
     except PathStopped:
-        return None
-    return Record(label, path.name, point) if label == "fold" else None
+        return []
+    return [*found, Record(label, path.name, point, excluded_pivots=scene.watch.unstable)] if label == "fold" else []
 
 
-def _excluded(scene: Scene, path: Path, points: list[Point]) -> Record | None:
-    """The first instability among the modes that a reduced model does not see, if there is one."""
-    modes = scene.model.excluded_modes
-    if modes:
-        scene.progress.doing("looking for modes that the model excludes")
-    try:
-        found = modes.first_instability(path, points) if modes else None
-    except PathStopped as e:
-        raise Stopped(f"a mode that the reduced model excludes is unstable, but where is not known: {e}") from None
-    return Record("bifurcation", path.name, found[1], found[0]) if found else None
+def _excluded(path: Path, crossings: Iterable[Crossing]) -> Iterator[Record]:
+    """Where modes that a reduced model does not see become unstable or stable."""
+    for found in crossings:
+        yield Record("bifurcation", path.name, found.point, found.label, excluded_pivots=found.unstable)
 
 
 def _why(path: Path, stop: PathStopped, points: list[Point]) -> str:

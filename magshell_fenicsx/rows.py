@@ -37,6 +37,7 @@ class RowMaker:
             "branch": record.branch,
             "error_over_h": point.error,
             "load_error": point.load_error,
+            "excluded_pivots": record.excluded_pivots,
         }
 
 

@@ -3,6 +3,7 @@
 import time
 from collections import defaultdict
 from collections.abc import Sequence
+from functools import cached_property
 from math import atan2, copysign, degrees, hypot, nan
 
 from mpi4py import MPI
@@ -25,6 +26,7 @@ from magshell_fenicsx.solve.journal import Journal, NoJournal
 from magshell_fenicsx.solve.newton import BorderedNewton
 from magshell_fenicsx.solve.progress import NoProgress, Progress
 from magshell_fenicsx.solve.system import State
+from magshell_fenicsx.solve.watch import Watch
 
 
 class Scene:
@@ -79,6 +81,11 @@ class Scene:
     def cells(self) -> int:
         topology = self.model.V.mesh.topology
         return int(topology.index_map(topology.dim).size_global)
+
+    @cached_property
+    def watch(self) -> Watch:
+        """Looks at the modes that the model excludes, along its paths. Compiles their kernels."""
+        return Watch(self.model.excluded_modes)
 
     def unloaded(self) -> State:
         """The undeformed shell with all amplitudes zero."""

@@ -47,8 +47,9 @@ def test_waves_before_the_fold(
     """Axisymmetric."""
     settings = f"shell.radius_to_thickness={R_over_h}", f"magnetic.lambda_m={lambda_m}", f"loading.control={control}"
     found = result("dimple_buckling.yaml", *settings)
-    assert [(p["kind"], p["mode"]) for p in found.limit_points] == [("bifurcation", mode), ("fold", "")]
-    assert [p["value"] for p in found.limit_points] == pytest.approx([first, fold], abs=1e-4)
+    points = [found.limit_points[0], found.limit_points[-1]]
+    assert [(p["kind"], p["mode"]) for p in points] == [("bifurcation", mode), ("fold", "")]
+    assert [p["value"] for p in points] == pytest.approx([first, fold], abs=1e-4)
     assert found.knockdown == found.limit_points[0]["value"]
 
 

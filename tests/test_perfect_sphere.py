@@ -43,7 +43,7 @@ def waves_of(found: Scene, vector: np.ndarray) -> int:
 
 def compare(symmetry: str, R_over_h: float, **mesh: Any) -> tuple[str, float, int, float]:
     """Mode and p/p_c of the meridian model, waves and p/p_c of the surface model."""
-    (waves,) = [r for r in follow(scene("axisymmetric", R_over_h)) if r.mode]
+    waves, *_ = [r for r in follow(scene("axisymmetric", R_over_h)) if r.mode]
     surface = scene(symmetry, R_over_h, **mesh)
     *_, before, found = [r for r in follow(surface) if r.mode != "antisymmetric"]
     state = before.point.state if found.label == "fold" else found.point.state

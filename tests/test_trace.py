@@ -95,7 +95,7 @@ def test_path_through_the_fold() -> None:
     """So many steps by arc length; the fold is on the way and the pressure falls after it."""
     scene = ms.Scene(ms.Case.load(CASES / "dimple_buckling.yaml"))
     records = list(ms.trace(scene, "pressure", first=0.1, until="points", steps=9))
-    table = ms.columns(scene, [record for record in records if not record.mode])  # waves are looked for at the end
+    table = ms.columns(scene, [record for record in records if not record.mode])
     fold = list(table["label"]).index("fold")
     assert sum(table["label"] == "step") == 9
     assert fold < len(table["label"]) - 1

@@ -63,6 +63,11 @@ def place(row: Row, amplitude: str) -> tuple[float, float]:
     return (-1.0 if x_key == "volume_change" else 1.0) * float(row[x_key]), float(row[y_key])
 
 
+def _unstable(row: Row) -> bool:
+    """In directions that the model sees or excludes, which a path.csv of an earlier version does not count."""
+    return int(row["negative_pivots"]) + int(row.get("excluded_pivots", 0)) > 0
+
+
 def _axes(amplitude: str) -> tuple[str, str, str, str]:
     return AXES.get(amplitude, ("w_pole_over_h", amplitude, POLE, amplitude.replace("_", " ")))
 
@@ -78,7 +83,7 @@ def plot_curve(axes: "Axes", rows: Sequence[Row], amplitude: str) -> None:
     for branch in sorted({int(row["branch"]) for row in part}):
         line = [row for row in part if row["branch"] == branch and row["mode"] in OWN_MODES]
         smooth_x, smooth_y = smooth(*zip(*(place(row, amplitude) for row in line), strict=True))
-        unstable = [int(row["negative_pivots"]) > 0 and row["label"] not in LOCATED for row in line]
+        unstable = [_unstable(row) and row["label"] not in LOCATED for row in line]
         for dashed, pieces in groupby(range(1, len(line)), key=unstable.__getitem__):
             i, *others = pieces
             piece = slice((i - 1) * FINE, (i + len(others)) * FINE + 1)

@@ -15,6 +15,7 @@ COUNTS = {
     "point": "point",
     "negative_pivots": "unstable directions",
     "negative_pivots_held": "unstable, w held",
+    "excluded_pivots": "unstable, excluded",
     "iterations": "iterations",
     "factorisations": "factor&shy;isations",
     "branch": "branch",

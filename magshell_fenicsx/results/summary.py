@@ -112,6 +112,7 @@ def summary(result: Result, total_s: float) -> dict[str, Any]:
         "limit_points": result.limit_points,
         "sensitivities": result.sensitivities,
         "knockdown": result.knockdown,
+        "most_excluded_pivots": max((int(row["excluded_pivots"]) for row in result.rows), default=0),
         "points": len(result.rows),
         "mesh": {"cells": scene.cells, "dofs": model.system.dofs, "degree": model.degree},
         **({"tolerance": result.adapted.account(result.value)} if result.adapted else {}),

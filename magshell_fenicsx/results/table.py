@@ -37,6 +37,7 @@ COLUMNS = (
     "w_point_over_h",
     "error_over_h",
     "load_error",
+    "excluded_pivots",
 )
 TEXTS = ("label", "amplitude", "mode")
 Row = dict[str, float | int | str]

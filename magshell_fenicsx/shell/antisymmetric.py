@@ -6,7 +6,6 @@ but v moves freely along the mirror normal m and not in the plane, and the edges
 two halves tilt against each other.
 """
 
-from bisect import bisect_left
 from collections.abc import Sequence
 
 import numpy as np
@@ -20,11 +19,10 @@ from magshell_fenicsx.shell import kinematics as kin
 from magshell_fenicsx.shell.edges import edge_density
 from magshell_fenicsx.shell.kinematics import Jet
 from magshell_fenicsx.shell.parameters import MIRROR_NORMAL
-from magshell_fenicsx.solve.events import locate_bifurcation
 from magshell_fenicsx.solve.factor import Factorisation
-from magshell_fenicsx.solve.path import Path, Point
 from magshell_fenicsx.solve.problem import FiniteElementSystem
 from magshell_fenicsx.solve.system import State
+from magshell_fenicsx.solve.watch import Family
 
 
 def antisymmetric_edge(
@@ -51,13 +49,15 @@ def antisymmetric_edge(
 
 
 class AntisymmetricModes:
-    """The tangent of the modes that a half model excludes; a `solve.events.Stability`.
+    """The tangent of the modes that a half model excludes; a `solve.watch.Family`.
 
     Attributes
     ----------
     system
         Whose tangent it is, at the displacements of the half model.
     """
+
+    label = "antisymmetric"
 
     def __init__(self, system: FiniteElementSystem) -> None:
         self.system = system
@@ -75,27 +75,14 @@ class AntisymmetricModes:
         """Whether an antisymmetric mode is unstable at a symmetric state."""
         return self.factor_at(state).negative_pivots > 0
 
-    def first_instability(self, path: Path, points: Sequence[Point]) -> tuple[str, Point] | None:
-        """The first point of a path at which an antisymmetric mode becomes unstable.
+    @property
+    def families(self) -> Sequence[Family]:
+        """For a `Watch`: they are one."""
+        return [self]
 
-        The last point is looked at first, then those before it, by bisection: what becomes
-        unstable on the way and stable again passes for stable.
-
-        Raises
-        ------
-        PathStopped
-            If Newton fails between two points that it had found.
-        """
-
-        def is_unstable(number: int) -> bool:
-            return self.is_unstable(points[number].state)
-
-        if not is_unstable(len(points) - 1):
-            return None
-        first = bisect_left(range(len(points) - 1), True, key=is_unstable)
-        if first == 0:
-            return "antisymmetric", points[0]
-        return "antisymmetric", locate_bifurcation(path, points[first - 1], points[first], self)
+    def counts(self, state: State) -> Sequence[int]:
+        """The number of unstable directions at a symmetric state."""
+        return [self.factor_at(state).negative_pivots]
 
 
 def held_against_mirror(V: fem.FunctionSpace, facets: NDArray[np.int32]) -> list[fem.DirichletBC]:

@@ -5,13 +5,14 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import hemisphere as triangulated
-from meridian_scenes import E3, buckle, dimpled, hemisphere
+from meridian_scenes import E3, Buckling, buckle, dimpled, hemisphere
 
-from magshell_fenicsx.axisymmetric.instability import first_circumferential_instability
+from magshell_fenicsx.axisymmetric.model import MeridianModel
 from magshell_fenicsx.shell.model import ShellModel
 from magshell_fenicsx.shell.parameters import Loads, Magnetisation, Material
 from magshell_fenicsx.shell.patterns import radial
 from magshell_fenicsx.solve.system import State
+from magshell_fenicsx.solve.watch import Crossing, Watch
 
 Array = np.ndarray
 FIELD = Magnetisation(radial, E3, gradient=np.diag([0.5, 0.5, -1.0]))
@@ -60,6 +61,12 @@ def on_the_shell(m: int, mu: dict[str, float], R_over_h: float, size: float) -> 
     return second_variation(model.system.tangent(cartesian(U0, 0 * U0, W0), mu), v)
 
 
+def crossings(model: MeridianModel, found: Buckling) -> list[Crossing]:
+    watch = Watch(model.excluded_modes)
+    watch.begin(found.path, found.points[0])
+    return [crossing for point in found.points[1:] for crossing in watch.pass_to(point)]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("m", [1, 2, 5])
 def test_agrees_with_the_full_shell(m: int) -> None:
@@ -105,9 +112,8 @@ def test_known_waves(R_over_h: float, lambda_m: float, wave_number: int, p_over_
     """An independent axisymmetric solver with its own circumferential modes; before the axisymmetric fold."""
     model = dimpled(R_over_h, lambda_m)
     waves, found = model.excluded_modes.waves, buckle(model, lambda_m)
-    first = first_circumferential_instability(waves, found.path, found.points)
-    assert first is not None
-    m, point = first
+    first = crossings(model, found)[0]
+    m, point = int(first.label.removeprefix("m = ")), first.point
     assert m == wave_number
     assert point.state.mu["pressure"] == pytest.approx(p_over_pc, rel=1e-4)
     assert point.state.mu["pressure"] < found.instability.point.state.mu["pressure"]
@@ -118,17 +124,23 @@ def test_no_wave_before_the_fold() -> None:
     """R/h = 90: the paper's knockdown is the axisymmetric fold."""
     model = dimpled(90, 0.00184)
     found = buckle(model, 0.00184)
-    assert first_circumferential_instability(model.excluded_modes.waves, found.path, found.points) is None
+    assert crossings(model, found) == []
 
 
 def test_perfect_hemisphere_buckles_in_waves_at_its_edge() -> None:
     """The full shell's tangent (44 589 unknowns) has its first two negative pivots between 0.8405 and 0.8418."""
     model = hemisphere(90, 0.5, Loads(pressure=True))
     found = buckle(model, 0.0)
-    first = first_circumferential_instability(model.excluded_modes.waves, found.path, found.points)
-    assert first is not None
-    assert first[0] == 14
-    assert first[1].state.mu["pressure"] == pytest.approx(0.84111, rel=1e-4)
-    named = model.excluded_modes.first_instability(found.path, found.points)
-    assert named is not None
-    assert named[0] == "m = 14"
+    first = crossings(model, found)[0]
+    assert first.label == "m = 14"
+    assert first.point.state.mu["pressure"] == pytest.approx(0.84111, rel=1e-4)
+
+
+@pytest.mark.parametrize(("R_over_h", "lambda_m"), [(90, 0.00184), (300, 0.00184)])
+def test_counts_of_all_waves_are_those_of_each(R_over_h: float, lambda_m: float) -> None:
+    """Interpolated between five m, as a polynomial of degree 4; 13 are unstable at one fold."""
+    model = dimpled(R_over_h, lambda_m)
+    waves, state = model.excluded_modes.waves, buckle(model, lambda_m).instability.point.state
+    counts = waves.counts(state)
+    assert {m: count for m, count in enumerate(counts, 1) if count} == waves.unstable(state)
+    assert sum(counts) == (13 if R_over_h == 300 else 0)
