@@ -41,8 +41,8 @@ class _Sprung:
         K = self._system.tangent(u, mu, stress)
         first = K.getOwnershipRange()[0]
         here = [first + int(i) for i in np.flatnonzero(self.e)]
-        itself = self.comm.allreduce(sum(abs(K.getValue(i, i)) for i in here))
-        self.stiffness = itself or K.norm(PETSc.NormType.INFINITY) or 1.0
+        itself = self.comm.allreduce(sum(K.getValue(i, i) for i in here))
+        self.stiffness = 2 * abs(itself) - itself or K.norm(PETSc.NormType.INFINITY) or 1.0  # the sum is positive
         for i in here:
             K.setValue(i, i, self.stiffness, addv=True)
         K.assemble()

@@ -19,6 +19,7 @@ from magshell_fenicsx.solve.system import State, System, Vector, Weighted, dot, 
 TOLERANCE = 1e-9  # of u, in lengths of the system
 MOST_ITERATIONS = 10
 LARGEST_STEP = 10.0  # in lengths; more is a divergence
+SCATTER = 3.0  # corrections of the load that only rounding makes, in standard deviations
 NEAR = 1e-5  # in lengths: after longer steps the state is brought back into equilibrium but for the force along v
 ROUNDING = 1e-2  # in lengths: steps that are smaller and do not shrink are the rounding of g
 
@@ -99,7 +100,7 @@ def _found(newton: BorderedNewton, guess: State, phi: Vector, name: str) -> Bifu
         response=w_mu,
         unstable=tangent.unstable,
         error=error,
-        load_error=max(changes[-2:]),
+        load_error=SCATTER * max(changes[-2:]),
         iterations=len(steps),
         factorisations=newton.factorisation.count - before,
     )

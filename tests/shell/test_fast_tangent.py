@@ -7,17 +7,22 @@ from collections.abc import Callable, Mapping
 import numpy as np
 import pytest
 import scipy.sparse
+import ufl
 from conftest import hemisphere, random_displacement
+from dolfinx import fem
 from petsc4py import PETSc
 
 from magshell_fenicsx import Case, Scene, follow
 from magshell_fenicsx.case.source import Source
+from magshell_fenicsx.shell import densities, kinematics
+from magshell_fenicsx.shell.energy import cell_quadrature
 from magshell_fenicsx.shell.fast_tangent import FastTangent, make_sites
 from magshell_fenicsx.shell.model import ShellModel
 from magshell_fenicsx.shell.parameters import Condition, Loads, Magnetisation, Material
 from magshell_fenicsx.shell.patterns import tangential
 from magshell_fenicsx.solve.kernels import KernelLog
 from magshell_fenicsx.solve.problem import FiniteElementSystem
+from magshell_fenicsx.solve.system import followed
 from magshell_fenicsx.solve.terms import FormTerm
 
 Shells = Callable[..., ShellModel]
@@ -117,6 +122,30 @@ def test_matrix_is_reused_and_follows_state_and_amplitudes(shell: Shells) -> Non
     assert abs(csr(K) - first).max() == 0
     assert K.isSymmetricKnown() == (True, True)
     assert abs(first - first.T).max() <= 1e-14 * abs(first).max()
+
+
+def test_stress_of_other_displacements(shell: Shells) -> None:
+    """v . K v changes by twice the integral of `densities.prestress` with the change of the strain, by a form."""
+    model = shell(3)
+    system, u, step, v = model.system, *(random_displacement(model, 1e-2, seed) for seed in range(3))
+    K = csr(system.tangent(u, MU))
+    assert abs(csr(system.tangent(u, MU, [(1.0, u)])) - K).max() <= 1e-14 * abs(K).max()
+    changed = csr(system.tangent(u, MU, followed(u - step, step)))
+
+    fields = [fem.Function(model.V) for _ in range(2)]
+    for field, values in zip(fields, (step, v), strict=True):
+        field.x.array[:] = values
+    r0, d, w = (kinematics.jet(field, model.V.mesh) for field in (model.r0, *fields))
+    square = kinematics.metric(d)
+    E = -ufl.as_vector([square[0, 0], square[0, 1], square[1, 1]]) / 2
+    density = densities.prestress(r0, d, w, model.material.nu, E) * kinematics.area_ratio(r0)
+    free = system.held(np.ones_like(v))
+    form = density * ufl.dx(metadata={"quadrature_degree": cell_quadrature(3)})
+    fields[1].x.array[:] = v * free
+    expected = 2 * fem.assemble_scalar(fem.form(form))
+    found = (v * free) @ ((changed - K) @ (v * free))
+    assert found == pytest.approx(expected, rel=1e-10)
+    assert abs(expected) > 1e-6 * abs((v * free) @ (K @ (v * free)))
 
 
 HALF_SHELL = {
