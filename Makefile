@@ -10,6 +10,7 @@ make check CASE=...   validate a case, print what would be built
 make figures          the paper's figures into results/figures/: 45 minutes on one core, N=ranks share it
 make benchmarks       the nonlinear obstacle course into docs/benchmarks/: three quarters of an hour on one core
 make extremes         shells far from the ordinary ones into docs/extremes/: 5 minutes
+make noise            every case under relative noise into docs/noise/: an hour on one core (ARGS="--seeds 3")
 make bench            error, time and memory of a fixed set into results/bench.json (OUT=file), and the ratios
                       to docs/bench/bench.json: 10 minutes on an idle machine
 make studies          error against run time of two cases into docs/study/: 10 minutes
@@ -23,7 +24,7 @@ make clean            remove caches and compiled kernels; keeps .env/root* and r
 endef
 export HELP
 
-.PHONY: help run check figures benchmarks extremes bench studies test fast lint image clean
+.PHONY: help run check figures benchmarks extremes noise bench studies test fast lint image clean
 
 help:
 	@echo "$$HELP"
@@ -40,6 +41,10 @@ benchmarks:
 
 extremes:
 	$(ENV) $(if $(N),mpirun -n $(N)) python3 -m magshell_fenicsx.extremes $(ARGS)
+
+noise:
+	@mkdir -p docs/noise
+	$(ENV) python3 cases/noise/table.py $(ARGS) > results/noise.md && mv results/noise.md docs/noise/README.md
 
 bench:
 	$(ENV) python3 -m magshell_fenicsx.bench $(if $(OUT),--out $(OUT)) --compare docs/bench/bench.json $(ARGS)

@@ -135,5 +135,5 @@ def first_difference(f: Callable[[Vector], Vector], system: System, u: Vector, v
 def _offset(system: System, v: Vector) -> float:
     size = max_abs(system.comm, v)
     if size == 0.0:
-        raise np.linalg.LinAlgError("the bordered tangent is singular too")
+        raise np.linalg.LinAlgError
     return DIFFERENCE * system.length / size

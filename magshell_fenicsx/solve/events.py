@@ -138,8 +138,8 @@ class _Search:
         path = self.path
         try:
             found = find_bifurcation(path.newton, guess, phi, path.name, stress)
-        except BifurcationLost as e:
-            return str(e)
+        except BifurcationLost:
+            return "no bifurcation was found"
         self.iterations += found.iterations
         self.factorisations += found.factorisations
         # of both branches' tangents, the one that continues the path

@@ -194,7 +194,8 @@ class BorderedNewton:
             u, mu = plus((u, mu), -1.0, progress.ahead)
         iterations = self._snes.getIterationNumber()
         self.iterations += iterations
-        reason = _REASONS.get(progress.verdict, f"SNES reason {self._snes.getConvergedReason()}")
+        ended = self._snes.getConvergedReason()
+        reason = _REASONS.get(progress.verdict) or _REASONS_OF_SNES.get(ended, f"SNES reason {ended}")
         error = progress.iterates.steps[-1].size if progress.iterates.steps else np.inf
         return Outcome(guess.with_(u, name, mu), converged, iterations, reason, error)
 
@@ -319,6 +320,10 @@ _REASON_OF = {
     "diverged": PETSc.SNES.ConvergedReason.DIVERGED_DTOL,
     "rounding": PETSc.SNES.ConvergedReason.DIVERGED_INNER,
     "too many": PETSc.SNES.ConvergedReason.DIVERGED_MAX_IT,
+}
+_REASONS_OF_SNES = {
+    compat.NOT_A_NUMBER: "the residual is not a number",
+    PETSc.SNES.ConvergedReason.DIVERGED_LINEAR_SOLVE: "the tangent could not be factored",
 }
 _REASONS: dict[str, str] = {
     "converged": "converged",
