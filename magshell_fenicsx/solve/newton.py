@@ -43,7 +43,9 @@ class NewtonOptions:
     max_iterations
         Iterations after which a step is given up.
     contraction
-        Factors are kept while a step is shorter than this part of the one before.
+        The first factors are kept while a step is shorter than this part of the one before.
+    hard
+        The same of later factors: where the first were not enough, old ones lead astray.
     fresh
         Lengths between where factors were made and a solution whose tangent and inertia they still tell.
     largest_step
@@ -53,6 +55,7 @@ class NewtonOptions:
     tolerance: float = 1e-9
     max_iterations: int = 25
     contraction: float = 0.6
+    hard: float = 0.1
     fresh: float = 0.05
     largest_step: float = 1e4
 
@@ -256,7 +259,8 @@ class BorderedNewton:
         if progress.matrix is not None:
             ahead = self._updated(progress.matrix.solve(*f))
             size = progress.matrix.size(ahead)
-            if size <= self.options.contraction * steps[-1].size:
+            first = sum(step.own for step in steps) == 1
+            if size <= (self.options.contraction if first else self.options.hard) * steps[-1].size:
                 steps.append(Step(size, own=False))
                 return ahead
         factors = self.factor_at(state, self._stress)

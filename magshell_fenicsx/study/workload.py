@@ -15,6 +15,7 @@ from mpi4py import MPI
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.follow import Stopped, follow
 from magshell_fenicsx.results.summary import Result
+from magshell_fenicsx.rows import RowMaker
 from magshell_fenicsx.scene import Scene
 from magshell_fenicsx.study.iteration import measured, timed
 from magshell_fenicsx.study.scalar import parse_scalar
@@ -25,14 +26,12 @@ REPEATS = 5
 
 def path(scene: Scene, results: list[str]) -> Report:
     """The history from the unloaded shell to its end, and numbers of it."""
-    result, comm = Result(scene, scene.unloaded()), scene.comm
+    result, made, comm = Result(scene, scene.unloaded()), RowMaker(scene), scene.comm
 
     def solve() -> None:
         try:
             for record in follow(scene):
-                told = {"label": record.label, "amplitude": record.amplitude, "mode": record.mode}
-                state = record.point.state
-                result.rows.append({**told, **scene.observe(state), "branch": record.branch})
+                result.rows.append(made.row(record, 0.0))
         except Stopped as e:
             result.stopped = str(e)
 

@@ -123,7 +123,14 @@ def _begun(at: float, result: Result) -> Continuation | None:
 
 
 def _row(scene: Scene, fold: Fold) -> Row:
-    return {"label": "fold", "amplitude": fold.name, **scene.observe(fold.state), "mode": "", "branch": 0}
+    return {
+        "label": "fold",
+        "amplitude": fold.name,
+        **scene.observe(fold.state),
+        "mode": "",
+        "branch": 0,
+        "load_error": 0.0,
+    }
 
 
 def _has_knockdown(case: Case) -> bool:
