@@ -55,7 +55,7 @@ class NewtonOptions:
     tolerance: float = 1e-9
     max_iterations: int = 25
     contraction: float = 0.6
-    hard: float = 0.1
+    hard: float = 0.3
     fresh: float = 0.05
     largest_step: float = 1e4
 
@@ -299,9 +299,7 @@ class BorderedNewton:
         self._progress.taken.append(self._progress.ahead)
         # the stress after the step is what follows linearly from before it (MIP Newton: Magisano, Leonetti, Garcea,
         # Computer Methods in Applied Mechanics and Engineering 313, 2017)
-        du = self._progress.ahead[0]
-        u = self._split(self._snes.getSolution())[0]
-        self._stress = followed(u, -du)
+        self._stress = followed(self._split(self._snes.getSolution())[0], -self._progress.ahead[0])
         self._join(*self._progress.ahead, y)
 
     def _mult(self, x: PETSc.Vec, y: PETSc.Vec) -> None:

@@ -14,6 +14,7 @@ from magshell_fenicsx.solve.system import State, Vector, Weighted, dot, followed
 
 Control = Literal["load", "conjugate", "arc"]
 MOST_LEAPS = 3  # longer steps that are tried where rounding hides a point
+MANY = 2  # hard solves after which the tangent takes the stress that follows from the last point, which costs a tenth
 SEEN = 1e-6  # a displacement that counts, in lengths of the system
 
 
@@ -126,6 +127,7 @@ class Path:
         self.newton, self.name, self.control, self.options = newton, name, control, options
         self.system = newton.system
         self.metric = Metric(newton.system, scale)
+        self._hard = 0  # solves that failed or took many matrices
         self._journal, self.progress = journal or NoJournal(), progress or NoProgress()
 
     def start(self, state: State, sense: float = 1.0) -> Point:
@@ -153,11 +155,14 @@ class Path:
         base
             The point whose tangent arc length is measured along.
         """
-        return self.solve(self._row(s, base), s, guess, followed(base.state.u, (s - base.s) * base.du))
+        stress = followed(base.state.u, (s - base.s) * base.du) if self._hard >= MANY else ()
+        return self.solve(self._row(s, base), s, guess, stress)
 
     def solve(self, row: Row, s: float, guess: State, stress: Sequence[Weighted] = ()) -> Point | str:
         """Solve for the point on which a row holds, or say why that failed; the tangent is per unit of the row."""
-        return self.recorded(lambda: self._solve(row, s, guess, stress))
+        found = self.recorded(lambda: self._solve(row, s, guess, stress))
+        self._hard += isinstance(found, str) or found.factorisations >= self.options.hard
+        return found
 
     def recorded(self, find: Callable[[], Point | str]) -> Point | str:
         """What is found, or what an interrupted run had found here."""
