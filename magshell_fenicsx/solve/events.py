@@ -7,7 +7,7 @@ from typing import Literal, Protocol
 
 import numpy as np
 
-from magshell_fenicsx.solve.bifurcation import BifurcationLost, find_bifurcation
+from magshell_fenicsx.solve.bifurcation import SCATTER, BifurcationLost, find_bifurcation
 from magshell_fenicsx.solve.bordered import Direction
 from magshell_fenicsx.solve.control import projected
 from magshell_fenicsx.solve.factor import Factorisation
@@ -191,6 +191,18 @@ class _Search:
             low, high = (point, high) if point.dmu * low.dmu > 0 else (low, point)
         return point
 
+    def scatter(self, point: Point, stability: Stability, slope: float) -> float:
+        """How far rounding of the tangent moves the load at which its eigenvalue is zero.
+
+        Parameters
+        ----------
+        slope
+            Of the eigenvalue over the load.
+        """
+        u = point.state.u
+        values = [critical_mode(stability, State(v, point.state.mu)).eigenvalue for v in (u, u + np.spacing(u))]
+        return float(SCATTER * abs(values[1] - values[0]) / abs(slope)) if slope else np.inf
+
     def bifurcation(self, low: Point, high: Point, stability: Stability) -> Point:
         """Where the eigenvalue that changes sign is zero, by the Illinois variant of regula falsi.
 
@@ -201,6 +213,7 @@ class _Search:
         first = critical_mode(stability, low.state)
         a, b = first.eigenvalue, critical_mode(stability, high.state).eigenvalue
         agreed, last = self.tolerance**0.75, np.inf
+        slope = (b - a) / (high.state.mu[path.name] - low.state.mu[path.name])
         for _ in range(MOST_STEPS):
             # the eigenvalue nearest to zero need not be the one that changes sign
             t = a / (a - b) if a * b < 0 else 0.5
@@ -208,9 +221,9 @@ class _Search:
             mu = point.state.mu[path.name]
             moved, width = abs(point.s - last) * abs(point.dmu), abs(high.s - low.s) * abs(point.dmu)
             if moved <= agreed * abs(mu) and a * b < 0:
-                return replace(point, load_error=moved)
+                return replace(point, load_error=max(moved, self.scatter(point, stability, slope)))
             if width <= self.tolerance * abs(mu):
-                return replace(point, load_error=width)
+                return replace(point, load_error=max(width, self.scatter(point, stability, slope)))
             last, mode = point.s, critical_mode(stability, point.state)
             if mode.negative_pivots != first.negative_pivots:
                 high, b = point, mode.eigenvalue
