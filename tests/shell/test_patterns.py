@@ -94,7 +94,7 @@ def test_long_sums(terms: int) -> None:
 
 
 def test_brackets_within_each_other() -> None:
-    """As many as Python reads; more, or longer sums than it reads, are told for what they are."""
+    """As many as Python reads; more, or longer sums than it reads, are refused with the reason."""
     assert formula("(" * 199 + "x" + ")" * 199)(np.ones(1), np.zeros(1), np.zeros(1)) == 1.0
     with pytest.raises(ValueError, match="allowed are 200 brackets within each other"):
         formula("(" * 300 + "x" + ")" * 300)
