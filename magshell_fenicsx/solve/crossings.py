@@ -63,8 +63,7 @@ class Step:
         if not solve:
             return None
         path, s = self._path, (low.s + high.s) / 2
-        guess = path.between(s, low, path.seen_from(low, high))
-        found = path.at(s, guess, self._low)
+        found = path.inside(s, low, path.seen_from(low, high), self._low)
         if isinstance(found, str):
             raise PathStopped(f"locating an instability: {found}", low)
         return self._kept(found)

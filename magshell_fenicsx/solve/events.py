@@ -100,7 +100,7 @@ class _Search:
         return found
 
     def try_at(self, s: float, low: Point, high: Point) -> Point | str:
-        found = self.path.at(s, self.path.between(s, low, high), self.base)
+        found = self.path.inside(s, low, high, self.base)
         if not isinstance(found, str):
             self.iterations += found.iterations
             self.factorisations += found.factorisations
@@ -217,7 +217,11 @@ class _Search:
         for _ in range(MOST_STEPS):
             # the eigenvalue nearest to zero need not be the one that changes sign
             t = a / (a - b) if a * b < 0 else 0.5
-            point = self.solve(low.s + t * (high.s - low.s), low, high)
+            tried = self.try_at(low.s + t * (high.s - low.s), low, high)
+            found = self.middle(low, high) if isinstance(tried, str) else tried
+            if found is None:  # the path's own tangent is singular there too
+                return replace(low, load_error=abs(high.state.mu[path.name] - low.state.mu[path.name]))
+            point = found
             mu = point.state.mu[path.name]
             moved, width = abs(point.s - last) * abs(point.dmu), abs(high.s - low.s) * abs(point.dmu)
             if moved <= agreed * abs(mu) and a * b < 0:

@@ -158,6 +158,12 @@ class Path:
         stress = followed(base.state.u, (s - base.s) * base.du) if self._hard >= MANY else ()
         return self.solve(self._row(s, base), s, guess, stress)
 
+    def inside(self, s: float, low: Point, high: Point, base: Point) -> Point | str:
+        """Solve for the point at `s` between two others; `base` is as that of `at`."""
+        t = (s - low.s) / (high.s - low.s)
+        stress = [(1 - t, low.state.u), (t, high.state.u)]
+        return self.solve(self._row(s, base), s, self.between(s, low, high), stress)
+
     def solve(self, row: Row, s: float, guess: State, stress: Sequence[Weighted] = ()) -> Point | str:
         """Solve for the point on which a row holds, or say why that failed; the tangent is per unit of the row."""
         found = self.recorded(lambda: self._solve(row, s, guess, stress))
