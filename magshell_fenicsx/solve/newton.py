@@ -55,7 +55,7 @@ class NewtonOptions:
     tolerance: float = 1e-9
     max_iterations: int = 25
     contraction: float = 0.6
-    hard: float = 0.3
+    hard: float = 0.1
     fresh: float = 0.05
     largest_step: float = 1e4
 
