@@ -39,15 +39,14 @@ def rolled(slenderness: float) -> tuple[Scene, list[Record]]:
 @pytest.mark.slow
 def test_steps_do_not_grow_with_slenderness() -> None:
     points = []
-    for slenderness in (100, 1000, 10000):
+    for slenderness in (100, 1000, 10_000, 100_000):
         scene, records = rolled(slenderness)
         end = records[-1]
         assert end.point.state.mu["load"] == 1.0
         tip = scene.plan.length * scene.model.displacement(end.point.state.u, "A")
         assert tip == pytest.approx([-LENGTH, 0, 0], abs=2e-3)  # the exact circle
         points.append(len(records))
-    assert points[1] < 1.3 * points[0]
-    assert points[2] < 2 * points[0]
+    assert max(points) < 1.6 * points[0], points
 
 
 @pytest.mark.slow

@@ -27,7 +27,7 @@ from magshell_fenicsx.solve.refine import refined_tangent
 from magshell_fenicsx.solve.system import State, System, Vector, Weighted, dot, followed, max_abs
 
 LEAST_REST = 0.3  # of a step: an update that would lengthen it more is not trusted
-MOTION = 1e-2  # part of the largest displacement that counts as a length, where it is longer than the system's
+MOTION = 0.1  # part of the largest displacement that counts as a length, where it is longer than the system's
 HIDDEN = "rounding hides the solution: the tangent is nearly singular"
 
 
@@ -38,14 +38,14 @@ class NewtonOptions:
     Attributes
     ----------
     tolerance
-        Estimated error of u, over the system's length or, where that is longer, a hundredth of the
+        Estimated error of u, over the system's length or, where that is longer, a tenth of the
         largest displacement: a strip of 1000 thicknesses that rolls up is not known to 1e-12 of its length.
     max_iterations
         Iterations after which a step is given up.
     contraction
         The first factors are kept while a step is shorter than this part of the one before.
     hard
-        The same of later factors: where the first were not enough, old ones lead astray.
+        The same of later factors, and of all where the guess comes with a stress: old ones lead astray there.
     fresh
         Lengths between where factors were made and a solution whose tangent and inertia they still tell.
     largest_step
@@ -188,6 +188,7 @@ class BorderedNewton:
         """
         self._guess, self._name, self._row = guess, name, row
         self._stress: Sequence[Weighted] = stress
+        self._followed = bool(stress)
         self._progress = progress = _Progress(Iterates(self.options.largest_step, self.options.max_iterations))
         self._join(guess.u, guess.mu[name], self._x)
         self._snes.solve(None, self._x)
@@ -259,7 +260,7 @@ class BorderedNewton:
         if progress.matrix is not None:
             ahead = self._updated(progress.matrix.solve(*f))
             size = progress.matrix.size(ahead)
-            first = sum(step.own for step in steps) == 1
+            first = sum(step.own for step in steps) == 1 and not self._followed
             if size <= (self.options.contraction if first else self.options.hard) * steps[-1].size:
                 steps.append(Step(size, own=False))
                 return ahead

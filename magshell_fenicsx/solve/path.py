@@ -299,8 +299,9 @@ class Path:
         outcome = self.newton.solve(guess, self.name, row, stress)
         if not outcome.converged:
             return outcome.reason
-        found = self._point(outcome.state, s, self.newton.response(outcome.state, self.name, row))
         spent = self.newton.factorisation.count - before
+        exact = self._hard >= MANY  # the stress that follows is as good as the tangent
+        found = self._point(outcome.state, s, self.newton.response(outcome.state, self.name, row, exact=exact))
         return replace(found, iterations=outcome.iterations, factorisations=spent, error=outcome.error)
 
     def exact(self, point: Point, base: Point) -> Point:
