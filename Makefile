@@ -4,6 +4,8 @@ PYTEST := python3 -m pytest -n auto --maxprocesses 4 --dist worksteal  # a worke
 # OPENBLAS_CORETYPE, on the command line or in the environment, must reach OpenBLAS in there
 CORE_TYPE = $(if $(OPENBLAS_CORETYPE),$(ENV) .ci/core-type $(OPENBLAS_CORETYPE))
 
+CAMPAIGN := env PYTHONPATH=cases python3 -m
+
 define HELP
 make run CASE=cases/dimple_buckling.yaml [OUT=dir] [N=ranks] [ARGS="--set a=b"]
 make check CASE=...   validate a case, print what would be built
@@ -34,20 +36,20 @@ run check:
 	$(ENV) $(if $(N),mpirun -n $(N)) magshell $@ $(CASE) $(if $(OUT),--out $(OUT)) $(ARGS)
 
 figures:
-	$(ENV) $(if $(N),mpirun -n $(N)) python3 -m magshell_fenicsx.figures $(ARGS)
+	$(ENV) $(if $(N),mpirun -n $(N)) $(CAMPAIGN) figures.figures $(ARGS)
 
 benchmarks:
-	$(ENV) python3 -m magshell_fenicsx.obstacles $(ARGS)
+	$(ENV) $(CAMPAIGN) benchmarks.obstacles $(ARGS)
 
 extremes:
-	$(ENV) $(if $(N),mpirun -n $(N)) python3 -m magshell_fenicsx.extremes $(ARGS)
+	$(ENV) $(if $(N),mpirun -n $(N)) $(CAMPAIGN) extreme.extremes $(ARGS)
 
 noise:
 	@mkdir -p docs/noise
-	$(ENV) python3 cases/noise/table.py $(ARGS) > results/noise.md && mv results/noise.md docs/noise/README.md
+	$(ENV) $(CAMPAIGN) noise.table $(ARGS) > results/noise.md && mv results/noise.md docs/noise/README.md
 
 bench:
-	$(ENV) python3 -m magshell_fenicsx.bench $(if $(OUT),--out $(OUT)) --compare docs/bench/bench.json $(ARGS)
+	$(ENV) $(CAMPAIGN) speed $(if $(OUT),--out $(OUT)) --compare docs/bench/bench.json $(ARGS)
 
 # $(call study,NAME,CASE and options): study.* of results/study_NAME to docs/study/NAME.*
 define study

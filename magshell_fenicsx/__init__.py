@@ -11,17 +11,17 @@ A scene is stepped through by `follow` (the history of its case) and `trace` (a 
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.source import CaseError
-from magshell_fenicsx.follow import Record, Stopped, follow
-from magshell_fenicsx.notebook import curve, picture, polydata, surface
-from magshell_fenicsx.rows import columns
-from magshell_fenicsx.run import Result, run
-from magshell_fenicsx.scene import Scene
-from magshell_fenicsx.sensitivity import fold_at, sensitivities
-from magshell_fenicsx.shell import kinematics
-from magshell_fenicsx.shell.kinematics import Jet
-from magshell_fenicsx.shell.own_term import OwnTerm
-from magshell_fenicsx.trace import trace
-from magshell_fenicsx.version import __version__
+from magshell_fenicsx.models.shell import kinematics
+from magshell_fenicsx.models.shell.kinematics import Jet
+from magshell_fenicsx.models.shell.own_term import OwnTerm
+from magshell_fenicsx.platform.version import __version__
+from magshell_fenicsx.run.notebook import curve, picture, polydata, surface
+from magshell_fenicsx.run.rows import columns
+from magshell_fenicsx.run.run import Result, run
+from magshell_fenicsx.simulate.follow import Record, Stopped, follow
+from magshell_fenicsx.simulate.scene import Scene
+from magshell_fenicsx.simulate.sensitivity import fold_at, sensitivities
+from magshell_fenicsx.simulate.trace import trace
 
 __all__ = [
     "Case",

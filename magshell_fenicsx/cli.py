@@ -63,11 +63,11 @@ def run(
     ] = None,
 ) -> None:
     """Solve a case and write path.csv, summary.json, fields and pictures."""
-    from magshell_fenicsx.live import live_line
     from magshell_fenicsx.mesh.patch import MeshError
-    from magshell_fenicsx.results.files import AlreadyComplete
-    from magshell_fenicsx.results.folder import DiskError
-    from magshell_fenicsx.run import run as run_case
+    from magshell_fenicsx.output.store.folder import DiskError
+    from magshell_fenicsx.platform.terminal import live_line
+    from magshell_fenicsx.run.files import AlreadyComplete
+    from magshell_fenicsx.run.run import run as run_case
 
     folder = out or Path("results") / case.stem
     try:
@@ -105,8 +105,8 @@ def sweep(
     ] = False,
 ) -> None:
     """Run a case over ranges of its keys; points that are in the folder already are kept."""
-    from magshell_fenicsx.results.folder import DiskError
-    from magshell_fenicsx.sweep.sweep import sweep as run_sweep
+    from magshell_fenicsx.output.store.folder import DiskError
+    from magshell_fenicsx.studies.sweep.sweep import sweep as run_sweep
 
     folder = out or Path("results") / f"{case.stem}_sweep"
     try:
@@ -139,9 +139,9 @@ def study(
     out: Annotated[Path | None, typer.Option(help="output folder; default results/<case name>_study/")] = None,
 ) -> None:
     """Measure error against run time over meshes, degrees, models and ranks; runs that are in the folder are kept."""
-    from magshell_fenicsx.results.folder import DiskError
-    from magshell_fenicsx.study.study import parse_ranks
-    from magshell_fenicsx.study.study import study as run_study
+    from magshell_fenicsx.output.store.folder import DiskError
+    from magshell_fenicsx.studies.study.study import parse_ranks
+    from magshell_fenicsx.studies.study.study import study as run_study
 
     folder = out or Path("results") / f"{case.stem}_study"
     try:
@@ -167,10 +167,10 @@ def compare(
     out: Annotated[Path | None, typer.Option(help="output folder; default results/<case name>_compare/")] = None,
 ) -> None:
     """Run a case as a shell and as a solid; put curves, difference and run times side by side."""
-    from magshell_fenicsx.compare.compare import compare as run_comparison
-    from magshell_fenicsx.compare.compare import parse_refinements
-    from magshell_fenicsx.compare.runs import NothingLeft
-    from magshell_fenicsx.results.folder import DiskError
+    from magshell_fenicsx.output.store.folder import DiskError
+    from magshell_fenicsx.studies.compare.compare import compare as run_comparison
+    from magshell_fenicsx.studies.compare.compare import parse_refinements
+    from magshell_fenicsx.studies.compare.runs import NothingLeft
 
     folder = out or Path("results") / f"{case.stem}_compare"
     try:
@@ -193,8 +193,8 @@ def plot(
     animation: Annotated[bool, typer.Option("--animation", help="draw animation.gif too, of the path")] = False,
 ) -> None:
     """Make a run's pictures and report again, from its folder alone."""
-    from magshell_fenicsx.results.plot import plot as plot_again
-    from magshell_fenicsx.results.render import NoScreen
+    from magshell_fenicsx.output.pictures.plot import plot as plot_again
+    from magshell_fenicsx.output.pictures.render import NoScreen
 
     if MPI.COMM_WORLD.rank:
         return
@@ -210,7 +210,7 @@ def plot(
 @app.command()
 def check(case: CaseFile, set_: Settings = None) -> None:
     """Validate a case; print what would be built and what is left out."""
-    from magshell_fenicsx.plan import describe
+    from magshell_fenicsx.plan.charted import describe
 
     try:
         _say(describe(Case.load(case, set_ or [])))
@@ -234,8 +234,8 @@ def info(
     compile_: Annotated[bool, typer.Option("--compile", help="compile every kernel of degrees 3 and 4 now")] = False,
 ) -> None:
     """Versions, the BLAS in use, the kernel cache."""
-    from magshell_fenicsx.environment import fast_blas, kernel_cache, versions
-    from magshell_fenicsx.precompile import precompile
+    from magshell_fenicsx.platform.environment import fast_blas, kernel_cache, versions
+    from magshell_fenicsx.simulate.precompile import precompile
 
     for name, number in versions().items():
         _say(f"{name:18} {number}")

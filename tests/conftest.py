@@ -14,8 +14,8 @@ from magshell_fenicsx.mesh.midsurface import Midsurface, distribute
 from magshell_fenicsx.mesh.shapes import DiscShape
 from magshell_fenicsx.mesh.sphere import Dimple, SphereEmbedding, flat
 from magshell_fenicsx.mesh.triangulation import triangulate
-from magshell_fenicsx.shell.model import ShellModel
-from magshell_fenicsx.shell.parameters import Condition, Loads, MagneticEnergy, Magnetisation, Material
+from magshell_fenicsx.models.shell.model import ShellModel
+from magshell_fenicsx.models.shell.parameters import Condition, Loads, MagneticEnergy, Magnetisation, Material
 
 CASES = Path(__file__).parents[1] / "cases"
 TILTED = Magnetisation(np.array([0.6, 0.0, 0.8]), np.array([0.0, 0.28, 0.96]))

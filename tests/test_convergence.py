@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from magshell_fenicsx import Case, run
+from magshell_fenicsx import Case
+from magshell_fenicsx.run.run import run
 
 CASE = Path(__file__).parents[1] / "cases" / "dimple_buckling.yaml"
 REFERENCE = {0.0: 0.326233289, 0.00184: 0.552053778, -0.00184: 0.120723848}

@@ -8,10 +8,10 @@ import pytest
 from conftest import CASES
 
 import magshell_fenicsx as ms
-from magshell_fenicsx.follow import follow
-from magshell_fenicsx.scene import Scene
-from magshell_fenicsx.solve.events import critical_mode
-from magshell_fenicsx.solve.system import State
+from magshell_fenicsx.continuation.events import critical_mode
+from magshell_fenicsx.continuation.system import State
+from magshell_fenicsx.simulate.follow import follow
+from magshell_fenicsx.simulate.scene import Scene
 
 SCENES, FIRST = 300, 10
 COARSE = ["symmetry=half", "mesh.degree=2", "mesh.refinement=0.3"]

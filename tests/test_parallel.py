@@ -8,7 +8,7 @@ from command import magshell, read_path
 from conftest import CASES
 from scipy.spatial import cKDTree
 
-from magshell_fenicsx.results.vtu import read_vtu
+from magshell_fenicsx.output.fields.vtu import read_vtu
 
 DEGREE = "--set=mesh.degree=3"
 COARSE = ["--set=mesh.refinement=0.5"]

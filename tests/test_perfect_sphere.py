@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from magshell_fenicsx import Case, Scene, follow
+from magshell_fenicsx import Case, Scene
 from magshell_fenicsx.case.source import Source
-from magshell_fenicsx.results.gathering import gatherer
-from magshell_fenicsx.solve.events import critical_mode
+from magshell_fenicsx.continuation.events import critical_mode
+from magshell_fenicsx.output.fields.gathering import gatherer
+from magshell_fenicsx.simulate import follow
 
 
 def scene(symmetry: str, R_over_h: float, **mesh: Any) -> Scene:

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from magshell_fenicsx import Case, Record, Scene, follow
+from magshell_fenicsx import Case, Record, Scene
 from magshell_fenicsx.case.source import Source
-from magshell_fenicsx.solve.noise import VARIABLE
+from magshell_fenicsx.continuation.noise import VARIABLE
+from magshell_fenicsx.simulate import follow
 
 E, LENGTH = 1e6, 1.0
 

@@ -1,6 +1,6 @@
-"""Every case under noise: python3 cases/noise/table.py [--seeds 20] [--seconds 60] [CASE ...] > docs/noise/README.md
+"""Every case under noise: make noise ARGS="[--seeds 20] [--seconds 60] [CASE ...]"
 
-The noise (`magshell_fenicsx.solve.noise`) stands for the rounding of another processor, at 1e-15, 1e-14 and 1e-13 in
+The noise (`continuation/noise.py`) stands for the rounding of another processor, at 1e-15, 1e-14 and 1e-13 in
 turn. A case should reach the same end through the same instabilities, with numbers within their estimated errors.
 """
 
@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import magshell_fenicsx as ms
-from magshell_fenicsx.solve.noise import VARIABLE
-from magshell_fenicsx.solve.system import max_abs
+from magshell_fenicsx.continuation.noise import VARIABLE
+from magshell_fenicsx.continuation.system import max_abs
 
 LEVELS = 1e-15, 1e-14, 1e-13
 LOCATED = "fold", "bifurcation"

@@ -1,0 +1,1 @@
+"""Cases and what they ask for, validated once."""

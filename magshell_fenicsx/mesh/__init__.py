@@ -1,0 +1,1 @@
+"""Mid-surfaces: shapes, files, gradings, and their triangles and hexahedra."""

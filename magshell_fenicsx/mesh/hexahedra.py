@@ -14,8 +14,8 @@ from dolfinx.cpp.io import perm_gmsh
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from magshell_fenicsx import compat
 from magshell_fenicsx.mesh.patch import Embedding, PatchMesh
+from magshell_fenicsx.platform import compat
 
 Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]

@@ -16,8 +16,8 @@ from dolfinx.cpp.io import perm_gmsh
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from magshell_fenicsx import compat
 from magshell_fenicsx.mesh.patch import PatchMesh, check_orientation
+from magshell_fenicsx.platform import compat
 
 ORDERS = {3: 1, 6: 2, 10: 3}  # nodes of a triangle -> its order
 

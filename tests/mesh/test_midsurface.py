@@ -14,7 +14,7 @@ from magshell_fenicsx.mesh.patch import MeshError, PatchMesh, check_orientation
 from magshell_fenicsx.mesh.shapes import DiscShape
 from magshell_fenicsx.mesh.sphere import Dimple, SphereEmbedding, flat
 from magshell_fenicsx.mesh.triangulation import triangulate
-from magshell_fenicsx.shell import kinematics as kin
+from magshell_fenicsx.models.shell import kinematics as kin
 
 
 def patch(size: float = 0.5) -> PatchMesh:

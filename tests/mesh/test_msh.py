@@ -10,16 +10,17 @@ import pytest
 from conftest import CASES
 from mpi4py import MPI
 
-from magshell_fenicsx import Case, Scene, run
+from magshell_fenicsx import Case, Scene
 from magshell_fenicsx.case.source import CaseError, Source
 from magshell_fenicsx.mesh.msh import MeshFile, read_msh
 from magshell_fenicsx.mesh.patch import MeshError, PatchMesh, check_orientation
-from magshell_fenicsx.plan import describe, make_plan
-from magshell_fenicsx.results.files import AlreadyComplete
-from magshell_fenicsx.shell.patterns import ByPatch
-from magshell_fenicsx.sweep.axes import parse_axis
-from magshell_fenicsx.sweep.points import make_points
-from magshell_fenicsx.sweep.sweep import sweep
+from magshell_fenicsx.models.shell.patterns import ByPatch
+from magshell_fenicsx.plan.charted import describe, make_plan
+from magshell_fenicsx.run.files import AlreadyComplete
+from magshell_fenicsx.run.run import run
+from magshell_fenicsx.studies.sweep.axes import parse_axis
+from magshell_fenicsx.studies.sweep.points import make_points
+from magshell_fenicsx.studies.sweep.sweep import sweep
 
 Script = Callable[[], None]
 

@@ -12,9 +12,9 @@ from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.source import CaseError, Source
 from magshell_fenicsx.mesh.midsurface import Midsurface
 from magshell_fenicsx.mesh.patch import MeshError
-from magshell_fenicsx.plan import describe, make_plan
-from magshell_fenicsx.scene import build_midsurface
-from magshell_fenicsx.shell import kinematics as kin
+from magshell_fenicsx.models.shell import kinematics as kin
+from magshell_fenicsx.plan.charted import describe, make_plan
+from magshell_fenicsx.simulate.scene import build_midsurface
 
 COMMON = {"thickness": 0.01, "poisson_ratio": 0.3}
 THIRD = {"azimuth": [0, 120]}

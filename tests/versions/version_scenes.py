@@ -11,15 +11,16 @@ from pathlib import Path
 
 import numpy as np
 
-from magshell_fenicsx import Case, follow
-from magshell_fenicsx.environment import versions
-from magshell_fenicsx.follow import Record
+from magshell_fenicsx import Case
 from magshell_fenicsx.mesh.msh import MeshFile, read_msh
 from magshell_fenicsx.mesh.patch import PatchMesh
-from magshell_fenicsx.plan import make_plan
-from magshell_fenicsx.planned import Plan
-from magshell_fenicsx.scene import Scene
-from magshell_fenicsx.stability import ShellModes
+from magshell_fenicsx.models.modes import ShellModes
+from magshell_fenicsx.plan.charted import make_plan
+from magshell_fenicsx.plan.plan import Plan
+from magshell_fenicsx.platform.environment import versions
+from magshell_fenicsx.simulate import follow
+from magshell_fenicsx.simulate.follow import Record
+from magshell_fenicsx.simulate.scene import Scene
 
 HERE = Path(__file__).parent
 CASES = HERE.parents[1] / "cases"

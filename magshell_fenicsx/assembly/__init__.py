@@ -1,0 +1,1 @@
+"""Energies as vectors and matrices: point kernels, batches of cells, sparsity, scatter. Knows no shells."""

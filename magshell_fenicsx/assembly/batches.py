@@ -1,0 +1,142 @@
+"""Cells and edges in batches that share their reference tables."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from dolfinx import fem
+from numpy.typing import NDArray
+
+from magshell_fenicsx.assembly.shape_tables import EDGES, Table, cell_rule, edge_covector, edge_rule
+from magshell_fenicsx.platform import compat
+
+POINTS = 2048  # at most, in a batch: its Hessians stay within a few megabytes
+
+
+@dataclass(frozen=True, eq=False)
+class Rule:
+    """Quadrature points on the reference cell.
+
+    Attributes
+    ----------
+    points
+        (q, 2) for each side: the same places in space.
+    tables
+        Shape functions there, for each side.
+    weights
+        (q,) of the quadrature.
+    """
+
+    points: tuple[NDArray[np.float64], ...]
+    tables: tuple[Table, ...]
+    weights: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Entities with the same rule.
+
+    Attributes
+    ----------
+    cells
+        (n,) local cells, for each side.
+    geometry
+        (n, 2 sides + 1): the covectors of the edge in the reference coordinates of each side (see
+        `reference.edge_covector`), and the width of the cells over it; (n, 0) for cells.
+    """
+
+    cells: tuple[NDArray[np.int32], ...]
+    rule: Rule
+    geometry: NDArray[np.float64]
+
+    @property
+    def size(self) -> int:
+        """Points of all its entities."""
+        return len(self.cells[0]) * len(self.rule.weights)
+
+
+def cell_batches(V: fem.FunctionSpace, degree: int) -> list[Batch]:
+    """The owned cells."""
+    X, w = cell_rule(degree)
+    rule = Rule((X,), (Table.tabulate(V.element.basix_element, X),), w)
+    cells = np.arange(V.mesh.topology.index_map(2).size_local, dtype=np.int32)
+    return [Batch((part,), rule, np.empty((len(part), 0))) for part in _chunks(cells, len(w))]
+
+
+def interior_batches(V: fem.FunctionSpace, degree: int) -> list[Batch]:
+    """The owned interior edges."""
+    cells, edges, backwards = interior_edges(V)
+    return list(_edge_batches(V, degree, cells, np.column_stack([edges, backwards])))
+
+
+def boundary_batches(V: fem.FunctionSpace, degree: int, facets: NDArray[np.int32]) -> list[Batch]:
+    """Those of some boundary edges that this rank owns."""
+    return list(_edge_batches(V, degree, *boundary_edges(V, facets)))
+
+
+def interior_edges(V: fem.FunctionSpace) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.bool_]]:
+    """The owned interior edges: cells (n, 2), number in each cell (n, 2), whether the cells run along them unlike."""
+    topology = V.mesh.topology
+    topology.create_connectivity(1, 2)
+    links = topology.connectivity(1, 2)
+    facets = np.flatnonzero(np.diff(links.offsets[: topology.index_map(1).size_local + 1]) == 2).astype(np.int32)
+    cells = links.array[links.offsets[facets][:, None] + np.arange(2)]
+    edges = np.column_stack([_local_edges(V, facets, cells[:, side]) for side in range(2)])
+    starts = [_corner(V, cells[:, side], edges[:, side]) for side in range(2)]
+    return cells, edges, starts[0] != starts[1]
+
+
+def boundary_edges(V: fem.FunctionSpace, facets: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Those of some boundary edges that this rank owns: cells (n, 1), number in the cell (n, 1)."""
+    topology = V.mesh.topology
+    topology.create_connectivity(1, 2)
+    links = topology.connectivity(1, 2)
+    facets = facets[facets < topology.index_map(1).size_local]
+    cells = links.array[links.offsets[facets]]
+    return cells[:, None], _local_edges(V, facets, cells)[:, None]
+
+
+def _edge_batches(
+    V: fem.FunctionSpace, degree: int, cells: NDArray[np.int32], kinds: NDArray[np.int32]
+) -> Iterator[Batch]:
+    """Sort edges by what they are in the cells of each side; with two sides, also by whether these run alike."""
+    sides = cells.shape[1]
+    for kind in np.unique(kinds, axis=0):
+        backwards = (False, bool(kind[-1]))[:sides]
+        rules = [edge_rule(degree, int(edge), back) for edge, back in zip(kind[:sides], backwards, strict=True)]
+        X, w = tuple(points for points, _ in rules), rules[0][1]
+        rule = Rule(X, tuple(Table.tabulate(V.element.basix_element, x) for x in X), w)
+        covectors = np.concatenate([edge_covector(int(edge)) for edge in kind[:sides]])
+        for part in _chunks(np.flatnonzero((kinds == kind).all(axis=1)).astype(np.int32), len(w)):
+            both = tuple(np.ascontiguousarray(side) for side in cells[part].T)
+            width = edge_width(V, both, np.full(len(part), kind[0]))
+            geometry = np.column_stack([np.tile(covectors, (len(part), 1)), width])
+            yield Batch(both, rule, geometry)
+
+
+def _chunks(entities: NDArray[np.int32], points: int) -> list[NDArray[np.int32]]:
+    size = max(POINTS // points, 1)
+    return [entities[i : i + size] for i in range(0, len(entities), size)]
+
+
+def _local_edges(V: fem.FunctionSpace, facets: NDArray[np.int32], cells: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Number of each facet in a cell of its own."""
+    V.mesh.topology.create_connectivity(2, 1)
+    edges = V.mesh.topology.connectivity(2, 1).array.reshape(-1, 3)[cells]
+    return np.asarray(np.argmax(edges == facets[:, None], axis=1), dtype=np.int32)
+
+
+def _corner(V: fem.FunctionSpace, cells: NDArray[np.int32], edges: NDArray[np.int32]) -> NDArray[np.int32]:
+    """The vertex at which an edge starts in a cell."""
+    first = np.array(EDGES)[:, 0][edges]
+    return np.asarray(compat.corner_numbers(V.mesh)[cells, first])
+
+
+def edge_width(
+    V: fem.FunctionSpace, cells: tuple[NDArray[np.int32], ...], edges: NDArray[np.int32]
+) -> NDArray[np.float64]:
+    """Flat area of the cells, averaged over the sides, over the flat length of their edge (its number on side 0)."""
+    corners = [V.mesh.geometry.x[compat.corner_numbers(V.mesh)[side]] for side in cells]
+    areas = [np.linalg.norm(np.cross(x[:, 1] - x[:, 0], x[:, 2] - x[:, 0]), axis=1) / 2 for x in corners]
+    start, end = (corners[0][np.arange(len(edges)), ends] for ends in np.array(EDGES)[edges].T)
+    return np.asarray(sum(areas) / len(areas) / np.linalg.norm(end - start, axis=1))

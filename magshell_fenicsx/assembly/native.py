@@ -1,0 +1,54 @@
+"""C code of our own, compiled once into the folder of FFCx's kernels."""
+
+import hashlib
+import importlib.util
+import sys
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import cffi  # type: ignore[import-untyped]
+from dolfinx.jit import get_options
+from mpi4py import MPI
+
+from magshell_fenicsx.platform.first import from_first
+
+OPTIONS = ["-O3", "-g0"]
+
+
+def native(source: Path, declarations: str, comm: MPI.Comm) -> tuple[Any, Any]:
+    """The cffi objects (ffi, lib) of a C file; compiled, if it was not before, by the first rank. Collective.
+
+    Raises
+    ------
+    RuntimeError
+        On all ranks, if it cannot be compiled.
+    """
+    text = "#include <stdint.h>\n" + source.read_text(encoding="utf-8")
+    key = hashlib.sha256(repr((text, declarations, OPTIONS, sys.version, cffi.__version__)).encode()).hexdigest()[:16]
+    name, folder = f"magshell_{source.stem}_{key}", Path(get_options()["cache_dir"])
+
+    def compiled() -> None:
+        if not (folder / f"{name}.so").is_file():
+            try:
+                _compile(name, folder, text, declarations)
+            except (OSError, cffi.VerificationError) as e:
+                raise RuntimeError(f"{source.name} cannot be compiled into {folder}: {e}") from None
+
+    from_first(comm, compiled)
+    spec = importlib.util.spec_from_file_location(name, folder / f"{name}.so")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module.ffi, module.lib
+
+
+def _compile(name: str, folder: Path, text: str, declarations: str) -> None:
+    """Put NAME.so into a folder, whole or not at all, whoever else does the same."""
+    folder.mkdir(parents=True, exist_ok=True)
+    builder = cffi.FFI()
+    builder.cdef(declarations)
+    builder.set_source(name, text, extra_compile_args=OPTIONS)
+    with TemporaryDirectory(dir=folder) as scratch:
+        Path(builder.compile(tmpdir=scratch)).replace(folder / f"{name}.so")

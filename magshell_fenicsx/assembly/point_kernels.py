@@ -1,0 +1,118 @@
+"""Second derivatives of a density at many points at once.
+
+The density is a function of a few vectors (3,) that change from point to point. Points are the
+cells of an interval and the vectors cell-wise constants on it, so that the just-in-time compiler
+of expressions does the rest: its kernels know neither mesh, degree nor quadrature.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import ufl
+from dolfinx import fem, mesh
+from mpi4py import MPI
+from numpy.typing import NDArray
+from ufl.core.expr import Expr
+
+from magshell_fenicsx.assembly.kernels import KernelLog
+from magshell_fenicsx.platform import compat
+
+Pair = tuple[int, int]
+
+
+class Points:
+    """Room for some points, on this rank alone."""
+
+    def __init__(self, capacity: int) -> None:
+        self.capacity = capacity
+        self._mesh = mesh.create_interval(MPI.COMM_SELF, capacity, (0.0, 1.0))
+        order = fem.functionspace(self._mesh, ("DG", 0)).dofmap.list[:, 0]
+        self._cells = np.argsort(order).astype(np.int32)  # point p is where the p-th value is
+        self._values = np.empty(0)
+
+    def field(self, size: int) -> fem.Function:
+        """A vector at each point, its array (capacity * size,) to be filled."""
+        return fem.Function(fem.functionspace(self._mesh, ("DG", 0, (size,))))
+
+    def constant(self, value: NDArray[np.float64]) -> fem.Constant:
+        """The same numbers at all points."""
+        return fem.Constant(self._mesh, value)
+
+    def evaluate(self, expression: fem.Expression, count: int) -> NDArray[np.float64]:
+        """(count, components) at the first points; the array is reused by the next call."""
+        size = expression.value_size
+        if self._values.size < count * size:
+            self._values = np.empty(self.capacity * size)
+        values = self._values[: count * size].reshape(count, size)
+        compat.evaluate(expression, self._mesh, self._cells[:count], values)
+        return values
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """Which blocks (3, 3) of a Hessian there are: d2W/dz_i dz_j for parts i, j of z, on one or two sides.
+
+    A block and its transpose are held by their symmetric and their skew part.
+
+    Attributes
+    ----------
+    same
+        i <= j, on each side.
+    cross
+        i on the first side, j on the second; empty for one side.
+    """
+
+    same: tuple[Pair, ...]
+    cross: tuple[Pair, ...] = ()
+
+    @property
+    def skew(self) -> tuple[Pair, ...]:
+        return tuple((i, j) for i, j in self.same if i < j)
+
+    def __or__(self, other: "Pairs") -> "Pairs":
+        def both(a: Sequence[Pair], b: Sequence[Pair]) -> tuple[Pair, ...]:
+            return tuple(dict.fromkeys((*a, *b)))
+
+        return Pairs(both(self.same, other.same), both(self.cross, other.cross))
+
+
+COMPONENTS = [(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)]  # of a symmetric block
+SKEW = [(0, 1), (0, 2), (1, 2)]
+
+
+def point_hessian(
+    name: str, W: Expr, z: fem.Function, parts: int, pairs: Pairs, log: KernelLog, comm: MPI.Comm, *, at_zero: bool
+) -> fem.Expression:
+    """Compile the blocks of d2W/dz2, at z itself or at z = 0.
+
+    Parameters
+    ----------
+    z
+        Field of `parts` vectors, of twice as many where there are two sides.
+    comm
+        All its ranks compile together.
+
+    Returns
+    -------
+    fem.Expression
+        For each side the symmetric parts (6, pairs) then the skew parts (3, skew pairs); after
+        them the cross blocks (9, pairs).
+    """
+    H = ufl.diff(ufl.diff(W, z), z)
+    if at_zero:
+        H = ufl.replace(ufl.algorithms.expand_derivatives(H), {z: ufl.zero(z.ufl_shape)})
+    components = []
+    for side in range(z.ufl_shape[0] // (3 * parts)):
+
+        def block(i: int, j: int, c: int, d: int, first: int = side * parts) -> Expr:
+            return H[3 * (first + i) + c, 3 * (first + j) + d]
+
+        components += [
+            block(i, j, c, d) if i == j or c == d else (block(i, j, c, d) + block(i, j, d, c)) / 2
+            for c, d in COMPONENTS
+            for i, j in pairs.same
+        ]
+        components += [(block(i, j, c, d) - block(i, j, d, c)) / 2 for c, d in SKEW for i, j in pairs.skew]
+    components += [H[3 * i + c, 3 * (parts + j) + d] for c in range(3) for d in range(3) for i, j in pairs.cross]
+    return log.compile_expression(f"{name} hessian", ufl.as_vector(components), comm)

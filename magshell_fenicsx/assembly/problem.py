@@ -1,0 +1,166 @@
+"""Terms on one finite-element space, as the system that the solvers see."""
+
+from collections.abc import Mapping, Sequence
+from typing import Protocol
+
+import numpy as np
+from dolfinx import fem
+from dolfinx.fem import petsc as fem_petsc
+from dolfinx.la import InsertMode
+from numpy.typing import NDArray
+from petsc4py import PETSc
+
+from magshell_fenicsx.assembly.terms import FormTerm, Term
+from magshell_fenicsx.continuation.noise import Noise
+from magshell_fenicsx.continuation.system import Amplitudes, Vector, Weighted
+from magshell_fenicsx.continuation.timing import Stopwatch
+from magshell_fenicsx.platform import compat
+
+
+class TangentAssembler(Protocol):
+    """A way to the tangent other than the terms' own forms."""
+
+    def tangent(
+        self, factors: Mapping[str, float], stress: Sequence[tuple[float, NDArray[np.float64]]] = ()
+    ) -> PETSc.Mat:
+        """The matrix of the terms with these factors, by name, at the u that they were written with.
+
+        `stress` is as that of `System.tangent`, of displacements with ghosts.
+        """
+
+
+class ResidualAssembler(Protocol):
+    """A way to the residual other than the terms' own forms.
+
+    Attributes
+    ----------
+    names
+        Of the terms that it serves.
+    """
+
+    names: frozenset[str]
+
+    def add(self, b: NDArray[np.float64], factors: Mapping[str, float]) -> None:
+        """Add the gradients of the terms with these factors, by name, at the u that they were written with."""
+
+
+class FiniteElementSystem:
+    """Sum of terms for a displacement u that vanishes at `clamped`.
+
+    Parameters
+    ----------
+    u
+        The displacement that the terms were written with; it is overwritten.
+    clamped
+        Homogeneous Dirichlet conditions.
+    pattern
+        The term with the widest coupling: its tangent's sparsity is that of the sum.
+    length
+        See `System`.
+    assembler
+        Makes the tangent with the same conditions, instead of the terms' forms.
+    gradients
+        Makes the residual, instead of the terms' forms.
+    """
+
+    def __init__(
+        self,
+        u: fem.Function,
+        terms: Sequence[Term],
+        clamped: list[fem.DirichletBC],
+        pattern: FormTerm,
+        length: float,
+        assembler: TangentAssembler | None = None,
+        gradients: ResidualAssembler | None = None,
+    ) -> None:
+        V = u.function_space
+        self.u, self.terms, self.clamped, self.length = u, terms, clamped, length
+        self.comm = V.mesh.comm
+        self.size = V.dofmap.index_map.size_local * V.dofmap.index_map_bs
+        self.dofs = V.dofmap.index_map.size_global * V.dofmap.index_map_bs
+        self.assembly, self.noise = Stopwatch(), Noise.from_environment()
+        fixed = [bc.dof_indices()[0] for bc in clamped]
+        fixed_dofs = np.unique(np.concatenate(fixed)) if fixed else np.empty(0, dtype=np.int32)
+        self._fixed = fixed_dofs[fixed_dofs < self.size]
+        self._b = fem.Function(V)
+        self._assembler, self.gradients = assembler, gradients
+        self._own_residual = [t for t in terms if gradients is None or t.name not in gradients.names]
+        for term in self._own_residual:
+            term.compile_residual()
+        if assembler is None:
+            for term in terms:
+                term.compile_tangent()
+            self._K = fem_petsc.create_matrix(pattern.tangent_form)
+            self._K.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+
+    def set(self, u: Vector) -> None:
+        """Put a displacement into the Function that the terms see."""
+        self.u.x.array[: self.size] = u
+        self.u.x.scatter_forward()
+
+    def _with_ghosts(self, u: Vector) -> NDArray[np.float64]:
+        self.set(u)
+        return np.array(self.u.x.array)
+
+    def held(self, u: Vector) -> Vector:
+        """A displacement with zeros at the clamped degrees of freedom."""
+        u = np.array(u)
+        u[self._fixed] = 0
+        return u
+
+    def residual(self, u: Vector, mu: Amplitudes) -> Vector:
+        factors = {t.name: _factor(t, mu) for t in self.terms}
+        if self.noise is None:
+            return self._gradient(u, factors)
+        first = self.u.function_space.dofmap.index_map.local_range[0] * self.u.function_space.dofmap.index_map_bs
+        parts = [self._gradient(u, {name: factor}) for name, factor in factors.items()]
+        return np.asarray(np.sum([self.noise.on_vector(part, first) for part in parts], axis=0))
+
+    def load(self, u: Vector, name: str) -> Vector:
+        return self._gradient(u, {t.name: 1.0 for t in self.terms if t.amplitude == name})
+
+    def potential(self, u: Vector, name: str) -> float:
+        self.set(u)
+        return float(self.comm.allreduce(sum(t.energy() for t in self.terms if t.amplitude == name)))
+
+    def energies(self, u: Vector) -> dict[str, float]:
+        """Each term's potential, without its amplitude."""
+        self.set(u)
+        return {t.name: float(self.comm.allreduce(t.energy())) for t in self.terms}
+
+    def tangent(self, u: Vector, mu: Amplitudes, stress: Sequence[Weighted] = ()) -> PETSc.Mat:
+        with self.assembly:
+            whole = [(weight, self._with_ghosts(v)) for weight, v in stress]
+            self.set(u)
+            factors = {t.name: _factor(t, mu) for t in self.terms}
+            K = self._assembler.tangent(factors, whole) if self._assembler else self._of_forms(factors)
+            if self.noise:
+                self.noise.on_matrix(K)
+            return K
+
+    def _of_forms(self, factors: Mapping[str, float]) -> PETSc.Mat:
+        """The tangent from the terms' own forms."""
+        self._K.zeroEntries()
+        for t in self.terms:
+            if factor := factors[t.name]:
+                t.add_tangent(self._K, factor, self.clamped)
+        compat.finish_matrix(self._K, self.u.function_space, self.clamped)
+        return self._K
+
+    def _gradient(self, u: Vector, factors: Mapping[str, float]) -> NDArray[np.float64]:
+        with self.assembly:
+            self.set(u)
+            b = self._b.x.array
+            b[:] = 0
+            if self.gradients:
+                self.gradients.add(b, factors)
+            for term in self._own_residual:
+                if factor := factors.get(term.name):
+                    term.add_residual(b, factor)
+            self._b.x.scatter_reverse(InsertMode.add)
+            b[self._fixed] = 0
+            return np.array(b[: self.size])
+
+
+def _factor(term: Term, mu: Amplitudes) -> float:
+    return 1.0 if term.amplitude is None else mu[term.amplitude]

@@ -1,0 +1,140 @@
+"""A potential Pi(u) with its amplitude: energy, residual and tangent."""
+
+from functools import cached_property
+from typing import Generic, Protocol, TypeVar
+
+import numpy as np
+import ufl
+from dolfinx import fem
+from numpy.typing import NDArray
+from petsc4py import PETSc
+
+from magshell_fenicsx.assembly.kernels import KernelLog
+from magshell_fenicsx.platform import compat
+
+Density = TypeVar("Density")  # whatever a form is made from
+
+
+class Term(Protocol):
+    """What a problem sums; `amplitude` names the load factor mu of mu Pi(u), or is None for 1."""
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def amplitude(self) -> str | None: ...
+
+    def energy(self) -> float:
+        """Pi(u) on this rank's part."""
+
+    def compile_residual(self) -> None:
+        """Compile what `add_residual` takes."""
+
+    def add_residual(self, b: NDArray[np.float64], factor: float) -> None:
+        """Add factor dPi/du to the local vector (ghosts included)."""
+
+    def compile_tangent(self) -> None:
+        """Compile what `add_tangent` takes."""
+
+    def add_tangent(self, K: PETSc.Mat, factor: float, clamped: list[fem.DirichletBC]) -> None:
+        """Add factor d2Pi/du2."""
+
+
+class FormTerm:
+    """A potential given by its UFL energy; both derivatives are automatic.
+
+    `linear` says that the energy is linear in u, so that it has no tangent.
+
+    Attributes
+    ----------
+    residual_form, tangent_form
+        Compiled when they are first asked for; no tangent for a linear energy.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        energy: ufl.Form,
+        u: fem.Function,
+        log: KernelLog,
+        amplitude: str | None = None,
+        *,
+        linear: bool = False,
+    ) -> None:
+        self.name, self.amplitude, self.linear = name, amplitude, linear
+        self._factor = fem.Constant(u.function_space.mesh, 1.0)
+        self._u, self._log = u, log
+        self._gradient = ufl.derivative(energy, u, ufl.TestFunction(u.function_space))
+        self._energy = log.compile(f"{name} energy", energy)
+
+    @cached_property
+    def residual_form(self) -> fem.Form:
+        return self._log.compile(f"{self.name} residual", self._factor * self._gradient)
+
+    @cached_property
+    def tangent_form(self) -> fem.Form | None:
+        if self.linear:
+            return None
+        hessian = ufl.derivative(self._gradient, self._u, ufl.TrialFunction(self._u.function_space))
+        return self._log.compile(f"{self.name} tangent", self._factor * hessian)
+
+    def energy(self) -> float:
+        return float(fem.assemble_scalar(self._energy))
+
+    def compile_residual(self) -> None:
+        _ = self.residual_form
+
+    def add_residual(self, b: NDArray[np.float64], factor: float) -> None:
+        self._factor.value = factor
+        fem.assemble_vector(b, self.residual_form)
+
+    def compile_tangent(self) -> None:
+        _ = self.tangent_form
+
+    def add_tangent(self, K: PETSc.Mat, factor: float, clamped: list[fem.DirichletBC]) -> None:
+        if self.tangent_form is not None:
+            self._factor.value = factor
+            compat.add_matrix(K, self.tangent_form, clamped)
+
+
+class DensityTerm(FormTerm, Generic[Density]):
+    """A form with the density that it came from."""
+
+    def __init__(
+        self,
+        name: str,
+        density: Density,
+        energy: ufl.Form,
+        u: fem.Function,
+        log: KernelLog,
+        amplitude: str | None = None,
+        *,
+        linear: bool = False,
+    ) -> None:
+        super().__init__(name, energy, u, log, amplitude, linear=linear)
+        self.density = density
+
+
+class LinearTerm:
+    """A dead load, Pi(u) = -l . u: `entries` of l at local, owned degrees of freedom."""
+
+    def __init__(
+        self, name: str, dofs: NDArray[np.int32], entries: NDArray[np.float64], u: fem.Function, amplitude: str
+    ) -> None:
+        self.name, self.amplitude = name, amplitude
+        self._dofs, self._entries, self._u = dofs, entries, u
+
+    def energy(self) -> float:
+        return -float(self._entries @ self._u.x.array[self._dofs])
+
+    def compile_residual(self) -> None:
+        """A sum of entries."""
+
+    def add_residual(self, b: NDArray[np.float64], factor: float) -> None:
+        b[self._dofs] -= factor * self._entries
+
+    def compile_tangent(self) -> None:
+        """A dead load has no tangent."""
+
+    def add_tangent(self, K: PETSc.Mat, factor: float, clamped: list[fem.DirichletBC]) -> None:
+        """A dead load has no tangent."""

@@ -1,1 +1,0 @@
-"""Axisymmetric scenes on their meridian, and the circumferential waves that it excludes."""

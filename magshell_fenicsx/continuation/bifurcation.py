@@ -1,0 +1,148 @@
+"""Simple bifurcations: a tangent that is singular while the load does no work along its null vector v.
+
+    R(u, mu) + beta b = 0,    g(u, mu) = 0,    v . R_mu = 0
+
+for (u, mu, beta), with g and v of `augmented.AugmentedTangent`. This system is regular at a simple bifurcation, also
+where a small imperfection of the mesh or of rounding has split it: beta is the force along v that makes it whole
+(Govaerts, Numerical methods for bifurcations of dynamical equilibria, SIAM 2000, ch. 4 and 6).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from magshell_fenicsx.continuation.augmented import AugmentedTangent, first_difference, held_along, third
+from magshell_fenicsx.continuation.newton import BorderedNewton
+from magshell_fenicsx.continuation.system import State, System, Vector, Weighted, dot, followed, max_abs
+
+TOLERANCE = 1e-9  # of u, in lengths of the system
+MOST_ITERATIONS = 10
+LARGEST_STEP = 10.0  # in lengths; more is a divergence
+SCATTER = 3.0  # corrections of the load that only rounding makes, in standard deviations
+NEAR = 1e-5  # in lengths: after longer steps the state is brought back into equilibrium but for the force along v
+ROUNDING = 1e-2  # in lengths: steps that are smaller and do not shrink are the rounding of g
+
+
+class BifurcationLost(RuntimeError):
+    """No bifurcation was found near the guess."""
+
+
+@dataclass(frozen=True)
+class Bifurcation:
+    """A simple bifurcation in one amplitude.
+
+    Attributes
+    ----------
+    phi
+        Null vector of K, of length one.
+    response
+        What u does per unit of -mu beside phi: the tangents of both branches are combinations of (phi, 0)
+        and (-response, 1).
+    unstable
+        Number of unstable directions besides `phi`.
+    error
+        Estimated error of u beside its place along `phi`, over the system's length.
+    load_error
+        Estimated error of the amplitude: what rounding of the tangent leaves.
+    iterations, factorisations
+        Work.
+    """
+
+    state: State
+    phi: Vector
+    response: Vector
+    unstable: int
+    error: float
+    load_error: float
+    iterations: int
+    factorisations: int
+
+
+def find_bifurcation(
+    newton: BorderedNewton, guess: State, phi: Vector, name: str, stress: Sequence[Weighted] = ()
+) -> Bifurcation:
+    """The bifurcation in the amplitude `name` near a guess, whose null vector is near `phi`.
+
+    `stress` is as that of `System.tangent`, of the guess.
+
+    Raises
+    ------
+    BifurcationLost
+        If Newton's method diverges or takes too long.
+    """
+    try:
+        return _found(newton, _settled(newton, guess, phi, stress)[0], phi, name)
+    except np.linalg.LinAlgError:
+        raise BifurcationLost from None
+
+
+def _found(newton: BorderedNewton, guess: State, phi: Vector, name: str) -> Bifurcation:
+    system, state, before = newton.system, guess, newton.factorisation.count
+    b, steps, changes = phi, list[float](), list[float]()
+    while not _done(steps):
+        if len(steps) == MOST_ITERATIONS:
+            raise BifurcationLost
+        tangent = AugmentedTangent(newton, state, b)
+        du, dmu, w_mu = _step(system, state, name, tangent)
+        b = tangent.v
+        steps.append(max_abs(system.comm, du) / system.length)
+        changes.append(abs(dmu))
+        if not steps[-1] <= LARGEST_STEP:
+            raise BifurcationLost
+        last, state = state.u, state.with_(state.u + du, name, state.mu[name] + dmu)
+        if steps[-1] > NEAR:  # off equilibrium, membrane stress that is not there spoils the tangent
+            state, _ = _settled(newton, state, tangent.v, followed(last, du))
+    state, error = _settled(newton, state, tangent.v)
+    return Bifurcation(
+        state=state,
+        phi=np.asarray(b / np.sqrt(dot(system.comm, b, b))),
+        response=w_mu,
+        unstable=tangent.unstable,
+        error=error,
+        load_error=SCATTER * max(changes[-2:]),
+        iterations=len(steps),
+        factorisations=newton.factorisation.count - before,
+    )
+
+
+def _settled(newton: BorderedNewton, state: State, v: Vector, stress: Sequence[Weighted] = ()) -> tuple[State, float]:
+    found = held_along(newton, state, v, stress)
+    if found is None:
+        raise BifurcationLost
+    return found
+
+
+def _step(system: System, state: State, name: str, tangent: AugmentedTangent) -> tuple[Vector, float, Vector]:
+    """Newton's step du = alpha v - w_R - dmu w_mu and dmu, from the rows for g and v . R_mu; and w_mu."""
+    comm, u, v = system.comm, state.u, tangent.v
+    w_R, _ = tangent.solve(system.residual(u, state.mu))
+    w_mu, pull = tangent.solve(system.load(u, name))  # pull = v . R_mu
+    cubic = third(system, state, v)
+    K_mu_v = first_difference(lambda u: system.load(u, name), system, u, v)
+    mixed = _mixed(system, state, v, w_mu) - K_mu_v
+    turn = dot(comm, mixed, v)
+    rows = [[turn, -dot(comm, cubic, v)], [dot(comm, mixed, w_mu) - dot(comm, K_mu_v, w_mu), -turn]]
+    rest = [-tangent.g - dot(comm, cubic, w_R), -pull - dot(comm, mixed, w_R)]
+    dmu, alpha = _solved(rows, rest)
+    return alpha * v - w_R - dmu * w_mu, dmu, w_mu
+
+
+def _solved(rows: Sequence[Sequence[float]], rest: Sequence[float]) -> tuple[float, float]:
+    a, b = np.linalg.solve(rows, rest)
+    return float(a), float(b)
+
+
+def _mixed(system: System, state: State, v: Vector, w: Vector) -> Vector:
+    """Pi'''(v, w, .), by polarisation."""
+    comm = system.comm
+    size = max_abs(comm, w) / max_abs(comm, v)
+    if size == 0.0:
+        return np.zeros_like(v)
+    return size / 4 * (third(system, state, v + w / size) - third(system, state, v - w / size))
+
+
+def _done(sizes: Sequence[float]) -> bool:
+    """Whether the last step is below the tolerance, or as small as rounding lets it be."""
+    stalled = len(sizes) > 1 and sizes[-1] > sizes[-2] / 2 and sizes[-1] <= ROUNDING
+    return stalled or (bool(sizes) and sizes[-1] <= TOLERANCE)

@@ -1,0 +1,98 @@
+"""The last row of the bordered system: what is prescribed along a path."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from math import sqrt
+from typing import Protocol
+
+import numpy as np
+
+from magshell_fenicsx.continuation.system import State, System, Vector, dot
+
+
+class Row(Protocol):
+    """g(u, mu) = 0 beside equilibrium."""
+
+    def residual(self, u: Vector, mu: float) -> float:
+        """g."""
+
+    def gradient(self, u: Vector) -> tuple[Vector | None, float]:
+        """dg/du (None where it is zero) and dg/dmu."""
+
+
+@dataclass(frozen=True)
+class GivenLoad:
+    """Load control: mu = target."""
+
+    target: float
+
+    def residual(self, u: Vector, mu: float) -> float:
+        return mu - self.target
+
+    def gradient(self, u: Vector) -> tuple[Vector | None, float]:
+        return None, 1.0
+
+
+@dataclass(frozen=True)
+class GivenConjugate:
+    """Displacement or volume control: -Pi_i(u) = target."""
+
+    system: System
+    name: str
+    target: float
+
+    def residual(self, u: Vector, mu: float) -> float:
+        return -self.system.potential(u, self.name) - self.target
+
+    def gradient(self, u: Vector) -> tuple[Vector | None, float]:
+        return -self.system.load(u, self.name), 0.0
+
+
+@dataclass(frozen=True)
+class Metric:
+    """Lengths along a path of (u, mu): root mean square of u over the system's length, beside mu over `scale`.
+
+    One step length then means the same for a thick shell and a thin one, and on any mesh.
+    """
+
+    system: System
+    scale: float
+
+    @cached_property
+    def weight(self) -> float:
+        """Of du . du."""
+        return 1 / (float(self.system.comm.allreduce(self.system.size)) * self.system.length**2)
+
+    def inner(self, a: tuple[Vector, float], b: tuple[Vector, float]) -> float:
+        """<a, b> of two directions (du, dmu)."""
+        return self.weight * dot(self.system.comm, a[0], b[0]) + a[1] * b[1] / self.scale**2
+
+    def norm(self, du: Vector, dmu: float) -> float:
+        """Length of a direction."""
+        return sqrt(self.inner((du, dmu), (du, dmu)))
+
+
+def projected(metric: Metric, a: tuple[Vector, float], span: Sequence[tuple[Vector, float]]) -> tuple[Vector, float]:
+    """The direction nearest to `a` among the combinations of others."""
+    gram = [[metric.inner(p, q) for q in span] for p in span]
+    parts = np.linalg.solve(gram, [metric.inner(p, a) for p in span])
+    du = np.sum([part * p[0] for part, p in zip(parts, span, strict=True)], axis=0)
+    return du, float(sum(part * p[1] for part, p in zip(parts, span, strict=True)))
+
+
+@dataclass(frozen=True)
+class Hyperplane:
+    """Arc length: <normal, (u, mu) - base> = distance."""
+
+    metric: Metric
+    name: str
+    base: State
+    normal: tuple[Vector, float]
+    distance: float
+
+    def residual(self, u: Vector, mu: float) -> float:
+        return self.metric.inner(self.normal, (u - self.base.u, mu - self.base.mu[self.name])) - self.distance
+
+    def gradient(self, u: Vector) -> tuple[Vector | None, float]:
+        return self.metric.weight * self.normal[0], self.normal[1] / self.metric.scale**2

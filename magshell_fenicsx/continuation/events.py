@@ -1,0 +1,291 @@
+"""Locating the instabilities between two points of a path: folds and bifurcations."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Literal, Protocol
+
+import numpy as np
+
+from magshell_fenicsx.continuation.bifurcation import SCATTER, BifurcationLost, find_bifurcation
+from magshell_fenicsx.continuation.bordered import Direction
+from magshell_fenicsx.continuation.control import projected
+from magshell_fenicsx.continuation.factor import Factorisation
+from magshell_fenicsx.continuation.inverse import NoEigenpair, nearest_to_zero
+from magshell_fenicsx.continuation.path import Path
+from magshell_fenicsx.continuation.point import PathStopped, Point
+from magshell_fenicsx.continuation.system import State, Vector, Weighted
+
+MOST_STEPS = 60  # bisection alone halves a bracket so often that nothing is left of it
+FLAT = 0.01  # slope of the amplitude, over that at the step's start, that means a fold
+MIDDLE = 0.5, 0.35, 0.65, 0.2, 0.8  # of a bracket, where a point between its ends is looked for
+MOST_HALVINGS = 12  # of a step that holds several instabilities; what is left counts as one
+
+
+class Stability(Protocol):
+    """A tangent whose inertia tells stability."""
+
+    def factor_at(self, state: State) -> Factorisation:
+        """Factor the tangent at a state."""
+
+
+@dataclass(frozen=True)
+class Instability:
+    """A point at which the tangent is singular.
+
+    Attributes
+    ----------
+    kind
+        "fold": the amplitude is stationary; "bifurcation": it is not.
+    """
+
+    point: Point
+    kind: Literal["fold", "bifurcation"]
+
+
+def instabilities(path: Path, low: Point, high: Point, tolerance: float = 1e-8) -> Iterator[Instability]:
+    """All singular points between two successive points that their inertia and tangents tell, in order.
+
+    Parameters
+    ----------
+    tolerance
+        Of the amplitude, relative.
+
+    Raises
+    ------
+    PathStopped
+        If Newton fails between two points that it had found.
+    """
+    search = _Search(path, low, tolerance)
+    yield from search.between(low, path.seen_from(low, high), MOST_HALVINGS)
+
+
+@dataclass
+class _Search:
+    """Work between two points, the first of which is the base of every solve.
+
+    `iterations` and `factorisations` are those since the last located point.
+    """
+
+    path: Path
+    base: Point
+    tolerance: float
+    iterations: int = 0
+    factorisations: int = 0
+
+    def between(self, low: Point, high: Point, halvings: int) -> Iterator[Instability]:
+        change = abs(high.negative_pivots - low.negative_pivots)
+        turned = low.dmu * high.dmu < 0
+        if change == 0 and not turned:
+            return
+        self.path.progress.doing("locating an instability")
+        single = change == 1 or not halvings
+        if single and turned:
+            yield Instability(self.told(self.fold(low, high)), "fold")
+        elif single:
+            point = self.crossing(low, high) or self.bracketed(low, high)
+            if abs(point.dmu) < FLAT * abs(low.dmu):
+                raise PathStopped("the step passed a fold and left the branch", low)
+            yield Instability(point, "bifurcation")
+        else:
+            middle = self.middle(low, high)
+            if middle is None:
+                raise PathStopped("several instabilities lie too close to each other", low)
+            yield from self.between(low, middle, halvings - 1)
+            yield from self.between(middle, high, halvings - 1)
+
+    def solve(self, s: float, low: Point, high: Point) -> Point:
+        found = self.try_at(s, low, high)
+        if isinstance(found, str):
+            raise PathStopped(f"locating an instability: {found}", low)
+        return found
+
+    def try_at(self, s: float, low: Point, high: Point) -> Point | str:
+        found = self.path.inside(s, low, high, self.base)
+        if not isinstance(found, str):
+            self.iterations += found.iterations
+            self.factorisations += found.factorisations
+        return found
+
+    def middle(self, low: Point, high: Point) -> Point | None:
+        """A point somewhere between two others, with its own inertia: rounding may hide some."""
+        for part in MIDDLE:
+            found = self.try_at(low.s + part * (high.s - low.s), low, high)
+            if not isinstance(found, str):
+                return self.path.exact(found, self.base)
+        return None
+
+    def crossing(self, low: Point, high: Point) -> Point | None:
+        """The bifurcation between two points, as the solution of a regular system; None if that is not found."""
+        path = self.path
+        try:
+            modes = [critical_mode(path.newton, end.state) for end in (low, high)]
+        except NoEigenpair:
+            return None
+        a, b = (mode.eigenvalue for mode in modes)
+        t = a / (a - b) if a * b < 0 else 0.5
+        guess = path.between(low.s + t * (high.s - low.s), low, high)
+        pivots = sorted(end.negative_pivots for end in (low, high))
+        for mode in sorted(modes, key=lambda mode: abs(mode.eigenvalue)):
+            stress = [(1 - t, low.state.u), (t, high.state.u)]
+            found = path.recorded(partial(self._regular, guess, mode.vector, stress, low, high))
+            if isinstance(found, str):
+                continue
+            if min(low.s, high.s) <= found.s <= max(low.s, high.s) and pivots[0] <= found.negative_pivots < pivots[1]:
+                return self.spent(found)
+        return None
+
+    def _regular(self, guess: State, phi: Vector, stress: Sequence[Weighted], low: Point, high: Point) -> Point | str:
+        path = self.path
+        try:
+            found = find_bifurcation(path.newton, guess, phi, path.name, stress)
+        except BifurcationLost:
+            return "no bifurcation was found"
+        self.iterations += found.iterations
+        self.factorisations += found.factorisations
+        # of both branches' tangents, the one that continues the path
+        state, along = found.state, self._slope(found.state, low, high)
+        direction = projected(path.metric, along, [(found.phi, 0.0), (-found.response, 1.0)])
+        point = path.on(state, direction, self.base, found.unstable)
+        return replace(point, error=found.error, load_error=found.load_error)
+
+    def _slope(self, state: State, low: Point, high: Point) -> Direction:
+        """The path's tangent near a state between two points, interpolated."""
+        name = self.path.name
+        t = (state.mu[name] - low.state.mu[name]) / (high.state.mu[name] - low.state.mu[name])
+        t = min(max(t, 0.0), 1.0)
+        return (1 - t) * low.du + t * high.du, (1 - t) * low.dmu + t * high.dmu
+
+    def bracketed(self, low: Point, high: Point) -> Point:
+        """The last point before an instability, by bisection as far as rounding lets inertia be trusted."""
+        name = self.path.name
+        for _ in range(MOST_STEPS):
+            width = abs(high.state.mu[name] - low.state.mu[name])
+            middle = self.middle(low, high) if width > self.tolerance * abs(low.state.mu[name]) else None
+            if middle is None:
+                break
+            low, high = (middle, high) if middle.negative_pivots == low.negative_pivots else (low, middle)
+        return replace(self.spent(low), load_error=abs(high.state.mu[name] - low.state.mu[name]))
+
+    def spent(self, point: Point) -> Point:
+        """The point with the work since the last located one."""
+        done = replace(point, iterations=self.iterations, factorisations=self.factorisations)
+        self.iterations = self.factorisations = 0
+        return done
+
+    def told(self, point: Point) -> Point:
+        self.factorisations += 1
+        return replace(self.spent(self.path.exact(point, self.base)), load_error=point.load_error)
+
+    def fold(self, low: Point, high: Point) -> Point:
+        """Zero of dmu/ds: stationary point of the cubic through both ends, repeated."""
+        name = self.path.name
+        for _ in range(MOST_STEPS):
+            s = _stationary(low, high, name)
+            point = self.solve(s, low, high)
+            mu = point.state.mu[name]
+            other = high if point.dmu * low.dmu > 0 else low
+            curvature = (other.dmu - point.dmu) / (other.s - point.s)
+            rest = abs(point.dmu**2 / (2 * curvature))
+            if rest <= self.tolerance * abs(mu):
+                return replace(point, load_error=rest)
+            low, high = (point, high) if point.dmu * low.dmu > 0 else (low, point)
+        return point
+
+    def scatter(self, point: Point, stability: Stability, slope: float) -> float:
+        """How far rounding of the tangent moves the load at which its eigenvalue is zero.
+
+        Parameters
+        ----------
+        slope
+            Of the eigenvalue over the load.
+        """
+        u = point.state.u
+        values = [critical_mode(stability, State(v, point.state.mu)).eigenvalue for v in (u, u + np.spacing(u))]
+        return float(SCATTER * abs(values[1] - values[0]) / abs(slope)) if slope else np.inf
+
+    def bifurcation(self, low: Point, high: Point, stability: Stability) -> Point:
+        """Where the eigenvalue that changes sign is zero, by the Illinois variant of regula falsi.
+
+        It ends when two successive guesses agree to the tolerance's power 3/4 (the order of the method
+        is 1.44): the eigenvalue itself drowns in rounding before it is zero.
+        """
+        path, side = self.path, 0
+        first = critical_mode(stability, low.state)
+        a, b = first.eigenvalue, critical_mode(stability, high.state).eigenvalue
+        agreed, last = self.tolerance**0.75, np.inf
+        slope = (b - a) / (high.state.mu[path.name] - low.state.mu[path.name])
+        for _ in range(MOST_STEPS):
+            # the eigenvalue nearest to zero need not be the one that changes sign
+            t = a / (a - b) if a * b < 0 else 0.5
+            tried = self.try_at(low.s + t * (high.s - low.s), low, high)
+            found = self.middle(low, high) if isinstance(tried, str) else tried
+            if found is None:  # the path's own tangent is singular there too
+                return replace(low, load_error=abs(high.state.mu[path.name] - low.state.mu[path.name]))
+            point = found
+            mu = point.state.mu[path.name]
+            moved, width = abs(point.s - last) * abs(point.dmu), abs(high.s - low.s) * abs(point.dmu)
+            if moved <= agreed * abs(mu) and a * b < 0:
+                return replace(point, load_error=max(moved, self.scatter(point, stability, slope)))
+            if width <= self.tolerance * abs(mu):
+                return replace(point, load_error=max(width, self.scatter(point, stability, slope)))
+            last, mode = point.s, critical_mode(stability, point.state)
+            if mode.negative_pivots != first.negative_pivots:
+                high, b = point, mode.eigenvalue
+                a = a / 2 if side == 1 else a
+                side = 1
+            else:
+                low, a = point, mode.eigenvalue
+                b = b / 2 if side == -1 else b
+                side = -1
+        return point
+
+
+def _stationary(low: Point, high: Point, name: str) -> float:
+    """Where the Hermite cubic of mu(s) is stationary between the ends."""
+    L = high.s - low.s
+    rise = (high.state.mu[name] - low.state.mu[name]) / L
+    c1, c2, c3 = low.dmu, 3 * rise - 2 * low.dmu - high.dmu, low.dmu + high.dmu - 2 * rise
+    roots = np.roots([3 * c3, 2 * c2, c1])
+    inside = [float(r.real) for r in roots if abs(r.imag) < 1e-12 and 0 < r.real < 1]
+    t = inside[0] if inside else low.dmu / (low.dmu - high.dmu)
+    return low.s + L * min(max(t, 1e-3), 1 - 1e-3)
+
+
+def locate_bifurcation(
+    path: Path, stable: Point, unstable: Point, stability: Stability, tolerance: float = 1e-8
+) -> Point:
+    """Where a tangent other than the path's own becomes singular, between two successive points.
+
+    Parameters
+    ----------
+    stability
+        Whose tangent is watched: that of modes which the model excludes.
+    tolerance
+        Of the amplitude, relative.
+
+    Raises
+    ------
+    PathStopped
+        If Newton fails between two points that it had found, or no eigenpair is found.
+    """
+    search = _Search(path, stable, tolerance)
+    try:
+        return search.told(search.bifurcation(stable, path.seen_from(stable, unstable), stability))
+    except NoEigenpair as e:
+        raise PathStopped(f"locating an instability: {e}", stable) from None
+
+
+@dataclass(frozen=True)
+class CriticalMode:
+    """Eigenpair of a tangent whose eigenvalue is nearest to zero; `negative_pivots` of the same tangent."""
+
+    eigenvalue: float
+    vector: Vector
+    negative_pivots: int
+
+
+def critical_mode(stability: Stability, state: State) -> CriticalMode:
+    """The eigenpair nearest to zero; the vector has length one."""
+    factors = stability.factor_at(state)
+    return CriticalMode(*nearest_to_zero(factors), factors.negative_pivots)

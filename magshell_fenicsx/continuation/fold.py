@@ -1,0 +1,176 @@
+"""Folds: equilibrium with a singular tangent, R(u, mu) = 0 and g(u, mu) = 0, solved for (u, mu).
+
+With g of `augmented.AugmentedTangent`, Newton's method for R = 0 and g = 0 takes one factorisation and
+three back-solves an iteration.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from magshell_fenicsx.continuation.augmented import AugmentedTangent, first_difference, third
+from magshell_fenicsx.continuation.newton import BorderedNewton
+from magshell_fenicsx.continuation.system import Amplitudes, State, System, Vector, dot, max_abs
+
+TOLERANCE = 1e-9  # estimated remaining error of u, over the system's length
+ROUNDING = 1e-6  # steps along phi that are smaller and do not shrink: 1e-8 to 1e-7 is what rounding of K leaves
+MOST_ITERATIONS = 8
+LARGEST_STEP = 10.0  # in lengths; more is a divergence
+
+
+class FoldLost(RuntimeError):
+    """No fold was found near the guess; the message says why."""
+
+
+@dataclass(frozen=True)
+class Guess:
+    """Where a fold may be, and its null vector; without one it is taken from the tangent."""
+
+    state: State
+    phi: Vector | None = None
+
+
+@dataclass(frozen=True)
+class Fold:
+    """A fold in the amplitude `name`.
+
+    Attributes
+    ----------
+    phi
+        Null vector of K; its largest entry is one in magnitude, and the displacement conjugate to
+        the amplitude grows along it.
+    curvature
+        Second derivative of the amplitude along the path in units of `phi` times the system's length;
+        negative where the amplitude is largest.
+    unstable
+        Number of unstable directions besides `phi`.
+    iterations, factorisations
+        Work.
+    """
+
+    state: State
+    name: str
+    phi: Vector
+    curvature: float
+    unstable: int
+    iterations: int
+    factorisations: int
+
+    @property
+    def value(self) -> float:
+        """The amplitude at the fold."""
+        return self.state.mu[self.name]
+
+
+def find_fold(newton: BorderedNewton, guess: Guess, name: str) -> Fold:
+    """The fold in the amplitude `name` near a guess, to 1e-9 lengths as far as rounding allows that.
+
+    Rounding of K leaves 1e-8 lengths along phi where elements are tiny; the amplitude, which is
+    stationary along phi, is exact all the same.
+
+    Raises
+    ------
+    FoldLost
+        If Newton's method diverges or takes too long.
+    """
+    system, state, before = newton.system, guess.state, newton.factorisation.count
+    b, steps = guess.phi, list[float]()
+    while not steps or _remaining(steps) > TOLERANCE:
+        if len(steps) == MOST_ITERATIONS:
+            raise FoldLost(f"Newton's method found no fold in {MOST_ITERATIONS} iterations")
+        try:
+            tangent = AugmentedTangent(newton, state, b if b is not None else _first_shape(newton, state, name))
+            du, dmu = _step(system, state, name, tangent)
+        except np.linalg.LinAlgError:
+            raise FoldLost("the tangent is singular in more than one direction") from None
+        b = tangent.v
+        steps.append(max_abs(system.comm, du) / system.length)
+        growing = len(steps) > 2 and steps[-1] > max(2 * steps[-2], ROUNDING)
+        if growing or not steps[-1] <= LARGEST_STEP:
+            raise FoldLost("Newton's method diverged on its way to a fold")
+        last, state = state, state.with_(state.u + du, name, state.mu[name] + dmu)
+    phi = _oriented(system, tangent.improved(last, state), system.load(state.u, name))
+    pull, cubic = dot(system.comm, phi, system.load(state.u, name)), third(system, state, phi)
+    return Fold(
+        state=state,
+        name=name,
+        phi=phi,
+        curvature=-dot(system.comm, phi, cubic) * system.length**2 / pull,
+        unstable=tangent.unstable,
+        iterations=len(steps),
+        factorisations=newton.factorisation.count - before,
+    )
+
+
+def sensitivity(system: System, fold: Fold, column: Vector) -> float:
+    """Derivative of the fold's amplitude in a parameter p, from R_p at the fold: -(phi . R_p)/(phi . R_mu).
+
+    For another amplitude, R_p is its load column.
+    """
+    pull = dot(system.comm, fold.phi, system.load(fold.state.u, fold.name))
+    return -dot(system.comm, fold.phi, column) / pull
+
+
+def predict_fold(system: System, known: Sequence[tuple[float, Fold]], p: float, others: Amplitudes) -> Guess:
+    """Extrapolate folds at other values of a parameter to `p`.
+
+    Of the polynomials through the last one, two and three folds, that with the least residual: on
+    long or uneven steps a quadratic may be worse than no extrapolation.
+
+    Parameters
+    ----------
+    system
+        At `p`.
+    known
+        Parameter and fold, in the unknowns of `system`, in the order of the continuation.
+    others
+        The other amplitudes at `p`.
+    """
+    guesses = [_extrapolated(known[-n:], p, others) for n in range(1, min(len(known), 3) + 1)]
+    residuals = [system.residual(guess.state.u, guess.state.mu) for guess in guesses]
+    return guesses[int(np.argmin([dot(system.comm, R, R) for R in residuals]))]
+
+
+def _extrapolated(known: Sequence[tuple[float, Fold]], p: float, others: Amplitudes) -> Guess:
+    values, folds = [value for value, _ in known], [fold for _, fold in known]
+    weights = [_lagrange(values, i, p) for i in range(len(values))]
+    u = np.sum([w * fold.state.u for w, fold in zip(weights, folds, strict=True)], axis=0)
+    mu = sum(w * fold.value for w, fold in zip(weights, folds, strict=True))
+    return Guess(State(u, {**others, folds[-1].name: mu}), folds[-1].phi)
+
+
+def _first_shape(newton: BorderedNewton, state: State, name: str) -> Vector:
+    """Near a fold the response to the load is nearly the null vector."""
+    return newton.factor_at(state).solve(newton.system.load(state.u, name))
+
+
+def _step(system: System, state: State, name: str, tangent: AugmentedTangent) -> tuple[Vector, float]:
+    """Newton's step du = alpha v - w_R - dmu w_mu; the rows for alpha and dmu are R along v, and g."""
+    comm, u, v = system.comm, state.u, tangent.v
+    w_R, t_R = tangent.solve(system.residual(u, state.mu))
+    w_mu, t_mu = tangent.solve(system.load(u, name))
+    cubic = third(system, state, v)
+    K_mu_v = first_difference(lambda u: system.load(u, name), system, u, v)
+    turn = dot(comm, cubic, w_mu) - dot(comm, v, K_mu_v)
+    rows = [[t_mu, -tangent.g], [turn, -dot(comm, cubic, v)]]
+    dmu, alpha = np.linalg.solve(rows, [-t_R, -tangent.g - dot(comm, cubic, w_R)])
+    return alpha * v - w_R - dmu * w_mu, float(dmu)
+
+
+def _oriented(system: System, v: Vector, load: Vector) -> Vector:
+    sense = -np.sign(dot(system.comm, v, load))
+    return np.asarray(sense * v / max_abs(system.comm, v))
+
+
+def _remaining(steps: Sequence[float]) -> float:
+    """Error after the last of a sequence of steps that shrinks at least as fast as a geometric one."""
+    rate = steps[-1] / steps[-2] if len(steps) > 1 else 0.5
+    if rate > 0.5 and steps[-1] <= ROUNDING:
+        return 0.0
+    return steps[-1] * rate / (1 - rate) if rate < 1 else np.inf
+
+
+def _lagrange(values: Sequence[float], i: int, p: float) -> float:
+    """Weight of the value `i` in the polynomial through all."""
+    return float(np.prod([(p - v) / (values[i] - v) for j, v in enumerate(values) if j != i]))

@@ -1,0 +1,122 @@
+"""The eigenpair of a factored tangent K that is nearest to zero, by Rayleigh-Ritz for K^-1 in a Krylov space.
+
+Plain inverse iteration turns endlessly between the modes of a and -a, and hardly moves among many of nearly one
+stiffness, as a sphere's. Their space grows here by one solve at a time until the pair's residual says that it is found.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from mpi4py import MPI
+from numpy.typing import NDArray
+from petsc4py import PETSc
+
+from magshell_fenicsx.continuation.factor import Factorisation
+from magshell_fenicsx.continuation.system import Vector, dot
+
+TOLERANCE = 1e-8  # of K^-1 v - v/lambda, over 1/|lambda|: the eigenvalue's own error is of its square
+MOST_SOLVES = 300
+MOST_VECTORS, KEPT = 24, 8  # of the space before it is begun anew, and after
+TIED = 1e-6  # of two eigenvalues a and -a that are as near to zero as this, relative, the negative one is meant
+PATIENCE = 12  # solves without progress, after which a residual at the level of rounding is the smallest there is
+ROUNDING = 100 * np.finfo(float).eps  # of a residual K v - lambda v, over the norm of K
+
+
+class NoEigenpair(RuntimeError):
+    """The eigenpair of a tangent nearest to zero could not be computed."""
+
+
+def nearest_to_zero(factors: Factorisation) -> tuple[float, Vector]:
+    """Eigenvalue and eigenvector, of length one; of a nearly singular tangent the null vector. Collective.
+
+    The vector of a multiple eigenvalue is one of many, and its sign is either.
+
+    Raises
+    ------
+    NoEigenpair
+        On all ranks, if neither the tolerance is met nor the limit of rounding reached.
+    """
+    space, best, waited = _Space(factors), np.inf, 0
+    while space.solves < MOST_SOLVES:
+        found = space.grown()
+        if found.error <= TOLERANCE or space.exhausted:
+            return found.value, found.vector
+        waited = 0 if found.error < best / 2 else waited + 1
+        best = min(best, found.error)
+        if waited >= PATIENCE and found.error * abs(found.value) <= ROUNDING * space.norm:
+            return found.value, found.vector
+    raise NoEigenpair(
+        f"the tangent's eigenvalue nearest to zero is not found in {MOST_SOLVES} solves: at {found.value:.3g} "
+        f"the residual is still {found.error:.1g} of it"
+    )
+
+
+@dataclass(frozen=True)
+class _Pair:
+    """`error`: the residual over 1/|lambda|, a rival's of the other sign too where that may be nearer to zero."""
+
+    value: float
+    vector: Vector
+    error: float
+
+
+class _Space:
+    """Orthonormal vectors and what K^-1 makes of them."""
+
+    def __init__(self, factors: Factorisation) -> None:
+        n, self._factors = factors.matrix.getLocalSize()[0], factors
+        self._comm: MPI.Comm = factors.matrix.comm.tompi4py()
+        self._size: int = factors.matrix.getSize()[0]
+        self._count, self.solves = 0, 0
+        self._V, self._W = np.empty((MOST_VECTORS, n)), np.empty((MOST_VECTORS, n))
+        self._next = np.sin(1.0 + np.arange(n) + self._comm.rank)
+        self.norm = factors.matrix.norm(PETSc.NormType.NORM_INFINITY)
+
+    @property
+    def exhausted(self) -> bool:
+        """Whether the space is the whole one."""
+        return self._count == self._size
+
+    def grown(self) -> _Pair:
+        """Take in one more vector; the pair nearest to zero in the space that results."""
+        v, k = self._next, self._count
+        for _ in range(2):  # once leaves what rounding makes of it
+            v = v - self._sums(self._V[:k] @ v) @ self._V[:k]
+            v = v / np.sqrt(dot(self._comm, v, v))
+        self._V[k], self._W[k] = v, self._factors.solve(v)
+        self._count, self.solves = k + 1, self.solves + 1
+        V, W = self._V[: k + 1], self._W[: k + 1]
+        inverse = self._sums(V @ W.T)
+        if not np.isfinite(inverse).all():
+            raise NoEigenpair("the tangent's factors give no finite numbers")
+        theta, Y = np.linalg.eigh((inverse + inverse.T) / 2)  # ascending, of K^-1
+        pairs = [self._pair(theta[i], Y[:, i]) for i in {0, k}]
+        pair = self._nearest(pairs)
+        if self._count == MOST_VECTORS:
+            far = np.argsort(-np.abs(theta))[:KEPT]
+            V[:KEPT], W[:KEPT] = Y[:, far].T @ V, Y[:, far].T @ W
+            self._count = KEPT
+        return pair
+
+    def _pair(self, theta: float, y: NDArray[np.float64]) -> tuple[float, Vector, Vector]:
+        """1/lambda, its vector after one more inverse iteration, and the residual."""
+        V, W = self._V[: self._count], self._W[: self._count]
+        w = y @ W
+        return theta, w / np.sqrt(dot(self._comm, w, w)), w - theta * (y @ V)
+
+    def _nearest(self, pairs: list[tuple[float, Vector, Vector]]) -> _Pair:
+        (theta, w, rest), *others = sorted(pairs, key=lambda pair: -abs(pair[0]))
+        size = np.sqrt(dot(self._comm, rest, rest))
+        self._next, error = rest, size / abs(theta)
+        for rival, rival_w, rival_rest in others:
+            rival_size = np.sqrt(dot(self._comm, rival_rest, rival_rest))
+            if rival * theta < 0 and abs(rival) + rival_size >= (1 - TIED) * abs(theta):
+                error = max(error, rival_size / abs(theta))
+                self._next = rest if size > rival_size else rival_rest
+                if rival < 0 and abs(rival) >= (1 - TIED) * abs(theta):
+                    theta, w = rival, rival_w
+        return _Pair(1 / theta, w, error)
+
+    def _sums(self, here: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Inner products over all ranks."""
+        return np.asarray(self._comm.allreduce(here))

@@ -1,0 +1,336 @@
+"""PETSc SNES on the bordered system for (u, mu):
+
+    R(u) + mu R_mu(u) = 0      K du + R_mu dmu = -R
+    g(u, mu)          = 0      c.du + d    dmu = -g
+
+One factorisation of K and two back-solves make a Newton step, whatever the last row. The bordered
+matrix is kept while the steps shrink, with Broyden's update on top (C. T. Kelley, Iterative
+Methods for Linear and Nonlinear Equations, SIAM 1995, algorithm brsol).
+The unknown vector is u with mu appended on the last rank.
+"""
+
+import weakref
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from petsc4py import PETSc
+
+from magshell_fenicsx.continuation.bordered import Bordered, Direction, plus
+from magshell_fenicsx.continuation.control import Row
+from magshell_fenicsx.continuation.factor import Factorisation
+from magshell_fenicsx.continuation.iterates import Iterates, Step, Verdict
+from magshell_fenicsx.continuation.refine import refined_tangent
+from magshell_fenicsx.continuation.system import State, System, Vector, Weighted, dot, followed, max_abs
+from magshell_fenicsx.platform import compat
+
+LEAST_REST = 0.3  # of a step: an update that would lengthen it more is not trusted
+MOTION = 0.1  # part of the largest displacement that counts as a length, where it is longer than the system's
+HIDDEN = "rounding hides the solution: the tangent is nearly singular"
+
+
+@dataclass(frozen=True)
+class NewtonOptions:
+    """When a step counts as converged and when factors are kept.
+
+    Attributes
+    ----------
+    tolerance
+        Estimated error of u, over the system's length or, where that is longer, a tenth of the
+        largest displacement: a strip of 1000 thicknesses that rolls up is not known to 1e-12 of its length.
+    max_iterations
+        Iterations after which a step is given up.
+    contraction
+        The first factors are kept while a step is shorter than this part of the one before.
+    hard
+        The same of later factors, and of all where the guess comes with a stress: old ones lead astray there.
+    fresh
+        Lengths between where factors were made and a solution whose tangent and inertia they still tell.
+    largest_step
+        An iteration that moves u by more than this many lengths is a divergence.
+    """
+
+    tolerance: float = 1e-9
+    max_iterations: int = 25
+    contraction: float = 0.6
+    hard: float = 0.1
+    fresh: float = 0.05
+    largest_step: float = 1e4
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Where Newton ended, and what it took.
+
+    Attributes
+    ----------
+    error
+        Estimated error of u, over the system's length.
+    """
+
+    state: State
+    converged: bool
+    iterations: int
+    reason: str
+    error: float
+
+
+@dataclass(frozen=True)
+class Response:
+    """The tangent of a path at a solution, per unit of its row.
+
+    Attributes
+    ----------
+    softness
+        dq/dmu of the conjugate displacement q.
+    """
+
+    du: Vector
+    dmu: float
+    softness: float
+    negative_pivots: int
+
+
+@dataclass
+class _Progress:
+    """One solve.
+
+    Attributes
+    ----------
+    taken
+        The steps since the matrix was made.
+    ahead
+        The step that the present iterate asks for.
+    """
+
+    iterates: Iterates = field(default_factory=Iterates)
+    verdict: Verdict = "go on"
+    taken: list[Direction] = field(default_factory=list)
+    matrix: Bordered | None = None
+    ahead: Direction | None = None
+
+
+class _Border:
+    """What PETSc calls back; it does not keep the solver, and with it the factors, alive."""
+
+    def __init__(self, newton: "BorderedNewton") -> None:
+        self._newton = weakref.ref(newton)
+
+    @property
+    def newton(self) -> "BorderedNewton":
+        newton = self._newton()
+        assert newton is not None
+        return newton
+
+    def function(self, snes: PETSc.SNES, x: PETSc.Vec, f: PETSc.Vec) -> None:
+        self.newton._function(x, f)
+
+    def jacobian(self, snes: PETSc.SNES, x: PETSc.Vec, J: PETSc.Mat, P: PETSc.Mat) -> None:
+        J.assemble()
+
+    def test(self, snes: PETSc.SNES, iteration: int, norms: tuple[float, float, float]) -> Any:
+        return self.newton._test(snes, norms[2])
+
+    def apply(self, pc: PETSc.PC, f: PETSc.Vec, y: PETSc.Vec) -> None:
+        self.newton._apply(y)
+
+    def mult(self, J: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        self.newton._mult(x, y)
+
+
+class BorderedNewton:
+    """Solves R(u, mu) = 0 with one more row; reusable for every amplitude and row of a system.
+
+    Attributes
+    ----------
+    factorisation
+        Factors of the latest tangent.
+    """
+
+    def __init__(self, system: System, options: NewtonOptions | None = None) -> None:
+        self.system = system
+        self.options = options or NewtonOptions()
+        self.factorisation = Factorisation(system.comm)
+        self.iterations = 0
+        self._factored: State | None = None
+        self._progress = _Progress()
+        comm = system.comm
+        self._last = comm.rank == comm.size - 1
+        n = system.size + self._last
+        self._x = PETSc.Vec().createMPI((n, PETSc.DETERMINE), comm=comm)
+        f = self._x.duplicate()
+        me = _Border(self)
+        J = PETSc.Mat().createPython(((n, PETSc.DETERMINE), (n, PETSc.DETERMINE)), context=me, comm=comm)
+        J.setUp()
+        self._snes = snes = PETSc.SNES().create(comm)
+        snes.setOptionsPrefix("magshell_")
+        snes.setFunction(me.function, f)
+        snes.setJacobian(me.jacobian, J)
+        snes.setConvergenceTest(me.test)
+        snes.setType("newtonls")
+        given = PETSc.Options("magshell_")
+        if not given.hasName("snes_linesearch_type"):
+            given["snes_linesearch_type"] = "basic"  # full steps; the path shortens its own when they fail
+        snes.setTolerances(max_it=self.options.max_iterations)
+        ksp = snes.getKSP()
+        ksp.setType("preonly")
+        ksp.getPC().setType("python")
+        ksp.getPC().setPythonContext(me)
+        ksp.setNormType(PETSc.KSP.NormType.NONE)
+        snes.setFromOptions()
+
+    def solve(self, guess: State, name: str, row: Row, stress: Sequence[Weighted] = ()) -> Outcome:
+        """Find the equilibrium near `guess` on which `row` holds, with mu the amplitude `name`.
+
+        `stress` is as that of `System.tangent`, of the guess.
+        """
+        self._guess, self._name, self._row = guess, name, row
+        self._stress: Sequence[Weighted] = stress
+        self._followed = bool(stress)
+        self._progress = progress = _Progress(Iterates(self.options.largest_step, self.options.max_iterations))
+        self._join(guess.u, guess.mu[name], self._x)
+        self._snes.solve(None, self._x)
+        u, mu = self._split(self._x)
+        converged = self._snes.getConvergedReason() > 0
+        if converged and progress.ahead:  # it costs nothing more
+            u, mu = plus((u, mu), -1.0, progress.ahead)
+        iterations = self._snes.getIterationNumber()
+        self.iterations += iterations
+        ended = self._snes.getConvergedReason()
+        reason = _REASONS.get(progress.verdict) or _REASONS_OF_SNES.get(ended, f"SNES reason {ended}")
+        error = progress.iterates.steps[-1].size if progress.iterates.steps else np.inf
+        return Outcome(guess.with_(u, name, mu), converged, iterations, reason, error)
+
+    def factor_at(self, state: State, stress: Sequence[Weighted] = ()) -> Factorisation:
+        """Factor the tangent at a state, unless its factors are at hand."""
+        if self._factored is not state:
+            self.factorisation.factor(self.system.tangent(state.u, state.mu, stress))
+            self._factored = state
+        return self.factorisation
+
+    def response(self, state: State, name: str, row: Row, *, exact: bool = False) -> Response:
+        """The path's tangent at a solution: K du + R_mu dmu = 0, c.du + d dmu = 1.
+
+        Where the factors at hand were made near by, they serve, with the tangent refined against
+        differences of the residual; `exact` factors K at the solution itself.
+        """
+        comm, near = self.system.comm, self._factored
+        moved = np.inf if near is None else max_abs(comm, state.u - near.u) / self.system.length
+        fresh = moved <= self.options.fresh and not exact
+        matrix = self._bordered(near if fresh and near else state, name, row)
+        tangent, load = matrix.tangent, self.system.load(state.u, name)
+        if moved and fresh:
+            refined = refined_tangent(self.system, matrix, tangent, state, load, row)
+            if refined is None:
+                return self.response(state, name, row, exact=True)
+            tangent = refined
+        du, dmu = tangent
+        return Response(du, dmu, -dot(comm, load, du) / dmu, self.factorisation.negative_pivots)
+
+    def _bordered(self, state: State, name: str, row: Row) -> Bordered:
+        """The bordered matrix at a state, that of the last solve if it was made there for the same row."""
+        last = self._progress.matrix
+        if last and last.row is row and last.state is state is self._factored:
+            return last
+        return Bordered(self.system, self.factor_at(state), state, name, row)
+
+    def _function(self, x: PETSc.Vec, f: PETSc.Vec) -> None:
+        u, mu = self._split(x)
+        R = self.system.residual(u, {**self._guess.mu, self._name: mu})
+        self._join(R, self._row.residual(u, mu), f)
+
+    def _test(self, snes: PETSc.SNES, norm: float) -> Any:
+        progress, o = self._progress, self.options
+        if not np.isfinite(norm):
+            return compat.NOT_A_NUMBER
+        u, mu = self._split(snes.getSolution())
+        f = self._split(snes.getFunction()[0])
+        state = self._guess.with_(u, self._name, mu)
+        progress.ahead = self._ahead(state, f)
+        length = self.system.length
+        scale = max(1.0, MOTION * max_abs(self.system.comm, u) / length)
+        progress.verdict = progress.iterates.judge(o.tolerance * scale, lambda: self._rounding(state, f[0]))
+        return _REASON_OF[progress.verdict]
+
+    def _ahead(self, state: State, f: Direction) -> Direction:
+        """The step that an iterate asks for (SNES subtracts it): with the matrix at hand, or one made here."""
+        progress, steps = self._progress, self._progress.iterates.steps
+        if progress.matrix is not None:
+            ahead = self._updated(progress.matrix.solve(*f))
+            size = progress.matrix.size(ahead)
+            first = sum(step.own for step in steps) == 1 and not self._followed
+            if size <= (self.options.contraction if first else self.options.hard) * steps[-1].size:
+                steps.append(Step(size, own=False))
+                return ahead
+        factors = self.factor_at(state, self._stress)
+        progress.matrix = matrix = Bordered(self.system, factors, state, self._name, self._row)
+        progress.taken.clear()
+        ahead = matrix.solve(*f)
+        steps.append(Step(matrix.size(ahead), own=True))
+        return ahead
+
+    def _updated(self, step: Direction) -> Direction:
+        """A step of the matrix at hand with Broyden's update."""
+        taken, matrix = self._progress.taken, self._progress.matrix
+        assert matrix is not None
+        for before, after in pairwise(taken):
+            part = matrix.inner(before, step) / matrix.inner(before, before)
+            step = plus(step, part, after)
+        if taken:
+            rest = 1 - matrix.inner(taken[-1], step) / matrix.inner(taken[-1], taken[-1])
+            if rest > LEAST_REST:
+                return plus(step, 1 / rest - 1, step)
+            taken.clear()
+        return step
+
+    def _rounding(self, state: State, R: Vector) -> float:
+        """The error that rounding of the residual makes, by its change where u is rounded otherwise."""
+        matrix = self._progress.matrix
+        assert matrix is not None
+        side = np.random.default_rng(self.system.comm.rank).choice([-1.0, 1.0], state.u.size)
+        other = state.u + side * np.spacing(state.u)
+        change = self.system.residual(other, state.mu) - R
+        f = change - matrix.times(other - state.u, 0.0)[0]
+        return matrix.size(matrix.solve(f, 0.0))
+
+    def _apply(self, y: PETSc.Vec) -> None:
+        assert self._progress.ahead is not None
+        self._progress.taken.append(self._progress.ahead)
+        # the stress after the step is what follows linearly from before it (MIP Newton: Magisano, Leonetti, Garcea,
+        # Computer Methods in Applied Mechanics and Engineering 313, 2017)
+        self._stress = followed(self._split(self._snes.getSolution())[0], -self._progress.ahead[0])
+        self._join(*self._progress.ahead, y)
+
+    def _mult(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """The bordered matrix times a vector, for SNES's line searches and monitors."""
+        assert self._progress.matrix is not None
+        self._join(*self._progress.matrix.times(*self._split(x)), y)
+
+    def _join(self, u: Vector, mu: float, x: PETSc.Vec) -> None:
+        x.setArray(np.append(u, mu) if self._last else u)
+
+    def _split(self, x: PETSc.Vec) -> Direction:
+        local = x.array_r
+        mu = self.system.comm.bcast(float(local[-1]) if self._last else None, root=self.system.comm.size - 1)
+        return local[: self.system.size].copy(), mu
+
+
+_REASON_OF = {
+    "go on": PETSc.SNES.ConvergedReason.CONVERGED_ITERATING,
+    "converged": PETSc.SNES.ConvergedReason.CONVERGED_SNORM_RELATIVE,
+    "diverged": PETSc.SNES.ConvergedReason.DIVERGED_DTOL,
+    "rounding": PETSc.SNES.ConvergedReason.DIVERGED_INNER,
+    "too many": PETSc.SNES.ConvergedReason.DIVERGED_MAX_IT,
+}
+_REASONS_OF_SNES = {
+    compat.NOT_A_NUMBER: "the residual is not a number",
+    PETSc.SNES.ConvergedReason.DIVERGED_LINEAR_SOLVE: "the tangent could not be factored",
+}
+_REASONS: dict[str, str] = {
+    "converged": "converged",
+    "diverged": "the iteration diverged",
+    "rounding": HIDDEN,
+    "too many": "too many iterations",
+}

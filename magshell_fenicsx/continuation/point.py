@@ -1,0 +1,53 @@
+"""An accepted point of an equilibrium path."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from magshell_fenicsx.continuation.system import State, Vector
+
+
+@dataclass(frozen=True)
+class Point:
+    """An accepted point of a path.
+
+    Attributes
+    ----------
+    s
+        The controlled quantity: mu, the conjugate displacement -Pi_i(u), or the arc length.
+    du, dmu
+        Tangent of the path, d(u, mu)/ds.
+    negative_pivots
+        Number of unstable directions at fixed amplitudes.
+    negative_pivots_held
+        The same with the conjugate displacement held instead of the amplitude.
+    iterations, factorisations
+        Work since the point before.
+    error
+        Estimated error of u, over the system's length.
+    load_error
+        Of an instability: the estimated error of its amplitude.
+    """
+
+    state: State
+    s: float
+    du: Vector
+    dmu: float
+    negative_pivots: int
+    negative_pivots_held: int
+    iterations: int = 0
+    factorisations: int = 0
+    error: float = 0.0
+    load_error: float = 0.0
+
+    def per(self, rate: float) -> "Point":
+        """The same with its tangent over `rate`."""
+        return replace(self, du=np.asarray(self.du / rate), dmu=self.dmu / rate)
+
+
+class PathStopped(RuntimeError):
+    """The path could not be followed further; `point` is the last accepted one."""
+
+    def __init__(self, reason: str, point: Point) -> None:
+        super().__init__(reason)
+        self.point = point

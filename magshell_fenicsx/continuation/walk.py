@@ -1,0 +1,151 @@
+"""Walking along a path to where it shall end, with every instability and every requested point on the way."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from magshell_fenicsx.continuation.control import GivenConjugate, GivenLoad, Row
+from magshell_fenicsx.continuation.events import instabilities
+from magshell_fenicsx.continuation.path import Path
+from magshell_fenicsx.continuation.point import PathStopped, Point
+
+Label = Literal["step", "target", "fold", "bifurcation"]
+Until = Literal["limit", "bifurcation", "target", "points"]
+Quantity = Literal["load", "conjugate"]
+MOST_STEPS = 1000
+SAME = 1e-2  # distance along the path, in the system's lengths, below which two folds are one
+
+
+@dataclass(frozen=True)
+class Goal:
+    """Where a walk ends, and what is asked for on the way.
+
+    Attributes
+    ----------
+    until
+        "limit": at the first instability, or at the last target; "bifurcation": at the first
+        bifurcation, through folds; "target": at the last target; "points": after `steps` steps.
+    targets
+        Points that are asked for: values of s or, on a path by arc length, of `quantity`.
+    quantity
+        "load": the amplitude; "conjugate": the displacement conjugate to it.
+    steps
+        Elsewhere than with "points", the most that are tried.
+    sense
+        Direction of s where no target gives it.
+    """
+
+    until: Until
+    targets: Sequence[float] = ()
+    quantity: Quantity = "load"
+    steps: int = MOST_STEPS
+    sense: float = 1.0
+
+
+class Walk:
+    """A walk; iterate over it once.
+
+    Attributes
+    ----------
+    points
+        The start, the steps so far, and the instability or target that ended the walk.
+    """
+
+    def __init__(self, path: Path, start: Point, goal: Goal) -> None:
+        self.path, self.goal, self.points = path, goal, [start]
+        self._folds: list[Point] = []
+
+    def __iter__(self) -> Iterator[tuple[Label, Point]]:
+        """Points in order, each with what it is.
+
+        Raises
+        ------
+        PathStopped
+            If the path is lost, comes back to where it was, or is longer than it may be.
+        """
+        options, shorter = self.path.options, None
+        while True:
+            for point, reached in self.path.towards(self.points[-1], self._ahead()):
+                low, shorter = self.points[-1], None
+                try:
+                    between = self._between(low, point)
+                except PathStopped:  # the step had left the branch: come nearer in shorter ones
+                    shorter = abs(point.s - low.s) / 4
+                    break
+                for label, found, ends in between:
+                    yield label, found
+                    if label == "fold":
+                        self._refuse_loop(found)
+                    if ends:
+                        self.points.append(found)
+                        return
+                self.points.append(point)
+                yield ("target" if reached else "step"), point
+                if len(self.points) > self.goal.steps:
+                    if self.goal.until == "points":
+                        return
+                    raise PathStopped(f"{self.goal.steps} steps have not reached the {self.goal.until}", point)
+            if shorter is None:
+                return
+            if shorter < options.smallest:
+                raise PathStopped("an instability cannot be located", self.points[-1])
+            self.path.options = replace(options, first=shorter)
+
+    def _refuse_loop(self, fold: Point) -> None:
+        """See that a fold is none of those before: two in succession may be close, where a snap is being born."""
+        name, u = self.path.name, fold.state.u
+        mu = fold.state.mu[name]
+        for known in self._folds[:-1]:
+            if self.path.metric.norm(u - known.state.u, mu - known.state.mu[name]) < SAME:
+                raise PathStopped("the path has come back to this fold: a closed loop, which leads nowhere else", fold)
+        self._folds.append(fold)
+
+    @property
+    def _by_arc(self) -> bool:
+        return self.path.control == "arc"
+
+    def _ahead(self) -> list[float]:
+        """What is left for the path to aim at."""
+        goal, here = self.goal, self.points[-1].s
+        if self._by_arc:
+            return [np.inf]
+        if not goal.targets:
+            return [float(np.copysign(np.inf, goal.sense))]
+        sense = goal.targets[-1] - self.points[0].s
+        return [t for t in goal.targets if (t - here) * sense > 0]
+
+    def _between(self, low: Point, high: Point) -> list[tuple[Label, Point, bool]]:
+        """Instabilities and, by arc length, targets after `low` and before `high`; the flag ends the walk."""
+        found: list[tuple[Label, Point, bool]] = []
+        for event in instabilities(self.path, low, high):
+            ends = self.goal.until in ("limit", event.kind)
+            found.append((event.kind, event.point, ends))
+            if ends:
+                break
+        if self._by_arc and self.goal.targets:
+            found += self._crossed(low, high)
+        return sorted(found, key=lambda item: abs(item[1].s - low.s))
+
+    def _crossed(self, low: Point, high: Point) -> Iterator[tuple[Label, Point, bool]]:
+        """The targets between two points, each solved for."""
+        a, b, targets = self._value(low), self._value(high), self.goal.targets
+        for target in targets:
+            if (target - a) * (target - b) < 0 or b == target:
+                s = low.s + (target - a) / (b - a) * (high.s - low.s)
+                guess = self.path.between(s, low, self.path.seen_from(low, high))
+                point = self.path.solve(self._row(target), s, guess)
+                if isinstance(point, str):
+                    raise PathStopped(point, low)
+                yield "target", point, self.goal.until in ("target", "limit") and target == targets[-1]
+
+    def _value(self, point: Point) -> float:
+        if self.goal.quantity == "load":
+            return point.state.mu[self.path.name]
+        return -self.path.system.potential(point.state.u, self.path.name)
+
+    def _row(self, target: float) -> Row:
+        if self.goal.quantity == "load":
+            return GivenLoad(target)
+        return GivenConjugate(self.path.system, self.path.name, target)

@@ -1,0 +1,153 @@
+"""Stability of an axisymmetric state against waves cos(m theta), m >= 1.
+
+Along a wave v every component of a jet is a coefficient times cos(m theta) or sin(m theta),
+so the second variation of an axisymmetric energy is pi times the sum of that of the
+cosine's and of the sine's coefficients: one form on the meridian with m as a number.
+"""
+
+from collections.abc import Sequence
+from math import ceil, sqrt
+
+import numpy as np
+import ufl
+from dolfinx import fem
+from dolfinx.fem import petsc as fem_petsc
+from numpy.typing import NDArray
+from petsc4py import PETSc
+
+from magshell_fenicsx.assembly.kernels import KernelLog
+from magshell_fenicsx.assembly.problem import FiniteElementSystem
+from magshell_fenicsx.continuation.factor import Factorisation
+from magshell_fenicsx.continuation.inverse import nearest_to_zero
+from magshell_fenicsx.continuation.system import State
+from magshell_fenicsx.models.axisymmetric import jets
+from magshell_fenicsx.models.axisymmetric.energies import INTERIOR, Energy
+from magshell_fenicsx.models.axisymmetric.meridian import Meridian, held_at
+from magshell_fenicsx.models.shell.parameters import Condition
+from magshell_fenicsx.platform import compat
+
+
+class Waves:
+    """The second variation Q_m of an axisymmetric shell, for any m >= 1.
+
+    Parameters
+    ----------
+    system
+        Of the axisymmetric displacement.
+    energies
+        Its terms as functions of a jet, and the condition of the outer edge.
+
+    Attributes
+    ----------
+    V
+        Space of the waves' coefficients (U + V, V, W); see `jets.wave`.
+    largest
+        Waves that are looked at by default: m = 1 to this. The perfect sphere buckles in
+        waves of length 2 pi sqrt(Rh)/(12(1 - nu^2))^(1/4), of which
+        1.73 (nu = 0.5) to 1.86 (nu = 0) times sqrt(R/h) fit around the equator.
+    """
+
+    def __init__(
+        self,
+        system: FiniteElementSystem,
+        energies: Sequence[Energy],
+        meridian: Meridian,
+        condition: Condition,
+        log: KernelLog,
+    ) -> None:
+        self._system = system
+        degree = system.u.function_space.element.basix_element.degree
+        self.V = V = fem.functionspace(meridian.mesh, ("Lagrange", degree, (3,)))
+        self.largest = ceil(2.2 / sqrt(system.length)) + 5
+        self._m = fem.Constant(V.mesh, 1.0)
+        self._factor = fem.Constant(V.mesh, 1.0)
+        kept = [e for e in energies if not e.linear]
+        self._forms = [(e.amplitude, log.compile(f"{e.name} waves", self._second(e))) for e in kept]
+        axis, rim = meridian.axis, meridian.rim
+        edge = [] if condition == "free" else [held_at(V, rim, i) for i in range(3)]
+        self._held_once = [held_at(V, axis, 0), held_at(V, axis, 2), *edge]
+        self._held = [held_at(V, axis, 1), *self._held_once]
+        pattern = next(form for e, (_, form) in zip(kept, self._forms, strict=True) if e.name == INTERIOR)
+        self._K = fem_petsc.create_matrix(pattern)
+        self._K.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+        self._nodes = 1 + (self.largest - 1) * (1 - np.cos(np.pi * np.arange(5) / 4)) / 2
+        self._parts = [fem_petsc.create_matrix(pattern) for _ in self._nodes]
+        self._interpolated: PETSc.Mat | None = None
+        self._factorisation, self._counting = Factorisation(V.mesh.comm), Factorisation(V.mesh.comm)
+
+    def tangent(self, state: State, m: int) -> PETSc.Mat:
+        """The matrix of Q_m at an axisymmetric state; it is reused by the next call."""
+        self._system.set(state.u)
+        self._assemble(self._K, state, m, self.held(m))
+        return self._K
+
+    def held(self, m: int) -> list[fem.DirichletBC]:
+        """What is held at the axis and at the rim: a wave m = 1 may move the axis across itself."""
+        return self._held_once if m == 1 else self._held
+
+    def factor_at(self, state: State, m: int) -> Factorisation:
+        """Factor the matrix of Q_m at an axisymmetric state; the next call overwrites the factors."""
+        self._factorisation.factor(self.tangent(state, m))
+        return self._factorisation
+
+    def counts(self, state: State) -> list[int]:
+        """Number of unstable directions among the waves 1, 2, ... `largest`.
+
+        A jet of a wave is quadratic in m, and so Q_m is a polynomial of degree 4: its matrices are interpolated
+        between five.
+        """
+        self._system.set(state.u)
+        for part, node in zip(self._parts, self._nodes, strict=True):
+            self._assemble(part, state, node, [])
+        if self._interpolated is None:
+            self._interpolated = self._parts[0].copy()
+            self._interpolated.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+            self._interpolated.setOption(PETSc.Mat.Option.KEEP_NONZERO_PATTERN, True)
+        K, found = self._interpolated, []
+        for m in range(1, self.largest + 1):
+            K.zeroEntries()
+            for part, weight in zip(self._parts, _lagrange(self._nodes, m), strict=True):
+                K.axpy(weight, part, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
+            K.zeroRowsColumnsLocal(np.concatenate([bc.dof_indices()[0] for bc in self.held(m)]), 1.0)
+            self._counting.factor(K)
+            found.append(self._counting.negative_pivots)
+        return found
+
+    def negative_pivots(self, state: State, m: int) -> int:
+        """Number of unstable directions among the waves m."""
+        return self.factor_at(state, m).negative_pivots
+
+    def unstable(self, state: State, largest: int | None = None) -> dict[int, int]:
+        """m -> number of unstable directions, for the waves that have any."""
+        found = {m: self.negative_pivots(state, m) for m in range(1, (largest or self.largest) + 1)}
+        return {m: count for m, count in found.items() if count}
+
+    def critical_eigenvalue(self, state: State, m: int) -> float:
+        """Eigenvalue of Q_m's matrix nearest to zero; negative where Q_m is unstable."""
+        unstable = self.negative_pivots(state, m) > 0
+        value, _ = nearest_to_zero(self._factorisation)
+        return -abs(value) if unstable else abs(value)
+
+    def _assemble(self, K: PETSc.Mat, state: State, m: float, held: list[fem.DirichletBC]) -> None:
+        """Q_m's matrix at the displacement that the system has."""
+        self._m.value = m
+        K.zeroEntries()
+        for amplitude, form in self._forms:
+            self._factor.value = 1.0 if amplitude is None else state.mu[amplitude]
+            if self._factor.value:
+                compat.add_matrix(K, form, held)
+        compat.finish_matrix(K, self.V, held)
+
+    def _second(self, e: Energy) -> ufl.Form:
+        v, u = fem.Function(self.V), jets.revolved(self._system.u)
+        cosine, sine = jets.wave(v, self._m)
+        energy = np.pi * (e.of(u + cosine) + e.of(u + sine))
+        gradient = ufl.derivative(energy, v, ufl.TestFunction(self.V))
+        hessian = ufl.derivative(gradient, v, ufl.TrialFunction(self.V))
+        return self._factor * ufl.replace(hessian, {v: ufl.zero(3)})  # at v = 0 most of it vanishes
+
+
+def _lagrange(nodes: NDArray[np.float64], at: float) -> list[float]:
+    """What the values at some nodes weigh in their polynomial's value elsewhere."""
+    others = [np.delete(nodes, i) for i in range(len(nodes))]
+    return [float(np.prod((at - rest) / (node - rest))) for node, rest in zip(nodes, others, strict=True)]

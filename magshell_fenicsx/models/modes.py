@@ -1,0 +1,148 @@
+"""The lowest modes of a shell, those that its reduced model excludes included.
+
+Each solves K phi = lambda M phi with M the inner product of displacements over the undeformed mid-surface:
+lambda is the stiffness per area with which the shell resists phi. Lengths in R and energies in E h R^2 make
+its unit E h/R^2. A shallow wave of the best length on a sphere under pressure has lambda = 1 - (p/p_c)^2 in
+this unit, but for its tangential part.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from functools import partial
+
+import numpy as np
+import ufl
+from dolfinx import fem
+from petsc4py import PETSc
+from ufl.core.expr import Expr
+
+from magshell_fenicsx.assembly.problem import FiniteElementSystem
+from magshell_fenicsx.continuation.modes import lowest_modes, mass_matrix, null_vector
+from magshell_fenicsx.continuation.system import State, Vector
+from magshell_fenicsx.models.axisymmetric import jets
+from magshell_fenicsx.models.axisymmetric.model import MeridianModel
+from magshell_fenicsx.models.shell import kinematics as kin
+from magshell_fenicsx.models.shell.model import ShellModel
+from magshell_fenicsx.models.solid.model import SolidModel
+
+Model = ShellModel | MeridianModel | SolidModel
+EXCLUDED = ("antisymmetric", "m = ")  # what labels of modes begin with that a reduced model does not see
+
+
+@dataclass(frozen=True)
+class ShellMode:
+    """A mode of the whole shell.
+
+    Attributes
+    ----------
+    label
+        "" if the model sees it itself, else "antisymmetric" or "m = 7", as in `Record.mode`.
+    eigenvalue
+        Over E h/R^2; negative for an unstable direction.
+    vector
+        In the model's space, or of waves in that of their coefficients (U + V, V, W).
+    """
+
+    label: str
+    eigenvalue: float
+    vector: Vector
+
+
+@dataclass(frozen=True)
+class _Family:
+    """Modes that share a tangent, the degrees of freedom held, and an inner product (name and form)."""
+
+    label: str
+    tangent: Callable[[State], PETSc.Mat]
+    held: list[fem.DirichletBC]
+    product: tuple[str, ufl.Form]
+
+
+@dataclass
+class ShellModes:
+    """Modes of a model at any of its states. Overwrites the model's tangent, on which a path relies."""
+
+    model: Model
+    _products: dict[str, fem.Form] = field(default_factory=dict)
+
+    def lowest(self, state: State, count: int) -> list[ShellMode]:
+        """The lowest modes, ascending: of every family `count`, and all that are negative.
+
+        Waves count once, though each has a twin turned by a quarter of its length. Compiles a mass matrix
+        when it is first called, and the waves' kernels.
+
+        Raises
+        ------
+        ModesNotFound
+            See `solve.stability.lowest_modes`.
+        """
+        found = []
+        for family in _families(self.model):
+            M = mass_matrix(self._product(family), family.held)
+            modes = lowest_modes(family.tangent(state), M, count)
+            found += [ShellMode(family.label, mode.eigenvalue, mode.vector) for mode in modes]
+        return sorted(found, key=lambda mode: mode.eigenvalue)
+
+    def null_vector(self, state: State, label: str) -> Vector:
+        """The vector of the mode whose stiffness is nearest to zero: at a located instability the null vector.
+
+        Parameters
+        ----------
+        label
+            `Record.mode` of the instability.
+
+        Raises
+        ------
+        ModesNotFound
+            See `solve.stability.null_vector`.
+        """
+        label = label if label.startswith(EXCLUDED) else ""
+        family = next(family for family in _families(self.model) if family.label == label)
+        return null_vector(family.tangent(state))
+
+    def _product(self, family: _Family) -> fem.Form:
+        name, form = family.product
+        if name not in self._products:
+            self._products[name] = self.model.kernels.compile(name, form)
+        return self._products[name]
+
+
+def _families(model: Model) -> Iterator[_Family]:
+    """The modes that the model sees, then those that it excludes, whose kernels are compiled by then."""
+
+    mass = "mass", _of_displacements(model)
+
+    def of(label: str, system: FiniteElementSystem) -> _Family:
+        return _Family(label, lambda state: system.tangent(state.u, state.mu), system.clamped, mass)
+
+    yield of("", model.system)
+    if isinstance(model, MeridianModel):
+        waves = model.excluded_modes.waves
+        wave_mass = "wave mass", _of_waves(model)
+        for m in range(1, waves.largest + 1):
+            yield _Family(f"m = {m}", partial(waves.tangent, m=m), waves.held(m), wave_mass)
+    elif model.excluded_modes is not None:
+        yield of("antisymmetric", model.excluded_modes.system)
+
+
+def _of_displacements(model: Model) -> ufl.Form:
+    """The integral of u . v over the undeformed mid-surface of what is modelled."""
+    product = ufl.dot(ufl.TrialFunction(model.V), ufl.TestFunction(model.V))
+    return _integral(model, 2 * np.pi * product if isinstance(model, MeridianModel) else product)
+
+
+def _of_waves(model: MeridianModel) -> ufl.Form:
+    """The same of two waves with the coefficients (U + V, V, W); it does not depend on m."""
+    V = model.excluded_modes.waves.V
+    cosine, sine = zip(*(jets.wave(f, 1) for f in (ufl.TrialFunction(V), ufl.TestFunction(V))), strict=True)
+    return _integral(model, np.pi * sum(ufl.dot(a.r, b.r) for a, b in (cosine, sine)))
+
+
+def _integral(model: Model, f: Expr) -> ufl.Form:
+    """Over the undeformed area, of a solid averaged over the thickness; on a meridian per radian."""
+    domain, degree = model.V.mesh, model.degree
+    dx = ufl.Measure("dx", domain=domain, metadata={"quadrature_degree": 2 * degree + 2})
+    if isinstance(model, SolidModel):
+        return f / model.material.h * dx
+    j0 = jets.revolved(model.r0) if isinstance(model, MeridianModel) else kin.jet(model.r0, domain)
+    return f * kin.area_ratio(j0) * dx

@@ -1,0 +1,67 @@
+"""What is read off the displacement of a model with named points, shell or solid."""
+
+from collections.abc import Mapping
+
+import numpy as np
+from dolfinx import fem
+from numpy.typing import NDArray
+
+from magshell_fenicsx.assembly.problem import FiniteElementSystem
+from magshell_fenicsx.continuation.system import Vector
+from magshell_fenicsx.models.shell.parameters import Material
+from magshell_fenicsx.models.shell.point_load import point_entries
+
+Array = NDArray[np.float64]
+
+
+class Observed:
+    """The observations that a path is a table of; a model sets the attributes.
+
+    Attributes
+    ----------
+    system
+        What the solvers see.
+    multiplicity
+        2 for a half model, whose integrals and forces are those of one half; else 1.
+    normals
+        n0 (3,) at the named points.
+    """
+
+    system: FiniteElementSystem
+    material: Material
+    multiplicity: int
+    normals: Mapping[str, Array]
+
+    def observe(self, volume: fem.Form, points: Mapping[str, Array]) -> None:
+        """Take the volume change's form (of the modelled part), and the named vertices' places (3,)."""
+        self._volume = volume
+        # dofs of a vertex on the rank that owns it
+        V = self.system.u.function_space
+        self._probes = {name: point_entries(V, x, np.ones(3))[0] for name, x in points.items()}
+
+    def zero(self) -> Vector:
+        """The undeformed displacement."""
+        return np.zeros(self.system.size)
+
+    def volume_change(self, u: Vector) -> float:
+        """Delta V/R^3 of the whole shell."""
+        self.system.set(u)
+        return self.multiplicity * float(self.system.comm.allreduce(fem.assemble_scalar(self._volume)))
+
+    def deflection(self, u: Vector, point: str) -> float:
+        """w/R = -u . n0 at a named vertex."""
+        return -float(self.displacement(u, point) @ self.normals[point])
+
+    def displacement(self, u: Vector, point: str) -> Array:
+        """u/R (3,) at a named vertex."""
+        here = u[self._probes[point]].reshape(-1, 3).sum(axis=0)
+        return np.asarray(self.system.comm.allreduce(here))
+
+    def loaded_deflection(self, u: Vector) -> float:
+        """w/R conjugate to the force: at its point, or averaged over its patch."""
+        return -self.system.potential(u, "force") / self.force_unit
+
+    @property
+    def force_unit(self) -> float:
+        """The force F R/(2 pi D) = 1 on the modelled part, over E h R."""
+        return 2 * np.pi * self.material.bending_stiffness / self.multiplicity

@@ -1,0 +1,91 @@
+"""Stability of a half model against the modes that its mirror plane excludes.
+
+At a symmetric state u the whole shell's energy for an antisymmetric addition v is that of one half
+with u + v and of the other, mirrored, with u - v. Its Hessian at v = 0 on one half is the half's own,
+but v moves freely along the mirror normal m and not in the plane, and the edges on the plane see the
+two halves tilt against each other.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+import ufl
+from dolfinx import fem
+from numpy.typing import NDArray
+from ufl.core.expr import Expr
+
+from magshell_fenicsx.assembly.problem import FiniteElementSystem
+from magshell_fenicsx.continuation.factor import Factorisation
+from magshell_fenicsx.continuation.system import State
+from magshell_fenicsx.continuation.watch import Family
+from magshell_fenicsx.models.shell import densities
+from magshell_fenicsx.models.shell import kinematics as kin
+from magshell_fenicsx.models.shell.edges import edge_density
+from magshell_fenicsx.models.shell.kinematics import Jet
+from magshell_fenicsx.models.shell.parameters import MIRROR_NORMAL
+
+
+def antisymmetric_edge(
+    r0: Jet, u: Jet, v: Jet, m: Expr, width: Expr, nu: Expr, h: Expr, sigma: Expr, mirror: Expr
+) -> Expr:
+    """Half the energy of an edge between the half with u + v and the mirror image of that with u - v.
+
+    The other parameters are those of `edges.symmetric`.
+    """
+    nu1, nu2, stretch = kin.conormal(r0, m)
+
+    def mirrored(a: Expr) -> Expr:
+        return a - 2 * ufl.dot(a, mirror) * mirror
+
+    def jump(here: Jet, there: Jet) -> Expr:
+        outward, inward = (j.r1 * nu1 + j.r2 * nu2 for j in (here, there))
+        r_nu = (outward - mirrored(inward)) / 2
+        return -ufl.dot(mirrored(kin.normal(there)) - kin.normal(here), r_nu)
+
+    sides = (u + v, u - v)
+    J = jump(r0 + sides[0], r0 + sides[1]) - jump(r0, r0)
+    M = sum(densities.normal_moment(r0, side, nu1, nu2, nu, h) for side in sides) / 2
+    return edge_density(M, J, width, nu, h, sigma) * stretch / 2
+
+
+class AntisymmetricModes:
+    """The tangent of the modes that a half model excludes; a `solve.watch.Family`.
+
+    Attributes
+    ----------
+    system
+        Whose tangent it is, at the displacements of the half model.
+    """
+
+    label = "antisymmetric"
+
+    def __init__(self, system: FiniteElementSystem) -> None:
+        self.system = system
+        self._factorisation = Factorisation(system.comm)
+        self._factored: State | None = None
+
+    def factor_at(self, state: State) -> Factorisation:
+        """Factor the tangent of the antisymmetric modes at a symmetric state."""
+        if self._factored is not state:
+            self._factorisation.factor(self.system.tangent(state.u, state.mu))
+            self._factored = state
+        return self._factorisation
+
+    def is_unstable(self, state: State) -> bool:
+        """Whether an antisymmetric mode is unstable at a symmetric state."""
+        return self.factor_at(state).negative_pivots > 0
+
+    @property
+    def families(self) -> Sequence[Family]:
+        """For a `Watch`: they are one."""
+        return [self]
+
+    def counts(self, state: State) -> Sequence[int]:
+        """The number of unstable directions at a symmetric state."""
+        return [self.factor_at(state).negative_pivots]
+
+
+def held_against_mirror(V: fem.FunctionSpace, facets: NDArray[np.int32]) -> list[fem.DirichletBC]:
+    """v = (v . m) m on the mirror plane."""
+    in_plane = [V.sub(i) for i in range(3) if not MIRROR_NORMAL[i]]
+    return [fem.dirichletbc(0.0, fem.locate_dofs_topological(W, 1, facets), W) for W in in_plane]

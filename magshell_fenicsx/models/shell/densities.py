@@ -1,0 +1,112 @@
+"""Energy densities of the shell as plain functions of jets: the one source of the physics.
+
+All in units of E h per undeformed area (lengths in R), so that the membrane energy is
+of order one; `h` is then h/R. An energy is the integral of density times area_ratio(r0).
+"""
+
+import ufl
+from ufl.core.expr import Expr
+
+from magshell_fenicsx.models.shell import kinematics as kin
+from magshell_fenicsx.models.shell.kinematics import Jet
+
+
+def koiter(S: Expr, up: Expr, nu: Expr) -> Expr:
+    """(1 - nu) S:S + nu tr^2 S with indices raised by the undeformed metric `up`."""
+    T = kin.mixed(S, up)
+    return (1 - nu) * ufl.tr(ufl.dot(T, T)) + nu * ufl.tr(T) ** 2
+
+
+def bending_stiffness(h: Expr, nu: Expr) -> Expr:
+    """D/(E h R^2)."""
+    return h**2 / (12 * (1 - nu**2))
+
+
+def membrane(r0: Jet, u: Jet, nu: Expr) -> Expr:
+    """Stretching density, paper Eq. (eqn:energy), first term."""
+    return koiter(kin.membrane_strain(r0, u), kin.inverse_metric(r0), nu) / (2 * (1 - nu**2))
+
+
+def prestress(r0: Jet, u: Jet, v: Jet, nu: Expr, E: Expr) -> Expr:
+    """S : (v_i . v_j)/2 with the membrane stress S of the strain E_11, E_12, E_22: what it adds to the energy of v."""
+    up = kin.inverse_metric(r0)
+    strain, square = kin.mixed(ufl.as_matrix([[E[0], E[1]], [E[1], E[2]]]), up), kin.mixed(kin.metric(v), up)
+    contracted = (1 - nu) * ufl.tr(ufl.dot(strain, square)) + nu * ufl.tr(strain) * ufl.tr(square)
+    return contracted / (2 * (1 - nu**2))
+
+
+def bending(r0: Jet, u: Jet, nu: Expr, h: Expr) -> Expr:
+    """Bending density, paper Eq. (eqn:energy), second term."""
+    K = kin.curvature_change(r0, u)
+    return bending_stiffness(h, nu) / 2 * koiter(K, kin.inverse_metric(r0), nu)
+
+
+def normal_moment(r0: Jet, u: Jet, nu1: Expr, nu2: Expr, nu: Expr, h: Expr) -> Expr:
+    """M_nunu = D [(1 - nu) K_nunu + nu tr K] for the unit conormal nu^1, nu^2."""
+    K = kin.curvature_change(r0, u)
+    K_nunu = K[0, 0] * nu1**2 + 2 * K[0, 1] * nu1 * nu2 + K[1, 1] * nu2**2
+    trace = ufl.tr(kin.mixed(K, kin.inverse_metric(r0)))
+    return bending_stiffness(h, nu) * ((1 - nu) * K_nunu + nu * trace)
+
+
+def magnetic(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:
+    """-Ba . (F - F0) Br, F = a_i (x) a0^i + n (x) n0; paper Eq. (eq:magenergy) without its constant."""
+    up1, up2 = kin.dual_basis(r0)
+    n, n0 = kin.normal(r0 + u), kin.normal(r0)
+    return -ufl.dot(Ba, u.r1 * ufl.dot(up1, Br) + u.r2 * ufl.dot(up2, Br) + (n - n0) * ufl.dot(n0, Br))
+
+
+def magnetic_gradient(r0: Jet, u: Jet, Br: Expr, G: Expr) -> Expr:
+    """The part of Ba = G r: -(G r) . F Br at the deformed position, without its value at u = 0."""
+    return magnetic(r0, u, Br, ufl.dot(G, r0.r + u.r)) - ufl.dot(ufl.dot(G, u.r), Br)
+
+
+def magnetic_first(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:
+    """U1, linear in u: in-plane forces and a pressure; paper Eq. (eq:terms)."""
+    up1, up2 = kin.dual_basis(r0)
+    n0 = kin.normal(r0)
+    tangential = Ba - ufl.dot(Ba, n0) * n0
+    return -ufl.dot(tangential, u.r1 * ufl.dot(up1, Br) + u.r2 * ufl.dot(up2, Br))
+
+
+def magnetic_torque(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:
+    """Uq, quadratic in the rotation q_i = n0 . u,_i: rotational springs; paper Eq. (eq:terms)."""
+    n0 = kin.normal(r0)
+    q = _rotation(r0, u)
+    return ufl.dot(q, q) * ufl.dot(n0, Ba) * ufl.dot(n0, Br) / 2
+
+
+def magnetic_tau(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:
+    """Utau: torques from the surface gradient of u, q^c U_ac with a the derivative; paper Eq. (eq:terms)."""
+    up1, up2 = kin.dual_basis(r0)
+    q = _rotation(r0, u)
+    turned = ufl.dot(q, u.r1) * ufl.dot(up1, Ba) + ufl.dot(q, u.r2) * ufl.dot(up2, Ba)
+    return -turned * ufl.dot(kin.normal(r0), Br)
+
+
+def magnetic_couple(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:
+    """The other term linear in u, zero where Br is parallel to Ba; not in the paper's U1 and U2.
+
+    With it, U1 + Uq + Utau is the second-order Taylor polynomial of the full energy.
+    """
+    n0 = kin.normal(r0)
+    q = _rotation(r0, u)
+    return ufl.dot(q, Ba) * ufl.dot(n0, Br) - ufl.dot(n0, Ba) * ufl.dot(q, Br)
+
+
+def _rotation(r0: Jet, u: Jet) -> Expr:
+    """q^i a0_i with q_i = n0 . u,_i, tangent to the undeformed surface."""
+    up1, up2 = kin.dual_basis(r0)
+    n0 = kin.normal(r0)
+    return ufl.dot(n0, u.r1) * up1 + ufl.dot(n0, u.r2) * up2
+
+
+def volume(r0: Jet, u: Jet) -> Expr:
+    """(r . n dω - r0 . n0 dω0)/3 per flat area (already includes the area ratio)."""
+    r = r0 + u
+    return (ufl.dot(r.r, kin.area_vector(r)) - ufl.dot(r0.r, kin.area_vector(r0))) / 3
+
+
+def pressure(r0: Jet, u: Jet, unit: Expr) -> Expr:
+    """Pi/p of a live pressure in that unit; per area of the coordinates as `volume`."""
+    return unit * volume(r0, u)

@@ -1,0 +1,124 @@
+"""The bending energy of edges: C0 interior penalty for a C0 displacement.
+
+A C0 surface has b_nunu = (-[n] . r_nu) delta on an edge. With the jump J of that
+quantity over its undeformed value, an edge contributes
+
+    {M_nunu} J + sigma D/(2 h_e) J^2        per undeformed length.
+
+It is one energy: derived twice it gives a symmetric tangent. Every expression is
+invariant under exchange of '+' and '-'.
+"""
+
+from typing import Any
+
+import ufl
+from ufl.core.expr import Expr
+
+from magshell_fenicsx.models.shell import densities
+from magshell_fenicsx.models.shell import kinematics as kin
+from magshell_fenicsx.models.shell.kinematics import Jet
+
+Sides = tuple[Jet, Jet]
+
+
+def edge_density(M: Expr, J: Expr, width: Expr, nu: Expr, h: Expr, sigma: Expr) -> Expr:
+    """{M} J + sigma D/(2 h_e) J^2."""
+    return M * J + sigma * densities.bending_stiffness(h, nu) / (2 * width) * J**2
+
+
+def fold_jump(plus: Jet, minus: Jet, nu_plus: tuple[Expr, Expr], nu_minus: tuple[Expr, Expr]) -> Expr:
+    """-[n] . {r_nu}, nu out of '+', [n] = n- - n+."""
+    r_nu = (plus.r1 * nu_plus[0] + plus.r2 * nu_plus[1] - minus.r1 * nu_minus[0] - minus.r2 * nu_minus[1]) / 2
+    return -ufl.dot(kin.normal(minus) - kin.normal(plus), r_nu)
+
+
+def fold_angle(plus: Jet, minus: Jet, m_plus: Expr) -> tuple[Expr, Expr]:
+    """Sine and cosine of the angle between the normals about the edge; its sign is that of `fold_jump`."""
+    along = kin.unit(plus.r2 * m_plus[0] - plus.r1 * m_plus[1])
+    n_plus, n_minus = kin.normal(plus), kin.normal(minus)
+    return -ufl.dot(ufl.cross(n_plus, n_minus), along), ufl.dot(n_plus, n_minus)
+
+
+def two_sided(
+    J: Expr,
+    r0: Sides,
+    u: Sides,
+    m: tuple[Expr, Expr],
+    width: Expr,
+    nu: Expr,
+    h: Expr,
+    sigma: Expr,
+    t: tuple[Expr, Expr] | None = None,
+) -> Expr:
+    """Energy of an interior edge with that jump per length of its parameter.
+
+    Parameters
+    ----------
+    r0, u
+        Jets on both sides, '+' first.
+    m
+        Covectors of the edge on both sides; see `kinematics.conormal`.
+    width
+        h_e: half the height of the flat triangles over the edge, averaged.
+    t
+        What multiplies the thickness h on both sides, each (1,); None for 1.
+    """
+    conormals = [kin.conormal(j, covector) for j, covector in zip(r0, m, strict=True)]
+    stretch = (conormals[0][2] + conormals[1][2]) / 2
+    if t is None:
+        M = sum(densities.normal_moment(r0[i], u[i], *conormals[i][:2], nu, h) for i in range(2)) / 2
+        return edge_density(M, J, width, nu, h, sigma) * stretch
+    M = sum(t[i][0] * densities.normal_moment(r0[i], u[i], *conormals[i][:2], nu, t[i][0] * h) for i in range(2)) / 2
+    D = sum(t[i][0] * densities.bending_stiffness(t[i][0] * h, nu) for i in range(2)) / 2
+    return (M * J + sigma * D / (2 * width) * J**2) * stretch
+
+
+def interior(r0: Sides, u: Sides, m: tuple[Expr, Expr], *rest: Any) -> Expr:
+    """Energy of an interior edge between cells that meet smoothly, or nearly so; `rest` as in `two_sided`."""
+    nus = [kin.conormal(j, covector)[:2] for j, covector in zip(r0, m, strict=True)]
+    J = fold_jump(r0[0] + u[0], r0[1] + u[1], *nus) - fold_jump(*r0, *nus)
+    return two_sided(J, r0, u, m, *rest)
+
+
+def folded(r0: Sides, u: Sides, m: tuple[Expr, Expr], *rest: Any) -> Expr:
+    """The same across a fold of the undeformed surface: the jump is the change of the angle, whatever its size."""
+    sine0, cosine0 = fold_angle(*r0, m[0])
+    sine, cosine = fold_angle(r0[0] + u[0], r0[1] + u[1], m[0])
+    J = ufl.atan2(sine * cosine0 - cosine * sine0, cosine * cosine0 + sine * sine0)
+    return two_sided(J, r0, u, m, *rest)
+
+
+def turning(r0: Jet, u: Jet, m: Expr, width: Expr, intensity: Expr, past: Expr) -> Expr:
+    """-Pi of a moment per length about the edge's first tangent: intensity times the angle of the normal.
+
+    The tangent runs with the surface on its left, so that a positive angle turns the normal outward. The
+    angle is that of the normal's part normal to the tangent; `past` (2,) holds cosine and sine of the turn
+    that it is told from, so that it may grow beyond pi.
+    """
+    along = r0.r2 * m[0] - r0.r1 * m[1]
+    length = ufl.sqrt(ufl.dot(along, along))
+    t0, n0, n = along / length, kin.normal(r0), kin.normal(r0 + u)
+    sine, cosine = ufl.dot(ufl.cross(n0, n), t0), ufl.dot(n0, n)
+    angle = ufl.atan2(sine * past[0] - cosine * past[1], cosine * past[0] + sine * past[1])
+    return -intensity * angle * length
+
+
+def clamped(r0: Jet, u: Jet, m: Expr, width: Expr, nu: Expr, h: Expr, sigma: Expr) -> Expr:
+    """Energy of a clamped edge per length of its parameter: the outer normal is held at n0."""
+    nu1, nu2, stretch = kin.conormal(r0, m)
+    r = r0 + u
+    J = -ufl.dot(kin.normal(r0) - kin.normal(r), r.r1 * nu1 + r.r2 * nu2)
+    M = densities.normal_moment(r0, u, nu1, nu2, nu, h)
+    return edge_density(M, J, width, nu, h, sigma) * stretch
+
+
+def symmetric(r0: Jet, u: Jet, m: Expr, width: Expr, nu: Expr, h: Expr, sigma: Expr, mirror: Expr) -> Expr:
+    """Energy of an edge on a mirror plane with that normal per length of its parameter: half of an interior edge's."""
+    nu1, nu2, stretch = kin.conormal(r0, m)
+
+    def mirror_jump(j: Jet) -> Expr:
+        return 2 * ufl.dot(kin.normal(j), mirror) * ufl.dot(mirror, j.r1 * nu1 + j.r2 * nu2)
+
+    J = mirror_jump(r0 + u) - mirror_jump(r0)
+    M = densities.normal_moment(r0, u, nu1, nu2, nu, h)
+    return edge_density(M, J, width, nu, h, sigma) * stretch / 2

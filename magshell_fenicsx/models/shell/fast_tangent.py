@@ -1,0 +1,102 @@
+"""The tangent without compiled tangent forms, from the point Hessians of the terms' own densities."""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
+from typing import Protocol
+
+import numpy as np
+from dolfinx import fem
+from numpy.typing import NDArray
+from petsc4py import PETSc
+
+from magshell_fenicsx.assembly.batches import Batch, boundary_batches, cell_batches, interior_batches
+from magshell_fenicsx.assembly.kernels import KernelLog
+from magshell_fenicsx.assembly.scatter import BlockMatrix
+from magshell_fenicsx.assembly.terms import Term
+from magshell_fenicsx.models.shell.energy import Density, HessianTerm, ShellTerm, cell_quadrature, edge_quadrature
+from magshell_fenicsx.models.shell.sites import Site
+
+Array = NDArray[np.float64]
+
+
+Weighted = tuple[float, Array]
+
+
+class TangentSite(Protocol):
+    """What `FastTangent` sums.
+
+    Attributes
+    ----------
+    coupling
+        Batches of entities that couple two cells.
+    """
+
+    @property
+    def coupling(self) -> Sequence[Batch]: ...
+
+    def add(self, u: Array, factors: Mapping[str, float], same: Array, couple: Callable[[int, Array], None]) -> None:
+        """Add element matrices, see `Site.add`."""
+
+
+class FastTangent:
+    """The tangent of a sum of terms; a `solve.problem.TangentAssembler`.
+
+    Parameters
+    ----------
+    u
+        The displacement that the terms were written with.
+    sites
+        Where they live; others may live there too.
+    clamped
+        Homogeneous Dirichlet conditions.
+    """
+
+    def __init__(self, u: fem.Function, sites: Sequence[TangentSite], clamped: list[fem.DirichletBC]) -> None:
+        V = u.function_space
+        self._u, self._sites = u, sites
+        self._matrix = BlockMatrix(V, [batch.cells for site in sites for batch in site.coupling], clamped)
+        cells, functions = V.dofmap.list.shape
+        self._same = np.empty((cells, 9, functions * (functions + 1) // 2))
+
+    def tangent(self, factors: Mapping[str, float], stress: Sequence[Weighted] = ()) -> PETSc.Mat:
+        """The assembled matrix, at the present u; it is reused by the next call. Collective.
+
+        Parameters
+        ----------
+        stress
+            Displacements, ghosts included, with weights: the sum of their membrane strains makes the membrane
+            stress in place of the present strain.
+        """
+        self._same[:] = 0
+        self._matrix.clear()
+        first = 0
+        for site in self._sites:
+            if stress and isinstance(site, Site):
+                site.replace_strain(self._u.x.array, stress)
+            site.add(self._u.x.array, factors, self._same, partial(self._couple, first))
+            first += len(site.coupling)
+        self._matrix.add_cells(self._same)
+        return self._matrix.assemble()
+
+    def _couple(self, first: int, batch: int, K: Array) -> None:
+        self._matrix.add_coupling(first + batch, K)
+
+
+def make_sites(
+    r0: fem.Function, degree: int, terms: Iterable[Term], log: KernelLog, prestress: Density | None = None
+) -> list[Site]:
+    """The sites of some terms: all cells and all interior edges together, boundary edges term by term. Collective."""
+    V = r0.function_space
+    found = [t for t in terms if isinstance(t, ShellTerm | HessianTerm) and not t.linear]
+    cells = [t for t in found if t.density.facets is None and t.density.sides == 1]
+    interior = [t for t in found if t.density.sides == 2]
+    sites = []
+    if cells:
+        sites.append(Site(r0, cell_batches(V, cell_quadrature(degree)), 1, cells, log, prestress))
+    if interior:
+        sites.append(Site(r0, interior_batches(V, edge_quadrature(degree)), 2, interior, log))
+    for term in found:
+        if term.density.facets is not None:
+            batches = boundary_batches(V, edge_quadrature(degree), term.density.facets)
+            sites.append(Site(r0, batches, 1, [term], log))
+    return sites

@@ -1,0 +1,134 @@
+"""First derivatives of densities at points.
+
+The derivatives of u are those by the coordinates of the reference cell, so that one table of shape
+functions serves all cells. The kernels take them to the flat cell's own orthonormal coordinates
+first: the metric of a sliver is then as well conditioned as in a form.
+"""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import ufl
+from dolfinx import fem
+from mpi4py import MPI
+from numpy.typing import NDArray
+from ufl.core.expr import Expr
+
+from magshell_fenicsx.assembly.kernels import KernelLog
+from magshell_fenicsx.assembly.point_kernels import Points
+from magshell_fenicsx.models.shell.energy import Density, ShellTerm
+from magshell_fenicsx.models.shell.kinematics import Jet
+from magshell_fenicsx.models.shell.sites import NAMES, fill, parameters_at
+
+Array = NDArray[np.float64]
+CHUNK = 16384  # points at a time: their vectors stay within some ten megabytes
+FRAME = 4  # numbers of a cell's frame, see `cell_frames`
+
+
+class PointGradient:
+    """dW/du of the sum of some terms' densities at points.
+
+    Parameters
+    ----------
+    terms
+        All on cells, or all on edges with as many sides.
+    parts
+        Which parts of the jets the points have.
+    each
+        Points of an entity; a chunk has whole entities.
+    r0
+        (points, sides * parts * 3) in the cells' own coordinates.
+    geometry
+        (points, 4): `cell_frames`; on edges (points, 6 sides + 1): the frame of each side, the
+        covectors of the edge in the sides' own coordinates (see `kinematics.conormal`), the width.
+    values
+        Gives (points, 3) of a field that a density depends on.
+    comm
+        All its ranks compile together.
+
+    Attributes
+    ----------
+    chunks
+        The points that are treated together.
+    """
+
+    def __init__(
+        self,
+        terms: Sequence[ShellTerm],
+        parts: Sequence[str],
+        each: int,
+        r0: Array,
+        geometry: Array,
+        values: Callable[[fem.Function], Array],
+        log: KernelLog,
+        comm: MPI.Comm,
+    ) -> None:
+        count, self._size = r0.shape
+        chunk = max(CHUNK // each, 1) * each
+        self.chunks = [slice(first, min(first + chunk, count)) for first in range(0, count, chunk)]
+        points = self._points = Points(max(min(count, chunk), 1))
+        self._u, placement, place = (points.field(size) for size in (self._size, self._size, geometry.shape[1]))
+        self._known = [(placement, r0), (place, geometry)]
+        W = ufl.zero()
+        for term in terms:
+            parameters, varying = parameters_at(points, term.density)
+            self._known += [(here, values(field)) for here, field in varying]
+            W += _energy(term.density, placement, self._u, place, parts, parameters)
+        name = f"{', '.join(term.name for term in terms)} gradient"
+        self._gradient = log.compile_expression(name, ufl.diff(W, self._u), comm)
+        self._loaded: slice | None = None
+
+    def room(self, chunk: slice) -> Array:
+        """For the derivatives of u in reference coordinates, to be filled: (points, sides * parts * 3)."""
+        count = chunk.stop - chunk.start
+        return np.asarray(self._u.x.array[: count * self._size].reshape(count, self._size))
+
+    def evaluate(self, chunk: slice) -> Array:
+        """The derivatives by what was filled in, in the same order; the array is reused by the next call."""
+        if self._loaded != chunk:
+            for field, values in self._known:
+                fill(field, values[chunk])
+            self._loaded = chunk
+        return self._points.evaluate(self._gradient, chunk.stop - chunk.start)
+
+
+def in_own_coordinates(jet: Jet, frame: Sequence[Expr | Array]) -> Jet:
+    """From the derivatives by the reference coordinates; of expressions, or of arrays."""
+    p, q, s = frame[:3]
+    return Jet(
+        jet.r,
+        p * jet.r1,
+        q * jet.r1 + s * jet.r2,
+        p * p * jet.r11,
+        p * (q * jet.r11 + s * jet.r12),
+        q * q * jet.r11 + 2 * q * s * jet.r12 + s * s * jet.r22,
+    )
+
+
+def _energy(
+    density: Density,
+    r0: fem.Function,
+    u: fem.Function,
+    place: fem.Function,
+    parts: Sequence[str],
+    parameters: Sequence[fem.Constant | fem.Function],
+) -> Expr:
+    """Per area of the reference cell, or per parameter (from 0 to 1) of the edge."""
+    sides = range(density.sides)
+    frames = [[place[FRAME * side + i] for i in range(FRAME)] for side in sides]
+    r0_jets = [_jet(r0, side, parts) for side in sides]
+    u_jets = [in_own_coordinates(_jet(u, side, parts), frames[side]) for side in sides]
+    if not density.on_edges:
+        return frames[0][-1] * density.at([r0_jets, u_jets], None, parameters)
+    first = FRAME * density.sides
+    m = [ufl.as_vector([place[first + 2 * side], place[first + 2 * side + 1]]) for side in sides]
+    return density.at([r0_jets, u_jets], (m, place[first + 2 * density.sides]), parameters)
+
+
+def _jet(field: fem.Function, side: int, parts: Sequence[str]) -> Jet:
+    """The parts that are not there are zero: no density asks for them."""
+    first = 3 * len(parts) * side
+    vectors = {
+        part: ufl.as_vector([field[first + 3 * number + c] for c in range(3)]) for number, part in enumerate(parts)
+    }
+    return Jet(*(vectors.get(name, ufl.zero(3)) for name in NAMES))

@@ -1,0 +1,213 @@
+"""The shell as a system of terms: only those that its loads and edges call for.
+
+Lengths in R, energies in E h R^2. Amplitudes: "pressure" is p/p_c, "force" is
+F R/(2 pi D), "lambda_m" is lambda_m.
+"""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import cached_property
+
+import numpy as np
+from dolfinx import fem
+from numpy.typing import NDArray
+
+from magshell_fenicsx.assembly.kernels import KernelLog
+from magshell_fenicsx.assembly.problem import FiniteElementSystem
+from magshell_fenicsx.assembly.terms import LinearTerm, Term
+from magshell_fenicsx.continuation.system import Vector
+from magshell_fenicsx.mesh.midsurface import Midsurface
+from magshell_fenicsx.mesh.patch import MeshError
+from magshell_fenicsx.models.observed import Observed
+from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes, held_against_mirror
+from magshell_fenicsx.models.shell.dead_load import assemble_dead_loads
+from magshell_fenicsx.models.shell.fast_tangent import FastTangent, make_sites
+from magshell_fenicsx.models.shell.folds import FOLD, largest_fold
+from magshell_fenicsx.models.shell.parameters import (
+    MIRROR_NORMAL,
+    Condition,
+    EdgeMoment,
+    Force,
+    Held,
+    Loads,
+    Material,
+    default_penalty,
+)
+from magshell_fenicsx.models.shell.patterns import by_patch
+from magshell_fenicsx.models.shell.point_load import patch_entries, point_entries, vertex_normal
+from magshell_fenicsx.models.shell.residual import FastResidual
+from magshell_fenicsx.models.shell.supports import (
+    STRAIGHT,
+    held_at_vertex,
+    held_on,
+    open_to_pressure,
+    plane_of,
+    refuse_unknown,
+)
+from magshell_fenicsx.models.shell.terms import TermFactory
+from magshell_fenicsx.models.shell.thickness import Thickness, thickness_field
+
+
+class ShellModel(Observed):
+    """A Koiter shell on a mid-surface.
+
+    Parameters
+    ----------
+    midsurface
+        Mesh and placement.
+    degree
+        Of displacement and placement, 2 to 5.
+    conditions
+        Edge name -> condition; edges that are not named are free. A vertex can be held too, and a patch clamped or
+        held: then all of it.
+    sigma
+        Penalty of the C0 interior penalty form; None takes `default_penalty`.
+    thickness
+        What multiplies the thickness; None for 1.
+
+    Raises
+    ------
+    MeshError
+        On every rank, if the surface has no such edge, point or patch, an edge lies in no plane of symmetry, or
+        in one that is open to a live pressure.
+
+    Attributes
+    ----------
+    system, multiplicity, normals
+        See `Observed`.
+    kernels
+        Names and compile time of the forms in use.
+    thickness
+        h(x)/h, free to jump from cell to cell; None for 1.
+    load_size
+        The sum of the sizes of the dead loads, over E h R; see `DeadLoads`.
+    """
+
+    def __init__(
+        self,
+        midsurface: Midsurface,
+        material: Material,
+        degree: int,
+        conditions: Mapping[str, Condition],
+        loads: Loads,
+        sigma: float | None = None,
+        thickness: Thickness | None = None,
+    ) -> None:
+        refuse_unknown(midsurface.edges, midsurface.points, midsurface.patches, conditions, loads)
+        if loads.magnetic and loads.magnetic.patches:
+            topology = midsurface.mesh.topology.index_map(2)
+            cells = topology.size_local + topology.num_ghosts
+            remanent = by_patch(loads.magnetic.patches, midsurface.patches, cells)
+            loads = replace(loads, magnetic=replace(loads.magnetic, remanent=remanent))
+        self.midsurface, self.material, self.degree, self.loads = midsurface, material, degree, loads
+        self.multiplicity = 2 if "symmetry" in conditions.values() else 1
+        self.kernels = KernelLog()
+        self.V = V = fem.functionspace(midsurface.mesh, ("Lagrange", degree, (3,)))
+        self.r0, self.u = midsurface.placement(V), fem.Function(V, name="u")
+        self.sigma = default_penalty(degree) if sigma is None else sigma
+        self.thickness = factor = thickness_field(thickness, self.r0, midsurface) if thickness else None
+        factory = TermFactory(self.r0, self.u, material, self.sigma, degree, self.kernels, factor)
+        interior = factory.interior_edges(folded=midsurface.read and largest_fold(self.r0, degree) > FOLD)
+        terms: list[Term] = [factory.membrane(), factory.bending(), interior]
+        held, mirror = [], []
+
+        def facets(condition: Condition) -> NDArray[np.int32]:
+            found = [
+                midsurface.edges[name] for name, c in conditions.items() if c == condition and name in midsurface.edges
+            ]
+            return np.unique(np.concatenate(found)).astype(np.int32) if found else np.empty(0, np.int32)
+
+        if "clamped" in conditions.values():
+            terms.append(factory.clamped_edges(facets("clamped")))
+            held.append(_held(V, facets("clamped")))
+        if "simply supported" in conditions.values():
+            held.append(_held(V, facets("simply supported")))
+        if "symmetry" in conditions.values():
+            terms.append(factory.mirror_edges(facets("symmetry")))
+            mirror.append(_held_in_mirror(V, facets("symmetry")))
+        for name, condition in conditions.items():
+            components = condition.components if isinstance(condition, Held) else (0, 1, 2)
+            if name not in midsurface.edges and name in midsurface.patches:
+                cells = np.flatnonzero(midsurface.patches[name]).astype(np.int32)
+                held += held_on(V, 2, cells, components)
+            elif isinstance(condition, Held) and name in midsurface.edges:
+                held += held_on(V, 1, midsurface.edges[name], components)
+            elif isinstance(condition, Held):
+                held += held_at_vertex(V, midsurface.points[name], components)
+            elif condition == "plane":
+                axis, place = plane_of(V, self.r0, midsurface.edges[name], name)
+                if loads.pressure and abs(place) > STRAIGHT:
+                    raise MeshError(open_to_pressure(name))
+                terms.append(factory.mirror_edges(midsurface.edges[name], np.eye(3)[axis], f"{name} mirror edges"))
+                held += held_on(V, 1, midsurface.edges[name], (axis,))
+        if loads.magnetic:
+            terms += factory.magnetic(loads.magnetic)
+        if loads.pressure:
+            terms.append(factory.pressure())
+        terms += [factory.own(term) for term in loads.own]
+        self.normals = {name: vertex_normal(self.r0, x) for name, x in midsurface.points.items()}
+        if loads.force:
+            terms.append(self._force(loads.force))
+        self.load_size = 0.0
+        if loads.dead:
+            dead = assemble_dead_loads(loads.dead, self.r0, midsurface, degree, self.kernels)
+            self.load_size = dead.size
+            self._dead_load = LinearTerm("load", *dead.entries, self.u, "load")
+            terms.append(self._dead_load)
+            moments = [load for load in loads.dead if isinstance(load, EdgeMoment)]
+            terms += [
+                factory.edge_moment(f"moment {load.edge} {i}", midsurface.edges[load.edge], load.moment)
+                for i, load in enumerate(moments)
+            ]
+        self._sites = make_sites(self.r0, degree, terms, self.kernels, factory.prestress())
+        fast = FastTangent(self.u, self._sites, held + mirror)
+        gradients = FastResidual(self.r0, self.u, degree, terms, self.kernels)
+        self.system = FiniteElementSystem(self.u, terms, held + mirror, interior, material.h, fast, gradients)
+        self._factory, self._interior, self._held, self._mirror = factory, interior, held, facets("symmetry")
+        self.observe(self.kernels.compile("volume energy", factory.volume_change()), midsurface.points)
+
+    @cached_property
+    def excluded_modes(self) -> AntisymmetricModes | None:
+        """The modes that a half model does not see; None for a whole one. Compiles a kernel."""
+        if self.multiplicity == 1:
+            return None
+        edges = self._factory.antisymmetric_edges(self._mirror)
+        held = self._held + held_against_mirror(self.V, self._mirror)
+        sites = self._sites + make_sites(self.r0, self.degree, [edges], self.kernels)
+        fast = FastTangent(self.u, sites, held)
+        terms = [edges if t.name == "mirror edges" else t for t in self.system.terms]
+        system = self.system
+        return AntisymmetricModes(
+            FiniteElementSystem(self.u, terms, held, self._interior, system.length, fast, system.gradients)
+        )
+
+    def loaded_deflection(self, u: Vector) -> float:
+        """w/R conjugate to the force: at its point, or averaged over its patch; of dead loads along themselves.
+
+        Moments alone have none: that of the pole.
+        """
+        if self.loads.dead and not self.load_size:
+            return self.deflection(u, "pole")
+        if self.loads.dead:
+            self.system.set(u)
+            return -float(self.system.comm.allreduce(self._dead_load.energy())) / self.load_size
+        return super().loaded_deflection(u)
+
+    def _force(self, force: Force) -> LinearTerm:
+        x, inward = self.midsurface.points[force.point], -self.normals[force.point]
+        if force.patch:
+            entries = patch_entries(self.r0, x, force.patch, inward, self.degree, self.kernels)
+        else:
+            entries = point_entries(self.V, x, inward)
+        return LinearTerm("force", entries[0], self.force_unit * entries[1], self.u, "force")
+
+
+def _held(V: fem.FunctionSpace, facets: NDArray[np.int32]) -> fem.DirichletBC:
+    """u = 0 on an edge."""
+    return fem.dirichletbc(np.zeros(3), fem.locate_dofs_topological(V, 1, facets), V)
+
+
+def _held_in_mirror(V: fem.FunctionSpace, facets: NDArray[np.int32]) -> fem.DirichletBC:
+    """u . m = 0 on the mirror plane."""
+    normal = V.sub(int(np.argmax(MIRROR_NORMAL)))
+    return fem.dirichletbc(0.0, fem.locate_dofs_topological(normal, 1, facets), normal)

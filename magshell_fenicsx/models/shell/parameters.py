@@ -1,0 +1,143 @@
+"""What a shell is made of and what loads it, dimensionless."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magshell_fenicsx.models.shell.own_term import OwnTerm
+from magshell_fenicsx.models.shell.patterns import Pattern
+
+
+@dataclass(frozen=True)
+class Held:
+    """These components of the displacement are zero, rotations are free."""
+
+    components: tuple[int, ...]
+
+
+# "symmetry" is the mirror plane of a half model, "plane" one that belongs to the shell as it is described
+Condition = Literal["clamped", "simply supported", "free", "symmetry", "plane"] | Held
+MagneticEnergy = Literal["full", "first", "torque", "second", "second_consistent"]
+MIRROR_NORMAL = np.array([0.0, 1.0, 0.0])  # half models are the part y >= 0
+
+
+@dataclass(frozen=True)
+class Material:
+    """nu, and h over R."""
+
+    nu: float
+    h: float
+
+    @property
+    def bending_stiffness(self) -> float:
+        """D/(E h R^2)."""
+        return self.h**2 / (12 * (1 - self.nu**2))
+
+    @property
+    def classical_pressure(self) -> float:
+        """p_c/E = 2/sqrt(3 (1 - nu^2)) (h/R)^2, of the perfect sphere."""
+        return float(2 / np.sqrt(3 * (1 - self.nu**2)) * self.h**2)
+
+
+@dataclass(frozen=True)
+class Force:
+    """A dead force along the undeformed normal at a vertex, F > 0 pushing in.
+
+    Attributes
+    ----------
+    point
+        Name of the vertex.
+    patch
+        Radius over R of the smooth patch that it is spread over; 0 for a point.
+    """
+
+    point: str
+    patch: float = 0.0
+
+
+@dataclass(frozen=True)
+class Magnetisation:
+    """What is magnetised and how it is modelled.
+
+    Attributes
+    ----------
+    remanent, applied
+        The flux densities over their magnitudes: vectors (3,), or a pattern for the remanent one.
+    gradient
+        (3, 3) of the applied flux density, which is applied + gradient . r; None if uniform.
+    across
+        Unit vector (3,) normal to `applied` that the field turns towards, with the amplitude
+        "lambda_across"; None if it does not turn.
+    energy
+        The full energy, or which of the paper's approximations takes its place.
+    patches
+        Vectors (3,) on named patches of a mesh, in place of `remanent`; None without.
+    """
+
+    remanent: NDArray[np.float64] | Pattern
+    applied: NDArray[np.float64]
+    energy: MagneticEnergy = "full"
+    gradient: NDArray[np.float64] | None = None
+    across: NDArray[np.float64] | None = None
+    patches: Mapping[str, NDArray[np.float64]] | None = None
+
+
+@dataclass(frozen=True)
+class PointForce:
+    """A dead force (3,) over E h R at a named vertex."""
+
+    point: str
+    force: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class EdgeForce:
+    """A dead force (3,) on a named edge: per length over E h or, if `total`, in all over E h R."""
+
+    edge: str
+    force: NDArray[np.float64]
+    total: bool
+
+
+@dataclass(frozen=True)
+class EdgeMoment:
+    """A moment per length over E h R on a named edge; see `edges.turning`."""
+
+    edge: str
+    moment: float
+
+
+@dataclass(frozen=True)
+class AreaForce:
+    """A dead force (3,) per undeformed area over E h/R, on a patch, or on all.
+
+    A number in place of the vector is a pressure along the undeformed normal, positive from outside.
+    """
+
+    patch: str | None
+    force: NDArray[np.float64] | float
+
+
+DeadLoad = PointForce | EdgeForce | EdgeMoment | AreaForce
+
+
+@dataclass(frozen=True)
+class Loads:
+    """What loads the shell; None or False: no term, no kernel."""
+
+    pressure: bool = False
+    force: Force | None = None
+    magnetic: Magnetisation | None = None
+    dead: tuple[DeadLoad, ...] = ()
+    own: tuple[OwnTerm, ...] = ()
+
+
+def default_penalty(degree: int) -> float:
+    """sigma of the C0 interior penalty (over half the height of the triangles).
+
+    It grows with degree squared, as the inverse inequality asks.
+    """
+    return 5.0 * degree**2

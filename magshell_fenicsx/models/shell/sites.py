@@ -1,0 +1,211 @@
+"""Where terms live: the Hessians of their densities at points, contracted in batches.
+
+The densities are covariant, so the jets are taken in reference coordinates: the tables of the
+shape functions are then the same for all cells.
+"""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import fields
+from functools import reduce
+from itertools import combinations_with_replacement, product
+from operator import or_
+
+import numpy as np
+import ufl
+from dolfinx import fem
+from mpi4py import MPI
+from numpy.typing import NDArray
+
+from magshell_fenicsx.assembly.batches import Batch
+from magshell_fenicsx.assembly.contraction import Blocks, Contraction
+from magshell_fenicsx.assembly.kernels import KernelLog
+from magshell_fenicsx.assembly.point_kernels import Pair, Pairs, Points, point_hessian
+from magshell_fenicsx.assembly.shape_tables import PARTS
+from magshell_fenicsx.models.shell.energy import Density, HessianTerm, Parameter, ShellTerm
+from magshell_fenicsx.models.shell.kinematics import Jet
+
+PointTerm = ShellTerm | HessianTerm
+Array = NDArray[np.float64]
+NAMES = tuple(f.name for f in fields(Jet))  # in the order of `reference.Table`
+RANK = (2, 0, 0, 1, 1, 1)  # pairs of first derivatives come first: the terms' pairs are then neighbours
+
+
+class Site:
+    """Where some terms live together: the cells, the interior edges, or some boundary edges.
+
+    Parameters
+    ----------
+    batches
+        Those of this rank, perhaps none.
+    sides
+        2 for interior edges.
+    """
+
+    def __init__(
+        self,
+        r0: fem.Function,
+        batches: list[Batch],
+        sides: int,
+        terms: Sequence[PointTerm],
+        log: KernelLog,
+        prestress: Density | None = None,
+    ) -> None:
+        V = r0.function_space
+        self.batches, self._dofs, self._sides = batches, V.dofmap.list, sides
+        self._points = Points(max([1, *(batch.size for batch in batches)]))
+        self._u, self._r0 = (self._points.field(3 * PARTS * sides) for _ in range(2))
+        self._geometry = self._points.field(2 * sides + 1)
+        self._placements = [self._jets(batch, r0.x.array) for batch in batches]
+        self._kernels = {
+            t.name: Kernel(t.name, t.density, self._points, batches, of_v=isinstance(t, HessianTerm)) for t in terms
+        }
+        self._prestress = Kernel("prestress", prestress, self._points, batches, of_v=True) if prestress else None
+        self._replaced = False
+        for kernel in [*self._kernels.values(), *([self._prestress] if self._prestress else [])]:
+            kernel.compile(self._u, self._r0, self._geometry, sides, log, V.mesh.comm)
+        self.coupling = batches if sides == 2 else []
+        pairs = reduce(or_, (kernel.pairs for kernel in self._kernels.values()))
+        pairs = Pairs(tuple(sorted(pairs.same, key=_neighbours)), pairs.cross)
+        self._coupled = pairs
+        self._contractions = {rule: Contraction(rule, pairs) for rule in {batch.rule for batch in batches}}
+
+    def add(self, u: Array, factors: Mapping[str, float], same: Array, couple: Callable[[int, Array], None]) -> None:
+        """Add the terms' element matrices.
+
+        Parameters
+        ----------
+        u
+            (dofs,) with ghosts.
+        factors
+            By term; others are left out.
+        same
+            (local cells, 9, pairs of functions), see `BlockMatrix.add_cells`.
+        couple
+            Takes the number of each batch of interior edges and what couples the cells there.
+        """
+        kernels = [(kernel, factors[name]) for name, kernel in self._kernels.items() if factors.get(name)]
+        for number, batch in enumerate(self.batches):
+            fill(self._u, self._jets(batch, u))
+            fill(self._r0, self._placements[number])
+            fill(self._geometry, np.repeat(batch.geometry, len(batch.rule.weights), axis=0))
+            contraction, blocks = self._contractions[batch.rule], Blocks(batch, self._coupled)
+            for kernel, factor in kernels:
+                blocks.add(kernel.evaluate(number), factor, kernel.pairs)
+            if self._replaced and self._prestress:
+                blocks.add(self._prestress.evaluate(number), 1.0, self._prestress.pairs)
+            for side, cells in enumerate(batch.cells):
+                same[cells] += contraction.same(blocks, side)
+            if self._sides == 2:
+                couple(number, contraction.cross(blocks))
+        self._replaced = False
+
+    def replace_strain(self, u: Array, by: Sequence[tuple[float, Array]]) -> None:
+        """Take the weighted sum of other displacements' membrane strains in place of that of u, in the next `add`."""
+        if self._prestress is None:
+            return
+        for number, (batch, r0) in enumerate(zip(self.batches, self._placements, strict=True)):
+            strains = [w * _strain(r0, self._jets(batch, v)) for w, v in (*by, (-1.0, u))]
+            self._prestress.vary(number, np.sum(strains, axis=0))
+        self._replaced = True
+
+    def _jets(self, batch: Batch, field: Array) -> Array:
+        """(points, sides, 6, 3) of a field."""
+        nodes = field.reshape(-1, 3)
+        both = [t.jets(nodes[self._dofs[cells]]) for t, cells in zip(batch.rule.tables, batch.cells, strict=True)]
+        return np.stack(both, axis=2)
+
+
+class Kernel:
+    """The point Hessian of one term on a site."""
+
+    def __init__(self, name: str, density: Density, points: Points, batches: list[Batch], *, of_v: bool) -> None:
+        self._name, self._density, self._of_v = name, density, of_v
+        self._points, self._batches = points, batches
+        self._parameters, varying = parameters_at(points, density)
+        sides = range(density.sides)
+        self._varying = [(here, [_on_sides(field, batch, sides) for batch in batches]) for here, field in varying]
+
+    def compile(
+        self, u: fem.Function, r0: fem.Function, geometry: fem.Function, sides: int, log: KernelLog, comm: MPI.Comm
+    ) -> None:
+        """Collective."""
+        density, name, of_v = self._density, self._name, self._of_v
+        self.pairs = _pairs(density)
+        z = self._points.field(3 * PARTS) if of_v else u
+        jets = [[_jet(field, side) for side in range(sides)] for field in ((r0, u, z) if of_v else (r0, u))]
+        m = [ufl.as_vector([geometry[2 * side], geometry[2 * side + 1]]) for side in range(sides)]
+        W = density.at(jets, (m, geometry[2 * sides]) if density.on_edges else None, self._parameters)
+        self._hessian = point_hessian(name, W, z, PARTS, self.pairs, log, comm, at_zero=of_v)
+
+    def vary(self, number: int, values: Array) -> None:
+        """Give the first parameter that varies its values at the points of a batch."""
+        self._varying[0][1][number] = values
+
+    def evaluate(self, number: int) -> Array:
+        """The Hessian's parts at the points of a batch."""
+        for here, values in self._varying:
+            fill(here, values[number])
+        return self._points.evaluate(self._hessian, self._batches[number].size)
+
+
+def _strain(r0: Array, u: Array) -> Array:
+    """(points, 3): E_11, E_12, E_22 from jets (..., 6, 3)."""
+    (a, b), (p, q) = (np.moveaxis(jets.reshape(-1, PARTS, 3)[:, 1:3], 1, 0) for jets in (r0, u))
+
+    def dot(x: Array, y: Array) -> Array:
+        return np.asarray(np.einsum("pc,pc->p", x, y))
+
+    E12 = (dot(a, q) + dot(p, b) + dot(p, q)) / 2
+    return np.stack([dot(a, p) + dot(p, p) / 2, E12, dot(b, q) + dot(q, q) / 2], axis=1)
+
+
+def _pairs(density: Density) -> Pairs:
+    """Those of the parts that the density depends on, without those in which it is linear."""
+    parts = [NAMES.index(name) for name in density.parts]
+    linear = [NAMES.index(name) for name in density.linear]
+
+    def coupled(pairs: Iterable[Pair]) -> tuple[Pair, ...]:
+        return tuple(p for p in pairs if not (p[0] in linear and p[1] in linear))
+
+    same = coupled((min(p), max(p)) for p in combinations_with_replacement(parts, 2))
+    return Pairs(same, coupled(product(parts, parts)) if density.sides == 2 else ())
+
+
+def _neighbours(pair: Pair) -> tuple[int, Pair]:
+    return max(RANK[pair[0]], RANK[pair[1]]), pair
+
+
+def _jet(field: fem.Function, side: int) -> Jet:
+    parts = range(side * PARTS, (side + 1) * PARTS)
+    return Jet(*(ufl.as_vector([field[3 * part + c] for c in range(3)]) for part in parts))
+
+
+def parameters_at(points: Points, density: Density) -> tuple[list[Parameter], list[tuple[fem.Function, fem.Function]]]:
+    """A density's parameters at points; those that vary, to be filled, are told with the fields that they stand for.
+
+    Where there are two sides, such a vector holds that of the one and then that of the other.
+    """
+    here = [
+        points.constant(p.value) if isinstance(p, fem.Constant) else points.field(density.sides * p.ufl_shape[0])
+        for p in density.parameters
+    ]
+    pairs = zip(here, density.parameters, strict=True)
+    return here, [(there, p) for there, p in pairs if isinstance(p, fem.Function)]
+
+
+def at_points(field: fem.Function, X: Array, cells: NDArray[np.int32]) -> Array:
+    """(cells * points, components) of a field that varies over the cells, at reference points (points, 2)."""
+    Q, size = field.function_space, field.ufl_shape[0]
+    values = Q.element.basix_element.tabulate(0, X)[0, :, :, 0]
+    nodal = field.x.array.reshape(-1, size)[Q.dofmap.list[cells]]
+    return np.asarray(np.matmul(values, nodal)).reshape(-1, size)
+
+
+def _on_sides(field: fem.Function, batch: Batch, sides: range) -> Array:
+    """(points, sides * components) on the edges, or in the cells, of a batch."""
+    return np.hstack([at_points(field, batch.rule.points[side], batch.cells[side]) for side in sides])
+
+
+def fill(field: fem.Function, values: Array) -> None:
+    """The first points' values; the rest of the field is not looked at."""
+    field.x.array[: values.size] = values.ravel()

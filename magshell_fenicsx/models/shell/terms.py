@@ -1,0 +1,195 @@
+"""The densities as terms: each compiled once, and only when a scene calls for it."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import ufl
+from dolfinx import fem, mesh
+from numpy.typing import NDArray
+from ufl.core.expr import Expr
+
+from magshell_fenicsx.assembly.kernels import KernelLog
+from magshell_fenicsx.models.shell import densities, edges
+from magshell_fenicsx.models.shell import kinematics as kin
+from magshell_fenicsx.models.shell.antisymmetric import antisymmetric_edge
+from magshell_fenicsx.models.shell.energy import (
+    CURVED,
+    MOVED,
+    SECOND,
+    Density,
+    HessianTerm,
+    Parameter,
+    ShellTerm,
+    cell_quadrature,
+    edge_quadrature,
+    per_area,
+)
+from magshell_fenicsx.models.shell.kinematics import Jet
+from magshell_fenicsx.models.shell.moment import MomentTerm
+from magshell_fenicsx.models.shell.own_term import OwnTerm
+from magshell_fenicsx.models.shell.parameters import MIRROR_NORMAL, MagneticEnergy, Magnetisation, Material
+from magshell_fenicsx.models.shell.patterns import pattern_field
+from magshell_fenicsx.models.shell.thickness import thick
+
+MagneticDensity = Callable[[Jet, Jet, Expr, Expr], Expr]
+FIRST: dict[str, MagneticDensity] = {"U1": densities.magnetic_first}
+TORQUE: dict[str, MagneticDensity] = {"Uq": densities.magnetic_torque}
+QUADRATIC: dict[str, MagneticDensity] = {**FIRST, **TORQUE, "Utau": densities.magnetic_tau}
+MAGNETIC_TERMS: dict[MagneticEnergy, dict[str, MagneticDensity]] = {
+    "full": {"magnetic": densities.magnetic},
+    "first": FIRST,
+    "torque": TORQUE,
+    "second": QUADRATIC,
+    "second_consistent": {**QUADRATIC, "couple": densities.magnetic_couple},
+}
+LINEAR = ("U1", "couple")
+
+
+@dataclass(frozen=True)
+class TermFactory:
+    """Makes the terms of one shell; all share the fields r0 and u."""
+
+    r0: fem.Function
+    u: fem.Function
+    material: Material
+    sigma: float
+    degree: int
+    log: KernelLog
+    thickness: fem.Function | None = None
+
+    def membrane(self) -> ShellTerm:
+        density = Density(per_area(densities.membrane), (self._constant(self.material.nu),))
+        return self._cells("membrane", self._thick(density, None))
+
+    def prestress(self) -> Density:
+        """The part of the tangent that membrane stress makes; its last parameter but the thickness is the strain."""
+        strain = fem.Function(fem.functionspace(self._domain, ("DG", 0, (3,))))
+        return self._thick(Density(per_area(densities.prestress), (self._constant(self.material.nu), strain)), None)
+
+    def bending(self) -> ShellTerm:
+        return self._cells("bending", self._thick(Density(per_area(densities.bending), self._nu_h(), parts=CURVED), 1))
+
+    def interior_edges(self, *, folded: bool = False) -> ShellTerm:
+        """With `folded`, for a surface whose cells meet at angles that are not small."""
+        parameters = self._penalised() if self.thickness is None else (*self._penalised(), self.thickness)
+        density = Density(edges.folded if folded else edges.interior, parameters, CURVED, SECOND, sides=2)
+        r0, u = ((j.side("+"), j.side("-")) for j in self._jets())
+        m = kin.facet_covector(self._domain)
+        width = ufl.avg(ufl.CellVolume(self._domain)) / ufl.avg(ufl.FacetArea(self._domain))
+        sided = [(p("+"), p("-")) if isinstance(p, fem.Function) else p for p in parameters]
+        energy = density.of(r0, u, (m("+"), m("-")), width, *sided)
+        measure = ufl.dS(domain=self._domain, metadata=self._edge_rule())
+        return ShellTerm("interior edges", density, energy * measure, self.u, self.log)
+
+    def clamped_edges(self, facets: NDArray[np.int32]) -> ShellTerm:
+        density = Density(edges.clamped, self._penalised(), CURVED, SECOND, facets)
+        return self._edges("clamped edges", self._thick(density, 1))
+
+    def mirror_edges(
+        self, facets: NDArray[np.int32], normal: NDArray[np.float64] = MIRROR_NORMAL, name: str = "mirror edges"
+    ) -> ShellTerm:
+        parameters = (*self._penalised(), self._constant(normal))
+        return self._edges(name, self._thick(Density(edges.symmetric, parameters, CURVED, SECOND, facets), 1))
+
+    def edge_moment(self, name: str, facets: NDArray[np.int32], intensity: float) -> MomentTerm:
+        """A moment per length about the edge's first tangent, with the amplitude "load"; in E h R."""
+        past = self._constant(np.array([1.0, 0.0]))
+        density = Density(edges.turning, (self._constant(intensity), past), facets=facets)
+        energy = density.of(*self._jets(), *self._edge_geometry(), *density.parameters) * self._ds(facets)
+        along = kin.conormal(self._jets()[0], self._edge_geometry()[0])[2]
+        length = self.log.compile(f"{name} length", along * self._ds(facets))
+        total = self._domain.comm.allreduce(fem.assemble_scalar(length))
+        return MomentTerm(name, density, energy, self.u, self.log, intensity * total)
+
+    def antisymmetric_edges(self, facets: NDArray[np.int32]) -> HessianTerm:
+        """The mirror plane's edges under antisymmetric displacements."""
+        parameters = (*self._penalised(), self._constant(MIRROR_NORMAL))
+        density = Density(antisymmetric_edge, parameters, CURVED, facets=facets)
+        v = fem.Function(self.u.function_space)
+        jets = (*self._jets(), kin.jet(v, self._domain))
+        energy = density.of(*jets, *self._edge_geometry(), *parameters) * self._ds(facets)
+        return HessianTerm("antisymmetric edges", density, energy, v, self.log)
+
+    def magnetic(self, field: Magnetisation) -> list[ShellTerm]:
+        """The terms of the chosen energy, linear in the applied field, with the amplitude lambda_m."""
+        pattern = field.remanent
+        Br = pattern_field(pattern, self.r0) if callable(pattern) else self._constant(pattern)
+        directions = [("lambda_m", "", field.applied)]
+        if field.across is not None:
+            directions.append(("lambda_across", " across", field.across))
+        terms = [
+            self._cells(
+                name + suffix,
+                self._thick(Density(per_area(of), (Br, self._constant(Ba))), None),
+                amplitude,
+                linear=name in LINEAR,
+            )
+            for amplitude, suffix, Ba in directions
+            for name, of in MAGNETIC_TERMS[field.energy].items()
+        ]
+        if field.gradient is not None:
+            parameters = (Br, self._constant(field.gradient))
+            density = Density(per_area(densities.magnetic_gradient), parameters, parts=MOVED)
+            terms.append(self._cells("magnetic gradient", self._thick(density, None), "lambda_m"))
+        return terms
+
+    def pressure(self) -> ShellTerm:
+        """Amplitude p/p_c; potential p Delta V, of a live pressure."""
+        unit = self._constant(self.material.classical_pressure / self.material.h)
+        return self._cells("pressure", Density(densities.pressure, (unit,), parts=MOVED), "pressure")
+
+    def own(self, term: OwnTerm) -> ShellTerm:
+        """One's own energy, with the amplitude of its name."""
+        parameters = tuple(self._constant(np.asarray(p, dtype=float)) for p in term.parameters)
+        still = tuple(part for part in term.placed_parts if part not in term.parts)  # asked for of r0 alone
+        density = Density(per_area(term.density), parameters, parts=(*term.parts, *still), linear=still)
+        return self._cells(term.name, density, term.name, linear=term.linear)
+
+    def volume_change(self) -> ufl.Form:
+        """Delta V/R^3 of the modelled part."""
+        return densities.volume(*self._jets()) * self._dx()
+
+    @property
+    def _domain(self) -> mesh.Mesh:
+        return self.u.function_space.mesh
+
+    def _jets(self) -> tuple[Jet, Jet]:
+        return kin.jet(self.r0, self._domain), kin.jet(self.u, self._domain)
+
+    def _constant(self, value: float | NDArray[np.float64]) -> fem.Constant:
+        return fem.Constant(self._domain, value)
+
+    def _thick(self, density: Density, h_at: int | None) -> Density:
+        """The density with the thickness as it varies, if it does; `h_at` as of `thickness.thick`."""
+        return density if self.thickness is None else thick(density, self.thickness, h_at)
+
+    def _nu_h(self) -> tuple[Parameter, Parameter]:
+        return self._constant(self.material.nu), self._constant(self.material.h)
+
+    def _penalised(self) -> tuple[Parameter, ...]:
+        return *self._nu_h(), self._constant(self.sigma)
+
+    def _dx(self) -> ufl.Measure:
+        metadata = {"quadrature_degree": cell_quadrature(self.degree)}
+        return ufl.Measure("dx", domain=self._domain, metadata=metadata)
+
+    def _edge_rule(self) -> dict[str, int]:
+        return {"quadrature_degree": edge_quadrature(self.degree)}
+
+    def _ds(self, facets: NDArray[np.int32]) -> ufl.Measure:
+        tags = mesh.meshtags(self._domain, 1, facets, np.ones_like(facets))
+        return ufl.Measure("ds", domain=self._domain, subdomain_data=tags, metadata=self._edge_rule())(1)
+
+    def _edge_geometry(self) -> tuple[Expr, Expr]:
+        """Covector and width of a boundary edge."""
+        return kin.facet_covector(self._domain), ufl.CellVolume(self._domain) / ufl.FacetArea(self._domain)
+
+    def _cells(self, name: str, density: Density, amplitude: str | None = None, *, linear: bool = False) -> ShellTerm:
+        energy = density.of(*self._jets(), *density.parameters) * self._dx()
+        return ShellTerm(name, density, energy, self.u, self.log, amplitude, linear=linear)
+
+    def _edges(self, name: str, density: Density) -> ShellTerm:
+        assert density.facets is not None
+        energy = density.of(*self._jets(), *self._edge_geometry(), *density.parameters) * self._ds(density.facets)
+        return ShellTerm(name, density, energy, self.u, self.log)

@@ -1,0 +1,81 @@
+"""A thickness that varies over the surface: what multiplies h, and the densities with it."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from dolfinx import fem
+from numpy.typing import NDArray
+from ufl.core.expr import Expr
+
+from magshell_fenicsx.mesh.midsurface import Midsurface
+from magshell_fenicsx.mesh.patch import MeshError
+from magshell_fenicsx.models.shell.energy import Density
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Thickness:
+    """h(x)/h: a function of x, y, z over R, or a number for each named patch of a mesh (1 in the rest)."""
+
+    of_position: Callable[[Array, Array, Array], Array] | None = None
+    patches: Mapping[str, float] | None = None
+
+
+def thickness_field(thickness: Thickness, r0: fem.Function, midsurface: Midsurface) -> fem.Function:
+    """h(x)/h at the nodes of every cell, free to jump from cell to cell; shape (1,).
+
+    Raises
+    ------
+    MeshError
+        On every rank, if it is not positive somewhere, or a patch is unknown.
+    """
+    V = r0.function_space
+    nodes = r0.x.array.reshape(-1, 3)[V.dofmap.list]
+    values = np.ones(nodes.shape[:2])
+    if thickness.of_position:
+        values = np.array(thickness.of_position(*np.moveaxis(nodes, -1, 0)))
+    for name, factor in (thickness.patches or {}).items():
+        values[patch_of(midsurface.patches, name)] = factor
+    bad = nodes[~((values > 1e-3) & (values < 1e3))][:1].tolist()
+    if said := [place for places in V.mesh.comm.allgather(bad) for place in places]:
+        x, y, z = said[0]
+        raise MeshError(f"thickness_factor is not within 0.001 to 1000 at (x, y, z)/R = ({x:.3g}, {y:.3g}, {z:.3g})")
+    Q = fem.functionspace(V.mesh, ("DG", V.element.basix_element.degree, (1,)))
+    field = fem.Function(Q, name="thickness")
+    field.x.array[Q.dofmap.list] = values
+    return field
+
+
+def patch_of(patches: Mapping[str, NDArray[np.bool_]], name: str) -> NDArray[np.bool_]:
+    """Whether each cell belongs to a patch.
+
+    Raises
+    ------
+    MeshError
+        If there is no such patch.
+    """
+    if name not in patches:
+        there = ", ".join(patches) or "none"
+        raise MeshError(f"the surface has no patch {name}; it has {there}")
+    return patches[name]
+
+
+def thick(density: Density, t: fem.Function, h_at: int | None) -> Density:
+    """A density per E h with the thickness h t in place of h.
+
+    Parameters
+    ----------
+    h_at
+        Which of its parameters h is; None if it does not depend on it.
+    """
+
+    def of(*arguments: Expr) -> Expr:
+        *given, factor = arguments
+        if h_at is not None:
+            at = len(given) - len(density.parameters) + h_at
+            given[at] = factor[0] * given[at]
+        return factor[0] * density.of(*given)
+
+    return replace(density, of=of, parameters=(*density.parameters, t))

@@ -1,0 +1,1 @@
+"""What a run leaves: tables and checkpoints, fields, pictures, a report."""

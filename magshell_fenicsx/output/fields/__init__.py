@@ -1,0 +1,1 @@
+"""Fields on the deformed surface, for ParaView and for pictures."""

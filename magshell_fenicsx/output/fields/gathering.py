@@ -1,0 +1,29 @@
+"""What gathers a model's nodes on rank 0, for pictures and for ParaView."""
+
+from collections.abc import Mapping
+from typing import Protocol
+
+from mpi4py import MPI
+
+from magshell_fenicsx.continuation.system import Vector
+from magshell_fenicsx.models.axisymmetric.model import MeridianModel
+from magshell_fenicsx.models.shell.model import ShellModel
+from magshell_fenicsx.models.solid.model import SolidModel
+from magshell_fenicsx.output.fields.body import BodyGatherer
+from magshell_fenicsx.output.fields.surface import RevolvedGatherer, Surface, SurfaceGatherer
+
+
+class Gatherer(Protocol):
+    """Gathers displacements of one model; every rank calls."""
+
+    comm: MPI.Comm
+
+    def gather(self, u: Vector, mu: Mapping[str, float] | None = None) -> Surface | None:
+        """The model's nodes with a displacement, and a field of these amplitudes, on rank 0; None elsewhere."""
+
+
+def gatherer(model: ShellModel | MeridianModel | SolidModel, comm: MPI.Comm) -> Gatherer:
+    """What fits a model."""
+    if isinstance(model, MeridianModel):
+        return RevolvedGatherer(model, comm)
+    return BodyGatherer(model) if isinstance(model, SolidModel) else SurfaceGatherer(model)

@@ -1,0 +1,91 @@
+"""The magnetic energy read as loads: pressure, in-plane force, rotational springs, torques.
+
+Paper, section "Reduced magneto-elastic energy as load potentials"; for a field that is uniform in
+space, at the nodes of the undeformed surface, dimensionless as there.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magshell_fenicsx.models.shell.parameters import Magnetisation
+
+Array = NDArray[np.float64]
+
+
+def magnetic_loads(
+    g: "SurfaceGeometry", field: Magnetisation, r0: Array, h: float | Array
+) -> tuple[dict[str, Array], "Torque"]:
+    """At points r0 (..., 3) p_mag, k and, of a uniform remanence and thickness, f_mag; and the torque, of u.
+
+    Parameters
+    ----------
+    h
+        The thickness over R; where it varies, (...) at the points.
+    """
+    pattern = field.remanent
+    Br = pattern(r0, g.n0) if callable(pattern) else np.broadcast_to(pattern, r0.shape)
+    Ba = field.applied
+    loads = {"p_mag": magnetic_pressure(g, Br, Ba, h), "k": spring_stiffness(g, Br, Ba)}
+    if not callable(pattern) and isinstance(h, float):  # its divergence is of uniform vectors and thickness
+        loads["f_mag"] = in_plane_force(g, Br, Ba, h)
+    return loads, torque(g, Br, Ba)
+
+
+@dataclass(frozen=True)
+class SurfaceGeometry:
+    """Undeformed bases and curvature at points: a1, a2 (..., 2, 3), n0 (..., 3), b0_ij (..., 2, 2)."""
+
+    a: Array
+    n0: Array
+    b0: Array
+
+    @property
+    def dual(self) -> Array:
+        """a0^1, a0^2, (..., 2, 3)."""
+        metric = np.einsum("...ai,...bi->...ab", self.a, self.a)
+        return np.asarray(np.einsum("...ab,...bi->...ai", np.linalg.inv(metric), self.a))
+
+
+def magnetic_pressure(g: SurfaceGeometry, Br: Array, Ba: Array, h: float | Array) -> Array:
+    """p_mag = h b0:B0 with B0 = -Br (x) Ba, (...)."""
+    b = np.einsum("...ab,...ai,...bj->...ij", g.b0, g.dual, g.dual)
+    return np.asarray(-h * np.einsum("...ij,...i,j->...", b, Br, Ba))
+
+
+def in_plane_force(g: SurfaceGeometry, Br: Array, Ba: Array, h: float) -> Array:
+    """f_mag (..., 3) of uniform Br and Ba.
+
+    f_c = -h times the surface divergence of (a_c . Ba)(a^a . Br) B0's sign included, which for
+    constant vectors is h [b_ca (n . Ba)(a^a . Br) + tr b (n . Br)(a_c . Ba)].
+    """
+    dual = g.dual
+    along, normal_Ba = np.einsum("...ai,...i->...a", dual, Br), np.einsum("...i,i->...", g.n0, Ba)
+    trace = np.einsum("...ab,...ai,...bi->...", g.b0, dual, dual)
+    covariant = np.einsum("...ca,...a->...c", g.b0, along) * normal_Ba[..., None]
+    covariant += (trace * np.einsum("...i,...i->...", g.n0, Br))[..., None] * np.einsum("...ci,i->...c", g.a, Ba)
+    return np.asarray(h * np.einsum("...c,...ci->...i", covariant, dual))
+
+
+def spring_stiffness(g: SurfaceGeometry, Br: Array, Ba: Array) -> Array:
+    """k = (n0 (x) n0):B0, (...)."""
+    return np.asarray(-np.einsum("...i,...i->...", g.n0, Br) * np.einsum("...i,i->...", g.n0, Ba))
+
+
+@dataclass(frozen=True)
+class Torque:
+    """tau at points with normals n0 (..., 3); `along` holds -(n0 . Br)(a0^a . Ba), (..., 2)."""
+
+    n0: Array
+    along: Array
+
+    def __call__(self, du: Array) -> Array:
+        """tau_c = B0^ij (a0^a . e_j)(n0 . e_i) (u,_a . a0_c) as a vector (..., 3), of u,_1 and u,_2 (..., 2, 3)."""
+        turned = np.matmul(self.along[..., None, :], du)[..., 0, :]
+        return np.asarray(turned - np.sum(turned * self.n0, axis=-1, keepdims=True) * self.n0)
+
+
+def torque(g: SurfaceGeometry, Br: Array, Ba: Array) -> Torque:
+    """The torque as a function of the displacement's derivatives."""
+    return Torque(g.n0, -np.einsum("...i,...i->...", g.n0, Br)[..., None] * np.einsum("...ai,i->...a", g.dual, Ba))

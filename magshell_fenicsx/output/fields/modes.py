@@ -1,0 +1,183 @@
+"""Modes and null vectors on the whole deformed shell: fields for ParaView, a table, captions of their panels.
+
+A half is completed by the mirror image that the mode calls for, the coefficients of waves are turned around
+the axis.
+"""
+
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magshell_fenicsx.continuation.system import Vector
+from magshell_fenicsx.models.axisymmetric.model import MeridianModel
+from magshell_fenicsx.models.axisymmetric.revolution import Revolution
+from magshell_fenicsx.models.shell.model import ShellModel
+from magshell_fenicsx.models.solid.model import SolidModel
+from magshell_fenicsx.output.fields.gathering import Gatherer
+from magshell_fenicsx.output.fields.surface import Surface, completed, turned
+from magshell_fenicsx.output.fields.vtu import About, vtu_content
+from magshell_fenicsx.output.store.durable import write_whole
+
+Array = NDArray[np.float64]
+WAVES = "m = "
+RING, MOST_WAVES = 0.02, 80  # height over R of the circle that waves are counted on
+GAP = np.pi / 4  # between its nodes, in a mesh that could show a wave
+COLUMNS = ("point", "number", "mode", "eigenvalue")
+
+
+class Mode(Protocol):
+    """What is told of a mode; see `stability.ShellMode`."""
+
+    @property
+    def label(self) -> str: ...
+
+    @property
+    def eigenvalue(self) -> float: ...
+
+
+def mode_surface(
+    model: ShellModel | MeridianModel | SolidModel,
+    gatherer: Gatherer,
+    u: Vector,
+    label: str,
+    vector: Vector,
+    azimuth: float = 0.0,
+) -> Surface | None:
+    """The whole shell displaced by u with a mode as its fields; all ranks call.
+
+    Parameters
+    ----------
+    label, vector
+        "m = 7": coefficients (U + V, V, W) of waves; "antisymmetric": what the other half mirrors with the
+        opposite sign; anything else: in the model's own space and symmetry.
+    azimuth
+        Of the model's frame, rad.
+
+    Returns
+    -------
+    On rank 0 the surface with the fields "mode" (n, 3), its longest vector of length one, and "mode_w" (n,), its
+    part along -n0; None elsewhere.
+    """
+    if label.startswith(WAVES) and isinstance(model, MeridianModel):
+        if gatherer.comm.rank:
+            return None
+        return _with_mode(*_revolved_wave(model, u, int(label.removeprefix(WAVES)), vector))
+    base, mode = gatherer.gather(u), gatherer.gather(vector)
+    if base is None or mode is None:
+        return None
+    surface = _with_mode(base, mode.u)
+    if model.multiplicity == 2:
+        surface = completed(surface)
+        if label == "antisymmetric":
+            for values in surface.fields.values():
+                values[len(base.r0) :] *= -1
+    return turned(surface, azimuth)
+
+
+def mode_file(folder: Path, point: int, name: str, label: str) -> Path:
+    """Where a mode goes.
+
+    Parameters
+    ----------
+    name
+        "fold" or "bifurcation" of a null vector, the number of a mode.
+
+    Examples
+    --------
+    >>> mode_file(Path("out"), 12, "bifurcation", "m = 7").as_posix()
+    'out/fields/mode_0012_bifurcation_m7.vtu'
+    """
+    suffix = f"_{label.replace(' = ', '')}" if label else ""
+    return folder / "fields" / f"mode_{point:04d}_{name}{suffix}.vtu"
+
+
+def write_mode(file: Path, surface: Surface, about: About) -> None:
+    """Write what `mode_surface` made; `Warp By Vector` in ParaView, with "mode", moves the shell.
+
+    Raises
+    ------
+    OSError
+        If the disk is full; there is no such file then.
+    """
+    write_whole(file, vtu_content(surface, about))
+
+
+def mode_table(found: Mapping[int, Sequence[Mode]]) -> bytes:
+    """stability.csv: the modes of each point, in the order of their eigenvalues over E h/R^2."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(COLUMNS)
+    for point, modes in found.items():
+        writer.writerows((point, n, mode.label, repr(mode.eigenvalue)) for n, mode in enumerate(modes, 1))
+    return text.getvalue().encode()
+
+
+def mode_caption(number: int, mode: Mode) -> str:
+    """Of a panel: number, label and eigenvalue, with matplotlib's mathematics.
+
+    Examples
+    --------
+    >>> from types import SimpleNamespace
+    >>> mode_caption(2, SimpleNamespace(label="m = 7", eigenvalue=-1.5e-6))
+    '2 ($m$ = 7):  $\\\\lambda = -1.5 \\\\times 10^{-6}$'
+    """
+    mantissa, _, exponent = f"{mode.eigenvalue:.4g}".partition("e")
+    value = rf"{mantissa} \times 10^{{{int(exponent)}}}" if exponent else mantissa
+    label = f" ({mode.label.replace('m = ', '$m$ = ')})" if mode.label else ""
+    return rf"{number}{label}:  $\lambda = {value}$"
+
+
+def _with_mode(base: Surface, v: Array) -> Surface:
+    """Scaled to a longest vector of one; at the first of the places where its normal part is largest, it is inward."""
+    inward = -np.einsum("ij,ij->i", v, base.n0)
+    size = np.abs(inward)
+    first = np.argmax(size > (1 - 1e-6) * size.max())  # crests and troughs of a wave differ by rounding
+    scale = np.copysign(np.linalg.norm(v, axis=1).max(), inward[first])
+    return replace(base, fields={"mode": v / scale, "mode_w": inward / scale})
+
+
+def _revolved_wave(model: MeridianModel, u: Vector, m: int, vector: Vector) -> tuple[Surface, Array]:
+    """The surface in twelve sectors or more to a wave, and the wave at its nodes.
+
+    v = U cos(m theta) e_rho + V sin(m theta) e_theta + W cos(m theta) e_z.
+    """
+    sectors = max(96, 12 * m)
+    swept = Revolution(model, sectors)
+    nodes = model.excluded_modes.waves.V.tabulate_dof_coordinates()[:, 0]
+    U_and_V, V, W = vector.reshape(-1, 3)[np.argsort(nodes)[:: model.degree]].T[:, :, None]
+    theta = np.arange(sectors) * 2 * np.pi / sectors
+    radial, azimuthal = (U_and_V - V) * np.cos(m * theta), V * np.sin(m * theta)
+    x, y = (
+        radial * np.cos(theta) - azimuthal * np.sin(theta),
+        radial * np.sin(theta) + azimuthal * np.cos(theta),
+    )
+    v = np.stack([x, y, W * np.cos(m * theta)], axis=-1)
+    at_nodes = np.concatenate([v[0, :1], v[1:].reshape(-1, 3)])  # all sectors meet in the pole
+    return Surface(swept.r0, swept.displacement(u), swept.n0, swept.cells, {}), at_nodes
+
+
+def wave_number(surface: Surface) -> int | None:
+    """The number of waves around e3 of a mode, where it is largest.
+
+    None if it is not mainly one of m >= 2, or the surface is flat, or does not go around e3 there.
+    """
+    w, height = surface.fields["mode_w"], surface.r0[:, 2]
+    if np.ptp(height) < RING:
+        return None
+    ring = np.abs(height - height[np.argmax(np.abs(w))]) < RING
+    theta = np.arctan2(surface.r0[ring, 1], surface.r0[ring, 0])
+    turn = np.sort(theta)
+    if np.diff(turn, append=turn[0] + 2 * np.pi).max() > GAP:
+        return None
+    left = []
+    for m in range(MOST_WAVES + 1):
+        basis = np.column_stack([np.cos(m * theta), np.sin(m * theta)])
+        left.append(float(np.sum((w[ring] - basis @ np.linalg.lstsq(basis, w[ring])[0]) ** 2)))
+    best = int(np.argmin(left))
+    return best if best >= 2 and left[best] < 0.1 * float(np.sum(w[ring] ** 2)) else None

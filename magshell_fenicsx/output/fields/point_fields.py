@@ -1,0 +1,90 @@
+"""What is told of a shell's points besides their displacement: strains, moments, magnetic fields and loads."""
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magshell_fenicsx.models.shell.parameters import Magnetisation, Material
+from magshell_fenicsx.models.shell.strains import TangentFrame, bending_moment, principal
+from magshell_fenicsx.output.fields.interpretation import SurfaceGeometry, Torque, magnetic_loads
+
+Array = NDArray[np.float64]
+
+
+class PointFields:
+    """Fields at points (cells, points of each) of a shell.
+
+    Parameters
+    ----------
+    r0
+        (6, cells, points, 3) jet of the placement; see `strains.TangentFrame`.
+    field
+        The magnetisation; None without.
+    thickness
+        (cells, points) what multiplies h there; None for 1.
+
+    Attributes
+    ----------
+    constant
+        Name -> values (cells, points, ...) of what does not depend on the displacement: of a uniform applied field
+        p_mag, k, f_mag.
+    weight
+        (cells, points) of a cell's value in the mean over the cells that share a point: its area.
+    """
+
+    def __init__(self, r0: Array, material: Material, field: Magnetisation | None, thickness: Array | None) -> None:
+        self._frame, self._nu, self._field, self._thickness = TangentFrame.of(r0), material.nu, field, thickness
+        self.constant: dict[str, Array] = {}
+        self._torque: Torque | None = None
+        self.n0, self.weight = self._frame.n0, self._frame.area
+        if field:
+            pattern = field.remanent
+            self._Br = pattern(r0[0], self.n0) if callable(pattern) else np.broadcast_to(pattern, r0[0].shape)
+        if field and field.gradient is None:
+            h = material.h if thickness is None else material.h * thickness
+            self.constant, self._torque = magnetic_loads(self._geometry(), field, r0[0], h)
+
+    def of(self, u: Array, mu: Mapping[str, float]) -> dict[str, Array]:
+        """The fields of a displacement's jet (6, cells, points, 3) over R, and the amplitudes' values.
+
+        Returns
+        -------
+        E, M
+            (..., 3, 3) membrane strain and bending moment over D/R, D that of the thickness h, as tensors in space that
+            are tangent to the undeformed surface.
+        E_1, E_2, M_1, M_2
+            (...) their principal values, the larger first.
+        Br, Ba
+            (..., 3) the remanence, moved by the shell, over its magnitude; the applied flux density at the
+            deformed place, over mu_0 E / |Br|: its magnitude is lambda_m.
+        tau
+            (..., 3) torque, of a uniform field.
+        """
+        frame = self._frame
+        E, M = frame.membrane_strain(u), bending_moment(frame.curvature_change(u), self._nu)
+        if self._thickness is not None:
+            M *= self._thickness[..., None] ** 3
+        found = {"E": frame.tensor(E), "M": frame.tensor(M)}
+        found["E_1"], found["E_2"] = principal(E)
+        found["M_1"], found["M_2"] = principal(M)
+        if self._field:
+            found |= {"Br": frame.convected(self._Br, u), "Ba": _applied(self._field, mu, frame.jet[0] + u[0])}
+        if self._torque:
+            found["tau"] = self._torque(np.moveaxis(u[1:3], 0, -2))
+        return found
+
+    def _geometry(self) -> SurfaceGeometry:
+        r0 = self._frame.jet
+        b11, b12, b22 = np.einsum("d...i,...i->d...", r0[3:], self.n0)
+        b0 = np.stack([np.stack([b11, b12], -1), np.stack([b12, b22], -1)], -2)
+        return SurfaceGeometry(np.moveaxis(r0[1:3], 0, -2), self.n0, b0)
+
+
+def _applied(field: Magnetisation, mu: Mapping[str, float], r: Array) -> Array:
+    """The applied flux density (..., 3) at places r (..., 3)."""
+    along = mu.get("lambda_m", 0.0)
+    uniform = along * field.applied
+    if field.across is not None:
+        uniform = uniform + mu.get("lambda_across", 0.0) * field.across
+    return np.broadcast_to(uniform, r.shape) if field.gradient is None else uniform + along * r @ field.gradient.T

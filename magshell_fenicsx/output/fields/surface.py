@@ -1,0 +1,182 @@
+"""The deformed mid-surface gathered on rank 0, for pictures and for ParaView."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import basix
+import basix.ufl
+import numpy as np
+import scipy
+from dolfinx import fem, mesh
+from dolfinx.cpp.io import perm_vtk
+from mpi4py import MPI
+from numpy.typing import NDArray
+
+from magshell_fenicsx.continuation.system import Vector
+from magshell_fenicsx.models.axisymmetric.model import MeridianModel
+from magshell_fenicsx.models.axisymmetric.revolution import Revolution
+from magshell_fenicsx.models.shell.model import ShellModel
+from magshell_fenicsx.models.shell.parameters import MIRROR_NORMAL
+from magshell_fenicsx.output.fields.point_fields import PointFields
+
+TRIANGLE, LAGRANGE_TRIANGLE, LAGRANGE_HEXAHEDRON = 5, 69, 72  # VTK's numbers; the flat triangle, cells of any order
+HEXAHEDRON_NODES = 27
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Nodes of the whole mid-surface, or of the whole body of a solid, in lengths of R.
+
+    Attributes
+    ----------
+    r0, u, n0
+        (n, 3) undeformed placement, displacement, undeformed normal.
+    cells
+        (m, k) node numbers of triangles of the displacement's degree or of hexahedra, in VTK's order.
+    fields
+        Name -> (n,), (n, 3) or (n, 3, 3): see `point_fields.PointFields`; of a solid none.
+    """
+
+    r0: Array
+    u: Array
+    n0: Array
+    cells: NDArray[np.int64]
+    fields: dict[str, Array]
+
+    @property
+    def is_body(self) -> bool:
+        """Whether its cells are hexahedra."""
+        return self.cells.shape[1] == HEXAHEDRON_NODES
+
+    @property
+    def w(self) -> Array:
+        """Inward normal displacement -u . n0 over R, (n,)."""
+        return np.asarray(-np.einsum("ij,ij->i", self.u, self.n0))
+
+
+class SurfaceGatherer:
+    """Gathers displacements of one model; what does not change is computed and gathered once."""
+
+    def __init__(self, model: ShellModel) -> None:
+        self._model = model
+        domain, degree, map_ = model.V.mesh, model.degree, model.V.dofmap.index_map
+        self.comm = domain.comm
+        # VTK's nodes are equidistant, the displacement's are not; there are as many of them on edges and in cells
+        element = basix.create_element(
+            basix.ElementFamily.P, basix.CellType.triangle, degree, basix.LagrangeVariant.equispaced
+        )
+        self._places = element.points
+        self._table = model.V.element.basix_element.tabulate(2, self._places)[:, :, :, 0]
+        self._owned = domain.topology.index_map(2).size_local
+        V = fem.functionspace(domain, basix.ufl.wrap_element(element))  # numbers nodes that two cells share alike
+        local = V.dofmap.list[: self._owned]
+        numbers = V.dofmap.index_map.local_to_global(local.ravel().astype(np.int32)).reshape(local.shape)
+        cells = self.comm.gather(numbers[:, np.argsort(perm_vtk(mesh.CellType.triangle, local.shape[1]))])
+        self._cells = np.concatenate(cells) if self.comm.rank == 0 else numbers
+        r = self._at_nodes(model.r0)
+        factor = None if model.thickness is None else self._thickness(model.thickness)
+        self._fields = PointFields(r, model.material, model.loads.magnetic, factor)
+        self._mean = self._weighted_mean(numbers, map_.size_global)
+        n0 = self._averaged(self._fields.n0)
+        self._r0, self._n0 = self._averaged(r[0]), n0 / np.linalg.norm(n0, axis=1)[:, None]
+        self._constant = {name: self._averaged(values) for name, values in self._fields.constant.items()}
+
+    def gather(self, u: Vector, mu: Mapping[str, float] | None = None) -> Surface | None:
+        """The surface with a displacement, and a field of these amplitudes, on rank 0; None elsewhere."""
+        self._model.system.set(u)
+        jet = self._at_nodes(self._model.u)
+        found = {name: self._averaged(values) for name, values in self._fields.of(jet, mu or {}).items()}
+        nodes = self._averaged(jet[0])
+        return Surface(self._r0, nodes, self._n0, self._cells, self._constant | found) if self.comm.rank == 0 else None
+
+    def _at_nodes(self, f: fem.Function) -> Array:
+        """f, f,_1, f,_2, f,_11, f,_12, f,_22 in reference coordinates at each owned cell's nodes."""
+        coefficients = f.x.array.reshape(-1, 3)[self._model.V.dofmap.list[: self._owned]]
+        return np.asarray(np.matmul(self._table[:, None], coefficients))
+
+    def _thickness(self, factor: fem.Function) -> Array:
+        """h(x)/h at each owned cell's nodes."""
+        V = factor.function_space
+        element = V.element.basix_element
+        values = element.tabulate(0, self._places)[0, :, :, 0]
+        return np.asarray(factor.x.array[V.dofmap.list[: self._owned]] @ values.T)
+
+    def _weighted_mean(self, numbers: NDArray[np.int64], size: int) -> scipy.sparse.csr_matrix | None:
+        """From the nodes of all cells to nodes in global order, on rank 0.
+
+        Second derivatives jump between cells: the mean over those that share a node is weighted by their areas.
+        """
+        parts = self.comm.gather((numbers.ravel(), self._fields.weight.ravel()))
+        if self.comm.rank:
+            return None
+        where, weights = (np.concatenate(part) for part in zip(*parts, strict=True))
+        weights = weights / np.bincount(where, weights)[where]
+        return scipy.sparse.csr_matrix((weights, (where, np.arange(len(where)))), (size, len(where)))
+
+    def _averaged(self, values: Array) -> Array:
+        """Weighted mean over the cells that share a node, in global order, on rank 0."""
+        parts = self.comm.gather(values)
+        if self._mean is None:
+            return values
+        whole = np.concatenate(parts)
+        return np.asarray(self._mean @ whole.reshape(self._mean.shape[1], -1)).reshape(-1, *values.shape[2:])
+
+
+class RevolvedGatherer:
+    """The surface that a meridian sweeps, as flat triangles."""
+
+    def __init__(self, model: MeridianModel, comm: MPI.Comm) -> None:
+        self.comm, self._model, self._swept = comm, model, Revolution(model)
+        self._fields = PointFields(self._swept.jets(model.r0), model.material, model.loads.magnetic, None)
+        self._constant = self._around(self._fields.constant)
+
+    def gather(self, u: Vector, mu: Mapping[str, float] | None = None) -> Surface | None:
+        """The surface with a displacement, and a field of these amplitudes, on rank 0; None elsewhere."""
+        if self.comm.rank:
+            return None
+        self._model.system.set(u)
+        swept, found = self._swept, self._around(self._fields.of(self._swept.jets(self._model.u), mu or {}))
+        return Surface(swept.r0, swept.displacement(u), swept.n0, swept.cells, self._constant | found)
+
+    def _around(self, fields: Mapping[str, Array]) -> dict[str, Array]:
+        return {name: self._swept.around(values, self._fields.weight) for name, values in fields.items()}
+
+
+def turned(surface: Surface, azimuth: float) -> Surface:
+    """The surface turned about e3 (rad): from the model's frame back to the user's."""
+    return _moved(surface, rotation(azimuth))
+
+
+def rotation(azimuth: float) -> Array:
+    """What turns row vectors (n, 3) about e3 (rad)."""
+    return np.array([[np.cos(azimuth), np.sin(azimuth), 0], [-np.sin(azimuth), np.cos(azimuth), 0], [0, 0, 1]])
+
+
+def completed(surface: Surface, mirror: Array = MIRROR_NORMAL) -> Surface:
+    """A half surface with its image in the mirror plane of that unit normal (3,).
+
+    Seen from outside, the image's triangles run the other way round.
+    """
+    image = _moved(surface, np.eye(3) - 2 * np.outer(mirror, mirror))
+
+    def both(f: Array, other: Array) -> Array:
+        return np.concatenate([f, other])
+
+    return Surface(
+        both(surface.r0, image.r0),
+        both(surface.u, image.u),
+        both(surface.n0, image.n0),
+        np.concatenate([surface.cells, surface.cells + len(surface.r0)]),
+        {name: both(f, image.fields[name]) for name, f in surface.fields.items()},
+    )
+
+
+def _moved(surface: Surface, Q: Array) -> Surface:
+    """Places and vectors v -> v Q, tensors T -> Q^T T Q."""
+
+    def moved(f: Array) -> Array:
+        return f if f.ndim == 1 else f @ Q if f.ndim == 2 else Q.T @ f @ Q
+
+    fields = {name: moved(f) for name, f in surface.fields.items()}
+    return replace(surface, r0=moved(surface.r0), u=moved(surface.u), n0=moved(surface.n0), fields=fields)

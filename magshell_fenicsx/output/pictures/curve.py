@@ -1,0 +1,104 @@
+"""The load-displacement or pressure-volume curve as a picture."""
+
+from collections.abc import Sequence
+from itertools import groupby
+from typing import TYPE_CHECKING
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from magshell_fenicsx.output.store.table import LOCATED, OWN_MODES, Row, pole_name
+
+if TYPE_CHECKING:  # takes long to import
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+POLE = r"displacement of the pole  $w/h$"
+AXES = {
+    "force": ("w_over_h", "force", r"displacement at the load  $w/h$", r"force  $FR/(2\pi D)$"),
+    "load": ("w_over_h", "load_factor", r"displacement along the loads  $w/h$", "load factor"),
+    "pressure": ("volume_change", "p_over_pc", r"change of volume  $-\Delta V/R^3$", r"pressure  $p/p_\mathrm{c}$"),
+    "angle": ("field_angle", "w_pole_over_h", "angle of the field  (degrees)", POLE),
+    "lambda_m": ("w_pole_over_h", "lambda_m", POLE, r"field  $\lambda_\mathrm{m}$"),
+}
+
+NAMED = 5  # instabilities in the legend
+FINE = 16  # drawn pieces between two points
+
+
+def smooth(x: Sequence[float], y: Sequence[float]) -> NDArray[np.float64]:
+    """A smooth curve through the points, without overshoot, along their scaled chord: (2, FINE (n - 1) + 1)."""
+    xy = np.array([x, y])
+    scale = np.ptp(xy, axis=1)
+    steps = np.hypot(*(np.diff(xy, axis=1) / np.where(scale > 0, scale, 1)[:, None]))
+    chord = np.concatenate([[0], np.cumsum(np.maximum(steps, 1e-12))])
+    fine = np.interp(np.arange(FINE * (len(chord) - 1) + 1) / FINE, np.arange(len(chord)), chord)
+    return np.asarray(scipy.interpolate.PchipInterpolator(chord, xy, axis=1)(fine))
+
+
+def curve_figure(rows: Sequence[Row], amplitude: str, title: str) -> "Figure":
+    """Draw the part of the path in which `amplitude` varied, and its branches; instabilities are marked.
+
+    Stable parts are solid, unstable ones dashed. One's own amplitude is drawn over the displacement of the pole.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(4.6, 3.4), dpi=200, layout="constrained")
+    axes = figure.subplots()
+    plot_curve(axes, rows, amplitude)
+    axes.set_title(title, fontsize=9)
+    return figure
+
+
+def varied(rows: Sequence[Row], amplitude: str) -> Sequence[Row]:
+    """The part of a path in which an amplitude varied last."""
+    first = max(i for i, row in enumerate(rows) if row["amplitude"] != amplitude or row is rows[0])
+    return rows[0 if amplitude == "lambda_m" else first :]
+
+
+def place(row: Row, amplitude: str) -> tuple[float, float]:
+    """Where a point is in the curve's axes."""
+    x_key, y_key, *_ = _axes(amplitude)
+    return (-1.0 if x_key == "volume_change" else 1.0) * float(row[x_key]), float(row[y_key])
+
+
+def _unstable(row: Row) -> bool:
+    """In directions that the model sees or excludes, which a path.csv of an earlier version does not count."""
+    return int(row["negative_pivots"]) + int(row.get("excluded_pivots", 0)) > 0
+
+
+def _axes(amplitude: str) -> tuple[str, str, str, str]:
+    return AXES.get(amplitude, ("w_pole_over_h", amplitude, POLE, amplitude.replace("_", " ")))
+
+
+def plot_curve(axes: "Axes", rows: Sequence[Row], amplitude: str) -> None:
+    """The curve of `curve_figure` in axes that are there."""
+    part = varied(rows, amplitude)
+    _, y_key, *labels = _axes(amplitude)
+    if amplitude == "load" and all(row["w_over_h"] == row["w_pole_over_h"] for row in part):
+        labels[0] = POLE  # moments have no displacement along themselves
+    whose = pole_name(part[0]).replace("$", r"\$")  # as it is written, no mathematics
+    x_label, y_label = (label.replace("the pole", whose) for label in labels)
+    for branch in sorted({int(row["branch"]) for row in part}):
+        line = [row for row in part if row["branch"] == branch and row["mode"] in OWN_MODES]
+        smooth_x, smooth_y = smooth(*zip(*(place(row, amplitude) for row in line), strict=True))
+        unstable = [_unstable(row) and row["label"] not in LOCATED for row in line]
+        for dashed, pieces in groupby(range(1, len(line)), key=unstable.__getitem__):
+            i, *others = pieces
+            piece = slice((i - 1) * FINE, (i + len(others)) * FINE + 1)
+            axes.plot(smooth_x[piece], smooth_y[piece], color="C0", linestyle=(0, (2, 1.2)) if dashed else "-")
+        dots = [place(row, amplitude) for row in line if row["label"] in ("target", "step", "field")]
+        axes.plot([x for x, _ in dots], [y for _, y in dots], ".", color="C0", markersize=4)
+    marked = [row for row in part if row["label"] in LOCATED]
+    for number, row in enumerate(marked, 1):
+        mode = f" ({row['mode']})" if row["mode"] else ""
+        said = f"{row['label']}{mode} at {row[y_key]:.5g}"
+        if number > NAMED:
+            said = f"and {len(marked) - NAMED} more" if number == NAMED + 1 else "_"  # which matplotlib leaves out
+        axes.plot(*place(row, amplitude), "o", color="C3", markersize=6, label=said)
+    axes.set(xlabel=x_label, ylabel=y_label)
+    axes.locator_params(axis="x", nbins=6)
+    axes.axhline(0, color="0.8", linewidth=0.8, zorder=0)
+    if axes.get_legend_handles_labels()[1]:
+        axes.legend(frameon=False)

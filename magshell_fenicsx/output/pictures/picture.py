@@ -1,0 +1,186 @@
+"""Pictures of the deformed shell: displacement, strains, bending moments, magnetic fields and the loads they make."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magshell_fenicsx.output.fields.surface import Surface
+from magshell_fenicsx.output.pictures.layout import DPI, beside, directions, panels, with_margin
+from magshell_fenicsx.output.pictures.render import Arrows, Image, View, rendered, smooth_surface
+
+if TYPE_CHECKING:  # take long to import
+    import pyvista
+    from matplotlib.figure import Figure
+
+Array = NDArray[np.float64]
+LOADS = {
+    "p_mag": r"magnetic pressure $p_\mathrm{mag}$",
+    "f_mag": r"in-plane force $|f_\mathrm{mag}|$",
+    "k": "stiffness of rotational springs $k$",
+    "tau": r"torque $|\tau(u)|$",
+}
+STRAINS = {"E_1": "larger principal membrane strain $E_1$", "E_2": "smaller principal membrane strain $E_2$"}
+MOMENTS = {"M_1": "larger principal bending moment $M_1R/D$", "M_2": "smaller principal bending moment $M_2R/D$"}
+CONSTANT = 1e-9  # difference of a load, over that of fields along the normal, that is none
+ROUNDING = {"E_1": 1e-13, "M_1": 1e-8}  # values below are none
+EVERYWHERE, PEAK = 0.997, 1.5  # colours end at this much above what this part of the area is below
+FROM_THE_SIDE = np.array([2.2, -3.6, 2.85])
+PANEL, WHOLE = 480, 1000  # pixels
+SEEDS, APART = 70, 0.13  # the most places of arrows; how far they are from each other, over the shell's extent
+FIELDS = {  # colour, caption; length of the longest arrow and thickness over the shell's extent
+    "Br": ("C3", r"remanence $F\,\hat B^\mathrm{r}$", 0.105, 0.008),
+    "Ba": ("C0", r"applied field $\hat B^\mathrm{a}$", 0.15, 0.004),
+}
+
+
+@dataclass(frozen=True)
+class Picture:
+    """One picture: the views in it, none if it has nothing to show, and how they are put together."""
+
+    views: Callable[[Surface, "pyvista.PolyData", float], list[View]]
+    figure: Callable[[Sequence[Image], Sequence[View], str], "Figure"]
+
+
+def figures(surface: Surface, h: float, title: str, names: Sequence[str] = ()) -> dict[str, "Figure"]:
+    """Draw pictures of a whole deformed shell, by default all of `PICTURES`; without those that have nothing to show.
+
+    Raises
+    ------
+    NoScreen
+        If there is no screen to draw on.
+    """
+    smooth = smooth_surface(surface, h)
+    views = {name: PICTURES[name].views(surface, smooth, h) for name in names or PICTURES}
+    images = iter(rendered([view for shown in views.values() for view in shown]))
+    drawn = {name: [next(images) for _ in shown] for name, shown in views.items()}
+    return {name: PICTURES[name].figure(drawn[name], shown, title) for name, shown in views.items() if shown}
+
+
+def towards(place: Array) -> Array:
+    """The direction (3,) from which a place (3,) of a shell shows: from above, to the side of it."""
+    heading = np.arctan2(place[1], place[0]) if np.hypot(*place[:2]) > 0.1 else -0.5
+    return np.array([4.2 * np.cos(heading - 0.5), 4.2 * np.sin(heading - 0.5), 2.75])
+
+
+def deflected_place(surface: Surface) -> Array:
+    """The place (3,) whose normal displacement is the largest."""
+    return np.asarray(surface.r0[np.argmax(np.abs(surface.w))])
+
+
+def _shell(surface: Surface, smooth: "pyvista.PolyData", h: float) -> list[View]:
+    limit = float(np.abs(surface.w).max() / h) or 1.0
+    camera = towards(deflected_place(surface))
+    return [View(smooth, smooth.point_data["w_over_h"], (-limit, limit), "RdBu_r", camera, WHOLE, "$w/h$")]
+
+
+def _loads(surface: Surface, smooth: "pyvista.PolyData", h: float) -> list[View]:
+    return [_load(smooth, name) for name in LOADS if name in surface.fields]
+
+
+def _load(smooth: "pyvista.PolyData", name: str) -> View:
+    values = np.asarray(smooth.point_data[name])
+    values = np.linalg.norm(values, axis=1) if values.ndim == 2 else values
+    low, high = float(values.min()), float(values.max())
+    if high - low < CONSTANT:  # no pictures of rounding
+        low, high = low - 1, high + 1
+    return View(smooth, values, (low, high), "viridis", FROM_THE_SIDE, PANEL, LOADS[name])
+
+
+def _principal(captions: dict[str, str]) -> Callable[[Surface, "pyvista.PolyData", float], list[View]]:
+    """Two panels with the same colours, white at zero: a constant field is one colour, whatever its rounding."""
+
+    def views(surface: Surface, smooth: "pyvista.PolyData", h: float) -> list[View]:
+        if not all(name in surface.fields for name in captions):
+            return []
+        camera = towards(deflected_place(surface))
+        limit = _limit(surface, *captions)
+        return [
+            View(smooth, np.asarray(smooth.point_data[name]), (-limit, limit), "RdBu_r", camera, PANEL, said)
+            for name, said in captions.items()
+        ]
+
+    return views
+
+
+def _limit(surface: Surface, first: str, second: str) -> float:
+    """The largest magnitude of two fields, but for peaks of small area such as under a point load."""
+    size = np.maximum(np.abs(surface.fields[first]), np.abs(surface.fields[second]))
+    if (largest := float(size.max())) < ROUNDING[first]:
+        return 1.0
+    in_cells = size[surface.cells].mean(axis=1)
+    a, b, c = np.moveaxis(surface.r0[surface.cells[:, :3]], 1, 0)
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    order = np.argsort(in_cells)
+    most = in_cells[order][np.searchsorted(np.cumsum(area[order]), EVERYWHERE * area.sum())]
+    return float(min(largest, max(PEAK * most, ROUNDING[first])))
+
+
+def _fields(surface: Surface, smooth: "pyvista.PolyData", h: float) -> list[View]:
+    """Both fields at the same places on the side that is seen; arrows that point into the shell end on it."""
+    if not FIELDS.keys() & surface.fields.keys():
+        return []
+    camera = towards(deflected_place(surface))
+    r = surface.r0 + surface.u
+    extent = float(np.ptp(r, axis=0).max())
+    seeds = _spread(r, APART * extent)
+    normals = np.asarray(smooth.point_data["Normals"])[_nearest(np.asarray(smooth.points), r[seeds])]
+    side = normals * np.copysign(1.0, normals @ camera)[:, None]
+    arrows = []
+    for name, (colour, _, size, thickness) in FIELDS.items():
+        vectors = surface.fields[name][seeds]
+        length = np.linalg.norm(vectors, axis=1)
+        if not (longest := length.max()):
+            continue
+        shown, vectors = length > 1e-3 * longest, vectors * (size * extent / longest)
+        inward = np.einsum("ij,ij->i", vectors, side) < -1e-9
+        places = r[seeds] + 0.01 * extent * side - np.where(inward[:, None], vectors, 0.0)
+        arrows.append(Arrows(places[shown], vectors[shown], colour, thickness * extent))
+    grey = np.full(smooth.n_points, 0.25)
+    return [View(smooth, grey, (0.0, 1.0), "Greys", camera, 700, arrows=tuple(arrows))]
+
+
+def _spread(r: Array, apart: float) -> NDArray[np.int64]:
+    """The numbers of some of the points (n, 3), each the farthest from those before, as long as it is so far."""
+    chosen = [int(np.argmax(r[:, 2]))]
+    distance = np.full(len(r), np.inf)
+    while len(chosen) < SEEDS:
+        distance = np.minimum(distance, np.linalg.norm(r - r[chosen[-1]], axis=1))
+        if distance.max() < apart:
+            break
+        chosen.append(int(np.argmax(distance)))
+    return np.array(chosen)
+
+
+def _nearest(points: Array, places: Array) -> NDArray[np.int64]:
+    import scipy
+
+    return np.asarray(scipy.spatial.cKDTree(points).query(places)[1])
+
+
+def _one(images: Sequence[Image], views: Sequence[View], title: str) -> "Figure":
+    return beside(images[0], views[0], title)
+
+
+def _with_legend(images: Sequence[Image], views: Sequence[View], title: str) -> "Figure":
+    (image,), (view,) = images, views
+    figure = with_margin(image, 190, title)
+    width, height = (figure.get_size_inches() * DPI).round()
+    drawn = {arrows.colour for arrows in view.arrows}
+    for i, (colour, said, *_) in enumerate(FIELDS.values()):
+        if colour in drawn:
+            place = 1 - 15 / width, 1 - (40 + 26 * i) / height
+            figure.text(*place, said, color=colour, fontsize=11, ha="right", va="top")
+    directions(figure, view, width - 130, 10)
+    return figure
+
+
+PICTURES = {
+    "shell": Picture(_shell, _one),
+    "magnetic_loads": Picture(_loads, panels),
+    "strains": Picture(_principal(STRAINS), panels),
+    "moments": Picture(_principal(MOMENTS), panels),
+    "fields": Picture(_fields, _with_legend),
+}

@@ -1,0 +1,155 @@
+"""report.html: a run in one file, from what stands in its folder."""
+
+import base64
+import csv
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import yaml
+from markupsafe import Markup
+
+from magshell_fenicsx.output.report.html_numbers import number
+from magshell_fenicsx.output.report.report_path import Line, path_table, pole_head, symbol
+from magshell_fenicsx.output.report.verdict import Summary, bending_stiffness, located, physical_units, value, verdict
+from magshell_fenicsx.output.store.durable import write_whole
+from magshell_fenicsx.output.store.table import VALUE_COLUMN
+
+NAME, TEMPLATE = "report.html", "report_template.html"
+FOLDED = 30  # points from which on the table of the path is folded
+PICTURES = {  # in the order of the report
+    "curve.png": "Load over displacement; dashed where the shell is unstable.",
+    "shell.png": "The deformed shell at the last point, coloured by the inward displacement w/h.",
+    "animation.gif": "The shell along the path.",
+    "magnetic_loads.png": "The magnetic energy read as loads on the deformed shell, at the last point.",
+    "strains.png": "Strains of the mid-surface at the last point.",
+    "moments.png": "Bending moments at the last point.",
+    "fields.png": "Fields on the deformed shell at the last point.",
+    "instabilities.png": "Null vectors at the instabilities, on the deformed shell: how it buckles.",
+    "modes_*.png": "The modes of least stiffness, on the deformed shell.",
+}
+SMALL = ("curve.png", "shell.png")  # beside each other
+ADAPTED = ("hemisphere", "disc", "strip")  # geometries with mesh.tolerance
+TIMES = {
+    "jit_s": "compiling kernels",
+    "setup_s": "mesh and setup",
+    "assembly_s": "assembly",
+    "factor_s": "factorisation",
+    "solve_s": "solving with factors",
+    "output_s": "fields and pictures",
+    "total_s": "in all",
+}
+
+
+def write_report(folder: Path) -> None:
+    """Write report.html from the summary.json, the path.csv and what pictures there are in a run's folder.
+
+    Raises
+    ------
+    OSError
+        If there is no summary.json or path.csv, or the report cannot be written; an older one is as it was then.
+    """
+    write_whole(folder / NAME, report(folder).encode())
+
+
+def report(folder: Path) -> str:
+    """The content of report.html."""
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined  # takes long to import
+
+    loader = FileSystemLoader(Path(__file__).parent)
+    made = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    return made.get_template(TEMPLATE).render(_content(folder))
+
+
+def _content(folder: Path) -> dict[str, Any]:
+    """What the template shows."""
+    summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+    with (folder / "path.csv").open(encoding="utf-8", newline="") as stream:
+        lines = list(csv.DictReader(stream))
+    path = path_table(lines, "m" if summary["dimensions"]["units"] == "SI" else "")
+    return {
+        "name": folder.resolve().name,
+        "summary": summary,
+        "verdict": verdict(summary, lines),
+        "groups": _groups(summary),
+        "dimensions": _dimensions(summary),
+        "pictures": list(_pictures(folder)),
+        "pole": pole_head(lines[0] if lines else {}),
+        "instabilities": [_instability(line, summary) for line in located(lines)],
+        "sensitivities": [(name, number(v)) for name, v in summary["sensitivities"].items()],
+        "sensitive": symbol(VALUE_COLUMN[lines[-1]["amplitude"]]) if summary["sensitivities"] else "",
+        "how_to_estimate": _how_to_estimate(summary["case"]),
+        "path": path,
+        "rows": list(zip(*(column.cells for column in path), strict=True)),
+        "folded": len(lines) >= FOLDED,
+        "case": yaml.safe_dump(
+            summary["case"], sort_keys=False, allow_unicode=True, default_flow_style=None, width=110
+        ),
+        "times": [(said, summary["timing"][key]) for key, said in TIMES.items()],
+        "number": number,
+    }
+
+
+def _groups(summary: Summary) -> list[tuple[Markup, Markup]]:
+    of = summary["dimensionless"]
+    named = {
+        "R/h": of["radius_to_thickness"],
+        "ν": of["poisson_ratio"],
+        "λ<sub>m</sub> = |B<sup>r</sup>||B<sup>a</sup>|/(μ<sub>0</sub>E)": of["lambda_m"],
+        "Λ<sub>m</sub> = λ<sub>m</sub>R/h": of["Lambda_m"],
+        "p<sub>c</sub>/E": of["pc_over_E"],
+    }
+    return [(Markup(name), number(v)) for name, v in named.items()]
+
+
+def _dimensions(summary: Summary) -> list[tuple[Markup, Markup, str]]:
+    """Name, value and unit of what the case gives in units; empty for a case without."""
+    dims, magnetic, loads = summary["dimensions"], summary["case"].get("magnetic") or {}, physical_units(summary)
+    stiff = dims["youngs_modulus"] and dims["thickness"]
+    named = {
+        "radius R": (dims["radius"], "m"),
+        "thickness h": (dims["thickness"], "m"),
+        "Young’s modulus E": (dims["youngs_modulus"], "Pa"),
+        "bending stiffness D": (bending_stiffness(summary) if stiff else None, "N m"),
+        "classical pressure p<sub>c</sub>": loads.get("pressure", (None, "")),
+        "unit of the force, 2πD/R": loads.get("force", (None, "")),
+        "remanence |B<sup>r</sup>|": (magnetic.get("remanent", {}).get("flux_density"), "T"),
+        "applied |B<sup>a</sup>|": (magnetic.get("applied", {}).get("flux_density"), "T"),
+    }
+    in_si = dims["units"] == "SI"
+    return [
+        (Markup(name), number(v), unit if in_si or unit == "T" else "")
+        for name, (v, unit) in named.items()
+        if v is not None
+    ]
+
+
+def _pictures(folder: Path) -> Iterator[tuple[str, str, bool]]:
+    """Source and caption of what there is, and whether it is a small one."""
+    for pattern, caption in PICTURES.items():
+        for file in sorted(folder.glob(pattern)):
+            content = base64.b64encode(file.read_bytes()).decode()
+            yield f"data:image/{file.suffix[1:]};base64,{content}", caption, pattern in SMALL
+
+
+def _instability(line: Line, summary: Summary) -> dict[str, Any]:
+    return {
+        "point": line["point"],
+        "kind": line["label"],
+        "mode": line["mode"] or "–",
+        "branch": int(line["branch"]),
+        "load": value(line, summary),
+        "w": number(float(line["w_over_h"])),
+        "pole": number(float(line["w_pole_over_h"])),
+    }
+
+
+def _how_to_estimate(case: dict[str, Any]) -> str:
+    """What to do for an error estimate, where a run has none."""
+    if "tolerance" in case["mesh"]:
+        return "no result was found that mesh.tolerance could be of, and the default mesh was taken"
+    if case["model"] == "shell" and case["shell"]["geometry"] in ADAPTED:
+        return "give the case mesh: {tolerance: 1e-3} in place of degree and refinement"
+    finer = "mesh.degree one higher" if case["shell"]["geometry"] == "mesh" else "mesh.refinement twice as large"
+    return f"run it again with {finer} and compare (mesh.tolerance is not offered for this geometry or model)"

@@ -1,0 +1,182 @@
+"""DIR/checkpoint: the case, then every result of the solver, each on disk before the next is sought.
+
+Written by rank 0 alone and in one file, so that a full disk stops all ranks together: ADIOS2 (2.10, through
+adios4dolfinx 0.9.3) raises on one rank in `Close` then, and the others wait for it for ever.
+"""
+
+import json
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from dolfinx import fem
+from mpi4py import MPI
+
+from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.source import CaseError
+from magshell_fenicsx.continuation.point import Point
+from magshell_fenicsx.continuation.system import State
+from magshell_fenicsx.output.store.durable import AppendedFile, write_whole
+from magshell_fenicsx.output.store.folder import by_first
+from magshell_fenicsx.output.store.framing import framed, read_frame
+from magshell_fenicsx.output.store.ordering import Array, Ordering
+from magshell_fenicsx.platform import sources
+
+NAME = "checkpoint"
+
+
+def begin_checkpoint(file: Path, case: Case) -> None:
+    """Write an empty checkpoint."""
+    write_whole(file, framed(json.dumps(identity(case)).encode()))
+
+
+def check_resumable(file: Path, case: Case) -> None:
+    """See that a checkpoint is one of this case and these sources.
+
+    Raises
+    ------
+    CaseError
+        If there is none, or it is of another.
+    """
+    saved = begun_with(file)
+    if saved is None:
+        raise CaseError(f"--resume: {file.parent} holds no checkpoint; run without --resume")
+    refuse_other(saved, case, file.parent)
+
+
+def begun_with(file: Path) -> dict[str, Any] | None:
+    """The `identity` of the run that began a checkpoint; None if there is none."""
+    try:
+        with file.open("rb") as stream:
+            head = read_frame(stream)
+    except FileNotFoundError:
+        return None
+    return None if head is None else dict(json.loads(head))
+
+
+def identity(case: Case) -> dict[str, Any]:
+    """All that a run depends on: the case, the files that it names, the program."""
+    data = {"case": case.model_dump(mode="json", exclude_none=True), **case.outside, "sources": sources.ours()}
+    return dict(json.loads(json.dumps(data)))  # as it comes back from a file
+
+
+class OtherSources(CaseError):
+    """What is there was computed by other sources of this program."""
+
+
+def refuse_other(saved: dict[str, Any], case: Case, folder: Path) -> None:
+    """See that what was saved is of this case and these sources.
+
+    Raises
+    ------
+    CaseError
+        With the first difference; `OtherSources` if the sources are all of it.
+    """
+    now = identity(case)
+    there, here = saved.get("sources", saved.get("version")), now["sources"]
+    known = {key: value for key, value in saved.items() if key not in ("sources", "version")}
+    if known != {key: value for key, value in now.items() if key != "sources"}:
+        raise CaseError(f"--resume: {folder} is of another run: {_difference(known, now)}; run without --resume")
+    if there != here:
+        raise OtherSources(
+            f"--resume: {folder} was computed by other sources of magshell_fenicsx ({there}; these are {here}); "
+            "run without --resume, which computes it again"
+        )
+
+
+class Checkpoint:
+    """The journal of a run in its folder; every rank calls, rank 0 reads and writes.
+
+    Parameters
+    ----------
+    file
+        As `begin_checkpoint` or an earlier run left it; an entry torn by a kill is cut off.
+    V
+        The displacement's space.
+    comm
+        Of all ranks of the program.
+
+    Attributes
+    ----------
+    replayed
+        Number of results that were taken from the file.
+    """
+
+    def __init__(self, file: Path, V: fem.FunctionSpace, comm: MPI.Comm) -> None:
+        self._file, self._comm, self.replayed = file, comm, 0
+        self._writing: AppendedFile | None = None
+        places = by_first(comm, self._begin, "cannot be read")
+        self._ordering = Ordering(V, comm, places)
+        self._replaying = places is not None
+        if not self._replaying:
+            self._append(self._ordering.places.tobytes())
+
+    def _begin(self) -> Array | None:
+        """The places of the nodes, if they are there."""
+        self._reading = self._file.open("rb")
+        read_frame(self._reading)
+        content = read_frame(self._reading)
+        return None if content is None else np.frombuffer(content).reshape(-1, 3)
+
+    def replay(self) -> Point | str | None:
+        """The next result of the file; None from its end on."""
+        if not self._replaying:
+            return None
+        content = by_first(self._comm, lambda: read_frame(self._reading), "cannot be read")
+        if content is None:
+            self._replaying = False
+            return None
+        self.replayed += 1
+        return self._decoded(content)
+
+    def record(self, found: Point | str) -> None:
+        """Put a result on disk."""
+        if isinstance(found, str):
+            self._append(json.dumps({"failure": found}).encode())
+            return
+        u, du = (self._ordering.gather(v) for v in (found.state.u, found.du))
+        self._append(_encoded(found, u, du))
+
+    def close(self) -> None:
+        def close() -> None:
+            self._reading.close()
+            if self._writing:
+                self._writing.close()
+
+        by_first(self._comm, close)
+
+    def remove(self) -> None:
+        """Take the file away: the run is complete."""
+        by_first(self._comm, self._file.unlink)
+
+    def _append(self, content: bytes) -> None:
+        def write() -> None:
+            if self._writing is None:  # what comes after the last whole entry is torn
+                self._writing = AppendedFile(self._file, self._reading.tell())
+            self._writing.append(framed(content))
+
+        by_first(self._comm, write)
+
+    def _decoded(self, content: bytes) -> Point | str:
+        text, _, data = content.partition(b"\n")
+        known = json.loads(text)
+        if "failure" in known:
+            return str(known["failure"])
+        u, du = (self._ordering.scatter(v) for v in np.split(np.frombuffer(data), 2))
+        return Point(State(u, known.pop("mu")), du=du, **known)
+
+
+def _encoded(point: Point, u: Array, du: Array) -> bytes:
+    """A line of JSON with the numbers of a point, then both vectors."""
+    numbers = {f.name: getattr(point, f.name) for f in fields(point) if f.name not in ("state", "du")}
+    return json.dumps({**numbers, "mu": point.state.mu}).encode() + b"\n" + u.tobytes() + du.tobytes()
+
+
+def _difference(there: Any, here: Any, key: str = "") -> str:
+    """The first key with different values, and both."""
+    if isinstance(there, dict) and isinstance(here, dict):
+        name = next(name for name in {**there, **here} if there.get(name) != here.get(name))
+        return _difference(there.get(name), here.get(name), f"{key}.{name}".removeprefix(".").removeprefix("case."))
+    said = ["nothing" if value is None else json.dumps(value) for value in (there, here)]
+    return f"{key} is {said[0]} there and {said[1]} here"

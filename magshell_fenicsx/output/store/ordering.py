@@ -1,0 +1,73 @@
+"""Nodal values in an order that does not depend on the number of ranks."""
+
+import numpy as np
+import scipy
+from dolfinx import fem
+from mpi4py import MPI
+from numpy.typing import NDArray
+
+from magshell_fenicsx.case.source import CaseError
+from magshell_fenicsx.continuation.system import Vector
+
+Array = NDArray[np.float64]
+CLOSE = 1e-9  # distance, over the mesh's size, below which two nodes are one
+
+
+class Ordering:
+    """The nodes of a function space, numbered once and found again by their places.
+
+    Parameters
+    ----------
+    V
+        On all ranks together, or the same on every rank alone.
+    comm
+        Of all ranks of the program.
+    known
+        (n, 3) places on the affine mesh in the order to use, on rank 0; None there takes the present one.
+
+    Raises
+    ------
+    CaseError
+        On every rank, if these are not the nodes of `known`.
+
+    Attributes
+    ----------
+    places
+        (n, 3) places in the order in use.
+    """
+
+    def __init__(self, V: fem.FunctionSpace, comm: MPI.Comm, known: Array | None = None) -> None:
+        self._within, self._comm = V.mesh.comm, comm
+        self._values = V.dofmap.index_map_bs
+        mine = V.tabulate_dof_coordinates()[: V.dofmap.index_map.size_local]
+        present = self._within.allgather(mine)
+        known = comm.bcast(known)
+        if known is None:
+            self.places: Array = np.concatenate(present)
+            first = sum(len(part) for part in present[: self._within.rank])
+            self._mine: NDArray[np.int64] = first + np.arange(len(mine))
+        else:
+            self.places, self._mine = known, self._found(known, mine, comm)
+        self._parts = self._within.allgather(self._mine)
+
+    def _found(self, known: Array, mine: Array, comm: MPI.Comm) -> NDArray[np.int64]:
+        """The numbers of this rank's places among the known ones."""
+        distance, number = scipy.spatial.cKDTree(known).query(mine)
+        parts = self._within.allgather(number)
+        one_to_one = np.array_equal(np.sort(np.concatenate(parts)), np.arange(len(known)))
+        close = np.all(distance < CLOSE * np.abs(known).max())
+        if not comm.allreduce(bool(one_to_one and close), MPI.LAND):
+            raise CaseError("--resume: the mesh is not that of the checkpoint; run without --resume")
+        return np.asarray(number)
+
+    def gather(self, u: Vector) -> Array:
+        """All values of a displacement (n, components), on every rank that is rank 0 of its space; else empty."""
+        parts = self._within.gather(u)
+        whole = np.empty((len(self.places), self._values)) if parts else np.empty((0, self._values))
+        for where, part in zip(self._parts, parts or [], strict=False):
+            whole[where] = part.reshape(-1, self._values)
+        return whole
+
+    def scatter(self, whole: Array) -> Vector:
+        """The part of this rank of values known to every rank."""
+        return np.asarray(whole.reshape(-1, self._values)[self._mine].ravel())

@@ -1,0 +1,121 @@
+"""path.csv: one row per accepted point, on disk before the next point is sought."""
+
+import csv
+import io
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from magshell_fenicsx.output.store.durable import AppendedFile
+
+COLUMNS = (
+    "point",
+    "label",
+    "amplitude",
+    "p_over_pc",
+    "lambda_m",
+    "force",
+    "w_over_h",
+    "w_from_field_over_h",
+    "w_pole_over_h",
+    "volume_change",
+    "energy",
+    "negative_pivots",
+    "negative_pivots_held",
+    "iterations",
+    "factorisations",
+    "wall_s",
+    "stretching",
+    "bending",
+    "magnetic",
+    "U1",
+    "Uq",
+    "Utau",
+    "mode",
+    "field_angle",
+    "branch",
+    "w_point_over_h",
+    "error_over_h",
+    "load_error",
+    "excluded_pivots",
+)
+TEXTS = ("label", "amplitude", "mode")
+Row = dict[str, float | int | str]
+VALUE_COLUMN = {  # by what varied: the column of its value
+    "pressure": "p_over_pc",
+    "force": "force",
+    "load": "load_factor",
+    "lambda_m": "lambda_m",
+    "angle": "field_angle",
+}
+LOCATED = ("fold", "bifurcation")
+OWN_MODES = ("", "symmetric", "asymmetric")  # of an instability within the model; others it excludes
+
+
+def pole_name(row: Mapping[str, object]) -> str:
+    """Whose displacement `w_pole_over_h` is: the first named point's, where there is one."""
+    return next((key.removesuffix("_ux") for key in row if key.endswith("_ux")), "the pole")
+
+
+class PathTable:
+    """Writes rows as they come, after those of an interrupted run.
+
+    Parameters
+    ----------
+    extra
+        Columns besides those of every run.
+
+    Attributes
+    ----------
+    kept
+        The whole rows that the file had; what comes after them, torn by a kill, is cut off.
+    """
+
+    def __init__(self, file: Path, extra: Sequence[str] = ()) -> None:
+        self._columns = (*COLUMNS, *extra)
+        lines = file.read_bytes().decode().splitlines(keepends=True) if file.exists() else []
+        self.kept: list[dict[str, str]] = []
+        header = _line(self._columns)
+        length = len(header) if lines[:1] == [header] else 0
+        for line in lines[1:] if length else []:
+            values = next(csv.reader([line]))
+            if not line.endswith("\n") or values[0] != str(len(self.kept)) or len(values) != len(self._columns):
+                break
+            self.kept.append(dict(zip(self._columns, values, strict=True)))
+            length += len(line.encode())
+        self._file = AppendedFile(file, length)
+        if not length:
+            self._file.append(header.encode())
+
+    def write(self, row: Row) -> None:
+        """Add a row, unless the file has it.
+
+        Raises
+        ------
+        OSError
+            If the disk is full; the file ends with a whole row then.
+        """
+        if int(row["point"]) >= len(self.kept):
+            self._file.append(
+                _line(repr(float(v)) if isinstance(v := row[key], float) else v for key in self._columns).encode()
+            )
+
+    def close(self) -> None:
+        self._file.close()
+
+
+def _line(values: Iterable[Any]) -> str:
+    stream = io.StringIO()
+    csv.writer(stream).writerow(values)
+    return stream.getvalue()
+
+
+def read_rows(file: Path) -> list[Row]:
+    """The whole rows of a path.csv, also of a run that was killed."""
+    text = file.read_text(encoding="utf-8")
+    rows = csv.DictReader(io.StringIO(text[: text.rfind("\n") + 1], newline=""))
+    return [{key: v if key in TEXTS else _number(v) for key, v in row.items()} for row in rows]
+
+
+def _number(text: str) -> float | int:
+    return int(text) if text.lstrip("-").isdigit() else float(text)

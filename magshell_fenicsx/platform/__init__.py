@@ -1,0 +1,1 @@
+"""Versions, ranks, terminal: what differs between machines."""

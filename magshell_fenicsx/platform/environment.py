@@ -1,0 +1,43 @@
+"""What the program runs on: versions, the BLAS that PETSc found, the kernel cache."""
+
+import platform
+import re
+from pathlib import Path
+
+import dolfinx
+import ufl
+from dolfinx.jit import get_options
+from petsc4py import PETSc
+
+from magshell_fenicsx.platform.version import __version__
+
+FAST_BLAS = re.compile(r"/lib(openblas|mkl_rt|mkl_core|blis|flexiblas|armpl)[^/]*$", re.MULTILINE)
+
+
+def versions() -> dict[str, str]:
+    """Versions that a result depends on."""
+    return {
+        "magshell_fenicsx": __version__,
+        "dolfinx": dolfinx.__version__,
+        "ufl": ufl.__version__,
+        "petsc": ".".join(str(n) for n in PETSc.Sys.getVersion()),
+        "python": platform.python_version(),
+    }
+
+
+def fast_blas() -> str | None:
+    """Name of the optimised BLAS in this process; None if it is the reference one.
+
+    With the reference BLAS a factorisation takes seven times as long.
+    """
+    try:
+        loaded = Path("/proc/self/maps").read_text(encoding="utf-8")
+    except OSError:
+        return "unknown"
+    found = FAST_BLAS.search(loaded)
+    return found[1] if found else None
+
+
+def kernel_cache() -> str:
+    """Where compiled kernels are kept."""
+    return str(get_options()["cache_dir"])

@@ -1,0 +1,1 @@
+"""A run and its folder: rows, status line, interruption, summary."""

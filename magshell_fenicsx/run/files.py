@@ -1,0 +1,164 @@
+"""The output folder of one run."""
+
+import json
+import math
+from pathlib import Path
+from shutil import rmtree
+from typing import Any
+
+from mpi4py import MPI
+
+from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.source import CaseError
+from magshell_fenicsx.continuation.system import State
+from magshell_fenicsx.models.shell.parameters import MIRROR_NORMAL
+from magshell_fenicsx.output.fields.gathering import gatherer
+from magshell_fenicsx.output.fields.surface import rotation, turned
+from magshell_fenicsx.output.fields.vtu import About, FieldSeries
+from magshell_fenicsx.output.pictures.picture import PICTURES
+from magshell_fenicsx.output.store import checkpoint
+from magshell_fenicsx.output.store.durable import sync_folder, write_whole
+from magshell_fenicsx.output.store.folder import by_first, prepare_folder
+from magshell_fenicsx.output.store.table import PathTable, Row
+from magshell_fenicsx.simulate.scene import Scene
+
+DRAWN = (*PICTURES, "curve", "instabilities", "modes")
+LAST_FILES = (
+    *("summary.json", "report.html", "stability.csv", "animation.gif"),
+    *(f"{name}{end}.png" for name in DRAWN for end in ("", "_[0-9]*")),
+)
+MESH = "mesh.json"  # what was chosen for a tolerance
+COMPARED = ("p_over_pc", "lambda_m", "force", "w_over_h", "w_pole_over_h")
+
+
+class AlreadyComplete(Exception):
+    """There is nothing to resume; `summary` is what the finished run left."""
+
+    def __init__(self, summary: dict[str, Any]) -> None:
+        super().__init__(summary)
+        self.summary = summary
+
+
+def open_folder(out: Path, case: Case, comm: MPI.Comm, resume: bool) -> None:
+    """Make a folder ready for a new run, or see that a run in it can go on.
+
+    Raises
+    ------
+    CaseError
+        If the folder cannot be written, or has no run of this case to resume.
+    AlreadyComplete
+        If the run to be resumed is.
+    """
+    prepare_folder(out, comm, lambda folder: (_resumed if resume else _emptied)(folder, case))
+
+
+def _emptied(out: Path, case: Case) -> None:
+    """Take an earlier run's files out of the folder."""
+    for name in (checkpoint.NAME, "path.csv", MESH):
+        (out / name).unlink(missing_ok=True)
+    _remove_last_files(out)
+    rmtree(out / "fields", ignore_errors=True)
+    checkpoint.begin_checkpoint(out / checkpoint.NAME, case)
+
+
+def _resumed(out: Path, case: Case) -> None:
+    """Take out what only the end of a run writes."""
+    file = out / checkpoint.NAME
+    if not file.exists() and (out / "summary.json").exists():
+        summary = json.loads((out / "summary.json").read_text(encoding="utf-8"))
+        if summary["stopped"] is None:
+            kept = {key: summary[key] for key in ("case", "mesh_file", "sources") if key in summary}
+            checkpoint.refuse_other({"version": summary["versions"]["magshell_fenicsx"], **kept}, case, out)
+            raise AlreadyComplete(summary)
+    checkpoint.check_resumable(file, case)
+    _remove_last_files(out)
+
+
+def _remove_last_files(out: Path) -> None:
+    for pattern in LAST_FILES:
+        for file in out.glob(pattern):
+            file.unlink()
+
+
+class RunFiles:
+    """Writes a run; every rank calls, rank 0 writes.
+
+    Raises
+    ------
+    DiskError
+        From every method, on every rank, if something cannot be written.
+
+    Attributes
+    ----------
+    journal
+        The checkpoint.
+    kept
+        Number of points of an interrupted run whose rows and fields are there.
+    elapsed
+        Seconds that the interrupted run took up to the last of them.
+    """
+
+    def __init__(self, folder: Path, scene: Scene) -> None:
+        self._folder, self._scene, self._comm = folder, scene, scene.comm
+        self.journal = checkpoint.Checkpoint(folder / checkpoint.NAME, scene.model.V, scene.comm)
+        self._gatherer = gatherer(scene.model, scene.comm)
+        self.kept, self._rows = by_first(self._comm, self._open)
+        self.elapsed = float(self._rows[-1]["wall_s"]) if self._rows else 0.0
+
+    def _open(self) -> tuple[int, list[dict[str, str]]]:
+        begun = checkpoint.begun_with(self._folder / checkpoint.NAME) or {}
+        self._begun_with = {key: begun[key] for key in ("mesh_file", "sources") if key in begun}
+        self._table = PathTable(self._folder / "path.csv", self._scene.extra_columns)
+        plan = self._scene.plan
+        mirror = MIRROR_NORMAL @ rotation(plan.azimuth) if plan.half else None
+        about = About(plan.material.h, plan.material.nu, mirror)
+        self._fields = FieldSeries(self._folder / "fields", about)
+        sync_folder(self._folder)
+        return min(len(self._table.kept), self._fields.kept), self._table.kept
+
+    def write(self, row: Row, state: State) -> None:
+        """Write a point; of an interrupted run's points, what is missing.
+
+        Raises
+        ------
+        CaseError
+            If the point is not the one that the interrupted run had in its place.
+        """
+        number = int(row["point"])
+        if number < len(self._rows):
+            _same(row, self._rows[number])
+        if number < self.kept:
+            return
+        surface = self._gatherer.gather(state.u, state.mu)
+
+        def write() -> None:
+            assert surface is not None
+            self._table.write(row)
+            self._fields.write(number, turned(surface, self._scene.plan.azimuth))
+
+        by_first(self._comm, write)
+
+    def summarise(self, content: dict[str, Any]) -> None:
+        """Write summary.json, which is safe before any picture is drawn."""
+
+        def write() -> None:  # files that were changed since are not those of this run
+            data = (json.dumps({**content, **self._begun_with}, indent=2) + "\n").encode()
+            write_whole(self._folder / "summary.json", data)
+
+        by_first(self._comm, write)
+
+    def close(self, complete: bool) -> None:
+        """Close the files; a complete run needs no checkpoint, which goes last."""
+        by_first(self._comm, lambda: self._table.close())
+        self.journal.close()
+        if complete:
+            self.journal.remove()
+
+
+def _same(row: Row, there: dict[str, str]) -> None:
+    """See that a point found again is the one in path.csv."""
+    same = row["label"] == there["label"] and all(
+        math.isclose(float(row[key]), float(there[key]), rel_tol=1e-6, abs_tol=1e-9) for key in COMPARED
+    )
+    if not same:
+        raise CaseError(f"--resume: point {row['point']} is another than in path.csv; run without --resume")

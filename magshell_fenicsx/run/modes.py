@@ -1,0 +1,92 @@
+"""After a run: the null vectors of its instabilities, and the modes that the case asks for."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from magshell_fenicsx.case.stability import StabilitySection
+from magshell_fenicsx.continuation.modes import ModesNotFound
+from magshell_fenicsx.continuation.system import State, Vector
+from magshell_fenicsx.models.modes import ShellMode, ShellModes
+from magshell_fenicsx.output.fields.gathering import Gatherer, gatherer
+from magshell_fenicsx.output.fields.modes import mode_file, mode_surface, mode_table, wave_number, write_mode
+from magshell_fenicsx.output.fields.surface import Surface
+from magshell_fenicsx.output.fields.vtu import About
+from magshell_fenicsx.output.store.durable import write_whole
+from magshell_fenicsx.output.store.folder import by_first
+from magshell_fenicsx.output.store.table import OWN_MODES
+from magshell_fenicsx.run.summary import Result
+
+Say = Callable[[str], None]
+
+
+def modes_after(result: Result, folder: Path, say: Say) -> None:
+    """Write fields/mode_*.vtu and, if the case has a stability section, stability.csv.
+
+    Every rank calls, rank 0 writes. The run must be over: the model's tangent is overwritten.
+
+    Raises
+    ------
+    DiskError
+        On every rank, if something cannot be written.
+    """
+    scene, wanted = result.scene, result.scene.case.stability
+    if result.singular or wanted:
+        writer = _Writer(result, folder, say, gatherer(scene.model, scene.comm))
+        shell = ShellModes(scene.model)
+        writer.null_vectors(shell)
+        if wanted:
+            writer.modes(shell, wanted)
+
+
+@dataclass(frozen=True)
+class _Writer:
+    result: Result
+    folder: Path
+    say: Say
+    gatherer: Gatherer
+
+    def null_vectors(self, shell: ShellModes) -> None:
+        for number, state in self.result.singular.items():
+            row = self.result.rows[number]
+            label = "" if row["mode"] in OWN_MODES else str(row["mode"])
+            try:
+                vector = shell.null_vector(state, label)
+            except ModesNotFound as e:
+                self.say(f"warning: no modes of point {number}: {e}")
+                continue
+            surface = self._write(number, str(row["label"]), state, label, vector)
+            if surface is not None and not label and (m := wave_number(surface)):
+                self.say(f"the null vector at point {number} has {m} waves around e3")
+
+    def modes(self, shell: ShellModes, wanted: StabilitySection) -> None:
+        points = self.result.singular
+        if wanted.at == "end":
+            points = {len(self.result.rows) - 1: self.result.last}
+        found: dict[int, list[ShellMode]] = {}
+        for number, state in points.items():
+            try:
+                lowest = shell.lowest(state, wanted.modes)
+                unstable = sum(mode.eigenvalue < 0 for mode in lowest)
+                found[number] = lowest[: max(wanted.modes, unstable)]
+            except ModesNotFound as e:
+                self.say(f"warning: no modes of point {number}: {e}")
+        by_first(self.result.scene.comm, partial(write_whole, self.folder / "stability.csv", mode_table(found)))
+        for number, modes in found.items():
+            for n, mode in enumerate(modes[: wanted.modes], 1):
+                self._write(number, str(n), points[number], mode.label, mode.vector)
+            first = modes[0]
+            self.say(f"lowest stiffness at point {number}: {first.eigenvalue:.6g} E h/R^2  {first.label}".rstrip())
+
+    def _write(self, number: int, name: str, state: State, label: str, vector: Vector) -> Surface | None:
+        scene = self.result.scene
+        surface = mode_surface(scene.model, self.gatherer, state.u, label, vector, scene.plan.azimuth)
+
+        def write() -> None:
+            assert surface is not None
+            material = scene.plan.material
+            write_mode(mode_file(self.folder, number, name, label), surface, About(material.h, material.nu))
+
+        by_first(scene.comm, write)
+        return surface

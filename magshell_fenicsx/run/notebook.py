@@ -1,0 +1,87 @@
+"""What a notebook shows of a scene: the deformed surface as arrays and for pyvista, and pictures without files.
+
+All of it is collective; what is made on rank 0 alone is None elsewhere.
+"""
+
+import io
+from collections.abc import Sequence
+from functools import partial
+from typing import TYPE_CHECKING, Literal
+
+from magshell_fenicsx.output.fields.gathering import gatherer
+from magshell_fenicsx.output.fields.surface import Surface, completed, turned
+from magshell_fenicsx.output.pictures.captions import caption
+from magshell_fenicsx.output.pictures.curve import curve_figure
+from magshell_fenicsx.output.pictures.picture import figures
+from magshell_fenicsx.output.pictures.render import smooth_surface
+from magshell_fenicsx.output.store.table import Row
+from magshell_fenicsx.run.rows import rows
+from magshell_fenicsx.simulate.follow import Record
+from magshell_fenicsx.simulate.scene import Scene
+
+if TYPE_CHECKING:  # take long to import
+    import pyvista
+    from matplotlib.figure import Figure
+
+
+def surface(scene: Scene, record: Record) -> Surface | None:
+    """The whole deformed mid-surface as NumPy arrays, lengths in R: `r0`, `u`, `n0`, `w`, `cells` and `fields`.
+
+    The fields are membrane strains `E` and bending moments over D/R `M`, their principal values `E_1`, `E_2`, `M_1`,
+    `M_2`, and those of the magnetic field: `Br`, `Ba`, `p_mag`, `f_mag`, `k`, `tau`; see `results.point_fields`.
+    """
+    plan, state = scene.plan, record.point.state
+    found = gatherer(scene.model, scene.comm).gather(state.u, state.mu)
+    return turned(completed(found) if plan.half else found, plan.azimuth) if found else None
+
+
+def polydata(scene: Scene, record: Record) -> "pyvista.PolyData | None":
+    """The deformed mid-surface in flat triangles, for pyvista, with w_over_h, u_over_h, ... at its points.
+
+    `points` (n, 3) and `regular_faces` (m, 3) are the nodes in R and the triangles as NumPy arrays;
+    `plot(scalars="w_over_h")` shows it.
+    """
+    found = surface(scene, record)
+    return smooth_surface(found, scene.plan.material.h) if found else None
+
+
+def picture(
+    scene: Scene,
+    record: Record,
+    of: Literal["shell", "strains", "moments", "fields", "magnetic_loads"] = "shell",
+) -> "Figure | None":
+    """One of the pictures of a run, as in shell.png, strains.png, ...; None also where there is nothing `of` that.
+
+    Raises
+    ------
+    NoScreen
+        If there is no screen to draw on.
+    """
+    found, (row,) = surface(scene, record), rows(scene, [record])
+    if found is None:
+        return None
+    drawn = figures(found, scene.plan.material.h, _caption(scene, row), [of])
+    return _in_line(drawn[of]) if drawn else None
+
+
+def curve(scene: Scene, records: Sequence[Record], amplitude: str | None = None) -> "Figure":
+    """The path, as in curve.png; by default in the amplitude that varied last."""
+    found = rows(scene, records)
+    return _in_line(curve_figure(found, amplitude or records[-1].amplitude, _caption(scene, found[-1])))
+
+
+def _caption(scene: Scene, row: Row) -> str:
+    material = scene.plan.material
+    return caption(material.h, material.nu, row, [term.name for term in scene.plan.loads.own])
+
+
+def _in_line(figure: "Figure") -> "Figure":
+    """The same, which a notebook draws also if nobody has imported pyplot."""
+    figure._repr_png_ = partial(_png, figure)  # type: ignore[attr-defined]
+    return figure
+
+
+def _png(figure: "Figure") -> bytes:
+    content = io.BytesIO()
+    figure.savefig(content, format="png")
+    return content.getvalue()

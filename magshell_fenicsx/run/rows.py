@@ -1,0 +1,57 @@
+"""Records of a history as rows of path.csv, and as columns."""
+
+from collections.abc import Iterable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magshell_fenicsx.output.store.table import COLUMNS, Row
+from magshell_fenicsx.simulate.follow import Record
+from magshell_fenicsx.simulate.scene import Scene
+
+
+class RowMaker:
+    """Makes the rows of one history, in the order of its records."""
+
+    def __init__(self, scene: Scene) -> None:
+        self._scene, self._count, self._field_end = scene, 0, 0.0
+
+    def row(self, record: Record, wall_s: float) -> Row:
+        """The next row; `wall_s` in seconds since the history began. Collective."""
+        values, point = self._scene.observe(record.point.state), record.point
+        if record.label in ("start", "field"):
+            self._field_end = values["w_over_h"]
+        self._count += 1
+        return {
+            "point": self._count - 1,
+            "label": record.label,
+            "amplitude": record.amplitude,
+            **values,
+            "w_from_field_over_h": values["w_over_h"] - self._field_end,
+            "negative_pivots": point.negative_pivots,
+            "negative_pivots_held": point.negative_pivots_held,
+            "iterations": point.iterations,
+            "factorisations": point.factorisations,
+            "wall_s": round(wall_s, 3),
+            "mode": record.mode,
+            "branch": record.branch,
+            "error_over_h": point.error,
+            "load_error": point.load_error,
+            "excluded_pivots": record.excluded_pivots,
+        }
+
+
+def rows(scene: Scene, records: Iterable[Record]) -> list[Row]:
+    """The rows of some records; nobody measured their times, which are nan."""
+    maker = RowMaker(scene)
+    return [maker.row(record, np.nan) for record in records]
+
+
+def columns(scene: Scene, records: Iterable[Record]) -> dict[str, NDArray[np.generic]]:
+    """The columns of path.csv but for the time, each (records,); `pandas.DataFrame(columns(...))` is a frame.
+
+    Collective.
+    """
+    found = rows(scene, records)
+    names = [name for name in (*COLUMNS, *scene.extra_columns) if name != "wall_s"]
+    return {name: np.array([row[name] for row in found]) for name in names}

@@ -1,0 +1,204 @@
+"""Run a case: follow its history, write every accepted point, summarise."""
+
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+from mpi4py import MPI
+
+from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.loading import PathSection
+from magshell_fenicsx.continuation.factor import has_cholmod
+from magshell_fenicsx.continuation.fold import FoldLost, Guess, find_fold
+from magshell_fenicsx.continuation.inverse import NoEigenpair
+from magshell_fenicsx.continuation.journal import NoJournal
+from magshell_fenicsx.output.pictures.plot import draw
+from magshell_fenicsx.output.pictures.render import NoScreen
+from magshell_fenicsx.output.report.report import write_report
+from magshell_fenicsx.output.store.durable import write_whole
+from magshell_fenicsx.output.store.folder import DiskError, by_first, held_folder
+from magshell_fenicsx.output.store.table import LOCATED, Row
+from magshell_fenicsx.platform.environment import fast_blas
+from magshell_fenicsx.run.files import MESH, RunFiles, open_folder
+from magshell_fenicsx.run.interrupt import Interrupted, Stoppable, Watch
+from magshell_fenicsx.run.modes import modes_after
+from magshell_fenicsx.run.rows import RowMaker
+from magshell_fenicsx.run.status import RunProgress, waiting
+from magshell_fenicsx.run.summary import Result, summary
+from magshell_fenicsx.simulate.adapt.choice import Adapted
+from magshell_fenicsx.simulate.adapt.ending import NoResult
+from magshell_fenicsx.simulate.adapt.tolerance import adapted
+from magshell_fenicsx.simulate.follow import Stopped, follow
+from magshell_fenicsx.simulate.scene import Scene
+from magshell_fenicsx.simulate.sensitivity import sensitivities
+
+__all__ = ["Result", "run"]
+
+Say = Callable[[str], None]
+
+
+def run(
+    case: Case,
+    out: Path | str | None = None,
+    comm: MPI.Comm = MPI.COMM_WORLD,
+    say: Say = lambda line: None,
+    *,
+    tell: Say | None = None,
+    resume: bool = False,
+    time_limit: float | None = None,
+) -> Result:
+    """Run a case.
+
+    With `out`, SIGTERM, SIGINT and SIGUSR1 end the run after the point being solved for, and it can be resumed.
+
+    Parameters
+    ----------
+    out
+        Folder for path.csv, summary.json, fields and pictures; None writes nothing.
+    say
+        Called with one line of text per accepted point, on rank 0.
+    tell
+        Called with a line on what the run is at, which replaces the one before, on rank 0.
+    resume
+        Go on with the run that was interrupted in `out`.
+    time_limit
+        Seconds after which the run ends in the same way.
+
+    Raises
+    ------
+    CaseError
+        If the case has a fault that shows only now, `out` cannot be written, or has nothing of this case to resume.
+    AlreadyComplete
+        If the run to be resumed is complete.
+    DiskError
+        If the disk is full before the first point.
+    """
+    start = time.perf_counter()
+    watch = Watch(comm, start, time_limit, signals=out is not None)
+    say, tell = (say, tell or _nobody) if comm.rank == 0 else (_nobody, _nobody)
+    if out is None:
+        return _run(case, None, comm, say, tell, watch, start)
+    with held_folder(Path(out), comm, make=not resume):
+        open_folder(Path(out), case, comm, resume)
+        return _run(case, Path(out), comm, say, tell, watch, start)
+
+
+def _nobody(line: str) -> None:
+    """Hears nothing."""
+
+
+def _run(case: Case, folder: Path | None, comm: MPI.Comm, say: Say, tell: Say, watch: Watch, start: float) -> Result:
+    """Run a case in a folder that is ready; `start` in seconds of the clock."""
+
+    def doing(what: str) -> None:
+        tell(waiting(what, time.perf_counter() - start))
+
+    found = _mesh_for_tolerance(case, folder, comm, say, doing)
+    doing("mesh and kernels")
+    scene = found.choice.scene(case, comm) if found else Scene(case, comm)
+    result = Result(scene, scene.unloaded(), adapted=found)
+    say(f"{', '.join(scene.plan.included)}: {scene.cells} cells, {scene.model.system.dofs} unknowns")
+    if fast_blas() is None:
+        say("warning: PETSc uses the reference BLAS; install OpenBLAS to factor seven times faster")
+    if comm.size == 1 and not has_cholmod():
+        say("warning: PETSc has no CHOLMOD, which factors tangents that are positive definite in half of the time")
+    files = RunFiles(folder, scene) if folder else None
+    if files and files.kept:
+        start -= files.elapsed
+        say(f"resuming after {files.kept} points")
+    interrupted: RuntimeError | None = None
+    scene.progress = progress = RunProgress(scene, tell, start)
+    with watch:
+        scene.journal = Stoppable(files.journal if files else NoJournal(), watch)
+        try:
+            _follow(result, files, say, progress, start)
+            result.sensitivities = _sensitivities(result)
+        except (Stopped, NoEigenpair) as e:
+            result.stopped = str(e)
+        except (Interrupted, DiskError) as e:
+            interrupted, result.stopped = e, str(e)
+        if files and folder:
+            result.replayed = files.journal.replayed
+            try:
+                files.summarise(summary(result, time.perf_counter() - start))
+                if not interrupted:  # who interrupts does not wait for pictures
+                    progress.doing("modes and pictures")
+                    with result.output:
+                        modes_after(result, folder, say)
+                        by_first(comm, partial(_draw, folder, say))
+                    files.summarise(summary(result, time.perf_counter() - start))  # with the time of the pictures
+                by_first(comm, partial(write_report, folder))
+            except DiskError as e:
+                interrupted = interrupted or e
+            files.close(complete=not interrupted and not result.stopped)
+    if interrupted:
+        go_on = f"; what was found is in {folder}/, and --resume goes on from there" if folder else ""
+        result.stopped = f"{interrupted}{go_on}"
+    return result
+
+
+def _draw(folder: Path, say: Say) -> None:
+    """Draw what is in the folder; without a screen to draw on, say so."""
+    try:
+        draw(folder)
+    except NoScreen as e:
+        say(f"warning: no pictures: {e}")
+
+
+def _mesh_for_tolerance(case: Case, folder: Path | None, comm: MPI.Comm, say: Say, doing: Say) -> Adapted | None:
+    """The mesh for the case's tolerance, kept in the folder for a run that is resumed; None for the default mesh."""
+    if case.mesh.tolerance is None:
+        return None
+    file = folder / MESH if folder else None
+    if file and (known := by_first(comm, lambda: file.read_bytes() if file.exists() else b"", "cannot be read")):
+        return Adapted.from_json(case, known)
+    try:
+        found = adapted(case, comm, say, doing)
+    except NoResult as e:
+        say(f"warning: the default mesh is taken, there is no result that the tolerance could be of: {e}")
+        return None
+    if file:
+        by_first(comm, partial(write_whole, file, found.to_json()))
+    return found
+
+
+def _sensitivities(result: Result) -> dict[str, float]:
+    """Of the fold that the run ended at, if the case asks for them."""
+    scene, loading, last = result.scene, result.scene.case.loading, result.rows[-1]
+    if not (isinstance(loading, PathSection) and loading.sensitivities and last["label"] == "fold"):
+        return {}
+    try:
+        fold = find_fold(scene.newton, Guess(result.last), str(last["amplitude"]))
+    except FoldLost as e:
+        raise Stopped(f"the fold cannot be polished for its sensitivities: {e}") from None
+    return sensitivities(scene, fold)
+
+
+def _follow(result: Result, files: RunFiles | None, say: Say, progress: RunProgress, start: float) -> None:
+    """The history of a scene, point by point."""
+    scene, made = result.scene, RowMaker(result.scene)
+    for record in follow(scene):
+        result.history.add(record)
+        row = made.row(record, time.perf_counter() - start)
+        result.rows.append(row)
+        result.last = record.point.state
+        if record.label in LOCATED:
+            result.singular[len(result.rows) - 1] = record.point.state
+        if files:
+            with result.output:
+                files.write(row, record.point.state)
+        known = files is not None and len(result.rows) <= files.kept
+        progress.accepted(row, known=known)
+        if not known:
+            say(_line(row))
+
+
+def _line(row: Row) -> str:
+    factor = row.get("load_factor")
+    load = f"FR/2piD {row['force']:9.5f}" if factor is None else f"load factor {factor:9.5f}"
+    return (
+        f"{row['point']:4d} {row['label']:>11}  lambda_m {row['lambda_m']:+.4e}  p/pc {row['p_over_pc']:.6f}  "
+        f"{load}  w/h {row['w_over_h']:8.4f}  pole {row['w_pole_over_h']:8.4f}  "
+        f"unstable {row['negative_pivots']}  it {row['iterations']}"
+    )

@@ -1,0 +1,143 @@
+"""What a run found, and summary.json."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from magshell_fenicsx.case.shell import ShellSection
+from magshell_fenicsx.case.surfaces import Surface
+from magshell_fenicsx.continuation.system import State
+from magshell_fenicsx.continuation.timing import Stopwatch
+from magshell_fenicsx.output.store.table import LOCATED, VALUE_COLUMN, Row
+from magshell_fenicsx.platform import sources
+from magshell_fenicsx.platform.environment import fast_blas, versions
+from magshell_fenicsx.simulate.adapt.choice import Adapted
+from magshell_fenicsx.simulate.adapt.ending import History, NoResult
+from magshell_fenicsx.simulate.scene import Scene
+
+
+@dataclass
+class Result:
+    """What a run found.
+
+    Attributes
+    ----------
+    rows
+        One mapping per accepted point, with the columns of path.csv.
+    last
+        The displacement and the amplitudes at the last point.
+    singular
+        The same at the located instabilities, by their row.
+    stopped
+        Why the run ended before its target; None if it reached it.
+    replayed
+        Number of solves that were taken from a checkpoint.
+    sensitivities
+        Of the amplitude at the fold that the run ended at, if the case asks for them; see `sensitivity`.
+    adapted
+        How the mesh was found, if the case has a tolerance.
+    history
+        What of the run `value` is taken from.
+    """
+
+    scene: Scene
+    last: State
+    rows: list[Row] = field(default_factory=list)
+    singular: dict[int, State] = field(default_factory=dict)
+    stopped: str | None = None
+    replayed: int = 0
+    sensitivities: dict[str, float] = field(default_factory=dict)
+    output: Stopwatch = field(default_factory=Stopwatch)
+    adapted: Adapted | None = None
+    history: History = field(default_factory=History)
+
+    @property
+    def limit_points(self) -> list[dict[str, Any]]:
+        """The located instabilities."""
+        return [
+            {
+                "amplitude": row["amplitude"],
+                "value": row[VALUE_COLUMN[str(row["amplitude"])]],
+                "p_over_pc": row["p_over_pc"],
+                "w_pole_over_h": row["w_pole_over_h"],
+                "kind": row["label"],
+                "mode": row["mode"],
+                "branch": row["branch"],
+                "load_error": row["load_error"],
+            }
+            for row in self.rows
+            if row["label"] in LOCATED
+        ]
+
+    @property
+    def knockdown(self) -> float | None:
+        """k_d: p/p_c at the first instability under pressure; None if there is none."""
+        points = (p for p in self.limit_points if p["amplitude"] == "pressure" and not p["branch"])
+        return next((float(p["value"]) for p in points), None)
+
+    @property
+    def value(self) -> float | None:
+        """The result that a tolerance is of; None if the run has none."""
+        try:
+            return self.history.ending(self.scene, self.stopped).value
+        except NoResult:
+            return None
+
+
+def summary(result: Result, total_s: float) -> dict[str, Any]:
+    """The content of summary.json."""
+    scene = result.scene
+    material, model, newton = scene.plan.material, scene.model, scene.newton
+    R_over_h = 1 / material.h
+    return {
+        "case": (result.adapted.asked if result.adapted else scene.case).model_dump(mode="json", exclude_none=True),
+        **scene.case.outside,
+        "sources": sources.ours(),
+        "dimensionless": {
+            "radius_to_thickness": R_over_h,
+            "poisson_ratio": material.nu,
+            "lambda_m": scene.case.lambda_m,
+            "Lambda_m": scene.case.lambda_m * R_over_h,
+            "pc_over_E": material.classical_pressure,
+            "energy_unit": "E h R^2",
+        },
+        "dimensions": _dimensions(scene.case.shell),
+        "model": {
+            "included": scene.plan.included,
+            "left_out": scene.plan.left_out,
+            "kernels": model.kernels.names,
+            "forms": len(model.kernels.names),
+            "penalty": model.sigma,
+        },
+        "stopped": result.stopped,
+        "limit_points": result.limit_points,
+        "sensitivities": result.sensitivities,
+        "knockdown": result.knockdown,
+        "most_excluded_pivots": max((int(row["excluded_pivots"]) for row in result.rows), default=0),
+        "points": len(result.rows),
+        "mesh": {"cells": scene.cells, "dofs": model.system.dofs, "degree": model.degree},
+        **({"tolerance": result.adapted.account(result.value)} if result.adapted else {}),
+        "timing": {
+            "jit_s": model.kernels.seconds,
+            "setup_s": scene.setup_s,
+            "assembly_s": model.system.assembly.seconds,
+            "factor_s": newton.factorisation.stopwatch.seconds,
+            "output_s": result.output.seconds,
+            "solve_s": newton.factorisation.solving.seconds,
+            "total_s": total_s,
+        },
+        "replayed": result.replayed,
+        "factorisations": newton.factorisation.count,
+        "iterations": newton.iterations,
+        "ranks": scene.comm.size,
+        "blas": fast_blas() or "reference",
+        "versions": versions(),
+    }
+
+
+def _dimensions(shell: ShellSection | Surface) -> dict[str, Any]:
+    """Of the shell, where the case has them: in SI, or all in units of its own."""
+    if isinstance(shell, ShellSection):
+        lengths, in_si = {"radius": shell.radius, "thickness": shell.thickness}, True
+    else:
+        lengths, in_si = {"radius": shell.reference, "thickness": shell.thickness}, shell.with_units
+    return {**lengths, "youngs_modulus": shell.youngs_modulus, "units": "SI" if in_si else "the case's own"}

@@ -1,0 +1,1 @@
+"""A case as a scene that can be followed, traced and differentiated."""

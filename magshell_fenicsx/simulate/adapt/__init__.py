@@ -1,0 +1,1 @@
+"""Meshes that reach a tolerance."""

@@ -1,0 +1,143 @@
+"""Fields of a scene as the polynomials that they are on its cells, and their values on another mesh of the same case.
+
+`transfer` smooths, and scales between shells of different shape. Here source and target have one
+chart: to a higher degree on the same mesh a displacement is carried without any loss.
+"""
+
+import basix
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from magshell_fenicsx.continuation.system import Vector
+from magshell_fenicsx.simulate.scene import Scene
+from magshell_fenicsx.simulate.transfer import chart
+
+Array = NDArray[np.float64]
+CANDIDATES = 12  # cells with the nearest centres, among which the one that holds a point is sought
+WIDER = 8  # times as many, where none of them does
+NEWTON_STEPS = 4  # for the place in a cell with a curved edge
+INSIDE = 1e-6  # in cells, of the distance from one that holds a point: rounding
+BESIDE = 0.1  # in cells, of a point between an edge of one mesh and the same edge of another, curved otherwise
+FAR = 1.0  # in cells, where a cell's own map is of no use
+
+
+class NotCarried(RuntimeError):
+    """A place of the one mesh is nowhere on the other."""
+
+
+def carry(source: Scene, target: Scene, u: Vector) -> Vector:
+    """A displacement of `source` in the unknowns of `target`, zero where that is held; collective.
+
+    Raises
+    ------
+    NotCarried
+        On every rank, if a node of `target` lies more than a tenth of a cell beside all cells of `source`.
+    """
+    fields, comm, x = CellFields.of(source), target.comm, chart(target)
+    cells, xi, beside = fields.places(x)
+    worst, place = max(
+        comm.allgather((float(beside.max(initial=0.0)), x[np.argmax(beside)].tolist() if len(x) else []))
+    )
+    if worst > BESIDE:
+        raise NotCarried(f"the place {place} of the chart is {worst:.2g} cells beside the other mesh")
+    return target.model.system.held(fields.at(gathered(source, u), cells, xi).ravel())
+
+
+def gathered(scene: Scene, u: Vector) -> Array:
+    """Values (cells, nodes, components) of a displacement on the cells of all ranks, on every rank; collective."""
+    system, V = scene.model.system, scene.model.V
+    system.set(u)
+    topology = V.mesh.topology
+    here = V.dofmap.list[: topology.index_map(topology.dim).size_local]
+    return np.concatenate(system.comm.allgather(system.u.x.array.reshape(-1, V.dofmap.bs)[here]))
+
+
+class CellFields:
+    """Cells in a chart, to find points in them.
+
+    Parameters
+    ----------
+    nodes
+        (cells, nodes, 1 or 2) in the chart; with them the element maps its reference cell to the chart.
+    """
+
+    def __init__(self, nodes: Array, element: basix.finite_element.FiniteElement) -> None:
+        self.nodes, self._element = nodes, element
+        self._near = scipy.spatial.cKDTree(self.centres)
+
+    @classmethod
+    def of(cls, scene: Scene) -> "CellFields":
+        """The cells of all ranks; collective."""
+        x = chart(scene)
+        dim, bs = x.shape[1], scene.model.V.dofmap.bs
+        nodes = gathered(scene, np.pad(x, ((0, 0), (0, bs - dim))).ravel())[..., :dim]
+        return cls(nodes, scene.model.V.element.basix_element)
+
+    @property
+    def centres(self) -> Array:
+        """(cells, 1 or 2)."""
+        return np.asarray(self._corners.mean(axis=1))
+
+    def at(self, values: Array, cells: NDArray[np.int64], xi: Array) -> Array:
+        """Of `gathered` values, those (n, components) at places of `places`."""
+        return np.asarray(np.einsum("np,npc->nc", self.table(0, xi)[0], values[cells]))
+
+    def places(self, x: Array) -> tuple[NDArray[np.int64], Array, Array]:
+        """The cells (n,) that hold points x (n, 1 or 2) of the chart, and where in the reference cell (n, 1 or 2).
+
+        Beside all cells the nearest is meant; the last (n,) says how far beside, in cells, else it is zero.
+        """
+        count = min(CANDIDATES, len(self.nodes))
+        candidates = self._near.query(x, count)[1].reshape(len(x), count)
+        straight = np.stack([_beside(self._as_if_straight(x, cells)) for cells in candidates.T])
+        cells = candidates[np.arange(len(x)), straight.argmin(axis=0)]
+        xi, beside = self._in_cells(x, cells)
+        enough = INSIDE
+        while len(far := np.flatnonzero(beside > enough)):  # the one that holds a point may be large, beside small ones
+            candidates = self._near.query(x[far], count)[1].reshape(len(far), count)
+            for tried in candidates.T:
+                there, off = self._in_cells(x[far], tried)
+                better = far[off < beside[far]]
+                cells[better], xi[better], beside[better] = (a[off < beside[far]] for a in (tried, there, off))
+            if count == len(self.nodes):
+                break
+            enough = INSIDE if count <= CANDIDATES else BESIDE
+            count = min(WIDER * count, len(self.nodes))
+        return cells, xi, np.where(beside > INSIDE, beside, 0.0)
+
+    def _in_cells(self, x: Array, cells: NDArray[np.int64]) -> tuple[Array, Array]:
+        """Places of points in the reference cells of given cells, and how far beside; inf where Newton fails."""
+        xi = self._as_if_straight(x, cells)
+        beside = np.full(len(x), np.inf)
+        near = np.flatnonzero(_beside(xi) < FAR)
+        x, nodes, inside = x[near], self.nodes[cells[near]], xi[near]
+        for _ in range(NEWTON_STEPS):
+            table = self.table(1, inside)
+            rest = x - np.einsum("np,npd->nd", table[0], nodes)
+            step = _solve(np.einsum("jnp,npd->ndj", table[1:], nodes), rest)
+            inside = inside + step
+        xi[near], beside[near] = inside, np.where(np.abs(step).max(axis=1) < INSIDE, _beside(inside), np.inf)
+        return xi, beside
+
+    def table(self, derivatives: int, xi: Array) -> Array:
+        """Shape functions and derivatives (derivative, n, nodes) at points of the reference cell."""
+        return np.asarray(self._element.tabulate(derivatives, xi)[..., 0])
+
+    @property
+    def _corners(self) -> Array:
+        return self.nodes[:, : self.nodes.shape[2] + 1]
+
+    def _as_if_straight(self, x: Array, cells: NDArray[np.int64]) -> Array:
+        """Places in the reference cell if the cells had straight edges."""
+        corners = self._corners[cells]
+        return _solve(np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2), x - corners[:, 0])
+
+
+def _beside(xi: Array) -> Array:
+    """How far places (n, 1 or 2) are beside the reference cell; negative inside."""
+    return np.asarray(np.maximum(-xi.min(axis=1), xi.sum(axis=1) - 1))
+
+
+def _solve(matrices: Array, right: Array) -> Array:
+    return np.asarray(np.linalg.solve(matrices, right[..., None])[..., 0])

@@ -1,0 +1,151 @@
+"""What a run ends at, and the same on another mesh, without its path."""
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from magshell_fenicsx.case.loading import DeadSection, IndentationSection, PathSection, PressureSection
+from magshell_fenicsx.continuation.control import GivenConjugate, GivenLoad, Row
+from magshell_fenicsx.continuation.fold import FoldLost, Guess, find_fold
+from magshell_fenicsx.continuation.system import State, System, Vector
+from magshell_fenicsx.simulate.adapt.carry import NotCarried, carry
+from magshell_fenicsx.simulate.follow import Record, Stopped, follow
+from magshell_fenicsx.simulate.scene import Scene
+
+
+class NoResult(RuntimeError):
+    """A run ends at nothing that could be compared on two meshes; the message says why."""
+
+
+@dataclass(frozen=True)
+class Ending:
+    """The end of a run.
+
+    Attributes
+    ----------
+    kind
+        A fold or a target, both solved for directly; another instability is found by its path only.
+    name
+        The amplitude that varied.
+    value
+        The result of the run. At an instability the amplitude; at a target the amplitude where the conjugate
+        displacement is prescribed (force at a depth, pressure at a volume), else the conjugate displacement.
+    tangent
+        Of the path, in u; the null vector at a fold. It weighs what an error of u does to the value.
+    held
+        The prescribed conjugate displacement; None where the load is prescribed.
+    """
+
+    kind: Literal["fold", "target", "instability"]
+    name: str
+    value: float
+    state: State
+    tangent: Vector
+    held: float | None = None
+
+
+@dataclass
+class History:
+    """What of a run's records its ending depends on."""
+
+    last: Record | None = None
+    located: list[Record] = field(default_factory=list)
+
+    def add(self, record: Record) -> None:
+        if record.branch:
+            return
+        if record.label in ("fold", "bifurcation"):
+            self.located.append(record)
+        else:
+            self.last = record
+
+    def ending(self, scene: Scene, stopped: str | None) -> Ending:
+        """The first instability, or the last where folds are passed, or the last target if that is the goal.
+
+        Raises
+        ------
+        NoResult
+            If the history stopped before its target and not at an instability, or has no load.
+        """
+        loading = scene.case.loading
+        until = loading.until if isinstance(loading, PathSection) else "target"
+        if until in ("target", "points") and not stopped and self.last and self.last.amplitude:
+            return _target(scene, self.last)
+        if not self.located:
+            raise NoResult(stopped or "the case has neither a load nor a field")
+        end = self.located[-1 if until == "bifurcation" else 0]
+        if end.amplitude not in end.point.state.mu:
+            raise NoResult("an instability of a turning field is not a single load")
+        own_fold = end.label == "fold" and not end.mode
+        value = end.point.state.mu[end.amplitude]
+        return Ending("fold" if own_fold else "instability", end.amplitude, value, end.point.state, end.point.du)
+
+
+def by_path(scene: Scene) -> Ending:
+    """The end of the whole history of a scene.
+
+    Raises
+    ------
+    NoResult
+        See `History.ending`.
+    """
+    history, stopped = History(), None
+    try:
+        for record in follow(scene):
+            history.add(record)
+    except Stopped as e:
+        stopped = str(e)
+    return history.ending(scene, stopped)
+
+
+def from_near(scene: Scene, source: Scene, near: Ending) -> Ending:
+    """The end of a scene by Newton's method from that of another mesh or degree; where that fails, by the path.
+
+    Raises
+    ------
+    NoResult
+        See `History.ending`.
+    """
+    if near.kind == "instability":
+        return by_path(scene)
+    try:
+        u, tangent = (carry(source, scene, v) for v in (near.state.u, near.tangent))
+    except NotCarried:
+        return by_path(scene)
+    guess = State(u, dict(near.state.mu))
+    is_fold = near.kind == "fold"
+    found = _fold(scene, Guess(guess, tangent), near.name) if is_fold else _equilibrium(scene, guess, near)
+    return found or by_path(scene)
+
+
+def _fold(scene: Scene, guess: Guess, name: str) -> Ending | None:
+    try:
+        fold = find_fold(scene.newton, guess, name)
+    except FoldLost:
+        return None
+    return None if fold.unstable else Ending("fold", name, fold.value, fold.state, fold.phi)
+
+
+def _equilibrium(scene: Scene, guess: State, near: Ending) -> Ending | None:
+    newton, system, name, held = scene.newton, scene.newton.system, near.name, near.held
+    row: Row = GivenLoad(guess.mu[name]) if held is None else GivenConjugate(system, name, held)
+    outcome = newton.solve(guess, name, row)
+    if not outcome.converged:
+        return None
+    state = outcome.state
+    tangent = newton.response(state, name, row, exact=True).du
+    return Ending("target", name, _value(system, state, name, held), state, tangent, held)
+
+
+def _target(scene: Scene, record: Record) -> Ending:
+    system, state, loading = scene.newton.system, record.point.state, scene.case.loading
+    name = "lambda_across" if record.amplitude == "angle" else record.amplitude
+    given = loading.pressure if isinstance(loading, PressureSection) else 0.0
+    if isinstance(loading, IndentationSection | DeadSection):
+        given = loading.force if isinstance(loading, IndentationSection) else loading.factor
+    given_load = given is not None
+    held = None if given_load else -system.potential(state.u, name)
+    return Ending("target", name, _value(system, state, name, held), state, record.point.du, held)
+
+
+def _value(system: System, state: State, name: str, held: float | None) -> float:
+    return state.mu[name] if held is not None else -system.potential(state.u, name)

@@ -1,0 +1,86 @@
+"""Where on a mesh the error of a result comes from.
+
+The result J of a run is an amplitude on a path of stationary points, or its conjugate displacement, so
+its first variation in the residual is the path's tangent z: J - J_h = a(e_u, e_z) up to higher order,
+with the tangent stiffness a and the errors e of u and z (dual weighted residuals: R. Becker, R. Rannacher,
+Acta Numerica 10, 2001). Cell by cell that is at most sqrt(|e_u|^2 |e_z|^2) in the energy norm. The
+errors are taken against a solution of higher degree on the same mesh.
+"""
+
+import basix
+import numpy as np
+from numpy.typing import NDArray
+
+from magshell_fenicsx.continuation.system import Vector, dot
+from magshell_fenicsx.models.shell.model import ShellModel
+from magshell_fenicsx.simulate.adapt.carry import CellFields, carry, gathered
+from magshell_fenicsx.simulate.adapt.ending import Ending
+from magshell_fenicsx.simulate.scene import Scene
+
+Array = NDArray[np.float64]
+
+
+def indicators(coarse: tuple[Scene, Ending], fine: tuple[Scene, Ending]) -> tuple[Array, Array]:
+    """Share of each cell in the error of the result, up to a factor; collective.
+
+    Parameters
+    ----------
+    coarse, fine
+        Scenes of one mesh, the second of higher degree, and their ends.
+
+    Returns
+    -------
+    Centres of the cells (n, 2) in the chart, in one order on any number of ranks, and their shares (n,).
+    """
+    (scene, low), (richer, high) = coarse, fine
+    cells, comm = CellFields.of(richer), richer.newton.system.comm
+    u, z = (carry(scene, richer, v) for v in (low.state.u, low.tangent))
+    scale = dot(comm, z, high.tangent) / dot(comm, z, z)  # null vectors have no size of their own
+    energy = _TangentEnergy(richer, cells, high.state.u)
+    shares = np.sqrt(energy(high.state.u - u) * energy(high.tangent - scale * z))
+    order = np.lexsort(cells.centres.round(9).T)
+    return cells.centres[order], shares[order]
+
+
+class _TangentEnergy:
+    """Membrane and bending energy of the linearised strains of a variation, cell by cell.
+
+    With the deformed a_i, n and a_i,j: dE_ij = sym(a_i . v,_j), dK_ij = n . (v,_ij - G^k_ij v,_k).
+    """
+
+    def __init__(self, scene: Scene, cells: CellFields, u: Vector) -> None:
+        model, self._scene = scene.model, scene
+        assert isinstance(model, ShellModel)
+        points, self._weights = basix.make_quadrature(basix.CellType.triangle, 2 * model.degree)
+        self._table = cells.table(2, points)
+        r0 = self._derivatives(model.r0.x.array[: model.system.size])
+        first, second = (a + b for a, b in zip(r0, self._derivatives(u), strict=True))
+        metric0, metric = (np.einsum("...ic,...jc->...ij", a, a) for a in (r0[0], first))
+        normal = np.cross(first[..., 0, :], first[..., 1, :])
+        self._normal = normal / np.linalg.norm(normal, axis=-1, keepdims=True)
+        self._a, self._raise = first, np.linalg.inv(metric0)
+        self._gamma = np.einsum("...ijc,...kc->...ijk", second, np.linalg.solve(metric, first))
+        self._area = np.sqrt(np.linalg.det(metric0))
+
+    def __call__(self, v: Vector) -> Array:
+        """(cells,), over E h R^2."""
+        material = self._scene.plan.material
+        first, second = self._derivatives(v)
+        E = np.einsum("...ic,...jc->...ij", self._a, first)
+        bent = second - np.einsum("...ijk,...kc->...ijc", self._gamma, first)
+        K = np.einsum("...c,...ijc->...ij", self._normal, bent)
+        membrane, bending = (self._square((S + np.swapaxes(S, -1, -2)) / 2, material.nu) for S in (E, K))
+        density = membrane / (2 * (1 - material.nu**2)) + material.bending_stiffness / 2 * bending
+        return np.asarray((density * self._area) @ self._weights)
+
+    def _derivatives(self, v: Vector) -> tuple[Array, Array]:
+        """First (cells, points, i, 3) and second (cells, points, i, j, 3) in the reference cell."""
+        d = np.einsum("jqp,npc->jnqc", self._table, gathered(self._scene, v))
+        second = np.stack([np.stack([d[3], d[4]], axis=-2), np.stack([d[4], d[5]], axis=-2)], axis=-3)
+        return np.stack([d[1], d[2]], axis=-2), second
+
+    def _square(self, S: Array, nu: float) -> Array:
+        """(1 - nu) S:S + nu tr^2 S."""
+        mixed = self._raise @ S
+        trace = np.trace(mixed, axis1=-2, axis2=-1)
+        return np.asarray((1 - nu) * np.einsum("...ij,...ji->...", mixed, mixed) + nu * trace**2)

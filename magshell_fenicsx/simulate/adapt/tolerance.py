@@ -1,0 +1,129 @@
+"""A mesh for a tolerance of the result: rounds of estimate and remesh, with one path in all.
+
+    (a) the whole path on a coarse mesh of degree 3, its end there with the degree that goes with the tolerance
+    (b) its end with one degree more: the change of the result estimates the error
+    (c) done if that is at most the tolerance and at least a fifth of it
+    (d) else a mesh on which all cells have equal shares in the error (`indicator`), with as many of them
+        as make the error 0.55 of the tolerance; its end by Newton's method from that of (b); on with (b)
+
+The meridian, where cells cost nothing, is refined as a whole. There, and on a surface of a few cells, the error
+may be far below a loose tolerance.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+from mpi4py import MPI
+
+from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.plan.limits import MOST_UNKNOWNS
+from magshell_fenicsx.simulate.adapt.choice import Adapted, Choice, Round
+from magshell_fenicsx.simulate.adapt.ending import Ending, NoResult, by_path, from_near
+from magshell_fenicsx.simulate.adapt.indicator import indicators
+from magshell_fenicsx.simulate.adapt.size import equidistributed
+from magshell_fenicsx.simulate.scene import Scene
+
+DEGREES = ((3e-3, 3), (2e-4, 4), (0.0, 5))  # down to a tolerance: the degree with which it takes the least time
+CHEAP = 3  # degree of the path
+FIRST = (0.5, 1.0, 2.0)  # refinements of the first mesh: the next if the path is lost on the one before
+SAFETY = 1.25  # the richer solution has an error too
+AIM, LEAST = 0.55, 1 / 5  # estimated error over the tolerance
+MOST_ROUNDS = 6
+COARSEST, FINEST = 0.1, 20.0  # refinement of a meridian
+FEW = 50  # cells of a surface that are not worth making fewer
+
+Say = Callable[[str], None]
+Solved = tuple[Scene, Ending]
+
+
+def adapted(case: Case, comm: MPI.Comm, say: Say = lambda line: None, doing: Say = lambda what: None) -> Adapted:
+    """Find a mesh on which the result of a case has an error below `mesh.tolerance`, relative; collective.
+
+    The result is that of `Ending`: k_d or the critical amplitude at an instability; at the last target the load,
+    or the displacement conjugate to a load that is given. It should not be zero.
+
+    Parameters
+    ----------
+    say
+        Called with one line of text per round.
+    doing
+        Called with a few words on what is about to be done.
+
+    Raises
+    ------
+    NoResult
+        If the case ends without a result on any first mesh.
+    """
+    tolerance = case.mesh.tolerance
+    assert tolerance is not None
+    doing(f"a mesh for the tolerance {tolerance:g}: the path on a coarse one")
+    choice, coarse = _first(case, comm)
+    for degree in range(CHEAP + 1, _degree(tolerance) + 1):
+        choice = Choice(degree, choice.refinement)
+        coarse = _moved(case, choice, coarse)
+    tried: list[tuple[Round, Choice]] = []
+    while True:
+        doing(f"a mesh for the tolerance {tolerance:g}: round {len(tried) + 1}, degree {choice.degree}, estimating")
+        fine = _moved(case, Choice(choice.degree + 1, choice.refinement, choice.size), coarse)
+        here = _judged(choice, coarse, fine)
+        tried.append((here, choice))
+        say(
+            f"tolerance {tolerance:g}: degree {here.degree}, {here.cells} cells, {here.dofs} unknowns: "
+            f"result {here.result:.9g}, estimated error {here.estimate:.1e}"
+        )
+        if LEAST * tolerance <= here.estimate <= tolerance or len(tried) == MOST_ROUNDS:
+            break
+        another = _remeshed(choice, coarse, fine, AIM * tolerance / here.estimate)
+        if another is None:
+            break
+        doing(f"a mesh for the tolerance {tolerance:g}: round {len(tried) + 1}, degree {another.degree}, solving")
+        choice, coarse = another, _moved(case, another, fine)
+    within = [t for t in tried if t[0].estimate <= tolerance]
+    best, choice = min(within, key=lambda t: t[0].dofs) if within else min(tried, key=lambda t: t[0].estimate)
+    if not within:
+        say(f"warning: no mesh was found for the tolerance; the least estimated error is {best.estimate:.1e}")
+    return Adapted(case, choice, best, [r for r, _ in tried])
+
+
+def _degree(tolerance: float) -> int:
+    return next(degree for least, degree in DEGREES if tolerance >= least)
+
+
+def _first(case: Case, comm: MPI.Comm) -> tuple[Choice, Solved]:
+    """The whole path on the coarsest mesh where it has an end."""
+    for refinement in FIRST:
+        choice = Choice(CHEAP, refinement)
+        scene = choice.scene(case, comm)
+        try:
+            return choice, (scene, by_path(scene))
+        except NoResult as e:
+            lost = e
+    raise lost
+
+
+def _moved(case: Case, choice: Choice, near: Solved) -> Solved:
+    scene = choice.scene(case, near[0].comm)
+    return scene, from_near(scene, *near)
+
+
+def _judged(choice: Choice, coarse: Solved, fine: Solved) -> Round:
+    (scene, low), (_, high) = coarse, fine
+    estimate = SAFETY * abs(high.value - low.value) / max(abs(high.value), np.finfo(float).tiny)
+    return Round(choice.degree, choice.refinement, scene.cells, scene.model.system.dofs, low.value, estimate)
+
+
+def _remeshed(choice: Choice, coarse: Solved, fine: Solved, reduction: float) -> Choice | None:
+    """The same degree on another mesh, for an error so many times the present one; None if there is none."""
+    scene, degree = coarse[0], choice.degree
+    order = 2 * degree - 2  # of an energy in the size of the cells
+    if scene.plan.axisymmetric:
+        finer = np.clip(choice.refinement * np.clip(reduction, 1e-3, 1e3) ** (-1 / order), COARSEST, FINEST)
+        refinement = round(float(finer), 3)
+        return Choice(degree, refinement) if refinement != choice.refinement else None
+    if reduction > 1 and scene.cells <= FEW:
+        return None
+    centres, shares = indicators(coarse, fine)
+    size, more = equidistributed(scene.plan.size, centres, shares, order, reduction, scene.plan.material.h)
+    if fine[0].model.system.dofs * more > MOST_UNKNOWNS / 2:  # on an estimate
+        return None
+    return Choice(degree, round(choice.refinement * more**0.5, 3), size)

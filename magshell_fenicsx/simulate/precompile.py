@@ -1,0 +1,63 @@
+"""Compile kernels ahead of time, for images and clusters without a compiler at run time.
+
+Those of hemispheres, of solids, and of any mid-surface under dead loads. Remanences by formula or in layers, fields
+with a gradient, other energies than the full one, and surfaces with kinks compile theirs on their first run.
+"""
+
+import time
+from collections.abc import Iterator
+from typing import Any
+
+from mpi4py import MPI
+
+from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.source import Source
+from magshell_fenicsx.simulate.scene import Scene
+
+HEMISPHERE = {
+    "shell": {"geometry": "hemisphere", "radius_to_thickness": 20, "poisson_ratio": 0.3},
+    "boundary": {"equator": "clamped"},
+    "magnetic": {"lambda_m": 1e-3},
+}
+SCENES = (
+    ("half", {"kind": "pressure"}),
+    ("axisymmetric", {"kind": "pressure"}),
+    ("half", {"kind": "indentation", "at": {"polar": 45}, "depth": 1, "patch": 5}),
+)
+SOLIDS = SCENES[::2]  # of one degree
+OCTANT: dict[str, Any] = {  # symmetric in three planes, each a kernel of its own
+    "shell": {"geometry": "cylinder", "radius": 1, "length": 1, "azimuth": [0, 90], "thickness": 0.05}
+    | {"youngs_modulus": 1, "poisson_ratio": 0.3},
+    "magnetic": {"lambda_m": 1e-3},
+    "boundary": {"left": "symmetry", "right": "symmetry", "bottom": "symmetry"},
+    "points": {"A": [1, 0, 0]},
+    "loading": {
+        "kind": "dead",
+        "factor": 1,
+        "loads": [
+            {"at": "A", "force": [1, 0, 0]},
+            {"edge": "top", "force": [0, 0, 1]},
+            {"edge": "top", "moment": 1},
+            {"over": "all", "per_area": [0, 0, 1]},
+            {"over": "all", "pressure": 1},
+        ],
+    },
+}
+
+
+def precompile(degree: int) -> float:
+    """Compile the kernels of shells of a degree, and of solids; the seconds that it took."""
+    start = time.perf_counter()
+    for data in _cases(degree):
+        scene = Scene(Case.from_source(Source("precompile", data)), MPI.COMM_WORLD)
+        scene.model.excluded_modes  # noqa: B018  (compiles theirs)
+    return time.perf_counter() - start
+
+
+def _cases(degree: int) -> Iterator[dict[str, Any]]:
+    for symmetry, loading in SCENES:
+        yield {**HEMISPHERE, "symmetry": symmetry, "loading": loading, "mesh": {"refinement": 0.5, "degree": degree}}
+    for symmetry, loading in SOLIDS:
+        yield {**HEMISPHERE, "model": "solid", "symmetry": symmetry, "loading": loading, "mesh": {"refinement": 0.5}}
+    for factor in ({}, {"thickness_factor": "1 + z/2"}):
+        yield {**OCTANT, "shell": {**OCTANT["shell"], **factor}, "mesh": {"size": 0.5, "degree": degree}}

@@ -1,0 +1,165 @@
+"""The composition root: from a case, build the mid-surface, the model and its solver."""
+
+import time
+from collections import defaultdict
+from collections.abc import Sequence
+from functools import cached_property
+from math import atan2, copysign, degrees, hypot, nan
+
+from mpi4py import MPI
+
+from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.shell import ShellSection
+from magshell_fenicsx.case.solid import SolidSection
+from magshell_fenicsx.continuation.journal import Journal, NoJournal
+from magshell_fenicsx.continuation.listener import NoProgress, Progress
+from magshell_fenicsx.continuation.newton import BorderedNewton
+from magshell_fenicsx.continuation.system import State
+from magshell_fenicsx.continuation.watch import Watch
+from magshell_fenicsx.mesh.hexahedra import sweep
+from magshell_fenicsx.mesh.midsurface import Midsurface, distribute
+from magshell_fenicsx.models.axisymmetric.meridian import make_meridian
+from magshell_fenicsx.models.axisymmetric.model import MeridianModel
+from magshell_fenicsx.models.shell.model import ShellModel
+from magshell_fenicsx.models.shell.own_term import OwnTerm
+from magshell_fenicsx.models.shell.supports import refuse_loose
+from magshell_fenicsx.models.solid.model import SolidModel
+from magshell_fenicsx.plan.charted import Plan, meridian_vertices, neo_hookean
+from magshell_fenicsx.plan.own_terms import plan_with
+from magshell_fenicsx.platform.first import from_first
+
+
+class Scene:
+    """A case ready to be solved.
+
+    Parameters
+    ----------
+    plan
+        What to make of the case; by default `plan_with` says.
+    terms
+        One's own energies, which a given plan has already (`Loads.own`). Their amplitudes are zero until a
+        state says otherwise, see `trace`.
+
+    Attributes
+    ----------
+    case, plan
+        What was asked for, and what was made of it.
+    model, newton
+        The shell as a system of terms, and the solver of its bordered systems.
+    journal, progress
+        Keeps what the solver finds, for a run that is interrupted; is told what the solver is at. Both are set by
+        whoever runs the scene.
+    setup_s
+        Seconds of building, without compiling kernels.
+    """
+
+    def __init__(
+        self,
+        case: Case,
+        comm: MPI.Comm = MPI.COMM_WORLD,
+        plan: Plan | None = None,
+        *,
+        terms: Sequence[OwnTerm] = (),
+    ) -> None:
+        start = time.perf_counter()
+        self.case, self.plan, self.comm = case, plan or plan_with(case, terms), comm
+        self.model: ShellModel | MeridianModel | SolidModel
+        if self.plan.axisymmetric:
+            self.model = build_meridian_model(case, self.plan)
+        elif case.model == "solid":
+            self.model = build_solid_model(case, self.plan, comm)
+        else:
+            self.model = build_model(case, self.plan, comm)
+            if not isinstance(case.shell, ShellSection):
+                refuse_loose(self.model.system, self.model.r0, self.unloaded().mu)
+        self.newton = BorderedNewton(self.model.system)
+        self.journal: Journal = NoJournal()
+        self.progress: Progress = NoProgress()
+        self.setup_s = time.perf_counter() - start - self.model.kernels.seconds
+
+    @property
+    def cells(self) -> int:
+        topology = self.model.V.mesh.topology
+        return int(topology.index_map(topology.dim).size_global)
+
+    @cached_property
+    def watch(self) -> Watch:
+        """Looks at the modes that the model excludes, along its paths. Compiles their kernels."""
+        return Watch(self.model.excluded_modes)
+
+    def unloaded(self) -> State:
+        """The undeformed shell with all amplitudes zero."""
+        amplitudes = {t.amplitude for t in self.model.system.terms if t.amplitude}
+        return State(self.model.zero(), dict.fromkeys(sorted(amplitudes), 0.0))
+
+    def observe(self, state: State) -> dict[str, float]:
+        """The physical columns of a table row: loads, displacements over h, volume, energies over E h R^2."""
+        model, h, force = self.model, self.plan.material.h, self.model.loads.force
+        pole = model.deflection(state.u, "pole") / h
+        potentials, energies = model.system.energies(state.u), defaultdict[str, float](float)
+        for t in model.system.terms:
+            amplitude = state.mu[t.amplitude] if t.amplitude else 1.0
+            energies[t.name.removesuffix(" across")] += model.multiplicity * amplitude * potentials[t.name]
+        along, across = state.mu.get("lambda_m", 0.0), state.mu.get("lambda_across", 0.0)
+        sense, split = copysign(1.0, self.case.lambda_m), "membrane" in energies  # of which a solid knows nothing
+        return {
+            "p_over_pc": state.mu.get("pressure", 0.0),
+            "lambda_m": sense * hypot(along, across) if across else along,
+            "field_angle": degrees(atan2(sense * across, sense * along)) if across else 0.0,
+            "force": state.mu.get("force", 0.0),
+            "w_over_h": model.loaded_deflection(state.u) / h if force or model.loads.dead else pole,
+            "w_pole_over_h": pole,
+            "w_point_over_h": model.deflection(state.u, force.point) / h if force else pole,
+            "volume_change": model.volume_change(state.u),
+            "energy": sum(energies.values()),
+            "stretching": energies["membrane"] if split else nan,
+            "bending": sum(v for name, v in energies.items() if name == "bending" or name.endswith(" edges"))
+            if split
+            else nan,
+            "magnetic": sum(energies[name] for name in ("magnetic", "magnetic gradient", "U1", "Uq", "Utau", "couple")),
+            **{name: energies[name] for name in ("U1", "Uq", "Utau")},
+            **self._observe_points(state),
+            **{term.name: state.mu[term.name] for term in self.plan.loads.own},
+        }
+
+    @property
+    def extra_columns(self) -> tuple[str, ...]:
+        """What `observe` tells besides the columns of every run."""
+        named = tuple(f"{point}_u{axis}" for point in self.case.points for axis in "xyz")
+        own = (term.name for term in self.plan.loads.own)
+        return (*(["load_factor"] if self.plan.loads.dead else []), *named, *own)
+
+    def _observe_points(self, state: State) -> dict[str, float]:
+        """The load factor, and the displacements of named points in the unit of the shell's lengths."""
+        found = {"load_factor": state.mu["load"]} if self.plan.loads.dead else {}
+        for point in self.case.points:
+            assert isinstance(self.model, ShellModel)
+            u = self.plan.length * self.model.displacement(state.u, point)
+            found |= {f"{point}_u{axis}": float(c) for axis, c in zip("xyz", u, strict=True)}
+        return found
+
+
+def build_model(case: Case, plan: Plan, comm: MPI.Comm) -> ShellModel:
+    """The whole shell or half of it, on all ranks together."""
+    surface = build_midsurface(plan, comm)
+    return ShellModel(
+        surface, plan.material, case.mesh.degree, plan.conditions, plan.loads, case.mesh.penalty, plan.thickness
+    )
+
+
+def build_meridian_model(case: Case, plan: Plan) -> MeridianModel:
+    """The meridian, whole on every rank."""
+    meridian = make_meridian(plan.embedding, meridian_vertices(plan, case.mesh.refinement))
+    condition = plan.conditions["rim"]
+    return MeridianModel(meridian, plan.material, case.mesh.degree, condition, plan.loads, case.mesh.penalty)
+
+
+def build_solid_model(case: Case, plan: Plan, comm: MPI.Comm) -> SolidModel:
+    """The whole body or half of it, on all ranks together."""
+    body = sweep(from_first(comm, plan.triangulated), plan.material.h, (case.solid or SolidSection()).layers, comm)
+    return SolidModel(body, plan.material, neo_hookean(case), plan.conditions, plan.loads)
+
+
+def build_midsurface(plan: Plan, comm: MPI.Comm) -> Midsurface:
+    """Triangulate on rank 0, distribute to all."""
+    return distribute(from_first(comm, plan.triangulated), comm)

@@ -1,0 +1,140 @@
+"""How the amplitude at a fold, the buckling pressure for instance, depends on everything else.
+
+To first order d mu*/dp = -(phi . R_p)/(phi . R_mu): one dot product for each parameter p.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from dolfinx.la import InsertMode
+
+from magshell_fenicsx.assembly.kernels import KernelLog
+from magshell_fenicsx.assembly.terms import FormTerm
+from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.continuation.fold import Fold, Guess, find_fold, sensitivity
+from magshell_fenicsx.continuation.system import State, Vector
+from magshell_fenicsx.models.axisymmetric import jets
+from magshell_fenicsx.models.axisymmetric.energies import EnergyFactory
+from magshell_fenicsx.models.axisymmetric.model import MeridianModel
+from magshell_fenicsx.models.shell.model import ShellModel
+from magshell_fenicsx.models.shell.parameters import Magnetisation
+from magshell_fenicsx.models.shell.patterns import Array, InsideAndOutside, Pattern
+from magshell_fenicsx.models.shell.terms import TermFactory
+from magshell_fenicsx.simulate.follow import Record
+from magshell_fenicsx.simulate.scene import Scene
+from magshell_fenicsx.simulate.transfer import same_mesh, transfer
+
+DEFECT = "defect.amplitude"
+DEFECT_STEP = 1e-3  # in delta/h; central differences of a smooth residual
+
+
+def fold_at(scene: Scene, record: Record) -> Fold:
+    """The fold of a record that is labelled so, with its null vector; collective.
+
+    Raises
+    ------
+    ValueError
+        If it is none.
+    FoldLost
+        If Newton's method for the fold fails.
+    """
+    if record.label != "fold":
+        raise ValueError(f"this record is no fold, but a {record.label}")
+    return find_fold(scene.newton, Guess(record.point.state), record.amplitude)
+
+
+def sensitivities(scene: Scene, fold: Fold) -> dict[str, float]:
+    """Derivatives of a fold's amplitude (p/p_c for pressure, so d k_d); collective.
+
+    Returns
+    -------
+    By name of what varies, the rest being fixed:
+
+    - every other amplitude of the scene ("lambda_m", "force", that of one's own term, ...);
+    - "defect.amplitude": the dimple's depth delta/h;
+    - "remanence dimple", "remanence rest": a relative change of the remanence of one patch, within the
+      dimple's rim or outside it ("remanence" where there is no dimple). Their sum is lambda_m times
+      the derivative in lambda_m.
+    """
+    system, state = scene.model.system, fold.state
+    columns = {name: system.load(state.u, name) for name in state.mu if name != fold.name}
+    columns |= _remanence_columns(scene, fold)
+    found = {name: sensitivity(system, fold, column) for name, column in columns.items()}
+    return found | ({DEFECT: _to_defect(scene, fold)} if scene.case.shell.defect else {})
+
+
+def _to_defect(scene: Scene, fold: Fold) -> float:
+    """By central differences of the residual: the mesh does not depend on delta, only r0 on it does."""
+
+    def out_of_balance(change: float) -> float:
+        other = Scene(deepened(scene.case, change), scene.comm, terms=scene.plan.loads.own)
+        assert same_mesh(scene, other)
+        u, phi = (transfer(scene, other, v) for v in (fold.state.u, fold.phi))
+        moved = replace(fold, state=State(u, fold.state.mu), phi=phi)
+        return sensitivity(other.model.system, moved, other.model.system.residual(u, fold.state.mu))
+
+    return (out_of_balance(DEFECT_STEP) - out_of_balance(-DEFECT_STEP)) / (2 * DEFECT_STEP)
+
+
+def deepened(case: Case, change: float) -> Case:
+    """The case with its dimple deeper by `change` thicknesses."""
+    assert case.shell.defect
+    defect = case.shell.defect.model_copy(update={"amplitude": case.shell.defect.amplitude + change})
+    return case.model_copy(update={"shell": case.shell.model_copy(update={"defect": defect})})
+
+
+@dataclass(frozen=True)
+class _Within:
+    """A remanence in one patch, zero elsewhere."""
+
+    whole: Array | Pattern
+    patch: InsideAndOutside
+
+    def __call__(self, r0: Array, n0: Array) -> Array:
+        vectors = self.whole(r0, n0) if callable(self.whole) else self.whole
+        return np.asarray(vectors * self.patch(r0, n0))
+
+
+def _remanence_columns(scene: Scene, fold: Fold) -> dict[str, Vector]:
+    """mu_i dPi_i/du of the magnetic terms, with the remanence of one patch only."""
+    field = scene.model.loads.magnetic
+    if field is None:
+        return {}
+    if not scene.case.shell.defect:
+        return {"remanence": _magnetic_column(scene, fold, field)}
+    rim, one = scene.case.charted.dimple_half_width, np.ones(3)
+    patches = {"dimple": InsideAndOutside(rim, one, 0 * one), "rest": InsideAndOutside(rim, 0 * one, one)}
+    return {
+        f"remanence {name}": _magnetic_column(scene, fold, replace(field, remanent=_Within(field.remanent, patch)))
+        for name, patch in patches.items()
+    }
+
+
+def _magnetic_column(scene: Scene, fold: Fold, field: Magnetisation) -> Vector:
+    model, system = scene.model, scene.model.system
+    terms = _magnetic_terms(scene, field)
+    system.set(fold.state.u)
+    column = system.u.copy()
+    column.x.array[:] = 0
+    for term in terms:
+        assert term.amplitude
+        term.add_residual(column.x.array, fold.state.mu[term.amplitude])
+    column.x.scatter_reverse(InsertMode.add)
+    for held in system.clamped:
+        held.set(column.x.array)
+    return np.array(column.x.array[: model.system.size])
+
+
+def _magnetic_terms(scene: Scene, field: Magnetisation) -> Sequence[FormTerm]:
+    """The model's magnetic terms with another remanence."""
+    model, log = scene.model, KernelLog()
+    if isinstance(model, MeridianModel):
+        factory = EnergyFactory(model.meridian, model.r0, model.material, model.sigma, model.degree)
+        u = jets.revolved(model.u)
+        return [
+            FormTerm(e.name, 2 * np.pi * e.of(u), model.u, log, e.amplitude, linear=e.linear)
+            for e in factory.magnetic(field)
+        ]
+    assert isinstance(model, ShellModel)  # the case refuses a solid's
+    return TermFactory(model.r0, model.u, model.material, model.sigma, model.degree, log).magnetic(field)

@@ -1,0 +1,86 @@
+"""A path in any amplitude of a scene, from any state: what a notebook steps through."""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from magshell_fenicsx.continuation.control import GivenLoad
+from magshell_fenicsx.continuation.path import SEEN, Control, StepOptions
+from magshell_fenicsx.continuation.system import State, max_abs
+from magshell_fenicsx.continuation.walk import MOST_STEPS, Goal, Quantity, Until
+from magshell_fenicsx.simulate.follow import Record, Stopped, begin, followed
+from magshell_fenicsx.simulate.scene import Scene
+
+
+def trace(
+    scene: Scene,
+    name: str,
+    start: Record | State | None = None,
+    *,
+    control: Control = "arc",
+    until: Until = "limit",
+    targets: Sequence[float] = (),
+    quantity: Quantity = "load",
+    first: float | None = None,
+    steps: int = MOST_STEPS,
+) -> Iterator[Record]:
+    """Follow the equilibria of a scene while one amplitude varies and the others stay.
+
+    The first record is the start, brought into equilibrium by Newton's method at its own amplitudes. As in `follow`,
+    the last may be an instability that a reduced model excludes (`Record.mode`) and that was passed on the way.
+
+    Parameters
+    ----------
+    name
+        The amplitude: "pressure" (p/p_c), "force" (F R/(2 pi D)), "lambda_m", "load", or that of one's own term.
+    start
+        A point found before, or a state; by default the undeformed shell with all amplitudes zero.
+    control
+        "load": the amplitude is given; "conjugate": the displacement conjugate to it, -Pi_i(u), is
+        (`scene.model.system.potential` tells Pi_i); "arc": by arc length, through folds of both.
+    until
+        Where it ends, see `Goal`: "limit" at the first instability or at the last target, "bifurcation",
+        "target" at the last target, "points" after so many steps.
+    targets
+        Values that shall be met: of what is given or, by arc length, of `quantity`.
+    quantity
+        "load": the amplitude; "conjugate": -Pi_i(u). Only by arc length.
+    first
+        Change of the amplitude in the first step, whose sign is the direction. By default a tenth of the
+        way to the last target of what is given; by arc length towards conjugate displacements there is none.
+    steps
+        The most that are tried, or with "points" those that are asked for.
+
+    Raises
+    ------
+    ValueError
+        If the scene has no such amplitude, or nothing says how long the first step is.
+    Stopped
+        If the path is lost, or there is no equilibrium to start from.
+    """
+    state = start.point.state if isinstance(start, Record) else start or scene.unloaded()
+    if name not in state.mu:
+        raise ValueError(f"trace: {name}: the scene has no such amplitude, only {', '.join(state.mu) or 'none'}")
+    of_load = control == "load" or (control == "arc" and quantity == "load")
+    if until == "target" and not targets:
+        raise ValueError("trace: until='target' needs targets")
+    if first is None and targets and of_load:
+        first = (targets[-1] - state.mu[name]) / 10
+    if first is None and targets and control == "conjugate":
+        first = 1.0  # the targets say how long a step is
+    if not first:
+        raise ValueError(f"trace: {name}: give first, the change of the amplitude in the first step, not zero")
+    rest = scene.newton.solve(state, name, GivenLoad(state.mu[name]))
+    if not rest.converged:
+        raise Stopped(f"there is no equilibrium to start from near the given state: {rest.reason}")
+    if control == "conjugate":
+        moved = scene.newton.response(rest.state, name, GivenLoad(0.0), exact=True).du
+        if max_abs(scene.newton.system.comm, moved) * abs(first) < SEEN * scene.newton.system.length:
+            raise Stopped(f"{name} moves nothing at the start, so nothing is conjugate to it: follow it by arc length")
+    path, here = begin(scene, name, control, rest.state, first, 10 * first)
+    if targets and control == "conjugate":
+        step = abs(targets[-1] - here.s) / 10
+        path.options = StepOptions(step, 2 * step, 1e-5 * step)
+    sense = float(np.copysign(1.0, first * here.dmu))
+    yield Record("start", "", here)
+    yield from followed(scene, path, here, Goal(until, targets, quantity, steps, sense))

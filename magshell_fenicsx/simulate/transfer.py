@@ -1,0 +1,158 @@
+"""Carrying displacements from one scene to another with the same kind of model, as a first guess there."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy
+from mpi4py import MPI
+from numpy.typing import NDArray
+
+from magshell_fenicsx.continuation.system import Vector
+from magshell_fenicsx.mesh.sphere import SphereEmbedding
+from magshell_fenicsx.models.axisymmetric.model import MeridianModel
+from magshell_fenicsx.models.solid.model import SolidModel
+from magshell_fenicsx.simulate.scene import Scene
+
+Array = NDArray[np.float64]
+NEIGHBOURS = {1: 10, 2: 40}  # nodes that a value is interpolated from, by dimension of the chart
+TINY = 1e-300  # the pole, where a direction is divided by its length, stays where it is
+ROUNDING = 1e-9
+EQUATOR = np.pi / 2
+
+
+def transfer(source: Scene, target: Scene, u: Vector) -> Vector:
+    """A displacement of one scene in the unknowns of another; collective.
+
+    On the same mesh it is copied. Else it is interpolated in the chart and scaled like the thickness or,
+    on dimpled hemispheres, like a shallow shell: see `_Stretch`.
+
+    Parameters
+    ----------
+    u
+        Owned degrees of freedom of `source`.
+
+    Returns
+    -------
+    Owned degrees of freedom of `target`, zero where it is held.
+    """
+    comm, system = source.model.system.comm, target.model.system
+    values = np.concatenate(comm.allgather(u.reshape(-1, source.model.V.dofmap.bs)))
+    matching = _matching(source, target)
+    if matching is not None:
+        return np.asarray(values[matching].ravel())
+    nodes, wanted, stretch = _all_nodes(source), chart(target), _stretch(source, target)
+    if stretch:
+        moved = stretch.turn(_interpolated(nodes, values, stretch.place(wanted), stretch.source_rim), wanted)
+    else:
+        scale = system.length / source.model.system.length
+        moved = np.asarray(scale * _interpolated(nodes, values, wanted, np.inf))
+    return system.held(moved.ravel())
+
+
+def _interpolated(nodes: Array, values: Array, x: Array, rim: float) -> Array:
+    """Values at x (n, 1 or 2), on either side of the rim from the nodes of that side: derivatives jump there."""
+    found: Array = np.zeros((len(x), values.shape[1]))
+    from_pole, polar = np.linalg.norm(nodes, axis=1), np.linalg.norm(x, axis=1)
+    inside = from_pole < rim * (1 + ROUNDING), polar < rim * (1 + ROUNDING)
+    outside = from_pole > rim * (1 - ROUNDING), polar > rim * (1 - ROUNDING)
+    for here, wanted in (inside, outside):
+        if wanted.any():
+            neighbours = NEIGHBOURS[nodes.shape[1]]
+            field = scipy.interpolate.RBFInterpolator(
+                nodes[here], values[here], neighbors=neighbours, kernel="quintic", degree=3
+            )
+            found[wanted] = field(x[wanted])
+    return found
+
+
+def same_mesh(source: Scene, target: Scene) -> bool:
+    """Whether both have the same nodes, in whatever order and on whatever ranks; collective."""
+    return _matching(source, target) is not None
+
+
+def _matching(source: Scene, target: Scene) -> NDArray[np.int64] | None:
+    """For each node of this rank its number among all nodes of the source; None, on all ranks, if the nodes differ."""
+    comm, nodes, wanted = source.model.system.comm, _all_nodes(source), chart(target)
+    distance, number = scipy.spatial.cKDTree(nodes).query(wanted)
+    equal = comm.allreduce(len(wanted)) == len(nodes) and comm.allreduce(distance.max(initial=0.0), MPI.MAX) < ROUNDING
+    return np.asarray(number) if equal else None
+
+
+@dataclass(frozen=True)
+class _Stretch:
+    """From the chart of a dimpled hemisphere to that of another, whose rim is at other polar angle.
+
+    The charts are similar up to the rim, and equal at the equator. With the ratio q of the rims, displacements
+    across the surface are scaled by q^2 and those along it by q^3: so do the strains u_n/R + u_t,s + u_n,s^2/2
+    of a shallow shell keep their shape. What is out of proportion in them, Newton's method forgives least.
+    """
+
+    rim: float
+    source_rim: float
+
+    def place(self, x: Array) -> Array:
+        """Where the source has the points x (n, 1 or 2) of the target."""
+        polar = np.linalg.norm(x, axis=1, keepdims=True)
+        return np.asarray(x * self._polar(polar) / np.maximum(polar, TINY))
+
+    def turn(self, u: Array, x: Array) -> Array:
+        """Displacements (n, 2 or 3) of the source at the places of x, turned and stretched along the surface."""
+        polar = np.linalg.norm(x, axis=1, keepdims=True)
+        azimuth = x / np.maximum(polar, TINY) if x.shape[1] == 2 else np.ones_like(polar)
+        there, here = _frame(self._polar(polar), azimuth), _frame(polar, azimuth)
+        across, along = (np.sum(u * e, axis=1, keepdims=True) for e in there)
+        sideways = u - across * there[0] - along * there[1]
+        ratio = self.rim / self.source_rim
+        return np.asarray(ratio**2 * (across * here[0] + (along * here[1] + sideways) / self._slope(polar)))
+
+    def _polar(self, polar: Array) -> Array:
+        t = self._beyond(polar)
+        ratio = self.source_rim / self.rim
+        return np.asarray(np.clip(ratio * polar + (1 - ratio) * EQUATOR * t**2, 0, EQUATOR))
+
+    def _slope(self, polar: Array) -> Array:
+        ratio = self.source_rim / self.rim
+        slope = ratio + (1 - ratio) * EQUATOR * 2 * self._beyond(polar) / (EQUATOR - self.rim)
+        return np.asarray(np.maximum(slope, 0.5))
+
+    def _beyond(self, polar: Array) -> Array:
+        """0 up to the rim, 1 at the equator."""
+        return np.asarray(np.maximum((polar - self.rim) / (EQUATOR - self.rim), 0.0))
+
+
+def _frame(polar: Array, azimuth: Array) -> tuple[Array, Array]:
+    """Unit vectors of the sphere, across it and along its meridians, for directions of the azimuth (n, 1 or 2)."""
+    return np.hstack([np.sin(polar) * azimuth, np.cos(polar)]), np.hstack([np.cos(polar) * azimuth, -np.sin(polar)])
+
+
+def _stretch(source: Scene, target: Scene) -> _Stretch | None:
+    """None where the charts are compared as they are."""
+    rims = []
+    for scene in (target, source):
+        embedding = scene.plan.embedding
+        if not isinstance(embedding, SphereEmbedding) or embedding.defect is None:
+            return None
+        rims.append(embedding.defect.phi_o)
+    return _Stretch(*rims)
+
+
+def _all_nodes(scene: Scene) -> Array:
+    """The nodes of all ranks in the chart."""
+    return np.concatenate(scene.model.system.comm.allgather(chart(scene)))
+
+
+def chart(scene: Scene) -> Array:
+    """Coordinates (n, 1 or 2) of this rank's nodes in the chart, where a defect does not move them.
+
+    Of a solid their places (n, 3): its displacements are carried to the same mesh only.
+    """
+    model = scene.model
+    if isinstance(model, MeridianModel):
+        return np.asarray(model.V.tabulate_dof_coordinates()[:, :1])
+    r0: Array = model.r0.x.array[: model.system.size].reshape(-1, 3)
+    if isinstance(model, SolidModel):
+        return r0
+    if not isinstance(scene.plan.embedding, SphereEmbedding):
+        return r0[:, :2]
+    across = np.hypot(r0[:, 0], r0[:, 1])[:, None]
+    return np.asarray(r0[:, :2] * np.arctan2(across, r0[:, 2:]) / np.maximum(across, TINY))

@@ -1,0 +1,1 @@
+"""The shell beside the solid, or one case beside another."""

@@ -1,0 +1,105 @@
+"""Curve against curve, and the one number that a run is judged by."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from magshell_fenicsx.studies.compare.runs import ModelRun
+from magshell_fenicsx.studies.study.scalar import Scalar
+
+W = "w"  # the displacement in the middle of the thickness since the end of the field
+# amplitude -> column of the displacement, column of the load
+AXES = {
+    "pressure": ("w_pole_over_h", "p_over_pc"),
+    "force": ("w_point_over_h", "force"),
+    "lambda_m": ("w_pole_over_h", "lambda_m"),
+}
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Loads of both models at the same displacement."""
+
+    w_over_h: float
+    shell: float
+    solid: float
+
+    @property
+    def relative(self) -> float:
+        """Of the solid from the shell."""
+        return self.solid / self.shell - 1
+
+
+def amplitude_of(run: ModelRun) -> str:
+    """What the path's last part varied."""
+    return run.rows[-1]["amplitude"]
+
+
+def curve(run: ModelRun) -> tuple[list[float], list[float]]:
+    """Displacement and load along that part, without branches."""
+    y = AXES[amplitude_of(run)][1]
+    return [float(row[W]) for row in loaded(run)], [float(row[y]) for row in loaded(run)]
+
+
+def loaded(run: ModelRun) -> list[dict[str, str]]:
+    """The rows of that part after the last one before it, with the displacement since then.
+
+    The field moves a solid's middle more than a shell's: it also stretches the thickness, nu lambda_m R/h of w/h.
+    """
+    amplitude = amplitude_of(run)
+    x = AXES[amplitude][0]
+    first = next(i for i, row in enumerate(run.rows) if row["amplitude"] == amplitude)
+    before = run.rows[max(first - 1, 0)]
+    part = [before, *(row for row in run.rows[first:] if row["amplitude"] == amplitude and row["branch"] == "0")]
+    return [{**row, W: repr(float(row[x]) - float(before[x]))} for row in part]
+
+
+def places(runs: Sequence[ModelRun]) -> list[float]:
+    """The whole thicknesses that all runs come to, or the last displacement below the first.
+
+    None where a run has no targets: between the long steps of its own a curve is not known well enough.
+    """
+    if not all(any(row["label"] == "target" for row in loaded(run)) for run in runs):
+        return []
+    end = min(max(curve(run)[0]) for run in runs)
+    return [float(w) for w in range(1, int(end + 1e-6) + 1)] or [end]
+
+
+def differences(shell: ModelRun, solid: ModelRun) -> list[Difference]:
+    """At the displacements that both come to."""
+    found = []
+    for place in places([shell, solid]):
+        loads = [load_at(run, place) for run in (shell, solid)]
+        if loads[0] is not None and loads[1] is not None:
+            found.append(Difference(place, loads[0], loads[1]))
+    return found
+
+
+def load_at(run: ModelRun, w: float) -> float | None:
+    """The load at a displacement; None if the run does not come there."""
+    return Scalar("", AXES[amplitude_of(run)][1], W, w).of(run.summary, loaded(run))
+
+
+def judged(runs: Sequence[ModelRun], at: float | None) -> tuple[str, list[float | None]]:
+    """What runs are compared by, and its values: k_d if all have one, else the load at a displacement."""
+    if all(run.summary["knockdown"] is not None for run in runs):
+        return "knockdown", [float(run.summary["knockdown"]) for run in runs]
+    if at is None:
+        return "nothing", [None for _ in runs]
+    return f"{AXES[amplitude_of(runs[0])][1]} at w/h = {at:g}", [load_at(run, at) for run in runs]
+
+
+def time_at(error: float, runs: Sequence[tuple[float, float]]) -> float | None:
+    """Seconds to an error, interpolated between runs (error, seconds); None if it is not among them.
+
+    Examples
+    --------
+    >>> round(time_at(0.01, [(0.1, 1.0), (0.001, 100.0)]), 9)
+    10.0
+    """
+    ordered = sorted((e, s) for e, s in runs if e > 0)
+    if not ordered or not ordered[0][0] <= error <= ordered[-1][0]:
+        return None
+    e, s = np.log(np.array(ordered)).T
+    return float(np.exp(np.interp(np.log(error), e, s)))

@@ -1,0 +1,84 @@
+"""One model of a case as a process of its own, kept in a folder."""
+
+import csv
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from magshell_fenicsx.output.store.durable import write_whole
+from magshell_fenicsx.platform import sources
+from magshell_fenicsx.studies.study.measure import measure
+
+ModelName = Literal["shell", "solid"]
+MODELS: tuple[ModelName, ...] = ("shell", "solid")
+
+
+@dataclass(frozen=True)
+class ModelRun:
+    """What a run left.
+
+    Attributes
+    ----------
+    refinement
+        Divides the element sizes of its model.
+    summary, rows
+        The content of summary.json and of path.csv.
+    cpu_s, wall_s
+        Of the process, without the compilation of kernels.
+    """
+
+    model: ModelName
+    refinement: float
+    summary: dict[str, Any]
+    rows: list[dict[str, str]]
+    cpu_s: float
+    wall_s: float
+
+    @property
+    def dofs(self) -> int:
+        return int(self.summary["mesh"]["dofs"])
+
+
+class NothingLeft(RuntimeError):
+    """A run left no results; the message says why."""
+
+
+def run_model(
+    case: Path,
+    settings: Sequence[str],
+    model: ModelName,
+    refinement: float,
+    folder: Path,
+    say: Callable[[str], None] = print,
+) -> ModelRun:
+    """Run a case with one of the models, unless the folder has that run, of the same sources.
+
+    Raises
+    ------
+    NothingLeft
+        If there is nothing to compare.
+    """
+    chosen = [*settings, f"model={model}", f"mesh.refinement={refinement:g}"]
+    if model == "shell":
+        chosen.append("solid=null")
+    used, asked = folder / "usage.json", {"case": case.read_text(encoding="utf-8"), "settings": chosen}
+    asked["sources"] = sources.ours()
+    kept = json.loads(used.read_text(encoding="utf-8")) if used.exists() else {}
+    if kept.get("asked") != asked:
+        if {**kept.get("asked", {}), "sources": asked["sources"]} == asked:
+            say(f"{model} at refinement {refinement:g}: again, the folder has it of other sources of magshell_fenicsx")
+        sets = [part for setting in chosen for part in ("--set", setting)]
+        measured = measure("magshell_fenicsx", ["run", str(case), *sets, "--out", str(folder)])
+        if not (folder / "summary.json").exists() or measured.code not in (0, 3):
+            said = measured.errors.strip().splitlines()
+            raise NothingLeft(f"model: {model}: {said[-1] if said else f'exit code {measured.code}'}")
+        by = json.loads((folder / "summary.json").read_text(encoding="utf-8"))["sources"]
+        kept = {"asked": {**asked, "sources": by}, "cpu_s": measured.cpu_s, "wall_s": measured.wall_s}
+        write_whole(used, (json.dumps(kept, indent=1) + "\n").encode())
+    summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+    with (folder / "path.csv").open(encoding="utf-8", newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    compiling = float(summary["timing"]["jit_s"])
+    return ModelRun(model, refinement, summary, rows, kept["cpu_s"] - compiling, kept["wall_s"] - compiling)

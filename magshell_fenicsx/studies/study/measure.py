@@ -1,0 +1,78 @@
+"""One command as a process of its own: its wall time, CPU time and peak memory."""
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+
+@dataclass(frozen=True)
+class Usage:
+    """What a process took.
+
+    Attributes
+    ----------
+    code
+        Exit code.
+    wall_s, cpu_s
+        Of the whole process; CPU seconds are summed over ranks and everything that they started.
+    peak_mb
+        Largest resident memory (2^20 bytes), summed over the ranks; None if a rank died.
+    output, errors
+        What it printed.
+    """
+
+    code: int
+    wall_s: float
+    cpu_s: float
+    peak_mb: float | None
+    output: str
+    errors: str
+
+
+def measure(
+    module: str, arguments: Sequence[str], ranks: int = 1, environment: Mapping[str, str] | None = None
+) -> Usage:
+    """Run `python3 -m MODULE ARGUMENT...` and wait for it; one thread per rank.
+
+    Parameters
+    ----------
+    ranks
+        More than one are started by mpirun.
+    environment
+        Variables to set besides our own.
+    """
+    launcher = ["mpirun", "--map-by", ":OVERSUBSCRIBE", "-n", str(ranks)] if ranks > 1 else []
+    with TemporaryDirectory() as scratch:
+        command = [*launcher, sys.executable, "-m", "magshell_fenicsx.studies.study.meter", scratch, module, *arguments]
+        output, errors = Path(scratch) / "output", Path(scratch) / "errors"
+        with output.open("wb") as stdout, errors.open("wb") as stderr:
+            start = time.perf_counter()
+            process = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=stdout,
+                stderr=stderr,
+                env={**os.environ, "OMP_NUM_THREADS": "1", **(environment or {})},
+            )
+            try:
+                _, status, usage = os.wait4(process.pid, 0)
+            except BaseException:
+                process.terminate()
+                process.wait()
+                raise
+            wall_s = time.perf_counter() - start
+        process.returncode = os.waitstatus_to_exitcode(status)  # it is gone: Popen must not wait for it
+        peaks = [int(file.read_text(encoding="utf-8")) for file in Path(scratch).glob("peak.*")]
+        return Usage(
+            code=process.returncode,
+            wall_s=wall_s,
+            cpu_s=usage.ru_utime + usage.ru_stime,
+            peak_mb=sum(peaks) / 1024 if len(peaks) == ranks else None,
+            output=output.read_text(encoding="utf-8", errors="replace"),
+            errors=errors.read_text(encoding="utf-8", errors="replace"),
+        )

@@ -1,0 +1,114 @@
+"""What `--result` names: one number of a run."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+from scipy.interpolate import barycentric_interpolate
+
+from magshell_fenicsx.case.source import CaseError
+from magshell_fenicsx.output.store.table import COLUMNS, OWN_MODES
+
+WORDS = ("label", "amplitude", "mode")  # columns without numbers
+NUMBERS = tuple(column for column in COLUMNS if column not in WORDS)
+FORMS = "write knockdown, critical_field, COLUMN@COLUMN=VALUE or COLUMN@end, with columns of path.csv"
+
+
+@dataclass(frozen=True)
+class Scalar:
+    """A named number of a run.
+
+    Attributes
+    ----------
+    name
+        As `--result` has it.
+    column, at, value
+        For a number of the path: the column, and the column and value where it is taken, or "end".
+    """
+
+    name: str
+    column: str = ""
+    at: str = ""
+    value: float = 0.0
+
+    def of(self, summary: Mapping[str, Any], rows: Sequence[Mapping[str, str]]) -> float | None:
+        """The number; None if the run does not have it.
+
+        Parameters
+        ----------
+        summary, rows
+            The content of summary.json and of path.csv.
+        """
+        if self.name == "knockdown":
+            return _number(summary["knockdown"])
+        if self.name == "critical_field":
+            points = (point["value"] for point in summary["limit_points"] if point["amplitude"] == "lambda_m")
+            return _number(next(points, None))
+        path = [row for row in rows if row["branch"] == "0" and row["mode"] in OWN_MODES]
+        if self.at == "end":
+            return float(path[-1][self.column]) if path else None
+        return _crossing(path, self.column, self.at, self.value)
+
+
+def parse_scalar(text: str) -> Scalar:
+    """Read `--result`.
+
+    Raises
+    ------
+    CaseError
+        If it is not of the form.
+
+    Examples
+    --------
+    >>> parse_scalar("force@w_over_h=10")
+    Scalar(name='force@w_over_h=10', column='force', at='w_over_h', value=10.0)
+    """
+    if text in ("knockdown", "critical_field"):
+        return Scalar(text)
+    column, _, place = text.partition("@")
+    at, _, number = place.partition("=")
+    for name in (column, at) if place != "end" else (column,):
+        if name not in NUMBERS:
+            raise CaseError(f"--result {text}: {name or 'nothing'} is no column with numbers; {FORMS}")
+    if place == "end":
+        return Scalar(text, column, "end")
+    try:
+        value = float(number)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise CaseError(f"--result {text}: {number or 'nothing'} is no finite number; {FORMS}")
+    return Scalar(text, column, at, value)
+
+
+def _crossing(path: Sequence[Mapping[str, str]], column: str, at: str, value: float) -> float | None:
+    """The column where another first has a value: a cubic through the points around it.
+
+    The points are those of one load: the curve has a corner where the field ends. At a requested point of the
+    path the number is that of its row.
+    """
+    x = [float(row[at]) for row in path]
+    i = next((i for i in range(len(x) - 1) if (x[i] - value) * (x[i + 1] - value) <= 0 and x[i] != x[i + 1]), None)
+    if i is None:
+        met = bool(x) and math.isclose(x[-1], value, rel_tol=1e-9)  # a target is met to the solver's tolerance
+        return float(path[-1][column]) if met else None
+    first, last = i, i + 1
+    if i and path[i]["amplitude"] == path[i + 1]["amplitude"]:
+        first -= 1
+    if i + 2 < len(path) and path[i + 2]["amplitude"] == path[i + 1]["amplitude"]:
+        last += 1
+    window = slice(first, last + 1)
+    if not _monotone(x[window]):
+        window = slice(i, i + 2)
+    return float(barycentric_interpolate(x[window], [float(row[column]) for row in path[window]], value))
+
+
+def _monotone(x: Sequence[float]) -> bool:
+    steps = [b - a for a, b in pairwise(x)]
+    return all(step > 0 for step in steps) or all(step < 0 for step in steps)
+
+
+def _number(value: float | None) -> float | None:
+    return None if value is None else float(value)

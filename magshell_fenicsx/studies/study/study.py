@@ -1,0 +1,169 @@
+"""Error against run time: a case over meshes, degrees, models and ranks, every run a process of its own."""
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from math import isfinite
+from pathlib import Path
+from shutil import which
+from typing import Any
+
+from mpi4py import MPI
+
+from magshell_fenicsx.case.source import CaseError
+from magshell_fenicsx.output.store.durable import write_whole
+from magshell_fenicsx.output.store.folder import by_first, held_folder
+from magshell_fenicsx.platform import sources
+from magshell_fenicsx.studies.study.machine import fingerprint
+from magshell_fenicsx.studies.study.plot import draw_study
+from magshell_fenicsx.studies.study.reference import Reference
+from magshell_fenicsx.studies.study.rows import COLUMNS, Row, Run, make_rows
+from magshell_fenicsx.studies.study.sample import Measured, complete, load, of_others
+from magshell_fenicsx.studies.study.scalar import Scalar, parse_scalar
+from magshell_fenicsx.studies.study.table import repeated, said, write_table
+from magshell_fenicsx.studies.sweep.axes import parse_axes
+from magshell_fenicsx.studies.sweep.points import make_points
+from magshell_fenicsx.studies.sweep.table import write_csv
+
+
+@dataclass(frozen=True)
+class Study:
+    """A finished study.
+
+    Attributes
+    ----------
+    rows
+        As in study.csv, the points in product order, the ranks fastest.
+    reference
+        None if no run gave the result.
+    """
+
+    rows: list[Row]
+    reference: Reference | None
+
+    @property
+    def without_result(self) -> int:
+        """Number of runs that did not give the number asked for."""
+        return sum(row["result"] is None for row in self.rows)
+
+
+def _print(line: str) -> None:
+    print(line, flush=True)
+
+
+def study(
+    file: Path | str,
+    over: Sequence[str],
+    settings: Sequence[str] = (),
+    *,
+    result: str,
+    reference: float | None = None,
+    ranks: Sequence[int] = (1,),
+    repeat: int = 3,
+    out: Path | str = "results/study",
+    say: Callable[[str], None] = _print,
+) -> Study:
+    """Measure error and run time at all points of a product; writes study.csv, .json, .md and .png.
+
+    Each run is a process of its own, one at a time: once to compile its kernels, then `repeat` times.
+    Runs that are in the folder and were measured on this machine, with these sources, are kept.
+
+    Parameters
+    ----------
+    over
+        `key.path=start:stop:count` or `key.path=value,value`; keys tied with `+`.
+    result
+        `knockdown`, `critical_field`, `COLUMN@COLUMN=VALUE` or `COLUMN@end`; see `Scalar`.
+    reference
+        What errors are relative to; None takes the finest run, whose own error is estimated.
+    ranks
+        Numbers of MPI ranks to run every point on.
+    say
+        Called with one line per run.
+
+    Raises
+    ------
+    CaseError
+        Before anything is computed: if a point is no valid case, the result has no such name, or `out`
+        cannot be written.
+    DiskError
+        If the disk is full; runs that are there are kept.
+    """
+    scalar, axes = parse_scalar(result), parse_axes(over)
+    _check(reference, ranks, repeat)
+    points, folder, machine, runs = make_points(Path(file), axes, settings), Path(out), fingerprint(), []
+    with held_folder(folder, MPI.COMM_WORLD, make=True):
+        by_first(MPI.COMM_WORLD, lambda: (folder / "points").mkdir(exist_ok=True))
+        files = {
+            (i, n): folder / "points" / f"{point.key}-{n}.json" for i, point in enumerate(points) for n in set(ranks)
+        }
+        origins = [{"sources": sources.ours(), **point.case.outside} for point in points]
+        if again := sum(of_others(file, origins[i]) for (i, _), file in files.items()):
+            say(f"{again} of {len(files)} again: what the folder has of them is of other sources of magshell_fenicsx")
+        for number, (point, origin) in enumerate(zip(points, origins, strict=True), 1):
+            chosen = [*settings, *(f"{key}={value}" for key, value in point.values.items())]
+            arguments = [str(file), *(word for setting in chosen for word in ("--set", setting))]
+            for n in sorted(set(ranks)):
+                run = Run(point, n, load(files[number - 1, n], machine, origin))
+                complete(run.measured, arguments, n, repeat, files[number - 1, n], origin)
+                runs.append(run)
+                say(f"{number:4d}/{len(points)}  {run.label}: {_said(run.measured, scalar)}")
+        rows, against = make_rows(runs, scalar, reference)
+        told = {
+            "case": Path(file).name,
+            "settings": list(settings),
+            "over": list(over),
+            "result": result,
+            "reference": asdict(against) if against else None,
+            "reference_said": said(against),
+            "repeat": repeat,
+            "machine": machine,
+        }
+        done = Study(rows, against)
+        by_first(MPI.COMM_WORLD, lambda: _write(done, tuple(points[0].values), told, folder))
+    say(said(against))
+    return done
+
+
+def parse_ranks(text: str) -> list[int]:
+    """Read `--ranks`.
+
+    Examples
+    --------
+    >>> parse_ranks("1,2")
+    [1, 2]
+    """
+    try:
+        return [int(word) for word in text.split(",")]
+    except ValueError:
+        raise CaseError(f"--ranks {text}: write whole numbers with commas, for example 1,2") from None
+
+
+def _check(reference: float | None, ranks: Sequence[int], repeat: int) -> None:
+    if MPI.COMM_WORLD.size > 1:
+        raise CaseError("a study starts its ranks itself: use --ranks instead of mpirun")
+    if repeat < 1 or not ranks or min(ranks) < 1:
+        raise CaseError("--repeat and --ranks must be at least 1")
+    if max(ranks) > 1 and not which("mpirun"):
+        raise CaseError("--ranks: there is no mpirun to start more than one")
+    if reference is not None and not isfinite(reference):
+        raise CaseError(f"--reference {reference}: must be a finite number")
+
+
+def _write(done: Study, keys: Sequence[str], told: dict[str, Any], folder: Path) -> None:
+    write_whole(folder / "study.json", (json.dumps(told, indent=1) + "\n").encode())
+    write_csv(done.rows, (*keys, *COLUMNS), folder / "study.csv")
+    write_table(done.rows, keys, told, folder / "study.md")
+    repeats = repeated(told["repeat"]).lower()
+    title = f"{told['result']} of {told['case']}\n{told['machine']['cpu']}, kernels compiled, {repeats}"
+    own_error = done.reference.error if done.reference else None
+    draw_study(done.rows, keys, title, own_error, folder / "study.png")
+
+
+def _said(measured: Measured, scalar: Scalar) -> str:
+    if measured.summary is None:
+        return f"stopped early: {measured.failure}"
+    value = scalar.of(measured.summary, measured.rows)
+    found = f"{scalar.name} = {value:.9g}" if value is not None else f"no {scalar.name}"
+    stopped = measured.summary["stopped"]
+    return f"{found}, {measured.typical('wall_s'):.2f} s" + (f", stopped early: {stopped}" if stopped else "")

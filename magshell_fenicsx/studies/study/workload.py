@@ -1,0 +1,81 @@
+"""Pieces of a run that are timed inside a process of their own, without files.
+
+`[mpirun -n N] python3 -m magshell_fenicsx.studies.study.workload KIND CASE SETTINGS RESULTS`, the last two JSON
+lists, prints one line of JSON. Every time is in wall seconds of the slowest rank and in CPU seconds
+of all ranks.
+"""
+
+import json
+import sys
+from collections.abc import Callable
+from typing import Any
+
+from mpi4py import MPI
+
+from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.run.rows import RowMaker
+from magshell_fenicsx.run.summary import Result
+from magshell_fenicsx.simulate.follow import Stopped, follow
+from magshell_fenicsx.simulate.scene import Scene
+from magshell_fenicsx.studies.study.iteration import measured, timed
+from magshell_fenicsx.studies.study.scalar import parse_scalar
+
+Report = dict[str, Any]
+REPEATS = 5
+
+
+def path(scene: Scene, results: list[str]) -> Report:
+    """The history from the unloaded shell to its end, and numbers of it."""
+    result, made, comm = Result(scene, scene.unloaded()), RowMaker(scene), scene.comm
+
+    def solve() -> None:
+        try:
+            for record in follow(scene):
+                result.rows.append(made.row(record, 0.0))
+        except Stopped as e:
+            result.stopped = str(e)
+
+    wall, cpu = timed(comm, solve)
+    found = {"knockdown": result.knockdown, "limit_points": result.limit_points}
+    rows = [{key: str(value) for key, value in row.items()} for row in result.rows]
+    newton = scene.newton
+    return {
+        "solve_phase_wall_s": wall,
+        "solve_phase_cpu_s": cpu,
+        "assembly_wall_s": scene.model.system.assembly.seconds,
+        "factor_wall_s": newton.factorisation.stopwatch.seconds,
+        "back_solve_wall_s": newton.factorisation.solving.seconds,
+        "factorisations": newton.factorisation.count,
+        "iterations": newton.iterations,
+        "values": {name: parse_scalar(name).of(found, rows) for name in results},
+        "stopped": result.stopped,
+    }
+
+
+def iteration(scene: Scene, results: list[str]) -> Report:
+    """The pieces of a Newton iteration, medians of several."""
+    return {**measured(scene, REPEATS)}
+
+
+def kernels(scene: Scene, results: list[str]) -> Report:
+    """Every kernel that the scene needs, also for the modes that it excludes."""
+    scene.model.excluded_modes  # noqa: B018  (compiles theirs)
+    return {"kernels": len(scene.model.kernels.names)}
+
+
+KINDS: dict[str, Callable[[Scene, list[str]], Report]] = {"path": path, "iteration": iteration, "kernels": kernels}
+
+
+def main(kind: str, case: str, settings: str, results: str) -> None:
+    """Build the scene of a case, do the work, print what it took."""
+    comm = MPI.COMM_WORLD
+    scene = Scene(Case.load(case, json.loads(settings)), comm)
+    report = KINDS[kind](scene, json.loads(results))
+    if comm.rank == 0:
+        model = scene.model
+        built = {"jit_s": model.kernels.seconds, "setup_s": scene.setup_s, "dofs": model.system.dofs}
+        print(json.dumps({**built, **report}), flush=True)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -1,0 +1,145 @@
+"""Chains: the points of a sweep along one axis, run one after the other on one rank.
+
+Where the result is a knockdown, the fold of one point is followed to the next; where that fails,
+and at the first point, a full path is.
+"""
+
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+from mpi4py import MPI
+
+from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.loading import PressureSection
+from magshell_fenicsx.case.shell import ShellSection
+from magshell_fenicsx.continuation.fold import Fold, FoldLost
+from magshell_fenicsx.mesh.patch import MeshError
+from magshell_fenicsx.output.store.table import Row
+from magshell_fenicsx.plan.charted import make_plan
+from magshell_fenicsx.run.run import Result, run
+from magshell_fenicsx.simulate.scene import Scene
+from magshell_fenicsx.studies.sweep.axes import Axis, along
+from magshell_fenicsx.studies.sweep.continuation import Continuation
+from magshell_fenicsx.studies.sweep.outcome import Outcome, outcome_of
+from magshell_fenicsx.studies.sweep.points import SweepPoint
+
+Symmetry = Literal["none", "half", "axisymmetric"]
+SYMMETRIES: tuple[Symmetry, ...] = ("none", "half", "axisymmetric")  # a model of the first holds for the others
+
+
+@dataclass(frozen=True)
+class Link:
+    """A point of a chain: its number in the sweep, its place on the axis, and what is run."""
+
+    number: int
+    at: float
+    case: Case
+
+
+Chain = list[Link]
+
+
+def make_chains(
+    axes: Sequence[Axis], points: Sequence[SweepPoint], missing: Sequence[int], *, full_paths: bool
+) -> list[Chain]:
+    """Put the missing points into chains.
+
+    Parameters
+    ----------
+    missing
+        Numbers of the points to compute.
+    full_paths
+        Make each a chain of its own, and so wherever folds cannot be followed.
+    """
+    axis = along(axes)
+    if full_paths or axis is None:
+        return [[Link(number, 0.0, points[number].case)] for number in missing]
+    lines: dict[tuple[str, ...], list[int]] = {}
+    for number, point in enumerate(points):
+        lines.setdefault(tuple(v for key, v in point.values.items() if key not in axis.keys), []).append(number)
+    return [chain for line in lines.values() for chain in _chains_of(line, axis.keys[0], points, set(missing))]
+
+
+def _chains_of(line: list[int], key: str, points: Sequence[SweepPoint], missing: set[int]) -> list[Chain]:
+    """The missing points of one line, as one chain if their folds can be followed."""
+    wanted = [Link(n, float(points[n].values[key]), points[n].case) for n in line if n in missing]
+    one_mesh = key.startswith("magnetic.")  # a solid's state is not carried to another
+    followed = all(_has_knockdown(link.case) and (one_mesh or link.case.model == "shell") for link in wanted)
+    if len(wanted) < 2 or not followed:
+        return [[link] for link in wanted]
+    common = min((_symmetry(points[number].case) for number in line), key=SYMMETRIES.index)
+    chain = [replace(link, case=link.case.model_copy(update={"symmetry": common})) for link in wanted]
+    return [sorted(chain, key=lambda link: link.at)]
+
+
+def run_chain(chain: Chain) -> Iterator[tuple[int, Outcome]]:
+    """Number and outcome of each point of a chain, on this rank alone."""
+    continuation = None
+    for link in chain:
+        start, spent, outcome = time.perf_counter(), 0, None
+        if continuation:
+            outcome, spent = _by_fold(continuation, link, start)
+        if not outcome:
+            outcome, continuation = _by_path(link, spent, start, go_on=link is not chain[-1])
+        yield link.number, outcome
+
+
+def _by_fold(continuation: Continuation, link: Link, start: float) -> tuple[Outcome | None, int]:
+    """The outcome, None if the fold could not be followed, and the factorisations."""
+    try:
+        scene = Scene(link.case, MPI.COMM_SELF)
+    except MeshError:
+        return None, 0
+    factorisation = scene.newton.factorisation
+    try:
+        fold = continuation.follow(link.at, scene)
+    except FoldLost:
+        return None, factorisation.count
+    result = Result(scene, fold.state, [_row(scene, fold)])
+    return outcome_of(result, "fold", factorisation.count, time.perf_counter() - start), factorisation.count
+
+
+def _by_path(link: Link, spent: int, start: float, *, go_on: bool) -> tuple[Outcome, Continuation | None]:
+    """The outcome of a full path, and the continuation from its fold if one can go on."""
+    try:
+        result = run(link.case, comm=MPI.COMM_SELF)
+    except MeshError as e:
+        return Outcome(None, None, str(e), None, time.perf_counter() - start, [], "path", spent), None
+    continuation = _begun(link.at, result) if go_on else None
+    work = spent + result.scene.newton.factorisation.count
+    return outcome_of(result, "path", work, time.perf_counter() - start), continuation
+
+
+def _begun(at: float, result: Result) -> Continuation | None:
+    last = result.rows[-1]
+    if last["label"] != "fold" or last["amplitude"] != "pressure" or last["p_over_pc"] != result.knockdown:
+        return None
+    try:
+        return Continuation(at, result.scene, result.last)
+    except FoldLost:
+        return None
+
+
+def _row(scene: Scene, fold: Fold) -> Row:
+    return {
+        "label": "fold",
+        "amplitude": fold.name,
+        **scene.observe(fold.state),
+        "mode": "",
+        "branch": 0,
+        "load_error": 0.0,
+    }
+
+
+def _has_knockdown(case: Case) -> bool:
+    loading = case.loading
+    # with a tolerance the mesh is another for each point; states are carried over between charts that are known
+    by_one_mesh = case.mesh.tolerance is None and isinstance(case.shell, ShellSection)
+    return by_one_mesh and isinstance(loading, PressureSection) and loading.until == "limit" and not loading.branches
+
+
+def _symmetry(case: Case) -> Symmetry:
+    plan = make_plan(case)
+    return "axisymmetric" if plan.axisymmetric else "half" if plan.half else "none"

@@ -1,0 +1,68 @@
+"""A fold under pressure followed from case to case, each with a scene of its own."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from magshell_fenicsx.continuation.fold import Fold, FoldLost, Guess, find_fold, predict_fold
+from magshell_fenicsx.continuation.system import State, dot
+from magshell_fenicsx.simulate.scene import Scene
+from magshell_fenicsx.simulate.transfer import transfer
+
+KEPT = 3  # folds, for a quadratic extrapolation
+LEAST_COSINE = 0.5  # between successive null vectors; less is taken for a jump to another fold
+
+
+class Continuation:
+    """Follows a fold of the pressure through a parameter p of the case.
+
+    All scenes have the same kind of model. The folds found so far are kept in the unknowns of the
+    last scene.
+
+    Parameters
+    ----------
+    p, scene, state
+        Where it begins: a fold that a path has located. It is polished.
+
+    Raises
+    ------
+    FoldLost
+        If there is no fold, or if it is not the first instability.
+    """
+
+    def __init__(self, p: float, scene: Scene, state: State) -> None:
+        fold = find_fold(scene.newton, Guess(state), "pressure")
+        _check(scene, fold, fold)
+        self._known, self._scene = [(p, fold)], scene
+
+    def follow(self, p: float, scene: Scene) -> Fold:
+        """The fold at another value of the parameter.
+
+        Raises
+        ------
+        FoldLost
+            If none is found, or if it is not the first instability as far as that can be known there.
+        """
+        known = [(q, self._moved(fold, scene)) for q, fold in self._known]
+        others = {name: scene.case.lambda_m for name in scene.unloaded().mu if name == "lambda_m"}
+        guess = predict_fold(scene.newton.system, known, p, others)
+        fold = find_fold(scene.newton, guess, "pressure")
+        _check(scene, fold, known[-1][1])
+        self._known, self._scene = [*known, (p, fold)][-KEPT:], scene
+        return fold
+
+    def _moved(self, fold: Fold, scene: Scene) -> Fold:
+        u, phi = (transfer(self._scene, scene, v) for v in (fold.state.u, fold.phi))
+        return replace(fold, state=State(u, fold.state.mu), phi=phi)
+
+
+def _check(scene: Scene, fold: Fold, last: Fold) -> None:
+    """Refuse a fold that is not the first instability on the way from no pressure, as far as it shows here."""
+    comm, a, b = scene.newton.system.comm, fold.phi, last.phi
+    if dot(comm, a, b) < LEAST_COSINE * np.sqrt(dot(comm, a, a) * dot(comm, b, b)):
+        raise FoldLost("another fold was found")
+    if fold.value <= 0 or fold.curvature >= 0:
+        raise FoldLost("the fold is not a maximum of the pressure")
+    modes = scene.model.excluded_modes
+    if fold.unstable or (modes and modes.is_unstable(fold.state)):
+        raise FoldLost("another instability comes before the fold")

@@ -1,0 +1,92 @@
+"""What a sweep keeps of a run, and its file."""
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+from uuid import uuid4
+
+from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.output.store.table import Row
+from magshell_fenicsx.platform import sources
+from magshell_fenicsx.run.run import Result
+
+CURVE = (
+    "label",
+    "amplitude",
+    "p_over_pc",
+    "lambda_m",
+    "field_angle",
+    "force",
+    "load_factor",  # of dead loads only
+    "w_over_h",
+    "w_pole_over_h",
+    "volume_change",
+    "mode",
+    "branch",
+)
+Found = Literal["path", "fold"]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The outcome of one point.
+
+    Attributes
+    ----------
+    knockdown
+        k_d; None if there is no instability under pressure.
+    limit
+        The first limit point (the one of k_d) as in summary.json; None if there is none.
+    stopped
+        Why the run ended before its target; None if it reached it.
+    curve
+        Every accepted point, with those columns of `CURVE` that the run has.
+    found
+        "path": by a run of its own; "fold": the fold of the point before was followed, and the curve
+        has only that.
+    factorisations
+        Of the model's tangent, attempts that failed included; without the modes that it excludes.
+    """
+
+    knockdown: float | None
+    limit: dict[str, Any] | None
+    stopped: str | None
+    dofs: int | None
+    wall_s: float
+    curve: list[Row]
+    found: Found
+    factorisations: int
+
+
+def outcome_of(result: Result, found: Found, factorisations: int, wall_s: float) -> Outcome:
+    """What is kept of a run, or of a fold in the form of one."""
+    limits = sorted(result.limit_points, key=lambda p: p["amplitude"] != "pressure" or p["value"] != result.knockdown)
+    return Outcome(
+        knockdown=result.knockdown,
+        limit=next(iter(limits), None),
+        stopped=result.stopped,
+        dofs=result.scene.model.system.dofs,
+        wall_s=round(wall_s, 3),
+        curve=[{key: row[key] for key in CURVE if key in row} for row in result.rows],
+        found=found,
+        factorisations=factorisations,
+    )
+
+
+def save(outcome: Outcome, case: Case, file: Path) -> None:
+    """Write a point's file; a killed sweep leaves the whole of it or nothing."""
+    known = {"case": case.model_dump(mode="json", exclude_none=True), **case.outside, "sources": sources.ours()}
+    content = {**known, "outcome": asdict(outcome)}
+    unfinished = file.with_suffix(f".{uuid4().hex}")  # two sweeps may write to one folder
+    unfinished.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    unfinished.replace(file)
+
+
+def load(file: Path) -> Outcome | None:
+    """Read a point's file; None if there is none that can be used, one of other sources for instance."""
+    try:
+        content = json.loads(file.read_text(encoding="utf-8"))
+        return Outcome(**content["outcome"]) if content["sources"] == sources.ours() else None
+    except (OSError, ValueError, KeyError, TypeError):
+        return None

@@ -1,0 +1,87 @@
+"""The points of a sweep: the product of its axes, every one a valid case."""
+
+import copy
+import hashlib
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+from math import prod
+from pathlib import Path
+
+from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.source import CaseError, Source, override, read_source
+from magshell_fenicsx.plan.charted import make_plan
+from magshell_fenicsx.studies.sweep.axes import MOST_POINTS, Axis
+
+
+@dataclass(frozen=True)
+class SweepPoint:
+    """One point.
+
+    Attributes
+    ----------
+    values
+        Swept key -> its value here, as text.
+    key
+        Hash of the problem: equal problems have equal keys, in any sweep, whatever program solves them.
+    """
+
+    values: dict[str, str]
+    case: Case
+    key: str
+
+    @property
+    def label(self) -> str:
+        """For people: `energy=full, remanent.polar=45`."""
+        return ", ".join(f"{short(key)}={value}" for key, value in self.values.items())
+
+
+def make_points(file: Path, axes: Sequence[Axis], settings: Sequence[str] = ()) -> list[SweepPoint]:
+    """All points, in the order of the product, the last axis fastest.
+
+    Raises
+    ------
+    CaseError
+        If any point is no valid case; nothing has been computed then.
+    """
+    source = read_source(file)
+    for setting in settings:
+        if setting.partition("=")[0].strip() in {key for axis in axes for key in axis.keys}:
+            raise CaseError(f"--set {setting}: this key is swept by --over")
+        override(source, setting)
+    count = prod(len(axis.values) for axis in axes)
+    if count > MOST_POINTS:
+        raise CaseError(f"--over: {count} points; allowed at most {MOST_POINTS}")
+    return [_point(source, axes, values) for values in product(*(axis.values for axis in axes))]
+
+
+def _point(source: Source, axes: Sequence[Axis], values: Sequence[str]) -> SweepPoint:
+    here = copy.deepcopy(source)
+    chosen = {key: value for axis, value in zip(axes, values, strict=True) for key in axis.keys}
+    assignments = [f"{key}={value}" for key, value in chosen.items()]
+    try:
+        for assignment in assignments:
+            override(here, assignment)
+        case = Case.from_source(here)
+        make_plan(case)  # finds what only the plan can: no mirror plane for symmetry: half
+    except CaseError as e:
+        message = str(e)
+        for assignment in assignments:
+            message = message.replace(f"--set {assignment}", f"--over {assignment}")
+        raise CaseError(f"{message}\nin the point {', '.join(assignments)}") from None
+    return SweepPoint(chosen, case, identity(case))
+
+
+def identity(case: Case) -> str:
+    """Hash of what is solved: of the resolved case, without a field that is zero, and of its mesh file."""
+    data = case.model_dump(mode="json") | case.outside
+    if not case.lambda_m:
+        del data["magnetic"]
+    return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def short(key: str) -> str:
+    """The last words of a key that people need: `energy`, `remanent.polar`."""
+    words = key.split(".")
+    return ".".join(words[-2:] if words[-1] in ("polar", "azimuth") else words[-1:])

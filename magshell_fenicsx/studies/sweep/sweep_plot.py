@@ -1,0 +1,85 @@
+"""A sweep as a picture: the knockdown factor against a swept number, or the curve of every point."""
+
+from collections.abc import Sequence
+from itertools import cycle
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from magshell_fenicsx.output.pictures.curve import AXES
+from magshell_fenicsx.output.store.table import OWN_MODES
+from magshell_fenicsx.studies.sweep.axes import Axis, along
+from magshell_fenicsx.studies.sweep.outcome import Outcome
+from magshell_fenicsx.studies.sweep.points import SweepPoint, short
+
+if TYPE_CHECKING:
+    from magshell_fenicsx.output.store.table import Row
+
+LEGEND_ROWS = 16
+STYLES = ("-", "--", ":", "-.")
+UNITS = {"polar": "degrees", "azimuth": "degrees"}
+
+
+def draw_sweep(axes: Sequence[Axis], points: Sequence[SweepPoint], outcomes: Sequence[Outcome], file: Path) -> None:
+    """Draw one line per combination of the values that are not on the horizontal axis."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, plot = plt.subplots(figsize=(7.2, 4.2), layout="constrained")
+    if any(outcome.knockdown is not None for outcome in outcomes):
+        _knockdowns(plot, axes, points, outcomes)
+    else:
+        _curves(plot, points, outcomes)
+    labels = plot.get_legend_handles_labels()[1]
+    if labels:
+        columns = -(-len(labels) // LEGEND_ROWS)
+        figure.legend(loc="outside right upper", fontsize=8, frameon=False, ncols=columns)
+    figure.savefig(file, dpi=200)
+    plt.close(figure)
+
+
+def _knockdowns(plot: Any, axes: Sequence[Axis], points: Sequence[SweepPoint], outcomes: Sequence[Outcome]) -> None:
+    """k_d against the last axis with numbers; points without k_d are left out."""
+    axis = along(axes) or axes[-1]
+    lines: dict[str, list[tuple[float | str, float]]] = {}
+    for point, outcome in zip(points, outcomes, strict=True):
+        line = lines.setdefault(_label(point, axis), [])
+        if outcome.knockdown is not None:
+            x = point.values[axis.keys[0]]
+            line.append((float(x) if axis.numbers else x, outcome.knockdown))
+    for (label, line), style in zip(lines.items(), cycle(STYLES), strict=False):
+        plot.plot(*zip(*line, strict=True), style, marker=".", label=label) if line else None
+    unit = UNITS.get(axis.keys[0].split(".")[-1])
+    if axis.numbers:
+        plot.locator_params(axis="x", nbins=5)  # long numbers would touch
+    plot.set_xlabel(" = ".join(short(key) for key in axis.keys) + (f"  ({unit})" if unit else ""))
+    plot.set_ylabel(r"knockdown factor  $k_\mathrm{d}$")
+
+
+def _curves(plot: Any, points: Sequence[SweepPoint], outcomes: Sequence[Outcome]) -> None:
+    """The last varied load against its displacement, for every point."""
+    amplitude = next((str(o.curve[-1]["amplitude"]) for o in outcomes if len(o.curve) > 1), "force")
+    x_key, y_key, x_label, y_label = AXES[amplitude]
+    sign = -1.0 if x_key == "volume_change" else 1.0
+    for point, outcome, style in zip(points, outcomes, cycle(STYLES), strict=False):
+        part = loaded(outcome.curve, amplitude)
+        x, y = ([float(row[key]) for row in part] for key in (x_key, y_key))
+        plot.plot([sign * value for value in x], y, style, marker=".", label=_label(point, None))
+    plot.axhline(0, color="0.8", linewidth=0.8, zorder=0)
+    plot.set(xlabel=x_label, ylabel=y_label)
+
+
+def loaded(curve: Sequence["Row"], amplitude: str) -> list["Row"]:
+    """The part of a curve in which an amplitude varied, from the point before on.
+
+    Instabilities of modes that the model excludes are not in their order in a run: they are left out, as branches are.
+    """
+    first = next((i for i, row in enumerate(curve) if row["amplitude"] == amplitude), len(curve))
+    part = curve[max(first - 1, 0) :] if first < len(curve) else []
+    return [row for row in part if row["mode"] in OWN_MODES and not row["branch"]]
+
+
+def _label(point: SweepPoint, without: Axis | None) -> str:
+    hidden = without.keys if without else ()
+    return ", ".join(f"{short(key)} {value}" for key, value in point.values.items() if key not in hidden)

@@ -1,0 +1,63 @@
+"""sweep.csv, one row a point, and curves.csv, one row for every accepted point of every run."""
+
+import csv
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from magshell_fenicsx.studies.sweep.outcome import CURVE, Outcome
+from magshell_fenicsx.studies.sweep.points import SweepPoint
+
+COLUMNS = (
+    "k_d",
+    "p_over_pc",
+    "w_pole_over_h",
+    "kind",
+    "mode",
+    "amplitude",
+    "value",
+    "stopped",
+    "found",
+    "factorisations",
+    "dofs",
+    "wall_s",
+    "point",
+)
+
+
+def write_sweep(points: Sequence[SweepPoint], outcomes: Sequence[Outcome], file: Path) -> None:
+    """Write sweep.csv."""
+    rows = [
+        {**point.values, **sweep_row(outcome), "point": point.key}
+        for point, outcome in zip(points, outcomes, strict=True)
+    ]
+    write_csv(rows, (*points[0].values, *COLUMNS), file)
+
+
+def sweep_row(outcome: Outcome) -> dict[str, Any]:
+    """What sweep.csv says of an outcome; what there is not is empty."""
+    limit = outcome.limit or {}
+    return {
+        "k_d": outcome.knockdown,
+        **{key: limit.get(key) for key in ("p_over_pc", "w_pole_over_h", "kind", "mode", "amplitude", "value")},
+        "stopped": outcome.stopped,
+        "found": outcome.found,
+        "factorisations": outcome.factorisations,
+        "dofs": outcome.dofs,
+        "wall_s": outcome.wall_s,
+    }
+
+
+def write_curves(points: Sequence[SweepPoint], outcomes: Sequence[Outcome], file: Path) -> None:
+    """Write curves.csv."""
+    rows = [{**point.values, **row} for point, outcome in zip(points, outcomes, strict=True) for row in outcome.curve]
+    there = [key for key in CURVE if any(key in row for row in rows)]
+    write_csv(rows, (*points[0].values, *there), file)
+
+
+def write_csv(rows: Iterable[Mapping[str, Any]], columns: Sequence[str], file: Path) -> None:
+    """Write rows with exact numbers."""
+    with file.open("w", newline="", encoding="utf-8") as stream:
+        writer = csv.DictWriter(stream, columns, extrasaction="ignore")
+        writer.writeheader()
+        writer.writerows({k: repr(v) if isinstance(v, float) else v for k, v in row.items()} for row in rows)

@@ -1,0 +1,104 @@
+"""Paths of toys whose folds and bifurcations are known in closed form."""
+
+import gc
+import weakref
+
+import numpy as np
+import pytest
+from continuation.toys import Toy, pitchfork, snap_through
+
+from magshell_fenicsx.continuation.control import GivenConjugate, GivenLoad
+from magshell_fenicsx.continuation.events import instabilities
+from magshell_fenicsx.continuation.newton import BorderedNewton
+from magshell_fenicsx.continuation.path import Control, Path, StepOptions
+from magshell_fenicsx.continuation.point import PathStopped, Point
+from magshell_fenicsx.continuation.system import State
+
+
+def path_of(toy: Toy, control: Control, options: StepOptions) -> tuple[Path, Point]:
+    path = Path(BorderedNewton(toy), "load", control, options)
+    return path, path.start(State(np.zeros(toy.size), {"load": 0.0}))
+
+
+def test_load_control_finds_the_equilibrium() -> None:
+    toy = snap_through()
+    outcome = BorderedNewton(toy).solve(State(np.zeros(1), {"load": 0.0}), "load", GivenLoad(0.2))
+    assert outcome.converged
+    u = outcome.state.u[0]
+    assert u**3 - 3 * u**2 + 2 * u == pytest.approx(0.2, abs=1e-9)
+
+
+def test_displacement_control_gives_the_load() -> None:
+    toy = snap_through()
+    row = GivenConjugate(toy, "load", 1.5)
+    outcome = BorderedNewton(toy).solve(State(np.zeros(1), {"load": 0.0}), "load", row)
+    assert outcome.state.mu["load"] == pytest.approx(1.5**3 - 3 * 1.5**2 + 2 * 1.5, abs=1e-9)
+
+
+def test_load_control_stops_at_the_fold() -> None:
+    path, start = path_of(snap_through(), "load", StepOptions(0.1, 0.1, 1e-6))
+    with pytest.raises(PathStopped) as stop:
+        list(path.towards(start, [0.5]))
+    assert 0 < 2 / (3 * np.sqrt(3)) - stop.value.point.s < 1e-3
+
+
+def test_displacement_control_passes_the_folds_and_counts_pivots() -> None:
+    path, start = path_of(snap_through(), "conjugate", StepOptions(0.05, 0.1, 1e-6))
+    for point, _ in path.towards(start, [2.0]):
+        u = point.state.u[0]
+        assert point.state.mu["load"] == pytest.approx(u**3 - 3 * u**2 + 2 * u, abs=1e-10)
+        assert point.dmu == pytest.approx(3 * u**2 - 6 * u + 2, abs=1e-8)
+        assert point.negative_pivots == (abs(u - 1) < 1 / np.sqrt(3))
+
+
+@pytest.mark.parametrize("step", [0.02, 0.3, 0.9])
+def test_fold_is_located(step: float) -> None:
+    path, low = path_of(snap_through(), "conjugate", StepOptions(step, step, 1e-6))
+    for high, _ in path.towards(low, [2.0]):
+        if high.negative_pivots:
+            break
+        low = high
+    (found,) = instabilities(path, low, high, tolerance=1e-12)
+    assert found.kind == "fold"
+    assert found.point.state.mu["load"] == pytest.approx(2 / (3 * np.sqrt(3)), abs=1e-9)  # as Newton solves
+    assert found.point.s == pytest.approx(1 - 1 / np.sqrt(3), abs=1e-5)
+
+
+@pytest.mark.parametrize("control", ["load", "conjugate"])
+def test_bifurcation_is_located(control: Control) -> None:
+    path, low = path_of(pitchfork(), control, StepOptions(0.3, 0.4, 1e-6))
+    for high, _ in path.towards(low, [3.0]):
+        if high.negative_pivots:
+            break
+        low = high
+    (found,) = instabilities(path, low, high)
+    assert found.kind == "bifurcation"
+    assert found.point.state.mu["load"] == pytest.approx(1.0, rel=1e-8)
+    assert found.point.state.u[1] == pytest.approx(0.0, abs=1e-12)
+
+
+def test_imperfection_turns_the_pitchfork_into_a_stable_path() -> None:
+    """The path bends away from the bifurcation: no instability, v^2 -> u - 1."""
+    path, straight = path_of(pitchfork(imperfection=0.01), "conjugate", StepOptions(0.1, 0.2, 1e-6))
+    bent = path.newton.solve(straight.state, "load", GivenLoad(0.0))
+    point = start = path.start(bent.state)
+    for point, _ in path.towards(start, [3.0]):
+        assert point.negative_pivots == 0
+    u, v = point.state.u
+    assert (1 - u) * v + v**3 == pytest.approx(0.01, abs=1e-10)
+
+
+def test_targets_are_met_exactly() -> None:
+    path, start = path_of(snap_through(), "conjugate", StepOptions(0.07, 0.3, 1e-6))
+    reached = [point.s for point, flag in path.towards(start, [0.25, 0.5, 1.75]) if flag]
+    assert reached == [0.25, 0.5, 1.75]
+
+
+def test_a_solver_is_released_with_its_factors() -> None:
+    """PETSc calls back into the solver but must not keep it: sweeps make hundreds."""
+    newton = BorderedNewton(snap_through())
+    newton.solve(State(np.zeros(1), {"load": 0.0}), "load", GivenLoad(0.1))
+    gone = weakref.ref(newton)
+    del newton
+    gc.collect()
+    assert gone() is None

@@ -1,0 +1,123 @@
+"""Walks by arc length on a toy with snap-through, snap-back and a pitchfork, all known in closed form."""
+
+import numpy as np
+import pytest
+from continuation.toys import closed_loop, pitchfork, snap_back
+
+from magshell_fenicsx.continuation.branch import branching
+from magshell_fenicsx.continuation.newton import BorderedNewton
+from magshell_fenicsx.continuation.path import Path, StepOptions
+from magshell_fenicsx.continuation.point import PathStopped, Point
+from magshell_fenicsx.continuation.system import State
+from magshell_fenicsx.continuation.walk import Goal, Label, Walk
+
+K, C = 0.4, 1.9
+FOLDS = 1 - 1 / np.sqrt(3), 1 + 1 / np.sqrt(3)
+
+
+def f(x: float) -> float:
+    return x**3 - 3 * x**2 + 2 * x
+
+
+def begin(first: float = 0.05, largest: float = 0.2) -> tuple[Path, Point]:
+    toy = snap_back(K, C)
+    path = Path(BorderedNewton(toy), "load", "arc", StepOptions(first, largest, 1e-7))
+    return path, path.start(State(np.zeros(3), {"load": 0.0}))
+
+
+def walked(goal: Goal, first: float = 0.05, largest: float = 0.2) -> list[tuple[Label, Point]]:
+    return list(Walk(*begin(first, largest), goal))
+
+
+@pytest.mark.parametrize(("first", "largest"), [(0.01, 0.05), (0.05, 0.2), (0.3, 0.6)])
+def test_all_events_of_the_path_are_located(first: float, largest: float) -> None:
+    path = walked(Goal("target", [4.0], "conjugate"), first, largest)
+    events = [(label, point) for label, point in path if label in ("fold", "bifurcation")]
+    assert [label for label, _ in events] == ["fold", "fold", "bifurcation"]
+    for (_, point), x in zip(events, (*FOLDS, C), strict=True):
+        assert point.state.mu["load"] == pytest.approx(f(x), rel=1e-8)
+        assert point.state.u[1] == pytest.approx(x, abs=1e-4)
+    assert path[-1][1].state.u[0] == pytest.approx(4.0, abs=1e-9)
+
+
+def test_path_passes_the_snap_back_and_its_stability_is_told() -> None:
+    turns = 1 - np.sqrt((1 - K) / 3), 1 + np.sqrt((1 - K) / 3)
+    backwards = 0
+    for label, point in walked(Goal("target", [4.0], "conjugate")):
+        if label == "step":
+            q, x, _ = point.state.u
+            assert point.state.mu["load"] == pytest.approx(f(x), abs=1e-8)
+            assert q == pytest.approx(x + f(x) / K, abs=1e-8)
+            assert point.negative_pivots == (FOLDS[0] < x < FOLDS[1]) + (x > C)
+            assert point.negative_pivots_held == (turns[0] < x < turns[1]) + (x > C)
+            backwards += turns[0] < x < turns[1]
+    assert backwards > 2
+
+
+def test_targets_are_met_on_every_part_of_the_path() -> None:
+    """q = 1 is passed once; load = 0.1 three times."""
+    loads = [p.state.u[1] for label, p in walked(Goal("points", [0.1], "load", steps=60)) if label == "target"]
+    assert np.sort(loads)[:3] == pytest.approx(np.sort(np.roots([1, -3, 2, -0.1]).real), abs=1e-9)
+
+
+@pytest.mark.parametrize(("until", "x"), [("limit", FOLDS[0]), ("bifurcation", C)])
+def test_walk_ends_where_it_shall(until: str, x: float) -> None:
+    label, point = walked(Goal(until))[-1]  # type: ignore[arg-type]
+    assert label == ("fold" if until == "limit" else "bifurcation")
+    assert point.state.mu["load"] == pytest.approx(f(x), rel=1e-8)
+
+
+def test_number_of_steps() -> None:
+    assert [label for label, _ in walked(Goal("points", steps=7))].count("step") == 7
+
+
+def test_too_long_a_walk_is_stopped() -> None:
+    with pytest.raises(PathStopped, match="4 steps have not reached the bifurcation"):
+        walked(Goal("bifurcation", steps=4))
+
+
+def test_both_branches_of_the_pitchfork() -> None:
+    path, start = begin()
+    *_, (_, point) = Walk(path, start, Goal("bifurcation"))
+    found = branching(path, point)
+    assert found is not None
+    assert found.symmetric
+    for first, sense in zip(found.starts, (1, -1), strict=True):
+        sides = []
+        for _, p in [("step", first), *Walk(path, first, Goal("points", steps=10))]:
+            _, x, v = p.state.u
+            assert v**2 == pytest.approx(x - C, abs=1e-8)
+            assert p.state.mu["load"] == pytest.approx(f(x) - (x - C) / 2, abs=1e-8)
+            sides.append(np.sign(v))
+        assert len(set(sides)) == 1
+        assert np.sign(found.starts[0].state.u[2]) * sides[0] == sense
+
+
+def test_asymmetric_branch_is_told() -> None:
+    """u^2/2 + (1 - u) v^2/2 + v^3/3: load = u - v^2/2 and v = u - 1 on the branch, which rises one way."""
+    toy = pitchfork()
+    base_gradient, base_hessian = toy.gradient, toy.hessian
+    toy.gradient = lambda x: base_gradient(x) + np.array([0.0, x[1] ** 2 - x[1] ** 3])
+    toy.hessian = lambda x: base_hessian(x) + np.diag([0.0, 2 * x[1] - 3 * x[1] ** 2])
+    toy.length = 0.1
+    path = Path(BorderedNewton(toy), "load", "arc", StepOptions(0.3, 0.5, 1e-6))
+    *_, (label, point) = Walk(path, path.start(State(np.zeros(2), {"load": 0.0})), Goal("limit"))
+    assert label == "bifurcation"
+    assert point.state.mu["load"] == pytest.approx(1.0, rel=1e-8)
+    found = branching(path, point)
+    assert found is not None
+    assert not found.symmetric
+    for start in found.starts:
+        u, v = start.state.u
+        assert v == pytest.approx(u - 1, abs=1e-8)
+        assert start.state.mu["load"] == pytest.approx(u - v**2 / 2, abs=1e-8)
+
+
+def test_a_closed_loop_is_told() -> None:
+    """Four folds on the circle; the walk ends at the first of them, met again."""
+    path = Path(BorderedNewton(closed_loop()), "load", "arc", StepOptions(0.05, 0.1, 1e-7))
+    walk, folds = Walk(path, path.start(State(np.array([1.0, 0.0]), {"load": 0.0})), Goal("points", steps=900)), []
+    with pytest.raises(PathStopped, match="come back to this fold: a closed loop"):  # noqa: PT012
+        for label, point in walk:
+            folds += [point.state.mu["load"]] if label == "fold" else []
+    assert folds == pytest.approx([1, -1, 1, -1, 1], rel=1e-8)

@@ -1,0 +1,81 @@
+"""Paths of the meridian model against an independent axisymmetric solver (nine digits)."""
+
+import time
+
+import numpy as np
+import pytest
+from meridian_scenes import POLE_FORCE, buckle, dimpled, hemisphere, indent, unloaded
+
+from magshell_fenicsx.continuation.newton import BorderedNewton
+from magshell_fenicsx.continuation.path import Path, StepOptions
+from magshell_fenicsx.mesh.sphere import flat
+from magshell_fenicsx.models.axisymmetric.meridian import graded_vertices, make_meridian
+from magshell_fenicsx.models.axisymmetric.model import MeridianModel
+from magshell_fenicsx.models.shell.parameters import Force, Loads, Material
+
+
+@pytest.mark.parametrize(
+    ("R_over_h", "lambda_m", "k_d"),
+    [
+        (90, 0, 0.326233289),
+        (90, 0.00184, 0.552053778),
+        (90, -0.00184, 0.120723848),
+        (78.75, 0, 0.326944309),
+        (300, 0.00184, 1.093385),
+    ],
+)
+def test_knockdown(R_over_h: float, lambda_m: float, k_d: float) -> None:
+    found = buckle(dimpled(R_over_h, lambda_m), lambda_m).instability
+    assert found.kind == "fold"
+    assert found.point.state.mu["pressure"] == pytest.approx(k_d, rel=2e-7)
+
+
+def test_pole_indentation() -> None:
+    """F R/(2 pi D) at w/h = 1.5 and 6, R/h = 90, nu = 0.5."""
+    forces = indent(hemisphere(90, 0.5, POLE_FORCE), [1.5, 6.0])
+    assert forces == pytest.approx([2.9615563, 5.6202235], rel=1e-5)
+
+
+def test_patch_carries_the_whole_force_and_tends_to_the_point() -> None:
+    models = [hemisphere(90, 0.5, Loads(force=Force("pole", patch / 90))) for patch in (2.0, 0.5)]
+    for model in models:
+        down = model.zero()
+        down[1::2] = -1
+        assert -model.system.load(down, "force") @ down == pytest.approx(model.force_unit, rel=1e-12)
+        assert model.loaded_deflection(down) == pytest.approx(1.0, rel=1e-12)
+    point, *patches = (indent(model, [1.5])[0] for model in [hemisphere(90, 0.5, POLE_FORCE), *models])
+    assert point < patches[1] < patches[0] < 1.02 * point
+
+
+def test_clamped_plate() -> None:
+    """w0 = p R^4/(64 D) (Timoshenko)."""
+    h, nu, p_over_pc = 1 / 50, 0.3, 1e-5
+    meridian = make_meridian(flat, graded_vertices(1.0, None, h))
+    model = MeridianModel(meridian, Material(nu, h), 4, "clamped", Loads(pressure=True))
+    path = Path(BorderedNewton(model.system), "pressure", "load", StepOptions(p_over_pc, p_over_pc, p_over_pc))
+    ((point, _),) = path.towards(path.start(unloaded(model)), [p_over_pc])
+    p = p_over_pc * model.material.classical_pressure / h
+    w0 = model.deflection(point.state.u, "pole")
+    assert w0 == pytest.approx(p / (64 * model.material.bending_stiffness), rel=2e-5)  # the membrane carries 1e-5
+    assert model.volume_change(point.state.u) == pytest.approx(-np.pi * w0 / 3, rel=2e-5)
+
+
+def test_axial_motion_costs_nothing() -> None:
+    model = hemisphere(30, 0.3, Loads(), condition="free")
+    u = model.zero()
+    u[1::2] = 0.7
+    R, K = model.system.residual(u, {}), model.system.tangent(u, {})
+    assert np.abs(R).max() < 1e-14 * K.norm()
+
+
+def test_takes_seconds() -> None:
+    """Warm kernels."""
+    dimpled(90, 0.00184)
+    start = time.perf_counter()
+    buckle(dimpled(90, 0.00184), 0.00184)
+    assert time.perf_counter() - start < 2
+
+
+def test_every_rank_has_the_whole_meridian() -> None:
+    """So it runs under mpirun as it does alone."""
+    assert hemisphere(30, 0.3, Loads()).system.comm.size == 1

@@ -1,0 +1,146 @@
+"""The second variation along waves: rigid motions, the full shell's tangent, known instabilities."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import hemisphere as triangulated
+from meridian_scenes import E3, Buckling, buckle, dimpled, hemisphere
+
+from magshell_fenicsx.continuation.system import State
+from magshell_fenicsx.continuation.watch import Crossing, Watch
+from magshell_fenicsx.models.axisymmetric.model import MeridianModel
+from magshell_fenicsx.models.shell.model import ShellModel
+from magshell_fenicsx.models.shell.parameters import Loads, Magnetisation, Material
+from magshell_fenicsx.models.shell.patterns import radial
+
+Array = np.ndarray
+FIELD = Magnetisation(radial, E3, gradient=np.diag([0.5, 0.5, -1.0]))
+LOADS = Loads(pressure=True, magnetic=FIELD)
+
+
+def displacement(phi: Array) -> tuple[Array, Array]:
+    """A smooth (U, W), zero on the equator and with a slope there."""
+    return 0.1 * np.sin(phi) * np.cos(phi), -0.2 * np.cos(phi) ** 2 + 0.1 * np.cos(phi)
+
+
+def wave(phi: Array, m: int) -> tuple[Array, Array, Array]:
+    """Smooth coefficients (U, V, W): U + V like rho^(m+1), U - V like rho^(m-1), W like rho^m."""
+    rho, z = np.sin(phi), np.cos(phi)
+    return z * (rho ** (m - 1) + rho ** (m + 1)), z * (-(rho ** (m - 1)) + 2 * rho ** (m + 1)), z * rho**m
+
+
+def second_variation(K: Any, v: Array) -> float:
+    x, y = K.createVecs()
+    x.setArray(v)
+    K.mult(x, y)
+    return float(x.dot(y))
+
+
+def on_the_meridian(m: int, mu: dict[str, float], R_over_h: float) -> float:
+    model = hemisphere(R_over_h, 0.3, LOADS, refinement=4, sigma=0.0)
+    waves = model.excluded_modes.waves
+    phi = waves.V.tabulate_dof_coordinates()[:, 0]
+    U, V, W = wave(phi, m)
+    u = np.column_stack(displacement(model.V.tabulate_dof_coordinates()[:, 0])).ravel()
+    return second_variation(waves.tangent(State(u, mu), m), np.column_stack([U + V, V, W]).ravel())
+
+
+def on_the_shell(m: int, mu: dict[str, float], R_over_h: float, size: float) -> float:
+    model = ShellModel(triangulated(size), Material(0.3, 1 / R_over_h), 4, {"rim": "clamped"}, LOADS, sigma=0.0)
+    x, y, z = model.r0.x.array.reshape(-1, 3).T
+    phi, theta = np.arctan2(np.hypot(x, y), z), np.arctan2(y, x)
+
+    def cartesian(U: Array, V: Array, W: Array) -> Array:
+        c, s = np.cos(theta), np.sin(theta)
+        return np.column_stack([U * c - V * s, U * s + V * c, W]).ravel()
+
+    U0, W0 = displacement(phi)
+    U, V, W = wave(phi, m)
+    v = cartesian(U * np.cos(m * theta), V * np.sin(m * theta), W * np.cos(m * theta))
+    return second_variation(model.system.tangent(cartesian(U0, 0 * U0, W0), mu), v)
+
+
+def crossings(model: MeridianModel, found: Buckling) -> list[Crossing]:
+    watch = Watch(model.excluded_modes)
+    watch.begin(found.path, found.points[0])
+    return [crossing for point in found.points[1:] for crossing in watch.pass_to(point)]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("m", [1, 2, 5])
+def test_agrees_with_the_full_shell(m: int) -> None:
+    """All terms but the penalty; thick enough that bending matters, the loads' parts compared by themselves.
+
+    The fields turn the clamped edge, where the penalty would depend on the mesh: it is left out.
+    """
+    unloaded = {"pressure": 0.0, "lambda_m": 0.0}
+    for mu in ({**unloaded, "pressure": 0.5}, {**unloaded, "lambda_m": 0.05}, unloaded):
+        errors = []
+        for size in (0.5, 0.125):
+            pair = [on_the_meridian(m, mu, 4), on_the_shell(m, mu, 4, size)]
+            if mu is not unloaded:
+                pair[0] -= on_the_meridian(m, unloaded, 4)
+                pair[1] -= on_the_shell(m, unloaded, 4, size)
+            errors.append(abs(pair[1] / pair[0] - 1))
+            print(m, mu, size, pair, errors[-1])
+        assert errors[1] < 1e-4
+        assert errors[1] < errors[0] / 4
+
+
+def test_rigid_motions_are_neutral() -> None:
+    """Of the undeformed shell translation and rotation; of a deformed one translation, exactly."""
+    model = hemisphere(20, 0.3, Loads(), condition="free")
+    waves = model.excluded_modes.waves
+    rho, z = model.r0.x.array.reshape(-1, 2).T
+    zero = 0 * rho
+    translation, rotation = (np.column_stack(c).ravel() for c in ([zero, zero - 1, zero], [zero, -z, -rho]))
+    still = State(model.zero(), {})
+    u = np.column_stack(displacement(model.V.tabulate_dof_coordinates()[:, 0])).ravel()
+    for state, v in ((still, translation), (still, rotation), (State(u, {}), translation)):
+        K = waves.tangent(state, 1)
+        x, y = K.createVecs()
+        x.setArray(v)
+        K.mult(x, y)
+        assert y.norm() < 1e-12 * K.norm() * x.norm()
+
+
+@pytest.mark.parametrize(
+    ("R_over_h", "lambda_m", "wave_number", "p_over_pc"), [(300, 0.00184, 28, 1.0145), (1000, 0.0005, 53, 0.9937)]
+)
+def test_known_waves(R_over_h: float, lambda_m: float, wave_number: int, p_over_pc: float) -> None:
+    """An independent axisymmetric solver with its own circumferential modes; before the axisymmetric fold."""
+    model = dimpled(R_over_h, lambda_m)
+    waves, found = model.excluded_modes.waves, buckle(model, lambda_m)
+    first = crossings(model, found)[0]
+    m, point = int(first.label.removeprefix("m = ")), first.point
+    assert m == wave_number
+    assert point.state.mu["pressure"] == pytest.approx(p_over_pc, rel=1e-4)
+    assert point.state.mu["pressure"] < found.instability.point.state.mu["pressure"]
+    assert abs(waves.critical_eigenvalue(point.state, m)) < 1e-5 * waves.critical_eigenvalue(found.points[0].state, m)
+
+
+def test_no_wave_before_the_fold() -> None:
+    """R/h = 90: the paper's knockdown is the axisymmetric fold."""
+    model = dimpled(90, 0.00184)
+    found = buckle(model, 0.00184)
+    assert crossings(model, found) == []
+
+
+def test_perfect_hemisphere_buckles_in_waves_at_its_edge() -> None:
+    """The full shell's tangent (44 589 unknowns) has its first two negative pivots between 0.8405 and 0.8418."""
+    model = hemisphere(90, 0.5, Loads(pressure=True))
+    found = buckle(model, 0.0)
+    first = crossings(model, found)[0]
+    assert first.label == "m = 14"
+    assert first.point.state.mu["pressure"] == pytest.approx(0.84111, rel=1e-4)
+
+
+@pytest.mark.parametrize(("R_over_h", "lambda_m"), [(90, 0.00184), (300, 0.00184)])
+def test_counts_of_all_waves_are_those_of_each(R_over_h: float, lambda_m: float) -> None:
+    """Interpolated between five m, as a polynomial of degree 4; 13 are unstable at one fold."""
+    model = dimpled(R_over_h, lambda_m)
+    waves, state = model.excluded_modes.waves, buckle(model, lambda_m).instability.point.state
+    counts = waves.counts(state)
+    assert {m: count for m, count in enumerate(counts, 1) if count} == waves.unstable(state)
+    assert sum(counts) == (13 if R_over_h == 300 else 0)

@@ -1,0 +1,118 @@
+"""Residual and tangent of every term against finite differences of the energy."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import scipy.sparse
+from conftest import hemisphere, random_displacement
+
+from magshell_fenicsx.assembly.problem import FiniteElementSystem
+from magshell_fenicsx.assembly.terms import FormTerm
+from magshell_fenicsx.models.shell.model import ShellModel
+from magshell_fenicsx.models.shell.parameters import Force, Loads, Magnetisation, Material
+from magshell_fenicsx.models.shell.patterns import tangential
+
+Shells = Callable[..., ShellModel]
+TERMS = [
+    "membrane",
+    "bending",
+    "interior edges",
+    "clamped edges",
+    "mirror edges",
+    "magnetic",
+    "pressure",
+    "U1",
+    "Uq",
+    "Utau",
+    "couple",
+]
+DEGREES = [2, 3, pytest.param(4, marks=pytest.mark.slow), pytest.param(5, marks=pytest.mark.slow)]
+
+
+def alone(model: ShellModel, name: str) -> FiniteElementSystem:
+    """The model with one term only, nothing held."""
+    pattern = next(t for t in model.system.terms if t.name == "interior edges")
+    assert isinstance(pattern, FormTerm)
+    term = next(t for t in model.system.terms if t.name == name)
+    return FiniteElementSystem(model.u, [term], [], pattern, 1.0)
+
+
+def dense(system: FiniteElementSystem, u: np.ndarray, mu: dict[str, float]) -> np.ndarray:
+    rows, columns, values = system.tangent(u, mu).getValuesCSR()
+    return np.asarray(scipy.sparse.csr_array((values, columns, rows), shape=(u.size, u.size)).toarray())
+
+
+def check(system: FiniteElementSystem, u: np.ndarray, mu: dict[str, float]) -> None:
+    rng = np.random.default_rng(1)
+    v = rng.standard_normal(u.size)
+    v[system._fixed] = 0
+
+    def energy(x: np.ndarray) -> float:
+        return sum((mu[t.amplitude] if t.amplitude else 1) * system.energies(x)[t.name] for t in system.terms)
+
+    e = 1e-5
+    slope = (8 * (energy(u + e * v) - energy(u - e * v)) - (energy(u + 2 * e * v) - energy(u - 2 * e * v))) / (12 * e)
+    R = system.residual(u, mu)
+    assert R @ v == pytest.approx(slope, rel=1e-6, abs=1e-9 * np.linalg.norm(R) * np.linalg.norm(v))
+    K = dense(system, u, mu)
+    assert np.abs(K - K.T).max() <= 1e-12 * np.abs(K).max()
+    rate = (
+        8 * (system.residual(u + e * v, mu) - system.residual(u - e * v, mu))
+        - (system.residual(u + 2 * e * v, mu) - system.residual(u - 2 * e * v, mu))
+    ) / (12 * e)
+    Kv = K @ v
+    free = np.setdiff1d(np.arange(u.size), system._fixed)
+    assert np.linalg.norm((Kv - rate)[free]) <= 1e-6 * np.linalg.norm(Kv)
+
+
+@pytest.mark.parametrize("degree", DEGREES)
+@pytest.mark.parametrize("name", TERMS)
+def test_term_alone(shell: Shells, degree: int, name: str) -> None:
+    model = shell(degree, half=name == "mirror edges", energy="full" if name in TERMS[:-4] else "second_consistent")
+    u = random_displacement(model, 2e-3 / degree**2)
+    check(alone(model, name), u, {"lambda_m": 1.0, "pressure": 1.0})
+
+
+@pytest.mark.parametrize("degree", DEGREES)
+@pytest.mark.parametrize("half", [False, True])
+def test_terms_together(shell: Shells, degree: int, half: bool) -> None:
+    model = shell(degree, half=half)
+    u = random_displacement(model, 2e-3 / degree**2)
+    u[model.system._fixed] = 0
+    check(model.system, u, {"lambda_m": 0.02, "pressure": 0.3})
+
+
+def test_field_gradient_and_pattern() -> None:
+    """Br varying over the surface in a field linear in space."""
+    G = np.array([[-0.5, 0.2, 0.1], [0.2, -0.7, 0.3], [0.1, 0.3, 1.2]])
+    field = Magnetisation(tangential, np.array([0.0, 0.6, 0.8]), "full", G)
+    model = ShellModel(hemisphere(), Material(0.3, 0.05), 3, {}, Loads(magnetic=field))
+    u = random_displacement(model, 2e-4)
+    for name in ("magnetic", "magnetic gradient"):
+        check(alone(model, name), u, {"lambda_m": 1.0})
+
+
+@pytest.mark.parametrize("amplitude", ["lambda_m", "pressure"])
+def test_tangent_changes_with_each_amplitude(shell: Shells, amplitude: str) -> None:
+    """K(mu) - K(0) = mu K_mu, and K_mu is not zero."""
+    model = shell(3)
+    u = random_displacement(model, 1e-3)
+    zero = {"lambda_m": 0.0, "pressure": 0.0}
+    K = [dense(model.system, u, {**zero, amplitude: mu}) for mu in (0.0, 0.5, 1.0)]
+    change = np.abs(K[2] - K[0]).max()
+    assert change > 1e-4 * np.abs(K[0]).max() * model.material.h
+    assert np.abs(K[2] - 2 * K[1] + K[0]).max() <= 1e-10 * np.abs(K[0]).max()
+
+
+def test_force_has_the_load_vector_of_its_work() -> None:
+    """Pi_F = -F w, and its column is minus the gradient of w."""
+    surface = hemisphere()
+    for force in (Force("load"), Force("load", patch=0.7)):
+        model = ShellModel(surface, Material(0.3, 0.05), 3, {}, Loads(force=force))
+        u = random_displacement(model, 1e-3)
+        load = model.system.load(u, "force")
+        assert -load @ u == pytest.approx(model.force_unit * model.loaded_deflection(u), rel=1e-12)
+        # a unit translation along the inward normal has w = 1, so the total force is F along it
+        inward = -model.normals["load"]
+        assert -load.reshape(-1, 3).sum(axis=0) == pytest.approx(model.force_unit * inward, rel=1e-12, abs=1e-15)

@@ -1,0 +1,215 @@
+"""The tangent from point Hessians against that of FFCx's forms, the reference."""
+
+import subprocess
+import sys
+from collections.abc import Callable, Mapping
+
+import numpy as np
+import pytest
+import scipy.sparse
+import ufl
+from conftest import hemisphere, random_displacement
+from dolfinx import fem
+from petsc4py import PETSc
+
+from magshell_fenicsx import Case, Scene
+from magshell_fenicsx.assembly.kernels import KernelLog
+from magshell_fenicsx.assembly.problem import FiniteElementSystem
+from magshell_fenicsx.assembly.terms import FormTerm
+from magshell_fenicsx.case.source import Source
+from magshell_fenicsx.continuation.system import followed
+from magshell_fenicsx.models.shell import densities, kinematics
+from magshell_fenicsx.models.shell.energy import cell_quadrature
+from magshell_fenicsx.models.shell.fast_tangent import FastTangent, make_sites
+from magshell_fenicsx.models.shell.model import ShellModel
+from magshell_fenicsx.models.shell.parameters import Condition, Loads, Magnetisation, Material
+from magshell_fenicsx.models.shell.patterns import tangential
+from magshell_fenicsx.simulate import follow
+
+Shells = Callable[..., ShellModel]
+DEGREES = [2, 3, pytest.param(4, marks=pytest.mark.slow), pytest.param(5, marks=pytest.mark.slow)]
+TERMS = {
+    "membrane": "full",
+    "bending": "full",
+    "interior edges": "full",
+    "clamped edges": "full",
+    "mirror edges": "full",
+    "magnetic": "full",
+    "pressure": "full",
+    "Uq": "second_consistent",
+    "Utau": "second_consistent",
+}
+MU = {"lambda_m": 0.4, "lambda_across": -0.7, "pressure": 0.3}
+
+
+def pattern(system: FiniteElementSystem) -> FormTerm:
+    found = next(t for t in system.terms if t.name == "interior edges")
+    assert isinstance(found, FormTerm)
+    return found
+
+
+def csr(K: PETSc.Mat) -> scipy.sparse.csr_array:
+    rows, columns, values = K.getValuesCSR()
+    return scipy.sparse.csr_array((values, columns, rows), shape=K.size)
+
+
+def difference(fast: FiniteElementSystem, u: np.ndarray, mu: Mapping[str, float]) -> float:
+    """Largest difference from the forms' tangent over its largest entry."""
+    by_forms = FiniteElementSystem(fast.u, fast.terms, fast.clamped, pattern(fast), 1.0)
+    assert fast._assembler is not None
+    K, reference = (csr(system.tangent(u, mu)) for system in (fast, by_forms))
+    return float(abs(K - reference).max() / abs(reference).max())
+
+
+@pytest.mark.parametrize("degree", DEGREES)
+@pytest.mark.parametrize("name", TERMS)
+def test_term_alone(shell: Shells, name: str, degree: int) -> None:
+    """To 1e-12 at random nodal values, nothing held."""
+    model = shell(degree, half=name == "mirror edges", energy=TERMS[name])
+    term = next(t for t in model.system.terms if t.name == name)
+    assembler = FastTangent(model.u, make_sites(model.r0, degree, [term], KernelLog()), [])
+    u = random_displacement(model, 1e-3)
+    by_forms = FiniteElementSystem(model.u, [term], [], pattern(model.system), 1.0)
+    reference = csr(by_forms.tangent(u, MU))
+    model.system.set(u)
+    K = csr(assembler.tangent({name: MU[term.amplitude] if term.amplitude else 1.0}))
+    assert abs(K - reference).max() <= 1e-12 * abs(reference).max()
+
+
+@pytest.mark.parametrize("degree", DEGREES)
+@pytest.mark.parametrize("energy", ["full", "second_consistent"])
+@pytest.mark.parametrize("half", [False, True])
+def test_terms_together(shell: Shells, half: bool, energy: str, degree: int) -> None:
+    model = shell(degree, half=half, energy=energy)
+    for seed, amplitudes in enumerate(({"lambda_m": 0.0, "pressure": 0.0}, MU)):
+        assert difference(model.system, random_displacement(model, 1e-3, seed), amplitudes) <= 1e-12
+
+
+@pytest.mark.parametrize("degree", DEGREES)
+def test_excluded_modes(shell: Shells, degree: int) -> None:
+    model = shell(degree, half=True)
+    modes = model.excluded_modes
+    assert modes is not None
+    # the interior edges' form has the widest coupling here too
+    assert difference(modes.system, random_displacement(model, 1e-3), MU) <= 1e-12
+
+
+@pytest.mark.parametrize("condition", ["free", "simply supported", "clamped"])
+def test_edge_conditions(condition: Condition) -> None:
+    model = ShellModel(hemisphere(0.8), Material(0.3, 0.05), 3, {"rim": condition}, Loads(pressure=True))
+    assert difference(model.system, random_displacement(model, 1e-3), MU) <= 1e-12
+
+
+def test_remanence_that_varies_field_that_varies_and_turns() -> None:
+    """A pattern, a gradient, and a field with a part across."""
+    G = np.array([[0.5, 0.2, -0.1], [0.2, -0.7, 0.3], [0.1, 0.3, 1.2]])
+    across = np.array([1.0, 0.0, 0.0])
+    field = Magnetisation(tangential, np.array([0.0, 0.6, 0.8]), "full", G, across)
+    model = ShellModel(hemisphere(0.8), Material(0.3, 0.05), 3, {}, Loads(magnetic=field))
+    system, u = model.system, random_displacement(model, 1e-3)
+    for mu in (MU, {"lambda_m": 0.0, "lambda_across": 1.0}, {"lambda_m": 10.0, "lambda_across": 0.0}):
+        assert difference(system, u, mu) <= 1e-12
+
+
+def test_matrix_is_reused_and_follows_state_and_amplitudes(shell: Shells) -> None:
+    """One Mat, as the factorisation expects; what it held before leaves no trace."""
+    system = shell(3).system
+    u = [random_displacement(shell(3), 1e-3, seed) for seed in range(2)]
+    K = system.tangent(u[0], MU)
+    first = csr(K)
+    assert system.tangent(u[1], MU) is K
+    assert abs(csr(K) - first).max() > 1e-3 * abs(first).max()
+    system.tangent(u[0], MU)
+    assert abs(csr(K) - first).max() == 0
+    assert K.isSymmetricKnown() == (True, True)
+    assert abs(first - first.T).max() <= 1e-14 * abs(first).max()
+
+
+def test_stress_of_other_displacements(shell: Shells) -> None:
+    """v . K v changes by twice the integral of `densities.prestress` with the change of the strain, by a form."""
+    model = shell(3)
+    system, u, step, v = model.system, *(random_displacement(model, 1e-2, seed) for seed in range(3))
+    K = csr(system.tangent(u, MU))
+    assert abs(csr(system.tangent(u, MU, [(1.0, u)])) - K).max() <= 1e-14 * abs(K).max()
+    changed = csr(system.tangent(u, MU, followed(u - step, step)))
+
+    fields = [fem.Function(model.V) for _ in range(2)]
+    for field, values in zip(fields, (step, v), strict=True):
+        field.x.array[:] = values
+    r0, d, w = (kinematics.jet(field, model.V.mesh) for field in (model.r0, *fields))
+    square = kinematics.metric(d)
+    E = -ufl.as_vector([square[0, 0], square[0, 1], square[1, 1]]) / 2
+    density = densities.prestress(r0, d, w, model.material.nu, E) * kinematics.area_ratio(r0)
+    free = system.held(np.ones_like(v))
+    form = density * ufl.dx(metadata={"quadrature_degree": cell_quadrature(3)})
+    fields[1].x.array[:] = v * free
+    expected = 2 * fem.assemble_scalar(fem.form(form))
+    found = (v * free) @ ((changed - K) @ (v * free))
+    assert found == pytest.approx(expected, rel=1e-10)
+    assert abs(expected) > 1e-6 * abs((v * free) @ (K @ (v * free)))
+
+
+HALF_SHELL = {
+    "shell": {"geometry": "hemisphere", "radius_to_thickness": 20, "poisson_ratio": 0.3},
+    "boundary": {"equator": "clamped"},
+    "magnetic": {"lambda_m": 1e-3},
+    "loading": {"kind": "pressure", "until": "target", "control": "load", "pressure": 0.2, "points": 1},
+    "mesh": {"degree": 3, "refinement": 0.6},
+    "symmetry": "half",
+}
+
+
+def test_run_compiles_no_forms_but_energies() -> None:
+    """Nor do the modes that a half shell excludes."""
+    scene = Scene(Case.from_source(Source("half", HALF_SHELL)))
+    states = [record.point.state for record in follow(scene)]
+    assert scene.model.excluded_modes
+    scene.model.excluded_modes.factor_at(states[-1])
+    names = scene.model.kernels.names
+    assert len(names) == len(set(names))
+    assert [name for name in names if name.endswith(("tangent", "residual"))] == []
+    assert "interior edges hessian" in names
+    assert "antisymmetric edges hessian" in names
+
+
+RANKS = f"""
+import numpy as np
+from mpi4py import MPI
+from petsc4py import PETSc
+from magshell_fenicsx import Case, Scene
+from magshell_fenicsx.case.source import Source
+from magshell_fenicsx.assembly.problem import FiniteElementSystem
+from magshell_fenicsx.assembly.terms import FormTerm
+
+scene = Scene(Case.from_source(Source("half", {HALF_SHELL!r})))
+model, mu = scene.model, dict(pressure=0.3, lambda_m=0.4)
+x = model.r0.x.array[: model.system.size].reshape(-1, 3)  # each node's own place makes the same u on all ranks
+u = (1e-2 * np.sin(40 * x @ np.array([[3, 1, 2], [1, -2, 5], [-4, 2, 1]]))).ravel()
+form = next(t for t in model.system.terms if t.name == "interior edges")
+for fast in (model.system, model.excluded_modes.system):
+    K = fast.tangent(u, mu)
+    size = K.norm(PETSc.NormType.FROBENIUS)
+    reference = FiniteElementSystem(fast.u, fast.terms, fast.clamped, form, 1.0).tangent(u, mu)
+    difference = K.copy()
+    difference.axpy(-1, reference, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
+    if scene.comm.rank == 0:
+        print("result", repr(size))
+    error = difference.norm(PETSc.NormType.INFINITY) / reference.norm(PETSc.NormType.INFINITY)
+    if scene.comm.rank == 0:
+        print("result", repr(error))
+"""
+
+
+@pytest.mark.slow
+def test_ranks() -> None:
+    """On 1, 2 and 3 ranks the tangents are those of the forms, and equal."""
+    found = []
+    for ranks in (1, 2, 3):
+        command = ["mpirun", "--map-by", ":OVERSUBSCRIBE", "-n", str(ranks), sys.executable, "-c", RANKS]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
+        found.append([float(line.split()[1]) for line in done.stdout.splitlines() if line.startswith("result")])
+    assert [len(each) for each in found] == [4, 4, 4]
+    for size, error, excluded_size, excluded_error in found:
+        assert max(error, excluded_error) <= 1e-12
+        assert [size, excluded_size] == pytest.approx([found[0][0], found[0][2]], rel=1e-12)

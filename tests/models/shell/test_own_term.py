@@ -1,0 +1,241 @@
+"""One's own energies: what is found from a density, and that they go the way of the shell's own."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import ufl
+from conftest import CASES, TILTED, hemisphere, random_displacement
+from test_fast_residual import difference as residual_difference
+from test_fast_tangent import difference as tangent_difference
+from ufl.core.expr import Expr
+
+from magshell_fenicsx import Case, CaseError, Jet, OwnTerm, Scene
+from magshell_fenicsx.case.source import Source
+from magshell_fenicsx.continuation.system import dot
+from magshell_fenicsx.models.shell import densities
+from magshell_fenicsx.models.shell import kinematics as kin
+from magshell_fenicsx.models.shell.model import ShellModel
+from magshell_fenicsx.models.shell.parameters import AreaForce, Loads, Material
+from magshell_fenicsx.plan.charted import make_plan
+from magshell_fenicsx.plan.own_terms import plan_with
+
+E1, E2, E3 = np.eye(3)
+Density = Callable[..., Expr]
+
+
+def winkler(r0: Jet, u: Jet) -> Expr:
+    return ufl.dot(u.r, kin.normal(r0)) ** 2 / 2
+
+
+def weight(r0: Jet, u: Jet, g: Expr) -> Expr:
+    return -ufl.dot(g, u.r)
+
+
+def hydrostatic(r0: Jet, u: Jet, depth: Expr) -> Expr:
+    """A live pressure that grows downwards, on a surface per undeformed area; not a potential at free edges."""
+    r = r0 + u
+    return (depth - r.r[2] / 2) * r.r[2] * ufl.dot(kin.area_vector(r), ufl.as_vector([0, 0, 1])) / kin.area_ratio(r0)
+
+
+def stretching(r0: Jet, u: Jet) -> Expr:
+    return ufl.tr(kin.mixed(kin.membrane_strain(r0, u), kin.inverse_metric(r0))) ** 2
+
+
+def one_sided(r0: Jet, u: Jet) -> Expr:
+    """A floor in the way of the lower half."""
+    gap = (r0 + u).r[2] - 0.5
+    return ufl.conditional(ufl.lt(gap, 0), gap**2, 0)
+
+
+def twisting(r0: Jet, u: Jet) -> Expr:
+    return ufl.dot(ufl.as_vector([0, 0, 1]), ufl.cross(r0.r, u.r))
+
+
+def tilted(r0: Jet, u: Jet) -> Expr:
+    """The normal's direction, an energy of first derivatives."""
+    return -ufl.dot(kin.normal(r0 + u), ufl.as_vector([0.6, 0.0, 0.8]))
+
+
+DENSITIES: dict[str, tuple[Density, tuple[np.ndarray | float, ...], tuple[str, ...], bool, bool, bool]] = {
+    # of what, whether linear, whether it turns about e3, whether it is mirrored in y = 0
+    "winkler": (winkler, (), ("r",), False, True, True),
+    "weight along e3": (weight, (E3,), ("r",), True, True, True),
+    "weight along e1": (weight, (E1,), ("r",), True, False, True),
+    "weight along e2": (weight, (E2,), ("r",), True, False, False),
+    "hydrostatic": (hydrostatic, (2.0,), ("r", "r1", "r2"), False, True, True),
+    "stretching": (stretching, (), ("r1", "r2"), False, True, True),
+    "one-sided": (one_sided, (), ("r",), False, True, True),
+    "twisting": (twisting, (), ("r",), True, True, False),
+    "tilted": (tilted, (), ("r1", "r2"), False, False, True),
+}
+
+
+@pytest.mark.parametrize("name", DENSITIES)
+def test_what_is_found_from_a_density(name: str) -> None:
+    of, parameters, parts, linear, turns, mirrors = DENSITIES[name]
+    term = OwnTerm("own", of, parameters)
+    assert (term.parts, term.linear, term.turns, term.mirrors) == (parts, linear, turns, mirrors)
+
+
+def test_far_floor_is_not_taken_for_linear() -> None:
+    """Where it is not touched the energy is zero, but not everywhere."""
+    term = OwnTerm("floor", lambda r0, u: ufl.conditional(ufl.lt((r0 + u).r[2], -10), ((r0 + u).r[2] + 10) ** 2, 0))
+    assert not term.linear
+
+
+def test_density_that_is_not_defined_everywhere() -> None:
+    """Has no symmetry that could be relied on."""
+    term = OwnTerm("own", lambda r0, u: ufl.ln(r0.r[2]) * u.r[2])
+    assert not term.turns
+    assert not term.mirrors
+
+
+@pytest.mark.parametrize("energy", ["magnetic", "magnetic_first", "magnetic_torque", "magnetic_tau", "magnetic_couple"])
+def test_symmetry_of_the_magnetic_densities(energy: str) -> None:
+    """Fields along e3 turn and mirror; in the plane y = 0 they mirror; across it they do not."""
+    of = getattr(densities, energy)
+    for Br, Ba, turns, mirrors in ((E3, E3, True, True), (E3, E1 + E3, False, True), (E3, E2 + E3, False, False)):
+        term = OwnTerm("own", of, (Br, Ba))
+        assert (term.turns, term.mirrors) == (turns, mirrors)
+
+
+@pytest.mark.parametrize(
+    ("name", "of", "said"),
+    [
+        ("a b", winkler, "identifier"),
+        ("own", lambda r0, u: u.r, "shape"),
+        ("own", lambda r0, u: ufl.dot(r0.r, r0.r), "does not depend"),
+        ("own", lambda r0, u: u.r[0] * ufl.SpatialCoordinate(hemisphere(0.8).mesh)[0], "jets and parameters alone"),
+        ("own", lambda r0, u: densities.bending(r0, u, 0.3, 0.1), "u.r11, u.r12, u.r22"),
+    ],
+)
+def test_what_no_term_can_be(name: str, of: Density, said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        OwnTerm(name, of)
+
+
+@pytest.mark.parametrize("name", DENSITIES)
+def test_residual_and_tangent(name: str) -> None:
+    """Of the point derivatives against those of the forms; on a shell that has all other terms too."""
+    of, parameters, *_ = DENSITIES[name]
+    loads = Loads(pressure=True, magnetic=TILTED, own=(OwnTerm("own", of, parameters),))
+    model = ShellModel(hemisphere(0.8), Material(0.3, 0.05), 2, {"rim": "clamped"}, loads)
+    u = random_displacement(model, 1e-2)
+    for mu in ({"lambda_m": 0.4, "pressure": 0.3, "own": 1.3}, {"lambda_m": 0.0, "pressure": 0.0, "own": 20.0}):
+        assert tangent_difference(model.system, u, mu) <= 1e-12
+        assert residual_difference(model.system, u, mu) <= 1e-12
+
+
+@pytest.mark.parametrize("name", ["winkler", "weight along e1", "hydrostatic", "tilted"])
+def test_load_is_the_derivative_of_the_potential(name: str) -> None:
+    """Central differences along a random displacement."""
+    of, parameters, *_ = DENSITIES[name]
+    loads = Loads(own=(OwnTerm("own", of, parameters),))
+    system = ShellModel(hemisphere(0.8), Material(0.3, 0.05), 2, {"rim": "clamped"}, loads).system
+    model_u, v = (system.held(1e-2 * np.random.default_rng(i).standard_normal(system.size)) for i in range(2))
+    step = 1e-3
+    slope = (system.potential(model_u + step * v, "own") - system.potential(model_u - step * v, "own")) / (2 * step)
+    assert slope == pytest.approx(dot(system.comm, system.load(model_u, "own"), v), rel=1e-6)
+
+
+@pytest.mark.parametrize("symmetry", ["axisymmetric", "half", "none"])
+def test_the_shells_own_pressure_as_ones_own(symmetry: str) -> None:
+    """The same density by both ways: potentials, load columns and residuals agree."""
+    settings = ["mesh.degree=2", "mesh.refinement=0.5", f"symmetry={symmetry}"]
+    case = Case.load(CASES / "dimple_buckling.yaml", settings)
+    unit = Material(case.shell.poisson_ratio, 1 / case.shell.R_over_h).classical_pressure * case.shell.R_over_h
+
+    def pressure(r0: Jet, u: Jet, unit: Expr) -> Expr:
+        return densities.pressure(r0, u, unit) / kin.area_ratio(r0)
+
+    scene = Scene(case, terms=[OwnTerm("own", pressure, (unit,))])
+    system = scene.model.system
+    u = system.held(1e-2 * np.random.default_rng(0).standard_normal(system.size))
+    assert system.potential(u, "own") == pytest.approx(system.potential(u, "pressure"), rel=1e-11)
+    ours, theirs = system.load(u, "own"), system.load(u, "pressure")
+    assert np.abs(ours - theirs).max() < 1e-11 * np.abs(theirs).max()
+    mu = {"own": -0.7, "pressure": 0.7}
+    assert np.abs(system.residual(u, mu) - system.residual(u, dict.fromkeys(mu, 0.0))).max() < 1e-10
+
+
+def test_weight_is_a_dead_load_on_any_surface() -> None:
+    """On a cylinder: the column of the case file's own force per area."""
+    case = Case.from_source(
+        Source(
+            "cylinder",
+            {
+                "shell": {
+                    "geometry": "cylinder",
+                    "radius": 100,
+                    "length": 100,
+                    "azimuth": [0, 90],
+                    "thickness": 2,
+                    "youngs_modulus": 30.0e3,
+                    "poisson_ratio": 0.3,
+                },
+                "boundary": {"bottom": "clamped"},
+                "loading": {"kind": "dead", "loads": [{"over": "all", "per_area": [0.1, 0.2, -0.3]}], "factor": 1},
+                "mesh": {"size": 50, "degree": 3},
+            },
+        )
+    )
+    (dead,) = make_plan(case).loads.dead
+    assert isinstance(dead, AreaForce)
+    system = Scene(case, terms=[OwnTerm("own", weight, (dead.force,))]).model.system
+    u = system.held(1e-2 * np.random.default_rng(0).standard_normal(system.size))
+    ours, theirs = system.load(u, "own"), system.load(u, "load")
+    assert np.abs(theirs).max() > 0
+    assert np.abs(ours - theirs).max() < 1e-11 * np.abs(theirs).max()
+    assert system.potential(u, "own") == pytest.approx(system.potential(u, "load"), rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("name", "built"),
+    [("winkler", "meridian"), ("weight along e1", "half shell"), ("weight along e2", "full shell")],
+)
+def test_smallest_model_that_shares_the_symmetry(name: str, built: str) -> None:
+    of, parameters, *_ = DENSITIES[name]
+    case = Case.load(CASES / "dimple_buckling.yaml")
+    plan = plan_with(case, [OwnTerm("own", of, parameters)])
+    assert plan.included[0] == built
+    assert plan.included[-1] == "own energy: own"
+
+
+def test_half_model_of_another_plane_needs_a_term_that_turns() -> None:
+    """The half shell's frame is turned to its mirror plane; a direction would have to turn with it."""
+    settings = ["magnetic={lambda_m: 1e-3, remanent: {polar: 30, azimuth: 20}, applied: {polar: 60, azimuth: 20}}"]
+    case = Case.load(CASES / "dimple_buckling.yaml", settings)
+    assert plan_with(case, [OwnTerm("own", winkler)]).half
+    assert not plan_with(case, [OwnTerm("own", weight, (E1,))]).half
+
+
+@pytest.mark.parametrize(
+    ("settings", "names", "said"),
+    [
+        (["symmetry=axisymmetric"], ["own"], "symmetry: axisymmetric: the energy own"),
+        (["symmetry=half"], ["own"], "symmetry: half: the energy own"),
+        (["model=solid"], ["own"], "mid-surface"),
+        ([], ["pressure"], "terms: pressure"),
+        ([], ["w_over_h"], "terms: w_over_h"),
+        ([], ["own", "own"], "terms: own"),
+    ],
+)
+def test_what_the_plan_refuses(settings: list[str], names: list[str], said: str) -> None:
+    case = Case.load(CASES / "dimple_buckling.yaml", settings)
+    with pytest.raises(CaseError, match=said):
+        plan_with(case, [OwnTerm(name, weight, (E2,)) for name in names])
+
+
+def test_parameters_need_no_new_kernel() -> None:
+    """Densities are compiled by what they are, not by the numbers in them."""
+    models = [
+        ShellModel(
+            hemisphere(0.8), Material(0.3, 0.05), 2, {"rim": "clamped"}, Loads(own=(OwnTerm("own", weight, (g,)),))
+        )
+        for g in (E3, 2 * E3)
+    ]
+    forms = [next(t for t in m.system.terms if t.name == "own")._energy for m in models]  # type: ignore[attr-defined]
+    assert forms[0].module is forms[1].module or forms[0].module.__file__ == forms[1].module.__file__
+    u = random_displacement(models[0], 1e-2)
+    assert models[1].system.potential(u, "own") == pytest.approx(2 * models[0].system.potential(u, "own"))

@@ -1,0 +1,82 @@
+"""Residual and tangent of the solid against finite differences and FFCx's tangent forms."""
+
+import numpy as np
+import pytest
+import scipy.sparse
+from bodies import hemisphere
+from petsc4py import PETSc
+
+from magshell_fenicsx.assembly.problem import FiniteElementSystem
+from magshell_fenicsx.mesh.sphere import Dimple
+from magshell_fenicsx.models.shell.parameters import Loads, Magnetisation, Material
+from magshell_fenicsx.models.solid.material import NeoHookean
+from magshell_fenicsx.models.solid.model import SolidModel
+
+MU = {"pressure": 0.3, "lambda_m": 0.4, "lambda_across": -0.7}
+FIELD = Magnetisation(
+    np.array([0.6, 0.0, 0.8]),
+    np.array([0.0, 0.28, 0.96]),
+    gradient=np.array([[1.0, 0.2, 0.0], [0.2, 0.5, 0.3], [0.0, 0.3, -1.5]]),
+    across=np.array([1.0, 0.0, 0.0]),
+)
+
+
+@pytest.fixture(scope="module")
+def model() -> SolidModel:
+    """A coarse dimpled half with every load."""
+    body = hemisphere(0.6, 0.1, half=True, dimple=Dimple(0.05, 0.5))
+    conditions = {"rim": "clamped", "symmetry": "symmetry"}
+    loads = Loads(pressure=True, magnetic=FIELD)
+    return SolidModel(body, Material(0.5, 0.1), NeoHookean.of(0.5, 100.0), conditions, loads)  # type: ignore[arg-type]
+
+
+def csr(K: PETSc.Mat) -> scipy.sparse.csr_array:
+    rows, columns, values = K.getValuesCSR()
+    return scipy.sparse.csr_array((values, columns, rows), shape=K.size)
+
+
+def displacement(model: SolidModel) -> np.ndarray:
+    return model.system.held(2e-3 * np.random.default_rng(0).standard_normal(model.system.size))
+
+
+def test_tangent_is_that_of_the_forms_and_symmetric(model: SolidModel) -> None:
+    u, fast = displacement(model), model.system
+    by_forms = FiniteElementSystem(model.u, fast.terms, fast.clamped, model._pattern, 1.0)
+    K, reference = (csr(system.tangent(u, MU)) for system in (fast, by_forms))
+    assert abs(K - reference).max() <= 1e-12 * abs(reference).max()
+    assert abs(K - K.T).max() <= 1e-13 * abs(K).max()
+
+
+@pytest.mark.parametrize("name", ["distortion", "compression", "magnetic", "magnetic gradient", "pressure"])
+def test_residual_is_the_derivative_of_the_energy(model: SolidModel, name: str) -> None:
+    term = next(t for t in model.system.terms if t.name == name)
+    system = FiniteElementSystem(model.u, [term], [], model._pattern, 1.0)
+    u, v = displacement(model), np.random.default_rng(1).standard_normal(model.system.size)
+
+    def energy(step: float) -> float:
+        return system.energies(u + step * v)[name]
+
+    e = 1e-5
+    slope = (8 * (energy(e) - energy(-e)) - (energy(2 * e) - energy(-2 * e))) / (12 * e)
+    alone = dict.fromkeys(MU, 1.0)
+    assert system.residual(u, alone) @ v == pytest.approx(slope, rel=1e-6)
+
+
+def test_tangent_is_the_derivative_of_the_residual(model: SolidModel) -> None:
+    u, system = displacement(model), model.system
+    v = system.held(np.random.default_rng(2).standard_normal(system.size))
+    e = 1e-6
+    rate = (system.residual(u + e * v, MU) - system.residual(u - e * v, MU)) / (2 * e)
+    Kv = system.held(csr(system.tangent(u, MU)) @ v)
+    assert np.linalg.norm(Kv - rate) <= 1e-6 * np.linalg.norm(rate)
+
+
+def test_pressure_is_conservative_and_its_conjugate_is_the_enclosed_volume(model: SolidModel) -> None:
+    """A uniform stretch s that keeps the planes of the mirror and of the equator: V grows by s^3 - 1.
+
+    V/R^3 of the half under the outer face is pi/3 (1 + h/2)^3 without the dimple; here the whole's by the same form.
+    """
+    stretched = model.r0.x.array[: model.system.size].copy()
+    V, s = model.volume_change(-stretched), 1.1  # -X brings the face to the origin: -V
+    assert model.volume_change((s - 1) * stretched) == pytest.approx(-V * (s**3 - 1), rel=1e-10)
+    assert pytest.approx(2 * np.pi / 3 * 1.05**3, rel=0.02) == -V  # the dimple takes 1 %

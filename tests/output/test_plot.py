@@ -1,0 +1,112 @@
+"""`magshell plot`: the pictures of a folder again, from the folder alone, and the moving one."""
+
+import io
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import magshell_fenicsx as ms
+from magshell_fenicsx.case.source import CaseError, Source
+from magshell_fenicsx.output.pictures.picture import PICTURES
+from magshell_fenicsx.output.pictures.plot import draw, draw_animation, plot
+from magshell_fenicsx.output.store.table import read_rows
+
+pytestmark = pytest.mark.skipif(shutil.which("Xvfb") is None, reason="no screen to draw on")
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A dimpled hemisphere in a field, up to its fold: meridian, seconds."""
+    defect = {"kind": "dimple", "amplitude": 0.5, "width": 3.2}
+    sections = {
+        "shell": {"geometry": "hemisphere", "radius_to_thickness": 90, "poisson_ratio": 0.5, "defect": defect},
+        "boundary": {"equator": "clamped"},
+        "magnetic": {"lambda_m": 1e-4},
+        "loading": {"kind": "pressure", "until": "limit"},
+    }
+    out = tmp_path_factory.mktemp("run")
+    ms.run(ms.Case.from_source(Source("test", sections)), out)
+    return out
+
+
+def copied(run: Path, to: Path, *without: str) -> Path:
+    return Path(shutil.copytree(run, to / "copy", ignore=shutil.ignore_patterns(*without)))
+
+
+def pixels(file: Path) -> np.ndarray:
+    return np.asarray(Image.open(file).convert("RGB"), dtype=int)
+
+
+def test_pictures_of_a_run_are_those_of_its_folder(run: Path, tmp_path: Path) -> None:
+    """Without summary, as a killed run is: the same files with the same pixels, but for rounding."""
+    there = {file.name for file in run.glob("*.png")}
+    wanted = {"shell.png", "curve.png", "magnetic_loads.png", "strains.png", "moments.png", "fields.png"}
+    assert there == wanted | {"instabilities.png"}
+    again = copied(run, tmp_path, "*.png", "summary.json")
+    assert set(draw(again)) == there
+    for name in there:
+        difference = np.abs(pixels(again / name) - pixels(run / name))
+        assert (difference > 8).sum() < 20, name  # VTK rounds otherwise now and then
+
+
+def test_a_torn_row_is_no_point(run: Path, tmp_path: Path) -> None:
+    again = copied(run, tmp_path, "*.png")
+    text = (again / "path.csv").read_text()
+    (again / "path.csv").write_text(text[: text.rstrip().rfind("\n") + 20])
+    assert len(read_rows(again / "path.csv")) == len(read_rows(run / "path.csv")) - 1
+    assert "shell.png" in draw(again)
+
+
+def test_another_point(run: Path, tmp_path: Path) -> None:
+    again = copied(run, tmp_path, "*.png")
+    assert set(draw(again, 1)) == {f"{name}_0001.png" for name in PICTURES}
+    first, last = pixels(again / "shell_0001.png"), pixels(run / "shell.png")
+    assert first.shape != last.shape or (np.abs(first - last) > 8).sum() > 1000
+    with pytest.raises(CaseError, match=r"--point 99: .* has points 0 to"):
+        draw(again, 99)
+
+
+def test_a_turning_field(tmp_path: Path) -> None:
+    """Its amplitudes are NumPy's numbers, whose repr no reader of path.csv understands."""
+    sections = {
+        "shell": {"geometry": "strip", "radius_to_thickness": 100, "width": 0.1, "poisson_ratio": 0},
+        "boundary": {"root": "clamped"},
+        "magnetic": {"lambda_m": 3.3e-6, "remanent": {"polar": 90}, "applied": {"polar": 90}},
+        "loading": {"kind": "rotation", "to": {"polar": 0}, "points": 1},
+        "mesh": {"degree": 2, "refinement": 0.5},
+    }
+    ms.run(ms.Case.from_source(Source("test", sections)), tmp_path)
+    last = read_rows(tmp_path / "path.csv")[-1]
+    assert last["field_angle"] == pytest.approx(90)
+    assert isinstance(last["energy"], float)
+    assert (tmp_path / "curve.png").exists()
+
+
+@pytest.mark.parametrize("name", ["", "absent", "case.yaml"])
+def test_nothing_there(tmp_path: Path, name: str) -> None:
+    """An empty folder, none, or a file in its place: one line."""
+    (tmp_path / "case.yaml").touch()
+    with pytest.raises(CaseError, match=rf"{tmp_path / name} holds no run: it has no path\.csv"):
+        plot(tmp_path / name)
+
+
+def test_animation(run: Path, tmp_path: Path) -> None:
+    """A frame for every point of the pressure's path; what does not move has the same pixels in all."""
+    again = copied(run, tmp_path)
+    assert draw_animation(again) == "animation.gif"
+    content = (again / "animation.gif").read_bytes()
+    rows = [row for row in read_rows(again / "path.csv") if row["amplitude"] == "pressure"]
+    with Image.open(io.BytesIO(content)) as moving:
+        frames = []
+        for i in range(moving.n_frames):  # type: ignore[attr-defined]
+            moving.seek(i)
+            frames.append(np.asarray(moving.convert("RGB"), dtype=int))
+    assert len(content) < 3e6
+    assert len(rows) <= len(frames) <= len(rows) + 1
+    changes = np.array([np.abs(frame - frames[0]).max(axis=2) for frame in frames])
+    foot = changes[:, -20:]
+    assert (foot == 0).all()
+    assert (changes[-1] > 40).any()

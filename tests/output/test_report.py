@@ -1,0 +1,195 @@
+"""report.html: one file that says what stands in the folder of a run, whatever of it there is."""
+
+import base64
+import copy
+import json
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from magshell_fenicsx.output.report.report import write_report
+from magshell_fenicsx.output.report.report_path import path_table
+from magshell_fenicsx.output.report.verdict import verdict
+from magshell_fenicsx.output.store.table import COLUMNS
+
+SUMMARY: dict[str, Any] = {
+    "case": {
+        "model": "shell",
+        "shell": {"geometry": "hemisphere", "radius": 0.0252, "thickness": 0.00028, "youngs_modulus": 1.8e6},
+        "loading": {"kind": "pressure", "control": "volume", "until": "limit"},
+        "mesh": {"degree": 4, "refinement": 1.0},
+    },
+    "dimensionless": {
+        "radius_to_thickness": 90.0,
+        "poisson_ratio": 0.5,
+        "lambda_m": 0.0,
+        "Lambda_m": 0.0,
+        "pc_over_E": 4 / 3 / 90**2,  # 2/sqrt(3 (1 - nu^2)) (h/R)^2 with nu = 1/2
+    },
+    "dimensions": {"radius": 0.0252, "thickness": 0.00028, "youngs_modulus": 1.8e6, "units": "SI"},
+    "model": {"included": ["meridian", "live pressure"], "left_out": ["force: none"]},
+    "stopped": None,
+    "sensitivities": {},
+    "knockdown": 0.32623330500000004,
+    "points": 3,
+    "mesh": {"cells": 76, "dofs": 610, "degree": 4},
+    "timing": dict.fromkeys(("jit_s", "setup_s", "assembly_s", "factor_s", "output_s", "solve_s", "total_s"), 1.25),
+    "replayed": 0,
+    "factorisations": 7,
+    "iterations": 12,
+    "ranks": 2,
+    "blas": "openblas",
+    "versions": {"magshell_fenicsx": "0.1.0", "dolfinx": "0.9.0"},
+}
+START = dict.fromkeys(COLUMNS, 0.0) | {"label": "start", "amplitude": "", "mode": "", "branch": 0}
+FOLD = {"label": "fold", "amplitude": "pressure", "p_over_pc": 0.32623330500000004, "w_pole_over_h": 3.4}
+
+
+class Page(HTMLParser):
+    """Tags, text and the sources of images of a page."""
+
+    def __init__(self, content: str) -> None:
+        super().__init__()
+        self.tags: list[str] = []
+        self.sources: list[str] = []
+        self.references: list[str | None] = []
+        self.text = ""
+        self.feed(content)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        for name, value in attrs:
+            if tag == "img" and name == "src":
+                self.sources.append(str(value))
+            elif name in ("src", "href", "srcset", "action", "data"):
+                self.references.append(value)
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+
+def page(folder: Path, rows: list[dict[str, Any]], pictures: dict[str, bytes] | None = None, **changes: Any) -> Page:
+    """The report of a folder with a start, so many more rows, and a summary with changes."""
+    lines = [",".join(COLUMNS)]
+    for number, row in enumerate([{}, *rows]):
+        lines.append(",".join(str((START | {"point": number} | row)[name]) for name in COLUMNS))
+    (folder / "path.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    (folder / "summary.json").write_text(json.dumps(copy.deepcopy(SUMMARY) | changes), encoding="utf-8")
+    for name, content in (pictures or {}).items():
+        (folder / name).write_bytes(content)
+    write_report(folder)
+    return Page((folder / "report.html").read_text(encoding="utf-8"))
+
+
+def test_one_file_with_every_picture_and_no_reference(tmp_path: Path) -> None:
+    """Pictures are in it byte by byte, in the order of the report; nothing is looked for elsewhere."""
+    names = ["curve.png", "shell.png", "animation.gif", "magnetic_loads.png", "instabilities.png", "modes_0003.png"]
+    pictures = {name: name.encode() for name in reversed(names)}
+    found = page(tmp_path, [FOLD], pictures | {"a_user's own.png": b"no part of the run"})
+    kinds = [f"data:image/{name[-3:]};base64," for name in names]
+    assert [source.split(",")[0] + "," for source in found.sources] == kinds
+    assert [base64.b64decode(source.split(",")[1]).decode() for source in found.sources] == names
+    assert found.references == []
+    assert not {"script", "link", "iframe", "object"} & set(found.tags)
+    content = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "url(" not in content
+    assert "@import" not in content
+
+
+def test_buckling_in_one_sentence_and_in_pascals(tmp_path: Path) -> None:
+    """p_c = 1.8e6 * 4/3/90^2 = 296.296 Pa, k_d p_c = 96.6617 Pa."""
+    text = page(tmp_path, [FOLD]).text
+    assert (
+        "The shell buckles at the knockdown factor kd = p/pc = 0.326233 (96.6617 Pa): a fold, w/h = 3.4 at the" in text
+    )
+    assert "296.296Pa" in text.replace("\n", "")
+    assert "326233305" not in text
+
+
+def test_force_at_the_target_in_newtons(tmp_path: Path) -> None:
+    """2 pi D/R with D = 1.8e6 (2.8e-4)^3/9 = 4.3904e-6 N m is 1.094671e-3 N; times 27.532."""
+    rows = [{"label": "target", "amplitude": "force", "force": 27.532, "w_over_h": 20.0}]
+    case = SUMMARY["case"] | {"loading": {"kind": "indentation", "until": "target"}}
+    text = page(tmp_path, rows, case=case, knockdown=None).text
+    assert "The run reached its target: F R/(2πD) = 27.532 (0.0301385 N), w/h = 20 at the load." in text
+
+
+def test_displacement_along_the_loads(tmp_path: Path) -> None:
+    """Of moments alone, which have none, it is that of the pole."""
+    lines = [START | {"amplitude": "load", "load_factor": 1.0, "w_over_h": 2.0, "w_pole_over_h": w} for w in (2.0, 1.0)]
+    told = [verdict(SUMMARY | {"case": {}}, [{key: str(v) for key, v in line.items()}]) for line in lines]
+    assert told[0].endswith("load factor = 1, w/h = 2 at the pole.")
+    assert told[1].endswith("load factor = 1, w/h = 2 along the loads.")
+
+
+def test_critical_field_and_excluded_mode(tmp_path: Path) -> None:
+    rows = [{"label": "bifurcation", "amplitude": "lambda_m", "lambda_m": -0.003355, "mode": "m = 7"}]
+    stop = "the field alone makes the shell unstable"
+    found = page(tmp_path, rows, knockdown=None, stopped=stop)
+    assert "unstable at the critical λm = −0.003355: a bifurcation (m = 7 waves), w/h = 0 at the pole" in found.text
+    assert f"The run stopped early, after 2 points: {stop}." in found.text
+
+
+def test_interrupted_at_once_without_pictures(tmp_path: Path) -> None:
+    """What stopped it is shown as text, whatever is in it."""
+    found = page(tmp_path, [], stopped="<b>1 & 2</b>", knockdown=None)
+    assert found.sources == []
+    assert "after 1 point: <b>1 & 2</b>." in found.text
+
+
+def test_path_has_the_columns_that_vary(tmp_path: Path) -> None:
+    """Many points are folded away; a displacement that is another one but for rounding stands once."""
+    rows = [
+        {"label": "step", "amplitude": "pressure", "p_over_pc": 0.01 * i, "w_over_h": 0.1 * i, "w_pole_over_h": 0.1 * i}
+        for i in range(1, 40)
+    ]
+    rows[3]["w_pole_over_h"] += 1e-15
+    found = page(tmp_path, rows, knockdown=None)
+    assert "details" in found.tags
+    assert "All 40 points" in found.text
+    heads = found.text[found.text.index("All 40 points") :].split("\n")[:4]
+    assert "pointwhatvariedp/pcw/h" in "".join(heads).replace(" ", "")
+    assert "details" not in page(tmp_path, rows[:5]).tags
+
+
+def test_columns_name_the_point() -> None:
+    """Whose displacement w_pole_over_h is: that of the first named point, whatever is in its name; else the pole's."""
+    fixed = {name: str(value) for name, value in START.items()}
+    rows = [fixed | {"w_over_h": str(i), "w_pole_over_h": str(i**2)} for i in range(3)]
+    assert "w/h, pole" in [column.head for column in path_table(rows, "")]
+    assert "w/h, A&lt;b&gt;" in [column.head for column in path_table([row | {"A<b>_ux": "0"} for row in rows], "")]
+
+
+def test_error_estimate_or_how_to_get_one(tmp_path: Path) -> None:
+    tried = {"degree": 4, "refinement": 0.5, "cells": 40, "dofs": 330, "result": 0.32626, "estimate": 8e-5}
+    taken = {"degree": 4, "refinement": 1.0, "cells": 76, "dofs": 610, "result": 0.326233, "estimate": 1.234e-6}
+    tolerance = {"tolerance": 1e-5, "error_estimate": 1.234e-6, "rounds": [tried, taken]}
+    sensitivities = {"lambda_m": 126.12}
+    found = page(tmp_path, [FOLD], tolerance=tolerance, sensitivities=sensitivities)
+    assert "Estimated relative error of the discretisation: 1.2 · 10−6; asked for: below\n10−5" in found.text
+    assert 'class="taken"' in (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "derivative of p/pc" in found.text
+    assert "126.12" in found.text
+    ended_elsewhere = page(tmp_path, [FOLD], tolerance=tolerance | {"error_estimate": None}).text
+    assert "There is no estimate" in ended_elsewhere
+    assert "no error estimate. For one: give the case mesh: {tolerance: 1e-3}" in page(tmp_path, [FOLD]).text
+
+
+def test_units_of_ones_own(tmp_path: Path) -> None:
+    """Nobody knows what an amount of them is in pascals."""
+    found = page(tmp_path, [FOLD], dimensions=SUMMARY["dimensions"] | {"units": "the case's own"})
+    assert "in the case's own units" in found.text
+    assert "Pa" not in found.text[: found.text.index("Path")]
+
+
+@pytest.mark.parametrize("missing", ["summary.json", "path.csv"])
+def test_nothing_to_report(tmp_path: Path, missing: str) -> None:
+    """The report that is there stays as it is."""
+    page(tmp_path, [FOLD])
+    before = (tmp_path / "report.html").read_bytes()
+    (tmp_path / missing).unlink()
+    with pytest.raises(FileNotFoundError, match=missing):
+        write_report(tmp_path)
+    assert (tmp_path / "report.html").read_bytes() == before

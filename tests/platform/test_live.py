@@ -1,0 +1,179 @@
+"""The live line: at the foot of a terminal and nowhere else, gone when the run is over."""
+
+import io
+import os
+import pty
+import re
+import select
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from command import magshell
+from conftest import CASES
+
+from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.platform.terminal import LAUNCHERS, live_line
+from magshell_fenicsx.run.status import Aim, RunProgress, time_left
+
+QUICK = (CASES / "pole_indentation.yaml", "--set=mesh.degree=3", "--set=mesh.refinement=0.5")
+
+
+class Terminal:
+    """A process on a terminal of its own: what it wrote, and what is seen of it."""
+
+    def __init__(self, *arguments: str | Path, launcher: tuple[str, ...] = ()) -> None:
+        self._end, other = pty.openpty()
+        command = [*launcher, sys.executable, "-m", "magshell_fenicsx", *map(str, arguments)]
+        environment = os.environ | {"TERM": "xterm", "COLUMNS": "200"}
+        found = signal.signal(signal.SIGINT, signal.default_int_handler)  # background jobs begin with SIGINT ignored
+        self.process = subprocess.Popen(command, stdout=other, stderr=other, env=environment)
+        signal.signal(signal.SIGINT, found)
+        os.close(other)
+        self.written = ""
+
+    def read(self, until: Callable[[str], bool] = lambda written: False) -> None:
+        """Read on until what was written is as wanted, or to the end."""
+        latest = time.monotonic() + 120
+        with suppress(OSError):  # the other end is closed
+            while not until(self.written):
+                assert time.monotonic() < latest
+                if select.select([self._end], [], [], 0.1)[0]:
+                    self.written += os.read(self._end, 65536).decode()
+        if not until(self.written):
+            self.process.wait()
+            os.close(self._end)
+
+    @property
+    def screen(self) -> list[str]:
+        """The lines that are left; knows carriage returns and the erasure of a line, and no other escape."""
+        lines, place = [""], 0
+        for piece in re.findall(r"\r|\n|\x1b\[K|[^\r\n\x1b]+|\x1b", self.written):
+            if piece == "\r":
+                place = 0
+            elif piece == "\n":
+                lines.append("")
+                place = 0
+            elif piece == "\x1b[K":
+                lines[-1] = lines[-1][:place]
+            else:
+                assert piece != "\x1b"
+                lines[-1] = lines[-1][:place] + piece + lines[-1][place + len(piece) :]
+                place += len(piece)
+        return lines
+
+    @property
+    def feet(self) -> list[str]:
+        """Lines that were rewritten."""
+        return re.findall(r"\r\x1b\[K([^\r\n]+)(?=\r\x1b)", self.written)
+
+
+def test_terminal_and_pipe(tmp_path: Path) -> None:
+    """What stays on a terminal is what a pipe gets, which has no control characters."""
+    terminal = Terminal("run", *QUICK, "--out", tmp_path)
+    terminal.read()
+    piped = magshell("run", *QUICK, "--out", tmp_path)
+    assert terminal.process.returncode == piped.returncode == 0
+    assert terminal.screen == piped.stdout.split("\n")
+    assert not set("\r\x1b") & set(piped.stdout)
+    feet = terminal.feet
+    assert re.fullmatch(r"mesh and kernels  \d:\d\d", feet[0])
+    steps = [foot for foot in feet if " step " in foot]
+    assert re.fullmatch(r"1 point  w/h 0 -> 6  step \d\.?\d* h  \d:\d\d", steps[0])
+    assert re.fullmatch(r"\d points  w/h \d\.?\d* -> 6  step .* h  \d:\d\d, about \d:\d\d left", steps[-1])
+    assert [foot for foot in feet if "looking for modes that the model excludes" in foot]
+    assert "modes and pictures" in feet[-1]
+
+
+def test_one_rank_of_mpirun(tmp_path: Path) -> None:
+    """It has a terminal between it and mpirun, which may write to a file."""
+    terminal = Terminal("run", *QUICK, "--time-limit", "0", "--out", tmp_path, launcher=("mpirun", "-n", "1"))
+    terminal.read()
+    assert "results in" in terminal.written
+    assert "\x1b" not in terminal.written
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_stopped_on_the_way(tmp_path: Path, number: signal.Signals) -> None:
+    """The run ends after the point, and only its message is left."""
+    terminal = Terminal("run", *QUICK, "--set=loading.points=60", "--out", tmp_path)
+    terminal.read(lambda written: "5 points" in written)
+    terminal.process.send_signal(number)
+    terminal.read()
+    assert terminal.process.returncode == 3
+    *_, results, message, last = terminal.screen
+    assert results == f"results in {tmp_path}/"
+    assert message.startswith(f"stopped early: interrupted by {number.name}; ")
+    assert last == ""
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, -signal.SIGTERM)])
+def test_stopped_while_a_mesh_is_found(tmp_path: Path, number: signal.Signals, code: int) -> None:
+    """Nothing can be resumed, so the process ends at once; the line that told of the mesh is gone."""
+    case = CASES / "dimple_buckling.yaml"
+    terminal = Terminal("run", case, "--set=mesh.tolerance=1e-5", "--set=symmetry=half", "--out", tmp_path)
+    terminal.read(lambda written: "a mesh for the tolerance 1e-05: the path on a coarse one" in written)
+    terminal.process.send_signal(number)
+    terminal.read()
+    assert terminal.process.returncode == code
+    assert not [line for line in terminal.screen if "tolerance" in line]
+    assert terminal.screen[-1] == ""
+
+
+def test_a_narrow_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A line that wrapped could not be erased; what stays may wrap."""
+    screen = io.StringIO()
+    screen.isatty = lambda: True  # type: ignore[method-assign]
+    monkeypatch.setattr(sys, "stdout", screen)
+    monkeypatch.setenv("COLUMNS", "10")
+    monkeypatch.setenv("TERM", "xterm")
+    for name in LAUNCHERS:
+        monkeypatch.delenv(name, raising=False)
+    with live_line(1, print) as (say, tell):
+        assert tell
+        tell("0123456789")
+        say("0123456789")
+    assert screen.getvalue() == "\r\x1b[K0123456\r\x1b[K0123456789\n0123456\r\x1b[K"
+    with live_line(2, print) as (say, tell):
+        assert (say, tell) == (print, None)
+
+
+def test_time_left_of_a_resumed_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Known points took no time, so only new ones tell how long the rest takes; the field has no part in it."""
+    case = Case.load(CASES / "indentation.yaml")
+    plan = SimpleNamespace(material=SimpleNamespace(h=0.01))
+    told: list[str] = []
+    clock = iter(range(0, 1000, 10))
+    monkeypatch.setattr(time, "perf_counter", lambda: next(clock))
+    progress = RunProgress(SimpleNamespace(case=case, plan=plan), told.append, -30.0)  # type: ignore[arg-type]
+    here = SimpleNamespace(du=np.array([0.0, -0.5]))
+    row = {"lambda_m": 0.00092, "w_over_h": -0.03}
+    for label, w, known in (("field", -0.03, True), ("step", 8.0, True), ("step", 12.0, False), ("step", 14.0, False)):
+        progress.accepted({**row, "label": label, "w_over_h": w}, known=known)
+        progress.trying(here, 0.02)  # type: ignore[arg-type]
+    assert told == [
+        "1 point  lambda_m 0.00092 -> 0.00184  step 1 h  0:40",
+        "2 points  w/h 8 -> 20  step 1 h  1:00",
+        "3 points  w/h 12 -> 20  step 1 h  1:20, about 0:30 left",  # 4 of 12 took 20 s: 40 s, 10 s ago
+        "4 points  w/h 14 -> 20  step 1 h  1:40, about 0:30 left",
+    ]
+
+
+def test_where_a_path_leads() -> None:
+    """To a value, through a number of steps, or nobody knows how far."""
+    row = {"p_over_pc": 0.25, "w_over_h": 5.0}
+    assert Aim("w_over_h", 20.0).part(row, 7) == 0.25
+    assert Aim("w_over_h", words="28 steps", steps=28).part(row, 7) == 0.25
+    assert Aim("p_over_pc", words="the first instability").part(row, 7) is None
+    assert Aim("p_over_pc", words="the first instability").told(row) == "p/pc 0.25 -> the first instability"
+    assert time_left((0.0, 10.0), (0.25, 20.0)) == 30.0
+    assert time_left((0.2, 10.0), (0.4, 20.0)) == pytest.approx(30.0)
+    assert time_left((0.0, 10.0), (1.0, 20.0)) is None
+    assert time_left((0.5, 10.0), (0.4, 20.0)) is None

@@ -1,0 +1,157 @@
+"""A run that is killed at any moment goes on from there, on any number of ranks, as if nothing had happened."""
+
+import json
+import random
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from command import magshell
+from conftest import CASES
+from interrupted import check_fields, check_same_path, kill, start, wait_for_rows, wait_until, whole_lines
+from mpi4py import MPI
+
+from magshell_fenicsx.output.store.folder import held_folder
+
+INDENTATION, BUCKLING = CASES / "pole_indentation.yaml", CASES / "dimple_buckling.yaml"
+MERIDIAN = (BUCKLING, "--set=magnetic.lambda_m=0.00184", "--set=mesh.refinement=0.5")
+HALF = (INDENTATION, "--set=symmetry=half", "--set=mesh.degree=3", "--set=mesh.refinement=0.5")
+LONG = (INDENTATION, "--set=loading.points=30", "--set=mesh.refinement=0.5")
+SOLID = (
+    CASES / "solid_indentation.yaml",
+    *("--set=shell.radius_to_thickness=20", "--set=mesh.refinement=0.4"),
+    *("--set=loading.depth=3", "--set=loading.points=6"),
+)
+CASE = {"meridian": MERIDIAN, "half": HALF, "long": LONG, "solid": SOLID}
+
+
+@dataclass(frozen=True)
+class Whole:
+    """A run that nobody interrupted; seconds to its first row, and from there to its end."""
+
+    case: tuple[str | Path, ...]
+    out: Path
+    first: float
+    rest: float
+
+
+@pytest.fixture(scope="module")
+def whole(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Whole:
+    case, out, begun = CASE[request.param], tmp_path_factory.mktemp("whole") / "out", time.monotonic()
+    run = start("run", *case, "--out", out)
+    wait_for_rows(run, out, 1)
+    first = time.monotonic() - begun
+    assert run.wait() == 0
+    return Whole(case, out, first, time.monotonic() - begun - first)
+
+
+@pytest.mark.parametrize("whole", ["meridian", "half", pytest.param("solid", marks=pytest.mark.slow)], indirect=True)
+def test_killed_twice(whole: Whole, tmp_path: Path) -> None:
+    """kill -9 after three rows, resumed on two ranks, killed after two more, resumed on one."""
+    out, seen = tmp_path / "out", b""
+    for ranks, rows in ((0, 3), (2, 5)):
+        run = start("run", *whole.case, "--out", out, *["--resume"][: bool(ranks)], ranks=ranks)
+        wait_for_rows(run, out, rows)
+        kill(run, ranks)
+        assert whole_lines(out).startswith(seen)
+        seen = whole_lines(out)
+        assert seen.count(b"\n") > rows
+    assert not (out / "summary.json").exists()
+    done = magshell("run", *whole.case, "--out", out, "--resume")
+    assert done.returncode == 0, done.stderr
+    assert (out / "path.csv").read_bytes().startswith(seen)
+    check_same_path(out, whole.out)
+    check_fields(out)
+    assert {file.name for file in out.iterdir()} == {file.name for file in whole.out.iterdir()}
+    a, b = (json.loads((folder / "summary.json").read_text(encoding="utf-8")) for folder in (out, whole.out))
+    assert b["replayed"] == 0 < a["replayed"]
+    assert a["factorisations"] < b["factorisations"]
+    assert a["knockdown"] == pytest.approx(b["knockdown"], rel=1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("whole", ["long", "meridian"], indirect=True)
+def test_killed_at_random_moments(whole: Whole, tmp_path: Path) -> None:
+    """kill -9 at twenty random moments; on one rank and on two in turn."""
+    rng, kills, folders, seen = random.Random(4), 0, 0, b""
+    out = tmp_path / "0"
+    while kills < 20:
+        ranks = 2 * (kills % 2)
+        resume = ["--resume"] if (out / "checkpoint").exists() else []
+        run = start("run", *whole.case, "--out", out, *resume, ranks=ranks)
+        moment = time.monotonic() + whole.first * (2 if ranks else 1) * 0.8 + rng.uniform(0, 1.2 * whole.rest)
+        wait_until(lambda run=run, moment=moment: time.monotonic() > moment or run.poll() is not None)
+        kill(run, ranks)
+        assert whole_lines(out).startswith(seen)
+        seen = whole_lines(out)
+        if (out / "checkpoint").exists() or not (out / "summary.json").exists():
+            kills += 1
+        else:  # it was complete: begin another
+            check_same_path(out, whole.out)
+            check_fields(out)
+            folders, seen = folders + 1, b""
+            out = tmp_path / str(folders)
+    done = magshell("run", *whole.case, "--out", out, *(["--resume"] if (out / "checkpoint").exists() else []))
+    assert done.returncode == 0, done.stderr
+    assert (out / "path.csv").read_bytes().startswith(seen)
+    check_same_path(out, whole.out)
+    check_fields(out)
+
+
+@pytest.mark.parametrize("whole", ["meridian"], indirect=True)
+def test_torn_files(whole: Whole, tmp_path: Path) -> None:
+    """Half a row and half an entry, as a crash of the machine leaves them, are cut off."""
+    out = tmp_path / "out"
+    run = start("run", *whole.case, "--out", out)
+    wait_for_rows(run, out, 4)
+    kill(run, 0)
+    seen = whole_lines(out)
+    (out / "path.csv").write_bytes(seen[:-9])
+    entries = (out / "checkpoint").read_bytes()
+    (out / "checkpoint").write_bytes(entries[:-100])
+    assert magshell("run", *whole.case, "--out", out, "--resume").returncode == 0
+    check_same_path(out, whole.out)
+    check_fields(out)
+
+
+@pytest.mark.parametrize("whole", ["meridian"], indirect=True)
+def test_complete_already(whole: Whole) -> None:
+    before = (whole.out / "summary.json").stat()
+    done = magshell("run", *whole.case, "--out", whole.out, "--resume")
+    assert done.returncode == 0
+    assert done.stdout.startswith("complete already: ")
+    assert (whole.out / "summary.json").stat().st_mtime_ns == before.st_mtime_ns
+    done = magshell("run", *whole.case, "--set=mesh.degree=3", "--out", whole.out, "--resume")
+    assert done.returncode == 2
+    assert "mesh.degree is 4 there and 3 here" in done.stderr
+
+
+@pytest.mark.parametrize("ranks", [0, 2])
+def test_another_case(tmp_path: Path, ranks: int) -> None:
+    """And a run that was stopped keeps its checkpoint."""
+    assert magshell("run", *MERIDIAN, "--out", tmp_path, "--time-limit", 0).returncode == 3
+    done = magshell("run", *MERIDIAN, "--set=shell.radius_to_thickness=100", "--out", tmp_path, "--resume", ranks=ranks)
+    assert done.returncode == 2
+    said = f"--resume: {tmp_path} is of another run: shell.radius_to_thickness is 90.0 there and 100.0 here"
+    assert done.stderr.count(said) == 1
+    assert "Traceback" not in done.stderr
+    assert (tmp_path / "checkpoint").exists()
+
+
+def test_nothing_to_resume(tmp_path: Path) -> None:
+    done = magshell("run", INDENTATION, "--out", tmp_path, "--resume")
+    assert done.returncode == 2
+    assert done.stderr == f"--resume: {tmp_path} holds no checkpoint; run without --resume\n"
+    nowhere = tmp_path / "nowhere"
+    assert magshell("run", INDENTATION, "--out", nowhere, "--resume").returncode == 2
+    assert not nowhere.exists()
+
+
+def test_one_run_at_a_time(tmp_path: Path) -> None:
+    """A run that still writes to the folder, such as ranks that outlive mpirun, is not joined by another."""
+    with held_folder(tmp_path, MPI.COMM_SELF, make=False):
+        second = magshell("run", *LONG, "--out", tmp_path)
+    assert second.returncode == 2
+    assert second.stderr == f"--out {tmp_path}: cannot be written: another run is writing to it\n"
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,238 @@
+"""Sweeps: what --over means, what is kept, what is written, and that ranks do not matter."""
+
+import csv
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from command import magshell
+from conftest import CASES
+from figures import figures
+from figures.figures import FIGURES
+
+from magshell_fenicsx import CaseError
+from magshell_fenicsx.run.run import run
+from magshell_fenicsx.studies.sweep import chain
+from magshell_fenicsx.studies.sweep import sweep as module
+from magshell_fenicsx.studies.sweep.axes import parse_axes
+from magshell_fenicsx.studies.sweep.points import SweepPoint, make_points
+
+PLATE, DIMPLE, POLE = (CASES / f"{name}.yaml" for name in ("clamped_plate", "dimple_buckling", "pole_indentation"))
+COARSE = ["mesh.degree=3", "mesh.refinement=0.5"]
+PRESSURES = "loading.pressure=1e-5:3e-5:2"
+
+
+def points(file: Path, *over: str) -> list[SweepPoint]:
+    return make_points(file, parse_axes(over))
+
+
+def read(file: Path) -> list[dict[str, str]]:
+    with file.open(encoding="utf-8") as stream:
+        return list(csv.DictReader(stream))
+
+
+@pytest.fixture
+def computed(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """Pressures of the cases that a sweep really computes, in order."""
+    done: list[float] = []
+
+    def counted(case, comm):  # type: ignore[no-untyped-def]
+        done.append(case.loading.pressure)
+        return run(case, comm=comm)
+
+    monkeypatch.setattr(chain, "run", counted)
+    return done
+
+
+def plate(out: Path, *over: str, settings: tuple[str, ...] = (), say: Callable[[str], None] = print) -> module.Sweep:
+    return module.sweep(PLATE, over or [PRESSURES], [*COARSE, *settings], out, say=say)
+
+
+def test_product_and_ties() -> None:
+    """The last axis is the fastest; tied keys have one value."""
+    found = points(
+        DIMPLE,
+        "magnetic.energy=full,first",
+        "magnetic.remanent.polar+magnetic.applied.polar=0:90:3",
+        "mesh.degree=3:4:2",
+    )
+    assert len(found) == 2 * 3 * 2
+    magnetic = [p.case.magnetic for p in found]
+    assert [m.energy for m in magnetic if m] == ["full"] * 6 + ["first"] * 6
+    assert [m.applied.polar for m in magnetic if m] == [0, 0, 45, 45, 90, 90] * 2
+    assert [m.remanent.polar for m in magnetic if m] == [0, 0, 45, 45, 90, 90] * 2
+    assert [p.case.mesh.degree for p in found] == [3, 4] * 6
+    assert list(found[2].values.items()) == [
+        ("magnetic.energy", "full"),
+        ("magnetic.remanent.polar", "45"),
+        ("magnetic.applied.polar", "45"),
+        ("mesh.degree", "3"),
+    ]
+
+
+def test_units_and_exact_ends() -> None:
+    found = points(PLATE, "loading.pressure=0.1:0.3:3")
+    assert [p.values["loading.pressure"] for p in found] == ["0.1", "0.2", "0.3"]
+    settings = ["shell={geometry: disc, radius: 1 m, thickness: 1 mm, poisson_ratio: 0.3}"]
+    found = make_points(PLATE, parse_axes(["shell.radius=25.2 mm,1 m"]), settings)
+    assert [p.case.shell.radius for p in found] == pytest.approx([0.0252, 1])
+
+
+@pytest.mark.parametrize(
+    ("over", "message"),
+    [
+        ("mesh.degree", "--over mesh.degree: write it as key.path=start:stop:count"),
+        ("=1,2", "write it as"),
+        ("mesh.degree+=3,4", "write it as"),
+        ("mesh.degree=3,,4", "a value is missing"),
+        ("mesh.degree=", "a value is missing"),
+        ("mesh.degree=3:4", "3:4 is not start:stop:count"),
+        ("mesh.degree=3:4:a", "is not start:stop:count"),
+        ("mesh.refinement=nan:1:3", "start and stop must be finite"),
+        ("mesh.refinement=1:2:1", "count is 1; allowed 2 to 10000"),
+        ("mesh.refinement=1:2:100000000", "count is 100000000"),
+        ("magnetic.remanent=[1,2]", "only numbers and words"),
+        ("mesh.degree+mesh.degree=3,4", "mesh.degree is swept twice"),
+        ("mesh.refinement.x=1,2", "--over mesh.refinement.x=1: refinement is a value, not a section"),
+        ("mesh.degre=3,4", "mesh.degre: unknown key; did you mean degree?"),
+        ("mesh.degree=3:4:3", "mesh.degree: 3.5: must be a valid integer"),
+        ("mesh.degree=3,4,9", "--over mesh.degree=9: mesh.degree: 9: must be less than or equal to 5"),
+        ("symmetry=auto,half", "have no common mirror plane"),
+    ],
+)
+def test_mistakes_are_found_at_the_door(over: str, message: str) -> None:
+    with pytest.raises(CaseError) as e:
+        make_points(
+            DIMPLE,
+            parse_axes([over]),
+            ["magnetic={lambda_m: 1e-3, remanent: {polar: 9}, applied: {polar: 9, azimuth: 9}}", "mesh.refinement=1"],
+        )
+    assert message in str(e.value)
+
+
+def test_too_many_points_and_a_key_that_is_also_set() -> None:
+    with pytest.raises(CaseError, match="1000000 points; allowed at most 10000"):
+        points(DIMPLE, "magnetic.lambda_m=0:1:1000", "mesh.refinement=1:2:1000")
+    with pytest.raises(CaseError, match="this key is swept"):
+        make_points(DIMPLE, parse_axes(["mesh.degree=3,4"]), ["mesh.degree=3"])
+
+
+@pytest.mark.parametrize("ranks", [0, 2])
+def test_invalid_point_is_one_message_and_nothing_is_computed(tmp_path: Path, ranks: int) -> None:
+    done = magshell("sweep", PLATE, "--over", "shell.poisson_ratio=0.3,0.7", "--out", tmp_path / "out", ranks=ranks)
+    assert done.returncode == 2
+    assert done.stderr.count("--over shell.poisson_ratio=0.7: shell.poisson_ratio: 0.7: must be less than") == 1
+    assert "in the point shell.poisson_ratio=0.7" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_unwritable_out_and_no_over() -> None:
+    done = magshell("sweep", PLATE, "--over", "mesh.degree=3,4", "--out", "/dev/null/x")
+    assert done.returncode == 2
+    assert done.stderr.startswith("--out /dev/null/x: cannot be written: ")
+    assert magshell("sweep", PLATE).returncode == 2
+
+
+def test_second_call_computes_what_is_missing(tmp_path: Path, computed: list[float]) -> None:
+    first = plate(tmp_path)
+    assert computed == [1e-5, 3e-5]
+    table = (tmp_path / "sweep.csv").read_text(encoding="utf-8")
+    assert plate(tmp_path).outcomes == first.outcomes
+    assert computed == [1e-5, 3e-5]
+    assert (tmp_path / "sweep.csv").read_text(encoding="utf-8") == table
+    plate(tmp_path, "loading.pressure=1e-5:3e-5:3")  # the ends are there
+    assert computed == [1e-5, 3e-5, 2e-5]
+    damaged = tmp_path / "points" / f"{first.points[0].key}.json"
+    damaged.write_text(damaged.read_text(encoding="utf-8")[:100], encoding="utf-8")
+    assert plate(tmp_path).outcomes[0].curve == first.outcomes[0].curve
+    assert computed == [1e-5, 3e-5, 2e-5, 1e-5]
+
+
+def test_changed_case_is_computed_again(tmp_path: Path, computed: list[float]) -> None:
+    thick = plate(tmp_path)
+    thin = plate(tmp_path, settings=("shell.radius_to_thickness=60",))
+    assert len(computed) == 4
+    assert thin.outcomes[0].curve[-1]["w_pole_over_h"] != thick.outcomes[0].curve[-1]["w_pole_over_h"]
+
+
+def test_equal_problems_are_computed_once(tmp_path: Path, computed: list[float]) -> None:
+    """Without a field, its direction and its energy do not matter."""
+    over = ("magnetic.energy=full,first", "magnetic.applied.polar=0,45")
+    found = plate(tmp_path, *over, settings=("magnetic.lambda_m=0",))
+    assert len(found.points) == 4
+    assert len(computed) == len(list((tmp_path / "points").iterdir())) == 1
+
+
+@pytest.mark.slow
+def test_table_tells_knockdowns_and_reasons(tmp_path: Path) -> None:
+    """k_d from the axisymmetric reference; a field below -0.003355 destabilises alone: no knockdown, but a reason."""
+    over = ["--over", "magnetic.lambda_m=-0.004,0,0.00184", "--set=mesh.refinement=0.5"]
+    done = magshell("sweep", DIMPLE, *over, "--out", tmp_path)
+    assert done.returncode == 3
+    assert "1 of 3 points stopped early" in done.stderr
+    assert len([line for line in done.stdout.splitlines() if "/3  lambda_m=" in line]) == 3
+    alone, none, positive = read(tmp_path / "sweep.csv")
+    assert [row["magnetic.lambda_m"] for row in (alone, none, positive)] == ["-0.004", "0", "0.00184"]
+    assert alone["k_d"] == ""
+    assert (alone["amplitude"], alone["kind"]) == ("lambda_m", "fold")
+    assert float(alone["value"]) == pytest.approx(-0.003355, rel=1e-3)
+    assert "the field alone makes the shell unstable" in alone["stopped"]
+    for row, k_d in ((none, 0.326233289), (positive, 0.552053778)):
+        assert float(row["k_d"]) == float(row["p_over_pc"]) == pytest.approx(k_d, rel=3e-4)
+        assert row["kind"] == "fold"
+        assert row["found"] in ("path", "fold")
+        assert int(row["factorisations"]) > 0
+        assert row["stopped"] == ""
+        assert int(row["dofs"]) > 100
+        assert float(row["wall_s"]) > 0
+        assert float(row["w_pole_over_h"]) > 1
+        kept = json.loads((tmp_path / "points" / f"{row['point']}.json").read_text(encoding="utf-8"))
+        assert kept["case"]["magnetic"]["lambda_m"] == float(row["magnetic.lambda_m"])
+    assert (tmp_path / "sweep.png").stat().st_size > 10_000
+
+
+def test_two_ranks_give_the_numbers_of_one(tmp_path: Path) -> None:
+    over = ["--over", "shell.poisson_ratio=0.3:0.5:3", "--over", "loading.depth=1,2"]
+    for ranks in (1, 2):
+        done = magshell(
+            "sweep", POLE, *over, *(f"--set={s}" for s in COARSE), "--out", tmp_path / str(ranks), ranks=ranks
+        )
+        assert done.returncode == 0, done.stderr
+        assert (tmp_path / str(ranks) / "sweep.png").stat().st_size > 10_000
+    for name in ("sweep.csv", "curves.csv"):
+        one, two = (read(tmp_path / str(ranks) / name) for ranks in (1, 2))
+        assert len(one) == len(two) > 5
+        for a, b in zip(one, two, strict=True):
+            assert a.keys() == b.keys()
+            for key in a.keys() - {"wall_s"}:
+                try:
+                    assert float(b[key]) == pytest.approx(float(a[key]), rel=1e-9, abs=1e-12)
+                except ValueError:
+                    assert b[key] == a[key]
+
+
+@pytest.mark.parametrize(
+    ("name", "count"), [("indentation", 12), ("aligned", 156), ("tilted", 195), ("noncoplanar", 195)]
+)
+def test_every_point_of_the_figures_is_valid(name: str, count: int) -> None:
+    figure = FIGURES[name]
+    assert len(points(figures.CASES / figure.case, *figure.over)) == count
+
+
+@pytest.mark.slow
+def test_figure_has_its_numbers_and_its_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Paper, figure b: the first-order energy gives an almost null change, the torque energy most of it."""
+    over = ("magnetic.lambda_m=0,0.00184", "magnetic.energy=full,first,torque", "magnetic.applied.polar=0,45")
+    monkeypatch.setitem(FIGURES, "tilted", replace(FIGURES["tilted"], over=over))
+    figures.make("tilted", tmp_path)
+    rows = read(tmp_path / "tilted.csv")
+    change = {(row["magnetic.energy"], row["magnetic.applied.polar"]): float(row["delta_k_d"]) for row in rows}
+    assert len(rows) == len(change) == 6
+    assert change["full", "0"] == pytest.approx(0.552053778 - 0.326233289, rel=1e-3)
+    for angle in ("0", "45"):
+        assert abs(change["first", angle]) < 0.06 * change["full", angle]
+        assert change["torque", angle] == pytest.approx(change["full", angle], rel=0.15)
+    assert (tmp_path / "tilted.png").stat().st_size > 10_000
