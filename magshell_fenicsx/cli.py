@@ -210,7 +210,7 @@ def plot(
 @app.command()
 def check(case: CaseFile, set_: Settings = None) -> None:
     """Validate a case; print what would be built and what is left out."""
-    from magshell_fenicsx.plan.charted import describe
+    from magshell_fenicsx.plan.check import describe
 
     try:
         _say(describe(Case.load(case, set_ or [])))

@@ -23,7 +23,7 @@ from magshell_fenicsx.continuation.point import PathStopped
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.mesh.grading import Grading
 from magshell_fenicsx.mesh.shapes import StripShape
-from magshell_fenicsx.plan.charted import make_plan
+from magshell_fenicsx.plan.planner import make_plan
 from magshell_fenicsx.run.run import run
 from magshell_fenicsx.run.summary import Result
 from magshell_fenicsx.simulate.scene import build_model
@@ -132,11 +132,11 @@ def slivers(aspect: float, way: str) -> Line:
     start = time.perf_counter()
     case = Case.load(CASES / "slivers.yaml")
     plan, target = make_plan(case), case.lambda_m
-    assert case.charted.width
+    assert case.width
     stretch = aspect if way == "along" else 1 / aspect
     # as many triangles along the strip as across, but for the stretch
-    size = 0.25 if way == "along" and aspect > 1 else min(0.05, 2 * case.charted.width / aspect)
-    shape = StripShape(case.charted.width * stretch, half=False)
+    size = 0.25 if way == "along" and aspect > 1 else min(0.05, 2 * case.width / aspect)
+    shape = StripShape(case.width * stretch, half=False)
     plan = replace(plan, shape=shape, size=Grading([], size), embedding=_Stretched(stretch))
     model = build_model(case, plan, MPI.COMM_WORLD)
     newton = BorderedNewton(model.system)

@@ -7,7 +7,8 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import Field, ModelWrapValidatorHandler, ValidationError, model_validator
 
 from magshell_fenicsx.case.base import Section, or_number, texts
-from magshell_fenicsx.case.boundary import EDGES, BoundarySection, HeldSection
+from magshell_fenicsx.case.boundary import EDGES, BoundarySection
+from magshell_fenicsx.case.defects import DimpleSection
 from magshell_fenicsx.case.fields import MagneticSection
 from magshell_fenicsx.case.loading import (
     DeadSection,
@@ -22,7 +23,7 @@ from magshell_fenicsx.case.shell import ShellSection
 from magshell_fenicsx.case.solid import SolidSection
 from magshell_fenicsx.case.source import CaseError, Source, override, read_source
 from magshell_fenicsx.case.stability import StabilitySection
-from magshell_fenicsx.case.surfaces import MeshSurface, Surface
+from magshell_fenicsx.case.surfaces import CapSurface, MeshSurface, RevolutionSurface, Surface, SurfaceSection
 
 SOLID_DEGREE = 2
 
@@ -35,11 +36,12 @@ class MeshSection(Section):
     refinement: float = Field(default=1.0, ge=0.1, le=20)
     """Divides every element size; not of a mesh file"""
     size: Annotated[float, or_number("metre"), Field(gt=0, le=1e12)] | None = None
-    """Element size, by default 2 √(Rh), at most 0.35 R; of plates, annuli, ... alone [the shell's length]"""
+    """Element size everywhere; by default graded where there is a pole, elsewhere 2 √(Rh), at most 0.35 R [the
+    shell's length]"""
     penalty: float | None = Field(default=None, ge=1e-3, le=1e9)
     """σ of the interior penalty; by default 5 k²"""
     tolerance: float | None = Field(default=None, ge=1e-6, le=0.1)
-    """Relative error of the run's result; chooses degree and refinement, on hemispheres, discs and strips"""
+    """Relative error of the run's result; chooses degree and refinement"""
 
     @model_validator(mode="after")
     def _tolerance_chooses_the_mesh(self) -> Self:
@@ -63,7 +65,7 @@ class Case(Section):
     boundary: BoundarySection
     """What is held"""
     points: dict[str, Place] = Field(default_factory=dict)
-    """Name -> place of what is loaded, held or watched; not on hemispheres, discs, strips [the shell's length]"""
+    """Name -> place of what is loaded, held or watched [the shell's length; over R if that has no unit]"""
     magnetic: MagneticSection | None = None
     """Remanence and applied field, which is applied before the load"""
     loading: LoadingSection | None = None
@@ -73,14 +75,14 @@ class Case(Section):
     stability: StabilitySection | None = None
     """Lowest modes after the run"""
     symmetry: Literal["auto", "none", "half", "axisymmetric"] = "auto"
-    """The part that is modelled of a hemisphere, disc or strip: the smallest that the case allows (auto), all (none),
-    one side of a mirror plane through e3 (half), the meridian (axisymmetric)"""
+    """The part that is modelled: the smallest that the case allows (auto), all (none), one side of a mirror plane
+    through e3 (half), the meridian (axisymmetric); the last two of shapes with a pole at e3, half of strips too"""
 
     @model_validator(mode="wrap")
     @classmethod
     def _units_go_with_those_of_the_shell(cls, data: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
         section = handler(data)
-        if isinstance(data, dict) and not isinstance(section.shell, ShellSection) and not section.shell.with_units:
+        if isinstance(data, dict) and not section.shell.with_units:
             loads = section.loading if isinstance(section.loading, DeadSection) else None
             parts = {"points": data.get("points"), "mesh": data.get("mesh"), "loading": loads and data.get("loading")}
             for key in texts(parts):
@@ -100,77 +102,65 @@ class Case(Section):
                 raise ValueError("loading.kind: rotation needs a uniform field, without magnetic.applied.gradient")
             if abs(self.magnetic.applied.vector() @ self.loading.to.vector()) > 1 - 1e-9:
                 raise ValueError("loading.to: must be neither parallel nor opposite to magnetic.applied")
-        if not isinstance(self.shell, ShellSection):
-            return self._any_surface(self.shell)
-        return self._charted(self.shell)
-
-    def _charted(self, shell: ShellSection) -> Self:
-        """Rules of hemispheres, discs and strips."""
-        geometry, conditions = shell.geometry, self.boundary.conditions()
-        edges = EDGES[geometry]
-        if self.points:
-            raise ValueError(f"points: not on a {geometry}; all other geometries have named points")
-        if isinstance(self.loading, DeadSection):
-            raise ValueError(f"loading.kind: 'dead': not on a {geometry}; a plate or cap of the same shape takes it")
-        if self.mesh.size is not None:
-            raise ValueError(f"mesh.size: not on a {geometry}; mesh.refinement divides every element size")
-        for name in conditions:
-            if name not in edges:
-                raise ValueError(f"boundary.{name}: a {geometry} has no such edge, only {', '.join(edges)}")
-        if not any(conditions.get(name, "free") != "free" for name in edges):
-            raise ValueError(f"boundary.{edges[0]}: must be clamped or simply supported, else the shell is not held")
-        for name, condition in conditions.items():
-            if condition == "symmetry" or isinstance(condition, HeldSection):
-                raise ValueError(f"boundary.{name}: a {geometry} is clamped, hinged (simply supported) or free there")
-        patches = self.magnetic.remanent.patches if self.magnetic else None
-        if patches is not None:
-            if unknown := set(patches) - {"dimple", "rest"}:
-                raise ValueError(f"magnetic.remanent.patches: {min(unknown)}: a {geometry} has only dimple and rest")
-            if "rest" not in patches:
-                raise ValueError("magnetic.remanent: patches needs the patch rest")
-            if "dimple" in patches and shell.defect is None:
-                raise ValueError("magnetic.remanent.patches: the shell has no dimple")
-        if isinstance(self.loading, IndentationSection):
-            polar = self.loading.at.polar
-            if geometry != "hemisphere" and polar:
-                raise ValueError(f"loading.at.polar: a {geometry} is loaded at its centre or tip, polar: 0")
-            if not 0 <= polar < 89:
-                raise ValueError(f"loading.at.polar: {polar:g} is not on the shell: allowed 0 to 89")
         return self
 
-    def _any_surface(self, shell: Surface) -> Self:
-        """Rules of the other geometries."""
-        if isinstance(self.loading, IndentationSection):
-            raise ValueError(
-                f"loading.kind: 'indentation': not on a {shell.geometry}; kind: dead takes forces at points"
-            )
-        if self.symmetry not in ("auto", "none"):
-            raise ValueError(
-                f"symmetry: {self.symmetry}: not with a {shell.geometry}; describe a part of it and give its edges "
-                "boundary: {name: symmetry}"
-            )
+    @model_validator(mode="after")
+    def _named_parts_are_there(self) -> Self:
+        """Points, and the edges and patches of geometries whose names are known."""
+        shell, loading = self.shell, self.loading
         if "pole" in self.points:
             raise ValueError("points.pole: is taken, by the point that w_pole_over_h is of; choose another name")
+        if "load" in self.points:
+            raise ValueError("points.load: is taken, by the point that is indented; choose another name")
+        loads = loading.loads if isinstance(loading, DeadSection) else []
+        if loads and shell.modulus is None:
+            raise ValueError("shell.youngs_modulus is needed for loads of kind: dead")
+        indented = []
+        if isinstance(loading, IndentationSection):
+            indented = [loading.at.point]
+            self._on_shell(loading.at.polar)
+        for name in (*(load.at for load in loads), *indented):
+            if name is not None and name not in self.points:
+                raise ValueError(f"loading: at: {name}: name it in points, with its place")
+        if isinstance(shell, ShellSection):
+            edges = EDGES[shell.geometry]
+            for name in self.boundary.conditions():
+                if name not in edges and name not in self.points:
+                    raise ValueError(f"boundary.{name}: a {shell.geometry} has no such edge, only {', '.join(edges)}")
+        self._patches()
+        return self
+
+    def _on_shell(self, polar: float) -> None:
+        """A degree from the edge of a sphere at least."""
+        shell = self.shell
+        edge = shell.polar if isinstance(shell, CapSurface) else 90.0
+        if shell.geometry in ("hemisphere", "cap") and not 0 <= polar < edge - 1:
+            raise ValueError(f"loading.at.polar: {polar:g} is not on the shell: allowed 0 to {edge - 1:g}")
+
+    def _patches(self) -> None:
+        patches = self.magnetic.remanent.patches if self.magnetic else None
+        if patches is None or isinstance(self.shell, MeshSurface):
+            return
+        geometry = self.shell.geometry
+        if self.defect is None and ("dimple" in patches or not isinstance(self.shell, ShellSection)):
+            raise ValueError("magnetic.remanent.patches: the shell has no dimple")
+        if unknown := set(patches) - {"dimple", "rest"}:
+            raise ValueError(f"magnetic.remanent.patches: {min(unknown)}: a {geometry} has only dimple and rest")
+        if "rest" not in patches:
+            raise ValueError("magnetic.remanent: patches needs the patch rest")
+
+    @model_validator(mode="after")
+    def _mesh_fits(self) -> Self:
+        shell = self.shell
         if isinstance(shell, MeshSurface):
-            for key in sorted(self.mesh.model_fields_set & {"size", "refinement"}):
+            for key in sorted(self.mesh.model_fields_set & {"size", "refinement", "tolerance"}):
                 raise ValueError(f"mesh.{key}: not with geometry: mesh, whose elements are those of the file")
-        if self.magnetic and self.magnetic.lambda_m is None and not shell.with_units:
+        by_densities = self.magnetic is not None and self.magnetic.lambda_m is None
+        if by_densities and isinstance(shell, SurfaceSection) and not shell.with_units:
             raise ValueError(
                 "magnetic: flux densities need shell.youngs_modulus in pascals: give youngs_modulus and lengths units, "
                 "or lambda_m"
             )
-        if self.mesh.tolerance is not None:
-            raise ValueError(f"mesh.tolerance: not with a {shell.geometry}; magshell study compares meshes and degrees")
-        if self.magnetic and self.magnetic.remanent.patches is not None and not isinstance(shell, MeshSurface):
-            raise ValueError("magnetic.remanent.kind: 'patches': only a hemisphere and geometry: mesh have patches")
-        if isinstance(self.loading, PathSection) and self.loading.sensitivities:
-            raise ValueError(f"loading.sensitivities: not with a {shell.geometry}")
-        if isinstance(self.loading, DeadSection):
-            if shell.youngs_modulus is None:
-                raise ValueError("shell.youngs_modulus is needed for loads of kind: dead")
-            for load in self.loading.loads:
-                if load.at is not None and load.at not in self.points:
-                    raise ValueError(f"loading.loads: at: {load.at}: name it in points, with its place")
         return self
 
     @model_validator(mode="after")
@@ -180,8 +170,8 @@ class Case(Section):
                 raise ValueError("solid belongs to model: solid")
             return self
         magnetic, loading = self.magnetic, self.loading
-        if not isinstance(self.shell, ShellSection) or self.points:
-            raise ValueError("model: solid: needs a hemisphere, disc or strip, without named points")
+        if isinstance(self.shell, MeshSurface) or isinstance(loading, DeadSection) or self.points:
+            raise ValueError("model: solid: takes no mesh file, no dead loads and no named points")
         if magnetic and magnetic.energy != "full":
             raise ValueError(f"magnetic.energy: {magnetic.energy}: not of a solid, which has the full energy")
         if magnetic and magnetic.remanent.kind != "uniform":
@@ -216,10 +206,25 @@ class Case(Section):
         return self.mesh.degree if self.model == "shell" else SOLID_DEGREE
 
     @property
-    def charted(self) -> ShellSection:
-        """The shell, where it is a hemisphere, disc or strip."""
-        assert isinstance(self.shell, ShellSection)
-        return self.shell
+    def defect(self) -> DimpleSection | None:
+        """The dimple at the pole."""
+        return self.shell.defect if isinstance(self.shell, ShellSection | CapSurface | RevolutionSurface) else None
+
+    @property
+    def dimple_half_width(self) -> float:
+        """phi_o (rad)."""
+        assert self.defect
+        return self.defect.half_width(self.shell.R_over_h, self.shell.poisson_ratio)
+
+    @property
+    def thickness_factor(self) -> str | dict[str, float] | None:
+        """What multiplies h: a formula, or numbers of patches."""
+        return self.shell.thickness_factor if isinstance(self.shell, SurfaceSection) else None
+
+    @property
+    def width(self) -> float | None:
+        """Of a strip, over its length."""
+        return self.shell.width if isinstance(self.shell, ShellSection) else None
 
     @property
     def lambda_m(self) -> float:

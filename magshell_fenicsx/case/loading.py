@@ -72,14 +72,27 @@ class PressureSection(PathSection):
         return self
 
 
+class Place(Direction):
+    """A direction from the centre of a hemisphere or cap, `polar: 0` of a pole, centre or tip; or a named point."""
+
+    point: str | None = None
+    """Name of a point of `points`, on any geometry"""
+
+    @model_validator(mode="after")
+    def _one_way(self) -> Self:
+        if self.point is not None and {"polar", "azimuth"} & self.model_fields_set:
+            raise ValueError("give a point, or polar and azimuth")
+        return self
+
+
 class IndentationSection(PathSection):
-    """A dead force along the undeformed normal at one place of a hemisphere, disc (centre) or strip (tip).
+    """A dead force along the undeformed normal at one place of the shell.
 
     F > 0 pushes in. With `until: points` a depth may be given that the mesh shall be fine enough for.
     """
 
     kind: Literal["indentation"]
-    at: Direction
+    at: Place
     """Where the force is; on a hemisphere polar is below 89"""
     control: Literal["displacement", "load", "arc"] = "displacement"
     """What is prescribed step by step: w, F, or arc length, which passes every fold"""
@@ -143,7 +156,7 @@ class DeadLoadSection(Section):
 
 
 class DeadSection(PathSection):
-    """Loads that keep their direction and grow by a common factor; not on hemispheres, discs and strips.
+    """Loads that keep their direction and grow by a common factor.
 
     A target is the `factor`, or the `displacement` of the loads along themselves (their work over the sum of
     their sizes) in the units of the shell's lengths.

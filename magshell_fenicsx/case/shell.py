@@ -1,6 +1,6 @@
 """The shell: geometry, thickness, material, defect."""
 
-from math import pi, sqrt
+from math import pi
 from typing import Literal, Self
 
 from pydantic import Field, model_validator
@@ -11,6 +11,8 @@ from magshell_fenicsx.case.defects import DimpleSection
 
 class ShellSection(Section):
     """Either radius_to_thickness, or radius and thickness with units; a strip's radius is its length.
+
+    Without units lengths are over R, forces over E R².
 
     Edges: equator (hemisphere), rim (disc), root (x = 0), tip and sides (strip).
     """
@@ -46,18 +48,8 @@ class ShellSection(Section):
             raise ValueError("width (over the length) belongs to geometry: strip, and only to it")
         if self.defect and self.geometry != "hemisphere":
             raise ValueError("a dimple needs geometry: hemisphere")
-        if self.defect and self.dimple_half_width >= 0.9 * pi / 2:
-            raise ValueError(
-                f"the dimple's half-width phi_o is {self.dimple_half_width * 180 / pi:.1f} degrees at this R/h "
-                f"and poisson_ratio; it must stay below 81"
-            )
-        if self.defect and self.defect.amplitude > 0.5 * self.R_over_h:
-            depth = self.defect.amplitude / self.R_over_h
-            raise ValueError(f"the dimple is {depth:.2g} radii deep; it must stay below half a radius")
-        if self.defect and self.dimple_slope > 2:
-            raise ValueError(
-                f"the dimple's steepest slope is {self.dimple_slope:.3g}: too steep for a shell, at most 2"
-            )
+        if self.defect:
+            self.defect.refuse_unfit(self.R_over_h, self.poisson_ratio, pi / 2)
         if self.width is not None and self.width * self.R_over_h < 1:
             raise ValueError(
                 f"the strip is narrower than its thickness; width must be at least {1 / self.R_over_h:.4g}"
@@ -73,13 +65,16 @@ class ShellSection(Section):
         return self.radius / self.thickness
 
     @property
-    def dimple_half_width(self) -> float:
-        """phi_o (rad)."""
-        assert self.defect
-        return self.defect.width / sqrt(sqrt(12 * (1 - self.poisson_ratio**2)) * self.R_over_h)
+    def reference(self) -> float:
+        """R, or 1 where the case has no lengths: those of points are then over R."""
+        return self.radius or 1.0
 
     @property
-    def dimple_slope(self) -> float:
-        """Largest |dw0/dphi| over R, at phi_o/sqrt(3)."""
-        assert self.defect
-        return 8 / sqrt(27) * self.defect.amplitude / self.R_over_h / self.dimple_half_width
+    def with_units(self) -> bool:
+        """Whether lengths have units, and are in metres."""
+        return self.radius is not None
+
+    @property
+    def modulus(self) -> float | None:
+        """E that dead loads are over: of a case without lengths 1, so that forces are over E R²."""
+        return self.youngs_modulus if self.with_units else 1.0

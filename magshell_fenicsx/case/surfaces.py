@@ -76,9 +76,9 @@ class SurfaceSection(Section):
         return self.reference / self.thickness
 
     @property
-    def defect(self) -> DimpleSection | None:
-        """Only hemispheres have one."""
-        return None
+    def modulus(self) -> float | None:
+        """E that dead loads are over."""
+        return self.youngs_modulus
 
 
 MEASURES = ("thickness", "youngs_modulus", "radius", "length", "width", "inner_radius", "tube_radius")
@@ -121,6 +121,8 @@ class CapSurface(RoundSection):
     """Angle of the rim from e3 [degree]"""
     hole: float | None = Field(default=None, ge=0.1)
     """Angle of the hole's edge from e3 [degree]"""
+    defect: DimpleSection | None = None
+    """At the pole of a cap without a hole"""
 
     @model_validator(mode="after")
     def _hole_within(self) -> Self:
@@ -128,6 +130,10 @@ class CapSurface(RoundSection):
             raise ValueError(f"hole: {self.hole:g}: must be smaller than polar, {self.polar:g}")
         if self.hole is None and self.azimuth is not None:
             raise ValueError("azimuth: a part of a cap needs a hole around the pole")
+        if self.defect and self.hole is not None:
+            raise ValueError("defect: a dimple is at the pole, where this cap has a hole")
+        if self.defect:
+            self.defect.refuse_unfit(self.R_over_h, self.poisson_ratio, radians(self.polar))
         return self
 
 
@@ -233,6 +239,8 @@ class RevolutionSurface(SurfaceSection):
     profile: ProfileSection
     """The curve; its largest r is the reference length R"""
     azimuth: Azimuth = None
+    defect: DimpleSection | None = None
+    """At the pole, where the profile ends; φ is there the distance from the pole along the meridian over R"""
 
     @property
     def reference(self) -> float:
@@ -249,6 +257,11 @@ class RevolutionSurface(SurfaceSection):
         _refuse_overturned(self.azimuth)
         if self.azimuth is not None and self.profile.curve[-1, 0] == 0:
             raise ValueError("azimuth: a part of a surface with a pole cannot be built")
+        if self.defect and self.profile.curve[-1, 0] != 0:
+            raise ValueError("defect: a dimple is at the pole, and this profile does not end on the axis")
+        if self.defect:
+            length = np.hypot(*np.diff(self.profile.curve, axis=0).T).sum() / self.reference
+            self.defect.refuse_unfit(self.R_over_h, self.poisson_ratio, float(length))
         return self
 
 

@@ -12,7 +12,10 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.optimize import minimize_scalar
 
+from magshell_fenicsx.mesh.sphere import Dimple
+
 Array = NDArray[np.float64]
+ROUNDS = 4  # of a spline's parameter, which converges to its arc length as the square of its steps
 
 
 class Profile(Protocol):
@@ -24,6 +27,9 @@ class Profile(Protocol):
 
     def __call__(self, s: Array) -> Array:
         """(..., 2) places at s (...)."""
+
+    def tangent(self, s: Array) -> Array:
+        """(..., 2) unit vectors in the direction of s."""
 
     def foot(self, rz: Array) -> float:
         """s of the place nearest to a point (2,)."""
@@ -42,6 +48,9 @@ class Segment:
 
     def __call__(self, s: Array) -> Array:
         return np.asarray(self.start + np.asarray(s)[..., None] / self.length * np.subtract(self.end, self.start))
+
+    def tangent(self, s: Array) -> Array:
+        return np.broadcast_to(np.subtract(self.end, self.start) / self.length, (*np.shape(s), 2))
 
     def foot(self, rz: Array) -> float:
         along = np.subtract(self.end, self.start) / self.length
@@ -65,6 +74,10 @@ class Arc:
         angle = self.start + np.asarray(s) / self.radius
         return self.radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1) + [self.centre, 0.0]
 
+    def tangent(self, s: Array) -> Array:
+        angle = self.start + np.asarray(s) / self.radius
+        return np.stack([-np.sin(angle), np.cos(angle)], axis=-1)
+
     def foot(self, rz: Array) -> float:
         turn = np.arctan2(rz[1], rz[0] - self.centre) - self.start
         beyond = 2 * np.pi - (self.end - self.start)
@@ -73,15 +86,24 @@ class Arc:
 
 
 class Spline:
-    """A smooth profile through points (n, 2)."""
+    """A smooth profile through points (n, 2), over its arc length."""
 
     def __init__(self, points: Array) -> None:
         steps = np.hypot(*np.diff(points, axis=0).T)
-        knots = np.concatenate([[0.0], np.cumsum(steps)])
-        self._curve, self.length = CubicSpline(knots, points), float(knots[-1])
+        for _ in range(ROUNDS):  # from chords to arcs
+            knots = np.concatenate([[0.0], np.cumsum(steps)])
+            self._curve = CubicSpline(knots, points)
+            x, w = np.polynomial.legendre.leggauss(6)
+            at = knots[:-1, None] + np.diff(knots)[:, None] * (x + 1) / 2
+            steps = np.diff(knots) / 2 * (np.linalg.norm(self._curve(at, 1), axis=2) @ w)
+        self.length = float(knots[-1])
 
     def __call__(self, s: Array) -> Array:
         return np.asarray(self._curve(s))
+
+    def tangent(self, s: Array) -> Array:
+        along = self._curve(s, 1)
+        return np.asarray(along / np.linalg.norm(along, axis=-1)[..., None])
 
     def foot(self, rz: Array) -> float:
         coarse = np.linspace(0, self.length, 401, dtype=np.float64)
@@ -114,13 +136,18 @@ class Revolved:
 
 @dataclass(frozen=True)
 class Capped:
-    """Chart t (cos theta, sin theta), t from the pole at the profile's end -> space."""
+    """Chart t (cos theta, sin theta), t from the pole at the profile's end -> space, with a dimple along the normal."""
 
     profile: Profile
+    defect: Dimple | None = None
 
     def __call__(self, chart: Array) -> Array:
         t = np.hypot(chart[:, 0], chart[:, 1])
-        r, z = self.profile(self.profile.length - t).T
+        s = self.profile.length - t
+        r, z = self.profile(s).T
+        if self.defect:
+            (along_r, along_z), w0 = self.profile.tangent(s).T, self.defect(t)
+            r, z = r + w0 * along_z, z - w0 * along_r
         direction = np.where(t[:, None] > 0, chart / np.maximum(t, 1e-300)[:, None], 0.0)
         return np.column_stack([r[:, None] * direction, z])
 

@@ -3,17 +3,15 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.expressions import formula
 from magshell_fenicsx.case.fields import Direction, MagneticSection, layer_average
-from magshell_fenicsx.case.shell import ShellSection
-from magshell_fenicsx.case.surfaces import Surface
+from magshell_fenicsx.case.surfaces import MeshSurface
 from magshell_fenicsx.models.shell.parameters import Magnetisation
 from magshell_fenicsx.models.shell.patterns import Components, InsideAndOutside, Pattern, radial, tangential
 
 
-def magnetisation(
-    magnetic: MagneticSection, shell: ShellSection | Surface, turn: float, to: Direction | None
-) -> Magnetisation:
+def magnetisation(magnetic: MagneticSection, case: Case, turn: float, to: Direction | None) -> Magnetisation:
     """What is magnetised and how it is modelled, in a frame turned about e3 (rad).
 
     Parameters
@@ -31,10 +29,10 @@ def magnetisation(
         remanent = Components([formula(text) for text in section.components])
     elif section.layers:
         remanent = layer_average(section.layers, turn)
-    elif section.patches and isinstance(shell, ShellSection):
+    elif section.patches and not isinstance(case.shell, MeshSurface):
         rest = section.patches["rest"].vector(turn)
         inside = section.patches.get("dimple")
-        remanent = InsideAndOutside(shell.dimple_half_width, inside.vector(turn), rest) if inside else rest
+        remanent = InsideAndOutside(case.dimple_half_width, inside.vector(turn), rest) if inside else rest
     else:
         remanent = section.vector(turn)
     along = magnetic.applied.vector(turn)
@@ -43,7 +41,7 @@ def magnetisation(
         away = to.vector(turn) - (to.vector(turn) @ along) * along
         across = magnetic.applied.uniform * away / np.linalg.norm(away)
     patches = None
-    if section.patches and not isinstance(shell, ShellSection):
+    if section.patches and isinstance(case.shell, MeshSurface):
         patches = {name: direction.vector(turn) for name, direction in section.patches.items()}
     G = np.array(gradient) if gradient else None
     return Magnetisation(remanent, applied, magnetic.energy, G, across, patches)

@@ -7,7 +7,8 @@ from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.output.store.table import COLUMNS
-from magshell_fenicsx.plan.charted import Plan, make_plan
+from magshell_fenicsx.plan.plan import Plan
+from magshell_fenicsx.plan.planner import make_plan
 
 AMPLITUDES = ("pressure", "force", "load", "load_factor", "turn", "push", "lambda_m", "lambda_across")
 ENERGIES = ("membrane", "couple")  # besides those with a column

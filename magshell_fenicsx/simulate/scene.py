@@ -9,7 +9,6 @@ from math import atan2, copysign, degrees, hypot, nan
 from mpi4py import MPI
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.shell import ShellSection
 from magshell_fenicsx.case.solid import SolidSection
 from magshell_fenicsx.continuation.journal import Journal, NoJournal
 from magshell_fenicsx.continuation.listener import NoProgress, Progress
@@ -18,14 +17,19 @@ from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.continuation.watch import Watch
 from magshell_fenicsx.mesh.hexahedra import sweep
 from magshell_fenicsx.mesh.midsurface import Midsurface, distribute
+from magshell_fenicsx.mesh.patch import MeshError
+from magshell_fenicsx.mesh.shapes import DiscShape
 from magshell_fenicsx.models.axisymmetric.meridian import make_meridian
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.shell.own_term import OwnTerm
-from magshell_fenicsx.models.shell.supports import refuse_loose
+from magshell_fenicsx.models.shell.supports import refuse_loose, refuse_unknown
 from magshell_fenicsx.models.solid.model import SolidModel
-from magshell_fenicsx.plan.charted import Plan, meridian_vertices, neo_hookean
+from magshell_fenicsx.plan.account import neo_hookean
+from magshell_fenicsx.plan.loads import turned
 from magshell_fenicsx.plan.own_terms import plan_with
+from magshell_fenicsx.plan.plan import Plan
+from magshell_fenicsx.plan.planner import meridian_vertices
 from magshell_fenicsx.platform.first import from_first
 
 
@@ -70,7 +74,7 @@ class Scene:
             self.model = build_solid_model(case, self.plan, comm)
         else:
             self.model = build_model(case, self.plan, comm)
-            if not isinstance(case.shell, ShellSection):
+            if not self.plan.fixed:
                 refuse_loose(self.model.system, self.model.r0, self.unloaded().mu)
         self.newton = BorderedNewton(self.model.system)
         self.journal: Journal = NoJournal()
@@ -133,8 +137,7 @@ class Scene:
         """The load factor, and the displacements of named points in the unit of the shell's lengths."""
         found = {"load_factor": state.mu["load"]} if self.plan.loads.dead else {}
         for point in self.case.points:
-            assert isinstance(self.model, ShellModel)
-            u = self.plan.length * self.model.displacement(state.u, point)
+            u = self.plan.length * turned(-self.plan.azimuth)(self.model.displacement(state.u, point))
             found |= {f"{point}_u{axis}": float(c) for axis, c in zip("xyz", u, strict=True)}
         return found
 
@@ -150,7 +153,11 @@ def build_model(case: Case, plan: Plan, comm: MPI.Comm) -> ShellModel:
 def build_meridian_model(case: Case, plan: Plan) -> MeridianModel:
     """The meridian, whole on every rank."""
     meridian = make_meridian(plan.embedding, meridian_vertices(plan, case.mesh.refinement))
-    condition = plan.conditions["rim"]
+    assert isinstance(plan.shape, DiscShape)
+    refuse_unknown([plan.shape.edge], plan.points, [], plan.conditions, plan.loads)
+    if not plan.fixed:
+        raise MeshError("boundary: the shell is not held: it is free to move along (0, 0, 1)")
+    condition = plan.conditions.get(plan.shape.edge, "free")
     return MeridianModel(meridian, plan.material, case.mesh.degree, condition, plan.loads, case.mesh.penalty)
 
 

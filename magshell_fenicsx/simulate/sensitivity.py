@@ -61,7 +61,7 @@ def sensitivities(scene: Scene, fold: Fold) -> dict[str, float]:
     columns = {name: system.load(state.u, name) for name in state.mu if name != fold.name}
     columns |= _remanence_columns(scene, fold)
     found = {name: sensitivity(system, fold, column) for name, column in columns.items()}
-    return found | ({DEFECT: _to_defect(scene, fold)} if scene.case.shell.defect else {})
+    return found | ({DEFECT: _to_defect(scene, fold)} if scene.case.defect else {})
 
 
 def _to_defect(scene: Scene, fold: Fold) -> float:
@@ -79,8 +79,8 @@ def _to_defect(scene: Scene, fold: Fold) -> float:
 
 def deepened(case: Case, change: float) -> Case:
     """The case with its dimple deeper by `change` thicknesses."""
-    assert case.shell.defect
-    defect = case.shell.defect.model_copy(update={"amplitude": case.shell.defect.amplitude + change})
+    assert case.defect
+    defect = case.defect.model_copy(update={"amplitude": case.defect.amplitude + change})
     return case.model_copy(update={"shell": case.shell.model_copy(update={"defect": defect})})
 
 
@@ -101,9 +101,9 @@ def _remanence_columns(scene: Scene, fold: Fold) -> dict[str, Vector]:
     field = scene.model.loads.magnetic
     if field is None:
         return {}
-    if not scene.case.shell.defect:
+    if not scene.case.defect:
         return {"remanence": _magnetic_column(scene, fold, field)}
-    rim, one = scene.case.charted.dimple_half_width, np.ones(3)
+    rim, one = scene.case.dimple_half_width, np.ones(3)
     patches = {"dimple": InsideAndOutside(rim, one, 0 * one), "rest": InsideAndOutside(rim, 0 * one, one)}
     return {
         f"remanence {name}": _magnetic_column(scene, fold, replace(field, remanent=_Within(field.remanent, patch)))

@@ -64,7 +64,6 @@ def test_physical_input_gives_the_dimensionless_numbers(file: Path) -> None:
         ("shell.defect.width=40", "half-width"),
         ("shell=3", "must be a section"),
         ("boundary.rim=clamped", "no such edge, only equator"),
-        ("boundary.equator=free", "not held"),
         ("magnetic.lambda_m=a lot", "'a lot'"),
         ("magnetic.energy=secnd", "must be 'full', 'first'"),
         ("magnetic.remanent.flux_density=60 mT", "not both"),

@@ -5,7 +5,7 @@ from conftest import CASES
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.mesh.triangulation import triangulate
-from magshell_fenicsx.plan.charted import make_plan
+from magshell_fenicsx.plan.planner import make_plan
 
 
 @pytest.mark.parametrize(

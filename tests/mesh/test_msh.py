@@ -15,7 +15,8 @@ from magshell_fenicsx.case.source import CaseError, Source
 from magshell_fenicsx.mesh.msh import MeshFile, read_msh
 from magshell_fenicsx.mesh.patch import MeshError, PatchMesh, check_orientation
 from magshell_fenicsx.models.shell.patterns import ByPatch
-from magshell_fenicsx.plan.charted import describe, make_plan
+from magshell_fenicsx.plan.check import describe
+from magshell_fenicsx.plan.planner import make_plan
 from magshell_fenicsx.run.files import AlreadyComplete
 from magshell_fenicsx.run.run import run
 from magshell_fenicsx.studies.sweep.axes import parse_axis

@@ -6,7 +6,8 @@ import pytest
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.fields import Direction
 from magshell_fenicsx.case.source import CaseError, Source
-from magshell_fenicsx.plan.charted import common_azimuth, make_plan
+from magshell_fenicsx.plan.planner import make_plan
+from magshell_fenicsx.plan.symmetry import common_azimuth
 
 
 def case(**sections: object) -> Case:
@@ -15,10 +16,10 @@ def case(**sections: object) -> Case:
 
 
 def test_common_azimuth() -> None:
-    up, tilted, across = (Direction(polar=p, azimuth=a) for p, a in ((0, 70), (30, 20), (30, 110)))
+    up, tilted, across = (Direction(polar=p, azimuth=a).vector() for p, a in ((0, 70), (30, 20), (30, 110)))
     assert common_azimuth([up]) == 0.0
     assert common_azimuth([up, tilted]) == pytest.approx(np.radians(20))
-    assert common_azimuth([tilted, Direction(polar=45, azimuth=200)]) == pytest.approx(np.radians(20))
+    assert common_azimuth([tilted, Direction(polar=45, azimuth=200).vector()]) == pytest.approx(np.radians(20))
     assert common_azimuth([tilted, across]) is None
 
 

@@ -18,7 +18,7 @@ from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.output.pictures.render import NoScreen
 from magshell_fenicsx.output.store.checkpoint import Checkpoint
 from magshell_fenicsx.output.store.folder import DiskError, by_first, prepare_folder
-from magshell_fenicsx.plan.charted import Plan
+from magshell_fenicsx.plan.plan import Plan
 from magshell_fenicsx.platform.first import from_first
 from magshell_fenicsx.run.files import AlreadyComplete
 from magshell_fenicsx.simulate.scene import Scene

@@ -70,7 +70,7 @@ def test_remanence_of_the_dimple() -> None:
     model, field = scene.model, scene.model.loads.magnetic
     assert isinstance(model, MeridianModel)
     assert field
-    rim, B = scene.case.shell.dimple_half_width, np.array([0.0, 0.0, 1.0])
+    rim, B = scene.case.dimple_half_width, np.array([0.0, 0.0, 1.0])
 
     def stronger(change: float) -> float:
         loads = replace(model.loads, magnetic=replace(field, remanent=InsideAndOutside(rim, (1 + change) * B, B)))

@@ -186,13 +186,14 @@ def test_a_point_in_a_large_cell_beside_small_ones_is_found() -> None:
     assert cells.places(beside)[2] == pytest.approx([1e-3])
 
 
-def test_a_place_that_the_other_mesh_has_not_is_refused() -> None:
+@pytest.mark.parametrize("symmetry", ["axisymmetric", "half"])
+def test_a_place_that_the_other_mesh_has_not_is_refused(symmetry: str) -> None:
     """Polynomials that are exact inside grow without limit outside."""
 
     def cap(polar: float) -> Scene:
         shell = {"geometry": "cap", "radius": 1.0, "thickness": 0.02, "polar": polar, "poisson_ratio": 0.3}
         shell["youngs_modulus"] = 1.0
-        sections = {"shell": shell, "boundary": {"rim": "clamped"}, "mesh": {"degree": 2}}
+        sections = {"shell": shell, "boundary": {"rim": "clamped"}, "mesh": {"degree": 2}, "symmetry": symmetry}
         return Scene(Case.from_source(Source("cap", sections | {"loading": {"kind": "pressure", "until": "limit"}})))
 
     low, wide = cap(30), cap(60)

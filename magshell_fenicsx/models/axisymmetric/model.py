@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 import ufl
 from dolfinx import fem
+from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
@@ -21,6 +22,8 @@ from magshell_fenicsx.models.axisymmetric.meridian import Meridian, held_at
 from magshell_fenicsx.models.axisymmetric.waves import Waves
 from magshell_fenicsx.models.shell.parameters import Condition, Force, Loads, Material, default_penalty
 from magshell_fenicsx.models.shell.point_load import Entries
+
+Array = NDArray[np.float64]
 
 
 class MeridianModel:
@@ -104,9 +107,12 @@ class MeridianModel:
         return float(fem.assemble_scalar(self._volume))
 
     def deflection(self, u: Vector, point: str) -> float:
-        """w/R = -W at the pole, the only named point."""
-        assert point == "pole"
+        """w/R = -W at the pole, where all named points are."""
         return -float(u[self._pole[0]])
+
+    def displacement(self, u: Vector, point: str) -> Array:
+        """u/R (3,) there."""
+        return np.array([0.0, 0.0, u[self._pole[0]]])
 
     def loaded_deflection(self, u: Vector) -> float:
         """w/R conjugate to the force: at the pole, or averaged over its patch."""

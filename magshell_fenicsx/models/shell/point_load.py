@@ -8,9 +8,11 @@ from dolfinx.la import InsertMode
 from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.kernels import KernelLog
+from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.platform import compat
 
+COARSE = 0.15  # of the integral that a patch's weight has on a plane
 Entries = tuple[NDArray[np.int32], NDArray[np.float64]]
 
 
@@ -29,6 +31,11 @@ def patch_entries(
 
     d is the distance from x in space. The weight's integral is taken with the same
     quadrature, so that the total force is exact on any mesh.
+
+    Raises
+    ------
+    MeshError
+        On every rank, if the mesh is too coarse to know the patch.
     """
     V = r0.function_space
     domain = V.mesh
@@ -38,6 +45,11 @@ def patch_entries(
     weight = ufl.conditional(ufl.gt(inside, 0), inside**2, 0) * kin.area_ratio(j0)
     dx = ufl.Measure("dx", domain=domain, metadata={"quadrature_degree": 2 * degree})
     total = domain.comm.allreduce(fem.assemble_scalar(log.compile("patch weight", weight * dx)))
+    if not COARSE <= total / (np.pi * radius**2 / 3) <= 1 / COARSE:  # 1 of a whole patch, 1/4 at a corner
+        raise MeshError(
+            f"loading.patch: its radius is {radius:.3g} R, which the mesh is too coarse for: choose a smaller mesh.size, "
+            "or 0 for a force at a point"
+        )
     load = fem.assemble_vector(log.compile("patch load", weight * ufl.dot(along, ufl.TestFunction(V)) * dx))
     load.scatter_reverse(InsertMode.add)
     owned = 3 * V.dofmap.index_map.size_local

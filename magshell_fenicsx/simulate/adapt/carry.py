@@ -111,6 +111,8 @@ class CellFields:
         xi = self._as_if_straight(x, cells)
         beside = np.full(len(x), np.inf)
         near = np.flatnonzero(_beside(xi) < FAR)
+        if not len(near):
+            return xi, beside
         x, nodes, inside = x[near], self.nodes[cells[near]], xi[near]
         for _ in range(NEWTON_STEPS):
             table = self.table(1, inside)

@@ -8,7 +8,8 @@ import numpy as np
 from mpi4py import MPI
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.plan.charted import Plan, make_plan
+from magshell_fenicsx.plan.plan import Plan
+from magshell_fenicsx.plan.planner import make_plan
 from magshell_fenicsx.simulate.adapt.size import Sampled
 from magshell_fenicsx.simulate.scene import Scene
 

@@ -13,11 +13,11 @@ from mpi4py import MPI
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.loading import PressureSection
-from magshell_fenicsx.case.shell import ShellSection
+from magshell_fenicsx.case.surfaces import MeshSurface
 from magshell_fenicsx.continuation.fold import Fold, FoldLost
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.output.store.table import Row
-from magshell_fenicsx.plan.charted import make_plan
+from magshell_fenicsx.plan.planner import make_plan
 from magshell_fenicsx.run.run import Result, run
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.studies.sweep.axes import Axis, along
@@ -136,7 +136,7 @@ def _row(scene: Scene, fold: Fold) -> Row:
 def _has_knockdown(case: Case) -> bool:
     loading = case.loading
     # with a tolerance the mesh is another for each point; states are carried over between charts that are known
-    by_one_mesh = case.mesh.tolerance is None and isinstance(case.shell, ShellSection)
+    by_one_mesh = case.mesh.tolerance is None and not isinstance(case.shell, MeshSurface)
     return by_one_mesh and isinstance(loading, PressureSection) and loading.until == "limit" and not loading.branches
 
 

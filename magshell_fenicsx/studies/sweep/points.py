@@ -11,7 +11,7 @@ from pathlib import Path
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.source import CaseError, Source, override, read_source
-from magshell_fenicsx.plan.charted import make_plan
+from magshell_fenicsx.plan.planner import make_plan
 from magshell_fenicsx.studies.sweep.axes import MOST_POINTS, Axis
 
 

@@ -17,8 +17,8 @@ from magshell_fenicsx.models.shell import densities
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.shell.parameters import AreaForce, Loads, Material
-from magshell_fenicsx.plan.charted import make_plan
 from magshell_fenicsx.plan.own_terms import plan_with
+from magshell_fenicsx.plan.planner import make_plan
 
 E1, E2, E3 = np.eye(3)
 Density = Callable[..., Expr]

@@ -12,7 +12,8 @@ from magshell_fenicsx.models.modes import ShellModes
 from magshell_fenicsx.models.solid.model import SolidModel
 from magshell_fenicsx.output.fields.gathering import gatherer
 from magshell_fenicsx.output.fields.vtu import unstructured_grid
-from magshell_fenicsx.plan.charted import describe, make_plan
+from magshell_fenicsx.plan.check import describe
+from magshell_fenicsx.plan.planner import make_plan
 
 BUCKLING, INDENTATION = CASES / "solid_buckling.yaml", CASES / "solid_indentation.yaml"
 

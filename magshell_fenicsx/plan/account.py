@@ -1,0 +1,49 @@
+"""What a model has and what is left out, in words."""
+
+from math import degrees
+
+from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.solid import SolidSection
+from magshell_fenicsx.models.shell.parameters import Loads
+from magshell_fenicsx.models.solid.material import NeoHookean
+
+
+def account(case: Case, loads: Loads, model: str, azimuth: float) -> tuple[list[str], list[str]]:
+    """What is included and what is left out; `model` is "meridian", "half shell", ..., `azimuth` that of its plane."""
+    included = [model, "membrane and bending energy" if case.model == "shell" else _elastic(case)]
+    left_out = []
+    if loads.magnetic:
+        included.append(f"magnetic energy ({loads.magnetic.energy}), lambda_m = {case.lambda_m:g}")
+    else:
+        left_out.append("magnetic energy: " + ("lambda_m is zero" if case.magnetic else "no magnetic section"))
+    if loads.pressure:
+        included.append("live pressure" if case.model == "shell" else "live pressure on the outer face")
+    else:
+        left_out.append("pressure: not loaded by it (the volume is only reported)")
+    if loads.force:
+        patch = loads.force.patch * case.shell.R_over_h
+        included.append(f"force on a patch of radius {patch:g} h" if patch else "force at a point")
+    else:
+        left_out.append("force: none")
+    if loads.dead:
+        included.append(f"{len(loads.dead)} dead load{'s' * (len(loads.dead) > 1)}")
+    if model == "meridian":
+        left_out.append("waves around the axis (they are looked for at each point)")
+    if model.startswith("half"):
+        left_out.append(
+            f"the other half: mirror plane through e3 at azimuth {degrees(azimuth):g} degrees "
+            "(modes antisymmetric to it are looked for along the path)"
+        )
+    return included, left_out
+
+
+def neo_hookean(case: Case) -> NeoHookean:
+    """The solid's material."""
+    return NeoHookean.of(case.shell.poisson_ratio, (case.solid or SolidSection()).bulk_to_shear)
+
+
+def _elastic(case: Case) -> str:
+    material, layers = neo_hookean(case), (case.solid or SolidSection()).layers
+    ratio = material.bulk / material.shear
+    small_strains = f"E = {material.youngs_modulus:.5g}, nu = {material.nu:.5g} for small strains"
+    return f"neo-Hookean energy, kappa/mu = {ratio:.5g} ({small_strains}), {layers} layer{'s' * (layers > 1)}"

@@ -1,0 +1,81 @@
+"""What `magshell check` prints of a plan."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.solid import SolidSection
+from magshell_fenicsx.case.source import CaseError
+from magshell_fenicsx.mesh.msh import MeshFile
+from magshell_fenicsx.mesh.patch import MeshError, PatchMesh
+from magshell_fenicsx.plan.plan import Plan
+from magshell_fenicsx.plan.planner import make_plan, meridian_vertices
+
+
+def describe(case: Case) -> str:
+    """What `magshell check` prints: dimensionless numbers, what is built, what is left out.
+
+    Raises
+    ------
+    CaseError
+        If the case cannot be built, or nothing is held.
+    """
+    plan = make_plan(case)
+    if all(condition == "free" for condition in plan.conditions.values()):
+        raise CaseError("boundary: nothing is held: clamp an edge or a patch, or hold points, for instance")
+    numbers = {
+        "R/h": 1 / plan.material.h,
+        "nu": plan.material.nu,
+        "p_c/E": plan.material.classical_pressure,
+        "lambda_m": case.lambda_m,
+        "Lambda_m = lambda_m R/h": case.lambda_m / plan.material.h,
+    }
+    lines = [f"{name} = {value:.6g}" for name, value in numbers.items()]
+    if case.mesh.tolerance is None:
+        patch = None if plan.axisymmetric else _meshed(plan)
+        cells, unknowns = _count(case, plan, patch)
+        lines.append(f"mesh: {cells} cells of degree {case.degree}, {unknowns} unknowns")
+        if patch and isinstance(plan.shape, MeshFile):
+            lines += _surface(patch)
+    else:
+        lines.append(f"mesh: found by the run, for a relative error of its result below {case.mesh.tolerance:g}")
+    left_out = plan.left_out or ["nothing"]
+    lines += ["built:", *(f"  {item}" for item in plan.included), "left out:", *(f"  {item}" for item in left_out)]
+    return "\n".join(lines)
+
+
+def _meshed(plan: Plan) -> PatchMesh:
+    try:
+        return plan.triangulated()
+    except MeshError as e:
+        raise CaseError(str(e)) from None
+
+
+def _surface(patch: PatchMesh) -> list[str]:
+    """What a mesh file holds, for its author to see that it was read as it was meant."""
+    places = patch.embedding(patch.nodes)
+    a, b, c = places[patch.cells[0, :3]]
+    normal = np.cross(b - a, c - a)
+    extent, at, n = np.ptp(places, axis=0), (a + b + c) / 3, normal / np.linalg.norm(normal)
+    return [
+        f"extent over the radius: {' x '.join(f'{x:.4g}' for x in extent)}",
+        f"edges: {', '.join(patch.edges) or 'none'}; patches: {', '.join(patch.patches) or 'none'}",
+        f"outside: the normal at {_told(at)}, over the radius, is {_told(n)}",
+    ]
+
+
+def _told(vector: NDArray[np.float64]) -> str:
+    return f"({', '.join(f'{x + 0.0:.4g}' for x in np.round(vector, 9))})"
+
+
+def _count(case: Case, plan: Plan, patch: PatchMesh | None) -> tuple[int, int]:
+    """Cells and unknowns of the mesh, or of the meridian."""
+    k = case.degree
+    if patch is None:
+        return (count := len(meridian_vertices(plan, case.mesh.refinement)) - 1), 2 * (k * count + 1)
+    cells, corners = patch.corners, len(np.unique(patch.corners))
+    sides = len(np.unique(np.sort(cells[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0))
+    if case.model == "solid":  # three hexahedra a layer above each triangle
+        layers = (case.solid or SolidSection()).layers
+        return 3 * len(cells) * layers, 3 * (2 * layers + 1) * (corners + 3 * sides + 7 * len(cells))
+    return len(cells), 3 * (corners + (k - 1) * sides + (k - 1) * (k - 2) // 2 * len(cells))

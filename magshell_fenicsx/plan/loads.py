@@ -1,0 +1,119 @@
+"""The loads of a case in the model's terms: over E h R and in the model's frame, on the part that is modelled."""
+
+from collections.abc import Callable
+from math import radians
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.loading import DeadLoadSection, DeadSection, IndentationSection, PressureSection
+from magshell_fenicsx.case.loading import RotationSection as Rotation
+from magshell_fenicsx.case.source import CaseError
+from magshell_fenicsx.models.shell.parameters import (
+    AreaForce,
+    DeadLoad,
+    EdgeForce,
+    EdgeMoment,
+    Force,
+    Loads,
+    PointForce,
+)
+from magshell_fenicsx.plan.magnetisation import magnetisation
+from magshell_fenicsx.plan.outline import Outline
+
+Array = NDArray[np.float64]
+
+
+def loads(case: Case, under: str, turn: float, part: float) -> Loads:
+    """What loads the shell.
+
+    Parameters
+    ----------
+    under
+        Name of the vertex under an indentation.
+    turn
+        Azimuth of the model's frame (rad).
+    part
+        Of the shell that is modelled, 1/2 or 1: a concentrated load is shared by the halves.
+    """
+    loading, magnetic = case.loading, case.magnetic
+    force = None
+    if isinstance(loading, IndentationSection):
+        force = Force(under, loading.patch / case.shell.R_over_h)
+    to = loading.to if isinstance(loading, Rotation) else None
+    field = magnetisation(magnetic, case, turn, to) if magnetic and case.lambda_m else None
+    dead = tuple(_dead(load, case, turn, part) for load in loading.loads) if isinstance(loading, DeadSection) else ()
+    return Loads(isinstance(loading, PressureSection), force, field, dead)
+
+
+def indented(case: Case, outline: Outline) -> Array | None:
+    """The place (3,) of an indentation, over R; None without one.
+
+    Raises
+    ------
+    CaseError
+        If it is not on the shell, or its patch reaches the edge.
+    """
+    loading = case.loading
+    if not isinstance(loading, IndentationSection):
+        return None
+    if loading.at.point is not None:
+        return np.asarray(np.array(case.points[loading.at.point]) / case.shell.reference)
+    polar = radians(loading.at.polar)
+    if not outline.sphere and polar:
+        where = "at its centre or tip, polar: 0, or at a point of points"
+        raise CaseError(f"loading.at.polar: {loading.at.polar:g}: a {case.shell.geometry} is loaded {where}")
+    if outline.highest is None or not (outline.disc or case.shell.geometry == "strip"):
+        raise CaseError(f"loading.at: a {case.shell.geometry} has no pole: give {{point: NAME}}, of points")
+    if not outline.sphere:
+        return np.asarray(outline.embedding(outline.highest[None])[0])
+    if 0 < polar < 1 / case.shell.R_over_h:
+        raise CaseError(f"loading.at.polar: {loading.at.polar:g}: 0, or more than a thickness from the pole")
+    chart = polar * loading.at.vector()[:2] / max(np.hypot(*loading.at.vector()[:2]), 1e-300)
+    return np.asarray(outline.embedding(chart[None])[0])
+
+
+def refuse_wide_patch(case: Case, outline: Outline, at: Array) -> None:
+    """See that the patch of a force is no wider than the shell around its place `at` in the chart.
+
+    Raises
+    ------
+    CaseError
+        With the radii that are allowed.
+    """
+    assert isinstance(case.loading, IndentationSection)
+    room = outline.edge - float(np.hypot(*at[:2])) if outline.sphere else min(1.0, case.width or 1.0)
+    patch, most = case.loading.patch, room * case.shell.R_over_h
+    if patch and not 0.3 <= patch <= most:
+        raise CaseError(
+            f"loading.patch: {patch:g}: allowed are 0 for a point, or 0.3 to {most:.4g}, where it reaches the edge"
+        )
+
+
+def turned(turn: float) -> Callable[[Array], Array]:
+    """Vectors and places (3,) in a frame turned about e3 (rad)."""
+    c, s = np.cos(turn), np.sin(turn)
+    frame = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+    return (lambda v: np.asarray(frame @ v)) if turn else (lambda v: v)
+
+
+def _dead(load: DeadLoadSection, case: Case, turn: float, part: float) -> DeadLoad:
+    shell, into = case.shell, turned(turn)
+    E, t, R = shell.modulus, shell.reference / shell.R_over_h, shell.reference
+    assert E is not None
+    force = np.asarray(part * into(np.array(load.force or np.zeros(3))) / (E * t * R))
+    if load.at is not None:
+        return PointForce(load.at, force)
+    if load.edge is not None and load.moment is not None:
+        return EdgeMoment(load.edge, load.moment / (E * t * R))
+    if load.edge is not None and load.force is not None:
+        return EdgeForce(load.edge, force, total=True)
+    if load.edge is not None:
+        assert load.per_length is not None
+        return EdgeForce(load.edge, np.asarray(into(np.array(load.per_length)) / (E * t)), total=False)
+    patch = None if load.over == "all" else load.over
+    if load.pressure is not None:
+        return AreaForce(patch, load.pressure * R / (E * t))
+    assert load.per_area is not None
+    return AreaForce(patch, np.asarray(into(np.array(load.per_area)) * R / (E * t)))

@@ -1,0 +1,156 @@
+"""The symmetry that each part of a case leaves; a model takes what all leave."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from math import atan2, hypot, sin
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magshell_fenicsx.case.boundary import HeldSection
+from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.loading import DeadSection, IndentationSection, RotationSection
+from magshell_fenicsx.plan.outline import Outline
+
+Array = NDArray[np.float64]
+Vectors = Sequence[Array]
+PARALLEL = 1e-12
+
+
+def _every(azimuth: float) -> bool:
+    return True
+
+
+def _none(azimuth: float) -> bool:
+    return False
+
+
+def _along_x(azimuth: float) -> bool:
+    return abs(sin(azimuth)) < PARALLEL
+
+
+@dataclass(frozen=True)
+class Leaves:
+    """What one part leaves.
+
+    Attributes
+    ----------
+    askew
+        Why the case cannot be turned about e3 with this part; None if it can.
+    vectors
+        Vectors and places (3,) that a mirror plane through e3 must hold.
+    mirrors
+        Whether the plane through e3 at an azimuth (rad) is left, apart from `vectors`.
+    """
+
+    askew: str | None = None
+    vectors: Vectors = ()
+    mirrors: Callable[[float], bool] = _every
+
+
+def left(case: Case, outline: Outline, indented: Array | None) -> list[Leaves]:
+    """What each part of a case leaves; `indented` is the place (3,) of an indentation, over R."""
+    return [
+        _shape(case, outline),
+        *(_support(case, name, condition) for name, condition in case.boundary.conditions().items()),
+        *(_field(case) if case.magnetic and case.lambda_m else []),
+        *_load(case, indented),
+        *(_named(case) if case.points else []),
+    ]
+
+
+def common_azimuth(vectors: Vectors) -> float | None:
+    """Azimuth (rad) of the plane through e3 that holds all vectors; None if there is none.
+
+    0 if every vector is along e3.
+    """
+    tilted = [v[:2] for v in vectors if hypot(*v[:2]) > PARALLEL]
+    if not tilted:
+        return 0.0
+    x, y = tilted[0]
+    if any(abs(x * v[1] - y * v[0]) > 1e-10 * hypot(x, y) * hypot(*v) for v in tilted):
+        return None
+    return atan2(y, x)
+
+
+def mirror(parts: Sequence[Leaves]) -> float | None:
+    """Azimuth (rad) of a plane through e3 that all parts leave; None if there is none."""
+    azimuth = common_azimuth([v for part in parts for v in part.vectors])
+    return azimuth if azimuth is not None and all(part.mirrors(azimuth) for part in parts) else None
+
+
+def askew(parts: Sequence[Leaves]) -> str | None:
+    """What keeps a case from being a meridian turned about e3; None if nothing does."""
+    return next((part.askew for part in parts if part.askew), None)
+
+
+def _shape(case: Case, outline: Outline) -> Leaves:
+    geometry = case.shell.geometry
+    if outline.disc and isinstance(case.thickness_factor, str):
+        return Leaves("only the user knows whether the formula of the thickness is", mirrors=_none)
+    if outline.disc:
+        return Leaves()
+    if geometry == "strip":
+        return Leaves("a strip is no surface of revolution", mirrors=_along_x)
+    return Leaves(f"not with a {geometry}: a meridian ends at a pole", mirrors=_none)
+
+
+def _support(case: Case, name: str, condition: str | HeldSection) -> Leaves:
+    if isinstance(condition, HeldSection):
+        return Leaves(f"boundary.{name}: held components are those of e1, e2 and e3", mirrors=_along_x)
+    return Leaves(f"boundary.{name}: a mirror plane of the case's own") if condition == "symmetry" else Leaves()
+
+
+def _field(case: Case) -> list[Leaves]:
+    magnetic = case.magnetic
+    assert magnetic
+    vectors = [d.vector() for d in (*magnetic.remanent.directions(), magnetic.applied)]
+    found = [Leaves("a field is not along e3" if any(_tilted(v) for v in vectors) else None, vectors)]
+
+    def told(azimuth: float) -> bool:  # only the user knows whether it is symmetric to the plane y = 0
+        return case.symmetry == "half" and not azimuth
+
+    if magnetic.remanent.kind == "expression":
+        found.append(Leaves("only the user knows whether the remanence's formula is", mirrors=told))
+    if magnetic.applied.gradient:
+        G = np.array(magnetic.applied.gradient)
+        round_ = np.abs(G - np.diag([G[0, 0], G[0, 0], G[2, 2]])).max() <= PARALLEL
+        found.append(Leaves(None if round_ else "the gradient of the applied field is not diag(a, a, b)", mirrors=told))
+    return found
+
+
+def _load(case: Case, indented: Array | None) -> list[Leaves]:
+    loading = case.loading
+    if isinstance(loading, IndentationSection):
+        assert indented is not None
+        return [Leaves("the force is not at the pole" if _tilted(indented) else None, [indented])]
+    if isinstance(loading, RotationSection):
+        return [Leaves("the field turns", [loading.to.vector()])]
+    if isinstance(loading, DeadSection):
+        forces = [np.array(v) for load in loading.loads for v in (load.force, load.per_length, load.per_area) if v]
+        places = [np.array(case.points[load.at]) for load in loading.loads if load.at]
+        patches = any(load.over not in (None, "all") for load in loading.loads)
+        mirrors = _none if patches else _every
+        return [Leaves("a meridian takes no dead loads", [_unit(v) for v in (*forces, *places)], mirrors)]
+    return []
+
+
+def _named(case: Case) -> list[Leaves]:
+    """Named points lie on the half that is modelled, y >= 0."""
+    places = [_unit(np.array(x)) for x in case.points.values()]
+
+    def within(azimuth: float) -> bool:
+        across = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
+        return all(x @ across > -PARALLEL for x in places)
+
+    off = any(_tilted(x) for x in places)
+    return [Leaves("points are named off the axis" if off else None, mirrors=within)]
+
+
+def _tilted(v: Array) -> bool:
+    return bool(hypot(*v[:2]) > PARALLEL)
+
+
+def _unit(v: Array) -> Array:
+    size = np.linalg.norm(v)
+    return np.asarray(v / size) if size else v
