@@ -5,26 +5,32 @@ import signal
 import sys
 import traceback
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from mpi4py import MPI
 
 from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.examples import examples, title, write_example
 from magshell_fenicsx.case.source import CaseError
+from magshell_fenicsx.platform.completion import case_files, left_to_the_shell
+from magshell_fenicsx.platform.version import __version__
 
 app = typer.Typer(
     help="Thin magnetic shells: deformation, indentation, buckling.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
-    add_completion=False,
 )
-CaseFile = Annotated[Path, typer.Argument(metavar="CASE.yaml", help="the case file")]
+CaseFile = Annotated[Path, typer.Argument(metavar="CASE.yaml", help="the case file", autocompletion=case_files)]
 Settings = Annotated[
     list[str] | None, typer.Option("--set", metavar="KEY.PATH=VALUE", help="replace a key of the case")
 ]
 
 INVALID, STOPPED = 2, 3
+
+
+def _folder(default: str) -> Any:
+    return typer.Option(help=f"output folder; default {default}", autocompletion=left_to_the_shell)
 
 
 def _say(line: str) -> None:
@@ -43,7 +49,7 @@ def main() -> None:
     """The program."""
     signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # of `| head`, say; PETSc would report a crash
     try:
-        app()
+        app(prog_name="magshell")  # by whatever name it was started: completion goes by it
     except Exception:
         if MPI.COMM_WORLD.size == 1:
             raise
@@ -52,11 +58,26 @@ def main() -> None:
         MPI.COMM_WORLD.Abort(1)  # the other ranks would wait for this one for ever
 
 
+def _tell_version(asked: bool) -> None:
+    if asked:
+        _say(f"magshell_fenicsx {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    version: Annotated[
+        bool, typer.Option("--version", is_eager=True, callback=_tell_version, help="the version, and nothing else")
+    ] = False,
+) -> None:
+    """Options before the command."""
+
+
 @app.command()
 def run(
     case: CaseFile,
     set_: Settings = None,
-    out: Annotated[Path | None, typer.Option(help="output folder; default results/<case name>/")] = None,
+    out: Annotated[Path | None, _folder("results/<case name>/")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="go on with the run that was interrupted there")] = False,
     time_limit: Annotated[
         float | None, typer.Option(min=0, metavar="SECONDS", help="stop then, so that the run can be resumed")
@@ -99,7 +120,7 @@ def sweep(
         ),
     ],
     set_: Settings = None,
-    out: Annotated[Path | None, typer.Option(help="output folder; default results/<case name>_sweep/")] = None,
+    out: Annotated[Path | None, _folder("results/<case name>_sweep/")] = None,
     full_paths: Annotated[
         bool, typer.Option("--full-paths", help="a path of its own at every point; no fold is followed")
     ] = False,
@@ -136,7 +157,7 @@ def study(
     reference: Annotated[float | None, typer.Option(help="that errors are relative to; default the finest run")] = None,
     ranks: Annotated[str, typer.Option(metavar="N,N", help="numbers of MPI ranks to run each point on")] = "1",
     repeat: Annotated[int, typer.Option(min=1, help="runs of each point, whose medians are told")] = 3,
-    out: Annotated[Path | None, typer.Option(help="output folder; default results/<case name>_study/")] = None,
+    out: Annotated[Path | None, _folder("results/<case name>_study/")] = None,
 ) -> None:
     """Measure error against run time over meshes, degrees, models and ranks; runs that are in the folder are kept."""
     from magshell_fenicsx.output.store.folder import DiskError
@@ -164,7 +185,7 @@ def compare(
     set_: Settings = None,
     shell: Annotated[str, typer.Option(metavar="R,R", help="refinements of the shell's mesh; the finest counts")] = "1",
     solid: Annotated[str, typer.Option(metavar="R,R", help="of the solid's; three tell error against run time")] = "1",
-    out: Annotated[Path | None, typer.Option(help="output folder; default results/<case name>_compare/")] = None,
+    out: Annotated[Path | None, _folder("results/<case name>_compare/")] = None,
 ) -> None:
     """Run a case as a shell and as a solid; put curves, difference and run times side by side."""
     from magshell_fenicsx.output.store.folder import DiskError
@@ -188,7 +209,10 @@ def compare(
 
 @app.command()
 def plot(
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="a run's results, whole or interrupted")],
+    folder: Annotated[
+        Path,
+        typer.Argument(metavar="DIR", help="a run's results, whole or interrupted", autocompletion=left_to_the_shell),
+    ],
     point: Annotated[int | None, typer.Option(metavar="N", help="draw this point, as shell_000N.png, ...")] = None,
     animation: Annotated[bool, typer.Option("--animation", help="draw animation.gif too, of the path")] = False,
 ) -> None:
@@ -216,6 +240,34 @@ def check(case: CaseFile, set_: Settings = None) -> None:
         _say(describe(Case.load(case, set_ or [])))
     except CaseError as e:
         raise _failure(str(e), INVALID) from None
+
+
+def _names() -> list[str]:
+    return list(examples())
+
+
+@app.command()
+def example(
+    name: Annotated[
+        str | None, typer.Argument(metavar="NAME", help="of the case to write", autocompletion=_names)
+    ] = None,
+    file: Annotated[
+        Path | None,
+        typer.Argument(metavar="FILE.yaml", help="where to; default NAME.yaml", autocompletion=left_to_the_shell),
+    ] = None,
+) -> None:
+    """Write an example case to a file, to run and to change; without NAME, list all of them."""
+    if name is None:
+        for known, where in examples().items():
+            _say(f"{known:24} {title(where)}")
+        return
+    if MPI.COMM_WORLD.rank:
+        return
+    try:
+        written = write_example(name, file)
+    except CaseError as e:
+        raise _failure(str(e), INVALID) from None
+    _say(f"wrote {', '.join(map(str, written))}")
 
 
 @app.command()

@@ -10,6 +10,8 @@ import pytest
 from command import magshell, read_path
 from conftest import CASES
 
+from magshell_fenicsx.platform.version import __version__
+
 PLATE = CASES / "clamped_plate.yaml"
 COLUMNS = (
     "point,label,amplitude,p_over_pc,lambda_m,force,w_over_h,w_from_field_over_h,w_pole_over_h,volume_change,energy,"
@@ -91,7 +93,7 @@ def test_a_bug_on_one_rank_ends_all(tmp_path: Path) -> None:
     """The other waits for it in a collective call."""
     program = """
 from magshell_fenicsx import cli
-def app():
+def app(**_):
     if cli.MPI.COMM_WORLD.rank == 0:
         raise AssertionError("a bug")
     cli.MPI.COMM_WORLD.Barrier()
@@ -128,6 +130,31 @@ def test_check_tells_what_is_left_out() -> None:
     assert done.returncode == 0
     assert "magnetic energy: lambda_m is zero" in done.stdout
     assert "R/h = 90" in done.stdout
+
+
+def test_version() -> None:
+    done = magshell("--version")
+    assert (done.returncode, done.stdout, done.stderr) == (0, f"magshell_fenicsx {__version__}\n", "")
+
+
+def test_examples_have_names() -> None:
+    """Which are listed, and told where a name is none."""
+    listed = magshell("example").stdout.splitlines()
+    assert "clamped_plate            Clamped circular plate under a small pressure" in listed
+    done = magshell("example", "plate", ranks=2)
+    assert done.returncode == 2
+    assert done.stderr.count("example plate: there is no such case, only bracket, clamped_plate, ") == 1
+
+
+def test_an_example_is_written_once(tmp_path: Path) -> None:
+    """What is there is kept, with exit code 2 and one message."""
+    target = tmp_path / "mine.yaml"
+    assert magshell("example", "clamped_plate", target).stdout == f"wrote {target}\n"
+    before = target.read_bytes()
+    again = magshell("example", "clamped_plate", target)
+    assert (again.returncode, again.stdout) == (2, "")
+    assert again.stderr == f"{target}: is there already, and is kept; name a file elsewhere\n"
+    assert target.read_bytes() == before
 
 
 def test_info() -> None:

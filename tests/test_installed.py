@@ -1,0 +1,143 @@
+"""The package does its work where only pip put it: another folder, without the repository on the path."""
+
+import csv
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from conftest import CASES
+
+from magshell_fenicsx.case.examples import examples
+from magshell_fenicsx.case.schema import schema_text
+from magshell_fenicsx.platform import sources
+from magshell_fenicsx.platform.version import __version__
+
+TOP = CASES.parent
+QUICK = ("--set=mesh.degree=3", "--set=mesh.refinement=0.3")
+CASE = "dimple_buckling.yaml"
+
+
+def outside(command: list[str | Path], folder: Path) -> subprocess.CompletedProcess[str]:
+    """Run a command in a folder, without the path to the repository that tests have."""
+    told = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    return subprocess.run([str(word) for word in command], capture_output=True, text=True, cwd=folder, env=told)
+
+
+class Installed:
+    """The program in an environment of its own, and the folder that it is used from."""
+
+    def __init__(self, place: Path) -> None:
+        self.bin, self.folder = place / "venv" / "bin", place / "folder"
+        self.folder.mkdir()
+
+    def magshell(self, *words: str) -> str:
+        """What a command says that succeeds."""
+        done = outside([self.bin / "magshell", *words], self.folder)
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    def python(self, program: str) -> str:
+        """What a program prints."""
+        done = outside([self.bin / "python", "-c", program], self.folder)
+        assert done.returncode == 0, done.stderr
+        return done.stdout.strip()
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory: pytest.TempPathFactory) -> Installed:
+    """From a copy of the repository, for pip leaves its build in there; the copy is gone when it is used."""
+    place = tmp_path_factory.mktemp("installed")
+    copy, home = place / "copy", place / "venv"
+    left_out = shutil.ignore_patterns("__pycache__", "*.egg-info", ".*", "build", "results", "docs", "tests")
+    shutil.copytree(TOP, copy, ignore=left_out)
+    commands: list[list[str | Path]] = [
+        [sys.executable, "-m", "venv", "--without-pip", "--system-site-packages", home],
+        [
+            sys.executable,
+            "-m",
+            "pip",
+            "--python",
+            home,
+            "install",
+            "--no-deps",
+            "--no-index",
+            "--no-build-isolation",
+            copy,
+        ],
+    ]
+    for command in commands:
+        done = outside(command, place)
+        assert done.returncode == 0, done.stderr
+    shutil.rmtree(copy)
+    return Installed(place)
+
+
+@pytest.mark.slow
+def test_what_is_installed(installed: Installed) -> None:
+    """The code with its template, C source and marker of types, and of cases/ the examples alone."""
+    package = Path(installed.python("import magshell_fenicsx; print(magshell_fenicsx.__path__[0])"))
+    assert package.is_relative_to(installed.bin.parent)
+    for file in ("py.typed", "assembly/scatter.c", "output/report/report_template.html"):
+        assert (package / file).is_file()
+    there = {file.relative_to(package / "examples").as_posix() for file in (package / "examples").rglob("*.*")}
+    cases = {file.relative_to(TOP).as_posix() for file in examples().values()}
+    assert there == cases | {"meshes/bracket.msh", "meshes/gripper.msh"}
+
+
+@pytest.mark.slow
+def test_results_are_of_the_same_sources(installed: Installed) -> None:
+    """What the repository's program keeps on disk, the installed one goes on with, and the other way round."""
+    assert installed.python("from magshell_fenicsx.platform import sources; print(sources.ours())") == sources.ours()
+
+
+@pytest.mark.slow
+def test_commands_without_a_case(installed: Installed) -> None:
+    assert installed.magshell("--version") == f"magshell_fenicsx {__version__}\n"
+    assert installed.magshell("schema") == schema_text()
+    assert len(installed.magshell("example").splitlines()) == len(examples())
+
+
+@pytest.mark.slow
+def test_a_case_with_a_mesh(installed: Installed) -> None:
+    """The mesh comes with the case, and is found beside it."""
+    installed.magshell("example", "bracket")
+    assert "built:" in installed.magshell("check", "bracket.yaml")
+
+
+@pytest.mark.slow
+def test_the_way_of_an_example(installed: Installed) -> None:
+    """Written, checked, run, drawn again, swept (the second time from the disk), studied.
+
+    k_d = 0.326233 of an axisymmetric solver; this mesh is coarse.
+    """
+    folder = installed.folder / "results"
+    installed.magshell("example", "dimple_buckling")
+    assert "R/h = 90" in installed.magshell("check", CASE)
+
+    installed.magshell("run", CASE, *QUICK)
+    summary = json.loads((folder / "dimple_buckling/summary.json").read_text(encoding="utf-8"))
+    assert summary["knockdown"] == pytest.approx(0.326233, abs=5e-4)
+    (folder / "dimple_buckling/report.html").unlink()
+    assert "report.html" in installed.magshell("plot", "results/dimple_buckling")
+    assert (folder / "dimple_buckling/report.html").read_text(encoding="utf-8").count("data:image/png;base64,") >= 4
+
+    sweep = ("sweep", CASE, *QUICK, "--over", "magnetic.lambda_m=0,1e-4")
+    installed.magshell(*sweep)
+    before = {file: file.stat().st_mtime_ns for file in (folder / "dimple_buckling_sweep/points").iterdir()}
+    installed.magshell(*sweep)
+    assert before == {file: file.stat().st_mtime_ns for file in (folder / "dimple_buckling_sweep/points").iterdir()}
+    assert len(rows(folder / "dimple_buckling_sweep/sweep.csv")) == 2
+
+    over = ("--over", "mesh.refinement=0.3", "--set=mesh.degree=3", "--result", "knockdown", "--repeat", "1")
+    installed.magshell("study", CASE, *over)
+    assert len(rows(folder / "dimple_buckling_study/study.csv")) == 1
+
+
+def rows(file: Path) -> list[dict[str, str]]:
+    """Of a table."""
+    with file.open(encoding="utf-8") as stream:
+        return list(csv.DictReader(stream))
