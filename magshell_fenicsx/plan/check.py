@@ -20,7 +20,7 @@ def describe(case: Case) -> str:
     CaseError
         If the case cannot be built, or nothing is held.
     """
-    plan = make_plan(case)
+    plan = _planned(case)
     if all(condition == "free" for condition in plan.conditions.values()):
         raise CaseError("boundary: nothing is held: clamp an edge or a patch, or hold points, for instance")
     numbers = {
@@ -42,6 +42,13 @@ def describe(case: Case) -> str:
     left_out = plan.left_out or ["nothing"]
     lines += ["built:", *(f"  {item}" for item in plan.included), "left out:", *(f"  {item}" for item in left_out)]
     return "\n".join(lines)
+
+
+def _planned(case: Case) -> Plan:
+    try:
+        return make_plan(case)
+    except MeshError as e:
+        raise CaseError(str(e)) from None
 
 
 def _meshed(plan: Plan) -> PatchMesh:

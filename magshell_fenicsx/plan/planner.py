@@ -16,6 +16,7 @@ from magshell_fenicsx.mesh.shapes import DiscShape, StripShape
 from magshell_fenicsx.mesh.sphere import Dimple
 from magshell_fenicsx.models.axisymmetric.meridian import graded_vertices
 from magshell_fenicsx.models.shell.parameters import Condition, Held, Material
+from magshell_fenicsx.models.shell.supports import refuse_unknown
 from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.plan.account import account
 from magshell_fenicsx.plan.limits import refuse_too_large, refuse_too_many, refuse_unbounded_fields, sample
@@ -36,6 +37,8 @@ def make_plan(case: Case) -> Plan:
     ------
     CaseError
         If the symmetry that is asked for is not there, or what is asked for cannot be built.
+    MeshError
+        If the meridian has no such edge or point.
     """
     material = Material(case.shell.poisson_ratio, 1 / case.shell.R_over_h)
     defect = Dimple(case.defect.amplitude * material.h, case.dimple_half_width) if case.defect else None
@@ -58,6 +61,8 @@ def make_plan(case: Case) -> Plan:
     if half:
         conditions["symmetry"] = "symmetry"
     loaded = loads(case, under, turn, 0.5 if half else 1.0)
+    if axisymmetric and isinstance(shape, DiscShape):  # which is not triangulated, where this is seen
+        refuse_unknown([shape.edge], points, [], conditions, loaded)
     model = "meridian" if axisymmetric else f"{'half' if half else 'full'} {case.model}"
     included, left_out = account(case, loaded, model, turn)
     return Plan(

@@ -23,7 +23,7 @@ from magshell_fenicsx.models.axisymmetric.meridian import make_meridian
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.shell.own_term import OwnTerm
-from magshell_fenicsx.models.shell.supports import refuse_loose, refuse_unknown
+from magshell_fenicsx.models.shell.supports import refuse_loose
 from magshell_fenicsx.models.solid.model import SolidModel
 from magshell_fenicsx.plan.account import neo_hookean
 from magshell_fenicsx.plan.loads import turned
@@ -154,7 +154,6 @@ def build_meridian_model(case: Case, plan: Plan) -> MeridianModel:
     """The meridian, whole on every rank."""
     meridian = make_meridian(plan.embedding, meridian_vertices(plan, case.mesh.refinement))
     assert isinstance(plan.shape, DiscShape)
-    refuse_unknown([plan.shape.edge], plan.points, [], plan.conditions, plan.loads)
     if not plan.fixed:
         raise MeshError("boundary: the shell is not held: it is free to move along (0, 0, 1)")
     condition = plan.conditions.get(plan.shape.edge, "free")

@@ -120,7 +120,6 @@ def test_named_points_are_vertices(shell: dict[str, Any], place: list[float]) ->
 
 DENSITIES = {"remanent": {"flux_density": "60 mT"}, "applied": {"flux_density": "50 mT"}}
 FILE = {**COMMON, "geometry": "mesh", "file": "part.msh", "radius": 1}
-DISC = {"geometry": "disc", "radius_to_thickness": 50, "poisson_ratio": 0.3}
 CAP = {"geometry": "cap", "radius": 1, "polar": 60}
 MOMENT = {"kind": "dead", "loads": [{"edge": "top", "moment": 1}], "factor": 1}
 REFUSED: list[tuple[dict[str, Any], str]] = [
@@ -209,7 +208,11 @@ def test_points_loads_and_sizes_may_have_units() -> None:
 
 
 def test_a_ring_is_not_told_to_take_half() -> None:
-    data = {"shell": {**COMMON, **CAP, "hole": 1, "thickness": 1e-5}, "boundary": {"rim": "clamped"}, "mesh": {"refinement": 20}}
+    data = {
+        "shell": {**COMMON, **CAP, "hole": 1, "thickness": 1e-5},
+        "boundary": {"rim": "clamped"},
+        "mesh": {"refinement": 20},
+    }
     with pytest.raises(CaseError) as error:
         make_plan(Case.from_source(Source("test", data)))
     assert "unknowns" in str(error.value)

@@ -12,7 +12,7 @@ from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.platform import compat
 
-COARSE = 0.15  # of the integral that a patch's weight has on a plane
+COARSE = 0.15  # of the integral that a patch's weight has on a plane; at a corner it is a quarter
 Entries = tuple[NDArray[np.int32], NDArray[np.float64]]
 
 
@@ -45,7 +45,7 @@ def patch_entries(
     weight = ufl.conditional(ufl.gt(inside, 0), inside**2, 0) * kin.area_ratio(j0)
     dx = ufl.Measure("dx", domain=domain, metadata={"quadrature_degree": 2 * degree})
     total = domain.comm.allreduce(fem.assemble_scalar(log.compile("patch weight", weight * dx)))
-    if not COARSE <= total / (np.pi * radius**2 / 3) <= 1 / COARSE:  # 1 of a whole patch, 1/4 at a corner
+    if not COARSE <= total / (np.pi * radius**2 / 3) <= 1 / COARSE:
         raise MeshError(
             f"loading.patch: its radius is {radius:.3g} R, which the mesh is too coarse for: choose a smaller mesh.size, "
             "or 0 for a force at a point"
