@@ -12,7 +12,7 @@ from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.platform import compat
 
-COARSE = 0.15  # of the integral that a patch's weight has on a plane; at a corner it is a quarter
+COARSE = 0.15  # of the integral that a patch has on a plane; at a corner it has a quarter
 Entries = tuple[NDArray[np.int32], NDArray[np.float64]]
 
 
