@@ -47,8 +47,8 @@ def patch_entries(
     total = domain.comm.allreduce(fem.assemble_scalar(log.compile("patch weight", weight * dx)))
     if not COARSE <= total / (np.pi * radius**2 / 3) <= 1 / COARSE:
         raise MeshError(
-            f"loading.patch: its radius is {radius:.3g} R, which the mesh is too coarse for: choose a smaller mesh.size, "
-            "or 0 for a force at a point"
+            f"loading.patch: its radius is {radius:.3g} R, which the mesh is too coarse for: choose a smaller "
+            "mesh.size, or 0 for a force at a point"
         )
     load = fem.assemble_vector(log.compile("patch load", weight * ufl.dot(along, ufl.TestFunction(V)) * dx))
     load.scatter_reverse(InsertMode.add)
