@@ -37,7 +37,7 @@ class Grid:
     @property
     def edges(self) -> tuple[str, ...]:
         """Names of the edges that the surface has."""
-        return tuple(name for i, name in enumerate(self.sides) if not self.glued[i // 2])
+        return tuple(dict.fromkeys(name for i, name in enumerate(self.sides) if not self.glued[i // 2]))
 
     @property
     def corners(self) -> Array:
@@ -91,6 +91,9 @@ def grid_mesh(grid: Grid, points: Mapping[str, Array], embedding: Embedding) -> 
         one[number[-1]] = one[number[0]]
     if grid.glued[1]:
         one[number[:, -1]] = one[number[:, 0]]
-    rows = dict(zip(grid.sides, (number[0], number[-1], number[:, 0], number[:, -1]), strict=True))
-    edges = {name: one[np.stack([rows[name][:-1], rows[name][1:]], axis=-1)] for name in grid.edges}
+    edges: dict[str, NDArray[np.int64]] = {}
+    for name, row in zip(grid.sides, (number[0], number[-1], number[:, 0], number[:, -1]), strict=True):
+        if name in grid.edges:  # two sides may have one name
+            line = one[np.stack([row[:-1], row[1:]], axis=-1)]
+            edges[name] = np.concatenate([edges[name], line]) if name in edges else line
     return PatchMesh(nodes, cells, embedding, edges, dict(points), one=one)

@@ -21,7 +21,7 @@ def describe(case: Case) -> str:
         If the case cannot be built, or nothing is held.
     """
     plan = _planned(case)
-    if all(condition == "free" for condition in plan.conditions.values()):
+    if all(condition in ("free", "symmetry") for condition in plan.conditions.values()):
         raise CaseError("boundary: nothing is held: clamp an edge or a patch, or hold points, for instance")
     numbers = {
         "R/h": 1 / plan.material.h,

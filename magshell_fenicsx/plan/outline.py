@@ -30,6 +30,7 @@ from magshell_fenicsx.mesh.sphere import Dimple, SphereEmbedding, flat
 
 Array = NDArray[np.float64]
 Chart = Shape | Grid | MeshFile
+ROUNDING = 1e-9
 ON_SURFACE = 1e-6  # of R, within which a named point lies on the surface
 
 
@@ -50,6 +51,10 @@ class Outline:
         Distance of the outer edge from the chart's origin; infinite where the chart is no disc.
     sphere
         Whether chart distances from the origin are polar angles.
+    round
+        Whether it is closed around e3.
+    ends
+        First chart coordinates between which the half of a ring lies; None where the second coordinate is y.
     """
 
     chart: Callable[[bool, float], Chart]
@@ -58,6 +63,16 @@ class Outline:
     highest: Array | None
     edge: float = inf
     sphere: bool = False
+    round: bool = False
+    ends: tuple[float, float] | None = None
+
+    def on_half(self, chart: Array) -> Array:
+        """A place of the chart on the half y >= 0, from which rounding may have moved it."""
+        if self.ends is not None:
+            low, high = self.ends
+            x = low if chart[0] < low + ROUNDING else high if chart[0] > high - ROUNDING else chart[0]
+            return np.array([x, chart[1]])
+        return np.array([chart[0], chart[1] if chart[1] > ROUNDING else 0.0])
 
     @property
     def disc(self) -> bool:
@@ -129,7 +144,7 @@ def _disc(
         beyond = np.hypot(*found) / edge
         return np.asarray(found / max(beyond, 1.0))
 
-    return Outline(chart, embedding, within, np.zeros(2), edge, sphere)
+    return Outline(chart, embedding, within, np.zeros(2), edge, sphere, round=True)
 
 
 def _ring(shell: Surface, profile: Profile, names: tuple[str, str]) -> Outline:
@@ -142,12 +157,17 @@ def _ring(shell: Surface, profile: Profile, names: tuple[str, str]) -> Outline:
     embedding = Revolved(profile, rho)
 
     def chart(half: bool, size: float) -> Chart:
+        if half:
+            mirror = ("symmetry", "symmetry", *names)
+            return Grid((0.0, 0.0), (pi * rho, profile.length), size, mirror, (False, glued[1]))
         return Grid(low, high, size, ("left", "right", *names), glued)
 
     def inverse(x: Array) -> Array:
         return np.clip(embedding.inverse(x, first), low, high)
 
-    return Outline(chart, embedding, inverse, np.array(low if any(glued) else high))
+    return Outline(
+        chart, embedding, inverse, np.array(low if any(glued) else high), round=glued[0], ends=(0.0, pi * rho)
+    )
 
 
 def _profile(shell: Surface) -> tuple[Profile, tuple[str, str | None]]:

@@ -46,7 +46,7 @@ def make_plan(case: Case) -> Plan:
     place = indented(case, drawn)
     axisymmetric, azimuth = _symmetry(case, drawn, left(case, drawn, place))
     half = azimuth is not None
-    turn = (azimuth or 0.0) if drawn.disc else 0.0  # a strip lies along e1 whichever way the field points
+    turn = (azimuth or 0.0) if drawn.round else 0.0  # a strip lies along e1 whichever way the field points
     points = _points(case, drawn, place, turn, half)
     under = "load" if "load" in points else "pole"
     if place is not None:
@@ -109,7 +109,7 @@ def _symmetry(case: Case, drawn: Outline, parts: list[Leaves]) -> tuple[bool, fl
     """Whether to model the meridian, and else the azimuth of the mirror plane of a half, None for a full model."""
     reason, azimuth = askew(parts), mirror(parts)
     if case.symmetry == "half" and azimuth is None:
-        if not drawn.disc and case.shell.geometry != "strip":
+        if not drawn.round and case.shell.geometry != "strip":
             raise CaseError(
                 f"symmetry: half: not with a {case.shell.geometry}; describe a part of it and give its edges "
                 "boundary: {name: symmetry}"
@@ -128,7 +128,7 @@ def _points(case: Case, drawn: Outline, place: Array | None, turn: float, half: 
 
     def chart(name: str, x: Array) -> Array:
         found = charted(name, into(x), drawn, R)
-        return np.array([found[0], max(found[1], 0.0)]) if half else found  # rounding may put it beyond the mirror
+        return drawn.on_half(found) if half else found
 
     points = {name: chart(name, np.array(x) / R) for name, x in case.points.items()}
     if points:
@@ -150,7 +150,7 @@ def _place(case: Case, drawn: Outline, place: Array, turn: float, half: bool) ->
         polar, theta = radians(loading.at.polar), radians(loading.at.azimuth) - turn
         return polar * np.array([np.cos(theta), 0.0 if half else np.sin(theta)]) if polar else np.zeros(2)
     found = charted(loading.at.point or "load", turned(turn)(place), drawn, case.shell.reference)
-    return np.array([found[0], 0.0]) if half else found
+    return drawn.on_half(found) if half else found
 
 
 def _refuse_unreasonable(case: Case, drawn: Outline, shape: Chart, size: Grading, axisymmetric: bool) -> None:

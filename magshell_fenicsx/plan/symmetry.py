@@ -86,13 +86,13 @@ def askew(parts: Sequence[Leaves]) -> str | None:
 
 def _shape(case: Case, outline: Outline) -> Leaves:
     geometry = case.shell.geometry
-    if outline.disc and isinstance(case.thickness_factor, str):
+    if outline.round and case.thickness_factor is not None:
         return Leaves("only the user knows whether the formula of the thickness is", mirrors=_none)
-    if outline.disc:
-        return Leaves()
+    if outline.round:
+        return Leaves(None if outline.disc else "a meridian ends at a pole")
     if geometry == "strip":
         return Leaves("a strip is no surface of revolution", mirrors=_along_x)
-    return Leaves(f"not with a {geometry}: a meridian ends at a pole", mirrors=_none)
+    return Leaves(f"not with a {geometry} that is not closed around e3", mirrors=_none)
 
 
 def _support(case: Case, name: str, condition: str | HeldSection) -> Leaves:

@@ -63,7 +63,7 @@ SURFACES: list[tuple[dict[str, Any], float, set[str]]] = [
 
 
 def built(shell: dict[str, Any], **sections: Any) -> Midsurface:
-    data = {"shell": {**COMMON, **shell}, "boundary": {}, "mesh": {"size": 0.4}, **sections}
+    data = {"shell": {**COMMON, **shell}, "boundary": {}, "mesh": {"size": 0.4}, "symmetry": "none", **sections}
     return build_midsurface(make_plan(Case.from_source(Source("test", data))), MPI.COMM_SELF)
 
 
@@ -135,7 +135,7 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"loading": {"kind": "dead", "loads": [{"edge": "top"}], "factor": 1}}, "one of force, per_length, moment"),
     ({"loading": {"kind": "dead", "loads": [{"at": "B", "force": [1, 0, 0]}], "factor": 1}}, "name it in points"),
     ({"loading": {"kind": "dead", "loads": [{"at": "B", "force": [0, 0, 0]}], "factor": 1}}, "force: is zero"),
-    ({"symmetry": "half"}, "boundary: {name: symmetry}"),
+    ({"shell.azimuth": [0, 90], "symmetry": "half"}, "boundary: {name: symmetry}"),
     ({"mesh.tolerance": 1e-3}, "mesh.tolerance: not with a cylinder"),
     ({"shell.thickness_factor": "1 +"}, "is not a formula"),
     ({"points": {"pole": [1, 0, 0]}}, "points.pole: is taken"),
@@ -257,7 +257,7 @@ def test_names_are_known_before_anything_is_solved(shell: dict[str, Any], sectio
 def test_loads_on_the_edge_of_a_surface_with_a_pole() -> None:
     load = {"kind": "dead", "loads": [{"edge": "bottom", "per_length": [0, 0, 1]}], "factor": 1}
     data = {"shell": {**PARABOLOID, "youngs_modulus": 1}, "boundary": {"bottom": {"held": ["x", "y"]}}, "loading": load}
-    assert built(data["shell"], boundary=data["boundary"], loading=load).edges.keys() == {"bottom", "symmetry"}
+    assert built(data["shell"], boundary=data["boundary"], loading=load).edges.keys() == {"bottom"}
 
 
 CYLINDER = {"geometry": "cylinder", "radius": 1, "length": 1}
