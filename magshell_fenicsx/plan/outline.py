@@ -111,20 +111,19 @@ def outline(case: Case, defect: Dimple | None) -> Outline:
     return _ring(shell, profile, (names[0], names[1]))
 
 
-def charted(name: str, x: Array, outline: Outline, R: float) -> Array:
-    """Where a named point is in the chart (of a mesh file in space).
+def refuse_beside(name: str, x: Array, outline: Outline, R: float) -> None:
+    """See that a named point (3,) is on the surface.
 
     Raises
     ------
     CaseError
-        If it is not on the surface.
+        With a place near it that is.
     """
     found = outline.inverse(x)
     there = x if len(found) == 3 else outline.embedding(found[None])[0]
     if np.linalg.norm(there - x) > ON_SURFACE:
         near = ", ".join(f"{c * R:.8g}" for c in there)
         raise CaseError(f"points.{name}: is not on the surface; a place near it that is: [{near}]")
-    return found
 
 
 def _disc(

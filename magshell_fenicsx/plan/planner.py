@@ -21,7 +21,7 @@ from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.plan.account import account
 from magshell_fenicsx.plan.limits import refuse_too_large, refuse_too_many, refuse_unbounded_fields, sample
 from magshell_fenicsx.plan.loads import indented, loads, refuse_wide_patch, turned
-from magshell_fenicsx.plan.outline import Chart, Outline, charted, outline
+from magshell_fenicsx.plan.outline import Chart, Outline, outline, refuse_beside
 from magshell_fenicsx.plan.plan import Plan
 from magshell_fenicsx.plan.sizes import grading
 from magshell_fenicsx.plan.symmetry import Leaves, askew, left, mirror
@@ -127,7 +127,8 @@ def _points(case: Case, drawn: Outline, place: Array | None, turn: float, half: 
     into, R = turned(turn), case.shell.reference
 
     def chart(name: str, x: Array) -> Array:
-        found = charted(name, into(x), drawn, R)
+        refuse_beside(name, x, drawn, R)
+        found = drawn.inverse(into(x))
         return drawn.on_half(found) if half else found
 
     points = {name: chart(name, np.array(x) / R) for name, x in case.points.items()}
@@ -149,7 +150,7 @@ def _place(case: Case, drawn: Outline, place: Array, turn: float, half: bool) ->
     if loading.at.point is None and drawn.sphere:
         polar, theta = radians(loading.at.polar), radians(loading.at.azimuth) - turn
         return polar * np.array([np.cos(theta), 0.0 if half else np.sin(theta)]) if polar else np.zeros(2)
-    found = charted(loading.at.point or "load", turned(turn)(place), drawn, case.shell.reference)
+    found = drawn.inverse(turned(turn)(place))
     return drawn.on_half(found) if half else found
 
 
