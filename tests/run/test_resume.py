@@ -20,7 +20,7 @@ HALF = (INDENTATION, "--set=symmetry=half", "--set=mesh.degree=3", "--set=mesh.r
 LONG = (INDENTATION, "--set=loading.points=30", "--set=mesh.refinement=0.5")
 SOLID = (
     CASES / "solid_indentation.yaml",
-    *("--set=shell.radius_to_thickness=20", "--set=mesh.refinement=0.25"),
+    *("--set=shell.radius_to_thickness=20", "--set=mesh.refinement=0.4"),
     *("--set=loading.depth=3", "--set=loading.points=6"),
 )
 CASE = {"meridian": MERIDIAN, "half": HALF, "long": LONG, "solid": SOLID}
