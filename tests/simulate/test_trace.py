@@ -18,7 +18,7 @@ from magshell_fenicsx.continuation.path import Control
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.output.store.table import COLUMNS
 
-HALF = ["symmetry=half", "mesh.degree=3", "mesh.refinement=0.3"]
+HALF = ["symmetry=half", "mesh.degree=3", "mesh.refinement=0.4"]
 SHELLS = [pytest.param([], id="meridian"), pytest.param(HALF, id="half")]
 
 
@@ -167,7 +167,7 @@ RANKS = """
 import json, ufl
 from mpi4py import MPI
 import magshell_fenicsx as ms
-case = ms.Case.load("{file}", ["mesh.degree=2", "mesh.refinement=0.2"])
+case = ms.Case.load("{file}", ["mesh.degree=2", "mesh.refinement=0.3"])
 terms = [
     ms.OwnTerm("foundation", lambda r0, u: ufl.dot(u.r, ms.kinematics.normal(r0)) ** 2 / 2),
     ms.OwnTerm("weight", lambda r0, u, g: ufl.dot(g, u.r), ([0.0, 0.6, 0.8],)),
