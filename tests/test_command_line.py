@@ -113,6 +113,7 @@ def test_missing_file_and_no_case() -> None:
     assert magshell("run").returncode == 2
 
 
+@pytest.mark.slow
 def test_stopping_early_is_told_and_keeps_the_points(tmp_path: Path) -> None:
     """Load control cannot pass the limit point of the dimpled shell."""
     settings = ["loading={kind: pressure, control: load, until: target, pressure: 0.5, points: 2}"]

@@ -14,7 +14,7 @@ from magshell_fenicsx import Case, Scene
 from magshell_fenicsx.case.source import Source
 from magshell_fenicsx.continuation.events import critical_mode
 from magshell_fenicsx.output.fields.gathering import gatherer
-from magshell_fenicsx.simulate import follow
+from magshell_fenicsx.simulate.follow import follow
 
 
 def scene(symmetry: str, R_over_h: float, **mesh: Any) -> Scene:

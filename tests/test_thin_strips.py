@@ -1,12 +1,14 @@
 """Thin strips rolled up by an end moment: as many steps whatever the thickness, the same path under noise."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 
 from magshell_fenicsx import Case, Record, Scene
 from magshell_fenicsx.case.source import Source
 from magshell_fenicsx.continuation.noise import VARIABLE
-from magshell_fenicsx.simulate import follow
+from magshell_fenicsx.simulate.follow import follow
 
 E, LENGTH = 1e6, 1.0
 
@@ -37,11 +39,16 @@ def rolled(slenderness: float) -> tuple[Scene, list[Record]]:
     return scene, list(follow(scene))
 
 
+@cache
+def quiet() -> tuple[Scene, list[Record]]:
+    return rolled(100)
+
+
 @pytest.mark.slow
 def test_steps_do_not_grow_with_slenderness() -> None:
     points = []
-    for slenderness in (100, 1000, 10_000, 100_000):
-        scene, records = rolled(slenderness)
+    for slenderness in (100, 10_000, 100_000):
+        scene, records = quiet() if slenderness == 100 else rolled(slenderness)
         end = records[-1]
         assert end.point.state.mu["load"] == 1.0
         tip = scene.plan.length * scene.model.displacement(end.point.state.u, "A")
@@ -53,7 +60,7 @@ def test_steps_do_not_grow_with_slenderness() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("noise", ["1e-15 1", "1e-14 2", "1e-13 3"])
 def test_the_same_instability_under_noise(noise: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    _, clean = rolled(100)
+    _, clean = quiet()
     monkeypatch.setenv(VARIABLE, noise)
     _, noisy = rolled(100)
     found = [[r for r in records if r.label in ("fold", "bifurcation")] for records in (clean, noisy)]

@@ -77,6 +77,7 @@ def test_table_has_the_medians_and_the_ratios() -> None:
     assert lines[-1] == "- a ratio: 0.5"
 
 
+@pytest.mark.slow
 def test_path_of_the_meridian() -> None:
     """k_d of the axisymmetric solver; the solve phase is a part of its process."""
     numbers = measure_item(Item("path", "dimple_buckling", ("mesh.refinement=0.5",), K_D, repeat=2))
@@ -133,6 +134,7 @@ def test_mistakes_are_messages(tmp_path: Path, capsys: pytest.CaptureFixture[str
         assert said in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_run_that_stops_is_no_benchmark(monkeypatch: pytest.MonkeyPatch) -> None:
     """The field -0.004 is beyond the critical one, -0.0033554."""
     settings = ("magnetic.lambda_m=-0.004", "mesh.refinement=0.5")

@@ -43,6 +43,7 @@ def test_penalty_moves_nothing_over_six_decades(penalty: float) -> None:
     assert first(result("extreme/penalty.yaml", f"mesh.penalty={penalty}")) == pytest.approx(0.326233289, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_almost_perfect_dimple_buckles_like_the_perfect_shell() -> None:
     """delta/h = 0.01 moves the waves at the clamped edge of the perfect shell by less than 1e-4."""
     perfect = result("extreme/nothing.yaml", "loading={kind: pressure}")
@@ -59,6 +60,7 @@ def test_beyond_the_fold() -> None:
     assert max(float(row["w_pole_over_h"]) for row in found.rows) > 25
 
 
+@pytest.mark.slow
 def test_hemisphere_turned_inside_out() -> None:
     """Pogorelov's mirror buckling, F ~ sqrt(w), in the middle; at w = 2R the pole is as far below as it was above."""
     found = result("extreme/inside_out.yaml")

@@ -55,6 +55,7 @@ def test_indentation() -> None:
     assert np.ptp(image[..., :3], axis=2).max() > 0.4, "no colours"
 
 
+@pytest.mark.slow
 def test_readme_and_howto(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Their Python, block after block, as a reader would type it; knockdown: axisymmetric reference."""
     (tmp_path / "cases").symlink_to(CASES)

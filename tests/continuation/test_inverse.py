@@ -88,6 +88,7 @@ def shared() -> None:
             print(value, *np.abs(whole))
 
 
+@pytest.mark.slow
 def test_same_on_any_number_of_ranks() -> None:
     """Value and vector, but for its sign, though the start depends on how the rows are shared out."""
     found = []

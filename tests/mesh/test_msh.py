@@ -1,6 +1,7 @@
 """Meshes made elsewhere: what is read from them, and what is refused with the place named."""
 
 from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -127,6 +128,12 @@ def deflection(data: dict[str, Any]) -> float:
     return float(result.rows[-1]["A_ux"])
 
 
+@cache
+def built_in() -> float:
+    shell = {"geometry": "cylinder", "radius": 1, "length": 1, "azimuth": [0, 90], **MATERIAL}
+    return deflection({**LOADED, "shell": shell, "mesh": {"degree": 4, "size": 0.2}})
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("order", "tolerance"), [(1, 0.03), (2, 3e-3), (3, 3e-3)])
 def test_same_answer_as_the_built_in_geometry(model: Any, tmp_path: Path, order: int, tolerance: float) -> None:
@@ -134,10 +141,7 @@ def test_same_answer_as_the_built_in_geometry(model: Any, tmp_path: Path, order:
     panel(model, order, 0.12)
     gmsh.write(str(tmp_path / "part.msh"))
     shell = {"geometry": "mesh", "file": str(tmp_path / "part.msh"), "radius": 1, **MATERIAL}
-    built_in = {"geometry": "cylinder", "radius": 1, "length": 1, "azimuth": [0, 90], **MATERIAL}
-    mesh = {"degree": 4, "size": 0.2}
-    reference = deflection({**LOADED, "shell": built_in, "mesh": mesh})
-    assert deflection({**LOADED, "shell": shell}) == pytest.approx(reference, rel=tolerance)
+    assert deflection({**LOADED, "shell": shell}) == pytest.approx(built_in(), rel=tolerance)
 
 
 @pytest.mark.slow

@@ -75,6 +75,7 @@ class Terminal:
         return re.findall(r"\r\x1b\[K([^\r\n]+)(?=\r\x1b)", self.written)
 
 
+@pytest.mark.slow
 def test_terminal_and_pipe(tmp_path: Path) -> None:
     """What stays on a terminal is what a pipe gets, which has no control characters."""
     terminal = Terminal("run", *QUICK, "--out", tmp_path)
@@ -100,7 +101,7 @@ def test_one_rank_of_mpirun(tmp_path: Path) -> None:
     assert "\x1b" not in terminal.written
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
 def test_stopped_on_the_way(tmp_path: Path, number: signal.Signals) -> None:
     """The run ends after the point, and only its message is left."""
     terminal = Terminal("run", *QUICK, "--set=loading.points=60", "--out", tmp_path)
@@ -114,7 +115,9 @@ def test_stopped_on_the_way(tmp_path: Path, number: signal.Signals) -> None:
     assert last == ""
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, -signal.SIGTERM)])
+@pytest.mark.parametrize(
+    ("number", "code"), [(signal.SIGINT, 130), pytest.param(signal.SIGTERM, -signal.SIGTERM, marks=pytest.mark.slow)]
+)
 def test_stopped_while_a_mesh_is_found(tmp_path: Path, number: signal.Signals, code: int) -> None:
     """Nothing can be resumed, so the process ends at once; the line that told of the mesh is gone."""
     case = CASES / "dimple_buckling.yaml"

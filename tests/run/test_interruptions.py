@@ -19,7 +19,7 @@ from magshell_fenicsx.output.store.durable import write_whole
 from magshell_fenicsx.output.store.table import COLUMNS, PathTable
 from magshell_fenicsx.run.interrupt import Interrupted, Watch
 
-LONG = (CASES / "pole_indentation.yaml", "--set=loading.points=60", "--set=mesh.refinement=0.5")
+LONG = (CASES / "pole_indentation.yaml", "--set=loading.points=30", "--set=mesh.refinement=0.5")
 # of a surface the checkpoint soon is larger than a file of fields
 SURFACE = (
     CASES / "pole_indentation.yaml",
@@ -51,7 +51,11 @@ def check_goes_on(out: Path, reference: Path, case: tuple[Path | str, ...] = LON
 
 @pytest.mark.parametrize(
     ("ranks", "number"),
-    [(2, signal.SIGTERM), (0, signal.SIGINT), pytest.param(2, signal.SIGUSR1, marks=pytest.mark.slow)],
+    [
+        pytest.param(2, signal.SIGTERM, marks=pytest.mark.slow),
+        (0, signal.SIGINT),
+        pytest.param(2, signal.SIGUSR1, marks=pytest.mark.slow),
+    ],
 )
 def test_signal(tmp_path: Path, reference: Path, ranks: int, number: signal.Signals) -> None:
     """Also if only one rank of two gets it; mpirun passes SIGUSR1 to all."""
@@ -109,6 +113,7 @@ def test_full_disk(tmp_path: Path) -> None:
     check_goes_on(out, whole, SURFACE)
 
 
+@pytest.mark.slow
 def test_full_disk_at_the_first_field(tmp_path: Path, reference: Path) -> None:
     run = start("run", *LONG, "--out", tmp_path, size_limit=100_000)
     said = run.communicate(timeout=60)[1]
@@ -118,6 +123,7 @@ def test_full_disk_at_the_first_field(tmp_path: Path, reference: Path) -> None:
     check_goes_on(tmp_path, reference)
 
 
+@pytest.mark.slow
 def test_no_room_for_pictures(tmp_path: Path) -> None:
     """The summary is there without one, and resuming draws it."""
     case = (CASES / "clamped_plate.yaml", "--set=mesh.degree=3", "--set=mesh.refinement=0.1")
@@ -163,6 +169,7 @@ def largest_file(size: int) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_FSIZE, (hard, hard))
 
 
+@pytest.mark.slow
 def test_lost_rank(tmp_path: Path, reference: Path) -> None:
     """mpirun says so and ends the others."""
     out = tmp_path / "out"

@@ -173,6 +173,7 @@ def test_run_without_the_result_is_a_row_with_its_cause() -> None:
     assert make_rows(runs[:2], Scalar("knockdown"), None)[1] is None
 
 
+@pytest.mark.slow
 def test_peak_and_cpu_are_those_of_the_process(tmp_path: Path) -> None:
     """200 MB written to and a second of work, against neither; the starter's own 400 MB do not count."""
     (tmp_path / "rest.py").write_text("import sys; sys.exit(3)", encoding="utf-8")

@@ -194,8 +194,9 @@ def test_table_tells_knockdowns_and_reasons(tmp_path: Path) -> None:
     assert (tmp_path / "sweep.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_two_ranks_give_the_numbers_of_one(tmp_path: Path) -> None:
-    over = ["--over", "shell.poisson_ratio=0.3:0.5:3", "--over", "loading.depth=1,2"]
+    over = ["--over", "shell.poisson_ratio=0.3,0.5", "--over", "loading.depth=1,2"]
     for ranks in (1, 2):
         done = magshell(
             "sweep", POLE, *over, *(f"--set={s}" for s in COARSE), "--out", tmp_path / str(ranks), ranks=ranks
@@ -204,7 +205,7 @@ def test_two_ranks_give_the_numbers_of_one(tmp_path: Path) -> None:
         assert (tmp_path / str(ranks) / "sweep.png").stat().st_size > 10_000
     for name in ("sweep.csv", "curves.csv"):
         one, two = (read(tmp_path / str(ranks) / name) for ranks in (1, 2))
-        assert len(one) == len(two) > 5
+        assert len(one) == len(two) >= 4
         for a, b in zip(one, two, strict=True):
             assert a.keys() == b.keys()
             for key in a.keys() - {"wall_s"}:

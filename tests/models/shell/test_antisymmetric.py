@@ -11,7 +11,7 @@ from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.mesh.sphere import Dimple
 from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.shell.parameters import Loads, Material
-from magshell_fenicsx.simulate import follow
+from magshell_fenicsx.simulate.follow import follow
 
 
 def second_variation(size: float, half: bool) -> float:

@@ -24,7 +24,7 @@ from magshell_fenicsx.models.shell.fast_tangent import FastTangent, make_sites
 from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.shell.parameters import Condition, Loads, Magnetisation, Material
 from magshell_fenicsx.models.shell.patterns import tangential
-from magshell_fenicsx.simulate import follow
+from magshell_fenicsx.simulate.follow import follow
 
 Shells = Callable[..., ShellModel]
 DEGREES = [2, 3, pytest.param(4, marks=pytest.mark.slow), pytest.param(5, marks=pytest.mark.slow)]

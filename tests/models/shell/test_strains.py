@@ -13,7 +13,7 @@ from magshell_fenicsx.models.shell.parameters import Loads, Magnetisation, Mater
 from magshell_fenicsx.models.shell.strains import TangentFrame, bending_moment, principal
 from magshell_fenicsx.output.fields.point_fields import PointFields
 from magshell_fenicsx.output.fields.surface import Surface, SurfaceGatherer
-from magshell_fenicsx.simulate import follow
+from magshell_fenicsx.simulate.follow import follow
 
 NU, H = 0.3, 0.05
 RNG = np.random.default_rng(1)
@@ -106,6 +106,7 @@ def test_sphere_under_pressure() -> None:
     assert found.fields["M_2"].min() == pytest.approx(found.fields["M_2"][edge].mean())
 
 
+@pytest.mark.slow
 def test_meridian_and_half_shell_agree() -> None:
     """Two discretisations of the same fields, away from the layer at the clamped edge."""
     magnetic = {"lambda_m": 1e-3, "remanent": {"kind": "radial"}}
