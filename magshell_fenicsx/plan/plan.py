@@ -58,8 +58,8 @@ class Plan:
 
     @property
     def fixed(self) -> bool:
-        """Whether an edge is held against all rigid motions."""
-        return any(condition in ("clamped", "simply supported") for condition in self.conditions.values())
+        """Whether something is clamped, so that there is no rigid motion."""
+        return "clamped" in self.conditions.values()
 
     def triangulated(self) -> PatchMesh:
         """The triangulation; call it on one rank only.

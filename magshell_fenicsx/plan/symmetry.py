@@ -52,7 +52,7 @@ def left(case: Case, outline: Outline, indented: Array | None) -> list[Leaves]:
     """What each part of a case leaves; `indented` is the place (3,) of an indentation, over R."""
     return [
         _shape(case, outline),
-        *(_support(case, name, condition) for name, condition in case.boundary.conditions().items()),
+        *_supports(case),
         *(_field(case) if case.magnetic and case.lambda_m else []),
         *_load(case, indented),
         *(_named(case) if case.points else []),
@@ -95,10 +95,19 @@ def _shape(case: Case, outline: Outline) -> Leaves:
     return Leaves(f"not with a {geometry} that is not closed around e3", mirrors=_none)
 
 
-def _support(case: Case, name: str, condition: str | HeldSection) -> Leaves:
-    if isinstance(condition, HeldSection):
-        return Leaves(f"boundary.{name}: held components are those of e1, e2 and e3", mirrors=_along_x)
-    return Leaves(f"boundary.{name}: a mirror plane of the case's own") if condition == "symmetry" else Leaves()
+def _supports(case: Case) -> list[Leaves]:
+    """A half does not see rigid motions across its plane: it needs a support against all."""
+    found, fixed = list[Leaves](), False
+    for name, condition in case.boundary.conditions().items():
+        fixed = fixed or condition in ("clamped", "simply supported", "hinged")
+        if isinstance(condition, HeldSection):
+            fixed = fixed or len(condition.components) == 3
+            found.append(Leaves(f"boundary.{name}: held components are those of e1, e2 and e3", mirrors=_along_x))
+        elif condition == "symmetry":
+            found.append(Leaves(f"boundary.{name}: a mirror plane of the case's own"))
+    return (
+        found if fixed else [*found, Leaves("boundary: nothing is clamped, hinged or held as a whole", mirrors=_none)]
+    )
 
 
 def _field(case: Case) -> list[Leaves]:

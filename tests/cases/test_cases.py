@@ -34,7 +34,7 @@ def force_at(found: Result, depth: float) -> float:
 
 def test_every_case_is_run() -> None:
     """Here or in another of these files, where its name stands in quotes."""
-    tests = "".join(file.read_text(encoding="utf-8") for file in pathlib.Path(__file__).parent.glob("test_*.py"))
+    tests = "".join(file.read_text(encoding="utf-8") for file in pathlib.Path(__file__).parents[1].rglob("test_*.py"))
     cases = [file.relative_to(CASES).as_posix().removeprefix("benchmarks/") for file in CASES.rglob("*.yaml")]
     assert [case for case in cases if f'"{case}"' not in tests] == []
 

@@ -32,7 +32,8 @@ class PlanOnFile(Plan):
 
     def _made(self) -> PatchMesh:
         patch = read_msh(MeshFile(HERE / "half_disc.msh", 1.0), {k: np.append(x, 0.0) for k, x in self.points.items()})
-        return replace(patch, nodes=patch.nodes[:, :2], embedding=self.embedding, points=self.points)
+        edges = {"equator" if name == "rim" else name: edge for name, edge in patch.edges.items()}
+        return replace(patch, nodes=patch.nodes[:, :2], embedding=self.embedding, points=self.points, edges=edges)
 
 
 def _scene(file: str, *settings: str, on_file: bool = False) -> Scene:
