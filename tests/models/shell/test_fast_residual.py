@@ -116,7 +116,7 @@ def test_slivers(aspect: float) -> None:
         reference, found = np.zeros_like(model.u.x.array), np.zeros_like(model.u.x.array)
         term.add_residual(reference, 1.0)
         residual.add(found, {term.name: 1.0})
-        rounding = 10 * np.finfo(float).eps * aspect**2
+        rounding = 20 * np.finfo(float).eps * aspect**2  # of the forms' sums: 10.6 on the most unlike of processors
         assert np.abs(found - reference).max() <= rounding * np.abs(reference).max()
 
 
