@@ -1,15 +1,20 @@
 """The loads of a case in the model's terms: over E h R and in the model's frame, on the part that is modelled."""
 
-from collections.abc import Callable
 from math import radians
 
 import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.loading import DeadLoadSection, DeadSection, IndentationSection, PressureSection
-from magshell_fenicsx.case.loading import RotationSection as Rotation
+from magshell_fenicsx.case.loading import (
+    DeadLoadSection,
+    DeadSection,
+    IndentationSection,
+    PressureSection,
+    RotationSection,
+)
 from magshell_fenicsx.case.source import CaseError
+from magshell_fenicsx.mesh.frame import rotation
 from magshell_fenicsx.models.shell.parameters import (
     AreaForce,
     DeadLoad,
@@ -41,7 +46,7 @@ def loads(case: Case, under: str, turn: float, part: float) -> Loads:
     force = None
     if isinstance(loading, IndentationSection):
         force = Force(under, loading.patch / case.shell.R_over_h)
-    to = loading.to if isinstance(loading, Rotation) else None
+    to = loading.to if isinstance(loading, RotationSection) else None
     field = magnetisation(magnetic, case, turn, to) if magnetic and case.lambda_m else None
     dead = tuple(_dead(load, case, turn, part) for load in loading.loads) if isinstance(loading, DeadSection) else ()
     return Loads(isinstance(loading, PressureSection), force, field, dead)
@@ -53,7 +58,7 @@ def indented(case: Case, outline: Outline) -> Array | None:
     Raises
     ------
     CaseError
-        If it is not on the shell, or its patch reaches the edge.
+        If a direction does not say where it is on this geometry, or it is too near to the pole.
     """
     loading = case.loading
     if not isinstance(loading, IndentationSection):
@@ -91,18 +96,11 @@ def refuse_wide_patch(case: Case, outline: Outline, at: Array) -> None:
         )
 
 
-def turned(turn: float) -> Callable[[Array], Array]:
-    """Vectors and places (3,) in a frame turned about e3 (rad)."""
-    c, s = np.cos(turn), np.sin(turn)
-    frame = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
-    return (lambda v: np.asarray(frame @ v)) if turn else (lambda v: v)
-
-
 def _dead(load: DeadLoadSection, case: Case, turn: float, part: float) -> DeadLoad:
-    shell, into = case.shell, turned(turn)
+    shell, Q = case.shell, rotation(turn)
     E, t, R = shell.modulus, shell.reference / shell.R_over_h, shell.reference
     assert E is not None
-    force = np.asarray(part * into(np.array(load.force or np.zeros(3))) / (E * t * R))
+    force = np.asarray(part * (Q @ (load.force or np.zeros(3))) / (E * t * R))
     if load.at is not None:
         return PointForce(load.at, force)
     if load.edge is not None and load.moment is not None:
@@ -111,9 +109,9 @@ def _dead(load: DeadLoadSection, case: Case, turn: float, part: float) -> DeadLo
         return EdgeForce(load.edge, force, total=True)
     if load.edge is not None:
         assert load.per_length is not None
-        return EdgeForce(load.edge, np.asarray(into(np.array(load.per_length)) / (E * t)), total=False)
+        return EdgeForce(load.edge, np.asarray(Q @ load.per_length / (E * t)), total=False)
     patch = None if load.over == "all" else load.over
     if load.pressure is not None:
         return AreaForce(patch, load.pressure * R / (E * t))
     assert load.per_area is not None
-    return AreaForce(patch, np.asarray(into(np.array(load.per_area)) * R / (E * t)))
+    return AreaForce(patch, np.asarray(Q @ load.per_area * R / (E * t)))

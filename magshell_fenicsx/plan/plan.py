@@ -10,7 +10,6 @@ from magshell_fenicsx.mesh.grid import Grid, grid_mesh
 from magshell_fenicsx.mesh.msh import MeshFile, read_msh
 from magshell_fenicsx.mesh.patch import Embedding, PatchMesh
 from magshell_fenicsx.mesh.shapes import Shape
-from magshell_fenicsx.mesh.sphere import Dimple
 from magshell_fenicsx.mesh.triangulation import triangulate
 from magshell_fenicsx.models.shell.parameters import Condition, Loads, Material
 from magshell_fenicsx.models.shell.thickness import Thickness
@@ -32,8 +31,6 @@ class Plan:
         displacement is reported: the pole, the disc's centre, the strip's tip.
     included, left_out
         What the model has and lacks, for people.
-    defect
-        The dimple at the pole; None without.
     thickness
         What multiplies the thickness; None for 1.
     length
@@ -53,7 +50,6 @@ class Plan:
     included: list[str]
     left_out: list[str]
     thickness: Thickness | None = None
-    defect: Dimple | None = None
     length: float = 1.0
 
     @property

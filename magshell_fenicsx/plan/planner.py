@@ -10,6 +10,7 @@ from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.expressions import formula
 from magshell_fenicsx.case.loading import DeadSection, IndentationSection
 from magshell_fenicsx.case.source import CaseError
+from magshell_fenicsx.mesh.frame import rotation
 from magshell_fenicsx.mesh.grading import Grading
 from magshell_fenicsx.mesh.grid import Grid
 from magshell_fenicsx.mesh.shapes import DiscShape, StripShape
@@ -20,7 +21,7 @@ from magshell_fenicsx.models.shell.supports import refuse_unknown
 from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.plan.account import account
 from magshell_fenicsx.plan.limits import refuse_too_large, refuse_too_many, refuse_unbounded_fields, sample
-from magshell_fenicsx.plan.loads import indented, loads, refuse_wide_patch, turned
+from magshell_fenicsx.plan.loads import indented, loads, refuse_wide_patch
 from magshell_fenicsx.plan.outline import Chart, Outline, outline, refuse_beside
 from magshell_fenicsx.plan.plan import Plan
 from magshell_fenicsx.plan.sizes import grading
@@ -79,7 +80,6 @@ def make_plan(case: Case) -> Plan:
         included=included,
         left_out=left_out,
         thickness=_thickness(case),
-        defect=defect,
         length=case.shell.reference,
     )
 
@@ -124,11 +124,11 @@ def _symmetry(case: Case, drawn: Outline, parts: list[Leaves]) -> tuple[bool, fl
 
 def _points(case: Case, drawn: Outline, place: Array | None, turn: float, half: bool) -> Points:
     """Named vertices in the chart, "pole" and "load" among them."""
-    into, R = turned(turn), case.shell.reference
+    Q, R = rotation(turn), case.shell.reference
 
     def chart(name: str, x: Array) -> Array:
         refuse_beside(name, x, drawn, R)
-        found = drawn.inverse(into(x))
+        found = drawn.inverse(Q @ x)
         return drawn.on_half(found) if half else found
 
     points = {name: chart(name, np.array(x) / R) for name, x in case.points.items()}
@@ -150,7 +150,7 @@ def _place(case: Case, drawn: Outline, place: Array, turn: float, half: bool) ->
     if loading.at.point is None and drawn.sphere:
         polar, theta = radians(loading.at.polar), radians(loading.at.azimuth) - turn
         return polar * np.array([np.cos(theta), 0.0 if half else np.sin(theta)]) if polar else np.zeros(2)
-    found = drawn.inverse(turned(turn)(place))
+    found = drawn.inverse(rotation(turn) @ place)
     return drawn.on_half(found) if half else found
 
 

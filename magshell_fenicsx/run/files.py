@@ -11,9 +11,10 @@ from mpi4py import MPI
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.continuation.system import State
+from magshell_fenicsx.mesh.frame import rotation
 from magshell_fenicsx.models.shell.parameters import MIRROR_NORMAL
 from magshell_fenicsx.output.fields.gathering import gatherer
-from magshell_fenicsx.output.fields.surface import rotation, turned
+from magshell_fenicsx.output.fields.surface import turned
 from magshell_fenicsx.output.fields.vtu import About, FieldSeries
 from magshell_fenicsx.output.pictures.picture import PICTURES
 from magshell_fenicsx.output.store import checkpoint

@@ -15,6 +15,7 @@ from magshell_fenicsx.continuation.listener import NoProgress, Progress
 from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.continuation.watch import Watch
+from magshell_fenicsx.mesh.frame import rotation
 from magshell_fenicsx.mesh.hexahedra import sweep
 from magshell_fenicsx.mesh.midsurface import Midsurface, distribute
 from magshell_fenicsx.mesh.patch import MeshError
@@ -26,7 +27,6 @@ from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.supports import refuse_loose
 from magshell_fenicsx.models.solid.model import SolidModel
 from magshell_fenicsx.plan.account import neo_hookean
-from magshell_fenicsx.plan.loads import turned
 from magshell_fenicsx.plan.own_terms import plan_with
 from magshell_fenicsx.plan.plan import Plan
 from magshell_fenicsx.plan.planner import meridian_vertices
@@ -137,7 +137,7 @@ class Scene:
         """The load factor, and the displacements of named points in the unit of the shell's lengths."""
         found = {"load_factor": state.mu["load"]} if self.plan.loads.dead else {}
         for point in self.case.points:
-            u = self.plan.length * turned(-self.plan.azimuth)(self.model.displacement(state.u, point))
+            u = self.plan.length * self.model.displacement(state.u, point) @ rotation(self.plan.azimuth)
             found |= {f"{point}_u{axis}": float(c) for axis, c in zip("xyz", u, strict=True)}
         return found
 

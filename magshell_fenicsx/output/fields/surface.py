@@ -13,6 +13,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.system import Vector
+from magshell_fenicsx.mesh.frame import rotation
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.axisymmetric.revolution import Revolution
 from magshell_fenicsx.models.shell.model import ShellModel
@@ -146,11 +147,6 @@ class RevolvedGatherer:
 def turned(surface: Surface, azimuth: float) -> Surface:
     """The surface turned about e3 (rad): from the model's frame back to the user's."""
     return _moved(surface, rotation(azimuth))
-
-
-def rotation(azimuth: float) -> Array:
-    """What turns row vectors (n, 3) about e3 (rad)."""
-    return np.array([[np.cos(azimuth), np.sin(azimuth), 0], [-np.sin(azimuth), np.cos(azimuth), 0], [0, 0, 1]])
 
 
 def completed(surface: Surface, mirror: Array = MIRROR_NORMAL) -> Surface:
