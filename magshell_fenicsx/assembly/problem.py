@@ -75,6 +75,7 @@ class FiniteElementSystem:
     ) -> None:
         V = u.function_space
         self.u, self.terms, self.clamped, self.length = u, terms, clamped, length
+        self.coordinates = frozenset[str]()
         self.comm = V.mesh.comm
         self.size = V.dofmap.index_map.size_local * V.dofmap.index_map_bs
         self.dofs = V.dofmap.index_map.size_global * V.dofmap.index_map_bs
@@ -116,12 +117,21 @@ class FiniteElementSystem:
         parts = [self._gradient(u, {name: factor}) for name, factor in factors.items()]
         return np.asarray(np.sum([self.noise.on_vector(part, first) for part in parts], axis=0))
 
-    def load(self, u: Vector, name: str) -> Vector:
+    def load(self, u: Vector, mu: Amplitudes, name: str) -> Vector:
         return self._gradient(u, {t.name: 1.0 for t in self.terms if t.amplitude == name})
 
-    def potential(self, u: Vector, name: str) -> float:
+    def potential(self, u: Vector, mu: Amplitudes, name: str) -> float:
         self.set(u)
         return float(self.comm.allreduce(sum(t.energy() for t in self.terms if t.amplitude == name)))
+
+    def curvature(self, u: Vector, mu: Amplitudes, name: str, other: str) -> float:
+        return 0.0  # all amplitudes multiply their terms
+
+    def accept(self, u: Vector) -> None:
+        """Take u for a point of the path, from which whole turns of moments are counted on."""
+        self.set(u)
+        for term in self.terms:
+            term.accept()
 
     def energies(self, u: Vector) -> dict[str, float]:
         """Each term's potential, without its amplitude."""

@@ -209,7 +209,7 @@ class FieldSection(PathSection):
 class RotationSection(Section):
     """The applied field, at its full magnitude, turns on the shortest way to another direction.
 
-    The requested points are equal angles apart; between two of them the field moves along the chord.
+    The requested points are equal angles apart; the field keeps its magnitude.
     """
 
     kind: Literal["rotation"]

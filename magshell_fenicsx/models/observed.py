@@ -59,7 +59,7 @@ class Observed:
 
     def loaded_deflection(self, u: Vector) -> float:
         """w/R conjugate to the force: at its point, or averaged over its patch."""
-        return -self.system.potential(u, "force") / self.force_unit
+        return -self.system.potential(u, {}, "force") / self.force_unit
 
     @property
     def force_unit(self) -> float:

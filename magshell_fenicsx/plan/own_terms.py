@@ -10,7 +10,7 @@ from magshell_fenicsx.output.store.table import COLUMNS
 from magshell_fenicsx.plan.plan import Plan
 from magshell_fenicsx.plan.planner import make_plan
 
-AMPLITUDES = ("pressure", "force", "load", "load_factor", "turn", "push", "lambda_m", "lambda_across")
+AMPLITUDES = ("pressure", "force", "load", "load_factor", "angle", "push", "lambda_m", "lambda_across")
 ENERGIES = ("membrane", "couple")  # besides those with a column
 
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -17,6 +16,7 @@ from magshell_fenicsx.case.loading import (
 )
 from magshell_fenicsx.continuation.along import Along
 from magshell_fenicsx.continuation.branch import Branching, branching
+from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.path import Control, Path, StepOptions
 from magshell_fenicsx.continuation.point import PathStopped, Point
 from magshell_fenicsx.continuation.system import State
@@ -127,7 +127,7 @@ def _pressure(scene: Scene, loading: PressureSection, state: State) -> Iterator[
         targets = _divided(0.0, loading.pressure, loading.points)
     elif loading.volume_change is not None:
         unit = -scene.plan.material.classical_pressure / scene.plan.material.h / scene.model.multiplicity
-        now = -scene.newton.system.potential(state.u, "pressure")
+        now = -scene.newton.system.potential(state.u, state.mu, "pressure")
         targets = _divided(now, loading.volume_change * unit, loading.points)
     quantity: Quantity = "load" if loading.pressure is not None else "conjugate"
     yield from followed(scene, path, start, _goal(loading, targets, quantity), branches=loading)
@@ -140,12 +140,12 @@ def _indentation(scene: Scene, loading: IndentationSection, state: State) -> Ite
     first = asked / loading.points if loading.control == "load" else float(np.copysign(1.0, asked))
     path, start = begin(scene, "force", CONTROLS[loading.control], state, first)
     if loading.control == "displacement":
-        path.options = StepOptions(unit, 2 * unit, 1e-3 * unit)
+        path = path.in_steps(StepOptions(unit, 2 * unit, 1e-3 * unit))
     targets: list[float] = []
     if loading.until == "target":
         end = asked if quantity == "load" else unit * asked
         # the field may have moved the point past the first targets already
-        now = 0.0 if quantity == "load" else -scene.newton.system.potential(state.u, "force")
+        now = 0.0 if quantity == "load" else -scene.newton.system.potential(state.u, state.mu, "force")
         targets = [t for t in _divided(0.0, end, loading.points) if (t - now) * end > 0]
     yield from followed(scene, path, start, _goal(loading, targets, quantity, asked), branches=loading)
 
@@ -161,7 +161,7 @@ def _dead(scene: Scene, loading: DeadSection, state: State) -> Iterator[Record]:
     path, start = begin(scene, "load", CONTROLS[loading.control], state, first)
     if loading.control == "displacement" and not by_load:
         step = abs(end) / loading.points
-        path.options = StepOptions(step, 2 * step, 1e-4 * step)
+        path = path.in_steps(StepOptions(step, 2 * step, 1e-4 * step))
     targets = _divided(0.0, end, loading.points) if loading.until == "target" else []
     yield from followed(scene, path, start, _goal(loading, targets, quantity, asked), branches=loading)
 
@@ -170,39 +170,37 @@ def _rotation(scene: Scene, loading: RotationSection, state: State) -> Iterator[
     magnetic = scene.case.magnetic
     assert magnetic is not None
     total = float(np.arccos(magnetic.applied.vector() @ loading.to.vector()))
-    watch, system = scene.watch, scene.newton.system
-    for angle in _divided(0.0, total, loading.points):
-        end = {name: scene.case.lambda_m * f(angle) for name, f in (("lambda_m", np.cos), ("lambda_across", np.sin))}
-        scene.newton.system = chord = Along(
-            system, "turn", state.mu, {name: value - state.mu[name] for name, value in end.items()}
-        )
-        label: Label = "start"
-        try:
-            path, start = begin(scene, "turn", "arc", State(state.u, {**state.mu, "turn": 0.0}), 1.0)
-            watch.begin(path, start, partial(_expanded, chord))
-            for label, point in Walk(path, start, Goal("limit", [1.0])):
-                for found in _excluded(path, watch.pass_to(point, look=label != "step")):
-                    yield replace(found, amplitude="angle", point=_turned(chord, found.point))
-                here = _turned(chord, point)
-                state = here.state
-                yield Record(label, "angle", here, excluded_pivots=watch.unstable)
-        except PathStopped as e:
-            raise Stopped(f"the turning field stopped before {np.degrees(angle):.4g} degrees: {e}") from None
-        finally:
-            scene.newton.system = system
-        if label != "target":
-            raise Stopped(f"the turning field makes the shell unstable before {np.degrees(angle):.4g} degrees: {label}")
-        if watch.unstable:
-            raise Stopped(f"an antisymmetric instability lies before {np.degrees(angle):.4g} degrees of the field")
+    watch, circle = scene.watch, _circle(scene)
+    step, angle = total / loading.points, 0.0
+    start = State(
+        state.u, {"angle": 0.0, **{name: mu for name, mu in state.mu.items() if not name.startswith("lambda")}}
+    )
+    path, here = begin(scene, "angle", "arc", start, step, step, scene.newton.on(circle))
+    watch.begin(path, here, circle.expand)
+    try:
+        for label, point in Walk(path, here, Goal("limit", _divided(0.0, total, loading.points))):
+            angle = point.state.mu["angle"]
+            found = [*_excluded(path, watch.pass_to(point, look=label != "step"))]
+            for record in [*found, Record(label, "angle", point, excluded_pivots=watch.unstable)]:
+                yield replace(record, point=replace(record.point, state=circle.expand(record.point.state)))
+            if found or label in ("fold", "bifurcation"):
+                kind = found[0].mode if found else label
+                raise Stopped(f"the turning field makes the shell unstable at {np.degrees(angle):.4g} degrees: {kind}")
+    except PathStopped as e:
+        raise Stopped(f"the turning field stopped at {np.degrees(angle):.4g} degrees: {e}") from None
 
 
-def _expanded(chord: Along, state: State) -> State:
-    """A state on the chord between two angles, with the amplitudes of the model."""
-    return State(state.u, chord.expand(state.mu))
-
-
-def _turned(chord: Along, point: Point) -> Point:
-    return replace(point, state=_expanded(chord, point.state))
+def _circle(scene: Scene) -> Along:
+    """The model in the angle of the applied field, of full magnitude."""
+    lambda_m, system = scene.case.lambda_m, scene.model.system
+    return Along(
+        system,
+        "angle",
+        {
+            "lambda_m": lambda t: (lambda_m * np.cos(t), -lambda_m * np.sin(t), -lambda_m * np.cos(t)),
+            "lambda_across": lambda t: (lambda_m * np.sin(t), lambda_m * np.cos(t), -lambda_m * np.sin(t)),
+        },
+    )
 
 
 def _divided(start: float, end: float, points: int) -> list[float]:
@@ -211,17 +209,23 @@ def _divided(start: float, end: float, points: int) -> list[float]:
 
 
 def begin(
-    scene: Scene, name: str, control: Control, state: State, first: float, scale: float = 1.0
+    scene: Scene,
+    name: str,
+    control: Control,
+    state: State,
+    first: float,
+    scale: float = 1.0,
+    newton: BorderedNewton | None = None,
 ) -> tuple[Path, Point]:
     """A path from a state in equilibrium; its first step changes the amplitude by about `first`.
 
-    `scale` is as that of `Path`.
+    `scale` is as that of `Path`; `newton` is that of another system than the scene's.
     """
-    path = Path(scene.newton, name, control, StepOptions(1.0, 1.0, 1.0), abs(scale), scene.journal, scene.progress)
+    options = StepOptions(1.0, 1.0, 1.0)
+    path = Path(newton or scene.newton, name, control, options, abs(scale), scene.journal, scene.progress)
     start = path.start(state, first)
     step = abs(first / start.dmu)
-    path.options = StepOptions(step, (LONGEST if control == "arc" else 2) * step, 1e-5 * step)
-    return path, start
+    return path.in_steps(StepOptions(step, (LONGEST if control == "arc" else 2) * step, 1e-5 * step)), start
 
 
 def _goal(loading: PathSection, targets: Sequence[float], quantity: Quantity, sense: float = 1.0) -> Goal:
@@ -290,13 +294,13 @@ def _by_arc(scene: Scene, path: Path) -> Path:
     """The same path by arc length, in steps as long as the one off it at a bifurcation."""
     scale = path.metric.scale
     options = StepOptions(0.1, LONGEST * 0.1, 1e-6)
-    return Path(scene.newton, path.name, "arc", options, scale, scene.journal, scene.progress)
+    return Path(path.newton, path.name, "arc", options, scale, scene.journal, scene.progress)
 
 
 def _fold_ahead(scene: Scene, path: Path, points: list[Point]) -> list[Record]:
     """The fold that ended a path under load control, by arc length from its last point, and what comes before it."""
     onward = points[-1].s - points[-2].s if len(points) > 1 else 1.0
-    by_arc, start = begin(scene, path.name, "arc", points[-1].state, onward, path.metric.scale)
+    by_arc, start = begin(scene, path.name, "arc", points[-1].state, onward, path.metric.scale, path.newton)
     scene.watch.begin(by_arc, start)
     found: list[Record] = []
     try:

@@ -99,6 +99,7 @@ class Scene:
     def observe(self, state: State) -> dict[str, float]:
         """The physical columns of a table row: loads, displacements over h, volume, energies over E h R^2."""
         model, h, force = self.model, self.plan.material.h, self.model.loads.force
+        model.system.accept(state.u)
         pole = model.deflection(state.u, "pole") / h
         potentials, energies = model.system.energies(state.u), defaultdict[str, float](float)
         for t in model.system.terms:

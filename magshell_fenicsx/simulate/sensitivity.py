@@ -58,7 +58,7 @@ def sensitivities(scene: Scene, fold: Fold) -> dict[str, float]:
       the derivative in lambda_m.
     """
     system, state = scene.model.system, fold.state
-    columns = {name: system.load(state.u, name) for name in state.mu if name != fold.name}
+    columns = {name: system.load(state.u, state.mu, name) for name in state.mu if name != fold.name}
     columns |= _remanence_columns(scene, fold)
     found = {name: sensitivity(system, fold, column) for name, column in columns.items()}
     return found | ({DEFECT: _to_defect(scene, fold)} if scene.case.defect else {})

@@ -126,7 +126,7 @@ def test_dimple_drift_on_the_shell() -> None:
             np.arctan2(rho, z)
         ).T
         guess = State(shell.model.system.held(np.column_stack([U * c, U * s, W]).ravel()), record.point.state.mu)
-        volume = -shell.model.system.potential(guess.u, "pressure")
+        volume = -shell.model.system.potential(guess.u, {}, "pressure")
         there = shell.newton.solve(guess, "pressure", GivenConjugate(shell.newton.system, "pressure", volume))
         assert there.converged
         assert there.state.mu["pressure"] == pytest.approx(record.point.state.mu["pressure"], rel=4e-3)

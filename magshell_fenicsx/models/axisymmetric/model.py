@@ -116,7 +116,7 @@ class MeridianModel:
 
     def loaded_deflection(self, u: Vector) -> float:
         """w/R conjugate to the force: at the pole, or averaged over its patch."""
-        return -self.system.potential(u, "force") / self.force_unit
+        return -self.system.potential(u, {}, "force") / self.force_unit
 
     @property
     def force_unit(self) -> float:

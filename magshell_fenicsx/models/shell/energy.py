@@ -135,6 +135,9 @@ class HessianTerm:
     def energy(self) -> float:
         return 0.0
 
+    def accept(self) -> None:
+        """It has no energy, and so no history."""
+
     def compile_residual(self) -> None:
         """There is none."""
 

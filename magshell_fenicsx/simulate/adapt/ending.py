@@ -127,7 +127,7 @@ def _fold(scene: Scene, guess: Guess, name: str) -> Ending | None:
 
 def _equilibrium(scene: Scene, guess: State, near: Ending) -> Ending | None:
     newton, system, name, held = scene.newton, scene.newton.system, near.name, near.held
-    row: Row = GivenLoad(guess.mu[name]) if held is None else GivenConjugate(system, name, held)
+    row: Row = GivenLoad(name, guess.mu[name]) if held is None else GivenConjugate(system, name, held)
     outcome = newton.solve(guess, name, row)
     if not outcome.converged:
         return None
@@ -143,9 +143,9 @@ def _target(scene: Scene, record: Record) -> Ending:
     if isinstance(loading, IndentationSection | DeadSection):
         given = loading.force if isinstance(loading, IndentationSection) else loading.factor
     given_load = given is not None
-    held = None if given_load else -system.potential(state.u, name)
+    held = None if given_load else -system.potential(state.u, state.mu, name)
     return Ending("target", name, _value(system, state, name, held), state, record.point.du, held)
 
 
 def _value(system: System, state: State, name: str, held: float | None) -> float:
-    return state.mu[name] if held is not None else -system.potential(state.u, name)
+    return state.mu[name] if held is not None else -system.potential(state.u, state.mu, name)

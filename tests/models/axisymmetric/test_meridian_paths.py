@@ -41,7 +41,7 @@ def test_patch_carries_the_whole_force_and_tends_to_the_point() -> None:
     for model in models:
         down = model.zero()
         down[1::2] = -1
-        assert -model.system.load(down, "force") @ down == pytest.approx(model.force_unit, rel=1e-12)
+        assert -model.system.load(down, {}, "force") @ down == pytest.approx(model.force_unit, rel=1e-12)
         assert model.loaded_deflection(down) == pytest.approx(1.0, rel=1e-12)
     point, *patches = (indent(model, [1.5])[0] for model in [hemisphere(90, 0.5, POLE_FORCE), *models])
     assert point < patches[1] < patches[0] < 1.02 * point

@@ -46,7 +46,7 @@ def difference(system: FiniteElementSystem, u: np.ndarray, mu: Mapping[str, floa
     reference = by_forms(system)
     pairs = [(system.residual(u, mu), reference.residual(u, mu))]
     loads = {t.amplitude for t in system.terms if t.amplitude}
-    pairs += [(system.load(u, name), reference.load(u, name)) for name in loads]
+    pairs += [(system.load(u, {}, name), reference.load(u, {}, name)) for name in loads]
     return max(float(np.abs(here - there).max() / np.abs(there).max()) for here, there in pairs)
 
 

@@ -135,8 +135,10 @@ def test_load_is_the_derivative_of_the_potential(name: str) -> None:
     system = ShellModel(hemisphere(0.8), Material(0.3, 0.05), 2, {"rim": "clamped"}, loads).system
     model_u, v = (system.held(1e-2 * np.random.default_rng(i).standard_normal(system.size)) for i in range(2))
     step = 1e-3
-    slope = (system.potential(model_u + step * v, "own") - system.potential(model_u - step * v, "own")) / (2 * step)
-    assert slope == pytest.approx(dot(system.comm, system.load(model_u, "own"), v), rel=1e-6)
+    slope = (system.potential(model_u + step * v, {}, "own") - system.potential(model_u - step * v, {}, "own")) / (
+        2 * step
+    )
+    assert slope == pytest.approx(dot(system.comm, system.load(model_u, {}, "own"), v), rel=1e-6)
 
 
 @pytest.mark.parametrize("symmetry", ["axisymmetric", "half", "none"])
@@ -152,8 +154,8 @@ def test_the_shells_own_pressure_as_ones_own(symmetry: str) -> None:
     scene = Scene(case, terms=[OwnTerm("own", pressure, (unit,))])
     system = scene.model.system
     u = system.held(1e-2 * np.random.default_rng(0).standard_normal(system.size))
-    assert system.potential(u, "own") == pytest.approx(system.potential(u, "pressure"), rel=1e-11)
-    ours, theirs = system.load(u, "own"), system.load(u, "pressure")
+    assert system.potential(u, {}, "own") == pytest.approx(system.potential(u, {}, "pressure"), rel=1e-11)
+    ours, theirs = system.load(u, {}, "own"), system.load(u, {}, "pressure")
     assert np.abs(ours - theirs).max() < 1e-11 * np.abs(theirs).max()
     mu = {"own": -0.7, "pressure": 0.7}
     assert np.abs(system.residual(u, mu) - system.residual(u, dict.fromkeys(mu, 0.0))).max() < 1e-10
@@ -184,10 +186,10 @@ def test_weight_is_a_dead_load_on_any_surface() -> None:
     assert isinstance(dead, AreaForce)
     system = Scene(case, terms=[OwnTerm("own", weight, (dead.force,))]).model.system
     u = system.held(1e-2 * np.random.default_rng(0).standard_normal(system.size))
-    ours, theirs = system.load(u, "own"), system.load(u, "load")
+    ours, theirs = system.load(u, {}, "own"), system.load(u, {}, "load")
     assert np.abs(theirs).max() > 0
     assert np.abs(ours - theirs).max() < 1e-11 * np.abs(theirs).max()
-    assert system.potential(u, "own") == pytest.approx(system.potential(u, "load"), rel=1e-9)
+    assert system.potential(u, {}, "own") == pytest.approx(system.potential(u, {}, "load"), rel=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -238,4 +240,4 @@ def test_parameters_need_no_new_kernel() -> None:
     forms = [next(t for t in m.system.terms if t.name == "own")._energy for m in models]  # type: ignore[attr-defined]
     assert forms[0].module is forms[1].module or forms[0].module.__file__ == forms[1].module.__file__
     u = random_displacement(models[0], 1e-2)
-    assert models[1].system.potential(u, "own") == pytest.approx(2 * models[0].system.potential(u, "own"))
+    assert models[1].system.potential(u, {}, "own") == pytest.approx(2 * models[0].system.potential(u, {}, "own"))
