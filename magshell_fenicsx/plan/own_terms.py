@@ -6,12 +6,9 @@ from dataclasses import replace
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.models.shell.own_term import OwnTerm
-from magshell_fenicsx.output.store.table import COLUMNS
 from magshell_fenicsx.plan.plan import Plan
 from magshell_fenicsx.plan.planner import make_plan
-
-AMPLITUDES = ("pressure", "force", "load", "load_factor", "turn", "push", "lambda_m", "lambda_across")
-ENERGIES = ("membrane", "couple")  # besides those with a column
+from magshell_fenicsx.quantities.registry import TAKEN
 
 
 def plan_with(case: Case, terms: Sequence[OwnTerm]) -> Plan:
@@ -27,7 +24,7 @@ def plan_with(case: Case, terms: Sequence[OwnTerm]) -> Plan:
         raise CaseError("model: solid: one's own terms are energies of a mid-surface")
     names = [term.name for term in terms]
     for name in names:
-        if name in (*AMPLITUDES, *ENERGIES, *COLUMNS) or names.count(name) > 1:
+        if name in TAKEN or names.count(name) > 1:
             raise CaseError(f"terms: {name}: something else has this name already")
     plan = make_plan(case)
     if wrong := _not_sharing(plan, terms):
