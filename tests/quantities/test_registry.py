@@ -9,9 +9,11 @@ from magshell_fenicsx.output.report.report_path import path_table
 from magshell_fenicsx.output.store.table import COLUMNS
 from magshell_fenicsx.quantities.registry import AMPLITUDES, QUANTITIES, amplitude, axes_of, quantity
 
-FIRST_RELEASE = """point label amplitude p_over_pc lambda_m force w_over_h w_from_field_over_h w_pole_over_h
-volume_change energy negative_pivots negative_pivots_held iterations factorisations wall_s stretching bending magnetic U1 Uq Utau mode
-field_angle branch w_point_over_h error_over_h load_error excluded_pivots"""
+FIRST_RELEASE = """
+point label amplitude p_over_pc lambda_m force w_over_h w_from_field_over_h w_pole_over_h volume_change energy
+negative_pivots negative_pivots_held iterations factorisations wall_s stretching bending magnetic U1 Uq Utau mode
+field_angle branch w_point_over_h error_over_h load_error excluded_pivots
+"""
 
 
 def test_no_column_is_renamed_or_moved() -> None:
