@@ -72,7 +72,7 @@ OF_EVERY_RUN = (
     _energy("Utau", "torques of gradients", "Of the approximate magnetic energies.", "U_τ"),
     Quantity("mode", "mode", "Of an instability: symmetric, asymmetric, m = 2, antisymmetric, ...", "text"),
     Quantity("field_angle", "field angle", "By which the field has turned.", "load", unit="degrees", si="degrees"),
-    Quantity("branch", "branch", "0 is the path, 1 and -1 leave it at its first bifurcation.", "count"),
+    Quantity("branch", "branch", "0 is the path, 1 and 2 leave it at its first bifurcation.", "count"),
     _w("w_point_over_h", "of the loaded point", "Inward displacement of the loaded point itself."),
     Quantity("error_over_h", "error of u", "Estimate of the algebraic error, the next step.", "error", "", "h", "m"),
     Quantity("load_error", "error of the load", "Estimate of that of the amplitude at a located point.", "error"),
@@ -91,7 +91,7 @@ AMPLITUDES = {
     )
 }
 # names of terms, and of amplitudes that only the solvers see
-INTERNAL = ("angle", "push", "lambda_across", "membrane", "couple")
+INTERNAL = ("push", "lambda_across", "membrane", "couple")
 TAKEN = frozenset((*QUANTITIES, *AMPLITUDES, *INTERNAL))
 
 
