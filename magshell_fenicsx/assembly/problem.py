@@ -10,6 +10,7 @@ from dolfinx.la import InsertMode
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
+from magshell_fenicsx.assembly.parameter import Parameter
 from magshell_fenicsx.assembly.terms import FormTerm, Term
 from magshell_fenicsx.continuation.noise import Noise
 from magshell_fenicsx.continuation.system import Amplitudes, Vector, Weighted
@@ -61,6 +62,8 @@ class FiniteElementSystem:
         Makes the tangent with the same conditions, instead of the terms' forms.
     gradients
         Makes the residual, instead of the terms' forms.
+    parameters
+        Those that enter terms freely, by name.
     """
 
     def __init__(
@@ -72,10 +75,12 @@ class FiniteElementSystem:
         length: float,
         assembler: TangentAssembler | None = None,
         gradients: ResidualAssembler | None = None,
+        parameters: Mapping[str, Parameter] | None = None,
     ) -> None:
         V = u.function_space
         self.u, self.terms, self.clamped, self.length = u, terms, clamped, length
-        self.coordinates = frozenset[str]()
+        self.parameters = parameters or {}
+        self.coordinates = frozenset(self.parameters)
         self.comm = V.mesh.comm
         self.size = V.dofmap.index_map.size_local * V.dofmap.index_map_bs
         self.dofs = V.dofmap.index_map.size_global * V.dofmap.index_map_bs
@@ -109,7 +114,13 @@ class FiniteElementSystem:
         u[self._fixed] = 0
         return u
 
+    def place(self, mu: Amplitudes) -> None:
+        """Put the free parameters into the terms."""
+        for name, parameter in self.parameters.items():
+            parameter.constant.value = mu[name]
+
     def residual(self, u: Vector, mu: Amplitudes) -> Vector:
+        self.place(mu)
         factors = {t.name: _factor(t, mu) for t in self.terms}
         if self.noise is None:
             return self._gradient(u, factors)
@@ -118,14 +129,35 @@ class FiniteElementSystem:
         return np.asarray(np.sum([self.noise.on_vector(part, first) for part in parts], axis=0))
 
     def load(self, u: Vector, mu: Amplitudes, name: str) -> Vector:
+        self.place(mu)
+        if name in self.parameters:
+            slopes = self.parameters[name].slopes
+            return self._gradient(u, {}, [(mu[amplitude], slope) for amplitude, slope in slopes.items()])
         return self._gradient(u, {t.name: 1.0 for t in self.terms if t.amplitude == name})
 
     def potential(self, u: Vector, mu: Amplitudes, name: str) -> float:
         self.set(u)
-        return float(self.comm.allreduce(sum(t.energy() for t in self.terms if t.amplitude == name)))
+        self.place(mu)
+        if name in self.parameters:
+            here = sum(mu[amplitude] * slope.energy() for amplitude, slope in self.parameters[name].slopes.items())
+        else:
+            here = sum(t.energy() for t in self.terms if t.amplitude == name)
+        return float(self.comm.allreduce(here))
 
     def curvature(self, u: Vector, mu: Amplitudes, name: str, other: str) -> float:
-        return 0.0  # all amplitudes multiply their terms
+        if not {name, other} & set(self.parameters):
+            return 0.0  # amplitudes that multiply their terms
+        self.set(u)
+        self.place(mu)
+        if name not in self.parameters:
+            name, other = other, name
+        parameter = self.parameters[name]
+        if other in self.parameters:
+            bends = parameter.bends.get(other, {})
+            here = sum(mu[amplitude] * fem.assemble_scalar(form) for amplitude, form in bends.items())
+        else:
+            here = parameter.slopes[other].energy() if other in parameter.slopes else 0.0
+        return float(self.comm.allreduce(here))
 
     def accept(self, u: Vector) -> None:
         """Take u for a point of the path, from which whole turns of moments are counted on."""
@@ -147,6 +179,7 @@ class FiniteElementSystem:
         with self.assembly:
             whole = [(weight, self._with_ghosts(v)) for weight, v in stress]
             self.set(u)
+            self.place(mu)
             factors = {t.name: _factor(t, mu) for t in self.terms}
             K = self._assembler.tangent(factors, whole) if self._assembler else self._of_forms(factors)
             if self.noise:
@@ -162,15 +195,18 @@ class FiniteElementSystem:
         compat.finish_matrix(self._K, self.u.function_space, self.clamped)
         return self._K
 
-    def _gradient(self, u: Vector, factors: Mapping[str, float]) -> NDArray[np.float64]:
+    def _gradient(
+        self, u: Vector, factors: Mapping[str, float], besides: Sequence[tuple[float, Term]] = ()
+    ) -> NDArray[np.float64]:
+        """Of the terms with these factors, by name, and of others."""
         with self.assembly:
             self.set(u)
             b = self._b.x.array
             b[:] = 0
-            if self.gradients:
+            if self.gradients and factors:
                 self.gradients.add(b, factors)
-            for term in self._own_residual:
-                if factor := factors.get(term.name):
+            for factor, term in [*((factors.get(t.name, 0.0), t) for t in self._own_residual), *besides]:
+                if factor:
                     term.add_residual(b, factor)
             self._b.x.scatter_reverse(InsertMode.add)
             b[self._fixed] = 0

@@ -27,6 +27,7 @@ def surface_terms(case: Case, own: Sequence[OwnTerm]) -> tuple[OwnTerm, ...]:
             found.append(term)
     found += own
     names = [name for term in found for name in (term.name, *term.observed)]
+    names += {p.name for term in found for p in term.free}
     for name in names:
         if name in TAKEN or names.count(name) > 1:
             raise CaseError(f"terms: {name}: something else has this name already")

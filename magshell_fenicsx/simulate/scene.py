@@ -93,8 +93,8 @@ class Scene:
     def unloaded(self) -> State:
         """The undeformed shell: all amplitudes are zero but those that terms have a value for."""
         amplitudes = {t.amplitude for t in self.model.system.terms if t.amplitude}
-        given = {term.name: term.value for term in self.plan.loads.own}
-        return State(self.model.zero(), {name: given.get(name, 0.0) for name in sorted(amplitudes)})
+        given = self._own_amplitudes
+        return State(self.model.zero(), {name: given.get(name, 0.0) for name in sorted({*amplitudes, *given})})
 
     def observe(self, state: State) -> dict[str, float]:
         """The physical columns of a table row: loads, displacements over h, volume, energies over E h R^2."""
@@ -124,7 +124,7 @@ class Scene:
             "magnetic": sum(energies[name] for name in ("magnetic", "magnetic gradient", "U1", "Uq", "Utau", "couple")),
             **{name: energies[name] for name in ("U1", "Uq", "Utau")},
             **self._observe_points(state),
-            **{term.name: state.mu[term.name] for term in self.plan.loads.own},
+            **{name: state.mu[name] for name in self._own_amplitudes},
             **{
                 column: state.mu[term.name]
                 * model.multiplicity
@@ -135,11 +135,16 @@ class Scene:
         }
 
     @property
+    def _own_amplitudes(self) -> dict[str, float]:
+        """Those of surface energies, and of parameters that enter them freely, with their values at the start."""
+        terms = self.plan.loads.own
+        return {term.name: term.value for term in terms} | {p.name: p.value for term in terms for p in term.free}
+
+    @property
     def extra_columns(self) -> tuple[str, ...]:
         """What `observe` tells besides the columns of every run."""
         named = tuple(f"{point}_u{axis}" for point in self.case.points for axis in "xyz")
-        terms = self.plan.loads.own
-        own = (*(term.name for term in terms), *(column for term in terms for column in term.observed))
+        own = (*self._own_amplitudes, *(column for term in self.plan.loads.own for column in term.observed))
         return (*(["load_factor"] if self.plan.loads.dead else []), *named, *own)
 
     def _observe_points(self, state: State) -> dict[str, float]:

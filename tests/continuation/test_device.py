@@ -139,7 +139,7 @@ def test_a_coordinate_is_unstable_where_a_force_is_not() -> None:
 
 
 def test_eigenpair_of_the_edged_tangent() -> None:
-    """Against NumPy's of the same matrix, y = mu/scale with the scales 1/x of the responses rounded to powers of two."""
+    """Against NumPy's of the same matrix of five unknowns."""
     newton, rest = under("y and force")
     factors = newton.factor_at(rest)
     whole = np.array([factors.times(e) for e in np.eye(5)])

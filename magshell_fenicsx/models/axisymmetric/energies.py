@@ -5,7 +5,7 @@ axisymmetric displacement and the waves added to it.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import ufl
@@ -18,6 +18,7 @@ from magshell_fenicsx.models.axisymmetric.meridian import Meridian
 from magshell_fenicsx.models.axisymmetric.pattern import pattern_field
 from magshell_fenicsx.models.shell import densities, edges
 from magshell_fenicsx.models.shell import kinematics as kin
+from magshell_fenicsx.models.shell.free import Constants, constants_of
 from magshell_fenicsx.models.shell.kinematics import Jet
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.parameters import Magnetisation, Material
@@ -45,6 +46,7 @@ class EnergyFactory:
     material: Material
     sigma: float
     degree: int
+    free: Constants = field(default_factory=dict)  # of parameters that enter freely
 
     def membrane(self) -> Energy:
         j0, nu = self._j0, self._constant(self.material.nu)
@@ -120,7 +122,7 @@ class EnergyFactory:
         }
 
     def _surface(self, term: OwnTerm, of: Callable[..., Expr]) -> Callable[[Jet], Expr]:
-        j0, parameters = self._j0, [self._constant(np.asarray(p, dtype=float)) for p in term.parameters]
+        j0, parameters = self._j0, constants_of(term, self.meridian.mesh, self.free)
         return lambda u: of(j0, u, *parameters)
 
     def volume_change(self, u: Jet) -> ufl.Form:

@@ -20,6 +20,7 @@ from magshell_fenicsx.models.axisymmetric.energies import INTERIOR, Energy, Ener
 from magshell_fenicsx.models.axisymmetric.instability import ExcludedWaves
 from magshell_fenicsx.models.axisymmetric.meridian import Meridian, held_at
 from magshell_fenicsx.models.axisymmetric.waves import Waves
+from magshell_fenicsx.models.shell.free import free_parameters
 from magshell_fenicsx.models.shell.parameters import Condition, Force, Loads, Material, default_penalty
 from magshell_fenicsx.models.shell.point_load import Entries
 
@@ -90,7 +91,13 @@ class MeridianModel:
         held = [held_at(V, meridian.axis, 0)]
         if condition != "free":
             held += [held_at(V, meridian.rim, i) for i in range(2)]
-        self.system = FiniteElementSystem(self.u, terms, held, forms[INTERIOR], material.h)
+        parameters = free_parameters(
+            loads.own,
+            factory.free,
+            lambda term: self._term(factory.own(term)),
+            lambda term: self.kernels.compile_all([factory.observed(term, u)]),
+        )
+        self.system = FiniteElementSystem(self.u, terms, held, forms[INTERIOR], material.h, parameters=parameters)
         volume = 2 * np.pi * factory.volume_change(jets.revolved(self.u))
         self._volume = self.kernels.compile("volume energy", volume)
 

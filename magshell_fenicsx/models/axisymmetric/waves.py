@@ -78,6 +78,7 @@ class Waves:
     def tangent(self, state: State, m: int) -> PETSc.Mat:
         """The matrix of Q_m at an axisymmetric state; it is reused by the next call."""
         self._system.set(state.u)
+        self._system.place(state.mu)
         self._assemble(self._K, state, m, self.held(m))
         return self._K
 
@@ -97,6 +98,7 @@ class Waves:
         between five.
         """
         self._system.set(state.u)
+        self._system.place(state.mu)
         for part, node in zip(self._parts, self._nodes, strict=True):
             self._assemble(part, state, node, [])
         if self._interpolated is None:

@@ -23,6 +23,7 @@ from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes, held
 from magshell_fenicsx.models.shell.dead_load import assemble_dead_loads
 from magshell_fenicsx.models.shell.fast_tangent import FastTangent, make_sites
 from magshell_fenicsx.models.shell.folds import FOLD, largest_fold
+from magshell_fenicsx.models.shell.free import free_parameters
 from magshell_fenicsx.models.shell.parameters import (
     MIRROR_NORMAL,
     Condition,
@@ -163,7 +164,12 @@ class ShellModel(Observed):
         self._sites = make_sites(self.r0, degree, terms, self.kernels, factory.prestress())
         fast = FastTangent(self.u, self._sites, held + mirror)
         gradients = FastResidual(self.r0, self.u, degree, terms, self.kernels)
-        self.system = FiniteElementSystem(self.u, terms, held + mirror, interior, material.h, fast, gradients)
+        parameters = free_parameters(
+            loads.own, factory.free, factory.own, lambda term: self.kernels.compile_all([factory.observed(term)])
+        )
+        self.system = FiniteElementSystem(
+            self.u, terms, held + mirror, interior, material.h, fast, gradients, parameters
+        )
         self._factory, self._interior, self._held, self._mirror = factory, interior, held, facets("symmetry")
         self.observe(self.kernels.compile("volume energy", factory.volume_change()), midsurface.points)
 
@@ -179,7 +185,9 @@ class ShellModel(Observed):
         terms = [edges if t.name == "mirror edges" else t for t in self.system.terms]
         system = self.system
         return AntisymmetricModes(
-            FiniteElementSystem(self.u, terms, held, self._interior, system.length, fast, system.gradients)
+            FiniteElementSystem(
+                self.u, terms, held, self._interior, system.length, fast, system.gradients, system.parameters
+            )
         )
 
     def loaded_deflection(self, u: Vector) -> float:

@@ -24,6 +24,18 @@ SAME = 1e-10  # difference of two values that is rounding, over the larger
 
 
 @dataclass(frozen=True)
+class Free:
+    """A parameter of densities that is an amplitude of its own, and may enter them in any way.
+
+    A place, an angle or a natural curvature, for instance: what is conjugate to it is -dPi/dp, a force on what it
+    moves. `value` is that of the undeformed shell.
+    """
+
+    name: str
+    value: float = 0.0
+
+
+@dataclass(frozen=True)
 class OwnTerm:
     """The energy mu Pi(u), Pi the integral of a density over the undeformed mid-surface.
 
@@ -40,7 +52,7 @@ class OwnTerm:
         jets are taken in: build it from values and from what `kinematics` offers. It may depend on the value and
         the first derivatives of u; an energy of its second derivatives would miss the rotations between cells.
     parameters
-        Numbers and vectors; other values of them need no new kernel.
+        Numbers and vectors; other values of them need no new kernel. A `Free` one can be varied as mu can.
     value
         mu of the undeformed shell, which a path keeps unless it varies mu.
     observed
@@ -54,7 +66,7 @@ class OwnTerm:
 
     name: str
     density: Callable[..., Expr]
-    parameters: tuple[float | Array, ...] = ()
+    parameters: tuple[float | Array | Free, ...] = ()
     value: float = 0.0
     observed: Mapping[str, Callable[..., Expr]] = field(default_factory=dict)
 
@@ -85,6 +97,24 @@ class OwnTerm:
     def placed_parts(self) -> tuple[str, ...]:
         """Those of the placement's jet; the area of the surface takes the first derivatives anyway."""
         return tuple(name for name in ("r", *CURVED) if name in (*FIRST, *self._found_in(self._symbolic[1])))
+
+    @property
+    def free(self) -> tuple[Free, ...]:
+        """Its parameters that are amplitudes."""
+        return tuple(p for p in self.parameters if isinstance(p, Free))
+
+    def derivative(self, *names: str) -> Callable[..., Expr]:
+        """The derivative of the density in free parameters, one after the other."""
+        places = {p.name: i for i, p in enumerate(self.parameters) if isinstance(p, Free)}
+
+        def derived(r0: Jet, u: Jet, *parameters: Expr) -> Expr:
+            variables = [ufl.variable(p) for p in parameters]
+            found = self.density(r0, u, *variables)
+            for name in names:
+                found = ufl.diff(found, variables[places[name]])
+            return found
+
+        return derived
 
     @cached_property
     def linear(self) -> bool:
@@ -155,5 +185,7 @@ def _as_jet(parts: Array) -> Jet:
     return Jet(*map(_as_expression, parts))
 
 
-def _as_expression(value: float | Array) -> Expr:
+def _as_expression(value: float | Array | Free) -> Expr:
+    if isinstance(value, Free):
+        return ufl.as_ufl(value.value or 1.0)  # of no place in its range, such as zero, that hides terms
     return ufl.as_ufl(float(value)) if np.ndim(value) == 0 else ufl.as_tensor(np.asarray(value, dtype=float).tolist())

@@ -186,7 +186,7 @@ def parameters_at(points: Points, density: Density) -> tuple[list[Parameter], li
     Where there are two sides, such a vector holds that of the one and then that of the other.
     """
     here = [
-        points.constant(p.value) if isinstance(p, fem.Constant) else points.field(density.sides * p.ufl_shape[0])
+        points.constant(p) if isinstance(p, fem.Constant) else points.field(density.sides * p.ufl_shape[0])
         for p in density.parameters
     ]
     pairs = zip(here, density.parameters, strict=True)

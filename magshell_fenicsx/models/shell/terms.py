@@ -1,7 +1,7 @@
 """The densities as terms: each compiled once, and only when a scene calls for it."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import ufl
@@ -22,6 +22,7 @@ from magshell_fenicsx.models.shell.energy import (
     edge_quadrature,
     per_area,
 )
+from magshell_fenicsx.models.shell.free import Constants, constants_of
 from magshell_fenicsx.models.shell.kinematics import CURVED, MOVED, SECOND, Jet
 from magshell_fenicsx.models.shell.moment import MomentTerm
 from magshell_fenicsx.models.shell.own_term import OwnTerm
@@ -54,6 +55,7 @@ class TermFactory:
     degree: int
     log: KernelLog
     thickness: fem.Function | None = None
+    free: Constants = field(default_factory=dict)  # of parameters that enter freely
 
     def membrane(self) -> ShellTerm:
         density = Density(per_area(densities.membrane), (self._constant(self.material.nu),))
@@ -149,7 +151,7 @@ class TermFactory:
         return {column: per_area(of)(*arguments) * self._dx() for column, of in term.observed.items()}
 
     def _parameters(self, term: OwnTerm) -> tuple[fem.Constant, ...]:
-        return tuple(self._constant(np.asarray(p, dtype=float)) for p in term.parameters)
+        return constants_of(term, self._domain, self.free)
 
     def volume_change(self) -> ufl.Form:
         """Delta V/R^3 of the modelled part."""

@@ -20,6 +20,7 @@ from magshell_fenicsx.mesh.hexahedra import Body, quadratic
 from magshell_fenicsx.models.observed import Observed
 from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes
 from magshell_fenicsx.models.shell.fast_tangent import FastTangent
+from magshell_fenicsx.models.shell.free import free_parameters
 from magshell_fenicsx.models.shell.parameters import MIRROR_NORMAL, Condition, Force, Loads, Material
 from magshell_fenicsx.models.solid.material import NeoHookean
 from magshell_fenicsx.models.solid.sites import make_sites
@@ -91,8 +92,13 @@ class SolidModel(Observed):
         return AntisymmetricModes(self._system(self._held + _held(self.V, self._mirror, in_plane)))
 
     def _system(self, held: list[fem.DirichletBC]) -> FiniteElementSystem:
-        fast = FastTangent(self.u, self._sites, held)
-        return FiniteElementSystem(self.u, self._terms, held, self._pattern, self.material.h, fast)
+        fast, factory = FastTangent(self.u, self._sites, held), self._factory
+        parameters = free_parameters(
+            self.loads.own, factory.free, factory.own, lambda term: self.kernels.compile_all([factory.observed(term)])
+        )
+        return FiniteElementSystem(
+            self.u, self._terms, held, self._pattern, self.material.h, fast, parameters=parameters
+        )
 
     def _force(self, force: Force) -> LinearTerm:
         """Averaged over the outer face with the weight (1 - d^2/radius^2)^2, d the distance from the loaded point."""

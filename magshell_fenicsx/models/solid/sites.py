@@ -87,7 +87,7 @@ class Site:
 
     def _density(self, term: SolidTerm) -> Any:
         density, g, z = term.density, self._g, self._u
-        parameters = [self._points.constant(p.value) for p in density.parameters]
+        parameters = [self._points.constant(p) for p in density.parameters]
 
         def vector(f: fem.Function, part: int) -> Any:
             return ufl.as_vector([f[3 * part + c] for c in range(3)])

@@ -1,7 +1,7 @@
 """The densities as terms: each compiled once, and only when a scene calls for it."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import ufl
@@ -13,6 +13,7 @@ from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.terms import DensityTerm
 from magshell_fenicsx.mesh.hexahedra import OUTER, Body
 from magshell_fenicsx.models.shell.energy import per_area
+from magshell_fenicsx.models.shell.free import Constants, constants_of
 from magshell_fenicsx.models.shell.kinematics import SECOND, Jet
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.parameters import Magnetisation
@@ -58,6 +59,7 @@ class TermFactory:
     material: NeoHookean
     h: float
     log: KernelLog
+    free: Constants = field(default_factory=dict)  # of parameters that enter freely
 
     def distortion(self) -> SolidTerm:
         return self._bulk("distortion", Density(densities.distortion, self._constants(self.material.shear, self.h)))
@@ -109,7 +111,7 @@ class TermFactory:
         def on_face(X: Expr, X1: Expr, X2: Expr, u: Expr, u1: Expr, u2: Expr, *parameters: Expr) -> Expr:
             return per_area(of)(Jet(X, X1, X2, *flat), Jet(u, u1, u2, *flat), *parameters)
 
-        parameters = self._constants(*(np.asarray(p, dtype=float) for p in term.parameters))
+        parameters = constants_of(term, self.u.function_space.mesh, self.free)
         return Density(on_face, parameters, ON_FACE, on_face=True)
 
     def volume_change(self) -> ufl.Form:
