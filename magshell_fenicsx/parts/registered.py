@@ -9,8 +9,10 @@ from pydantic import Field, create_model
 from magshell_fenicsx.parts.part import Part
 from magshell_fenicsx.parts.section import Section
 
-# key of the case file and name of the file here -> class in it
-REGISTERED: dict[str, str] = {}
+REGISTERED: dict[str, str] = {
+    # key of the case file, and name of the file here -> the class in it
+    "foundation": "Foundation",
+}
 PARTS: dict[str, type[Part]] = {
     key: getattr(import_module(f"{__package__}.{key}"), name) for key, name in REGISTERED.items()
 }
