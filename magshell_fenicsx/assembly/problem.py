@@ -128,6 +128,11 @@ class FiniteElementSystem:
         self.set(u)
         return {t.name: float(self.comm.allreduce(t.energy())) for t in self.terms}
 
+    def integral(self, u: Vector, form: fem.Form) -> float:
+        """Of a compiled form in the displacement, over all ranks."""
+        self.set(u)
+        return float(self.comm.allreduce(fem.assemble_scalar(form)))
+
     def tangent(self, u: Vector, mu: Amplitudes, stress: Sequence[Weighted] = ()) -> PETSc.Mat:
         with self.assembly:
             whole = [(weight, self._with_ghosts(v)) for weight, v in stress]

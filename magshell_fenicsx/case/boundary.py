@@ -4,7 +4,7 @@ from typing import Annotated, Any, Literal, get_args
 
 from pydantic import BeforeValidator, Field, ValidationError
 
-from magshell_fenicsx.case.base import Section
+from magshell_fenicsx.parts.section import Section
 
 EDGES = {"hemisphere": ("equator",), "disc": ("rim",), "strip": ("root", "tip", "sides")}
 Axis = Literal["x", "y", "z"]

@@ -6,7 +6,6 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, ModelWrapValidatorHandler, ValidationError, model_validator
 
-from magshell_fenicsx.case.base import Section, or_number, texts
 from magshell_fenicsx.case.boundary import EDGES, BoundarySection
 from magshell_fenicsx.case.defects import DimpleSection
 from magshell_fenicsx.case.fields import MagneticSection
@@ -24,6 +23,9 @@ from magshell_fenicsx.case.solid import SolidSection
 from magshell_fenicsx.case.source import CaseError, Source, override, read_source
 from magshell_fenicsx.case.stability import StabilitySection
 from magshell_fenicsx.case.surfaces import CapSurface, MeshSurface, RevolutionSurface, Surface, SurfaceSection
+from magshell_fenicsx.parts.part import Part, Scales
+from magshell_fenicsx.parts.registered import PARTS, WithParts
+from magshell_fenicsx.parts.section import Section, or_number, texts
 
 SOLID_DEGREE = 2
 
@@ -53,7 +55,7 @@ class MeshSection(Section):
 Place = Annotated[list[Annotated[float, or_number("metre")]], Field(min_length=3, max_length=3)]
 
 
-class Case(Section):
+class Case(WithParts):
     """A shell, what holds it, its field and its load; validated."""
 
     model: Literal["shell", "solid"] = "shell"
@@ -84,7 +86,9 @@ class Case(Section):
         section = handler(data)
         if isinstance(data, dict) and not section.shell.with_units:
             loads = section.loading if isinstance(section.loading, DeadSection) else None
-            parts = {"points": data.get("points"), "mesh": data.get("mesh"), "loading": loads and data.get("loading")}
+            parts = {key: data.get(key) for key in ("points", "mesh", *PARTS)} | {
+                "loading": loads and data.get("loading")
+            }
             for key in texts(parts):
                 raise ValueError(f"{key}: has a unit, but the shell's lengths have none: give all of them one, or none")
         return section
@@ -113,8 +117,9 @@ class Case(Section):
         if "load" in self.points:
             raise ValueError("points.load: is taken, by the point that is indented; choose another name")
         loads = loading.loads if isinstance(loading, DeadSection) else []
-        if loads and shell.modulus is None:
-            raise ValueError("shell.youngs_modulus is needed for loads of kind: dead")
+        for key in (*(["loads of kind: dead"] if loads else []), *self.parts):
+            if shell.modulus is None:
+                raise ValueError(f"shell.youngs_modulus is needed for {key}")
         indented = []
         if isinstance(loading, IndentationSection):
             indented = [loading.at.point]
@@ -199,6 +204,18 @@ class Case(Section):
         if isinstance(loading, PathSection) and loading.sensitivities:
             raise ValueError("loading.sensitivities: not of a solid")
         return self
+
+    @property
+    def parts(self) -> dict[str, Part]:
+        """The registered parts that it has, by key."""
+        return {key: part for key in PARTS if (part := getattr(self, key)) is not None}
+
+    @property
+    def scales(self) -> Scales:
+        """What forces and stiffnesses are over; there is a modulus where something needs it."""
+        shell = self.shell
+        assert shell.modulus is not None
+        return Scales(shell.reference, shell.reference / shell.R_over_h, shell.modulus, shell.poisson_ratio)
 
     @property
     def degree(self) -> int:

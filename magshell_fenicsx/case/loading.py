@@ -5,8 +5,8 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from magshell_fenicsx.case.base import Section, or_number
 from magshell_fenicsx.case.fields import Direction
+from magshell_fenicsx.parts.section import Section, or_number
 
 Until = Annotated[
     Literal["limit", "bifurcation", "target", "points"],

@@ -25,12 +25,15 @@ class Observed:
         2 for a half model, whose integrals and forces are those of one half; else 1.
     normals
         n0 (3,) at the named points.
+    observed
+        Column -> the form that a term observes, see `OwnTerm.observed`; of the modelled part.
     """
 
     system: FiniteElementSystem
     material: Material
     multiplicity: int
     normals: Mapping[str, Array]
+    observed: Mapping[str, fem.Form]
 
     def observe(self, volume: fem.Form, points: Mapping[str, Array]) -> None:
         """Take the volume change's form (of the modelled part), and the named vertices' places (3,)."""
@@ -45,8 +48,7 @@ class Observed:
 
     def volume_change(self, u: Vector) -> float:
         """Delta V/R^3 of the whole shell."""
-        self.system.set(u)
-        return self.multiplicity * float(self.system.comm.allreduce(fem.assemble_scalar(self._volume)))
+        return self.multiplicity * self.system.integral(u, self._volume)
 
     def deflection(self, u: Vector, point: str) -> float:
         """w/R = -u . n0 at a named vertex."""

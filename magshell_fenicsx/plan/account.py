@@ -6,6 +6,7 @@ from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.solid import SolidSection
 from magshell_fenicsx.models.shell.parameters import Loads
 from magshell_fenicsx.models.solid.material import NeoHookean
+from magshell_fenicsx.parts.registered import PARTS
 
 
 def account(case: Case, loads: Loads, model: str, azimuth: float) -> tuple[list[str], list[str]]:
@@ -27,6 +28,11 @@ def account(case: Case, loads: Loads, model: str, azimuth: float) -> tuple[list[
         left_out.append("force: none")
     if loads.dead:
         included.append(f"{len(loads.dead)} dead load{'s' * (len(loads.dead) > 1)}")
+    for key, part in PARTS.items():
+        if key in case.parts:
+            included.append(case.parts[key].account(case.scales))
+        else:
+            left_out.append(part.absent)
     if model == "meridian":
         left_out.append("waves around the axis (they are looked for at each point)")
     if model.startswith("half"):

@@ -15,6 +15,7 @@ from magshell_fenicsx.case.loading import (
 )
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.mesh.frame import rotation
+from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.parameters import (
     AreaForce,
     DeadLoad,
@@ -30,7 +31,7 @@ from magshell_fenicsx.plan.outline import Outline
 Array = NDArray[np.float64]
 
 
-def loads(case: Case, under: str, turn: float, part: float) -> Loads:
+def loads(case: Case, under: str, turn: float, part: float, own: tuple[OwnTerm, ...]) -> Loads:
     """What loads the shell.
 
     Parameters
@@ -41,6 +42,8 @@ def loads(case: Case, under: str, turn: float, part: float) -> Loads:
         Azimuth of the model's frame (rad).
     part
         Of the shell that is modelled, 1/2 or 1: a concentrated load is shared by the halves.
+    own
+        See `surface_terms`.
     """
     loading, magnetic = case.loading, case.magnetic
     force = None
@@ -49,7 +52,7 @@ def loads(case: Case, under: str, turn: float, part: float) -> Loads:
     to = loading.to if isinstance(loading, RotationSection) else None
     field = magnetisation(magnetic, case, turn, to) if magnetic and case.lambda_m else None
     dead = tuple(_dead(load, case, turn, part) for load in loading.loads) if isinstance(loading, DeadSection) else ()
-    return Loads(isinstance(loading, PressureSection), force, field, dead)
+    return Loads(isinstance(loading, PressureSection), force, field, dead, own)
 
 
 def indented(case: Case, outline: Outline) -> Array | None:
@@ -97,9 +100,8 @@ def refuse_wide_patch(case: Case, outline: Outline, at: Array) -> None:
 
 
 def _dead(load: DeadLoadSection, case: Case, turn: float, part: float) -> DeadLoad:
-    shell, Q = case.shell, rotation(turn)
-    E, t, R = shell.modulus, shell.reference / shell.R_over_h, shell.reference
-    assert E is not None
+    Q, scales = rotation(turn), case.scales
+    E, t, R = scales.E, scales.h, scales.R
     force = np.asarray(part * (Q @ (load.force or np.zeros(3))) / (E * t * R))
     if load.at is not None:
         return PointForce(load.at, force)

@@ -11,6 +11,7 @@ from magshell_fenicsx.mesh.msh import MeshFile, read_msh
 from magshell_fenicsx.mesh.patch import Embedding, PatchMesh
 from magshell_fenicsx.mesh.shapes import Shape
 from magshell_fenicsx.mesh.triangulation import triangulate
+from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.parameters import Condition, Loads, Material
 from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.plan.names import refuse_unfit
@@ -35,6 +36,8 @@ class Plan:
         What multiplies the thickness; None for 1.
     length
         R in the unit that results are told in.
+    own
+        One's own energies; `loads` has them too, after those of the case's parts.
     """
 
     material: Material
@@ -51,6 +54,7 @@ class Plan:
     left_out: list[str]
     thickness: Thickness | None = None
     length: float = 1.0
+    own: tuple[OwnTerm, ...] = ()
 
     @property
     def fixed(self) -> bool:

@@ -1,5 +1,6 @@
 """From a case to what must be built for it, without building anything: the parts added up."""
 
+from collections.abc import Sequence
 from math import radians
 
 import numpy as np
@@ -16,6 +17,7 @@ from magshell_fenicsx.mesh.grid import Grid
 from magshell_fenicsx.mesh.shapes import DiscShape, StripShape
 from magshell_fenicsx.mesh.sphere import Dimple
 from magshell_fenicsx.models.axisymmetric.meridian import graded_vertices
+from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.parameters import Condition, Held, Material
 from magshell_fenicsx.models.shell.supports import refuse_unknown
 from magshell_fenicsx.models.shell.thickness import Thickness
@@ -23,16 +25,17 @@ from magshell_fenicsx.plan.account import account
 from magshell_fenicsx.plan.limits import refuse_too_large, refuse_too_many, refuse_unbounded_fields, sample
 from magshell_fenicsx.plan.loads import indented, loads, refuse_wide_patch
 from magshell_fenicsx.plan.outline import Chart, Outline, outline, refuse_beside
+from magshell_fenicsx.plan.own_terms import surface_terms
 from magshell_fenicsx.plan.plan import Plan
 from magshell_fenicsx.plan.sizes import grading
-from magshell_fenicsx.plan.symmetry import Leaves, askew, left, mirror
+from magshell_fenicsx.plan.symmetry import Leaves, askew, left, mirror, unmirrored
 
 Array = NDArray[np.float64]
 Points = dict[str, Array]
 
 
-def make_plan(case: Case) -> Plan:
-    """Plan a case.
+def make_plan(case: Case, terms: Sequence[OwnTerm] = ()) -> Plan:
+    """Plan a case, with one's own energies.
 
     Raises
     ------
@@ -45,7 +48,8 @@ def make_plan(case: Case) -> Plan:
     defect = Dimple(case.defect.amplitude * material.h, case.dimple_half_width) if case.defect else None
     drawn = outline(case, defect)
     place = indented(case, drawn)
-    axisymmetric, azimuth = _symmetry(case, drawn, left(case, drawn, place))
+    energies = surface_terms(case, terms)
+    axisymmetric, azimuth = _symmetry(case, drawn, left(case, drawn, place, energies))
     half = azimuth is not None
     turn = (azimuth or 0.0) if drawn.round else 0.0  # a strip lies along e1 whichever way the field points
     points = _points(case, drawn, place, turn, half)
@@ -61,7 +65,7 @@ def make_plan(case: Case) -> Plan:
     conditions = edge_conditions(case.boundary)
     if half:
         conditions["symmetry"] = "symmetry"
-    loaded = loads(case, under, turn, 0.5 if half else 1.0)
+    loaded = loads(case, under, turn, 0.5 if half else 1.0, energies)
     if axisymmetric and isinstance(shape, DiscShape):  # which is not triangulated, where this is seen
         refuse_unknown([shape.edge], points, [], conditions, loaded)
     model = "meridian" if axisymmetric else f"{'half' if half else 'full'} {case.model}"
@@ -77,10 +81,11 @@ def make_plan(case: Case) -> Plan:
         embedding=drawn.embedding,
         points=points,
         size=size,
-        included=included,
+        included=[*included, *(f"own energy: {term.name}" for term in terms)],
         left_out=left_out,
         thickness=_thickness(case),
         length=case.shell.reference,
+        own=tuple(terms),
     )
 
 
@@ -109,6 +114,8 @@ def _symmetry(case: Case, drawn: Outline, parts: list[Leaves]) -> tuple[bool, fl
     """Whether to model the meridian, and else the azimuth of the mirror plane of a half, None for a full model."""
     reason, azimuth = askew(parts), mirror(parts)
     if case.symmetry == "half" and azimuth is None:
+        if name := unmirrored(parts):
+            raise CaseError(f"symmetry: half: the energy {name} does not share it")
         if not drawn.round and case.shell.geometry != "strip":
             raise CaseError(
                 f"symmetry: half: not with a {case.shell.geometry}; describe a part of it and give its edges "

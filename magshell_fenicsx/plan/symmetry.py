@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.case.boundary import HeldSection
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.loading import DeadSection, IndentationSection, RotationSection
+from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.plan.outline import Outline
 
 Array = NDArray[np.float64]
@@ -41,14 +42,17 @@ class Leaves:
         Vectors and places (3,) that a mirror plane through e3 must hold.
     mirrors
         Whether the plane through e3 at an azimuth (rad) is left, apart from `vectors`.
+    energy
+        The name of the energy that it is of, if any.
     """
 
     askew: str | None = None
     vectors: Vectors = ()
     mirrors: Callable[[float], bool] = _every
+    energy: str = ""
 
 
-def left(case: Case, outline: Outline, indented: Array | None) -> list[Leaves]:
+def left(case: Case, outline: Outline, indented: Array | None, terms: Sequence[OwnTerm]) -> list[Leaves]:
     """What each part of a case leaves; `indented` is the place (3,) of an indentation, over R."""
     return [
         _shape(case, outline),
@@ -56,6 +60,7 @@ def left(case: Case, outline: Outline, indented: Array | None) -> list[Leaves]:
         *(_field(case) if case.magnetic and case.lambda_m else []),
         *_load(case, indented),
         *(_named(case) if case.points else []),
+        *(_energy(term, outline) for term in terms),
     ]
 
 
@@ -82,6 +87,22 @@ def mirror(parts: Sequence[Leaves]) -> float | None:
 def askew(parts: Sequence[Leaves]) -> str | None:
     """What keeps a case from being a meridian turned about e3; None if nothing does."""
     return next((part.askew for part in parts if part.askew), None)
+
+
+def unmirrored(parts: Sequence[Leaves]) -> str | None:
+    """The name of an energy that keeps a case from being a half; None if there is none."""
+    azimuth = common_azimuth([v for part in parts for v in part.vectors])
+    return next((part.energy for part in parts if part.energy and not part.mirrors(azimuth or 0.0)), None)
+
+
+def _energy(term: OwnTerm, outline: Outline) -> Leaves:
+    """The frame of a half is turned to its plane, that of a strip excepted: a term that does not turn stays behind."""
+
+    def mirrors(azimuth: float) -> bool:
+        return term.mirrors and (not outline.round or azimuth == 0 or term.turns)
+
+    shared = term.mirrors and term.turns
+    return Leaves(None if shared else f"the energy {term.name} does not share it", (), mirrors, term.name)
 
 
 def _shape(case: Case, outline: Outline) -> Leaves:

@@ -1,6 +1,7 @@
 """Every amplitude and every column of path.csv, in the order of the file."""
 
 import re
+from collections.abc import Iterable
 from dataclasses import replace
 
 from magshell_fenicsx.quantities.quantity import Amplitude, Kind, Quantity
@@ -92,6 +93,11 @@ AMPLITUDES = {
 # names of terms, and of amplitudes that only the solvers see
 INTERNAL = ("turn", "push", "lambda_across", "membrane", "couple")
 TAKEN = frozenset((*QUANTITIES, *AMPLITUDES, *INTERNAL))
+
+
+def register(quantities: Iterable[Quantity]) -> None:
+    """Add the columns of a part."""
+    QUANTITIES.update({q.name: q for q in quantities})
 
 
 def quantity(name: str) -> Quantity:

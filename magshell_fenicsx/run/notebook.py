@@ -72,7 +72,7 @@ def curve(scene: Scene, records: Sequence[Record], amplitude: str | None = None)
 
 def _caption(scene: Scene, row: Row) -> str:
     material = scene.plan.material
-    return caption(material.h, material.nu, row, [term.name for term in scene.plan.loads.own])
+    return caption(material.h, material.nu, row, [term.name for term in scene.plan.own])
 
 
 def _in_line(figure: "Figure") -> "Figure":

@@ -27,9 +27,8 @@ from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.supports import refuse_loose
 from magshell_fenicsx.models.solid.model import SolidModel
 from magshell_fenicsx.plan.account import neo_hookean
-from magshell_fenicsx.plan.own_terms import plan_with
 from magshell_fenicsx.plan.plan import Plan
-from magshell_fenicsx.plan.planner import meridian_vertices
+from magshell_fenicsx.plan.planner import make_plan, meridian_vertices
 from magshell_fenicsx.platform.first import from_first
 
 
@@ -39,10 +38,10 @@ class Scene:
     Parameters
     ----------
     plan
-        What to make of the case; by default `plan_with` says.
+        What to make of the case; by default `make_plan` says.
     terms
-        One's own energies, which a given plan has already (`Loads.own`). Their amplitudes are zero until a
-        state says otherwise, see `trace`.
+        One's own energies, which a given plan has already. Their amplitudes are `OwnTerm.value` until a state says
+        otherwise, see `trace`.
 
     Attributes
     ----------
@@ -66,7 +65,7 @@ class Scene:
         terms: Sequence[OwnTerm] = (),
     ) -> None:
         start = time.perf_counter()
-        self.case, self.plan, self.comm = case, plan or plan_with(case, terms), comm
+        self.case, self.plan, self.comm = case, plan or make_plan(case, terms), comm
         self.model: ShellModel | MeridianModel | SolidModel
         if self.plan.axisymmetric:
             self.model = build_meridian_model(case, self.plan)
@@ -92,9 +91,10 @@ class Scene:
         return Watch(self.model.excluded_modes)
 
     def unloaded(self) -> State:
-        """The undeformed shell with all amplitudes zero."""
+        """The undeformed shell: all amplitudes are zero but those that terms have a value for."""
         amplitudes = {t.amplitude for t in self.model.system.terms if t.amplitude}
-        return State(self.model.zero(), dict.fromkeys(sorted(amplitudes), 0.0))
+        given = {term.name: term.value for term in self.plan.loads.own}
+        return State(self.model.zero(), {name: given.get(name, 0.0) for name in sorted(amplitudes)})
 
     def observe(self, state: State) -> dict[str, float]:
         """The physical columns of a table row: loads, displacements over h, volume, energies over E h R^2."""
@@ -124,13 +124,21 @@ class Scene:
             **{name: energies[name] for name in ("U1", "Uq", "Utau")},
             **self._observe_points(state),
             **{term.name: state.mu[term.name] for term in self.plan.loads.own},
+            **{
+                column: state.mu[term.name]
+                * model.multiplicity
+                * model.system.integral(state.u, model.observed[column])
+                for term in self.plan.loads.own
+                for column in term.observed
+            },
         }
 
     @property
     def extra_columns(self) -> tuple[str, ...]:
         """What `observe` tells besides the columns of every run."""
         named = tuple(f"{point}_u{axis}" for point in self.case.points for axis in "xyz")
-        own = (term.name for term in self.plan.loads.own)
+        terms = self.plan.loads.own
+        own = (*(term.name for term in terms), *(column for term in terms for column in term.observed))
         return (*(["load_factor"] if self.plan.loads.dead else []), *named, *own)
 
     def _observe_points(self, state: State) -> dict[str, float]:

@@ -68,7 +68,7 @@ def _to_defect(scene: Scene, fold: Fold) -> float:
     """By central differences of the residual: the mesh does not depend on delta, only r0 on it does."""
 
     def out_of_balance(change: float) -> float:
-        other = Scene(deepened(scene.case, change), scene.comm, terms=scene.plan.loads.own)
+        other = Scene(deepened(scene.case, change), scene.comm, terms=scene.plan.own)
         assert same_mesh(scene, other)
         u, phi = (transfer(scene, other, v) for v in (fold.state.u, fold.phi))
         moved = replace(fold, state=State(u, fold.state.mu), phi=phi)

@@ -109,9 +109,19 @@ class EnergyFactory:
         return Energy("pressure", lambda u: unit * self.volume_change(u), "pressure")
 
     def own(self, term: OwnTerm) -> Energy:
-        """One's own energy, with the amplitude of its name; it shares the symmetry."""
+        """The energy of a part or one's own, with the amplitude of its name; it shares the symmetry."""
+        return self._cells(term.name, self._surface(term, term.density), term.name, linear=term.linear)
+
+    def observed(self, term: OwnTerm, u: Jet) -> dict[str, ufl.Form]:
+        """What it observes, of the whole shell."""
+        return {
+            column: 2 * np.pi * self._cells(column, self._surface(term, of)).of(u)
+            for column, of in term.observed.items()
+        }
+
+    def _surface(self, term: OwnTerm, of: Callable[..., Expr]) -> Callable[[Jet], Expr]:
         j0, parameters = self._j0, [self._constant(np.asarray(p, dtype=float)) for p in term.parameters]
-        return self._cells(term.name, lambda u: term.density(j0, u, *parameters), term.name, linear=term.linear)
+        return lambda u: of(j0, u, *parameters)
 
     def volume_change(self, u: Jet) -> ufl.Form:
         """Delta V/R^3 per radian."""

@@ -79,6 +79,8 @@ class MeridianModel:
         if loads.pressure:
             self.energies.append(factory.pressure())
         self.energies += [factory.own(term) for term in loads.own]
+        u = jets.revolved(self.u)
+        self.observed = self.kernels.compile_all(factory.observed(term, u) for term in loads.own)
         forms = {e.name: self._term(e) for e in self.energies}
         terms: list[Term] = list(forms.values())
         axis = fem.locate_dofs_topological(V, 0, meridian.axis)
@@ -103,8 +105,7 @@ class MeridianModel:
 
     def volume_change(self, u: Vector) -> float:
         """Delta V/R^3 of the whole shell."""
-        self.system.set(u)
-        return float(fem.assemble_scalar(self._volume))
+        return self.system.integral(u, self._volume)
 
     def deflection(self, u: Vector, point: str) -> float:
         """w/R = -W at the pole, where all named points are."""

@@ -145,6 +145,7 @@ class ShellModel(Observed):
         if loads.pressure:
             terms.append(factory.pressure())
         terms += [factory.own(term) for term in loads.own]
+        self.observed = self.kernels.compile_all(factory.observed(term) for term in loads.own)
         self.normals = {name: vertex_normal(self.r0, x) for name, x in midsurface.points.items()}
         if loads.force:
             terms.append(self._force(loads.force))

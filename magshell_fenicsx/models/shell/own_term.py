@@ -1,7 +1,7 @@
-"""One's own energy as a term of the shell, from nothing but its density."""
+"""An energy of the mid-surface, a part's or one's own, from nothing but its density."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import basix.ufl
@@ -16,8 +16,7 @@ from ufl.core.expr import Expr
 from ufl.corealg.traversal import traverse_unique_terminals
 from ufl.geometry import GeometricQuantity
 
-from magshell_fenicsx.models.shell.energy import CURVED, FIRST, SECOND
-from magshell_fenicsx.models.shell.kinematics import Jet
+from magshell_fenicsx.models.shell.kinematics import CURVED, FIRST, SECOND, Jet
 
 Array = NDArray[np.float64]
 SAMPLES = 24  # random surfaces on which a symmetry is looked for
@@ -42,6 +41,10 @@ class OwnTerm:
         the first derivatives of u; an energy of its second derivatives would miss the rotations between cells.
     parameters
         Numbers and vectors; other values of them need no new kernel.
+    value
+        mu of the undeformed shell, which a path keeps unless it varies mu.
+    observed
+        Column -> density as above; mu times its integral is observed along a path.
 
     Raises
     ------
@@ -52,6 +55,8 @@ class OwnTerm:
     name: str
     density: Callable[..., Expr]
     parameters: tuple[float | Array, ...] = ()
+    value: float = 0.0
+    observed: Mapping[str, Callable[..., Expr]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if not self.name.isidentifier():

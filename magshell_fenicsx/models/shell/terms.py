@@ -14,9 +14,6 @@ from magshell_fenicsx.models.shell import densities, edges
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.antisymmetric import antisymmetric_edge
 from magshell_fenicsx.models.shell.energy import (
-    CURVED,
-    MOVED,
-    SECOND,
     Density,
     HessianTerm,
     Parameter,
@@ -25,7 +22,7 @@ from magshell_fenicsx.models.shell.energy import (
     edge_quadrature,
     per_area,
 )
-from magshell_fenicsx.models.shell.kinematics import Jet
+from magshell_fenicsx.models.shell.kinematics import CURVED, MOVED, SECOND, Jet
 from magshell_fenicsx.models.shell.moment import MomentTerm
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.parameters import MIRROR_NORMAL, MagneticEnergy, Magnetisation, Material
@@ -140,11 +137,19 @@ class TermFactory:
         return self._cells("pressure", Density(densities.pressure, (unit,), parts=MOVED), "pressure")
 
     def own(self, term: OwnTerm) -> ShellTerm:
-        """One's own energy, with the amplitude of its name."""
-        parameters = tuple(self._constant(np.asarray(p, dtype=float)) for p in term.parameters)
+        """The energy of a part or one's own, with the amplitude of its name."""
         still = tuple(part for part in term.placed_parts if part not in term.parts)  # asked for of r0 alone
+        parameters = self._parameters(term)
         density = Density(per_area(term.density), parameters, parts=(*term.parts, *still), linear=still)
         return self._cells(term.name, density, term.name, linear=term.linear)
+
+    def observed(self, term: OwnTerm) -> dict[str, ufl.Form]:
+        """What it observes."""
+        arguments = (*self._jets(), *self._parameters(term))
+        return {column: per_area(of)(*arguments) * self._dx() for column, of in term.observed.items()}
+
+    def _parameters(self, term: OwnTerm) -> tuple[fem.Constant, ...]:
+        return tuple(self._constant(np.asarray(p, dtype=float)) for p in term.parameters)
 
     def volume_change(self) -> ufl.Form:
         """Delta V/R^3 of the modelled part."""

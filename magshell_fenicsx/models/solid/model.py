@@ -71,6 +71,8 @@ class SolidModel(Observed):
             self._terms += factory.magnetic(loads.magnetic)
         if loads.pressure:
             self._terms.append(factory.pressure(material.classical_pressure))
+        self._terms += [factory.own(term) for term in loads.own]
+        self.observed = self.kernels.compile_all(factory.observed(term) for term in loads.own)
         if loads.force:
             self._terms.append(self._force(loads.force))
         self._held = _held(V, [body.faces[n] for n, c in conditions.items() if c == "clamped"], range(3))

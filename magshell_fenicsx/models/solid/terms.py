@@ -12,6 +12,9 @@ from ufl.core.expr import Expr
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.terms import DensityTerm
 from magshell_fenicsx.mesh.hexahedra import OUTER, Body
+from magshell_fenicsx.models.shell.energy import per_area
+from magshell_fenicsx.models.shell.kinematics import SECOND, Jet
+from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.parameters import Magnetisation
 from magshell_fenicsx.models.solid import densities
 from magshell_fenicsx.models.solid.material import NeoHookean
@@ -88,6 +91,26 @@ class TermFactory:
         """Amplitude p/p_c, `classical` being p_c/E; on the outer face."""
         density = Density(densities.pressure, self._constants(classical / self.h), ON_FACE, on_face=True)
         return SolidTerm("pressure", density, self._on_face(density), self.u, self.log, "pressure")
+
+    def own(self, term: OwnTerm) -> SolidTerm:
+        """The energy of a part or one's own on the outer face, with the amplitude of its name."""
+        density = self._surface(term, term.density)
+        energy = self._on_face(density)
+        return SolidTerm(term.name, density, energy, self.u, self.log, term.name, linear=term.linear)
+
+    def observed(self, term: OwnTerm) -> dict[str, ufl.Form]:
+        """What it observes on the outer face."""
+        return {column: self._on_face(self._surface(term, of)) for column, of in term.observed.items()}
+
+    def _surface(self, term: OwnTerm, of: Callable[..., Expr]) -> Density:
+        """Of the mid-surface's density the same on the outer face, per area of the reference cell."""
+        flat = [ufl.zero(3)] * len(SECOND)
+
+        def on_face(X: Expr, X1: Expr, X2: Expr, u: Expr, u1: Expr, u2: Expr, *parameters: Expr) -> Expr:
+            return per_area(of)(Jet(X, X1, X2, *flat), Jet(u, u1, u2, *flat), *parameters)
+
+        parameters = self._constants(*(np.asarray(p, dtype=float) for p in term.parameters))
+        return Density(on_face, parameters, ON_FACE, on_face=True)
 
     def volume_change(self) -> ufl.Form:
         """Delta V/R^3 under the outer face of the modelled part."""

@@ -17,7 +17,6 @@ from magshell_fenicsx.models.shell import densities
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.shell.parameters import AreaForce, Loads, Material
-from magshell_fenicsx.plan.own_terms import plan_with
 from magshell_fenicsx.plan.planner import make_plan
 
 E1, E2, E3 = np.eye(3)
@@ -139,11 +138,17 @@ def test_load_is_the_derivative_of_the_potential(name: str) -> None:
     assert slope == pytest.approx(dot(system.comm, system.load(model_u, "own"), v), rel=1e-6)
 
 
-@pytest.mark.parametrize("symmetry", ["axisymmetric", "half", "none"])
-def test_the_shells_own_pressure_as_ones_own(symmetry: str) -> None:
+@pytest.mark.parametrize(
+    ("file", "symmetry", "size"),
+    [
+        *(("dimple_buckling.yaml", each, 1e-2) for each in ("axisymmetric", "half", "none")),
+        ("solid_buckling.yaml", "half", 1e-4),
+    ],
+)
+def test_the_shells_own_pressure_as_ones_own(file: str, symmetry: str, size: float) -> None:
     """The same density by both ways: potentials, load columns and residuals agree."""
     settings = ["mesh.degree=2", "mesh.refinement=0.5", f"symmetry={symmetry}"]
-    case = Case.load(CASES / "dimple_buckling.yaml", settings)
+    case = Case.load(CASES / file, settings)
     unit = Material(case.shell.poisson_ratio, 1 / case.shell.R_over_h).classical_pressure * case.shell.R_over_h
 
     def pressure(r0: Jet, u: Jet, unit: Expr) -> Expr:
@@ -151,7 +156,7 @@ def test_the_shells_own_pressure_as_ones_own(symmetry: str) -> None:
 
     scene = Scene(case, terms=[OwnTerm("own", pressure, (unit,))])
     system = scene.model.system
-    u = system.held(1e-2 * np.random.default_rng(0).standard_normal(system.size))
+    u = system.held(size * np.random.default_rng(0).standard_normal(system.size))
     assert system.potential(u, "own") == pytest.approx(system.potential(u, "pressure"), rel=1e-11)
     ours, theirs = system.load(u, "own"), system.load(u, "pressure")
     assert np.abs(ours - theirs).max() < 1e-11 * np.abs(theirs).max()
@@ -197,7 +202,7 @@ def test_weight_is_a_dead_load_on_any_surface() -> None:
 def test_smallest_model_that_shares_the_symmetry(name: str, built: str) -> None:
     of, parameters, *_ = DENSITIES[name]
     case = Case.load(CASES / "dimple_buckling.yaml")
-    plan = plan_with(case, [OwnTerm("own", of, parameters)])
+    plan = make_plan(case, [OwnTerm("own", of, parameters)])
     assert plan.included[0] == built
     assert plan.included[-1] == "own energy: own"
 
@@ -206,8 +211,8 @@ def test_half_model_of_another_plane_needs_a_term_that_turns() -> None:
     """The half shell's frame is turned to its mirror plane; a direction would have to turn with it."""
     settings = ["magnetic={lambda_m: 1e-3, remanent: {polar: 30, azimuth: 20}, applied: {polar: 60, azimuth: 20}}"]
     case = Case.load(CASES / "dimple_buckling.yaml", settings)
-    assert plan_with(case, [OwnTerm("own", winkler)]).half
-    assert not plan_with(case, [OwnTerm("own", weight, (E1,))]).half
+    assert make_plan(case, [OwnTerm("own", winkler)]).half
+    assert not make_plan(case, [OwnTerm("own", weight, (E1,))]).half
 
 
 @pytest.mark.parametrize(
@@ -215,7 +220,6 @@ def test_half_model_of_another_plane_needs_a_term_that_turns() -> None:
     [
         (["symmetry=axisymmetric"], ["own"], "symmetry: axisymmetric: the energy own"),
         (["symmetry=half"], ["own"], "symmetry: half: the energy own"),
-        (["model=solid"], ["own"], "mid-surface"),
         ([], ["pressure"], "terms: pressure"),
         ([], ["w_over_h"], "terms: w_over_h"),
         ([], ["own", "own"], "terms: own"),
@@ -224,7 +228,14 @@ def test_half_model_of_another_plane_needs_a_term_that_turns() -> None:
 def test_what_the_plan_refuses(settings: list[str], names: list[str], said: str) -> None:
     case = Case.load(CASES / "dimple_buckling.yaml", settings)
     with pytest.raises(CaseError, match=said):
-        plan_with(case, [OwnTerm(name, weight, (E2,)) for name in names])
+        make_plan(case, [OwnTerm(name, weight, (E2,)) for name in names])
+
+
+def test_a_solid_has_no_curvature() -> None:
+    case = Case.load(CASES / "solid_buckling.yaml")
+    curved = OwnTerm("own", lambda r0, u: r0.r11[0] * u.r[2])
+    with pytest.raises(CaseError, match=r"own depends on r0\.r11, which only"):
+        make_plan(case, [curved])
 
 
 def test_parameters_need_no_new_kernel() -> None:
