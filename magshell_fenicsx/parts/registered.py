@@ -11,6 +11,7 @@ from magshell_fenicsx.parts.section import Section
 
 REGISTERED: dict[str, str] = {
     # key of the case file, and name of the file here -> the class in it
+    "foundation": "Foundation",
 }
 PARTS: dict[str, type[Part]] = {
     key: getattr(import_module(f"{__package__}.{key}"), name) for key, name in REGISTERED.items()
