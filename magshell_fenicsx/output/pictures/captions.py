@@ -23,8 +23,8 @@ def caption(h: float, nu: float, row: Row, own: Sequence[str] = ()) -> str:
     Examples
     --------
     >>> row = {"lambda_m": 0.0, "field_angle": 0.0, "p_over_pc": 0.25, "amplitude": "pressure"}
-    >>> caption(0.01, 0.5, row | {"foundation": 0.02}, own=["foundation"])
-    '$R/h$ = 100, $\\\\nu$ = 0.5, $p/p_\\\\mathrm{c}$ = 0.25, foundation = 0.02'
+    >>> caption(0.01, 0.5, row | {"my_springs": 0.02}, own=["my_springs"])
+    '$R/h$ = 100, $\\\\nu$ = 0.5, $p/p_\\\\mathrm{c}$ = 0.25, my springs = 0.02'
     """
     said = [shell_caption(h, nu, row)]
     if row["field_angle"]:
