@@ -27,6 +27,7 @@ from magshell_fenicsx.mesh.patch import Embedding
 from magshell_fenicsx.mesh.revolved import Arc, Capped, Profile, Revolved, Segment, Spline
 from magshell_fenicsx.mesh.shapes import DiscShape, Shape, StripShape
 from magshell_fenicsx.mesh.sphere import Dimple, SphereEmbedding, flat
+from magshell_fenicsx.plan.plan import Span
 
 Array = NDArray[np.float64]
 Chart = Shape | Grid | MeshFile
@@ -55,6 +56,8 @@ class Outline:
         Whether it is closed around e3.
     ends
         First chart coordinates between which the half of a ring lies; None where the second coordinate is y.
+    span
+        The meridian; None if it is closed, or the surface is none of revolution.
     """
 
     chart: Callable[[bool, float], Chart]
@@ -65,6 +68,7 @@ class Outline:
     sphere: bool = False
     round: bool = False
     ends: tuple[float, float] | None = None
+    span: Span | None = None
 
     def on_half(self, chart: Array) -> Array:
         """A place of the chart on the half y >= 0, from which rounding may have moved it."""
@@ -143,7 +147,8 @@ def _disc(
         beyond = np.hypot(*found) / edge
         return np.asarray(found / max(beyond, 1.0))
 
-    return Outline(chart, embedding, within, np.zeros(2), edge, sphere, round=True)
+    span = Span(edge, circle, (None, name), embedding)
+    return Outline(chart, embedding, within, np.zeros(2), edge, sphere, round=True, span=span)
 
 
 def _ring(shell: Surface, profile: Profile, names: tuple[str, str]) -> Outline:
@@ -164,9 +169,13 @@ def _ring(shell: Surface, profile: Profile, names: tuple[str, str]) -> Outline:
     def inverse(x: Array) -> Array:
         return np.clip(embedding.inverse(x, first), low, high)
 
-    return Outline(
-        chart, embedding, inverse, np.array(low if any(glued) else high), round=glued[0], ends=(0.0, pi * rho)
-    )
+    def section(chart: Array) -> Array:
+        r, z = profile(profile.length - chart[:, 0]).T  # from its end: the normal points outwards
+        return np.column_stack([r, 0 * r, z])
+
+    span = None if glued[1] or not glued[0] else Span(profile.length, None, (names[1], names[0]), section)
+    seen = np.array(low if any(glued) else high)
+    return Outline(chart, embedding, inverse, seen, round=glued[0], ends=(0.0, pi * rho), span=span)
 
 
 def _profile(shell: Surface) -> tuple[Profile, tuple[str, str | None]]:

@@ -17,13 +17,35 @@ from magshell_fenicsx.plan.names import refuse_unfit
 
 
 @dataclass(frozen=True)
+class Span:
+    """A meridian, walked from the pole or one edge to the other.
+
+    Attributes
+    ----------
+    length
+        Of its chart, which starts at 0.
+    circle
+        Where the curvature jumps; None if nowhere.
+    names
+        Of its ends; None for the pole.
+    embedding
+        Chart (n, 2), its second coordinate 0 -> the plane of e1 and e3.
+    """
+
+    length: float
+    circle: float | None
+    names: tuple[str | None, str]
+    embedding: Embedding
+
+
+@dataclass(frozen=True)
 class Plan:
     """Everything that a scene is built from, dimensionless (lengths in R).
 
     Attributes
     ----------
-    axisymmetric
-        Model the meridian.
+    meridian
+        What is modelled instead of the surface; None if that is modelled.
     half
         Model the half y >= 0 of a frame turned about e3 by `azimuth` (rad).
     shape, size, points, embedding
@@ -40,7 +62,7 @@ class Plan:
     material: Material
     loads: Loads
     conditions: dict[str, Condition]
-    axisymmetric: bool
+    meridian: Span | None
     half: bool
     azimuth: float
     shape: Shape | Grid | MeshFile
@@ -51,6 +73,11 @@ class Plan:
     left_out: list[str]
     thickness: Thickness | None = None
     length: float = 1.0
+
+    @property
+    def axisymmetric(self) -> bool:
+        """Whether the meridian is modelled."""
+        return self.meridian is not None
 
     @property
     def fixed(self) -> bool:

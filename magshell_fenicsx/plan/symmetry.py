@@ -89,7 +89,7 @@ def _shape(case: Case, outline: Outline) -> Leaves:
     if outline.round and case.thickness_factor is not None:
         return Leaves("only the user knows whether the formula of the thickness is", mirrors=_none)
     if outline.round:
-        return Leaves(None if outline.disc else "a meridian ends at a pole")
+        return Leaves(None if outline.span else "the section of the tube is closed")
     if geometry == "strip":
         return Leaves("a strip is no surface of revolution", mirrors=_along_x)
     return Leaves(f"not with a {geometry} that is not closed around e3", mirrors=_none)

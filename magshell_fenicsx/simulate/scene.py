@@ -19,7 +19,6 @@ from magshell_fenicsx.mesh.frame import rotation
 from magshell_fenicsx.mesh.hexahedra import sweep
 from magshell_fenicsx.mesh.midsurface import Midsurface, distribute
 from magshell_fenicsx.mesh.patch import MeshError
-from magshell_fenicsx.mesh.shapes import DiscShape
 from magshell_fenicsx.models.axisymmetric.meridian import make_meridian
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.shell.model import ShellModel
@@ -152,12 +151,12 @@ def build_model(case: Case, plan: Plan, comm: MPI.Comm) -> ShellModel:
 
 def build_meridian_model(case: Case, plan: Plan) -> MeridianModel:
     """The meridian, whole on every rank."""
-    meridian = make_meridian(plan.embedding, meridian_vertices(plan, case.mesh.refinement))
-    assert isinstance(plan.shape, DiscShape)
+    span = plan.meridian
+    assert span
+    meridian = make_meridian(span.embedding, meridian_vertices(plan, case.mesh.refinement), span.names)
     if not plan.fixed and "simply supported" not in plan.conditions.values():
         raise MeshError("boundary: the shell is not held: it is free to move along (0, 0, 1)")
-    condition = plan.conditions.get(plan.shape.edge, "free")
-    return MeridianModel(meridian, plan.material, case.mesh.degree, condition, plan.loads, case.mesh.penalty)
+    return MeridianModel(meridian, plan.material, case.mesh.degree, plan.conditions, plan.loads, case.mesh.penalty)
 
 
 def build_solid_model(case: Case, plan: Plan, comm: MPI.Comm) -> SolidModel:

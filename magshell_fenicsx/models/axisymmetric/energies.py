@@ -70,11 +70,10 @@ class EnergyFactory:
 
         return Energy(INTERIOR, energy)
 
-    def clamped_edges(self) -> Energy:
-        """The outer normal is held at n0."""
+    def clamped_edges(self, facets: NDArray[np.int32]) -> Energy:
+        """The normal is held at n0 at some ends."""
         j0, nu, h, sigma = self._j0, *self._nu_h(), self._constant(self.sigma)
-        rim = self.meridian.rim
-        tags = mesh.meshtags(self.meridian.mesh, 0, rim, np.ones_like(rim))
+        tags = mesh.meshtags(self.meridian.mesh, 0, facets, np.ones_like(facets))
         ds = ufl.Measure("ds", domain=self.meridian.mesh, subdomain_data=tags)(1)
         nu1 = self._conormal(j0)
 

@@ -1,6 +1,6 @@
 """The meridian of a surface of revolution: an interval mesh and, apart from it, the placement r0."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from math import sqrt
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.mesh.patch import Embedding
 
 Array = NDArray[np.float64]
+Names = tuple[str | None, str]
 
 
 @dataclass(frozen=True)
@@ -24,15 +25,17 @@ class Meridian:
     ----------
     mesh
         Interval mesh over the parameter s, the distance from the origin of the chart.
-    axis, rim
-        Facets (local numbers) of the point on the axis and of the outer end.
+    axis
+        Facets (local numbers) of the point on the axis, none where the surface has a hole there.
+    ends
+        Name -> facets of the ends that are edges of the surface.
     embedding
         Chart (n, 2) -> surface (n, 3), of revolution about e3.
     """
 
     mesh: mesh.Mesh
     axis: NDArray[np.int32]
-    rim: NDArray[np.int32]
+    ends: Mapping[str, NDArray[np.int32]]
     embedding: Embedding
 
     def placement(self, V: fem.FunctionSpace) -> fem.Function:
@@ -43,8 +46,8 @@ class Meridian:
         return r0
 
 
-def make_meridian(embedding: Embedding, vertices: Array) -> Meridian:
-    """Mesh the meridian; `vertices` (n,) ascend from 0 on the axis."""
+def make_meridian(embedding: Embedding, vertices: Array, names: Names = (None, "rim")) -> Meridian:
+    """Mesh the meridian; `vertices` (n,) ascend from 0, `names` are those of its ends, None for the axis."""
     numbers = np.arange(len(vertices), dtype=np.int64)
     element = basix.ufl.element("Lagrange", "interval", 1, shape=(1,))
     domain = mesh.create_mesh(
@@ -53,15 +56,16 @@ def make_meridian(embedding: Embedding, vertices: Array) -> Meridian:
         x=vertices[:, None].astype(np.float64),
         e=element,
     )
-    axis, rim = (
+    facets = [
         mesh.locate_entities_boundary(domain, 0, lambda x, end=end: np.isclose(x[0], end))
         for end in (vertices[0], vertices[-1])
-    )
-    return Meridian(domain, axis, rim, embedding)
+    ]
+    axis = np.empty(0, np.int32) if names[0] else facets[0]
+    return Meridian(domain, axis, {name: end for name, end in zip(names, facets, strict=True) if name}, embedding)
 
 
-def graded_vertices(end: float, circle: float | None, h: float, *, refinement: float = 1.0) -> Array:
-    """Vertices for 1e-7 in k_d at degree 4: cells of a fraction of sqrt(h), finer on the axis.
+def graded_vertices(end: float, circle: float | None, h: float, *, refinement: float = 1.0, axis: bool = True) -> Array:
+    """Vertices for 1e-7 in k_d at degree 4: cells of a fraction of sqrt(h), finer on the axis, if 0 is there.
 
     Parameters
     ----------
@@ -80,7 +84,7 @@ def graded_vertices(end: float, circle: float | None, h: float, *, refinement: f
     largest, smallest, growth = 0.2 * sqrt(h) / refinement, h, 0.3 / refinement
 
     def size(s: Array) -> Array:
-        return np.minimum(smallest + growth * s, largest)
+        return np.minimum(smallest + growth * s, largest) if axis else np.full_like(s, largest)
 
     corners = [0.0, end] if circle is None or circle >= end else [0.0, circle, end]
     return _equidistributed(corners, size)

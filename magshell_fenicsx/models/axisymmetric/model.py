@@ -4,6 +4,7 @@ Lengths in R, energies in E h R^2, of the whole shell. Amplitudes as in `ShellMo
 "pressure" is p/p_c, "force" is F R/(2 pi D), "lambda_m" is lambda_m.
 """
 
+from collections.abc import Mapping
 from functools import cached_property
 
 import numpy as np
@@ -19,6 +20,7 @@ from magshell_fenicsx.models.axisymmetric import jets
 from magshell_fenicsx.models.axisymmetric.energies import INTERIOR, Energy, EnergyFactory
 from magshell_fenicsx.models.axisymmetric.instability import ExcludedWaves
 from magshell_fenicsx.models.axisymmetric.meridian import Meridian, held_at
+from magshell_fenicsx.models.axisymmetric.pattern import nodal_normals
 from magshell_fenicsx.models.axisymmetric.waves import Waves
 from magshell_fenicsx.models.shell.parameters import Condition, Force, Loads, Material, default_penalty
 from magshell_fenicsx.models.shell.point_load import Entries
@@ -33,8 +35,8 @@ class MeridianModel:
     ----------
     degree
         Of displacement and placement, 2 to 5.
-    condition
-        Of the outer edge.
+    conditions
+        Of the named ends; those that are not named are free.
     loads
         A force at the pole; an applied field along e3, its gradient diag(a, a, b), a remanence
         that is the same along every meridian and has no component across it.
@@ -60,20 +62,20 @@ class MeridianModel:
         meridian: Meridian,
         material: Material,
         degree: int,
-        condition: Condition,
+        conditions: Mapping[str, Condition],
         loads: Loads,
         sigma: float | None = None,
     ) -> None:
         self.meridian, self.material, self.degree, self.loads = meridian, material, degree, loads
-        self.condition = condition
+        self.conditions = conditions
         self.kernels = KernelLog()
         self.V = V = fem.functionspace(meridian.mesh, ("Lagrange", degree, (2,)))
         self.r0, self.u = meridian.placement(V), fem.Function(V, name="u")
         self.sigma = default_penalty(degree) if sigma is None else sigma
         factory = EnergyFactory(meridian, self.r0, material, self.sigma, degree)
         self.energies = [factory.membrane(), factory.bending(), factory.interior_edges()]
-        if condition == "clamped":
-            self.energies.append(factory.clamped_edges())
+        if len(clamped := self._ends("clamped")):
+            self.energies.append(factory.clamped_edges(clamped))
         if loads.magnetic:
             self.energies += factory.magnetic(loads.magnetic)
         if loads.pressure:
@@ -81,13 +83,13 @@ class MeridianModel:
         self.energies += [factory.own(term) for term in loads.own]
         forms = {e.name: self._term(e) for e in self.energies}
         terms: list[Term] = list(forms.values())
-        axis = fem.locate_dofs_topological(V, 0, meridian.axis)
-        self._pole = np.array([2 * axis[0] + 1], dtype=np.int32)
+        there = meridian.axis if len(meridian.axis) else list(meridian.ends.values())[-1]
+        self._seen = int(fem.locate_dofs_topological(V, 0, there)[0])
+        self._normal = nodal_normals(self.r0)[self._seen]
         if loads.force:
             terms.append(self._force(loads.force, factory))
-        held = [held_at(V, meridian.axis, 0)]
-        if condition != "free":
-            held += [held_at(V, meridian.rim, i) for i in range(2)]
+        fixed = self._ends("clamped", "simply supported")
+        held = [held_at(V, meridian.axis, 0), *(held_at(V, fixed, i) for i in range(2))]
         self.system = FiniteElementSystem(self.u, terms, held, forms[INTERIOR], material.h)
         volume = 2 * np.pi * factory.volume_change(jets.revolved(self.u))
         self._volume = self.kernels.compile("volume energy", volume)
@@ -95,7 +97,8 @@ class MeridianModel:
     @cached_property
     def excluded_modes(self) -> ExcludedWaves:
         """The waves around the axis, which an axisymmetric model does not see. Compiles kernels."""
-        return ExcludedWaves(Waves(self.system, self.energies, self.meridian, self.condition, self.kernels))
+        fixed = self._ends("clamped", "simply supported")
+        return ExcludedWaves(Waves(self.system, self.energies, self.meridian, fixed, self.kernels))
 
     def zero(self) -> Vector:
         """The undeformed displacement."""
@@ -107,12 +110,18 @@ class MeridianModel:
         return float(fem.assemble_scalar(self._volume))
 
     def deflection(self, u: Vector, point: str) -> float:
-        """w/R = -W at the pole, where all named points are."""
-        return -float(u[self._pole[0]])
+        """w/R = -u . n0 at the pole, where all named points are, or at the last end of a surface without one."""
+        return -float(self.displacement(u, point) @ self._normal)
 
     def displacement(self, u: Vector, point: str) -> Array:
         """u/R (3,) there."""
-        return np.array([0.0, 0.0, u[self._pole[0]]])
+        U, W = u[2 * self._seen : 2 * self._seen + 2]
+        return np.array([U, 0.0, W])
+
+    def _ends(self, *conditions: Condition) -> NDArray[np.int32]:
+        """Facets of the ends with one of some conditions."""
+        found = [ends for name, ends in self.meridian.ends.items() if self.conditions.get(name) in conditions]
+        return np.asarray(np.unique(np.concatenate([np.empty(0, np.int32), *found])), dtype=np.int32)
 
     def loaded_deflection(self, u: Vector) -> float:
         """w/R conjugate to the force: at the pole, or averaged over its patch."""
@@ -129,7 +138,8 @@ class MeridianModel:
 
     def _force(self, force: Force, factory: EnergyFactory) -> LinearTerm:
         assert force.point == "pole"
-        dofs, entries = self._patch(force.patch, factory) if force.patch else (self._pole, np.array([-1.0]))
+        pole = np.array([2 * self._seen + 1], dtype=np.int32)
+        dofs, entries = self._patch(force.patch, factory) if force.patch else (pole, np.array([-1.0]))
         return LinearTerm("force", dofs, self.force_unit * entries, self.u, "force")
 
     def _patch(self, radius: float, factory: EnergyFactory) -> Entries:

@@ -24,3 +24,10 @@ def cell_normals(r0: fem.Function) -> NDArray[np.float64]:
     slopes = element.tabulate(1, element.points)[1, :, :, 0]
     rho_s, z_s = np.moveaxis(r0.x.array.reshape(-1, 2)[V.dofmap.list], -1, 0) @ slopes.T
     return np.asarray(np.stack([-z_s, 0 * z_s, rho_s], axis=-1) / np.hypot(rho_s, z_s)[..., None])
+
+
+def nodal_normals(r0: fem.Function) -> NDArray[np.float64]:
+    """Unit normals (nodes, 3) at the azimuth 0, averaged over the cells that meet."""
+    normals = np.zeros((len(r0.x.array) // 2, 3))
+    np.add.at(normals, r0.function_space.dofmap.list, cell_normals(r0))
+    return np.asarray(normals / np.linalg.norm(normals, axis=1)[:, None])

@@ -23,7 +23,6 @@ from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.models.axisymmetric import jets
 from magshell_fenicsx.models.axisymmetric.energies import INTERIOR, Energy
 from magshell_fenicsx.models.axisymmetric.meridian import Meridian, held_at
-from magshell_fenicsx.models.shell.parameters import Condition
 from magshell_fenicsx.platform import compat
 
 
@@ -35,7 +34,9 @@ class Waves:
     system
         Of the axisymmetric displacement.
     energies
-        Its terms as functions of a jet, and the condition of the outer edge.
+        Its terms as functions of a jet.
+    held
+        Facets of the ends that cannot move.
 
     Attributes
     ----------
@@ -52,7 +53,7 @@ class Waves:
         system: FiniteElementSystem,
         energies: Sequence[Energy],
         meridian: Meridian,
-        condition: Condition,
+        held: NDArray[np.int32],
         log: KernelLog,
     ) -> None:
         self._system = system
@@ -63,8 +64,8 @@ class Waves:
         self._factor = fem.Constant(V.mesh, 1.0)
         kept = [e for e in energies if not e.linear]
         self._forms = [(e.amplitude, log.compile(f"{e.name} waves", self._second(e))) for e in kept]
-        axis, rim = meridian.axis, meridian.rim
-        edge = [] if condition == "free" else [held_at(V, rim, i) for i in range(3)]
+        axis = meridian.axis
+        edge = [held_at(V, held, i) for i in range(3)]
         self._held_once = [held_at(V, axis, 0), held_at(V, axis, 2), *edge]
         self._held = [held_at(V, axis, 1), *self._held_once]
         pattern = next(form for e, (_, form) in zip(kept, self._forms, strict=True) if e.name == INTERIOR)
@@ -82,7 +83,7 @@ class Waves:
         return self._K
 
     def held(self, m: int) -> list[fem.DirichletBC]:
-        """What is held at the axis and at the rim: a wave m = 1 may move the axis across itself."""
+        """What is held at the axis and at the ends: a wave m = 1 may move the axis across itself."""
         return self._held_once if m == 1 else self._held
 
     def factor_at(self, state: State, m: int) -> Factorisation:
