@@ -1,5 +1,6 @@
 """What a scene is built from."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,12 +31,23 @@ class Span:
         Of its ends; None for the pole.
     embedding
         Chart (n, 2), its second coordinate 0 -> the plane of e1 and e3.
+    place
+        Chart (2,) of the surface -> parameter of this one and azimuth (rad).
+    curvature
+        The largest of the meridian over 1/R, at least 1.
     """
 
     length: float
     circle: float | None
     names: tuple[str | None, str]
     embedding: Embedding
+    place: Callable[[NDArray[np.float64]], tuple[float, float]]
+    curvature: float = 1.0
+
+    def sample(self) -> NDArray[np.float64]:
+        """Places (n, 3) along it, its ends among them."""
+        s = np.linspace(0.0, self.length, 401)
+        return self.embedding(np.column_stack([s, 0 * s]))
 
 
 @dataclass(frozen=True)

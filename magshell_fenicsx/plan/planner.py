@@ -1,6 +1,5 @@
 """From a case to what must be built for it, without building anything: the parts added up."""
 
-from collections.abc import Mapping
 from math import radians
 
 import numpy as np
@@ -14,16 +13,15 @@ from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.mesh.frame import rotation
 from magshell_fenicsx.mesh.grading import Grading
 from magshell_fenicsx.mesh.grid import Grid
-from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.mesh.shapes import DiscShape, StripShape
 from magshell_fenicsx.mesh.sphere import Dimple
 from magshell_fenicsx.models.axisymmetric.meridian import graded_vertices
-from magshell_fenicsx.models.shell.parameters import Condition, Held, Loads, Material
-from magshell_fenicsx.models.shell.supports import open_to_pressure, refuse_unknown
+from magshell_fenicsx.models.shell.parameters import Condition, Held, Material
 from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.plan.account import account
 from magshell_fenicsx.plan.limits import refuse_too_large, refuse_too_many, refuse_unbounded_fields, sample
 from magshell_fenicsx.plan.loads import indented, loads, refuse_wide_patch
+from magshell_fenicsx.plan.names import refuse_unfit_ends
 from magshell_fenicsx.plan.outline import Chart, Outline, outline, refuse_beside
 from magshell_fenicsx.plan.plan import Plan, Span
 from magshell_fenicsx.plan.sizes import grading
@@ -59,14 +57,14 @@ def make_plan(case: Case) -> Plan:
     names = [under] if isinstance(loading, IndentationSection) else at
     size = grading(case, drawn, material.h, defect, [points[name] for name in names])
     shape = drawn.chart(half, size.largest)
-    _refuse_unreasonable(case, drawn, shape, size, axisymmetric)
+    span = drawn.span if axisymmetric else None
+    _refuse_unreasonable(case, drawn, shape, size, span)
     conditions = edge_conditions(case.boundary)
     if half:
         conditions["symmetry"] = "symmetry"
     loaded = loads(case, under, turn, 0.5 if half else 1.0)
-    span = drawn.span if axisymmetric else None
-    if span:  # it is not triangulated, where this is seen
-        _refuse_unfit(span, points, conditions, loaded)
+    if span:
+        refuse_unfit_ends([name for name in span.names if name], points, conditions, loaded)
     model = "meridian" if axisymmetric else f"{'half' if half else 'full'} {case.model}"
     included, left_out = account(case, loaded, model, turn)
     return Plan(
@@ -107,7 +105,8 @@ def meridian_vertices(plan: Plan, refinement: float) -> Array:
     span = plan.meridian
     assert span
     pole = span.names[0] is None
-    return graded_vertices(span.length, span.circle, plan.material.h, refinement=refinement, axis=pole)
+    h = plan.material.h / span.curvature
+    return graded_vertices(span.length, span.circle, h, refinement=refinement, axis=pole)
 
 
 def _symmetry(case: Case, drawn: Outline, parts: list[Leaves]) -> tuple[bool, float | None]:
@@ -159,28 +158,19 @@ def _place(case: Case, drawn: Outline, place: Array, turn: float, half: bool) ->
     return drawn.on_half(found) if half else found
 
 
-def _refuse_unreasonable(case: Case, drawn: Outline, shape: Chart, size: Grading, axisymmetric: bool) -> None:
+def _refuse_unreasonable(case: Case, drawn: Outline, shape: Chart, size: Grading, span: Span | None) -> None:
+    if span:
+        refuse_unbounded_fields(case, span.sample())
+        return
     if isinstance(shape, DiscShape | StripShape):
         refuse_unbounded_fields(case, drawn.embedding(sample(shape)))
-    else:
-        refuse_unbounded_fields(case, np.zeros((0, 3)))
-    if axisymmetric:
-        return
-    if isinstance(shape, DiscShape | StripShape):
         refuse_too_large(case, size, shape)
         return
+    refuse_unbounded_fields(case, np.zeros((0, 3)))
     if case.mesh.tolerance is not None:
         raise CaseError(f"mesh.tolerance: not with a {case.shell.geometry}; magshell study compares meshes and degrees")
     if isinstance(shape, Grid):
         refuse_too_many(case, shape.cells)
-
-
-def _refuse_unfit(span: Span, points: Points, conditions: Mapping[str, Condition], loaded: Loads) -> None:
-    edges = [name for name in span.names if name]
-    refuse_unknown(edges, points, [], conditions, loaded)
-    for name in edges:
-        if loaded.pressure and conditions.get(name, "free") == "free":
-            raise MeshError(open_to_pressure(name))
 
 
 def _thickness(case: Case) -> Thickness | None:

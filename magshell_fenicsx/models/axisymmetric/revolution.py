@@ -44,17 +44,25 @@ class Revolution:
 
         At the pole, where the surface has no second direction, a little off it.
         """
-        V = f.function_space
-        order = np.argsort(V.tabulate_dof_coordinates()[V.dofmap.list].mean(axis=1)[:, 0])
-        nodes = f.x.array.reshape(-1, 2)[V.dofmap.list[order]]
-        table = V.element.basix_element.tabulate(2, np.array([[0.0], [1.0], [OFF_POLE]]))[:, :, :, 0]
-        values = np.einsum("dvk,cki->dcvi", table, nodes)
+        values = self._at_ends(f)
         if self._first:
             values[:, 0, 0] = values[:, 0, 2]
         (U, W), (Us, Ws), (Uss, Wss) = np.moveaxis(values[:, :, :2], -1, 1)
         o = np.zeros_like(U)
         jet = [(U, o, W), (Us, o, Ws), (o, U, o), (Uss, o, Wss), (o, Us, o), (-U, o, o)]
         return np.stack([np.stack(v, axis=-1) for v in jet])
+
+    def scalars(self, f: fem.Function) -> Array:
+        """The values of a field (1,) at the ends of all cells: (cells, 2)."""
+        return self._at_ends(f)[0, :, :2, 0]
+
+    def _at_ends(self, f: fem.Function) -> Array:
+        """(3, cells, 3, components) values, first and second derivatives, the last ones a little off the first end."""
+        V = f.function_space
+        cells, bs = V.dofmap.list, V.dofmap.bs
+        order = np.argsort(V.tabulate_dof_coordinates()[cells].mean(axis=1)[:, 0])
+        table = V.element.basix_element.tabulate(2, np.array([[0.0], [1.0], [OFF_POLE]]))[:, :, :, 0]
+        return np.asarray(np.einsum("dvk,cki->dcvi", table, f.x.array.reshape(-1, bs)[cells[order]]))
 
     def around(self, ends: Array, weight: Array) -> Array:
         """Values at the nodes, of those at the ends of all cells.
