@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.continuation.system import Vector
-from magshell_fenicsx.models.shell.parameters import Material
+from magshell_fenicsx.models.shell.parameters import Loads, Material
 from magshell_fenicsx.models.shell.point_load import point_entries
 
 Array = NDArray[np.float64]
@@ -25,6 +25,8 @@ class Observed:
         2 for a half model, whose integrals and forces are those of one half; else 1.
     normals
         n0 (3,) at the named points.
+    loads, load_size
+        What loads it, and the sum of the sizes of the dead loads over E h R; see `DeadLoads`.
     observed
         Column -> the form that a term observes, see `OwnTerm.observed`; of the modelled part.
     """
@@ -33,6 +35,8 @@ class Observed:
     material: Material
     multiplicity: int
     normals: Mapping[str, Array]
+    loads: Loads
+    load_size: float = 0.0
     observed: Mapping[str, fem.Form]
 
     def observe(self, volume: fem.Form, points: Mapping[str, Array]) -> None:
@@ -60,7 +64,16 @@ class Observed:
         return np.asarray(self.system.comm.allreduce(here))
 
     def loaded_deflection(self, u: Vector) -> float:
-        """w/R conjugate to the force: at its point, or averaged over its patch."""
+        """w/R conjugate to the force: at its point, or averaged over its patch; of dead loads along themselves.
+
+        Moments alone have none: that of the pole.
+        """
+        if self.loads.dead and not self.load_size:
+            return self.deflection(u, "pole")
+        if self.loads.dead:
+            self.system.set(u)
+            load = next(term for term in self.system.terms if term.name == "load")
+            return -float(self.system.comm.allreduce(load.energy())) / self.load_size
         return -self.system.potential(u, {}, "force") / self.force_unit
 
     @property

@@ -1,6 +1,6 @@
 """What a plan asks of its surface, against what the surface has: its edges, points and patches."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +35,22 @@ def refuse_unfit(
             patch_of(patch.patches, load.patch)
     if loads.pressure:
         _refuse_open(patch, conditions)
+
+
+def refuse_unfit_ends(
+    ends: Collection[str], points: Collection[str], conditions: Mapping[str, Condition], loads: Loads
+) -> None:
+    """The same of a meridian, which has ends and points.
+
+    Raises
+    ------
+    MeshError
+        With the name.
+    """
+    refuse_unknown(ends, points, [], conditions, loads)
+    for name in ends if loads.pressure else ():
+        if not _closes(conditions.get(name, "free")):
+            raise MeshError(open_to_pressure(name))
 
 
 def _refuse_open(patch: PatchMesh, conditions: Mapping[str, Condition]) -> None:

@@ -27,6 +27,7 @@ from magshell_fenicsx.mesh.patch import Embedding
 from magshell_fenicsx.mesh.revolved import Arc, Capped, Profile, Revolved, Segment, Spline
 from magshell_fenicsx.mesh.shapes import DiscShape, Shape, StripShape
 from magshell_fenicsx.mesh.sphere import Dimple, SphereEmbedding, flat
+from magshell_fenicsx.plan.plan import Span
 
 Array = NDArray[np.float64]
 Chart = Shape | Grid | MeshFile
@@ -55,6 +56,8 @@ class Outline:
         Whether it is closed around e3.
     ends
         First chart coordinates between which the half of a ring lies; None where the second coordinate is y.
+    span
+        The meridian; None if it is closed, or the surface is none of revolution.
     """
 
     chart: Callable[[bool, float], Chart]
@@ -65,6 +68,7 @@ class Outline:
     sphere: bool = False
     round: bool = False
     ends: tuple[float, float] | None = None
+    span: Span | None = None
 
     def on_half(self, chart: Array) -> Array:
         """A place of the chart on the half y >= 0, from which rounding may have moved it."""
@@ -107,7 +111,8 @@ def outline(case: Case, defect: Dimple | None) -> Outline:
     if names[1] is None:
         perfect = Capped(profile)
         circle = defect.phi_o if defect else None
-        return _disc(profile.length, names[0], Capped(profile, defect), perfect.inverse, circle)
+        bent = _curvature(profile)
+        return _disc(profile.length, names[0], Capped(profile, defect), perfect.inverse, circle, curvature=bent)
     return _ring(shell, profile, (names[0], names[1]))
 
 
@@ -134,6 +139,7 @@ def _disc(
     circle: float | None = None,
     *,
     sphere: bool = False,
+    curvature: float = 1.0,
 ) -> Outline:
     def chart(half: bool, size: float) -> Chart:
         return DiscShape(edge, half, circle, name)
@@ -143,7 +149,11 @@ def _disc(
         beyond = np.hypot(*found) / edge
         return np.asarray(found / max(beyond, 1.0))
 
-    return Outline(chart, embedding, within, np.zeros(2), edge, sphere, round=True)
+    def place(chart: Array) -> tuple[float, float]:
+        return float(np.hypot(*chart)), float(np.arctan2(chart[1], chart[0]))
+
+    span = Span(edge, circle, (None, name), embedding, place, curvature)
+    return Outline(chart, embedding, within, np.zeros(2), edge, sphere, round=True, span=span)
 
 
 def _ring(shell: Surface, profile: Profile, names: tuple[str, str]) -> Outline:
@@ -164,9 +174,25 @@ def _ring(shell: Surface, profile: Profile, names: tuple[str, str]) -> Outline:
     def inverse(x: Array) -> Array:
         return np.clip(embedding.inverse(x, first), low, high)
 
-    return Outline(
-        chart, embedding, inverse, np.array(low if any(glued) else high), round=glued[0], ends=(0.0, pi * rho)
-    )
+    def section(chart: Array) -> Array:
+        r, z = profile(profile.length - chart[:, 0]).T  # from its end: the normal points outwards
+        return np.column_stack([r, 0 * r, z])
+
+    def place(chart: Array) -> tuple[float, float]:
+        return profile.length - float(chart[1]), float(chart[0]) / rho
+
+    span = None
+    if glued == (True, False):
+        span = Span(profile.length, None, (names[1], names[0]), section, place, _curvature(profile))
+    seen = np.array(low if any(glued) else high)
+    return Outline(chart, embedding, inverse, seen, round=glued[0], ends=(0.0, pi * rho), span=span)
+
+
+def _curvature(profile: Profile) -> float:
+    """The largest, at least 1; to a thousandth, not to rounding."""
+    s = np.linspace(0, profile.length, 1001, dtype=np.float64)
+    turned = np.linalg.norm(np.diff(profile.tangent(s), axis=0), axis=1)
+    return max(1.0, round(float(turned.max() / s[1]), 3))
 
 
 def _profile(shell: Surface) -> tuple[Profile, tuple[str, str | None]]:

@@ -1,5 +1,6 @@
 """What a scene is built from."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,13 +19,46 @@ from magshell_fenicsx.plan.names import refuse_unfit
 
 
 @dataclass(frozen=True)
+class Span:
+    """A meridian, walked from the pole or one edge to the other.
+
+    Attributes
+    ----------
+    length
+        Of its chart, which starts at 0.
+    circle
+        Where the curvature jumps; None if nowhere.
+    names
+        Of its ends; None for the pole.
+    embedding
+        Chart (n, 2), its second coordinate 0 -> the plane of e1 and e3.
+    place
+        Chart (2,) of the surface -> parameter of this one and azimuth (rad).
+    curvature
+        The largest of the meridian over 1/R, at least 1.
+    """
+
+    length: float
+    circle: float | None
+    names: tuple[str | None, str]
+    embedding: Embedding
+    place: Callable[[NDArray[np.float64]], tuple[float, float]]
+    curvature: float = 1.0
+
+    def sample(self) -> NDArray[np.float64]:
+        """Places (n, 3) along it, its ends among them."""
+        s = np.linspace(0.0, self.length, 401)
+        return self.embedding(np.column_stack([s, 0 * s]))
+
+
+@dataclass(frozen=True)
 class Plan:
     """Everything that a scene is built from, dimensionless (lengths in R).
 
     Attributes
     ----------
-    axisymmetric
-        Model the meridian.
+    meridian
+        What is modelled instead of the surface; None if that is modelled.
     half
         Model the half y >= 0 of a frame turned about e3 by `azimuth` (rad).
     shape, size, points, embedding
@@ -43,7 +77,7 @@ class Plan:
     material: Material
     loads: Loads
     conditions: dict[str, Condition]
-    axisymmetric: bool
+    meridian: Span | None
     half: bool
     azimuth: float
     shape: Shape | Grid | MeshFile
@@ -55,6 +89,11 @@ class Plan:
     thickness: Thickness | None = None
     length: float = 1.0
     own: tuple[OwnTerm, ...] = ()
+
+    @property
+    def axisymmetric(self) -> bool:
+        """Whether the meridian is modelled."""
+        return self.meridian is not None
 
     @property
     def fixed(self) -> bool:

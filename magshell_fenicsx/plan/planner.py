@@ -19,14 +19,14 @@ from magshell_fenicsx.mesh.sphere import Dimple
 from magshell_fenicsx.models.axisymmetric.meridian import graded_vertices
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.parameters import Condition, Held, Material
-from magshell_fenicsx.models.shell.supports import refuse_unknown
 from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.plan.account import account
 from magshell_fenicsx.plan.limits import refuse_too_large, refuse_too_many, refuse_unbounded_fields, sample
 from magshell_fenicsx.plan.loads import indented, loads, refuse_wide_patch
+from magshell_fenicsx.plan.names import refuse_unfit_ends
 from magshell_fenicsx.plan.outline import Chart, Outline, outline, refuse_beside
 from magshell_fenicsx.plan.own_terms import surface_terms
-from magshell_fenicsx.plan.plan import Plan
+from magshell_fenicsx.plan.plan import Plan, Span
 from magshell_fenicsx.plan.sizes import grading
 from magshell_fenicsx.plan.symmetry import Leaves, askew, left, mirror, unmirrored
 
@@ -61,20 +61,21 @@ def make_plan(case: Case, terms: Sequence[OwnTerm] = ()) -> Plan:
     names = [under] if isinstance(loading, IndentationSection) else at
     size = grading(case, drawn, material.h, defect, [points[name] for name in names])
     shape = drawn.chart(half, size.largest)
-    _refuse_unreasonable(case, drawn, shape, size, axisymmetric)
+    span = drawn.span if axisymmetric else None
+    _refuse_unreasonable(case, drawn, shape, size, span)
     conditions = edge_conditions(case.boundary)
     if half:
         conditions["symmetry"] = "symmetry"
     loaded = loads(case, under, turn, 0.5 if half else 1.0, energies)
-    if axisymmetric and isinstance(shape, DiscShape):  # which is not triangulated, where this is seen
-        refuse_unknown([shape.edge], points, [], conditions, loaded)
+    if span:
+        refuse_unfit_ends([name for name in span.names if name], points, conditions, loaded)
     model = "meridian" if axisymmetric else f"{'half' if half else 'full'} {case.model}"
     included, left_out = account(case, loaded, model, turn)
     return Plan(
         material=material,
         loads=loaded,
         conditions=conditions,
-        axisymmetric=axisymmetric,
+        meridian=span,
         half=half,
         azimuth=turn,
         shape=shape,
@@ -106,8 +107,11 @@ def edge_conditions(boundary: BoundarySection) -> dict[str, Condition]:
 
 def meridian_vertices(plan: Plan, refinement: float) -> Array:
     """Vertices of the meridian's mesh, in the chart."""
-    assert isinstance(plan.shape, DiscShape)
-    return graded_vertices(plan.shape.radius, plan.shape.circle, plan.material.h, refinement=refinement)
+    span = plan.meridian
+    assert span
+    pole = span.names[0] is None
+    h = plan.material.h / span.curvature
+    return graded_vertices(span.length, span.circle, h, refinement=refinement, axis=pole)
 
 
 def _symmetry(case: Case, drawn: Outline, parts: list[Leaves]) -> tuple[bool, float | None]:
@@ -161,11 +165,13 @@ def _place(case: Case, drawn: Outline, place: Array, turn: float, half: bool) ->
     return drawn.on_half(found) if half else found
 
 
-def _refuse_unreasonable(case: Case, drawn: Outline, shape: Chart, size: Grading, axisymmetric: bool) -> None:
+def _refuse_unreasonable(case: Case, drawn: Outline, shape: Chart, size: Grading, span: Span | None) -> None:
+    if span:
+        refuse_unbounded_fields(case, span.sample())
+        return
     if isinstance(shape, DiscShape | StripShape):
         refuse_unbounded_fields(case, drawn.embedding(sample(shape)))
-        if not axisymmetric:
-            refuse_too_large(case, size, shape)
+        refuse_too_large(case, size, shape)
         return
     refuse_unbounded_fields(case, np.zeros((0, 3)))
     if case.mesh.tolerance is not None:

@@ -12,6 +12,7 @@ from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.loading import DeadSection, IndentationSection, RotationSection
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.plan.outline import Outline
+from magshell_fenicsx.plan.turning import scalar_turns, vector_turns
 
 Array = NDArray[np.float64]
 Vectors = Sequence[Array]
@@ -57,7 +58,7 @@ def left(case: Case, outline: Outline, indented: Array | None, terms: Sequence[O
     return [
         _shape(case, outline),
         *_supports(case),
-        *(_field(case) if case.magnetic and case.lambda_m else []),
+        *(_field(case, outline) if case.magnetic and case.lambda_m else []),
         *_load(case, indented),
         *(_named(case) if case.points else []),
         *(_energy(term, outline) for term in terms),
@@ -107,10 +108,11 @@ def _energy(term: OwnTerm, outline: Outline) -> Leaves:
 
 def _shape(case: Case, outline: Outline) -> Leaves:
     geometry = case.shell.geometry
-    if outline.round and case.thickness_factor is not None:
-        return Leaves("only the user knows whether the formula of the thickness is", mirrors=_none)
+    factor = case.thickness_factor
+    if outline.round and isinstance(factor, str) and not (outline.span and scalar_turns(factor, outline.span)):
+        return Leaves("the thickness differs around e3", mirrors=_none)
     if outline.round:
-        return Leaves(None if outline.disc else "a meridian ends at a pole")
+        return Leaves(None if outline.span else "the section of the tube is closed: it has no edge to hold it by")
     if geometry == "strip":
         return Leaves("a strip is no surface of revolution", mirrors=_along_x)
     return Leaves(f"not with a {geometry} that is not closed around e3", mirrors=_none)
@@ -121,17 +123,19 @@ def _supports(case: Case) -> list[Leaves]:
     found, fixed = list[Leaves](), False
     for name, condition in case.boundary.conditions().items():
         fixed = fixed or condition in ("clamped", "simply supported", "hinged")
-        if isinstance(condition, HeldSection):
-            fixed = fixed or len(condition.components) == 3
-            found.append(Leaves(f"boundary.{name}: held components are those of e1, e2 and e3", mirrors=_along_x))
-        elif condition == "symmetry":
-            found.append(Leaves(f"boundary.{name}: a mirror plane of the case's own"))
-    return (
-        found if fixed else [*found, Leaves("boundary: nothing is clamped, hinged or held as a whole", mirrors=_none)]
-    )
+        if not isinstance(condition, HeldSection):
+            continue
+        fixed = fixed or len(condition.components) == 3
+        place = np.array(case.points.get(name, [0.0, 0.0, 1.0]))
+        one_sided = len({0, 1} & set(condition.components)) == 1
+        why = "is held along x or y alone" if one_sided else "is held off the axis" if _tilted(place) else None
+        found.append(
+            Leaves(why and f"boundary.{name}: {why}", [_unit(place)], mirrors=_along_x if one_sided else _every)
+        )
+    return found if fixed else [*found, Leaves(mirrors=_none)]
 
 
-def _field(case: Case) -> list[Leaves]:
+def _field(case: Case, outline: Outline) -> list[Leaves]:
     magnetic = case.magnetic
     assert magnetic
     vectors = [d.vector() for d in (*magnetic.remanent.directions(), magnetic.applied)]
@@ -140,8 +144,9 @@ def _field(case: Case) -> list[Leaves]:
     def told(azimuth: float) -> bool:  # only the user knows whether it is symmetric to the plane y = 0
         return case.symmetry == "half" and not azimuth
 
-    if magnetic.remanent.kind == "expression":
-        found.append(Leaves("only the user knows whether the remanence's formula is", mirrors=told))
+    components, span = magnetic.remanent.components, outline.span
+    if components and not (span and vector_turns(components, span)):
+        found.append(Leaves("the formula of the remanence differs around e3", mirrors=told))
     if magnetic.applied.gradient:
         G = np.array(magnetic.applied.gradient)
         round_ = np.abs(G - np.diag([G[0, 0], G[0, 0], G[2, 2]])).max() <= PARALLEL
@@ -161,7 +166,10 @@ def _load(case: Case, indented: Array | None) -> list[Leaves]:
         places = [np.array(case.points[load.at]) for load in loading.loads if load.at]
         patches = any(load.over not in (None, "all") for load in loading.loads)
         mirrors = _none if patches else _every
-        return [Leaves("a meridian takes no dead loads", [_unit(v) for v in (*forces, *places)], mirrors)]
+        vectors = [_unit(v) for v in (*forces, *places)]
+        tilted = any(_tilted(v) for v in vectors)
+        why = "a load is not along e3, or off the axis" if tilted else "a patch is loaded" if patches else None
+        return [Leaves(why, vectors, mirrors)]
     return []
 
 
@@ -173,8 +181,7 @@ def _named(case: Case) -> list[Leaves]:
         across = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
         return all(x @ across > -PARALLEL for x in places)
 
-    off = any(_tilted(x) for x in places)
-    return [Leaves("points are named off the axis" if off else None, mirrors=within)]
+    return [Leaves(mirrors=within)]
 
 
 def _tilted(v: Array) -> bool:

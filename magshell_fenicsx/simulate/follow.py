@@ -22,12 +22,12 @@ from magshell_fenicsx.continuation.point import PathStopped, Point
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.continuation.walk import MOST_STEPS, Goal, Quantity, Walk
 from magshell_fenicsx.continuation.watch import Crossing
-from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.simulate.scene import Scene
 
 Label = Literal["start", "field", "step", "target", "fold", "bifurcation"]
 CONTROLS: dict[str, Control] = {"volume": "conjugate", "displacement": "conjugate", "load": "load", "arc": "arc"}
 LONGEST = 50.0  # step by arc length, over the first
+BEYOND = 2.0  # times the load of the first instability that the model excludes a walk goes on
 
 
 @dataclass(frozen=True)
@@ -151,7 +151,6 @@ def _indentation(scene: Scene, loading: IndentationSection, state: State) -> Ite
 
 
 def _dead(scene: Scene, loading: DeadSection, state: State) -> Iterator[Record]:
-    assert isinstance(scene.model, ShellModel)
     quantity: Quantity = "load" if loading.displacement is None else "conjugate"
     asked = next((value for value in (loading.factor, loading.displacement) if value is not None), 1.0)
     # a displacement is told as the work of the loads at it
@@ -236,19 +235,29 @@ def _goal(loading: PathSection, targets: Sequence[float], quantity: Quantity, se
 def followed(
     scene: Scene, path: Path, start: Point, goal: Goal, branches: PathSection | None = None
 ) -> Iterator[Record]:
-    """A walk, what the reduced model excludes on it, and the branches if they are asked for."""
+    """A walk, what the reduced model excludes on it, and the branches if they are asked for.
+
+    With `until: bifurcation` a mode that the model excludes ends the walk; with `until: limit` the walk goes on to
+    the model's own first instability, if that is below `BEYOND` times the load of the first excluded one.
+    """
     scene.progress.doing("looking for modes that the model excludes")
     walk, crossing, lost, watch = Walk(path, start, goal), None, "", scene.watch
+    ends = dict[str, float]()  # by `until`, once an excluded mode is unstable: amplitudes that the walk may have
     watch.begin(path, start)
     try:
         for label, point in walk:
             mode, located = "", label in ("fold", "bifurcation")
-            yield from _excluded(path, watch.pass_to(point, look=located))
+            for found in _excluded(path, watch.pass_to(point, look=located)):
+                yield found
+                ends.setdefault("bifurcation", 0.0)
+                ends.setdefault("limit", BEYOND * abs(found.point.state.mu[path.name]))
             if label == "bifurcation":
                 here = branching(_by_arc(scene, path), point)
                 crossing = crossing or here
                 mode = ("symmetric" if here.symmetric else "asymmetric") if here else ""
             yield Record(label, path.name, point, mode, excluded_pivots=watch.unstable)
+            if abs(point.state.mu[path.name]) >= ends.get(goal.until, np.inf):
+                break
     except PathStopped as e:
         lost = _why(path, e, walk.points)
     yield from _excluded(path, watch.end())

@@ -18,8 +18,6 @@ from magshell_fenicsx.continuation.watch import Watch
 from magshell_fenicsx.mesh.frame import rotation
 from magshell_fenicsx.mesh.hexahedra import sweep
 from magshell_fenicsx.mesh.midsurface import Midsurface, distribute
-from magshell_fenicsx.mesh.patch import MeshError
-from magshell_fenicsx.mesh.shapes import DiscShape
 from magshell_fenicsx.models.axisymmetric.meridian import make_meridian
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.shell.model import ShellModel
@@ -166,12 +164,16 @@ def build_model(case: Case, plan: Plan, comm: MPI.Comm) -> ShellModel:
 
 def build_meridian_model(case: Case, plan: Plan) -> MeridianModel:
     """The meridian, whole on every rank."""
-    meridian = make_meridian(plan.embedding, meridian_vertices(plan, case.mesh.refinement))
-    assert isinstance(plan.shape, DiscShape)
-    if not plan.fixed and "simply supported" not in plan.conditions.values():
-        raise MeshError("boundary: the shell is not held: it is free to move along (0, 0, 1)")
-    condition = plan.conditions.get(plan.shape.edge, "free")
-    return MeridianModel(meridian, plan.material, case.mesh.degree, condition, plan.loads, case.mesh.penalty)
+    span = plan.meridian
+    assert span
+    points = {name: span.place(x) for name, x in plan.points.items()}
+    vertices = meridian_vertices(plan, case.mesh.refinement)
+    meridian = make_meridian(span.embedding, vertices, span.names, points, span.curvature)
+    model = MeridianModel(
+        meridian, plan.material, case.mesh.degree, plan.conditions, plan.loads, case.mesh.penalty, plan.thickness
+    )
+    model.supports.refuse_loose(model.r0)
+    return model
 
 
 def build_solid_model(case: Case, plan: Plan, comm: MPI.Comm) -> SolidModel:

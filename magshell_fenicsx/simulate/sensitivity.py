@@ -15,7 +15,6 @@ from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.continuation.fold import Fold, Guess, find_fold, sensitivity
 from magshell_fenicsx.continuation.system import State, Vector
 from magshell_fenicsx.models.axisymmetric import jets
-from magshell_fenicsx.models.axisymmetric.energies import EnergyFactory
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.shell.parameters import Magnetisation
@@ -130,11 +129,12 @@ def _magnetic_terms(scene: Scene, field: Magnetisation) -> Sequence[FormTerm]:
     """The model's magnetic terms with another remanence."""
     model, log = scene.model, KernelLog()
     if isinstance(model, MeridianModel):
-        factory = EnergyFactory(model.meridian, model.r0, model.material, model.sigma, model.degree)
         u = jets.revolved(model.u)
         return [
             FormTerm(e.name, 2 * np.pi * e.of(u), model.u, log, e.amplitude, linear=e.linear)
-            for e in factory.magnetic(field)
+            for e in model.factory.magnetic(field)
         ]
     assert isinstance(model, ShellModel)  # the case refuses a solid's
-    return TermFactory(model.r0, model.u, model.material, model.sigma, model.degree, log).magnetic(field)
+    return TermFactory(model.r0, model.u, model.material, model.sigma, model.degree, log, model.thickness).magnetic(
+        field
+    )

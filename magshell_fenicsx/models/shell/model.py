@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.assembly.terms import LinearTerm, Term
-from magshell_fenicsx.continuation.system import Vector
 from magshell_fenicsx.mesh.midsurface import Midsurface
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.observed import Observed
@@ -74,14 +73,12 @@ class ShellModel(Observed):
 
     Attributes
     ----------
-    system, multiplicity, normals
+    system, multiplicity, normals, loads, load_size
         See `Observed`.
     kernels
         Names and compile time of the forms in use.
     thickness
         h(x)/h, free to jump from cell to cell; None for 1.
-    load_size
-        The sum of the sizes of the dead loads, over E h R; see `DeadLoads`.
     """
 
     def __init__(
@@ -150,12 +147,10 @@ class ShellModel(Observed):
         self.normals = {name: vertex_normal(self.r0, x) for name, x in midsurface.points.items()}
         if loads.force:
             terms.append(self._force(loads.force))
-        self.load_size = 0.0
         if loads.dead:
             dead = assemble_dead_loads(loads.dead, self.r0, midsurface, degree, self.kernels)
             self.load_size = dead.size
-            self._dead_load = LinearTerm("load", *dead.entries, self.u, "load")
-            terms.append(self._dead_load)
+            terms.append(LinearTerm("load", *dead.entries, self.u, "load"))
             moments = [load for load in loads.dead if isinstance(load, EdgeMoment)]
             terms += [
                 factory.edge_moment(f"moment {load.edge} {i}", midsurface.edges[load.edge], load.moment)
@@ -189,18 +184,6 @@ class ShellModel(Observed):
                 self.u, terms, held, self._interior, system.length, fast, system.gradients, system.parameters
             )
         )
-
-    def loaded_deflection(self, u: Vector) -> float:
-        """w/R conjugate to the force: at its point, or averaged over its patch; of dead loads along themselves.
-
-        Moments alone have none: that of the pole.
-        """
-        if self.loads.dead and not self.load_size:
-            return self.deflection(u, "pole")
-        if self.loads.dead:
-            self.system.set(u)
-            return -float(self.system.comm.allreduce(self._dead_load.energy())) / self.load_size
-        return super().loaded_deflection(u)
 
     def _force(self, force: Force) -> LinearTerm:
         x, inward = self.midsurface.points[force.point], -self.normals[force.point]

@@ -69,6 +69,14 @@ def open_to_pressure(name: str) -> str:
     )
 
 
+def no_mirror(name: str) -> str:
+    """What is said of an edge in no plane of symmetry."""
+    return (
+        f"boundary.{name}: symmetry: the edge must lie in a plane normal to x, y or z that the surface crosses at "
+        "right angles; turn the geometry so that it does"
+    )
+
+
 def plane_of(V: fem.FunctionSpace, r0: fem.Function, facets: NDArray[np.int32], name: str) -> tuple[int, float]:
     """The axis that the plane of an edge is normal to, and where on it the plane is, over R; collective.
 
@@ -85,10 +93,7 @@ def plane_of(V: fem.FunctionSpace, r0: fem.Function, facets: NDArray[np.int32], 
     across = _conormal_axes(V, facets)
     flat = flat[across[flat] > CROSSING]
     if len(flat) != 1:
-        raise MeshError(
-            f"boundary.{name}: symmetry: the edge must lie in a plane normal to x, y or z that the surface crosses at "
-            "right angles; turn the geometry so that it does"
-        )
+        raise MeshError(no_mirror(name))
     return int(flat[0]), float(places[:, flat[0]].mean())
 
 

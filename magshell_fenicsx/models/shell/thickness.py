@@ -38,6 +38,17 @@ def thickness_field(thickness: Thickness, r0: fem.Function, midsurface: Midsurfa
         values = np.array(thickness.of_position(*np.moveaxis(nodes, -1, 0)))
     for name, factor in (thickness.patches or {}).items():
         values[patch_of(midsurface.patches, name)] = factor
+    return nodal_thickness(values, nodes, V)
+
+
+def nodal_thickness(values: Array, nodes: Array, V: fem.FunctionSpace) -> fem.Function:
+    """The field with values (cells, nodes) at places (cells, nodes, 3), shape (1,); collective.
+
+    Raises
+    ------
+    MeshError
+        On every rank, if it is not positive somewhere.
+    """
     bad = nodes[~((values > 1e-3) & (values < 1e3))][:1].tolist()
     if said := [place for places in V.mesh.comm.allgather(bad) for place in places]:
         x, y, z = said[0]

@@ -129,7 +129,8 @@ class RevolvedGatherer:
 
     def __init__(self, model: MeridianModel, comm: MPI.Comm) -> None:
         self.comm, self._model, self._swept = comm, model, Revolution(model)
-        self._fields = PointFields(self._swept.jets(model.r0), model.material, model.loads.magnetic, None)
+        factor = None if model.thickness is None else self._swept.scalars(model.thickness)
+        self._fields = PointFields(self._swept.jets(model.r0), model.material, model.loads.magnetic, factor)
         self._constant = self._around(self._fields.constant)
 
     def gather(self, u: Vector, mu: Mapping[str, float] | None = None) -> Surface | None:

@@ -51,7 +51,7 @@ def test_clamped_plate() -> None:
     """w0 = p R^4/(64 D) (Timoshenko)."""
     h, nu, p_over_pc = 1 / 50, 0.3, 1e-5
     meridian = make_meridian(flat, graded_vertices(1.0, None, h))
-    model = MeridianModel(meridian, Material(nu, h), 4, "clamped", Loads(pressure=True))
+    model = MeridianModel(meridian, Material(nu, h), 4, {"rim": "clamped"}, Loads(pressure=True))
     path = Path(BorderedNewton(model.system), "pressure", "load", StepOptions(p_over_pc, p_over_pc, p_over_pc))
     ((point, _),) = path.towards(path.start(unloaded(model)), [p_over_pc])
     p = p_over_pc * model.material.classical_pressure / h
