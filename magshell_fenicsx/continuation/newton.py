@@ -47,7 +47,7 @@ class NewtonOptions:
     hard
         The same of later factors, and of all where the guess comes with a stress: old ones lead astray there.
     fresh
-        Lengths between where factors were made and a solution whose tangent and inertia they still tell.
+        Distance, in lengths, up to which factors serve for the tangent and the inertia of a solution.
     largest_step
         An iteration that moves u by more than this many lengths is a divergence.
     """

@@ -67,7 +67,7 @@ class Path:
     journal
         Keeps every result of `at`, and gives back those of an interrupted run.
     progress
-        Is told of every step before it is tried.
+        Hears of every step before it is tried.
     """
 
     def __init__(
@@ -162,7 +162,7 @@ class Path:
         return base.s + self.metric.inner((base.du, base.dmu), chord)
 
     def towards(self, start: Point, targets: Sequence[float]) -> Iterator[tuple[Point, bool]]:
-        """Accepted points through every target in turn; the flag tells the targets.
+        """Accepted points through every target in turn; the flag marks the targets.
 
         Raises
         ------
