@@ -78,7 +78,8 @@ class Case(WithParts):
     """Lowest modes after the run"""
     symmetry: Literal["auto", "none", "half", "axisymmetric"] = "auto"
     """The part that is modelled: the smallest that the case allows (auto), all (none), one side of a mirror plane
-    through e3 of a strip or of what is closed around e3 (half), the meridian of a shape with a pole (axisymmetric)"""
+    through e3 of a strip or of what is closed around e3 (half), the meridian of what is closed around e3 and has an
+    edge (axisymmetric)"""
 
     @model_validator(mode="wrap")
     @classmethod

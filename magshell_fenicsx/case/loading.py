@@ -11,8 +11,9 @@ from magshell_fenicsx.parts.section import Section, or_number
 Until = Annotated[
     Literal["limit", "bifurcation", "target", "points"],
     Field(
-        description="Where the path ends: at the first instability (limit), at the first bifurcation, through folds, "
-        "at the target, or after `points` steps by arc length"
+        description="Where the path ends: at the first instability (limit; past one that a half or a meridian excludes "
+        "it goes on to the model's own, up to twice the load), at the first bifurcation, through folds, at the target, "
+        "or after `points` steps by arc length"
     ),
 ]
 Count = Annotated[int, Field(ge=1, le=10000, description="Equal parts to the target, each a row; or steps")]

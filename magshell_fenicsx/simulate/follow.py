@@ -242,21 +242,24 @@ def followed(
     """
     scene.progress.doing("looking for modes that the model excludes")
     walk, crossing, lost, watch = Walk(path, start, goal), None, "", scene.watch
-    ends = dict[str, float]()  # by `until`, once an excluded mode is unstable: amplitudes that the walk may have
+    furthest = np.inf  # amplitude, once an excluded mode is unstable
     watch.begin(path, start)
     try:
         for label, point in walk:
             mode, located = "", label in ("fold", "bifurcation")
-            for found in _excluded(path, watch.pass_to(point, look=located)):
-                yield found
-                ends.setdefault("bifurcation", 0.0)
-                ends.setdefault("limit", BEYOND * abs(found.point.state.mu[path.name]))
+            excluded = list(_excluded(path, watch.pass_to(point, look=located)))
+            if excluded and goal.until == "bifurcation":
+                yield excluded[0]
+                break
+            yield from excluded
+            if excluded and goal.until == "limit":
+                furthest = min(furthest, BEYOND * abs(excluded[0].point.state.mu[path.name]))
             if label == "bifurcation":
                 here = branching(_by_arc(scene, path), point)
                 crossing = crossing or here
                 mode = ("symmetric" if here.symmetric else "asymmetric") if here else ""
             yield Record(label, path.name, point, mode, excluded_pivots=watch.unstable)
-            if abs(point.state.mu[path.name]) >= ends.get(goal.until, np.inf):
+            if abs(point.state.mu[path.name]) > furthest:
                 break
     except PathStopped as e:
         lost = _why(path, e, walk.points)

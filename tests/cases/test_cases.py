@@ -182,6 +182,15 @@ def test_clamped_plate() -> None:
     assert found.rows[-1]["w_pole_over_h"] == pytest.approx(w0_over_h, rel=1e-4)
 
 
+def test_cylinder_waves() -> None:
+    """The half shell's first bifurcation, p/p_c = 0.113764 with elements of 0.14 R; a tube between two walls, m = 9."""
+    found = result("cylinder_waves.yaml")
+    (first,) = found.limit_points
+    assert (first["kind"], first["mode"]) == ("bifurcation", "m = 9")
+    assert found.knockdown == pytest.approx(0.113764, rel=2e-4)
+    assert found.rows[-1]["label"] == "bifurcation"
+
+
 def test_bracket() -> None:
     """w = F b^2 (a + b/3)/(E I) (Bernoulli): the fold of the mesh is part of the undeformed shape."""
     found = result("bracket.yaml")

@@ -76,7 +76,7 @@ def supports(meridian: Meridian, conditions: Mapping[str, Condition], *, pressur
     MeshError
         If an end lies in no plane of symmetry, or in one that is open to a live `pressure`.
     """
-    horizontal, axial, clamped, mirror = ([np.empty(0, np.int32)] for _ in range(4))
+    horizontal, axial, clamped, mirror = found = [list[Facets]() for _ in range(4)]
     for name, condition in conditions.items():
         here = meridian.ends.get(name, meridian.axis)
         held = set(condition.components) if isinstance(condition, Held) else set()
@@ -92,7 +92,7 @@ def supports(meridian: Meridian, conditions: Mapping[str, Condition], *, pressur
             horizontal.append(here)
         if AXIAL in held:
             axial.append(here)
-    return Supports(meridian.axis, *(np.unique(np.concatenate(f)) for f in (horizontal, axial, clamped, mirror)))
+    return Supports(meridian.axis, *(np.unique(np.concatenate([np.empty(0, np.int32), *f])) for f in found))
 
 
 def _refuse_slanting(meridian: Meridian, name: str, *, pressure: bool) -> None:

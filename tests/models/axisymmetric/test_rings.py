@@ -149,7 +149,7 @@ def test_waves_of_a_hinged_cylinder() -> None:
 
 WAVY: list[tuple[dict[str, Any], dict[str, Any]]] = [
     ({"bottom": "clamped", "top": "clamped"}, {"kind": "pressure"}),
-    ({"bottom": "clamped"}, {"kind": "dead", "loads": [{"edge": "top", "moment": -1e-5}]}),
+    ({"bottom": "clamped"}, {"kind": "dead", "loads": [{"edge": "top", "moment": 1e-5}]}),
 ]
 
 
@@ -159,7 +159,7 @@ def test_waves_are_those_of_the_half_shell(boundary: dict[str, Any], loading: di
     shell = {**CYLINDER, "thickness": 0.03}
     problem = {"shell": shell, "boundary": boundary, "loading": {**loading, "until": "bifurcation"}}
     _, load = first_wave(problem, degree=4)
-    half = ms.Scene(ms.Case.from_source(Source("test", {**problem, "symmetry": "half", "mesh": {"size": 0.22}})))
+    half = ms.Scene(ms.Case.from_source(Source("test", {**problem, "symmetry": "half", "mesh": {"size": 0.3}})))
     name = "load" if half.plan.loads.dead else "pressure"
     below, above = 0.995 * load, 1.005 * load
     path = Path(half.newton, name, "load", StepOptions(below, below, 1e-3 * below))
