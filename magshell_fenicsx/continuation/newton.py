@@ -46,6 +46,9 @@ class NewtonOptions:
         The first factors are kept while a step is shorter than this part of the one before.
     hard
         The same of later factors, and of all where the guess comes with a stress: old ones lead astray there.
+    cheap
+        As many steps with old factors cost less than new ones: so near the end old ones are kept that halve a step,
+        but not where the guess comes with a stress.
     fresh
         Distance, in lengths, up to which factors serve for the tangent and the inertia of a solution.
     largest_step
@@ -56,6 +59,7 @@ class NewtonOptions:
     max_iterations: int = 25
     contraction: float = 0.6
     hard: float = 0.1
+    cheap: int = 8
     fresh: float = 0.05
     largest_step: float = 1e4
 
@@ -287,8 +291,10 @@ class BorderedNewton:
         if progress.matrix is not None:
             ahead = self._updated(progress.matrix.solve(*f))
             size = progress.matrix.size(ahead)
-            first = sum(step.own for step in steps) == 1 and not self._followed
-            if size <= (self.options.contraction if first else self.options.hard) * steps[-1].size:
+            first, o = sum(step.own for step in steps) == 1 and not self._followed, self.options
+            ratio = size / steps[-1].size
+            ends = ratio <= 0.5 and size * ratio**o.cheap <= o.tolerance and not self._followed
+            if ends or ratio <= (o.contraction if first else o.hard):
                 steps.append(Step(size, own=False))
                 return ahead
         factors = self.factor_at(state, self._stress)

@@ -103,7 +103,7 @@ class SurfaceGatherer:
         values = element.tabulate(0, self._places)[0, :, :, 0]
         return np.asarray(factor.x.array[V.dofmap.list[: self._owned]] @ values.T)
 
-    def _weighted_mean(self, numbers: NDArray[np.int64], size: int) -> scipy.sparse.csr_matrix | None:
+    def _weighted_mean(self, numbers: NDArray[np.int64], size: int) -> "scipy.sparse.csr_matrix | None":
         """From the nodes of all cells to nodes in global order, on rank 0.
 
         Second derivatives jump between cells: the mean over those that share a node is weighted by their areas.
