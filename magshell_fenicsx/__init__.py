@@ -26,7 +26,8 @@ if TYPE_CHECKING:
     from magshell_fenicsx.run.notebook import curve, picture, polydata, surface
     from magshell_fenicsx.run.rows import columns
     from magshell_fenicsx.run.run import Result, run
-    from magshell_fenicsx.simulate.follow import Record, Stopped, follow
+    from magshell_fenicsx.simulate.follow import follow
+    from magshell_fenicsx.simulate.record import Record, Stopped
     from magshell_fenicsx.simulate.scene import Scene
     from magshell_fenicsx.simulate.sensitivity import fold_at, sensitivities
     from magshell_fenicsx.simulate.trace import trace
@@ -64,7 +65,8 @@ _ROOMS = {
     "run.notebook": "curve picture polydata surface",
     "run.rows": "columns",
     "run.run": "Result run",
-    "simulate.follow": "Record Stopped follow",
+    "simulate.follow": "follow",
+    "simulate.record": "Record Stopped",
     "simulate.scene": "Scene",
     "simulate.sensitivity": "fold_at sensitivities",
     "simulate.trace": "trace",

@@ -16,7 +16,7 @@ from magshell_fenicsx.output.pictures.picture import figures
 from magshell_fenicsx.output.pictures.render import smooth_surface
 from magshell_fenicsx.output.store.table import Row
 from magshell_fenicsx.run.rows import rows
-from magshell_fenicsx.simulate.follow import Record
+from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.scene import Scene
 
 if TYPE_CHECKING:  # take long to import

@@ -30,7 +30,8 @@ from magshell_fenicsx.run.summary import Result, summary
 from magshell_fenicsx.simulate.adapt.choice import Adapted
 from magshell_fenicsx.simulate.adapt.ending import NoResult
 from magshell_fenicsx.simulate.adapt.tolerance import adapted
-from magshell_fenicsx.simulate.follow import Stopped, follow
+from magshell_fenicsx.simulate.follow import follow
+from magshell_fenicsx.simulate.record import Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.sensitivity import sensitivities
 

@@ -20,7 +20,7 @@ from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.shell.parameters import Magnetisation
 from magshell_fenicsx.models.shell.patterns import Array, InsideAndOutside, Pattern
 from magshell_fenicsx.models.shell.terms import TermFactory
-from magshell_fenicsx.simulate.follow import Record
+from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.transfer import same_mesh, transfer
 

@@ -8,7 +8,8 @@ from magshell_fenicsx.continuation.control import GivenConjugate, GivenLoad, Row
 from magshell_fenicsx.continuation.fold import FoldLost, Guess, find_fold
 from magshell_fenicsx.continuation.system import State, System, Vector
 from magshell_fenicsx.simulate.adapt.carry import NotCarried, carry
-from magshell_fenicsx.simulate.follow import Record, Stopped, follow
+from magshell_fenicsx.simulate.follow import follow
+from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
 
 
