@@ -26,6 +26,8 @@ class Grid:
         Names of x = low, x = high, y = low and y = high.
     glued
         Whether the two ends of each axis are one line of the surface.
+    through
+        Coordinates across either axis that have a grid line.
     """
 
     low: tuple[float, float]
@@ -33,6 +35,7 @@ class Grid:
     size: float
     sides: tuple[str, str, str, str] = ("left", "right", "bottom", "top")
     glued: tuple[bool, bool] = (False, False)
+    through: tuple[tuple[float, ...], tuple[float, ...]] = ((), ())
 
     @property
     def edges(self) -> tuple[str, ...]:
@@ -53,7 +56,7 @@ class Grid:
     def lines(self, axis: int, points: Sequence[Array]) -> Array:
         """Coordinates of the grid lines across an axis: through every point, and no farther apart than the size."""
         low, high = self.low[axis], self.high[axis]
-        given = np.unique([low, high, *(float(x[axis]) for x in points)])
+        given = np.unique([low, high, *self.through[axis], *(float(x[axis]) for x in points)])
         given = given[np.concatenate([[True], np.diff(given) > CLOSE * (high - low)])]
         given[-1] = high
         parts = [max(int(np.ceil((b - a) / self.size - 1e-6)), 1) for a, b in pairwise(given)]

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.source import CaseError
+from magshell_fenicsx.mesh.mirror import Y0
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.output.store.table import COLUMNS
 from magshell_fenicsx.plan.plan import Plan
@@ -45,7 +46,7 @@ def _not_sharing(plan: Plan, terms: Sequence[OwnTerm]) -> OwnTerm | None:
 
     def shares(term: OwnTerm) -> bool:
         if plan.axisymmetric:
-            return term.turns and term.mirrors
-        return not plan.half or (term.mirrors and (term.turns or plan.azimuth == 0))
+            return term.turns and term.mirrored(Y0)
+        return not plan.mirror or (term.mirrored(plan.mirror) and (term.turns or plan.azimuth == 0))
 
     return next((term for term in terms if not shares(term)), None)
