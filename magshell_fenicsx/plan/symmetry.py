@@ -167,7 +167,9 @@ def _field(case: Case, outline: Outline) -> list[Leaves]:
 
         def images(sign: float) -> bool:
             uniform = all(np.abs(S @ v - sign * v).max() <= 1e-10 for v in (*vectors, *turning))
-            varying = all(_alike(sign * field(x) @ S, field(mirror.image(x))) for field in fields)
+            varying = all(
+                _alike(sign * np.einsum("ni,ij->nj", field(x), S), field(mirror.image(x))) for field in fields
+            )
             kinds = {"radial": 1.0, "tangential": float(S[2, 2])}
             return uniform and varying and kinds.get(remanent.kind, sign) == sign
 
@@ -230,6 +232,8 @@ def _named(case: Case, outline: Outline) -> list[Leaves]:
 
 def _alike(here: Array, there: Array) -> bool:
     """Equal to rounding, and finite."""
+    if not (np.isfinite(here).all() and np.isfinite(there).all()):
+        return False
     return bool((np.abs(here - there) <= ROUNDING * np.abs(here).max(initial=0.0)).all())
 
 

@@ -135,7 +135,10 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
     ({"loading": {"kind": "dead", "loads": [{"edge": "top"}], "factor": 1}}, "one of force, per_length, moment"),
     ({"loading": {"kind": "dead", "loads": [{"at": "B", "force": [1, 0, 0]}], "factor": 1}}, "name it in points"),
     ({"loading": {"kind": "dead", "loads": [{"at": "B", "force": [0, 0, 0]}], "factor": 1}}, "force: is zero"),
-    ({"shell.azimuth": [0, 90], "symmetry": "half"}, "boundary: {name: symmetry}"),
+    (
+        {"boundary": {"bottom": "clamped", "left": "hinged"}, "shell.azimuth": [0, 90], "symmetry": "half"},
+        "no common mir",
+    ),
     ({"mesh.tolerance": 1e-3}, "mesh.tolerance: not with a cylinder"),
     ({"shell.thickness_factor": "1 +"}, "is not a formula"),
     ({"points": {"pole": [1, 0, 0]}}, "points.pole: is taken"),

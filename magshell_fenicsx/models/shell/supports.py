@@ -16,7 +16,7 @@ from magshell_fenicsx.models.shell.parameters import Condition, Held, Loads
 
 Array = NDArray[np.float64]
 STRAIGHT = 1e-6  # deviation of an edge from a plane, in lengths of R
-RIGHT = 0.99  # cosine between the surface's mean direction at an edge and the normal of the plane that it crosses
+RIGHT = 0.99  # mean cosine between the conormals of an edge and the normal of the plane that the surface crosses
 FREE = 1e-12  # of the squares that a rigid motion has where the shell is held, over the largest: rounding
 LOOSE = 1e-13  # of a rigid motion's energy, over the tangent's largest row
 
@@ -82,17 +82,18 @@ def plane_of(r0: fem.Function, facets: NDArray[np.int32], name: str) -> Mirror:
     V = r0.function_space
     dofs = fem.locate_dofs_topological(V, 1, facets)
     places = np.concatenate(V.mesh.comm.allgather(r0.x.array.reshape(-1, 3)[dofs]))
-    across, centre = _mean_conormal(r0, facets), places.mean(axis=0)
+    conormals, centre = _conormals(r0, facets), places.mean(axis=0)
     _, spread, axes = np.linalg.svd(places - centre, full_matrices=False)
     if spread[1] > STRAIGHT * spread[0]:
         candidates = [axes[2]]
     else:  # a straight edge lies in many planes: those of the axes, and through e3, are exact
         upright = np.array([-centre[1], centre[0], 0.0])
-        fitted = across - (across @ axes[0]) * axes[0]
+        fitted = conormals.sum(axis=0) @ (np.eye(3) - np.outer(axes[0], axes[0]))
         candidates = [*np.eye(3), *([upright] if upright.any() else []), fitted]
     for normal in candidates:
         plane = Mirror.of(normal, float(normal @ centre))
-        if np.ptp(plane.beyond(places)) < STRAIGHT and abs(plane.normal @ across) > RIGHT * np.linalg.norm(across):
+        crossing = np.abs(conormals @ plane.normal).sum() / np.linalg.norm(conormals, axis=1).sum()
+        if np.ptp(plane.beyond(places)) < STRAIGHT and crossing > RIGHT:
             return plane
     raise MeshError(f"boundary.{name}: symmetry: the edge must lie in a plane that the surface crosses at right angles")
 
@@ -106,13 +107,13 @@ def closing_point(planes: Sequence[Mirror]) -> Array | None:
     return np.asarray(point) if np.abs(normals @ point - offsets).max() < STRAIGHT else None
 
 
-def _mean_conormal(r0: fem.Function, facets: NDArray[np.int32]) -> Array:
-    """Mean (3,) of the outward conormals in the middle of some edges; collective."""
+def _conormals(r0: fem.Function, facets: NDArray[np.int32]) -> Array:
+    """Outward conormals (n, 3) in the middle of some edges, as long as those; collective."""
     V = r0.function_space
     topology = V.mesh.topology
     for dims in ((1, 2), (2, 1)):
         topology.create_connectivity(*dims)
-    corners, total = basix.geometry(basix.CellType.triangle), np.zeros(3)
+    corners, found = basix.geometry(basix.CellType.triangle), []
     for facet in facets[facets < topology.index_map(1).size_local]:
         cell = topology.connectivity(1, 2).links(facet)[0]
         side = int(np.flatnonzero(topology.connectivity(2, 1).links(cell) == facet)[0])
@@ -121,8 +122,8 @@ def _mean_conormal(r0: fem.Function, facets: NDArray[np.int32]) -> Array:
         a = table @ r0.x.array.reshape(-1, 3)[V.dofmap.list[cell]]
         along, outward = (ends[1] - ends[0]) @ a, (ends.mean(axis=0) - corners[side]) @ a
         outward -= (outward @ along) / (along @ along) * along
-        total += np.linalg.norm(along) * outward / np.linalg.norm(outward)
-    return np.asarray(V.mesh.comm.allreduce(total))
+        found.append(np.linalg.norm(along) * outward / np.linalg.norm(outward))
+    return np.concatenate(V.mesh.comm.allgather(np.reshape(found, (-1, 3))))
 
 
 def refuse_loose(system: FiniteElementSystem, r0: fem.Function, amplitudes: Amplitudes) -> None:

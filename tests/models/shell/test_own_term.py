@@ -13,6 +13,7 @@ from ufl.core.expr import Expr
 from magshell_fenicsx import Case, CaseError, Jet, OwnTerm, Scene
 from magshell_fenicsx.case.source import Source
 from magshell_fenicsx.continuation.system import dot
+from magshell_fenicsx.mesh.mirror import Y0
 from magshell_fenicsx.models.shell import densities
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.model import ShellModel
