@@ -21,6 +21,7 @@ from magshell_fenicsx.case.surfaces import (
     Surface,
     TorusSurface,
 )
+from magshell_fenicsx.mesh.grading import Grading
 from magshell_fenicsx.mesh.grid import Grid
 from magshell_fenicsx.mesh.mirror import Y0, Mirror
 from magshell_fenicsx.mesh.msh import MeshFile, in_space, read_msh
@@ -32,6 +33,7 @@ from magshell_fenicsx.plan.mirrors import grid_mirrors, lines_on, mesh_mirrors
 
 Array = NDArray[np.float64]
 Chart = Shape | Grid | MeshFile
+ANY = Grading([], 1.0)
 ROUNDING = 1e-9
 ON_SURFACE = 1e-6  # of R, within which a named point lies on the surface
 
@@ -43,7 +45,7 @@ class Outline:
     Attributes
     ----------
     chart
-        What is meshed, for a mirror plane in the model's frame or None, and an element size (of grids).
+        What is meshed, for a mirror plane in the model's frame or None, and element sizes (of grids).
     inverse
         Chart (2,) of a place (3,); of a mesh file the place itself.
     highest
@@ -60,7 +62,7 @@ class Outline:
         hold, and whether its edges suffice (see `mesh_mirrors`).
     """
 
-    chart: Callable[[Mirror | None, float], Chart]
+    chart: Callable[[Mirror | None, Grading], Chart]
     embedding: Embedding
     inverse: Callable[[Array], Array]
     highest: Array | None
@@ -71,13 +73,19 @@ class Outline:
 
     def on_half(self, chart: Array) -> Array:
         """A place of the chart on its half, from which rounding may have moved it; grids and meshes are cut."""
-        if isinstance(self.chart(None, 1.0), Grid | MeshFile):
+        if self.grid or isinstance(self.chart(None, ANY), MeshFile):
             return chart
         return np.array([chart[0], chart[1] if chart[1] > ROUNDING else 0.0])
 
+    @property
+    def grid(self) -> Grid | None:
+        """What is meshed, if that is a grid."""
+        shape = self.chart(None, ANY)
+        return shape if isinstance(shape, Grid) else None
+
     def sample(self) -> Array:
         """Places (n, 3) all over the surface, with its centre, edges and axes among them."""
-        shape = self.chart(None, 1.0)
+        shape = self.chart(None, ANY)
         if isinstance(shape, MeshFile):
             return read_msh(shape, {}).nodes
         t = np.linspace(0, 1, 41)
@@ -155,7 +163,7 @@ def _disc(
     *,
     sphere: bool = False,
 ) -> Outline:
-    def chart(mirror: Mirror | None, size: float) -> Chart:
+    def chart(mirror: Mirror | None, size: Grading) -> Chart:
         return DiscShape(edge, mirror is not None, circle, name)
 
     def within(x: Array) -> Array:
@@ -183,9 +191,9 @@ def _ring(shell: Surface, profile: Profile, names: tuple[str, str]) -> Outline:
 
 
 def _grid(grid: Grid, embedding: Embedding, inverse: Callable[[Array], Array], highest: Array) -> Outline:
-    def chart(mirror: Mirror | None, size: float) -> Chart:
+    def chart(mirror: Mirror | None, size: Grading) -> Chart:
         through = lines_on(mirror, grid, embedding) if mirror else grid.through
-        return replace(grid, size=size, through=through)
+        return replace(grid, size=size.across if size.features else size.largest, through=through)
 
     def planes(vectors: Sequence[Array], loosely: bool) -> list[Mirror]:
         return _either_half(grid_mirrors(grid, embedding))

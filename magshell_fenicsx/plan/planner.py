@@ -11,6 +11,7 @@ from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.expressions import formula
 from magshell_fenicsx.case.loading import DeadSection, IndentationSection
 from magshell_fenicsx.case.source import CaseError
+from magshell_fenicsx.case.surfaces import MeshSurface
 from magshell_fenicsx.mesh.frame import rotation
 from magshell_fenicsx.mesh.grading import Grading
 from magshell_fenicsx.mesh.grid import Grid
@@ -61,7 +62,7 @@ def make_plan(case: Case) -> Plan:
     at = [load.at for load in loading.loads if load.at] if isinstance(loading, DeadSection) else []
     names = [under] if isinstance(loading, IndentationSection) else at
     size = grading(case, drawn, material.h, defect, [points[name] for name in names])
-    shape = drawn.chart(beyond, size.largest)
+    shape = drawn.chart(beyond, size)
     if isinstance(shape, Grid) and beyond:  # what a point needs, its image needs too
         images = [drawn.inverse(beyond.image(drawn.embedding(x[None])[0])) for x in points.values()]
         x, y = ((*shape.through[i], *(float(image[i]) for image in images)) for i in range(2))
@@ -125,7 +126,9 @@ def _symmetry(case: Case, drawn: Outline, parts: list[Leaves]) -> tuple[bool, Mi
         return False, None
     plane = mirror(parts, drawn, loosely=case.symmetry == "half")
     if case.symmetry == "half" and plane is None:
-        raise CaseError("symmetry: half: the shell, its supports, the fields and the load have no common mirror plane")
+        made = "; edges of a mesh file must lie in it: mesh a half, mirror the nodes and triangles, join them"
+        hint = made if isinstance(case.shell, MeshSurface) else ""
+        raise CaseError(f"symmetry: half: shell, supports, fields and load have no common mirror plane{hint}")
     return False, plane
 
 
@@ -168,8 +171,6 @@ def _refuse_unreasonable(
     refuse_unbounded_fields(case, drawn.sample() if charted else np.zeros((0, 3)))
     if isinstance(shape, MeshFile) or axisymmetric:
         return
-    if isinstance(shape, Grid) and case.mesh.tolerance is not None:
-        raise CaseError(f"mesh.tolerance: not with a {case.shell.geometry}; magshell study compares meshes and degrees")
     cells = shape.cells * (0.5 if half else 1.0) if isinstance(shape, Grid) else size.cells(shape)
     hint = "" if half else "; where shell, fields and loads have a mirror plane, symmetry: half halves it"
     refuse_too_many(case, cells, hint)

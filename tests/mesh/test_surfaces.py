@@ -139,7 +139,6 @@ REFUSED: list[tuple[dict[str, Any], str]] = [
         {"boundary": {"bottom": "clamped", "left": "hinged"}, "shell.azimuth": [0, 90], "symmetry": "half"},
         "no common mir",
     ),
-    ({"mesh.tolerance": 1e-3}, "mesh.tolerance: not with a cylinder"),
     ({"shell.thickness_factor": "1 +"}, "is not a formula"),
     ({"points": {"pole": [1, 0, 0]}}, "points.pole: is taken"),
     ({"magnetic": DENSITIES}, "give youngs_modulus and lengths units, or lambda_m"),

@@ -115,13 +115,15 @@ def test_a_half_knows_the_modes_of_the_whole() -> None:
     assert values[0] == pytest.approx(values[1], rel=1e-7)
 
 
-def written(file: Path, nodes: NDArray[np.float64], cells: NDArray[np.int64], rim: NDArray[np.int64]) -> Path:
-    """A file of cubic triangles, with the edge `rim`."""
+def written(
+    file: Path, nodes: NDArray[np.float64], cells: NDArray[np.int64], rim: NDArray[np.int64], order: int = 3
+) -> Path:
+    """A file of triangles, with the edge `rim`."""
     gmsh.initialize(readConfigFiles=False, interruptible=False)
     gmsh.option.setNumber("General.Terminal", 0)
     surface, curve = gmsh.model.addDiscreteEntity(2), gmsh.model.addDiscreteEntity(1)
     gmsh.model.mesh.addNodes(2, surface, np.arange(1, len(nodes) + 1), nodes.ravel())
-    gmsh.model.mesh.addElementsByType(surface, 21, [], (cells + 1).ravel())
+    gmsh.model.mesh.addElementsByType(surface, {1: 2, 3: 21}[order], [], (cells + 1).ravel())
     gmsh.model.mesh.addElementsByType(curve, 1, [], (rim + 1).ravel())
     gmsh.model.addPhysicalGroup(2, [surface], name="all")
     gmsh.model.addPhysicalGroup(1, [curve], name="rim")
@@ -130,35 +132,67 @@ def written(file: Path, nodes: NDArray[np.float64], cells: NDArray[np.int64], ri
     return file
 
 
-@pytest.fixture(scope="module")
-def hemisphere_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The triangles of the built-in half, and their mirror images, as an order-3 mesh file."""
-    shell = {"geometry": "hemisphere", "radius_to_thickness": 1 / H, "poisson_ratio": NU}
-    data = {"shell": shell, "boundary": {"equator": "clamped"}, "symmetry": "half", **INDENTED}
-    patch = make_plan(ms.Case.from_source(Source("test", data))).triangulated()
+def mesh_of(asked: ms.Case, file: Path) -> Path:
+    """The triangles of a built-in half, and their mirror images, as an order-3 mesh file."""
+    patch = make_plan(asked).triangulated()
     places, n = patch.embedding(patch.nodes), len(patch.nodes)
     on_plane = np.abs(places[:, 1]) < 1e-12
     places[on_plane, 1] = 0
     image = np.where(on_plane, np.arange(n), n + np.cumsum(~on_plane) - 1)
     cells = np.vstack([patch.cells, image[patch.cells[:, [0, 2, 1, 8, 7, 6, 5, 4, 3, 9]]]])
     rim = np.vstack([patch.edges["equator"], image[patch.edges["equator"]]])
-    nodes = np.vstack([places, places[~on_plane] * [1, -1, 1]])
-    return written(tmp_path_factory.mktemp("mesh") / "hemisphere.msh", nodes, cells, rim)
+    return written(file, np.vstack([places, places[~on_plane] * [1, -1, 1]]), cells, rim)
 
 
-INDENTED = {
-    "loading": {"kind": "indentation", "at": {"polar": 0}, "depth": 10, "points": 4},
-    "mesh": {"degree": 4, "refinement": 0.7},
+DIMPLED = {"defect": {"kind": "dimple", "amplitude": 1.64, "width": 3.2}}
+FOUND = {
+    "force": ({}, {"kind": "indentation", "at": {"polar": 0}, "depth": 10, "points": 4}),
+    "p_over_pc": (DIMPLED, {"kind": "pressure"}),
 }
 
 
-def test_an_order_3_mesh_file_of_a_hemisphere(hemisphere_file: Path) -> None:
-    """F(10) on the triangles of the built-in shape, cubic in place of exact; its half and its whole."""
-    shell = {"geometry": "hemisphere", "radius_to_thickness": 1 / H, "poisson_ratio": NU}
-    data = {"shell": shell, "boundary": {"equator": "clamped"}, "symmetry": "half", **INDENTED}
-    built_in = end(ms.Case.from_source(Source("test", data)))["force"]
-    shell = {"geometry": "mesh", "file": str(hemisphere_file), "radius": 1.0, "thickness": H, "poisson_ratio": NU}
-    loading = INDENTED["loading"] | {"at": {"point": "A"}}
-    data = {"shell": shell, "boundary": {"rim": "clamped"}, "points": {"A": [0, 0, 1]}, "loading": loading}
-    asked = ms.Case.from_source(Source("test", data | {"mesh": {"degree": 4}, "symmetry": "half"}))
-    assert end(asked)["force"] == pytest.approx(built_in, rel=2e-4)
+def result(asked: ms.Case, column: str) -> float:
+    """At the first instability, or at the end."""
+    scene = ms.Scene(asked)
+    records = list(ms.follow(scene))
+    located = [record for record in records if record.label in ("fold", "bifurcation")]
+    return scene.observe((located or records[-1:])[0].point.state)[column]
+
+
+@pytest.mark.parametrize("column", FOUND)
+def test_an_order_3_mesh_file_of_a_hemisphere(column: str, tmp_path: Path) -> None:
+    """F(10) and k_d on the triangles of the built-in half, cubic in place of exact; by half and whole."""
+    defect, loading = FOUND[column]
+    shell = {"geometry": "hemisphere", "radius_to_thickness": 1 / H, "poisson_ratio": NU, **defect}
+    mesh = {"degree": 3, "refinement": 0.5}
+    data = {"shell": shell, "boundary": {"equator": "clamped"}, "loading": loading, "mesh": mesh, "symmetry": "half"}
+    built_in = ms.Case.from_source(Source("test", data))
+    file = mesh_of(built_in, tmp_path / "hemisphere.msh")
+    shell = {"geometry": "mesh", "file": str(file), "radius": 1.0, "thickness": H, "poisson_ratio": NU}
+    data = {"shell": shell, "boundary": {"rim": "clamped"}, "mesh": {"degree": 3}, "loading": loading}
+    if column == "force":
+        data |= {"points": {"A": [0, 0, 1]}, "loading": loading | {"at": {"point": "A"}}}
+    half, whole = (ms.Case.from_source(Source("test", data | {"symmetry": s})) for s in ("auto", "none"))
+    assert (make_plan(half).half, make_plan(whole).half) == (True, False)
+    found = result(half, column)
+    assert found == pytest.approx(result(built_in, column), rel=2e-4)
+    assert found == pytest.approx(result(whole, column), rel=1e-9)
+
+
+def test_a_mesh_file_with_a_curve_in_its_plane(tmp_path: Path) -> None:
+    """Other triangles on either side: one of them is half of the surface, if that is asked for."""
+    grid = {"shell": MATERIAL | PLATE, "boundary": {}, "mesh": {"size": 0.25}, "symmetry": "none"}
+    patch = make_plan(ms.Case.from_source(Source("test", grid))).triangulated()
+    nodes = patch.embedding(patch.nodes)
+    move = (nodes[:, 0] > 0.51) & (nodes[:, 0] < 0.99) & (nodes[:, 1] > 0.01) & (nodes[:, 1] < 0.49)
+    nodes[move] += [0.03, 0.02, 0.0]
+    file = written(tmp_path / "plate.msh", nodes, patch.cells, np.vstack(list(patch.edges.values())), order=1)
+    shell = {"geometry": "mesh", "file": str(file), "radius": 1.0, **MATERIAL}
+    sections = {"shell": shell, "boundary": {"rim": "clamped"}, "mesh": {"degree": 3}}
+    assert not make_plan(case("auto", **sections)).mirror
+    half, whole = (end(case(s, **sections)) for s in ("half", "none"))
+    assert half["w_over_h"] == pytest.approx(whole["w_over_h"], rel=2e-3)
+    nodes[(np.abs(nodes[:, 0] - 0.5) < 1e-9) & (nodes[:, 1] > 0.4), 0] += 0.01
+    written(file, nodes, patch.cells, np.vstack(list(patch.edges.values())), order=1)
+    with pytest.raises(CaseError, match="mesh a half, mirror the nodes"):
+        make_plan(case("half", **sections))
