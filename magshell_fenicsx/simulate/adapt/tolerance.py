@@ -31,6 +31,7 @@ SAFETY = 1.25  # the richer solution has an error too
 AIM, LEAST = 0.55, 1 / 5  # estimated error over the tolerance
 MOST_ROUNDS = 6
 COARSEST, FINEST = 0.1, 20.0  # refinement of a meridian
+LINES = 1.25  # least refinement of a grid, which may have few lines to add to
 FEW = 50  # cells of a surface that are not worth making fewer
 
 Say = Callable[[str], None]
@@ -118,7 +119,10 @@ def _remeshed(choice: Choice, coarse: Solved, fine: Solved, reduction: float) ->
     scene, degree = coarse[0], choice.degree
     order = 2 * degree - 2  # of an energy in the size of the cells
     if scene.plan.axisymmetric or isinstance(scene.plan.shape, Grid):
-        finer = np.clip(choice.refinement * np.clip(reduction, 1e-3, 1e3) ** (-1 / order), COARSEST, FINEST)
+        change = np.clip(reduction, 1e-3, 1e3) ** (-1 / order)
+        if reduction < 1 and not scene.plan.axisymmetric:
+            change = max(change, LINES)
+        finer = np.clip(choice.refinement * change, COARSEST, FINEST)
         refinement = round(float(finer), 3)
         return Choice(degree, refinement) if refinement != choice.refinement else None
     if reduction > 1 and scene.cells <= FEW:
