@@ -71,11 +71,12 @@ class SolidModel(Observed):
         self.r0.interpolate(lambda x: x)
         self._factory = factory = TermFactory(body, self.u, neo_hookean, material.h, self.kernels)
         self._pattern = factory.distortion()
+        origin = mirror.offset * mirror.normal
         self._terms: list[Term] = [self._pattern, factory.compression()]
         if loads.magnetic:
             self._terms += factory.magnetic(loads.magnetic)
         if loads.pressure:
-            self._terms.append(factory.pressure(material.classical_pressure))
+            self._terms.append(factory.pressure(material.classical_pressure, origin))
         if loads.force:
             self._terms.append(self._force(loads.force))
         self._held = _held(V, [body.faces[n] for n, c in conditions.items() if c == "clamped"], range(3))
@@ -83,7 +84,7 @@ class SolidModel(Observed):
         self.mirror = mirror
         self._sites = make_sites(body, self.r0, self._terms, self.kernels)
         self.system = self._system(self._held + self._held_on_mirror([mirror.normal]))
-        self.observe(self.kernels.compile("volume energy", factory.volume_change()), body.points)
+        self.observe(self.kernels.compile("volume energy", factory.volume_change(origin)), body.points)
 
     @cached_property
     def excluded_modes(self) -> AntisymmetricModes | None:
