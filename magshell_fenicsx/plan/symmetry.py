@@ -92,7 +92,8 @@ def mirror(parts: Sequence[Leaves], outline: Outline, *, loosely: bool = False) 
 
     if any(part.mirrors is _none for part in parts):
         return None
-    return first(upright) or first(outline.mirrors([_unit(v) for v in vectors], loosely))
+    found = first(upright) or first(outline.mirrors([_unit(v) for v in vectors], False))
+    return first(outline.mirrors([_unit(v) for v in vectors], True)) if loosely and not found else found
 
 
 def askew(parts: Sequence[Leaves]) -> str | None:
