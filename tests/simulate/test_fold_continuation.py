@@ -16,7 +16,7 @@ from magshell_fenicsx.case.source import Source
 from magshell_fenicsx.continuation.fold import Fold, FoldLost, Guess, find_fold
 from magshell_fenicsx.run.run import run
 from magshell_fenicsx.simulate.scene import Scene
-from magshell_fenicsx.simulate.transfer import same_mesh, transfer
+from magshell_fenicsx.simulate.transfer import _stretch, same_mesh, transfer
 from magshell_fenicsx.studies.sweep.continuation import Continuation
 from magshell_fenicsx.studies.sweep.outcome import Outcome
 from magshell_fenicsx.studies.sweep.sweep import sweep
@@ -143,6 +143,9 @@ def test_shallow_caps_are_similar() -> None:
         return result.scene, find_fold(result.scene.newton, Guess(result.last), "pressure")
 
     (source, fold), (target, there) = at(90), at(100)
+    rim, stretch = np.radians([[35.0]]), _stretch(source, target)
+    assert stretch
+    assert stretch.place(rim) == pytest.approx(rim, rel=1e-12)
     u = transfer(source, target, fold.state.u)
     assert abs(u - there.state.u).max() < 0.1 * (100 / 90 - 1) * abs(there.state.u).max()
 
