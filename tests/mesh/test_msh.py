@@ -321,6 +321,7 @@ shell: {geometry: mesh, file: parts/part.msh, radius: 1, thickness: 0.02, youngs
 boundary: {rim: clamped}
 loading: {kind: dead, control: load, loads: [{over: all, pressure: 1e-9}], factor: 1, points: 1}
 mesh: {degree: 2}
+symmetry: none
 """
 
 
