@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from magshell_fenicsx.assembly.parameter import Parameter
+from magshell_fenicsx.assembly.sliding import Constraint, Projection, Sliding
 from magshell_fenicsx.assembly.terms import FormTerm, Term
 from magshell_fenicsx.continuation.noise import Noise
 from magshell_fenicsx.continuation.system import Amplitudes, Vector, Weighted
@@ -46,14 +47,14 @@ class ResidualAssembler(Protocol):
 
 
 class FiniteElementSystem:
-    """Sum of terms for a displacement u that vanishes at `clamped`.
+    """Sum of terms for a displacement u that is held.
 
     Parameters
     ----------
     u
         The displacement that the terms were written with; it is overwritten.
-    clamped
-        Homogeneous Dirichlet conditions.
+    held
+        Where u, or a component of it in any direction, is zero.
     pattern
         The term with the widest coupling: its tangent's sparsity is that of the sum.
     length
@@ -70,7 +71,7 @@ class FiniteElementSystem:
         self,
         u: fem.Function,
         terms: Sequence[Term],
-        clamped: list[fem.DirichletBC],
+        held: Sequence[Constraint],
         pattern: FormTerm,
         length: float,
         assembler: TangentAssembler | None = None,
@@ -78,7 +79,10 @@ class FiniteElementSystem:
         parameters: Mapping[str, Parameter] | None = None,
     ) -> None:
         V = u.function_space
-        self.u, self.terms, self.clamped, self.length = u, terms, clamped, length
+        self.u, self.terms, self.length = u, terms, length
+        self.clamped = clamped = [c for c in held if isinstance(c, fem.DirichletBC)]
+        sliding = [c for c in held if isinstance(c, Sliding)]
+        self.projection = Projection(V, sliding, clamped) if sliding else None
         self.parameters = parameters or {}
         self.coordinates = frozenset(self.parameters)
         self.comm = V.mesh.comm
@@ -109,10 +113,15 @@ class FiniteElementSystem:
         return np.array(self.u.x.array)
 
     def held(self, u: Vector) -> Vector:
-        """A displacement with zeros at the clamped degrees of freedom."""
+        """A displacement with zeros where it is held."""
         u = np.array(u)
-        u[self._fixed] = 0
+        self._hold(u)
         return u
+
+    def _hold(self, u: Vector) -> None:
+        u[self._fixed] = 0
+        if self.projection:
+            self.projection.project(u)
 
     def place(self, mu: Amplitudes) -> None:
         """Put the free parameters into the terms."""
@@ -182,6 +191,8 @@ class FiniteElementSystem:
             self.place(mu)
             factors = {t.name: _factor(t, mu) for t in self.terms}
             K = self._assembler.tangent(factors, whole) if self._assembler else self._of_forms(factors)
+            if self.projection:
+                K = self.projection.tangent(K)
             if self.noise:
                 self.noise.on_matrix(K)
             return K
@@ -209,7 +220,7 @@ class FiniteElementSystem:
                 if factor:
                     term.add_residual(b, factor)
             self._b.x.scatter_reverse(InsertMode.add)
-            b[self._fixed] = 0
+            self._hold(b)
             return np.array(b[: self.size])
 
 

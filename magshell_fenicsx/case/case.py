@@ -31,15 +31,14 @@ SOLID_DEGREE = 2
 
 
 class MeshSection(Section):
-    """The elements: C0 interior penalty on triangles; of hemispheres, graded towards dimple, load and edge."""
+    """The elements: C0 interior penalty on triangles, graded towards dimple, load and held edges."""
 
     degree: int = Field(default=4, ge=2, le=5)
     """Degree k of the displacement. Degree 2 locks; a solid has degree 2 and no other"""
     refinement: float = Field(default=1.0, ge=0.1, le=20)
     """Divides every element size; not of a mesh file"""
     size: Annotated[float, or_number("metre"), Field(gt=0, le=1e12)] | None = None
-    """Element size everywhere; by default graded where there is a pole, elsewhere 2 √(Rh), at most 0.35 R [the
-    shell's length]"""
+    """Element size everywhere; by default graded, away from loads and held edges at most 0.35 R [the shell's length]"""
     penalty: float | None = Field(default=None, ge=1e-3, le=1e9)
     """σ of the interior penalty; by default 5 k²"""
     tolerance: float | None = Field(default=None, ge=1e-6, le=0.1)
@@ -78,8 +77,8 @@ class Case(WithParts):
     """Lowest modes after the run"""
     symmetry: Literal["auto", "none", "half", "axisymmetric"] = "auto"
     """The part that is modelled: the smallest that the case allows (auto), all (none), one side of a mirror plane
-    through e3 of a strip or of what is closed around e3 (half), the meridian of what is closed around e3 and has an
-    edge (axisymmetric)"""
+    that shape, supports, fields and load share (half), the meridian of what is closed around e3 and has an edge
+    (axisymmetric)"""
 
     @model_validator(mode="wrap")
     @classmethod

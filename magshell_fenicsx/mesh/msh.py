@@ -1,12 +1,13 @@
 """A surface that somebody else meshed: gmsh's .msh with triangles of order 1, 2 or 3."""
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from magshell_fenicsx.mesh.mirror import Mirror, cut
 from magshell_fenicsx.mesh.msh_format import Block, Content, parsed
 from magshell_fenicsx.mesh.patch import MeshError, PatchMesh
 from magshell_fenicsx.mesh.soundness import border_edges, oriented, said_place
@@ -37,7 +38,7 @@ def in_space(x: Array) -> Array:
     return x
 
 
-def read_msh(file: MeshFile, points: Mapping[str, Array]) -> PatchMesh:
+def read_msh(file: MeshFile, points: Mapping[str, Array], mirror: Mirror | None = None) -> PatchMesh:
     """Read a surface; call it on one rank only.
 
     Physical groups of surfaces become named patches, those of curves named edges. Triangles that run the
@@ -47,12 +48,20 @@ def read_msh(file: MeshFile, points: Mapping[str, Array]) -> PatchMesh:
     ----------
     points
         Named places (3,) that must be vertices, in lengths of R. Without a "pole" it is the highest vertex.
+    mirror
+        Of the half that is taken; None for all.
 
     Raises
     ------
     MeshError
         If the file cannot be read, or holds no sound surface; see `soundness`.
     """
+    patch = _whole(file)
+    patch = cut(patch, mirror) if mirror else patch
+    return replace(patch, points=_vertices(patch.nodes, patch.cells, points))
+
+
+def _whole(file: MeshFile) -> PatchMesh:
     nodes, cells, patches, edges = _content(file)
     used, again = np.unique(cells, return_inverse=True)  # without nodes that no triangle has
     cells = again.reshape(cells.shape)
@@ -65,7 +74,7 @@ def read_msh(file: MeshFile, points: Mapping[str, Array]) -> PatchMesh:
             raise MeshError(f"{file.path}: the physical curve {name} is not part of the surface")
     cells = oriented(nodes, cells)
     edges = border_edges(nodes, cells, edges)
-    return PatchMesh(nodes, cells, in_space, edges, _vertices(nodes, cells, points), patches=patches)
+    return PatchMesh(nodes, cells, in_space, edges, patches=patches)
 
 
 def _vertices(nodes: Array, cells: NDArray[np.int64], points: Mapping[str, Array]) -> dict[str, Array]:

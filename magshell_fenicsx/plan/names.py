@@ -23,9 +23,7 @@ def refuse_unfit(
         With the name.
     """
     refuse_unknown(patch.edges, patch.points, patch.patches, conditions, loads)
-    for name, condition in conditions.items():
-        if isinstance(condition, Held) and name in patch.edges and name in patch.points:
-            raise MeshError(f"boundary.{name}: is an edge and a point; give the point another name")
+    _refuse_ambiguous(patch.edges, patch.points, conditions)
     if loads.magnetic and loads.magnetic.patches:
         by_patch(loads.magnetic.patches, patch.patches, len(patch.cells))
     for name in (thickness and thickness.patches) or {}:
@@ -48,9 +46,16 @@ def refuse_unfit_ends(
         With the name.
     """
     refuse_unknown(ends, points, [], conditions, loads)
+    _refuse_ambiguous(ends, points, conditions)
     for name in ends if loads.pressure else ():
         if not _closes(conditions.get(name, "free")):
             raise MeshError(open_to_pressure(name))
+
+
+def _refuse_ambiguous(edges: Collection[str], points: Collection[str], conditions: Mapping[str, Condition]) -> None:
+    for name, condition in conditions.items():
+        if isinstance(condition, Held) and name in edges and name in points:
+            raise MeshError(f"boundary.{name}: is an edge and a point; give the point another name")
 
 
 def _refuse_open(patch: PatchMesh, conditions: Mapping[str, Condition]) -> None:

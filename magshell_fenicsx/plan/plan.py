@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.mesh.grading import Size
 from magshell_fenicsx.mesh.grid import Grid, grid_mesh
+from magshell_fenicsx.mesh.mirror import Mirror, cut
 from magshell_fenicsx.mesh.msh import MeshFile, read_msh
 from magshell_fenicsx.mesh.patch import Embedding, PatchMesh
 from magshell_fenicsx.mesh.shapes import Shape
@@ -59,8 +60,10 @@ class Plan:
     ----------
     meridian
         What is modelled instead of the surface; None if that is modelled.
-    half
-        Model the half y >= 0 of a frame turned about e3 by `azimuth` (rad).
+    mirror
+        Plane of the half that is modelled; None for all.
+    azimuth
+        The model's frame is turned about e3 by it (rad).
     shape, size, points, embedding
         What is triangulated, and how it is put into space. The point "pole" is the one whose
         displacement is reported: the pole, the disc's centre, the strip's tip.
@@ -78,7 +81,7 @@ class Plan:
     loads: Loads
     conditions: dict[str, Condition]
     meridian: Span | None
-    half: bool
+    mirror: Mirror | None
     azimuth: float
     shape: Shape | Grid | MeshFile
     embedding: Embedding
@@ -94,6 +97,10 @@ class Plan:
     def axisymmetric(self) -> bool:
         """Whether the meridian is modelled."""
         return self.meridian is not None
+
+    @property
+    def half(self) -> bool:
+        return self.mirror is not None
 
     @property
     def fixed(self) -> bool:
@@ -114,7 +121,8 @@ class Plan:
 
     def _made(self) -> PatchMesh:
         if isinstance(self.shape, MeshFile):
-            return read_msh(self.shape, self.points)
+            return read_msh(self.shape, self.points, self.mirror)
         if isinstance(self.shape, Grid):
-            return grid_mesh(self.shape, self.points, self.embedding)
+            patch = grid_mesh(self.shape, self.points, self.embedding)
+            return cut(patch, self.mirror) if self.mirror else patch
         return triangulate(self.shape, self.size, self.points, self.embedding)

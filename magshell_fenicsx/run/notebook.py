@@ -32,7 +32,7 @@ def surface(scene: Scene, record: Record) -> Surface | None:
     """
     plan, state = scene.plan, record.point.state
     found = gatherer(scene.model, scene.comm).gather(state.u, state.mu)
-    return turned(completed(found) if plan.half else found, plan.azimuth) if found else None
+    return turned(completed(found, plan.mirror.plane) if plan.mirror else found, plan.azimuth) if found else None
 
 
 def polydata(scene: Scene, record: Record) -> "pyvista.PolyData | None":

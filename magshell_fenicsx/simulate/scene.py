@@ -18,6 +18,7 @@ from magshell_fenicsx.continuation.watch import Watch
 from magshell_fenicsx.mesh.frame import rotation
 from magshell_fenicsx.mesh.hexahedra import sweep
 from magshell_fenicsx.mesh.midsurface import Midsurface, distribute
+from magshell_fenicsx.mesh.mirror import Y0
 from magshell_fenicsx.models.axisymmetric.meridian import make_meridian
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.shell.model import ShellModel
@@ -158,7 +159,14 @@ def build_model(case: Case, plan: Plan, comm: MPI.Comm) -> ShellModel:
     """The whole shell or half of it, on all ranks together."""
     surface = build_midsurface(plan, comm)
     return ShellModel(
-        surface, plan.material, case.mesh.degree, plan.conditions, plan.loads, case.mesh.penalty, plan.thickness
+        surface,
+        plan.material,
+        case.mesh.degree,
+        plan.conditions,
+        plan.loads,
+        case.mesh.penalty,
+        plan.thickness,
+        plan.mirror or Y0,
     )
 
 
@@ -179,7 +187,7 @@ def build_meridian_model(case: Case, plan: Plan) -> MeridianModel:
 def build_solid_model(case: Case, plan: Plan, comm: MPI.Comm) -> SolidModel:
     """The whole body or half of it, on all ranks together."""
     body = sweep(from_first(comm, plan.triangulated), plan.material.h, (case.solid or SolidSection()).layers, comm)
-    return SolidModel(body, plan.material, neo_hookean(case), plan.conditions, plan.loads)
+    return SolidModel(body, plan.material, neo_hookean(case), plan.conditions, plan.loads, plan.mirror or Y0)
 
 
 def build_midsurface(plan: Plan, comm: MPI.Comm) -> Midsurface:

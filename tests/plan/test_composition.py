@@ -80,7 +80,8 @@ def test_a_dead_force_along_the_normal_is_an_indentation(shape: str) -> None:
     loading = {"kind": "indentation", "at": {"point": "A"}, "control": "load", "force": 0.05, "points": 1}
     indented = case(shape, points=points, mesh=mesh, loading=loading)
     a, b = end(dead), end(indented)
-    assert make_plan(dead).half == make_plan(indented).half == (shape != "plate")
+    assert make_plan(dead).half
+    assert make_plan(indented).half
     for column in ("w_over_h", "A_ux", "A_uy", "A_uz"):
         # the vertex's normal is that of flat triangles: to the square of their angle
         assert a[column] == pytest.approx(b[column], rel=2e-3, abs=1e-9)
@@ -124,7 +125,9 @@ MIRRORED: list[tuple[dict[str, Any], bool, bool]] = [
     ({"boundary": {"equator": {"held": ["x", "y", "z"]}}}, True, True),
     ({"boundary": {"equator": {"held": ["x", "z"]}}}, False, False),
     ({"points": {"A": [0, 0, 1.0]}}, True, True),
-    ({"points": {"A": [0, -0.6, 0.8]}}, True, False),
+    ({"points": {"A": [0.6, 0, 0.8]}}, True, True),
+    ({"points": {"A": [0, -0.6, 0.8]}}, True, True),
+    ({"points": {f"{x}{y}": [x * 0.48, y * 0.36, 0.8] for x in (-1, 1) for y in (-1, 1)}}, True, False),
     ({"points": {"A": [0.6, 0, 0.8]}, "boundary": {"equator": "clamped", "A": {"held": ["z"]}}}, False, True),
     ({"loading": {"kind": "dead", "loads": [{"over": "all", "per_area": [0, 0, 1]}], "factor": 1}}, True, True),
     ({"loading": {"kind": "dead", "loads": [{"over": "all", "per_area": [1, 2, 0]}], "factor": 1}}, False, True),

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.axisymmetric.meridian import Meridian
 from magshell_fenicsx.models.shell.parameters import Condition, Held
-from magshell_fenicsx.models.shell.supports import CROSSING, STRAIGHT, no_mirror, open_to_pressure
+from magshell_fenicsx.models.shell.supports import RIGHT, STRAIGHT, no_mirror, open_to_pressure
 
 Facets = NDArray[np.int32]
 HORIZONTAL, AXIAL = {0, 1}, 2  # components of the displacement
@@ -99,7 +99,7 @@ def _refuse_slanting(meridian: Meridian, name: str, *, pressure: bool) -> None:
     """See that the surface crosses the plane of an end at right angles, and a live pressure a plane through 0."""
     s = meridian.parameter(name)
     (rho, z), (rho_near, z_near) = meridian.section(np.array([s, s + (STRAIGHT if s == 0 else -STRAIGHT)]))
-    if abs(z_near - z) < CROSSING * np.hypot(rho_near - rho, z_near - z):
+    if abs(z_near - z) < RIGHT * np.hypot(rho_near - rho, z_near - z):
         raise MeshError(no_mirror(name))
     if pressure and abs(z) > STRAIGHT:
         raise MeshError(open_to_pressure(name))

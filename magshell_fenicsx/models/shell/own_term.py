@@ -16,6 +16,7 @@ from ufl.core.expr import Expr
 from ufl.corealg.traversal import traverse_unique_terminals
 from ufl.geometry import GeometricQuantity
 
+from magshell_fenicsx.mesh.mirror import Mirror
 from magshell_fenicsx.models.shell.kinematics import CURVED, FIRST, SECOND, Jet
 
 Array = NDArray[np.float64]
@@ -133,13 +134,15 @@ class OwnTerm:
 
         return all(self._same((r0, u), (turned(r0, a), turned(u, a))) for a, (r0, u) in enumerate(_random_jets(), 1))
 
-    @cached_property
-    def mirrors(self) -> bool:
-        """Whether its value stays if shell and displacement are mirrored in the plane y = 0; at random jets."""
+    def mirrored(self, mirror: Mirror) -> bool:
+        """Whether its value stays if shell and displacement are mirrored; at random jets."""
         # the first coordinate changes places with the second, so that the normal stays outward
-        order = [("r", *CURVED).index(name) for name in ("r", "r2", "r1", "r22", "r12", "r11")]
-        flip = np.array([1.0, -1.0, 1.0])
-        return all(self._same((r0, u), (flip * r0[order], flip * u[order])) for r0, u in _random_jets())
+        order, S = [("r", *CURVED).index(name) for name in ("r", "r2", "r1", "r22", "r12", "r11")], mirror.reflection
+
+        def image(r0: Array, u: Array) -> tuple[Array, Array]:
+            return np.vstack([mirror.image(r0[:1]), r0[order[1:]] @ S]), u[order] @ S
+
+        return all(self._same((r0, u), image(r0, u)) for r0, u in _random_jets())
 
     @cached_property
     def _symbolic(self) -> tuple[Expr, Jet, Jet]:

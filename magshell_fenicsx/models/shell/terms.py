@@ -26,7 +26,7 @@ from magshell_fenicsx.models.shell.free import Constants, constants_of
 from magshell_fenicsx.models.shell.kinematics import CURVED, MOVED, SECOND, Jet
 from magshell_fenicsx.models.shell.moment import MomentTerm
 from magshell_fenicsx.models.shell.own_term import OwnTerm
-from magshell_fenicsx.models.shell.parameters import MIRROR_NORMAL, MagneticEnergy, Magnetisation, Material
+from magshell_fenicsx.models.shell.parameters import MagneticEnergy, Magnetisation, Material
 from magshell_fenicsx.models.shell.patterns import pattern_field
 from magshell_fenicsx.models.shell.thickness import thick
 
@@ -86,7 +86,7 @@ class TermFactory:
         return self._edges("clamped edges", self._thick(density, 1))
 
     def mirror_edges(
-        self, facets: NDArray[np.int32], normal: NDArray[np.float64] = MIRROR_NORMAL, name: str = "mirror edges"
+        self, facets: NDArray[np.int32], normal: NDArray[np.float64], name: str = "mirror edges"
     ) -> ShellTerm:
         parameters = (*self._penalised(), self._constant(normal))
         return self._edges(name, self._thick(Density(edges.symmetric, parameters, CURVED, SECOND, facets), 1))
@@ -101,9 +101,9 @@ class TermFactory:
         total = self._domain.comm.allreduce(fem.assemble_scalar(length))
         return MomentTerm(name, density, energy, self.u, self.log, intensity * total)
 
-    def antisymmetric_edges(self, facets: NDArray[np.int32]) -> HessianTerm:
+    def antisymmetric_edges(self, facets: NDArray[np.int32], normal: NDArray[np.float64]) -> HessianTerm:
         """The mirror plane's edges under antisymmetric displacements."""
-        parameters = (*self._penalised(), self._constant(MIRROR_NORMAL))
+        parameters = (*self._penalised(), self._constant(normal))
         density = Density(antisymmetric_edge, parameters, CURVED, facets=facets)
         v = fem.Function(self.u.function_space)
         jets = (*self._jets(), kin.jet(v, self._domain))
@@ -133,10 +133,11 @@ class TermFactory:
             terms.append(self._cells("magnetic gradient", self._thick(density, None), "lambda_m"))
         return terms
 
-    def pressure(self) -> ShellTerm:
-        """Amplitude p/p_c; potential p Delta V, of a live pressure."""
+    def pressure(self, origin: NDArray[np.float64]) -> ShellTerm:
+        """Amplitude p/p_c; potential p Delta V, of a live pressure; `origin` as of `volume_change`."""
         unit = self._constant(self.material.classical_pressure / self.material.h)
-        return self._cells("pressure", Density(densities.pressure, (unit,), parts=MOVED), "pressure")
+        parameters = (unit, self._constant(origin)) if origin.any() else (unit,)
+        return self._cells("pressure", Density(densities.pressure, parameters, parts=MOVED), "pressure")
 
     def own(self, term: OwnTerm) -> ShellTerm:
         """The energy of a part or one's own, with the amplitude of its name."""
@@ -153,9 +154,9 @@ class TermFactory:
     def _parameters(self, term: OwnTerm) -> tuple[fem.Constant, ...]:
         return constants_of(term, self._domain, self.free)
 
-    def volume_change(self) -> ufl.Form:
-        """Delta V/R^3 of the modelled part."""
-        return densities.volume(*self._jets()) * self._dx()
+    def volume_change(self, origin: NDArray[np.float64]) -> ufl.Form:
+        """Delta V/R^3 of the modelled part, between it and a point of all its symmetry planes."""
+        return densities.volume(*self._jets(), *([self._constant(origin)] if origin.any() else [])) * self._dx()
 
     @property
     def _domain(self) -> mesh.Mesh:

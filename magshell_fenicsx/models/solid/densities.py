@@ -35,6 +35,7 @@ def enclosed(x: Expr, x1: Expr, x2: Expr) -> Expr:
     return ufl.dot(x, ufl.cross(x1, x2)) / 3
 
 
-def pressure(X: Expr, X1: Expr, X2: Expr, u: Expr, u1: Expr, u2: Expr, unit: Expr) -> Expr:
-    """Pi/p of a live pressure in that unit: the change of the volume under the outer face."""
+def pressure(X: Expr, X1: Expr, X2: Expr, u: Expr, u1: Expr, u2: Expr, unit: Expr, origin: Expr | None = None) -> Expr:
+    """Pi/p of a live pressure in that unit: the change of the volume between the outer face and an origin."""
+    X = X if origin is None else X - origin
     return unit * (enclosed(X + u, X1 + u1, X2 + u2) - enclosed(X, X1, X2))

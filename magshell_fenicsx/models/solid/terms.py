@@ -89,9 +89,10 @@ class TermFactory:
             terms.append(self._bulk("magnetic gradient", density, "lambda_m"))
         return terms
 
-    def pressure(self, classical: float) -> SolidTerm:
-        """Amplitude p/p_c, `classical` being p_c/E; on the outer face."""
-        density = Density(densities.pressure, self._constants(classical / self.h), ON_FACE, on_face=True)
+    def pressure(self, classical: float, origin: NDArray[np.float64]) -> SolidTerm:
+        """Amplitude p/p_c, `classical` being p_c/E; on the outer face, `origin` in the mirror plane of a half."""
+        parameters = self._constants(classical / self.h, *([origin] if origin.any() else []))
+        density = Density(densities.pressure, parameters, ON_FACE, on_face=True)
         return SolidTerm("pressure", density, self._on_face(density), self.u, self.log, "pressure")
 
     def own(self, term: OwnTerm) -> SolidTerm:
@@ -114,9 +115,10 @@ class TermFactory:
         parameters = constants_of(term, self.u.function_space.mesh, self.free)
         return Density(on_face, parameters, ON_FACE, on_face=True)
 
-    def volume_change(self) -> ufl.Form:
+    def volume_change(self, origin: NDArray[np.float64]) -> ufl.Form:
         """Delta V/R^3 under the outer face of the modelled part."""
-        return self._on_face(Density(densities.pressure, self._constants(1.0), on_face=True))
+        parameters = self._constants(1.0, *([origin] if origin.any() else []))
+        return self._on_face(Density(densities.pressure, parameters, on_face=True))
 
     def outer_measure(self) -> ufl.Measure:
         """Area of the undeformed outer face."""

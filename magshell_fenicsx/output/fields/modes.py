@@ -73,7 +73,8 @@ def mode_surface(
         return None
     surface = _with_mode(base, mode.u)
     if model.multiplicity == 2:
-        surface = completed(surface)
+        assert not isinstance(model, MeridianModel)
+        surface = completed(surface, model.mirror.plane)
         if label == "antisymmetric":
             for values in surface.fields.values():
                 values[len(base.r0) :] *= -1

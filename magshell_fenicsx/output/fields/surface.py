@@ -17,7 +17,6 @@ from magshell_fenicsx.mesh.frame import rotation
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.axisymmetric.revolution import Revolution
 from magshell_fenicsx.models.shell.model import ShellModel
-from magshell_fenicsx.models.shell.parameters import MIRROR_NORMAL
 from magshell_fenicsx.output.fields.point_fields import PointFields
 
 TRIANGLE, LAGRANGE_TRIANGLE, LAGRANGE_HEXAHEDRON = 5, 69, 72  # VTK's numbers; the flat triangle, cells of any order
@@ -150,12 +149,14 @@ def turned(surface: Surface, azimuth: float) -> Surface:
     return _moved(surface, rotation(azimuth))
 
 
-def completed(surface: Surface, mirror: Array = MIRROR_NORMAL) -> Surface:
-    """A half surface with its image in the mirror plane of that unit normal (3,).
+def completed(surface: Surface, mirror: Array) -> Surface:
+    """A half surface with its image in a mirror plane: its unit normal (3,), and offset if that is not zero.
 
     Seen from outside, the image's triangles run the other way round.
     """
-    image = _moved(surface, np.eye(3) - 2 * np.outer(mirror, mirror))
+    normal, offset = mirror[:3], float(mirror[3:].sum())
+    image = _moved(surface, np.eye(3) - 2 * np.outer(normal, normal))
+    image = replace(image, r0=image.r0 + 2 * offset * normal)
 
     def both(f: Array, other: Array) -> Array:
         return np.concatenate([f, other])

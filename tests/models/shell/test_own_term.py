@@ -13,6 +13,7 @@ from ufl.core.expr import Expr
 from magshell_fenicsx import Case, CaseError, Jet, OwnTerm, Scene
 from magshell_fenicsx.case.source import Source
 from magshell_fenicsx.continuation.system import dot
+from magshell_fenicsx.mesh.mirror import Y0
 from magshell_fenicsx.models.shell import densities
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.model import ShellModel
@@ -74,7 +75,7 @@ DENSITIES: dict[str, tuple[Density, tuple[np.ndarray | float, ...], tuple[str, .
 def test_what_is_found_from_a_density(name: str) -> None:
     of, parameters, parts, linear, turns, mirrors = DENSITIES[name]
     term = OwnTerm("own", of, parameters)
-    assert (term.parts, term.linear, term.turns, term.mirrors) == (parts, linear, turns, mirrors)
+    assert (term.parts, term.linear, term.turns, term.mirrored(Y0)) == (parts, linear, turns, mirrors)
 
 
 def test_far_floor_is_not_taken_for_linear() -> None:
@@ -87,7 +88,7 @@ def test_density_that_is_not_defined_everywhere() -> None:
     """Has no symmetry that could be relied on."""
     term = OwnTerm("own", lambda r0, u: ufl.ln(r0.r[2]) * u.r[2])
     assert not term.turns
-    assert not term.mirrors
+    assert not term.mirrored(Y0)
 
 
 @pytest.mark.parametrize("energy", ["magnetic", "magnetic_first", "magnetic_torque", "magnetic_tau", "magnetic_couple"])
@@ -96,7 +97,7 @@ def test_symmetry_of_the_magnetic_densities(energy: str) -> None:
     of = getattr(densities, energy)
     for Br, Ba, turns, mirrors in ((E3, E3, True, True), (E3, E1 + E3, False, True), (E3, E2 + E3, False, False)):
         term = OwnTerm("own", of, (Br, Ba))
-        assert (term.turns, term.mirrors) == (turns, mirrors)
+        assert (term.turns, term.mirrored(Y0)) == (turns, mirrors)
 
 
 @pytest.mark.parametrize(
