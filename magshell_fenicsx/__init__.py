@@ -79,7 +79,7 @@ class _Package(ModuleType):
 
     def __getattr__(self, name: str) -> Any:
         if name not in _WHERE:
-            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+            raise AttributeError(f"{__name__}.{name}")
         room = import_module(_WHERE[name])
         return getattr(room, name, None) or import_module(f"{_WHERE[name]}.{name}")
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.mesh.mirror import Mirror, cut
-from magshell_fenicsx.mesh.msh_format import Block, Content, parsed
+from magshell_fenicsx.mesh.msh_format import Content, parsed
 from magshell_fenicsx.mesh.patch import MeshError, PatchMesh
 from magshell_fenicsx.mesh.soundness import border_edges, oriented, said_place
 
@@ -104,24 +104,31 @@ def _content(
         raise MeshError(f"{file.path}: {e}") from None
     if not len(held.tags):
         raise MeshError(f"{file.path}: there is no mesh in it")
-    faces = [block for block in held.blocks if block.dimension == 2]
-    if len({_cells(file, block, TRIANGLES).shape[1] for block in faces}) != 1:
+    faces = _elements(file, held, 2, TRIANGLES)
+    if len({nodes.shape[1] for _, nodes in faces}) != 1:
         raise MeshError(f"{file.path}: it has no triangles, or triangles of several orders")
-    cells = _places(file, held, np.concatenate([block.nodes for block in faces]))
-    entity = np.concatenate([np.full(len(block.nodes), block.entity) for block in faces])
-    patches = {name: np.isin(entity, sorted(entities)) for name, entities in _groups(held, 2).items()}
+    cells = _places(file, held, np.concatenate([nodes for _, nodes in faces]))
+    entity = np.concatenate([np.full(len(nodes), entity) for entity, nodes in faces])
+    patches = {name: np.isin(entity, entities) for name, entities in held.groups[2].items()}
     edges = {}
-    for name, entities in _groups(held, 1).items():
-        lines = [block for block in held.blocks if block.dimension == 1 and block.entity in entities]
+    for name, entities in held.groups[1].items():
+        lines = [nodes[:, :2] for entity, nodes in _elements(file, held, 1, LINES) if entity in entities]
         if lines:  # a curve of the drawing may carry no elements
-            edges[name] = _places(file, held, np.concatenate([_cells(file, line, LINES)[:, :2] for line in lines]))
+            edges[name] = _places(file, held, np.concatenate(lines))
     return held.places, cells, patches, edges
 
 
-def _cells(file: MeshFile, block: Block, known: Collection[str]) -> NDArray[np.int64]:
-    if block.name not in known:
-        raise MeshError(f"{file.path}: it has elements {block.name}; allowed are triangles of order 1, 2 and 3")
-    return block.nodes
+def _elements(
+    file: MeshFile, held: Content, dimension: int, known: Collection[str]
+) -> list[tuple[int, NDArray[np.int64]]]:
+    """Entity and nodes of the blocks of one dimension."""
+    found = []
+    for name, dim, entity, nodes in held.blocks:
+        if dim == dimension:
+            if name not in known:
+                raise MeshError(f"{file.path}: it has elements {name}; allowed are triangles of order 1, 2 and 3")
+            found.append((entity, nodes))
+    return found
 
 
 def _places(file: MeshFile, held: Content, numbers: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -131,12 +138,3 @@ def _places(file: MeshFile, held: Content, numbers: NDArray[np.int64]) -> NDArra
     if (missing := held.tags[found] != numbers).any():
         raise MeshError(f"{file.path}: it has elements with the node {numbers[missing][0]}, which is not there")
     return found
-
-
-def _groups(held: Content, dim: int) -> dict[str, set[int]]:
-    """Name of each physical group -> its entities; without a name, its number."""
-    found: dict[int, set[int]] = {}
-    for (of, entity), groups in held.groups.items():
-        for group in groups if of == dim else ():
-            found.setdefault(group, set()).add(entity)
-    return {held.names.get((dim, group)) or str(group): found[group] for group in sorted(found)}
