@@ -9,7 +9,6 @@ Methods for Linear and Nonlinear Equations, SIAM 1995, algorithm brsol).
 The unknown vector is u with mu appended on the last rank.
 """
 
-import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -23,12 +22,12 @@ from magshell_fenicsx.continuation.control import Row
 from magshell_fenicsx.continuation.factor import Factorisation
 from magshell_fenicsx.continuation.iterates import Iterates, Step, Verdict
 from magshell_fenicsx.continuation.refine import refined_tangent
+from magshell_fenicsx.continuation.snes import REASON_OF, in_words, make_snes
 from magshell_fenicsx.continuation.system import State, System, Vector, Weighted, dot, followed, max_abs
 from magshell_fenicsx.platform import compat
 
 LEAST_REST = 0.3  # of a step: an update that would lengthen it more is not trusted
 MOTION = 0.1  # part of the largest displacement that counts as a length, where it is longer than the system's
-HIDDEN = "rounding hides the solution: the tangent is nearly singular"
 
 
 @dataclass(frozen=True)
@@ -121,34 +120,6 @@ class _Work:
     iterations: int = 0
 
 
-class _Border:
-    """What PETSc calls back; it does not keep the solver, and with it the factors, alive."""
-
-    def __init__(self, newton: "BorderedNewton") -> None:
-        self._newton = weakref.ref(newton)
-
-    @property
-    def newton(self) -> "BorderedNewton":
-        newton = self._newton()
-        assert newton is not None
-        return newton
-
-    def function(self, snes: PETSc.SNES, x: PETSc.Vec, f: PETSc.Vec) -> None:
-        self.newton._function(x, f)
-
-    def jacobian(self, snes: PETSc.SNES, x: PETSc.Vec, J: PETSc.Mat, P: PETSc.Mat) -> None:
-        J.assemble()
-
-    def test(self, snes: PETSc.SNES, iteration: int, norms: tuple[float, float, float]) -> Any:
-        return self.newton._test(snes, norms[2])
-
-    def apply(self, pc: PETSc.PC, f: PETSc.Vec, y: PETSc.Vec) -> None:
-        self.newton._apply(y)
-
-    def mult(self, J: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        self.newton._mult(x, y)
-
-
 class BorderedNewton:
     """Solves R(u, mu) = 0 with one more row; reusable for every amplitude and row of a system.
 
@@ -172,26 +143,7 @@ class BorderedNewton:
         self._last = comm.rank == comm.size - 1
         n = system.size + self._last
         self._x = PETSc.Vec().createMPI((n, PETSc.DETERMINE), comm=comm)
-        f = self._x.duplicate()
-        me = _Border(self)
-        J = PETSc.Mat().createPython(((n, PETSc.DETERMINE), (n, PETSc.DETERMINE)), context=me, comm=comm)
-        J.setUp()
-        self._snes = snes = PETSc.SNES().create(comm)
-        snes.setOptionsPrefix("magshell_")
-        snes.setFunction(me.function, f)
-        snes.setJacobian(me.jacobian, J)
-        snes.setConvergenceTest(me.test)
-        snes.setType("newtonls")
-        given = PETSc.Options("magshell_")
-        if not given.hasName("snes_linesearch_type"):
-            given["snes_linesearch_type"] = "basic"  # full steps; the path shortens its own when they fail
-        snes.setTolerances(max_it=self.options.max_iterations)
-        ksp = snes.getKSP()
-        ksp.setType("preonly")
-        ksp.getPC().setType("python")
-        ksp.getPC().setPythonContext(me)
-        ksp.setNormType(PETSc.KSP.NormType.NONE)
-        snes.setFromOptions()
+        self._snes = make_snes(self, self._x, self.options.max_iterations)
 
     def on(self, system: System) -> "BorderedNewton":
         """The same for another system, whose tangent is made of this one's; factors and work are shared."""
@@ -222,7 +174,7 @@ class BorderedNewton:
         iterations = self._snes.getIterationNumber()
         self._work.iterations += iterations
         ended = self._snes.getConvergedReason()
-        reason = _REASONS.get(progress.verdict) or _REASONS_OF_SNES.get(ended, f"SNES reason {ended}")
+        reason = in_words(progress.verdict, ended)
         error = progress.iterates.steps[-1].size if progress.iterates.steps else np.inf
         return Outcome(guess.with_(u, name, mu), converged, iterations, reason, error)
 
@@ -267,12 +219,14 @@ class BorderedNewton:
             return last
         return Bordered(self.system, self.factor_at(state), state, name, row)
 
-    def _function(self, x: PETSc.Vec, f: PETSc.Vec) -> None:
+    def function(self, x: PETSc.Vec, f: PETSc.Vec) -> None:
+        """SNES asks for R and g."""
         u, mu = self._split(x)
         state = self._guess.with_(u, self._name, mu)
         self._join(self.system.residual(u, state.mu), self._row.residual(state), f)
 
-    def _test(self, snes: PETSc.SNES, norm: float) -> Any:
+    def test(self, snes: PETSc.SNES, norm: float) -> Any:
+        """SNES asks whether it has converged."""
         progress, o = self._progress, self.options
         if not np.isfinite(norm):
             return compat.NOT_A_NUMBER
@@ -283,7 +237,7 @@ class BorderedNewton:
         length = self.system.length
         scale = max(1.0, MOTION * max_abs(self.system.comm, u) / length)
         progress.verdict = progress.iterates.judge(o.tolerance * scale, lambda: self._rounding(state, f[0]))
-        return _REASON_OF[progress.verdict]
+        return REASON_OF[progress.verdict]
 
     def _ahead(self, state: State, f: Direction) -> Direction:
         """The step that an iterate asks for (SNES subtracts it): with the matrix at hand, or one made here."""
@@ -328,7 +282,8 @@ class BorderedNewton:
         f = change - matrix.times(other - state.u, 0.0)[0]
         return matrix.size(matrix.solve(f, 0.0))
 
-    def _apply(self, y: PETSc.Vec) -> None:
+    def apply(self, y: PETSc.Vec) -> None:
+        """SNES asks for the step."""
         assert self._progress.ahead is not None
         self._progress.taken.append(self._progress.ahead)
         # the stress after the step is what follows linearly from before it (MIP Newton: Magisano, Leonetti, Garcea,
@@ -336,7 +291,7 @@ class BorderedNewton:
         self._stress = followed(self._split(self._snes.getSolution())[0], -self._progress.ahead[0])
         self._join(*self._progress.ahead, y)
 
-    def _mult(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
+    def mult(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """The bordered matrix times a vector, for SNES's line searches and monitors."""
         assert self._progress.matrix is not None
         self._join(*self._progress.matrix.times(*self._split(x)), y)
@@ -348,22 +303,3 @@ class BorderedNewton:
         local = x.array_r
         mu = self.system.comm.bcast(float(local[-1]) if self._last else None, root=self.system.comm.size - 1)
         return local[: self.system.size].copy(), mu
-
-
-_REASON_OF = {
-    "go on": PETSc.SNES.ConvergedReason.CONVERGED_ITERATING,
-    "converged": PETSc.SNES.ConvergedReason.CONVERGED_SNORM_RELATIVE,
-    "diverged": PETSc.SNES.ConvergedReason.DIVERGED_DTOL,
-    "rounding": PETSc.SNES.ConvergedReason.DIVERGED_INNER,
-    "too many": PETSc.SNES.ConvergedReason.DIVERGED_MAX_IT,
-}
-_REASONS_OF_SNES = {
-    compat.NOT_A_NUMBER: "the residual is not a number",
-    PETSc.SNES.ConvergedReason.DIVERGED_LINEAR_SOLVE: "the tangent could not be factored",
-}
-_REASONS: dict[str, str] = {
-    "converged": "converged",
-    "diverged": "the iteration diverged",
-    "rounding": HIDDEN,
-    "too many": "too many iterations",
-}
