@@ -17,6 +17,7 @@ from petsc4py import PETSc
 
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
+from magshell_fenicsx.continuation.banded import Banded
 from magshell_fenicsx.continuation.factor import Factorisation
 from magshell_fenicsx.continuation.inverse import nearest_to_zero
 from magshell_fenicsx.continuation.system import State
@@ -73,6 +74,7 @@ class Waves:
         self._nodes = 1 + (self.largest - 1) * (1 - np.cos(np.pi * np.arange(5) / 4)) / 2
         self._parts = [fem_petsc.create_matrix(pattern) for _ in self._nodes]
         self._interpolated: PETSc.Mat | None = None
+        self._bands: list[Banded] = []
         self._factorisation, self._counting = Factorisation(V.mesh.comm), Factorisation(V.mesh.comm)
 
     def tangent(self, state: State, m: int) -> PETSc.Mat:
@@ -95,25 +97,37 @@ class Waves:
         """Number of unstable directions among the waves 1, 2, ... `largest`.
 
         A jet of a wave is quadratic in m, and so Q_m is a polynomial of degree 4: its matrices are interpolated
-        between five.
+        between five. Only those that are not positive definite are factored for their inertia.
         """
         self._system.set(state.u)
         self._system.place(state.mu)
         for part, node in zip(self._parts, self._nodes, strict=True):
             self._assemble(part, state, node, [])
+        if not self._bands:
+            self._bands = [Banded(self._parts[0], self._rows(m)) for m in (1, 2)]
+        values, found = [part.getValuesCSR()[2] for part in self._parts], list[int]()
+        entries = [band.entries(values) for band in self._bands]
+        for m in range(1, self.largest + 1):
+            weights = _lagrange(self._nodes, m)
+            definite = self._bands[m > 1].positive(entries[m > 1], weights)
+            found.append(0 if definite else self._interpolated_pivots(m, weights))
+        return found
+
+    def _interpolated_pivots(self, m: int, weights: Sequence[float]) -> int:
         if self._interpolated is None:
             self._interpolated = self._parts[0].copy()
             self._interpolated.setOption(PETSc.Mat.Option.SYMMETRIC, True)
             self._interpolated.setOption(PETSc.Mat.Option.KEEP_NONZERO_PATTERN, True)
-        K, found = self._interpolated, []
-        for m in range(1, self.largest + 1):
-            K.zeroEntries()
-            for part, weight in zip(self._parts, _lagrange(self._nodes, m), strict=True):
-                K.axpy(weight, part, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
-            K.zeroRowsColumnsLocal(np.concatenate([bc.dof_indices()[0] for bc in self.held(m)]), 1.0)
-            self._counting.factor(K)
-            found.append(self._counting.negative_pivots)
-        return found
+        K = self._interpolated
+        K.zeroEntries()
+        for part, weight in zip(self._parts, weights, strict=True):
+            K.axpy(weight, part, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
+        K.zeroRowsColumnsLocal(self._rows(m), 1.0)
+        self._counting.factor(K)
+        return self._counting.negative_pivots
+
+    def _rows(self, m: int) -> NDArray[np.int32]:
+        return np.concatenate([bc.dof_indices()[0] for bc in self.held(m)])
 
     def negative_pivots(self, state: State, m: int) -> int:
         """Number of unstable directions among the waves m."""
