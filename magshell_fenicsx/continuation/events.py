@@ -193,8 +193,8 @@ class _Search:
             low, high = (point, high) if point.dmu * low.dmu > 0 else (low, point)
         return point
 
-    def scatter(self, point: Point, stability: Stability, slope: float) -> float:
-        """How far rounding of the tangent moves the load at which its eigenvalue is zero.
+    def rest(self, point: Point, stability: Stability, slope: float) -> float:
+        """How far the load is from where the eigenvalue is zero, and what rounding of the tangent hides of that.
 
         Parameters
         ----------
@@ -202,8 +202,9 @@ class _Search:
             Of the eigenvalue over the load.
         """
         u = point.state.u
-        values = [critical_mode(stability, State(v, point.state.mu)).eigenvalue for v in (u, u + np.spacing(u))]
-        return float(SCATTER * abs(values[1] - values[0]) / abs(slope)) if slope else np.inf
+        side = np.random.default_rng(self.path.system.comm.rank).choice([-1.0, 1.0], u.size)  # as rounding does
+        values = [critical_mode(stability, State(v, point.state.mu)).eigenvalue for v in (u, u + side * np.spacing(u))]
+        return float(max(abs(values[0]), SCATTER * abs(values[1] - values[0])) / abs(slope)) if slope else np.inf
 
     def bifurcation(self, low: Point, high: Point, stability: Stability) -> Point:
         """Where the eigenvalue that changes sign is zero, by the Illinois variant of regula falsi.
@@ -227,9 +228,9 @@ class _Search:
             mu = point.state.mu[path.name]
             moved, width = abs(point.s - last) * abs(point.dmu), abs(high.s - low.s) * abs(point.dmu)
             if moved <= agreed * abs(mu) and a * b < 0:
-                return replace(point, load_error=max(moved, self.scatter(point, stability, slope)))
+                return replace(point, load_error=self.rest(point, stability, slope))
             if width <= self.tolerance * abs(mu):
-                return replace(point, load_error=max(width, self.scatter(point, stability, slope)))
+                return replace(point, load_error=max(width, self.rest(point, stability, slope)))
             last, mode = point.s, critical_mode(stability, point.state)
             if mode.negative_pivots != first.negative_pivots:
                 high, b = point, mode.eigenvalue
