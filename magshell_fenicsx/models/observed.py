@@ -7,8 +7,10 @@ from dolfinx import fem
 from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
+from magshell_fenicsx.assembly.terms import LinearTerm
 from magshell_fenicsx.continuation.system import Vector
-from magshell_fenicsx.models.shell.parameters import Material
+from magshell_fenicsx.models.shell.dead_load import DeadLoads
+from magshell_fenicsx.models.shell.parameters import Loads, Material
 from magshell_fenicsx.models.shell.point_load import point_entries
 
 Array = NDArray[np.float64]
@@ -25,12 +27,17 @@ class Observed:
         2 for a half model, whose integrals and forces are those of one half; else 1.
     normals
         n0 (3,) at the named points.
+    load_size
+        The sum of the sizes of the dead loads, over E h R; see `DeadLoads`.
     """
 
     system: FiniteElementSystem
     material: Material
+    loads: Loads
     multiplicity: int
     normals: Mapping[str, Array]
+    u: fem.Function
+    load_size = 0.0
 
     def observe(self, volume: fem.Form, points: Mapping[str, Array]) -> None:
         """Take the volume change's form (of the modelled part), and the named vertices' places (3,)."""
@@ -38,6 +45,11 @@ class Observed:
         # dofs of a vertex on the rank that owns it
         V = self.system.u.function_space
         self._probes = {name: point_entries(V, x, np.ones(3))[0] for name, x in points.items()}
+
+    def load_with(self, dead: DeadLoads) -> LinearTerm:
+        """The term of the dead loads but the moments."""
+        self.load_size, self._dead_load = dead.size, LinearTerm("load", *dead.entries, self.u, "load")
+        return self._dead_load
 
     def zero(self) -> Vector:
         """The undeformed displacement."""
@@ -58,7 +70,15 @@ class Observed:
         return np.asarray(self.system.comm.allreduce(here))
 
     def loaded_deflection(self, u: Vector) -> float:
-        """w/R conjugate to the force: at its point, or averaged over its patch."""
+        """w/R conjugate to the force: at its point, or averaged over its patch; of dead loads along themselves.
+
+        Moments alone have none: that of the pole.
+        """
+        if self.loads.dead and not self.load_size:
+            return self.deflection(u, "pole")
+        if self.loads.dead:
+            self.system.set(u)
+            return -float(self.system.comm.allreduce(self._dead_load.energy())) / self.load_size
         return -self.system.potential(u, "force") / self.force_unit
 
     @property

@@ -44,4 +44,5 @@ def magnetisation(magnetic: MagneticSection, case: Case, turn: float, to: Direct
     if section.patches and isinstance(case.shell, MeshSurface):
         patches = {name: direction.vector(turn) for name, direction in section.patches.items()}
     G = np.array(gradient) if gradient else None
-    return Magnetisation(remanent, applied, magnetic.energy, G, across, patches)
+    layers = tuple((layer.fraction, layer.vector(turn)) for layer in section.layers or [])
+    return Magnetisation(remanent, applied, magnetic.energy, G, across, patches, layers)

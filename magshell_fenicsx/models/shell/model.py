@@ -15,12 +15,11 @@ from numpy.typing import NDArray
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.assembly.terms import LinearTerm, Term
-from magshell_fenicsx.continuation.system import Vector
 from magshell_fenicsx.mesh.midsurface import Midsurface
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.observed import Observed
 from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes, held_against_mirror
-from magshell_fenicsx.models.shell.dead_load import assemble_dead_loads
+from magshell_fenicsx.models.shell.dead_load import SurfaceMeasures, assemble_dead_loads
 from magshell_fenicsx.models.shell.fast_tangent import FastTangent, make_sites
 from magshell_fenicsx.models.shell.folds import FOLD, largest_fold
 from magshell_fenicsx.models.shell.parameters import (
@@ -79,8 +78,6 @@ class ShellModel(Observed):
         Names and compile time of the forms in use.
     thickness
         h(x)/h, free to jump from cell to cell; None for 1.
-    load_size
-        The sum of the sizes of the dead loads, over E h R; see `DeadLoads`.
     """
 
     def __init__(
@@ -148,12 +145,9 @@ class ShellModel(Observed):
         self.normals = {name: vertex_normal(self.r0, x) for name, x in midsurface.points.items()}
         if loads.force:
             terms.append(self._force(loads.force))
-        self.load_size = 0.0
         if loads.dead:
-            dead = assemble_dead_loads(loads.dead, self.r0, midsurface, degree, self.kernels)
-            self.load_size = dead.size
-            self._dead_load = LinearTerm("load", *dead.entries, self.u, "load")
-            terms.append(self._dead_load)
+            on = SurfaceMeasures(self.r0, midsurface, degree)
+            terms.append(self.load_with(assemble_dead_loads(loads.dead, V, on, self.kernels)))
             moments = [load for load in loads.dead if isinstance(load, EdgeMoment)]
             terms += [
                 factory.edge_moment(f"moment {load.edge} {i}", midsurface.edges[load.edge], load.moment)
@@ -180,18 +174,6 @@ class ShellModel(Observed):
         return AntisymmetricModes(
             FiniteElementSystem(self.u, terms, held, self._interior, system.length, fast, system.gradients)
         )
-
-    def loaded_deflection(self, u: Vector) -> float:
-        """w/R conjugate to the force: at its point, or averaged over its patch; of dead loads along themselves.
-
-        Moments alone have none: that of the pole.
-        """
-        if self.loads.dead and not self.load_size:
-            return self.deflection(u, "pole")
-        if self.loads.dead:
-            self.system.set(u)
-            return -float(self.system.comm.allreduce(self._dead_load.energy())) / self.load_size
-        return super().loaded_deflection(u)
 
     def _force(self, force: Force) -> LinearTerm:
         x, inward = self.midsurface.points[force.point], -self.normals[force.point]

@@ -20,17 +20,26 @@ FREE = 1e-12  # of the squares that a rigid motion has where the shell is held, 
 LOOSE = 1e-13  # of a rigid motion's energy, over the tangent's largest row
 
 
-def held_on(V: fem.FunctionSpace, dim: int, entities: NDArray[np.int32], axes: Iterable[int]) -> list[fem.DirichletBC]:
-    """Those components are zero on some edges (`dim` 1) or cells (2)."""
-    V.mesh.topology.create_connectivity(dim, 2)
-    return [fem.dirichletbc(0.0, fem.locate_dofs_topological(V.sub(i), dim, entities), V.sub(i)) for i in axes]
+def held_on(
+    V: fem.FunctionSpace,
+    dim: int,
+    entities: NDArray[np.int32],
+    axes: Iterable[int],
+    nodes: NDArray[np.bool_] | None = None,
+) -> list[fem.DirichletBC]:
+    """Those components are zero on entities of some dimension, or at some of the `nodes` there alone."""
+    V.mesh.topology.create_connectivity(dim, V.mesh.topology.dim)
+    found = []
+    for space in (V.sub(i) for i in axes):
+        dofs = fem.locate_dofs_topological(space, dim, entities)
+        found.append(fem.dirichletbc(0.0, dofs if nodes is None else dofs[nodes[dofs // 3]], space))
+    return found
 
 
-def held_at_vertex(V: fem.FunctionSpace, x: Array, components: Iterable[int]) -> list[fem.DirichletBC]:
-    """Those components are zero at a vertex."""
-    V.mesh.topology.create_connectivity(0, 2)
-    near = mesh.locate_entities(V.mesh, 0, lambda y: np.linalg.norm(y.T - x, axis=1) < 1e-9)
-    return [fem.dirichletbc(0.0, fem.locate_dofs_topological(V.sub(i), 0, near), V.sub(i)) for i in components]
+def held_at_vertex(V: fem.FunctionSpace, x: Array, axes: Iterable[int]) -> list[fem.DirichletBC]:
+    """Those components are zero at the node at a vertex."""
+    near = fem.locate_dofs_geometrical(V, lambda y: np.linalg.norm(y.T - x, axis=1) < 1e-9)
+    return [fem.dirichletbc(0.0, 3 * near + np.int32(i), V.sub(i)) for i in axes]
 
 
 def refuse_unknown(
@@ -70,20 +79,21 @@ def open_to_pressure(name: str) -> str:
 
 
 def plane_of(V: fem.FunctionSpace, r0: fem.Function, facets: NDArray[np.int32], name: str) -> tuple[int, float]:
-    """The axis that the plane of an edge is normal to, and where on it the plane is, over R; collective.
+    """The axis that the plane of an edge, or face of a body, is normal to, and where on it it is, over R; collective.
 
     Raises
     ------
     MeshError
         On every rank, if the edge lies in no plane normal to e1, e2 or e3, or in more than one.
     """
-    dofs = fem.locate_dofs_topological(V, 1, facets)
+    dim = V.mesh.topology.dim - 1
+    dofs = fem.locate_dofs_topological(V, dim, facets)
     here = r0.x.array.reshape(-1, 3)[dofs]
     places = np.concatenate(V.mesh.comm.allgather(here))
     flat = np.flatnonzero(np.ptp(places, axis=0) < STRAIGHT)
     # a straight edge lies in two planes, one in its own surface in none that this surface crosses
-    across = _conormal_axes(V, facets)
-    flat = flat[across[flat] > CROSSING]
+    if dim == 1:
+        flat = flat[_conormal_axes(V, facets)[flat] > CROSSING]
     if len(flat) != 1:
         raise MeshError(
             f"boundary.{name}: symmetry: the edge must lie in a plane normal to x, y or z that the surface crosses at "
