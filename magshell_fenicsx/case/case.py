@@ -15,7 +15,6 @@ from magshell_fenicsx.case.loading import (
     FieldSection,
     IndentationSection,
     LoadingSection,
-    PathSection,
     RotationSection,
 )
 from magshell_fenicsx.case.messages import explain
@@ -57,7 +56,7 @@ class Case(Section):
     """A shell, what holds it, its field and its load; validated."""
 
     model: Literal["shell", "solid"] = "shell"
-    """A thin shell, or the body of a hemisphere, disc or strip in three dimensions"""
+    """A thin shell, or its body in three dimensions"""
     shell: Annotated[ShellSection | Surface, Field(discriminator="geometry")]
     """Mid-surface, thickness and material"""
     solid: SolidSection | None = None
@@ -170,15 +169,10 @@ class Case(Section):
                 raise ValueError("solid belongs to model: solid")
             return self
         magnetic, loading = self.magnetic, self.loading
-        if isinstance(self.shell, MeshSurface) or isinstance(loading, DeadSection) or self.points:
-            raise ValueError("model: solid: takes no mesh file, no dead loads and no named points")
+        if isinstance(self.thickness_factor, dict):
+            raise ValueError("shell.thickness_factor: of a solid a formula: a step in the thickness is no swept body")
         if magnetic and magnetic.energy != "full":
-            raise ValueError(f"magnetic.energy: {magnetic.energy}: not of a solid, which has the full energy")
-        if magnetic and magnetic.remanent.kind != "uniform":
-            raise ValueError(f"magnetic.remanent.kind: {magnetic.remanent.kind}: a solid's remanence is uniform")
-        for name, condition in self.boundary.conditions().items():
-            if condition in ("simply supported", "hinged"):
-                raise ValueError(f"boundary.{name}: {condition}: the face of a solid is clamped or free")
+            raise ValueError(f"magnetic.energy: {magnetic.energy}: not of a solid, whose full energy is linear in F")
         for key in self.mesh.model_fields_set & {"degree", "penalty", "tolerance"}:
             if key != "degree" or self.mesh.degree != SOLID_DEGREE:
                 raise ValueError(
@@ -196,8 +190,6 @@ class Case(Section):
                 "solid.bulk_to_shear: takes the place of shell.poisson_ratio: 0.5; here that is "
                 f"{self.shell.poisson_ratio:g}, which says all"
             )
-        if isinstance(loading, PathSection) and loading.sensitivities:
-            raise ValueError("loading.sensitivities: not of a solid")
         return self
 
     @property

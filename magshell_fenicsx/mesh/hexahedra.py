@@ -82,7 +82,7 @@ def sweep(
     quads = split(patch)
     ends = np.linspace(0, 1, layers + 1) if isinstance(layers, int) else np.array(layers)
     heights = np.concatenate([ends[:1], *([(a + b) / 2, b] for a, b in zip(ends[:-1], ends[1:], strict=True))])
-    thick = np.full(len(quads.places), h) if factor is None else h * factor(quads.places)
+    thick = h * (np.ones(len(quads.places)) if factor is None else factor(quads.places))
     z = (heights - MIDDLE) * thick[:, None]
     X = (quads.places[:, None] + z[..., None] * quads.offsets[:, None]).reshape(-1, 3)
     first, cells = comm.rank == 0, _swept(quads.cells, len(ends) - 1)

@@ -22,7 +22,7 @@ from magshell_fenicsx.continuation.point import PathStopped, Point
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.continuation.walk import MOST_STEPS, Goal, Quantity, Walk
 from magshell_fenicsx.continuation.watch import Crossing
-from magshell_fenicsx.models.shell.model import ShellModel
+from magshell_fenicsx.models.observed import Observed
 from magshell_fenicsx.simulate.scene import Scene
 
 Label = Literal["start", "field", "step", "target", "fold", "bifurcation"]
@@ -151,7 +151,7 @@ def _indentation(scene: Scene, loading: IndentationSection, state: State) -> Ite
 
 
 def _dead(scene: Scene, loading: DeadSection, state: State) -> Iterator[Record]:
-    assert isinstance(scene.model, ShellModel)
+    assert isinstance(scene.model, Observed)
     quantity: Quantity = "load" if loading.displacement is None else "conjugate"
     asked = next((value for value in (loading.factor, loading.displacement) if value is not None), 1.0)
     # a displacement is told as the work of the loads at it

@@ -47,16 +47,11 @@ class BodyMeasures:
         domain, x, n = self._body.mesh, self._body.points[name], self._body.normals[name]
         centre, normal = (fem.Constant(domain, v) for v in (x, n))
         d = ufl.SpatialCoordinate(domain) - centre
-        height, h = ufl.dot(d, normal), self._thickness_at(x)
+        height, h = ufl.dot(d, normal), thickness_at(self._body, x)
         radius = fem.Constant(domain, max(h, self._reach(x, n)))
         here = ufl.conditional(ufl.lt(abs(height), fem.Constant(domain, h)), 1.0, 0.0)  # and not through a closed shell
         dx = ufl.Measure("dx", domain=domain, metadata={"quadrature_degree": SMOOTH})
         return averaged(self._V, force, Weighted(here * smooth(d - height * normal, radius), dx), self._log)
-
-    def _thickness_at(self, x: Array) -> float:
-        X = self._body.mesh.geometry.x
-        near = np.linalg.norm(X - x, axis=1) < 1e-9
-        return float(self._V.mesh.comm.allreduce(self._body.thickness[near].max(initial=0.0), MPI.MAX))
 
     def _reach(self, x: Array, n: Array) -> float:
         """Distance from the normal line at x of the farthest node of the cells around it."""
@@ -66,10 +61,16 @@ class BodyMeasures:
         return float(self._V.mesh.comm.allreduce(np.linalg.norm(across, axis=2).max(initial=0.0), MPI.MAX))
 
 
-def outer_patch(body: Body, V: fem.FunctionSpace, point: str, radius: float, h: float, log: KernelLog) -> Entries:
+def thickness_at(body: Body, x: Array) -> float:
+    """h over R at a vertex of the mid-surface; collective."""
+    near = np.linalg.norm(body.mesh.geometry.x - x, axis=1) < 1e-9
+    return float(body.mesh.comm.allreduce(body.thickness[near].max(initial=0.0), MPI.MAX))
+
+
+def outer_patch(body: Body, V: fem.FunctionSpace, point: str, radius: float, log: KernelLog) -> Entries:
     """An inward force averaged over the outer face around a point, with the weight `smooth`."""
-    normal = body.normals[point]
-    values = body.points[point] + h / 2 * normal, radius
+    x, normal = body.points[point], body.normals[point]
+    values = x + thickness_at(body, x) / 2 * normal, radius
     centre, a = (fem.Constant(body.mesh, value) for value in values)
     ds = face_measure(body.mesh, [body.faces[OUTER]])(1)
     return averaged(V, -normal, Weighted(smooth(ufl.SpatialCoordinate(body.mesh) - centre, a), ds), log, radius)

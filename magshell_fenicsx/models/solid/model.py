@@ -85,7 +85,7 @@ class SolidModel(Observed):
         if loads.pressure:
             self._terms += factory.pressure(material.classical_pressure)
         if loads.force:
-            patch = outer_patch(body, V, loads.force.point, loads.force.patch, material.h, self.kernels)
+            patch = outer_patch(body, V, loads.force.point, loads.force.patch, self.kernels)
             self._terms.append(LinearTerm("force", patch[0], self.force_unit * patch[1], self.u, "force"))
         if loads.dead:
             on = BodyMeasures(body, V, self.kernels)
