@@ -36,8 +36,9 @@ class Body:
         Name -> whether each local cell is above that part of the mid-surface.
     between
         (cells, 2) where each local cell begins and ends in the thickness: from 0 inside to 1 outside.
-    heights, thickness
-        Of each node of the geometry: where it is in the thickness, from 0 to 1, and h(x) over R; see `at_nodes`.
+    chart, heights, thickness
+        Of each node of the geometry: the chart's coordinates (n, d) under it, where it is in the thickness, from 0 to
+        1, and h(x) over R; see `at_nodes`.
     """
 
     mesh: mesh.Mesh
@@ -46,12 +47,14 @@ class Body:
     normals: dict[str, Array]
     patches: dict[str, NDArray[np.bool_]]
     between: Array
+    chart: Array
     heights: Array
     thickness: Array
 
     def at_nodes(self, V: fem.FunctionSpace, values: Array) -> Array:
         """What is known at the nodes of the geometry, at those of a quadratic space."""
-        found = np.empty(V.dofmap.index_map.size_local + V.dofmap.index_map.num_ghosts)
+        nodes = V.dofmap.index_map
+        found = np.empty((nodes.size_local + nodes.num_ghosts, *values.shape[1:]))
         found[V.dofmap.list] = values[compat.corner_numbers(self.mesh)]
         return found
 
@@ -106,6 +109,7 @@ def sweep(
         {name: quads.offsets[n] / np.linalg.norm(quads.offsets[n]) for name, n in nearest.items()},
         {name: inside[triangle] for name, inside in patch.patches.items()},
         np.column_stack([ends[layer], ends[layer + 1]]),
+        quads.nodes[node],
         heights[level],
         thick[node],
     )

@@ -27,8 +27,8 @@ class Quadrilaterals:
 
     Attributes
     ----------
-    places
-        (n, 3) nodes in space.
+    nodes, places
+        (n, d) nodes in the chart, and (n, 3) in space.
     offsets
         (n, 3) what the nodes move by when the surface moves outward by one: the unit normal or, at a kink, the
         vector on which every face moves by one.
@@ -38,6 +38,7 @@ class Quadrilaterals:
         Name -> pairs of vertices.
     """
 
+    nodes: Array
     places: Array
     offsets: Array
     cells: Numbers
@@ -82,7 +83,7 @@ def split(patch: PatchMesh) -> Quadrilaterals:
         ).reshape(-1, 2)
         for name, pairs in patch.edges.items()
     }
-    return Quadrilaterals(patch.embedding(nodes), offsets, numbers[:, quads].reshape(-1, 9), edges)
+    return Quadrilaterals(nodes, patch.embedding(nodes), offsets, numbers[:, quads].reshape(-1, 9), edges)
 
 
 def surface_normal(embedding: Embedding, x: Array) -> Array:

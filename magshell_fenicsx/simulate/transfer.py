@@ -144,14 +144,15 @@ def _all_nodes(scene: Scene) -> Array:
 def chart(scene: Scene) -> Array:
     """Coordinates (n, 1 or 2) of this rank's nodes in the chart, where a defect does not move them.
 
-    Of a solid their places (n, 3): its displacements are carried to the same mesh only.
+    Of a solid with their height in the thickness: its displacements are carried to the same mesh only.
     """
     model = scene.model
     if isinstance(model, MeridianModel):
         return np.asarray(model.V.tabulate_dof_coordinates()[:, :1])
     r0: Array = model.r0.x.array[: model.system.size].reshape(-1, 3)
     if isinstance(model, SolidModel):
-        return r0
+        body = model.body
+        return body.at_nodes(model.V, np.column_stack([body.chart, body.heights]))[: len(r0)]
     if not isinstance(scene.plan.embedding, SphereEmbedding):
         return r0[:, :2]
     across = np.hypot(r0[:, 0], r0[:, 1])[:, None]
