@@ -11,7 +11,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from magshell_fenicsx.mesh.patch import MeshError, PatchMesh
-from magshell_fenicsx.mesh.quadrilaterals import Quadrilaterals, split
+from magshell_fenicsx.mesh.quadrilaterals import Quadrilaterals, split, square
 from magshell_fenicsx.platform import compat
 
 Array = NDArray[np.float64]
@@ -136,10 +136,7 @@ def _swept(quads: Numbers, layers: int) -> Numbers:
     points = basix.create_element(
         basix.ElementFamily.P, basix.CellType.hexahedron, 2, basix.LagrangeVariant.equispaced
     ).points
-    square = basix.create_element(
-        basix.ElementFamily.P, basix.CellType.quadrilateral, 2, basix.LagrangeVariant.equispaced
-    ).points
-    below = np.argmin(np.linalg.norm(points[:, None, :2] - square[None], axis=2), axis=1)
+    below = np.argmin(np.linalg.norm(points[:, None, :2] - square()[None], axis=2), axis=1)
     level = np.rint(2 * points[:, 2]).astype(np.int64)
     levels = 2 * layers + 1
     cells = [quads[:, below] * levels + level + 2 * layer for layer in range(layers)]

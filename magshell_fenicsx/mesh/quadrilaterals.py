@@ -70,7 +70,7 @@ def split(patch: PatchMesh) -> Quadrilaterals:
     x, a1, a2 = np.einsum("dqk,ckx->dcqx", values, patch.nodes[patch.cells[:, to_dolfinx]])
     nodes = np.empty((numbers.max() + 1, patch.nodes.shape[1]))
     nodes[numbers] = x  # of glued sides either: they have one place in space
-    offsets = _mitred(a1, a2, numbers) if nodes.shape[1] == 3 else surface_normal(patch.embedding, nodes)
+    offsets = _mitred(a1, a2, numbers, quads) if nodes.shape[1] == 3 else surface_normal(patch.embedding, nodes)
     middle_of = {(int(a), int(b)): len(vertices) + 3 * n + 1 for n, (a, b) in enumerate(sides)}
 
     def halves(a: int, b: int) -> list[list[int]]:
@@ -92,11 +92,12 @@ def surface_normal(embedding: Embedding, x: Array) -> Array:
     return _unit(np.cross(a1, a2))
 
 
-def _mitred(a1: Array, a2: Array, numbers: Numbers) -> Array:
+def _mitred(a1: Array, a2: Array, numbers: Numbers, quads: Numbers) -> Array:
     """Offsets (nodes, 3) from the tangents (cells, places, 3) of a surface that may have kinks.
 
-    The mean normal, each cell's weighted by its angle at the node, over its mean cosine with the cells' normals:
-    exact between two faces and between three that are normal to each other.
+    At corners of quadrilaterals the mean normal, each cell's weighted by its angle there, over its mean cosine with
+    the cells' normals: exact between two faces and between three that are normal to each other. What a cell's own
+    normal lacks of it is interpolated to the nodes between.
     """
     n = _unit(np.cross(a1, a2))
     weights = np.full(n.shape[:2], np.pi)
@@ -106,7 +107,14 @@ def _mitred(a1: Array, a2: Array, numbers: Numbers) -> Array:
     total = np.zeros((numbers.max() + 1, 3))
     np.add.at(total, numbers, weights[..., None] * n)
     whole = np.bincount(numbers.ravel(), weights.ravel())[:, None]
-    return np.asarray(total * whole / np.maximum(np.sum(total**2, axis=1, keepdims=True), 1e-300))
+    mitre = total * whole / np.maximum(np.sum(total**2, axis=1, keepdims=True), 1e-300)
+    s, t = square().T
+    bilinear = np.column_stack([(1 - s) * (1 - t), s * (1 - t), (1 - s) * t, s * t])
+    lacking = mitre[numbers[:, quads[:, :4]]] - n[:, quads[:, :4]]
+    found = n[:, quads] + np.einsum("kc,mqcx->mqkx", bilinear, lacking)
+    offsets = np.zeros_like(total)
+    np.add.at(offsets, numbers[:, quads], found)
+    return np.asarray(offsets / np.bincount(numbers[:, quads].ravel())[:, None])
 
 
 def _unit(v: Array) -> Array:
@@ -115,10 +123,7 @@ def _unit(v: Array) -> Array:
 
 def _reference_split() -> tuple[Array, Numbers, list[list[int]]]:
     """Places (19, 2) in the reference triangle, vertices first; quadrilaterals (3, 9) of them; those on each side."""
-    square = basix.create_element(
-        basix.ElementFamily.P, basix.CellType.quadrilateral, 2, basix.LagrangeVariant.equispaced
-    ).points
-    s, t = square.T[:, :, None]
+    s, t = square().T[:, :, None]
     centre = VERTICES.mean(axis=0)
     found = [*VERTICES]
     quads = []
@@ -140,3 +145,11 @@ def _reference_split() -> tuple[Array, Numbers, list[list[int]]]:
         return [int(np.argmin(np.linalg.norm(places - x, axis=1))) for x in wanted]
 
     return places, np.array(quads), [along(*side) for side in SIDES]
+
+
+def square() -> Array:
+    """Nodes (9, 2) of the reference quadrilateral, corners first."""
+    element = basix.create_element(
+        basix.ElementFamily.P, basix.CellType.quadrilateral, 2, basix.LagrangeVariant.equispaced
+    )
+    return np.asarray(element.points)

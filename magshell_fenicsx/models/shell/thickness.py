@@ -39,9 +39,7 @@ def refuse_unfit(factors: Array, x: Array, comm: MPI.Comm) -> None:
     bad = x[~((factors > 1e-3) & (factors < 1e3))][:1].tolist()
     if said := [place for places in comm.allgather(bad) for place in places]:
         x1, x2, x3 = said[0]
-        raise MeshError(
-            f"thickness_factor is not within 0.001 to 1000 at (x, y, z)/R = ({x1:.3g}, {x2:.3g}, {x3:.3g})"
-        )
+        raise MeshError(f"thickness_factor is not within 0.001 to 1000 at (x, y, z)/R = ({x1:.3g}, {x2:.3g}, {x3:.3g})")
 
 
 def thickness_field(thickness: Thickness, r0: fem.Function, midsurface: Midsurface) -> fem.Function:

@@ -14,7 +14,9 @@ ALL = (0, 1, 2)
 ROUNDING = 1e-9
 
 
-def supports(body: Body, r0: fem.Function, conditions: Mapping[str, Condition], *, pressed: bool) -> list[fem.DirichletBC]:
+def supports(
+    body: Body, r0: fem.Function, conditions: Mapping[str, Condition], *, pressed: bool
+) -> list[fem.DirichletBC]:
     """All but the mirror plane of a half model; collective.
 
     Raises
@@ -35,7 +37,11 @@ def supports(body: Body, r0: fem.Function, conditions: Mapping[str, Condition], 
                 raise MeshError(open_to_pressure(name))
             components = (axis,)
         if name in body.faces or name in body.patches:
-            where = (2, body.faces[name]) if name in body.faces else (3, np.flatnonzero(body.patches[name]).astype(np.int32))
+            where = (
+                (2, body.faces[name])
+                if name in body.faces
+                else (3, np.flatnonzero(body.patches[name]).astype(np.int32))
+            )
             whole = condition in ("clamped", "plane")
             found += held_on(V, *where, components, None if whole else in_middle)
         else:

@@ -176,8 +176,8 @@ class TermFactory:
             n = J[:, 2] / ufl.sqrt(ufl.dot(J[:, 2], J[:, 2]))
             t = ufl.cross(n, ufl.FacetNormal(domain))
             per_area = density.of(X, u, H, n, t / ufl.sqrt(ufl.dot(t, t)), *density.parameters)
-            names = "quadrature_points", "quadrature_weights"
-            rule = dict(zip(names, density.rule, strict=True)) | {"quadrature_rule": "custom"}
+            points, weights = (tuple(map(tuple, x)) if x.ndim == 2 else tuple(x) for x in density.rule)
+            rule = {"quadrature_rule": "custom", "quadrature_points": points, "quadrature_weights": weights}
             forms.append(per_area * (ds(tag, metadata=rule) if density.upper else ds(tag)))
         return sum(forms[1:], forms[0])
 
