@@ -4,12 +4,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
+import numpy as np
 from pydantic import Field, ModelWrapValidatorHandler, ValidationError, model_validator
 
 from magshell_fenicsx.case.base import Section, or_number, texts
 from magshell_fenicsx.case.boundary import EDGES, BoundarySection
 from magshell_fenicsx.case.defects import DimpleSection
-from magshell_fenicsx.case.fields import MagneticSection
+from magshell_fenicsx.case.fields import MagneticSection, layer_average
 from magshell_fenicsx.case.loading import (
     DeadSection,
     FieldSection,
@@ -92,6 +93,12 @@ class Case(Section):
     def _sections_fit(self) -> Self:
         if self.magnetic and self.magnetic.lambda_m is None and self.shell.youngs_modulus is None:
             raise ValueError("shell.youngs_modulus is needed to turn flux densities into lambda_m")
+        layers = self.magnetic.remanent.layers if self.magnetic else None
+        if layers and self.model == "shell" and np.linalg.norm(layer_average(layers)) < 1e-9:
+            raise ValueError(
+                "magnetic.remanent.layers: the layers cancel: their average, which is all that a shell knows of them, "
+                "is zero"
+            )
         if isinstance(self.loading, FieldSection) and not self.lambda_m:
             raise ValueError("loading.kind: field needs magnetic.lambda_m, not zero, for its target or direction")
         if isinstance(self.loading, RotationSection):

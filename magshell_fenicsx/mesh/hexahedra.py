@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import basix
 import basix.ufl
@@ -84,7 +85,7 @@ def sweep(
     """
     quads = split(patch)
     ends = np.linspace(0, 1, layers + 1) if isinstance(layers, int) else np.array(layers)
-    heights = np.concatenate([ends[:1], *([(a + b) / 2, b] for a, b in zip(ends[:-1], ends[1:], strict=True))])
+    heights = np.concatenate([ends[:1], *([(a + b) / 2, b] for a, b in pairwise(ends))])
     thick = h * (np.ones(len(quads.places)) if factor is None else factor(quads.places))
     z = (heights - MIDDLE) * thick[:, None]
     X = (quads.places[:, None] + z[..., None] * quads.offsets[:, None]).reshape(-1, 3)

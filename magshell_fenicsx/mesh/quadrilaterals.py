@@ -5,6 +5,7 @@ and their edges follow the same circles.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import basix
 import numpy as np
@@ -117,7 +118,7 @@ def _mitred(a1: Array, a2: Array, numbers: Numbers, quads: Numbers) -> Array:
     return np.asarray(offsets / np.bincount(numbers[:, quads].ravel())[:, None])
 
 
-def _unit(v: Array) -> Array:
+def _unit(v: NDArray[Any]) -> Array:
     return np.asarray(v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-300))
 
 

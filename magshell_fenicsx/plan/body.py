@@ -1,5 +1,6 @@
 """What a solid is made of besides the shell that it is the body of."""
 
+from itertools import pairwise
 from math import ceil
 
 from magshell_fenicsx.case.case import Case
@@ -26,7 +27,7 @@ def layers(case: Case) -> list[float]:
     tops = [sum(layer.fraction for layer in magnetised[: n + 1]) for n in range(len(magnetised) - 1)]
     ends = [0.0, *sorted({MIDDLE, *(round(top, 9) for top in tops)}), 1.0]
     found = [0.0]
-    for low, high in zip(ends[:-1], ends[1:], strict=True):
+    for low, high in pairwise(ends):
         parts = max(ceil((high - low) * count - ROUNDING), 1)
         found += [low + (high - low) * (n + 1) / parts for n in range(parts)]
     return found

@@ -20,8 +20,8 @@ from magshell_fenicsx.models.axisymmetric.energies import INTERIOR, Energy, Ener
 from magshell_fenicsx.models.axisymmetric.instability import ExcludedWaves
 from magshell_fenicsx.models.axisymmetric.meridian import Meridian, held_at
 from magshell_fenicsx.models.axisymmetric.waves import Waves
+from magshell_fenicsx.models.shell.load_vector import Entries
 from magshell_fenicsx.models.shell.parameters import Condition, Force, Loads, Material, default_penalty
-from magshell_fenicsx.models.shell.point_load import Entries
 
 Array = NDArray[np.float64]
 

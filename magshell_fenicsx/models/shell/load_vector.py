@@ -68,4 +68,4 @@ def averaged(
             "mesh.size, or 0 for a force at a point"
         )
     dofs, values = entries(V, fem.Constant(V.mesh, direction), on, log, "patch load")
-    return dofs, values / total
+    return dofs, np.asarray(values / total)

@@ -99,7 +99,7 @@ class Site:
 
     def _density(self, term: SolidTerm) -> Any:
         density, g, z = term.density, self._g, self._u
-        parameters, varying = parameters_at(self._points, density)
+        parameters, varying = parameters_at(self._points, density.parameters, 1)
         self._varying[term.name] = [
             (here, [at_points(field, batch.rule.points[0], batch.cells[0]) for batch in self._batches])
             for here, field in varying
@@ -129,11 +129,11 @@ def make_sites(body: Body, X: fem.Function, terms: Sequence[Term], log: KernelLo
     for term in found:
         if term.density.where == "body":
             continue
-        cells, numbers = _cells_at(body, term.density.facets)
+        around, numbers = _cells_at(body, term.density.facets)
         points, w = term.density.rule
         for facet in np.flatnonzero(V.mesh.comm.allreduce(np.bincount(numbers, minlength=6))):
             rule = _rule(V, _on_facet(points, facet), w)
-            sites.append(Site(X, cells[numbers == facet], rule, [term], log, facet))
+            sites.append(Site(X, around[numbers == facet], rule, [term], log, facet))
     return sites
 
 

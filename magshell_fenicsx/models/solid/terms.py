@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar, Literal
+from typing import Literal
 
 import basix
 import numpy as np
@@ -49,7 +49,6 @@ class Density:
         Whether it lives on the outer half of these alone.
     """
 
-    sides: ClassVar = 1
     of: Callable[..., Expr]
     parameters: tuple[fem.Constant | fem.Function, ...]
     parts: tuple[int, ...] = GRADIENT
@@ -62,7 +61,7 @@ class Density:
     def rule(self) -> tuple[Array, Array]:
         """Points on the reference facet, and their weights."""
         points, weights = basix.make_quadrature(basix.CellType.quadrilateral, self.degree)
-        return ((points + [0.0, 1.0]) / [1.0, 2.0], weights / 2) if self.upper else (points, weights)
+        return ((points + np.eye(2)[1]) / [1.0, 2.0], weights / 2) if self.upper else (points, weights)
 
 
 class SolidTerm(DensityTerm[Density]):
@@ -176,8 +175,11 @@ class TermFactory:
             n = J[:, 2] / ufl.sqrt(ufl.dot(J[:, 2], J[:, 2]))
             t = ufl.cross(n, ufl.FacetNormal(domain))
             per_area = density.of(X, u, H, n, t / ufl.sqrt(ufl.dot(t, t)), *density.parameters)
-            points, weights = (tuple(map(tuple, x)) if x.ndim == 2 else tuple(x) for x in density.rule)
-            rule = {"quadrature_rule": "custom", "quadrature_points": points, "quadrature_weights": weights}
+            points, weights = density.rule
+            rule = {"quadrature_rule": "custom"} | {
+                "quadrature_points": tuple(tuple(x) for x in points),
+                "quadrature_weights": tuple(weights),
+            }
             forms.append(per_area * (ds(tag, metadata=rule) if density.upper else ds(tag)))
         return sum(forms[1:], forms[0])
 

@@ -65,7 +65,7 @@ BENDING: list[dict[str, Any]] = [
 
 @pytest.mark.parametrize("load", BENDING)
 def test_a_strip_under_dead_loads(load: dict[str, Any]) -> None:
-    """Bent by 0.1 to 1 rad: as its shell, to 2.5 %; a force at a point to 10 %, as its patch of radius h ends at the edge."""
+    """Bent by 0.1 to 1 rad: as its shell to 2.5 %; a force at a point, whose patch ends at the edge, to 10 %."""
     shell, solid = (end(m, STRIP, boundary=CLAMPED, points=TIP, loading=dead(load)) for m in ("shell", "solid"))
     assert abs(shell["A_uz"]) > 0.1
     apart = 2 * H if "at" in load else H / 2
@@ -197,7 +197,8 @@ def test_a_layered_case_has_elements_for_its_layers() -> None:
     assert np.unique(scene.model.body.between).tolist() == pytest.approx([0, 0.3, 0.5, 1])
     vectors = scene.model.loads.magnetic.remanent.vectors  # type: ignore[union-attr]
     inner = scene.model.body.between[:, 1] < 0.31
-    assert np.allclose(vectors[inner], [1, 0, 0]) and np.allclose(vectors[~inner], [0, 0, 1])
+    assert np.allclose(vectors[inner], [1, 0, 0])
+    assert np.allclose(vectors[~inner], [0, 0, 1])
 
 
 def test_a_strip_that_grows_thinner() -> None:
@@ -237,7 +238,7 @@ def test_a_bracket_from_a_mesh_file() -> None:
 
 
 def test_patches_of_a_mesh_file() -> None:
-    """The gripper of magnetised arms on a hub that is clamped: an elastica at q = 4, which rises by 0.66996 (cases/)."""
+    """The gripper on a hub that is clamped: its arms are elasticas at q = 4, which rise by 0.66996."""
     case = ms.Case.load(CASES / "gripper.yaml", ["model=solid", "mesh.degree=2", "loading.points=2"])
     scene = ms.Scene(case)
     *_, last = ms.follow(scene)
