@@ -96,8 +96,8 @@ class Case(Section):
         layers = self.magnetic.remanent.layers if self.magnetic else None
         if layers and self.model == "shell" and np.linalg.norm(layer_average(layers)) < 1e-9:
             raise ValueError(
-                "magnetic.remanent.layers: the layers cancel: their average, which is all that a shell knows of them, "
-                "is zero"
+                "magnetic.remanent.layers: the layers cancel: their average is a remanence of length zero, and a shell "
+                "knows no more of them"
             )
         if isinstance(self.loading, FieldSection) and not self.lambda_m:
             raise ValueError("loading.kind: field needs magnetic.lambda_m, not zero, for its target or direction")
