@@ -6,26 +6,36 @@
 0.32624
 
 A scene is stepped through by `follow` (the history of its case) and `trace` (a path in any amplitude); `columns`,
-`surface`, `polydata`, `curve` and `picture` show what was found; an `OwnTerm` is one's own energy.
+`surface`, `polydata`, `curve` and `picture` show what was found; an `OwnTerm` is one's own energy,
+whose `Free` parameters are amplitudes too.
 """
 
-from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.source import CaseError
-from magshell_fenicsx.models.shell import kinematics
-from magshell_fenicsx.models.shell.kinematics import Jet
-from magshell_fenicsx.models.shell.own_term import OwnTerm
+import sys
+from importlib import import_module
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
 from magshell_fenicsx.platform.version import __version__
-from magshell_fenicsx.run.notebook import curve, picture, polydata, surface
-from magshell_fenicsx.run.rows import columns
-from magshell_fenicsx.run.run import Result, run
-from magshell_fenicsx.simulate.follow import Record, Stopped, follow
-from magshell_fenicsx.simulate.scene import Scene
-from magshell_fenicsx.simulate.sensitivity import fold_at, sensitivities
-from magshell_fenicsx.simulate.trace import trace
+
+if TYPE_CHECKING:
+    from magshell_fenicsx.case.case import Case
+    from magshell_fenicsx.case.source import CaseError
+    from magshell_fenicsx.models.shell import kinematics
+    from magshell_fenicsx.models.shell.kinematics import Jet
+    from magshell_fenicsx.models.shell.own_term import Free, OwnTerm
+    from magshell_fenicsx.run.notebook import curve, picture, polydata, surface
+    from magshell_fenicsx.run.rows import columns
+    from magshell_fenicsx.run.run import Result, run
+    from magshell_fenicsx.simulate.follow import follow
+    from magshell_fenicsx.simulate.record import Record, Stopped
+    from magshell_fenicsx.simulate.scene import Scene
+    from magshell_fenicsx.simulate.sensitivity import fold_at, sensitivities
+    from magshell_fenicsx.simulate.trace import trace
 
 __all__ = [
     "Case",
     "CaseError",
+    "Free",
     "Jet",
     "OwnTerm",
     "Record",
@@ -45,3 +55,40 @@ __all__ = [
     "surface",
     "trace",
 ]
+
+_ROOMS = {
+    "case.case": "Case",
+    "case.source": "CaseError",
+    "models.shell": "kinematics",
+    "models.shell.kinematics": "Jet",
+    "models.shell.own_term": "Free OwnTerm",
+    "run.notebook": "curve picture polydata surface",
+    "run.rows": "columns",
+    "run.run": "Result run",
+    "simulate.follow": "follow",
+    "simulate.record": "Record Stopped",
+    "simulate.scene": "Scene",
+    "simulate.sensitivity": "fold_at sensitivities",
+    "simulate.trace": "trace",
+}
+_WHERE = {name: f"{__name__}.{room}" for room, names in _ROOMS.items() for name in names.split()}
+
+
+class _Package(ModuleType):
+    """The package, which imports a public name when it is asked for: dolfinx takes long."""
+
+    def __getattr__(self, name: str) -> Any:
+        if name not in _WHERE:
+            raise AttributeError(f"{__name__}.{name}")
+        room = import_module(_WHERE[name])
+        return getattr(room, name, None) or import_module(f"{_WHERE[name]}.{name}")
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if not (name in _WHERE and isinstance(value, ModuleType)):  # `run` is the function, not the folder
+            super().__setattr__(name, value)
+
+    def __dir__(self) -> list[str]:
+        return sorted({*super().__dir__(), *__all__})
+
+
+sys.modules[__name__].__class__ = _Package

@@ -1,4 +1,4 @@
-"""The command line; a thin user of the Python API."""
+"""The command line; a thin user of the Python API, of which each command imports what it needs."""
 
 import gc
 import signal
@@ -8,10 +8,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from mpi4py import MPI
 
-from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.examples import examples, title, write_example
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.platform.completion import case_files, left_to_the_shell
 from magshell_fenicsx.platform.version import __version__
@@ -33,13 +30,20 @@ def _folder(default: str) -> Any:
     return typer.Option(help=f"output folder; default {default}", autocompletion=left_to_the_shell)
 
 
+def _world() -> Any:
+    """All ranks."""
+    from mpi4py import MPI
+
+    return MPI.COMM_WORLD
+
+
 def _say(line: str) -> None:
-    if MPI.COMM_WORLD.rank == 0:
+    if _world().rank == 0:
         print(line, flush=True)
 
 
 def _failure(message: str, code: int) -> typer.Exit:
-    if MPI.COMM_WORLD.rank:
+    if _world().rank:
         return typer.Exit()  # at the first rank that fails mpirun ends the job, and may lose the message
     print(message, file=sys.stderr, flush=True)
     return typer.Exit(code)
@@ -51,11 +55,11 @@ def main() -> None:
     try:
         app(prog_name="magshell")  # by whatever name it was started: completion goes by it
     except Exception:
-        if MPI.COMM_WORLD.size == 1:
+        if _world().size == 1:
             raise
         traceback.print_exc()
         sys.stderr.flush()
-        MPI.COMM_WORLD.Abort(1)  # the other ranks would wait for this one for ever
+        _world().Abort(1)  # the other ranks would wait for this one for ever
 
 
 def _tell_version(asked: bool) -> None:
@@ -84,6 +88,7 @@ def run(
     ] = None,
 ) -> None:
     """Solve a case and write path.csv, summary.json, fields and pictures."""
+    from magshell_fenicsx.case.case import Case
     from magshell_fenicsx.mesh.patch import MeshError
     from magshell_fenicsx.output.store.folder import DiskError
     from magshell_fenicsx.platform.terminal import live_line
@@ -93,7 +98,7 @@ def run(
     folder = out or Path("results") / case.stem
     try:
         read = Case.load(case, set_ or [])
-        with live_line(MPI.COMM_WORLD.size, _say) as (say, tell):
+        with live_line(_world().size, _say) as (say, tell):
             result = run_case(read, folder, say=say, tell=tell, resume=resume, time_limit=time_limit)
     except (CaseError, MeshError) as e:
         raise _failure(str(e), INVALID) from None
@@ -220,7 +225,7 @@ def plot(
     from magshell_fenicsx.output.pictures.plot import plot as plot_again
     from magshell_fenicsx.output.pictures.render import NoScreen
 
-    if MPI.COMM_WORLD.rank:
+    if _world().rank:
         return
     try:
         drawn = plot_again(folder, point, animation)
@@ -234,6 +239,7 @@ def plot(
 @app.command()
 def check(case: CaseFile, set_: Settings = None) -> None:
     """Validate a case; print what would be built and what is left out."""
+    from magshell_fenicsx.case.case import Case
     from magshell_fenicsx.plan.check import describe
 
     try:
@@ -243,6 +249,8 @@ def check(case: CaseFile, set_: Settings = None) -> None:
 
 
 def _names() -> list[str]:
+    from magshell_fenicsx.case.examples import examples
+
     return list(examples())
 
 
@@ -257,11 +265,13 @@ def example(
     ] = None,
 ) -> None:
     """Write an example case to a file, to run and to change; without NAME, list all of them."""
+    from magshell_fenicsx.case.examples import examples, title, write_example
+
     if name is None:
         for known, where in examples().items():
             _say(f"{known:24} {title(where)}")
         return
-    if MPI.COMM_WORLD.rank:
+    if _world().rank:
         return
     try:
         written = write_example(name, file)
@@ -292,7 +302,7 @@ def info(
     for name, number in versions().items():
         _say(f"{name:18} {number}")
     _say(f"{'blas':18} {fast_blas() or 'reference (slow: install OpenBLAS)'}")
-    _say(f"{'ranks':18} {MPI.COMM_WORLD.size}")
+    _say(f"{'ranks':18} {_world().size}")
     _say(f"{'kernel cache':18} {kernel_cache()}")
     if compile_:
         for degree in (3, 4):

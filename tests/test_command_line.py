@@ -138,6 +138,31 @@ def test_version() -> None:
     assert (done.returncode, done.stdout, done.stderr) == (0, f"magshell_fenicsx {__version__}\n", "")
 
 
+@pytest.mark.parametrize("asked", ["--version", "--help", "example", "schema"])
+def test_words_load_no_solver(asked: str) -> None:
+    """Which would take seconds."""
+    code = "import sys; from magshell_fenicsx.cli import app; app(sys.argv[1:], standalone_mode=False)"
+    code += "; print(*sys.modules)"
+    told = subprocess.run([sys.executable, "-c", code, asked], capture_output=True, text=True, check=True).stdout
+    assert not {"dolfinx", "petsc4py", "ufl", "scipy"} & set(told.splitlines()[-1].split())
+
+
+def test_the_package_is_imported_as_it_is_used() -> None:
+    """Every public name is there, and `run` is the function even after an import of the folder run/."""
+    code = """
+import sys
+import magshell_fenicsx as ms
+assert "dolfinx" not in sys.modules
+import magshell_fenicsx.run.status
+assert ms.run.__name__ == "run" and "run" in dir(ms)
+from magshell_fenicsx import *
+assert run is ms.run and kinematics.Jet is ms.Jet
+assert set(ms.__all__) <= set(globals())
+assert not hasattr(ms, "none of it")
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
 def test_examples_have_names() -> None:
     """Which are listed, and told where a name is none."""
     listed = magshell("example").stdout.splitlines()

@@ -29,7 +29,7 @@ def unstable() -> None:
         if number % 10 == 0:
             assert [record.label for record in follow(scene)][-1] == "fold"
         rest, newton = scene.unloaded(), scene.newton
-        u = -newton.factor_at(rest).solve(newton.system.load(rest.u, "pressure"))
+        u = -newton.factor_at(rest).solve(newton.system.load(rest.u, {}, "pressure"))
         assert critical_mode(newton, State(3 * u, {"pressure": 3.0})).negative_pivots > 0
         print(resident(), flush=True)
 

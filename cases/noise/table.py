@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import magshell_fenicsx as ms
+from magshell_fenicsx.continuation.newton import MOTION
 from magshell_fenicsx.continuation.noise import VARIABLE
 from magshell_fenicsx.continuation.system import max_abs
 from magshell_fenicsx.plan.planner import make_plan
@@ -76,8 +77,10 @@ def load_ratio(a: ms.Record, b: ms.Record) -> float:
 
 def u_ratio(a: ms.Record, b: ms.Record, scene: ms.Scene) -> float:
     """The same of the displacement at a point that was asked for."""
-    moved = max_abs(scene.comm, a.point.state.u - b.point.state.u) / scene.model.system.length
-    tolerance = scene.newton.options.tolerance
+    length = scene.model.system.length
+    moved = max_abs(scene.comm, a.point.state.u - b.point.state.u) / length
+    scale = max(1.0, MOTION * max_abs(scene.comm, a.point.state.u) / length)  # as points are accepted
+    tolerance = scene.newton.options.tolerance * scale
     return moved / (a.point.error + b.point.error + tolerance)
 
 

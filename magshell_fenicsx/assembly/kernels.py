@@ -1,6 +1,7 @@
 """Compiling UFL forms: the options of the just-in-time compiler, and what it cost."""
 
 import time
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -28,6 +29,10 @@ class KernelLog:
         self.seconds += time.perf_counter() - start
         self.names.append(name)
         return form
+
+    def compile_all(self, named: Iterable[Mapping[str, ufl.Form]]) -> dict[str, fem.Form]:
+        """Compile forms under their names."""
+        return {name: self.compile(name, form) for each in named for name, form in each.items()}
 
     def compile_expression(self, name: str, expression: Expr, comm: MPI.Comm) -> fem.Expression:
         """Compile an expression of cell-wise constants, or load it from the cache; collective."""

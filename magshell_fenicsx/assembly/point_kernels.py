@@ -30,18 +30,23 @@ class Points:
         order = fem.functionspace(self._mesh, ("DG", 0)).dofmap.list[:, 0]
         self._cells = np.argsort(order).astype(np.int32)  # point p is where the p-th value is
         self._values = np.empty(0)
+        self._constants: list[tuple[NDArray[np.float64], NDArray[np.float64]]] = []  # views: here, and what is copied
 
     def field(self, size: int) -> fem.Function:
         """A vector at each point, its array (capacity * size,) to be filled."""
         return fem.Function(fem.functionspace(self._mesh, ("DG", 0, (size,))))
 
-    def constant(self, value: NDArray[np.float64]) -> fem.Constant:
-        """The same numbers at all points."""
-        return fem.Constant(self._mesh, value)
+    def constant(self, of: fem.Constant) -> fem.Constant:
+        """The same numbers at all points: those that another constant has when it is evaluated."""
+        here = fem.Constant(self._mesh, of.value)
+        self._constants.append((here.value, of.value))
+        return here
 
     def evaluate(self, expression: fem.Expression, count: int) -> NDArray[np.float64]:
         """(count, components) at the first points; the array is reused by the next call."""
         size = expression.value_size
+        for here, of in self._constants:
+            np.copyto(here, of)
         if self._values.size < count * size:
             self._values = np.empty(self.capacity * size)
         values = self._values[: count * size].reshape(count, size)

@@ -10,6 +10,8 @@ from dolfinx.la import InsertMode
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
+from magshell_fenicsx.assembly.parameter import Parameter
+from magshell_fenicsx.assembly.sliding import Constraint, Projection, Sliding
 from magshell_fenicsx.assembly.terms import FormTerm, Term
 from magshell_fenicsx.continuation.noise import Noise
 from magshell_fenicsx.continuation.system import Amplitudes, Vector, Weighted
@@ -45,14 +47,14 @@ class ResidualAssembler(Protocol):
 
 
 class FiniteElementSystem:
-    """Sum of terms for a displacement u that vanishes at `clamped`.
+    """Sum of terms for a displacement u that is held.
 
     Parameters
     ----------
     u
         The displacement that the terms were written with; it is overwritten.
-    clamped
-        Homogeneous Dirichlet conditions.
+    held
+        Where u, or a component of it in any direction, is zero.
     pattern
         The term with the widest coupling: its tangent's sparsity is that of the sum.
     length
@@ -61,20 +63,28 @@ class FiniteElementSystem:
         Makes the tangent with the same conditions, instead of the terms' forms.
     gradients
         Makes the residual, instead of the terms' forms.
+    parameters
+        Those that enter terms freely, by name.
     """
 
     def __init__(
         self,
         u: fem.Function,
         terms: Sequence[Term],
-        clamped: list[fem.DirichletBC],
+        held: Sequence[Constraint],
         pattern: FormTerm,
         length: float,
         assembler: TangentAssembler | None = None,
         gradients: ResidualAssembler | None = None,
+        parameters: Mapping[str, Parameter] | None = None,
     ) -> None:
         V = u.function_space
-        self.u, self.terms, self.clamped, self.length = u, terms, clamped, length
+        self.u, self.terms, self.length = u, terms, length
+        self.clamped = clamped = [c for c in held if isinstance(c, fem.DirichletBC)]
+        sliding = [c for c in held if isinstance(c, Sliding)]
+        self.projection = Projection(V, sliding, clamped) if sliding else None
+        self.parameters = parameters or {}
+        self.coordinates = frozenset(self.parameters)
         self.comm = V.mesh.comm
         self.size = V.dofmap.index_map.size_local * V.dofmap.index_map_bs
         self.dofs = V.dofmap.index_map.size_global * V.dofmap.index_map_bs
@@ -103,12 +113,23 @@ class FiniteElementSystem:
         return np.array(self.u.x.array)
 
     def held(self, u: Vector) -> Vector:
-        """A displacement with zeros at the clamped degrees of freedom."""
+        """A displacement with zeros where it is held."""
         u = np.array(u)
-        u[self._fixed] = 0
+        self._hold(u)
         return u
 
+    def _hold(self, u: Vector) -> None:
+        u[self._fixed] = 0
+        if self.projection:
+            self.projection.project(u)
+
+    def place(self, mu: Amplitudes) -> None:
+        """Put the free parameters into the terms."""
+        for name, parameter in self.parameters.items():
+            parameter.constant.value = mu[name]
+
     def residual(self, u: Vector, mu: Amplitudes) -> Vector:
+        self.place(mu)
         factors = {t.name: _factor(t, mu) for t in self.terms}
         if self.noise is None:
             return self._gradient(u, factors)
@@ -116,24 +137,62 @@ class FiniteElementSystem:
         parts = [self._gradient(u, {name: factor}) for name, factor in factors.items()]
         return np.asarray(np.sum([self.noise.on_vector(part, first) for part in parts], axis=0))
 
-    def load(self, u: Vector, name: str) -> Vector:
+    def load(self, u: Vector, mu: Amplitudes, name: str) -> Vector:
+        self.place(mu)
+        if name in self.parameters:
+            slopes = self.parameters[name].slopes
+            return self._gradient(u, {}, [(mu[amplitude], slope) for amplitude, slope in slopes.items()])
         return self._gradient(u, {t.name: 1.0 for t in self.terms if t.amplitude == name})
 
-    def potential(self, u: Vector, name: str) -> float:
+    def potential(self, u: Vector, mu: Amplitudes, name: str) -> float:
         self.set(u)
-        return float(self.comm.allreduce(sum(t.energy() for t in self.terms if t.amplitude == name)))
+        self.place(mu)
+        if name in self.parameters:
+            here = sum(mu[amplitude] * slope.energy() for amplitude, slope in self.parameters[name].slopes.items())
+        else:
+            here = sum(t.energy() for t in self.terms if t.amplitude == name)
+        return float(self.comm.allreduce(here))
+
+    def curvature(self, u: Vector, mu: Amplitudes, name: str, other: str) -> float:
+        if not {name, other} & set(self.parameters):
+            return 0.0  # amplitudes that multiply their terms
+        self.set(u)
+        self.place(mu)
+        if name not in self.parameters:
+            name, other = other, name
+        parameter = self.parameters[name]
+        if other in self.parameters:
+            bends = parameter.bends.get(other, {})
+            here = sum(mu[amplitude] * fem.assemble_scalar(form) for amplitude, form in bends.items())
+        else:
+            here = parameter.slopes[other].energy() if other in parameter.slopes else 0.0
+        return float(self.comm.allreduce(here))
+
+    def accept(self, u: Vector) -> None:
+        """Take u for a point of the path, from which whole turns of moments are counted on."""
+        self.set(u)
+        for term in self.terms:
+            term.accept()
 
     def energies(self, u: Vector) -> dict[str, float]:
         """Each term's potential, without its amplitude."""
         self.set(u)
         return {t.name: float(self.comm.allreduce(t.energy())) for t in self.terms}
 
+    def integral(self, u: Vector, form: fem.Form) -> float:
+        """Of a compiled form in the displacement, over all ranks."""
+        self.set(u)
+        return float(self.comm.allreduce(fem.assemble_scalar(form)))
+
     def tangent(self, u: Vector, mu: Amplitudes, stress: Sequence[Weighted] = ()) -> PETSc.Mat:
         with self.assembly:
             whole = [(weight, self._with_ghosts(v)) for weight, v in stress]
             self.set(u)
+            self.place(mu)
             factors = {t.name: _factor(t, mu) for t in self.terms}
             K = self._assembler.tangent(factors, whole) if self._assembler else self._of_forms(factors)
+            if self.projection:
+                K = self.projection.tangent(K)
             if self.noise:
                 self.noise.on_matrix(K)
             return K
@@ -147,18 +206,21 @@ class FiniteElementSystem:
         compat.finish_matrix(self._K, self.u.function_space, self.clamped)
         return self._K
 
-    def _gradient(self, u: Vector, factors: Mapping[str, float]) -> NDArray[np.float64]:
+    def _gradient(
+        self, u: Vector, factors: Mapping[str, float], besides: Sequence[tuple[float, Term]] = ()
+    ) -> NDArray[np.float64]:
+        """Of the terms with these factors, by name, and of others."""
         with self.assembly:
             self.set(u)
             b = self._b.x.array
             b[:] = 0
-            if self.gradients:
+            if self.gradients and factors:
                 self.gradients.add(b, factors)
-            for term in self._own_residual:
-                if factor := factors.get(term.name):
+            for factor, term in [*((factors.get(t.name, 0.0), t) for t in self._own_residual), *besides]:
+                if factor:
                     term.add_residual(b, factor)
             self._b.x.scatter_reverse(InsertMode.add)
-            b[self._fixed] = 0
+            self._hold(b)
             return np.array(b[: self.size])
 
 

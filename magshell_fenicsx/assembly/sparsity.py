@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
-import scipy.sparse
+import scipy
 from dolfinx.common import IndexMap
 from mpi4py import MPI
 from numpy.typing import NDArray
@@ -115,7 +115,7 @@ class Pattern:
         return came
 
 
-def _blocks(rows: Ints, columns: Ints, shape: tuple[int, int]) -> scipy.sparse.csr_array:
+def _blocks(rows: Ints, columns: Ints, shape: tuple[int, int]) -> "scipy.sparse.csr_array":
     """Each place once, sorted; the values mean nothing."""
     found = scipy.sparse.coo_array((np.zeros(len(rows), dtype=np.int8), (rows, columns)), shape=shape).tocsr()
     found.sum_duplicates()

@@ -27,6 +27,9 @@ class Term(Protocol):
     def energy(self) -> float:
         """Pi(u) on this rank's part."""
 
+    def accept(self) -> None:
+        """Take the present u for a point of the path: what counts turns counts from here."""
+
     def compile_residual(self) -> None:
         """Compile what `add_residual` takes."""
 
@@ -81,6 +84,9 @@ class FormTerm:
     def energy(self) -> float:
         return float(fem.assemble_scalar(self._energy))
 
+    def accept(self) -> None:
+        """Its energy has no history."""
+
     def compile_residual(self) -> None:
         _ = self.residual_form
 
@@ -126,6 +132,9 @@ class LinearTerm:
 
     def energy(self) -> float:
         return -float(self._entries @ self._u.x.array[self._dofs])
+
+    def accept(self) -> None:
+        """Its energy has no history."""
 
     def compile_residual(self) -> None:
         """A sum of entries."""

@@ -4,7 +4,7 @@ from typing import Annotated, Any, Literal, get_args
 
 from pydantic import BeforeValidator, Field, ValidationError
 
-from magshell_fenicsx.case.base import Section
+from magshell_fenicsx.parts.section import Section
 
 EDGES = {"hemisphere": ("equator",), "disc": ("rim",), "strip": ("root", "tip", "sides")}
 Axis = Literal["x", "y", "z"]
@@ -37,10 +37,10 @@ def _condition(value: Any) -> Any:
 class BoundarySection(Section):
     """Edge, point or patch of a mesh -> condition; edges that are not named are free.
 
-    clamped: neither displacement nor rotation. hinged, or simply supported: no displacement. symmetry: a
-    mirror plane, which must be normal to e1, e2 or e3 (not on hemispheres, discs and strips: there
-    `symmetry: half`). held: some components of the displacement; a point of `points` can be held too. A patch of
-    a mesh file can be clamped or held, all of it, if no edge has its name.
+    clamped: neither displacement nor rotation. hinged, or simply supported: no displacement. symmetry: the edge
+    lies in a mirror plane of a shape of which this is a part (of a whole shape take `symmetry: half`). held:
+    some components of the displacement; a point of `points` can be held too. A patch of a mesh file can be
+    clamped or held, all of it, if no edge has its name.
     """
 
     model_config = Section.model_config | {"extra": "allow"}

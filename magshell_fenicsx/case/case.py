@@ -7,7 +7,6 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import Field, ModelWrapValidatorHandler, ValidationError, model_validator
 
-from magshell_fenicsx.case.base import Section, or_number, texts
 from magshell_fenicsx.case.boundary import EDGES, BoundarySection
 from magshell_fenicsx.case.defects import DimpleSection
 from magshell_fenicsx.case.fields import MagneticSection, layer_average
@@ -24,20 +23,22 @@ from magshell_fenicsx.case.solid import SolidSection
 from magshell_fenicsx.case.source import CaseError, Source, override, read_source
 from magshell_fenicsx.case.stability import StabilitySection
 from magshell_fenicsx.case.surfaces import CapSurface, MeshSurface, RevolutionSurface, Surface, SurfaceSection
+from magshell_fenicsx.parts.part import Part, Scales
+from magshell_fenicsx.parts.registered import PARTS, WithParts
+from magshell_fenicsx.parts.section import Section, or_number, texts
 
 SOLID_DEGREE = 2
 
 
 class MeshSection(Section):
-    """The elements: C0 interior penalty on triangles; of hemispheres, graded towards dimple, load and edge."""
+    """The elements: C0 interior penalty on triangles, graded towards dimple, load and held edges."""
 
     degree: int = Field(default=4, ge=2, le=5)
     """Degree k of the displacement. Degree 2 locks; a solid has degree 2 and no other"""
     refinement: float = Field(default=1.0, ge=0.1, le=20)
     """Divides every element size; not of a mesh file"""
     size: Annotated[float, or_number("metre"), Field(gt=0, le=1e12)] | None = None
-    """Element size everywhere; by default graded where there is a pole, elsewhere 2 √(Rh), at most 0.35 R [the
-    shell's length]"""
+    """Element size everywhere; by default graded, away from loads and held edges at most 0.35 R [the shell's length]"""
     penalty: float | None = Field(default=None, ge=1e-3, le=1e9)
     """σ of the interior penalty; by default 5 k²"""
     tolerance: float | None = Field(default=None, ge=1e-6, le=0.1)
@@ -53,7 +54,7 @@ class MeshSection(Section):
 Place = Annotated[list[Annotated[float, or_number("metre")]], Field(min_length=3, max_length=3)]
 
 
-class Case(Section):
+class Case(WithParts):
     """A shell, what holds it, its field and its load; validated."""
 
     model: Literal["shell", "solid"] = "shell"
@@ -76,7 +77,8 @@ class Case(Section):
     """Lowest modes after the run"""
     symmetry: Literal["auto", "none", "half", "axisymmetric"] = "auto"
     """The part that is modelled: the smallest that the case allows (auto), all (none), one side of a mirror plane
-    through e3 of a strip or of what is closed around e3 (half), the meridian of a shape with a pole (axisymmetric)"""
+    that shape, supports, fields and load share (half), the meridian of what is closed around e3 and has an edge
+    (axisymmetric)"""
 
     @model_validator(mode="wrap")
     @classmethod
@@ -84,7 +86,9 @@ class Case(Section):
         section = handler(data)
         if isinstance(data, dict) and not section.shell.with_units:
             loads = section.loading if isinstance(section.loading, DeadSection) else None
-            parts = {"points": data.get("points"), "mesh": data.get("mesh"), "loading": loads and data.get("loading")}
+            parts = {key: data.get(key) for key in ("points", "mesh", *PARTS)} | {
+                "loading": loads and data.get("loading")
+            }
             for key in texts(parts):
                 raise ValueError(f"{key}: has a unit, but the shell's lengths have none: give all of them one, or none")
         return section
@@ -119,8 +123,9 @@ class Case(Section):
         if "load" in self.points:
             raise ValueError("points.load: is taken, by the point that is indented; choose another name")
         loads = loading.loads if isinstance(loading, DeadSection) else []
-        if loads and shell.modulus is None:
-            raise ValueError("shell.youngs_modulus is needed for loads of kind: dead")
+        for key in (*(["loads of kind: dead"] if loads else []), *self.parts):
+            if shell.modulus is None:
+                raise ValueError(f"shell.youngs_modulus is needed for {key}")
         indented = []
         if isinstance(loading, IndentationSection):
             indented = [loading.at.point]
@@ -182,9 +187,9 @@ class Case(Section):
             raise ValueError(f"magnetic.energy: {magnetic.energy}: not of a solid, whose full energy is linear in F")
         for key in self.mesh.model_fields_set & {"degree", "penalty", "tolerance"}:
             if key != "degree" or self.mesh.degree != SOLID_DEGREE:
-                raise ValueError(
-                    f"mesh.{key}: not of a solid, which has degree {SOLID_DEGREE}; mesh.refinement makes it finer"
-                )
+                read = isinstance(self.shell, MeshSurface)
+                finer = "a file with smaller elements" if read else "mesh.refinement"
+                raise ValueError(f"mesh.{key}: not of a solid, which has degree {SOLID_DEGREE}; {finer} makes it finer")
         if self.symmetry == "axisymmetric":
             raise ValueError("symmetry: axisymmetric: a solid is whole or half")
         if isinstance(loading, IndentationSection) and not loading.patch:
@@ -198,6 +203,18 @@ class Case(Section):
                 f"{self.shell.poisson_ratio:g}, which says all"
             )
         return self
+
+    @property
+    def parts(self) -> dict[str, Part]:
+        """The registered parts that it has, by key."""
+        return {key: part for key in PARTS if (part := getattr(self, key)) is not None}
+
+    @property
+    def scales(self) -> Scales:
+        """What forces and stiffnesses are over; there is a modulus where something needs it."""
+        shell = self.shell
+        assert shell.modulus is not None
+        return Scales(shell.reference, shell.reference / shell.R_over_h, shell.modulus, shell.poisson_ratio)
 
     @property
     def degree(self) -> int:

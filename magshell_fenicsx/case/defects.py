@@ -5,7 +5,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from magshell_fenicsx.case.base import Section
+from magshell_fenicsx.parts.section import Section
 
 
 class DimpleSection(Section):

@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, Field, model_validator
 
-from magshell_fenicsx.case.base import FluxDensity, Section
 from magshell_fenicsx.case.expressions import formula
+from magshell_fenicsx.parts.section import FluxDensity, Section
 
 MU_0 = 4e-7 * pi  # T m/A
 

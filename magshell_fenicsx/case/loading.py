@@ -5,14 +5,15 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from magshell_fenicsx.case.base import Section, or_number
 from magshell_fenicsx.case.fields import Direction
+from magshell_fenicsx.parts.section import Section, or_number
 
 Until = Annotated[
     Literal["limit", "bifurcation", "target", "points"],
     Field(
-        description="Where the path ends: at the first instability (limit), at the first bifurcation, through folds, "
-        "at the target, or after `points` steps by arc length"
+        description="Where the path ends: at the first instability (limit; past one that a half or a meridian excludes "
+        "it goes on to the model's own, up to twice the load), at the first bifurcation, through folds, at the target, "
+        "or after `points` steps by arc length"
     ),
 ]
 Count = Annotated[int, Field(ge=1, le=10000, description="Equal parts to the target, each a row; or steps")]
@@ -209,7 +210,7 @@ class FieldSection(PathSection):
 class RotationSection(Section):
     """The applied field, at its full magnitude, turns on the shortest way to another direction.
 
-    The requested points are equal angles apart; between two of them the field moves along the chord.
+    The requested points are equal angles apart; the field keeps its magnitude.
     """
 
     kind: Literal["rotation"]

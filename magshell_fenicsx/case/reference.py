@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from magshell_fenicsx.case.schema import schema
+from magshell_fenicsx.quantities.page import columns_page
 
 Schema = dict[str, Any]
 WHOLE = "The whole case"
@@ -36,7 +37,7 @@ def reference() -> str:
     titles = {name: _title(paths, sections[name]) for name, paths in _places(whole, sections).items()}
     parts = [HEAD, _section(WHOLE, whole, titles)]
     parts += [_section(title, sections[name], titles) for name, title in titles.items()]
-    return "\n".join(parts)
+    return "\n".join([*parts, columns_page()])
 
 
 def _places(whole: Schema, sections: dict[str, Schema]) -> dict[str, list[str]]:

@@ -6,6 +6,7 @@ from typing import Any
 from pydantic.json_schema import GenerateJsonSchema
 
 from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.parts.registered import PARTS
 
 _NOISE = {"title", "discriminator", "gt", "ge", "lt", "le"}  # the last are bounds of quantities, which are text
 
@@ -13,7 +14,11 @@ _NOISE = {"title", "discriminator", "gt", "ge", "lt", "le"}  # the last are boun
 def schema() -> dict[str, Any]:
     """What a case file may hold, key by key; rules between keys are `Case`'s alone."""
     head = {"$schema": GenerateJsonSchema.schema_dialect, "title": "magshell_fenicsx case"}
-    return {**head, **_without_noise(Case.model_json_schema())}
+    whole = _without_noise(Case.model_json_schema())
+    whole["properties"] = dict(
+        sorted(whole["properties"].items(), key=lambda item: item[0] in PARTS)
+    )  # parts come last
+    return {**head, **whole}
 
 
 def schema_text() -> str:

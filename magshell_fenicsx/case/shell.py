@@ -5,8 +5,8 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
-from magshell_fenicsx.case.base import Length, Pressure, Section
 from magshell_fenicsx.case.defects import DimpleSection
+from magshell_fenicsx.parts.section import Length, Pressure, Section
 
 
 class ShellSection(Section):

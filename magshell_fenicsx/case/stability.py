@@ -4,7 +4,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from magshell_fenicsx.case.base import Section
+from magshell_fenicsx.parts.section import Section
 
 
 class StabilitySection(Section):

@@ -12,10 +12,10 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import BeforeValidator, Field, ModelWrapValidatorHandler, PrivateAttr, model_validator
 
-from magshell_fenicsx.case.base import Section, in_units, or_number, texts
 from magshell_fenicsx.case.defects import DimpleSection
 from magshell_fenicsx.case.expressions import formula
 from magshell_fenicsx.case.fields import Formula
+from magshell_fenicsx.parts.section import Section, in_units, or_number, texts
 
 Positive = Annotated[float, Field(gt=0)]
 Measure = Annotated[float, or_number("metre", Positive), Field(gt=0)]

@@ -1,42 +1,58 @@
-"""A system with another amplitude than those underneath: several moved together."""
+"""A system with another amplitude than those underneath, which it moves together along a curve."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
-from petsc4py import PETSc
+from magshell_fenicsx.continuation.system import Amplitudes, State, System, Tangent, Vector, Weighted
 
-from magshell_fenicsx.continuation.system import Amplitudes, System, Vector, Weighted
+Curve = Callable[[float], tuple[float, float, float]]  # t -> mu and its first two derivatives
 
 
 class Along:
-    """A system in the amplitude t, which stands for mu_i = base_i + t direction_i of another.
+    """A system in the amplitude t, which stands for mu_i = f_i(t) of another.
 
     Parameters
     ----------
     name
         Of the amplitude t.
-    base, direction
-        Amplitudes at t = 0, and their change to t = 1.
+    curves
+        f_i with its first two derivatives, for the amplitudes that move.
     """
 
-    def __init__(self, system: System, name: str, base: Mapping[str, float], direction: Mapping[str, float]) -> None:
+    def __init__(self, system: System, name: str, curves: Mapping[str, Curve]) -> None:
         self.comm, self.size, self.length = system.comm, system.size, system.length
-        self._system, self._name, self._base, self._direction = system, name, base, direction
+        self.coordinates = system.coordinates
+        self._system, self._name, self._curves = system, name, curves
 
-    def expand(self, mu: Amplitudes) -> dict[str, float]:
-        """The amplitudes of the system underneath."""
-        t = mu[self._name]
-        others = {name: value for name, value in mu.items() if name != self._name}
-        return {**others, **{name: self._base[name] + t * rate for name, rate in self._direction.items()}}
+    def expand(self, state: State) -> State:
+        """A state with the amplitudes of the system underneath."""
+        return State(state.u, self._expanded(state.mu))
 
     def residual(self, u: Vector, mu: Amplitudes) -> Vector:
-        return self._system.residual(u, self.expand(mu))
+        return self._system.residual(u, self._expanded(mu))
 
-    def load(self, u: Vector, name: str) -> Vector:
-        columns = [rate * self._system.load(u, i) for i, rate in self._direction.items()]
+    def load(self, u: Vector, mu: Amplitudes, name: str) -> Vector:
+        whole, rates = self._expanded(mu), self._rates(mu, name)
+        columns = [rate * self._system.load(u, whole, i) for i, rate in rates.items()]
         return sum(columns[1:], columns[0])
 
-    def potential(self, u: Vector, name: str) -> float:
-        return sum(rate * self._system.potential(u, i) for i, rate in self._direction.items())
+    def potential(self, u: Vector, mu: Amplitudes, name: str) -> float:
+        whole = self._expanded(mu)
+        return sum(rate * self._system.potential(u, whole, i) for i, rate in self._rates(mu, name).items())
 
-    def tangent(self, u: Vector, mu: Amplitudes, stress: Sequence[Weighted] = ()) -> PETSc.Mat:
-        return self._system.tangent(u, self.expand(mu), stress)
+    def curvature(self, u: Vector, mu: Amplitudes, name: str, other: str) -> float:
+        whole, t = self._expanded(mu), mu[self._name]
+        here, there = self._rates(mu, name), self._rates(mu, other)
+        bends = {i: f(t)[2] for i, f in self._curves.items()} if name == other == self._name else {}
+        mixed = (a * b * self._system.curvature(u, whole, i, j) for i, a in here.items() for j, b in there.items())
+        return sum(mixed) + sum(bend * self._system.potential(u, whole, i) for i, bend in bends.items())
+
+    def tangent(self, u: Vector, mu: Amplitudes, stress: Sequence[Weighted] = ()) -> Tangent:
+        return self._system.tangent(u, self._expanded(mu), stress)
+
+    def _expanded(self, mu: Amplitudes) -> dict[str, float]:
+        others = {name: value for name, value in mu.items() if name != self._name}
+        return {**others, **{i: f(mu[self._name])[0] for i, f in self._curves.items()}}
+
+    def _rates(self, mu: Amplitudes, name: str) -> dict[str, float]:
+        """dmu_i/dt; of an amplitude underneath, itself."""
+        return {i: f(mu[self._name])[1] for i, f in self._curves.items()} if name == self._name else {name: 1.0}

@@ -10,6 +10,7 @@ Govaerts, Numerical methods for bifurcations of dynamical equilibria, SIAM 2000,
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -17,7 +18,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from magshell_fenicsx.continuation.newton import BorderedNewton
-from magshell_fenicsx.continuation.system import Amplitudes, State, System, Vector, Weighted, dot, followed, max_abs
+from magshell_fenicsx.continuation.system import Edged, State, System, Tangent, Vector, Weighted, dot, followed, max_abs
 
 TOLERANCE = 1e-9  # of u held along a direction, in lengths of the system
 MOST_TANGENTS, CONTRACTION = 8, 0.3
@@ -25,28 +26,35 @@ ROUNDING = 1e-5  # in lengths: steps that are smaller and do not shrink are roun
 DIFFERENCE = 1e-2  # in lengths, of u along v; only the speed of convergence depends on the error
 
 
-class _Sprung:
-    """A system with a spring on one degree of freedom, as stiff as that itself: regular at a simple fold."""
+@dataclass(frozen=True)
+class _Spring:
+    """A spring on the degree of freedom where a shape is largest, as stiff as that itself.
 
-    def __init__(self, system: System, shape: Vector) -> None:
-        self.comm, self.size, self.length = system.comm, system.size, system.length
-        self.residual, self.load, self.potential = system.residual, system.load, system.potential
-        self._system = system
-        _, owner = system.comm.allreduce((float(np.abs(shape).max(initial=0.0)), system.comm.rank), MPI.MAXLOC)
-        self.e = np.zeros(system.size)
-        if system.comm.rank == owner:
-            self.e[int(np.argmax(np.abs(shape)))] = 1.0
+    Attributes
+    ----------
+    e
+        One at the degree of freedom, zero elsewhere.
+    """
 
-    def tangent(self, u: Vector, mu: Amplitudes, stress: Sequence[Weighted] = ()) -> PETSc.Mat:
-        K = self._system.tangent(u, mu, stress)
-        first = K.getOwnershipRange()[0]
-        here = [first + int(i) for i in np.flatnonzero(self.e)]
-        itself = self.comm.allreduce(sum(K.getValue(i, i) for i in here))
-        self.stiffness = 2 * abs(itself) - itself or K.norm(PETSc.NormType.INFINITY) or 1.0  # the sum is positive
-        for i in here:
-            K.setValue(i, i, self.stiffness, addv=True)
-        K.assemble()
-        return K
+    e: Vector
+    stiffness: float
+
+
+def _sprung(tangent: Tangent, shape: Vector, comm: MPI.Comm) -> _Spring:
+    """Add the spring to a tangent; it is regular then at a simple fold."""
+    K = tangent.K if isinstance(tangent, Edged) else tangent
+    size, first = np.abs(shape[: K.getLocalSize()[0]]), K.getOwnershipRange()[0]  # not of an edge
+    _, owner = comm.allreduce((float(size.max(initial=0.0)), comm.rank), MPI.MAXLOC)
+    e = np.zeros_like(shape)
+    if comm.rank == owner:
+        e[int(np.argmax(size))] = 1.0
+    here = [first + int(i) for i in np.flatnonzero(e)]
+    itself = comm.allreduce(sum(K.getValue(i, i) for i in here))
+    stiffness = 2 * abs(itself) - itself or K.norm(PETSc.NormType.INFINITY) or 1.0  # the sum is positive
+    for i in here:
+        K.setValue(i, i, stiffness, addv=True)
+    K.assemble()
+    return _Spring(e, stiffness)
 
 
 class AugmentedTangent:
@@ -58,17 +66,16 @@ class AugmentedTangent:
 
     def __init__(self, newton: BorderedNewton, state: State, b: Vector, stress: Sequence[Weighted] = ()) -> None:
         self._system = system = newton.system
-        newton.system = sprung = _Sprung(system, b)
-        try:
-            self._factors = newton.factor_at(State(state.u, state.mu), stress)  # a state that nobody else asks for
-        finally:
-            newton.system = system
+        K = system.tangent(state.u, state.mu, stress)
+        spring = _sprung(K, b, system.comm)
+        self._factors = newton.factorisation
+        self._factors.factor(K)
         self.unstable = self._factors.negative_pivots  # the spring has made phi stable
         dot_ = partial(dot, system.comm)
-        self._b, self._e, self._dot = b / np.sqrt(dot_(b, b)), sprung.e, dot_
+        self._b, self._e, self._dot = b / np.sqrt(dot_(b, b)), spring.e, dot_
         self._p, self._q = self._factors.solve(self._e), self._factors.solve(self._b)
         q = dot_(self._e, self._q)
-        self._border = np.array([[1 / sprung.stiffness - dot_(self._e, self._p), q], [q, -dot_(self._b, self._q)]])
+        self._border = np.array([[1 / spring.stiffness - dot_(self._e, self._p), q], [q, -dot_(self._b, self._q)]])
         self.v, self.g = self._bordered(np.zeros_like(b), 1.0)
 
     def solve(self, f: Vector) -> tuple[Vector, float]:

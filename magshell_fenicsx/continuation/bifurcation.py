@@ -21,6 +21,7 @@ MOST_ITERATIONS = 10
 LARGEST_STEP = 10.0  # in lengths; more is a divergence
 SCATTER = 3.0  # corrections of the load that only rounding makes, in standard deviations
 NEAR = 1e-5  # in lengths: after longer steps the state is brought back into equilibrium but for the force along v
+DIFFERENCE = 1e-4  # relative, of an amplitude
 ROUNDING = 1e-2  # in lengths: steps that are smaller and do not shrink are the rounding of g
 
 
@@ -117,15 +118,22 @@ def _step(system: System, state: State, name: str, tangent: AugmentedTangent) ->
     """Newton's step du = alpha v - w_R - dmu w_mu and dmu, from the rows for g and v . R_mu; and w_mu."""
     comm, u, v = system.comm, state.u, tangent.v
     w_R, _ = tangent.solve(system.residual(u, state.mu))
-    w_mu, pull = tangent.solve(system.load(u, name))  # pull = v . R_mu
+    w_mu, pull = tangent.solve(system.load(u, state.mu, name))  # pull = v . R_mu
     cubic = third(system, state, v)
-    K_mu_v = first_difference(lambda u: system.load(u, name), system, u, v)
+    K_mu_v = first_difference(lambda u: system.load(u, state.mu, name), system, u, v)
     mixed = _mixed(system, state, v, w_mu) - K_mu_v
-    turn = dot(comm, mixed, v)
-    rows = [[turn, -dot(comm, cubic, v)], [dot(comm, mixed, w_mu) - dot(comm, K_mu_v, w_mu), -turn]]
+    turn, bend = dot(comm, mixed, v), dot(comm, v, _load_rate(system, state, name))
+    rows = [[turn, -dot(comm, cubic, v)], [dot(comm, mixed, w_mu) - dot(comm, K_mu_v, w_mu) + bend, -turn]]
     rest = [-tangent.g - dot(comm, cubic, w_R), -pull - dot(comm, mixed, w_R)]
     dmu, alpha = _solved(rows, rest)
     return alpha * v - w_R - dmu * w_mu, dmu, w_mu
+
+
+def _load_rate(system: System, state: State, name: str) -> Vector:
+    """R_mumu by a difference: zero, exactly, of an amplitude that multiplies its term."""
+    mu, d = state.mu[name], DIFFERENCE * (abs(state.mu[name]) or 1.0)
+    ahead, back = (system.load(state.u, {**state.mu, name: mu + step}, name) for step in (d, -d))
+    return np.asarray((ahead - back) / (2 * d))
 
 
 def _solved(rows: Sequence[Sequence[float]], rest: Sequence[float]) -> tuple[float, float]:

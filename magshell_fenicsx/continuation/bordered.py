@@ -35,8 +35,8 @@ class Bordered:
     def __init__(self, system: System, factors: Factorisation, state: State, name: str, row: Row) -> None:
         self.state, self.row, self._mu = state, row, state.mu[name]
         self._comm, self._factors, self._length = system.comm, factors, system.length
-        self._c, self._d = row.gradient(state.u)
-        self.column = system.load(state.u, name)
+        self._c, self._d = row.gradient(state)
+        self.column = system.load(state.u, state.mu, name)
         self._x2 = factors.solve(self.column)
         self._schur = self._d - (dot(self._comm, self._c, self._x2) if self._c is not None else 0.0)
         self._weight = dot(self._comm, self._x2, self._x2)  # of dmu: the displacement that it makes

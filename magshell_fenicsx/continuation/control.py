@@ -14,10 +14,10 @@ from magshell_fenicsx.continuation.system import State, System, Vector, dot
 class Row(Protocol):
     """g(u, mu) = 0 beside equilibrium."""
 
-    def residual(self, u: Vector, mu: float) -> float:
+    def residual(self, state: State) -> float:
         """g."""
 
-    def gradient(self, u: Vector) -> tuple[Vector | None, float]:
+    def gradient(self, state: State) -> tuple[Vector | None, float]:
         """dg/du (None where it is zero) and dg/dmu."""
 
 
@@ -25,28 +25,30 @@ class Row(Protocol):
 class GivenLoad:
     """Load control: mu = target."""
 
+    name: str
     target: float
 
-    def residual(self, u: Vector, mu: float) -> float:
-        return mu - self.target
+    def residual(self, state: State) -> float:
+        return state.mu[self.name] - self.target
 
-    def gradient(self, u: Vector) -> tuple[Vector | None, float]:
+    def gradient(self, state: State) -> tuple[Vector | None, float]:
         return None, 1.0
 
 
 @dataclass(frozen=True)
 class GivenConjugate:
-    """Displacement or volume control: -Pi_i(u) = target."""
+    """Displacement or volume control: -dPi/dmu = target."""
 
     system: System
     name: str
     target: float
 
-    def residual(self, u: Vector, mu: float) -> float:
-        return -self.system.potential(u, self.name) - self.target
+    def residual(self, state: State) -> float:
+        return -self.system.potential(state.u, state.mu, self.name) - self.target
 
-    def gradient(self, u: Vector) -> tuple[Vector | None, float]:
-        return -self.system.load(u, self.name), 0.0
+    def gradient(self, state: State) -> tuple[Vector | None, float]:
+        u, mu, name = state.u, state.mu, self.name
+        return -self.system.load(u, mu, name), -self.system.curvature(u, mu, name, name)
 
 
 @dataclass(frozen=True)
@@ -91,8 +93,9 @@ class Hyperplane:
     normal: tuple[Vector, float]
     distance: float
 
-    def residual(self, u: Vector, mu: float) -> float:
-        return self.metric.inner(self.normal, (u - self.base.u, mu - self.base.mu[self.name])) - self.distance
+    def residual(self, state: State) -> float:
+        chord = (state.u - self.base.u, state.mu[self.name] - self.base.mu[self.name])
+        return self.metric.inner(self.normal, chord) - self.distance
 
-    def gradient(self, u: Vector) -> tuple[Vector | None, float]:
+    def gradient(self, state: State) -> tuple[Vector | None, float]:
         return self.metric.weight * self.normal[0], self.normal[1] / self.metric.scale**2

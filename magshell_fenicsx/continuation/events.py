@@ -23,7 +23,7 @@ MOST_HALVINGS = 12  # of a step that holds several instabilities; what is left c
 
 
 class Stability(Protocol):
-    """A tangent whose inertia tells stability."""
+    """A tangent whose inertia decides stability."""
 
     def factor_at(self, state: State) -> Factorisation:
         """Factor the tangent at a state."""
@@ -44,7 +44,7 @@ class Instability:
 
 
 def instabilities(path: Path, low: Point, high: Point, tolerance: float = 1e-8) -> Iterator[Instability]:
-    """All singular points between two successive points that their inertia and tangents tell, in order.
+    """All singular points between two successive points, in order, as far as inertia and tangents show them.
 
     Parameters
     ----------
@@ -81,7 +81,7 @@ class _Search:
         self.path.progress.doing("locating an instability")
         single = change == 1 or not halvings
         if single and turned:
-            yield Instability(self.told(self.fold(low, high)), "fold")
+            yield Instability(self.finished(self.fold(low, high)), "fold")
         elif single:
             point = self.crossing(low, high) or self.bracketed(low, high)
             if abs(point.dmu) < FLAT * abs(low.dmu):
@@ -173,7 +173,8 @@ class _Search:
         self.iterations = self.factorisations = 0
         return done
 
-    def told(self, point: Point) -> Point:
+    def finished(self, point: Point) -> Point:
+        """The point with its own tangent and inertia, and with the work."""
         self.factorisations += 1
         return replace(self.spent(self.path.exact(point, self.base)), load_error=point.load_error)
 
@@ -271,7 +272,7 @@ def locate_bifurcation(
     """
     search = _Search(path, stable, tolerance)
     try:
-        return search.told(search.bifurcation(stable, path.seen_from(stable, unstable), stability))
+        return search.finished(search.bifurcation(stable, path.seen_from(stable, unstable), stability))
     except NoEigenpair as e:
         raise PathStopped(f"locating an instability: {e}", stable) from None
 

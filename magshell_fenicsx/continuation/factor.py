@@ -4,7 +4,8 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from magshell_fenicsx.continuation.system import Vector
+from magshell_fenicsx.continuation.edge import Edge
+from magshell_fenicsx.continuation.system import Edged, Tangent, Vector
 from magshell_fenicsx.continuation.timing import Stopwatch
 
 PREFIX = "magshell_factor_"
@@ -27,7 +28,7 @@ class Factorisation:
     solving
         Time spent on solving with the factors.
     matrix
-        The matrix last factored.
+        The matrix last factored; of an edged one, K.
     negative_pivots
         Unstable directions of the latest factored tangent (Sylvester's law of inertia).
     """
@@ -35,28 +36,45 @@ class Factorisation:
     def __init__(self, comm: MPI.Comm) -> None:
         self.count, self.negative_pivots = 0, 0
         self.stopwatch, self.solving = Stopwatch(), Stopwatch()
-        self._comm = comm
+        self.comm = comm
         self._cholmod: _Definite | None = None
         self._mumps: PETSc.PC | None = None
         self._pc: PETSc.PC | None = None
         self._rhs: PETSc.Vec | None = None
         self._definite = comm.size == 1
+        self._edge: Edge | None = None
 
-    def factor(self, K: PETSc.Mat) -> None:
-        """Factor K.
+    def factor(self, tangent: Tangent) -> None:
+        """Factor a matrix; an edged one by the factors of its K and k back-solves.
 
         Raises
         ------
         PETSc.Error
             If MUMPS fails, for want of memory for instance, or CHOLMOD in a way that says nothing of the matrix.
         """
+        K = tangent.K if isinstance(tangent, Edged) else tangent
         with self.stopwatch:
-            self.matrix = K
+            self.matrix, self._edge = K, None
             if self._rhs is None:
                 self._rhs, self._solution = K.createVecs()
             if not (self._definite and self._factor_definite(K)):
                 self._factor_any(K)
         self.count += 1
+        if isinstance(tangent, Edged):
+            self._edge = Edge(tangent, self.comm, self._inner, self._product)
+            self.negative_pivots += self._edge.negative_pivots
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Rows of the matrix last factored: on this rank, and in all."""
+        edge = self._edge.count if self._edge else 0
+        here, whole = (size[0] for size in (self.matrix.getLocalSize(), self.matrix.getSize()))
+        return here + edge * (self.comm.rank == self.comm.size - 1), whole + edge
+
+    @property
+    def norm(self) -> float:
+        """Of K: its largest sum of a row's magnitudes."""
+        return float(self.matrix.norm(PETSc.NormType.NORM_INFINITY))
 
     def _factor_definite(self, K: PETSc.Mat) -> bool:
         """Try CHOLMOD; False if K is not positive definite, or CHOLMOD cannot say."""
@@ -80,7 +98,7 @@ class Factorisation:
             F.setMumpsIcntl(24, 1)  # null pivots are reported, without it there is no inertia,
             F.setMumpsCntl(3, -1e-100)  # but only true zeros: else the null vector would be lost at a fold,
             F.setMumpsCntl(5, 1e-17)  # and those are made tiny, for the same reason
-            if self._comm.size > 1:
+            if self.comm.size > 1:
                 F.setMumpsIcntl(13, 1)  # the root front too must be counted, so it is not left to ScaLAPACK
             F.setMumpsIcntl(14, 50)
             F.setMumpsIcntl(8, 0)  # unscaled: a tenth faster, the tangent's entries are of one size
@@ -88,14 +106,21 @@ class Factorisation:
         self._pc, self.negative_pivots = self._mumps, self._mumps.getFactorMatrix().getInertia()[0]
 
     def times(self, x: Vector) -> Vector:
-        """K x with the matrix last factored."""
+        """The matrix last factored times x."""
+        return self._edge.times(x) if self._edge else self._product(x)
+
+    def solve(self, rhs: Vector) -> Vector:
+        """The solution with the latest factors."""
+        return self._edge.solve(rhs) if self._edge else self._inner(rhs)
+
+    def _product(self, x: Vector) -> Vector:
         v, y = self.matrix.createVecs()
         v.setArray(x)
         self.matrix.mult(v, y)
         return np.array(y.array_r)
 
-    def solve(self, rhs: Vector) -> Vector:
-        """K^-1 rhs with the latest factors."""
+    def _inner(self, rhs: Vector) -> Vector:
+        """K^-1 rhs."""
         assert self._pc is not None
         assert self._rhs is not None
         with self.solving:

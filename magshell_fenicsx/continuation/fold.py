@@ -90,8 +90,8 @@ def find_fold(newton: BorderedNewton, guess: Guess, name: str) -> Fold:
         if growing or not steps[-1] <= LARGEST_STEP:
             raise FoldLost("Newton's method diverged on its way to a fold")
         last, state = state, state.with_(state.u + du, name, state.mu[name] + dmu)
-    phi = _oriented(system, tangent.improved(last, state), system.load(state.u, name))
-    pull, cubic = dot(system.comm, phi, system.load(state.u, name)), third(system, state, phi)
+    phi = _oriented(system, tangent.improved(last, state), system.load(state.u, state.mu, name))
+    pull, cubic = dot(system.comm, phi, system.load(state.u, state.mu, name)), third(system, state, phi)
     return Fold(
         state=state,
         name=name,
@@ -108,7 +108,7 @@ def sensitivity(system: System, fold: Fold, column: Vector) -> float:
 
     For another amplitude, R_p is its load column.
     """
-    pull = dot(system.comm, fold.phi, system.load(fold.state.u, fold.name))
+    pull = dot(system.comm, fold.phi, system.load(fold.state.u, fold.state.mu, fold.name))
     return -dot(system.comm, fold.phi, column) / pull
 
 
@@ -142,16 +142,16 @@ def _extrapolated(known: Sequence[tuple[float, Fold]], p: float, others: Amplitu
 
 def _first_shape(newton: BorderedNewton, state: State, name: str) -> Vector:
     """Near a fold the response to the load is nearly the null vector."""
-    return newton.factor_at(state).solve(newton.system.load(state.u, name))
+    return newton.factor_at(state).solve(newton.system.load(state.u, state.mu, name))
 
 
 def _step(system: System, state: State, name: str, tangent: AugmentedTangent) -> tuple[Vector, float]:
     """Newton's step du = alpha v - w_R - dmu w_mu; the rows for alpha and dmu are R along v, and g."""
     comm, u, v = system.comm, state.u, tangent.v
     w_R, t_R = tangent.solve(system.residual(u, state.mu))
-    w_mu, t_mu = tangent.solve(system.load(u, name))
+    w_mu, t_mu = tangent.solve(system.load(u, state.mu, name))
     cubic = third(system, state, v)
-    K_mu_v = first_difference(lambda u: system.load(u, name), system, u, v)
+    K_mu_v = first_difference(lambda u: system.load(u, state.mu, name), system, u, v)
     turn = dot(comm, cubic, w_mu) - dot(comm, v, K_mu_v)
     rows = [[t_mu, -tangent.g], [turn, -dot(comm, cubic, v)]]
     dmu, alpha = np.linalg.solve(rows, [-t_R, -tangent.g - dot(comm, cubic, w_R)])

@@ -7,9 +7,7 @@ stiffness, as a sphere's. Their space grows here by one solve at a time until th
 from dataclasses import dataclass
 
 import numpy as np
-from mpi4py import MPI
 from numpy.typing import NDArray
-from petsc4py import PETSc
 
 from magshell_fenicsx.continuation.factor import Factorisation
 from magshell_fenicsx.continuation.system import Vector, dot
@@ -64,13 +62,12 @@ class _Space:
     """Orthonormal vectors and what K^-1 makes of them."""
 
     def __init__(self, factors: Factorisation) -> None:
-        n, self._factors = factors.matrix.getLocalSize()[0], factors
-        self._comm: MPI.Comm = factors.matrix.comm.tompi4py()
-        self._size: int = factors.matrix.getSize()[0]
+        self._factors, self._comm = factors, factors.comm
+        n, self._size = factors.size
         self._count, self.solves = 0, 0
         self._V, self._W = np.empty((MOST_VECTORS, n)), np.empty((MOST_VECTORS, n))
         self._next = np.sin(1.0 + np.arange(n) + self._comm.rank)
-        self.norm = factors.matrix.norm(PETSc.NormType.NORM_INFINITY)
+        self.norm = factors.norm
 
     @property
     def exhausted(self) -> bool:

@@ -1,4 +1,4 @@
-"""When a sequence of Newton's steps has converged, told from the steps alone.
+"""When a sequence of Newton's steps has converged, judged by the steps alone.
 
 The residual is no measure of the error: where a structure is soft, the rounding of its stiff part hides
 it. The next step is one, if the matrix that it is made with is good: P. Deuflhard, Newton Methods for

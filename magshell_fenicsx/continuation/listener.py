@@ -6,7 +6,7 @@ from magshell_fenicsx.continuation.point import Point
 
 
 class Progress(Protocol):
-    """Is told what is about to be done. No part of it is collective, and nothing may depend on it."""
+    """Hears what is about to be done. No part of it is collective, and nothing may depend on it."""
 
     def trying(self, here: Point, length: float) -> None:
         """A step from an accepted point over a length of s."""

@@ -73,7 +73,7 @@ def lowest_modes(K: PETSc.Mat, M: PETSc.Mat, count: int) -> list[Mode]:
     """
     slices = _Slices(K, M)
     wanted = min(max(count, slices.below(0.0)), slices.finite)
-    # (a) those nearest to zero tell how large eigenvalues are
+    # (a) those nearest to zero show how large eigenvalues are
     shift = -2 * max(abs(mode.eigenvalue) for mode in slices.around(0.0, wanted + 1, 1e-3))
     # (b) a shift with nothing below it
     trials = 0

@@ -46,8 +46,11 @@ class NewtonOptions:
         The first factors are kept while a step is shorter than this part of the one before.
     hard
         The same of later factors, and of all where the guess comes with a stress: old ones lead astray there.
+    cheap
+        As many steps with old factors cost less than new ones: so near the end old ones are kept that halve a step,
+        but not where the guess comes with a stress.
     fresh
-        Lengths between where factors were made and a solution whose tangent and inertia they still tell.
+        Distance, in lengths, up to which factors serve for the tangent and the inertia of a solution.
     largest_step
         An iteration that moves u by more than this many lengths is a divergence.
     """
@@ -56,6 +59,7 @@ class NewtonOptions:
     max_iterations: int = 25
     contraction: float = 0.6
     hard: float = 0.1
+    cheap: int = 8
     fresh: float = 0.05
     largest_step: float = 1e4
 
@@ -112,6 +116,11 @@ class _Progress:
     ahead: Direction | None = None
 
 
+@dataclass
+class _Work:
+    iterations: int = 0
+
+
 class _Border:
     """What PETSc calls back; it does not keep the solver, and with it the factors, alive."""
 
@@ -149,12 +158,15 @@ class BorderedNewton:
         Factors of the latest tangent.
     """
 
-    def __init__(self, system: System, options: NewtonOptions | None = None) -> None:
+    def __init__(
+        self, system: System, options: NewtonOptions | None = None, factorisation: Factorisation | None = None
+    ) -> None:
         self.system = system
         self.options = options or NewtonOptions()
-        self.factorisation = Factorisation(system.comm)
-        self.iterations = 0
-        self._factored: State | None = None
+        self.factorisation = factorisation or Factorisation(system.comm)
+        self._work = _Work()
+        self._made: tuple[State | None, int] = None, 0  # the state that was factored last, and the count of it
+        self._stressed = False  # it was factored with another stress than its own
         self._progress = _Progress()
         comm = system.comm
         self._last = comm.rank == comm.size - 1
@@ -181,6 +193,17 @@ class BorderedNewton:
         ksp.setNormType(PETSc.KSP.NormType.NONE)
         snes.setFromOptions()
 
+    def on(self, system: System) -> "BorderedNewton":
+        """The same for another system, whose tangent is made of this one's; factors and work are shared."""
+        other = BorderedNewton(system, self.options, self.factorisation)
+        other._work = self._work
+        return other
+
+    @property
+    def iterations(self) -> int:
+        """Those of all solves so far."""
+        return self._work.iterations
+
     def solve(self, guess: State, name: str, row: Row, stress: Sequence[Weighted] = ()) -> Outcome:
         """Find the equilibrium near `guess` on which `row` holds, with mu the amplitude `name`.
 
@@ -197,7 +220,7 @@ class BorderedNewton:
         if converged and progress.ahead:  # it costs nothing more
             u, mu = plus((u, mu), -1.0, progress.ahead)
         iterations = self._snes.getIterationNumber()
-        self.iterations += iterations
+        self._work.iterations += iterations
         ended = self._snes.getConvergedReason()
         reason = _REASONS.get(progress.verdict) or _REASONS_OF_SNES.get(ended, f"SNES reason {ended}")
         error = progress.iterates.steps[-1].size if progress.iterates.steps else np.inf
@@ -205,10 +228,17 @@ class BorderedNewton:
 
     def factor_at(self, state: State, stress: Sequence[Weighted] = ()) -> Factorisation:
         """Factor the tangent at a state, unless its factors are at hand."""
-        if self._factored is not state:
+        near = self._factored
+        if near is not state and (near is None or self._stressed or not near.equals(state, self.system.comm)):
             self.factorisation.factor(self.system.tangent(state.u, state.mu, stress))
-            self._factored = state
+            self._made, self._stressed = (state, self.factorisation.count), bool(stress)
         return self.factorisation
+
+    @property
+    def _factored(self) -> State | None:
+        """The state whose tangent's factors are at hand."""
+        state, count = self._made
+        return state if count == self.factorisation.count else None
 
     def response(self, state: State, name: str, row: Row, *, exact: bool = False) -> Response:
         """The path's tangent at a solution: K du + R_mu dmu = 0, c.du + d dmu = 1.
@@ -220,26 +250,27 @@ class BorderedNewton:
         moved = np.inf if near is None else max_abs(comm, state.u - near.u) / self.system.length
         fresh = moved <= self.options.fresh and not exact
         matrix = self._bordered(near if fresh and near else state, name, row)
-        tangent, load = matrix.tangent, self.system.load(state.u, name)
+        tangent, load = matrix.tangent, self.system.load(state.u, state.mu, name)
         if moved and fresh:
             refined = refined_tangent(self.system, matrix, tangent, state, load, row)
             if refined is None:
                 return self.response(state, name, row, exact=True)
             tangent = refined
         du, dmu = tangent
-        return Response(du, dmu, -dot(comm, load, du) / dmu, self.factorisation.negative_pivots)
+        softness = -dot(comm, load, du) / dmu - self.system.curvature(state.u, state.mu, name, name)
+        return Response(du, dmu, softness, self.factorisation.negative_pivots)
 
     def _bordered(self, state: State, name: str, row: Row) -> Bordered:
         """The bordered matrix at a state, that of the last solve if it was made there for the same row."""
         last = self._progress.matrix
-        if last and last.row is row and last.state is state is self._factored:
+        if last and last.row is row and last.state is state is self._factored:  # one object, not only equal
             return last
         return Bordered(self.system, self.factor_at(state), state, name, row)
 
     def _function(self, x: PETSc.Vec, f: PETSc.Vec) -> None:
         u, mu = self._split(x)
-        R = self.system.residual(u, {**self._guess.mu, self._name: mu})
-        self._join(R, self._row.residual(u, mu), f)
+        state = self._guess.with_(u, self._name, mu)
+        self._join(self.system.residual(u, state.mu), self._row.residual(state), f)
 
     def _test(self, snes: PETSc.SNES, norm: float) -> Any:
         progress, o = self._progress, self.options
@@ -260,8 +291,10 @@ class BorderedNewton:
         if progress.matrix is not None:
             ahead = self._updated(progress.matrix.solve(*f))
             size = progress.matrix.size(ahead)
-            first = sum(step.own for step in steps) == 1 and not self._followed
-            if size <= (self.options.contraction if first else self.options.hard) * steps[-1].size:
+            first, o = sum(step.own for step in steps) == 1 and not self._followed, self.options
+            ratio = size / steps[-1].size
+            ends = ratio <= 0.5 and size * ratio**o.cheap <= o.tolerance and not self._followed
+            if ends or ratio <= (o.contraction if first else o.hard):
                 steps.append(Step(size, own=False))
                 return ahead
         factors = self.factor_at(state, self._stress)

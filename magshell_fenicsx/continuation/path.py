@@ -1,6 +1,7 @@
 """Following an equilibrium path by load, by conjugate displacement or by arc length, with adaptive steps."""
 
 from collections.abc import Callable, Iterator, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -66,7 +67,7 @@ class Path:
     journal
         Keeps every result of `at`, and gives back those of an interrupted run.
     progress
-        Is told of every step before it is tried.
+        Hears of every step before it is tried.
     """
 
     def __init__(
@@ -93,11 +94,11 @@ class Path:
         sense
             Of the arc length: the sign of dmu/ds.
         """
-        response = self.newton.response(state, self.name, GivenLoad(0.0), exact=True)
+        response = self.newton.response(state, self.name, GivenLoad(self.name, 0.0), exact=True)
         if self.control == "load":
             s, rate = state.mu[self.name], 1.0
         elif self.control == "conjugate":
-            s, rate = -self.system.potential(state.u, self.name), response.softness
+            s, rate = self._conjugate(state), response.softness
         else:
             s, rate = 0.0, float(np.copysign(self.metric.norm(response.du, 1.0), sense))
         return self._point(state, s, response).per(rate)
@@ -143,8 +144,9 @@ class Path:
             The tangent (du, dmu), of any length.
         """
         du, dmu = direction
-        load = self.system.load(state.u, self.name)
-        dq = -dot(self.system.comm, load, du)
+        u, mu, name = state.u, state.mu, self.name
+        bend = self.system.curvature(u, mu, name, name)
+        dq = -dot(self.system.comm, self.system.load(u, mu, name), du) - bend * dmu
         rate = {"load": dmu, "conjugate": dq, "arc": self.metric.inner((base.du, base.dmu), direction)}[self.control]
         softness = dq / dmu if dmu else np.inf
         return self._point(state, self._s(state, base), Response(du, dmu, softness, negative_pivots)).per(rate)
@@ -155,12 +157,12 @@ class Path:
         if self.control == "load":
             return mu
         if self.control == "conjugate":
-            return -self.system.potential(state.u, self.name)
+            return self._conjugate(state)
         chord = (state.u - base.state.u, mu - base.state.mu[self.name])
         return base.s + self.metric.inner((base.du, base.dmu), chord)
 
     def towards(self, start: Point, targets: Sequence[float]) -> Iterator[tuple[Point, bool]]:
-        """Accepted points through every target in turn; the flag tells the targets.
+        """Accepted points through every target in turn; the flag marks the targets.
 
         Raises
         ------
@@ -268,16 +270,26 @@ class Path:
 
     def _row(self, s: float, base: Point) -> Row:
         if self.control == "load":
-            return GivenLoad(s)
+            return GivenLoad(self.name, s)
         if self.control == "conjugate":
             return GivenConjugate(self.system, self.name, s)
         return Hyperplane(self.metric, self.name, base.state, (base.du, base.dmu), s - base.s)
 
-    @staticmethod
-    def _point(state: State, s: float, response: Response) -> Point:
+    def _conjugate(self, state: State) -> float:
+        return -self.system.potential(state.u, state.mu, self.name)
+
+    def _point(self, state: State, s: float, response: Response) -> Point:
         """Holding q instead of mu takes one unstable direction away where dq/dmu < 0.
 
-        This is Haynsworth's inertia additivity: dq/dmu = R_mu . K^-1 R_mu is minus the Schur complement.
+        This is Haynsworth's inertia additivity: dq/dmu = R_mu . K^-1 R_mu - Pi_mumu is minus the Schur complement.
+        A coordinate whose force is held adds one instead where dq/dmu > 0.
         """
         pivots = response.negative_pivots
-        return Point(state, s, response.du, response.dmu, pivots, pivots - (response.softness < 0))
+        held = pivots + (response.softness >= 0) - (self.name not in self.system.coordinates)
+        return Point(state, s, response.du, response.dmu, pivots, held)
+
+    def in_steps(self, options: StepOptions) -> "Path":
+        """The same path in other steps."""
+        other = copy(self)
+        other.options = options
+        return other

@@ -15,7 +15,7 @@ def refined_tangent(
     system: System, matrix: Bordered, t: Direction, state: State, load: Vector, row: Row
 ) -> Direction | None:
     """The tangent at a state from that of a matrix near by, by generalised conjugate residuals; None if too far."""
-    comm, (c, d) = system.comm, row.gradient(state.u)
+    comm, (c, d) = system.comm, row.gradient(state)
     R = system.residual(state.u, state.mu)
 
     def times(t: Direction) -> Direction:

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, TypeAlias
 
 import numpy as np
 from mpi4py import MPI
@@ -14,8 +14,31 @@ Amplitudes = Mapping[str, float]
 Weighted = tuple[float, Vector]
 
 
+@dataclass(frozen=True)
+class Edged:
+    """The symmetric matrix [K C; C^T D]: a tangent with k more unknowns, which are numbers.
+
+    Attributes
+    ----------
+    C, D
+        k columns on this rank, and (k, k) numbers.
+    multipliers
+        How many of the unknowns keep a constraint; each takes one negative pivot that is no unstable direction.
+    """
+
+    K: PETSc.Mat
+    C: Sequence[Vector]
+    D: NDArray[np.float64]
+    multipliers: int
+
+
+Tangent: TypeAlias = PETSc.Mat | Edged
+
+
 class System(Protocol):
-    """Equilibrium of Pi(u) = Pi_0(u) + sum_i mu_i Pi_i(u), spread over the ranks of `comm`.
+    """Equilibrium of an energy Pi(u; mu), spread over the ranks of `comm`.
+
+    Most amplitudes multiply a term, Pi = Pi_0 + sum_i mu_i Pi_i; a parameter may also enter freely.
 
     Attributes
     ----------
@@ -23,22 +46,30 @@ class System(Protocol):
         Number of unknowns on this rank.
     length
         A displacement that counts as of order one; convergence is measured with it.
+    coordinates
+        Parameters that say where something is, such as a body that presses on the shell. Where the conjugate of
+        one is held, a force, it moves freely. The others are forces: where the conjugate of one is held, it keeps a
+        constraint.
     """
 
     comm: MPI.Comm
     size: int
     length: float
+    coordinates: frozenset[str]
 
     def residual(self, u: Vector, mu: Amplitudes) -> Vector:
         """dPi/du."""
 
-    def load(self, u: Vector, name: str) -> Vector:
-        """dPi_i/du: the column of the amplitude `name`."""
+    def load(self, u: Vector, mu: Amplitudes, name: str) -> Vector:
+        """d2Pi/du dmu_i: the column of the amplitude `name`."""
 
-    def potential(self, u: Vector, name: str) -> float:
-        """Pi_i(u), on every rank; -Pi_i is the displacement conjugate to the amplitude."""
+    def potential(self, u: Vector, mu: Amplitudes, name: str) -> float:
+        """dPi/dmu_i, on every rank; with the opposite sign it is what is conjugate to the amplitude."""
 
-    def tangent(self, u: Vector, mu: Amplitudes, stress: Sequence[Weighted] = ()) -> PETSc.Mat:
+    def curvature(self, u: Vector, mu: Amplitudes, name: str, other: str) -> float:
+        """d2Pi/dmu_i dmu_j, on every rank; zero between amplitudes that multiply their terms."""
+
+    def tangent(self, u: Vector, mu: Amplitudes, stress: Sequence[Weighted] = ()) -> Tangent:
         """d2Pi/du2, assembled; the matrix is reused by the next call.
 
         Parameters
@@ -63,6 +94,11 @@ class State:
 
     def with_(self, u: Vector, name: str, value: float) -> "State":
         return State(u, {**self.mu, name: value})
+
+    def equals(self, other: "State", comm: MPI.Comm) -> bool:
+        """Whether it is the same state, on all ranks."""
+        here = self.mu == other.mu and np.array_equal(self.u, other.u)
+        return bool(comm.allreduce(here, MPI.LAND))
 
 
 def dot(comm: MPI.Comm, a: Vector, b: Vector) -> float:

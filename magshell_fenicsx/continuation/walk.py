@@ -91,7 +91,7 @@ class Walk:
                 return
             if shorter < options.smallest:
                 raise PathStopped("an instability cannot be located", self.points[-1])
-            self.path.options = replace(options, first=shorter)
+            self.path = self.path.in_steps(replace(options, first=shorter))
 
     def _refuse_loop(self, fold: Point) -> None:
         """See that a fold is none of those before: two in succession may be close, where a snap is being born."""
@@ -143,9 +143,9 @@ class Walk:
     def _value(self, point: Point) -> float:
         if self.goal.quantity == "load":
             return point.state.mu[self.path.name]
-        return -self.path.system.potential(point.state.u, self.path.name)
+        return -self.path.system.potential(point.state.u, point.state.mu, self.path.name)
 
     def _row(self, target: float) -> Row:
         if self.goal.quantity == "load":
-            return GivenLoad(target)
+            return GivenLoad(self.path.name, target)
         return GivenConjugate(self.path.system, self.path.name, target)

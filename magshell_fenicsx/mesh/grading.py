@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from math import log1p, pi, sqrt
+from math import inf, log1p, pi, sqrt
 from typing import Protocol
 
 import numpy as np
@@ -16,6 +16,9 @@ PER_AREA = 4 / sqrt(3)  # triangles of size one per unit area
 
 class Feature(Protocol):
     """A place with small elements around it."""
+
+    def across(self, axis: int, x: float) -> float:
+        """Wanted distance of grid lines across an axis, at a coordinate."""
 
     def __call__(self, x: NDArray[np.float64]) -> float:
         """Wanted element size at a point of the chart."""
@@ -37,6 +40,9 @@ class Disc:
         distance = np.hypot(x[0] - self.centre[0], x[1] - self.centre[1])
         return float(self.size + self.growth * max(0.0, distance - self.radius))
 
+    def across(self, axis: int, x: float) -> float:
+        return self.size + self.growth * max(0.0, abs(x - self.centre[axis]) - self.radius)
+
     def cells(self, reach: float) -> float:
         """Integral of 2 pi t/(s + g max(0, t - a))^2 over t, a the radius or, if that is less, the reach."""
         s, g, a = self.size, self.growth, min(self.radius, reach)
@@ -56,9 +62,32 @@ class Ring:
     def __call__(self, x: NDArray[np.float64]) -> float:
         return float(self.size + self.growth * abs(np.hypot(x[0], x[1]) - self.radius))
 
+    def across(self, axis: int, x: float) -> float:
+        return inf  # of discs, which are no grids
+
     def cells(self, reach: float) -> float:
         """Of its inner side: the outer one lies beyond the edge."""
         return PER_AREA * 2 * pi * self.radius * reach / (self.size * (self.size + self.growth * reach))
+
+
+@dataclass(frozen=True)
+class Line:
+    """Elements of `size` at the line x[axis] = place of a grid, growing away."""
+
+    axis: int
+    place: float
+    size: float
+    growth: float
+
+    def __call__(self, x: NDArray[np.float64]) -> float:
+        return self.across(self.axis, float(x[self.axis]))
+
+    def across(self, axis: int, x: float) -> float:
+        return self.size + self.growth * abs(x - self.place) if axis == self.axis else inf
+
+    def cells(self, reach: float) -> float:
+        """Of a square of that side."""
+        return PER_AREA * reach**2 / (self.size * (self.size + self.growth * reach))
 
 
 @dataclass(frozen=True)
@@ -70,6 +99,10 @@ class Grading:
 
     def __call__(self, x: NDArray[np.float64]) -> float:
         return min([self.largest, *(feature(x) for feature in self.features)])
+
+    def across(self, axis: int, x: float) -> float:
+        """Of grid lines, see `Feature`."""
+        return min([self.largest, *(feature.across(axis, x) for feature in self.features)])
 
     def cells(self, shape: Shape) -> float:
         """About how many triangles fill a shape; too many by the overlap of the features, at most by half."""

@@ -1,6 +1,6 @@
 """A rectangular chart in crossed quadrilaterals, each cut into four triangles; opposite sides may be glued."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -12,6 +12,7 @@ from magshell_fenicsx.mesh.patch import Embedding, MeshError, PatchMesh
 Array = NDArray[np.float64]
 Side = tuple[str, int, int]  # name, axis across it, and which end of that axis
 CLOSE = 1e-9  # over the chart's extent
+SAMPLES = 2001  # of a size that varies
 
 
 @dataclass(frozen=True)
@@ -21,18 +22,21 @@ class Grid:
     Attributes
     ----------
     size
-        Largest side of a quadrilateral.
+        Largest side of a quadrilateral: a number, or for each axis what it is at a coordinate.
     sides
         Names of x = low, x = high, y = low and y = high.
     glued
         Whether the two ends of each axis are one line of the surface.
+    through
+        Coordinates across either axis that have a grid line.
     """
 
     low: tuple[float, float]
     high: tuple[float, float]
-    size: float
+    size: float | Callable[[int, float], float]
     sides: tuple[str, str, str, str] = ("left", "right", "bottom", "top")
     glued: tuple[bool, bool] = (False, False)
+    through: tuple[tuple[float, ...], tuple[float, ...]] = ((), ())
 
     @property
     def edges(self) -> tuple[str, ...]:
@@ -47,19 +51,35 @@ class Grid:
     @property
     def cells(self) -> float:
         """About how many triangles it is cut into."""
-        quadrilaterals = [max((b - a) / self.size, 1.0) for a, b in zip(self.low, self.high, strict=True)]
-        return 4 * quadrilaterals[0] * quadrilaterals[1]
+        quadrilaterals = [max(self._counted(axis)[1][-1], 1.0) for axis in range(2)]
+        return float(4 * quadrilaterals[0] * quadrilaterals[1])
+
+    def _counted(self, axis: int) -> tuple[Array, Array]:
+        """Coordinates across an axis, and how many sides of a quadrilateral go up to each."""
+        low, high, size = self.low[axis], self.high[axis], self.size
+        if not callable(size):
+            return np.array([low, high]), np.array([0.0, (high - low) / size])
+        x = np.linspace(low, high, SAMPLES, dtype=np.float64)
+        per_length = 1 / np.array([size(axis, float(c)) for c in x])
+        return x, np.concatenate([[0.0], np.cumsum((per_length[1:] + per_length[:-1]) / 2 * np.diff(x))])
 
     def lines(self, axis: int, points: Sequence[Array]) -> Array:
         """Coordinates of the grid lines across an axis: through every point, and no farther apart than the size."""
         low, high = self.low[axis], self.high[axis]
-        given = np.unique([low, high, *(float(x[axis]) for x in points)])
+        given = np.unique([low, high, *self.through[axis], *(float(x[axis]) for x in points)])
         given = given[np.concatenate([[True], np.diff(given) > CLOSE * (high - low)])]
         given[-1] = high
-        parts = [max(int(np.ceil((b - a) / self.size - 1e-6)), 1) for a, b in pairwise(given)]
+        x, sides = self._counted(axis)
+        counts = np.interp(given, x, sides)
+        parts = [max(int(np.ceil(b - a - 1e-6)), 1) for a, b in pairwise(counts)]
         if self.glued[axis] and sum(parts) < 3:
             parts = [max(n, -(-3 // len(parts))) for n in parts]  # fewer would fold onto themselves
-        inner = [np.linspace(a, b, n + 1)[1:] for a, b, n in zip(given[:-1], given[1:], parts, strict=True)]
+        inner = []
+        for a, b, n, first, last in zip(given[:-1], given[1:], parts, counts[:-1], counts[1:], strict=True):
+            between = np.linspace(a, b, n + 1)[1:]
+            if callable(self.size):
+                between[:-1] = np.interp(np.linspace(first, last, n + 1)[1:-1], sides, x)
+            inner.append(between)
         return np.concatenate([given[:1], *inner])
 
 

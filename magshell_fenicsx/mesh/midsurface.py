@@ -41,8 +41,8 @@ class Midsurface:
     points: dict[str, NDArray[np.float64]]
     _patch: PatchMesh
 
-    def placement(self, V: fem.FunctionSpace) -> fem.Function:
-        """The undeformed placement r0 in the Lagrange space `V` (vector valued)."""
+    def charted(self, V: fem.FunctionSpace) -> NDArray[np.float64]:
+        """Chart coordinates (cells, nodes, 2 | 3) of the nodes of each cell of this rank, in its own chart."""
         patch = self._patch
         order = ORDERS[patch.cells.shape[1]]
         geometry = basix.create_element(
@@ -51,11 +51,13 @@ class Midsurface:
         to_dolfinx = perm_gmsh(mesh.CellType.triangle, patch.cells.shape[1])
         values = geometry.tabulate(0, compat.interpolation_points(V))[0, :, :, 0]
         cells = patch.cells[self._original_cells]
-        chart = np.einsum("qk,ckd->cqd", values, patch.nodes[cells[:, to_dolfinx]])
-        r0 = fem.Function(V, name="r0")
-        r0.x.array.reshape(-1, 3)[V.dofmap.list] = patch.embedding(chart.reshape(-1, chart.shape[-1])).reshape(
-            *chart.shape[:2], 3
-        )
+        return np.asarray(np.einsum("qk,ckd->cqd", values, patch.nodes[cells[:, to_dolfinx]]))
+
+    def placement(self, V: fem.FunctionSpace) -> fem.Function:
+        """The undeformed placement r0 in the Lagrange space `V` (vector valued)."""
+        chart, r0 = self.charted(V), fem.Function(V, name="r0")
+        places = self._patch.embedding(chart.reshape(-1, chart.shape[-1]))
+        r0.x.array.reshape(-1, 3)[V.dofmap.list] = places.reshape(*chart.shape[:2], 3)
         r0.x.scatter_forward()
         return r0
 

@@ -1,13 +1,14 @@
 """A surface that somebody else meshed: gmsh's .msh with triangles of order 1, 2 or 3."""
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.mesh.msh_format import Block, Content, parsed
+from magshell_fenicsx.mesh.mirror import Mirror, cut
+from magshell_fenicsx.mesh.msh_format import Content, parsed
 from magshell_fenicsx.mesh.patch import MeshError, PatchMesh
 from magshell_fenicsx.mesh.soundness import border_edges, oriented, said_place
 
@@ -37,7 +38,7 @@ def in_space(x: Array) -> Array:
     return x
 
 
-def read_msh(file: MeshFile, points: Mapping[str, Array]) -> PatchMesh:
+def read_msh(file: MeshFile, points: Mapping[str, Array], mirror: Mirror | None = None) -> PatchMesh:
     """Read a surface; call it on one rank only.
 
     Physical groups of surfaces become named patches, those of curves named edges. Triangles that run the
@@ -47,12 +48,20 @@ def read_msh(file: MeshFile, points: Mapping[str, Array]) -> PatchMesh:
     ----------
     points
         Named places (3,) that must be vertices, in lengths of R. Without a "pole" it is the highest vertex.
+    mirror
+        Of the half that is taken; None for all.
 
     Raises
     ------
     MeshError
         If the file cannot be read, or holds no sound surface; see `soundness`.
     """
+    patch = _whole(file)
+    patch = cut(patch, mirror) if mirror else patch
+    return replace(patch, points=_vertices(patch.nodes, patch.cells, points))
+
+
+def _whole(file: MeshFile) -> PatchMesh:
     nodes, cells, patches, edges = _content(file)
     used, again = np.unique(cells, return_inverse=True)  # without nodes that no triangle has
     cells = again.reshape(cells.shape)
@@ -65,7 +74,7 @@ def read_msh(file: MeshFile, points: Mapping[str, Array]) -> PatchMesh:
             raise MeshError(f"{file.path}: the physical curve {name} is not part of the surface")
     cells = oriented(nodes, cells)
     edges = border_edges(nodes, cells, edges)
-    return PatchMesh(nodes, cells, in_space, edges, _vertices(nodes, cells, points), patches=patches)
+    return PatchMesh(nodes, cells, in_space, edges, patches=patches)
 
 
 def _vertices(nodes: Array, cells: NDArray[np.int64], points: Mapping[str, Array]) -> dict[str, Array]:
@@ -95,24 +104,31 @@ def _content(
         raise MeshError(f"{file.path}: {e}") from None
     if not len(held.tags):
         raise MeshError(f"{file.path}: there is no mesh in it")
-    faces = [block for block in held.blocks if block.dimension == 2]
-    if len({_cells(file, block, TRIANGLES).shape[1] for block in faces}) != 1:
+    faces = _elements(file, held, 2, TRIANGLES)
+    if len({nodes.shape[1] for _, nodes in faces}) != 1:
         raise MeshError(f"{file.path}: it has no triangles, or triangles of several orders")
-    cells = _places(file, held, np.concatenate([block.nodes for block in faces]))
-    entity = np.concatenate([np.full(len(block.nodes), block.entity) for block in faces])
-    patches = {name: np.isin(entity, sorted(entities)) for name, entities in _groups(held, 2).items()}
+    cells = _places(file, held, np.concatenate([nodes for _, nodes in faces]))
+    entity = np.concatenate([np.full(len(nodes), entity) for entity, nodes in faces])
+    patches = {name: np.isin(entity, entities) for name, entities in held.groups[2].items()}
     edges = {}
-    for name, entities in _groups(held, 1).items():
-        lines = [block for block in held.blocks if block.dimension == 1 and block.entity in entities]
+    for name, entities in held.groups[1].items():
+        lines = [nodes[:, :2] for entity, nodes in _elements(file, held, 1, LINES) if entity in entities]
         if lines:  # a curve of the drawing may carry no elements
-            edges[name] = _places(file, held, np.concatenate([_cells(file, line, LINES)[:, :2] for line in lines]))
+            edges[name] = _places(file, held, np.concatenate(lines))
     return held.places, cells, patches, edges
 
 
-def _cells(file: MeshFile, block: Block, known: Collection[str]) -> NDArray[np.int64]:
-    if block.name not in known:
-        raise MeshError(f"{file.path}: it has elements {block.name}; allowed are triangles of order 1, 2 and 3")
-    return block.nodes
+def _elements(
+    file: MeshFile, held: Content, dimension: int, known: Collection[str]
+) -> list[tuple[int, NDArray[np.int64]]]:
+    """Entity and nodes of the blocks of one dimension."""
+    found = []
+    for name, dim, entity, nodes in held.blocks:
+        if dim == dimension:
+            if name not in known:
+                raise MeshError(f"{file.path}: it has elements {name}; allowed are triangles of order 1, 2 and 3")
+            found.append((entity, nodes))
+    return found
 
 
 def _places(file: MeshFile, held: Content, numbers: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -122,12 +138,3 @@ def _places(file: MeshFile, held: Content, numbers: NDArray[np.int64]) -> NDArra
     if (missing := held.tags[found] != numbers).any():
         raise MeshError(f"{file.path}: it has elements with the node {numbers[missing][0]}, which is not there")
     return found
-
-
-def _groups(held: Content, dim: int) -> dict[str, set[int]]:
-    """Name of each physical group -> its entities; without a name, its number."""
-    found: dict[int, set[int]] = {}
-    for (of, entity), groups in held.groups.items():
-        for group in groups if of == dim else ():
-            found.setdefault(group, set()).add(entity)
-    return {held.names.get((dim, group)) or str(group): found[group] for group in sorted(found)}

@@ -8,9 +8,8 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
-from scipy.optimize import minimize_scalar
 
 from magshell_fenicsx.mesh.sphere import Dimple
 
@@ -92,7 +91,7 @@ class Spline:
         steps = np.hypot(*np.diff(points, axis=0).T)
         for _ in range(ROUNDS):  # from chords to arcs
             knots = np.concatenate([[0.0], np.cumsum(steps)])
-            self._curve = CubicSpline(knots, points)
+            self._curve = scipy.interpolate.CubicSpline(knots, points)
             x, w = np.polynomial.legendre.leggauss(6)
             at = knots[:-1, None] + np.diff(knots)[:, None] * (x + 1) / 2
             steps = np.diff(knots) / 2 * (np.linalg.norm(self._curve(at, 1), axis=2) @ w)
@@ -109,7 +108,7 @@ class Spline:
         coarse = np.linspace(0, self.length, 401, dtype=np.float64)
         nearest = int(np.argmin(np.linalg.norm(self(coarse) - rz, axis=1)))
         around = coarse[max(nearest - 1, 0)], coarse[min(nearest + 1, 400)]
-        found = minimize_scalar(
+        found = scipy.optimize.minimize_scalar(
             lambda s: np.sum((self(s) - rz) ** 2), bounds=around, method="bounded", options={"xatol": 1e-13}
         )
         ends = [float(found.x), *(float(s) for s in around)]

@@ -3,10 +3,8 @@
 from collections.abc import Mapping
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from magshell_fenicsx.mesh.patch import MeshError
 
@@ -52,8 +50,8 @@ def oriented(nodes: Array, cells: Cells) -> Cells:
     # every triangle twice, either way round: a surface with two sides is two separate copies
     rows = np.concatenate([left, left + m])
     columns = np.concatenate([np.where(agree, right, right + m), np.where(agree, right + m, right)])
-    graph = coo_array((np.ones(len(rows)), (rows, columns)), shape=(2 * m, 2 * m))
-    _, copy = connected_components(graph, directed=False)
+    graph = scipy.sparse.coo_array((np.ones(len(rows)), (rows, columns)), shape=(2 * m, 2 * m))
+    _, copy = scipy.sparse.csgraph.connected_components(graph, directed=False)
     if (copy[:m] == copy[m:]).any():
         place = nodes[edges[one[~agree][0]]].mean(axis=0)
         raise MeshError(
@@ -71,7 +69,9 @@ def oriented(nodes: Array, cells: Cells) -> Cells:
 def _torn(nodes: Array, cells: Cells, apart: int) -> str:
     place = nodes[cells[apart, 0]]
     vertices = np.unique(cells[:, :3])
-    near = cKDTree(nodes[vertices]).query_pairs(SAME_PLACE * np.ptp(nodes, axis=0).max(), output_type="ndarray")
+    near = scipy.spatial.cKDTree(nodes[vertices]).query_pairs(
+        SAME_PLACE * np.ptp(nodes, axis=0).max(), output_type="ndarray"
+    )
     if len(near):
         place = nodes[vertices[near[0, 0]]]
         return f"the surface is torn: there are two nodes at {said_place(place)}, and its parts are not connected"

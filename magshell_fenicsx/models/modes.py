@@ -17,6 +17,7 @@ from petsc4py import PETSc
 from ufl.core.expr import Expr
 
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
+from magshell_fenicsx.assembly.sliding import Projection
 from magshell_fenicsx.continuation.modes import lowest_modes, mass_matrix, null_vector
 from magshell_fenicsx.continuation.system import State, Vector
 from magshell_fenicsx.models.axisymmetric import jets
@@ -50,12 +51,13 @@ class ShellMode:
 
 @dataclass(frozen=True)
 class _Family:
-    """Modes that share a tangent, the degrees of freedom held, and an inner product (name and form)."""
+    """Modes that share a tangent, what is held, and an inner product (name and form)."""
 
     label: str
     tangent: Callable[[State], PETSc.Mat]
     held: list[fem.DirichletBC]
     product: tuple[str, ufl.Form]
+    projection: Projection | None = None
 
 
 @dataclass
@@ -79,6 +81,7 @@ class ShellModes:
         found = []
         for family in _families(self.model):
             M = mass_matrix(self._product(family), family.held)
+            M = family.projection.mass(M) if family.projection else M
             modes = lowest_modes(family.tangent(state), M, count)
             found += [ShellMode(family.label, mode.eigenvalue, mode.vector) for mode in modes]
         return sorted(found, key=lambda mode: mode.eigenvalue)
@@ -113,7 +116,7 @@ def _families(model: Model) -> Iterator[_Family]:
     mass = "mass", _of_displacements(model)
 
     def of(label: str, system: FiniteElementSystem) -> _Family:
-        return _Family(label, lambda state: system.tangent(state.u, state.mu), system.clamped, mass)
+        return _Family(label, lambda state: system.tangent(state.u, state.mu), system.clamped, mass, system.projection)
 
     yield of("", model.system)
     if isinstance(model, MeridianModel):

@@ -27,17 +27,20 @@ class Observed:
         2 for a half model, whose integrals and forces are those of one half; else 1.
     normals
         n0 (3,) at the named points.
-    load_size
-        The sum of the sizes of the dead loads, over E h R; see `DeadLoads`.
+    loads, load_size
+        What loads it, and the sum of the sizes of the dead loads over E h R; see `DeadLoads`.
+    observed
+        Column -> the form that a term observes, see `OwnTerm.observed`; of the modelled part.
     """
 
     system: FiniteElementSystem
     material: Material
-    loads: Loads
     multiplicity: int
     normals: Mapping[str, Array]
     u: fem.Function
-    load_size = 0.0
+    loads: Loads
+    load_size: float = 0.0
+    observed: Mapping[str, fem.Form]
 
     def observe(self, volume: fem.Form, points: Mapping[str, Array]) -> None:
         """Take the volume change's form (of the modelled part), and the named vertices' places (3,)."""
@@ -48,8 +51,8 @@ class Observed:
 
     def load_with(self, dead: DeadLoads) -> LinearTerm:
         """The term of the dead loads but the moments."""
-        self.load_size, self._dead_load = dead.size, LinearTerm("load", *dead.entries, self.u, "load")
-        return self._dead_load
+        self.load_size = dead.size
+        return LinearTerm("load", *dead.entries, self.u, "load")
 
     def zero(self) -> Vector:
         """The undeformed displacement."""
@@ -57,8 +60,7 @@ class Observed:
 
     def volume_change(self, u: Vector) -> float:
         """Delta V/R^3 of the whole shell."""
-        self.system.set(u)
-        return self.multiplicity * float(self.system.comm.allreduce(fem.assemble_scalar(self._volume)))
+        return self.multiplicity * self.system.integral(u, self._volume)
 
     def deflection(self, u: Vector, point: str) -> float:
         """w/R = -u . n0 at a named vertex."""
@@ -78,8 +80,9 @@ class Observed:
             return self.deflection(u, "pole")
         if self.loads.dead:
             self.system.set(u)
-            return -float(self.system.comm.allreduce(self._dead_load.energy())) / self.load_size
-        return -self.system.potential(u, "force") / self.force_unit
+            load = next(term for term in self.system.terms if term.name == "load")
+            return -float(self.system.comm.allreduce(load.energy())) / self.load_size
+        return -self.system.potential(u, {}, "force") / self.force_unit
 
     @property
     def force_unit(self) -> float:

@@ -3,12 +3,14 @@
 from math import degrees
 
 from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.mesh.mirror import Mirror, said_plane
 from magshell_fenicsx.models.shell.parameters import Loads
+from magshell_fenicsx.parts.registered import PARTS
 from magshell_fenicsx.plan.body import layers, neo_hookean
 
 
-def account(case: Case, loads: Loads, model: str, azimuth: float) -> tuple[list[str], list[str]]:
-    """What is included and what is left out; `model` is "meridian", "half shell", ..., `azimuth` that of its plane."""
+def account(case: Case, loads: Loads, model: str, mirror: Mirror | None) -> tuple[list[str], list[str]]:
+    """What is included and what is left out; `model` is "meridian", "half shell", ..., `mirror` its plane."""
     included = [model, "membrane and bending energy" if case.model == "shell" else _elastic(case)]
     left_out = []
     if loads.magnetic:
@@ -26,12 +28,19 @@ def account(case: Case, loads: Loads, model: str, azimuth: float) -> tuple[list[
         left_out.append("force: none")
     if loads.dead:
         included.append(f"{len(loads.dead)} dead load{'s' * (len(loads.dead) > 1)}")
+    for key, part in PARTS.items():
+        if key in case.parts:
+            included.append(case.parts[key].account(case.scales))
+        else:
+            left_out.append(part.absent)
     if model == "meridian":
         left_out.append("waves around the axis (they are looked for at each point)")
-    if model.startswith("half"):
+    if mirror:
+        plane = (
+            f"through e3 at azimuth {degrees(mirror.azimuth):g} degrees" if mirror.through_e3 else said_plane(mirror)
+        )
         left_out.append(
-            f"the other half: mirror plane through e3 at azimuth {degrees(azimuth):g} degrees "
-            "(modes antisymmetric to it are looked for along the path)"
+            f"the other half: mirror plane {plane} (modes antisymmetric to it are looked for along the path)"
         )
     return included, left_out
 

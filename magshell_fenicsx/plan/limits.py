@@ -6,10 +6,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.expressions import formula
 from magshell_fenicsx.case.messages import shown
-from magshell_fenicsx.case.shell import ShellSection
 from magshell_fenicsx.case.source import CaseError
-from magshell_fenicsx.mesh.grading import Grading
-from magshell_fenicsx.mesh.shapes import Shape, StripShape
 from magshell_fenicsx.plan.body import layers
 
 Array = NDArray[np.float64]
@@ -17,23 +14,10 @@ MOST_UNKNOWNS = 2_000_000  # whose factors fill the memory of a large workstatio
 SMALLEST_FIELD, LARGEST_FIELD = 1e-12, 10.0  # of lambda_m: rounding, and a thousand times what destabilises a shell
 
 
-def refuse_too_large(case: Case, size: Grading, shape: Shape) -> None:
-    """Estimate the unknowns before gmsh makes the mesh: of degree k, a triangle brings 3 k^2/2.
+def refuse_too_many(case: Case, cells: float, hint: str = "") -> None:
+    """Estimate the unknowns of a number of triangles before they are made: of degree k, one brings 3 k^2/2.
 
     The body over it brings three hexahedra of degree 2 in each layer.
-
-    Raises
-    ------
-    CaseError
-        If they are more than `MOST_UNKNOWNS`.
-    """
-    charted = isinstance(case.shell, ShellSection)  # the others have their symmetry edges
-    hint = "; with coplanar fields and loads, symmetry: half halves it" if charted else ""
-    refuse_too_many(case, size.cells(shape), hint)
-
-
-def refuse_too_many(case: Case, cells: float, hint: str = "") -> None:
-    """The same for a number of triangles that is known.
 
     Raises
     ------
@@ -73,14 +57,3 @@ def refuse_unbounded_fields(case: Case, r0: Array) -> None:
                 f"magnetic.remanent.components: {shown(text)}: has no finite value (or one above 1e6) "
                 f"at (x, y, z) = ({x:.3g}, {y:.3g}, {z:.3g})"
             )
-
-
-def sample(shape: Shape) -> Array:
-    """Points (n, 2) all over a chart, with its centre, edges and axes among them."""
-    t = np.linspace(0, 1, 41)
-    if isinstance(shape, StripShape):
-        x, y = np.meshgrid(t, (t - 0.5) * shape.width)
-    else:
-        rho, theta = np.meshgrid(shape.reach * t, 2 * np.pi * t)
-        x, y = rho * np.cos(theta), rho * np.sin(theta)
-    return np.column_stack([x.ravel(), y.ravel()])

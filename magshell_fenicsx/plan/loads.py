@@ -15,6 +15,8 @@ from magshell_fenicsx.case.loading import (
 )
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.mesh.frame import rotation
+from magshell_fenicsx.mesh.mirror import Mirror
+from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.parameters import (
     AreaForce,
     DeadLoad,
@@ -30,7 +32,7 @@ from magshell_fenicsx.plan.outline import Outline
 Array = NDArray[np.float64]
 
 
-def loads(case: Case, under: str, turn: float, part: float) -> Loads:
+def loads(case: Case, under: str, turn: float, mirror: Mirror | None, own: tuple[OwnTerm, ...]) -> Loads:
     """What loads the shell.
 
     Parameters
@@ -39,8 +41,11 @@ def loads(case: Case, under: str, turn: float, part: float) -> Loads:
         Name of the vertex under an indentation.
     turn
         Azimuth of the model's frame (rad).
-    part
-        Of the shell that is modelled, 1/2 or 1: a concentrated load is shared by the halves.
+    mirror
+        Of the half that is modelled; None for all. A force on the plane, or on an edge across it, is shared by the
+        halves; the loads of an edge of the other half are left out.
+    own
+        See `surface_terms`.
     """
     loading, magnetic = case.loading, case.magnetic
     force = None
@@ -48,8 +53,9 @@ def loads(case: Case, under: str, turn: float, part: float) -> Loads:
         force = Force(under, loading.patch / case.shell.R_over_h)
     to = loading.to if isinstance(loading, RotationSection) else None
     field = magnetisation(magnetic, case, turn, to) if magnetic and case.lambda_m else None
-    dead = tuple(_dead(load, case, turn, part) for load in loading.loads) if isinstance(loading, DeadSection) else ()
-    return Loads(isinstance(loading, PressureSection), force, field, dead)
+    listed = loading.loads if isinstance(loading, DeadSection) else []
+    dead = tuple(_dead(load, case, turn, mirror) for load in listed if not mirror or load.edge not in mirror.lost)
+    return Loads(isinstance(loading, PressureSection), force, field, dead, own)
 
 
 def indented(case: Case, outline: Outline) -> Array | None:
@@ -96,11 +102,11 @@ def refuse_wide_patch(case: Case, outline: Outline, at: Array) -> None:
         )
 
 
-def _dead(load: DeadLoadSection, case: Case, turn: float, part: float) -> DeadLoad:
-    shell, Q = case.shell, rotation(turn)
-    E, t, R = shell.modulus, shell.reference / shell.R_over_h, shell.reference
-    assert E is not None
-    force = np.asarray(part * (Q @ (load.force or np.zeros(3))) / (E * t * R))
+def _dead(load: DeadLoadSection, case: Case, turn: float, mirror: Mirror | None) -> DeadLoad:
+    shared = mirror is not None and (load.edge is None or mirror.other(load.edge) == load.edge)
+    Q, scales = rotation(turn), case.scales
+    E, t, R = scales.E, scales.h, scales.R
+    force = np.asarray((0.5 if shared else 1.0) * (Q @ (load.force or np.zeros(3))) / (E * t * R))
     if load.at is not None:
         return PointForce(load.at, force)
     if load.edge is not None and load.moment is not None:

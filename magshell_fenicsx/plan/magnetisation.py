@@ -7,6 +7,7 @@ from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.expressions import formula
 from magshell_fenicsx.case.fields import Direction, MagneticSection, layer_average
 from magshell_fenicsx.case.surfaces import MeshSurface
+from magshell_fenicsx.mesh.frame import rotation
 from magshell_fenicsx.models.shell.parameters import Magnetisation
 from magshell_fenicsx.models.shell.patterns import Components, InsideAndOutside, Pattern, radial, tangential
 
@@ -26,7 +27,7 @@ def magnetisation(magnetic: MagneticSection, case: Case, turn: float, to: Direct
     elif section.kind == "tangential":
         remanent = tangential
     elif section.components:
-        remanent = Components([formula(text) for text in section.components])
+        remanent = Components([formula(text) for text in section.components], rotation(turn) if turn else None)
     elif section.layers:
         remanent = layer_average(section.layers, turn)
     elif section.patches and not isinstance(case.shell, MeshSurface):
@@ -43,6 +44,7 @@ def magnetisation(magnetic: MagneticSection, case: Case, turn: float, to: Direct
     patches = None
     if section.patches and isinstance(case.shell, MeshSurface):
         patches = {name: direction.vector(turn) for name, direction in section.patches.items()}
-    G = np.array(gradient) if gradient else None
+    Q = rotation(turn)
+    G = Q @ np.array(gradient) @ Q.T if gradient else None
     layers = tuple((layer.fraction, layer.vector(turn)) for layer in section.layers or [])
     return Magnetisation(remanent, applied, magnetic.energy, G, across, patches, layers)

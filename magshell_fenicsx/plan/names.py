@@ -1,6 +1,6 @@
 """What a plan asks of its surface, against what the surface has: its edges, points and patches."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,9 +23,7 @@ def refuse_unfit(
         With the name.
     """
     refuse_unknown(patch.edges, patch.points, patch.patches, conditions, loads)
-    for name, condition in conditions.items():
-        if isinstance(condition, Held) and name in patch.edges and name in patch.points:
-            raise MeshError(f"boundary.{name}: is an edge and a point; give the point another name")
+    _refuse_ambiguous(patch.edges, patch.points, conditions)
     if loads.magnetic and loads.magnetic.patches:
         by_patch(loads.magnetic.patches, patch.patches, len(patch.cells))
     for name in (thickness and thickness.patches) or {}:
@@ -37,11 +35,34 @@ def refuse_unfit(
         _refuse_open(patch, conditions)
 
 
+def refuse_unfit_ends(
+    ends: Collection[str], points: Collection[str], conditions: Mapping[str, Condition], loads: Loads
+) -> None:
+    """The same of a meridian, which has ends and points.
+
+    Raises
+    ------
+    MeshError
+        With the name.
+    """
+    refuse_unknown(ends, points, [], conditions, loads)
+    _refuse_ambiguous(ends, points, conditions)
+    for name in ends if loads.pressure else ():
+        if not _closes(conditions.get(name, "free")):
+            raise MeshError(open_to_pressure(name))
+
+
+def _refuse_ambiguous(edges: Collection[str], points: Collection[str], conditions: Mapping[str, Condition]) -> None:
+    for name, condition in conditions.items():
+        if isinstance(condition, Held) and name in edges and name in points:
+            raise MeshError(f"boundary.{name}: is an edge and a point; give the point another name")
+
+
 def _refuse_open(patch: PatchMesh, conditions: Mapping[str, Condition]) -> None:
     """p int x.n/3 is the work of a live pressure only up to (p/3) of the line integral of dx.(x cross t) on its edges.
 
     It vanishes where the edge cannot move, or stays in a plane through the origin; where a plane of the user's
-    is, `ShellModel` sees.
+    is, the model sees.
     """
     pairs = {name: _pairs(edge) for name, edge in patch.edges.items()}
     closed = set().union(*(pairs[name] for name, c in conditions.items() if name in pairs and _closes(c)))

@@ -1,7 +1,7 @@
 """The chart of each geometry, over the reference length R: what is meshed, and how it is put into space."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from math import inf, pi, radians
 
 import numpy as np
@@ -21,15 +21,20 @@ from magshell_fenicsx.case.surfaces import (
     Surface,
     TorusSurface,
 )
+from magshell_fenicsx.mesh.grading import Grading
 from magshell_fenicsx.mesh.grid import Grid
-from magshell_fenicsx.mesh.msh import MeshFile, in_space
-from magshell_fenicsx.mesh.patch import Embedding
+from magshell_fenicsx.mesh.mirror import Y0, Mirror
+from magshell_fenicsx.mesh.msh import MeshFile, in_space, read_msh
+from magshell_fenicsx.mesh.patch import Embedding, MeshError
 from magshell_fenicsx.mesh.revolved import Arc, Capped, Profile, Revolved, Segment, Spline
 from magshell_fenicsx.mesh.shapes import DiscShape, Shape, StripShape
 from magshell_fenicsx.mesh.sphere import Dimple, SphereEmbedding, flat
+from magshell_fenicsx.plan.mirrors import grid_mirrors, lines_on, mesh_mirrors
+from magshell_fenicsx.plan.plan import Span
 
 Array = NDArray[np.float64]
 Chart = Shape | Grid | MeshFile
+ANY = Grading([], 1.0)
 ROUNDING = 1e-9
 ON_SURFACE = 1e-6  # of R, within which a named point lies on the surface
 
@@ -41,7 +46,7 @@ class Outline:
     Attributes
     ----------
     chart
-        What is meshed, of the half y >= 0 or of all, for an element size (of grids).
+        What is meshed, for a mirror plane in the model's frame or None, and element sizes (of grids).
     inverse
         Chart (2,) of a place (3,); of a mesh file the place itself.
     highest
@@ -53,26 +58,50 @@ class Outline:
         Whether chart distances from the origin are polar angles.
     round
         Whether it is closed around e3.
-    ends
-        First chart coordinates between which the half of a ring lies; None where the second coordinate is y.
+    mirrors
+        Its planes, but for those through e3 of what is `round`; of a mesh file for vectors that a plane should
+        hold, and whether its edges suffice (see `mesh_mirrors`).
+    span
+        The meridian; None if it is closed, or the surface is none of revolution.
     """
 
-    chart: Callable[[bool, float], Chart]
+    chart: Callable[[Mirror | None, Grading], Chart]
     embedding: Embedding
     inverse: Callable[[Array], Array]
     highest: Array | None
     edge: float = inf
     sphere: bool = False
     round: bool = False
-    ends: tuple[float, float] | None = None
+    mirrors: Callable[[Sequence[Array], bool], Sequence[Mirror]] = lambda vectors, loosely: []
+    span: Span | None = None
 
     def on_half(self, chart: Array) -> Array:
-        """A place of the chart on the half y >= 0, from which rounding may have moved it."""
-        if self.ends is not None:
-            low, high = self.ends
-            x = low if chart[0] < low + ROUNDING else high if chart[0] > high - ROUNDING else chart[0]
-            return np.array([x, chart[1]])
+        """A place of the chart on its half, from which rounding may have moved it; grids and meshes are cut."""
+        if self.grid or isinstance(self.chart(None, ANY), MeshFile):
+            return chart
         return np.array([chart[0], chart[1] if chart[1] > ROUNDING else 0.0])
+
+    @property
+    def grid(self) -> Grid | None:
+        """What is meshed, if that is a grid."""
+        shape = self.chart(None, ANY)
+        return shape if isinstance(shape, Grid) else None
+
+    def sample(self) -> Array:
+        """Places (n, 3) all over the surface, with its centre, edges and axes among them."""
+        shape = self.chart(None, ANY)
+        if isinstance(shape, MeshFile):
+            return read_msh(shape, {}).nodes
+        t = np.linspace(0, 1, 41)
+        if isinstance(shape, DiscShape):
+            rho, theta = np.meshgrid(shape.reach * t, 2 * np.pi * t)
+            x, y = rho * np.cos(theta), rho * np.sin(theta)
+        elif isinstance(shape, StripShape):
+            x, y = np.meshgrid(t, (t - 0.5) * shape.width)
+        else:
+            assert isinstance(shape, Grid)
+            x, y = np.meshgrid(*(a + t * (b - a) for a, b in zip(shape.low, shape.high, strict=True)))
+        return self.embedding(np.column_stack([x.ravel(), y.ravel()]))
 
     @property
     def disc(self) -> bool:
@@ -85,10 +114,18 @@ def outline(case: Case, defect: Dimple | None) -> Outline:
     shell = case.shell
     if isinstance(shell, MeshSurface):
         file = MeshFile(shell.path, (shell.unit or 1.0) / shell.reference)
-        return Outline(lambda half, size: file, in_space, lambda x: x, None)
+
+        def planes(vectors: Sequence[Array], loosely: bool) -> list[Mirror]:
+            try:
+                return _either_half(mesh_mirrors(read_msh(file, {}), vectors, loosely=loosely))
+            except MeshError:  # for whoever builds it to report
+                return []
+
+        return Outline(lambda mirror, size: file, in_space, lambda x: x, None, mirrors=planes)
     if isinstance(shell, ShellSection) and shell.width is not None:
         width = shell.width
-        return Outline(lambda half, size: StripShape(width, half), flat, _plane, np.array([1.0, 0.0]))
+        tip = np.array([1.0, 0.0])
+        return Outline(lambda m, size: StripShape(width, m is not None), flat, _plane, tip, mirrors=lambda *_: [Y0])
     if isinstance(shell, ShellSection) and shell.geometry == "disc":
         return _disc(1.0, "rim", flat, _plane)
     if isinstance(shell, ShellSection) or (isinstance(shell, CapSurface) and shell.hole is None):
@@ -97,17 +134,13 @@ def outline(case: Case, defect: Dimple | None) -> Outline:
         return _disc(edge, name, SphereEmbedding(defect), _of_sphere, defect.phi_o if defect else None, sphere=True)
     if isinstance(shell, PlateSurface):
         high = np.array([1.0, shell.width / shell.reference])
-        return Outline(
-            lambda half, size: Grid((0.0, 0.0), (1.0, float(high[1])), size),
-            flat,
-            lambda x: np.clip(x[:2], 0.0, high),
-            high,
-        )
+        return _grid(Grid((0.0, 0.0), (1.0, float(high[1])), 1.0), flat, lambda x: np.clip(x[:2], 0.0, high), high)
     profile, names = _profile(shell)
     if names[1] is None:
         perfect = Capped(profile)
         circle = defect.phi_o if defect else None
-        return _disc(profile.length, names[0], Capped(profile, defect), perfect.inverse, circle)
+        bent = _curvature(profile)
+        return _disc(profile.length, names[0], Capped(profile, defect), perfect.inverse, circle, curvature=bent)
     return _ring(shell, profile, (names[0], names[1]))
 
 
@@ -134,16 +167,21 @@ def _disc(
     circle: float | None = None,
     *,
     sphere: bool = False,
+    curvature: float = 1.0,
 ) -> Outline:
-    def chart(half: bool, size: float) -> Chart:
-        return DiscShape(edge, half, circle, name)
+    def chart(mirror: Mirror | None, size: Grading) -> Chart:
+        return DiscShape(edge, mirror is not None, circle, name)
 
     def within(x: Array) -> Array:
         found = inverse(x)
         beyond = np.hypot(*found) / edge
         return np.asarray(found / max(beyond, 1.0))
 
-    return Outline(chart, embedding, within, np.zeros(2), edge, sphere, round=True)
+    def place(chart: Array) -> tuple[float, float]:
+        return float(np.hypot(*chart)), float(np.arctan2(chart[1], chart[0]))
+
+    span = Span(edge, circle, (None, name), embedding, place, curvature)
+    return Outline(chart, embedding, within, np.zeros(2), edge, sphere, round=True, span=span)
 
 
 def _ring(shell: Surface, profile: Profile, names: tuple[str, str]) -> Outline:
@@ -155,18 +193,45 @@ def _ring(shell: Surface, profile: Profile, names: tuple[str, str]) -> Outline:
     low, high = (first * rho, 0.0), (last * rho, profile.length)
     embedding = Revolved(profile, rho)
 
-    def chart(half: bool, size: float) -> Chart:
-        if half:
-            mirror = ("symmetry", "symmetry", *names)
-            return Grid((0.0, 0.0), (pi * rho, profile.length), size, mirror, (False, glued[1]))
-        return Grid(low, high, size, ("left", "right", *names), glued)
-
     def inverse(x: Array) -> Array:
         return np.clip(embedding.inverse(x, first), low, high)
 
-    return Outline(
-        chart, embedding, inverse, np.array(low if any(glued) else high), round=glued[0], ends=(0.0, pi * rho)
-    )
+    def section(chart: Array) -> Array:
+        r, z = profile(profile.length - chart[:, 0]).T  # from its end: the normal points outwards
+        return np.column_stack([r, 0 * r, z])
+
+    def place(chart: Array) -> tuple[float, float]:
+        return profile.length - float(chart[1]), float(chart[0]) / rho
+
+    span = None
+    if glued == (True, False):
+        span = Span(profile.length, None, (names[1], names[0]), section, place, _curvature(profile))
+    grid = Grid(low, high, 1.0, ("left", "right", *names), glued)
+    return _grid(grid, embedding, inverse, np.array(low if any(glued) else high), span)
+
+
+def _curvature(profile: Profile) -> float:
+    """The largest, at least 1; to a thousandth, not to rounding."""
+    s = np.linspace(0, profile.length, 1001, dtype=np.float64)
+    turned = np.linalg.norm(np.diff(profile.tangent(s), axis=0), axis=1)
+    return max(1.0, round(float(turned.max() / s[1]), 3))
+
+
+def _grid(
+    grid: Grid, embedding: Embedding, inverse: Callable[[Array], Array], highest: Array, span: Span | None = None
+) -> Outline:
+    def chart(mirror: Mirror | None, size: Grading) -> Chart:
+        through = lines_on(mirror, grid, embedding) if mirror else grid.through
+        return replace(grid, size=size.across if size.features else size.largest, through=through)
+
+    def planes(vectors: Sequence[Array], loosely: bool) -> list[Mirror]:
+        return _either_half(grid_mirrors(grid, embedding))
+
+    return Outline(chart, embedding, inverse, highest, round=grid.glued[0], mirrors=planes, span=span)
+
+
+def _either_half(planes: Sequence[Mirror]) -> list[Mirror]:
+    return [half for plane in planes for half in (plane, plane.reversed)]
 
 
 def _profile(shell: Surface) -> tuple[Profile, tuple[str, str | None]]:

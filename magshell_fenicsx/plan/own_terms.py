@@ -1,51 +1,37 @@
-"""One's own terms in the plan: their names, and a model that shares their symmetry."""
+"""The energies of the mid-surface in a plan: those of registered parts and one's own."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.source import CaseError
+from magshell_fenicsx.models.shell.kinematics import SECOND
 from magshell_fenicsx.models.shell.own_term import OwnTerm
-from magshell_fenicsx.output.store.table import COLUMNS
-from magshell_fenicsx.plan.plan import Plan
-from magshell_fenicsx.plan.planner import make_plan
+from magshell_fenicsx.quantities.registry import TAKEN
 
-AMPLITUDES = ("pressure", "force", "load", "load_factor", "turn", "push", "lambda_m", "lambda_across")
-ENERGIES = ("membrane", "couple")  # besides those with a column
+LEAST, MOST = 1e-12, 1e9  # of a part's amplitude, in E h/R^2: rounding, and what no mesh of a shell resolves
 
 
-def plan_with(case: Case, terms: Sequence[OwnTerm]) -> Plan:
-    """Plan a case with one's own terms; what `symmetry: auto` takes is the smallest model that all of them allow.
+def surface_terms(case: Case, own: Sequence[OwnTerm]) -> tuple[OwnTerm, ...]:
+    """The terms of a case's parts, then one's own.
 
     Raises
     ------
     CaseError
-        As `make_plan`; if a term has the name of something else, if the symmetry that is asked for
-        is not the terms', or if the case is of a solid.
+        If a part's amplitude is out of bounds, a name is taken, or a solid cannot have a term.
     """
-    if terms and case.model == "solid":
-        raise CaseError("model: solid: one's own terms are energies of a mid-surface")
-    names = [term.name for term in terms]
+    found = []
+    for key, part in case.parts.items():
+        for term in part.terms(case.scales):
+            if not LEAST <= abs(term.value) <= MOST:
+                raise CaseError(f"{key}: {term.name} is {term.value:.4g} E h/R²; allowed are {LEAST:g} to {MOST:g}")
+            found.append(term)
+    found += own
+    names = [name for term in found for name in (term.name, *term.observed)]
+    names += {p.name for term in found for p in term.free}
     for name in names:
-        if name in (*AMPLITUDES, *ENERGIES, *COLUMNS) or names.count(name) > 1:
+        if name in TAKEN or names.count(name) > 1:
             raise CaseError(f"terms: {name}: something else has this name already")
-    plan = make_plan(case)
-    if wrong := _not_sharing(plan, terms):
-        if case.symmetry != "auto":
-            raise CaseError(f"symmetry: {case.symmetry}: the energy {wrong.name} does not share it")
-        smaller = ("half", "none") if plan.axisymmetric else ("none",)
-        plans = (make_plan(case.model_copy(update={"symmetry": symmetry})) for symmetry in smaller)
-        plan = next(each for each in plans if not _not_sharing(each, terms))
-    included = [*plan.included, *(f"own energy: {name}" for name in names)]
-    return replace(plan, loads=replace(plan.loads, own=tuple(terms)), included=included)
-
-
-def _not_sharing(plan: Plan, terms: Sequence[OwnTerm]) -> OwnTerm | None:
-    """A term that a reduced model cannot have."""
-
-    def shares(term: OwnTerm) -> bool:
-        if plan.axisymmetric:
-            return term.turns and term.mirrors
-        return not plan.half or (term.mirrors and (term.turns or plan.azimuth == 0))
-
-    return next((term for term in terms if not shares(term)), None)
+    for term in found if case.model == "solid" else []:
+        if curved := [f"r0.{name}" for name in term.placed_parts if name in SECOND]:
+            raise CaseError(f"model: solid: {term.name} depends on {', '.join(curved)}, which only a shell has")
+    return tuple(found)

@@ -1,5 +1,6 @@
 """What a scene is built from."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -7,13 +8,48 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.mesh.grading import Size
 from magshell_fenicsx.mesh.grid import Grid, grid_mesh
+from magshell_fenicsx.mesh.mirror import Mirror, cut
 from magshell_fenicsx.mesh.msh import MeshFile, read_msh
 from magshell_fenicsx.mesh.patch import Embedding, PatchMesh
 from magshell_fenicsx.mesh.shapes import Shape
 from magshell_fenicsx.mesh.triangulation import triangulate
+from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.parameters import Condition, Loads, Material
 from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.plan.names import refuse_unfit
+
+
+@dataclass(frozen=True)
+class Span:
+    """A meridian, walked from the pole or one edge to the other.
+
+    Attributes
+    ----------
+    length
+        Of its chart, which starts at 0.
+    circle
+        Where the curvature jumps; None if nowhere.
+    names
+        Of its ends; None for the pole.
+    embedding
+        Chart (n, 2), its second coordinate 0 -> the plane of e1 and e3.
+    place
+        Chart (2,) of the surface -> parameter of this one and azimuth (rad).
+    curvature
+        The largest of the meridian over 1/R, at least 1.
+    """
+
+    length: float
+    circle: float | None
+    names: tuple[str | None, str]
+    embedding: Embedding
+    place: Callable[[NDArray[np.float64]], tuple[float, float]]
+    curvature: float = 1.0
+
+    def sample(self) -> NDArray[np.float64]:
+        """Places (n, 3) along it, its ends among them."""
+        s = np.linspace(0.0, self.length, 401)
+        return self.embedding(np.column_stack([s, 0 * s]))
 
 
 @dataclass(frozen=True)
@@ -22,10 +58,12 @@ class Plan:
 
     Attributes
     ----------
-    axisymmetric
-        Model the meridian.
-    half
-        Model the half y >= 0 of a frame turned about e3 by `azimuth` (rad).
+    meridian
+        What is modelled instead of the surface; None if that is modelled.
+    mirror
+        Plane of the half that is modelled; None for all.
+    azimuth
+        The model's frame is turned about e3 by it (rad).
     shape, size, points, embedding
         What is triangulated, and how it is put into space. The point "pole" is the one whose
         displacement is reported: the pole, the disc's centre, the strip's tip.
@@ -35,13 +73,15 @@ class Plan:
         What multiplies the thickness; None for 1.
     length
         R in the unit that results are told in.
+    own
+        One's own energies; `loads` has them too, after those of the case's parts.
     """
 
     material: Material
     loads: Loads
     conditions: dict[str, Condition]
-    axisymmetric: bool
-    half: bool
+    meridian: Span | None
+    mirror: Mirror | None
     azimuth: float
     shape: Shape | Grid | MeshFile
     embedding: Embedding
@@ -51,6 +91,16 @@ class Plan:
     left_out: list[str]
     thickness: Thickness | None = None
     length: float = 1.0
+    own: tuple[OwnTerm, ...] = ()
+
+    @property
+    def axisymmetric(self) -> bool:
+        """Whether the meridian is modelled."""
+        return self.meridian is not None
+
+    @property
+    def half(self) -> bool:
+        return self.mirror is not None
 
     @property
     def fixed(self) -> bool:
@@ -71,7 +121,8 @@ class Plan:
 
     def _made(self) -> PatchMesh:
         if isinstance(self.shape, MeshFile):
-            return read_msh(self.shape, self.points)
+            return read_msh(self.shape, self.points, self.mirror)
         if isinstance(self.shape, Grid):
-            return grid_mesh(self.shape, self.points, self.embedding)
+            patch = grid_mesh(self.shape, self.points, self.embedding)
+            return cut(patch, self.mirror) if self.mirror else patch
         return triangulate(self.shape, self.size, self.points, self.embedding)

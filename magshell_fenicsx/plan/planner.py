@@ -1,5 +1,7 @@
 """From a case to what must be built for it, without building anything: the parts added up."""
 
+from collections.abc import Sequence
+from dataclasses import replace
 from math import radians
 
 import numpy as np
@@ -10,29 +12,34 @@ from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.expressions import formula
 from magshell_fenicsx.case.loading import DeadSection, IndentationSection
 from magshell_fenicsx.case.source import CaseError
+from magshell_fenicsx.case.surfaces import MeshSurface
 from magshell_fenicsx.mesh.frame import rotation
 from magshell_fenicsx.mesh.grading import Grading
 from magshell_fenicsx.mesh.grid import Grid
+from magshell_fenicsx.mesh.mirror import CUT, Y0, Mirror
+from magshell_fenicsx.mesh.msh import MeshFile
 from magshell_fenicsx.mesh.shapes import DiscShape, StripShape
 from magshell_fenicsx.mesh.sphere import Dimple
 from magshell_fenicsx.models.axisymmetric.meridian import graded_vertices
+from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.parameters import Condition, Held, Material
-from magshell_fenicsx.models.shell.supports import refuse_unknown
 from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.plan.account import account
-from magshell_fenicsx.plan.limits import refuse_too_large, refuse_too_many, refuse_unbounded_fields, sample
+from magshell_fenicsx.plan.limits import refuse_too_many, refuse_unbounded_fields
 from magshell_fenicsx.plan.loads import indented, loads, refuse_wide_patch
+from magshell_fenicsx.plan.names import refuse_unfit_ends
 from magshell_fenicsx.plan.outline import Chart, Outline, outline, refuse_beside
-from magshell_fenicsx.plan.plan import Plan
+from magshell_fenicsx.plan.own_terms import surface_terms
+from magshell_fenicsx.plan.plan import Plan, Span
 from magshell_fenicsx.plan.sizes import grading
-from magshell_fenicsx.plan.symmetry import Leaves, askew, left, mirror
+from magshell_fenicsx.plan.symmetry import Leaves, askew, left, mirror, unmirrored
 
 Array = NDArray[np.float64]
 Points = dict[str, Array]
 
 
-def make_plan(case: Case) -> Plan:
-    """Plan a case.
+def make_plan(case: Case, terms: Sequence[OwnTerm] = ()) -> Plan:
+    """Plan a case, with one's own energies.
 
     Raises
     ------
@@ -45,9 +52,12 @@ def make_plan(case: Case) -> Plan:
     defect = Dimple(case.defect.amplitude * material.h, case.dimple_half_width) if case.defect else None
     drawn = outline(case, defect)
     place = indented(case, drawn)
-    axisymmetric, azimuth = _symmetry(case, drawn, left(case, drawn, place))
-    half = azimuth is not None
-    turn = (azimuth or 0.0) if drawn.round else 0.0  # a strip lies along e1 whichever way the field points
+    energies = surface_terms(case, terms)
+    axisymmetric, plane = _symmetry(case, drawn, left(case, drawn, place, energies))
+    half = plane is not None
+    turn, beyond = 0.0, plane
+    if plane and drawn.round and plane.through_e3:  # the frame is turned into the plane
+        turn, beyond = plane.azimuth, Y0
     points = _points(case, drawn, place, turn, half)
     under = "load" if "load" in points else "pole"
     if place is not None:
@@ -56,36 +66,42 @@ def make_plan(case: Case) -> Plan:
     at = [load.at for load in loading.loads if load.at] if isinstance(loading, DeadSection) else []
     names = [under] if isinstance(loading, IndentationSection) else at
     size = grading(case, drawn, material.h, defect, [points[name] for name in names])
-    shape = drawn.chart(half, size.largest)
-    _refuse_unreasonable(case, drawn, shape, size, axisymmetric)
-    conditions = edge_conditions(case.boundary)
-    if half:
-        conditions["symmetry"] = "symmetry"
-    loaded = loads(case, under, turn, 0.5 if half else 1.0)
-    if axisymmetric and isinstance(shape, DiscShape):  # which is not triangulated, where this is seen
-        refuse_unknown([shape.edge], points, [], conditions, loaded)
+    shape = drawn.chart(beyond, size)
+    if isinstance(shape, Grid) and beyond:  # what a point needs, its image needs too
+        images = [drawn.inverse(beyond.image(drawn.embedding(x[None])[0])) for x in points.values()]
+        x, y = ((*shape.through[i], *(float(image[i]) for image in images)) for i in range(2))
+        shape = replace(shape, through=(x, y))
+    span = drawn.span if axisymmetric else None
+    _refuse_unreasonable(case, drawn, shape, size, span, half=half)
+    conditions = edge_conditions(case.boundary, turn)
+    if beyond:
+        conditions = {name: c for name, c in conditions.items() if name not in beyond.lost} | {CUT: "symmetry"}
+    loaded = loads(case, under, turn, beyond, energies)
+    if span:
+        refuse_unfit_ends([name for name in span.names if name], points, conditions, loaded)
     model = "meridian" if axisymmetric else f"{'half' if half else 'full'} {case.model}"
-    included, left_out = account(case, loaded, model, turn)
+    included, left_out = account(case, loaded, model, plane)
     return Plan(
         material=material,
         loads=loaded,
         conditions=conditions,
-        axisymmetric=axisymmetric,
-        half=half,
+        meridian=span,
+        mirror=beyond,
         azimuth=turn,
         shape=shape,
         embedding=drawn.embedding,
         points=points,
         size=size,
-        included=included,
+        included=[*included, *(f"own energy: {term.name}" for term in terms)],
         left_out=left_out,
-        thickness=_thickness(case),
+        thickness=_thickness(case, turn),
         length=case.shell.reference,
+        own=tuple(terms),
     )
 
 
-def edge_conditions(boundary: BoundarySection) -> dict[str, Condition]:
-    """The conditions of a case in the model's terms."""
+def edge_conditions(boundary: BoundarySection, turn: float) -> dict[str, Condition]:
+    """The conditions of a case in the model's terms, in a frame turned about e3 (rad)."""
     terms: dict[EdgeCondition, Condition] = {
         "hinged": "simply supported",
         "symmetry": "plane",
@@ -94,32 +110,37 @@ def edge_conditions(boundary: BoundarySection) -> dict[str, Condition]:
         "free": "free",
     }
     return {
-        name: Held(c.components) if isinstance(c, HeldSection) else terms[c]
+        name: Held(tuple(_turned(c.components, turn))) if isinstance(c, HeldSection) else terms[c]
         for name, c in boundary.conditions().items()
     }
 
 
 def meridian_vertices(plan: Plan, refinement: float) -> Array:
     """Vertices of the meridian's mesh, in the chart."""
-    assert isinstance(plan.shape, DiscShape)
-    return graded_vertices(plan.shape.radius, plan.shape.circle, plan.material.h, refinement=refinement)
+    span = plan.meridian
+    assert span
+    pole = span.names[0] is None
+    h = plan.material.h / span.curvature
+    return graded_vertices(span.length, span.circle, h, refinement=refinement, axis=pole)
 
 
-def _symmetry(case: Case, drawn: Outline, parts: list[Leaves]) -> tuple[bool, float | None]:
-    """Whether to model the meridian, and else the azimuth of the mirror plane of a half, None for a full model."""
-    reason, azimuth = askew(parts), mirror(parts)
-    if case.symmetry == "half" and azimuth is None:
-        if not drawn.round and case.shell.geometry != "strip":
-            raise CaseError(
-                f"symmetry: half: not with a {case.shell.geometry}; describe a part of it and give its edges "
-                "boundary: {name: symmetry}"
-            )
-        raise CaseError("symmetry: half: the shell, the fields and the load have no common mirror plane through e3")
+def _symmetry(case: Case, drawn: Outline, parts: list[Leaves]) -> tuple[bool, Mirror | None]:
+    """Whether to model the meridian, and else the mirror plane of a half, None for a full model."""
+    reason = askew(parts)
     if reason and case.symmetry == "axisymmetric":
         raise CaseError(f"symmetry: axisymmetric: {reason}")
-    axisymmetric = reason is None and case.symmetry in ("auto", "axisymmetric") and case.model == "shell"
-    half = not axisymmetric and case.symmetry in ("auto", "half")
-    return axisymmetric, azimuth if half else None
+    if reason is None and case.symmetry in ("auto", "axisymmetric") and case.model == "shell":
+        return True, None
+    if case.symmetry not in ("auto", "half"):
+        return False, None
+    plane = mirror(parts, drawn, loosely=case.symmetry == "half")
+    if case.symmetry == "half" and plane is None:
+        if name := unmirrored(parts, drawn):
+            raise CaseError(f"symmetry: half: the energy {name} does not share it")
+        made = "; edges of a mesh file must lie in it: mesh a half, mirror the nodes and triangles, join them"
+        hint = made if isinstance(case.shell, MeshSurface) else ""
+        raise CaseError(f"symmetry: half: shell, supports, fields and load have no common mirror plane{hint}")
+    return False, plane
 
 
 def _points(case: Case, drawn: Outline, place: Array | None, turn: float, half: bool) -> Points:
@@ -154,21 +175,32 @@ def _place(case: Case, drawn: Outline, place: Array, turn: float, half: bool) ->
     return drawn.on_half(found) if half else found
 
 
-def _refuse_unreasonable(case: Case, drawn: Outline, shape: Chart, size: Grading, axisymmetric: bool) -> None:
-    if isinstance(shape, DiscShape | StripShape):
-        refuse_unbounded_fields(case, drawn.embedding(sample(shape)))
-        if not axisymmetric:
-            refuse_too_large(case, size, shape)
+def _refuse_unreasonable(
+    case: Case, drawn: Outline, shape: Chart, size: Grading, span: Span | None, *, half: bool
+) -> None:
+    if span:
+        refuse_unbounded_fields(case, span.sample())
         return
-    refuse_unbounded_fields(case, np.zeros((0, 3)))
-    if case.mesh.tolerance is not None:
-        raise CaseError(f"mesh.tolerance: not with a {case.shell.geometry}; magshell study compares meshes and degrees")
-    if isinstance(shape, Grid):
-        refuse_too_many(case, shape.cells)
+    charted = isinstance(shape, DiscShape | StripShape)
+    refuse_unbounded_fields(case, drawn.sample() if charted else np.zeros((0, 3)))
+    if isinstance(shape, MeshFile):
+        return
+    cells = shape.cells * (0.5 if half else 1.0) if isinstance(shape, Grid) else size.cells(shape)
+    hint = "" if half else "; where shell, fields and loads have a mirror plane, symmetry: half halves it"
+    refuse_too_many(case, cells, hint)
 
 
-def _thickness(case: Case) -> Thickness | None:
+def _turned(components: tuple[int, ...], turn: float) -> list[int]:
+    """The components in a frame into which they turn as a whole."""
+    held = np.eye(3)[list(components)] @ rotation(turn).T
+    return [i for i in range(3) if held[:, i] @ held[:, i] > 0.5]
+
+
+def _thickness(case: Case, turn: float) -> Thickness | None:
     factor = case.thickness_factor
     if isinstance(factor, dict):
         return Thickness(patches=factor)
-    return Thickness(formula(factor)) if factor else None
+    if not factor:
+        return None
+    told, Q = formula(factor), rotation(turn)
+    return Thickness(lambda x, y, z: told(*(Q.T @ np.stack([x, y, z]))) if turn else told(x, y, z))

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.loading import DeadSection, IndentationSection, PressureSection
-from magshell_fenicsx.case.shell import ShellSection
-from magshell_fenicsx.mesh.grading import Disc, Feature, Grading, Ring
+from magshell_fenicsx.case.surfaces import MeshSurface
+from magshell_fenicsx.mesh.grading import Disc, Feature, Grading, Line, Ring
 from magshell_fenicsx.mesh.sphere import Dimple
 from magshell_fenicsx.plan.outline import Outline
 
@@ -24,17 +24,13 @@ def grading(case: Case, outline: Outline, h: float, defect: Dimple | None, loade
     loaded
         The places of concentrated loads in the chart.
     """
-    if not _graded(case, outline):
+    if case.mesh.size is not None or isinstance(case.shell, MeshSurface):
         return Grading([], _uniform(case, h))
     indentation = case.loading if isinstance(case.loading, IndentationSection) else None
     features = [*_rim(case, outline, h), *(_dimple(case, h, defect) if defect else [])]
     for place in loaded:
         features += _load(case, h, place, indentation)
     return Grading(features, _largest(case, outline, h, defect) / case.mesh.refinement)
-
-
-def _graded(case: Case, outline: Outline) -> bool:
-    return case.mesh.size is None and (outline.disc or isinstance(case.shell, ShellSection))
 
 
 def _uniform(case: Case, h: float) -> float:
@@ -44,6 +40,8 @@ def _uniform(case: Case, h: float) -> float:
 
 
 def _largest(case: Case, outline: Outline, h: float, defect: Dimple | None) -> float:
+    if outline.grid:
+        return min(2 * sqrt(h), 0.35)
     if not outline.disc or case.shell.geometry == "disc":
         return min(0.25, 0.5 * (case.width or 1.0))
     if isinstance(case.loading, DeadSection):
@@ -60,6 +58,12 @@ def _growth(case: Case) -> float:
 
 def _rim(case: Case, outline: Outline, h: float) -> list[Feature]:
     """Smaller elements along the edge of a curved surface; of a hemisphere the edge is far from a dent."""
+    if grid := outline.grid:
+        size, held = 1.2 * sqrt(h) / case.mesh.refinement, case.boundary.conditions()
+        ends = ((axis, end[axis]) for axis in range(2) for end in (grid.low, grid.high))
+        sides = zip(ends, grid.sides, grid.glued[:1] * 2 + grid.glued[1:] * 2, strict=True)
+        fixed = (at for at, name, glued in sides if not glued and held.get(name, "free") not in ("free", "symmetry"))
+        return [Line(axis, place, size, _growth(case)) for axis, place in fixed]
     if not outline.disc or case.shell.geometry == "disc":
         return []
     indented = (2.0 if case.model == "solid" else 2.8) if isinstance(case.loading, IndentationSection) else 1.4

@@ -2,31 +2,32 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from math import atan2, hypot, sin
+from functools import partial
+from math import atan2, hypot, pi
 
 import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.case.boundary import HeldSection
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.loading import DeadSection, IndentationSection, RotationSection
+from magshell_fenicsx.case.expressions import formula
+from magshell_fenicsx.case.loading import DeadLoadSection, DeadSection, IndentationSection, RotationSection
+from magshell_fenicsx.mesh.mirror import ROUNDING, Y0, Mirror
+from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.plan.outline import Outline
+from magshell_fenicsx.plan.turning import scalar_turns, vector_turns
 
 Array = NDArray[np.float64]
 Vectors = Sequence[Array]
 PARALLEL = 1e-12
 
 
-def _every(azimuth: float) -> bool:
+def _every(mirror: Mirror) -> bool:
     return True
 
 
-def _none(azimuth: float) -> bool:
+def _none(mirror: Mirror) -> bool:
     return False
-
-
-def _along_x(azimuth: float) -> bool:
-    return abs(sin(azimuth)) < PARALLEL
 
 
 @dataclass(frozen=True)
@@ -38,24 +39,28 @@ class Leaves:
     askew
         Why the case cannot be turned about e3 with this part; None if it can.
     vectors
-        Vectors and places (3,) that a mirror plane through e3 must hold.
+        Vectors and places (3,) that a mirror plane through e3 must hold, so that they choose one.
     mirrors
-        Whether the plane through e3 at an azimuth (rad) is left, apart from `vectors`.
+        Whether a plane is left.
+    energy
+        The name of the energy that it is of, if any.
     """
 
     askew: str | None = None
     vectors: Vectors = ()
-    mirrors: Callable[[float], bool] = _every
+    mirrors: Callable[[Mirror], bool] = _every
+    energy: str = ""
 
 
-def left(case: Case, outline: Outline, indented: Array | None) -> list[Leaves]:
+def left(case: Case, outline: Outline, indented: Array | None, terms: Sequence[OwnTerm]) -> list[Leaves]:
     """What each part of a case leaves; `indented` is the place (3,) of an indentation, over R."""
     return [
         _shape(case, outline),
         *_supports(case),
-        *(_field(case) if case.magnetic and case.lambda_m else []),
+        *(_field(case, outline) if case.magnetic and case.lambda_m else []),
         *_load(case, indented),
-        *(_named(case) if case.points else []),
+        *_named(case, outline),
+        *(_energy(term, outline) for term in terms),
     ]
 
 
@@ -73,10 +78,28 @@ def common_azimuth(vectors: Vectors) -> float | None:
     return atan2(y, x)
 
 
-def mirror(parts: Sequence[Leaves]) -> float | None:
-    """Azimuth (rad) of a plane through e3 that all parts leave; None if there is none."""
-    azimuth = common_azimuth([v for part in parts for v in part.vectors])
-    return azimuth if azimuth is not None and all(part.mirrors(azimuth) for part in parts) else None
+def mirror(parts: Sequence[Leaves], outline: Outline, *, loosely: bool = False) -> Mirror | None:
+    """A plane that all parts leave, through e3 if there is one; None if there is none.
+
+    Parameters
+    ----------
+    loosely
+        Of a mesh file, see `mesh_mirrors`.
+    """
+    vectors = [v for part in parts for v in part.vectors]
+    azimuth = common_azimuth(vectors) if outline.round else None
+    upright: list[Mirror] = []
+    if azimuth is not None:
+        turns = (0.0, pi) if any(_tilted(v) for v in vectors) else (0.0, pi, pi / 2, -pi / 2)
+        upright = [Mirror.upright(azimuth + turn) for turn in turns]
+
+    def first(planes: Sequence[Mirror]) -> Mirror | None:
+        return next((plane for plane in planes if all(part.mirrors(plane) for part in parts)), None)
+
+    if any(part.mirrors is _none for part in parts):
+        return None
+    found = first(upright) or first(outline.mirrors([_unit(v) for v in vectors], False))
+    return first(outline.mirrors([_unit(v) for v in vectors], True)) if loosely and not found else found
 
 
 def askew(parts: Sequence[Leaves]) -> str | None:
@@ -84,76 +107,169 @@ def askew(parts: Sequence[Leaves]) -> str | None:
     return next((part.askew for part in parts if part.askew), None)
 
 
+def unmirrored(parts: Sequence[Leaves], outline: Outline) -> str | None:
+    """The name of an energy that alone keeps a case from being a half; None if there is none."""
+    others = [part for part in parts if not part.energy]
+    plane = mirror(others, outline, loosely=True)
+    return next((part.energy for part in parts if plane and part.energy and not part.mirrors(plane)), None)
+
+
+def _energy(term: OwnTerm, outline: Outline) -> Leaves:
+    """The frame of a half of what is round is turned to its plane: a term that does not turn stays behind."""
+
+    def mirrors(mirror: Mirror) -> bool:
+        turned = outline.round and mirror.through_e3 and mirror.azimuth != 0
+        return term.mirrored(Y0 if turned else mirror) and (not turned or term.turns)
+
+    shared = term.mirrored(Y0) and term.turns
+    return Leaves(None if shared else f"the energy {term.name} does not share it", (), mirrors, term.name)
+
+
 def _shape(case: Case, outline: Outline) -> Leaves:
-    geometry = case.shell.geometry
-    if outline.round and case.thickness_factor is not None:
-        return Leaves("only the user knows whether the formula of the thickness is", mirrors=_none)
-    if outline.round:
-        return Leaves(None if outline.disc else "a meridian ends at a pole")
-    if geometry == "strip":
-        return Leaves("a strip is no surface of revolution", mirrors=_along_x)
-    return Leaves(f"not with a {geometry} that is not closed around e3", mirrors=_none)
+    factor, geometry = case.thickness_factor, case.shell.geometry
+
+    def mirrors(mirror: Mirror) -> bool:
+        if not isinstance(factor, str):
+            return True  # patches are mapped onto themselves
+        x = outline.sample()
+        return _alike(formula(factor)(*x.T), formula(factor)(*mirror.image(x).T))
+
+    reason = None
+    if not outline.round:
+        reason = f"not with a {geometry} that is not closed around e3"
+    elif not outline.span:
+        reason = "the section of the tube is closed: it has no edge to hold it by"
+    elif isinstance(factor, str) and not scalar_turns(factor, outline.span):
+        reason = "the thickness differs around e3"
+    return Leaves(reason, mirrors=mirrors)
 
 
 def _supports(case: Case) -> list[Leaves]:
     """A half does not see rigid motions across its plane: it needs a support against all."""
+    conditions = case.boundary.conditions()
     found, fixed = list[Leaves](), False
-    for name, condition in case.boundary.conditions().items():
+    for name, condition in conditions.items():
         fixed = fixed or condition in ("clamped", "simply supported", "hinged")
+        reason = None
         if isinstance(condition, HeldSection):
             fixed = fixed or len(condition.components) == 3
-            found.append(Leaves(f"boundary.{name}: held components are those of e1, e2 and e3", mirrors=_along_x))
-        elif condition == "symmetry":
-            found.append(Leaves(f"boundary.{name}: a mirror plane of the case's own"))
-    return (
-        found if fixed else [*found, Leaves("boundary: nothing is clamped, hinged or held as a whole", mirrors=_none)]
-    )
-
-
-def _field(case: Case) -> list[Leaves]:
-    magnetic = case.magnetic
-    assert magnetic
-    vectors = [d.vector() for d in (*magnetic.remanent.directions(), magnetic.applied)]
-    found = [Leaves("a field is not along e3" if any(_tilted(v) for v in vectors) else None, vectors)]
-
-    def told(azimuth: float) -> bool:  # only the user knows whether it is symmetric to the plane y = 0
-        return case.symmetry == "half" and not azimuth
-
-    if magnetic.remanent.kind == "expression":
-        found.append(Leaves("only the user knows whether the remanence's formula is", mirrors=told))
-    if magnetic.applied.gradient:
-        G = np.array(magnetic.applied.gradient)
-        round_ = np.abs(G - np.diag([G[0, 0], G[0, 0], G[2, 2]])).max() <= PARALLEL
-        found.append(Leaves(None if round_ else "the gradient of the applied field is not diag(a, a, b)", mirrors=told))
+            one_sided = len({0, 1} & set(condition.components)) == 1
+            off = _tilted(np.array(case.points.get(name, [0.0, 0.0, 1.0])))
+            why = "is held along x or y alone" if one_sided else "is held off the axis" if off else None
+            reason = why and f"boundary.{name}: {why}"
+        found.append(Leaves(reason, mirrors=partial(_leaves_support, case, name)))
+    if not fixed:  # a meridian asks for itself whether it is held
+        found.append(Leaves(mirrors=_none))
     return found
 
 
+def _leaves_support(case: Case, name: str, mirror: Mirror) -> bool:
+    """The other half is held in the same way, and a point that is held is on the plane."""
+    conditions = case.boundary.conditions()
+    condition, other = conditions[name], conditions.get(mirror.other(name), "free")
+    if isinstance(condition, HeldSection):
+        held, S = np.diag([float(i in condition.components) for i in range(3)]), mirror.reflection
+        if np.abs(S @ held @ S - held).max() > PARALLEL:
+            return False
+    place = case.points.get(name)
+    off = 0.0 if place is None else float(mirror.beyond(np.array(place) / case.shell.reference))
+    return abs(off) < ROUNDING and condition == other
+
+
+def _field(case: Case, outline: Outline) -> list[Leaves]:
+    """Remanence and applied field must both be symmetric to a plane, or both antisymmetric."""
+    magnetic = case.magnetic
+    assert magnetic
+    vectors = [d.vector() for d in (*magnetic.remanent.directions(), magnetic.applied)]
+    turning = [case.loading.to.vector()] if isinstance(case.loading, RotationSection) else []
+    remanent, G = magnetic.remanent, np.array(magnetic.applied.gradient or np.zeros((3, 3)))
+    fields: list[Callable[[Array], Array]] = [lambda x: np.asarray(x @ G.T)] if G.any() else []
+    if remanent.components:
+        texts = [formula(text) for text in remanent.components]
+        fields.append(lambda x: np.stack([f(*x.T) for f in texts], axis=-1))
+    askew = ["a field is not along e3"] if any(_tilted(v) for v in vectors) else []
+    if remanent.components and not (outline.span and vector_turns(remanent.components, outline.span)):
+        askew.append("the formula of the remanence differs around e3")
+    if np.abs(G - np.diag([G[0, 0], G[0, 0], G[2, 2]])).max() > PARALLEL:
+        askew.append("the gradient of the applied field is not diag(a, a, b)")
+
+    def mirrors(mirror: Mirror) -> bool:
+        S, x = mirror.reflection, outline.sample() if fields else np.zeros((0, 3))
+
+        def images(sign: float) -> bool:
+            uniform = all(np.abs(S @ v - sign * v).max() <= 1e-10 for v in (*vectors, *turning))
+            varying = all(
+                _alike(sign * np.einsum("ni,ij->nj", field(x), S), field(mirror.image(x))) for field in fields
+            )
+            kinds = {"radial": 1.0, "tangential": float(S[2, 2])}
+            return uniform and varying and kinds.get(remanent.kind, sign) == sign
+
+        return images(1.0) or images(-1.0)
+
+    return [Leaves(next(iter(askew), None), vectors, mirrors)]
+
+
 def _load(case: Case, indented: Array | None) -> list[Leaves]:
-    loading = case.loading
+    loading, R = case.loading, case.shell.reference
     if isinstance(loading, IndentationSection):
         assert indented is not None
-        return [Leaves("the force is not at the pole" if _tilted(indented) else None, [indented])]
+        place = indented
+        reason = "the force is not at the pole" if _tilted(place) else None
+        return [Leaves(reason, [place], lambda mirror: bool(abs(mirror.beyond(place)) < ROUNDING))]
     if isinstance(loading, RotationSection):
         return [Leaves("the field turns", [loading.to.vector()])]
     if isinstance(loading, DeadSection):
         forces = [np.array(v) for load in loading.loads for v in (load.force, load.per_length, load.per_area) if v]
-        places = [np.array(case.points[load.at]) for load in loading.loads if load.at]
+        places = [np.array(case.points[load.at]) / R for load in loading.loads if load.at]
+        vectors = [_unit(v) for v in (*forces, *places)]
         patches = any(load.over not in (None, "all") for load in loading.loads)
-        mirrors = _none if patches else _every
-        return [Leaves("a meridian takes no dead loads", [_unit(v) for v in (*forces, *places)], mirrors)]
+
+        def mirrors(mirror: Mirror) -> bool:
+            on_plane = all(abs(float(mirror.beyond(x))) < ROUNDING for x in places)
+            return on_plane and all(any(_is_image(a, b, mirror) for b in loading.loads) for a in loading.loads)
+
+        tilted = any(_tilted(v) for v in vectors)
+        why = "a load is not along e3, or off the axis" if tilted else "a patch is loaded" if patches else None
+        return [Leaves(why, vectors, mirrors)]
     return []
 
 
-def _named(case: Case) -> list[Leaves]:
-    """Named points lie on the half that is modelled, y >= 0."""
-    places = [_unit(np.array(x)) for x in case.points.values()]
+def _is_image(load: DeadLoadSection, other: DeadLoadSection, mirror: Mirror) -> bool:
+    edge = load.edge and mirror.other(load.edge)
+    if (edge, load.at, load.over, load.moment, load.pressure) != (
+        other.edge,
+        other.at,
+        other.over,
+        other.moment,
+        other.pressure,
+    ):
+        return False
+    for here, there in ((getattr(x, key) for x in (load, other)) for key in ("force", "per_length", "per_area")):
+        if (here is None) != (there is None):
+            return False
+        if here and np.abs(mirror.reflection @ here - there).max() > 1e-10 * np.linalg.norm(here):
+            return False
+    return True
 
-    def within(azimuth: float) -> bool:
-        across = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
-        return all(x @ across > -PARALLEL for x in places)
 
-    off = any(_tilted(x) for x in places)
-    return [Leaves("points are named off the axis" if off else None, mirrors=within)]
+def _named(case: Case, outline: Outline) -> list[Leaves]:
+    """Named points lie on the half that is modelled, and so does the one that is reported without any."""
+    places = [np.array(x) / case.shell.reference for x in case.points.values()]
+    if not places and outline.highest is not None:
+        places = [outline.embedding(outline.highest[None])[0]]
+
+    def within(mirror: Mirror) -> bool:
+        chosen = outline.round and mirror.through_e3 and not case.points  # then the chart begins at the plane
+        return chosen or all(float(mirror.beyond(x)) > -ROUNDING for x in places)
+
+    return [Leaves(mirrors=within)]
+
+
+def _alike(here: Array, there: Array) -> bool:
+    """Equal to rounding, and finite."""
+    if not (np.isfinite(here).all() and np.isfinite(there).all()):
+        return False
+    return bool((np.abs(here - there) <= ROUNDING * np.abs(here).max(initial=0.0)).all())
 
 
 def _tilted(v: Array) -> bool:

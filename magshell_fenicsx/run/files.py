@@ -11,8 +11,6 @@ from mpi4py import MPI
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.continuation.system import State
-from magshell_fenicsx.mesh.frame import rotation
-from magshell_fenicsx.models.shell.parameters import MIRROR_NORMAL
 from magshell_fenicsx.output.fields.gathering import gatherer
 from magshell_fenicsx.output.fields.surface import turned
 from magshell_fenicsx.output.fields.vtu import About, FieldSeries
@@ -111,7 +109,7 @@ class RunFiles:
         self._begun_with = {key: begun[key] for key in ("mesh_file", "sources") if key in begun}
         self._table = PathTable(self._folder / "path.csv", self._scene.extra_columns)
         plan = self._scene.plan
-        mirror = MIRROR_NORMAL @ rotation(plan.azimuth) if plan.half else None
+        mirror = plan.mirror.turned(plan.azimuth).plane if plan.mirror else None
         about = About(plan.material.h, plan.material.nu, mirror)
         self._fields = FieldSeries(self._folder / "fields", about)
         sync_folder(self._folder)

@@ -16,7 +16,7 @@ from magshell_fenicsx.output.pictures.picture import figures
 from magshell_fenicsx.output.pictures.render import smooth_surface
 from magshell_fenicsx.output.store.table import Row
 from magshell_fenicsx.run.rows import rows
-from magshell_fenicsx.simulate.follow import Record
+from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.scene import Scene
 
 if TYPE_CHECKING:  # take long to import
@@ -32,7 +32,7 @@ def surface(scene: Scene, record: Record) -> Surface | None:
     """
     plan, state = scene.plan, record.point.state
     found = gatherer(scene.model, scene.comm).gather(state.u, state.mu)
-    return turned(completed(found) if plan.half else found, plan.azimuth) if found else None
+    return turned(completed(found, plan.mirror.plane) if plan.mirror else found, plan.azimuth) if found else None
 
 
 def polydata(scene: Scene, record: Record) -> "pyvista.PolyData | None":
@@ -72,7 +72,7 @@ def curve(scene: Scene, records: Sequence[Record], amplitude: str | None = None)
 
 def _caption(scene: Scene, row: Row) -> str:
     material = scene.plan.material
-    return caption(material.h, material.nu, row, [term.name for term in scene.plan.loads.own])
+    return caption(material.h, material.nu, row, [term.name for term in scene.plan.own])
 
 
 def _in_line(figure: "Figure") -> "Figure":

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.output.store.table import COLUMNS, Row
-from magshell_fenicsx.simulate.follow import Record
+from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.scene import Scene
 
 

@@ -20,6 +20,7 @@ from magshell_fenicsx.output.store.durable import write_whole
 from magshell_fenicsx.output.store.folder import DiskError, by_first, held_folder
 from magshell_fenicsx.output.store.table import LOCATED, Row
 from magshell_fenicsx.platform.environment import fast_blas
+from magshell_fenicsx.quantities.registry import quantity
 from magshell_fenicsx.run.files import MESH, RunFiles, open_folder
 from magshell_fenicsx.run.interrupt import Interrupted, Stoppable, Watch
 from magshell_fenicsx.run.modes import modes_after
@@ -29,7 +30,8 @@ from magshell_fenicsx.run.summary import Result, summary
 from magshell_fenicsx.simulate.adapt.choice import Adapted
 from magshell_fenicsx.simulate.adapt.ending import NoResult
 from magshell_fenicsx.simulate.adapt.tolerance import adapted
-from magshell_fenicsx.simulate.follow import Stopped, follow
+from magshell_fenicsx.simulate.follow import follow
+from magshell_fenicsx.simulate.record import Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.sensitivity import sensitivities
 
@@ -195,10 +197,10 @@ def _follow(result: Result, files: RunFiles | None, say: Say, progress: RunProgr
 
 
 def _line(row: Row) -> str:
-    factor = row.get("load_factor")
-    load = f"FR/2piD {row['force']:9.5f}" if factor is None else f"load factor {factor:9.5f}"
+    load = "load_factor" if "load_factor" in row else "force"
+    formats = {"lambda_m": "+.4e", "p_over_pc": ".6f", load: "9.5f", "w_over_h": "8.4f"}
+    loads = "  ".join(f"{quantity(name).plain} {row[name]:{form}}" for name, form in formats.items())
     return (
-        f"{row['point']:4d} {row['label']:>11}  lambda_m {row['lambda_m']:+.4e}  p/pc {row['p_over_pc']:.6f}  "
-        f"{load}  w/h {row['w_over_h']:8.4f}  pole {row['w_pole_over_h']:8.4f}  "
+        f"{row['point']:4d} {row['label']:>11}  {loads}  pole {row['w_pole_over_h']:8.4f}  "
         f"unstable {row['negative_pivots']}  it {row['iterations']}"
     )

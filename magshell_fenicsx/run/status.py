@@ -17,17 +17,9 @@ from magshell_fenicsx.case.loading import (
 )
 from magshell_fenicsx.continuation.point import Point
 from magshell_fenicsx.output.store.table import Row
+from magshell_fenicsx.quantities.registry import quantity
 from magshell_fenicsx.simulate.scene import Scene
 
-SYMBOLS = {
-    "p_over_pc": "p/pc",
-    "volume_change": "dV/R^3",
-    "force": "FR/2piD",
-    "w_over_h": "w/h",
-    "load_factor": "load factor",
-    "lambda_m": "lambda_m",
-    "field_angle": "field angle",
-}
 WORDS = {"limit": "the first instability", "bifurcation": "the first bifurcation"}
 
 
@@ -69,7 +61,7 @@ class Aim:
         ('w/h 5 -> 20', 'p/pc 0.25 -> the first instability')
         """
         end = self.words if self.end is None else f"{self.end:.4g}"
-        return f"{SYMBOLS[self.column]} {float(row[self.column]) + 0.0:.4g} -> {end}"  # no minus zero
+        return f"{quantity(self.column).plain} {float(row[self.column]) + 0.0:.4g} -> {end}"  # no minus zero
 
 
 def aim(scene: Scene) -> Aim:

@@ -7,9 +7,10 @@ from magshell_fenicsx.case.shell import ShellSection
 from magshell_fenicsx.case.surfaces import Surface
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.continuation.timing import Stopwatch
-from magshell_fenicsx.output.store.table import LOCATED, VALUE_COLUMN, Row
+from magshell_fenicsx.output.store.table import LOCATED, Row
 from magshell_fenicsx.platform import sources
 from magshell_fenicsx.platform.environment import fast_blas, versions
+from magshell_fenicsx.quantities.registry import amplitude
 from magshell_fenicsx.simulate.adapt.choice import Adapted
 from magshell_fenicsx.simulate.adapt.ending import History, NoResult
 from magshell_fenicsx.simulate.scene import Scene
@@ -56,7 +57,7 @@ class Result:
         return [
             {
                 "amplitude": row["amplitude"],
-                "value": row[VALUE_COLUMN[str(row["amplitude"])]],
+                "value": row[amplitude(str(row["amplitude"])).column],
                 "p_over_pc": row["p_over_pc"],
                 "w_pole_over_h": row["w_pole_over_h"],
                 "kind": row["label"],

@@ -19,8 +19,7 @@ from magshell_fenicsx.continuation.watch import Watch
 from magshell_fenicsx.mesh.frame import rotation
 from magshell_fenicsx.mesh.hexahedra import sweep
 from magshell_fenicsx.mesh.midsurface import Midsurface, distribute
-from magshell_fenicsx.mesh.patch import MeshError
-from magshell_fenicsx.mesh.shapes import DiscShape
+from magshell_fenicsx.mesh.mirror import Y0
 from magshell_fenicsx.models.axisymmetric.meridian import make_meridian
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.shell.model import ShellModel
@@ -29,9 +28,8 @@ from magshell_fenicsx.models.shell.supports import refuse_loose
 from magshell_fenicsx.models.shell.thickness import Thickness, refuse_unfit
 from magshell_fenicsx.models.solid.model import SolidModel
 from magshell_fenicsx.plan.body import layers, neo_hookean
-from magshell_fenicsx.plan.own_terms import plan_with
 from magshell_fenicsx.plan.plan import Plan
-from magshell_fenicsx.plan.planner import meridian_vertices
+from magshell_fenicsx.plan.planner import make_plan, meridian_vertices
 from magshell_fenicsx.platform.first import from_first
 
 Array = NDArray[np.float64]
@@ -43,10 +41,10 @@ class Scene:
     Parameters
     ----------
     plan
-        What to make of the case; by default `plan_with` says.
+        What to make of the case; by default `make_plan` says.
     terms
-        One's own energies, which a given plan has already (`Loads.own`). Their amplitudes are zero until a
-        state says otherwise, see `trace`.
+        One's own energies, which a given plan has already. Their amplitudes are `OwnTerm.value` until a state says
+        otherwise, see `trace`.
 
     Attributes
     ----------
@@ -70,7 +68,7 @@ class Scene:
         terms: Sequence[OwnTerm] = (),
     ) -> None:
         start = time.perf_counter()
-        self.case, self.plan, self.comm = case, plan or plan_with(case, terms), comm
+        self.case, self.plan, self.comm = case, plan or make_plan(case, terms), comm
         self.model: ShellModel | MeridianModel | SolidModel
         if self.plan.axisymmetric:
             self.model = build_meridian_model(case, self.plan)
@@ -96,13 +94,15 @@ class Scene:
         return Watch(self.model.excluded_modes)
 
     def unloaded(self) -> State:
-        """The undeformed shell with all amplitudes zero."""
+        """The undeformed shell: all amplitudes are zero but those that terms have a value for."""
         amplitudes = {t.amplitude for t in self.model.system.terms if t.amplitude}
-        return State(self.model.zero(), dict.fromkeys(sorted(amplitudes), 0.0))
+        given = self._own_amplitudes
+        return State(self.model.zero(), {name: given.get(name, 0.0) for name in sorted({*amplitudes, *given})})
 
     def observe(self, state: State) -> dict[str, float]:
         """The physical columns of a table row: loads, displacements over h, volume, energies over E h R^2."""
         model, h, force = self.model, self.plan.material.h, self.model.loads.force
+        model.system.accept(state.u)
         pole = model.deflection(state.u, "pole") / h
         potentials, energies = model.system.energies(state.u), defaultdict[str, float](float)
         for t in model.system.terms:
@@ -127,14 +127,27 @@ class Scene:
             "magnetic": sum(energies[name] for name in ("magnetic", "magnetic gradient", "U1", "Uq", "Utau", "couple")),
             **{name: energies[name] for name in ("U1", "Uq", "Utau")},
             **self._observe_points(state),
-            **{term.name: state.mu[term.name] for term in self.plan.loads.own},
+            **{name: state.mu[name] for name in self._own_amplitudes},
+            **{
+                column: state.mu[term.name]
+                * model.multiplicity
+                * model.system.integral(state.u, model.observed[column])
+                for term in self.plan.loads.own
+                for column in term.observed
+            },
         }
+
+    @property
+    def _own_amplitudes(self) -> dict[str, float]:
+        """Those of surface energies, and of parameters that enter them freely, with their values at the start."""
+        terms = self.plan.loads.own
+        return {term.name: term.value for term in terms} | {p.name: p.value for term in terms for p in term.free}
 
     @property
     def extra_columns(self) -> tuple[str, ...]:
         """What `observe` tells besides the columns of every run."""
         named = tuple(f"{point}_u{axis}" for point in self.case.points for axis in "xyz")
-        own = (term.name for term in self.plan.loads.own)
+        own = (*self._own_amplitudes, *(column for term in self.plan.loads.own for column in term.observed))
         return (*(["load_factor"] if self.plan.loads.dead else []), *named, *own)
 
     def _observe_points(self, state: State) -> dict[str, float]:
@@ -150,18 +163,29 @@ def build_model(case: Case, plan: Plan, comm: MPI.Comm) -> ShellModel:
     """The whole shell or half of it, on all ranks together."""
     surface = build_midsurface(plan, comm)
     return ShellModel(
-        surface, plan.material, case.mesh.degree, plan.conditions, plan.loads, case.mesh.penalty, plan.thickness
+        surface,
+        plan.material,
+        case.mesh.degree,
+        plan.conditions,
+        plan.loads,
+        case.mesh.penalty,
+        plan.thickness,
+        plan.mirror or Y0,
     )
 
 
 def build_meridian_model(case: Case, plan: Plan) -> MeridianModel:
     """The meridian, whole on every rank."""
-    meridian = make_meridian(plan.embedding, meridian_vertices(plan, case.mesh.refinement))
-    assert isinstance(plan.shape, DiscShape)
-    if not plan.fixed and "simply supported" not in plan.conditions.values():
-        raise MeshError("boundary: the shell is not held: it is free to move along (0, 0, 1)")
-    condition = plan.conditions.get(plan.shape.edge, "free")
-    return MeridianModel(meridian, plan.material, case.mesh.degree, condition, plan.loads, case.mesh.penalty)
+    span = plan.meridian
+    assert span
+    points = {name: span.place(x) for name, x in plan.points.items()}
+    vertices = meridian_vertices(plan, case.mesh.refinement)
+    meridian = make_meridian(span.embedding, vertices, span.names, points, span.curvature)
+    model = MeridianModel(
+        meridian, plan.material, case.mesh.degree, plan.conditions, plan.loads, case.mesh.penalty, plan.thickness
+    )
+    model.supports.refuse_loose(model.r0)
+    return model
 
 
 def build_solid_model(case: Case, plan: Plan, comm: MPI.Comm) -> SolidModel:
@@ -173,7 +197,7 @@ def build_solid_model(case: Case, plan: Plan, comm: MPI.Comm) -> SolidModel:
         return found
 
     body = sweep(from_first(comm, plan.triangulated), plan.material.h, layers(case), comm, factor)
-    return SolidModel(body, plan.material, neo_hookean(case), plan.conditions, plan.loads)
+    return SolidModel(body, plan.material, neo_hookean(case), plan.conditions, plan.loads, plan.mirror or Y0)
 
 
 def build_midsurface(plan: Plan, comm: MPI.Comm) -> Midsurface:

@@ -15,13 +15,12 @@ from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.continuation.fold import Fold, Guess, find_fold, sensitivity
 from magshell_fenicsx.continuation.system import State, Vector
 from magshell_fenicsx.models.axisymmetric import jets
-from magshell_fenicsx.models.axisymmetric.energies import EnergyFactory
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.shell.parameters import Magnetisation
 from magshell_fenicsx.models.shell.patterns import Array, InsideAndOutside, Pattern
 from magshell_fenicsx.models.shell.terms import TermFactory
 from magshell_fenicsx.models.solid.model import SolidModel
-from magshell_fenicsx.simulate.follow import Record
+from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.transfer import same_mesh, transfer
 
@@ -58,7 +57,7 @@ def sensitivities(scene: Scene, fold: Fold) -> dict[str, float]:
       the derivative in lambda_m.
     """
     system, state = scene.model.system, fold.state
-    columns = {name: system.load(state.u, name) for name in state.mu if name != fold.name}
+    columns = {name: system.load(state.u, state.mu, name) for name in state.mu if name != fold.name}
     columns |= _remanence_columns(scene, fold)
     found = {name: sensitivity(system, fold, column) for name, column in columns.items()}
     return found | ({DEFECT: _to_defect(scene, fold)} if scene.case.defect else {})
@@ -68,7 +67,7 @@ def _to_defect(scene: Scene, fold: Fold) -> float:
     """By central differences of the residual: the mesh does not depend on delta, only r0 on it does."""
 
     def out_of_balance(change: float) -> float:
-        other = Scene(deepened(scene.case, change), scene.comm, terms=scene.plan.loads.own)
+        other = Scene(deepened(scene.case, change), scene.comm, terms=scene.plan.own)
         assert same_mesh(scene, other)
         u, phi = (transfer(scene, other, v) for v in (fold.state.u, fold.phi))
         moved = replace(fold, state=State(u, fold.state.mu), phi=phi)
@@ -130,12 +129,13 @@ def _magnetic_terms(scene: Scene, field: Magnetisation) -> Sequence[FormTerm]:
     """The model's magnetic terms with another remanence."""
     model, log = scene.model, KernelLog()
     if isinstance(model, MeridianModel):
-        factory = EnergyFactory(model.meridian, model.r0, model.material, model.sigma, model.degree)
         u = jets.revolved(model.u)
         return [
             FormTerm(e.name, 2 * np.pi * e.of(u), model.u, log, e.amplitude, linear=e.linear)
-            for e in factory.magnetic(field)
+            for e in model.factory.magnetic(field)
         ]
     if isinstance(model, SolidModel):
         return replace(model.factory, log=log).magnetic(field)
-    return TermFactory(model.r0, model.u, model.material, model.sigma, model.degree, log).magnetic(field)
+    return TermFactory(model.r0, model.u, model.material, model.sigma, model.degree, log, model.thickness).magnetic(
+        field
+    )

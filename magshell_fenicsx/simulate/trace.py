@@ -8,8 +8,10 @@ from magshell_fenicsx.continuation.control import GivenLoad
 from magshell_fenicsx.continuation.path import SEEN, Control, StepOptions
 from magshell_fenicsx.continuation.system import State, max_abs
 from magshell_fenicsx.continuation.walk import MOST_STEPS, Goal, Quantity, Until
-from magshell_fenicsx.simulate.follow import Record, Stopped, begin, followed
+from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
+from magshell_fenicsx.simulate.stage import plain
+from magshell_fenicsx.simulate.walked import followed
 
 
 def trace(
@@ -37,7 +39,7 @@ def trace(
         A point found before, or a state; by default the undeformed shell with all amplitudes zero.
     control
         "load": the amplitude is given; "conjugate": the displacement conjugate to it, -Pi_i(u), is
-        (`scene.model.system.potential` tells Pi_i); "arc": by arc length, through folds of both.
+        (`scene.model.system.potential` gives Pi_i); "arc": by arc length, through folds of both.
     until
         Where it ends, see `Goal`: "limit" at the first instability or at the last target, "bifurcation",
         "target" at the last target, "points" after so many steps.
@@ -70,17 +72,17 @@ def trace(
         first = 1.0  # the targets say how long a step is
     if not first:
         raise ValueError(f"trace: {name}: give first, the change of the amplitude in the first step, not zero")
-    rest = scene.newton.solve(state, name, GivenLoad(state.mu[name]))
+    rest = scene.newton.solve(state, name, GivenLoad(name, state.mu[name]))
     if not rest.converged:
         raise Stopped(f"there is no equilibrium to start from near the given state: {rest.reason}")
     if control == "conjugate":
-        moved = scene.newton.response(rest.state, name, GivenLoad(0.0), exact=True).du
+        moved = scene.newton.response(rest.state, name, GivenLoad(name, 0.0), exact=True).du
         if max_abs(scene.newton.system.comm, moved) * abs(first) < SEEN * scene.newton.system.length:
             raise Stopped(f"{name} moves nothing at the start, so nothing is conjugate to it: follow it by arc length")
-    path, here = begin(scene, name, control, rest.state, first, 10 * first)
+    path, here = plain(scene).begin(name, control, rest.state, first, 10 * first)
     if targets and control == "conjugate":
         step = abs(targets[-1] - here.s) / 10
-        path.options = StepOptions(step, 2 * step, 1e-5 * step)
+        path = path.in_steps(StepOptions(step, 2 * step, 1e-5 * step))
     sense = float(np.copysign(1.0, first * here.dmu))
     yield Record("start", "", here)
-    yield from followed(scene, path, here, Goal(until, targets, quantity, steps, sense))
+    yield from followed(plain(scene), path, here, Goal(until, targets, quantity, steps, sense))

@@ -8,23 +8,23 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.system import Vector
+from magshell_fenicsx.mesh.shapes import DiscShape
 from magshell_fenicsx.mesh.sphere import SphereEmbedding
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.solid.model import SolidModel
 from magshell_fenicsx.simulate.scene import Scene
 
 Array = NDArray[np.float64]
-NEIGHBOURS = {1: 10, 2: 40}  # nodes that a value is interpolated from, by dimension of the chart
+NEIGHBOURS = {1: 10, 2: 40, 3: 10}  # nodes that a value is interpolated from, by dimension of the chart
 TINY = 1e-300  # the pole, where a direction is divided by its length, stays where it is
 ROUNDING = 1e-9
-EQUATOR = np.pi / 2
 
 
 def transfer(source: Scene, target: Scene, u: Vector) -> Vector:
     """A displacement of one scene in the unknowns of another; collective.
 
     On the same mesh it is copied. Else it is interpolated in the chart and scaled like the thickness or,
-    on dimpled hemispheres, like a shallow shell: see `_Stretch`.
+    on dimpled spheres, like a shallow shell: see `_Stretch`.
 
     Parameters
     ----------
@@ -57,9 +57,10 @@ def _interpolated(nodes: Array, values: Array, x: Array, rim: float) -> Array:
     outside = from_pole > rim * (1 - ROUNDING), polar > rim * (1 - ROUNDING)
     for here, wanted in (inside, outside):
         if wanted.any():
-            neighbours = NEIGHBOURS[nodes.shape[1]]
+            dim = nodes.shape[1]
+            kernel, degree = ("quintic", 3) if dim < 3 else ("linear", 0)  # cubics may vanish on a surface in space
             field = scipy.interpolate.RBFInterpolator(
-                nodes[here], values[here], neighbors=neighbours, kernel="quintic", degree=3
+                nodes[here], values[here], neighbors=NEIGHBOURS[dim], kernel=kernel, degree=degree
             )
             found[wanted] = field(x[wanted])
     return found
@@ -80,15 +81,16 @@ def _matching(source: Scene, target: Scene) -> NDArray[np.int64] | None:
 
 @dataclass(frozen=True)
 class _Stretch:
-    """From the chart of a dimpled hemisphere to that of another, whose rim is at other polar angle.
+    """From the chart of a dimpled sphere to that of another up to the same edge, whose rim is at other polar angle.
 
-    The charts are similar up to the rim, and equal at the equator. With the ratio q of the rims, displacements
+    The charts are similar up to the rim, and equal at the edge. With the ratio q of the rims, displacements
     across the surface are scaled by q^2 and those along it by q^3: so do the strains u_n/R + u_t,s + u_n,s^2/2
     of a shallow shell keep their shape. What is out of proportion in them, Newton's method forgives least.
     """
 
     rim: float
     source_rim: float
+    edge: float
 
     def place(self, x: Array) -> Array:
         """Where the source has the points x (n, 1 or 2) of the target."""
@@ -108,16 +110,16 @@ class _Stretch:
     def _polar(self, polar: Array) -> Array:
         t = self._beyond(polar)
         ratio = self.source_rim / self.rim
-        return np.asarray(np.clip(ratio * polar + (1 - ratio) * EQUATOR * t**2, 0, EQUATOR))
+        return np.asarray(np.clip(ratio * polar + (1 - ratio) * self.edge * t**2, 0, self.edge))
 
     def _slope(self, polar: Array) -> Array:
         ratio = self.source_rim / self.rim
-        slope = ratio + (1 - ratio) * EQUATOR * 2 * self._beyond(polar) / (EQUATOR - self.rim)
+        slope = ratio + (1 - ratio) * self.edge * 2 * self._beyond(polar) / (self.edge - self.rim)
         return np.asarray(np.maximum(slope, 0.5))
 
     def _beyond(self, polar: Array) -> Array:
-        """0 up to the rim, 1 at the equator."""
-        return np.asarray(np.maximum((polar - self.rim) / (EQUATOR - self.rim), 0.0))
+        """0 up to the rim, 1 at the edge."""
+        return np.asarray(np.maximum((polar - self.rim) / (self.edge - self.rim), 0.0))
 
 
 def _frame(polar: Array, azimuth: Array) -> tuple[Array, Array]:
@@ -127,13 +129,15 @@ def _frame(polar: Array, azimuth: Array) -> tuple[Array, Array]:
 
 def _stretch(source: Scene, target: Scene) -> _Stretch | None:
     """None where the charts are compared as they are."""
-    rims = []
+    rims, edges = [], []
     for scene in (target, source):
-        embedding = scene.plan.embedding
+        embedding, shape = scene.plan.embedding, scene.plan.shape
         if not isinstance(embedding, SphereEmbedding) or embedding.defect is None:
             return None
+        assert isinstance(shape, DiscShape)
         rims.append(embedding.defect.phi_o)
-    return _Stretch(*rims)
+        edges.append(shape.radius)
+    return _Stretch(rims[0], rims[1], edges[0]) if abs(edges[0] - edges[1]) < ROUNDING else None
 
 
 def _all_nodes(scene: Scene) -> Array:
@@ -144,16 +148,17 @@ def _all_nodes(scene: Scene) -> Array:
 def chart(scene: Scene) -> Array:
     """Coordinates (n, 1 or 2) of this rank's nodes in the chart, where a defect does not move them.
 
-    Of a solid with their height in the thickness: its displacements are carried to the same mesh only.
+    Of a solid with their height in the thickness: its displacements are carried to the same mesh only. Of a mesh file
+    their places (n, 3).
     """
     model = scene.model
     if isinstance(model, MeridianModel):
         return np.asarray(model.V.tabulate_dof_coordinates()[:, :1])
-    r0: Array = model.r0.x.array[: model.system.size].reshape(-1, 3)
     if isinstance(model, SolidModel):
         body = model.body
-        return body.at_nodes(model.V, np.column_stack([body.chart, body.heights]))[: len(r0)]
-    if not isinstance(scene.plan.embedding, SphereEmbedding):
-        return r0[:, :2]
-    across = np.hypot(r0[:, 0], r0[:, 1])[:, None]
-    return np.asarray(r0[:, :2] * np.arctan2(across, r0[:, 2:]) / np.maximum(across, TINY))
+        places = body.at_nodes(model.V, np.column_stack([body.chart, body.heights]))
+        return places[: model.V.dofmap.index_map.size_local]
+    cells, nodes = model.midsurface.charted(model.V), model.V.dofmap.list
+    found = np.full((model.V.dofmap.index_map.size_local + model.V.dofmap.index_map.num_ghosts, cells.shape[2]), np.inf)
+    np.minimum.at(found, nodes, cells)  # of a node on a seam, which has two places, the first
+    return found[: model.V.dofmap.index_map.size_local]

@@ -126,7 +126,7 @@ def test_dimple_drift_on_the_shell() -> None:
             np.arctan2(rho, z)
         ).T
         guess = State(shell.model.system.held(np.column_stack([U * c, U * s, W]).ravel()), record.point.state.mu)
-        volume = -shell.model.system.potential(guess.u, "pressure")
+        volume = -shell.model.system.potential(guess.u, {}, "pressure")
         there = shell.newton.solve(guess, "pressure", GivenConjugate(shell.newton.system, "pressure", volume))
         assert there.converged
         assert there.state.mu["pressure"] == pytest.approx(record.point.state.mu["pressure"], rel=4e-3)
@@ -180,6 +180,15 @@ def test_clamped_plate() -> None:
     pressure = 1e-5 * 2 / (3 * (1 - nu**2)) ** 0.5 / R_over_h**2
     w0_over_h = pressure * 12 * (1 - nu**2) * R_over_h**4 / 64
     assert found.rows[-1]["w_pole_over_h"] == pytest.approx(w0_over_h, rel=1e-4)
+
+
+def test_cylinder_waves() -> None:
+    """The half shell's first bifurcation, p/p_c = 0.113764 with elements of 0.14 R; a tube between two walls, m = 9."""
+    found = result("cylinder_waves.yaml")
+    (first,) = found.limit_points
+    assert (first["kind"], first["mode"]) == ("bifurcation", "m = 9")
+    assert found.knockdown == pytest.approx(0.113764, rel=2e-4)
+    assert found.rows[-1]["label"] == "bifurcation"
 
 
 def test_bracket() -> None:

@@ -21,7 +21,7 @@ class Noisy(Toy):
     noise: Noise
 
     def residual(self, u: Vector, mu: Amplitudes) -> Vector:
-        return self.noise.on_vector(self.gradient(u), 0) + mu["load"] * self.load(u, "load")
+        return self.noise.on_vector(self.gradient(u), 0) + mu["load"] * self.load(u, mu, "load")
 
     def tangent(self, u: Vector, mu: Amplitudes, stress: Sequence[Weighted] = ()) -> PETSc.Mat:
         K = super().tangent(u, mu)

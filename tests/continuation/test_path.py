@@ -22,7 +22,7 @@ def path_of(toy: Toy, control: Control, options: StepOptions) -> tuple[Path, Poi
 
 def test_load_control_finds_the_equilibrium() -> None:
     toy = snap_through()
-    outcome = BorderedNewton(toy).solve(State(np.zeros(1), {"load": 0.0}), "load", GivenLoad(0.2))
+    outcome = BorderedNewton(toy).solve(State(np.zeros(1), {"load": 0.0}), "load", GivenLoad("load", 0.2))
     assert outcome.converged
     u = outcome.state.u[0]
     assert u**3 - 3 * u**2 + 2 * u == pytest.approx(0.2, abs=1e-9)
@@ -80,7 +80,7 @@ def test_bifurcation_is_located(control: Control) -> None:
 def test_imperfection_turns_the_pitchfork_into_a_stable_path() -> None:
     """The path bends away from the bifurcation: no instability, v^2 -> u - 1."""
     path, straight = path_of(pitchfork(imperfection=0.01), "conjugate", StepOptions(0.1, 0.2, 1e-6))
-    bent = path.newton.solve(straight.state, "load", GivenLoad(0.0))
+    bent = path.newton.solve(straight.state, "load", GivenLoad("load", 0.0))
     point = start = path.start(bent.state)
     for point, _ in path.towards(start, [3.0]):
         assert point.negative_pivots == 0
@@ -97,7 +97,7 @@ def test_targets_are_met_exactly() -> None:
 def test_a_solver_is_released_with_its_factors() -> None:
     """PETSc calls back into the solver but must not keep it: sweeps make hundreds."""
     newton = BorderedNewton(snap_through())
-    newton.solve(State(np.zeros(1), {"load": 0.0}), "load", GivenLoad(0.1))
+    newton.solve(State(np.zeros(1), {"load": 0.0}), "load", GivenLoad("load", 0.1))
     gone = weakref.ref(newton)
     del newton
     gc.collect()

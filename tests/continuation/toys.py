@@ -19,6 +19,7 @@ class Toy:
     size: int
     length: float = 1.0
     comm = MPI.COMM_SELF
+    coordinates = frozenset[str]()
 
     def __post_init__(self) -> None:
         self.K = PETSc.Mat().createAIJ([self.size, self.size], comm=self.comm)
@@ -26,15 +27,18 @@ class Toy:
         self.K.setOption(PETSc.Mat.Option.SYMMETRIC, True)
 
     def residual(self, u: Vector, mu: Amplitudes) -> Vector:
-        return self.gradient(u) + mu["load"] * self.load(u, "load")
+        return self.gradient(u) + mu["load"] * self.load(u, mu, "load")
 
-    def load(self, u: Vector, name: str) -> Vector:
+    def load(self, u: Vector, mu: Amplitudes, name: str) -> Vector:
         column = np.zeros(self.size)
         column[0] = -1.0
         return column
 
-    def potential(self, u: Vector, name: str) -> float:
+    def potential(self, u: Vector, mu: Amplitudes, name: str) -> float:
         return -float(u[0])
+
+    def curvature(self, u: Vector, mu: Amplitudes, name: str, other: str) -> float:
+        return 0.0
 
     def tangent(self, u: Vector, mu: Amplitudes, stress: Sequence[Weighted] = ()) -> PETSc.Mat:
         self.K.setValues(range(self.size), range(self.size), self.hessian(u))

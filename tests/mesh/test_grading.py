@@ -1,11 +1,19 @@
 """The estimate of a mesh's size before it is made."""
 
+from typing import Any
+
+import numpy as np
 import pytest
 from conftest import CASES
+from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.source import Source
+from magshell_fenicsx.mesh.grid import Grid
 from magshell_fenicsx.mesh.triangulation import triangulate
 from magshell_fenicsx.plan.planner import make_plan
+
+Array = NDArray[np.float64]
 
 
 @pytest.mark.parametrize(
@@ -24,3 +32,39 @@ def test_estimate_of_cells_is_near_what_gmsh_makes(file: str, setting: str) -> N
     plan = make_plan(Case.load(CASES / file, [setting]))
     cells = len(triangulate(plan.shape, plan.size, plan.points, plan.embedding).cells)
     assert 0.9 < plan.size.cells(plan.shape) / cells < 1.6
+
+
+PLATE = {"geometry": "plate", "length": 1, "width": 1, "thickness": 0.005, "poisson_ratio": 0.3}
+
+
+def lines(**sections: Any) -> list[Array]:
+    """Those of a grid across its axes."""
+    data = {"shell": PLATE, "boundary": {"left": "clamped"}, "symmetry": "none", **sections}
+    plan = make_plan(Case.from_source(Source("test", data)))
+    assert isinstance(plan.shape, Grid)
+    assert plan.shape.cells == pytest.approx(len(plan.triangulated().cells), rel=0.35)
+    return [plan.shape.lines(axis, list(plan.points.values())) for axis in range(2)]
+
+
+def test_grid_lines_are_dense_where_an_edge_is_held() -> None:
+    """1.2 sqrt(Rh) at the clamped edge, 2 sqrt(Rh) far from it; all the same along it."""
+    across, along = lines()
+    steps, root = np.diff(across), np.sqrt(0.005)
+    assert steps[0] == pytest.approx(1.4 * root, rel=0.2)  # the mean of the size over the first step
+    assert steps[-1] == pytest.approx(2 * root, rel=0.2)
+    assert (np.diff(steps) > -1e-12).all()
+    assert np.diff(along) == pytest.approx(np.full(len(along) - 1, along[1]))
+
+
+def test_grid_lines_are_dense_at_a_load() -> None:
+    """Down to the thickness at the point, the same on either side of it."""
+    loading = {"kind": "indentation", "at": {"point": "A"}, "depth": 1}
+    for x in lines(points={"A": [0.5, 0.5, 0]}, loading=loading, boundary=dict.fromkeys(("left", "right"), "clamped")):
+        steps = np.diff(x)
+        assert steps == pytest.approx(steps[::-1])
+        assert steps.min() == pytest.approx(0.005, rel=0.5)
+        assert steps.max() > 10 * steps.min()
+
+
+def test_a_given_size_is_everywhere() -> None:
+    assert [np.diff(x) for x in lines(mesh={"size": 0.1})] == [pytest.approx(np.full(10, 0.1))] * 2

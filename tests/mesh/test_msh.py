@@ -286,6 +286,7 @@ def test_rest_of_a_mesh_without_patches(model: Any, tmp_path: Path) -> None:
     magnetic = {"lambda_m": 1e-3, "remanent": {"kind": "patches", "patches": {"rest": {"polar": 0}}}}
     shell = {"geometry": "mesh", "file": str(tmp_path / "part.msh"), "radius": 1, **MATERIAL}
     data = {"shell": shell, "boundary": {"rim": "clamped"}, "magnetic": magnetic, "mesh": {"degree": 2}}
+    data["symmetry"] = "none"  # its two triangles are each other's mirror images
     scene = Scene(Case.from_source(Source("test", data)), MPI.COMM_SELF)
     assert not scene.model.midsurface.patches
     assert isinstance(scene.model.loads.magnetic.remanent, ByPatch)  # type: ignore[union-attr]
@@ -320,6 +321,7 @@ shell: {geometry: mesh, file: parts/part.msh, radius: 1, thickness: 0.02, youngs
 boundary: {rim: clamped}
 loading: {kind: dead, control: load, loads: [{over: all, pressure: 1e-9}], factor: 1, points: 1}
 mesh: {degree: 2}
+symmetry: none
 """
 
 

@@ -69,7 +69,7 @@ def test_first_order_energy_is_the_work_of_the_loads() -> None:
     shell = model(Magnetisation(UP, Ba, "first"))
     x, y, z = shell.r0.x.array.reshape(-1, 3).T
     u = (z[:, None] * np.column_stack([x * z, y + z, 0.5 + x])).ravel()
-    U1 = shell.system.potential(u, "lambda_m")
+    U1 = shell.system.potential(u, {}, "lambda_m")
     r0, v = kin.jet(shell.r0, shell.V.mesh), shell.u
     n0, Br, A = kin.normal(r0), ufl.as_vector(UP.tolist()), ufl.as_vector(Ba.tolist())
     P = ufl.Identity(3) - ufl.outer(n0, n0)

@@ -118,7 +118,7 @@ def test_captions_tell_the_load() -> None:
     assert "load factor = 0.5, $w/h$ = 3" in caption(0.01, 0.3, row | {"w_over_h": 3.0})
     row |= {"field_angle": 45.0, "amplitude": "force", "force": 2.5, "w_over_h": 7.0}
     assert caption(0.01, 0.3, row).count("45") == 1
-    assert "$FR/2\\pi D$ = 2.5, $w/h$ = 7 at the load" in caption(0.01, 0.3, row)
+    assert "$F R/(2\\pi D)$ = 2.5, $w/h$ = 7 at the load" in caption(0.01, 0.3, row)
 
 
 def test_names_are_no_mathematics() -> None:

@@ -12,10 +12,11 @@ from command import magshell
 from conftest import CASES
 
 from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.source import Source
 from magshell_fenicsx.continuation.fold import Fold, FoldLost, Guess, find_fold
 from magshell_fenicsx.run.run import run
 from magshell_fenicsx.simulate.scene import Scene
-from magshell_fenicsx.simulate.transfer import same_mesh, transfer
+from magshell_fenicsx.simulate.transfer import _stretch, same_mesh, transfer
 from magshell_fenicsx.studies.sweep.continuation import Continuation
 from magshell_fenicsx.studies.sweep.outcome import Outcome
 from magshell_fenicsx.studies.sweep.sweep import sweep
@@ -128,6 +129,25 @@ def test_shallow_shells_are_similar(model: str) -> None:
     assert abs(u - there.state.u).max() < 0.1 * (100 / 90 - 1) * abs(there.state.u).max()
     held = np.concatenate([bc.dof_indices()[0] for bc in target.model.system.clamped])
     assert not u[held].any()
+
+
+def test_shallow_caps_are_similar() -> None:
+    """The same on a cap of 35 degrees, whose charts are equal at its rim."""
+
+    def at(R: int) -> tuple[Scene, Fold]:
+        dimple = {"kind": "dimple", "amplitude": 1.64, "width": 3.2}
+        shell = {"geometry": "cap", "radius": R, "thickness": 1, "polar": 35, "poisson_ratio": 0.5, "defect": dimple}
+        mesh = {"degree": 4, "refinement": 0.4}
+        data = {"shell": shell, "boundary": {"rim": "clamped"}, "mesh": mesh, "loading": {"kind": "pressure"}}
+        result = run(Case.from_source(Source("test", data)))
+        return result.scene, find_fold(result.scene.newton, Guess(result.last), "pressure")
+
+    (source, fold), (target, there) = at(90), at(100)
+    rim, stretch = np.radians([[35.0]]), _stretch(source, target)
+    assert stretch
+    assert stretch.place(rim) == pytest.approx(rim, rel=1e-12)
+    u = transfer(source, target, fold.state.u)
+    assert abs(u - there.state.u).max() < 0.1 * (100 / 90 - 1) * abs(there.state.u).max()
 
 
 def test_same_mesh_is_copied() -> None:

@@ -74,7 +74,7 @@ def test_remanence_of_the_dimple() -> None:
 
     def stronger(change: float) -> float:
         loads = replace(model.loads, magnetic=replace(field, remanent=InsideAndOutside(rim, (1 + change) * B, B)))
-        other = MeridianModel(model.meridian, model.material, model.degree, model.condition, loads)
+        other = MeridianModel(model.meridian, model.material, model.degree, model.conditions, loads)
         return find_fold(BorderedNewton(other.system), Guess(fold.state, fold.phi), "pressure").value
 
     expected = derivative(stronger, 0.02)

@@ -156,6 +156,20 @@ def test_refused(setting: str, said: str) -> None:
         Case.load(CASES / "dimple_buckling.yaml", ["mesh.tolerance=1e-3", setting])
 
 
+def test_a_tolerance_on_a_grid() -> None:
+    """A closed cylinder dented at one side, a seam in its chart: against degree 5 on 2.5 times as many cells."""
+    data = {
+        "shell": {"geometry": "cylinder", "radius": 1, "length": 1, "thickness": 0.02, "poisson_ratio": 0.3},
+        "boundary": {"bottom": "clamped", "top": "clamped"},
+        "points": {"A": [1, 0, 0.5]},
+        "loading": {"kind": "indentation", "at": {"point": "A"}, "depth": 1, "points": 1},
+    }
+    fine = Case.from_source(Source("test", {**data, "mesh": {"degree": 5, "refinement": 1.6}}))
+    mesh = adapted(Case.from_source(Source("test", {**data, "mesh": {"tolerance": 1e-2}})), COMM)
+    error = abs(mesh.best.result / by_path(Scene(fine, COMM)).value - 1)
+    assert 1e-3 < error < mesh.best.estimate < 1e-2
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("ranks", [2, 3])
 def test_in_parallel(ranks: int, tmp_path: Path) -> None:

@@ -55,7 +55,7 @@ def test_every_control_finds_the_same_point(settings: list[str]) -> None:
     scene, k = on_foundation(*settings), 0.02
     *_, pressed = ms.trace(scene, "pressure", targets=[0.2])
     *_, reference = ms.trace(scene, "foundation", pressed, control="load", targets=[k])
-    conjugate = -scene.model.system.potential(reference.point.state.u, "foundation")
+    conjugate = -scene.model.system.potential(reference.point.state.u, {}, "foundation")
     ways: list[tuple[Control, float, str]] = [("arc", k, "load"), ("conjugate", conjugate, "load")]
     for control, target, quantity in ways:
         records = list(ms.trace(scene, "foundation", pressed, control=control, targets=[target], quantity=quantity))

@@ -18,7 +18,8 @@ from magshell_fenicsx.models.modes import ShellModes
 from magshell_fenicsx.plan.plan import Plan
 from magshell_fenicsx.plan.planner import make_plan
 from magshell_fenicsx.platform.environment import versions
-from magshell_fenicsx.simulate.follow import Record, follow
+from magshell_fenicsx.simulate.follow import follow
+from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.scene import Scene
 
 HERE = Path(__file__).parent

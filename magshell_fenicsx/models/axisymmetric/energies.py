@@ -5,7 +5,7 @@ axisymmetric displacement and the waves added to it.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import ufl
@@ -18,12 +18,16 @@ from magshell_fenicsx.models.axisymmetric.meridian import Meridian
 from magshell_fenicsx.models.axisymmetric.pattern import pattern_field
 from magshell_fenicsx.models.shell import densities, edges
 from magshell_fenicsx.models.shell import kinematics as kin
+from magshell_fenicsx.models.shell.energy import Density
+from magshell_fenicsx.models.shell.free import Constants, constants_of
 from magshell_fenicsx.models.shell.kinematics import Jet
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.parameters import Magnetisation, Material
 from magshell_fenicsx.models.shell.terms import LINEAR, MAGNETIC_TERMS
 
 INTERIOR = "interior edges"
+Facets = NDArray[np.int32]
+Integral = Callable[[Expr], ufl.Form]
 
 
 @dataclass(frozen=True)
@@ -38,117 +42,154 @@ class Energy:
 
 @dataclass(frozen=True)
 class EnergyFactory:
-    """Makes the energies of one meridian; all share the placement r0."""
+    """Makes the energies of one meridian; all share the placement r0.
+
+    Attributes
+    ----------
+    thickness
+        What multiplies h, (1,); None for 1.
+    """
 
     meridian: Meridian
     r0: fem.Function
     material: Material
     sigma: float
     degree: int
+    thickness: fem.Function | None = None
+    free: Constants = field(default_factory=dict)  # of parameters that enter freely
 
     def membrane(self) -> Energy:
-        j0, nu = self._j0, self._constant(self.material.nu)
-        return self._cells("membrane", lambda u: densities.membrane(j0, u, nu))
+        j0, t, nu = self.j0, self._t, self.constant(self.material.nu)
+        return self._cells("membrane", lambda u: t * densities.membrane(j0, u, nu))
 
     def bending(self) -> Energy:
-        j0, nu, h = self._j0, *self._nu_h()
-        return self._cells("bending", lambda u: densities.bending(j0, u, nu, h))
+        j0, t, (nu, h) = self.j0, self._t, self._nu_h()
+        return self._cells("bending", lambda u: t * densities.bending(j0, u, nu, t * h))
 
     def interior_edges(self) -> Energy:
         """Folds between cells: the interior edges of the meridian are circles."""
-        j0, nu, h, sigma = self._j0, *self._nu_h(), self._constant(self.sigma)
+        j0, nu, h, sigma = self.j0, *self._nu_h(), self.constant(self.sigma)
         dS = ufl.Measure("dS", domain=self.meridian.mesh)
-        nus = {s: (self._conormal(j0)(s), 0) for s in "+-"}
-        width, radius = ufl.avg(self._width(j0)), ufl.avg(self.r0[0])
-
-        def jump(j: Jet) -> Expr:
-            return edges.fold_jump(j.side("+"), j.side("-"), nus["+"], nus["-"])
+        t = self.thickness and (self.thickness("+"), self.thickness("-"))
+        m, width = self._covector(), ufl.avg(self._width())
 
         def energy(u: Jet) -> ufl.Form:
-            M = sum(densities.normal_moment(j0.side(s), u.side(s), *nus[s], nu, h) for s in "+-") / 2
-            return edges.edge_density(M, jump(j0 + u) - jump(j0), width, nu, h, sigma) * radius * dS
+            r0, v = ((j.side("+"), j.side("-")) for j in (j0, u))
+            return edges.interior(r0, v, (m("+"), m("-")), width, nu, h, sigma, t) * dS
 
         return Energy(INTERIOR, energy)
 
-    def clamped_edges(self) -> Energy:
-        """The outer normal is held at n0."""
-        j0, nu, h, sigma = self._j0, *self._nu_h(), self._constant(self.sigma)
-        rim = self.meridian.rim
-        tags = mesh.meshtags(self.meridian.mesh, 0, rim, np.ones_like(rim))
-        ds = ufl.Measure("ds", domain=self.meridian.mesh, subdomain_data=tags)(1)
-        nu1 = self._conormal(j0)
+    def clamped_edges(self, facets: Facets) -> Energy:
+        """The normal is held at n0 at some ends."""
+        return self._ends("clamped edges", edges.clamped, facets)
 
-        def energy(u: Jet) -> ufl.Form:
-            r = j0 + u
-            M = densities.normal_moment(j0, u, nu1, 0, nu, h)
-            J = -ufl.dot(kin.normal(j0) - kin.normal(r), r.r1 * nu1)
-            return edges.edge_density(M, J, self._width(j0), nu, h, sigma) * self.r0[0] * ds
+    def mirror_edges(self, facets: Facets) -> Energy:
+        """A plane normal to e3 mirrors the shell at some ends."""
+        return self._ends("mirror edges", edges.symmetric, facets, self.constant(np.array([0.0, 0.0, 1.0])))
 
-        return Energy("clamped edges", energy)
+    def moment(self, name: str, facets: Facets, density: Density) -> Energy:
+        """A moment per length about an edge, with the amplitude "load"; `density` as of `TermFactory.edge_moment`."""
+        j0, ds, m, width = self.j0, self._ds(facets), self._covector(), self._width()
+        return Energy(name, lambda u: density.of(j0, u, m, width, *density.parameters) * ds, "load")
 
     def magnetic(self, field: Magnetisation) -> list[Energy]:
         """The terms of the chosen energy for axisymmetric fields; all have the amplitude lambda_m."""
-        j0, pattern = self._j0, field.remanent
-        Br = pattern_field(pattern, self.r0) if callable(pattern) else self._constant(pattern)
-        Ba = self._constant(field.applied)
+        j0, t, pattern = self.j0, self._t, field.remanent
+        Br = pattern_field(pattern, self.r0) if callable(pattern) else self.constant(pattern)
 
-        def term(name: str, density: Callable[[Jet, Jet, Expr, Expr], Expr]) -> Energy:
-            return self._cells(name, lambda u: density(j0, u, Br, Ba), "lambda_m", linear=name in LINEAR)
+        def term(name: str, density: Callable[[Jet, Jet, Expr, Expr], Expr], Ba: Expr) -> Energy:
+            return self._cells(name, lambda u: t * density(j0, u, Br, Ba), "lambda_m", linear=name in LINEAR)
 
-        terms = [term(name, density) for name, density in MAGNETIC_TERMS[field.energy].items()]
+        Ba = self.constant(field.applied)
+        terms = [term(name, density, Ba) for name, density in MAGNETIC_TERMS[field.energy].items()]
         if field.gradient is not None:
-            G = self._constant(field.gradient)
-            terms.append(
-                self._cells("magnetic gradient", lambda u: densities.magnetic_gradient(j0, u, Br, G), "lambda_m")
-            )
+            terms.append(term("magnetic gradient", densities.magnetic_gradient, self.constant(field.gradient)))
         return terms
 
     def pressure(self) -> Energy:
         """Amplitude p/p_c; potential p Delta V, of a live pressure."""
-        unit = self._constant(self.material.classical_pressure / self.material.h)
+        unit = self.constant(self.material.classical_pressure / self.material.h)
         return Energy("pressure", lambda u: unit * self.volume_change(u), "pressure")
 
     def own(self, term: OwnTerm) -> Energy:
-        """One's own energy, with the amplitude of its name; it shares the symmetry."""
-        j0, parameters = self._j0, [self._constant(np.asarray(p, dtype=float)) for p in term.parameters]
-        return self._cells(term.name, lambda u: term.density(j0, u, *parameters), term.name, linear=term.linear)
+        """The energy of a part or one's own, with the amplitude of its name; it shares the symmetry."""
+        return self._cells(term.name, self._surface(term, term.density), term.name, linear=term.linear)
+
+    def observed(self, term: OwnTerm, u: Jet) -> dict[str, ufl.Form]:
+        """What it observes, of the whole shell."""
+        return {
+            column: 2 * np.pi * self._cells(column, self._surface(term, of)).of(u)
+            for column, of in term.observed.items()
+        }
+
+    def _surface(self, term: OwnTerm, of: Callable[..., Expr]) -> Callable[[Jet], Expr]:
+        j0, parameters = self.j0, constants_of(term, self.meridian.mesh, self.free)
+        return lambda u: of(j0, u, *parameters)
 
     def volume_change(self, u: Jet) -> ufl.Form:
         """Delta V/R^3 per radian."""
-        return densities.volume(self._j0, u) * self._dx()
+        return densities.volume(self.j0, u) * self._dx()
 
-    def patch(self, radius: float) -> Callable[[Expr], ufl.Form]:
-        """Integral of f (1 - d^2/radius^2)^2 per radian, d the distance in space from the pole."""
-        a = self._constant(radius)
-        pole = self._constant(self.meridian.embedding(np.zeros((1, 2)))[0, [0, 2]])
+    def area(self) -> Integral:
+        """Over the undeformed area, per radian as all of these."""
+        ratio = kin.area_ratio(self.j0)
+        return lambda f: f * ratio * self._dx()
+
+    def around(self, facets: Facets) -> Integral:
+        """Along the undeformed circle of an end."""
+        return lambda f: f * self.r0[0] * self._ds(facets)
+
+    def at_pole(self) -> Integral:
+        """The value on the axis, over 2 pi."""
+        return lambda f: f / (2 * np.pi) * self._ds(self.meridian.axis)
+
+    def patch(self, radius: float) -> Integral:
+        """Of f (1 - d^2/radius^2)^2, d the distance in space from the pole."""
+        a, pole = self.constant(radius), self.constant(self.meridian.section(np.zeros(1))[0])
         inside = 1 - ufl.dot(self.r0 - pole, self.r0 - pole) / a**2
-        weight = ufl.conditional(ufl.gt(inside, 0), inside**2, 0) * kin.area_ratio(self._j0)
-        return lambda f: weight * f * self._dx()
+        weight, over = ufl.conditional(ufl.gt(inside, 0), inside**2, 0), self.area()
+        return lambda f: over(weight * f)
 
     @property
-    def _j0(self) -> Jet:
+    def j0(self) -> Jet:
+        """Of the placement."""
         return jets.revolved(self.r0)
 
-    def _constant(self, value: float | NDArray[np.float64]) -> fem.Constant:
+    def constant(self, value: float | NDArray[np.float64]) -> fem.Constant:
+        """A number or a vector in a form."""
         return fem.Constant(self.meridian.mesh, value)
 
+    @property
+    def _t(self) -> Expr | float:
+        return 1.0 if self.thickness is None else self.thickness[0]
+
     def _nu_h(self) -> tuple[fem.Constant, fem.Constant]:
-        return self._constant(self.material.nu), self._constant(self.material.h)
+        return self.constant(self.material.nu), self.constant(self.material.h)
 
     def _dx(self) -> ufl.Measure:
         # one point more than the surface's 2k: on the axis the densities are rational
         return ufl.Measure("dx", domain=self.meridian.mesh, metadata={"quadrature_degree": 2 * self.degree + 2})
 
-    def _conormal(self, j0: Jet) -> Expr:
-        """nu^1 of the undeformed outward unit conormal; nu^2 = 0."""
-        return ufl.FacetNormal(self.meridian.mesh)[0] / ufl.sqrt(ufl.dot(j0.r1, j0.r1))
+    def _ds(self, facets: Facets) -> ufl.Measure:
+        tags = mesh.meshtags(self.meridian.mesh, 0, facets, np.ones_like(facets))
+        return ufl.Measure("ds", domain=self.meridian.mesh, subdomain_data=tags)(1)
 
-    def _width(self, j0: Jet) -> Expr:
+    def _covector(self) -> Expr:
+        """Of an edge, see `kinematics.conormal`: its length is then that per radian."""
+        return ufl.as_vector([ufl.FacetNormal(self.meridian.mesh)[0], 0])
+
+    def _width(self) -> Expr:
         """Half the length of a cell, as the triangles of the surface have half their height."""
-        return ufl.CellVolume(self.meridian.mesh) / 2 * ufl.sqrt(ufl.dot(j0.r1, j0.r1))
+        return ufl.CellVolume(self.meridian.mesh) / 2 * ufl.sqrt(ufl.dot(self.j0.r1, self.j0.r1))
 
     def _cells(
         self, name: str, density: Callable[[Jet], Expr], amplitude: str | None = None, *, linear: bool = False
     ) -> Energy:
-        ratio = kin.area_ratio(self._j0)
-        return Energy(name, lambda u: density(u) * ratio * self._dx(), amplitude, linear)
+        over = self.area()
+        return Energy(name, lambda u: over(density(u)), amplitude, linear)
+
+    def _ends(self, name: str, density: Callable[..., Expr], facets: Facets, *rest: Expr) -> Energy:
+        """The bending energy of ends whose normal does not turn freely."""
+        j0, t, nu, h, sigma = self.j0, self._t, *self._nu_h(), self.constant(self.sigma)
+        ds, m, width = self._ds(facets), self._covector(), self._width()
+        return Energy(name, lambda u: t * density(j0, u, m, width, nu, t * h, sigma, *rest) * ds)

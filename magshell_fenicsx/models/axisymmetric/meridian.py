@@ -1,6 +1,6 @@
 """The meridian of a surface of revolution: an interval mesh and, apart from it, the placement r0."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from math import sqrt
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.mesh.patch import Embedding
 
 Array = NDArray[np.float64]
+Names = tuple[str | None, str]
 
 
 @dataclass(frozen=True)
@@ -24,27 +25,64 @@ class Meridian:
     ----------
     mesh
         Interval mesh over the parameter s, the distance from the origin of the chart.
-    axis, rim
-        Facets (local numbers) of the point on the axis and of the outer end.
+    axis
+        Facets (local numbers) of the point on the axis, none where the surface has a hole there.
+    ends
+        Name -> facets of the ends that are edges of the surface.
     embedding
         Chart (n, 2) -> surface (n, 3), of revolution about e3.
+    points
+        Name -> parameter s and azimuth (rad) of a place whose displacement is observed.
+    curvature
+        The largest of the meridian over 1/R, at least 1.
     """
 
     mesh: mesh.Mesh
     axis: NDArray[np.int32]
-    rim: NDArray[np.int32]
+    ends: Mapping[str, NDArray[np.int32]]
     embedding: Embedding
+    points: Mapping[str, tuple[float, float]]
+    curvature: float
+
+    @property
+    def reach(self) -> float:
+        """The largest distance from the axis, at least 1."""
+        return max(1.0, float(self.section(self.mesh.geometry.x[:, 0])[:, 0].max()))
+
+    def parameter(self, end: str) -> float:
+        """s there."""
+        return float(self.mesh.geometry.x[mesh.entities_to_geometry(self.mesh, 0, self.ends[end])[0, 0], 0])
+
+    def section(self, s: Array) -> Array:
+        """(n, 2) rho and z at some parameters."""
+        return np.asarray(self.embedding(np.column_stack([s, 0 * s]))[:, [0, 2]])
 
     def placement(self, V: fem.FunctionSpace) -> fem.Function:
         """(rho, z) in the Lagrange space `V` of two components, so that axial motions are exact."""
         s = V.tabulate_dof_coordinates()[:, 0]
         r0 = fem.Function(V, name="r0")
-        r0.x.array[:] = self.embedding(np.column_stack([s, 0 * s]))[:, [0, 2]].ravel()
+        r0.x.array[:] = self.section(s).ravel()
         return r0
 
 
-def make_meridian(embedding: Embedding, vertices: Array) -> Meridian:
-    """Mesh the meridian; `vertices` (n,) ascend from 0 on the axis."""
+def make_meridian(
+    embedding: Embedding,
+    vertices: Array,
+    names: Names = (None, "rim"),
+    points: Mapping[str, tuple[float, float]] | None = None,
+    curvature: float = 1.0,
+) -> Meridian:
+    """Mesh the meridian.
+
+    Parameters
+    ----------
+    vertices
+        (n,) ascending from 0.
+    names
+        Of its ends, None for the axis.
+    points
+        See `Meridian`; by default the one on the axis, "pole".
+    """
     numbers = np.arange(len(vertices), dtype=np.int64)
     element = basix.ufl.element("Lagrange", "interval", 1, shape=(1,))
     domain = mesh.create_mesh(
@@ -53,15 +91,18 @@ def make_meridian(embedding: Embedding, vertices: Array) -> Meridian:
         x=vertices[:, None].astype(np.float64),
         e=element,
     )
-    axis, rim = (
+    domain.topology.create_connectivity(0, 1)
+    facets = [
         mesh.locate_entities_boundary(domain, 0, lambda x, end=end: np.isclose(x[0], end))
         for end in (vertices[0], vertices[-1])
-    )
-    return Meridian(domain, axis, rim, embedding)
+    ]
+    axis = np.empty(0, np.int32) if names[0] else facets[0]
+    ends = {name: end for name, end in zip(names, facets, strict=True) if name}
+    return Meridian(domain, axis, ends, embedding, points or {"pole": (0.0, 0.0)}, curvature)
 
 
-def graded_vertices(end: float, circle: float | None, h: float, *, refinement: float = 1.0) -> Array:
-    """Vertices for 1e-7 in k_d at degree 4: cells of a fraction of sqrt(h), finer on the axis.
+def graded_vertices(end: float, circle: float | None, h: float, *, refinement: float = 1.0, axis: bool = True) -> Array:
+    """Vertices for 1e-7 in k_d at degree 4: cells of a fraction of sqrt(h), finer on the axis, if 0 is there.
 
     Parameters
     ----------
@@ -80,7 +121,7 @@ def graded_vertices(end: float, circle: float | None, h: float, *, refinement: f
     largest, smallest, growth = 0.2 * sqrt(h) / refinement, h, 0.3 / refinement
 
     def size(s: Array) -> Array:
-        return np.minimum(smallest + growth * s, largest)
+        return np.minimum(smallest + growth * s, largest) if axis else np.full_like(s, largest)
 
     corners = [0.0, end] if circle is None or circle >= end else [0.0, circle, end]
     return _equidistributed(corners, size)
@@ -97,9 +138,3 @@ def _equidistributed(corners: Sequence[float], size: Callable[[Array], Array]) -
         piece[[0, -1]] = a, b
         pieces.append(piece[:-1])
     return np.concatenate([*pieces, corners[-1:]])
-
-
-def held_at(V: fem.FunctionSpace, facets: NDArray[np.int32], component: int) -> fem.DirichletBC:
-    """A component is zero at an end of the meridian."""
-    part = V.sub(component)
-    return fem.dirichletbc(0.0, fem.locate_dofs_topological(part, 0, facets), part)

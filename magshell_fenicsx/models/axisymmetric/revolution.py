@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.system import Vector
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
-from magshell_fenicsx.models.axisymmetric.pattern import cell_normals
+from magshell_fenicsx.models.axisymmetric.pattern import nodal_normals
 
 Array = NDArray[np.float64]
 OFF_POLE = 1e-3  # of the first cell
@@ -18,7 +18,7 @@ class Revolution:
     Attributes
     ----------
     r0, n0
-        (n, 3) undeformed placement and unit normal, lengths in R; the pole comes first.
+        (n, 3) undeformed placement and unit normal, lengths in R; a pole comes first.
     cells
         (m, 3) node numbers of triangles with the outer side up.
     """
@@ -30,11 +30,10 @@ class Revolution:
         cos, sin, zero = np.cos(theta), np.sin(theta), 0 * theta
         basis = np.array([[cos, sin, zero], [-sin, cos, zero], [zero, zero, zero + 1]])  # e_rho, e_theta, e_z
         self._basis = np.moveaxis(basis, -1, 0)
-        normals = np.zeros((len(model.r0.x.array) // 2, 3))
-        np.add.at(normals, V.dofmap.list, cell_normals(model.r0))
-        normals /= np.linalg.norm(normals, axis=1)[:, None]
+        self._first = min(len(model.meridian.axis), 1)  # circle: all sectors meet in the pole
+        normals = nodal_normals(model.r0)
         self.r0, self.n0 = self._turned(model.r0.x.array.reshape(-1, 2)), self._turned(normals[:, [0, 2]])
-        self.cells = self._triangles(len(self._vertices) - 1, sectors)
+        self.cells = self._triangles(len(self._vertices) - self._first, sectors)
 
     def displacement(self, u: Vector) -> Array:
         """The displacement of the nodes, (n, 3) over R."""
@@ -45,16 +44,25 @@ class Revolution:
 
         At the pole, where the surface has no second direction, a little off it.
         """
-        V = f.function_space
-        order = np.argsort(V.tabulate_dof_coordinates()[V.dofmap.list].mean(axis=1)[:, 0])
-        nodes = f.x.array.reshape(-1, 2)[V.dofmap.list[order]]
-        table = V.element.basix_element.tabulate(2, np.array([[0.0], [1.0], [OFF_POLE]]))[:, :, :, 0]
-        values = np.einsum("dvk,cki->dcvi", table, nodes)
-        values[:, 0, 0] = values[:, 0, 2]
+        values = self._at_ends(f)
+        if self._first:
+            values[:, 0, 0] = values[:, 0, 2]
         (U, W), (Us, Ws), (Uss, Wss) = np.moveaxis(values[:, :, :2], -1, 1)
         o = np.zeros_like(U)
         jet = [(U, o, W), (Us, o, Ws), (o, U, o), (Uss, o, Wss), (o, Us, o), (-U, o, o)]
         return np.stack([np.stack(v, axis=-1) for v in jet])
+
+    def scalars(self, f: fem.Function) -> Array:
+        """The values of a field (1,) at the ends of all cells: (cells, 2)."""
+        return self._at_ends(f)[0, :, :2, 0]
+
+    def _at_ends(self, f: fem.Function) -> Array:
+        """(3, cells, 3, components) values, first and second derivatives, the last ones a little off the first end."""
+        V = f.function_space
+        cells, bs = V.dofmap.list, V.dofmap.bs
+        order = np.argsort(V.tabulate_dof_coordinates()[cells].mean(axis=1)[:, 0])
+        table = V.element.basix_element.tabulate(2, np.array([[0.0], [1.0], [OFF_POLE]]))[:, :, :, 0]
+        return np.asarray(np.einsum("dvk,cki->dcvi", table, f.x.array.reshape(-1, bs)[cells[order]]))
 
     def around(self, ends: Array, weight: Array) -> Array:
         """Values at the nodes, of those at the ends of all cells.
@@ -74,27 +82,28 @@ class Revolution:
             return total
 
         at = sums(weight * ends) / sums(weight)
-        circles = at[1:, None]
+        circles = at[self._first :, None]
         if at.ndim == 1:
             circles = np.repeat(circles, len(self._basis), axis=1)
         elif at.ndim == 2:
             circles, at = (circles[:, :, None] @ self._basis)[:, :, 0], at * [0.0, 0.0, 1.0]
         else:
             circles = np.swapaxes(self._basis, 1, 2) @ circles @ self._basis
-        return np.concatenate([at[:1], circles.reshape(-1, *at.shape[1:])])
+        return np.concatenate([at[: self._first], circles.reshape(-1, *at.shape[1:])])
 
     def _turned(self, nodal: Array) -> Array:
         """(rho, z) components at the meridian's nodes -> vectors at the pole and on the circles."""
         along = nodal[self._vertices]
-        circles = along[1:, None, :1] * self._basis[:, 0] + along[1:, None, 1:] * self._basis[:, 2]
-        return np.concatenate([[[0.0, 0.0, along[0, 1]]], circles.reshape(-1, 3)])
+        turning = along[self._first :, None]
+        circles = turning[:, :, :1] * self._basis[:, 0] + turning[:, :, 1:] * self._basis[:, 2]
+        pole = along[: self._first] * [0.0, 1.0]
+        return np.concatenate([np.insert(pole, 1, 0.0, axis=1), circles.reshape(-1, 3)])
 
-    @staticmethod
-    def _triangles(circles: int, sectors: int) -> NDArray[np.int64]:
+    def _triangles(self, circles: int, sectors: int) -> NDArray[np.int64]:
         here = np.arange(sectors)
         there = (here + 1) % sectors
-        cap = np.column_stack([0 * here, 1 + here, 1 + there])
-        inner = 1 + sectors * np.arange(circles - 1)[:, None]
+        cap = np.column_stack([0 * here, 1 + here, 1 + there])[: sectors * self._first]
+        inner = self._first + sectors * np.arange(circles - 1)[:, None]
         a, b, c, d = inner + here, inner + there, inner + sectors + here, inner + sectors + there
         bands = [np.stack(corners, axis=-1).reshape(-1, 3) for corners in ((a, c, d), (a, d, b))]
         return np.concatenate([cap, *bands])

@@ -22,8 +22,8 @@ from magshell_fenicsx.continuation.inverse import nearest_to_zero
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.models.axisymmetric import jets
 from magshell_fenicsx.models.axisymmetric.energies import INTERIOR, Energy
-from magshell_fenicsx.models.axisymmetric.meridian import Meridian, held_at
-from magshell_fenicsx.models.shell.parameters import Condition
+from magshell_fenicsx.models.axisymmetric.meridian import Meridian
+from magshell_fenicsx.models.axisymmetric.supports import Supports
 from magshell_fenicsx.platform import compat
 
 
@@ -35,7 +35,9 @@ class Waves:
     system
         Of the axisymmetric displacement.
     energies
-        Its terms as functions of a jet, and the condition of the outer edge.
+        Its terms as functions of a jet.
+    supports
+        What is held.
 
     Attributes
     ----------
@@ -44,7 +46,8 @@ class Waves:
     largest
         Waves that are looked at by default: m = 1 to this. The perfect sphere buckles in
         waves of length 2 pi sqrt(Rh)/(12(1 - nu^2))^(1/4), of which
-        1.73 (nu = 0.5) to 1.86 (nu = 0) times sqrt(R/h) fit around the equator.
+        1.73 (nu = 0.5) to 1.86 (nu = 0) times sqrt(R/h) fit around the equator; a wider circle has more, and
+        so has a surface of smaller radii of curvature.
     """
 
     def __init__(
@@ -52,21 +55,18 @@ class Waves:
         system: FiniteElementSystem,
         energies: Sequence[Energy],
         meridian: Meridian,
-        condition: Condition,
+        supports: Supports,
         log: KernelLog,
     ) -> None:
         self._system = system
         degree = system.u.function_space.element.basix_element.degree
         self.V = V = fem.functionspace(meridian.mesh, ("Lagrange", degree, (3,)))
-        self.largest = ceil(2.2 / sqrt(system.length)) + 5
+        self.largest = ceil(2.2 * meridian.reach * sqrt(meridian.curvature / system.length)) + 5
         self._m = fem.Constant(V.mesh, 1.0)
         self._factor = fem.Constant(V.mesh, 1.0)
         kept = [e for e in energies if not e.linear]
         self._forms = [(e.amplitude, log.compile(f"{e.name} waves", self._second(e))) for e in kept]
-        axis, rim = meridian.axis, meridian.rim
-        edge = [] if condition == "free" else [held_at(V, rim, i) for i in range(3)]
-        self._held_once = [held_at(V, axis, 0), held_at(V, axis, 2), *edge]
-        self._held = [held_at(V, axis, 1), *self._held_once]
+        self._held_once, self._held = supports.held_waves(V, 1), supports.held_waves(V, 2)
         pattern = next(form for e, (_, form) in zip(kept, self._forms, strict=True) if e.name == INTERIOR)
         self._K = fem_petsc.create_matrix(pattern)
         self._K.setOption(PETSc.Mat.Option.SYMMETRIC, True)
@@ -78,11 +78,12 @@ class Waves:
     def tangent(self, state: State, m: int) -> PETSc.Mat:
         """The matrix of Q_m at an axisymmetric state; it is reused by the next call."""
         self._system.set(state.u)
+        self._system.place(state.mu)
         self._assemble(self._K, state, m, self.held(m))
         return self._K
 
     def held(self, m: int) -> list[fem.DirichletBC]:
-        """What is held at the axis and at the rim: a wave m = 1 may move the axis across itself."""
+        """What is held at the axis and at the ends: a wave m = 1 may move the axis across itself."""
         return self._held_once if m == 1 else self._held
 
     def factor_at(self, state: State, m: int) -> Factorisation:
@@ -97,6 +98,7 @@ class Waves:
         between five.
         """
         self._system.set(state.u)
+        self._system.place(state.mu)
         for part, node in zip(self._parts, self._nodes, strict=True):
             self._assemble(part, state, node, [])
         if self._interpolated is None:

@@ -8,10 +8,7 @@ two halves tilt against each other.
 
 from collections.abc import Sequence
 
-import numpy as np
 import ufl
-from dolfinx import fem
-from numpy.typing import NDArray
 from ufl.core.expr import Expr
 
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
@@ -22,7 +19,6 @@ from magshell_fenicsx.models.shell import densities
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.edges import edge_density
 from magshell_fenicsx.models.shell.kinematics import Jet
-from magshell_fenicsx.models.shell.parameters import MIRROR_NORMAL
 
 
 def antisymmetric_edge(
@@ -83,9 +79,3 @@ class AntisymmetricModes:
     def counts(self, state: State) -> Sequence[int]:
         """The number of unstable directions at a symmetric state."""
         return [self.factor_at(state).negative_pivots]
-
-
-def held_against_mirror(V: fem.FunctionSpace, facets: NDArray[np.int32]) -> list[fem.DirichletBC]:
-    """v = (v . m) m on the mirror plane."""
-    in_plane = [V.sub(i) for i in range(3) if not MIRROR_NORMAL[i]]
-    return [fem.dirichletbc(0.0, fem.locate_dofs_topological(W, 1, facets), W) for W in in_plane]

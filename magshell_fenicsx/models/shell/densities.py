@@ -101,12 +101,13 @@ def _rotation(r0: Jet, u: Jet) -> Expr:
     return ufl.dot(n0, u.r1) * up1 + ufl.dot(n0, u.r2) * up2
 
 
-def volume(r0: Jet, u: Jet) -> Expr:
-    """(r . n dω - r0 . n0 dω0)/3 per flat area (already includes the area ratio)."""
+def volume(r0: Jet, u: Jet, origin: Expr | None = None) -> Expr:
+    """(x . n dω - x0 . n0 dω0)/3 per flat area (already includes the area ratio), x told from the origin."""
     r = r0 + u
-    return (ufl.dot(r.r, kin.area_vector(r)) - ufl.dot(r0.r, kin.area_vector(r0))) / 3
+    x, x0 = (r.r, r0.r) if origin is None else (r.r - origin, r0.r - origin)
+    return (ufl.dot(x, kin.area_vector(r)) - ufl.dot(x0, kin.area_vector(r0))) / 3
 
 
-def pressure(r0: Jet, u: Jet, unit: Expr) -> Expr:
+def pressure(r0: Jet, u: Jet, unit: Expr, origin: Expr | None = None) -> Expr:
     """Pi/p of a live pressure in that unit; per area of the coordinates as `volume`."""
-    return unit * volume(r0, u)
+    return unit * volume(r0, u, origin)

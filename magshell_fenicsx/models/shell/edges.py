@@ -93,7 +93,7 @@ def turning(r0: Jet, u: Jet, m: Expr, width: Expr, intensity: Expr, past: Expr) 
 
     The tangent runs with the surface on its left, so that a positive angle turns the normal outward. The
     angle is that of the normal's part normal to the tangent; `past` (2,) holds cosine and sine of the turn
-    that it is told from, so that it may grow beyond pi.
+    that it is counted from, so that it may grow beyond pi.
     """
     along = r0.r2 * m[0] - r0.r1 * m[1]
     length = ufl.sqrt(ufl.dot(along, along))

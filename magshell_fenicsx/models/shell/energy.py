@@ -15,14 +15,10 @@ from ufl.core.expr import Expr
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.terms import DensityTerm
 from magshell_fenicsx.models.shell import kinematics as kin
-from magshell_fenicsx.models.shell.kinematics import Jet
+from magshell_fenicsx.models.shell.kinematics import FIRST, Jet
 from magshell_fenicsx.platform import compat
 
 Parameter: TypeAlias = fem.Constant | fem.Function
-FIRST = ("r1", "r2")
-SECOND = ("r11", "r12", "r22")
-CURVED = (*FIRST, *SECOND)
-MOVED = ("r", *FIRST)
 
 
 @dataclass(frozen=True)
@@ -134,6 +130,9 @@ class HessianTerm:
 
     def energy(self) -> float:
         return 0.0
+
+    def accept(self) -> None:
+        """It has no energy, and so no history."""
 
     def compile_residual(self) -> None:
         """There is none."""

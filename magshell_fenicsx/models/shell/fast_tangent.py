@@ -12,6 +12,7 @@ from petsc4py import PETSc
 from magshell_fenicsx.assembly.batches import Batch, boundary_batches, cell_batches, interior_batches
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.scatter import BlockMatrix
+from magshell_fenicsx.assembly.sliding import Constraint
 from magshell_fenicsx.assembly.terms import Term
 from magshell_fenicsx.models.shell.energy import Density, HessianTerm, ShellTerm, cell_quadrature, edge_quadrature
 from magshell_fenicsx.models.shell.sites import Site
@@ -47,12 +48,12 @@ class FastTangent:
         The displacement that the terms were written with.
     sites
         Where they live; others may live there too.
-    clamped
-        Homogeneous Dirichlet conditions.
+    held
+        Of which components of u are zero; other directions are the system's.
     """
 
-    def __init__(self, u: fem.Function, sites: Sequence[TangentSite], clamped: list[fem.DirichletBC]) -> None:
-        V = u.function_space
+    def __init__(self, u: fem.Function, sites: Sequence[TangentSite], held: Sequence[Constraint]) -> None:
+        V, clamped = u.function_space, [c for c in held if isinstance(c, fem.DirichletBC)]
         self._u, self._sites = u, sites
         self._matrix = BlockMatrix(V, [batch.cells for site in sites for batch in site.coupling], clamped)
         cells, functions = V.dofmap.list.shape

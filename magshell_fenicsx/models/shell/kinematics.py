@@ -10,6 +10,11 @@ from dataclasses import dataclass, fields
 import ufl
 from ufl.core.expr import Expr
 
+FIRST = ("r1", "r2")
+SECOND = ("r11", "r12", "r22")
+CURVED = (*FIRST, *SECOND)
+MOVED = ("r", *FIRST)
+
 
 @dataclass(frozen=True)
 class Jet:

@@ -14,16 +14,18 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
+from magshell_fenicsx.assembly.sliding import Constraint, held_along
 from magshell_fenicsx.assembly.terms import LinearTerm, Term
 from magshell_fenicsx.mesh.midsurface import Midsurface
+from magshell_fenicsx.mesh.mirror import Y0, Mirror
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.observed import Observed
-from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes, held_against_mirror
+from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes
 from magshell_fenicsx.models.shell.dead_load import SurfaceMeasures, assemble_dead_loads
 from magshell_fenicsx.models.shell.fast_tangent import FastTangent, make_sites
 from magshell_fenicsx.models.shell.folds import FOLD, largest_fold
+from magshell_fenicsx.models.shell.free import free_parameters
 from magshell_fenicsx.models.shell.parameters import (
-    MIRROR_NORMAL,
     Condition,
     EdgeMoment,
     Force,
@@ -36,7 +38,7 @@ from magshell_fenicsx.models.shell.patterns import by_patch
 from magshell_fenicsx.models.shell.point_load import patch_entries, point_entries, vertex_normal
 from magshell_fenicsx.models.shell.residual import FastResidual
 from magshell_fenicsx.models.shell.supports import (
-    STRAIGHT,
+    closing_point,
     held_at_vertex,
     held_on,
     open_to_pressure,
@@ -63,6 +65,8 @@ class ShellModel(Observed):
         Penalty of the C0 interior penalty form; None takes `default_penalty`.
     thickness
         What multiplies the thickness; None for 1.
+    mirror
+        The plane of the edge with the condition "symmetry", of a half model.
 
     Raises
     ------
@@ -72,12 +76,14 @@ class ShellModel(Observed):
 
     Attributes
     ----------
-    system, multiplicity, normals
+    system, multiplicity, normals, loads, load_size
         See `Observed`.
     kernels
         Names and compile time of the forms in use.
     thickness
         h(x)/h, free to jump from cell to cell; None for 1.
+    mirror
+        Of a half model.
     """
 
     def __init__(
@@ -89,6 +95,7 @@ class ShellModel(Observed):
         loads: Loads,
         sigma: float | None = None,
         thickness: Thickness | None = None,
+        mirror: Mirror = Y0,
     ) -> None:
         refuse_unknown(midsurface.edges, midsurface.points, midsurface.patches, conditions, loads)
         if loads.magnetic and loads.magnetic.patches:
@@ -106,7 +113,9 @@ class ShellModel(Observed):
         factory = TermFactory(self.r0, self.u, material, self.sigma, degree, self.kernels, factor)
         interior = factory.interior_edges(folded=midsurface.read and largest_fold(self.r0, degree) > FOLD)
         terms: list[Term] = [factory.membrane(), factory.bending(), interior]
-        held, mirror = [], []
+        held: list[Constraint] = []
+        mirrored: list[Constraint] = []
+        planes: list[Mirror] = []
 
         def facets(condition: Condition) -> NDArray[np.int32]:
             found = [
@@ -120,8 +129,9 @@ class ShellModel(Observed):
         if "simply supported" in conditions.values():
             held.append(_held(V, facets("simply supported")))
         if "symmetry" in conditions.values():
-            terms.append(factory.mirror_edges(facets("symmetry")))
-            mirror.append(_held_in_mirror(V, facets("symmetry")))
+            planes.append(mirror)
+            terms.append(factory.mirror_edges(facets("symmetry"), mirror.normal))
+            mirrored.append(held_along(V, 1, facets("symmetry"), mirror.normal))
         for name, condition in conditions.items():
             components = condition.components if isinstance(condition, Held) else (0, 1, 2)
             if name not in midsurface.edges and name in midsurface.patches:
@@ -132,16 +142,19 @@ class ShellModel(Observed):
             elif isinstance(condition, Held):
                 held += held_at_vertex(V, midsurface.points[name], components)
             elif condition == "plane":
-                axis, place = plane_of(V, self.r0, midsurface.edges[name], name)
-                if loads.pressure and abs(place) > STRAIGHT:
-                    raise MeshError(open_to_pressure(name))
-                terms.append(factory.mirror_edges(midsurface.edges[name], np.eye(3)[axis], f"{name} mirror edges"))
-                held += held_on(V, 1, midsurface.edges[name], (axis,))
+                planes.append(plane := plane_of(self.r0, midsurface.edges[name], name))
+                terms.append(factory.mirror_edges(midsurface.edges[name], plane.normal, f"{name} mirror edges"))
+                held.append(held_along(V, 1, midsurface.edges[name], plane.normal))
+        closing = closing_point(planes)
+        if closing is None and loads.pressure:
+            raise MeshError(open_to_pressure(next(name for name, c in conditions.items() if c == "plane")))
+        closing = np.zeros(3) if closing is None else closing
         if loads.magnetic:
             terms += factory.magnetic(loads.magnetic)
         if loads.pressure:
-            terms.append(factory.pressure())
+            terms.append(factory.pressure(closing))
         terms += [factory.own(term) for term in loads.own]
+        self.observed = self.kernels.compile_all(factory.observed(term) for term in loads.own)
         self.normals = {name: vertex_normal(self.r0, x) for name, x in midsurface.points.items()}
         if loads.force:
             terms.append(self._force(loads.force))
@@ -154,25 +167,33 @@ class ShellModel(Observed):
                 for i, load in enumerate(moments)
             ]
         self._sites = make_sites(self.r0, degree, terms, self.kernels, factory.prestress())
-        fast = FastTangent(self.u, self._sites, held + mirror)
+        fast = FastTangent(self.u, self._sites, held + mirrored)
         gradients = FastResidual(self.r0, self.u, degree, terms, self.kernels)
-        self.system = FiniteElementSystem(self.u, terms, held + mirror, interior, material.h, fast, gradients)
-        self._factory, self._interior, self._held, self._mirror = factory, interior, held, facets("symmetry")
-        self.observe(self.kernels.compile("volume energy", factory.volume_change()), midsurface.points)
+        parameters = free_parameters(
+            loads.own, factory.free, factory.own, lambda term: self.kernels.compile_all([factory.observed(term)])
+        )
+        self.system = FiniteElementSystem(
+            self.u, terms, held + mirrored, interior, material.h, fast, gradients, parameters
+        )
+        self._factory, self._interior, self._held, self.mirror = factory, interior, held, mirror
+        self._on_mirror = facets("symmetry")
+        self.observe(self.kernels.compile("volume energy", factory.volume_change(closing)), midsurface.points)
 
     @cached_property
     def excluded_modes(self) -> AntisymmetricModes | None:
         """The modes that a half model does not see; None for a whole one. Compiles a kernel."""
         if self.multiplicity == 1:
             return None
-        edges = self._factory.antisymmetric_edges(self._mirror)
-        held = self._held + held_against_mirror(self.V, self._mirror)
+        edges = self._factory.antisymmetric_edges(self._on_mirror, self.mirror.normal)
+        held = self._held + [held_along(self.V, 1, self._on_mirror, along) for along in self.mirror.in_plane]
         sites = self._sites + make_sites(self.r0, self.degree, [edges], self.kernels)
         fast = FastTangent(self.u, sites, held)
         terms = [edges if t.name == "mirror edges" else t for t in self.system.terms]
         system = self.system
         return AntisymmetricModes(
-            FiniteElementSystem(self.u, terms, held, self._interior, system.length, fast, system.gradients)
+            FiniteElementSystem(
+                self.u, terms, held, self._interior, system.length, fast, system.gradients, system.parameters
+            )
         )
 
     def _force(self, force: Force) -> LinearTerm:
@@ -187,9 +208,3 @@ class ShellModel(Observed):
 def _held(V: fem.FunctionSpace, facets: NDArray[np.int32]) -> fem.DirichletBC:
     """u = 0 on an edge."""
     return fem.dirichletbc(np.zeros(3), fem.locate_dofs_topological(V, 1, facets), V)
-
-
-def _held_in_mirror(V: fem.FunctionSpace, facets: NDArray[np.int32]) -> fem.DirichletBC:
-    """u . m = 0 on the mirror plane."""
-    normal = V.sub(int(np.argmax(MIRROR_NORMAL)))
-    return fem.dirichletbc(0.0, fem.locate_dofs_topological(normal, 1, facets), normal)

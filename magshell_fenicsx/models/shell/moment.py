@@ -10,8 +10,8 @@ from magshell_fenicsx.models.shell.energy import ShellTerm
 class Counted(FormTerm):
     """-Pi = intensity times the edge's angle, integrated; its derivatives know no turns, the energy counts them.
 
-    The angle is told from where the edge was when the energy was last asked for, so that between two
-    such times, points of a path, it must turn by less than pi.
+    The angle is counted from where the edge was at the last accepted point, so that between two of these it must
+    turn by less than pi.
     """
 
     def count_from(self, past: fem.Constant, whole: float) -> None:
@@ -20,7 +20,7 @@ class Counted(FormTerm):
         Parameters
         ----------
         past
-            The turn that the angle is told from; see `edges.turning`.
+            The turn that the angle is counted from; see `edges.turning`.
         whole
             Intensity times the edge's length: -Pi of one radian.
         """
@@ -28,13 +28,12 @@ class Counted(FormTerm):
         self._turned = 0.0
 
     def energy(self) -> float:
-        """Collective: all ranks must agree on the turn."""
-        on_this_rank = super().energy()
-        since = -float(self._comm.allreduce(on_this_rank)) / self._whole  # mean angle
-        share = on_this_rank - (self._turned * self._whole if self._comm.rank == 0 else 0.0)
-        self._turned += since
+        return super().energy() - (self._turned * self._whole if self._comm.rank == 0 else 0.0)
+
+    def accept(self) -> None:
+        """Count from the present displacement on. Collective: all ranks must agree on the turn."""
+        self._turned -= float(self._comm.allreduce(super().energy())) / self._whole  # mean angle
         self._past.value = np.array([np.cos(self._turned), np.sin(self._turned)])
-        return share
 
 
 class MomentTerm(Counted, ShellTerm):

@@ -1,7 +1,7 @@
-"""One's own energy as a term of the shell, from nothing but its density."""
+"""An energy of the mid-surface, a part's or one's own, from nothing but its density."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import basix.ufl
@@ -16,12 +16,24 @@ from ufl.core.expr import Expr
 from ufl.corealg.traversal import traverse_unique_terminals
 from ufl.geometry import GeometricQuantity
 
-from magshell_fenicsx.models.shell.energy import CURVED, FIRST, SECOND
-from magshell_fenicsx.models.shell.kinematics import Jet
+from magshell_fenicsx.mesh.mirror import Mirror
+from magshell_fenicsx.models.shell.kinematics import CURVED, FIRST, SECOND, Jet
 
 Array = NDArray[np.float64]
 SAMPLES = 24  # random surfaces on which a symmetry is looked for
 SAME = 1e-10  # difference of two values that is rounding, over the larger
+
+
+@dataclass(frozen=True)
+class Free:
+    """A parameter of densities that is an amplitude of its own, and may enter them in any way.
+
+    A place, an angle or a natural curvature, for instance: what is conjugate to it is -dPi/dp, a force on what it
+    moves. `value` is that of the undeformed shell.
+    """
+
+    name: str
+    value: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -41,7 +53,11 @@ class OwnTerm:
         jets are taken in: build it from values and from what `kinematics` offers. It may depend on the value and
         the first derivatives of u; an energy of its second derivatives would miss the rotations between cells.
     parameters
-        Numbers and vectors; other values of them need no new kernel.
+        Numbers and vectors; other values of them need no new kernel. A `Free` one can be varied as mu can.
+    value
+        mu of the undeformed shell, which a path keeps unless it varies mu.
+    observed
+        Column -> density as above; mu times its integral is observed along a path.
 
     Raises
     ------
@@ -51,7 +67,9 @@ class OwnTerm:
 
     name: str
     density: Callable[..., Expr]
-    parameters: tuple[float | Array, ...] = ()
+    parameters: tuple[float | Array | Free, ...] = ()
+    value: float = 0.0
+    observed: Mapping[str, Callable[..., Expr]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if not self.name.isidentifier():
@@ -81,6 +99,24 @@ class OwnTerm:
         """Those of the placement's jet; the area of the surface takes the first derivatives anyway."""
         return tuple(name for name in ("r", *CURVED) if name in (*FIRST, *self._found_in(self._symbolic[1])))
 
+    @property
+    def free(self) -> tuple[Free, ...]:
+        """Its parameters that are amplitudes."""
+        return tuple(p for p in self.parameters if isinstance(p, Free))
+
+    def derivative(self, *names: str) -> Callable[..., Expr]:
+        """The derivative of the density in free parameters, one after the other."""
+        places = {p.name: i for i, p in enumerate(self.parameters) if isinstance(p, Free)}
+
+        def derived(r0: Jet, u: Jet, *parameters: Expr) -> Expr:
+            variables = [ufl.variable(p) for p in parameters]
+            found = self.density(r0, u, *variables)
+            for name in names:
+                found = ufl.diff(found, variables[places[name]])
+            return found
+
+        return derived
+
     @cached_property
     def linear(self) -> bool:
         """Whether the density is linear in the displacement: its second derivatives vanish identically."""
@@ -98,13 +134,15 @@ class OwnTerm:
 
         return all(self._same((r0, u), (turned(r0, a), turned(u, a))) for a, (r0, u) in enumerate(_random_jets(), 1))
 
-    @cached_property
-    def mirrors(self) -> bool:
-        """Whether its value stays if shell and displacement are mirrored in the plane y = 0; at random jets."""
+    def mirrored(self, mirror: Mirror) -> bool:
+        """Whether its value stays if shell and displacement are mirrored; at random jets."""
         # the first coordinate changes places with the second, so that the normal stays outward
-        order = [("r", *CURVED).index(name) for name in ("r", "r2", "r1", "r22", "r12", "r11")]
-        flip = np.array([1.0, -1.0, 1.0])
-        return all(self._same((r0, u), (flip * r0[order], flip * u[order])) for r0, u in _random_jets())
+        order, S = [("r", *CURVED).index(name) for name in ("r", "r2", "r1", "r22", "r12", "r11")], mirror.reflection
+
+        def image(r0: Array, u: Array) -> tuple[Array, Array]:
+            return np.vstack([mirror.image(r0[:1]), r0[order[1:]] @ S]), u[order] @ S
+
+        return all(self._same((r0, u), image(r0, u)) for r0, u in _random_jets())
 
     @cached_property
     def _symbolic(self) -> tuple[Expr, Jet, Jet]:
@@ -150,5 +188,7 @@ def _as_jet(parts: Array) -> Jet:
     return Jet(*map(_as_expression, parts))
 
 
-def _as_expression(value: float | Array) -> Expr:
+def _as_expression(value: float | Array | Free) -> Expr:
+    if isinstance(value, Free):
+        return ufl.as_ufl(value.value or 1.0)  # of no place in its range, such as zero, that hides terms
     return ufl.as_ufl(float(value)) if np.ndim(value) == 0 else ufl.as_tensor(np.asarray(value, dtype=float).tolist())

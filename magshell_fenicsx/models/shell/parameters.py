@@ -21,7 +21,6 @@ class Held:
 # "symmetry" is the mirror plane of a half model, "plane" one that belongs to the shell as it is described
 Condition = Literal["clamped", "simply supported", "free", "symmetry", "plane"] | Held
 MagneticEnergy = Literal["full", "first", "torque", "second", "second_consistent"]
-MIRROR_NORMAL = np.array([0.0, 1.0, 0.0])  # half models are the part y >= 0
 
 
 @dataclass(frozen=True)

@@ -30,11 +30,14 @@ def tangential(r0: Array, n0: Array) -> Array:
 
 @dataclass(frozen=True)
 class Components:
-    """Three functions of x, y, z."""
+    """Three functions of x, y, z, perhaps of a frame whose axes (3, 3), told in this one, are columns of `frame`."""
 
     of_position: list[Callable[[Array, Array, Array], Array]]
+    frame: Array | None = None
 
     def __call__(self, r0: Array, n0: Array) -> Array:
+        if self.frame is not None:
+            return np.asarray(Components(self.of_position)(r0 @ self.frame, n0) @ self.frame.T)
         return np.stack([f(*np.moveaxis(r0, -1, 0)) for f in self.of_position], axis=-1)
 
 

@@ -13,9 +13,9 @@ from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.shape_tables import Table, cell_rule, edge_covector, edge_rule
 from magshell_fenicsx.assembly.sheets import Sheet
 from magshell_fenicsx.assembly.terms import Term
-from magshell_fenicsx.models.shell.energy import CURVED, Density, ShellTerm, cell_quadrature, edge_quadrature
+from magshell_fenicsx.models.shell.energy import Density, ShellTerm, cell_quadrature, edge_quadrature
 from magshell_fenicsx.models.shell.gradients import FRAME, PointGradient, in_own_coordinates
-from magshell_fenicsx.models.shell.kinematics import Jet
+from magshell_fenicsx.models.shell.kinematics import CURVED, Jet
 from magshell_fenicsx.models.shell.sites import NAMES, at_points
 
 Array = NDArray[np.float64]

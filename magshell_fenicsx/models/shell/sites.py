@@ -188,8 +188,7 @@ def parameters_at(
     Where there are two sides, such a vector holds that of the one and then that of the other.
     """
     here = [
-        points.constant(p.value) if isinstance(p, fem.Constant) else points.field(sides * p.ufl_shape[0])
-        for p in parameters
+        points.constant(p) if isinstance(p, fem.Constant) else points.field(sides * p.ufl_shape[0]) for p in parameters
     ]
     pairs = zip(here, parameters, strict=True)
     return here, [(there, p) for there, p in pairs if isinstance(p, fem.Function)]

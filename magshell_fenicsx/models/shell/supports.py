@@ -1,21 +1,22 @@
 """What holds a shell: displacements that are zero, and whether it is held against rigid motions."""
 
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 
+import basix
 import numpy as np
-from dolfinx import fem, mesh
+from dolfinx import fem
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.continuation.system import Amplitudes
+from magshell_fenicsx.mesh.mirror import Mirror
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.shell.parameters import Condition, Held, Loads
-from magshell_fenicsx.platform import compat
 
 Array = NDArray[np.float64]
 STRAIGHT = 1e-6  # deviation of an edge from a plane, in lengths of R
-CROSSING = 0.9  # mean cosine between flat cells and the normal of the plane that the surface crosses
+RIGHT = 0.99  # mean cosine between the conormals of an edge and the normal of the plane that the surface crosses
 FREE = 1e-12  # of the squares that a rigid motion has where the shell is held, over the largest: rounding
 LOOSE = 1e-13  # of a rigid motion's energy, over the tangent's largest row
 
@@ -73,53 +74,72 @@ def refuse_unknown(
 def open_to_pressure(name: str) -> str:
     """What is said of an edge where the energy p V of a live pressure would load the edge too."""
     return (
-        f"loading.kind: pressure: the edge {name} must be held (clamped or hinged), or lie in a symmetry plane through "
-        "the origin; kind: dead with {over: all, pressure: ..} has no such limit (not on a strip)"
+        f"loading.kind: pressure: the edge {name} must be held (clamped or hinged), or lie in a symmetry plane, and "
+        "all these planes have a common point; kind: dead with {over: all, pressure: ..} has no such limit "
+        "(not on a strip)"
     )
 
 
-def plane_of(V: fem.FunctionSpace, r0: fem.Function, facets: NDArray[np.int32], name: str) -> tuple[int, float]:
-    """The axis that the plane of an edge, or face of a body, is normal to, and where on it it is, over R; collective.
+def no_mirror(name: str) -> str:
+    """What is said of an edge in no plane of symmetry."""
+    return f"boundary.{name}: symmetry: the edge must lie in a plane that the surface crosses at right angles"
+
+
+def plane_of(r0: fem.Function, facets: NDArray[np.int32], name: str) -> Mirror:
+    """The plane of an edge, which the surface crosses at right angles, or of a face of a body; collective.
 
     Raises
     ------
     MeshError
-        On every rank, if the edge lies in no plane normal to e1, e2 or e3, or in more than one.
+        On every rank, if there is none.
     """
-    dim = V.mesh.topology.dim - 1
-    dofs = fem.locate_dofs_topological(V, dim, facets)
-    here = r0.x.array.reshape(-1, 3)[dofs]
-    places = np.concatenate(V.mesh.comm.allgather(here))
-    flat = np.flatnonzero(np.ptp(places, axis=0) < STRAIGHT)
-    # a straight edge lies in two planes, one in its own surface in none that this surface crosses
-    if dim == 1:
-        flat = flat[_conormal_axes(V, facets)[flat] > CROSSING]
-    if len(flat) != 1:
-        raise MeshError(
-            f"boundary.{name}: symmetry: the edge must lie in a plane normal to x, y or z that the surface crosses at "
-            "right angles; turn the geometry so that it does"
-        )
-    return int(flat[0]), float(places[:, flat[0]].mean())
+    V = r0.function_space
+    on_edge = V.mesh.topology.dim == 2
+    dofs = fem.locate_dofs_topological(V, V.mesh.topology.dim - 1, facets)
+    places = np.concatenate(V.mesh.comm.allgather(r0.x.array.reshape(-1, 3)[dofs]))
+    centre = places.mean(axis=0)
+    _, spread, axes = np.linalg.svd(places - centre, full_matrices=False)
+    conormals = _conormals(r0, facets) if on_edge else axes[2:]  # the thickness stands at right angles
+    if spread[1] > STRAIGHT * spread[0]:
+        candidates = [axes[2]]
+    else:  # a straight edge lies in many planes: those of the axes, and through e3, are exact
+        upright = np.array([-centre[1], centre[0], 0.0])
+        fitted = conormals.sum(axis=0) @ (np.eye(3) - np.outer(axes[0], axes[0]))
+        candidates = [*np.eye(3), *([upright] if upright.any() else []), fitted]
+    for normal in candidates:
+        plane = Mirror.of(normal, float(normal @ centre))
+        crossing = np.abs(conormals @ plane.normal).sum() / np.linalg.norm(conormals, axis=1).sum()
+        if np.ptp(plane.beyond(places)) < STRAIGHT and crossing > RIGHT:
+            return plane
+    raise MeshError(no_mirror(name))
 
 
-def _conormal_axes(V: fem.FunctionSpace, facets: NDArray[np.int32]) -> Array:
-    """Mean size (3,) of the components of the flat cells' conormals at some edges; collective."""
-    domain = V.mesh
-    domain.topology.create_connectivity(1, 2)
-    domain.topology.create_connectivity(1, 0)
-    domain.topology.create_connectivity(2, 0)
-    total, length, owned = np.zeros(3), 0.0, domain.topology.index_map(1).size_local
-    corners = domain.geometry.x[compat.corner_numbers(domain)]
-    for facet in facets[facets < owned]:
-        cell = domain.topology.connectivity(1, 2).links(facet)[0]
-        ends = domain.geometry.x[mesh.entities_to_geometry(domain, 1, np.array([facet], dtype=np.int32))[0]]
-        size = np.linalg.norm(ends[1] - ends[0])
-        along = (ends[1] - ends[0]) / size
-        outward = ends.mean(axis=0) - corners[cell].mean(axis=0)
-        outward -= (outward @ along) * along
-        total += size * np.abs(outward) / np.linalg.norm(outward)
-        length += float(size)
-    return np.asarray(domain.comm.allreduce(total) / domain.comm.allreduce(length))
+def closing_point(planes: Sequence[Mirror]) -> Array | None:
+    """A point (3,) of all planes, from which the volume beside them is told; None if they have none."""
+    if not planes:
+        return np.zeros(3)
+    normals, offsets = np.array([p.normal for p in planes]), np.array([p.offset for p in planes])
+    point = np.linalg.lstsq(normals, offsets, rcond=STRAIGHT)[0]
+    return np.asarray(point) if np.abs(normals @ point - offsets).max() < STRAIGHT else None
+
+
+def _conormals(r0: fem.Function, facets: NDArray[np.int32]) -> Array:
+    """Outward conormals (n, 3) in the middle of some edges, as long as those; collective."""
+    V = r0.function_space
+    topology = V.mesh.topology
+    for dims in ((1, 2), (2, 1)):
+        topology.create_connectivity(*dims)
+    corners, found = basix.geometry(basix.CellType.triangle), []
+    for facet in facets[facets < topology.index_map(1).size_local]:
+        cell = topology.connectivity(1, 2).links(facet)[0]
+        side = int(np.flatnonzero(topology.connectivity(2, 1).links(cell) == facet)[0])
+        ends = np.delete(corners, side, axis=0)
+        table = V.element.basix_element.tabulate(1, ends.mean(axis=0)[None])[1:, 0, :, 0]
+        a = table @ r0.x.array.reshape(-1, 3)[V.dofmap.list[cell]]
+        along, outward = (ends[1] - ends[0]) @ a, (ends.mean(axis=0) - corners[side]) @ a
+        outward -= (outward @ along) / (along @ along) * along
+        found.append(np.linalg.norm(along) * outward / np.linalg.norm(outward))
+    return np.concatenate(V.mesh.comm.allgather(np.reshape(found, (-1, 3))))
 
 
 def refuse_loose(system: FiniteElementSystem, r0: fem.Function, amplitudes: Amplitudes) -> None:

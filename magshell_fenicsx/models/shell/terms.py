@@ -1,7 +1,7 @@
 """The densities as terms: each compiled once, and only when a scene calls for it."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import ufl
@@ -14,9 +14,6 @@ from magshell_fenicsx.models.shell import densities, edges
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.antisymmetric import antisymmetric_edge
 from magshell_fenicsx.models.shell.energy import (
-    CURVED,
-    MOVED,
-    SECOND,
     Density,
     HessianTerm,
     Parameter,
@@ -25,10 +22,11 @@ from magshell_fenicsx.models.shell.energy import (
     edge_quadrature,
     per_area,
 )
-from magshell_fenicsx.models.shell.kinematics import Jet
+from magshell_fenicsx.models.shell.free import Constants, constants_of
+from magshell_fenicsx.models.shell.kinematics import CURVED, MOVED, SECOND, Jet
 from magshell_fenicsx.models.shell.moment import MomentTerm
 from magshell_fenicsx.models.shell.own_term import OwnTerm
-from magshell_fenicsx.models.shell.parameters import MIRROR_NORMAL, MagneticEnergy, Magnetisation, Material
+from magshell_fenicsx.models.shell.parameters import MagneticEnergy, Magnetisation, Material
 from magshell_fenicsx.models.shell.patterns import pattern_field
 from magshell_fenicsx.models.shell.thickness import thick
 
@@ -57,6 +55,7 @@ class TermFactory:
     degree: int
     log: KernelLog
     thickness: fem.Function | None = None
+    free: Constants = field(default_factory=dict)  # of parameters that enter freely
 
     def membrane(self) -> ShellTerm:
         density = Density(per_area(densities.membrane), (self._constant(self.material.nu),))
@@ -87,7 +86,7 @@ class TermFactory:
         return self._edges("clamped edges", self._thick(density, 1))
 
     def mirror_edges(
-        self, facets: NDArray[np.int32], normal: NDArray[np.float64] = MIRROR_NORMAL, name: str = "mirror edges"
+        self, facets: NDArray[np.int32], normal: NDArray[np.float64], name: str = "mirror edges"
     ) -> ShellTerm:
         parameters = (*self._penalised(), self._constant(normal))
         return self._edges(name, self._thick(Density(edges.symmetric, parameters, CURVED, SECOND, facets), 1))
@@ -104,9 +103,9 @@ class TermFactory:
         term.count_from(past, intensity * total)
         return term
 
-    def antisymmetric_edges(self, facets: NDArray[np.int32]) -> HessianTerm:
+    def antisymmetric_edges(self, facets: NDArray[np.int32], normal: NDArray[np.float64]) -> HessianTerm:
         """The mirror plane's edges under antisymmetric displacements."""
-        parameters = (*self._penalised(), self._constant(MIRROR_NORMAL))
+        parameters = (*self._penalised(), self._constant(normal))
         density = Density(antisymmetric_edge, parameters, CURVED, facets=facets)
         v = fem.Function(self.u.function_space)
         jets = (*self._jets(), kin.jet(v, self._domain))
@@ -136,21 +135,30 @@ class TermFactory:
             terms.append(self._cells("magnetic gradient", self._thick(density, None), "lambda_m"))
         return terms
 
-    def pressure(self) -> ShellTerm:
-        """Amplitude p/p_c; potential p Delta V, of a live pressure."""
+    def pressure(self, origin: NDArray[np.float64]) -> ShellTerm:
+        """Amplitude p/p_c; potential p Delta V, of a live pressure; `origin` as of `volume_change`."""
         unit = self._constant(self.material.classical_pressure / self.material.h)
-        return self._cells("pressure", Density(densities.pressure, (unit,), parts=MOVED), "pressure")
+        parameters = (unit, self._constant(origin)) if origin.any() else (unit,)
+        return self._cells("pressure", Density(densities.pressure, parameters, parts=MOVED), "pressure")
 
     def own(self, term: OwnTerm) -> ShellTerm:
-        """One's own energy, with the amplitude of its name."""
-        parameters = tuple(self._constant(np.asarray(p, dtype=float)) for p in term.parameters)
+        """The energy of a part or one's own, with the amplitude of its name."""
         still = tuple(part for part in term.placed_parts if part not in term.parts)  # asked for of r0 alone
+        parameters = self._parameters(term)
         density = Density(per_area(term.density), parameters, parts=(*term.parts, *still), linear=still)
         return self._cells(term.name, density, term.name, linear=term.linear)
 
-    def volume_change(self) -> ufl.Form:
-        """Delta V/R^3 of the modelled part."""
-        return densities.volume(*self._jets()) * self._dx()
+    def observed(self, term: OwnTerm) -> dict[str, ufl.Form]:
+        """What it observes."""
+        arguments = (*self._jets(), *self._parameters(term))
+        return {column: per_area(of)(*arguments) * self._dx() for column, of in term.observed.items()}
+
+    def _parameters(self, term: OwnTerm) -> tuple[fem.Constant, ...]:
+        return constants_of(term, self._domain, self.free)
+
+    def volume_change(self, origin: NDArray[np.float64]) -> ufl.Form:
+        """Delta V/R^3 of the modelled part, between it and a point of all its symmetry planes."""
+        return densities.volume(*self._jets(), *([self._constant(origin)] if origin.any() else [])) * self._dx()
 
     @property
     def _domain(self) -> mesh.Mesh:

@@ -55,6 +55,17 @@ def thickness_field(thickness: Thickness, r0: fem.Function, midsurface: Midsurfa
     values = thickness.at(nodes)
     for name, factor in (thickness.patches or {}).items():
         values[patch_of(midsurface.patches, name)] = factor
+    return nodal_thickness(values, nodes, V)
+
+
+def nodal_thickness(values: Array, nodes: Array, V: fem.FunctionSpace) -> fem.Function:
+    """The field with values (cells, nodes) at places (cells, nodes, 3), shape (1,); collective.
+
+    Raises
+    ------
+    MeshError
+        On every rank, if it is not positive somewhere.
+    """
     refuse_unfit(values, nodes, V.mesh.comm)
     Q = fem.functionspace(V.mesh, ("DG", V.element.basix_element.degree, (1,)))
     field = fem.Function(Q, name="thickness")

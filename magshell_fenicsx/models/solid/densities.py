@@ -36,14 +36,15 @@ def enclosed(x: Expr, x1: Expr, x2: Expr) -> Expr:
     return ufl.dot(x, ufl.cross(x1, x2)) / 3
 
 
-def pressure(X: Expr, X1: Expr, X2: Expr, u: Expr, u1: Expr, u2: Expr, unit: Expr) -> Expr:
-    """Pi/p of a live pressure in that unit: the change of the volume under the outer face."""
+def pressure(X: Expr, X1: Expr, X2: Expr, u: Expr, u1: Expr, u2: Expr, unit: Expr, origin: Expr | None = None) -> Expr:
+    """Pi/p of a live pressure in that unit: the change of the volume between the outer face and an origin."""
+    X = X if origin is None else X - origin
     return unit * (enclosed(X + u, X1 + u1, X2 + u2) - enclosed(X, X1, X2))
 
 
-def sealing(X: Expr, u: Expr, H: Expr, n: Expr, t: Expr, unit: Expr) -> Expr:
+def sealing(X: Expr, u: Expr, H: Expr, n: Expr, t: Expr, unit: Expr, origin: Expr | None = None) -> Expr:
     """The same on a part of an end, per undeformed area."""
-    return pressure(X, t, n, u, ufl.dot(H, t), ufl.dot(H, n), unit)
+    return pressure(X, t, n, u, ufl.dot(H, t), ufl.dot(H, n), unit, origin)
 
 
 def turning(X: Expr, u: Expr, H: Expr, n: Expr, t: Expr, weight: Expr, intensity: Expr, past: Expr) -> Expr:

@@ -4,23 +4,28 @@ Lengths in R, energies in E h R^2, amplitudes as in `ShellModel`. Displacements 
 of the thickness; the pressure, the volume and the loaded patch are of the outer face.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
 from dolfinx import fem
+from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
+from magshell_fenicsx.assembly.sliding import Constraint, held_along
 from magshell_fenicsx.assembly.terms import LinearTerm, Term
 from magshell_fenicsx.mesh.hexahedra import Body, quadratic
+from magshell_fenicsx.mesh.mirror import Y0, Mirror
+from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.observed import Observed
 from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes
 from magshell_fenicsx.models.shell.dead_load import assemble_dead_loads
 from magshell_fenicsx.models.shell.fast_tangent import FastTangent
-from magshell_fenicsx.models.shell.parameters import MIRROR_NORMAL, Condition, EdgeMoment, Loads, Material
-from magshell_fenicsx.models.shell.supports import held_on
+from magshell_fenicsx.models.shell.free import free_parameters
+from magshell_fenicsx.models.shell.parameters import Condition, EdgeMoment, Loads, Material
+from magshell_fenicsx.models.shell.supports import closing_point, open_to_pressure
 from magshell_fenicsx.models.solid.loads import BodyMeasures, outer_patch
 from magshell_fenicsx.models.solid.material import NeoHookean
 from magshell_fenicsx.models.solid.remanence import in_cells
@@ -28,6 +33,7 @@ from magshell_fenicsx.models.solid.sites import make_sites
 from magshell_fenicsx.models.solid.supports import supports
 from magshell_fenicsx.models.solid.terms import TermFactory
 
+Array = NDArray[np.float64]
 MIRRORS = ("symmetry", "plane")
 
 
@@ -40,11 +46,14 @@ class SolidModel(Observed):
         As of `ShellModel`: a whole face is clamped or in a mirror plane, else its middle line is held.
     loads
         A force has a patch, on the outer face; the magnetic energy is the full one.
+    mirror
+        The plane of the faces with the condition "symmetry", of a half model.
 
     Raises
     ------
     MeshError
-        On every rank, if an edge lies in no plane of symmetry, or a patch is not there or unknown to the mesh.
+        On every rank, if an edge lies in no plane of symmetry, if these planes leave a live pressure open, or if a
+        patch is not there or unknown to the mesh.
 
     Attributes
     ----------
@@ -66,6 +75,7 @@ class SolidModel(Observed):
         neo_hookean: NeoHookean,
         conditions: Mapping[str, Condition],
         loads: Loads,
+        mirror: Mirror = Y0,
     ) -> None:
         if loads.magnetic:
             loads = replace(loads, magnetic=replace(loads.magnetic, remanent=in_cells(loads.magnetic, body)))
@@ -79,11 +89,15 @@ class SolidModel(Observed):
         hinged = tuple(n for n, c in conditions.items() if n in body.faces and c not in ("free", "clamped", *MIRRORS))
         self.factory = factory = TermFactory(body, self.u, neo_hookean, material.h, self.kernels, hinged)
         self._pattern = factory.distortion()
+        self._held, planes = supports(body, self.r0, conditions)
+        origin = self._closing_point([mirror, *planes] if self.multiplicity == 2 else planes, conditions)
         self._terms: list[Term] = [self._pattern, factory.compression()]
         if loads.magnetic:
             self._terms += factory.magnetic(loads.magnetic)
         if loads.pressure:
-            self._terms += factory.pressure(material.classical_pressure)
+            self._terms += factory.pressure(material.classical_pressure, origin)
+        self._terms += [factory.own(term) for term in loads.own]
+        self.observed = self.kernels.compile_all(factory.observed(term) for term in loads.own)
         if loads.force:
             patch = outer_patch(body, V, loads.force.point, loads.force.patch, self.kernels)
             self._terms.append(LinearTerm("force", patch[0], self.force_unit * patch[1], self.u, "force"))
@@ -92,21 +106,34 @@ class SolidModel(Observed):
             self._terms.append(self.load_with(assemble_dead_loads(loads.dead, V, on, self.kernels)))
             moments = [load for load in loads.dead if isinstance(load, EdgeMoment)]
             self._terms += [factory.moment(f"moment {m.edge} {i}", m.edge, m.moment) for i, m in enumerate(moments)]
-        self._held = supports(body, self.r0, conditions, pressed=loads.pressure)
-        self._mirror = body.faces["symmetry"] if self.multiplicity == 2 else np.empty(0, np.int32)
-        along = int(np.argmax(MIRROR_NORMAL))
+        self._faces = [body.faces[n] for n, c in conditions.items() if c == "symmetry"]
+        self.mirror = mirror
         self._sites = make_sites(body, self.r0, self._terms, self.kernels)
-        self.system = self._system(self._held + held_on(V, 2, self._mirror, [along]))
-        self.observe(self.kernels.compile("volume energy", factory.volume_change()), body.points)
+        self.system = self._system(self._held + self._held_on_mirror([mirror.normal]))
+        self.observe(self.kernels.compile("volume energy", factory.volume_change(origin)), body.points)
 
     @cached_property
     def excluded_modes(self) -> AntisymmetricModes | None:
         """The modes that a half model does not see: moved freely across the mirror plane and not in it."""
         if self.multiplicity == 1:
             return None
-        in_plane = [i for i in range(3) if not MIRROR_NORMAL[i]]
-        return AntisymmetricModes(self._system(self._held + held_on(self.V, 2, self._mirror, in_plane)))
+        return AntisymmetricModes(self._system(self._held + self._held_on_mirror(self.mirror.in_plane)))
 
-    def _system(self, held: list[fem.DirichletBC]) -> FiniteElementSystem:
-        fast = FastTangent(self.u, self._sites, held)
-        return FiniteElementSystem(self.u, self._terms, held, self._pattern, self.material.h, fast)
+    def _closing_point(self, planes: list[Mirror], conditions: Mapping[str, Condition]) -> Array:
+        """From where the volume beside the symmetry planes is told."""
+        found = closing_point(planes)
+        if found is None and self.loads.pressure:
+            raise MeshError(open_to_pressure(next(name for name, c in conditions.items() if c == "plane")))
+        return np.zeros(3) if found is None else found
+
+    def _held_on_mirror(self, directions: Iterable[Array]) -> list[Constraint]:
+        return [held_along(self.V, 2, facets, along) for facets in self._faces for along in directions]
+
+    def _system(self, held: list[Constraint]) -> FiniteElementSystem:
+        fast, factory = FastTangent(self.u, self._sites, held), self.factory
+        parameters = free_parameters(
+            self.loads.own, factory.free, factory.own, lambda term: self.kernels.compile_all([factory.observed(term)])
+        )
+        return FiniteElementSystem(
+            self.u, self._terms, held, self._pattern, self.material.h, fast, parameters=parameters
+        )

@@ -14,7 +14,11 @@ from ufl.core.expr import Expr
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.terms import DensityTerm
 from magshell_fenicsx.mesh.hexahedra import MIDDLE, OUTER, Body
+from magshell_fenicsx.models.shell.energy import per_area
+from magshell_fenicsx.models.shell.free import Constants, constants_of
+from magshell_fenicsx.models.shell.kinematics import SECOND, Jet
 from magshell_fenicsx.models.shell.moment import Counted
+from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.parameters import Magnetisation
 from magshell_fenicsx.models.solid import densities
 from magshell_fenicsx.models.solid.material import NeoHookean
@@ -82,6 +86,7 @@ class TermFactory:
     h: float
     log: KernelLog
     hinged: tuple[str, ...] = ()
+    free: Constants = field(default_factory=dict)  # of parameters that enter freely
 
     def distortion(self) -> SolidTerm:
         return self._bulk("distortion", Density(densities.distortion, self._constants(self.material.shear, self.h)))
@@ -112,16 +117,39 @@ class TermFactory:
             terms.append(self._bulk("magnetic gradient", density, "lambda_m"))
         return terms
 
-    def pressure(self, classical: float) -> list[SolidTerm]:
-        """Amplitude p/p_c, `classical` being p_c/E; on the outer face, and above the middle line of hinged ends."""
+    def pressure(self, classical: float, origin: Array) -> list[SolidTerm]:
+        """Amplitude p/p_c, `classical` being p_c/E; on the outer face, and above the middle line of hinged ends.
+
+        `origin` is a point of all symmetry planes.
+        """
         return [
             SolidTerm(name, density, self._on_faces([density]), self.u, self.log, "pressure")
-            for name, density in self._enclosing(classical / self.h).items()
+            for name, density in self._enclosing(classical / self.h, origin).items()
         ]
 
-    def volume_change(self) -> ufl.Form:
+    def own(self, term: OwnTerm) -> SolidTerm:
+        """The energy of a part or one's own on the outer face, with the amplitude of its name."""
+        density = self._surface(term, term.density)
+        energy = self._on_faces([density])
+        return SolidTerm(term.name, density, energy, self.u, self.log, term.name, linear=term.linear)
+
+    def observed(self, term: OwnTerm) -> dict[str, ufl.Form]:
+        """What it observes on the outer face."""
+        return {column: self._on_faces([self._surface(term, of)]) for column, of in term.observed.items()}
+
+    def _surface(self, term: OwnTerm, of: Callable[..., Expr]) -> Density:
+        """Of the mid-surface's density the same on the outer face, per area of the reference cell."""
+        flat = [ufl.zero(3)] * len(SECOND)
+
+        def on_face(X: Expr, X1: Expr, X2: Expr, u: Expr, u1: Expr, u2: Expr, *parameters: Expr) -> Expr:
+            return per_area(of)(Jet(X, X1, X2, *flat), Jet(u, u1, u2, *flat), *parameters)
+
+        parameters = constants_of(term, self.u.function_space.mesh, self.free)
+        return Density(on_face, parameters, ON_FACE, where="outer", facets=self.body.faces[OUTER])
+
+    def volume_change(self, origin: Array) -> ufl.Form:
         """Delta V/R^3 under the outer face of the modelled part."""
-        return self._on_faces(list(self._enclosing(1.0).values()))
+        return self._on_faces(list(self._enclosing(1.0, origin).values()))
 
     def moment(self, name: str, edge: str, intensity: float) -> EndMoment:
         """A moment per length in E h R about the first tangent of an edge, with the amplitude "load"."""
@@ -136,13 +164,9 @@ class TermFactory:
         term.count_from(past, intensity * self.body.mesh.comm.allreduce(fem.assemble_scalar(length)))
         return term
 
-    def outer_measure(self) -> ufl.Measure:
-        """Area of the undeformed outer face."""
-        return face_measure(self.body.mesh, [self.body.faces[OUTER]])(1)
-
-    def _enclosing(self, unit: float) -> dict[str, Density]:
+    def _enclosing(self, unit: float, origin: Array) -> dict[str, Density]:
         """p times the change of the volume under the outer face, down to the middle line where an end is hinged."""
-        parameters, faces = self._constants(unit), self.body.faces
+        parameters, faces = self._constants(unit, *([origin] if origin.any() else [])), self.body.faces
         found = {"pressure": Density(densities.pressure, parameters, ON_FACE, WHOLE, "outer", faces[OUTER])}
         if self.hinged:
             facets = np.unique(np.concatenate([faces[name] for name in self.hinged]))

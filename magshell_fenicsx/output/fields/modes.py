@@ -73,7 +73,8 @@ def mode_surface(
         return None
     surface = _with_mode(base, mode.u)
     if model.multiplicity == 2:
-        surface = completed(surface)
+        assert not isinstance(model, MeridianModel)
+        surface = completed(surface, model.mirror.plane)
         if label == "antisymmetric":
             for values in surface.fields.values():
                 values[len(base.r0) :] *= -1
@@ -158,7 +159,8 @@ def _revolved_wave(model: MeridianModel, u: Vector, m: int, vector: Vector) -> t
         radial * np.sin(theta) + azimuthal * np.cos(theta),
     )
     v = np.stack([x, y, W * np.cos(m * theta)], axis=-1)
-    at_nodes = np.concatenate([v[0, :1], v[1:].reshape(-1, 3)])  # all sectors meet in the pole
+    first = min(len(model.meridian.axis), 1)  # all sectors meet in the pole
+    at_nodes = np.concatenate([v[:first, 0], v[first:].reshape(-1, 3)])
     return Surface(swept.r0, swept.displacement(u), swept.n0, swept.cells, {}), at_nodes
 
 

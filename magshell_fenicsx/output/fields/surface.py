@@ -17,7 +17,6 @@ from magshell_fenicsx.mesh.frame import rotation
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.axisymmetric.revolution import Revolution
 from magshell_fenicsx.models.shell.model import ShellModel
-from magshell_fenicsx.models.shell.parameters import MIRROR_NORMAL
 from magshell_fenicsx.output.fields.point_fields import PointFields
 
 TRIANGLE, LAGRANGE_TRIANGLE, LAGRANGE_HEXAHEDRON = 5, 69, 72  # VTK's numbers; the flat triangle, cells of any order
@@ -103,7 +102,7 @@ class SurfaceGatherer:
         values = element.tabulate(0, self._places)[0, :, :, 0]
         return np.asarray(factor.x.array[V.dofmap.list[: self._owned]] @ values.T)
 
-    def _weighted_mean(self, numbers: NDArray[np.int64], size: int) -> scipy.sparse.csr_matrix | None:
+    def _weighted_mean(self, numbers: NDArray[np.int64], size: int) -> "scipy.sparse.csr_matrix | None":
         """From the nodes of all cells to nodes in global order, on rank 0.
 
         Second derivatives jump between cells: the mean over those that share a node is weighted by their areas.
@@ -129,7 +128,8 @@ class RevolvedGatherer:
 
     def __init__(self, model: MeridianModel, comm: MPI.Comm) -> None:
         self.comm, self._model, self._swept = comm, model, Revolution(model)
-        self._fields = PointFields(self._swept.jets(model.r0), model.material, model.loads.magnetic, None)
+        factor = None if model.thickness is None else self._swept.scalars(model.thickness)
+        self._fields = PointFields(self._swept.jets(model.r0), model.material, model.loads.magnetic, factor)
         self._constant = self._around(self._fields.constant)
 
     def gather(self, u: Vector, mu: Mapping[str, float] | None = None) -> Surface | None:
@@ -149,12 +149,14 @@ def turned(surface: Surface, azimuth: float) -> Surface:
     return _moved(surface, rotation(azimuth))
 
 
-def completed(surface: Surface, mirror: Array = MIRROR_NORMAL) -> Surface:
-    """A half surface with its image in the mirror plane of that unit normal (3,).
+def completed(surface: Surface, mirror: Array) -> Surface:
+    """A half surface with its image in a mirror plane: its unit normal (3,), and offset if that is not zero.
 
     Seen from outside, the image's triangles run the other way round.
     """
-    image = _moved(surface, np.eye(3) - 2 * np.outer(mirror, mirror))
+    normal, offset = mirror[:3], float(mirror[3:].sum())
+    image = _moved(surface, np.eye(3) - 2 * np.outer(normal, normal))
+    image = replace(image, r0=image.r0 + 2 * offset * normal)
 
     def both(f: Array, other: Array) -> Array:
         return np.concatenate([f, other])

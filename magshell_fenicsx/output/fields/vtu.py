@@ -31,7 +31,7 @@ class About:
     nu
         Poisson's ratio.
     mirror
-        Unit normal (3,) of the plane that a half is completed by; None of a whole.
+        Unit normal (3,) of the plane that a half is completed by, and its offset if that is not zero; None of a whole.
     """
 
     h: float

@@ -9,19 +9,11 @@ import scipy
 from numpy.typing import NDArray
 
 from magshell_fenicsx.output.store.table import LOCATED, OWN_MODES, Row, pole_name
+from magshell_fenicsx.quantities.registry import axes_of, quantity
 
 if TYPE_CHECKING:  # takes long to import
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-POLE = r"displacement of the pole  $w/h$"
-AXES = {
-    "force": ("w_over_h", "force", r"displacement at the load  $w/h$", r"force  $FR/(2\pi D)$"),
-    "load": ("w_over_h", "load_factor", r"displacement along the loads  $w/h$", "load factor"),
-    "pressure": ("volume_change", "p_over_pc", r"change of volume  $-\Delta V/R^3$", r"pressure  $p/p_\mathrm{c}$"),
-    "angle": ("field_angle", "w_pole_over_h", "angle of the field  (degrees)", POLE),
-    "lambda_m": ("w_pole_over_h", "lambda_m", POLE, r"field  $\lambda_\mathrm{m}$"),
-}
 
 NAMED = 5  # instabilities in the legend
 FINE = 16  # drawn pieces between two points
@@ -59,8 +51,8 @@ def varied(rows: Sequence[Row], amplitude: str) -> Sequence[Row]:
 
 def place(row: Row, amplitude: str) -> tuple[float, float]:
     """Where a point is in the curve's axes."""
-    x_key, y_key, *_ = _axes(amplitude)
-    return (-1.0 if x_key == "volume_change" else 1.0) * float(row[x_key]), float(row[y_key])
+    x, y = axes_of(amplitude)
+    return x.on_axis(row), y.on_axis(row)
 
 
 def _unstable(row: Row) -> bool:
@@ -68,18 +60,14 @@ def _unstable(row: Row) -> bool:
     return int(row["negative_pivots"]) + int(row.get("excluded_pivots", 0)) > 0
 
 
-def _axes(amplitude: str) -> tuple[str, str, str, str]:
-    return AXES.get(amplitude, ("w_pole_over_h", amplitude, POLE, amplitude.replace("_", " ")))
-
-
 def plot_curve(axes: "Axes", rows: Sequence[Row], amplitude: str) -> None:
     """The curve of `curve_figure` in axes that are there."""
     part = varied(rows, amplitude)
-    _, y_key, *labels = _axes(amplitude)
+    x, y = axes_of(amplitude)
     if amplitude == "load" and all(row["w_over_h"] == row["w_pole_over_h"] for row in part):
-        labels[0] = POLE  # moments have no displacement along themselves
+        x = quantity("w_pole_over_h")  # moments have no displacement along themselves
     whose = pole_name(part[0]).replace("$", r"\$")  # as it is written, no mathematics
-    x_label, y_label = (label.replace("the pole", whose) for label in labels)
+    x_label, y_label = (each.label.replace("the pole", whose) for each in (x, y))
     for branch in sorted({int(row["branch"]) for row in part}):
         line = [row for row in part if row["branch"] == branch and row["mode"] in OWN_MODES]
         smooth_x, smooth_y = smooth(*zip(*(place(row, amplitude) for row in line), strict=True))
@@ -93,7 +81,7 @@ def plot_curve(axes: "Axes", rows: Sequence[Row], amplitude: str) -> None:
     marked = [row for row in part if row["label"] in LOCATED]
     for number, row in enumerate(marked, 1):
         mode = f" ({row['mode']})" if row["mode"] else ""
-        said = f"{row['label']}{mode} at {row[y_key]:.5g}"
+        said = f"{row['label']}{mode} at {row[y.name]:.5g}"
         if number > NAMED:
             said = f"and {len(marked) - NAMED} more" if number == NAMED + 1 else "_"  # which matplotlib leaves out
         axes.plot(*place(row, amplitude), "o", color="C3", markersize=6, label=said)

@@ -17,9 +17,10 @@ from magshell_fenicsx.output.pictures.mode_picture import draw_modes
 from magshell_fenicsx.output.pictures.picture import figures
 from magshell_fenicsx.output.report.report import write_report
 from magshell_fenicsx.output.store.durable import write_whole
-from magshell_fenicsx.output.store.table import LOCATED, OWN_MODES, VALUE_COLUMN, Row, read_rows
+from magshell_fenicsx.output.store.table import LOCATED, OWN_MODES, Row, read_rows
+from magshell_fenicsx.quantities.registry import amplitude as registered
+from magshell_fenicsx.quantities.registry import quantity
 
-SYMBOLS = {"pressure": r"$p/p_\mathrm{c}$", "force": r"$FR/2\pi D$", "lambda_m": r"$\lambda_\mathrm{m}$"}
 MOST_PANELS = 9
 MOST_FRAMES = 40
 Panel = tuple[Surface, About, str]  # with a mode, and a caption
@@ -175,6 +176,6 @@ def _drawn(panels: Sequence[Panel], title: str) -> bytes:
 
 
 def _where(row: Row) -> str:
-    amplitude = str(row["amplitude"])
-    value = f": {SYMBOLS[amplitude]} = {row[VALUE_COLUMN[amplitude]]:.5g}" if amplitude in SYMBOLS else ""
+    varied = quantity(registered(str(row["amplitude"])).column)
+    value = f": {varied.latex} = {row[varied.name]:.5g}" if row["amplitude"] else ""
     return f"point {row['point']}{value}"

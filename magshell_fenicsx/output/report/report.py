@@ -14,7 +14,7 @@ from magshell_fenicsx.output.report.html_numbers import number
 from magshell_fenicsx.output.report.report_path import Line, path_table, pole_head, symbol
 from magshell_fenicsx.output.report.verdict import Summary, bending_stiffness, located, physical_units, value, verdict
 from magshell_fenicsx.output.store.durable import write_whole
-from magshell_fenicsx.output.store.table import VALUE_COLUMN
+from magshell_fenicsx.quantities.registry import amplitude
 
 NAME, TEMPLATE = "report.html", "report_template.html"
 FOLDED = 30  # points from which on the table of the path is folded
@@ -78,7 +78,7 @@ def _content(folder: Path) -> dict[str, Any]:
         "pole": pole_head(lines[0] if lines else {}),
         "instabilities": [_instability(line, summary) for line in located(lines)],
         "sensitivities": [(name, number(v)) for name, v in summary["sensitivities"].items()],
-        "sensitive": symbol(VALUE_COLUMN[lines[-1]["amplitude"]]) if summary["sensitivities"] else "",
+        "sensitive": symbol(amplitude(lines[-1]["amplitude"]).column) if summary["sensitivities"] else "",
         "how_to_estimate": _how_to_estimate(summary["case"]),
         "path": path,
         "rows": list(zip(*(column.cells for column in path), strict=True)),

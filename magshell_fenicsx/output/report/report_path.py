@@ -8,42 +8,10 @@ from markupsafe import Markup
 
 from magshell_fenicsx.output.report.html_numbers import column, power
 from magshell_fenicsx.output.store.table import pole_name
+from magshell_fenicsx.quantities.registry import amplitude, quantity
 
 Line = Mapping[str, str]  # of path.csv
-WORDS = {"label": "what", "mode": "mode", "amplitude": "varied"}
-COUNTS = {
-    "point": "point",
-    "negative_pivots": "unstable directions",
-    "negative_pivots_held": "unstable, w held",
-    "excluded_pivots": "unstable, excluded",
-    "iterations": "iterations",
-    "factorisations": "factor&shy;isations",
-    "branch": "branch",
-}
-ENERGY = "E h R²"
-NUMBERS = {
-    "p_over_pc": ("p/p<sub>c</sub>", ""),
-    "lambda_m": ("λ<sub>m</sub>", ""),
-    "field_angle": ("field angle", "degrees"),
-    "force": ("F R/(2πD)", ""),
-    "load_factor": ("load factor", ""),
-    "w_over_h": ("w/h", ""),
-    "w_from_field_over_h": ("w/h since the field", ""),
-    "w_pole_over_h": ("w/h", ""),
-    "w_point_over_h": ("w/h, point", ""),
-    "volume_change": ("ΔV/R³", ""),
-    "energy": ("energy", ENERGY),
-    "stretching": ("stretching", ENERGY),
-    "bending": ("bending", ENERGY),
-    "magnetic": ("magnetic", ENERGY),
-    "U1": ("U<sub>1</sub>", ENERGY),
-    "Uq": ("U<sub>q</sub>", ENERGY),
-    "Utau": ("U<sub>τ</sub>", ENERGY),
-    "error_over_h": ("error of u", "h"),
-    "load_error": ("error of the load", ""),
-    "wall_s": ("time", "s"),
-}
-AMPLITUDES = {"pressure": "pressure", "force": "force", "load": "loads", "lambda_m": "field", "angle": "field angle"}
+ORDER = ("text", "load", "displacement", "energy", "error", "time", "place", "count")  # of kinds of columns
 
 
 @dataclass(frozen=True)
@@ -58,7 +26,8 @@ class Column:
 
 def symbol(name: str) -> Markup:
     """What a column of numbers is called; that of a named point or of one's own amplitude by its name."""
-    return Markup(NUMBERS[name][0]) if name in NUMBERS else Markup("{}").format(name.replace("_", " "))
+    known = quantity(name)
+    return Markup(known.html) if known.symbol else Markup("{}").format(known.words)
 
 
 def pole_head(line: Line) -> Markup:
@@ -74,8 +43,8 @@ def path_table(lines: Sequence[Line], length_unit: str) -> list[Column]:
     length_unit
         Of the displacements of named points.
     """
-    own = [name for name in (lines[0] if lines else ()) if name not in COUNTS]
-    order = dict.fromkeys(("point", *WORDS, "branch", *NUMBERS, *own, *COUNTS))
+    names = [name for name in (lines[0] if lines else ()) if name != "point"]
+    order = ["point", *sorted(names, key=lambda name: ORDER.index(quantity(name).kind))]
     found: dict[str, list[str]] = {}
     for name in order:
         values = [line.get(name, "") for line in lines]
@@ -89,14 +58,17 @@ def path_table(lines: Sequence[Line], length_unit: str) -> list[Column]:
 
 
 def _column(name: str, values: Sequence[str], length_unit: str) -> Column:
-    if name in WORDS:
-        return Column(Markup(WORDS[name]), Markup(), [AMPLITUDES.get(value, value) for value in values], numeric=False)
-    if name in COUNTS:
-        return Column(Markup(COUNTS[name]), Markup(), values)
+    known = quantity(name)
+    if known.kind == "text":
+        varied = [quantity(amplitude(value).column).words for value in values] if name == "amplitude" else values
+        return Column(symbol(name), Markup(), varied, numeric=False)
+    if known.kind == "count":
+        return Column(symbol(name), Markup(), values)
     exponent, cells = column([float(value) for value in values])
-    unit = NUMBERS[name][1] if name in NUMBERS else length_unit
     size = power(exponent) if exponent else Markup()
-    return Column(symbol(name), Markup("{} {}").format(size, unit), cells)
+    head = Markup("{} {}").format(symbol(name), known.note) if known.note else symbol(name)
+    unit = length_unit if known.kind == "place" else known.shown_unit
+    return Column(head, Markup("{} {}").format(size, unit), cells)
 
 
 def _same(values: Sequence[str], others: Sequence[str]) -> bool:

@@ -8,7 +8,8 @@ from markupsafe import Markup
 
 from magshell_fenicsx.output.report.html_numbers import number
 from magshell_fenicsx.output.report.report_path import Line, symbol
-from magshell_fenicsx.output.store.table import LOCATED, OWN_MODES, VALUE_COLUMN, pole_name
+from magshell_fenicsx.output.store.table import LOCATED, OWN_MODES, pole_name
+from magshell_fenicsx.quantities.registry import amplitude, quantity
 
 Summary = Mapping[str, Any]
 
@@ -33,7 +34,7 @@ def verdict(summary: Summary, lines: Sequence[Line]) -> Markup:
 
 def value(line: Line, summary: Summary) -> Markup:
     """The amplitude that varied at a point, as "p/p_c = 0.326233 (53.7 Pa)"."""
-    name = VALUE_COLUMN[line["amplitude"]]
+    name = amplitude(line["amplitude"]).column
     amount, degrees = float(line[name]), "°" if line["amplitude"] == "angle" else ""
     size, unit = physical_units(summary).get(line["amplitude"], (0.0, ""))
     measured = Markup(" ({} {})").format(number(amount * size), unit) if size else ""
@@ -42,16 +43,15 @@ def value(line: Line, summary: Summary) -> Markup:
 
 def physical_units(summary: Summary) -> dict[str, tuple[float, str]]:
     """What an amplitude of one is with its unit, where the case gives it: the field's by its flux density."""
-    dims, of, found = summary["dimensions"], summary["dimensionless"], {}
+    dims, of, sizes = summary["dimensions"], summary["dimensionless"], {}
     applied = ((summary["case"].get("magnetic") or {}).get("applied") or {}).get("flux_density")
     if applied and of["lambda_m"]:
-        found["lambda_m"] = (1e3 * abs(applied / of["lambda_m"]), "mT")
-    if dims["units"] != "SI" or not dims["youngs_modulus"]:
-        return found
-    found["pressure"] = (of["pc_over_E"] * dims["youngs_modulus"], "Pa")
-    if dims["thickness"]:
-        found["force"] = (2 * pi * bending_stiffness(summary) / dims["radius"], "N")
-    return found
+        sizes["lambda_m"] = 1e3 * abs(applied / of["lambda_m"])
+    if dims["units"] == "SI" and dims["youngs_modulus"]:
+        sizes["pressure"] = of["pc_over_E"] * dims["youngs_modulus"]
+        if dims["thickness"]:
+            sizes["force"] = 2 * pi * bending_stiffness(summary) / dims["radius"]
+    return {name: (size, quantity(amplitude(name).column).si) for name, size in sizes.items()}
 
 
 def bending_stiffness(summary: Summary) -> float:
@@ -84,7 +84,7 @@ def _end(summary: Summary, lines: Sequence[Line]) -> Markup:
 
 
 def _displacement(line: Line) -> Markup:
-    place = {"force": "at the load", "load": "along the loads"}.get(line["amplitude"])
-    if place and line["w_over_h"] != line["w_pole_over_h"]:
-        return Markup("w/h = {} {}").format(number(float(line["w_over_h"])), place)
-    return Markup("w/h = {} at {}").format(number(float(line["w_pole_over_h"])), pole_name(line))
+    varied, w = amplitude(line["amplitude"]), symbol("w_over_h")
+    if varied.conjugate == "w_over_h" and line["w_over_h"] != line["w_pole_over_h"]:
+        return Markup("{} = {} {}").format(w, number(float(line["w_over_h"])), varied.place)
+    return Markup("{} = {} at {}").format(w, number(float(line["w_pole_over_h"])), pole_name(line))

@@ -7,47 +7,11 @@ from pathlib import Path
 from typing import Any
 
 from magshell_fenicsx.output.store.durable import AppendedFile
+from magshell_fenicsx.quantities.registry import OF_EVERY_RUN
 
-COLUMNS = (
-    "point",
-    "label",
-    "amplitude",
-    "p_over_pc",
-    "lambda_m",
-    "force",
-    "w_over_h",
-    "w_from_field_over_h",
-    "w_pole_over_h",
-    "volume_change",
-    "energy",
-    "negative_pivots",
-    "negative_pivots_held",
-    "iterations",
-    "factorisations",
-    "wall_s",
-    "stretching",
-    "bending",
-    "magnetic",
-    "U1",
-    "Uq",
-    "Utau",
-    "mode",
-    "field_angle",
-    "branch",
-    "w_point_over_h",
-    "error_over_h",
-    "load_error",
-    "excluded_pivots",
-)
-TEXTS = ("label", "amplitude", "mode")
+COLUMNS = tuple(q.name for q in OF_EVERY_RUN)
+TEXTS = tuple(q.name for q in OF_EVERY_RUN if q.kind == "text")
 Row = dict[str, float | int | str]
-VALUE_COLUMN = {  # by what varied: the column of its value
-    "pressure": "p_over_pc",
-    "force": "force",
-    "load": "load_factor",
-    "lambda_m": "lambda_m",
-    "angle": "field_angle",
-}
 LOCATED = ("fold", "bifurcation")
 OWN_MODES = ("", "symmetric", "asymmetric")  # of an instability within the model; others it excludes
 

@@ -10,6 +10,7 @@ import scipy
 from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.system import Vector
+from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.transfer import chart
 
@@ -69,9 +70,13 @@ class CellFields:
     @classmethod
     def of(cls, scene: Scene) -> "CellFields":
         """The cells of all ranks; collective."""
-        x = chart(scene)
-        dim, bs = x.shape[1], scene.model.V.dofmap.bs
-        nodes = gathered(scene, np.pad(x, ((0, 0), (0, bs - dim))).ravel())[..., :dim]
+        model, V = scene.model, scene.model.V
+        if isinstance(model, ShellModel):  # cells beside a seam keep their own chart
+            here = model.midsurface.charted(V)[: V.mesh.topology.index_map(2).size_local]
+            nodes = np.concatenate(scene.comm.allgather(here))
+        else:
+            x = chart(scene)
+            nodes = gathered(scene, np.pad(x, ((0, 0), (0, V.dofmap.bs - x.shape[1]))).ravel())[..., : x.shape[1]]
         return cls(nodes, scene.model.V.element.basix_element)
 
     @property

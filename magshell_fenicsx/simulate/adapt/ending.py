@@ -8,7 +8,8 @@ from magshell_fenicsx.continuation.control import GivenConjugate, GivenLoad, Row
 from magshell_fenicsx.continuation.fold import FoldLost, Guess, find_fold
 from magshell_fenicsx.continuation.system import State, System, Vector
 from magshell_fenicsx.simulate.adapt.carry import NotCarried, carry
-from magshell_fenicsx.simulate.follow import Record, Stopped, follow
+from magshell_fenicsx.simulate.follow import follow
+from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
 
 
@@ -127,7 +128,7 @@ def _fold(scene: Scene, guess: Guess, name: str) -> Ending | None:
 
 def _equilibrium(scene: Scene, guess: State, near: Ending) -> Ending | None:
     newton, system, name, held = scene.newton, scene.newton.system, near.name, near.held
-    row: Row = GivenLoad(guess.mu[name]) if held is None else GivenConjugate(system, name, held)
+    row: Row = GivenLoad(name, guess.mu[name]) if held is None else GivenConjugate(system, name, held)
     outcome = newton.solve(guess, name, row)
     if not outcome.converged:
         return None
@@ -143,9 +144,9 @@ def _target(scene: Scene, record: Record) -> Ending:
     if isinstance(loading, IndentationSection | DeadSection):
         given = loading.force if isinstance(loading, IndentationSection) else loading.factor
     given_load = given is not None
-    held = None if given_load else -system.potential(state.u, name)
+    held = None if given_load else -system.potential(state.u, state.mu, name)
     return Ending("target", name, _value(system, state, name, held), state, record.point.du, held)
 
 
 def _value(system: System, state: State, name: str, held: float | None) -> float:
-    return state.mu[name] if held is not None else -system.potential(state.u, name)
+    return state.mu[name] if held is not None else -system.potential(state.u, state.mu, name)

@@ -6,8 +6,8 @@
     (d) else a mesh on which all cells have equal shares in the error (`indicator`), with as many of them
         as make the error 0.55 of the tolerance; its end by Newton's method from that of (b); on with (b)
 
-The meridian, where cells cost nothing, is refined as a whole. There, and on a surface of a few cells, the error
-may be far below a loose tolerance.
+The meridian, where cells cost nothing, and grids, whose lines go from edge to edge, are refined as a whole. There,
+and on a surface of a few cells, the error may be far below a loose tolerance.
 """
 
 from collections.abc import Callable
@@ -16,6 +16,7 @@ import numpy as np
 from mpi4py import MPI
 
 from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.mesh.grid import Grid
 from magshell_fenicsx.plan.limits import MOST_UNKNOWNS
 from magshell_fenicsx.simulate.adapt.choice import Adapted, Choice, Round
 from magshell_fenicsx.simulate.adapt.ending import Ending, NoResult, by_path, from_near
@@ -30,6 +31,7 @@ SAFETY = 1.25  # the richer solution has an error too
 AIM, LEAST = 0.55, 1 / 5  # estimated error over the tolerance
 MOST_ROUNDS = 6
 COARSEST, FINEST = 0.1, 20.0  # refinement of a meridian
+LINES = 1.25  # least refinement of a grid, which may have few lines to add to
 FEW = 50  # cells of a surface that are not worth making fewer
 
 Say = Callable[[str], None]
@@ -116,8 +118,11 @@ def _remeshed(choice: Choice, coarse: Solved, fine: Solved, reduction: float) ->
     """The same degree on another mesh, for an error so many times the present one; None if there is none."""
     scene, degree = coarse[0], choice.degree
     order = 2 * degree - 2  # of an energy in the size of the cells
-    if scene.plan.axisymmetric:
-        finer = np.clip(choice.refinement * np.clip(reduction, 1e-3, 1e3) ** (-1 / order), COARSEST, FINEST)
+    if scene.plan.axisymmetric or isinstance(scene.plan.shape, Grid):
+        change = np.clip(reduction, 1e-3, 1e3) ** (-1 / order)
+        if reduction < 1 and not scene.plan.axisymmetric:
+            change = max(change, LINES)
+        finer = np.clip(choice.refinement * change, COARSEST, FINEST)
         refinement = round(float(finer), 3)
         return Choice(degree, refinement) if refinement != choice.refinement else None
     if reduction > 1 and scene.cells <= FEW:

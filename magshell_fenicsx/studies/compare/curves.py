@@ -5,16 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from magshell_fenicsx.quantities.registry import amplitude
 from magshell_fenicsx.studies.compare.runs import ModelRun
 from magshell_fenicsx.studies.study.scalar import Scalar
 
 W = "w"  # the displacement in the middle of the thickness since the end of the field
-# amplitude -> column of the displacement, column of the load
-AXES = {
-    "pressure": ("w_pole_over_h", "p_over_pc"),
-    "force": ("w_point_over_h", "force"),
-    "lambda_m": ("w_pole_over_h", "lambda_m"),
-}
 
 
 @dataclass(frozen=True)
@@ -38,7 +33,7 @@ def amplitude_of(run: ModelRun) -> str:
 
 def curve(run: ModelRun) -> tuple[list[float], list[float]]:
     """Displacement and load along that part, without branches."""
-    y = AXES[amplitude_of(run)][1]
+    y = amplitude(amplitude_of(run)).column
     return [float(row[W]) for row in loaded(run)], [float(row[y]) for row in loaded(run)]
 
 
@@ -47,11 +42,11 @@ def loaded(run: ModelRun) -> list[dict[str, str]]:
 
     The field moves a solid's middle more than a shell's: it also stretches the thickness, nu lambda_m R/h of w/h.
     """
-    amplitude = amplitude_of(run)
-    x = AXES[amplitude][0]
-    first = next(i for i, row in enumerate(run.rows) if row["amplitude"] == amplitude)
+    varied = amplitude_of(run)
+    x = "w_point_over_h" if varied == "force" else "w_pole_over_h"  # of both models at the same place
+    first = next(i for i, row in enumerate(run.rows) if row["amplitude"] == varied)
     before = run.rows[max(first - 1, 0)]
-    part = [before, *(row for row in run.rows[first:] if row["amplitude"] == amplitude and row["branch"] == "0")]
+    part = [before, *(row for row in run.rows[first:] if row["amplitude"] == varied and row["branch"] == "0")]
     return [{**row, W: repr(float(row[x]) - float(before[x]))} for row in part]
 
 
@@ -78,7 +73,7 @@ def differences(shell: ModelRun, solid: ModelRun) -> list[Difference]:
 
 def load_at(run: ModelRun, w: float) -> float | None:
     """The load at a displacement; None if the run does not come there."""
-    return Scalar("", AXES[amplitude_of(run)][1], W, w).of(run.summary, loaded(run))
+    return Scalar("", amplitude(amplitude_of(run)).column, W, w).of(run.summary, loaded(run))
 
 
 def judged(runs: Sequence[ModelRun], at: float | None) -> tuple[str, list[float | None]]:
@@ -87,7 +82,7 @@ def judged(runs: Sequence[ModelRun], at: float | None) -> tuple[str, list[float 
         return "knockdown", [float(run.summary["knockdown"]) for run in runs]
     if at is None:
         return "nothing", [None for _ in runs]
-    return f"{AXES[amplitude_of(runs[0])][1]} at w/h = {at:g}", [load_at(run, at) for run in runs]
+    return f"{amplitude(amplitude_of(runs[0])).column} at w/h = {at:g}", [load_at(run, at) for run in runs]
 
 
 def time_at(error: float, runs: Sequence[tuple[float, float]]) -> float | None:

@@ -3,14 +3,10 @@
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from magshell_fenicsx.quantities.registry import amplitude, quantity
 from magshell_fenicsx.studies.compare.curves import Difference, amplitude_of, curve
 from magshell_fenicsx.studies.compare.runs import ModelRun
 
-LABELS = {
-    "pressure": (r"$w/h$ of the pole since the field", r"pressure  $p/p_\mathrm{c}$"),
-    "force": (r"$w/h$ at the load since the field", r"force  $FR/(2\pi D)$"),
-    "lambda_m": (r"displacement of the pole  $w/h$", r"field  $\lambda_\mathrm{m}$"),
-}
 Errors = Mapping[str, Sequence[tuple[float, float]]]
 
 
@@ -28,7 +24,8 @@ def draw_comparison(
 
     panels = 1 + bool(found) + any(errors.values())
     figure = Figure(figsize=(4.4 * panels, 3.7), dpi=160, layout="constrained")
-    x_label, y_label = LABELS[amplitude_of(shell)]
+    varied = amplitude(amplitude_of(shell))
+    x_label, y_label = f"{quantity('w_over_h').latex} {varied.place} since the field", quantity(varied.column).label
     first, *others = figure.subplots(1, panels, squeeze=False)[0]
     first.plot(*curve(shell), ".-", color="C0", markersize=4, linewidth=1, label=f"shell, {shell.dofs} unknowns")
     first.plot(*curve(solid), "o", color="C3", markersize=4, fillstyle="none", label=f"solid, {solid.dofs} unknowns")

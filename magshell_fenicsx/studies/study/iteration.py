@@ -40,7 +40,7 @@ def measured(scene: Scene, repeats: int) -> dict[str, float]:
     system = model.system
     r0 = model.r0.x.array[: system.size].reshape(-1, 3)
     u = system.held((HEIGHT * system.length * np.sin(r0 @ WAVES)).ravel())
-    rhs = system.load(u, "pressure")
+    rhs = system.load(u, MU, "pressure")
     first = timed(comm, lambda: factorisation.factor(system.tangent(u, MU)))
     K = system.tangent(u, MU)
     pieces = {

@@ -9,10 +9,9 @@ from typing import Any
 from scipy.interpolate import barycentric_interpolate
 
 from magshell_fenicsx.case.source import CaseError
-from magshell_fenicsx.output.store.table import COLUMNS, OWN_MODES
+from magshell_fenicsx.output.store.table import COLUMNS, OWN_MODES, TEXTS
 
-WORDS = ("label", "amplitude", "mode")  # columns without numbers
-NUMBERS = tuple(column for column in COLUMNS if column not in WORDS)
+NUMBERS = tuple(column for column in COLUMNS if column not in TEXTS)
 FORMS = "write knockdown, critical_field, COLUMN@COLUMN=VALUE or COLUMN@end, with columns of path.csv"
 
 

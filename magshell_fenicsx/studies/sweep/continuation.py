@@ -44,7 +44,8 @@ class Continuation:
             If none is found, or if it is not the first instability as far as that can be known there.
         """
         known = [(q, self._moved(fold, scene)) for q, fold in self._known]
-        others = {name: scene.case.lambda_m for name in scene.unloaded().mu if name == "lambda_m"}
+        given = scene.unloaded().mu
+        others = {**given, **({"lambda_m": scene.case.lambda_m} if "lambda_m" in given else {})}
         guess = predict_fold(scene.newton.system, known, p, others)
         fold = find_fold(scene.newton, guess, "pressure")
         _check(scene, fold, known[-1][1])

@@ -5,8 +5,8 @@ from itertools import cycle
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from magshell_fenicsx.output.pictures.curve import AXES
 from magshell_fenicsx.output.store.table import OWN_MODES
+from magshell_fenicsx.quantities.registry import axes_of
 from magshell_fenicsx.studies.sweep.axes import Axis, along
 from magshell_fenicsx.studies.sweep.outcome import Outcome
 from magshell_fenicsx.studies.sweep.points import SweepPoint, short
@@ -60,14 +60,13 @@ def _knockdowns(plot: Any, axes: Sequence[Axis], points: Sequence[SweepPoint], o
 def _curves(plot: Any, points: Sequence[SweepPoint], outcomes: Sequence[Outcome]) -> None:
     """The last varied load against its displacement, for every point."""
     amplitude = next((str(o.curve[-1]["amplitude"]) for o in outcomes if len(o.curve) > 1), "force")
-    x_key, y_key, x_label, y_label = AXES[amplitude]
-    sign = -1.0 if x_key == "volume_change" else 1.0
+    x, y = axes_of(amplitude)
     for point, outcome, style in zip(points, outcomes, cycle(STYLES), strict=False):
         part = loaded(outcome.curve, amplitude)
-        x, y = ([float(row[key]) for row in part] for key in (x_key, y_key))
-        plot.plot([sign * value for value in x], y, style, marker=".", label=_label(point, None))
+        places = ([each.on_axis(row) for row in part] for each in (x, y))
+        plot.plot(*places, style, marker=".", label=_label(point, None))
     plot.axhline(0, color="0.8", linewidth=0.8, zorder=0)
-    plot.set(xlabel=x_label, ylabel=y_label)
+    plot.set(xlabel=x.label, ylabel=y.label)
 
 
 def loaded(curve: Sequence["Row"], amplitude: str) -> list["Row"]:

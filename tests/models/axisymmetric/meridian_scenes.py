@@ -36,7 +36,7 @@ def hemisphere(
     defect = Dimple(dimple[0] * h, phi_o) if dimple else None
     vertices = graded_vertices(np.pi / 2, phi_o, h, refinement=refinement)
     return MeridianModel(
-        make_meridian(SphereEmbedding(defect), vertices), Material(nu, h), degree, condition, loads, sigma
+        make_meridian(SphereEmbedding(defect), vertices), Material(nu, h), degree, {"rim": condition}, loads, sigma
     )
 
 

@@ -4,17 +4,40 @@ import numpy as np
 import pytest
 import scipy.sparse
 from meridian_scenes import ALONG_AXIS, hemisphere
+from petsc4py import PETSc
 
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
+from magshell_fenicsx.continuation.system import State
+from magshell_fenicsx.models.axisymmetric.meridian import make_meridian
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
-from magshell_fenicsx.models.shell.parameters import Loads
+from magshell_fenicsx.models.shell.parameters import AreaForce, EdgeForce, EdgeMoment, Loads, Material
+from magshell_fenicsx.models.shell.thickness import Thickness
 
 TERMS = ["membrane", "bending", "interior edges", "clamped edges", "magnetic", "pressure"]
+RING_TERMS = ["membrane", "bending", "interior edges", "mirror edges", "magnetic", "load", "moment b 0"]
+FACTORS = {"lambda_m": 0.02, "pressure": 0.3, "load": 0.5}
 
 
 def coarse() -> MeridianModel:
     loads = Loads(pressure=True, magnetic=ALONG_AXIS)
     return hemisphere(20, 0.3, loads, dimple=(1.0, 2.0), refinement=0.15)
+
+
+def ring() -> MeridianModel:
+    """A tube of varying thickness that opens like a trumpet, mirrored at its one end and loaded at the other."""
+
+    def trumpet(chart: np.ndarray) -> np.ndarray:
+        s = chart[:, 0]
+        return np.column_stack([1 + 0.3 * s**2, 0 * s, -s])
+
+    dead = (EdgeForce("b", np.array([0.0, 0.0, 0.1]), total=False), AreaForce(None, 0.02), EdgeMoment("b", 0.03))
+    meridian = make_meridian(trumpet, np.linspace(0, 1, 4), ("a", "b"), {"pole": (1.0, 0.0)})
+    thickness = Thickness(lambda x, y, z: 1 + 0.5 * z**2)
+    loads = Loads(magnetic=ALONG_AXIS, dead=dead)
+    return MeridianModel(meridian, Material(0.3, 0.05), 4, {"a": "plane"}, loads, thickness=thickness)
+
+
+MODELS = {"hemisphere": coarse, "ring": ring}
 
 
 def check(system: FiniteElementSystem, u: np.ndarray, mu: dict[str, float]) -> None:
@@ -36,18 +59,40 @@ def check(system: FiniteElementSystem, u: np.ndarray, mu: dict[str, float]) -> N
     assert np.linalg.norm(difference) <= 1e-6 * np.linalg.norm(K @ v)
 
 
-@pytest.mark.parametrize("name", TERMS)
-def test_term_alone(name: str) -> None:
-    model = coarse()
+@pytest.mark.parametrize(
+    ("made", "name"), [*(("hemisphere", name) for name in TERMS), *(("ring", name) for name in RING_TERMS)]
+)
+def test_term_alone(made: str, name: str) -> None:
+    model = MODELS[made]()
     terms = {t.name: t for t in model.system.terms}
     alone = FiniteElementSystem(model.u, [terms[name]], model.system.clamped, terms["interior edges"], 1.0)
     u = 1e-4 * np.random.default_rng(0).standard_normal(alone.size)
     u[alone._fixed] = 0
-    check(alone, u, {"lambda_m": 1.0, "pressure": 1.0})
+    check(alone, u, dict.fromkeys(FACTORS, 1.0))
 
 
-def test_terms_together() -> None:
-    model = coarse()
+@pytest.mark.parametrize("made", MODELS)
+def test_terms_together(made: str) -> None:
+    model = MODELS[made]()
     u = 1e-4 * np.random.default_rng(0).standard_normal(model.system.size)
     u[model.system._fixed] = 0
-    check(model.system, u, {"lambda_m": 0.02, "pressure": 0.3})
+    check(model.system, u, FACTORS)
+
+
+def test_waves_have_every_term_that_is_not_linear() -> None:
+    """Of U and W alone and with m = 0, Q_m is the form of the tangent with pi in place of 2 pi."""
+    model = ring()
+    u = 1e-2 * np.random.default_rng(0).standard_normal(model.system.size)
+    u[model.system._fixed] = 0
+    v = np.random.default_rng(1).standard_normal(model.system.size)
+    v[model.system._fixed] = 0
+    wave = np.insert(v.reshape(-1, 2), 1, 0.0, axis=1).ravel()
+
+    def form(K: PETSc.Mat, x: np.ndarray) -> float:
+        given, out = K.createVecs()
+        given.setArray(x)
+        K.mult(given, out)
+        return float(x @ out.array)
+
+    whole = form(model.system.tangent(u, FACTORS), v)
+    assert form(model.excluded_modes.waves.tangent(State(u, FACTORS), 0), wave) == pytest.approx(whole / 2, rel=1e-10)

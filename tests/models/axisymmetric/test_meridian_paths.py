@@ -41,7 +41,7 @@ def test_patch_carries_the_whole_force_and_tends_to_the_point() -> None:
     for model in models:
         down = model.zero()
         down[1::2] = -1
-        assert -model.system.load(down, "force") @ down == pytest.approx(model.force_unit, rel=1e-12)
+        assert -model.system.load(down, {}, "force") @ down == pytest.approx(model.force_unit, rel=1e-12)
         assert model.loaded_deflection(down) == pytest.approx(1.0, rel=1e-12)
     point, *patches = (indent(model, [1.5])[0] for model in [hemisphere(90, 0.5, POLE_FORCE), *models])
     assert point < patches[1] < patches[0] < 1.02 * point
@@ -51,7 +51,7 @@ def test_clamped_plate() -> None:
     """w0 = p R^4/(64 D) (Timoshenko)."""
     h, nu, p_over_pc = 1 / 50, 0.3, 1e-5
     meridian = make_meridian(flat, graded_vertices(1.0, None, h))
-    model = MeridianModel(meridian, Material(nu, h), 4, "clamped", Loads(pressure=True))
+    model = MeridianModel(meridian, Material(nu, h), 4, {"rim": "clamped"}, Loads(pressure=True))
     path = Path(BorderedNewton(model.system), "pressure", "load", StepOptions(p_over_pc, p_over_pc, p_over_pc))
     ((point, _),) = path.towards(path.start(unloaded(model)), [p_over_pc])
     p = p_over_pc * model.material.classical_pressure / h

@@ -46,7 +46,7 @@ def difference(system: FiniteElementSystem, u: np.ndarray, mu: Mapping[str, floa
     reference = by_forms(system)
     pairs = [(system.residual(u, mu), reference.residual(u, mu))]
     loads = {t.amplitude for t in system.terms if t.amplitude}
-    pairs += [(system.load(u, name), reference.load(u, name)) for name in loads]
+    pairs += [(system.load(u, {}, name), reference.load(u, {}, name)) for name in loads]
     return max(float(np.abs(here - there).max() / np.abs(there).max()) for here, there in pairs)
 
 
@@ -148,7 +148,7 @@ x = model.r0.x.array[: system.size].reshape(-1, 3)  # each node's own place make
 u = (1e-2 * np.sin(40 * x @ np.array([[3, 1, 2], [1, -2, 5], [-4, 2, 1]]))).ravel()
 form = next(t for t in system.terms if t.name == "interior edges")
 forms = FiniteElementSystem(system.u, system.terms, system.clamped, form, 1.0, system._assembler)
-for get in (lambda s: s.residual(u, mu), lambda s: s.load(u, "pressure"), lambda s: s.load(u, "lambda_m")):
+for get in (lambda s: s.residual(u, mu), lambda s: s.load(u, mu, "pressure"), lambda s: s.load(u, mu, "lambda_m")):
     R, reference = get(system), get(forms)
     size, error = dot(scene.comm, R, R) ** 0.5, max_abs(scene.comm, R - reference) / max_abs(scene.comm, reference)
     if scene.comm.rank == 0:

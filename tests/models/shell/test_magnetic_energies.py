@@ -30,7 +30,7 @@ def energy() -> Callable[[MagneticEnergy, np.ndarray, float], float]:
             loads = Loads(magnetic=Magnetisation(UP, applied, kind))
             models[key] = ShellModel(surface, Material(0.3, 0.05), 3, {}, loads)
         model = models[key]
-        return float(model.system.potential(size * smooth(model.r0.x.array), "lambda_m"))
+        return float(model.system.potential(size * smooth(model.r0.x.array), {}, "lambda_m"))
 
     return value
 

@@ -141,8 +141,11 @@ def test_moment_counts_turns() -> None:
         a = n * np.pi / 4
         Q = np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]])
         # the right edge runs along -e3 with the surface on its left... the sign is that of the outward normal
-        found = -model.system.potential((x @ Q.T - x).ravel(), "load")
+        u = (x @ Q.T - x).ravel()
+        found = -model.system.potential(u, {}, "load")
         assert abs(found) == pytest.approx(0.01 * a, rel=1e-9)
+        assert -model.system.potential(u, {}, "load") == found  # asking changes nothing
+        model.system.accept(u)
 
 
 def test_dead_loads_add_up_to_their_resultants() -> None:
@@ -155,7 +158,7 @@ def test_dead_loads_add_up_to_their_resultants() -> None:
         AreaForce(None, 2.0),
     )
     model = ShellModel(panel(), MATERIAL, 4, {}, Loads(dead=loads))
-    entries = -model.system.load(model.zero(), "load").reshape(-1, 3).sum(axis=0)
+    entries = -model.system.load(model.zero(), {}, "load").reshape(-1, 3).sum(axis=0)
     pressure = -2.0 * np.array([np.sin(1), 1 - np.cos(1), 0.0])
     assert entries == pytest.approx(np.array([1.0, 2.0, 3.0]) + np.array([1.0, 1.0, 1.0]) + pressure, abs=1e-7)
     assert model.load_size == pytest.approx(np.sqrt(14) + 1 + 1 + 1 + 2, rel=1e-7)
@@ -169,7 +172,7 @@ def bent(thickness: Thickness | None, h: float, degree: int = 3) -> float:
     force = 1e-9
     loads = Loads(dead=(EdgeForce("right", np.array([0.0, 0.0, force]), total=True),))
     model = ShellModel(surface, Material(0.0, h), degree, {"left": "clamped"}, loads, thickness=thickness)
-    found = BorderedNewton(model.system).solve(State(model.zero(), {"load": 0.0}), "load", GivenLoad(1.0))
+    found = BorderedNewton(model.system).solve(State(model.zero(), {"load": 0.0}), "load", GivenLoad("load", 1.0))
     return float(model.displacement(found.state.u, "pole")[2]) / force
 
 

@@ -13,11 +13,11 @@ from ufl.core.expr import Expr
 from magshell_fenicsx import Case, CaseError, Jet, OwnTerm, Scene
 from magshell_fenicsx.case.source import Source
 from magshell_fenicsx.continuation.system import dot
+from magshell_fenicsx.mesh.mirror import Y0
 from magshell_fenicsx.models.shell import densities
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.shell.parameters import AreaForce, Loads, Material
-from magshell_fenicsx.plan.own_terms import plan_with
 from magshell_fenicsx.plan.planner import make_plan
 
 E1, E2, E3 = np.eye(3)
@@ -75,7 +75,7 @@ DENSITIES: dict[str, tuple[Density, tuple[np.ndarray | float, ...], tuple[str, .
 def test_what_is_found_from_a_density(name: str) -> None:
     of, parameters, parts, linear, turns, mirrors = DENSITIES[name]
     term = OwnTerm("own", of, parameters)
-    assert (term.parts, term.linear, term.turns, term.mirrors) == (parts, linear, turns, mirrors)
+    assert (term.parts, term.linear, term.turns, term.mirrored(Y0)) == (parts, linear, turns, mirrors)
 
 
 def test_far_floor_is_not_taken_for_linear() -> None:
@@ -88,7 +88,7 @@ def test_density_that_is_not_defined_everywhere() -> None:
     """Has no symmetry that could be relied on."""
     term = OwnTerm("own", lambda r0, u: ufl.ln(r0.r[2]) * u.r[2])
     assert not term.turns
-    assert not term.mirrors
+    assert not term.mirrored(Y0)
 
 
 @pytest.mark.parametrize("energy", ["magnetic", "magnetic_first", "magnetic_torque", "magnetic_tau", "magnetic_couple"])
@@ -97,7 +97,7 @@ def test_symmetry_of_the_magnetic_densities(energy: str) -> None:
     of = getattr(densities, energy)
     for Br, Ba, turns, mirrors in ((E3, E3, True, True), (E3, E1 + E3, False, True), (E3, E2 + E3, False, False)):
         term = OwnTerm("own", of, (Br, Ba))
-        assert (term.turns, term.mirrors) == (turns, mirrors)
+        assert (term.turns, term.mirrored(Y0)) == (turns, mirrors)
 
 
 @pytest.mark.parametrize(
@@ -135,15 +135,23 @@ def test_load_is_the_derivative_of_the_potential(name: str) -> None:
     system = ShellModel(hemisphere(0.8), Material(0.3, 0.05), 2, {"rim": "clamped"}, loads).system
     model_u, v = (system.held(1e-2 * np.random.default_rng(i).standard_normal(system.size)) for i in range(2))
     step = 1e-3
-    slope = (system.potential(model_u + step * v, "own") - system.potential(model_u - step * v, "own")) / (2 * step)
-    assert slope == pytest.approx(dot(system.comm, system.load(model_u, "own"), v), rel=1e-6)
+    slope = (system.potential(model_u + step * v, {}, "own") - system.potential(model_u - step * v, {}, "own")) / (
+        2 * step
+    )
+    assert slope == pytest.approx(dot(system.comm, system.load(model_u, {}, "own"), v), rel=1e-6)
 
 
-@pytest.mark.parametrize("symmetry", ["axisymmetric", "half", "none"])
-def test_the_shells_own_pressure_as_ones_own(symmetry: str) -> None:
+@pytest.mark.parametrize(
+    ("file", "symmetry", "size"),
+    [
+        *(("dimple_buckling.yaml", each, 1e-2) for each in ("axisymmetric", "half", "none")),
+        ("solid_buckling.yaml", "half", 1e-4),
+    ],
+)
+def test_the_shells_own_pressure_as_ones_own(file: str, symmetry: str, size: float) -> None:
     """The same density by both ways: potentials, load columns and residuals agree."""
     settings = ["mesh.degree=2", "mesh.refinement=0.5", f"symmetry={symmetry}"]
-    case = Case.load(CASES / "dimple_buckling.yaml", settings)
+    case = Case.load(CASES / file, settings)
     unit = Material(case.shell.poisson_ratio, 1 / case.shell.R_over_h).classical_pressure * case.shell.R_over_h
 
     def pressure(r0: Jet, u: Jet, unit: Expr) -> Expr:
@@ -151,9 +159,9 @@ def test_the_shells_own_pressure_as_ones_own(symmetry: str) -> None:
 
     scene = Scene(case, terms=[OwnTerm("own", pressure, (unit,))])
     system = scene.model.system
-    u = system.held(1e-2 * np.random.default_rng(0).standard_normal(system.size))
-    assert system.potential(u, "own") == pytest.approx(system.potential(u, "pressure"), rel=1e-11)
-    ours, theirs = system.load(u, "own"), system.load(u, "pressure")
+    u = system.held(size * np.random.default_rng(0).standard_normal(system.size))
+    assert system.potential(u, {}, "own") == pytest.approx(system.potential(u, {}, "pressure"), rel=1e-11)
+    ours, theirs = system.load(u, {}, "own"), system.load(u, {}, "pressure")
     assert np.abs(ours - theirs).max() < 1e-11 * np.abs(theirs).max()
     mu = {"own": -0.7, "pressure": 0.7}
     assert np.abs(system.residual(u, mu) - system.residual(u, dict.fromkeys(mu, 0.0))).max() < 1e-10
@@ -184,10 +192,10 @@ def test_weight_is_a_dead_load_on_any_surface() -> None:
     assert isinstance(dead, AreaForce)
     system = Scene(case, terms=[OwnTerm("own", weight, (dead.force,))]).model.system
     u = system.held(1e-2 * np.random.default_rng(0).standard_normal(system.size))
-    ours, theirs = system.load(u, "own"), system.load(u, "load")
+    ours, theirs = system.load(u, {}, "own"), system.load(u, {}, "load")
     assert np.abs(theirs).max() > 0
     assert np.abs(ours - theirs).max() < 1e-11 * np.abs(theirs).max()
-    assert system.potential(u, "own") == pytest.approx(system.potential(u, "load"), rel=1e-9)
+    assert system.potential(u, {}, "own") == pytest.approx(system.potential(u, {}, "load"), rel=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -197,7 +205,7 @@ def test_weight_is_a_dead_load_on_any_surface() -> None:
 def test_smallest_model_that_shares_the_symmetry(name: str, built: str) -> None:
     of, parameters, *_ = DENSITIES[name]
     case = Case.load(CASES / "dimple_buckling.yaml")
-    plan = plan_with(case, [OwnTerm("own", of, parameters)])
+    plan = make_plan(case, [OwnTerm("own", of, parameters)])
     assert plan.included[0] == built
     assert plan.included[-1] == "own energy: own"
 
@@ -206,8 +214,8 @@ def test_half_model_of_another_plane_needs_a_term_that_turns() -> None:
     """The half shell's frame is turned to its mirror plane; a direction would have to turn with it."""
     settings = ["magnetic={lambda_m: 1e-3, remanent: {polar: 30, azimuth: 20}, applied: {polar: 60, azimuth: 20}}"]
     case = Case.load(CASES / "dimple_buckling.yaml", settings)
-    assert plan_with(case, [OwnTerm("own", winkler)]).half
-    assert not plan_with(case, [OwnTerm("own", weight, (E1,))]).half
+    assert make_plan(case, [OwnTerm("own", winkler)]).half
+    assert not make_plan(case, [OwnTerm("own", weight, (E1,))]).half
 
 
 @pytest.mark.parametrize(
@@ -215,7 +223,6 @@ def test_half_model_of_another_plane_needs_a_term_that_turns() -> None:
     [
         (["symmetry=axisymmetric"], ["own"], "symmetry: axisymmetric: the energy own"),
         (["symmetry=half"], ["own"], "symmetry: half: the energy own"),
-        (["model=solid"], ["own"], "mid-surface"),
         ([], ["pressure"], "terms: pressure"),
         ([], ["w_over_h"], "terms: w_over_h"),
         ([], ["own", "own"], "terms: own"),
@@ -224,7 +231,14 @@ def test_half_model_of_another_plane_needs_a_term_that_turns() -> None:
 def test_what_the_plan_refuses(settings: list[str], names: list[str], said: str) -> None:
     case = Case.load(CASES / "dimple_buckling.yaml", settings)
     with pytest.raises(CaseError, match=said):
-        plan_with(case, [OwnTerm(name, weight, (E2,)) for name in names])
+        make_plan(case, [OwnTerm(name, weight, (E2,)) for name in names])
+
+
+def test_a_solid_has_no_curvature() -> None:
+    case = Case.load(CASES / "solid_buckling.yaml")
+    curved = OwnTerm("own", lambda r0, u: r0.r11[0] * u.r[2])
+    with pytest.raises(CaseError, match=r"own depends on r0\.r11, which only"):
+        make_plan(case, [curved])
 
 
 def test_parameters_need_no_new_kernel() -> None:
@@ -238,4 +252,4 @@ def test_parameters_need_no_new_kernel() -> None:
     forms = [next(t for t in m.system.terms if t.name == "own")._energy for m in models]  # type: ignore[attr-defined]
     assert forms[0].module is forms[1].module or forms[0].module.__file__ == forms[1].module.__file__
     u = random_displacement(models[0], 1e-2)
-    assert models[1].system.potential(u, "own") == pytest.approx(2 * models[0].system.potential(u, "own"))
+    assert models[1].system.potential(u, {}, "own") == pytest.approx(2 * models[0].system.potential(u, {}, "own"))

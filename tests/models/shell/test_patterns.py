@@ -26,7 +26,7 @@ def model(
 
 def swelling(of: ShellModel) -> float:
     """The energy over the size: -Ba . (I - n n) Br integrated."""
-    return of.system.potential(SIZE * of.r0.x.array, "lambda_m") / SIZE
+    return of.system.potential(SIZE * of.r0.x.array, {}, "lambda_m") / SIZE
 
 
 def test_radial_stays_radial() -> None:
@@ -66,7 +66,7 @@ def test_gradient_pulls_a_rigid_shell() -> None:
     G = np.array([[-0.5, 0.2, 0.1], [0.2, -0.7, 0.3], [0.1, 0.3, 1.2]])
     Br, t = np.array([0.6, 0.0, 0.8]), np.array([0.3, -0.2, 0.5])
     shell = model(Br, G)
-    found = shell.system.potential(np.tile(t, shell.system.size // 3), "lambda_m")
+    found = shell.system.potential(np.tile(t, shell.system.size // 3), {}, "lambda_m")
     assert found == pytest.approx(-(G @ t) @ Br * 2 * np.pi, rel=1e-4)
 
 

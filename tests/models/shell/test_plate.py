@@ -24,7 +24,9 @@ def solve(size: float, degree: int, w0_over_h: float = 1e-4) -> tuple[float, flo
     h, D = MATERIAL.h, MATERIAL.bending_stiffness * MATERIAL.h  # D over E R^3
     p = 64 * D * w0_over_h * h  # over E
     amplitude = p / MATERIAL.classical_pressure
-    found = BorderedNewton(model.system).solve(State(model.zero(), {"pressure": 0.0}), "pressure", GivenLoad(amplitude))
+    found = BorderedNewton(model.system).solve(
+        State(model.zero(), {"pressure": 0.0}), "pressure", GivenLoad("pressure", amplitude)
+    )
     assert found.converged
     u = found.state.u
     w0 = model.deflection(u, "pole")
@@ -62,7 +64,9 @@ def test_simply_supported_edge(degree: int) -> None:
     h, nu, D = MATERIAL.h, MATERIAL.nu, MATERIAL.bending_stiffness * MATERIAL.h
     p = 1e-4 * h * 64 * D * (1 + nu) / (5 + nu)
     start = State(model.zero(), {"pressure": 0.0})
-    found = BorderedNewton(model.system).solve(start, "pressure", GivenLoad(p / MATERIAL.classical_pressure))
+    found = BorderedNewton(model.system).solve(
+        start, "pressure", GivenLoad("pressure", p / MATERIAL.classical_pressure)
+    )
     assert model.deflection(found.state.u, "pole") == pytest.approx(1e-4 * h, rel=1e-4)
 
 

@@ -4,10 +4,11 @@ from typing import Any
 
 import pytest
 
-from magshell_fenicsx import Case, Scene
+from magshell_fenicsx import Case, Scene, follow
 from magshell_fenicsx.case.source import Source
 from magshell_fenicsx.mesh.patch import MeshError
 
+THIN = {"thickness": 0.02, "poisson_ratio": 0.3}
 PLATE = {"geometry": "plate", "length": 1, "width": 1, "thickness": 0.02, "poisson_ratio": 0.3}
 CYLINDER = {"geometry": "cylinder", "radius": 1, "length": 1, "thickness": 0.02, "poisson_ratio": 0.3}
 CORNERS = {"A": [0, 0, 0], "B": [1, 0, 0], "C": [0, 1, 0]}
@@ -51,9 +52,10 @@ def test_held(shell: dict[str, Any], boundary: dict[str, Any]) -> None:
 
 
 def test_plane_of_symmetry_must_be_one() -> None:
-    panel = {**CYLINDER, "azimuth": [0, 60]}
-    with pytest.raises(MeshError, match=r"boundary.right: symmetry: the edge must lie in a plane normal to x, y or z"):
-        scene(panel, {"right": "symmetry", "bottom": "clamped"}, {})
+    """A cone crosses the plane of its edge at 45 degrees."""
+    cone = {"geometry": "revolution", "profile": {"points": [[1, 0], [0.5, 0.5]]}, **THIN}
+    with pytest.raises(MeshError, match=r"boundary.bottom: symmetry: the edge must lie in a plane that the surf"):
+        scene(cone, {"bottom": "symmetry", "top": "clamped"}, {})
 
 
 ANNULUS = {"geometry": "annulus", "radius": 1, "inner_radius": 0.5, "thickness": 0.02, "poisson_ratio": 0.3}
@@ -71,21 +73,54 @@ def test_a_symmetry_plane_is_crossed(shell: dict[str, Any], boundary: dict[str, 
     if not refused:
         assert scene(shell, boundary, {}).newton
         return
-    with pytest.raises(MeshError, match=r"boundary.outer: symmetry: the edge must lie in a plane normal to"):
+    with pytest.raises(MeshError, match=r"boundary.outer: symmetry: the edge must lie in a plane that"):
         scene(shell, boundary, {})
 
 
-@pytest.mark.parametrize("edge", ["left", "right"])
-def test_live_pressure_at_symmetry_planes(edge: str) -> None:
-    """Of int x.n/3 an edge in the plane x.m = c has the line integral of dx.(c m cross t)/3 left."""
-    held = dict.fromkeys({"left", "right", "bottom", "top"} - {edge}, "clamped")
-    data = {"shell": PLATE, "boundary": {**held, edge: "symmetry"}, "loading": {"kind": "pressure"}}
-    case = Case.from_source(Source("test", {**data, "mesh": {"degree": 2, "size": 0.5}}))
-    if edge == "left":  # x = 0
-        assert Scene(case).newton
-        return
-    with pytest.raises(MeshError, match=r"loading.kind: pressure: the edge right must be held"):
-        Scene(case)
+def pressed(shell: dict[str, Any], boundary: dict[str, Any]) -> Case:
+    loading = {"kind": "pressure", "until": "target", "control": "load", "pressure": 0.05, "points": 1}
+    mesh = {"degree": 3, "size": 0.25}
+    return Case.from_source(
+        Source("test", {"shell": shell, "boundary": boundary, "loading": loading, "mesh": mesh, "symmetry": "none"})
+    )
+
+
+def test_live_pressure_beside_a_symmetry_plane_anywhere() -> None:
+    """Half of a plate of twice the length, held at x = 0 or beside x = 1: volumes are told from that plane."""
+    found = []
+    for edge in ("left", "right"):
+        held = dict.fromkeys({"left", "right", "bottom", "top"} - {edge}, "clamped")
+        *_, last = follow(half := Scene(pressed(PLATE, {**held, edge: "symmetry"})))
+        found.append(half.observe(last.point.state)["volume_change"])
+    held = dict.fromkeys(("left", "right", "bottom", "top"), "clamped")
+    long = {**PLATE, "length": 2, "thickness": 0.02}
+    loading = {"pressure": 0.05 * 4}  # p_c is over R^2, and R twice as long
+    asked = pressed(long, held)
+    assert asked.loading
+    asked = asked.model_copy(update={"loading": asked.loading.model_copy(update=loading)})
+    *_, last = follow(whole := Scene(asked))
+    expected = whole.observe(last.point.state)["volume_change"] * 2**3 / 2
+    assert found == pytest.approx([expected, expected], rel=1e-6)
+
+
+def test_live_pressure_between_parallel_symmetry_planes() -> None:
+    """The planes have no common point, and the volume between edge and point is no longer known."""
+    edges = {"left": "symmetry", "right": "symmetry", "bottom": "clamped", "top": "clamped"}
+    with pytest.raises(MeshError, match=r"loading.kind: pressure: the edge left must be held .* have a common point"):
+        Scene(pressed(PLATE, edges))
+
+
+def test_sectors_between_oblique_symmetry_planes() -> None:
+    """Of a cylinder under dead pressure: all have the energy per angle of a quarter between x = 0 and y = 0."""
+    loading = {"kind": "dead", "loads": [{"over": "all", "pressure": 1e-4}], "factor": 1, "points": 1}
+    edges = {"left": "symmetry", "right": "symmetry", "bottom": "clamped", "top": "clamped"}
+    found = []
+    for first, last in ((0, 90), (0, 60), (-25, 35)):
+        shell = {**CYLINDER, "youngs_modulus": 1, "azimuth": [first, last]}
+        data = {"shell": shell, "boundary": edges, "loading": loading, "mesh": {"degree": 3, "size": 0.2618}}
+        *_, end = follow(sector := Scene(Case.from_source(Source("test", {**data, "symmetry": "none"}))))
+        found.append(sector.observe(end.point.state)["energy"] / (last - first))
+    assert found[1:] == pytest.approx([found[0]] * 2, rel=1e-9)
 
 
 def test_a_remanence_without_value_is_refused() -> None:

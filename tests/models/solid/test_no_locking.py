@@ -35,7 +35,7 @@ def deflection_over_theory(bulk_to_shear: float, *, whole: bool = False) -> floa
         system = FiniteElementSystem(model.u, terms, system.clamped, model._pattern, H)
     zero, factors = model.zero(), Factorisation(system.comm)
     factors.factor(system.tangent(zero, {"pressure": 0.0}))
-    u = factors.solve(-system.load(zero, "pressure"))  # to first order in p/p_c
+    u = factors.solve(-system.load(zero, {}, "pressure"))  # to first order in p/p_c
     D = material.youngs_modulus * H**3 / (12 * (1 - material.nu**2))
     return model.deflection(u, "pole") / (Material(0.5, H).classical_pressure / (64 * D))
 

@@ -75,7 +75,7 @@ def test_a_strip_under_dead_loads(load: dict[str, Any]) -> None:
 
 def resultant(model: SolidModel, rigid: np.ndarray) -> float:
     """The work of the loads on a displacement (nodes, 3)."""
-    return float(-model.system.load(model.zero(), "load") @ rigid.ravel())
+    return float(-model.system.load(model.zero(), {}, "load") @ rigid.ravel())
 
 
 @pytest.mark.parametrize(
@@ -148,6 +148,54 @@ def test_mirror_planes_of_the_case() -> None:
     assert solid["energy"] == pytest.approx(shell["energy"], rel=H / 2)
 
 
+PRESSED = {"kind": "pressure", "control": "load", "until": "target", "pressure": 0.1, "points": 1}
+
+
+def test_skew_mirror_planes() -> None:
+    """A sector of a cylinder between planes at 25 and 85 degrees moves as the one between 0 and 60."""
+    given = {"boundary": {"left": "symmetry", "right": "symmetry", "bottom": "hinged", "top": "clamped"}}
+    straight, skew = (
+        end("solid", {**CYLINDER, "azimuth": azimuth}, 0.3, **given, loading=PRESSED) for azimuth in ([0, 60], [25, 85])
+    )
+    assert straight["energy"] != 0
+    for column in ("energy", "volume_change"):
+        assert skew[column] == pytest.approx(straight[column], rel=1e-6)
+
+
+@pytest.mark.parametrize("end_of", ["clamped", "hinged"])
+def test_volume_beside_a_mirror_plane_away_from_the_origin(end_of: str) -> None:
+    """Pressed, with the mirror plane at the top as with it at the bottom, to the triangles' diagonals."""
+    sides = {"left": "symmetry", "right": "symmetry"}
+    below, above = (
+        end(
+            "solid",
+            {**CYLINDER, "azimuth": [0, 45]},
+            0.2,
+            boundary={**sides, plane: "symmetry", other: end_of},
+            loading=PRESSED,
+        )
+        for plane, other in (("bottom", "top"), ("top", "bottom"))
+    )
+    for column in ("energy", "volume_change"):
+        assert above[column] == pytest.approx(below[column], rel=1e-3)
+
+
+def test_a_foundation_under_the_outer_face() -> None:
+    """A strip that is hinged at both ends, pressed onto springs: as its shell."""
+    shell, solid = (
+        end(
+            m,
+            STRIP,
+            boundary={"left": "hinged", "right": {"held": ["z"]}},
+            points={"A": [0.5, WIDTH / 2, 0.0]},
+            foundation={"stiffness": 1e-3},
+            loading=dead({"over": "all", "pressure": 1e-6}),
+        )
+        for m in ("shell", "solid")
+    )
+    assert solid["A_uz"] == pytest.approx(shell["A_uz"], rel=H / 2)
+
+
 def test_a_closed_cylinder_dented_at_a_named_point() -> None:
     """The chart's seam is no slit: by h from the shell, as the patch is on the outer face."""
     loading = {"kind": "indentation", "at": {"point": "A"}, "depth": 0.5, "points": 1, "patch": 2}
@@ -183,7 +231,7 @@ def test_layers_pull_a_strip_crooked() -> None:
     model = SolidModel(body, Material(0.0, H), NeoHookean.of(0.0, 100.0), {"left": "clamped"}, Loads(magnetic=field))
     factors = Factorisation(model.system.comm)
     factors.factor(model.system.tangent(model.zero(), {"lambda_m": 0.0}))
-    u = factors.solve(-model.system.load(model.zero(), "lambda_m"))
+    u = factors.solve(-model.system.load(model.zero(), {}, "lambda_m"))
     assert lambda_m * model.displacement(u, "A")[2] == pytest.approx(3 * lambda_m / H / 2, rel=5e-3)
 
 

@@ -31,13 +31,13 @@ class Section(BaseModel):
     """
 
     model_config = ConfigDict(
-        extra="forbid", strict=True, frozen=True, allow_inf_nan=False, use_attribute_docstrings=True
+        extra="forbid", strict=True, frozen=True, allow_inf_nan=False, use_attribute_docstrings=True, defer_build=True
     )
 
 
 def with_unit(unit: str) -> Any:
     """What the schema says of text with a unit; names of units are checked by pint alone."""
-    return Annotated[str, Field(pattern=rf"^\s*{_NUMBER}[\s*]*[^\s\d*]", examples=[_EXAMPLES[unit]])]
+    return Annotated[str, Field(pattern=rf"^\s*{_NUMBER}[\s*]*[^\s\d*]", examples=[_example(unit)])]
 
 
 def _quantity(unit: str) -> Any:
@@ -45,7 +45,7 @@ def _quantity(unit: str) -> Any:
 
     def convert(value: Any) -> float:
         if not isinstance(value, str):
-            raise ValueError(f'needs a unit, for example "{_EXAMPLES[unit]}"')
+            raise ValueError(f'needs a unit, for example "{_example(unit)}"')
         return _converted(value, unit)
 
     return BeforeValidator(convert, json_schema_input_type=with_unit(unit))
@@ -62,7 +62,7 @@ def _converted(value: str, unit: str) -> float:
     except pint.DimensionalityError as e:
         raise ValueError(f"is not convertible to {unit}: it has the dimension {e.dim1}") from None
     except Exception:  # pint raises many kinds for text that is no quantity
-        raise ValueError(f'is not a number with a unit such as "{_EXAMPLES[unit]}"') from None
+        raise ValueError(f'is not a number with a unit such as "{_example(unit)}"') from None
 
 
 def in_units(unit: str, *, bare: bool = False) -> Callable[[Any], float]:
@@ -102,6 +102,12 @@ _EXAMPLES = {
     "newton": "20 mN",
     "newton/metre": "5 N/m",
 }
+
+
+def _example(unit: str) -> str:
+    return _EXAMPLES.get(unit, f"5 {unit.replace('**', '^')}")
+
+
 Length = Annotated[float, _quantity("metre")]
 Pressure = Annotated[float, _quantity("pascal")]
 FluxDensity = Annotated[float, _quantity("tesla")]

@@ -1,0 +1,87 @@
+"""A loading device: amplitudes that are unknown, since what is conjugate to them is held.
+
+A sealed volume has an unknown pressure; a body that is pressed on with a given force has an unknown place.
+The Legendre transform
+
+    L(u, mu_f; mu) = Pi(u; mu_f, mu) + sum_f mu_f q_f
+
+is stationary in u and in the amplitudes mu_f where Pi is in equilibrium and -dPi/dmu_f = q_f. So a device is a system
+like any other, whose unknowns are u and y_f = mu_f length/scale_f, and its inertia is that of the shell in it.
+"""
+
+from collections.abc import Mapping, Sequence
+from math import log2
+
+import numpy as np
+
+from magshell_fenicsx.continuation.edge import join, split
+from magshell_fenicsx.continuation.factor import Factorisation
+from magshell_fenicsx.continuation.system import Amplitudes, Edged, State, System, Vector, Weighted, max_abs
+
+
+class Device:
+    """A system under a loading device.
+
+    Parameters
+    ----------
+    held
+        Amplitude -> the value of -dPi/dmu that is held. The amplitude becomes unknown.
+    scale
+        Amplitude -> a value that counts as of order one.
+    """
+
+    def __init__(self, system: System, held: Mapping[str, float], scale: Mapping[str, float]) -> None:
+        self.comm, self.length, self.coordinates = system.comm, system.length, system.coordinates
+        self._system, self._names, self._held = system, list(held), np.array(list(held.values()))
+        self._unit = np.array([scale[name] / system.length for name in held])
+        self.size = system.size + len(held) * (self.comm.rank == self.comm.size - 1)
+
+    def enter(self, state: State) -> State:
+        """A state of the system underneath as one of the device."""
+        y = np.array([state.mu[name] for name in self._names]) / self._unit
+        fixed = {name: value for name, value in state.mu.items() if name not in self._names}
+        return State(join(state.u, y, self.comm), fixed)
+
+    def leave(self, state: State) -> State:
+        """A state of the device as one of the system underneath."""
+        return State(*self._split(state.u, state.mu))
+
+    def displacement(self, x: Vector) -> Vector:
+        """u of a vector (u, y)."""
+        return split(x, len(self._names), self.comm)[0]
+
+    def residual(self, u: Vector, mu: Amplitudes) -> Vector:
+        v, whole = self._split(u, mu)
+        rows = [self._system.potential(v, whole, name) for name in self._names]
+        return join(self._system.residual(v, whole), (np.array(rows) + self._held) * self._unit, self.comm)
+
+    def load(self, u: Vector, mu: Amplitudes, name: str) -> Vector:
+        v, whole = self._split(u, mu)
+        mixed = [self._system.curvature(v, whole, other, name) for other in self._names]
+        return join(self._system.load(v, whole, name), np.array(mixed) * self._unit, self.comm)
+
+    def potential(self, u: Vector, mu: Amplitudes, name: str) -> float:
+        return self._system.potential(*self._split(u, mu), name)
+
+    def curvature(self, u: Vector, mu: Amplitudes, name: str, other: str) -> float:
+        return self._system.curvature(*self._split(u, mu), name, other)
+
+    def tangent(self, u: Vector, mu: Amplitudes, stress: Sequence[Weighted] = ()) -> Edged:
+        v, whole = self._split(u, mu)
+        columns = [unit * self._system.load(v, whole, name) for name, unit in zip(self._names, self._unit, strict=True)]
+        D = np.array([[self._system.curvature(v, whole, i, j) for j in self._names] for i in self._names])
+        below = [(weight, self.displacement(w)) for weight, w in stress]
+        K = self._system.tangent(v, whole, below)
+        assert not isinstance(K, Edged)  # a device of a device is one device
+        multipliers = sum(name not in self.coordinates for name in self._names)
+        return Edged(K, columns, D * np.outer(self._unit, self._unit), multipliers)
+
+    def _split(self, x: Vector, mu: Amplitudes) -> tuple[Vector, dict[str, float]]:
+        u, y = split(x, len(self._names), self.comm)
+        return u, {**mu, **dict(zip(self._names, (float(v) for v in y * self._unit), strict=True))}
+
+
+def natural_scale(system: System, factors: Factorisation, state: State, name: str) -> float:
+    """The amplitude that moves the system by about its length, a power of two: the same on any number of ranks."""
+    moved = max_abs(system.comm, factors.solve(system.load(state.u, state.mu, name))) / system.length
+    return 2.0 ** -round(log2(moved)) if moved else 1.0

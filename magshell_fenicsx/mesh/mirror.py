@@ -1,0 +1,146 @@
+"""A mirror plane, and the half of a triangulation on one side of it."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magshell_fenicsx.mesh.frame import rotation
+from magshell_fenicsx.mesh.patch import MeshError, PatchMesh
+
+Array = NDArray[np.float64]
+CUT = "symmetry"  # name of the edge on the plane
+ROUNDING = 1e-9
+
+
+@dataclass(frozen=True)
+class Mirror:
+    """The plane normal . x = offset; the half beyond it, where normal . x is larger, is modelled.
+
+    Attributes
+    ----------
+    normal
+        Unit vector (3,); a component that is only rounding is zero.
+    lost
+        Edges of the other half -> their mirror images.
+    """
+
+    normal: Array
+    offset: float = 0.0
+    lost: Mapping[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, normal: Array, offset: float = 0.0, lost: Mapping[str, str] | None = None) -> "Mirror":
+        """With a normal of any length."""
+        unit = np.asarray(normal) / np.linalg.norm(normal)
+        unit = np.where(np.abs(unit) < ROUNDING, 0.0, unit)
+        return cls(unit / np.linalg.norm(unit), offset / float(np.linalg.norm(normal)), lost or {})
+
+    @classmethod
+    def upright(cls, azimuth: float) -> "Mirror":
+        """The plane through e3 at an azimuth (rad)."""
+        return cls.of(np.array([-np.sin(azimuth), np.cos(azimuth), 0.0]))
+
+    @property
+    def through_e3(self) -> bool:
+        """Whether the axis e3 lies in the plane."""
+        return not self.normal[2] and not self.offset
+
+    @property
+    def azimuth(self) -> float:
+        """Of a plane through e3 (rad)."""
+        return float(np.arctan2(-self.normal[0], self.normal[1]))
+
+    @property
+    def plane(self) -> Array:
+        """The normal, and the offset if it is not zero: (3,) or (4,)."""
+        return np.append(self.normal, self.offset) if self.offset else self.normal
+
+    def turned(self, azimuth: float) -> "Mirror":
+        """The plane whose place in a frame turned about e3 (rad) this is."""
+        return replace(self, normal=self.normal @ rotation(azimuth))
+
+    @property
+    def reversed(self) -> "Mirror":
+        """The same plane with the other half."""
+        return Mirror(-self.normal, -self.offset, {kept: lost for lost, kept in self.lost.items()})
+
+    @property
+    def reflection(self) -> Array:
+        """(3, 3) of vectors."""
+        return np.asarray(np.eye(3) - 2 * np.outer(self.normal, self.normal))
+
+    def image(self, x: Array) -> Array:
+        """Mirrored places (..., 3)."""
+        return np.asarray(x - 2 * self.beyond(x)[..., None] * self.normal)
+
+    def beyond(self, x: Array) -> Array:
+        """Distances (...) from the plane, positive in the half that is modelled."""
+        return np.asarray(np.asarray(x) @ self.normal - self.offset)
+
+    def other(self, edge: str) -> str:
+        """The mirror image of an edge."""
+        return {**{kept: lost for lost, kept in self.lost.items()}, **self.lost}.get(edge, edge)
+
+    @property
+    def in_plane(self) -> tuple[Array, Array]:
+        """Two unit vectors normal to each other."""
+        first = np.eye(3)[int(np.argmin(np.abs(self.normal)))]
+        along = np.cross(first, self.normal)
+        along /= np.linalg.norm(along)
+        return along, np.asarray(np.cross(self.normal, along))
+
+
+Y0 = Mirror(np.array([0.0, 1.0, 0.0]))  # of shapes whose chart is halved: their frame is turned into it
+
+
+def cut(patch: PatchMesh, mirror: Mirror) -> PatchMesh:
+    """The half of a triangulation; its edge on the plane is `CUT`.
+
+    Raises
+    ------
+    MeshError
+        If triangles lie across the plane.
+    """
+    places = patch.embedding(patch.nodes)
+    beyond, extent = mirror.beyond(places), np.ptp(places, axis=0).max()
+    kept = beyond[patch.cells[:, :3]].mean(axis=1) > 0
+    corners = beyond[patch.cells[kept, :3]]
+    if not kept.any() or (~kept).sum() == 0 or corners.min() < -ROUNDING * extent:
+        raise MeshError(
+            f"symmetry: half: no edges of the mesh lie in the plane {said_plane(mirror)}: mesh it with a curve there"
+        )
+    cells = patch.cells[kept]
+    used, cells = np.unique(cells, return_inverse=True)
+    cells = cells.reshape(-1, patch.cells.shape[1])
+    one = np.arange(len(patch.nodes)) if patch.one is None else patch.one
+    first = np.full(len(patch.nodes), -1, dtype=np.int64)  # of each vertex of the surface, its first node that is left
+    first[one[used][::-1]] = np.arange(len(used))[::-1]
+    edges = {name: first[one[pairs]] for name, pairs in patch.edges.items()}
+    sides = np.sort(first[one[used[_sides(cells)]]], axis=1)
+    pairs, times = np.unique(sides, axis=0, return_counts=True)
+    ends = {(int(a), int(b)) for a, b in pairs[times == 1]}
+    edges = {
+        name: lines[[(int(a), int(b)) in ends for a, b in np.sort(lines, axis=1)]] for name, lines in edges.items()
+    }
+    named = {(int(a), int(b)) for lines in edges.values() for a, b in np.sort(lines, axis=1)}
+    edges[CUT] = np.array(sorted(ends - named), dtype=np.int64).reshape(-1, 2)
+    return replace(
+        patch,
+        nodes=patch.nodes[used],
+        cells=cells,
+        edges={name: lines for name, lines in edges.items() if len(lines)},
+        one=None if patch.one is None else first[one[used]],
+        patches={name: inside[kept] for name, inside in patch.patches.items()},
+    )
+
+
+def said_plane(mirror: Mirror) -> str:
+    """Normal and offset, for people."""
+    normal = ", ".join(f"{c + 0.0:.4g}" for c in np.round(mirror.normal, 9))
+    return f"({normal}) . x = {round(mirror.offset, 9) + 0.0:.4g} R"
+
+
+def _sides(cells: NDArray[np.int64]) -> NDArray[np.int64]:
+    return cells[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)

@@ -1,0 +1,110 @@
+"""What holds a meridian: displacements that are zero at its ends, and whether it is held against rigid motions."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from dolfinx import fem
+from numpy.typing import NDArray
+
+from magshell_fenicsx.mesh.patch import MeshError
+from magshell_fenicsx.models.axisymmetric.meridian import Meridian
+from magshell_fenicsx.models.shell.parameters import Condition, Held
+from magshell_fenicsx.models.shell.supports import RIGHT, STRAIGHT, no_mirror, open_to_pressure
+
+Facets = NDArray[np.int32]
+HORIZONTAL, AXIAL = {0, 1}, 2  # components of the displacement
+
+
+@dataclass(frozen=True)
+class Supports:
+    """Facets of the meridian by what is held there.
+
+    Attributes
+    ----------
+    axis
+        The point on the axis, which no axisymmetric displacement moves off it.
+    horizontal, axial
+        Where the displacements normal to e3 and along e3 are zero.
+    clamped, mirror
+        Where the normal is held, and where a plane normal to e3 mirrors the shell.
+    """
+
+    axis: Facets
+    horizontal: Facets
+    axial: Facets
+    clamped: Facets
+    mirror: Facets
+
+    def held(self, V: fem.FunctionSpace) -> list[fem.DirichletBC]:
+        """Of the axisymmetric displacement (U, W)."""
+        return [_zero(V, self.axis, 0), _zero(V, self.horizontal, 0), _zero(V, self.axial, 1)]
+
+    def held_waves(self, V: fem.FunctionSpace, m: int) -> list[fem.DirichletBC]:
+        """Of the coefficients (U + V, V, W): a wave m = 1 may move the axis across itself."""
+        at_axis = [_zero(V, self.axis, i) for i in ((0, 2) if m == 1 else (0, 1, 2))]
+        return [*at_axis, *(_zero(V, self.horizontal, i) for i in range(2)), _zero(V, self.axial, 2)]
+
+    def refuse_loose(self, r0: fem.Function) -> None:
+        """See that no rigid motion is left free; nothing but supports holds an unloaded shell.
+
+        Raises
+        ------
+        MeshError
+            With the motion.
+        """
+
+        def places(facets: Facets) -> NDArray[np.float64]:
+            dofs = fem.locate_dofs_topological(r0.function_space, 0, facets)
+            return np.asarray(r0.x.array.reshape(-1, 2)[dofs])
+
+        if not len(self.axial):
+            raise MeshError("boundary: the shell is not held: it is free to move along (0, 0, 1)")
+        # moved by a along e1 and turned by b about e2 it moves by a + b z along e1, at most by b rho along e3
+        rows = [[1.0, z] for _, z in places(self.horizontal)] + [[0.0, rho] for rho, _ in places(self.axial)]
+        stopped = np.linalg.matrix_rank(np.array(rows), tol=1e-9)
+        if stopped < 2:
+            motion = "turn" if len(self.horizontal) else "move along (1, 0, 0)"
+            raise MeshError(f"boundary: the shell is not held: it is free to {motion}")
+
+
+def supports(meridian: Meridian, conditions: Mapping[str, Condition], *, pressure: bool = False) -> Supports:
+    """The supports that conditions of named ends make, and those of a named point on the axis.
+
+    Raises
+    ------
+    MeshError
+        If an end lies in no plane of symmetry, or in one that is open to a live `pressure`.
+    """
+    horizontal, axial, clamped, mirror = found = [list[Facets]() for _ in range(4)]
+    for name, condition in conditions.items():
+        here = meridian.ends.get(name, meridian.axis)
+        held = set(condition.components) if isinstance(condition, Held) else set()
+        if condition in ("clamped", "simply supported"):
+            held = {*HORIZONTAL, AXIAL}
+        if condition == "clamped":
+            clamped.append(here)
+        elif condition == "plane":
+            _refuse_slanting(meridian, name, pressure=pressure)
+            mirror.append(here)
+            held = {AXIAL}
+        if held >= HORIZONTAL:
+            horizontal.append(here)
+        if AXIAL in held:
+            axial.append(here)
+    return Supports(meridian.axis, *(np.unique(np.concatenate([np.empty(0, np.int32), *f])) for f in found))
+
+
+def _refuse_slanting(meridian: Meridian, name: str, *, pressure: bool) -> None:
+    """See that the surface crosses the plane of an end at right angles, and a live pressure a plane through 0."""
+    s = meridian.parameter(name)
+    (rho, z), (rho_near, z_near) = meridian.section(np.array([s, s + (STRAIGHT if s == 0 else -STRAIGHT)]))
+    if abs(z_near - z) < RIGHT * np.hypot(rho_near - rho, z_near - z):
+        raise MeshError(no_mirror(name))
+    if pressure and abs(z) > STRAIGHT:
+        raise MeshError(open_to_pressure(name))
+
+
+def _zero(V: fem.FunctionSpace, facets: Facets, component: int) -> fem.DirichletBC:
+    part = V.sub(component)
+    return fem.dirichletbc(0.0, fem.locate_dofs_topological(part, 0, facets), part)

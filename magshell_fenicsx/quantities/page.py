@@ -1,0 +1,39 @@
+"""The columns of path.csv and the amplitudes as tables of docs/case.md."""
+
+from collections.abc import Iterable, Sequence
+
+from magshell_fenicsx.quantities.registry import AMPLITUDES, QUANTITIES
+
+HEAD = """
+## The columns of path.csv
+
+One row for each accepted point. The numbers have no units: multiply one by the size of one to get the quantity in SI.
+Named points add `NAME_ux`, `NAME_uy` and `NAME_uz`, in the unit of the shell's lengths. One's own energies add a column
+of their name, their amplitude.
+"""
+AMPLITUDES_HEAD = """
+The column `amplitude` says what varied:
+"""
+
+
+def columns_page() -> str:
+    """Two tables in Markdown."""
+    columns = [
+        (f"`{q.name}`", f"{q.html} {q.note}".strip() if q.symbol else q.words, q.unit, q.si, q.meaning)
+        for q in QUANTITIES.values()
+    ]
+    amplitudes = [(f"`{a.name}`", f"`{a.column}`", f"`{a.conjugate}`") for a in AMPLITUDES.values()]
+    return "\n".join(
+        [
+            HEAD,
+            *_table(("column", "label", "size of one", "SI", "meaning"), columns),
+            AMPLITUDES_HEAD,
+            *_table(("amplitude", "column of its value", "displacement that its curve shows"), amplitudes),
+            "",
+        ]
+    )
+
+
+def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
+    lines = [head, ["---"] * len(head), *rows]
+    return [f"| {' | '.join(cell.replace('|', '&#124;') for cell in line)} |" for line in lines]

@@ -1,0 +1,123 @@
+"""Every amplitude and every column of path.csv, in the order of the file."""
+
+import re
+from collections.abc import Iterable
+from dataclasses import replace
+
+from magshell_fenicsx.quantities.quantity import Amplitude, Kind, Quantity
+
+
+def _energy(name: str, words: str, meaning: str, symbol: str = "") -> Quantity:
+    return Quantity(name, words, meaning, "energy", symbol, "E h R²", "J")
+
+
+def _w(name: str, note: str, meaning: str) -> Quantity:
+    return Quantity(name, "displacement", meaning, "displacement", "w/h", "h", "m", note=note)
+
+
+OF_EVERY_RUN = (
+    Quantity("point", "point", "Number of the accepted point.", "count"),
+    Quantity("label", "what", "start, field, step, target, fold or bifurcation.", "text"),
+    Quantity("amplitude", "varied", "The amplitude that varied.", "text"),
+    Quantity(
+        "p_over_pc",
+        "pressure",
+        "Live pressure, positive from outside, over p_c = 2E/√(3(1 - ν²)) (h/R)².",
+        "load",
+        "p/p_c",
+        "p_c",
+        "Pa",
+    ),
+    Quantity(
+        "lambda_m",
+        "field",
+        "|Br||Ba|/(μ0 E), with the sign of the case; in SI the applied flux density.",
+        "load",
+        "λ_m",
+        si="mT",
+    ),
+    Quantity("force", "force", "Dead force of an indentation, positive inwards.", "load", "F R/(2πD)", "2πD/R", "N"),
+    _w(
+        "w_over_h",
+        "",
+        "Inward displacement at the force, of dead loads along them, else of the pole; over a patch its mean.",
+    ),
+    _w("w_from_field_over_h", "since the field", "w_over_h less its value where the field ended."),
+    _w(
+        "w_pole_over_h",
+        "of the pole",
+        "Inward displacement of the pole, a disc's centre or a strip's tip; of the first of `points` if there are any.",
+    ),
+    Quantity(
+        "volume_change",
+        "change of volume",
+        "Change of the volume under the shell, negative where it shrinks.",
+        "displacement",
+        "ΔV/R³",
+        "R³",
+        "m³",
+        sign=-1.0,
+    ),
+    _energy("energy", "energy", "Π, the sum of all terms."),
+    Quantity("negative_pivots", "unstable directions", "Of the model, with all amplitudes given.", "count"),
+    Quantity("negative_pivots_held", "unstable, w held", "The same with the conjugate displacement given.", "count"),
+    Quantity("iterations", "iterations", "Of Newton's method.", "count"),
+    Quantity("factorisations", "factorisations", "Of the tangent.", "count"),
+    Quantity("wall_s", "time", "Since the run began.", "time", unit="s", si="s"),
+    _energy("stretching", "stretching", "Membrane energy; not of a solid."),
+    _energy("bending", "bending", "Bending energy with that of the edges; not of a solid."),
+    _energy("magnetic", "magnetic", "Magnetic energy."),
+    _energy("U1", "first term", "Of the approximate magnetic energies.", "U_1"),
+    _energy("Uq", "torques of rotations", "Of the approximate magnetic energies.", "U_q"),
+    _energy("Utau", "torques of gradients", "Of the approximate magnetic energies.", "U_τ"),
+    Quantity("mode", "mode", "Of an instability: symmetric, asymmetric, m = 2, antisymmetric, ...", "text"),
+    Quantity("field_angle", "field angle", "By which the field has turned.", "load", unit="degrees", si="degrees"),
+    Quantity("branch", "branch", "0 is the path, 1 and 2 leave it at its first bifurcation.", "count"),
+    _w("w_point_over_h", "of the loaded point", "Inward displacement of the loaded point itself."),
+    Quantity("error_over_h", "error of u", "Estimate of the algebraic error, the next step.", "error", "", "h", "m"),
+    Quantity("load_error", "error of the load", "Estimate of that of the amplitude at a located point.", "error"),
+    Quantity("excluded_pivots", "unstable, excluded", "Of modes that the model's symmetry excludes.", "count"),
+)
+OF_SOME_RUNS = (Quantity("load_factor", "load factor", "Of all dead loads together.", "load"),)
+QUANTITIES = {q.name: q for q in (*OF_EVERY_RUN, *OF_SOME_RUNS)}
+AMPLITUDES = {
+    a.name: a
+    for a in (
+        Amplitude("pressure", "p_over_pc", "volume_change"),
+        Amplitude("force", "force", "w_over_h", "at the load"),
+        Amplitude("load", "load_factor", "w_over_h", "along the loads"),
+        Amplitude("lambda_m", "lambda_m"),
+        Amplitude("angle", "field_angle"),
+    )
+}
+# names of terms, and of amplitudes that only the solvers see
+INTERNAL = ("push", "lambda_across", "membrane", "couple")
+TAKEN = frozenset((*QUANTITIES, *AMPLITUDES, *INTERNAL))
+
+
+def register(quantities: Iterable[Quantity]) -> None:
+    """Add the columns of a part."""
+    QUANTITIES.update({q.name: q for q in quantities})
+
+
+def quantity(name: str) -> Quantity:
+    """That of a column; a named point's displacement or one's own amplitude is called by its name."""
+    kind: Kind = "place" if re.search(r"_u[xyz]$", name) else "load"
+    return QUANTITIES.get(name) or Quantity(name, name.replace("_", " "), "", kind)
+
+
+def amplitude(name: str) -> Amplitude:
+    """That of a name; one's own has the column of its name."""
+    return AMPLITUDES.get(name) or Amplitude(name, name)
+
+
+def axes_of(name: str) -> tuple[Quantity, Quantity]:
+    """What an amplitude's curve is drawn over, and what is drawn: its value over a displacement.
+
+    An angle is given, and drawn over it is the displacement.
+    """
+    varied = amplitude(name)
+    over, drawn = quantity(varied.conjugate), quantity(varied.column)
+    if varied.conjugate == "w_over_h":
+        over = replace(over, note=varied.place)
+    return (drawn, over) if name == "angle" else (over, drawn)

@@ -1,0 +1,147 @@
+"""Walking along a path of a scene: its records, the modes that its model excludes, and branches."""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from magshell_fenicsx.case.loading import PathSection
+from magshell_fenicsx.continuation.branch import Branching, branching
+from magshell_fenicsx.continuation.path import Path, StepOptions
+from magshell_fenicsx.continuation.point import PathStopped, Point
+from magshell_fenicsx.continuation.walk import Goal, Walk
+from magshell_fenicsx.continuation.watch import Crossing
+from magshell_fenicsx.simulate.record import Record, Stopped
+from magshell_fenicsx.simulate.stage import LONGEST, Stage
+
+BEYOND = 2.0  # times the load of the first instability that the model excludes a walk goes on
+
+
+def followed(
+    stage: Stage, path: Path, start: Point, goal: Goal, branches: PathSection | None = None
+) -> Iterator[Record]:
+    """A walk, what the reduced model excludes on it, and the branches if they are asked for.
+
+    With `until: bifurcation` a mode that the model excludes ends the walk; with `until: limit` the walk goes on to
+    the model's own first instability, if that is below `BEYOND` times the load of the first excluded one.
+
+    Raises
+    ------
+    Stopped
+        If the path is lost.
+    """
+    for record in _followed(stage, path, start, goal, branches):
+        yield replace(record, point=stage.point(record.point))
+
+
+def _followed(
+    stage: Stage, path: Path, start: Point, goal: Goal, branches: PathSection | None = None
+) -> Iterator[Record]:
+    stage.scene.progress.doing("looking for modes that the model excludes")
+    walk, crossing, lost, watch = Walk(path, start, goal), None, "", stage.scene.watch
+    furthest = np.inf  # amplitude, once an excluded mode is unstable
+    watch.begin(path, start, stage.leave)
+    try:
+        for label, point in walk:
+            mode, located = "", label in ("fold", "bifurcation")
+            excluded = list(_excluded(path, watch.pass_to(point, look=located)))
+            if excluded and goal.until == "bifurcation":
+                yield excluded[0]
+                break
+            yield from excluded
+            if excluded and goal.until == "limit":
+                furthest = min(furthest, BEYOND * abs(excluded[0].point.state.mu[path.name]))
+            if label == "bifurcation":
+                here = branching(_by_arc(stage, path), point)
+                crossing = crossing or here
+                mode = ("symmetric" if here.symmetric else "asymmetric") if here else ""
+            yield Record(label, path.name, point, mode, excluded_pivots=watch.unstable)
+            if abs(point.state.mu[path.name]) > furthest:
+                break
+    except PathStopped as e:
+        lost = _why(path, e, walk.points)
+    yield from _excluded(path, watch.end())
+    if lost and path.control == "load":
+        for found in _fold_ahead(stage, path, walk.points):
+            yield found
+            if found.label == "fold":
+                at = f"{path.name} = {found.point.state.mu[path.name]:.9g}"
+                lost = f"load control cannot pass the fold at {at}; {lost}"
+    if watch.unlocated:
+        why = f"a mode that the reduced model excludes is unstable, but where is not known: {watch.unlocated}"
+        lost = f"{lost}; {why}" if lost else why
+    if lost:
+        raise Stopped(lost)
+    if branches and branches.branches and crossing:
+        yield from _branches(stage, path, crossing, goal, branches.points)
+
+
+def _branches(stage: Stage, path: Path, crossing: Branching, goal: Goal, steps: int) -> Iterator[Record]:
+    """Both directions of a branch, to the same target as the path or for a number of steps."""
+    lost, watch = [], stage.scene.watch
+    if goal.until != "target":
+        goal = Goal("points", steps=steps)
+    for number, start in enumerate(crossing.starts, 1):
+        by_arc = _by_arc(stage, path)
+        walk = Walk(by_arc, start, goal)
+        watch.begin(by_arc, start, stage.leave, look=True)
+        yield Record("step", path.name, start, branch=number, excluded_pivots=watch.unstable)
+        try:
+            for label, point in walk:
+                for found in _excluded(by_arc, watch.pass_to(point, look=label in ("fold", "bifurcation"))):
+                    yield replace(found, branch=number)
+                yield Record(label, path.name, point, branch=number, excluded_pivots=watch.unstable)
+        except PathStopped as e:
+            lost.append(f"branch {number}: {_why(by_arc, e, walk.points)}")
+        for found in _excluded(by_arc, watch.end()):
+            yield replace(found, branch=number)
+    if lost:
+        raise Stopped("; ".join(lost))
+
+
+def _by_arc(stage: Stage, path: Path) -> Path:
+    """The same path by arc length, in steps as long as the one off it at a bifurcation."""
+    scale = path.metric.scale
+    return stage.path(path.name, "arc", StepOptions(0.1, LONGEST * 0.1, 1e-6), scale)
+
+
+def _fold_ahead(stage: Stage, path: Path, points: list[Point]) -> list[Record]:
+    """The fold that ended a path under load control, by arc length from its last point, and what comes before it."""
+    onward = points[-1].s - points[-2].s if len(points) > 1 else 1.0
+    by_arc, start = stage.begin(path.name, "arc", points[-1].state, onward, path.metric.scale)
+    stage.scene.watch.begin(by_arc, start, stage.leave)
+    found: list[Record] = []
+    try:
+        for label, point in Walk(by_arc, start, Goal("limit", steps=20)):
+            found += _excluded(by_arc, stage.scene.watch.pass_to(point, look=label == "fold"))
+    except PathStopped:
+        return []
+    return (
+        [*found, Record(label, path.name, point, excluded_pivots=stage.scene.watch.unstable)] if label == "fold" else []
+    )
+
+
+def _excluded(path: Path, crossings: Iterable[Crossing]) -> Iterator[Record]:
+    """Where modes that a reduced model does not see become unstable or stable."""
+    for found in crossings:
+        yield Record("bifurcation", path.name, found.point, found.label, excluded_pivots=found.unstable)
+
+
+def _why(path: Path, stop: PathStopped, points: list[Point]) -> str:
+    """What the user reads when a path is lost, with the fold in the control named if it is one."""
+    here = stop.point
+    said = f"the last point has {path.name} = {here.state.mu[path.name]:.6g}: {stop}"
+    if path.control == "load":
+        return f"load control stopped; {said}. Past a limit point only control: arc or by displacement can follow"
+    before = points[-2] if len(points) > 1 else here
+    if path.control == "arc" or before.dmu == here.dmu:
+        return f"the controlled path stopped; {said}"
+    # near a fold in the controlled s, (ds/dmu)^2 falls linearly to zero with s
+    a, b = before.dmu**-2, here.dmu**-2
+    ahead = b * (here.s - before.s) / (a - b) if a > b else np.inf
+    if 0 < ahead / (here.s - before.s) < 10:
+        return (
+            f"the path turns back in the controlled displacement, {ahead / here.s:.2%} beyond the last point: "
+            f"a fold that displacement control cannot pass, but control: arc can; {said}"
+        )
+    return f"the controlled path stopped; {said}"
