@@ -4,17 +4,17 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
+import numpy as np
 from pydantic import Field, ModelWrapValidatorHandler, ValidationError, model_validator
 
 from magshell_fenicsx.case.boundary import EDGES, BoundarySection
 from magshell_fenicsx.case.defects import DimpleSection
-from magshell_fenicsx.case.fields import MagneticSection
+from magshell_fenicsx.case.fields import MagneticSection, layer_average
 from magshell_fenicsx.case.loading import (
     DeadSection,
     FieldSection,
     IndentationSection,
     LoadingSection,
-    PathSection,
     RotationSection,
 )
 from magshell_fenicsx.case.messages import explain
@@ -58,7 +58,7 @@ class Case(WithParts):
     """A shell, what holds it, its field and its load; validated."""
 
     model: Literal["shell", "solid"] = "shell"
-    """A thin shell, or the body of a hemisphere, disc or strip in three dimensions"""
+    """A thin shell, or its body in three dimensions"""
     shell: Annotated[ShellSection | Surface, Field(discriminator="geometry")]
     """Mid-surface, thickness and material"""
     solid: SolidSection | None = None
@@ -97,6 +97,12 @@ class Case(WithParts):
     def _sections_fit(self) -> Self:
         if self.magnetic and self.magnetic.lambda_m is None and self.shell.youngs_modulus is None:
             raise ValueError("shell.youngs_modulus is needed to turn flux densities into lambda_m")
+        layers = self.magnetic.remanent.layers if self.magnetic else None
+        if layers and self.model == "shell" and np.linalg.norm(layer_average(layers)) < 1e-9:
+            raise ValueError(
+                "magnetic.remanent.layers: the layers cancel: their average is a remanence of length zero, and a shell "
+                "knows no more of them"
+            )
         if isinstance(self.loading, FieldSection) and not self.lambda_m:
             raise ValueError("loading.kind: field needs magnetic.lambda_m, not zero, for its target or direction")
         if isinstance(self.loading, RotationSection):
@@ -175,20 +181,15 @@ class Case(WithParts):
                 raise ValueError("solid belongs to model: solid")
             return self
         magnetic, loading = self.magnetic, self.loading
-        if isinstance(self.shell, MeshSurface) or isinstance(loading, DeadSection) or self.points:
-            raise ValueError("model: solid: takes no mesh file, no dead loads and no named points")
+        if isinstance(self.thickness_factor, dict):
+            raise ValueError("shell.thickness_factor: of a solid a formula: a step in the thickness is no swept body")
         if magnetic and magnetic.energy != "full":
-            raise ValueError(f"magnetic.energy: {magnetic.energy}: not of a solid, which has the full energy")
-        if magnetic and magnetic.remanent.kind != "uniform":
-            raise ValueError(f"magnetic.remanent.kind: {magnetic.remanent.kind}: a solid's remanence is uniform")
-        for name, condition in self.boundary.conditions().items():
-            if condition in ("simply supported", "hinged"):
-                raise ValueError(f"boundary.{name}: {condition}: the face of a solid is clamped or free")
+            raise ValueError(f"magnetic.energy: {magnetic.energy}: not of a solid, whose full energy is linear in F")
         for key in self.mesh.model_fields_set & {"degree", "penalty", "tolerance"}:
             if key != "degree" or self.mesh.degree != SOLID_DEGREE:
-                raise ValueError(
-                    f"mesh.{key}: not of a solid, which has degree {SOLID_DEGREE}; mesh.refinement makes it finer"
-                )
+                read = isinstance(self.shell, MeshSurface)
+                finer = "a file with smaller elements" if read else "mesh.refinement"
+                raise ValueError(f"mesh.{key}: not of a solid, which has degree {SOLID_DEGREE}; {finer} makes it finer")
         if self.symmetry == "axisymmetric":
             raise ValueError("symmetry: axisymmetric: a solid is whole or half")
         if isinstance(loading, IndentationSection) and not loading.patch:
@@ -201,8 +202,6 @@ class Case(WithParts):
                 "solid.bulk_to_shear: takes the place of shell.poisson_ratio: 0.5; here that is "
                 f"{self.shell.poisson_ratio:g}, which says all"
             )
-        if isinstance(loading, PathSection) and loading.sensitivities:
-            raise ValueError("loading.sensitivities: not of a solid")
         return self
 
     @property

@@ -47,7 +47,8 @@ class RemanentSection(Direction):
 
     radial: along the normal. tangential: along the meridians, away from e3. expression: components as
     formulas of the undeformed position x, y, z over R. patches: a direction per named patch, "dimple"
-    (within its rim) of a hemisphere, those of a mesh, and "rest". layers: averaged over the thickness.
+    (within its rim) of a hemisphere, those of a mesh, and "rest". layers: from the inner face outwards; a shell takes
+    their average.
     """
 
     kind: Literal["uniform", "radial", "tangential", "expression", "patches", "layers"] = "uniform"
@@ -69,11 +70,8 @@ class RemanentSection(Direction):
                 raise ValueError(f"{key} belongs to kind: {kind}, and must be given there; the kind is {self.kind}")
         if self.kind != "uniform" and {"polar", "azimuth"} & self.model_fields_set:
             raise ValueError(f"polar and azimuth belong to kind: uniform; the kind is {self.kind}")
-        if self.layers:
-            if abs(sum(layer.fraction for layer in self.layers) - 1) > 1e-6:
-                raise ValueError("the fractions of the layers must add up to 1")
-            if np.linalg.norm(layer_average(self.layers)) < 1e-9:
-                raise ValueError("the layers cancel: their average is a remanence of length zero")
+        if self.layers and abs(sum(layer.fraction for layer in self.layers) - 1) > 1e-6:
+            raise ValueError("the fractions of the layers must add up to 1")
         return self
 
     def directions(self) -> list[Direction]:

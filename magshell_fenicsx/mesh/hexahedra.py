@@ -1,28 +1,24 @@
-"""A body of constant thickness around a mid-surface: hexahedra of degree 2, swept through the thickness.
+"""A body around a mid-surface: hexahedra of degree 2, swept through the thickness."""
 
-Each triangle of the mid-surface's own mesh is split into three quadrilaterals, which meet at its centre: the
-body is graded as the shell is, and its edges follow the same circles.
-"""
-
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import basix
 import basix.ufl
 import numpy as np
 from dolfinx import fem, mesh
-from dolfinx.cpp.io import perm_gmsh
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from magshell_fenicsx.mesh.patch import Embedding, PatchMesh
+from magshell_fenicsx.mesh.patch import MeshError, PatchMesh
+from magshell_fenicsx.mesh.quadrilaterals import Quadrilaterals, split, square
 from magshell_fenicsx.platform import compat
 
 Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
-STEP = 1e-5  # of the differences that give the normal: their error is 1e-10
 OUTER = "outer"  # face
-VERTICES = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
-SIDES = ((0, 1), (1, 2), (2, 0))  # of a triangle
+MIDDLE = 0.5  # of the thickness
 
 
 @dataclass(frozen=True)
@@ -37,31 +33,64 @@ class Body:
         Name -> facets (local numbers): "outer", and those above each named edge of the mid-surface.
     points, normals
         Name -> (3,) position of a node in the middle of the thickness, and the mid-surface's normal there.
+    patches
+        Name -> whether each local cell is above that part of the mid-surface.
+    between
+        (cells, 2) where each local cell begins and ends in the thickness: from 0 inside to 1 outside.
+    chart, heights, thickness
+        Of each node of the geometry: the chart's coordinates (n, d) under it, where it is in the thickness, from 0 to
+        1, and h(x) over R; see `at_nodes`.
     """
 
     mesh: mesh.Mesh
     faces: dict[str, NDArray[np.int32]]
     points: dict[str, Array]
     normals: dict[str, Array]
+    patches: dict[str, NDArray[np.bool_]]
+    between: Array
+    chart: Array
+    heights: Array
+    thickness: Array
+
+    def at_nodes(self, V: fem.FunctionSpace, values: Array) -> Array:
+        """What is known at the nodes of the geometry, at those of a quadratic space."""
+        nodes = V.dofmap.index_map
+        found = np.empty((nodes.size_local + nodes.num_ghosts, *values.shape[1:]))
+        found[V.dofmap.list] = values[compat.corner_numbers(self.mesh)]
+        return found
 
 
-@dataclass(frozen=True)
-class _Quadrilaterals:
-    """Nodes (n, 2) of the chart, cells (m, 9) in the order of basix, and the pairs of vertices on named edges."""
+def sweep(
+    patch: PatchMesh,
+    h: float,
+    layers: int | Sequence[float],
+    comm: MPI.Comm,
+    factor: Callable[[Array], Array] | None = None,
+) -> Body:
+    """Make the body of all ranks from the triangulation, which each of them has: it is small.
 
-    nodes: Array
-    cells: Numbers
-    edges: dict[str, Numbers]
+    Parameters
+    ----------
+    h
+        The thickness over R.
+    layers
+        Number of cells through the thickness, or where they begin and end, from 0 to 1.
+    factor
+        What multiplies h at places (n, 3) of the mid-surface; None for 1.
 
-
-def sweep(patch: PatchMesh, h: float, layers: int, comm: MPI.Comm) -> Body:
-    """Make the body of all ranks from the triangulation, which each of them has: it is small."""
-    quads, levels = _split(patch), 2 * layers + 1
-    z = np.linspace(-h / 2, h / 2, levels)
-    r, n = patch.embedding(quads.nodes), surface_normal(patch.embedding, quads.nodes)
-    X = (r[:, None] + z[:, None] * n[:, None]).reshape(-1, 3)
-    first = comm.rank == 0
-    cells = _swept(quads.cells, layers)
+    Raises
+    ------
+    MeshError
+        On every rank, if the body overlaps itself.
+    """
+    quads = split(patch)
+    ends = np.linspace(0, 1, layers + 1) if isinstance(layers, int) else np.array(layers)
+    heights = np.concatenate([ends[:1], *([(a + b) / 2, b] for a, b in pairwise(ends))])
+    thick = h * (np.ones(len(quads.places)) if factor is None else factor(quads.places))
+    z = (heights - MIDDLE) * thick[:, None]
+    X = (quads.places[:, None] + z[..., None] * quads.offsets[:, None]).reshape(-1, 3)
+    first, cells = comm.rank == 0, _swept(quads.cells, len(ends) - 1)
+    _refuse_overlap(X, cells)
     domain = mesh.create_mesh(
         comm,
         cells=cells if first else cells[:0],
@@ -69,89 +98,38 @@ def sweep(patch: PatchMesh, h: float, layers: int, comm: MPI.Comm) -> Body:
         e=basix.ufl.element("Lagrange", "hexahedron", 2, shape=(3,)),
         partitioner=compat.shared_facets(),
     )
-    chart = {name: x[None] for name, x in patch.points.items()}
+    original = domain.topology.original_cell_index
+    triangle, layer = original // (3 * (len(ends) - 1)), original % (len(ends) - 1)
+    places = {name: patch.embedding(x[None])[0] for name, x in patch.points.items()}
+    nearest = {name: np.argmin(np.linalg.norm(quads.places - x, axis=1)) for name, x in places.items()}
+    node, level = np.divmod(domain.geometry.input_global_indices, len(heights))
     return Body(
         domain,
-        _named_faces(domain, quads, levels),
-        {name: patch.embedding(x)[0] for name, x in chart.items()},
-        {name: surface_normal(patch.embedding, x)[0] for name, x in chart.items()},
+        _named_faces(domain, quads, len(heights)),
+        places,
+        {name: quads.offsets[n] / np.linalg.norm(quads.offsets[n]) for name, n in nearest.items()},
+        {name: inside[triangle] for name, inside in patch.patches.items()},
+        np.column_stack([ends[layer], ends[layer + 1]]),
+        quads.nodes[node],
+        heights[level],
+        thick[node],
     )
 
 
-def surface_normal(embedding: Embedding, x: Array) -> Array:
-    """Unit normals (n, 3) at points (n, 2) of a chart, by central differences."""
-    a1, a2 = (embedding(x + STEP * e) - embedding(x - STEP * e) for e in np.eye(2))
-    m = np.cross(a1, a2)
-    return np.asarray(m / np.linalg.norm(m, axis=1)[:, None])
-
-
-def _split(patch: PatchMesh) -> _Quadrilaterals:
-    """Three quadrilaterals for each triangle: vertex, middle of a side, centre, middle of the other side."""
-    reference, quads, on_sides = _reference_split()
-    order = {3: 1, 6: 2, 10: 3}[patch.cells.shape[1]]
-    geometry = basix.create_element(
-        basix.ElementFamily.P, basix.CellType.triangle, order, basix.LagrangeVariant.equispaced
+def _refuse_overlap(X: Array, cells: Numbers) -> None:
+    """Look at the volume of all cells at their nodes."""
+    element = basix.create_element(
+        basix.ElementFamily.P, basix.CellType.hexahedron, 2, basix.LagrangeVariant.equispaced
     )
-    to_dolfinx = perm_gmsh(mesh.CellType.triangle, patch.cells.shape[1])
-    values = geometry.tabulate(0, reference)[0, :, :, 0]
-    corners = patch.cells[:, :3]
-    vertices, corners = np.unique(corners, return_inverse=True)
-    corners = corners.reshape(-1, 3)
-    pairs = np.concatenate([corners[:, list(side)] for side in SIDES])
-    sides, side_of = np.unique(np.sort(pairs, axis=1), axis=0, return_inverse=True)
-    side_of, backwards = side_of.reshape(3, -1), (pairs[:, 0] > pairs[:, 1]).reshape(3, -1)
-    numbers = np.empty((len(corners), len(reference)), dtype=np.int64)
-    numbers[:, :3] = corners
-    for side, places in enumerate(on_sides):  # three nodes on a side, counted from its lower vertex
-        along = np.where(backwards[side][:, None], [2, 1, 0], [0, 1, 2])
-        numbers[:, places] = len(vertices) + 3 * side_of[side][:, None] + along
-    inner = np.setdiff1d(np.arange(len(reference)), [0, 1, 2, *np.ravel(on_sides)])
-    below = len(vertices) + 3 * len(sides)
-    numbers[:, inner] = below + len(inner) * np.arange(len(corners))[:, None] + np.arange(len(inner))
-    nodes = np.empty((numbers.max() + 1, patch.nodes.shape[1]))
-    nodes[numbers] = np.einsum("qk,ckd->cqd", values, patch.nodes[patch.cells[:, to_dolfinx]])
-    middle_of = {(int(a), int(b)): len(vertices) + 3 * n + 1 for n, (a, b) in enumerate(sides)}
-
-    def halves(a: int, b: int) -> list[list[int]]:
-        middle = middle_of[min(a, b), max(a, b)]
-        return [[a, middle], [middle, b]]
-
-    edges: dict[str, Numbers] = {
-        name: np.array(
-            [half for a, b in np.searchsorted(vertices, pairs) for half in halves(int(a), int(b))], dtype=np.int64
-        ).reshape(-1, 2)
-        for name, pairs in patch.edges.items()
-    }
-    return _Quadrilaterals(nodes, numbers[:, quads].reshape(-1, 9), edges)
-
-
-def _reference_split() -> tuple[Array, Numbers, list[list[int]]]:
-    """Places (19, 2) in the reference triangle, vertices first; quadrilaterals (3, 9) of them; those on each side."""
-    square = basix.create_element(
-        basix.ElementFamily.P, basix.CellType.quadrilateral, 2, basix.LagrangeVariant.equispaced
-    ).points
-    s, t = square.T[:, :, None]
-    centre = VERTICES.mean(axis=0)
-    found = [*VERTICES]
-    quads = []
-    for i in range(3):
-        here, following, before = (VERTICES[(i + k) % 3] for k in range(3))
-        side, other = (here + following) / 2, (here + before) / 2
-        quad = (1 - s) * (1 - t) * here + s * (1 - t) * side + s * t * centre + (1 - s) * t * other
-        numbers = []
-        for x in quad:
-            known = [n for n, y in enumerate(found) if np.allclose(x, y)]
-            if not known:
-                found.append(x)
-            numbers.append(known[0] if known else len(found) - 1)
-        quads.append(numbers)
-    places = np.array(found)
-
-    def along(a: int, b: int) -> list[int]:
-        wanted = VERTICES[a] + np.array([0.25, 0.5, 0.75])[:, None] * (VERTICES[b] - VERTICES[a])
-        return [int(np.argmin(np.linalg.norm(places - x, axis=1))) for x in wanted]
-
-    return places, np.array(quads), [along(*side) for side in SIDES]
+    tables = element.tabulate(1, element.points)[1:, :, :, 0]
+    for part in np.array_split(cells, len(cells) // 2000 + 1):
+        volumes = np.linalg.det(np.einsum("dqk,ckx->cqdx", tables, X[part]))
+        if (volumes <= 0).any():
+            x, y, z = X[part[np.argwhere(volumes <= 0)[0][0]]].mean(axis=0)
+            raise MeshError(
+                f"model: solid: the body overlaps itself around ({x:.4g}, {y:.4g}, {z:.4g})/R: half its thickness is "
+                "more than the radius of curvature, or than a fold leaves beside it"
+            )
 
 
 def _swept(quads: Numbers, layers: int) -> Numbers:
@@ -159,19 +137,16 @@ def _swept(quads: Numbers, layers: int) -> Numbers:
     points = basix.create_element(
         basix.ElementFamily.P, basix.CellType.hexahedron, 2, basix.LagrangeVariant.equispaced
     ).points
-    square = basix.create_element(
-        basix.ElementFamily.P, basix.CellType.quadrilateral, 2, basix.LagrangeVariant.equispaced
-    ).points
-    below = np.argmin(np.linalg.norm(points[:, None, :2] - square[None], axis=2), axis=1)
+    below = np.argmin(np.linalg.norm(points[:, None, :2] - square()[None], axis=2), axis=1)
     level = np.rint(2 * points[:, 2]).astype(np.int64)
     levels = 2 * layers + 1
     cells = [quads[:, below] * levels + level + 2 * layer for layer in range(layers)]
     return np.stack(cells, axis=1).reshape(-1, 27)
 
 
-def _named_faces(domain: mesh.Mesh, quads: _Quadrilaterals, levels: int) -> dict[str, NDArray[np.int32]]:
+def _named_faces(domain: mesh.Mesh, quads: Quadrilaterals, levels: int) -> dict[str, NDArray[np.int32]]:
     """Outer and side faces, found by the numbers of their nodes."""
-    for pair in ((2, 3), (2, 0), (0, 3)):
+    for pair in ((2, 3), (2, 0), (0, 3), (3, 2)):
         domain.topology.create_connectivity(*pair)
     facets = mesh.exterior_facet_indices(domain.topology)
     vertices = domain.topology.index_map(0)

@@ -7,7 +7,9 @@ from dolfinx import fem
 from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
+from magshell_fenicsx.assembly.terms import LinearTerm
 from magshell_fenicsx.continuation.system import Vector
+from magshell_fenicsx.models.shell.dead_load import DeadLoads
 from magshell_fenicsx.models.shell.parameters import Loads, Material
 from magshell_fenicsx.models.shell.point_load import point_entries
 
@@ -35,6 +37,7 @@ class Observed:
     material: Material
     multiplicity: int
     normals: Mapping[str, Array]
+    u: fem.Function
     loads: Loads
     load_size: float = 0.0
     observed: Mapping[str, fem.Form]
@@ -45,6 +48,11 @@ class Observed:
         # dofs of a vertex on the rank that owns it
         V = self.system.u.function_space
         self._probes = {name: point_entries(V, x, np.ones(3))[0] for name, x in points.items()}
+
+    def load_with(self, dead: DeadLoads) -> LinearTerm:
+        """The term of the dead loads but the moments."""
+        self.load_size = dead.size
+        return LinearTerm("load", *dead.entries, self.u, "load")
 
     def zero(self) -> Vector:
         """The undeformed displacement."""

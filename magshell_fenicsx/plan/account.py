@@ -3,11 +3,10 @@
 from math import degrees
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.solid import SolidSection
 from magshell_fenicsx.mesh.mirror import Mirror, said_plane
 from magshell_fenicsx.models.shell.parameters import Loads
-from magshell_fenicsx.models.solid.material import NeoHookean
 from magshell_fenicsx.parts.registered import PARTS
+from magshell_fenicsx.plan.body import layers, neo_hookean
 
 
 def account(case: Case, loads: Loads, model: str, mirror: Mirror | None) -> tuple[list[str], list[str]]:
@@ -46,13 +45,8 @@ def account(case: Case, loads: Loads, model: str, mirror: Mirror | None) -> tupl
     return included, left_out
 
 
-def neo_hookean(case: Case) -> NeoHookean:
-    """The solid's material."""
-    return NeoHookean.of(case.shell.poisson_ratio, (case.solid or SolidSection()).bulk_to_shear)
-
-
 def _elastic(case: Case) -> str:
-    material, layers = neo_hookean(case), (case.solid or SolidSection()).layers
+    material, count = neo_hookean(case), len(layers(case)) - 1
     ratio = material.bulk / material.shear
     small_strains = f"E = {material.youngs_modulus:.5g}, nu = {material.nu:.5g} for small strains"
-    return f"neo-Hookean energy, kappa/mu = {ratio:.5g} ({small_strains}), {layers} layer{'s' * (layers > 1)}"
+    return f"neo-Hookean energy, kappa/mu = {ratio:.5g} ({small_strains}), {count} layer{'s' * (count > 1)}"

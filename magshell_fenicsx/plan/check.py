@@ -4,10 +4,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.solid import SolidSection
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.mesh.msh import MeshFile
 from magshell_fenicsx.mesh.patch import MeshError, PatchMesh
+from magshell_fenicsx.plan.body import layers
 from magshell_fenicsx.plan.plan import Plan
 from magshell_fenicsx.plan.planner import make_plan, meridian_vertices
 
@@ -83,6 +83,6 @@ def _count(case: Case, plan: Plan, patch: PatchMesh | None) -> tuple[int, int]:
     cells, corners = patch.corners, len(np.unique(patch.corners))
     sides = len(np.unique(np.sort(cells[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0))
     if case.model == "solid":  # three hexahedra a layer above each triangle
-        layers = (case.solid or SolidSection()).layers
-        return 3 * len(cells) * layers, 3 * (2 * layers + 1) * (corners + 3 * sides + 7 * len(cells))
+        count = len(layers(case)) - 1
+        return 3 * len(cells) * count, 3 * (2 * count + 1) * (corners + 3 * sides + 7 * len(cells))
     return len(cells), 3 * (corners + (k - 1) * sides + (k - 1) * (k - 2) // 2 * len(cells))

@@ -6,8 +6,8 @@ from numpy.typing import NDArray
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.expressions import formula
 from magshell_fenicsx.case.messages import shown
-from magshell_fenicsx.case.solid import SolidSection
 from magshell_fenicsx.case.source import CaseError
+from magshell_fenicsx.plan.body import layers
 
 Array = NDArray[np.float64]
 MOST_UNKNOWNS = 2_000_000  # whose factors fill the memory of a large workstation
@@ -26,7 +26,7 @@ def refuse_too_many(case: Case, cells: float, hint: str = "") -> None:
     """
     per_triangle = 1.5 * case.degree**2
     if case.model == "solid":
-        per_triangle = 36 * (2 * (case.solid or SolidSection()).layers + 1)
+        per_triangle = 36 * (2 * len(layers(case)) - 1)
     unknowns = per_triangle * cells
     if unknowns > MOST_UNKNOWNS:
         raise CaseError(

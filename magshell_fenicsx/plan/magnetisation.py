@@ -46,4 +46,5 @@ def magnetisation(magnetic: MagneticSection, case: Case, turn: float, to: Direct
         patches = {name: direction.vector(turn) for name, direction in section.patches.items()}
     Q = rotation(turn)
     G = Q @ np.array(gradient) @ Q.T if gradient else None
-    return Magnetisation(remanent, applied, magnetic.energy, G, across, patches)
+    layers = tuple((layer.fraction, layer.vector(turn)) for layer in section.layers or [])
+    return Magnetisation(remanent, applied, magnetic.energy, G, across, patches, layers)

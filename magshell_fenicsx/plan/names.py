@@ -62,7 +62,7 @@ def _refuse_open(patch: PatchMesh, conditions: Mapping[str, Condition]) -> None:
     """p int x.n/3 is the work of a live pressure only up to (p/3) of the line integral of dx.(x cross t) on its edges.
 
     It vanishes where the edge cannot move, or stays in a plane through the origin; where a plane of the user's
-    is, `ShellModel` sees.
+    is, the model sees.
     """
     pairs = {name: _pairs(edge) for name, edge in patch.edges.items()}
     closed = set().union(*(pairs[name] for name, c in conditions.items() if name in pairs and _closes(c)))

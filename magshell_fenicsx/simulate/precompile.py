@@ -1,7 +1,7 @@
 """Compile kernels ahead of time, for images and clusters without a compiler at run time.
 
-Those of hemispheres, of solids, and of any mid-surface under dead loads. Remanences by formula or in layers, fields
-with a gradient, other energies than the full one, and surfaces with kinks compile theirs on their first run.
+Those of hemispheres, of their solids, and of any mid-surface under dead loads. Remanences by formula, fields with a
+gradient, other energies than the full one, surfaces with kinks and loads of other solids compile theirs on first use.
 """
 
 import time

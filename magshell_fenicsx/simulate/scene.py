@@ -6,10 +6,11 @@ from collections.abc import Sequence
 from functools import cached_property
 from math import atan2, copysign, degrees, hypot, nan
 
+import numpy as np
 from mpi4py import MPI
+from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.solid import SolidSection
 from magshell_fenicsx.continuation.journal import Journal, NoJournal
 from magshell_fenicsx.continuation.listener import NoProgress, Progress
 from magshell_fenicsx.continuation.newton import BorderedNewton
@@ -24,11 +25,14 @@ from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.supports import refuse_loose
+from magshell_fenicsx.models.shell.thickness import Thickness, refuse_unfit
 from magshell_fenicsx.models.solid.model import SolidModel
-from magshell_fenicsx.plan.account import neo_hookean
+from magshell_fenicsx.plan.body import layers, neo_hookean
 from magshell_fenicsx.plan.plan import Plan
 from magshell_fenicsx.plan.planner import make_plan, meridian_vertices
 from magshell_fenicsx.platform.first import from_first
+
+Array = NDArray[np.float64]
 
 
 class Scene:
@@ -72,8 +76,8 @@ class Scene:
             self.model = build_solid_model(case, self.plan, comm)
         else:
             self.model = build_model(case, self.plan, comm)
-            if not self.plan.fixed:
-                refuse_loose(self.model.system, self.model.r0, self.unloaded().mu)
+        if not (self.plan.fixed or isinstance(self.model, MeridianModel)):
+            refuse_loose(self.model.system, self.model.r0, self.unloaded().mu)
         self.newton = BorderedNewton(self.model.system)
         self.journal: Journal = NoJournal()
         self.progress: Progress = NoProgress()
@@ -186,7 +190,13 @@ def build_meridian_model(case: Case, plan: Plan) -> MeridianModel:
 
 def build_solid_model(case: Case, plan: Plan, comm: MPI.Comm) -> SolidModel:
     """The whole body or half of it, on all ranks together."""
-    body = sweep(from_first(comm, plan.triangulated), plan.material.h, (case.solid or SolidSection()).layers, comm)
+
+    def factor(x: Array) -> Array:
+        found = (plan.thickness or Thickness()).at(x)
+        refuse_unfit(found, x, comm)
+        return found
+
+    body = sweep(from_first(comm, plan.triangulated), plan.material.h, layers(case), comm, factor)
     return SolidModel(body, plan.material, neo_hookean(case), plan.conditions, plan.loads, plan.mirror or Y0)
 
 

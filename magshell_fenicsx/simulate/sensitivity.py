@@ -16,10 +16,10 @@ from magshell_fenicsx.continuation.fold import Fold, Guess, find_fold, sensitivi
 from magshell_fenicsx.continuation.system import State, Vector
 from magshell_fenicsx.models.axisymmetric import jets
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
-from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.shell.parameters import Magnetisation
 from magshell_fenicsx.models.shell.patterns import Array, InsideAndOutside, Pattern
 from magshell_fenicsx.models.shell.terms import TermFactory
+from magshell_fenicsx.models.solid.model import SolidModel
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.transfer import same_mesh, transfer
@@ -134,7 +134,8 @@ def _magnetic_terms(scene: Scene, field: Magnetisation) -> Sequence[FormTerm]:
             FormTerm(e.name, 2 * np.pi * e.of(u), model.u, log, e.amplitude, linear=e.linear)
             for e in model.factory.magnetic(field)
         ]
-    assert isinstance(model, ShellModel)  # the case refuses a solid's
+    if isinstance(model, SolidModel):
+        return replace(model.factory, log=log).magnetic(field)
     return TermFactory(model.r0, model.u, model.material, model.sigma, model.degree, log, model.thickness).magnetic(
         field
     )

@@ -148,13 +148,16 @@ def _all_nodes(scene: Scene) -> Array:
 def chart(scene: Scene) -> Array:
     """Coordinates (n, 1 or 2) of this rank's nodes in the chart, where a defect does not move them.
 
-    Of a solid and of a mesh file their places (n, 3).
+    Of a solid with their height in the thickness: its displacements are carried to the same mesh only. Of a mesh file
+    their places (n, 3).
     """
     model = scene.model
     if isinstance(model, MeridianModel):
         return np.asarray(model.V.tabulate_dof_coordinates()[:, :1])
     if isinstance(model, SolidModel):
-        return np.asarray(model.r0.x.array[: model.system.size].reshape(-1, 3))
+        body = model.body
+        places = body.at_nodes(model.V, np.column_stack([body.chart, body.heights]))
+        return places[: model.V.dofmap.index_map.size_local]
     cells, nodes = model.midsurface.charted(model.V), model.V.dofmap.list
     found = np.full((model.V.dofmap.index_map.size_local + model.V.dofmap.index_map.num_ghosts, cells.shape[2]), np.inf)
     np.minimum.at(found, nodes, cells)  # of a node on a seam, which has two places, the first

@@ -207,3 +207,30 @@ def test_half_of_a_cylinder_dented_at_one_side() -> None:
     half, whole = map(end, asked)
     assert half["force"] == pytest.approx(whole["force"], rel=1e-2)
     assert half["A_uy"] / half["A_ux"] == pytest.approx(np.tan(0.5), rel=1e-9)
+
+
+@pytest.mark.parametrize("load", [{"edge": "tip", "force": [0, 0, 1e-9]}, {"edge": "tip", "moment": 1e-8}])
+def test_half_of_a_solid_strip_under_dead_loads(load: dict[str, Any]) -> None:
+    """As the whole: 1 % apart, on meshes that differ."""
+    loading = {"kind": "dead", "loads": [load], "factor": 1, "points": 1, "control": "load"}
+    sections = {"points": {"A": [1.0, 0.0, 0.0]}, "loading": loading, "mesh": {"size": 0.2}, "model": "solid"}
+    half, whole = (end(case("strip", symmetry=s, **sections)) for s in ("half", "none"))
+    assert half["A_uz"] == pytest.approx(whole["A_uz"], rel=1e-2)
+
+
+def test_a_solid_hemisphere_dented_at_a_named_point() -> None:
+    """A direction and the point that it meets are one place; the motion is reported in the frame of the case."""
+    place, patch = (
+        {"points": {"A": PLACES["hemisphere"]}},
+        {"kind": "indentation", "depth": 0.5, "points": 1, "patch": 3},
+    )
+    mesh = {"refinement": 0.25}
+    polar = {"polar": float(np.degrees(0.7)), "azimuth": float(np.degrees(0.5))}
+    shell = {"radius_to_thickness": 10}
+    by_point, by_angle = (
+        end(case("hemisphere", shell, model="solid", mesh=mesh, loading={**patch, "at": at}, **given))
+        for at, given in (({"point": "A"}, place), (polar, {}))
+    )
+    # with points named, the pole is no vertex
+    assert by_point["force"] == pytest.approx(by_angle["force"], rel=1e-3)
+    assert by_point["A_uy"] / by_point["A_ux"] == pytest.approx(np.tan(0.5), rel=1e-9)

@@ -84,6 +84,36 @@ def test_half_and_whole_agree(name: str) -> None:
         assert half[column] == pytest.approx(whole[column], rel=1e-9, abs=1e-13)
 
 
+SOLID_HALVES = (
+    "plate magnetised across its plane",
+    "square plate clamped at two sides",
+    "panel",
+    "panel under live pressure",
+    "thicker on both sides",
+)
+
+
+@pytest.mark.parametrize("name", SOLID_HALVES)
+def test_half_and_whole_solids_agree(name: str) -> None:
+    """The same of bodies, with planes of any direction and away from the origin."""
+    sections = HALVES[name][1] | {"model": "solid", "mesh": {"size": 0.26}}
+    asked = case("auto", **sections)
+    assert make_plan(asked).mirror
+    half, whole = end(asked), end(case("none", **sections))
+    for column in ("w_over_h", "w_pole_over_h", "volume_change", "energy"):
+        assert half[column] == pytest.approx(whole[column], rel=1e-8, abs=1e-13)
+
+
+def test_a_half_of_a_solid_knows_the_modes_of_the_whole() -> None:
+    """As of shells: the plane is oblique."""
+    sections = HALVES["panel"][1] | {"model": "solid", "mesh": {"size": 0.26}}
+    half, whole = (ms.Scene(case(s, **sections)) for s in ("half", "none"))
+    found = [ShellModes(scene.model).lowest(scene.unloaded(), 4) for scene in (half, whole)]
+    assert {mode.label for mode in found[0][:4]} == {"", "antisymmetric"}
+    values = [[mode.eigenvalue for mode in modes[:4]] for modes in found]
+    assert values[0] == pytest.approx(values[1], rel=1e-6)
+
+
 NOT_HALVED: list[dict[str, Any]] = [
     {"shell": PLATE, "boundary": {"left": "clamped", "bottom": "hinged"}},
     {"shell": PLATE | {"thickness_factor": "1 + x*y"}, "boundary": AROUND},
@@ -179,7 +209,8 @@ def test_an_order_3_mesh_file_of_a_hemisphere(column: str, tmp_path: Path) -> No
     assert found == pytest.approx(result(whole, column), rel=1e-9)
 
 
-def test_a_mesh_file_with_a_curve_in_its_plane(tmp_path: Path) -> None:
+@pytest.mark.parametrize("model", [{"mesh": {"degree": 3}}, {"model": "solid"}])
+def test_a_mesh_file_with_a_curve_in_its_plane(model: dict[str, Any], tmp_path: Path) -> None:
     """Other triangles on either side: one of them is half of the surface, if that is asked for."""
     grid = {"shell": MATERIAL | PLATE, "boundary": {}, "mesh": {"size": 0.25}, "symmetry": "none"}
     patch = make_plan(ms.Case.from_source(Source("test", grid))).triangulated()
@@ -188,7 +219,7 @@ def test_a_mesh_file_with_a_curve_in_its_plane(tmp_path: Path) -> None:
     nodes[move] += [0.03, 0.02, 0.0]
     file = written(tmp_path / "plate.msh", nodes, patch.cells, np.vstack(list(patch.edges.values())), order=1)
     shell = {"geometry": "mesh", "file": str(file), "radius": 1.0, **MATERIAL}
-    sections = {"shell": shell, "boundary": {"rim": "clamped"}, "mesh": {"degree": 3}}
+    sections = {"shell": shell, "boundary": {"rim": "clamped"}, "mesh": {}, **model}
     assert not make_plan(case("auto", **sections)).mirror
     half, whole = (end(case(s, **sections)) for s in ("half", "none"))
     # the triangles differ: 5e-3 apart

@@ -27,7 +27,7 @@ from magshell_fenicsx.models.observed import Observed
 from magshell_fenicsx.models.shell import edges
 from magshell_fenicsx.models.shell.energy import Density
 from magshell_fenicsx.models.shell.free import free_parameters
-from magshell_fenicsx.models.shell.moment import MomentTerm
+from magshell_fenicsx.models.shell.moment import Counted
 from magshell_fenicsx.models.shell.parameters import Condition, EdgeMoment, Loads, Material, default_penalty
 from magshell_fenicsx.models.shell.thickness import Thickness
 
@@ -131,11 +131,13 @@ class MeridianModel(Observed):
         energy = 2 * np.pi * e.of(jets.revolved(self.u))
         return FormTerm(e.name, energy, self.u, self.kernels, e.amplitude, linear=e.linear)
 
-    def _moment(self, name: str, load: EdgeMoment) -> MomentTerm:
+    def _moment(self, name: str, load: EdgeMoment) -> Counted:
         facets, constant = self.meridian.ends[load.edge], self.factory.constant
-        density = Density(edges.turning, (constant(load.moment), constant(np.array([1.0, 0.0]))), facets=facets)
+        past = constant(np.array([1.0, 0.0]))
+        density = Density(edges.turning, (constant(load.moment), past), facets=facets)
         e = self.factory.moment(name, facets, density)
         self.energies.append(e)
         length = 2 * np.pi * self.meridian.section(np.array([self.meridian.parameter(load.edge)]))[0, 0]
-        energy = 2 * np.pi * e.of(jets.revolved(self.u))
-        return MomentTerm(name, density, energy, self.u, self.kernels, load.moment * length)
+        term = Counted(name, 2 * np.pi * e.of(jets.revolved(self.u)), self.u, self.kernels, "load")
+        term.count_from(past, load.moment * length)
+        return term

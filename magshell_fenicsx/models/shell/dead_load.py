@@ -1,12 +1,12 @@
-"""Dead loads on edges and areas: the entries of their load vectors."""
+"""Dead loads at points, on edges and areas: the entries of their load vectors."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import ufl
 from dolfinx import fem, mesh
-from dolfinx.la import InsertMode
 from numpy.typing import NDArray
 from ufl.core.expr import Expr
 
@@ -14,9 +14,31 @@ from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.mesh.midsurface import Midsurface
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.energy import edge_quadrature
+from magshell_fenicsx.models.shell.load_vector import Entries, Weighted, entries
 from magshell_fenicsx.models.shell.parameters import AreaForce, DeadLoad, EdgeForce, EdgeMoment, PointForce
-from magshell_fenicsx.models.shell.point_load import Entries, point_entries
+from magshell_fenicsx.models.shell.point_load import point_entries
 from magshell_fenicsx.models.shell.thickness import patch_of
+
+
+class Measures(Protocol):
+    """Where the loads of a model are.
+
+    Attributes
+    ----------
+    normal
+        The undeformed outward normal.
+    """
+
+    normal: Expr
+
+    def edge(self, name: str) -> Weighted:
+        """Undeformed length of a named edge."""
+
+    def area(self, patch: str | None) -> Weighted:
+        """Undeformed area of a named patch, or of all."""
+
+    def at_point(self, name: str, force: NDArray[np.float64]) -> Entries:
+        """The load vector of a force at a named vertex."""
 
 
 @dataclass(frozen=True)
@@ -36,31 +58,34 @@ class DeadLoads:
     size: float
 
 
-def assemble_dead_loads(
-    loads: Sequence[DeadLoad], r0: fem.Function, midsurface: Midsurface, degree: int, log: KernelLog
-) -> DeadLoads:
+def assemble_dead_loads(loads: Sequence[DeadLoad], V: fem.FunctionSpace, on: Measures, log: KernelLog) -> DeadLoads:
     """The load vector of all but the moments; collective."""
-    V, parts, size = r0.function_space, [], 0.0
-    forms = _Forms(r0, degree, log)
+    parts, size = list[Entries](), 0.0
+
+    def constant(value: float | NDArray[np.float64]) -> fem.Constant:
+        return fem.Constant(V.mesh, value)
+
+    def spread(along: Expr, measure: Weighted) -> None:
+        parts.append(entries(V, along, measure, log))
+
     for load in loads:
         if isinstance(load, PointForce):
-            parts.append(point_entries(V, midsurface.points[load.point], load.force))
+            parts.append(on.at_point(load.point, load.force))
             size += float(np.linalg.norm(load.force))
         elif isinstance(load, EdgeForce):
-            ds = forms.edge(midsurface.edges[load.edge])
-            length = forms.total(ds)
+            ds = on.edge(load.edge)
+            length = ds.total(V, log)
             force = np.asarray(load.force / length) if load.total else load.force
-            parts.append(forms.entries(ufl.dot(forms.constant(force), ufl.TestFunction(V)) * ds))
+            spread(constant(force), ds)
             size += float(np.linalg.norm(force)) * length
         elif isinstance(load, AreaForce):
-            inside = None if load.patch is None else patch_of(midsurface.patches, load.patch)
-            dx = forms.area(inside)
+            dx = on.area(load.patch)
             if isinstance(load.force, float):
-                along, strength = -kin.normal(forms.j0) * forms.constant(load.force), abs(load.force)
+                along, strength = -constant(load.force) * on.normal, abs(load.force)
             else:
-                along, strength = forms.constant(load.force), float(np.linalg.norm(load.force))
-            parts.append(forms.entries(ufl.dot(along, ufl.TestFunction(V)) * dx))
-            size += strength * forms.total(dx)
+                along, strength = constant(load.force), float(np.linalg.norm(load.force))
+            spread(along, dx)
+            size += strength * dx.total(V, log)
         else:
             assert isinstance(load, EdgeMoment)
     vector = np.zeros(3 * V.dofmap.index_map.size_local)
@@ -70,54 +95,35 @@ def assemble_dead_loads(
     return DeadLoads((dofs, vector[dofs]), size)
 
 
-class _Forms:
-    """Integrals over the undeformed surface."""
+def within(domain: mesh.Mesh, patch: NDArray[np.bool_]) -> fem.Function:
+    """One in the cells of a patch, zero in the others."""
+    found = fem.Function(fem.functionspace(domain, ("DG", 0)))
+    found.x.array[found.function_space.dofmap.list[:, 0]] = patch
+    return found
 
-    def __init__(self, r0: fem.Function, degree: int, log: KernelLog) -> None:
-        self._V, self._degree, self._log = r0.function_space, degree, log
-        self._domain = self._V.mesh
-        self.j0 = kin.jet(r0, self._domain)
 
-    def constant(self, value: float | NDArray[np.float64]) -> fem.Constant:
-        return fem.Constant(self._domain, value)
+class SurfaceMeasures:
+    """`Measures` of a mid-surface."""
 
-    def edge(self, facets: NDArray[np.int32]) -> "_Weighted":
-        """Undeformed length: a factor to integrands."""
-        tags = mesh.meshtags(self._domain, 1, facets, np.ones_like(facets))
+    def __init__(self, r0: fem.Function, midsurface: Midsurface, degree: int) -> None:
+        self._V, self._midsurface, self._degree = r0.function_space, midsurface, degree
+        self._j0 = kin.jet(r0, midsurface.mesh)
+        self.normal = kin.normal(self._j0)
+
+    def edge(self, name: str) -> Weighted:
+        domain, facets = self._midsurface.mesh, self._midsurface.edges[name]
+        tags = mesh.meshtags(domain, 1, facets, np.ones_like(facets))
         rule = {"quadrature_degree": edge_quadrature(self._degree) + 2}
-        ds = ufl.Measure("ds", domain=self._domain, subdomain_data=tags, metadata=rule)(1)
-        return _Weighted(kin.conormal(self.j0, kin.facet_covector(self._domain))[2], ds)
+        ds = ufl.Measure("ds", domain=domain, subdomain_data=tags, metadata=rule)(1)
+        return Weighted(kin.conormal(self._j0, kin.facet_covector(domain))[2], ds)
 
-    def area(self, inside: NDArray[np.bool_] | None) -> "_Weighted":
-        """Undeformed area, of some cells or all."""
-        dx = ufl.Measure("dx", domain=self._domain, metadata={"quadrature_degree": 2 * self._degree})
-        weight = kin.area_ratio(self.j0)
-        if inside is not None:
-            within = fem.Function(fem.functionspace(self._domain, ("DG", 0)))
-            within.x.array[within.function_space.dofmap.list[:, 0]] = inside
-            weight = weight * within
-        return _Weighted(weight, dx)
+    def area(self, patch: str | None) -> Weighted:
+        domain = self._midsurface.mesh
+        dx = ufl.Measure("dx", domain=domain, metadata={"quadrature_degree": 2 * self._degree})
+        weight = kin.area_ratio(self._j0)
+        if patch is not None:
+            weight = weight * within(domain, patch_of(self._midsurface.patches, patch))
+        return Weighted(weight, dx)
 
-    def total(self, measure: "_Weighted") -> float:
-        """Length or area."""
-        form = self._log.compile("load measure", self.constant(1.0) * measure)
-        return float(self._domain.comm.allreduce(fem.assemble_scalar(form)))
-
-    def entries(self, form: ufl.Form) -> Entries:
-        """Owned entries of a linear form."""
-        load = fem.assemble_vector(self._log.compile("load vector", form))
-        load.scatter_reverse(InsertMode.add)
-        owned = 3 * self._V.dofmap.index_map.size_local
-        dofs = np.flatnonzero(load.array[:owned]).astype(np.int32)
-        return dofs, load.array[dofs]
-
-
-@dataclass(frozen=True)
-class _Weighted:
-    """A measure with its density."""
-
-    weight: Expr
-    measure: ufl.Measure
-
-    def __rmul__(self, integrand: Expr) -> ufl.Form:
-        return integrand * self.weight * self.measure
+    def at_point(self, name: str, force: NDArray[np.float64]) -> Entries:
+        return point_entries(self._V, self._midsurface.points[name], force)

@@ -71,7 +71,7 @@ class PointGradient:
         self._known = [(placement, r0), (place, geometry)]
         W = ufl.zero()
         for term in terms:
-            parameters, varying = parameters_at(points, term.density)
+            parameters, varying = parameters_at(points, term.density.parameters, term.density.sides)
             self._known += [(here, values(field)) for here, field in varying]
             W += _energy(term.density, placement, self._u, place, parts, parameters)
         name = f"{', '.join(term.name for term in terms)} gradient"

@@ -21,7 +21,7 @@ from magshell_fenicsx.mesh.mirror import Y0, Mirror
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.observed import Observed
 from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes
-from magshell_fenicsx.models.shell.dead_load import assemble_dead_loads
+from magshell_fenicsx.models.shell.dead_load import SurfaceMeasures, assemble_dead_loads
 from magshell_fenicsx.models.shell.fast_tangent import FastTangent, make_sites
 from magshell_fenicsx.models.shell.folds import FOLD, largest_fold
 from magshell_fenicsx.models.shell.free import free_parameters
@@ -159,9 +159,8 @@ class ShellModel(Observed):
         if loads.force:
             terms.append(self._force(loads.force))
         if loads.dead:
-            dead = assemble_dead_loads(loads.dead, self.r0, midsurface, degree, self.kernels)
-            self.load_size = dead.size
-            terms.append(LinearTerm("load", *dead.entries, self.u, "load"))
+            on = SurfaceMeasures(self.r0, midsurface, degree)
+            terms.append(self.load_with(assemble_dead_loads(loads.dead, V, on, self.kernels)))
             moments = [load for load in loads.dead if isinstance(load, EdgeMoment)]
             terms += [
                 factory.edge_moment(f"moment {load.edge} {i}", midsurface.edges[load.edge], load.moment)

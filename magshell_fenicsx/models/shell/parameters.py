@@ -74,6 +74,8 @@ class Magnetisation:
         The full energy, or which of the paper's approximations takes its place.
     patches
         Vectors (3,) on named patches of a mesh, in place of `remanent`; None without.
+    layers
+        Fractions of the thickness and vectors (3,), from the inner face outwards, of which `remanent` is the average.
     """
 
     remanent: NDArray[np.float64] | Pattern
@@ -82,6 +84,7 @@ class Magnetisation:
     gradient: NDArray[np.float64] | None = None
     across: NDArray[np.float64] | None = None
     patches: Mapping[str, NDArray[np.float64]] | None = None
+    layers: tuple[tuple[float, NDArray[np.float64]], ...] = ()
 
 
 @dataclass(frozen=True)

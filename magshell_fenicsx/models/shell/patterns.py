@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from dolfinx import fem
+from mpi4py import MPI
 from numpy.typing import NDArray
 
 from magshell_fenicsx.mesh.patch import MeshError
@@ -107,12 +108,23 @@ def pattern_field(pattern: Pattern, r0: fem.Function) -> fem.Function:
     Q = fem.functionspace(V.mesh, ("DG", element.degree, (3,)))
     field = fem.Function(Q, name="Br")
     vectors = pattern(nodes, n0)
+    refuse_unbounded(vectors, nodes, V.mesh.comm)
+    field.x.array.reshape(-1, 3)[Q.dofmap.list] = vectors
+    return field
+
+
+def refuse_unbounded(vectors: Array, nodes: Array, comm: MPI.Comm) -> None:
+    """Look at vectors and places (cells, nodes, 3); collective.
+
+    Raises
+    ------
+    MeshError
+        On every rank, if a vector is not finite.
+    """
     bad = nodes[~(np.abs(vectors) <= LARGEST).all(axis=-1)][:1].tolist()
-    if said := [place for places in V.mesh.comm.allgather(bad) for place in places]:
+    if said := [place for places in comm.allgather(bad) for place in places]:
         x, y, z = said[0]
         raise MeshError(
             f"magnetic.remanent: has no finite value (or one above {LARGEST:g}) at (x, y, z)/R = "
             f"({x:.3g}, {y:.3g}, {z:.3g})"
         )
-    field.x.array.reshape(-1, 3)[Q.dofmap.list] = vectors
-    return field

@@ -4,16 +4,12 @@ import basix
 import numpy as np
 import ufl
 from dolfinx import fem
-from dolfinx.la import InsertMode
 from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.kernels import KernelLog
-from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.shell import kinematics as kin
+from magshell_fenicsx.models.shell.load_vector import Entries, Weighted, averaged, smooth
 from magshell_fenicsx.platform import compat
-
-COARSE = 0.15  # of the integral that a patch has on a plane; at a corner it has a quarter
-Entries = tuple[NDArray[np.int32], NDArray[np.float64]]
 
 
 def point_entries(V: fem.FunctionSpace, x: NDArray[np.float64], direction: NDArray[np.float64]) -> Entries:
@@ -39,22 +35,10 @@ def patch_entries(
     """
     V = r0.function_space
     domain = V.mesh
-    centre, a, along = (fem.Constant(domain, v) for v in (x, radius, direction))
-    j0 = kin.jet(r0, domain)
-    inside = 1 - ufl.dot(r0 - centre, r0 - centre) / a**2
-    weight = ufl.conditional(ufl.gt(inside, 0), inside**2, 0) * kin.area_ratio(j0)
+    centre, a = (fem.Constant(domain, v) for v in (x, radius))
     dx = ufl.Measure("dx", domain=domain, metadata={"quadrature_degree": 2 * degree})
-    total = domain.comm.allreduce(fem.assemble_scalar(log.compile("patch weight", weight * dx)))
-    if not COARSE <= total / (np.pi * radius**2 / 3) <= 1 / COARSE:
-        raise MeshError(
-            f"loading.patch: its radius is {radius:.3g} R, which the mesh is too coarse for: choose a smaller "
-            "mesh.size, or 0 for a force at a point"
-        )
-    load = fem.assemble_vector(log.compile("patch load", weight * ufl.dot(along, ufl.TestFunction(V)) * dx))
-    load.scatter_reverse(InsertMode.add)
-    owned = 3 * V.dofmap.index_map.size_local
-    dofs = np.flatnonzero(load.array[:owned]).astype(np.int32)
-    return dofs, load.array[dofs] / total
+    weight = smooth(r0 - centre, a) * kin.area_ratio(kin.jet(r0, domain))
+    return averaged(V, direction, Weighted(weight, dx), log, radius)
 
 
 def vertex_normal(r0: fem.Function, x: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -121,7 +121,7 @@ class Kernel:
     def __init__(self, name: str, density: Density, points: Points, batches: list[Batch], *, of_v: bool) -> None:
         self._name, self._density, self._of_v = name, density, of_v
         self._points, self._batches = points, batches
-        self._parameters, varying = parameters_at(points, density)
+        self._parameters, varying = parameters_at(points, density.parameters, density.sides)
         sides = range(density.sides)
         self._varying = [(here, [_on_sides(field, batch, sides) for batch in batches]) for here, field in varying]
 
@@ -180,16 +180,17 @@ def _jet(field: fem.Function, side: int) -> Jet:
     return Jet(*(ufl.as_vector([field[3 * part + c] for c in range(3)]) for part in parts))
 
 
-def parameters_at(points: Points, density: Density) -> tuple[list[Parameter], list[tuple[fem.Function, fem.Function]]]:
+def parameters_at(
+    points: Points, parameters: Sequence[Parameter], sides: int
+) -> tuple[list[Parameter], list[tuple[fem.Function, fem.Function]]]:
     """A density's parameters at points; those that vary, to be filled, are told with the fields that they stand for.
 
     Where there are two sides, such a vector holds that of the one and then that of the other.
     """
     here = [
-        points.constant(p) if isinstance(p, fem.Constant) else points.field(density.sides * p.ufl_shape[0])
-        for p in density.parameters
+        points.constant(p) if isinstance(p, fem.Constant) else points.field(sides * p.ufl_shape[0]) for p in parameters
     ]
-    pairs = zip(here, density.parameters, strict=True)
+    pairs = zip(here, parameters, strict=True)
     return here, [(there, p) for there, p in pairs if isinstance(p, fem.Function)]
 
 

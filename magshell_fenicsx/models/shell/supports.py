@@ -4,7 +4,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 
 import basix
 import numpy as np
-from dolfinx import fem, mesh
+from dolfinx import fem
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
@@ -21,17 +21,26 @@ FREE = 1e-12  # of the squares that a rigid motion has where the shell is held, 
 LOOSE = 1e-13  # of a rigid motion's energy, over the tangent's largest row
 
 
-def held_on(V: fem.FunctionSpace, dim: int, entities: NDArray[np.int32], axes: Iterable[int]) -> list[fem.DirichletBC]:
-    """Those components are zero on some edges (`dim` 1) or cells (2)."""
-    V.mesh.topology.create_connectivity(dim, 2)
-    return [fem.dirichletbc(0.0, fem.locate_dofs_topological(V.sub(i), dim, entities), V.sub(i)) for i in axes]
+def held_on(
+    V: fem.FunctionSpace,
+    dim: int,
+    entities: NDArray[np.int32],
+    axes: Iterable[int],
+    nodes: NDArray[np.bool_] | None = None,
+) -> list[fem.DirichletBC]:
+    """Those components are zero on entities of some dimension, or at some of the `nodes` there alone."""
+    V.mesh.topology.create_connectivity(dim, V.mesh.topology.dim)
+    found = []
+    for space in (V.sub(i) for i in axes):
+        dofs = fem.locate_dofs_topological(space, dim, entities)
+        found.append(fem.dirichletbc(0.0, dofs if nodes is None else dofs[nodes[dofs // 3]], space))
+    return found
 
 
-def held_at_vertex(V: fem.FunctionSpace, x: Array, components: Iterable[int]) -> list[fem.DirichletBC]:
-    """Those components are zero at a vertex."""
-    V.mesh.topology.create_connectivity(0, 2)
-    near = mesh.locate_entities(V.mesh, 0, lambda y: np.linalg.norm(y.T - x, axis=1) < 1e-9)
-    return [fem.dirichletbc(0.0, fem.locate_dofs_topological(V.sub(i), 0, near), V.sub(i)) for i in components]
+def held_at_vertex(V: fem.FunctionSpace, x: Array, axes: Iterable[int]) -> list[fem.DirichletBC]:
+    """Those components are zero at the node at a vertex."""
+    near = fem.locate_dofs_geometrical(V, lambda y: np.linalg.norm(y.T - x, axis=1) < 1e-9)
+    return [fem.dirichletbc(0.0, 3 * near + np.int32(i), V.sub(i)) for i in axes]
 
 
 def refuse_unknown(
@@ -77,7 +86,7 @@ def no_mirror(name: str) -> str:
 
 
 def plane_of(r0: fem.Function, facets: NDArray[np.int32], name: str) -> Mirror:
-    """The plane of an edge, which the surface crosses at right angles; collective.
+    """The plane of an edge, which the surface crosses at right angles, or of a face of a body; collective.
 
     Raises
     ------
@@ -85,10 +94,12 @@ def plane_of(r0: fem.Function, facets: NDArray[np.int32], name: str) -> Mirror:
         On every rank, if there is none.
     """
     V = r0.function_space
-    dofs = fem.locate_dofs_topological(V, 1, facets)
+    on_edge = V.mesh.topology.dim == 2
+    dofs = fem.locate_dofs_topological(V, V.mesh.topology.dim - 1, facets)
     places = np.concatenate(V.mesh.comm.allgather(r0.x.array.reshape(-1, 3)[dofs]))
-    conormals, centre = _conormals(r0, facets), places.mean(axis=0)
+    centre = places.mean(axis=0)
     _, spread, axes = np.linalg.svd(places - centre, full_matrices=False)
+    conormals = _conormals(r0, facets) if on_edge else axes[2:]  # the thickness stands at right angles
     if spread[1] > STRAIGHT * spread[0]:
         candidates = [axes[2]]
     else:  # a straight edge lies in many planes: those of the axes, and through e3, are exact

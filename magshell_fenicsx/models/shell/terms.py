@@ -99,7 +99,9 @@ class TermFactory:
         along = kin.conormal(self._jets()[0], self._edge_geometry()[0])[2]
         length = self.log.compile(f"{name} length", along * self._ds(facets))
         total = self._domain.comm.allreduce(fem.assemble_scalar(length))
-        return MomentTerm(name, density, energy, self.u, self.log, intensity * total)
+        term = MomentTerm(name, density, energy, self.u, self.log, "load")
+        term.count_from(past, intensity * total)
+        return term
 
     def antisymmetric_edges(self, facets: NDArray[np.int32], normal: NDArray[np.float64]) -> HessianTerm:
         """The mirror plane's edges under antisymmetric displacements."""

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from dolfinx import fem
+from mpi4py import MPI
 from numpy.typing import NDArray
 from ufl.core.expr import Expr
 
@@ -22,6 +23,24 @@ class Thickness:
     of_position: Callable[[Array, Array, Array], Array] | None = None
     patches: Mapping[str, float] | None = None
 
+    def at(self, x: Array) -> Array:
+        """Its values at places (..., 3), without patches."""
+        return np.array(self.of_position(*np.moveaxis(x, -1, 0))) if self.of_position else np.ones(x.shape[:-1])
+
+
+def refuse_unfit(factors: Array, x: Array, comm: MPI.Comm) -> None:
+    """Look at what multiplies the thickness at places (..., 3); collective.
+
+    Raises
+    ------
+    MeshError
+        On every rank, if it is not positive somewhere.
+    """
+    bad = x[~((factors > 1e-3) & (factors < 1e3))][:1].tolist()
+    if said := [place for places in comm.allgather(bad) for place in places]:
+        x1, x2, x3 = said[0]
+        raise MeshError(f"thickness_factor is not within 0.001 to 1000 at (x, y, z)/R = ({x1:.3g}, {x2:.3g}, {x3:.3g})")
+
 
 def thickness_field(thickness: Thickness, r0: fem.Function, midsurface: Midsurface) -> fem.Function:
     """h(x)/h at the nodes of every cell, free to jump from cell to cell; shape (1,).
@@ -33,9 +52,7 @@ def thickness_field(thickness: Thickness, r0: fem.Function, midsurface: Midsurfa
     """
     V = r0.function_space
     nodes = r0.x.array.reshape(-1, 3)[V.dofmap.list]
-    values = np.ones(nodes.shape[:2])
-    if thickness.of_position:
-        values = np.array(thickness.of_position(*np.moveaxis(nodes, -1, 0)))
+    values = thickness.at(nodes)
     for name, factor in (thickness.patches or {}).items():
         values[patch_of(midsurface.patches, name)] = factor
     return nodal_thickness(values, nodes, V)
@@ -49,10 +66,7 @@ def nodal_thickness(values: Array, nodes: Array, V: fem.FunctionSpace) -> fem.Fu
     MeshError
         On every rank, if it is not positive somewhere.
     """
-    bad = nodes[~((values > 1e-3) & (values < 1e3))][:1].tolist()
-    if said := [place for places in V.mesh.comm.allgather(bad) for place in places]:
-        x, y, z = said[0]
-        raise MeshError(f"thickness_factor is not within 0.001 to 1000 at (x, y, z)/R = ({x:.3g}, {y:.3g}, {z:.3g})")
+    refuse_unfit(values, nodes, V.mesh.comm)
     Q = fem.functionspace(V.mesh, ("DG", V.element.basix_element.degree, (1,)))
     field = fem.Function(Q, name="thickness")
     field.x.array[Q.dofmap.list] = values

@@ -1,7 +1,8 @@
 """Energy densities of the solid as plain functions of point quantities: the one source of its physics.
 
 Over E, with lengths in R; divided by h/R they are in the shell's unit E h R^2. X is the undeformed place,
-u the displacement and H its gradient by X; F = 1 + H.
+u the displacement and H its gradient by X; F = 1 + H. At an end, the face above an edge of the mid-surface, n is
+the undeformed outward normal of the mid-surface and t the edge's tangent, which has the surface on its left.
 """
 
 import ufl
@@ -39,3 +40,19 @@ def pressure(X: Expr, X1: Expr, X2: Expr, u: Expr, u1: Expr, u2: Expr, unit: Exp
     """Pi/p of a live pressure in that unit: the change of the volume between the outer face and an origin."""
     X = X if origin is None else X - origin
     return unit * (enclosed(X + u, X1 + u1, X2 + u2) - enclosed(X, X1, X2))
+
+
+def sealing(X: Expr, u: Expr, H: Expr, n: Expr, t: Expr, unit: Expr, origin: Expr | None = None) -> Expr:
+    """The same on a part of an end, per undeformed area."""
+    return pressure(X, t, n, u, ufl.dot(H, t), ufl.dot(H, n), unit, origin)
+
+
+def turning(X: Expr, u: Expr, H: Expr, n: Expr, t: Expr, weight: Expr, intensity: Expr, past: Expr) -> Expr:
+    """-Pi of a moment per length about t: intensity times the mean angle that lines along n have turned.
+
+    With the `weight` (1,) 3/2 (1 - 4 z^2/h^2)/h over the thickness, its forces are at first a traction linear in z.
+    `past` is that of `shell.edges.turning`.
+    """
+    line = n + ufl.dot(H, n)
+    sine, cosine = ufl.dot(ufl.cross(n, line), t), ufl.dot(n, line)
+    return -intensity * weight[0] * ufl.atan2(sine * past[0] - cosine * past[1], cosine * past[0] + sine * past[1])

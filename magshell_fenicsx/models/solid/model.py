@@ -5,12 +5,11 @@ of the thickness; the pressure, the volume and the loaded patch are of the outer
 """
 
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
-import ufl
 from dolfinx import fem
-from dolfinx.la import InsertMode
 from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.kernels import KernelLog
@@ -19,14 +18,23 @@ from magshell_fenicsx.assembly.sliding import Constraint, held_along
 from magshell_fenicsx.assembly.terms import LinearTerm, Term
 from magshell_fenicsx.mesh.hexahedra import Body, quadratic
 from magshell_fenicsx.mesh.mirror import Y0, Mirror
+from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.observed import Observed
 from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes
+from magshell_fenicsx.models.shell.dead_load import assemble_dead_loads
 from magshell_fenicsx.models.shell.fast_tangent import FastTangent
 from magshell_fenicsx.models.shell.free import free_parameters
-from magshell_fenicsx.models.shell.parameters import Condition, Force, Loads, Material
+from magshell_fenicsx.models.shell.parameters import Condition, EdgeMoment, Loads, Material
+from magshell_fenicsx.models.shell.supports import closing_point, open_to_pressure
+from magshell_fenicsx.models.solid.loads import BodyMeasures, outer_patch
 from magshell_fenicsx.models.solid.material import NeoHookean
+from magshell_fenicsx.models.solid.remanence import in_cells
 from magshell_fenicsx.models.solid.sites import make_sites
+from magshell_fenicsx.models.solid.supports import supports
 from magshell_fenicsx.models.solid.terms import TermFactory
+
+Array = NDArray[np.float64]
+MIRRORS = ("symmetry", "plane")
 
 
 class SolidModel(Observed):
@@ -35,11 +43,17 @@ class SolidModel(Observed):
     Parameters
     ----------
     conditions
-        Edge of the mid-surface -> "clamped", "symmetry" or "free", of the face above it.
+        As of `ShellModel`: a whole face is clamped or in a mirror plane, else its middle line is held.
     loads
-        The remanence is uniform, its energy the full one; a force has a patch, on the outer face.
+        A force has a patch, on the outer face; the magnetic energy is the full one.
     mirror
         The plane of the faces with the condition "symmetry", of a half model.
+
+    Raises
+    ------
+    MeshError
+        On every rank, if an edge lies in no plane of symmetry, if these planes leave a live pressure open, or if a
+        patch is not there or unknown to the mesh.
 
     Attributes
     ----------
@@ -63,6 +77,8 @@ class SolidModel(Observed):
         loads: Loads,
         mirror: Mirror = Y0,
     ) -> None:
+        if loads.magnetic:
+            loads = replace(loads, magnetic=replace(loads.magnetic, remanent=in_cells(loads.magnetic, body)))
         self.body, self.material, self.neo_hookean, self.loads = body, material, neo_hookean, loads
         self.normals = body.normals
         self.multiplicity = 2 if "symmetry" in conditions.values() else 1
@@ -70,19 +86,26 @@ class SolidModel(Observed):
         self.V = V = quadratic(body.mesh)
         self.u, self.r0 = fem.Function(V, name="u"), fem.Function(V, name="r0")
         self.r0.interpolate(lambda x: x)
-        self._factory = factory = TermFactory(body, self.u, neo_hookean, material.h, self.kernels)
+        hinged = tuple(n for n, c in conditions.items() if n in body.faces and c not in ("free", "clamped", *MIRRORS))
+        self.factory = factory = TermFactory(body, self.u, neo_hookean, material.h, self.kernels, hinged)
         self._pattern = factory.distortion()
-        origin = mirror.offset * mirror.normal
+        self._held, planes = supports(body, self.r0, conditions)
+        origin = self._closing_point([mirror, *planes] if self.multiplicity == 2 else planes, conditions)
         self._terms: list[Term] = [self._pattern, factory.compression()]
         if loads.magnetic:
             self._terms += factory.magnetic(loads.magnetic)
         if loads.pressure:
-            self._terms.append(factory.pressure(material.classical_pressure, origin))
+            self._terms += factory.pressure(material.classical_pressure, origin)
         self._terms += [factory.own(term) for term in loads.own]
         self.observed = self.kernels.compile_all(factory.observed(term) for term in loads.own)
         if loads.force:
-            self._terms.append(self._force(loads.force))
-        self._held = _held(V, [body.faces[n] for n, c in conditions.items() if c == "clamped"], range(3))
+            patch = outer_patch(body, V, loads.force.point, loads.force.patch, self.kernels)
+            self._terms.append(LinearTerm("force", patch[0], self.force_unit * patch[1], self.u, "force"))
+        if loads.dead:
+            on = BodyMeasures(body, V, self.kernels)
+            self._terms.append(self.load_with(assemble_dead_loads(loads.dead, V, on, self.kernels)))
+            moments = [load for load in loads.dead if isinstance(load, EdgeMoment)]
+            self._terms += [factory.moment(f"moment {m.edge} {i}", m.edge, m.moment) for i, m in enumerate(moments)]
         self._faces = [body.faces[n] for n, c in conditions.items() if c == "symmetry"]
         self.mirror = mirror
         self._sites = make_sites(body, self.r0, self._terms, self.kernels)
@@ -96,36 +119,21 @@ class SolidModel(Observed):
             return None
         return AntisymmetricModes(self._system(self._held + self._held_on_mirror(self.mirror.in_plane)))
 
-    def _held_on_mirror(self, directions: Iterable[NDArray[np.float64]]) -> list[Constraint]:
+    def _closing_point(self, planes: list[Mirror], conditions: Mapping[str, Condition]) -> Array:
+        """From where the volume beside the symmetry planes is told."""
+        found = closing_point(planes)
+        if found is None and self.loads.pressure:
+            raise MeshError(open_to_pressure(next(name for name, c in conditions.items() if c == "plane")))
+        return np.zeros(3) if found is None else found
+
+    def _held_on_mirror(self, directions: Iterable[Array]) -> list[Constraint]:
         return [held_along(self.V, 2, facets, along) for facets in self._faces for along in directions]
 
     def _system(self, held: list[Constraint]) -> FiniteElementSystem:
-        fast, factory = FastTangent(self.u, self._sites, held), self._factory
+        fast, factory = FastTangent(self.u, self._sites, held), self.factory
         parameters = free_parameters(
             self.loads.own, factory.free, factory.own, lambda term: self.kernels.compile_all([factory.observed(term)])
         )
         return FiniteElementSystem(
             self.u, self._terms, held, self._pattern, self.material.h, fast, parameters=parameters
         )
-
-    def _force(self, force: Force) -> LinearTerm:
-        """Averaged over the outer face with the weight (1 - d^2/radius^2)^2, d the distance from the loaded point."""
-        normal, domain = self.body.normals[force.point], self.V.mesh
-        values = self.body.points[force.point] + self.material.h / 2 * normal, force.patch, -normal
-        centre, a, along = (fem.Constant(domain, value) for value in values)
-        d = ufl.SpatialCoordinate(domain) - centre
-        inside = 1 - ufl.dot(d, d) / a**2
-        weight, ds = ufl.conditional(ufl.gt(inside, 0), inside**2, 0), self._factory.outer_measure()
-        total = domain.comm.allreduce(fem.assemble_scalar(self.kernels.compile("patch weight", weight * ds)))
-        form = self.kernels.compile("patch load", weight * ufl.dot(along, ufl.TestFunction(self.V)) * ds)
-        load = fem.assemble_vector(form)
-        load.scatter_reverse(InsertMode.add)
-        dofs = np.flatnonzero(load.array[: 3 * self.V.dofmap.index_map.size_local]).astype(np.int32)
-        return LinearTerm("force", dofs, self.force_unit * load.array[dofs] / total, self.u, "force")
-
-
-def _held(V: fem.FunctionSpace, faces: list[NDArray[np.int32]], components: range) -> list[Constraint]:
-    """Some components zero on some faces."""
-    facets = np.unique(np.concatenate(faces)).astype(np.int32) if faces else np.empty(0, np.int32)
-    spaces = [V.sub(i) for i in components] if faces else []
-    return [fem.dirichletbc(0.0, fem.locate_dofs_topological(W, 2, facets), W) for W in spaces]

@@ -20,12 +20,15 @@ from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.point_kernels import Pairs, Points, point_hessian
 from magshell_fenicsx.assembly.shape_tables import Table
 from magshell_fenicsx.assembly.terms import Term
-from magshell_fenicsx.mesh.hexahedra import OUTER, Body
+from magshell_fenicsx.mesh.hexahedra import Body
+from magshell_fenicsx.models.shell.sites import at_points, fill, parameters_at
 from magshell_fenicsx.models.solid.terms import SolidTerm
 
 Array = NDArray[np.float64]
 PARTS = 4  # value and three reference derivatives
-BULK, FACE = 13, 12  # numbers that a density wants at a point: X, the inverse of dX/dxi and its determinant; X's jet
+# numbers that a density wants at a point: in the body X, the inverse of dX/dxi and its determinant; on the outer face
+# X's jet; at ends as in the body with the area in place of the determinant, and n and t
+SIZES = {"body": 13, "outer": 12, "end": 19}
 
 
 class Site:
@@ -38,13 +41,21 @@ class Site:
     cells
         Those of this rank.
     rule
-        Quadrature on the reference cell, or on its outer face.
+        Quadrature on the reference cell, or on a face of it.
+    facet
+        The number of this face.
     """
 
     coupling: Sequence[Batch] = ()
 
     def __init__(
-        self, X: fem.Function, cells: NDArray[np.int32], rule: Rule, terms: Sequence[SolidTerm], log: KernelLog
+        self,
+        X: fem.Function,
+        cells: NDArray[np.int32],
+        rule: Rule,
+        terms: Sequence[SolidTerm],
+        log: KernelLog,
+        facet: int | None = None,
     ) -> None:
         V = X.function_space
         self._dofs = V.dofmap.list
@@ -52,12 +63,12 @@ class Site:
         parts = [cells[i : i + size] for i in range(0, len(cells), size)]
         self._batches = [Batch((part,), rule, np.empty((len(part), 0))) for part in parts]
         self._points = Points(max([1, *(batch.size for batch in self._batches)]))
-        on_face = terms[0].density.on_face
-        placements = [self._jets(batch, X.x.array) for batch in self._batches]
-        self._geometry = [jets.reshape(-1, FACE) if on_face else _inverted(jets) for jets in placements]
-        self._g, self._u = self._points.field(FACE if on_face else BULK), self._points.field(3 * PARTS)
+        where = terms[0].density.where
+        self._geometry = [_geometry(self._jets(batch, X.x.array), where, facet) for batch in self._batches]
+        self._g, self._u = self._points.field(SIZES[where]), self._points.field(3 * PARTS)
         self._hessians = {}
         self._pairs: dict[str, Pairs] = {}
+        self._varying: dict[str, list[tuple[fem.Function, list[Array]]]] = {}
         for term in terms:
             pairs = Pairs(tuple(combinations_with_replacement(term.density.parts, 2)))
             W = self._density(term)
@@ -72,12 +83,13 @@ class Site:
     def add(self, u: Array, factors: Mapping[str, float], same: Array, couple: Callable[[int, Array], None]) -> None:
         """Add the terms' element matrices to `same`; see `shell.sites.Site.add`."""
         names = [name for name in self._hessians if factors.get(name)]
-        for batch, geometry in zip(self._batches, self._geometry, strict=True):
-            jets = self._jets(batch, u)
-            self._u.x.array[: jets.size] = jets.ravel()
-            self._g.x.array[: geometry.size] = geometry.ravel()
+        for number, (batch, geometry) in enumerate(zip(self._batches, self._geometry, strict=True)):
+            fill(self._u, self._jets(batch, u))
+            fill(self._g, geometry)
             blocks = Blocks(batch, self._coupled)
             for name in names:
+                for here, values in self._varying[name]:
+                    fill(here, values[number])
                 blocks.add(self._points.evaluate(self._hessians[name], batch.size), factors[name], self._pairs[name])
             same[batch.cells[0]] += self._contraction.same(blocks, 0)
 
@@ -87,48 +99,74 @@ class Site:
 
     def _density(self, term: SolidTerm) -> Any:
         density, g, z = term.density, self._g, self._u
-        parameters = [self._points.constant(p) for p in density.parameters]
+        parameters, varying = parameters_at(self._points, density.parameters, 1)
+        self._varying[term.name] = [
+            (here, [at_points(field, batch.rule.points[0], batch.cells[0]) for batch in self._batches])
+            for here, field in varying
+        ]
 
         def vector(f: fem.Function, part: int) -> Any:
             return ufl.as_vector([f[3 * part + c] for c in range(3)])
 
-        if density.on_face:
+        if density.where == "outer":
             return density.of(*(vector(f, part) for f in (g, z) for part in range(3)), *parameters)
         by_reference = ufl.as_matrix([[z[3 * part + c] for part in range(1, PARTS)] for c in range(3)])
         inverse = ufl.as_matrix([[g[3 + 3 * i + j] for j in range(3)] for i in range(3)])
-        return density.of(vector(g, 0), vector(z, 0), ufl.dot(by_reference, inverse), *parameters) * g[12]
+        frame = [ufl.as_vector([g[i + c] for c in range(3)]) for i in (13, 16)] if density.where == "end" else []
+        return density.of(vector(g, 0), vector(z, 0), ufl.dot(by_reference, inverse), *frame, *parameters) * g[12]
 
 
 def make_sites(body: Body, X: fem.Function, terms: Sequence[Term], log: KernelLog) -> list[Site]:
     """The sites of the terms that have a tangent, one for each quadrature. Collective."""
     V = X.function_space
-    element = V.element.basix_element
     found = [t for t in terms if isinstance(t, SolidTerm) and not t.linear]
     sites = []
-    for on_face, degree in sorted({(t.density.on_face, t.density.degree) for t in found}):
-        if on_face:
-            square, w = basix.make_quadrature(basix.CellType.quadrilateral, degree)
-            points = np.column_stack([square, np.ones(len(square))])
-            cells = _cells_under(body)
-        else:
-            points, w = basix.make_quadrature(basix.CellType.hexahedron, degree)
-            cells = np.arange(V.mesh.topology.index_map(3).size_local, dtype=np.int32)
-        table = Table(np.ascontiguousarray(element.tabulate(1, points)[..., 0].transpose(1, 0, 2)))
-        here = [t for t in found if (t.density.on_face, t.density.degree) == (on_face, degree)]
-        sites.append(Site(X, cells, Rule((points,), (table,), w), here, log))
+    for degree in sorted({t.density.degree for t in found if t.density.where == "body"}):
+        points, w = basix.make_quadrature(basix.CellType.hexahedron, degree)
+        cells = np.arange(V.mesh.topology.index_map(3).size_local, dtype=np.int32)
+        here = [t for t in found if t.density.where == "body" and t.density.degree == degree]
+        sites.append(Site(X, cells, _rule(V, points, w), here, log))
+    for term in found:
+        if term.density.where == "body":
+            continue
+        around, numbers = _cells_at(body, term.density.facets)
+        points, w = term.density.rule
+        for facet in np.flatnonzero(V.mesh.comm.allreduce(np.bincount(numbers, minlength=6))):
+            rule = _rule(V, _on_facet(points, facet), w)
+            sites.append(Site(X, around[numbers == facet], rule, [term], log, facet))
     return sites
 
 
-def _cells_under(body: Body) -> NDArray[np.int32]:
-    """Owned cells with a facet on the outer face."""
+def _rule(V: fem.FunctionSpace, points: Array, weights: Array) -> Rule:
+    table = Table(np.ascontiguousarray(V.element.basix_element.tabulate(1, points)[..., 0].transpose(1, 0, 2)))
+    return Rule((points,), (table,), weights)
+
+
+def _on_facet(points: Array, facet: int) -> Array:
+    corners = basix.geometry(basix.CellType.hexahedron)[basix.topology(basix.CellType.hexahedron)[2][facet]]
+    return np.asarray(corners[0] + points @ (corners[1:3] - corners[0]))
+
+
+def _cells_at(body: Body, facets: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+    """Owned cells with one of these facets, and its number in each."""
     topology = body.mesh.topology
     links = topology.connectivity(2, 3)
-    cells = links.array[links.offsets[body.faces[OUTER]]]
-    return np.asarray(cells[cells < topology.index_map(3).size_local], dtype=np.int32)
+    cells = links.array[links.offsets[facets]]
+    numbers = np.argmax(topology.connectivity(3, 2).array.reshape(-1, 6)[cells] == facets[:, None], axis=1)
+    owned = cells < topology.index_map(3).size_local
+    return np.asarray(cells[owned], dtype=np.int32), numbers[owned]
 
 
-def _inverted(jets: Array) -> Array:
-    """(points, 13): X, the inverse of dX/dxi by rows, and its determinant."""
+def _geometry(jets: Array, where: str, facet: int | None) -> Array:
+    """(points, SIZES[where]) from the placement's jets; dX/dxi and n and t by rows."""
     flat = jets.reshape(-1, PARTS, 3)
+    if where == "outer":
+        return flat.reshape(-1, SIZES[where])
     G = flat[:, 1:].transpose(0, 2, 1)  # columns are the derivatives
-    return np.column_stack([flat[:, 0], np.linalg.inv(G).reshape(-1, 9), np.linalg.det(G)])
+    inverse, size = np.linalg.inv(G), np.linalg.det(G)
+    if facet is None:
+        return np.column_stack([flat[:, 0], inverse.reshape(-1, 9), size])
+    outward = basix.cell.facet_outward_normals(basix.CellType.hexahedron)[facet] @ inverse
+    n, t = flat[:, 3], np.cross(flat[:, 3], outward)
+    unit = [v / np.linalg.norm(v, axis=1)[:, None] for v in (n, t)]
+    return np.column_stack([flat[:, 0], inverse.reshape(-1, 9), size * np.linalg.norm(outward, axis=1), *unit])

@@ -1,8 +1,10 @@
 """The densities as terms: each compiled once, and only when a scene calls for it."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Literal
 
+import basix
 import numpy as np
 import ufl
 from dolfinx import fem, mesh
@@ -11,17 +13,22 @@ from ufl.core.expr import Expr
 
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.terms import DensityTerm
-from magshell_fenicsx.mesh.hexahedra import OUTER, Body
+from magshell_fenicsx.mesh.hexahedra import MIDDLE, OUTER, Body
 from magshell_fenicsx.models.shell.energy import per_area
 from magshell_fenicsx.models.shell.free import Constants, constants_of
 from magshell_fenicsx.models.shell.kinematics import SECOND, Jet
+from magshell_fenicsx.models.shell.moment import Counted
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.parameters import Magnetisation
 from magshell_fenicsx.models.solid import densities
 from magshell_fenicsx.models.solid.material import NeoHookean
+from magshell_fenicsx.models.solid.remanence import remanence_field
 
 WHOLE, REDUCED = 5, 3  # quadrature degrees: three and two points in each direction
 VALUE, GRADIENT, ON_FACE = (0,), (1, 2, 3), (0, 1, 2)  # parts of a displacement's jet: value, reference derivatives
+Array = NDArray[np.float64]
+Facets = NDArray[np.int32]
+ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
@@ -32,22 +39,41 @@ class Density:
     ----------
     of
         In the body of (X, u, H, *parameters) per volume, see `densities`; on its outer face of
-        (X, X1, X2, u, u1, u2, *parameters) per area of the reference cell.
+        (X, X1, X2, u, u1, u2, *parameters) per area of the reference cell; on ends, the faces above edges, of
+        (X, u, H, n, t, *parameters) per area.
+    parameters
+        Numbers, or fields of vectors.
     parts
         The parts of the displacement's jet that it depends on.
     degree
         Of the quadrature.
+    facets
+        Those that it lives on.
+    upper
+        Whether it lives on the outer half of these alone.
     """
 
     of: Callable[..., Expr]
-    parameters: tuple[fem.Constant, ...]
+    parameters: tuple[fem.Constant | fem.Function, ...]
     parts: tuple[int, ...] = GRADIENT
     degree: int = WHOLE
-    on_face: bool = False
+    where: Literal["body", "outer", "end"] = "body"
+    facets: Facets = field(default_factory=lambda: np.empty(0, dtype=np.int32))
+    upper: bool = False
+
+    @property
+    def rule(self) -> tuple[Array, Array]:
+        """Points on the reference facet, and their weights."""
+        points, weights = basix.make_quadrature(basix.CellType.quadrilateral, self.degree)
+        return ((points + np.eye(2)[1]) / [1.0, 2.0], weights / 2) if self.upper else (points, weights)
 
 
 class SolidTerm(DensityTerm[Density]):
     """A term of a solid."""
+
+
+class EndMoment(Counted, SolidTerm):
+    """A moment on an end."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +85,7 @@ class TermFactory:
     material: NeoHookean
     h: float
     log: KernelLog
+    hinged: tuple[str, ...] = ()
     free: Constants = field(default_factory=dict)  # of parameters that enter freely
 
     def distortion(self) -> SolidTerm:
@@ -73,37 +100,42 @@ class TermFactory:
         parameters = self._constants(self.material.bulk, self.h)
         return self._bulk("compression", Density(densities.compression, parameters, degree=REDUCED))
 
-    def magnetic(self, field: Magnetisation) -> list[SolidTerm]:
+    def magnetic(self, of: Magnetisation) -> list[SolidTerm]:
         """The terms, linear in the applied field, with the amplitude lambda_m."""
-        assert not callable(field.remanent)
-        directions = [("lambda_m", "", field.applied)]
-        if field.across is not None:
-            directions.append(("lambda_across", " across", field.across))
+        pattern = of.remanent
+        Br = remanence_field(pattern, self.u.function_space) if callable(pattern) else self._constants(pattern)[0]
+        directions = [("lambda_m", "", of.applied)]
+        if of.across is not None:
+            directions.append(("lambda_across", " across", of.across))
         terms = []
         for amplitude, suffix, Ba in directions:
-            density = Density(densities.magnetic, self._constants(field.remanent, Ba, self.h))
+            density = Density(densities.magnetic, (Br, *self._constants(Ba, self.h)))
             terms.append(self._bulk("magnetic" + suffix, density, amplitude, linear=True))
-        if field.gradient is not None:
-            parameters = self._constants(field.remanent, field.gradient, self.h)
+        if of.gradient is not None:
+            parameters = (Br, *self._constants(of.gradient, self.h))
             density = Density(densities.magnetic_gradient, parameters, VALUE + GRADIENT)
             terms.append(self._bulk("magnetic gradient", density, "lambda_m"))
         return terms
 
-    def pressure(self, classical: float, origin: NDArray[np.float64]) -> SolidTerm:
-        """Amplitude p/p_c, `classical` being p_c/E; on the outer face, `origin` in the mirror plane of a half."""
-        parameters = self._constants(classical / self.h, *([origin] if origin.any() else []))
-        density = Density(densities.pressure, parameters, ON_FACE, on_face=True)
-        return SolidTerm("pressure", density, self._on_face(density), self.u, self.log, "pressure")
+    def pressure(self, classical: float, origin: Array) -> list[SolidTerm]:
+        """Amplitude p/p_c, `classical` being p_c/E; on the outer face, and above the middle line of hinged ends.
+
+        `origin` is a point of all symmetry planes.
+        """
+        return [
+            SolidTerm(name, density, self._on_faces([density]), self.u, self.log, "pressure")
+            for name, density in self._enclosing(classical / self.h, origin).items()
+        ]
 
     def own(self, term: OwnTerm) -> SolidTerm:
         """The energy of a part or one's own on the outer face, with the amplitude of its name."""
         density = self._surface(term, term.density)
-        energy = self._on_face(density)
+        energy = self._on_faces([density])
         return SolidTerm(term.name, density, energy, self.u, self.log, term.name, linear=term.linear)
 
     def observed(self, term: OwnTerm) -> dict[str, ufl.Form]:
         """What it observes on the outer face."""
-        return {column: self._on_face(self._surface(term, of)) for column, of in term.observed.items()}
+        return {column: self._on_faces([self._surface(term, of)]) for column, of in term.observed.items()}
 
     def _surface(self, term: OwnTerm, of: Callable[..., Expr]) -> Density:
         """Of the mid-surface's density the same on the outer face, per area of the reference cell."""
@@ -113,38 +145,76 @@ class TermFactory:
             return per_area(of)(Jet(X, X1, X2, *flat), Jet(u, u1, u2, *flat), *parameters)
 
         parameters = constants_of(term, self.u.function_space.mesh, self.free)
-        return Density(on_face, parameters, ON_FACE, on_face=True)
+        return Density(on_face, parameters, ON_FACE, where="outer", facets=self.body.faces[OUTER])
 
-    def volume_change(self, origin: NDArray[np.float64]) -> ufl.Form:
+    def volume_change(self, origin: Array) -> ufl.Form:
         """Delta V/R^3 under the outer face of the modelled part."""
-        parameters = self._constants(1.0, *([origin] if origin.any() else []))
-        return self._on_face(Density(densities.pressure, parameters, on_face=True))
+        return self._on_faces(list(self._enclosing(1.0, origin).values()))
 
-    def outer_measure(self) -> ufl.Measure:
-        """Area of the undeformed outer face."""
-        facets = np.sort(self.body.faces[OUTER])
-        return face_measure(self.body.mesh, facets)
+    def moment(self, name: str, edge: str, intensity: float) -> EndMoment:
+        """A moment per length in E h R about the first tangent of an edge, with the amplitude "load"."""
+        Q = fem.functionspace(self.body.mesh, ("Lagrange", 2, (1,)))
+        weight, past = fem.Function(Q), self._constants(np.array([1.0, 0.0]))[0]
+        body = self.body
+        weight.x.array[:] = body.at_nodes(Q, 6 * body.heights * (1 - body.heights) / body.thickness)
+        parameters = (weight, *self._constants(intensity), past)
+        density = Density(densities.turning, parameters, where="end", facets=self.body.faces[edge])
+        term = EndMoment(name, density, self._on_faces([density]), self.u, self.log, "load")
+        length = self.log.compile("end length", weight[0] * face_measure(self.body.mesh, [self.body.faces[edge]])(1))
+        term.count_from(past, intensity * self.body.mesh.comm.allreduce(fem.assemble_scalar(length)))
+        return term
+
+    def _enclosing(self, unit: float, origin: Array) -> dict[str, Density]:
+        """p times the change of the volume under the outer face, down to the middle line where an end is hinged."""
+        parameters, faces = self._constants(unit, *([origin] if origin.any() else [])), self.body.faces
+        found = {"pressure": Density(densities.pressure, parameters, ON_FACE, WHOLE, "outer", faces[OUTER])}
+        if self.hinged:
+            facets = np.unique(np.concatenate([faces[name] for name in self.hinged]))
+            links = self.body.mesh.topology.connectivity(2, 3)
+            low, high = self.body.between[links.array[links.offsets[facets]]].T
+            parts = {"whole": low > MIDDLE - ROUNDING, "upper": (low < MIDDLE - ROUNDING) & (high > MIDDLE + ROUNDING)}
+            for name, inside in parts.items():
+                if self.body.mesh.comm.allreduce(int(inside.sum())):
+                    found[f"pressure {name}"] = Density(
+                        densities.sealing, parameters, VALUE + GRADIENT, WHOLE, "end", facets[inside], name == "upper"
+                    )
+        return found
 
     def _bulk(self, name: str, density: Density, amplitude: str | None = None, *, linear: bool = False) -> SolidTerm:
         domain, u = self.body.mesh, self.u
-        X = ufl.SpatialCoordinate(domain)
         dx = ufl.Measure("dx", domain=domain, metadata={"quadrature_degree": density.degree})
-        energy = density.of(X, u, ufl.grad(u), *density.parameters) * dx
+        energy = density.of(ufl.SpatialCoordinate(domain), u, ufl.grad(u), *density.parameters) * dx
         return SolidTerm(name, density, energy, self.u, self.log, amplitude, linear=linear)
 
-    def _on_face(self, density: Density) -> ufl.Form:
+    def _on_faces(self, found: Sequence[Density]) -> ufl.Form:
         domain, u = self.body.mesh, self.u
-        X, J = ufl.SpatialCoordinate(domain), ufl.Jacobian(domain)
-        X1, X2 = J[:, 0], J[:, 1]
-        area = ufl.cross(X1, X2)
-        per_area = density.of(X, X1, X2, u, ufl.grad(u) * X1, ufl.grad(u) * X2, *density.parameters)
-        return per_area / ufl.sqrt(ufl.dot(area, area)) * self.outer_measure()
+        X, J, H = ufl.SpatialCoordinate(domain), ufl.Jacobian(domain), ufl.grad(u)
+        ds, forms = face_measure(domain, [density.facets for density in found]), []
+        for tag, density in enumerate(found, 1):
+            if density.where == "outer":
+                area = ufl.cross(J[:, 0], J[:, 1])
+                given = X, J[:, 0], J[:, 1], u, ufl.dot(H, J[:, 0]), ufl.dot(H, J[:, 1])
+                forms.append(density.of(*given, *density.parameters) / ufl.sqrt(ufl.dot(area, area)) * ds(tag))
+                continue
+            n = J[:, 2] / ufl.sqrt(ufl.dot(J[:, 2], J[:, 2]))
+            t = ufl.cross(n, ufl.FacetNormal(domain))
+            per_area = density.of(X, u, H, n, t / ufl.sqrt(ufl.dot(t, t)), *density.parameters)
+            points, weights = density.rule
+            rule = {"quadrature_rule": "custom"} | {
+                "quadrature_points": tuple(tuple(x) for x in points),
+                "quadrature_weights": tuple(weights),
+            }
+            forms.append(per_area * (ds(tag, metadata=rule) if density.upper else ds(tag)))
+        return sum(forms[1:], forms[0])
 
-    def _constants(self, *values: float | NDArray[np.float64]) -> tuple[fem.Constant, ...]:
+    def _constants(self, *values: float | Array) -> tuple[fem.Constant, ...]:
         return tuple(fem.Constant(self.body.mesh, value) for value in values)
 
 
-def face_measure(domain: mesh.Mesh, facets: NDArray[np.int32]) -> ufl.Measure:
-    """Undeformed area of some facets, given in ascending order."""
-    tags = mesh.meshtags(domain, 2, facets, np.ones_like(facets))
-    return ufl.Measure("ds", domain=domain, subdomain_data=tags, metadata={"quadrature_degree": WHOLE})(1)
+def face_measure(domain: mesh.Mesh, parts: Sequence[Facets]) -> ufl.Measure:
+    """Undeformed area of some facets, those of each part under its number from 1."""
+    facets = np.concatenate(parts)
+    tags = np.repeat(np.arange(1, len(parts) + 1, dtype=np.int32), [len(part) for part in parts])
+    order = np.argsort(facets)
+    found = mesh.meshtags(domain, 2, facets[order], tags[order])
+    return ufl.Measure("ds", domain=domain, subdomain_data=found, metadata={"quadrature_degree": WHOLE})

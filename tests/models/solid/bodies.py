@@ -1,12 +1,17 @@
 """Small bodies that several tests share."""
 
+from typing import Any
+
 import numpy as np
 from mpi4py import MPI
 
+from magshell_fenicsx import Case
+from magshell_fenicsx.case.source import Source
 from magshell_fenicsx.mesh.hexahedra import Body, sweep
 from magshell_fenicsx.mesh.shapes import DiscShape
 from magshell_fenicsx.mesh.sphere import Dimple, SphereEmbedding, flat
 from magshell_fenicsx.mesh.triangulation import triangulate
+from magshell_fenicsx.plan.planner import make_plan
 
 
 def hemisphere(size: float, h: float, *, layers: int = 1, half: bool = False, dimple: Dimple | None = None) -> Body:
@@ -20,3 +25,10 @@ def plate(size: float, h: float, *, layers: int = 1, half: bool = False) -> Body
     """A disc of radius 1."""
     patch = triangulate(DiscShape(1.0, half), lambda x: size, {"pole": np.zeros(2)}, flat)
     return sweep(patch, h, layers, MPI.COMM_SELF)
+
+
+def body_of(shell: dict[str, Any], size: float, *, layers: int = 1, points: Any = None, factor: Any = None) -> Body:
+    """A body around a shell as a case describes it."""
+    data = {"shell": {"poisson_ratio": 0.3, **shell}, "boundary": {}, "points": points or {}, "mesh": {"size": size}}
+    plan = make_plan(Case.from_source(Source("test", data)))
+    return sweep(plan.triangulated(), plan.material.h, layers, MPI.COMM_SELF, factor)

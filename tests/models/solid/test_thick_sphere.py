@@ -70,7 +70,7 @@ def test_inflation(bulk_to_shear: float) -> None:
     axis, _ = fem.locate_dofs_geometrical((V.sub(0), W), lambda x: np.hypot(x[0], x[1]) < 1e-9)
     held.append(fem.dirichletbc(0.0, axis, V.sub(0)))  # else the sphere drifts along e1
     system = FiniteElementSystem(
-        model.u, [*model._terms, factory.pressure(1.0, np.zeros(3))], held, model._pattern, THICKNESS
+        model.u, [*model._terms, *factory.pressure(1.0, np.zeros(3))], held, model._pattern, THICKNESS
     )
     path = Path(BorderedNewton(system), "pressure", "load", StepOptions(0.05, 0.1, 1e-3))
     *_, (last, _) = path.towards(path.start(State(model.zero(), {"pressure": 0.0})), [pressure])
