@@ -1,7 +1,7 @@
 """A body of constant thickness around a mid-surface: hexahedra of degree 2, swept through the thickness.
 
-Each triangle of the mid-surface's own mesh is split into three quadrilaterals, which meet at its centre: the
-body is graded as the shell is, and its edges follow the same circles.
+Each triangle of the mid-surface's mesh is split into three quadrilaterals, which meet at its centre. So the body has
+the element sizes of the shell, and its edges follow the same circles.
 """
 
 from dataclasses import dataclass
@@ -10,12 +10,11 @@ import basix
 import basix.ufl
 import numpy as np
 from dolfinx import fem, mesh
-from dolfinx.cpp.io import perm_gmsh
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from magshell_fenicsx.mesh.patch import Embedding, PatchMesh
-from magshell_fenicsx.platform import compat
+from magshell_fenicsx.mesh.midsurface import at_reference_points, create_mesh
+from magshell_fenicsx.mesh.patch import Embedding, PatchMesh, as_set, directed_sides
 
 Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
@@ -55,20 +54,13 @@ class _Quadrilaterals:
 
 
 def sweep(patch: PatchMesh, h: float, layers: int, comm: MPI.Comm) -> Body:
-    """Make the body of all ranks from the triangulation, which each of them has: it is small."""
+    """Make the body on all ranks from the triangulation, which every rank has: it is small."""
     quads, levels = _split(patch), 2 * layers + 1
     z = np.linspace(-h / 2, h / 2, levels)
     r, n = patch.embedding(quads.nodes), surface_normal(patch.embedding, quads.nodes)
     X = (r[:, None] + z[:, None] * n[:, None]).reshape(-1, 3)
-    first = comm.rank == 0
-    cells = _swept(quads.cells, layers)
-    domain = mesh.create_mesh(
-        comm,
-        cells=cells if first else cells[:0],
-        x=X if first else X[:0],
-        e=basix.ufl.element("Lagrange", "hexahedron", 2, shape=(3,)),
-        partitioner=compat.shared_facets(),
-    )
+    element = basix.ufl.element("Lagrange", "hexahedron", 2, shape=(3,))
+    domain = create_mesh(comm, element, _swept(quads.cells, layers), X)
     chart = {name: x[None] for name, x in patch.points.items()}
     return Body(
         domain,
@@ -88,16 +80,9 @@ def surface_normal(embedding: Embedding, x: Array) -> Array:
 def _split(patch: PatchMesh) -> _Quadrilaterals:
     """Three quadrilaterals for each triangle: vertex, middle of a side, centre, middle of the other side."""
     reference, quads, on_sides = _reference_split()
-    order = {3: 1, 6: 2, 10: 3}[patch.cells.shape[1]]
-    geometry = basix.create_element(
-        basix.ElementFamily.P, basix.CellType.triangle, order, basix.LagrangeVariant.equispaced
-    )
-    to_dolfinx = perm_gmsh(mesh.CellType.triangle, patch.cells.shape[1])
-    values = geometry.tabulate(0, reference)[0, :, :, 0]
-    corners = patch.cells[:, :3]
-    vertices, corners = np.unique(corners, return_inverse=True)
+    vertices, corners = np.unique(patch.cells[:, :3], return_inverse=True)
     corners = corners.reshape(-1, 3)
-    pairs = np.concatenate([corners[:, list(side)] for side in SIDES])
+    pairs = directed_sides(corners)
     sides, side_of = np.unique(np.sort(pairs, axis=1), axis=0, return_inverse=True)
     side_of, backwards = side_of.reshape(3, -1), (pairs[:, 0] > pairs[:, 1]).reshape(3, -1)
     numbers = np.empty((len(corners), len(reference)), dtype=np.int64)
@@ -109,7 +94,7 @@ def _split(patch: PatchMesh) -> _Quadrilaterals:
     below = len(vertices) + 3 * len(sides)
     numbers[:, inner] = below + len(inner) * np.arange(len(corners))[:, None] + np.arange(len(inner))
     nodes = np.empty((numbers.max() + 1, patch.nodes.shape[1]))
-    nodes[numbers] = np.einsum("qk,ckd->cqd", values, patch.nodes[patch.cells[:, to_dolfinx]])
+    nodes[numbers] = at_reference_points(patch.nodes, patch.cells, reference)
     middle_of = {(int(a), int(b)): len(vertices) + 3 * n + 1 for n, (a, b) in enumerate(sides)}
 
     def halves(a: int, b: int) -> list[list[int]]:
@@ -127,9 +112,7 @@ def _split(patch: PatchMesh) -> _Quadrilaterals:
 
 def _reference_split() -> tuple[Array, Numbers, list[list[int]]]:
     """Places (19, 2) in the reference triangle, vertices first; quadrilaterals (3, 9) of them; those on each side."""
-    square = basix.create_element(
-        basix.ElementFamily.P, basix.CellType.quadrilateral, 2, basix.LagrangeVariant.equispaced
-    ).points
+    square = _quadratic_points(basix.CellType.quadrilateral)
     s, t = square.T[:, :, None]
     centre = VERTICES.mean(axis=0)
     found = [*VERTICES]
@@ -154,14 +137,15 @@ def _reference_split() -> tuple[Array, Numbers, list[list[int]]]:
     return places, np.array(quads), [along(*side) for side in SIDES]
 
 
+def _quadratic_points(cell: basix.CellType) -> Array:
+    """Places of the nodes of degree 2 in a reference cell."""
+    return basix.create_element(basix.ElementFamily.P, cell, 2, basix.LagrangeVariant.equispaced).points
+
+
 def _swept(quads: Numbers, layers: int) -> Numbers:
     """Hexahedra (quads * layers, 27) in the order of basix; node q at level k has the number q levels + k."""
-    points = basix.create_element(
-        basix.ElementFamily.P, basix.CellType.hexahedron, 2, basix.LagrangeVariant.equispaced
-    ).points
-    square = basix.create_element(
-        basix.ElementFamily.P, basix.CellType.quadrilateral, 2, basix.LagrangeVariant.equispaced
-    ).points
+    points = _quadratic_points(basix.CellType.hexahedron)
+    square = _quadratic_points(basix.CellType.quadrilateral)
     below = np.argmin(np.linalg.norm(points[:, None, :2] - square[None], axis=2), axis=1)
     level = np.rint(2 * points[:, 2]).astype(np.int64)
     levels = 2 * layers + 1
@@ -175,14 +159,14 @@ def _named_faces(domain: mesh.Mesh, quads: _Quadrilaterals, levels: int) -> dict
         domain.topology.create_connectivity(*pair)
     facets = mesh.exterior_facet_indices(domain.topology)
     vertices = domain.topology.index_map(0)
-    # of a vertex its number in the chart and its level
+    # a vertex has the number (number in the chart) * levels + level
     ends = mesh.entities_to_geometry(domain, 0, np.arange(vertices.size_local + vertices.num_ghosts, dtype=np.int32))
     numbers = domain.geometry.input_global_indices[ends[:, 0]]
     corners = domain.topology.connectivity(2, 0).array.reshape(-1, 4)[facets]
     chart, level = np.divmod(numbers[corners], levels)
     found = {OUTER: facets[(level == levels - 1).all(axis=1)]}
     for name, pairs in quads.edges.items():
-        wanted = {(a, b) for a, b in np.sort(pairs, axis=1)}
+        wanted = as_set(pairs)
         above = [len(set(c)) == 2 and (min(c), max(c)) in wanted for c in chart]
         found[name] = facets[np.array(above, dtype=bool)]
     return found
