@@ -6,7 +6,7 @@ from magshell_fenicsx.continuation.point import Point
 
 
 class Journal(Protocol):
-    """The results of `Path.solve`, in the order in which they came.
+    """The results of `Path.recorded`, in their order.
 
     A history is deterministic: from the same results it chooses the same steps, targets and brackets. So the
     results are a complete checkpoint.

@@ -7,15 +7,12 @@ eigenvalue lies below the shift, and none between those found is missing.
 from dataclasses import dataclass
 
 import numpy as np
-from dolfinx import fem
-from dolfinx.fem import petsc as fem_petsc
 from petsc4py import PETSc
 from slepc4py import SLEPc
 
 from magshell_fenicsx.continuation.factor import Factorisation
 from magshell_fenicsx.continuation.inverse import NoEigenpair, nearest_to_zero
 from magshell_fenicsx.continuation.system import Vector
-from magshell_fenicsx.platform import compat
 
 TOLERANCE = 1e-10  # of an eigenvalue, relative to its distance from the shift
 MARGIN = 1e-6  # eigenvalues closer than this, in the same relative measure, count as one multiple eigenvalue
@@ -42,20 +39,6 @@ class Mode:
     vector: Vector
 
 
-def mass_matrix(product: fem.Form, held: list[fem.DirichletBC]) -> PETSc.Mat:
-    """The matrix of an inner product, with zero rows and columns at held degrees of freedom.
-
-    So held degrees of freedom have no finite eigenvalue, whatever the tangent's diagonal is there.
-    """
-    M = fem_petsc.create_matrix(product)
-    M.setOption(
-        PETSc.Mat.Option.IGNORE_ZERO_ENTRIES, True
-    )  # the tangent has no entries between held degrees of freedom
-    compat.add_matrix(M, product, held)
-    M.assemble()
-    return M
-
-
 def lowest_modes(K: PETSc.Mat, M: PETSc.Mat, count: int) -> list[Mode]:
     """The algebraically lowest eigenpairs of K phi = lambda M phi, ascending.
 
@@ -64,8 +47,8 @@ def lowest_modes(K: PETSc.Mat, M: PETSc.Mat, count: int) -> list[Mode]:
     K
         A symmetric tangent. It may be indefinite, but not exactly singular.
     M
-        A symmetric matrix, positive definite on the free degrees of freedom. Its sparsity pattern is part of that of
-        K; see `mass_matrix`.
+        A symmetric matrix, positive definite on the free degrees of freedom, with zero rows and columns for the held
+        ones. Its sparsity pattern is part of that of K.
     count
         Number of eigenpairs. If there are more negative eigenvalues, all of these are returned.
 

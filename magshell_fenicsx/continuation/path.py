@@ -67,7 +67,7 @@ class Path:
     scale
         An amplitude that counts as of order one in the arc length.
     journal
-        Records every result of `solve`, and replays the results of an interrupted run.
+        Records every result of `recorded`, and replays the results of an interrupted run.
     progress
         Gets every step before it is tried.
     """

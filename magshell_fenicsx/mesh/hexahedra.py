@@ -95,7 +95,8 @@ def _split(patch: PatchMesh) -> _Quadrilaterals:
     numbers[:, inner] = below + len(inner) * np.arange(len(corners))[:, None] + np.arange(len(inner))
     nodes = np.empty((numbers.max() + 1, patch.nodes.shape[1]))
     nodes[numbers] = at_reference_points(patch.nodes, patch.cells, reference)
-    middle_of = {(int(a), int(b)): len(vertices) + 3 * n + 1 for n, (a, b) in enumerate(sides)}
+    ends = zip(sides[:, 0], sides[:, 1], strict=True)
+    middle_of = {(int(a), int(b)): len(vertices) + 3 * n + 1 for n, (a, b) in enumerate(ends)}
 
     def halves(a: int, b: int) -> list[list[int]]:
         middle = middle_of[min(a, b), max(a, b)]
@@ -139,7 +140,7 @@ def _reference_split() -> tuple[Array, Numbers, list[list[int]]]:
 
 def _quadratic_points(cell: basix.CellType) -> Array:
     """Places of the nodes of degree 2 in a reference cell."""
-    return basix.create_element(basix.ElementFamily.P, cell, 2, basix.LagrangeVariant.equispaced).points
+    return np.asarray(basix.create_element(basix.ElementFamily.P, cell, 2, basix.LagrangeVariant.equispaced).points)
 
 
 def _swept(quads: Numbers, layers: int) -> Numbers:
