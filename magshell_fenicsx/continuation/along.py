@@ -1,4 +1,4 @@
-"""A system with another amplitude than those underneath, which it moves together along a curve."""
+"""A system with one amplitude t in place of several others, which are functions of t."""
 
 from collections.abc import Callable, Mapping, Sequence
 
@@ -8,14 +8,14 @@ Curve = Callable[[float], tuple[float, float, float]]  # t -> mu and its first t
 
 
 class Along:
-    """A system in the amplitude t, which stands for mu_i = f_i(t) of another.
+    """A system in the amplitude t; the inner system has the amplitudes mu_i = f_i(t).
 
     Parameters
     ----------
     name
-        Of the amplitude t.
+        Name of the amplitude t.
     curves
-        f_i with its first two derivatives, for the amplitudes that move.
+        Amplitude of the inner system -> f_i with its first two derivatives.
     """
 
     def __init__(self, system: System, name: str, curves: Mapping[str, Curve]) -> None:
@@ -24,7 +24,7 @@ class Along:
         self._system, self._name, self._curves = system, name, curves
 
     def expand(self, state: State) -> State:
-        """A state with the amplitudes of the system underneath."""
+        """The state with the amplitudes of the inner system."""
         return State(state.u, self._expanded(state.mu))
 
     def residual(self, u: Vector, mu: Amplitudes) -> Vector:
@@ -54,5 +54,5 @@ class Along:
         return {**others, **{i: f(mu[self._name])[0] for i, f in self._curves.items()}}
 
     def _rates(self, mu: Amplitudes, name: str) -> dict[str, float]:
-        """dmu_i/dt; of an amplitude underneath, itself."""
+        """Amplitude of the inner system -> dmu_i/dt for t; for one of its own amplitudes, itself -> 1."""
         return {i: f(mu[self._name])[1] for i, f in self._curves.items()} if name == self._name else {name: 1.0}

@@ -20,15 +20,15 @@ from petsc4py import PETSc
 from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.system import Edged, State, System, Tangent, Vector, Weighted, dot, followed, max_abs
 
-TOLERANCE = 1e-9  # of u held along a direction, in lengths of the system
+TOLERANCE = 1e-9  # of u with its component along a direction held, in lengths of the system
 MOST_TANGENTS, CONTRACTION = 8, 0.3
-ROUNDING = 1e-5  # in lengths: steps that are smaller and do not shrink are rounding
-DIFFERENCE = 1e-2  # in lengths, of u along v; only the speed of convergence depends on the error
+ROUNDING = 1e-5  # in lengths: smaller steps that do not shrink are rounding
+DIFFERENCE = 1e-2  # in lengths: step of differences along v; only the speed of convergence depends on their error
 
 
 @dataclass(frozen=True)
 class _Spring:
-    """A spring on the degree of freedom where a shape is largest, as stiff as that itself.
+    """A spring at the degree of freedom where a shape is largest, as stiff as the diagonal entry there.
 
     Attributes
     ----------
@@ -41,9 +41,9 @@ class _Spring:
 
 
 def _sprung(tangent: Tangent, shape: Vector, comm: MPI.Comm) -> _Spring:
-    """Add the spring to a tangent; it is regular then at a simple fold."""
+    """Add the spring to a tangent, which is then regular at a simple fold."""
     K = tangent.K if isinstance(tangent, Edged) else tangent
-    size, first = np.abs(shape[: K.getLocalSize()[0]]), K.getOwnershipRange()[0]  # not of an edge
+    size, first = np.abs(shape[: K.getLocalSize()[0]]), K.getOwnershipRange()[0]  # without the entries of an edge
     _, owner = comm.allreduce((float(size.max(initial=0.0)), comm.rank), MPI.MAXLOC)
     e = np.zeros_like(shape)
     if comm.rank == owner:
@@ -60,8 +60,7 @@ def _sprung(tangent: Tangent, shape: Vector, comm: MPI.Comm) -> _Spring:
 class AugmentedTangent:
     """The tangent at a state, bordered by b, from factors of K + s e e with a spring s.
 
-    A factorisation of K itself would break down at the fold; the spring is taken back exactly
-    by one more border.
+    A factorisation of K itself would break down at the fold. One more border removes the spring exactly.
     """
 
     def __init__(self, newton: BorderedNewton, state: State, b: Vector, stress: Sequence[Weighted] = ()) -> None:
@@ -70,7 +69,7 @@ class AugmentedTangent:
         spring = _sprung(K, b, system.comm)
         self._factors = newton.factorisation
         self._factors.factor(K)
-        self.unstable = self._factors.negative_pivots  # the spring has made phi stable
+        self.unstable = self._factors.negative_pivots  # not phi, which the spring has made stable
         dot_ = partial(dot, system.comm)
         self._b, self._e, self._dot = b / np.sqrt(dot_(b, b)), spring.e, dot_
         self._p, self._q = self._factors.solve(self._e), self._factors.solve(self._b)
@@ -96,10 +95,10 @@ class AugmentedTangent:
 def held_along(
     newton: BorderedNewton, guess: State, b: Vector, stress: Sequence[Weighted] = ()
 ) -> tuple[State, float] | None:
-    """The equilibrium under a force along b that keeps the guess's place along b, and its estimated error.
+    """The equilibrium with the guess's component along b, which a force along b holds, and its estimated error.
 
-    It is no singular problem where b is the null vector (the Lyapunov-Schmidt reduction).
-    None if Newton's method fails. `stress` is as that of `System.tangent`, of the guess.
+    This problem is regular where b is the null vector (the Lyapunov-Schmidt reduction).
+    None if Newton's method fails. `stress` is the stress of the guess, see `System.tangent`.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Whether small symmetric matrices of one sparsity are positive definite, by LAPACK's banded Cholesky factors."""
+"""A test whether small symmetric matrices are positive definite, by LAPACK's banded Cholesky factors."""
 
 from collections.abc import Sequence
 
@@ -13,14 +13,14 @@ Array = NDArray[np.float64]
 
 
 class Banded:
-    """Combinations of matrices that have the sparsity of one.
+    """Weighted sums of matrices that share one sparsity pattern.
 
     Parameters
     ----------
     pattern
-        A matrix of one rank.
+        A matrix with the sparsity pattern, on one rank.
     held
-        Its rows and columns are those of the unit matrix.
+        Rows and columns that are replaced by those of the unit matrix.
     """
 
     def __init__(self, pattern: PETSc.Mat, held: NDArray[np.int32]) -> None:
@@ -40,7 +40,7 @@ class Banded:
         self._ones = place[held]
 
     def entries(self, values: Sequence[Array]) -> Array:
-        """What `positive` takes of the entries of some matrices."""
+        """The entries (matrices, kept) of some matrices that `positive` needs."""
         return np.stack([v[self._kept] for v in values])
 
     def positive(self, entries: Array, weights: Sequence[float]) -> bool:

@@ -2,8 +2,8 @@
 
     R(u, mu) + beta b = 0,    g(u, mu) = 0,    v . R_mu = 0
 
-for (u, mu, beta), with g and v of `augmented.AugmentedTangent`. This system is regular at a simple bifurcation, also
-where a small imperfection of the mesh or of rounding has split it: beta is the force along v that makes it whole
+for (u, mu, beta), with g and v of `augmented.AugmentedTangent`. This system is regular at a simple bifurcation. A small
+imperfection, from the mesh or from rounding, splits the bifurcation; beta is the force along v that restores it
 (Govaerts, Numerical methods for bifurcations of dynamical equilibria, SIAM 2000, ch. 4 and 6).
 """
 
@@ -18,9 +18,9 @@ from magshell_fenicsx.continuation.system import State, System, Vector, Weighted
 
 TOLERANCE = 1e-9  # of u, in lengths of the system
 MOST_ITERATIONS = 10
-LARGEST_STEP = 10.0  # in lengths; more is a divergence
-SCATTER = 3.0  # corrections of the load that only rounding makes, in standard deviations
-NEAR = 1e-5  # in lengths: after longer steps the state is brought back into equilibrium but for the force along v
+LARGEST_STEP = 10.0  # in lengths; a longer one counts as divergence
+SCATTER = 3.0  # load error in units of the last corrections, which are rounding
+NEAR = 1e-5  # in lengths: after a longer step the state is brought back into equilibrium, except for the force along v
 DIFFERENCE = 1e-4  # relative, of an amplitude
 ROUNDING = 1e-2  # in lengths: steps that are smaller and do not shrink are the rounding of g
 
@@ -38,14 +38,14 @@ class Bifurcation:
     phi
         Null vector of K, of length one.
     response
-        What u does per unit of -mu beside phi: the tangents of both branches are combinations of (phi, 0)
+        Change of u per unit of -mu, without phi. The tangents of both branches are combinations of (phi, 0)
         and (-response, 1).
     unstable
         Number of unstable directions besides `phi`.
     error
-        Estimated error of u beside its place along `phi`, over the system's length.
+        Estimated error of u, without its component along `phi`, over the system's length.
     load_error
-        Estimated error of the amplitude: what rounding of the tangent leaves.
+        Estimated error of the amplitude, from rounding of the tangent.
     iterations, factorisations
         Work.
     """
@@ -65,7 +65,7 @@ def find_bifurcation(
 ) -> Bifurcation:
     """The bifurcation in the amplitude `name` near a guess, whose null vector is near `phi`.
 
-    `stress` is as that of `System.tangent`, of the guess.
+    `stress` is the stress of the guess, see `System.tangent`.
 
     Raises
     ------
@@ -92,7 +92,7 @@ def _found(newton: BorderedNewton, guess: State, phi: Vector, name: str) -> Bifu
         if not steps[-1] <= LARGEST_STEP:
             raise BifurcationLost
         last, state = state.u, state.with_(state.u + du, name, state.mu[name] + dmu)
-        if steps[-1] > NEAR:  # off equilibrium, membrane stress that is not there spoils the tangent
+        if steps[-1] > NEAR:  # off equilibrium, a wrong membrane stress spoils the tangent
             state, _ = _settled(newton, state, tangent.v, followed(last, du))
     state, error = _settled(newton, state, tangent.v)
     return Bifurcation(
@@ -115,7 +115,7 @@ def _settled(newton: BorderedNewton, state: State, v: Vector, stress: Sequence[W
 
 
 def _step(system: System, state: State, name: str, tangent: AugmentedTangent) -> tuple[Vector, float, Vector]:
-    """Newton's step du = alpha v - w_R - dmu w_mu and dmu, from the rows for g and v . R_mu; and w_mu."""
+    """Newton's step (du, dmu) and w_mu: du = alpha v - w_R - dmu w_mu, alpha and dmu from the rows g and v . R_mu."""
     comm, u, v = system.comm, state.u, tangent.v
     w_R, _ = tangent.solve(system.residual(u, state.mu))
     w_mu, pull = tangent.solve(system.load(u, state.mu, name))  # pull = v . R_mu
@@ -125,20 +125,15 @@ def _step(system: System, state: State, name: str, tangent: AugmentedTangent) ->
     turn, bend = dot(comm, mixed, v), dot(comm, v, _load_rate(system, state, name))
     rows = [[turn, -dot(comm, cubic, v)], [dot(comm, mixed, w_mu) - dot(comm, K_mu_v, w_mu) + bend, -turn]]
     rest = [-tangent.g - dot(comm, cubic, w_R), -pull - dot(comm, mixed, w_R)]
-    dmu, alpha = _solved(rows, rest)
-    return alpha * v - w_R - dmu * w_mu, dmu, w_mu
+    dmu, alpha = np.linalg.solve(rows, rest)
+    return alpha * v - w_R - dmu * w_mu, float(dmu), w_mu
 
 
 def _load_rate(system: System, state: State, name: str) -> Vector:
-    """R_mumu by a difference: zero, exactly, of an amplitude that multiplies its term."""
+    """R_mumu by a difference; exactly zero for an amplitude that multiplies its term."""
     mu, d = state.mu[name], DIFFERENCE * (abs(state.mu[name]) or 1.0)
     ahead, back = (system.load(state.u, {**state.mu, name: mu + step}, name) for step in (d, -d))
     return np.asarray((ahead - back) / (2 * d))
-
-
-def _solved(rows: Sequence[Sequence[float]], rest: Sequence[float]) -> tuple[float, float]:
-    a, b = np.linalg.solve(rows, rest)
-    return float(a), float(b)
 
 
 def _mixed(system: System, state: State, v: Vector, w: Vector) -> Vector:
@@ -151,6 +146,6 @@ def _mixed(system: System, state: State, v: Vector, w: Vector) -> Vector:
 
 
 def _done(sizes: Sequence[float]) -> bool:
-    """Whether the last step is below the tolerance, or as small as rounding lets it be."""
+    """Whether the last step is below the tolerance, or as small as rounding allows."""
     stalled = len(sizes) > 1 and sizes[-1] > sizes[-2] / 2 and sizes[-1] <= ROUNDING
     return stalled or (bool(sizes) and sizes[-1] <= TOLERANCE)

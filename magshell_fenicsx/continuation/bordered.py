@@ -2,11 +2,9 @@
 
 import numpy as np
 
-from magshell_fenicsx.continuation.control import Row
+from magshell_fenicsx.continuation.control import Row, slope
 from magshell_fenicsx.continuation.factor import Factorisation
-from magshell_fenicsx.continuation.system import State, System, Vector, dot, max_abs
-
-Direction = tuple[Vector, float]  # (du, dmu)
+from magshell_fenicsx.continuation.system import Direction, State, System, Vector, dot, max_abs
 
 
 def plus(a: Direction, factor: float, b: Direction) -> Direction:
@@ -20,7 +18,7 @@ class Bordered:
     Parameters
     ----------
     factors
-        Those of K at the state.
+        The factors of K at the state.
     name
         The amplitude mu.
     row
@@ -35,14 +33,17 @@ class Bordered:
     def __init__(self, system: System, factors: Factorisation, state: State, name: str, row: Row) -> None:
         self.state, self.row, self._mu = state, row, state.mu[name]
         self._comm, self._factors, self._length = system.comm, factors, system.length
-        self._c, self._d = row.gradient(state)
+        self._gradient = row.gradient(state)
         self.column = system.load(state.u, state.mu, name)
         self._x2 = factors.solve(self.column)
-        self._schur = self._d - (dot(self._comm, self._c, self._x2) if self._c is not None else 0.0)
-        self._weight = dot(self._comm, self._x2, self._x2)  # of dmu: the displacement that it makes
+        self._schur = slope(self._comm, self._gradient, (-self._x2, 1.0))
+        self._weight = dot(self._comm, self._x2, self._x2)  # dmu counts as the displacement that it causes
 
     def size(self, step: Direction) -> float:
-        """Of a step: that of du in lengths of the system, or that of dmu, relative or by the displacement it makes."""
+        """The size of a step: the larger of du, in lengths of the system, and dmu.
+
+        dmu counts relative to mu or as the displacement that it causes, whichever is smaller.
+        """
         moved = max_abs(self._comm, self._x2) / self._length
         per_mu = min(moved, 1 / abs(self._mu)) if self._mu else moved
         return max(max_abs(self._comm, step[0]) / self._length, abs(step[1]) * per_mu)
@@ -50,13 +51,12 @@ class Bordered:
     def solve(self, f: Vector, g: float) -> Direction:
         """(du, dmu) with K du + R_mu dmu = f and c.du + d dmu = g."""
         x1 = self._factors.solve(f)
-        pull = dot(self._comm, self._c, x1) if self._c is not None else 0.0
-        dmu = (g - pull) / self._schur
+        dmu = (g - slope(self._comm, self._gradient, (x1, 0.0))) / self._schur
         return x1 - dmu * self._x2, dmu
 
     @property
     def tangent(self) -> Direction:
-        """The same for f = 0 and g = 1."""
+        """The solution for f = 0 and g = 1."""
         return np.asarray(-self._x2 / self._schur), 1 / self._schur
 
     def inner(self, a: Direction, b: Direction) -> float:
@@ -65,5 +65,4 @@ class Bordered:
 
     def times(self, du: Vector, dmu: float) -> Direction:
         """The matrix times a direction."""
-        g = self._d * dmu + (dot(self._comm, self._c, du) if self._c is not None else 0.0)
-        return self._factors.times(du) + dmu * self.column, g
+        return self._factors.times(du) + dmu * self.column, slope(self._comm, self._gradient, (du, dmu))

@@ -14,9 +14,9 @@ from magshell_fenicsx.continuation.path import Path
 from magshell_fenicsx.continuation.point import Point
 from magshell_fenicsx.continuation.system import State, Vector
 
-SIZES = 0.5, 2.0, 8.0  # of the first step off the path, in the system's length
-SEEN = 1e-4  # relative change of the amplitude that is no rounding error
-ODD = 0.1  # an asymmetric branch changes the amplitude this much more in one direction than in the other
+SIZES = 0.5, 2.0, 8.0  # of the first step off the path, in lengths of the system
+SEEN = 1e-4  # a larger relative change of the amplitude is no rounding error
+ODD = 0.1  # a branch is asymmetric if the changes of the amplitude in both directions differ by more than this part
 
 
 @dataclass(frozen=True)
@@ -26,9 +26,9 @@ class Branching:
     Attributes
     ----------
     symmetric
-        The amplitude rises, or falls, in both directions alike (a pitchfork).
+        Whether the amplitude changes equally in both directions (a pitchfork).
     starts
-        A point in each direction, its tangent leading away; arc length counts from it.
+        A point in each direction, with a tangent that leads away; arc length is zero there.
     """
 
     symmetric: bool
@@ -36,7 +36,7 @@ class Branching:
 
 
 def branching(path: Path, bifurcation: Point) -> Branching | None:
-    """Step off a path at a located bifurcation, along the null vector; None if that is not found or Newton fails there.
+    """Leave a path at a located bifurcation along the null vector; None if that or the first points are not found.
 
     Parameters
     ----------
@@ -63,16 +63,16 @@ def branching(path: Path, bifurcation: Point) -> Branching | None:
 
 
 def _largest(comm: MPI.Comm, v: Vector) -> float:
-    """The entry of largest magnitude, with its sign: the same on any number of ranks."""
+    """The entry of largest magnitude with its sign, which is the same on any number of ranks."""
     here = float(v[np.argmax(np.abs(v))]) if v.size else 0.0
     return float(max(comm.allgather(here), key=abs))
 
 
 def _step_off(path: Path, state: State, mode: Vector, size: float) -> Point | None:
-    """The point of the branch at a distance along the null vector, its tangent leading away.
+    """The point of the branch at a distance along the null vector, with a tangent that leads away.
 
-    First the shell is pushed there along the null vector at the same amplitude; then the push is taken away
-    and the amplitude given free.
+    First a force along the null vector pushes the system there at the same amplitude. Then the force is removed
+    and the amplitude is unknown.
     """
     metric, name, newton = path.metric, path.name, path.newton
     row = Hyperplane(metric, name, state, (mode, 0.0), size * metric.inner((mode, 0.0), (mode, 0.0)))

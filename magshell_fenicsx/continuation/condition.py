@@ -1,4 +1,4 @@
-"""How ill-conditioned a tangent is."""
+"""An estimate of the condition number of a tangent."""
 
 import numpy as np
 from mpi4py import MPI
@@ -13,9 +13,9 @@ def condition_estimate(factors: Factorisation, size: int, comm: MPI.Comm, iterat
     Parameters
     ----------
     size
-        Unknowns of this rank.
+        Unknowns on this rank.
     iterations
-        Of the power iteration for the one, and of inverse iteration for the other.
+        Power iterations for the largest eigenvalue, and inverse iterations for the smallest.
     """
     largest, inverse = 0.0, 0.0
     a = b = np.sin(1.0 + np.arange(size) + comm.rank)

@@ -1,4 +1,4 @@
-"""The last row of the bordered system: what is prescribed along a path."""
+"""The last row of the bordered system: the quantity that is prescribed along a path."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,8 +7,9 @@ from math import sqrt
 from typing import Protocol
 
 import numpy as np
+from mpi4py import MPI
 
-from magshell_fenicsx.continuation.system import State, System, Vector, dot
+from magshell_fenicsx.continuation.system import Direction, State, System, Vector, dot
 
 
 class Row(Protocol):
@@ -19,6 +20,12 @@ class Row(Protocol):
 
     def gradient(self, state: State) -> tuple[Vector | None, float]:
         """dg/du (None where it is zero) and dg/dmu."""
+
+
+def slope(comm: MPI.Comm, gradient: tuple[Vector | None, float], along: Direction) -> float:
+    """The derivative of g along a direction, from the gradient of its row."""
+    (c, d), (du, dmu) = gradient, along
+    return d * dmu + (dot(comm, c, du) if c is not None else 0.0)
 
 
 @dataclass(frozen=True)
@@ -53,9 +60,9 @@ class GivenConjugate:
 
 @dataclass(frozen=True)
 class Metric:
-    """Lengths along a path of (u, mu): root mean square of u over the system's length, beside mu over `scale`.
+    """Lengths along a path of (u, mu): from the root mean square of u over the system's length, and mu over `scale`.
 
-    One step length then means the same for a thick shell and a thin one, and on any mesh.
+    So a step length means the same for a thick and a thin shell, and on any mesh.
     """
 
     system: System
@@ -63,10 +70,10 @@ class Metric:
 
     @cached_property
     def weight(self) -> float:
-        """Of du . du."""
+        """The factor of du . du."""
         return 1 / (float(self.system.comm.allreduce(self.system.size)) * self.system.length**2)
 
-    def inner(self, a: tuple[Vector, float], b: tuple[Vector, float]) -> float:
+    def inner(self, a: Direction, b: Direction) -> float:
         """<a, b> of two directions (du, dmu)."""
         return self.weight * dot(self.system.comm, a[0], b[0]) + a[1] * b[1] / self.scale**2
 
@@ -75,7 +82,7 @@ class Metric:
         return sqrt(self.inner((du, dmu), (du, dmu)))
 
 
-def projected(metric: Metric, a: tuple[Vector, float], span: Sequence[tuple[Vector, float]]) -> tuple[Vector, float]:
+def projected(metric: Metric, a: Direction, span: Sequence[Direction]) -> Direction:
     """The direction nearest to `a` among the combinations of others."""
     gram = [[metric.inner(p, q) for q in span] for p in span]
     parts = np.linalg.solve(gram, [metric.inner(p, a) for p in span])
@@ -90,7 +97,7 @@ class Hyperplane:
     metric: Metric
     name: str
     base: State
-    normal: tuple[Vector, float]
+    normal: Direction
     distance: float
 
     def residual(self, state: State) -> float:

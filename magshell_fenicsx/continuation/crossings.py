@@ -1,7 +1,7 @@
-"""The points of a step at which modes that a model excludes are neutral."""
+"""Locating the points of a step at which excluded modes are neutral."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from magshell_fenicsx.continuation.events import Stability, locate_bifurcation
 from magshell_fenicsx.continuation.path import Path
@@ -12,7 +12,7 @@ MOST_HALVINGS = 12  # of a step in which several modes of a family change; what 
 
 @dataclass(frozen=True)
 class Change:
-    """The numbers of unstable directions of a family of modes before and after a step."""
+    """A family of modes, and its numbers of unstable directions before and after a step."""
 
     stability: Stability
     before: int
@@ -20,21 +20,21 @@ class Change:
 
 
 class Step:
-    """The way between two successive points of a path, with all points on it that were solved for.
+    """The part of a path between two successive points, with all points on it that were computed.
 
-    Arc length is measured along the tangent of the first.
+    Arc length is measured along the tangent of the first point.
     """
 
     def __init__(self, path: Path, low: Point, high: Point) -> None:
-        self._path, self._low = path, _as_base(path, low)
-        self._points = [self._low, _seen_from(path, self._low, high)]
+        self._path, self._low = path, path.as_base(low)
+        self._points = [self._low, path.measured_from(self._low, high)]
 
     def place(self, point: Point) -> float:
-        """How far a point is from the first one; s where that is given."""
-        return abs(_seen_from(self._path, self._low, point).s - self._low.s)
+        """The distance of a point from the first one, in s."""
+        return abs(self._path.measured_from(self._low, point).s - self._low.s)
 
     def crossings(self, change: Change) -> Iterator[tuple[Point, int]]:
-        """Each point at which a mode is neutral, and by how much the number of unstable directions rises there."""
+        """Each point at which a mode is neutral, and the change of the number of unstable directions there."""
         ends = self._points[0], self._points[-1]
         counts = {id(ends[0]): change.before, id(ends[1]): change.after}
         yield from self._between(*ends, change, counts, MOST_HALVINGS)
@@ -47,8 +47,8 @@ class Step:
             return
         middle = self._middle(low, high, solve=abs(after - before) > 1 and halvings > 0)
         if middle is None:
-            base = _as_base(self._path, low)
-            found = locate_bifurcation(self._path, base, _seen_from(self._path, base, high), change.stability)
+            base = self._path.as_base(low)
+            found = locate_bifurcation(self._path, base, self._path.measured_from(base, high), change.stability)
             self._kept(found)
             yield found, after - before
         else:
@@ -57,7 +57,7 @@ class Step:
             yield from self._between(middle, high, change, counts, halvings - 1)
 
     def _middle(self, low: Point, high: Point, *, solve: bool) -> Point | None:
-        """A point between two others: one that is there, else one that is solved for, if that is wanted."""
+        """A point between two others: a known one, else a new one if `solve` is set."""
         first, last = (next(i for i, p in enumerate(self._points) if p is end) for end in (low, high))
         if last - first > 1:
             return self._points[(first + last) // 2]
@@ -70,20 +70,7 @@ class Step:
         return self._kept(found)
 
     def _kept(self, point: Point) -> Point:
-        seen = _seen_from(self._path, self._low, point)
+        seen = self._path.measured_from(self._low, point)
         self._points.append(seen)
         self._points.sort(key=lambda p: abs(p.s - self._low.s))
         return seen
-
-
-def _as_base(path: Path, point: Point) -> Point:
-    """A point that arc length is measured from: its tangent has length one."""
-    return point.per(path.metric.norm(point.du, point.dmu)) if path.control == "arc" else point
-
-
-def _seen_from(path: Path, base: Point, point: Point) -> Point:
-    """The point at its arc length from a base."""
-    if path.control != "arc":
-        return point
-    away = point.state.u - base.state.u, point.state.mu[path.name] - base.state.mu[path.name]
-    return replace(point, s=base.s + path.metric.inner((base.du, base.dmu), away))

@@ -1,12 +1,12 @@
-"""A loading device: amplitudes that are unknown, since what is conjugate to them is held.
+"""A loading device holds the conjugates of some amplitudes, so these amplitudes are unknowns.
 
-A sealed volume has an unknown pressure; a body that is pressed on with a given force has an unknown place.
+For example, a sealed volume has an unknown pressure, and a body pressed on with a given force an unknown position.
 The Legendre transform
 
     L(u, mu_f; mu) = Pi(u; mu_f, mu) + sum_f mu_f q_f
 
 is stationary in u and in the amplitudes mu_f where Pi is in equilibrium and -dPi/dmu_f = q_f. So a device is a system
-like any other, whose unknowns are u and y_f = mu_f length/scale_f, and its inertia is that of the shell in it.
+like any other, with the unknowns u and y_f = mu_f length/scale_f. Its inertia is that of the shell in the device.
 """
 
 from collections.abc import Mapping, Sequence
@@ -25,7 +25,7 @@ class Device:
     Parameters
     ----------
     held
-        Amplitude -> the value of -dPi/dmu that is held. The amplitude becomes unknown.
+        Amplitude that becomes unknown -> the value of -dPi/dmu that is held.
     scale
         Amplitude -> a value that counts as of order one.
     """
@@ -37,13 +37,13 @@ class Device:
         self.size = system.size + len(held) * (self.comm.rank == self.comm.size - 1)
 
     def enter(self, state: State) -> State:
-        """A state of the system underneath as one of the device."""
+        """A state of the inner system as a state of the device."""
         y = np.array([state.mu[name] for name in self._names]) / self._unit
         fixed = {name: value for name, value in state.mu.items() if name not in self._names}
         return State(join(state.u, y, self.comm), fixed)
 
     def leave(self, state: State) -> State:
-        """A state of the device as one of the system underneath."""
+        """A state of the device as a state of the inner system."""
         return State(*self._split(state.u, state.mu))
 
     def displacement(self, x: Vector) -> Vector:
@@ -82,6 +82,6 @@ class Device:
 
 
 def natural_scale(system: System, factors: Factorisation, state: State, name: str) -> float:
-    """The amplitude that moves the system by about its length, a power of two: the same on any number of ranks."""
+    """The amplitude that moves the system by about its length, as a power of two: the same on any number of ranks."""
     moved = max_abs(system.comm, factors.solve(system.load(state.u, state.mu, name))) / system.length
     return 2.0 ** -round(log2(moved)) if moved else 1.0

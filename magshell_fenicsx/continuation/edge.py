@@ -1,4 +1,4 @@
-"""Solving with an edged matrix [K C; C^T D] by the factors of K (block elimination)."""
+"""Solving with an edged matrix [K C; C^T D] by block elimination with the factors of K."""
 
 from collections.abc import Callable
 
@@ -8,13 +8,13 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.system import Edged, Vector, dot
 
-ROUNDING = 1e-11  # a residual that is larger, relative to the right side, is solved for once more
+ROUNDING = 1e-11  # a larger residual, relative to the right side, takes a second solve
 
 
 class Edge:
-    """The k numbers beside u and the Schur complement S = D - C^T K^-1 C.
+    """The k additional unknowns y and the Schur complement S = D - C^T K^-1 C.
 
-    The numbers stand behind u on the last rank.
+    y follows u on the last rank.
 
     Parameters
     ----------
@@ -26,7 +26,7 @@ class Edge:
     count
         k.
     negative_pivots
-        What the edge adds to those of K (Haynsworth's inertia additivity), without those of its multipliers.
+        Number that the edge adds to that of K (Haynsworth's inertia additivity), without its multipliers.
     """
 
     def __init__(
@@ -45,7 +45,7 @@ class Edge:
         return join(self._times(u) + forces, self._products([u])[0] + self._D @ y, self._comm)
 
     def solve(self, rhs: Vector) -> Vector:
-        """Its solution; refined once where K is so nearly singular that elimination loses digits."""
+        """The solution; refined once if K is so nearly singular that elimination loses digits."""
         x = self._eliminated(rhs)
         rest = rhs - self.times(x)
         if dot(self._comm, rest, rest) > ROUNDING**2 * dot(self._comm, rhs, rhs):

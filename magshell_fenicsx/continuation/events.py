@@ -8,18 +8,17 @@ from typing import Literal, Protocol
 import numpy as np
 
 from magshell_fenicsx.continuation.bifurcation import SCATTER, BifurcationLost, find_bifurcation
-from magshell_fenicsx.continuation.bordered import Direction
 from magshell_fenicsx.continuation.control import projected
 from magshell_fenicsx.continuation.factor import Factorisation
 from magshell_fenicsx.continuation.inverse import NoEigenpair, nearest_to_zero
 from magshell_fenicsx.continuation.path import Path
 from magshell_fenicsx.continuation.point import PathStopped, Point
-from magshell_fenicsx.continuation.system import State, Vector, Weighted
+from magshell_fenicsx.continuation.system import Direction, State, Vector, Weighted
 
-MOST_STEPS = 60  # bisection alone halves a bracket so often that nothing is left of it
-FLAT = 0.01  # slope of the amplitude, over that at the step's start, that means a fold
-MIDDLE = 0.5, 0.35, 0.65, 0.2, 0.8  # of a bracket, where a point between its ends is looked for
-MOST_HALVINGS = 12  # of a step that holds several instabilities; what is left counts as one
+MOST_STEPS = 60  # so many bisections reduce any bracket to rounding
+FLAT = 0.01  # a smaller slope of the amplitude, over the slope at the step's start, means a fold
+MIDDLE = 0.5, 0.35, 0.65, 0.2, 0.8  # places in a bracket, tried in turn, for a point between its ends
+MOST_HALVINGS = 12  # of a step with several instabilities; what is left counts as one
 
 
 class Stability(Protocol):
@@ -44,7 +43,7 @@ class Instability:
 
 
 def instabilities(path: Path, low: Point, high: Point, tolerance: float = 1e-8) -> Iterator[Instability]:
-    """All singular points between two successive points, in order, as far as inertia and tangents show them.
+    """All singular points between two successive points, in order, as far as inertia and tangents reveal them.
 
     Parameters
     ----------
@@ -54,7 +53,7 @@ def instabilities(path: Path, low: Point, high: Point, tolerance: float = 1e-8) 
     Raises
     ------
     PathStopped
-        If Newton fails between two points that it had found.
+        If Newton's method fails between the two points.
     """
     search = _Search(path, low, tolerance)
     yield from search.between(low, path.seen_from(low, high), MOST_HALVINGS)
@@ -62,9 +61,9 @@ def instabilities(path: Path, low: Point, high: Point, tolerance: float = 1e-8) 
 
 @dataclass
 class _Search:
-    """Work between two points, the first of which is the base of every solve.
+    """A search between two points, the first of which is the base of every solve.
 
-    `iterations` and `factorisations` are those since the last located point.
+    `iterations` and `factorisations` count the work since the last located point.
     """
 
     path: Path
@@ -108,7 +107,7 @@ class _Search:
         return found
 
     def middle(self, low: Point, high: Point) -> Point | None:
-        """A point somewhere between two others, with its own inertia: rounding may hide some."""
+        """A point somewhere between two others, with its own inertia; rounding may hide some places."""
         for part in MIDDLE:
             found = self.try_at(low.s + part * (high.s - low.s), low, high)
             if not isinstance(found, str):
@@ -116,7 +115,7 @@ class _Search:
         return None
 
     def crossing(self, low: Point, high: Point) -> Point | None:
-        """The bifurcation between two points, as the solution of a regular system; None if that is not found."""
+        """The bifurcation between two points, as the solution of a regular system; None if there is no solution."""
         path = self.path
         try:
             modes = [critical_mode(path.newton, end.state) for end in (low, high)]
@@ -143,7 +142,7 @@ class _Search:
             return "no bifurcation was found"
         self.iterations += found.iterations
         self.factorisations += found.factorisations
-        # of both branches' tangents, the one that continues the path
+        # the null vector and the response span the tangents of both branches; this one continues the path
         state, along = found.state, self._slope(found.state, low, high)
         direction = projected(path.metric, along, [(found.phi, 0.0), (-found.response, 1.0)])
         point = path.on(state, direction, self.base, found.unstable)
@@ -157,7 +156,7 @@ class _Search:
         return (1 - t) * low.du + t * high.du, (1 - t) * low.dmu + t * high.dmu
 
     def bracketed(self, low: Point, high: Point) -> Point:
-        """The last point before an instability, by bisection as far as rounding lets inertia be trusted."""
+        """The last point before an instability, by bisection until rounding spoils the inertia."""
         name = self.path.name
         for _ in range(MOST_STEPS):
             width = abs(high.state.mu[name] - low.state.mu[name])
@@ -199,7 +198,7 @@ class _Search:
         Parameters
         ----------
         slope
-            Of the eigenvalue over the load.
+            Derivative of the eigenvalue by the load.
         """
         u = point.state.u
         side = np.random.default_rng(self.path.system.comm.rank).choice([-1.0, 1.0], u.size)  # as rounding does
@@ -207,10 +206,10 @@ class _Search:
         return float(max(abs(values[0]), SCATTER * abs(values[1] - values[0])) / abs(slope)) if slope else np.inf
 
     def bifurcation(self, low: Point, high: Point, stability: Stability) -> Point:
-        """Where the eigenvalue that changes sign is zero, by the Illinois variant of regula falsi.
+        """The zero of the eigenvalue that changes sign, by the Illinois variant of regula falsi.
 
-        It ends when two successive guesses agree to the tolerance's power 3/4 (the order of the method
-        is 1.44): the eigenvalue itself drowns in rounding before it is zero.
+        It ends when two successive guesses agree to tolerance^(3/4): the order of the method is 1.44, and close to
+        zero the eigenvalue is only rounding.
         """
         path, side = self.path, 0
         first = critical_mode(stability, low.state)
@@ -222,7 +221,7 @@ class _Search:
             t = a / (a - b) if a * b < 0 else 0.5
             tried = self.try_at(low.s + t * (high.s - low.s), low, high)
             found = self.middle(low, high) if isinstance(tried, str) else tried
-            if found is None:  # the path's own tangent is singular there too
+            if found is None:  # the path's own tangent is singular there as well
                 return replace(low, load_error=abs(high.state.mu[path.name] - low.state.mu[path.name]))
             point = found
             mu = point.state.mu[path.name]
@@ -262,14 +261,14 @@ def locate_bifurcation(
     Parameters
     ----------
     stability
-        Whose tangent is watched: that of modes which the model excludes.
+        The tangent of the modes that the model excludes.
     tolerance
         Of the amplitude, relative.
 
     Raises
     ------
     PathStopped
-        If Newton fails between two points that it had found, or no eigenpair is found.
+        If Newton's method fails between the two points, or no eigenpair is found.
     """
     search = _Search(path, stable, tolerance)
     try:

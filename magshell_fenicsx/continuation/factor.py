@@ -1,4 +1,4 @@
-"""Direct factorisation of the symmetric tangent, its inertia, and a count of the work."""
+"""Direct factorisation of the symmetric tangent, its inertia, and the work."""
 
 import numpy as np
 from mpi4py import MPI
@@ -9,17 +9,17 @@ from magshell_fenicsx.continuation.system import Edged, Tangent, Vector
 from magshell_fenicsx.continuation.timing import Stopwatch
 
 PREFIX = "magshell_factor_"
-# PETSc's numbers of what CHOLMOD may end with where MUMPS goes on (petscerror.h)
+# PETSc's error numbers (petscerror.h) after which MUMPS replaces CHOLMOD
 INDEFINITE, MISSING = 81, 92
-REFUSED = 76  # CHOLMOD itself: too large for its integers, or no memory, of which MUMPS decides
+REFUSED = 76  # CHOLMOD's own error: the matrix is too large for its integers or for the memory; MUMPS is tried
 
 
 class Factorisation:
     """Factors of the latest tangent; symbolic work is kept between calls.
 
-    A tangent that is expected to be positive definite is given to CHOLMOD on one rank, which takes half
-    the time and, by succeeding, proves that there is no negative pivot. Else MUMPS makes LDL^T and
-    counts them. After its first failure CHOLMOD is left alone, and its memory given back.
+    On one rank CHOLMOD is tried first: it takes half the time, and its success proves that there is no negative
+    pivot. Otherwise MUMPS computes LDL^T and counts the negative pivots. After its first failure CHOLMOD is not
+    used again, and its memory is released.
 
     Attributes
     ----------
@@ -28,7 +28,7 @@ class Factorisation:
     solving
         Time spent on solving with the factors.
     matrix
-        The matrix last factored; of an edged one, K.
+        The matrix last factored; K if that was an edged one.
     negative_pivots
         Unstable directions of the latest factored tangent (Sylvester's law of inertia).
     """
@@ -50,7 +50,7 @@ class Factorisation:
         Raises
         ------
         PETSc.Error
-            If MUMPS fails, for want of memory for instance, or CHOLMOD in a way that says nothing of the matrix.
+            If MUMPS fails, for example for lack of memory, or if CHOLMOD fails for a reason other than the matrix.
         """
         K = tangent.K if isinstance(tangent, Edged) else tangent
         with self.stopwatch:
@@ -66,18 +66,18 @@ class Factorisation:
 
     @property
     def size(self) -> tuple[int, int]:
-        """Rows of the matrix last factored: on this rank, and in all."""
+        """Rows of the matrix last factored: on this rank, and on all."""
         edge = self._edge.count if self._edge else 0
         here, whole = (size[0] for size in (self.matrix.getLocalSize(), self.matrix.getSize()))
         return here + edge * (self.comm.rank == self.comm.size - 1), whole + edge
 
     @property
     def norm(self) -> float:
-        """Of K: its largest sum of a row's magnitudes."""
+        """The largest sum of magnitudes in a row of K."""
         return float(self.matrix.norm(PETSc.NormType.NORM_INFINITY))
 
     def _factor_definite(self, K: PETSc.Mat) -> bool:
-        """Try CHOLMOD; False if K is not positive definite, or CHOLMOD cannot say."""
+        """Try CHOLMOD; False if K is not positive definite, or if CHOLMOD cannot be used."""
         if self._cholmod is None or not self._cholmod.is_of(K):
             self._cholmod = _Definite(K)
         try:
@@ -95,13 +95,13 @@ class Factorisation:
             self._mumps = _new_pc(K, "mumps")
             self._mumps.setFactorSetUpSolverType()
             F = self._mumps.getFactorMatrix()
-            F.setMumpsIcntl(24, 1)  # null pivots are reported, without it there is no inertia,
-            F.setMumpsCntl(3, -1e-100)  # but only true zeros: else the null vector would be lost at a fold,
-            F.setMumpsCntl(5, 1e-17)  # and those are made tiny, for the same reason
+            F.setMumpsIcntl(24, 1)  # report null pivots: PETSc gives no inertia without this
+            F.setMumpsCntl(3, -1e-100)  # only true zeros are null pivots: else the null vector is lost at a fold
+            F.setMumpsCntl(5, 1e-17)  # null pivots are replaced by a tiny number, for the same reason
             if self.comm.size > 1:
-                F.setMumpsIcntl(13, 1)  # the root front too must be counted, so it is not left to ScaLAPACK
+                F.setMumpsIcntl(13, 1)  # no ScaLAPACK for the root front: its pivots must be counted too
             F.setMumpsIcntl(14, 50)
-            F.setMumpsIcntl(8, 0)  # unscaled: a tenth faster, the tangent's entries are of one size
+            F.setMumpsIcntl(8, 0)  # no scaling: a tenth faster, and the tangent's entries are of similar size
         _renew(self._mumps, K)
         self._pc, self.negative_pivots = self._mumps, self._mumps.getFactorMatrix().getInertia()[0]
 
@@ -144,8 +144,9 @@ def has_cholmod() -> bool:
 
 
 class _Definite:
-    """CHOLMOD's factors of a matrix, by way of its upper triangle: of any other matrix PETSc copies that for
-    CHOLMOD each time, and loses the copy where CHOLMOD fails.
+    """CHOLMOD's factors of a copy of a matrix's upper triangle.
+
+    From any other format PETSc itself makes such a copy each time, and leaks it if CHOLMOD fails.
     """
 
     def __init__(self, K: PETSc.Mat) -> None:
@@ -164,7 +165,7 @@ class _Definite:
 
     def _copied(self, upper: PETSc.Mat) -> PETSc.Mat:
         K = self._K
-        if K.getBlockSize() > 1:  # which the triangle would have too
+        if K.getBlockSize() > 1:  # the copy would have the blocks too
             K = PETSc.Mat().createAIJ(K.getSize(), csr=K.getValuesCSR(), comm=K.comm)
         K.setOption(PETSc.Mat.Option.SYMMETRIC, True)
         return K.convert("seqsbaij", upper)
@@ -175,7 +176,7 @@ def _entries(K: PETSc.Mat) -> float:
 
 
 def _new_pc(K: PETSc.Mat, solver: str) -> PETSc.PC:
-    if solver == "cholmod":  # its other method factors indefinite matrices without a word
+    if solver == "cholmod":  # its simplicial method factors indefinite matrices without an error
         given = PETSc.Options(PREFIX)
         given["mat_cholmod_supernodal_switch"], given["mat_cholmod_print"] = 0.0, 0
     pc = PETSc.PC().create(K.comm)
@@ -191,4 +192,4 @@ def _renew(pc: PETSc.PC, K: PETSc.Mat) -> None:
     pc.setReusePreconditioner(False)
     pc.setOperators(K)
     pc.setUp()
-    pc.setReusePreconditioner(True)  # a solve must not factor anew when K was assembled again
+    pc.setReusePreconditioner(True)  # a solve must not factor again after K was assembled again

@@ -14,18 +14,18 @@ from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.system import Amplitudes, State, System, Vector, dot, max_abs
 
 TOLERANCE = 1e-9  # estimated remaining error of u, over the system's length
-ROUNDING = 1e-6  # steps along phi that are smaller and do not shrink: 1e-8 to 1e-7 is what rounding of K leaves
+ROUNDING = 1e-6  # smaller steps along phi that do not shrink are rounding of K, which is 1e-8 to 1e-7
 MOST_ITERATIONS = 8
-LARGEST_STEP = 10.0  # in lengths; more is a divergence
+LARGEST_STEP = 10.0  # in lengths; a longer one counts as divergence
 
 
 class FoldLost(RuntimeError):
-    """No fold was found near the guess; the message says why."""
+    """No fold was found near the guess; the message gives the reason."""
 
 
 @dataclass(frozen=True)
 class Guess:
-    """Where a fold may be, and its null vector; without one it is taken from the tangent."""
+    """A state near a fold, and the null vector; without that it is computed from the tangent."""
 
     state: State
     phi: Vector | None = None
@@ -64,10 +64,10 @@ class Fold:
 
 
 def find_fold(newton: BorderedNewton, guess: Guess, name: str) -> Fold:
-    """The fold in the amplitude `name` near a guess, to 1e-9 lengths as far as rounding allows that.
+    """The fold in the amplitude `name` near a guess, to 1e-9 lengths if rounding allows that.
 
-    Rounding of K leaves 1e-8 lengths along phi where elements are tiny; the amplitude, which is
-    stationary along phi, is exact all the same.
+    With tiny elements, rounding of K leaves an error of 1e-8 lengths along phi. The amplitude is stationary along phi,
+    so it is accurate nevertheless.
 
     Raises
     ------
@@ -115,15 +115,15 @@ def sensitivity(system: System, fold: Fold, column: Vector) -> float:
 def predict_fold(system: System, known: Sequence[tuple[float, Fold]], p: float, others: Amplitudes) -> Guess:
     """Extrapolate folds at other values of a parameter to `p`.
 
-    Of the polynomials through the last one, two and three folds, that with the least residual: on
-    long or uneven steps a quadratic may be worse than no extrapolation.
+    The polynomials through the last one, two and three folds are compared, and the one with the least residual is
+    used: for long or uneven steps a quadratic may be worse than no extrapolation.
 
     Parameters
     ----------
     system
-        At `p`.
+        The system at `p`.
     known
-        Parameter and fold, in the unknowns of `system`, in the order of the continuation.
+        Parameters and folds, in the unknowns of `system`, in the order of the continuation.
     others
         The other amplitudes at `p`.
     """

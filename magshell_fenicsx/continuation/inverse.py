@@ -1,7 +1,7 @@
 """The eigenpair of a factored tangent K that is nearest to zero, by Rayleigh-Ritz for K^-1 in a Krylov space.
 
-Plain inverse iteration turns endlessly between the modes of a and -a, and hardly moves among many of nearly one
-stiffness, as a sphere's. Their space grows here by one solve at a time until the pair's residual says that it is found.
+Plain inverse iteration does not converge between eigenvalues a and -a, and it converges slowly among many modes of
+almost equal stiffness, as on a sphere. Here the space grows by one solve at a time until the pair's residual is small.
 """
 
 from dataclasses import dataclass
@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from magshell_fenicsx.continuation.factor import Factorisation
 from magshell_fenicsx.continuation.system import Vector, dot
 
-TOLERANCE = 1e-8  # of K^-1 v - v/lambda, over 1/|lambda|: the eigenvalue's own error is of its square
+TOLERANCE = 1e-8  # of K^-1 v - v/lambda, over 1/|lambda|; the error of the eigenvalue is of its square
 MOST_SOLVES = 300
-MOST_VECTORS, KEPT = 24, 8  # of the space before it is begun anew, and after
-TIED = 1e-6  # of two eigenvalues a and -a that are as near to zero as this, relative, the negative one is meant
-PATIENCE = 12  # solves without progress, after which a residual at the level of rounding is the smallest there is
-ROUNDING = 100 * np.finfo(float).eps  # of a residual K v - lambda v, over the norm of K
+MOST_VECTORS, KEPT = 24, 8  # vectors in the space before a restart, and after it
+TIED = 1e-6  # if a and -a are equally near to zero up to this relative difference, the negative one is returned
+PATIENCE = 12  # after so many solves without progress, a residual at the level of rounding is accepted
+ROUNDING = 100 * np.finfo(float).eps  # level of rounding of K v - lambda v, over the norm of K
 
 
 class NoEigenpair(RuntimeError):
@@ -25,14 +25,14 @@ class NoEigenpair(RuntimeError):
 
 
 def nearest_to_zero(factors: Factorisation) -> tuple[float, Vector]:
-    """Eigenvalue and eigenvector, of length one; of a nearly singular tangent the null vector. Collective.
+    """Eigenvalue and eigenvector of length one; for a nearly singular tangent that is the null vector. Collective.
 
-    The vector of a multiple eigenvalue is one of many, and its sign is either.
+    The sign of the vector is arbitrary; for a multiple eigenvalue it is any vector of the eigenspace.
 
     Raises
     ------
     NoEigenpair
-        On all ranks, if neither the tolerance is met nor the limit of rounding reached.
+        On all ranks, if the residual reaches neither the tolerance nor the level of rounding.
     """
     space, best, waited = _Space(factors), np.inf, 0
     while space.solves < MOST_SOLVES:
@@ -51,7 +51,7 @@ def nearest_to_zero(factors: Factorisation) -> tuple[float, Vector]:
 
 @dataclass(frozen=True)
 class _Pair:
-    """`error`: the residual over 1/|lambda|, a rival's of the other sign too where that may be nearer to zero."""
+    """`error`: the residual over 1/|lambda|, including that of a pair of the other sign that may be nearer to zero."""
 
     value: float
     vector: Vector
@@ -59,7 +59,7 @@ class _Pair:
 
 
 class _Space:
-    """Orthonormal vectors and what K^-1 makes of them."""
+    """Orthonormal vectors V and their images W = K^-1 V."""
 
     def __init__(self, factors: Factorisation) -> None:
         self._factors, self._comm = factors, factors.comm
@@ -75,9 +75,9 @@ class _Space:
         return self._count == self._size
 
     def grown(self) -> _Pair:
-        """Take in one more vector; the pair nearest to zero in the space that results."""
+        """Add one vector; the pair nearest to zero in the larger space."""
         v, k = self._next, self._count
-        for _ in range(2):  # once leaves what rounding makes of it
+        for _ in range(2):  # a second time against rounding
             v = v - self._sums(self._V[:k] @ v) @ self._V[:k]
             v = v / np.sqrt(dot(self._comm, v, v))
         self._V[k], self._W[k] = v, self._factors.solve(v)

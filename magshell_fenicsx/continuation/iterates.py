@@ -1,8 +1,8 @@
-"""When a sequence of Newton's steps has converged, judged by the steps alone.
+"""Convergence of Newton's method, judged by the steps alone.
 
-The residual is no measure of the error: where a structure is soft, the rounding of its stiff part hides
-it. The next step is one, if the matrix that it is made with is good: P. Deuflhard, Newton Methods for
-Nonlinear Problems, Springer 2004, sec. 2.1.4 (QNERR). Sizes are in lengths of the system.
+The residual does not measure the error: rounding of the stiff part of a structure hides errors of its soft part.
+The next step measures the error if its matrix is good: P. Deuflhard, Newton Methods for Nonlinear Problems,
+Springer 2004, sec. 2.1.4 (QNERR). Sizes are in lengths of the system.
 """
 
 from collections.abc import Callable
@@ -12,22 +12,22 @@ from typing import Literal
 import numpy as np
 
 Verdict = Literal["go on", "converged", "diverged", "rounding", "too many"]
-FULL = 0.5  # a step as long as this part of the one before has not converged quadratically
-SMALL = 1e-3  # steps that small of full Newton iterations shrink, but for rounding
-PATIENCE, GAIN = 4, 0.1  # after so many matrices the steps must have shrunk to this part of the first
-ROUNDING = 10.0  # steps up to this many times the rounding error are taken for it
+FULL = 0.5  # a step longer than this part of the one before shows no quadratic convergence
+SMALL = 1e-3  # full Newton steps below this size shrink, unless they are rounding
+PATIENCE, GAIN = 4, 0.1  # after so many matrices the steps must have shrunk to this part of the first one
+ROUNDING = 10.0  # steps up to this many times the rounding error count as rounding
 
 
 @dataclass(frozen=True)
 class Step:
-    """A step that an iterate asks for.
+    """The next step at an iterate.
 
     Attributes
     ----------
     size
-        Of du.
+        Size of the step, see `Bordered.size`.
     own
-        Whether the matrix is that of the iterate itself.
+        Whether the matrix was computed at this iterate.
     """
 
     size: float
@@ -41,7 +41,7 @@ class Iterates:
     Parameters
     ----------
     largest
-        A step that is longer is a divergence.
+        A longer step counts as divergence.
     most
         Iterations after which the solve is given up.
     """
@@ -51,14 +51,14 @@ class Iterates:
     steps: list[Step] = field(default_factory=list)
 
     def judge(self, tolerance: float, rounding: Callable[[], float]) -> Verdict:
-        """What the last step says of the iterate.
+        """The verdict on the iterate, from the last step.
 
         Parameters
         ----------
         tolerance
             Of the iterate's error.
         rounding
-            Gives the error that rounding of the residual makes.
+            Computes the error from rounding of the residual.
         """
         step, before = self.steps[-1], self.steps[:-1]
         if not step.size <= self.largest:

@@ -1,4 +1,4 @@
-"""A record of everything a path solved for, from which an interrupted history is retraced without solving."""
+"""A record of all results of a path, from which an interrupted history is repeated without solving."""
 
 from typing import Protocol
 
@@ -6,16 +6,16 @@ from magshell_fenicsx.continuation.point import Point
 
 
 class Journal(Protocol):
-    """The results of `Path.solve`, in the order in which they came.
+    """The results of `Path.recorded`, in their order.
 
-    A history is deterministic: given the same results again, it chooses the same steps, targets and
-    brackets. So the results are a complete checkpoint.
+    A history is deterministic: from the same results it chooses the same steps, targets and brackets. So the
+    results are a complete checkpoint.
     """
 
     def replay(self) -> Point | str | None:
-        """The next result on record; None where there is none and it must be solved for.
+        """The next recorded result; None if there is none and a solve is needed.
 
-        Collective. May raise, to stop the history here: a new solve would begin.
+        Collective. It may raise an exception to stop the history before a new solve begins.
         """
 
     def record(self, found: Point | str) -> None:

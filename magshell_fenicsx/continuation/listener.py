@@ -1,4 +1,4 @@
-"""What a history is at, for people who wait for it."""
+"""Reports of the status of a history, for the user."""
 
 from typing import Protocol
 
@@ -6,17 +6,17 @@ from magshell_fenicsx.continuation.point import Point
 
 
 class Progress(Protocol):
-    """Hears what is about to be done. No part of it is collective, and nothing may depend on it."""
+    """Receives the next action of a history. No method is collective, and no result may depend on it."""
 
     def trying(self, here: Point, length: float) -> None:
-        """A step from an accepted point over a length of s."""
+        """A step of a length in s from an accepted point begins."""
 
     def doing(self, what: str) -> None:
-        """Something else that takes a while, in a few words."""
+        """Some other long action begins; `what` describes it in a few words."""
 
 
 class NoProgress:
-    """Nobody waits."""
+    """Reports nothing."""
 
     def trying(self, here: Point, length: float) -> None:
         pass

@@ -1,24 +1,21 @@
-"""The lowest eigenpairs of a tangent, K phi = lambda M phi, none of them missed.
+"""The lowest eigenpairs of a tangent, K phi = lambda M phi, without gaps.
 
-SLEPc's Lanczos iteration runs around a shift below all eigenvalues; that nothing lies below it, and
-nothing between the eigenvalues that were found, is read from the inertia of K - sigma M.
+SLEPc's Lanczos iteration runs around a shift below all eigenvalues. The inertia of K - sigma M shows that no
+eigenvalue lies below the shift, and none between those found is missing.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
-from dolfinx import fem
-from dolfinx.fem import petsc as fem_petsc
 from petsc4py import PETSc
 from slepc4py import SLEPc
 
 from magshell_fenicsx.continuation.factor import Factorisation
 from magshell_fenicsx.continuation.inverse import NoEigenpair, nearest_to_zero
 from magshell_fenicsx.continuation.system import Vector
-from magshell_fenicsx.platform import compat
 
 TOLERANCE = 1e-10  # of an eigenvalue, relative to its distance from the shift
-MARGIN = 1e-6  # eigenvalues closer than this, relative likewise, are taken for one that is multiple
+MARGIN = 1e-6  # eigenvalues closer than this, in the same relative measure, count as one multiple eigenvalue
 MOST_TRIALS = 30
 
 
@@ -42,29 +39,18 @@ class Mode:
     vector: Vector
 
 
-def mass_matrix(product: fem.Form, held: list[fem.DirichletBC]) -> PETSc.Mat:
-    """The matrix of an inner product, with zero rows and columns at held degrees of freedom.
-
-    Those then have no finite eigenvalue, whatever the tangent has on its diagonal there.
-    """
-    M = fem_petsc.create_matrix(product)
-    M.setOption(PETSc.Mat.Option.IGNORE_ZERO_ENTRIES, True)  # tangents have none of those that are held
-    compat.add_matrix(M, product, held)
-    M.assemble()
-    return M
-
-
 def lowest_modes(K: PETSc.Mat, M: PETSc.Mat, count: int) -> list[Mode]:
     """The algebraically lowest eigenpairs of K phi = lambda M phi, ascending.
 
     Parameters
     ----------
     K
-        A symmetric tangent; it may be indefinite, not exactly singular.
+        A symmetric tangent. It may be indefinite, but not exactly singular.
     M
-        A symmetric matrix, positive where nothing is held, whose entries K has too; see `mass_matrix`.
+        A symmetric matrix, positive definite on the free degrees of freedom, with zero rows and columns for the held
+        ones. Its sparsity pattern is part of that of K.
     count
-        How many are wanted. Negative ones are returned whatever their number.
+        Number of eigenpairs. If there are more negative eigenvalues, all of these are returned.
 
     Raises
     ------
@@ -73,7 +59,7 @@ def lowest_modes(K: PETSc.Mat, M: PETSc.Mat, count: int) -> list[Mode]:
     """
     slices = _Slices(K, M)
     wanted = min(max(count, slices.below(0.0)), slices.finite)
-    # (a) those nearest to zero show how large eigenvalues are
+    # (a) the eigenvalues nearest to zero give the order of magnitude
     shift = -2 * max(abs(mode.eigenvalue) for mode in slices.around(0.0, wanted + 1, 1e-3))
     # (b) a shift with nothing below it
     trials = 0
@@ -81,7 +67,7 @@ def lowest_modes(K: PETSc.Mat, M: PETSc.Mat, count: int) -> list[Mode]:
         if (trials := trials + 1) == MOST_TRIALS:
             raise ModesNotFound(f"the tangent has eigenvalues below {shift:g}")
         shift *= 4
-    # (c) from there upwards, and again with those that were missed below the last one
+    # (c) the eigenvalues above it; again with more if some below the last one were missed
     sought = wanted
     for _ in range(MOST_TRIALS):
         found = slices.around(shift, sought, TOLERANCE)
@@ -95,7 +81,7 @@ def lowest_modes(K: PETSc.Mat, M: PETSc.Mat, count: int) -> list[Mode]:
 
 
 def null_vector(K: PETSc.Mat) -> Vector:
-    """The direction that a nearly singular symmetric K resists least, of length one.
+    """The eigenvector of length one of the eigenvalue nearest to zero of a symmetric K.
 
     Raises
     ------
@@ -161,7 +147,7 @@ class _Slices:
 
 @dataclass(frozen=True)
 class _BackSolve:
-    """What PETSc calls in place of a preconditioner."""
+    """A preconditioner for PETSc that solves with the factors."""
 
     factorisation: Factorisation
 

@@ -17,22 +17,22 @@ from typing import Any
 import numpy as np
 from petsc4py import PETSc
 
-from magshell_fenicsx.continuation.bordered import Bordered, Direction, plus
+from magshell_fenicsx.continuation.bordered import Bordered, plus
 from magshell_fenicsx.continuation.control import Row
 from magshell_fenicsx.continuation.factor import Factorisation
 from magshell_fenicsx.continuation.iterates import Iterates, Step, Verdict
 from magshell_fenicsx.continuation.refine import refined_tangent
 from magshell_fenicsx.continuation.snes import REASON_OF, in_words, make_snes
-from magshell_fenicsx.continuation.system import State, System, Vector, Weighted, dot, followed, max_abs
+from magshell_fenicsx.continuation.system import Direction, State, System, Vector, Weighted, dot, followed, max_abs
 from magshell_fenicsx.platform import compat
 
-LEAST_REST = 0.3  # of a step: an update that would lengthen it more is not trusted
-MOTION = 0.1  # part of the largest displacement that counts as a length, where it is longer than the system's
+LEAST_REST = 0.3  # Broyden's update divides the step by a number; below this one it is not trusted
+MOTION = 0.1  # this part of the largest displacement counts as the length where it exceeds the system's length
 
 
 @dataclass(frozen=True)
 class NewtonOptions:
-    """When a step counts as converged and when factors are kept.
+    """When an iterate counts as converged, and when factors are kept.
 
     Attributes
     ----------
@@ -44,14 +44,14 @@ class NewtonOptions:
     contraction
         The first factors are kept while a step is shorter than this part of the one before.
     hard
-        The same of later factors, and of all where the guess comes with a stress: old ones lead astray there.
+        The same for later factors, and for all factors if the guess comes with a stress: old factors mislead there.
     cheap
-        As many steps with old factors cost less than new ones: so near the end old ones are kept that halve a step,
-        but not where the guess comes with a stress.
+        This many steps with old factors cost less than new factors. So old factors that halve the step are kept
+        if that many steps reach the tolerance, but not if the guess comes with a stress.
     fresh
-        Distance, in lengths, up to which factors serve for the tangent and the inertia of a solution.
+        Distance, in lengths, up to which factors are used for the tangent and the inertia of a solution.
     largest_step
-        An iteration that moves u by more than this many lengths is a divergence.
+        An iteration that moves u by more than this many lengths counts as divergence.
     """
 
     tolerance: float = 1e-9
@@ -65,7 +65,7 @@ class NewtonOptions:
 
 @dataclass(frozen=True)
 class Outcome:
-    """Where Newton ended, and what it took.
+    """The result of Newton's method, and its work.
 
     Attributes
     ----------
@@ -98,14 +98,14 @@ class Response:
 
 @dataclass
 class _Progress:
-    """One solve.
+    """The status of one solve.
 
     Attributes
     ----------
     taken
         The steps since the matrix was made.
     ahead
-        The step that the present iterate asks for.
+        The next step, computed at the present iterate.
     """
 
     iterates: Iterates = field(default_factory=Iterates)
@@ -136,8 +136,8 @@ class BorderedNewton:
         self.options = options or NewtonOptions()
         self.factorisation = factorisation or Factorisation(system.comm)
         self._work = _Work()
-        self._made: tuple[State | None, int] = None, 0  # the state that was factored last, and the count of it
-        self._stressed = False  # it was factored with another stress than its own
+        self._made: tuple[State | None, int] = None, 0  # the state that was factored last, and its number
+        self._stressed = False  # whether it was factored with another stress than its own
         self._progress = _Progress()
         comm = system.comm
         self._last = comm.rank == comm.size - 1
@@ -146,14 +146,14 @@ class BorderedNewton:
         self._snes = make_snes(self, self._x, self.options.max_iterations)
 
     def on(self, system: System) -> "BorderedNewton":
-        """The same for another system, whose tangent is made of this one's; factors and work are shared."""
+        """A solver for another system whose tangent contains this one's; factors and counts of work are shared."""
         other = BorderedNewton(system, self.options, self.factorisation)
         other._work = self._work
         return other
 
     @property
     def iterations(self) -> int:
-        """Those of all solves so far."""
+        """The iterations of all solves so far."""
         return self._work.iterations
 
     def solve(self, guess: State, name: str, row: Row, stress: Sequence[Weighted] = ()) -> Outcome:
@@ -169,7 +169,7 @@ class BorderedNewton:
         self._snes.solve(None, self._x)
         u, mu = self._split(self._x)
         converged = self._snes.getConvergedReason() > 0
-        if converged and progress.ahead:  # it costs nothing more
+        if converged and progress.ahead:  # the last step is known already
             u, mu = plus((u, mu), -1.0, progress.ahead)
         iterations = self._snes.getIterationNumber()
         self._work.iterations += iterations
@@ -179,7 +179,7 @@ class BorderedNewton:
         return Outcome(guess.with_(u, name, mu), converged, iterations, reason, error)
 
     def factor_at(self, state: State, stress: Sequence[Weighted] = ()) -> Factorisation:
-        """Factor the tangent at a state, unless its factors are at hand."""
+        """Factor the tangent at a state, unless its factors are known."""
         near = self._factored
         if near is not state and (near is None or self._stressed or not near.equals(state, self.system.comm)):
             self.factorisation.factor(self.system.tangent(state.u, state.mu, stress))
@@ -188,14 +188,14 @@ class BorderedNewton:
 
     @property
     def _factored(self) -> State | None:
-        """The state whose tangent's factors are at hand."""
+        """The state to which the latest factors belong; None if another solver made them."""
         state, count = self._made
         return state if count == self.factorisation.count else None
 
     def response(self, state: State, name: str, row: Row, *, exact: bool = False) -> Response:
         """The path's tangent at a solution: K du + R_mu dmu = 0, c.du + d dmu = 1.
 
-        Where the factors at hand were made near by, they serve, with the tangent refined against
+        If the latest factors belong to a state near by, they are used, and the tangent is refined with
         differences of the residual; `exact` factors K at the solution itself.
         """
         comm, near = self.system.comm, self._factored
@@ -213,20 +213,20 @@ class BorderedNewton:
         return Response(du, dmu, softness, self.factorisation.negative_pivots)
 
     def _bordered(self, state: State, name: str, row: Row) -> Bordered:
-        """The bordered matrix at a state, that of the last solve if it was made there for the same row."""
+        """The bordered matrix at a state; the one of the last solve if it has the same state and row."""
         last = self._progress.matrix
-        if last and last.row is row and last.state is state is self._factored:  # one object, not only equal
+        if last and last.row is row and last.state is state is self._factored:  # the same object, not only equal
             return last
         return Bordered(self.system, self.factor_at(state), state, name, row)
 
     def function(self, x: PETSc.Vec, f: PETSc.Vec) -> None:
-        """SNES asks for R and g."""
+        """Called by SNES for R and g."""
         u, mu = self._split(x)
         state = self._guess.with_(u, self._name, mu)
         self._join(self.system.residual(u, state.mu), self._row.residual(state), f)
 
     def test(self, snes: PETSc.SNES, norm: float) -> Any:
-        """SNES asks whether it has converged."""
+        """Called by SNES to test convergence."""
         progress, o = self._progress, self.options
         if not np.isfinite(norm):
             return compat.NOT_A_NUMBER
@@ -240,7 +240,7 @@ class BorderedNewton:
         return REASON_OF[progress.verdict]
 
     def _ahead(self, state: State, f: Direction) -> Direction:
-        """The step that an iterate asks for (SNES subtracts it): with the matrix at hand, or one made here."""
+        """The next step, which SNES subtracts: from the latest matrix, or from a new one at this iterate."""
         progress, steps = self._progress, self._progress.iterates.steps
         if progress.matrix is not None:
             ahead = self._updated(progress.matrix.solve(*f))
@@ -259,7 +259,7 @@ class BorderedNewton:
         return ahead
 
     def _updated(self, step: Direction) -> Direction:
-        """A step of the matrix at hand with Broyden's update."""
+        """A step of the latest matrix, with Broyden's update."""
         taken, matrix = self._progress.taken, self._progress.matrix
         assert matrix is not None
         for before, after in pairwise(taken):
@@ -273,7 +273,7 @@ class BorderedNewton:
         return step
 
     def _rounding(self, state: State, R: Vector) -> float:
-        """The error that rounding of the residual makes, by its change where u is rounded otherwise."""
+        """The error from rounding of the residual, estimated from its change when u is rounded differently."""
         matrix = self._progress.matrix
         assert matrix is not None
         side = np.random.default_rng(self.system.comm.rank).choice([-1.0, 1.0], state.u.size)
@@ -283,10 +283,10 @@ class BorderedNewton:
         return matrix.size(matrix.solve(f, 0.0))
 
     def apply(self, y: PETSc.Vec) -> None:
-        """SNES asks for the step."""
+        """Called by SNES for the step."""
         assert self._progress.ahead is not None
         self._progress.taken.append(self._progress.ahead)
-        # the stress after the step is what follows linearly from before it (MIP Newton: Magisano, Leonetti, Garcea,
+        # the stress after the step is extrapolated linearly from before it (MIP Newton: Magisano, Leonetti, Garcea,
         # Computer Methods in Applied Mechanics and Engineering 313, 2017)
         self._stress = followed(self._split(self._snes.getSolution())[0], -self._progress.ahead[0])
         self._join(*self._progress.ahead, y)

@@ -1,7 +1,7 @@
-"""A switch for tests: relative noise in residual and tangent, as another processor's rounding would make it.
+"""A switch for tests: relative noise in residual and tangent, which imitates the rounding of another processor.
 
-MAGSHELL_NOISE="1e-14 3" adds noise of that size with the seed 3. Each evaluation draws other numbers. The noise of a
-matrix is symmetric, and neither depends on how unknowns are spread over ranks.
+MAGSHELL_NOISE="1e-14 3" adds noise of relative size 1e-14 with the seed 3. Each evaluation draws new numbers. The noise
+of a matrix is symmetric. No noise depends on the distribution of unknowns over ranks.
 """
 
 import os
@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 
 @dataclass
 class Noise:
-    """Random factors 1 + level x with x between -1 and 1, in the order in which they are asked for."""
+    """Random factors 1 + level x with x between -1 and 1; each call draws the next ones."""
 
     level: float
     seed: int = 0
@@ -25,7 +25,7 @@ class Noise:
 
     @classmethod
     def from_environment(cls) -> "Noise | None":
-        """What the variable says; None where it is not set."""
+        """The noise that the environment variable sets; None if it is not set."""
         words = os.environ.get(VARIABLE, "").split()
         return cls(float(words[0]), int(words[1]) if len(words) > 1 else 0) if words else None
 
@@ -43,7 +43,7 @@ class Noise:
         K.assemble()
 
     def _factors(self, i: NDArray[np.uint64], j: NDArray[np.uint64]) -> Array:
-        """From a hash of the indices, the seed and the number of the call."""
+        """Factors from a hash of the indices, the seed and the number of the call."""
         self._calls += 1
         x = i * np.uint64(0x9E3779B97F4A7C15) ^ j * np.uint64(0xC2B2AE3D27D4EB4F)
         x ^= np.uint64((self.seed * 0x165667B19E3779F9 + self._calls * 0x27D4EB2F165667C5) % 2**64)

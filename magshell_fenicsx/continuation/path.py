@@ -13,12 +13,13 @@ from magshell_fenicsx.continuation.listener import NoProgress, Progress
 from magshell_fenicsx.continuation.newton import BorderedNewton, Response
 from magshell_fenicsx.continuation.point import PathStopped, Point
 from magshell_fenicsx.continuation.snes import HIDDEN
-from magshell_fenicsx.continuation.system import State, Vector, Weighted, dot, followed, max_abs
+from magshell_fenicsx.continuation.system import Direction, State, Weighted, dot, followed, max_abs
 
-Control = Literal["load", "conjugate", "arc"]
-MOST_LEAPS = 3  # longer steps that are tried where rounding hides a point
-MANY = 2  # hard solves after which the tangent takes the stress that follows from the last point, which costs a tenth
-SEEN = 1e-6  # a displacement that counts, in lengths of the system
+Quantity = Literal["load", "conjugate"]
+Control = Quantity | Literal["arc"]
+MOST_LEAPS = 3  # longer steps that are tried if rounding hides a point
+MANY = 2  # after so many hard solves the tangent takes the stress extrapolated from the last point: a tenth more time
+SEEN = 1e-6  # in lengths of the system: smaller displacements count as zero
 
 
 @dataclass(frozen=True)
@@ -30,16 +31,16 @@ class StepOptions:
     first, largest, smallest
         Step lengths in units of s.
     easy, hard
-        Factorisations up to which a step grows, and from which it shrinks.
+        A step grows after at most `easy` factorisations, and shrinks after at least `hard`.
     few
-        Iterations up to which it grows too.
+        A step also grows after at most so many iterations.
     straight
-        Cosine between the tangents of successive points above which a step grows.
+        A step grows only if the cosine between the tangents of successive points is larger.
     turn
-        Least cosine between the tangents of successive points; a sharper turn is
-        taken for a jump to another branch and tried again with a smaller step.
+        Least cosine between the tangents of successive points. A sharper turn counts as a jump to another
+        branch, and a smaller step is tried.
     gap
-        Largest part of a step that the tangents at its ends may leave unexplained, likewise.
+        Largest part of a step that the tangents at its ends may leave unexplained. A larger one counts as a jump too.
     """
 
     first: float
@@ -61,14 +62,14 @@ class Path:
     name
         The amplitude that varies.
     control
-        What s is. "load": the amplitude; "conjugate": the displacement conjugate to it;
+        The meaning of s. "load": the amplitude; "conjugate": the displacement conjugate to it;
         "arc": the arc length in a `Metric`, along the tangent of the point before.
     scale
         An amplitude that counts as of order one in the arc length.
     journal
-        Keeps every result of `at`, and gives back those of an interrupted run.
+        Records every result of `recorded`, and replays the results of an interrupted run.
     progress
-        Hears of every step before it is tried.
+        Gets every step before it is tried.
     """
 
     def __init__(
@@ -84,51 +85,49 @@ class Path:
         self.newton, self.name, self.control, self.options = newton, name, control, options
         self.system = newton.system
         self.metric = Metric(newton.system, scale)
-        self._hard = 0  # solves that failed or took many matrices
+        self._hard = 0  # number of solves that failed or took many matrices
         self._journal, self.progress = journal or NoJournal(), progress or NoProgress()
 
     def start(self, state: State, sense: float = 1.0) -> Point:
-        """The point of a state that is in equilibrium already.
+        """The first point of a path, from a state in equilibrium.
 
         Parameters
         ----------
         sense
-            Of the arc length: the sign of dmu/ds.
+            The sign of dmu/ds with control by arc length.
         """
         response = self.newton.response(state, self.name, GivenLoad(self.name, 0.0), exact=True)
-        if self.control == "load":
-            s, rate = state.mu[self.name], 1.0
-        elif self.control == "conjugate":
-            s, rate = self._conjugate(state), response.softness
-        else:
+        if self.control == "arc":
             s, rate = 0.0, float(np.copysign(self.metric.norm(response.du, 1.0), sense))
+        else:
+            s, rate = self.value(self.control, state), 1.0 if self.control == "load" else response.softness
         return self._point(state, s, response).per(rate)
 
     def at(self, s: float, guess: State, base: Point) -> Point | str:
-        """Solve for the point at `s`, or say why that failed.
+        """The point at `s`, or the reason why the solve failed.
 
         Parameters
         ----------
         base
-            The point whose tangent arc length is measured along.
+            Arc length is measured from this point, along its tangent.
         """
         stress = followed(base.state.u, (s - base.s) * base.du) if self._hard >= MANY else ()
         return self.solve(self._row(s, base), s, guess, stress)
 
     def inside(self, s: float, low: Point, high: Point, base: Point) -> Point | str:
-        """Solve for the point at `s` between two others; `base` is as that of `at`."""
+        """The point at `s` between two others, or the reason why the solve failed; `base` as in `at`."""
         t = (s - low.s) / (high.s - low.s)
         stress = [(1 - t, low.state.u), (t, high.state.u)]
         return self.solve(self._row(s, base), s, self.between(s, low, high), stress)
 
     def solve(self, row: Row, s: float, guess: State, stress: Sequence[Weighted] = ()) -> Point | str:
-        """Solve for the point on which a row holds, or say why that failed; the tangent is per unit of the row."""
+        """The point on which a row holds, or the reason why the solve failed; its tangent is per unit of the row."""
         found = self.recorded(lambda: self._solve(row, s, guess, stress))
         self._hard += isinstance(found, str) or found.factorisations >= self.options.hard
         return found
 
     def recorded(self, find: Callable[[], Point | str]) -> Point | str:
-        """What is found, or what an interrupted run had found here."""
+        """The result of `find`, or the result of an interrupted run at this place in the journal."""
         known = self._journal.replay()
         if known is not None:
             return known
@@ -136,31 +135,38 @@ class Path:
         self._journal.record(found)
         return found
 
-    def on(self, state: State, direction: tuple[Vector, float], base: Point, negative_pivots: int) -> Point:
-        """The point of a state on the path, with a tangent that has been found otherwise.
-
-        Parameters
-        ----------
-        direction
-            The tangent (du, dmu), of any length.
-        """
+    def on(self, state: State, direction: Direction, base: Point, negative_pivots: int) -> Point:
+        """The point of a state on the path, with a given tangent of any length."""
         du, dmu = direction
         u, mu, name = state.u, state.mu, self.name
         bend = self.system.curvature(u, mu, name, name)
         dq = -dot(self.system.comm, self.system.load(u, mu, name), du) - bend * dmu
         rate = {"load": dmu, "conjugate": dq, "arc": self.metric.inner((base.du, base.dmu), direction)}[self.control]
         softness = dq / dmu if dmu else np.inf
-        return self._point(state, self._s(state, base), Response(du, dmu, softness, negative_pivots)).per(rate)
+        s = self._arc_length(state, base) if self.control == "arc" else self.value(self.control, state)
+        return self._point(state, s, Response(du, dmu, softness, negative_pivots)).per(rate)
 
-    def _s(self, state: State, base: Point) -> float:
-        """The controlled quantity at a state."""
-        mu = state.mu[self.name]
-        if self.control == "load":
-            return mu
-        if self.control == "conjugate":
-            return self._conjugate(state)
-        chord = (state.u - base.state.u, mu - base.state.mu[self.name])
+    def _arc_length(self, state: State, base: Point) -> float:
+        chord = (state.u - base.state.u, state.mu[self.name] - base.state.mu[self.name])
         return base.s + self.metric.inner((base.du, base.dmu), chord)
+
+    def measured_from(self, base: Point, point: Point) -> Point:
+        """The point with its arc length from a base; unchanged with another control."""
+        return replace(point, s=self._arc_length(point.state, base)) if self.control == "arc" else point
+
+    def as_base(self, point: Point) -> Point:
+        """The point with a tangent of length one, so that arc length can be measured from it."""
+        return point.per(self.metric.norm(point.du, point.dmu)) if self.control == "arc" else point
+
+    def value(self, quantity: Quantity, state: State) -> float:
+        """The amplitude of the path, or the displacement conjugate to it, at a state."""
+        if quantity == "load":
+            return state.mu[self.name]
+        return -self.system.potential(state.u, state.mu, self.name)
+
+    def given(self, quantity: Quantity, target: float) -> Row:
+        """The row that holds the amplitude, or the displacement conjugate to it, at a target."""
+        return GivenLoad(self.name, target) if quantity == "load" else GivenConjugate(self.system, self.name, target)
 
     def towards(self, start: Point, targets: Sequence[float]) -> Iterator[tuple[Point, bool]]:
         """Accepted points through every target in turn; the flag marks the targets.
@@ -175,12 +181,12 @@ class Path:
             while here.s != target:
                 way = target - here.s
                 pieces = max(1.0, np.ceil(abs(way) / step)) if np.isfinite(way) else np.inf
-                length = abs(way) / pieces if pieces < 3 else step  # no stub of a step before a target
+                length = abs(way) / pieces if pieces < 3 else step  # no tiny step before a target
                 s = target if pieces == 1 else here.s + np.copysign(length, way)
                 found = self._try(s, before, here)
                 if isinstance(found, str):
                     leaps += 1
-                    over = found == HIDDEN and leaps <= MOST_LEAPS  # past the singular tangent, not into it
+                    over = found == HIDDEN and leaps <= MOST_LEAPS  # step over the singular tangent
                     step = 2 * length if over else length / 2
                     if step < self.options.smallest:
                         raise PathStopped(found, here)
@@ -203,7 +209,7 @@ class Path:
         return here.state.with_(here.state.u + a * here.du, self.name, here.state.mu[self.name] + a * here.dmu)
 
     def between(self, s: float, low: Point, high: Point) -> State:
-        """Hermite cubic through two points, as first guess."""
+        """A first guess at `s`: the Hermite cubic through two points."""
         L, name = high.s - low.s, self.name
         t = (s - low.s) / L
         h00, h10, h01, h11 = 2 * t**3 - 3 * t**2 + 1, t**3 - 2 * t**2 + t, 3 * t**2 - 2 * t**3, t**3 - t**2
@@ -212,7 +218,7 @@ class Path:
         return low.state.with_(u, name, float(mu))
 
     def seen_from(self, base: Point, point: Point) -> Point:
-        """The point with its tangent per unit of s as measured at `base`."""
+        """The point with its tangent per unit of s, where s is measured from `base`."""
         if self.control != "arc":
             return point
         return point.per(self.metric.inner((base.du, base.dmu), (point.du, point.dmu)))
@@ -226,12 +232,10 @@ class Path:
             found = self.exact(found, here)
         if trouble := self._jumped(here, found):
             return trouble
-        if self.control != "arc":
-            return found
-        return found.per(self.metric.norm(found.du, found.dmu))
+        return self.as_base(found)
 
     def _jumped(self, here: Point, found: Point) -> str | None:
-        """Why a step is not trusted: its ends do not look like ends of one smooth arc."""
+        """The reason to reject a step whose ends do not lie on one smooth arc; None if there is none."""
         length = found.s - here.s
         if abs(found.negative_pivots - here.negative_pivots) > 1 and abs(length) > self.options.first / 8:
             return "the step passed several instabilities, or jumped to another branch"
@@ -242,15 +246,12 @@ class Path:
             return "the path turns sharply, or the step jumped to another branch"
         return None
 
-    def _size(self, v: Vector) -> float:
-        return self.metric.norm(v, 0.0)
-
     def _cosine(self, a: Point, b: Point) -> float:
-        """Between the displacements of two tangents; 1 if the amplitude moves nothing there."""
-        lengths = self._size(a.du) * self._size(b.du)
+        """The cosine between the displacements of two tangents; 1 if the amplitude moves nothing there."""
+        lengths = self.metric.norm(a.du, 0.0) * self.metric.norm(b.du, 0.0)
         if lengths < SEEN**2:
             return 1.0
-        return self.metric.weight * dot(self.system.comm, a.du, b.du) / lengths
+        return self.metric.inner((a.du, 0.0), (b.du, 0.0)) / lengths
 
     def _solve(self, row: Row, s: float, guess: State, stress: Sequence[Weighted]) -> Point | str:
         before = self.newton.factorisation.count
@@ -258,39 +259,35 @@ class Path:
         if not outcome.converged:
             return outcome.reason
         spent = self.newton.factorisation.count - before
-        exact = self._hard >= MANY  # the stress that follows is as good as the tangent
+        exact = self._hard >= MANY  # the extrapolated stress is only as good as the tangent
         found = self._point(outcome.state, s, self.newton.response(outcome.state, self.name, row, exact=exact))
         return replace(found, iterations=outcome.iterations, factorisations=spent, error=outcome.error)
 
     def exact(self, point: Point, base: Point) -> Point:
-        """The point with the tangent and the inertia of its own K, not of one near by."""
+        """The point with the tangent and the inertia of its own K, not of the K of a state near by."""
         row = self._row(point.s, base)
         found = self._point(point.state, point.s, self.newton.response(point.state, self.name, row, exact=True))
         spent = point.factorisations + 1
         return replace(found, iterations=point.iterations, factorisations=spent, error=point.error)
 
     def _row(self, s: float, base: Point) -> Row:
-        if self.control == "load":
-            return GivenLoad(self.name, s)
-        if self.control == "conjugate":
-            return GivenConjugate(self.system, self.name, s)
-        return Hyperplane(self.metric, self.name, base.state, (base.du, base.dmu), s - base.s)
-
-    def _conjugate(self, state: State) -> float:
-        return -self.system.potential(state.u, state.mu, self.name)
+        if self.control == "arc":
+            return Hyperplane(self.metric, self.name, base.state, (base.du, base.dmu), s - base.s)
+        return self.given(self.control, s)
 
     def _point(self, state: State, s: float, response: Response) -> Point:
-        """Holding q instead of mu takes one unstable direction away where dq/dmu < 0.
+        """A point with its tangent and both numbers of unstable directions.
 
-        This is Haynsworth's inertia additivity: dq/dmu = R_mu . K^-1 R_mu - Pi_mumu is minus the Schur complement.
-        A coordinate whose force is held adds one instead where dq/dmu > 0.
+        With q held instead of mu, there is one unstable direction less where dq/dmu < 0. This is Haynsworth's
+        inertia additivity: dq/dmu = R_mu . K^-1 R_mu - Pi_mumu is minus the Schur complement.
+        A coordinate whose force is held has one more instead where dq/dmu > 0.
         """
         pivots = response.negative_pivots
         held = pivots + (response.softness >= 0) - (self.name not in self.system.coordinates)
         return Point(state, s, response.du, response.dmu, pivots, held)
 
     def in_steps(self, options: StepOptions) -> "Path":
-        """The same path in other steps."""
+        """The same path with other step lengths."""
         other = copy(self)
         other.options = options
         return other

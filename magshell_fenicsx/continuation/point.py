@@ -20,13 +20,13 @@ class Point:
     negative_pivots
         Number of unstable directions at fixed amplitudes.
     negative_pivots_held
-        The same with the conjugate displacement held instead of the amplitude.
+        Number of unstable directions with the conjugate displacement held instead of the amplitude.
     iterations, factorisations
         Work since the point before.
     error
         Estimated error of u, over the system's length.
     load_error
-        Of an instability: the estimated error of its amplitude.
+        The estimated error of the amplitude of an instability.
     """
 
     state: State
@@ -41,7 +41,7 @@ class Point:
     load_error: float = 0.0
 
     def per(self, rate: float) -> "Point":
-        """The same with its tangent over `rate`."""
+        """The point with its tangent divided by `rate`."""
         return replace(self, du=np.asarray(self.du / rate), dmu=self.dmu / rate)
 
 

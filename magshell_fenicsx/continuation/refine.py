@@ -1,26 +1,28 @@
-"""The tangent of a path at a solution, from factors that were made near by."""
+"""The tangent of a path at a solution, from the factors of a state near by."""
 
 import numpy as np
 
-from magshell_fenicsx.continuation.bordered import Bordered, Direction, plus
-from magshell_fenicsx.continuation.control import Row
-from magshell_fenicsx.continuation.system import State, System, Vector, dot, max_abs
+from magshell_fenicsx.continuation.bordered import Bordered, plus
+from magshell_fenicsx.continuation.control import Row, slope
+from magshell_fenicsx.continuation.system import Direction, State, System, Vector, max_abs
 
 MOST_REFINEMENTS = 4
 REFINED, SIGN = 1e-3, 1e-2  # relative errors of a tangent's du and dmu
-DIFFERENCE = 1e-5  # lengths, of the differences that stand for K times a vector
+DIFFERENCE = 1e-5  # in lengths: the step of the differences that replace K times a vector
 
 
 def refined_tangent(
     system: System, matrix: Bordered, t: Direction, state: State, load: Vector, row: Row
 ) -> Direction | None:
-    """The tangent at a state from that of a matrix near by, by generalised conjugate residuals; None if too far."""
-    comm, (c, d) = system.comm, row.gradient(state)
+    """The path's tangent at a state, from the matrix of a state near by, by generalised conjugate residuals.
+
+    None if the matrix is too far away.
+    """
+    comm, gradient = system.comm, row.gradient(state)
     R = system.residual(state.u, state.mu)
 
     def times(t: Direction) -> Direction:
-        g = d * t[1] + (dot(comm, c, t[0]) if c is not None else 0.0)
-        return matrix.solve(_stiffness(system, state, R, t[0]) + t[1] * load, g)
+        return matrix.solve(_stiffness(system, state, R, t[0]) + t[1] * load, slope(comm, gradient, t))
 
     z, known = plus(t, -1.0, times(t)), list[tuple[Direction, Direction, float]]()
     for _ in range(MOST_REFINEMENTS):
@@ -37,7 +39,7 @@ def refined_tangent(
 
 
 def _stiffness(system: System, state: State, R: Vector, du: Vector) -> Vector:
-    """K du by a difference of the residual from R, that of the state."""
+    """K du by a difference of the residual; R is the residual at the state."""
     size = max_abs(system.comm, du)
     if size == 0.0:
         return du

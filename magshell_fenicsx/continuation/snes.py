@@ -1,4 +1,4 @@
-"""PETSc's SNES around a solver that makes its own steps: what it calls back, and its reasons in words."""
+"""PETSc's SNES around a solver that computes its own steps: its callbacks, and its reasons in words."""
 
 import weakref
 from typing import Any, Protocol
@@ -12,7 +12,7 @@ HIDDEN = "rounding hides the solution: the tangent is nearly singular"
 
 
 class Solver(Protocol):
-    """What SNES calls; `x`, `f` and `y` hold u and, at the end of the last rank, mu."""
+    """The functions that SNES calls; `x`, `f` and `y` hold u and, at the end of the last rank, mu."""
 
     def function(self, x: PETSc.Vec, f: PETSc.Vec) -> None: ...
 
@@ -24,7 +24,7 @@ class Solver(Protocol):
 
 
 class _Callbacks:
-    """What PETSc calls back; it does not keep the solver, and with it the factors, alive."""
+    """The callbacks for PETSc. A weak reference, so that PETSc does not keep the solver and its factors in memory."""
 
     def __init__(self, newton: Solver) -> None:
         self._newton = weakref.ref(newton)
@@ -52,7 +52,7 @@ class _Callbacks:
 
 
 def make_snes(solver: Solver, x: PETSc.Vec, max_iterations: int) -> PETSc.SNES:
-    """A SNES for vectors like `x`, with full steps unless PETSc's options ask for a line search."""
+    """A SNES for vectors like `x`, with full steps unless PETSc's options set a line search."""
     me, f, sizes = _Callbacks(solver), x.duplicate(), x.getSizes()
     J = PETSc.Mat().createPython((sizes, sizes), context=me, comm=x.comm)
     J.setUp()
@@ -64,7 +64,7 @@ def make_snes(solver: Solver, x: PETSc.Vec, max_iterations: int) -> PETSc.SNES:
     snes.setType("newtonls")
     given = PETSc.Options("magshell_")
     if not given.hasName("snes_linesearch_type"):
-        given["snes_linesearch_type"] = "basic"  # full steps; the path shortens its own when they fail
+        given["snes_linesearch_type"] = "basic"  # full steps; if they fail, the path takes a smaller step
     snes.setTolerances(max_it=max_iterations)
     ksp = snes.getKSP()
     ksp.setType("preonly")
@@ -76,7 +76,7 @@ def make_snes(solver: Solver, x: PETSc.Vec, max_iterations: int) -> PETSc.SNES:
 
 
 def in_words(verdict: Verdict, ended: int) -> str:
-    """Why a solve ended, from the verdict on its steps and SNES's reason."""
+    """The reason why a solve ended, from the verdict on its steps and SNES's reason."""
     return _REASONS.get(verdict) or _REASONS_OF_SNES.get(ended, f"SNES reason {ended}")
 
 

@@ -1,4 +1,4 @@
-"""What the solvers see: vectors, a matrix and named amplitudes; nothing of shells."""
+"""The interface of a system to the solvers: vectors, a matrix and named amplitudes, no shells."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,6 +12,7 @@ from petsc4py import PETSc
 Vector = NDArray[np.float64]  # the owned part of a distributed vector
 Amplitudes = Mapping[str, float]
 Weighted = tuple[float, Vector]
+Direction = tuple[Vector, float]  # (du, dmu)
 
 
 @dataclass(frozen=True)
@@ -23,7 +24,7 @@ class Edged:
     C, D
         k columns on this rank, and (k, k) numbers.
     multipliers
-        How many of the unknowns keep a constraint; each takes one negative pivot that is no unstable direction.
+        Number of the unknowns that enforce a constraint. Each adds one negative pivot that is no unstable direction.
     """
 
     K: PETSc.Mat
@@ -47,9 +48,9 @@ class System(Protocol):
     length
         A displacement that counts as of order one; convergence is measured with it.
     coordinates
-        Parameters that say where something is, such as a body that presses on the shell. Where the conjugate of
-        one is held, a force, it moves freely. The others are forces: where the conjugate of one is held, it keeps a
-        constraint.
+        Amplitudes that are positions, for example of a body that presses on the shell. Their conjugates are forces:
+        where the force is held, the position is free. All other amplitudes are forces: where the conjugate of one
+        is held, that is a constraint.
     """
 
     comm: MPI.Comm
@@ -64,7 +65,7 @@ class System(Protocol):
         """d2Pi/du dmu_i: the column of the amplitude `name`."""
 
     def potential(self, u: Vector, mu: Amplitudes, name: str) -> float:
-        """dPi/dmu_i, on every rank; with the opposite sign it is what is conjugate to the amplitude."""
+        """dPi/dmu_i, on every rank. The conjugate of the amplitude is -dPi/dmu_i."""
 
     def curvature(self, u: Vector, mu: Amplitudes, name: str, other: str) -> float:
         """d2Pi/dmu_i dmu_j, on every rank; zero between amplitudes that multiply their terms."""
@@ -75,19 +76,19 @@ class System(Protocol):
         Parameters
         ----------
         stress
-            Displacements with weights. A system may take the weighted sum of their stresses in place of that of u:
-            it follows a path linearly where the stress of a guess is spoilt by the guess's small errors.
+            Displacements with weights. A system may use the weighted sum of their stresses in place of the stress
+            of u. That sum is linear along the path, while small errors of a guess u spoil its own stress.
         """
 
 
 def followed(u: Vector, step: Vector) -> list[Weighted]:
-    """The stress that follows linearly from u along a step, as weighted displacements; strain is quadratic in u."""
+    """The stress extrapolated linearly from u along a step, as weighted displacements; strain is quadratic in u."""
     return [(1.0, u), (0.5, u + step), (-0.5, u - step)]
 
 
 @dataclass(frozen=True)
 class State:
-    """A displacement with the amplitudes that it goes with."""
+    """A displacement and the amplitudes."""
 
     u: Vector
     mu: dict[str, float]

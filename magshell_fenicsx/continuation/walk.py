@@ -1,4 +1,4 @@
-"""Walking along a path to where it shall end, with every instability and every requested point on the way."""
+"""A walk along a path to its goal, with every instability and every requested point on the way."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -6,21 +6,19 @@ from typing import Literal
 
 import numpy as np
 
-from magshell_fenicsx.continuation.control import GivenConjugate, GivenLoad, Row
 from magshell_fenicsx.continuation.events import instabilities
-from magshell_fenicsx.continuation.path import Path
+from magshell_fenicsx.continuation.path import Path, Quantity
 from magshell_fenicsx.continuation.point import PathStopped, Point
 
 Label = Literal["step", "target", "fold", "bifurcation"]
 Until = Literal["limit", "bifurcation", "target", "points"]
-Quantity = Literal["load", "conjugate"]
 MOST_STEPS = 1000
 SAME = 1e-2  # distance along the path, in the system's lengths, below which two folds are one
 
 
 @dataclass(frozen=True)
 class Goal:
-    """Where a walk ends, and what is asked for on the way.
+    """Where a walk ends, and which points are requested on the way.
 
     Attributes
     ----------
@@ -28,13 +26,13 @@ class Goal:
         "limit": at the first instability, or at the last target; "bifurcation": at the first
         bifurcation, through folds; "target": at the last target; "points": after `steps` steps.
     targets
-        Points that are asked for: values of s or, on a path by arc length, of `quantity`.
+        Requested points: values of s or, on a path by arc length, of `quantity`.
     quantity
         "load": the amplitude; "conjugate": the displacement conjugate to it.
     steps
-        Elsewhere than with "points", the most that are tried.
+        With every other `until`, the largest number of steps.
     sense
-        Direction of s where no target gives it.
+        Direction of s if there is no target.
     """
 
     until: Until
@@ -58,12 +56,12 @@ class Walk:
         self._folds: list[Point] = []
 
     def __iter__(self) -> Iterator[tuple[Label, Point]]:
-        """Points in order, each with what it is.
+        """Labels and points, in the order of the path.
 
         Raises
         ------
         PathStopped
-            If the path is lost, comes back to where it was, or is longer than it may be.
+            If the path is lost, returns to a fold that it has passed, or needs more steps than allowed.
         """
         options, shorter = self.path.options, None
         while True:
@@ -71,7 +69,7 @@ class Walk:
                 low, shorter = self.points[-1], None
                 try:
                     between = self._between(low, point)
-                except PathStopped:  # the step had left the branch: come nearer in shorter ones
+                except PathStopped:  # the step had left the branch: approach in shorter steps
                     shorter = abs(point.s - low.s) / 4
                     break
                 for label, found, ends in between:
@@ -94,7 +92,7 @@ class Walk:
             self.path = self.path.in_steps(replace(options, first=shorter))
 
     def _refuse_loop(self, fold: Point) -> None:
-        """See that a fold is none of those before: two in succession may be close, where a snap is being born."""
+        """Stop at a fold that was passed before. Two successive folds may be close, so the last one is not compared."""
         name, u = self.path.name, fold.state.u
         mu = fold.state.mu[name]
         for known in self._folds[:-1]:
@@ -107,7 +105,7 @@ class Walk:
         return self.path.control == "arc"
 
     def _ahead(self) -> list[float]:
-        """What is left for the path to aim at."""
+        """The values of s that are still to be reached."""
         goal, here = self.goal, self.points[-1].s
         if self._by_arc:
             return [np.inf]
@@ -117,7 +115,7 @@ class Walk:
         return [t for t in goal.targets if (t - here) * sense > 0]
 
     def _between(self, low: Point, high: Point) -> list[tuple[Label, Point, bool]]:
-        """Instabilities and, by arc length, targets after `low` and before `high`; the flag ends the walk."""
+        """Instabilities and, with arc length, targets between two points; the flag marks the end of the walk."""
         found: list[tuple[Label, Point, bool]] = []
         for event in instabilities(self.path, low, high):
             ends = self.goal.until in ("limit", event.kind)
@@ -130,22 +128,13 @@ class Walk:
 
     def _crossed(self, low: Point, high: Point) -> Iterator[tuple[Label, Point, bool]]:
         """The targets between two points, each solved for."""
-        a, b, targets = self._value(low), self._value(high), self.goal.targets
+        path, quantity, targets = self.path, self.goal.quantity, self.goal.targets
+        a, b = path.value(quantity, low.state), path.value(quantity, high.state)
         for target in targets:
             if (target - a) * (target - b) < 0 or b == target:
                 s = low.s + (target - a) / (b - a) * (high.s - low.s)
-                guess = self.path.between(s, low, self.path.seen_from(low, high))
-                point = self.path.solve(self._row(target), s, guess)
+                guess = path.between(s, low, path.seen_from(low, high))
+                point = path.solve(path.given(quantity, target), s, guess)
                 if isinstance(point, str):
                     raise PathStopped(point, low)
                 yield "target", point, self.goal.until in ("target", "limit") and target == targets[-1]
-
-    def _value(self, point: Point) -> float:
-        if self.goal.quantity == "load":
-            return point.state.mu[self.path.name]
-        return -self.path.system.potential(point.state.u, point.state.mu, self.path.name)
-
-    def _row(self, target: float) -> Row:
-        if self.goal.quantity == "load":
-            return GivenLoad(self.path.name, target)
-        return GivenConjugate(self.path.system, self.path.name, target)

@@ -1,4 +1,4 @@
-"""Which modes that a model excludes are unstable along a path, and where each becomes unstable or stable again."""
+"""The unstable modes that a model excludes: their number along a path, and the points where it changes."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -13,19 +13,19 @@ from magshell_fenicsx.continuation.path import Path
 from magshell_fenicsx.continuation.point import PathStopped, Point
 from magshell_fenicsx.continuation.system import State, Vector, dot
 
-FASTER = 2.0  # than between the last two looks the softest mode may soften before it is looked at again
-MOST_PASSED = 4  # points in a row that are not looked at
-ITERATIONS = 4  # of inverse iteration from the last softest mode
-FIRST = 12  # the same where there is none
-NEW = 0.1  # of a start vector in all directions, lest a mode of another symmetry stays unseen
+FASTER = 2.0  # the softest mode is assumed to soften at most so many times as fast as between the last two looks
+MOST_PASSED = 4  # the most successive points without a look
+ITERATIONS = 4  # inverse iterations from the last softest mode
+FIRST = 12  # inverse iterations if there is no such mode
+NEW = 0.1  # part of a general vector in the start vector, so that modes of another symmetry are found
 
 
 class Family(Protocol):
-    """Modes that a model excludes and that share a tangent; a `solve.events.Stability`."""
+    """Modes that a model excludes and that share a tangent; an `events.Stability`."""
 
     @property
     def label(self) -> str:
-        """What a record of them says, "antisymmetric" or "m = 7"."""
+        """Their name in records, "antisymmetric" or "m = 7"."""
 
     def factor_at(self, state: State) -> Factorisation:
         """Factor their tangent at a state of the model."""
@@ -43,7 +43,7 @@ class Excluded(Protocol):
 
 @dataclass(frozen=True)
 class Crossing:
-    """Where a mode of a family is neutral, and how many excluded directions are unstable there."""
+    """A point where a mode of a family is neutral, and the number of excluded unstable directions there."""
 
     label: str
     point: Point
@@ -52,7 +52,7 @@ class Crossing:
 
 @dataclass(frozen=True)
 class _Look:
-    """What was seen at a point.
+    """The excluded modes at a point.
 
     Attributes
     ----------
@@ -61,7 +61,7 @@ class _Look:
     counts
         Numbers of unstable directions of all families.
     softest, vector
-        The size of the eigenvalue nearest to zero of the only family, and its mode; None if it was not asked for.
+        Magnitude of the eigenvalue nearest to zero of the only family, and its mode; None if there are several.
     """
 
     point: Point
@@ -74,16 +74,17 @@ class _Look:
 class Watch:
     """Looks along a path for the unstable directions that a model excludes.
 
-    Several families are looked at at every accepted point. A single one, whose tangent costs as much as the model's,
-    is passed over at a point if its softest mode, softening `FASTER` times as fast per length of the path as between
-    the last two looks, would not be neutral yet: at first at no point, then at one in a row, at two, at
-    `MOST_PASSED`. If the next look shows that it softened faster, and to less than a half, or that the number of
-    unstable directions is another, all points passed over are looked at.
+    A look counts the unstable directions at a point. Several families get a look at every accepted point. The tangent
+    of a single family costs as much as the model's. So a point is skipped if the softest mode would not yet be neutral
+    there, even if it softened `FASTER` times as fast per length of the path as between the last two looks. At first no
+    point is skipped, then at most one in a row, two, and `MOST_PASSED`. If the next look shows that the mode softened
+    faster, and to less than a half, or that the number of unstable directions has changed, all skipped points
+    get a look.
 
     Attributes
     ----------
     unlocated
-        Why a change could not be located, of the first such change; "" if there is none.
+        The reason why a change could not be located, for the first such change; "" if there is none.
     """
 
     def __init__(self, excluded: Excluded | None) -> None:
@@ -96,7 +97,7 @@ class Watch:
 
     @property
     def unstable(self) -> int:
-        """The number of unstable directions at the last point, as far as it was looked at."""
+        """The number of unstable directions at the last look."""
         return sum(self._looked.counts) if self._looked else 0
 
     def begin(
@@ -104,15 +105,15 @@ class Watch:
     ) -> None:
         """Begin to watch a path at its first point.
 
-        Unless it is the last point of the path before, that is looked at only if the second one is unstable; if it
-        is unstable too, `pass_to` gives it as a crossing.
+        If that is not the last point of the path before, it gets a look only if the second point is unstable. If it is
+        unstable too, `pass_to` returns it as a crossing.
 
         Parameters
         ----------
         expand
-            From a state of the path to one of the model.
+            Maps a state of the path to a state of the model.
         look
-            Whether it is looked at now; then it is no crossing.
+            Whether the first point gets a look now; then it is no crossing.
         """
         known = self._looked if start.state.u is self._u and not self._passed else None
         self._path, self._expand, self._last, self._u, self._along = path, expand, start, start.state.u, 0.0
@@ -125,12 +126,12 @@ class Watch:
             self._passed.append((start, 0.0))
 
     def pass_to(self, point: Point, *, look: bool = False) -> list[Crossing]:
-        """Go on to the next accepted point; what became unstable or stable on the way, in order.
+        """Go on to the next accepted point; the crossings on the way, in order.
 
         Parameters
         ----------
         look
-            Whether it must be looked at.
+            Whether the point must get a look.
         """
         name, last = self._path.name, self._last.state
         self._along += self._path.metric.norm(point.state.u - last.u, point.state.mu[name] - last.mu[name])
@@ -142,7 +143,7 @@ class Watch:
         return self._changes()
 
     def end(self) -> list[Crossing]:
-        """Look at the last point, unless that was done; see `pass_to`."""
+        """Look at the last point, if it was skipped; the crossings, see `pass_to`."""
         if self._looked and self._looked.point is self._last:
             return []
         self._passed = [passed for passed in self._passed if passed[0] is not self._last]
@@ -150,13 +151,13 @@ class Watch:
 
     @property
     def _at_least(self) -> float:
-        """How soft the softest mode may have become at the last point; without a rate, anything."""
+        """The least eigenvalue that the softest mode may have at the last point; -inf without a rate."""
         if self._looked is None or self._rate is None:
             return -np.inf
         return self._looked.softest - FASTER * self._rate * (self._along - self._looked.along)
 
     def _changes(self) -> list[Crossing]:
-        """Look at the last point, and, if need be, at those passed over; what changed up to it."""
+        """Look at the last point and, if necessary, at the skipped ones; the crossings up to it."""
         before, here = self._looked, self._look(self._last, self._along)
         softer = before is not None and here.softest < min(self._at_least, before.softest / 2)
         changed = here.counts != before.counts if before else any(here.counts)
@@ -173,13 +174,13 @@ class Watch:
         return found
 
     def _at_start(self, look: _Look) -> Iterator[Crossing]:
-        """What is unstable from the first point on."""
+        """The families that are unstable at the first point."""
         for family, count in zip(self._families, look.counts, strict=True):
             if count:
                 yield Crossing(family.label, look.point, sum(look.counts))
 
     def _between(self, low: _Look, high: _Look) -> list[Crossing]:
-        """Where the numbers of unstable directions change between two points, in the order of the path."""
+        """The crossings between two points, in the order of the path."""
         step, located = Step(self._path, low.point, high.point), list[tuple[float, str, Point, int]]()
         for family, before, after in zip(self._families, low.counts, high.counts, strict=True):
             change = Change(_Expanded(family, self._expand), before, after)
@@ -204,7 +205,7 @@ class Watch:
 
 @dataclass(frozen=True)
 class _Expanded:
-    """A family at the states of a path whose amplitudes stand for others."""
+    """A family, for the states of a path that `expand` maps to states of the model."""
 
     family: Family
     expand: Callable[[State], State]
@@ -214,7 +215,7 @@ class _Expanded:
 
 
 def _softest(factors: Factorisation, near: Vector | None) -> tuple[float, Vector]:
-    """The size of the eigenvalue nearest to zero, never too small, and its vector."""
+    """The magnitude of the eigenvalue nearest to zero, an upper bound, and its vector."""
     comm = factors.matrix.comm.tompi4py()
     v = np.sin(1.0 + np.arange(factors.matrix.getLocalSize()[0]) + comm.rank)
     if near is not None:
@@ -227,7 +228,7 @@ def _softest(factors: Factorisation, near: Vector | None) -> tuple[float, Vector
 
 
 def _rate(a: _Look, b: _Look) -> float | None:
-    """At which the softest mode changes per length of the path; None where there is no length."""
+    """The change of the softest eigenvalue per length of the path; None for zero length."""
     if b.along == a.along:
         return None
     change = abs(b.softest - a.softest) if a.counts == b.counts else a.softest + b.softest

@@ -5,6 +5,6 @@ from numpy.typing import NDArray
 
 
 def rotation(azimuth: float) -> NDArray[np.float64]:
-    """(3, 3): Q v has the components of v in a frame turned by an azimuth (rad), and rows v Q those of the way back."""
+    """Q (3, 3) of a frame turned by an azimuth (rad): Q v are the components of v in it, and w Q turns rows w back."""
     c, s = np.cos(azimuth), np.sin(azimuth)
     return np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])

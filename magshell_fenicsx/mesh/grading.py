@@ -1,4 +1,4 @@
-"""Element size over a surface: small where the shell's own length sqrt(Rh) shows."""
+"""Element size over a surface: small where the solution varies over the length sqrt(Rh)."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ class Feature(Protocol):
         """Wanted element size at a point of the chart."""
 
     def cells(self, reach: float) -> float:
-        """About how many elements it needs up to the distance `reach` from it."""
+        """Approximate number of elements up to the distance `reach` from the place."""
 
 
 @dataclass(frozen=True)
@@ -63,10 +63,10 @@ class Ring:
         return float(self.size + self.growth * abs(np.hypot(x[0], x[1]) - self.radius))
 
     def across(self, axis: int, x: float) -> float:
-        return inf  # of discs, which are no grids
+        return inf  # a ring belongs to discs, which are no grids
 
     def cells(self, reach: float) -> float:
-        """Of its inner side: the outer one lies beyond the edge."""
+        """Number on the inner side alone: the outer side lies beyond the edge."""
         return PER_AREA * 2 * pi * self.radius * reach / (self.size * (self.size + self.growth * reach))
 
 
@@ -86,13 +86,13 @@ class Line:
         return self.size + self.growth * abs(x - self.place) if axis == self.axis else inf
 
     def cells(self, reach: float) -> float:
-        """Of a square of that side."""
+        """Number in a square with the side `reach`."""
         return PER_AREA * reach**2 / (self.size * (self.size + self.growth * reach))
 
 
 @dataclass(frozen=True)
 class Grading:
-    """The size that satisfies every feature, and nowhere above `largest`."""
+    """The smallest size of all features, at most `largest`."""
 
     features: Sequence[Feature]
     largest: float
@@ -101,11 +101,11 @@ class Grading:
         return min([self.largest, *(feature(x) for feature in self.features)])
 
     def across(self, axis: int, x: float) -> float:
-        """Of grid lines, see `Feature`."""
+        """Wanted distance of grid lines, see `Feature`."""
         return min([self.largest, *(feature.across(axis, x) for feature in self.features)])
 
     def cells(self, shape: Shape) -> float:
-        """About how many triangles fill a shape; too many by the overlap of the features, at most by half."""
+        """Approximate number of triangles in a shape; the overlap of features makes it too large, at most by half."""
         share = 0.5 if shape.half else 1.0  # features lie on the mirror line
         around = share * sum(feature.cells(shape.reach) for feature in self.features)
         inner, outer = PER_AREA * shape.area / self.largest**2, 2 * shape.reach / self.largest  # of a thin strip

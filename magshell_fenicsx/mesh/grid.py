@@ -1,4 +1,4 @@
-"""A rectangular chart in crossed quadrilaterals, each cut into four triangles; opposite sides may be glued."""
+"""A grid of quadrilaterals on a rectangular chart, each cut into four triangles; opposite sides may be glued."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -22,13 +22,13 @@ class Grid:
     Attributes
     ----------
     size
-        Largest side of a quadrilateral: a number, or for each axis what it is at a coordinate.
+        Largest side of a quadrilateral: a number, or a function (axis, coordinate across it) -> side.
     sides
         Names of x = low, x = high, y = low and y = high.
     glued
         Whether the two ends of each axis are one line of the surface.
     through
-        Coordinates across either axis that have a grid line.
+        Coordinates across each axis at which there is a grid line.
     """
 
     low: tuple[float, float]
@@ -40,22 +40,22 @@ class Grid:
 
     @property
     def edges(self) -> tuple[str, ...]:
-        """Names of the edges that the surface has."""
+        """Names of the surface's edges: the sides that are not glued."""
         return tuple(dict.fromkeys(name for i, name in enumerate(self.sides) if not self.glued[i // 2]))
 
     @property
     def corners(self) -> Array:
-        """(4, 2)."""
+        """Chart coordinates (4, 2) of the corners."""
         return np.array([[x, y] for x in (self.low[0], self.high[0]) for y in (self.low[1], self.high[1])])
 
     @property
     def cells(self) -> float:
-        """About how many triangles it is cut into."""
+        """Approximate number of triangles."""
         quadrilaterals = [max(self._counted(axis)[1][-1], 1.0) for axis in range(2)]
         return float(4 * quadrilaterals[0] * quadrilaterals[1])
 
     def _counted(self, axis: int) -> tuple[Array, Array]:
-        """Coordinates across an axis, and how many sides of a quadrilateral go up to each."""
+        """Coordinates across an axis, and the number of sides of quadrilaterals up to each of them."""
         low, high, size = self.low[axis], self.high[axis], self.size
         if not callable(size):
             return np.array([low, high]), np.array([0.0, (high - low) / size])
@@ -64,7 +64,7 @@ class Grid:
         return x, np.concatenate([[0.0], np.cumsum((per_length[1:] + per_length[:-1]) / 2 * np.diff(x))])
 
     def lines(self, axis: int, points: Sequence[Array]) -> Array:
-        """Coordinates of the grid lines across an axis: through every point, and no farther apart than the size."""
+        """Coordinates of the grid lines across an axis: through every point, with distances up to the size."""
         low, high = self.low[axis], self.high[axis]
         given = np.unique([low, high, *self.through[axis], *(float(x[axis]) for x in points)])
         given = given[np.concatenate([[True], np.diff(given) > CLOSE * (high - low)])]
@@ -73,7 +73,7 @@ class Grid:
         counts = np.interp(given, x, sides)
         parts = [max(int(np.ceil(b - a - 1e-6)), 1) for a, b in pairwise(counts)]
         if self.glued[axis] and sum(parts) < 3:
-            parts = [max(n, -(-3 // len(parts))) for n in parts]  # fewer would fold onto themselves
+            parts = [max(n, -(-3 // len(parts))) for n in parts]  # with fewer, the glued mesh would be degenerate
         inner = []
         for a, b, n, first, last in zip(given[:-1], given[1:], parts, counts[:-1], counts[1:], strict=True):
             between = np.linspace(a, b, n + 1)[1:]

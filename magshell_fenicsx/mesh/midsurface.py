@@ -1,12 +1,13 @@
-"""The mid-surface: an affine dolfinx mesh and, apart from it, the placement r0.
+"""The mid-surface: an affine dolfinx mesh and, separate from it, the placement r0.
 
-The kernels see only the affine mesh, so their Jacobian is constant and one compiled
-kernel serves every shape; the shape itself is the vector field r0, interpolated at
-the nodes of the displacement's own element, so that rigid motions are exact.
+The kernels use the affine mesh alone. So their Jacobian is constant, and one compiled kernel serves every shape.
+The shape itself is the vector field r0. It is interpolated at the nodes of the displacement's own element, so that
+rigid motions are exact.
 """
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import basix
 import basix.ufl
@@ -16,7 +17,7 @@ from dolfinx.cpp.io import perm_gmsh
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from magshell_fenicsx.mesh.patch import PatchMesh, check_orientation
+from magshell_fenicsx.mesh.patch import PatchMesh, as_set, check_orientation
 from magshell_fenicsx.platform import compat
 
 ORDERS = {3: 1, 6: 2, 10: 3}  # nodes of a triangle -> its order
@@ -43,15 +44,9 @@ class Midsurface:
 
     def charted(self, V: fem.FunctionSpace) -> NDArray[np.float64]:
         """Chart coordinates (cells, nodes, 2 | 3) of the nodes of each cell of this rank, in its own chart."""
-        patch = self._patch
-        order = ORDERS[patch.cells.shape[1]]
-        geometry = basix.create_element(
-            basix.ElementFamily.P, basix.CellType.triangle, order, basix.LagrangeVariant.equispaced
+        return at_reference_points(
+            self._patch.nodes, self._patch.cells[self._original_cells], compat.interpolation_points(V)
         )
-        to_dolfinx = perm_gmsh(mesh.CellType.triangle, patch.cells.shape[1])
-        values = geometry.tabulate(0, compat.interpolation_points(V))[0, :, :, 0]
-        cells = patch.cells[self._original_cells]
-        return np.asarray(np.einsum("qk,ckd->cqd", values, patch.nodes[cells[:, to_dolfinx]]))
 
     def placement(self, V: fem.FunctionSpace) -> fem.Function:
         """The undeformed placement r0 in the Lagrange space `V` (vector valued)."""
@@ -63,7 +58,7 @@ class Midsurface:
 
     @property
     def read(self) -> bool:
-        """Whether it was meshed elsewhere, and may be faceted or folded."""
+        """Whether it comes from a mesh file, and so may have facets or folds."""
         return self._patch.nodes.shape[1] == 3
 
     @cached_property
@@ -79,7 +74,7 @@ class Midsurface:
 
 
 def distribute(patch: PatchMesh, comm: MPI.Comm) -> Midsurface:
-    """Make the mid-surface of all ranks from the triangulation, which each of them has: it is small.
+    """Make the mid-surface on all ranks from the triangulation, which every rank has: it is small.
 
     Raises
     ------
@@ -90,17 +85,34 @@ def distribute(patch: PatchMesh, comm: MPI.Comm) -> Midsurface:
     vertices, corners = np.unique(patch.corners, return_inverse=True)
     corners = corners.reshape(-1, 3).astype(np.int64)
     xyz = patch.embedding(patch.nodes[vertices])
+    domain = create_mesh(comm, basix.ufl.element("Lagrange", "triangle", 1, shape=(3,)), corners, xyz)
+    position = {name: patch.embedding(x[None])[0] for name, x in patch.points.items()}
+    return Midsurface(domain, _named_facets(domain, patch, vertices), position, patch)
+
+
+def create_mesh(comm: MPI.Comm, element: Any, cells: NDArray[np.int64], x: NDArray[np.float64]) -> mesh.Mesh:
+    """A mesh on all ranks, from cells and node positions (n, 3) that every rank has."""
     first = comm.rank == 0
-    element = basix.ufl.element("Lagrange", "triangle", 1, shape=(3,))
-    domain = mesh.create_mesh(
+    return mesh.create_mesh(
         comm,
-        cells=corners if first else corners[:0],
-        x=xyz if first else xyz[:0],
+        cells=cells if first else cells[:0],
+        x=x if first else x[:0],
         e=element,
         partitioner=compat.shared_facets(),
     )
-    position = {name: patch.embedding(x[None])[0] for name, x in patch.points.items()}
-    return Midsurface(domain, _named_facets(domain, patch, vertices), position, patch)
+
+
+def at_reference_points(
+    nodes: NDArray[np.float64], cells: NDArray[np.int64], points: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Coordinates (m, q, d) of reference points (q, 2) in triangles (m, 3 | 6 | 10) in gmsh's order."""
+    count = cells.shape[1]
+    geometry = basix.create_element(
+        basix.ElementFamily.P, basix.CellType.triangle, ORDERS[count], basix.LagrangeVariant.equispaced
+    )
+    values = geometry.tabulate(0, points)[0, :, :, 0]
+    to_dolfinx = perm_gmsh(mesh.CellType.triangle, count)
+    return np.asarray(np.einsum("qk,ckd->cqd", values, nodes[cells[:, to_dolfinx]]))
 
 
 def _named_facets(domain: mesh.Mesh, patch: PatchMesh, vertices: NDArray[np.int64]) -> dict[str, NDArray[np.int32]]:
@@ -113,7 +125,7 @@ def _named_facets(domain: mesh.Mesh, patch: PatchMesh, vertices: NDArray[np.int6
     numbers = np.sort(vertices[domain.geometry.input_global_indices[ends]], axis=1)
     found = {}
     for name, pairs in patch.edges.items():
-        wanted = {(a, b) for a, b in np.sort(pairs, axis=1)}
+        wanted = as_set(pairs)
         inside = [(a, b) in wanted for a, b in numbers]
         found[name] = facets[np.array(inside, dtype=bool)]
     return found

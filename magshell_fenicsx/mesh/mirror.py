@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.mesh.frame import rotation
-from magshell_fenicsx.mesh.patch import MeshError, PatchMesh
+from magshell_fenicsx.mesh.patch import MeshError, PatchMesh, as_set, border_pairs, directed_sides, on_border
 
 Array = NDArray[np.float64]
 CUT = "symmetry"  # name of the edge on the plane
@@ -16,12 +16,12 @@ ROUNDING = 1e-9
 
 @dataclass(frozen=True)
 class Mirror:
-    """The plane normal . x = offset; the half beyond it, where normal . x is larger, is modelled.
+    """The plane normal . x = offset; the half with normal . x > offset is modelled.
 
     Attributes
     ----------
     normal
-        Unit vector (3,); a component that is only rounding is zero.
+        Unit vector (3,); components that only rounding makes are set to zero.
     lost
         Edges of the other half -> their mirror images.
     """
@@ -32,7 +32,7 @@ class Mirror:
 
     @classmethod
     def of(cls, normal: Array, offset: float = 0.0, lost: Mapping[str, str] | None = None) -> "Mirror":
-        """With a normal of any length."""
+        """The plane with a normal of any length."""
         unit = np.asarray(normal) / np.linalg.norm(normal)
         unit = np.where(np.abs(unit) < ROUNDING, 0.0, unit)
         return cls(unit / np.linalg.norm(unit), offset / float(np.linalg.norm(normal)), lost or {})
@@ -49,7 +49,7 @@ class Mirror:
 
     @property
     def azimuth(self) -> float:
-        """Of a plane through e3 (rad)."""
+        """The azimuth of a plane through e3 (rad)."""
         return float(np.arctan2(-self.normal[0], self.normal[1]))
 
     @property
@@ -58,7 +58,7 @@ class Mirror:
         return np.append(self.normal, self.offset) if self.offset else self.normal
 
     def turned(self, azimuth: float) -> "Mirror":
-        """The plane whose place in a frame turned about e3 (rad) this is."""
+        """This plane, given in a frame turned about e3 by an azimuth (rad), in the frame that is not turned."""
         return replace(self, normal=self.normal @ rotation(azimuth))
 
     @property
@@ -68,7 +68,7 @@ class Mirror:
 
     @property
     def reflection(self) -> Array:
-        """(3, 3) of vectors."""
+        """The matrix (3, 3) that mirrors vectors."""
         return np.asarray(np.eye(3) - 2 * np.outer(self.normal, self.normal))
 
     def image(self, x: Array) -> Array:
@@ -85,14 +85,16 @@ class Mirror:
 
     @property
     def in_plane(self) -> tuple[Array, Array]:
-        """Two unit vectors normal to each other."""
+        """Two unit vectors in the plane, normal to each other."""
         first = np.eye(3)[int(np.argmin(np.abs(self.normal)))]
         along = np.cross(first, self.normal)
         along /= np.linalg.norm(along)
         return along, np.asarray(np.cross(self.normal, along))
 
 
-Y0 = Mirror(np.array([0.0, 1.0, 0.0]))  # of shapes whose chart is halved: their frame is turned into it
+Y0 = Mirror(
+    np.array([0.0, 1.0, 0.0])
+)  # for shapes whose chart is halved: the model's frame is turned so that this is their plane
 
 
 def cut(patch: PatchMesh, mirror: Mirror) -> PatchMesh:
@@ -109,38 +111,31 @@ def cut(patch: PatchMesh, mirror: Mirror) -> PatchMesh:
     corners = beyond[patch.cells[kept, :3]]
     if not kept.any() or (~kept).sum() == 0 or corners.min() < -ROUNDING * extent:
         raise MeshError(
-            f"symmetry: half: no edges of the mesh lie in the plane {said_plane(mirror)}: mesh it with a curve there"
+            f"symmetry: half: no edges of the mesh lie in the plane {plane_text(mirror)}: mesh it with a curve there"
         )
     cells = patch.cells[kept]
     used, cells = np.unique(cells, return_inverse=True)
     cells = cells.reshape(-1, patch.cells.shape[1])
     one = np.arange(len(patch.nodes)) if patch.one is None else patch.one
-    first = np.full(len(patch.nodes), -1, dtype=np.int64)  # of each vertex of the surface, its first node that is left
+    first = np.full(len(patch.nodes), -1, dtype=np.int64)  # for each vertex, its first node that is kept
     first[one[used][::-1]] = np.arange(len(used))[::-1]
     edges = {name: first[one[pairs]] for name, pairs in patch.edges.items()}
-    sides = np.sort(first[one[used[_sides(cells)]]], axis=1)
-    pairs, times = np.unique(sides, axis=0, return_counts=True)
-    ends = {(int(a), int(b)) for a, b in pairs[times == 1]}
-    edges = {
-        name: lines[[(int(a), int(b)) in ends for a, b in np.sort(lines, axis=1)]] for name, lines in edges.items()
-    }
-    named = {(int(a), int(b)) for lines in edges.values() for a, b in np.sort(lines, axis=1)}
-    edges[CUT] = np.array(sorted(ends - named), dtype=np.int64).reshape(-1, 2)
+    border = border_pairs(first[one[used[directed_sides(cells)]]])
+    edges = on_border(edges, border)
+    named = {pair for lines in edges.values() for pair in as_set(lines)}
+    if on_plane := sorted(as_set(border) - named):
+        edges[CUT] = np.array(on_plane, dtype=np.int64)
     return replace(
         patch,
         nodes=patch.nodes[used],
         cells=cells,
-        edges={name: lines for name, lines in edges.items() if len(lines)},
+        edges=edges,
         one=None if patch.one is None else first[one[used]],
         patches={name: inside[kept] for name, inside in patch.patches.items()},
     )
 
 
-def said_plane(mirror: Mirror) -> str:
-    """Normal and offset, for people."""
+def plane_text(mirror: Mirror) -> str:
+    """Normal and offset, for messages."""
     normal = ", ".join(f"{c + 0.0:.4g}" for c in np.round(mirror.normal, 9))
     return f"({normal}) . x = {round(mirror.offset, 9) + 0.0:.4g} R"
-
-
-def _sides(cells: NDArray[np.int64]) -> NDArray[np.int64]:
-    return cells[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)

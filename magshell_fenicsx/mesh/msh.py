@@ -1,4 +1,4 @@
-"""A surface that somebody else meshed: gmsh's .msh with triangles of order 1, 2 or 3."""
+"""Reading a surface mesh from a file of gmsh (.msh), with triangles of order 1, 2 or 3."""
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.mesh.mirror import Mirror, cut
 from magshell_fenicsx.mesh.msh_format import Content, parsed
-from magshell_fenicsx.mesh.patch import MeshError, PatchMesh
-from magshell_fenicsx.mesh.soundness import border_edges, oriented, said_place
+from magshell_fenicsx.mesh.patch import MeshError, PatchMesh, place_text
+from magshell_fenicsx.mesh.soundness import border_edges, oriented
 
 Array = NDArray[np.float64]
 TRIANGLES, LINES = ("Triangle 3", "Triangle 6", "Triangle 10"), ("Line 2", "Line 3", "Line 4")
-NEAR = 1e-6  # of the extent, within which a named point is a vertex
+NEAR = 1e-6  # distance, over the extent, up to which a vertex counts as a named point
 
 
 @dataclass(frozen=True)
@@ -23,10 +23,8 @@ class MeshFile:
 
     Attributes
     ----------
-    path
-        Of the file.
     scale
-        From its coordinates to lengths of R.
+        Factor from its coordinates to lengths over R.
     """
 
     path: Path
@@ -34,27 +32,27 @@ class MeshFile:
 
 
 def in_space(x: Array) -> Array:
-    """The chart of a mesh that lies in space already."""
+    """The embedding of a mesh whose nodes are given in space."""
     return x
 
 
 def read_msh(file: MeshFile, points: Mapping[str, Array], mirror: Mirror | None = None) -> PatchMesh:
     """Read a surface; call it on one rank only.
 
-    Physical groups of surfaces become named patches, those of curves named edges. Triangles that run the
-    other way round than most are turned over.
+    Physical groups of surfaces become named patches, those of curves named edges. Triangles whose orientation
+    differs from that of the larger area are turned over.
 
     Parameters
     ----------
     points
-        Named places (3,) that must be vertices, in lengths of R. Without a "pole" it is the highest vertex.
+        Named places (3,) over R that must be vertices. If no "pole" is named, the highest vertex is the pole.
     mirror
-        Of the half that is taken; None for all.
+        The plane whose half is read; None for the whole surface.
 
     Raises
     ------
     MeshError
-        If the file cannot be read, or holds no sound surface; see `soundness`.
+        If the file cannot be read, or its surface cannot carry a shell; see `soundness`.
     """
     patch = _whole(file)
     patch = cut(patch, mirror) if mirror else patch
@@ -63,7 +61,7 @@ def read_msh(file: MeshFile, points: Mapping[str, Array], mirror: Mirror | None 
 
 def _whole(file: MeshFile) -> PatchMesh:
     nodes, cells, patches, edges = _content(file)
-    used, again = np.unique(cells, return_inverse=True)  # without nodes that no triangle has
+    used, again = np.unique(cells, return_inverse=True)  # drops nodes without a triangle
     cells = again.reshape(cells.shape)
     number = np.full(len(nodes), -1, dtype=np.int64)
     number[used] = np.arange(len(used))
@@ -85,7 +83,7 @@ def _vertices(nodes: Array, cells: NDArray[np.int64], points: Mapping[str, Array
         distance = np.linalg.norm(corners - x, axis=1)
         nearest = corners[np.argmin(distance)]
         if distance.min() > NEAR * np.ptp(corners, axis=0).max():
-            raise MeshError(f"the point {name} is no vertex of the mesh; the nearest, over R, is {said_place(nearest)}")
+            raise MeshError(f"the point {name} is no vertex of the mesh; the nearest, over R, is {place_text(nearest)}")
         found[name] = nearest
     return found
 
@@ -113,7 +111,7 @@ def _content(
     edges = {}
     for name, entities in held.groups[1].items():
         lines = [nodes[:, :2] for entity, nodes in _elements(file, held, 1, LINES) if entity in entities]
-        if lines:  # a curve of the drawing may carry no elements
+        if lines:  # a curve of the geometry may have no elements
             edges[name] = _places(file, held, np.concatenate(lines))
     return held.places, cells, patches, edges
 
@@ -132,7 +130,7 @@ def _elements(
 
 
 def _places(file: MeshFile, held: Content, numbers: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Where the nodes of elements stand among all."""
+    """Indices of the nodes with these numbers."""
     order = np.argsort(held.tags)
     found: NDArray[np.int64] = order[np.searchsorted(held.tags, numbers, sorter=order).clip(max=len(order) - 1)]
     if (missing := held.tags[found] != numbers).any():

@@ -1,8 +1,8 @@
-"""What a file of gmsh's mesh format holds, MSH 2 to 4, as text or binary; gmsh reads it, and nothing in it is run.
+"""The content of a file in gmsh's mesh format (MSH 2 to 4, text or binary), read by gmsh without running anything.
 
-gmsh takes the kind of a file from its first line and runs what is a script (SystemCall "..."), and also a file beside
-it, called the same with .opt at its end. So it is given a copy that lies alone, and only if the first line is a mesh's.
-It crashes on some damaged files, and so reads in a process of its own, which is this module as a program.
+gmsh chooses how to read a file from its first line. It runs scripts (SystemCall "..."), and it also runs a file of the
+same name with .opt at its end. So gmsh gets a copy in an empty folder, and only if the first line is that of a mesh.
+gmsh crashes on some damaged files, so it runs in a process of its own: this module as a program.
 """
 
 import os
@@ -26,14 +26,14 @@ FOUND = "found"
 
 @dataclass(frozen=True)
 class Content:
-    """What a file holds.
+    """The mesh in a file.
 
     Attributes
     ----------
     tags, places
         Numbers (n,) and coordinates (n, 3) of the nodes.
     blocks
-        Elements of one type on one entity: gmsh's name of the type, dimension, entity, (m, k) numbers of their nodes.
+        Elements of one type on one entity: gmsh's name of the type, dimension, entity, node numbers (m, k).
     groups
         Dimension -> name of a physical group, or its number where it has none -> its entities.
     """
@@ -50,7 +50,7 @@ def parsed(content: bytes) -> Content:
     Raises
     ------
     MeshError
-        If it is of another kind, or damaged.
+        If the file is of another kind, or damaged.
     """
     if not content.startswith((b"$MeshFormat", b"$Comments")):
         raise MeshError(
@@ -64,9 +64,9 @@ def parsed(content: bytes) -> Content:
         here = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parents[2]), *filter(None, sys.path)])}
         done = subprocess.run(command, env=here, cwd=folder, capture_output=True, text=True, check=False)
         if done.returncode:
-            said = (done.stderr.strip().splitlines() or ["nothing"])[-1] if done.returncode > 0 else "it crashed"
-            said = said.replace(str(alone), "the file").removeprefix("Exception: ").strip()
-            raise MeshError(f"is damaged, or of a version that gmsh does not read, which says: {said}")
+            reason = (done.stderr.strip().splitlines() or ["nothing"])[-1] if done.returncode > 0 else "it crashed"
+            reason = reason.replace(str(alone), "the file").removeprefix("Exception: ").strip()
+            raise MeshError(f"is damaged, or of a version that gmsh does not read, which says: {reason}")
         found: Content = Content(*pickle.loads((Path(folder) / FOUND).read_bytes()))
     if not np.isfinite(found.places).all():
         raise MeshError("a coordinate is not a number")
@@ -74,14 +74,14 @@ def parsed(content: bytes) -> Content:
 
 
 def _held(model: Any) -> tuple[Integers, NDArray[np.float64], Blocks, dict[int, dict[str, list[int]]]]:
-    """What `Content` has."""
+    """The fields of `Content`."""
     tags, xyz, _ = model.mesh.getNodes()
     blocks, groups = Blocks(), dict[int, dict[str, list[int]]]({1: {}, 2: {}})
     for dim, entity in model.getEntities():
         for kind, _, nodes in zip(*model.mesh.getElements(dim, entity), strict=True):
             name, _, _, width, *_ = model.mesh.getElementProperties(kind)
             each = nodes.astype(np.int64).reshape(-1, width)
-            first = np.unique(each, axis=0, return_index=True)[1]  # version 2 has it once for each of its groups
+            first = np.unique(each, axis=0, return_index=True)[1]  # MSH 2 repeats an element for each of its groups
             blocks.append((name, dim, entity, each[np.sort(first)]))
     for dim, group in model.getPhysicalGroups():
         if dim in groups:

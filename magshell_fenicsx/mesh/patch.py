@@ -1,12 +1,13 @@
-"""A triangulated surface as it leaves the mesh generator, before dolfinx."""
+"""A triangulated surface before it is given to dolfinx, and the sides of its triangles."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 Embedding = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+Pairs = NDArray[np.int64]  # (n, 2) vertices of edges
 
 
 @dataclass(frozen=True)
@@ -26,8 +27,8 @@ class PatchMesh:
     points
         Name -> (d,) coordinates of a vertex of the mesh.
     one
-        (n,) the node that each is glued to (itself where it is not): the two have one place in space
-        and are one vertex; `edges` are told in these numbers. None where nothing is glued.
+        (n,) for each node the node that it is glued to, or itself: glued nodes have the same place in space
+        and are one vertex. `edges` has these numbers. None where nothing is glued.
     patches
         Name -> (m,) whether each triangle belongs to that part of the surface.
     """
@@ -51,6 +52,34 @@ class MeshError(ValueError):
     """The triangulation cannot carry a shell; the message says where and why."""
 
 
+def place_text(x: NDArray[np.float64]) -> str:
+    """The coordinates (3,) of a place, for messages."""
+    return f"({x[0]:.4g}, {x[1]:.4g}, {x[2]:.4g})"
+
+
+def directed_sides(cells: NDArray[np.int64]) -> Pairs:
+    """Sides (3 m, 2) in the direction of their triangles (m, 3 or more): all first sides, all second, all third."""
+    return np.concatenate([cells[:, [0, 1]], cells[:, [1, 2]], cells[:, [2, 0]]])
+
+
+def border_pairs(sides: Pairs) -> Pairs:
+    """The sides that belong to one triangle only, lower vertex first."""
+    pairs, times = np.unique(np.sort(sides, axis=1), axis=0, return_counts=True)
+    return np.asarray(pairs[times == 1])
+
+
+def as_set(pairs: Pairs) -> set[tuple[int, int]]:
+    """Pairs of vertices without a direction: lower vertex first."""
+    return {(int(a), int(b)) for a, b in np.sort(pairs, axis=1)}
+
+
+def on_border(named: Mapping[str, Pairs], border: Pairs) -> dict[str, Pairs]:
+    """The part of each named edge that lies on the border; names without such a part are left out."""
+    ends = as_set(border)
+    kept = {name: pairs[[(a, b) in ends for a, b in np.sort(pairs, axis=1)]] for name, pairs in named.items()}
+    return {name: pairs for name, pairs in kept.items() if len(pairs)}
+
+
 def check_orientation(patch: PatchMesh) -> None:
     """Refuse a triangulation whose normals do not all point to one side.
 
@@ -60,13 +89,11 @@ def check_orientation(patch: PatchMesh) -> None:
         If two neighbours run through their common edge in the same direction, or
         if more than two triangles share an edge.
     """
-    corners = patch.corners
-    directed = np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])
-    same_way, times = np.unique(directed, axis=0, return_counts=True)
+    same_way, times = np.unique(directed_sides(patch.corners), axis=0, return_counts=True)
     if (times > 1).any():
         a, b = same_way[times > 1][0]
         where = patch.embedding(patch.nodes[[a, b]]).mean(axis=0)
         raise MeshError(
             f"the normals of two neighbouring triangles point to opposite sides (or three triangles meet) "
-            f"at the edge around ({where[0]:.4g}, {where[1]:.4g}, {where[2]:.4g})"
+            f"at the edge around {place_text(where)}"
         )

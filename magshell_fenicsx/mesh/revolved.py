@@ -1,7 +1,7 @@
 """Surfaces of revolution about e3, charted by (rho theta, s) or, up to their pole, by s (cos theta, sin theta).
 
-A profile is walked along s in the plane (r, z); the normal of the surface points to its right, r to the
-right and z upwards: a cylinder walked upwards has it outside.
+A profile is a curve in the plane (r, z) with the coordinate s. With r to the right and z upwards, the normal of the
+surface points to the right of the direction of s: on a cylinder with s upwards it points outwards.
 """
 
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.mesh.sphere import Dimple
 
 Array = NDArray[np.float64]
-ROUNDS = 4  # of a spline's parameter, which converges to its arc length as the square of its steps
+ROUNDS = 4  # iterations for a spline's parameter, which converges to the arc length as the square of its steps
 
 
 class Profile(Protocol):
@@ -22,7 +22,7 @@ class Profile(Protocol):
 
     @property
     def length(self) -> float:
-        """s runs from 0 to it."""
+        """Length of the curve: the largest s."""
 
     def __call__(self, s: Array) -> Array:
         """(..., 2) places at s (...)."""
@@ -80,7 +80,7 @@ class Arc:
     def foot(self, rz: Array) -> float:
         turn = np.arctan2(rz[1], rz[0] - self.centre) - self.start
         beyond = 2 * np.pi - (self.end - self.start)
-        turn = (turn + beyond / 2) % (2 * np.pi) - beyond / 2  # whatever is nearer of the two ends
+        turn = (turn + beyond / 2) % (2 * np.pi) - beyond / 2  # a point beyond the arc belongs to the nearer end
         return float(np.clip(turn, 0.0, self.end - self.start) * self.radius)
 
 

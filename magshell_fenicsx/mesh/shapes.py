@@ -12,7 +12,7 @@ Faces = list[tuple[int, int]]
 
 
 class Shape(Protocol):
-    """What a triangulation needs of a shape; `area` is that of the part modelled, `reach` its extent."""
+    """A shape for `triangulate`; `area` is the area of the modelled part, `reach` its extent."""
 
     @property
     def area(self) -> float: ...
@@ -24,7 +24,7 @@ class Shape(Protocol):
     def half(self) -> bool: ...
 
     def faces(self, occ: Any) -> Faces:
-        """Make the shape's faces with gmsh's OpenCASCADE kernel; their common edges are followed."""
+        """Make the shape's faces with gmsh's OpenCASCADE kernel; elements follow their common edges."""
 
     def on_edges(self, x: Array) -> dict[str, NDArray[np.bool_]]:
         """Which of the points (n, 2) lie on each named boundary edge."""
@@ -37,7 +37,7 @@ class DiscShape:
     Attributes
     ----------
     circle
-        Radius of an inner circle that edges follow (the rim of a dimple).
+        Radius of an inner circle that element edges follow (the rim of a dimple).
     edge
         Name of its outer edge.
     """

@@ -13,18 +13,20 @@ from functools import partial
 import numpy as np
 import ufl
 from dolfinx import fem
+from dolfinx.fem import petsc as fem_petsc
 from petsc4py import PETSc
 from ufl.core.expr import Expr
 
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.assembly.sliding import Projection
-from magshell_fenicsx.continuation.modes import lowest_modes, mass_matrix, null_vector
+from magshell_fenicsx.continuation.modes import lowest_modes, null_vector
 from magshell_fenicsx.continuation.system import State, Vector
 from magshell_fenicsx.models.axisymmetric import jets
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.solid.model import SolidModel
+from magshell_fenicsx.platform import compat
 
 Model = ShellModel | MeridianModel | SolidModel
 EXCLUDED = ("antisymmetric", "m = ")  # what labels of modes begin with that a reduced model does not see
@@ -76,11 +78,11 @@ class ShellModes:
         Raises
         ------
         ModesNotFound
-            See `solve.stability.lowest_modes`.
+            See `continuation.modes.lowest_modes`.
         """
         found = []
         for family in _families(self.model):
-            M = mass_matrix(self._product(family), family.held)
+            M = _mass_matrix(self._product(family), family.held)
             M = family.projection.mass(M) if family.projection else M
             modes = lowest_modes(family.tangent(state), M, count)
             found += [ShellMode(family.label, mode.eigenvalue, mode.vector) for mode in modes]
@@ -149,3 +151,15 @@ def _integral(model: Model, f: Expr) -> ufl.Form:
         return f / model.material.h * dx
     j0 = jets.revolved(model.r0) if isinstance(model, MeridianModel) else kin.jet(model.r0, domain)
     return f * kin.area_ratio(j0) * dx
+
+
+def _mass_matrix(product: fem.Form, held: list[fem.DirichletBC]) -> PETSc.Mat:
+    """The matrix of an inner product, with zero rows and columns at held degrees of freedom.
+
+    So held degrees of freedom have no finite eigenvalue, whatever the tangent's diagonal is there.
+    """
+    M = fem_petsc.create_matrix(product)
+    M.setOption(PETSc.Mat.Option.IGNORE_ZERO_ENTRIES, True)  # the tangent has no entries of held ones
+    compat.add_matrix(M, product, held)
+    M.assemble()
+    return M

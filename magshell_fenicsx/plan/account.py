@@ -3,7 +3,7 @@
 from math import degrees
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.mesh.mirror import Mirror, said_plane
+from magshell_fenicsx.mesh.mirror import Mirror, plane_text
 from magshell_fenicsx.models.shell.parameters import Loads
 from magshell_fenicsx.parts.registered import PARTS
 from magshell_fenicsx.plan.body import layers, neo_hookean
@@ -37,7 +37,7 @@ def account(case: Case, loads: Loads, model: str, mirror: Mirror | None) -> tupl
         left_out.append("waves around the axis (they are looked for at each point)")
     if mirror:
         plane = (
-            f"through e3 at azimuth {degrees(mirror.azimuth):g} degrees" if mirror.through_e3 else said_plane(mirror)
+            f"through e3 at azimuth {degrees(mirror.azimuth):g} degrees" if mirror.through_e3 else plane_text(mirror)
         )
         left_out.append(
             f"the other half: mirror plane {plane} (modes antisymmetric to it are looked for along the path)"

@@ -14,9 +14,9 @@ from magshell_fenicsx.case.loading import (
     RotationSection,
 )
 from magshell_fenicsx.continuation.along import Along
-from magshell_fenicsx.continuation.path import Control, StepOptions
+from magshell_fenicsx.continuation.path import Control, Quantity, StepOptions
 from magshell_fenicsx.continuation.system import State
-from magshell_fenicsx.continuation.walk import MOST_STEPS, Goal, Quantity
+from magshell_fenicsx.continuation.walk import MOST_STEPS, Goal
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.stage import Stage, plain

@@ -5,9 +5,9 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from magshell_fenicsx.continuation.control import GivenLoad
-from magshell_fenicsx.continuation.path import SEEN, Control, StepOptions
+from magshell_fenicsx.continuation.path import SEEN, Control, Quantity, StepOptions
 from magshell_fenicsx.continuation.system import State, max_abs
-from magshell_fenicsx.continuation.walk import MOST_STEPS, Goal, Quantity, Until
+from magshell_fenicsx.continuation.walk import MOST_STEPS, Goal, Until
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.stage import plain
