@@ -1,7 +1,7 @@
 """Compile kernels ahead of time, for images and clusters without a compiler at run time.
 
-Those of hemispheres, of solids, and of any mid-surface under dead loads. Remanences by formula or in layers, fields
-with a gradient, other energies than the full one, and surfaces with kinks compile theirs on their first run.
+These are the kernels of hemispheres, of solids, and of any mid-surface under dead loads. Remanences by formula or in
+layers, fields with a gradient, approximate energies and surfaces with kinks compile their kernels on the first run.
 """
 
 import time
@@ -46,7 +46,7 @@ OCTANT: dict[str, Any] = {  # symmetric in three planes, each a kernel of its ow
 
 
 def precompile(degree: int) -> float:
-    """Compile the kernels of shells of a degree, and of solids; the seconds that it took."""
+    """Compile the kernels of shells of a degree and of solids; return the time in seconds."""
     start = time.perf_counter()
     for data in _cases(degree):
         scene = Scene(Case.from_source(Source("precompile", data)), MPI.COMM_WORLD)

@@ -68,9 +68,8 @@ def run_model(
     kept = json.loads(used.read_text(encoding="utf-8")) if used.exists() else {}
     if kept.get("asked") != asked:
         if {**kept.get("asked", {}), "sources": asked["sources"]} == asked:
-            say(
-                f"{model} at refinement {refinement:g}: computed again, the folder has results of other sources of magshell_fenicsx"
-            )
+            why = "the folder has results of other sources of magshell_fenicsx"
+            say(f"{model} at refinement {refinement:g}: computed again, {why}")
         sets = [part for setting in chosen for part in ("--set", setting)]
         measured = measure("magshell_fenicsx", ["run", str(case), *sets, "--out", str(folder)])
         if not (folder / "summary.json").exists() or measured.code not in (0, 3):

@@ -19,7 +19,7 @@ SHOWN = (
     *("cells", "dofs", "result", "error", "wall_s", "cpu_s", "jit_s", "setup_s", "assembly_s", "factor_s", "solve_s"),
     *("output_s", "peak_mb", "factorisations", "iterations", "stopped"),
 )
-LEGEND = """Wall and CPU seconds are for the whole process including its files, with compiled kernels; the phases are as in
+LEGEND = """Wall and CPU seconds are for the whole process with its files, kernels compiled; the phases are as in
 summary.json; the peak is the resident memory of all ranks. **Bold**: no other run is both faster and more accurate.
 """
 
