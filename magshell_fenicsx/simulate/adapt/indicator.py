@@ -2,9 +2,9 @@
 
 The result J of a run is an amplitude on a path of stationary points, or its conjugate displacement. Its first
 variation with the residual is therefore the path's tangent z: J - J_h = a(e_u, e_z) up to higher order, with the
-tangent stiffness a and the errors e of u and z (dual weighted residuals: R. Becker, R. Rannacher, Acta Numerica 10, 2001). In
-each cell this is at most sqrt(|e_u|^2 |e_z|^2) in the energy norm. The errors are estimated with a solution of higher
-degree on the same mesh.
+tangent stiffness a and the errors e of u and z (dual weighted residuals: R. Becker, R. Rannacher, Acta Numerica 10,
+2001). In each cell this is at most sqrt(|e_u|^2 |e_z|^2) in the energy norm. The errors are estimated with a solution
+of higher degree on the same mesh.
 """
 
 import basix
