@@ -1,9 +1,11 @@
-"""The command line; a thin user of the Python API, of which each command imports what it needs."""
+"""The command line: a thin layer over the Python API. Each command imports only what it needs."""
 
 import gc
 import signal
 import sys
 import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -37,23 +39,34 @@ def _world() -> Any:
     return MPI.COMM_WORLD
 
 
-def _say(line: str) -> None:
+def _print_line(line: str) -> None:
     if _world().rank == 0:
         print(line, flush=True)
 
 
 def _failure(message: str, code: int) -> typer.Exit:
     if _world().rank:
-        return typer.Exit()  # at the first rank that fails mpirun ends the job, and may lose the message
+        return typer.Exit()  # mpirun ends the job at the first failing rank, and may lose the message of rank 0
     print(message, file=sys.stderr, flush=True)
     return typer.Exit(code)
 
 
-def main() -> None:
-    """The program."""
-    signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # of `| head`, say; PETSc would report a crash
+@contextmanager
+def _exit_codes(*invalid: type[Exception], stopped: tuple[type[Exception], ...] = ()) -> Iterator[None]:
+    """Turn an invalid input (`CaseError` and `invalid`) or an early stop into a message and its exit code."""
     try:
-        app(prog_name="magshell")  # by whatever name it was started: completion goes by it
+        yield
+    except (CaseError, *invalid) as e:
+        raise _failure(str(e), INVALID) from None
+    except stopped as e:
+        raise _failure(f"stopped early: {e}", STOPPED) from None
+
+
+def main() -> None:
+    """Run the program."""
+    signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # sent by `magshell ... | head`; PETSc would report a crash
+    try:
+        app(prog_name="magshell")  # the same name however it was started: completion depends on it
     except Exception:
         if _world().size == 1:
             raise
@@ -62,16 +75,16 @@ def main() -> None:
         _world().Abort(1)  # the other ranks would wait for this one for ever
 
 
-def _tell_version(asked: bool) -> None:
-    if asked:
-        _say(f"magshell_fenicsx {__version__}")
+def _print_version(requested: bool) -> None:
+    if requested:
+        _print_line(f"magshell_fenicsx {__version__}")
         raise typer.Exit
 
 
 @app.callback()
 def options(
     version: Annotated[
-        bool, typer.Option("--version", is_eager=True, callback=_tell_version, help="the version, and nothing else")
+        bool, typer.Option("--version", is_eager=True, callback=_print_version, help="print the version and exit")
     ] = False,
 ) -> None:
     """Options before the command."""
@@ -82,9 +95,9 @@ def run(
     case: CaseFile,
     set_: Settings = None,
     out: Annotated[Path | None, _folder("results/<case name>/")] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="go on with the run that was interrupted there")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="continue the interrupted run in that folder")] = False,
     time_limit: Annotated[
-        float | None, typer.Option(min=0, metavar="SECONDS", help="stop then, so that the run can be resumed")
+        float | None, typer.Option(min=0, metavar="SECONDS", help="stop after this time; --resume continues")
     ] = None,
 ) -> None:
     """Solve a case and write path.csv, summary.json, fields and pictures."""
@@ -97,20 +110,17 @@ def run(
 
     folder = out or Path("results") / case.stem
     try:
-        read = Case.load(case, set_ or [])
-        with live_line(_world().size, _say) as (say, tell):
-            result = run_case(read, folder, say=say, tell=tell, resume=resume, time_limit=time_limit)
-    except (CaseError, MeshError) as e:
-        raise _failure(str(e), INVALID) from None
-    except DiskError as e:
-        raise _failure(f"stopped early: {e}", STOPPED) from None
+        with _exit_codes(MeshError, stopped=(DiskError,)):
+            read = Case.load(case, set_ or [])
+            with live_line(_world().size, _print_line) as (say, tell):
+                result = run_case(read, folder, say=say, tell=tell, resume=resume, time_limit=time_limit)
     except AlreadyComplete as e:
-        _say(f"complete already: {e.summary['points']} points; results in {folder}/")
+        _print_line(f"complete already: {e.summary['points']} points; results in {folder}/")
         return
-    gc.freeze()  # the process ends: to look for garbage once more takes longer than to import dolfinx
+    gc.freeze()  # the process ends soon: another garbage collection takes longer than importing dolfinx
     if result.knockdown is not None:
-        _say(f"knockdown factor k_d = {result.knockdown:.9g}")
-    _say(f"results in {folder}/")
+        _print_line(f"knockdown factor k_d = {result.knockdown:.9g}")
+    _print_line(f"results in {folder}/")
     if result.stopped:
         raise _failure(f"stopped early: {result.stopped}", STOPPED)
 
@@ -127,21 +137,17 @@ def sweep(
     set_: Settings = None,
     out: Annotated[Path | None, _folder("results/<case name>_sweep/")] = None,
     full_paths: Annotated[
-        bool, typer.Option("--full-paths", help="a path of its own at every point; no fold is followed")
+        bool, typer.Option("--full-paths", help="compute the full path at every point; follow no fold")
     ] = False,
 ) -> None:
-    """Run a case over ranges of its keys; points that are in the folder already are kept."""
+    """Run a case over ranges of its keys; keep the points that are already in the folder."""
     from magshell_fenicsx.output.store.folder import DiskError
     from magshell_fenicsx.studies.sweep.sweep import sweep as run_sweep
 
     folder = out or Path("results") / f"{case.stem}_sweep"
-    try:
+    with _exit_codes(stopped=(DiskError,)):
         done = run_sweep(case, over, set_ or [], folder, full_paths=full_paths)
-    except CaseError as e:
-        raise _failure(str(e), INVALID) from None
-    except DiskError as e:
-        raise _failure(f"stopped early: {e}", STOPPED) from None
-    _say(f"results in {folder}/")
+    _print_line(f"results in {folder}/")
     if done.stopped:
         raise _failure(f"{done.stopped} of {len(done.points)} points stopped early; sweep.csv says why", STOPPED)
 
@@ -159,27 +165,23 @@ def study(
         str, typer.Option(metavar="NAME", help="knockdown, critical_field, force@w_over_h=10, energy@end, ...")
     ],
     set_: Settings = None,
-    reference: Annotated[float | None, typer.Option(help="that errors are relative to; default the finest run")] = None,
-    ranks: Annotated[str, typer.Option(metavar="N,N", help="numbers of MPI ranks to run each point on")] = "1",
-    repeat: Annotated[int, typer.Option(min=1, help="runs of each point, whose medians are told")] = 3,
+    reference: Annotated[float | None, typer.Option(help="exact value for the errors; default the finest run")] = None,
+    ranks: Annotated[str, typer.Option(metavar="N,N", help="numbers of MPI ranks for each point")] = "1",
+    repeat: Annotated[int, typer.Option(min=1, help="runs of each point; medians are reported")] = 3,
     out: Annotated[Path | None, _folder("results/<case name>_study/")] = None,
 ) -> None:
-    """Measure error against run time over meshes, degrees, models and ranks; runs that are in the folder are kept."""
+    """Measure error against run time over meshes, degrees, models and ranks; keep the runs in the folder."""
     from magshell_fenicsx.output.store.folder import DiskError
     from magshell_fenicsx.studies.study.study import parse_ranks
     from magshell_fenicsx.studies.study.study import study as run_study
 
     folder = out or Path("results") / f"{case.stem}_study"
-    try:
+    with _exit_codes(stopped=(DiskError,)):
         numbers, settings = parse_ranks(ranks), set_ or []
         done = run_study(
             case, over, settings, result=result, reference=reference, ranks=numbers, repeat=repeat, out=folder
         )
-    except CaseError as e:
-        raise _failure(str(e), INVALID) from None
-    except DiskError as e:
-        raise _failure(f"stopped early: {e}", STOPPED) from None
-    _say(f"results in {folder}/")
+    _print_line(f"results in {folder}/")
     if done.without_result:
         raise _failure(f"{done.without_result} of {len(done.rows)} runs gave no {result}; study.csv says why", STOPPED)
 
@@ -188,52 +190,48 @@ def study(
 def compare(
     case: CaseFile,
     set_: Settings = None,
-    shell: Annotated[str, typer.Option(metavar="R,R", help="refinements of the shell's mesh; the finest counts")] = "1",
-    solid: Annotated[str, typer.Option(metavar="R,R", help="of the solid's; three tell error against run time")] = "1",
+    shell: Annotated[
+        str, typer.Option(metavar="R,R", help="refinements of the shell's mesh; the finest is compared")
+    ] = "1",
+    solid: Annotated[
+        str, typer.Option(metavar="R,R", help="refinements of the solid's mesh; three give error against run time")
+    ] = "1",
     out: Annotated[Path | None, _folder("results/<case name>_compare/")] = None,
 ) -> None:
-    """Run a case as a shell and as a solid; put curves, difference and run times side by side."""
+    """Run a case as a shell and as a solid; compare their curves and run times."""
     from magshell_fenicsx.output.store.folder import DiskError
     from magshell_fenicsx.studies.compare.compare import compare as run_comparison
     from magshell_fenicsx.studies.compare.compare import parse_refinements
     from magshell_fenicsx.studies.compare.runs import NothingLeft
 
     folder = out or Path("results") / f"{case.stem}_compare"
-    try:
+    with _exit_codes(stopped=(DiskError, NothingLeft)):
         refinements = parse_refinements(shell, solid)
-        done = run_comparison(case, set_ or [], refinements=refinements, out=folder, say=_say)
-    except CaseError as e:
-        raise _failure(str(e), INVALID) from None
-    except (DiskError, NothingLeft) as e:
-        raise _failure(f"stopped early: {e}", STOPPED) from None
+        done = run_comparison(case, set_ or [], refinements=refinements, out=folder, say=_print_line)
     difference = done.content["difference"]
     if difference is not None:
-        _say(f"{done.content['result']}: the solid's is {100 * difference:+.3f} % from the shell's")
-    _say(f"results in {folder}/")
+        _print_line(f"{done.content['result']}: the solid differs from the shell by {100 * difference:+.3f} %")
+    _print_line(f"results in {folder}/")
 
 
 @app.command()
 def plot(
     folder: Annotated[
         Path,
-        typer.Argument(metavar="DIR", help="a run's results, whole or interrupted", autocompletion=left_to_the_shell),
+        typer.Argument(metavar="DIR", help="folder of a finished or interrupted run", autocompletion=left_to_the_shell),
     ],
-    point: Annotated[int | None, typer.Option(metavar="N", help="draw this point, as shell_000N.png, ...")] = None,
-    animation: Annotated[bool, typer.Option("--animation", help="draw animation.gif too, of the path")] = False,
+    point: Annotated[int | None, typer.Option(metavar="N", help="draw only this point: shell_000N.png, ...")] = None,
+    animation: Annotated[bool, typer.Option("--animation", help="also draw the path: animation.gif")] = False,
 ) -> None:
-    """Make a run's pictures and report again, from its folder alone."""
+    """Draw the pictures and write the report of a run again, from its folder."""
     from magshell_fenicsx.output.pictures.plot import plot as plot_again
     from magshell_fenicsx.output.pictures.render import NoScreen
 
     if _world().rank:
         return
-    try:
+    with _exit_codes(stopped=(NoScreen, OSError)):
         drawn = plot_again(folder, point, animation)
-    except CaseError as e:
-        raise _failure(str(e), INVALID) from None
-    except (NoScreen, OSError) as e:
-        raise _failure(f"stopped early: {e}", STOPPED) from None
-    _say(f"{', '.join(drawn)} in {folder}/")
+    _print_line(f"{', '.join(drawn)} in {folder}/")
 
 
 @app.command()
@@ -242,10 +240,8 @@ def check(case: CaseFile, set_: Settings = None) -> None:
     from magshell_fenicsx.case.case import Case
     from magshell_fenicsx.plan.check import describe
 
-    try:
-        _say(describe(Case.load(case, set_ or [])))
-    except CaseError as e:
-        raise _failure(str(e), INVALID) from None
+    with _exit_codes():
+        _print_line(describe(Case.load(case, set_ or [])))
 
 
 def _names() -> list[str]:
@@ -257,53 +253,51 @@ def _names() -> list[str]:
 @app.command()
 def example(
     name: Annotated[
-        str | None, typer.Argument(metavar="NAME", help="of the case to write", autocompletion=_names)
+        str | None, typer.Argument(metavar="NAME", help="name of the example", autocompletion=_names)
     ] = None,
     file: Annotated[
         Path | None,
-        typer.Argument(metavar="FILE.yaml", help="where to; default NAME.yaml", autocompletion=left_to_the_shell),
+        typer.Argument(metavar="FILE.yaml", help="file to write; default NAME.yaml", autocompletion=left_to_the_shell),
     ] = None,
 ) -> None:
-    """Write an example case to a file, to run and to change; without NAME, list all of them."""
+    """Write an example case to a file; without NAME, list all examples."""
     from magshell_fenicsx.case.examples import examples, title, write_example
 
     if name is None:
         for known, where in examples().items():
-            _say(f"{known:24} {title(where)}")
+            _print_line(f"{known:24} {title(where)}")
         return
     if _world().rank:
         return
-    try:
+    with _exit_codes():
         written = write_example(name, file)
-    except CaseError as e:
-        raise _failure(str(e), INVALID) from None
-    _say(f"wrote {', '.join(map(str, written))}")
+    _print_line(f"wrote {', '.join(map(str, written))}")
 
 
 @app.command()
 def schema(
-    markdown: Annotated[bool, typer.Option("--markdown", help="as a page to read, docs/case.md")] = False,
+    markdown: Annotated[bool, typer.Option("--markdown", help="print the page docs/case.md instead")] = False,
 ) -> None:
-    """The JSON Schema of the case file, for editors."""
+    """Print the JSON Schema of the case file, for editors."""
     from magshell_fenicsx.case.reference import reference
     from magshell_fenicsx.case.schema import schema_text
 
-    _say((reference() if markdown else schema_text()).removesuffix("\n"))
+    _print_line((reference() if markdown else schema_text()).removesuffix("\n"))
 
 
 @app.command()
 def info(
-    compile_: Annotated[bool, typer.Option("--compile", help="compile every kernel of degrees 3 and 4 now")] = False,
+    compile_: Annotated[bool, typer.Option("--compile", help="compile the kernels of degrees 3 and 4 now")] = False,
 ) -> None:
-    """Versions, the BLAS in use, the kernel cache."""
+    """Print versions, the BLAS in use and the folder of the kernel cache."""
     from magshell_fenicsx.platform.environment import fast_blas, kernel_cache, versions
     from magshell_fenicsx.simulate.precompile import precompile
 
     for name, number in versions().items():
-        _say(f"{name:18} {number}")
-    _say(f"{'blas':18} {fast_blas() or 'reference (slow: install OpenBLAS)'}")
-    _say(f"{'ranks':18} {_world().size}")
-    _say(f"{'kernel cache':18} {kernel_cache()}")
+        _print_line(f"{name:18} {number}")
+    _print_line(f"{'blas':18} {fast_blas() or 'reference (slow: install OpenBLAS)'}")
+    _print_line(f"{'ranks':18} {_world().size}")
+    _print_line(f"{'kernel cache':18} {kernel_cache()}")
     if compile_:
         for degree in (3, 4):
-            _say(f"compiled degree {degree} in {precompile(degree):.1f} s")
+            _print_line(f"compiled degree {degree} in {precompile(degree):.1f} s")

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.assembly.shape_tables import EDGES, Table, cell_rule, edge_covector, edge_rule
 from magshell_fenicsx.platform import compat
 
-POINTS = 2048  # at most, in a batch: its Hessians stay within a few megabytes
+POINTS = 2048  # most points of a batch; its Hessians take a few megabytes
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,7 +20,7 @@ class Rule:
     Attributes
     ----------
     points
-        (q, 2) for each side: the same places in space.
+        (q, 2) for each side: the same points in space.
     tables
         Shape functions there, for each side.
     weights
@@ -42,7 +42,7 @@ class Batch:
         (n,) local cells, for each side.
     geometry
         (n, 2 sides + 1): the covectors of the edge in the reference coordinates of each side (see
-        `reference.edge_covector`), and the width of the cells over it; (n, 0) for cells.
+        `shape_tables.edge_covector`), and the width of the cells over it; (n, 0) for cells.
     """
 
     cells: tuple[NDArray[np.int32], ...]
@@ -51,12 +51,12 @@ class Batch:
 
     @property
     def size(self) -> int:
-        """Points of all its entities."""
+        """Number of points of all entities."""
         return len(self.cells[0]) * len(self.rule.weights)
 
 
 def cell_batches(V: fem.FunctionSpace, degree: int) -> list[Batch]:
-    """The owned cells."""
+    """Batches of the owned cells."""
     X, w = cell_rule(degree)
     rule = Rule((X,), (Table.tabulate(V.element.basix_element, X),), w)
     cells = np.arange(V.mesh.topology.index_map(2).size_local, dtype=np.int32)
@@ -64,18 +64,18 @@ def cell_batches(V: fem.FunctionSpace, degree: int) -> list[Batch]:
 
 
 def interior_batches(V: fem.FunctionSpace, degree: int) -> list[Batch]:
-    """The owned interior edges."""
+    """Batches of the owned interior edges."""
     cells, edges, backwards = interior_edges(V)
     return list(_edge_batches(V, degree, cells, np.column_stack([edges, backwards])))
 
 
 def boundary_batches(V: fem.FunctionSpace, degree: int, facets: NDArray[np.int32]) -> list[Batch]:
-    """Those of some boundary edges that this rank owns."""
+    """Batches of those boundary edges that this rank owns."""
     return list(_edge_batches(V, degree, *boundary_edges(V, facets)))
 
 
 def interior_edges(V: fem.FunctionSpace) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.bool_]]:
-    """The owned interior edges: cells (n, 2), number in each cell (n, 2), whether the cells run along them unlike."""
+    """The owned interior edges: cells (n, 2), number in each cell (n, 2), whether the cells' orientations differ."""
     topology = V.mesh.topology
     topology.create_connectivity(1, 2)
     links = topology.connectivity(1, 2)
@@ -87,7 +87,7 @@ def interior_edges(V: fem.FunctionSpace) -> tuple[NDArray[np.int32], NDArray[np.
 
 
 def boundary_edges(V: fem.FunctionSpace, facets: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Those of some boundary edges that this rank owns: cells (n, 1), number in the cell (n, 1)."""
+    """The owned ones of some boundary edges: cells (n, 1), number in the cell (n, 1)."""
     topology = V.mesh.topology
     topology.create_connectivity(1, 2)
     links = topology.connectivity(1, 2)
@@ -99,7 +99,7 @@ def boundary_edges(V: fem.FunctionSpace, facets: NDArray[np.int32]) -> tuple[NDA
 def _edge_batches(
     V: fem.FunctionSpace, degree: int, cells: NDArray[np.int32], kinds: NDArray[np.int32]
 ) -> Iterator[Batch]:
-    """Sort edges by what they are in the cells of each side; with two sides, also by whether these run alike."""
+    """Group edges by their number in the cell of each side and, with two sides, by relative orientation."""
     sides = cells.shape[1]
     for kind in np.unique(kinds, axis=0):
         backwards = (False, bool(kind[-1]))[:sides]
@@ -120,7 +120,7 @@ def _chunks(entities: NDArray[np.int32], points: int) -> list[NDArray[np.int32]]
 
 
 def _local_edges(V: fem.FunctionSpace, facets: NDArray[np.int32], cells: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Number of each facet in a cell of its own."""
+    """Number of each facet in its cell."""
     V.mesh.topology.create_connectivity(2, 1)
     edges = V.mesh.topology.connectivity(2, 1).array.reshape(-1, 3)[cells]
     return np.asarray(np.argmax(edges == facets[:, None], axis=1), dtype=np.int32)

@@ -1,4 +1,4 @@
-"""Flat cells: their own orthonormal coordinates, and the numbers that lead there from those of the reference cell."""
+"""Orthonormal coordinates of flat cells, and the transformation from reference coordinates."""
 
 import numpy as np
 from dolfinx import mesh

@@ -1,4 +1,4 @@
-"""From the Hessians at a batch's points to its entities' matrices: a few matrix products for a batch."""
+"""Matrices of a batch's entities from the Hessians at its points, by a few matrix products."""
 
 from collections.abc import Iterator
 
@@ -14,8 +14,8 @@ Array = NDArray[np.float64]
 class Contraction:
     """K[ac, bd] = sum over points and parts of w D_i[a] D_j[b] H[ic, jd].
 
-    The products of the shape functions' derivatives are the same for all entities of a rule, and
-    for a symmetric (skew) block they are symmetric (skew) in a, b: only a <= b is computed.
+    The products of the shape functions' derivatives are the same for all entities of a rule. For a symmetric (skew)
+    block they are symmetric (skew) in a, b, so only a <= b is computed.
     """
 
     def __init__(self, rule: Rule, pairs: Pairs) -> None:
@@ -60,7 +60,7 @@ class Blocks:
             first = last
 
     def _targets(self, pairs: Pairs) -> Iterator[tuple[Array, tuple[Pair, ...], tuple[Pair, ...]]]:
-        """Arrays, what pairs are there and which of them a term has, in the order of `point_hessian`."""
+        """The arrays, their pairs and the pairs of a term, in the order of `point_hessian`."""
         for symmetric, skew in zip(self.symmetric, self.skew, strict=True):
             yield symmetric, self._pairs.same, pairs.same
             yield skew, self._pairs.skew, pairs.skew
@@ -73,7 +73,7 @@ def _product(H: Array, products: Array) -> Array:
 
 
 def _places(all_pairs: tuple[Pair, ...], some: tuple[Pair, ...]) -> slice | list[int]:
-    """Where some pairs are among all, as a slice if they are next to each other."""
+    """The indices of some pairs among all, as a slice if they are contiguous."""
     places = [all_pairs.index(pair) for pair in some]
     if places and places == list(range(places[0], places[-1] + 1)):
         return slice(places[0], places[-1] + 1)

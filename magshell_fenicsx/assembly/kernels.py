@@ -1,4 +1,4 @@
-"""Compiling UFL forms: the options of the just-in-time compiler, and what it cost."""
+"""Compilation of UFL forms: the options of the just-in-time compiler, and the time."""
 
 import time
 from collections.abc import Iterable, Mapping
@@ -17,7 +17,7 @@ JIT_OPTIONS = {"cffi_extra_compile_args": ["-O1", "-g0", "-ffast-math"], "timeou
 
 @dataclass
 class KernelLog:
-    """Names of the kernels that a problem uses and the seconds spent on getting them."""
+    """Names of the kernels of a problem and the seconds spent on compiling or loading them."""
 
     names: list[str] = field(default_factory=list)
     seconds: float = 0.0

@@ -1,4 +1,4 @@
-"""C code of our own, compiled once into the folder of FFCx's kernels."""
+"""The package's C code, compiled once into the folder of FFCx's kernels."""
 
 import hashlib
 import importlib.util
@@ -17,7 +17,7 @@ OPTIONS = ["-O3", "-g0"]
 
 
 def native(source: Path, declarations: str, comm: MPI.Comm) -> tuple[Any, Any]:
-    """The cffi objects (ffi, lib) of a C file; compiled, if it was not before, by the first rank. Collective.
+    """The cffi objects (ffi, lib) of a C file, compiled by rank 0 on first use. Collective.
 
     Raises
     ------
@@ -45,7 +45,7 @@ def native(source: Path, declarations: str, comm: MPI.Comm) -> tuple[Any, Any]:
 
 
 def _compile(name: str, folder: Path, text: str, declarations: str) -> None:
-    """Put NAME.so into a folder, whole or not at all, whoever else does the same."""
+    """Compile NAME.so into a folder, atomically even if other processes do the same."""
     folder.mkdir(parents=True, exist_ok=True)
     builder = cffi.FFI()
     builder.cdef(declarations)

@@ -1,4 +1,4 @@
-"""A parameter that enters terms freely: the derivatives of their energies in it."""
+"""A free parameter of terms: the derivatives of their energies with respect to it."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from magshell_fenicsx.assembly.terms import Term
 
 @dataclass(frozen=True)
 class Parameter:
-    """What a free parameter p brings to a system, whose terms mu_i Pi_i(u; p) are written with a constant.
+    """A free parameter p of a system with the terms mu_i Pi_i(u; p), in which p is a constant.
 
     Attributes
     ----------

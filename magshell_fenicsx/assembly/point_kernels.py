@@ -1,8 +1,8 @@
 """Second derivatives of a density at many points at once.
 
-The density is a function of a few vectors (3,) that change from point to point. Points are the
-cells of an interval and the vectors cell-wise constants on it, so that the just-in-time compiler
-of expressions does the rest: its kernels know neither mesh, degree nor quadrature.
+The density is a function of a few vectors (3,) that vary between points. The points are represented as cells of an
+interval and the vectors as cell-wise constants, so the just-in-time compiler of expressions can be used. Its kernels do
+not depend on mesh, degree or quadrature.
 """
 
 from collections.abc import Sequence
@@ -22,22 +22,22 @@ Pair = tuple[int, int]
 
 
 class Points:
-    """Room for some points, on this rank alone."""
+    """Storage for a number of points, on this rank."""
 
     def __init__(self, capacity: int) -> None:
         self.capacity = capacity
         self._mesh = mesh.create_interval(MPI.COMM_SELF, capacity, (0.0, 1.0))
         order = fem.functionspace(self._mesh, ("DG", 0)).dofmap.list[:, 0]
-        self._cells = np.argsort(order).astype(np.int32)  # point p is where the p-th value is
+        self._cells = np.argsort(order).astype(np.int32)  # the cell of the p-th value
         self._values = np.empty(0)
         self._constants: list[tuple[NDArray[np.float64], NDArray[np.float64]]] = []  # views: here, and what is copied
 
     def field(self, size: int) -> fem.Function:
-        """A vector at each point, its array (capacity * size,) to be filled."""
+        """A vector at each point; the caller fills its array (capacity * size,)."""
         return fem.Function(fem.functionspace(self._mesh, ("DG", 0, (size,))))
 
     def constant(self, of: fem.Constant) -> fem.Constant:
-        """The same numbers at all points: those that another constant has when it is evaluated."""
+        """A constant here that takes the value of another constant at every evaluation."""
         here = fem.Constant(self._mesh, of.value)
         self._constants.append((here.value, of.value))
         return here
@@ -56,9 +56,9 @@ class Points:
 
 @dataclass(frozen=True)
 class Pairs:
-    """Which blocks (3, 3) of a Hessian there are: d2W/dz_i dz_j for parts i, j of z, on one or two sides.
+    """The nonzero blocks (3, 3) of a Hessian: d2W/dz_i dz_j for parts i, j of z, on one or two sides.
 
-    A block and its transpose are held by their symmetric and their skew part.
+    A block and its transpose are stored as symmetric and skew part.
 
     Attributes
     ----------
@@ -94,7 +94,7 @@ def point_hessian(
     Parameters
     ----------
     z
-        Field of `parts` vectors, of twice as many where there are two sides.
+        Field of `parts` vectors, or twice as many for two sides.
     comm
         All its ranks compile together.
 

@@ -1,4 +1,4 @@
-"""Terms on one finite-element space, as the system that the solvers see."""
+"""The sum of terms on a finite-element space, as a system for the solvers."""
 
 from collections.abc import Mapping, Sequence
 from typing import Protocol
@@ -20,51 +20,51 @@ from magshell_fenicsx.platform import compat
 
 
 class TangentAssembler(Protocol):
-    """A way to the tangent other than the terms' own forms."""
+    """Computes the tangent without the terms' forms."""
 
     def tangent(
         self, factors: Mapping[str, float], stress: Sequence[tuple[float, NDArray[np.float64]]] = ()
     ) -> PETSc.Mat:
-        """The matrix of the terms with these factors, by name, at the u that they were written with.
+        """The matrix of the terms with these factors, by name, at the present u.
 
-        `stress` is as that of `System.tangent`, of displacements with ghosts.
+        `stress` is that of `System.tangent`, of displacements with ghosts.
         """
 
 
 class ResidualAssembler(Protocol):
-    """A way to the residual other than the terms' own forms.
+    """Computes the residual of some terms without their forms.
 
     Attributes
     ----------
     names
-        Of the terms that it serves.
+        Names of these terms.
     """
 
     names: frozenset[str]
 
     def add(self, b: NDArray[np.float64], factors: Mapping[str, float]) -> None:
-        """Add the gradients of the terms with these factors, by name, at the u that they were written with."""
+        """Add the gradients of the terms with these factors, by name, at the present u."""
 
 
 class FiniteElementSystem:
-    """Sum of terms for a displacement u that is held.
+    """Sum of terms for a displacement u with supports.
 
     Parameters
     ----------
     u
-        The displacement that the terms were written with; it is overwritten.
+        The displacement in the terms' forms; it is overwritten.
     held
-        Where u, or a component of it in any direction, is zero.
+        Supports: where u, or a component of it in any direction, is zero.
     pattern
-        The term with the widest coupling: its tangent's sparsity is that of the sum.
+        The term with the widest coupling; it determines the sparsity of the tangent.
     length
         See `System`.
     assembler
-        Makes the tangent with the same conditions, instead of the terms' forms.
+        Computes the tangent with the same supports, instead of the terms' forms.
     gradients
-        Makes the residual, instead of the terms' forms.
+        Computes the residual, instead of the terms' forms.
     parameters
-        Those that enter terms freely, by name.
+        Free parameters of terms, by name.
     """
 
     def __init__(
@@ -104,7 +104,7 @@ class FiniteElementSystem:
             self._K.setOption(PETSc.Mat.Option.SYMMETRIC, True)
 
     def set(self, u: Vector) -> None:
-        """Put a displacement into the Function that the terms see."""
+        """Copy a displacement into the Function of the terms."""
         self.u.x.array[: self.size] = u
         self.u.x.scatter_forward()
 
@@ -113,7 +113,7 @@ class FiniteElementSystem:
         return np.array(self.u.x.array)
 
     def held(self, u: Vector) -> Vector:
-        """A displacement with zeros where it is held."""
+        """The displacement with zeros at the supports."""
         u = np.array(u)
         self._hold(u)
         return u
@@ -124,7 +124,7 @@ class FiniteElementSystem:
             self.projection.project(u)
 
     def place(self, mu: Amplitudes) -> None:
-        """Put the free parameters into the terms."""
+        """Set the free parameters of the terms."""
         for name, parameter in self.parameters.items():
             parameter.constant.value = mu[name]
 
@@ -169,7 +169,7 @@ class FiniteElementSystem:
         return float(self.comm.allreduce(here))
 
     def accept(self, u: Vector) -> None:
-        """Take u for a point of the path, from which whole turns of moments are counted on."""
+        """Accept u as a point of the path; moments count full turns from here."""
         self.set(u)
         for term in self.terms:
             term.accept()
@@ -180,7 +180,7 @@ class FiniteElementSystem:
         return {t.name: float(self.comm.allreduce(t.energy())) for t in self.terms}
 
     def integral(self, u: Vector, form: fem.Form) -> float:
-        """Of a compiled form in the displacement, over all ranks."""
+        """The value of a compiled form at a displacement, summed over all ranks."""
         self.set(u)
         return float(self.comm.allreduce(fem.assemble_scalar(form)))
 
@@ -209,7 +209,7 @@ class FiniteElementSystem:
     def _gradient(
         self, u: Vector, factors: Mapping[str, float], besides: Sequence[tuple[float, Term]] = ()
     ) -> NDArray[np.float64]:
-        """Of the terms with these factors, by name, and of others."""
+        """The gradient of the terms with these factors, by name, plus further terms."""
         with self.assembly:
             self.set(u)
             b = self._b.x.array

@@ -1,4 +1,4 @@
-"""The matrix of a field of vectors, filled from the cells' matrices and from what couples neighbouring cells."""
+"""The matrix of a vector field, assembled from the matrices of cells and of interior edges."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -23,7 +23,7 @@ FUNCTIONS = """
 class BlockMatrix:
     """A symmetric matrix; clamped degrees of freedom have ones on the diagonal and zeros beside it.
 
-    Its values are one array that PETSc shares: nothing is listed, sorted or copied when it is assembled.
+    PETSc shares the array of its values, so assembly copies and sorts nothing.
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ class BlockMatrix:
             self._K.setOption(option, True)
 
     def clear(self) -> None:
-        """Begin anew."""
+        """Set all values to zero."""
         self._values[:] = 0
 
     def add_cells(self, K: Array) -> None:
@@ -76,12 +76,12 @@ class BlockMatrix:
         ----------
         K
             (cells, 9, pairs a <= b of functions): the symmetric parts of the blocks at a, b, components in the
-            order of `points.COMPONENTS`, then their skew parts in that of `points.SKEW`.
+            order of `point_kernels.COMPONENTS`, then their skew parts in that of `point_kernels.SKEW`.
         """
         self._scatter("same", self._cells, self._blocks, K)
 
     def add_coupling(self, batch: int, K: Array) -> None:
-        """Add, and its transpose too, what couples the two cells of each pair of a batch.
+        """Add the blocks that couple the two cells of each pair of a batch, and their transposes.
 
         Parameters
         ----------
@@ -91,7 +91,7 @@ class BlockMatrix:
         self._scatter("cross", *self._coupled[batch], self._coupling_blocks[batch], K)
 
     def assemble(self) -> PETSc.Mat:
-        """The matrix, the ranks' parts added up; it is the same object every time. Collective."""
+        """The matrix, summed over the ranks; always the same object. Collective."""
         self._values[self._zeros] = 0
         self._pattern.add_ghosts(self._values)
         self._values[self._ones] = 1
@@ -109,7 +109,7 @@ class BlockMatrix:
         add(values, starts, self._pattern.owned, entities, functions, *map(pointer, arrays))
 
     def _free_pairs(self) -> Iterator[tuple[Ints, Ints]]:
-        """Pairs of nodes with a block: a clamped node has but its own."""
+        """Pairs of nodes with a block; a clamped node has only its diagonal block."""
         for rows, columns in self._together():
             i, j = _pairs(rows, columns)
             free = ~(self._wholly[i] | self._wholly[j])
@@ -122,7 +122,7 @@ class BlockMatrix:
             yield there, here
 
     def _held_entries(self, held: NDArray[np.bool_]) -> tuple[Longs, Longs]:
-        """The entries of this rank in rows and columns that are held, and those of them that are its diagonal."""
+        """This rank's entries in clamped rows and columns, and the diagonal ones among them."""
         some, own = np.array(held.any(axis=1)), np.arange(self._pattern.owned, dtype=np.int32)
         keys = [own[some[own]] * (len(held) + np.int64(1))]
         for i, j in self._free_pairs():
@@ -135,6 +135,6 @@ class BlockMatrix:
 
 
 def _pairs(rows: Ints, columns: Ints) -> tuple[Ints, Ints]:
-    """(entities, functions, functions) all pairs of an entity's nodes."""
+    """All pairs of an entity's nodes, (entities, functions, functions)."""
     i, j = np.broadcast_arrays(rows[:, :, None], columns[:, None, :])
     return i, j

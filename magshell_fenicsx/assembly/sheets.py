@@ -1,4 +1,4 @@
-"""Vector fields at the same reference points of all cells: one matrix product there, one back."""
+"""Evaluation of vector fields at the same reference points of all cells, and its transpose, by matrix products."""
 
 from collections.abc import Sequence
 
@@ -13,12 +13,12 @@ Array = NDArray[np.float64]
 class Sheet:
     """Some of a field's derivatives at points of every cell, in the order (cell; point, part, component).
 
-    The shape functions' table is expanded to vectors: three times the arithmetic, but nothing is sorted.
+    The table of shape functions is expanded to vectors. This triples the arithmetic but avoids sorting.
 
     Parameters
     ----------
     parts
-        Which of a `Table`'s derivatives.
+        The chosen derivatives of a `Table`.
     """
 
     def __init__(self, table: Table, weights: Array, parts: Sequence[int]) -> None:
@@ -28,9 +28,9 @@ class Sheet:
         self._back = np.einsum("q,qpf,cd->qpdfc", weights, D, one).reshape(-1, size)
 
     def at_points(self, nodal: Array, out: Array) -> None:
-        """Fill as many numbers, in any shape, from nodal vectors (cells, functions * 3)."""
+        """Write the values at the points to `out`, in any shape, from nodal vectors (cells, functions * 3)."""
         np.matmul(nodal, self._there, out=out.reshape(-1, self._there.shape[1]))
 
     def at_nodes(self, gradients: Array) -> Array:
-        """(cells, functions * 3): the weighted sum over points of gradients, in any shape."""
+        """The weighted sum (cells, functions * 3) over points of gradients, in any shape."""
         return np.asarray(gradients.reshape(-1, len(self._back)) @ self._back)

@@ -1,7 +1,7 @@
-"""Nodes that are held along any direction: the unknowns beside it are those of a projection.
+"""Supports in any direction, imposed by a projection.
 
-With the projector P of every such node, u stands for P u. The residual becomes P b and the tangent
-P K P + (I - P): its inertia is that of K among the displacements that are allowed.
+With the projector P of every such node, u is replaced by P u. The residual becomes P b and the tangent
+P K P + (I - P), whose number of negative eigenvalues is that of K for admissible displacements.
 """
 
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 
 Array = NDArray[np.float64]
-SAME = 1e-6  # sine of the angle between directions that are taken for one
+SAME = 1e-6  # directions at an angle with a smaller sine are equal
 
 
 @dataclass(frozen=True)
@@ -38,12 +38,12 @@ def held_along(V: fem.FunctionSpace, dim: int, entities: NDArray[np.int32], norm
 
 
 class Projection:
-    """Displacements -> those that some nodes may have.
+    """The projection of displacements onto the admissible ones.
 
     Parameters
     ----------
     clamped
-        What holds components, perhaps of the same nodes.
+        Conditions on components, possibly at the same nodes.
     """
 
     def __init__(self, V: fem.FunctionSpace, sliding: Sequence[Sliding], clamped: Sequence[fem.DirichletBC]) -> None:
@@ -63,13 +63,13 @@ class Projection:
         self._K: PETSc.Mat | None = None
 
     def project(self, u: Array) -> None:
-        """Overwrite a vector of own nodes, or of those and ghosts."""
+        """Project a vector of owned nodes, with or without ghosts, in place."""
         here = self._nodes < len(u) // 3
         nodes, x = self._nodes[here], u.reshape(-1, 3)
         x[nodes] = np.einsum("nij,nj->ni", self._P[here], x[nodes])
 
     def tangent(self, K: PETSc.Mat) -> PETSc.Mat:
-        """P K P + (I - P); the same object every time. Collective."""
+        """P K P + (I - P); always the same object. Collective."""
         if self._by_node is None:
             self._by_node, self._rest = self._blocks(self._P, 1.0), self._blocks(np.eye(3) - self._P, 0.0)
         self._K = K.ptap(self._by_node, self._K)
@@ -79,13 +79,13 @@ class Projection:
         return self._K
 
     def mass(self, M: PETSc.Mat) -> PETSc.Mat:
-        """P M P: what is held has no finite eigenvalue. Collective."""
+        """P M P; held directions then have no finite eigenvalue. Collective."""
         found = M.ptap(self._blocks(self._P, 1.0))
         found.setOption(PETSc.Mat.Option.SYMMETRIC, True)
         return found
 
     def _blocks(self, blocks: Array, elsewhere: float) -> PETSc.Mat:
-        """The matrix of blocks of own nodes, and of a number at the others."""
+        """The block-diagonal matrix with blocks at these nodes and a number on the diagonal elsewhere."""
         n, first = 3 * self._owned, 3 * self._first
         mat = PETSc.Mat().createAIJ(((n, None), (n, None)), nnz=(3, 0), comm=self._comm)
         here = self._nodes < self._owned
@@ -100,7 +100,7 @@ class Projection:
 
 
 def _beside(directions: Array) -> Array:
-    """(3, 3) projector onto what is normal to all directions (n, 3)."""
+    """The (3, 3) projector onto the complement of the directions (n, 3)."""
     _, sizes, axes = np.linalg.svd(directions)
     along = axes[: len(sizes)][sizes > SAME]
     return np.asarray(np.eye(3) - along.T @ along)

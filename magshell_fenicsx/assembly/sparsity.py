@@ -1,4 +1,4 @@
-"""Where the (3, 3) blocks of a distributed matrix lie: every rank has the rows of its own nodes."""
+"""The sparsity pattern of (3, 3) blocks of a distributed matrix; every rank has the rows of its own nodes."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -14,12 +14,12 @@ Longs = NDArray[np.int64]
 
 
 class Pattern:
-    """Which blocks there are on this rank, in an order that serves PETSc and communication.
+    """The blocks of this rank, in an order that suits PETSc and communication.
 
-    First those that couple this rank's n own nodes, row by row; then those of own nodes with others'
-    nodes; then those in the rows of ghosts, to be added to the ranks that own them. These 2 n + ghosts
-    rows of blocks are one matrix in compressed sparse rows, a block's three rows one after the other.
-    Making it is collective.
+    First come the blocks that couple this rank's n own nodes, row by row; then those that couple own nodes with nodes
+    of other ranks; then those in the rows of ghosts, which are added on the owning ranks. These 2 n + ghosts rows of
+    blocks form one matrix in compressed sparse rows, the three rows of a block one after the other. The constructor is
+    collective.
 
     Parameters
     ----------
@@ -68,19 +68,19 @@ class Pattern:
         self._leave, self._arrive = (self._entries(*at).ravel() for at in (self._at(*leaving), came))
 
     def blocks(self, i: Ints, j: Ints) -> Ints:
-        """Numbers of the blocks of pairs of local nodes; -1 where there is none."""
+        """Numbers of the blocks of pairs of local nodes; -1 for a missing block."""
         return self._find(*self._at(i, j))
 
     def entries(self, i: Ints, j: Ints) -> Longs:
-        """Where the entries (pairs, 3, 3) of the blocks of pairs of local nodes are in an array of all."""
+        """Indices (pairs, 3, 3) of the entries of the blocks of pairs of local nodes in the array of values."""
         return self._entries(*self._at(i, j))
 
     def add_ghosts(self, values: NDArray[np.float64]) -> None:
-        """Add what all ranks have in the rows of ghosts to where it belongs. Collective."""
+        """Add the rows of ghosts to the rows of their owners. Collective."""
         np.add.at(values, self._arrive, self._exchange(values[self._leave], 9))
 
     def csr(self, first: int, last: int) -> tuple[Ints, Ints]:
-        """The entries of some rows of blocks in compressed sparse rows: where each row starts, and its columns."""
+        """Some rows of blocks in compressed sparse rows: the start of each row, and the columns."""
         starts = self.starts[first : last + 1]
         columns = self.columns[starts[0] : starts[-1]]
         nothing = np.zeros((len(columns), 3, 3), dtype=np.int8)
@@ -108,7 +108,7 @@ class Pattern:
         return np.asarray(first[:, None, None] + c[:, None] * width[:, None, None] + c)
 
     def _exchange(self, values: NDArray[Any], size: int) -> NDArray[Any]:
-        """Values, `size` for each block, from those who have them to those to whom they belong. Collective."""
+        """Send values, `size` for each block, to the owners of the rows. Collective."""
         values = np.ascontiguousarray(values)
         came = np.empty(size * int(self._received.sum()), dtype=values.dtype)
         self._comm.Alltoallv([values, size * self._sent], [came, size * self._received])
@@ -116,7 +116,7 @@ class Pattern:
 
 
 def _blocks(rows: Ints, columns: Ints, shape: tuple[int, int]) -> "scipy.sparse.csr_array":
-    """Each place once, sorted; the values mean nothing."""
+    """A matrix with each position once, sorted; its values have no meaning."""
     found = scipy.sparse.coo_array((np.zeros(len(rows), dtype=np.int8), (rows, columns)), shape=shape).tocsr()
     found.sum_duplicates()
     return found

@@ -12,11 +12,11 @@ from petsc4py import PETSc
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.platform import compat
 
-Density = TypeVar("Density")  # whatever a form is made from
+Density = TypeVar("Density")  # the type of a form's density
 
 
 class Term(Protocol):
-    """What a problem sums; `amplitude` names the load factor mu of mu Pi(u), or is None for 1."""
+    """A summand of a problem; `amplitude` is the name of mu in mu Pi(u), or None for mu = 1."""
 
     @property
     def name(self) -> str: ...
@@ -28,16 +28,16 @@ class Term(Protocol):
         """Pi(u) on this rank's part."""
 
     def accept(self) -> None:
-        """Take the present u for a point of the path: what counts turns counts from here."""
+        """Accept the present u as a point of the path; turns are counted from here."""
 
     def compile_residual(self) -> None:
-        """Compile what `add_residual` takes."""
+        """Compile the form of `add_residual`."""
 
     def add_residual(self, b: NDArray[np.float64], factor: float) -> None:
         """Add factor dPi/du to the local vector (ghosts included)."""
 
     def compile_tangent(self) -> None:
-        """Compile what `add_tangent` takes."""
+        """Compile the form of `add_tangent`."""
 
     def add_tangent(self, K: PETSc.Mat, factor: float, clamped: list[fem.DirichletBC]) -> None:
         """Add factor d2Pi/du2."""
@@ -51,7 +51,7 @@ class FormTerm:
     Attributes
     ----------
     residual_form, tangent_form
-        Compiled when they are first asked for; no tangent for a linear energy.
+        Compiled on first use; None for the tangent of a linear energy.
     """
 
     def __init__(
@@ -104,7 +104,7 @@ class FormTerm:
 
 
 class DensityTerm(FormTerm, Generic[Density]):
-    """A form with the density that it came from."""
+    """A form that keeps its density."""
 
     def __init__(
         self,

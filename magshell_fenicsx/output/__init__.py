@@ -1,1 +1,1 @@
-"""What a run leaves: tables and checkpoints, fields, pictures, a report."""
+"""The output of a run: tables and checkpoints, fields, pictures, a report."""

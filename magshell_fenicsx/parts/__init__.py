@@ -1,1 +1,1 @@
-"""What a case is made of: the base of all sections, and parts that bring an energy with all that belongs to it."""
+"""The sections of a case: their base class, and parts that add an energy to the model."""

@@ -19,18 +19,18 @@ Stiffness = Annotated[float, Field(gt=0)]
 class Foundation(Part):
     """Winkler foundation: springs with the energy k w²/2 per undeformed area, w = -u·n0 the inward displacement.
 
-    They push and pull. On a solid they are on the outer face.
+    The springs resist tension and compression. On a solid they act on the outer face.
     """
 
     stiffness: Annotated[float, or_number("newton/metre**3", Stiffness), Field(gt=0)]
     """k, a force per area and displacement [E/R; force/length³]"""
 
     quantities = (
-        Quantity("foundation", "stiffness", "Of the foundation, k.", "load", "k R²/(E h)", "E h/R²", "N/m³"),
+        Quantity("foundation", "stiffness", "Stiffness k of the foundation.", "load", "k R²/(E h)", "E h/R²", "N/m³"),
         Quantity(
             "foundation_force",
             "reaction",
-            "Of the foundation, ∫ k w dA, positive outwards.",
+            "Reaction of the foundation, ∫ k w dA, positive outwards.",
             "load",
             "F_k R/(2πD)",
             "2πD/R",
@@ -51,10 +51,10 @@ class Foundation(Part):
 
 
 def energy(r0: Jet, u: Jet, force: Expr) -> Expr:
-    """Of k = 1."""
+    """The energy density for k = 1."""
     return ufl.dot(u.r, kin.normal(r0)) ** 2 / 2
 
 
 def reaction(r0: Jet, u: Jet, force: Expr) -> Expr:
-    """Of k = 1, over the unit of the force."""
+    """The density of the reaction for k = 1, over the unit of the force."""
     return -ufl.dot(u.r, kin.normal(r0)) / force

@@ -1,4 +1,4 @@
-"""A part of a case that brings its own energies."""
+"""The base of parts: sections of a case that add energies."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from magshell_fenicsx.quantities.registry import register
 
 @dataclass(frozen=True)
 class Scales:
-    """What the numbers of a case are over: R, h and E in the case's units, of a case without lengths 1, h/R and 1."""
+    """The scales of a case: R, h and E in its units; 1, h/R and 1 for a case without lengths."""
 
     R: float
     h: float
@@ -30,16 +30,16 @@ class Scales:
 class Part(Section):
     """A section of the case file whose energies are integrals over the mid-surface.
 
-    A subclass is one file and one line of `registered.py`. Its docstring and those of its keys are its lines in
-    docs/case.md. What its densities depend on, the symmetry that they leave and their derivatives are found from
-    them, see `OwnTerm`; so a part is there in every model.
+    A subclass needs one file and one line in `registered.py`. Its docstring and those of its keys appear in
+    docs/case.md. `OwnTerm` finds the arguments, the symmetry and the derivatives of its densities, so a part works in
+    every model.
 
     Attributes
     ----------
     quantities
-        The columns that it adds to path.csv: one with the name of each term, its amplitude, and what terms observe.
+        The columns that it adds to path.csv: the amplitude of each term under its name, and the observed integrals.
     absent
-        What `magshell check` lists as left out where a case does not have the part.
+        The line of `magshell check` for a case without the part.
     """
 
     quantities: ClassVar[tuple[Quantity, ...]]
@@ -50,9 +50,9 @@ class Part(Section):
         register(cls.quantities)
 
     def terms(self, scales: Scales) -> Sequence[OwnTerm]:
-        """Its energies, with the values of their amplitudes."""
+        """The energies, with the values of their amplitudes."""
         raise NotImplementedError
 
     def account(self, scales: Scales) -> str:
-        """What `magshell check` lists as built."""
+        """The line of `magshell check` for a case with the part."""
         raise NotImplementedError

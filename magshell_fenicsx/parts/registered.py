@@ -1,4 +1,4 @@
-"""The parts that a case can have: a line for each."""
+"""The list of all parts."""
 
 from importlib import import_module
 from inspect import cleandoc
@@ -25,7 +25,7 @@ def _meaning(part: type[Part]) -> str:
 
 if TYPE_CHECKING:
     WithParts = Section
-else:  # the keys of all parts, each of which a case may leave out
+else:  # an optional key for each part
     WithParts = create_model(
         "WithParts",
         __base__=Section,

@@ -1,4 +1,4 @@
-"""What all sections of a case share: strict types, no unknown keys, numbers with units."""
+"""The base of all sections of a case: strict types, no unknown keys, numbers with units."""
 
 import re
 from collections.abc import Callable, Iterator
@@ -10,7 +10,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 if TYPE_CHECKING:
     import pint
 
-# one number, then units; pint itself would compute any formula, 9**9**9 included
+# one number, then units; pint alone would evaluate any formula, even 9**9**9
 _NUMBER = r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?"
 _UNIT = r"[^\W\d]+(\s*(\*\*|\^)\s*-?[0-9])?"
 _NUMBER_AND_UNITS = re.compile(rf"\s*{_NUMBER}[\s*]*{_UNIT}([\s*/]+{_UNIT})*\s*")
@@ -18,7 +18,7 @@ _NUMBER_AND_UNITS = re.compile(rf"\s*{_NUMBER}[\s*]*{_UNIT}([\s*/]+{_UNIT})*\s*"
 
 @cache
 def _units() -> "pint.UnitRegistry":
-    """Made for the first number with a unit: most cases have none, and pint takes long to import."""
+    """Pint's units, imported on first use: the import is slow, and most cases have no units."""
     import pint
 
     return pint.UnitRegistry()
@@ -27,7 +27,7 @@ def _units() -> "pint.UnitRegistry":
 class Section(BaseModel):
     """A section of the case file.
 
-    The docstring of a key is its line in docs/case.md and in the schema; what it is in stands in brackets at its end.
+    The docstring of a key appears in docs/case.md and in the schema; its unit is in brackets at the end.
     """
 
     model_config = ConfigDict(
@@ -36,7 +36,7 @@ class Section(BaseModel):
 
 
 def with_unit(unit: str) -> Any:
-    """What the schema says of text with a unit; names of units are checked by pint alone."""
+    """The schema of text with a unit; only pint checks the names of units."""
     return Annotated[str, Field(pattern=rf"^\s*{_NUMBER}[\s*]*[^\s\d*]", examples=[_example(unit)])]
 
 
@@ -61,14 +61,14 @@ def _converted(value: str, unit: str) -> float:
         return float(quantity.to(unit).magnitude)
     except pint.DimensionalityError as e:
         raise ValueError(f"is not convertible to {unit}: it has the dimension {e.dim1}") from None
-    except Exception:  # pint raises many kinds for text that is no quantity
+    except Exception:  # pint raises many types for invalid text
         raise ValueError(f'is not a number with a unit such as "{_example(unit)}"') from None
 
 
 def in_units(unit: str, *, bare: bool = False) -> Callable[[Any], float]:
     """A validator: text with a unit -> a float in `unit`; a number stays as it is.
 
-    With `bare`, the text is the unit alone, and is turned into its size.
+    With `bare`, the text is a unit without a number, and the result is its size.
     """
 
     def convert(value: Any) -> Any:
@@ -80,15 +80,15 @@ def in_units(unit: str, *, bare: bool = False) -> Callable[[Any], float]:
 
 
 def or_number(unit: str, number: Any = float) -> BeforeValidator:
-    """A validator: a number as it is, or text with a unit in `unit`; `number` is the type that the schema tells."""
+    """A validator: a number unchanged, or text converted to `unit`; `number` is its type in the schema."""
     return BeforeValidator(in_units(unit), json_schema_input_type=number | with_unit(unit))
 
 
-NAMES = {"at", "edge", "over", "kind", "control", "until", "radius"}  # text without being quantities
+NAMES = {"at", "edge", "over", "kind", "control", "until", "radius"}  # keys with text that is no quantity
 
 
 def texts(part: Any, path: str = "") -> Iterator[str]:
-    """Where in plain data numbers stand as text, with a unit."""
+    """The keys of plain data whose numbers are text with a unit."""
     for key, value in part.items() if isinstance(part, dict) else enumerate(part if isinstance(part, list) else []):
         if isinstance(value, str) and key not in NAMES:
             yield f"{path}{key}"

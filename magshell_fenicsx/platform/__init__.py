@@ -1,1 +1,1 @@
-"""Versions, ranks, terminal: what differs between machines."""
+"""Versions, ranks, terminal: everything that differs between machines."""

@@ -1,4 +1,4 @@
-"""The calls into dolfinx and PETSc that differ between dolfinx 0.9, 0.10 and 0.11; nothing else knows a version."""
+"""The calls that differ between dolfinx 0.9, 0.10 and 0.11; no other module depends on a version."""
 
 from typing import Any
 
@@ -26,14 +26,14 @@ def shared_facets() -> Any:
 
 
 def interpolation_points(V: fem.FunctionSpace) -> NDArray[np.float64]:
-    """Where on the reference cell the nodes of a Lagrange space are; (n, dim)."""
+    """The nodes (n, dim) of a Lagrange space on the reference cell."""
     points = V.element.interpolation_points  # a method in dolfinx 0.9
     return np.asarray(points() if callable(points) else points)
 
 
 def corner_numbers(domain: mesh.Mesh) -> NDArray[np.int32]:
     """Rows of `geometry.x` at each cell's nodes; (cells, nodes)."""
-    dofmaps = getattr(domain.geometry, "dofmaps", None)  # a list since dolfinx 0.11, which warns of `dofmap`
+    dofmaps = getattr(domain.geometry, "dofmaps", None)  # a list since dolfinx 0.11, where `dofmap` is deprecated
     return np.asarray(dofmaps[0] if isinstance(dofmaps, list) else domain.geometry.dofmap)
 
 

@@ -1,4 +1,4 @@
-"""What the program runs on: versions, the BLAS that PETSc found, the kernel cache."""
+"""The environment of the program: versions, the BLAS of PETSc, the kernel cache."""
 
 import platform
 import re
@@ -15,7 +15,7 @@ FAST_BLAS = re.compile(r"/lib(openblas|mkl_rt|mkl_core|blis|flexiblas|armpl)[^/]
 
 
 def versions() -> dict[str, str]:
-    """Versions that a result depends on."""
+    """Versions of the packages that a result depends on."""
     return {
         "magshell_fenicsx": __version__,
         "dolfinx": dolfinx.__version__,
@@ -26,7 +26,7 @@ def versions() -> dict[str, str]:
 
 
 def fast_blas() -> str | None:
-    """Name of the optimised BLAS in this process; None if it is the reference one.
+    """Name of the optimised BLAS in this process; None for the reference BLAS.
 
     With the reference BLAS a factorisation takes seven times as long.
     """
@@ -39,5 +39,5 @@ def fast_blas() -> str | None:
 
 
 def kernel_cache() -> str:
-    """Where compiled kernels are kept."""
+    """The folder of the compiled kernels."""
     return str(get_options()["cache_dir"])

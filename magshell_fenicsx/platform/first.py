@@ -1,4 +1,4 @@
-"""What rank 0 does for all ranks: nobody waits for a rank that has failed."""
+"""Work that rank 0 does for all ranks; if it fails, all ranks fail together."""
 
 import pickle
 from collections.abc import Callable
@@ -10,12 +10,12 @@ T = TypeVar("T")
 
 
 def from_first(comm: MPI.Comm, do: Callable[[], T]) -> T:
-    """What rank 0 gets from `do`, on every rank; where it raises there, every rank raises the same. Collective.
+    """Call `do` on rank 0 and return its result on every rank; collective.
 
     Raises
     ------
     Exception
-        On every rank, whatever `do` raises on rank 0.
+        On every rank, the exception that `do` raises on rank 0.
     """
     if comm.size == 1:
         return do()
@@ -27,7 +27,7 @@ def from_first(comm: MPI.Comm, do: Callable[[], T]) -> T:
             failure, sent = e, _pickled(e)
     sent = comm.bcast(sent)
     if failure:
-        raise failure  # with the place where it came from
+        raise failure  # with its traceback
     found: T
     found, failure = pickle.loads(sent)
     if failure:
@@ -36,7 +36,7 @@ def from_first(comm: MPI.Comm, do: Callable[[], T]) -> T:
 
 
 def _pickled(e: Exception) -> bytes:
-    """An error that other ranks can raise: the same if it can be sent."""
+    """An error for the other ranks: the same one if it can be pickled."""
     try:
         sent = pickle.dumps((None, e))
         pickle.loads(sent)

@@ -1,4 +1,4 @@
-"""Which code a result comes from: what is kept of one is not taken for a result of another."""
+"""The code that computed a result; results of other code are not reused."""
 
 import hashlib
 from pathlib import Path
@@ -9,10 +9,7 @@ SUFFIXES = {".py", ".c", ".html"}
 
 
 def hashed(folder: Path) -> str:
-    """Version and hash of a package's files, wherever it is installed.
-
-    Comments count too: what can change a number is not for a program to say.
-    """
+    """Version and hash of a package's files, comments included, independent of where it is installed."""
     found = hashlib.sha256()
     for file in sorted(folder.rglob("*")):
         if file.suffix in SUFFIXES:
@@ -21,9 +18,9 @@ def hashed(folder: Path) -> str:
     return f"{__version__}+{found.hexdigest()[:16]}"
 
 
-_OURS = hashed(Path(__file__).parents[1])  # at the import, for that is the code that runs, whatever is edited later
+_OURS = hashed(Path(__file__).parents[1])  # hashed at import: files may be edited during a run
 
 
 def ours() -> str:
-    """Of the code that runs, such as 0.1.0+3f2a9c1b2d3e4f50."""
+    """Version and hash of the running code, such as 0.1.0+3f2a9c1b2d3e4f50."""
     return _OURS

@@ -1,4 +1,4 @@
-"""One line at the foot of a terminal that is rewritten in place, under lines that stay."""
+"""A status line at the foot of a terminal, rewritten in place below the printed lines."""
 
 import os
 import shutil
@@ -10,17 +10,22 @@ from types import FrameType
 
 Say = Callable[[str], None]
 ERASED = "\r\x1b[K"
-ROOM = 3  # columns for the ^C of an interrupt: a full line would wrap, and could not be erased
-# mpirun gives even a single rank a terminal of its own, whatever stands behind it
+ROOM = 3  # columns for the ^C of an interrupt; a full line would wrap and could not be erased
+# mpirun gives every rank a terminal, even if its own output is a file
 LAUNCHERS = {"OMPI_COMM_WORLD_SIZE", "PMI_SIZE", "PMIX_RANK"}
+
+
+def print_line(line: str) -> None:
+    """Print a line at once, also into a file."""
+    print(line, flush=True)
 
 
 @contextmanager
 def live_line(ranks: int, say: Say) -> Iterator[tuple[Say, Say | None]]:
-    """Two functions: one that prints a line that stays, one that rewrites the line at the foot.
+    """Two functions: the first prints a line, the second rewrites the status line.
 
-    Where standard output is no terminal, or a run on several ranks, they are `say` and None. Nothing of the line
-    is left after `with`, nor after a SIGTERM that ends the process.
+    They are `say` and None if standard output is no terminal or there are several ranks. The status line is erased
+    after `with`, and also when SIGTERM ends the process.
     """
     if ranks > 1 or LAUNCHERS & os.environ.keys() or not sys.stdout.isatty() or os.environ.get("TERM") == "dumb":
         yield say, None
@@ -36,7 +41,7 @@ def live_line(ranks: int, say: Say) -> Iterator[tuple[Say, Say | None]]:
         print(f"{ERASED}{foot}", end="", flush=True)
 
     def end(number: int, frame: FrameType | None) -> None:
-        os.write(sys.stdout.fileno(), ERASED.encode())  # the stream may be in the middle of a line
+        os.write(sys.stdout.fileno(), ERASED.encode())  # the stream may be in use
         signal.signal(number, before)
         signal.raise_signal(number)
 

@@ -1,1 +1,1 @@
-"""What varies and what is observed: names, symbols, units and meanings, one source for all that shows them."""
+"""The quantities of a run: names, symbols, units and meanings, defined once for all outputs."""

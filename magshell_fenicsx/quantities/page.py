@@ -7,17 +7,17 @@ from magshell_fenicsx.quantities.registry import AMPLITUDES, QUANTITIES
 HEAD = """
 ## The columns of path.csv
 
-One row for each accepted point. The numbers have no units: multiply one by the size of one to get the quantity in SI.
-Named points add `NAME_ux`, `NAME_uy` and `NAME_uz`, in the unit of the shell's lengths. One's own energies add a column
-of their name, their amplitude.
+One row for each accepted point. The numbers are dimensionless: multiply a number by its unit to get the quantity in SI.
+Named points add `NAME_ux`, `NAME_uy` and `NAME_uz`, in the unit of the shell's lengths. A user-defined energy adds a
+column with its name: its amplitude.
 """
 AMPLITUDES_HEAD = """
-The column `amplitude` says what varied:
+The column `amplitude` names the amplitude that varied:
 """
 
 
 def columns_page() -> str:
-    """Two tables in Markdown."""
+    """Both tables in Markdown."""
     columns = [
         (f"`{q.name}`", f"{q.html} {q.note}".strip() if q.symbol else q.words, q.unit, q.si, q.meaning)
         for q in QUANTITIES.values()
@@ -26,9 +26,9 @@ def columns_page() -> str:
     return "\n".join(
         [
             HEAD,
-            *_table(("column", "label", "size of one", "SI", "meaning"), columns),
+            *_table(("column", "label", "unit", "SI unit", "meaning"), columns),
             AMPLITUDES_HEAD,
-            *_table(("amplitude", "column of its value", "displacement that its curve shows"), amplitudes),
+            *_table(("amplitude", "column of its value", "displacement of its curve"), amplitudes),
             "",
         ]
     )

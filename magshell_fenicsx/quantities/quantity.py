@@ -1,4 +1,4 @@
-"""A quantity that is observed along a path, an amplitude that varies, and how their symbols are spelled."""
+"""A quantity observed along a path, an amplitude that varies, and the spelling of their symbols."""
 
 import re
 from collections.abc import Mapping
@@ -17,19 +17,19 @@ class Quantity:
     Attributes
     ----------
     name
-        Of the column.
+        Name of the column.
     words
-        What it is called beside an axis and above a column.
+        Name for axes and headings.
     meaning
-        What it is, in one sentence.
+        Definition in one sentence.
     symbol
-        As "λ_m": Greek letters and powers as such, an index after "_"; empty where there is none.
+        For example "λ_m": Greek letters and powers in Unicode, an index after "_"; empty if there is no symbol.
     unit, si
-        What a value of one is without units, and the unit of that in SI; empty for a pure number.
+        The unit as a formula such as "E h R²", and that unit in SI; empty for a pure number.
     note
-        What tells it from others with the same symbol, to stand after words or symbol.
+        Distinguishes quantities with the same symbol; follows the words or the symbol.
     sign
-        Of its value on an axis.
+        Sign of its value on an axis.
     """
 
     name: str
@@ -78,36 +78,36 @@ class Quantity:
 
     @property
     def shown_unit(self) -> str:
-        """The unit that stands beside a value; a symbol such as "w/h" says it already."""
+        """The unit shown with a value; empty if the symbol, such as "w/h", contains the unit."""
         return "" if "/" in self.symbol else self.unit
 
     @property
     def label(self) -> str:
-        """What stands beside an axis."""
+        """The label of an axis."""
         words = f"{self.words} {self.note}".strip()
         if self.symbol:
             return f"{words}  {self.latex if self.sign > 0 else f'$-{self.latex[1:]}'}"
         return f"{words}  ({self.unit})" if self.unit else words
 
     def on_axis(self, row: Mapping[str, float | int | str]) -> float:
-        """Its value in a row of path.csv, as it is drawn."""
+        """Its value in a row of path.csv, with the sign of the axis."""
         return self.sign * float(row[self.name])
 
 
 @dataclass(frozen=True)
 class Amplitude:
-    """What a path varies: mu of the energy mu Pi(u).
+    """The parameter that a path varies: mu of the energy mu Pi(u).
 
     Attributes
     ----------
     name
-        As in the column `amplitude`.
+        Name in the column `amplitude`.
     column
-        The column of its value.
+        Column of its value.
     conjugate
-        The column of the displacement that its curve is drawn over; in proportion to -Pi where the meaning says so.
+        Column of the displacement on the other axis of its curve; proportional to -Pi if its meaning says so.
     place
-        Where that displacement is.
+        Location of that displacement.
     """
 
     name: str

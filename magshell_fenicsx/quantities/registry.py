@@ -40,13 +40,13 @@ OF_EVERY_RUN = (
     _w(
         "w_over_h",
         "",
-        "Inward displacement at the force, of dead loads along them, else of the pole; over a patch its mean.",
+        "Inward displacement at the force (its mean over a patch), along the dead loads, or else of the pole.",
     ),
-    _w("w_from_field_over_h", "since the field", "w_over_h less its value where the field ended."),
+    _w("w_from_field_over_h", "since the field", "w_over_h minus its value at the end of the field."),
     _w(
         "w_pole_over_h",
         "of the pole",
-        "Inward displacement of the pole, a disc's centre or a strip's tip; of the first of `points` if there are any.",
+        "Inward displacement of the pole, a disc's centre or a strip's tip; of the first named point if there is one.",
     ),
     Quantity(
         "volume_change",
@@ -59,26 +59,47 @@ OF_EVERY_RUN = (
         sign=-1.0,
     ),
     _energy("energy", "energy", "Π, the sum of all terms."),
-    Quantity("negative_pivots", "unstable directions", "Of the model, with all amplitudes given.", "count"),
-    Quantity("negative_pivots_held", "unstable, w held", "The same with the conjugate displacement given.", "count"),
-    Quantity("iterations", "iterations", "Of Newton's method.", "count"),
-    Quantity("factorisations", "factorisations", "Of the tangent.", "count"),
-    Quantity("wall_s", "time", "Since the run began.", "time", unit="s", si="s"),
+    Quantity(
+        "negative_pivots",
+        "unstable directions",
+        "Number of unstable directions of the model with all amplitudes fixed.",
+        "count",
+    ),
+    Quantity(
+        "negative_pivots_held", "unstable, w held", "The same number with the conjugate displacement fixed.", "count"
+    ),
+    Quantity("iterations", "iterations", "Iterations of Newton's method.", "count"),
+    Quantity("factorisations", "factorisations", "Factorisations of the tangent.", "count"),
+    Quantity("wall_s", "time", "Time since the start of the run.", "time", unit="s", si="s"),
     _energy("stretching", "stretching", "Membrane energy; not of a solid."),
-    _energy("bending", "bending", "Bending energy with that of the edges; not of a solid."),
+    _energy("bending", "bending", "Bending energy, including the edges; not of a solid."),
     _energy("magnetic", "magnetic", "Magnetic energy."),
-    _energy("U1", "first term", "Of the approximate magnetic energies.", "U_1"),
-    _energy("Uq", "torques of rotations", "Of the approximate magnetic energies.", "U_q"),
-    _energy("Utau", "torques of gradients", "Of the approximate magnetic energies.", "U_τ"),
-    Quantity("mode", "mode", "Of an instability: symmetric, asymmetric, m = 2, antisymmetric, ...", "text"),
-    Quantity("field_angle", "field angle", "By which the field has turned.", "load", unit="degrees", si="degrees"),
+    _energy("U1", "first term", "First term of the approximate magnetic energies.", "U_1"),
+    _energy("Uq", "torques of rotations", "Torque term of the approximate magnetic energies, in rotations.", "U_q"),
+    _energy(
+        "Utau",
+        "torques of gradients",
+        "Torque term of the approximate magnetic energies, in displacement gradients.",
+        "U_τ",
+    ),
+    Quantity("mode", "mode", "Mode of an instability: symmetric, asymmetric, m = 2, antisymmetric, ...", "text"),
+    Quantity(
+        "field_angle", "field angle", "Angle by which the field has turned.", "load", unit="degrees", si="degrees"
+    ),
     Quantity("branch", "branch", "0 is the path, 1 and 2 leave it at its first bifurcation.", "count"),
     _w("w_point_over_h", "of the loaded point", "Inward displacement of the loaded point itself."),
-    Quantity("error_over_h", "error of u", "Estimate of the algebraic error, the next step.", "error", "", "h", "m"),
-    Quantity("load_error", "error of the load", "Estimate of that of the amplitude at a located point.", "error"),
-    Quantity("excluded_pivots", "unstable, excluded", "Of modes that the model's symmetry excludes.", "count"),
+    Quantity(
+        "error_over_h", "error of u", "Estimate of the algebraic error: the next Newton step.", "error", "", "h", "m"
+    ),
+    Quantity("load_error", "error of the load", "Estimate of the error of the amplitude at a located point.", "error"),
+    Quantity(
+        "excluded_pivots",
+        "unstable, excluded",
+        "Number of unstable directions that the model's symmetry excludes.",
+        "count",
+    ),
 )
-OF_SOME_RUNS = (Quantity("load_factor", "load factor", "Of all dead loads together.", "load"),)
+OF_SOME_RUNS = (Quantity("load_factor", "load factor", "Common factor of all dead loads.", "load"),)
 QUANTITIES = {q.name: q for q in (*OF_EVERY_RUN, *OF_SOME_RUNS)}
 AMPLITUDES = {
     a.name: a
@@ -90,7 +111,7 @@ AMPLITUDES = {
         Amplitude("angle", "field_angle"),
     )
 }
-# names of terms, and of amplitudes that only the solvers see
+# names of terms, and of amplitudes that only the solvers use
 INTERNAL = ("push", "lambda_across", "membrane", "couple")
 TAKEN = frozenset((*QUANTITIES, *AMPLITUDES, *INTERNAL))
 
@@ -101,20 +122,20 @@ def register(quantities: Iterable[Quantity]) -> None:
 
 
 def quantity(name: str) -> Quantity:
-    """That of a column; a named point's displacement or one's own amplitude is called by its name."""
+    """The quantity of a column; a named point's displacement or a user-defined amplitude has its own name."""
     kind: Kind = "place" if re.search(r"_u[xyz]$", name) else "load"
     return QUANTITIES.get(name) or Quantity(name, name.replace("_", " "), "", kind)
 
 
 def amplitude(name: str) -> Amplitude:
-    """That of a name; one's own has the column of its name."""
+    """The amplitude with a name; a user-defined one has a column of the same name."""
     return AMPLITUDES.get(name) or Amplitude(name, name)
 
 
 def axes_of(name: str) -> tuple[Quantity, Quantity]:
-    """What an amplitude's curve is drawn over, and what is drawn: its value over a displacement.
+    """The quantities on the x and y axis of an amplitude's curve: its displacement and its value.
 
-    An angle is given, and drawn over it is the displacement.
+    An angle is on the x axis, and the displacement on the y axis.
     """
     varied = amplitude(name)
     over, drawn = quantity(varied.conjugate), quantity(varied.column)

@@ -26,12 +26,12 @@ LAST_FILES = (
     *("summary.json", "report.html", "stability.csv", "animation.gif"),
     *(f"{name}{end}.png" for name in DRAWN for end in ("", "_[0-9]*")),
 )
-MESH = "mesh.json"  # what was chosen for a tolerance
+MESH = "mesh.json"  # the mesh chosen for a tolerance
 COMPARED = ("p_over_pc", "lambda_m", "force", "w_over_h", "w_pole_over_h")
 
 
 class AlreadyComplete(Exception):
-    """There is nothing to resume; `summary` is what the finished run left."""
+    """There is nothing to resume; `summary` is the summary.json of the finished run."""
 
     def __init__(self, summary: dict[str, Any]) -> None:
         super().__init__(summary)
@@ -39,20 +39,20 @@ class AlreadyComplete(Exception):
 
 
 def open_folder(out: Path, case: Case, comm: MPI.Comm, resume: bool) -> None:
-    """Make a folder ready for a new run, or see that a run in it can go on.
+    """Prepare a folder for a new run, or check that the run in it can be resumed.
 
     Raises
     ------
     CaseError
         If the folder cannot be written, or has no run of this case to resume.
     AlreadyComplete
-        If the run to be resumed is.
+        If the run to be resumed is complete.
     """
     prepare_folder(out, comm, lambda folder: (_resumed if resume else _emptied)(folder, case))
 
 
 def _emptied(out: Path, case: Case) -> None:
-    """Take an earlier run's files out of the folder."""
+    """Delete the files of an earlier run and begin a checkpoint."""
     for name in (checkpoint.NAME, "path.csv", MESH):
         (out / name).unlink(missing_ok=True)
     _remove_last_files(out)
@@ -61,7 +61,7 @@ def _emptied(out: Path, case: Case) -> None:
 
 
 def _resumed(out: Path, case: Case) -> None:
-    """Take out what only the end of a run writes."""
+    """Check that the run can be resumed, and delete the files that the end of a run writes."""
     file = out / checkpoint.NAME
     if not file.exists() and (out / "summary.json").exists():
         summary = json.loads((out / "summary.json").read_text(encoding="utf-8"))
@@ -80,7 +80,7 @@ def _remove_last_files(out: Path) -> None:
 
 
 class RunFiles:
-    """Writes a run; every rank calls, rank 0 writes.
+    """Writes the files of a run; every method is collective, and rank 0 writes.
 
     Raises
     ------
@@ -92,9 +92,9 @@ class RunFiles:
     journal
         The checkpoint.
     kept
-        Number of points of an interrupted run whose rows and fields are there.
+        Number of points of an interrupted run with rows and fields on disk.
     elapsed
-        Seconds that the interrupted run took up to the last of them.
+        Run time in seconds of the interrupted run up to the last of these points.
     """
 
     def __init__(self, folder: Path, scene: Scene) -> None:
@@ -116,12 +116,12 @@ class RunFiles:
         return min(len(self._table.kept), self._fields.kept), self._table.kept
 
     def write(self, row: Row, state: State) -> None:
-        """Write a point; of an interrupted run's points, what is missing.
+        """Write a point, unless an interrupted run has written it.
 
         Raises
         ------
         CaseError
-            If the point is not the one that the interrupted run had in its place.
+            If the point differs from the one of the interrupted run.
         """
         number = int(row["point"])
         if number < len(self._rows):
@@ -138,16 +138,16 @@ class RunFiles:
         by_first(self._comm, write)
 
     def summarise(self, content: dict[str, Any]) -> None:
-        """Write summary.json, which is safe before any picture is drawn."""
+        """Write summary.json."""
 
-        def write() -> None:  # files that were changed since are not those of this run
+        def write() -> None:  # names the mesh file and the sources as they were at the start
             data = (json.dumps({**content, **self._begun_with}, indent=2) + "\n").encode()
             write_whole(self._folder / "summary.json", data)
 
         by_first(self._comm, write)
 
     def close(self, complete: bool) -> None:
-        """Close the files; a complete run needs no checkpoint, which goes last."""
+        """Close the files; at the end of a complete run, delete the checkpoint."""
         by_first(self._comm, lambda: self._table.close())
         self.journal.close()
         if complete:
@@ -155,9 +155,9 @@ class RunFiles:
 
 
 def _same(row: Row, there: dict[str, str]) -> None:
-    """See that a point found again is the one in path.csv."""
+    """Check that a recomputed point equals the one in path.csv."""
     same = row["label"] == there["label"] and all(
         math.isclose(float(row[key]), float(there[key]), rel_tol=1e-6, abs_tol=1e-9) for key in COMPARED
     )
     if not same:
-        raise CaseError(f"--resume: point {row['point']} is another than in path.csv; run without --resume")
+        raise CaseError(f"--resume: point {row['point']} differs from path.csv; run without --resume")

@@ -1,4 +1,4 @@
-"""Stopping a run between two solves: a signal, or a limit of time."""
+"""Stopping a run between two solves, by a signal or a time limit."""
 
 import signal
 import threading
@@ -12,29 +12,29 @@ from mpi4py import MPI
 from magshell_fenicsx.continuation.journal import Journal
 from magshell_fenicsx.continuation.point import Point
 
-SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1)  # of them mpirun passes the last on, and waits
+SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1)  # mpirun passes SIGUSR1 on to the ranks and waits
 
 
 class Interrupted(RuntimeError):
-    """The run was asked to stop; the message says by what."""
+    """The run was asked to stop; the message names the signal or the limit."""
 
 
 class Watch:
-    """Notes what asks a run to stop; inside `with`, signals are noted instead of obeyed.
+    """Records requests to stop; inside `with`, signals are recorded instead of obeyed.
 
     Parameters
     ----------
     start
-        When the run began, in seconds of the clock.
+        Start of the run, in seconds of `time.perf_counter`.
     limit
-        Seconds after which it shall stop; None sets no limit.
+        Seconds after which the run stops; None sets no limit.
     signals
-        Whether `SIGNALS` are noted. A second SIGINT is obeyed.
+        Whether `SIGNALS` are recorded. A second SIGINT is obeyed.
     """
 
     def __init__(self, comm: MPI.Comm, start: float, limit: float | None, signals: bool) -> None:
         self._comm, self._start, self._limit = comm, start, limit
-        # Python allows handlers in its main thread alone
+        # Python allows signal handlers only in the main thread
         self._signals = SIGNALS if signals and threading.current_thread() is threading.main_thread() else ()
         self._reason: str | None = None
 
@@ -51,7 +51,7 @@ class Watch:
             signal.signal(number, handler)
 
     def check(self) -> None:
-        """Collective.
+        """Stop if a rank has been asked to; collective.
 
         Raises
         ------
@@ -71,7 +71,7 @@ class Watch:
 
 
 class Stoppable:
-    """A journal that ends a history before a new solve begins, if the watch says so."""
+    """A journal that stops the run before a new solve if the watch requests it."""
 
     def __init__(self, journal: Journal, watch: Watch) -> None:
         self._journal, self._watch = journal, watch

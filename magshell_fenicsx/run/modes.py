@@ -1,4 +1,4 @@
-"""After a run: the null vectors of its instabilities, and the modes that the case asks for."""
+"""After a run: null vectors at the instabilities, and the modes that the case requests."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ Say = Callable[[str], None]
 def modes_after(result: Result, folder: Path, say: Say) -> None:
     """Write fields/mode_*.vtu and, if the case has a stability section, stability.csv.
 
-    Every rank calls, rank 0 writes. The run must be over: the model's tangent is overwritten.
+    Collective; rank 0 writes. Call it after the run, because it overwrites the model's tangent.
 
     Raises
     ------

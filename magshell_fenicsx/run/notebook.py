@@ -1,9 +1,8 @@
-"""What a notebook shows of a scene: the deformed surface as arrays and for pyvista, and pictures without files.
+"""A scene in a notebook: the deformed surface as arrays and for pyvista, and pictures without files.
 
-All of it is collective; what is made on rank 0 alone is None elsewhere.
+All functions are collective. Results that only rank 0 has are None on other ranks.
 """
 
-import io
 from collections.abc import Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Literal
@@ -12,6 +11,7 @@ from magshell_fenicsx.output.fields.gathering import gatherer
 from magshell_fenicsx.output.fields.surface import Surface, completed, turned
 from magshell_fenicsx.output.pictures.captions import caption
 from magshell_fenicsx.output.pictures.curve import curve_figure
+from magshell_fenicsx.output.pictures.layout import png
 from magshell_fenicsx.output.pictures.picture import figures
 from magshell_fenicsx.output.pictures.render import smooth_surface
 from magshell_fenicsx.output.store.table import Row
@@ -28,7 +28,7 @@ def surface(scene: Scene, record: Record) -> Surface | None:
     """The whole deformed mid-surface as NumPy arrays, lengths in R: `r0`, `u`, `n0`, `w`, `cells` and `fields`.
 
     The fields are membrane strains `E` and bending moments over D/R `M`, their principal values `E_1`, `E_2`, `M_1`,
-    `M_2`, and those of the magnetic field: `Br`, `Ba`, `p_mag`, `f_mag`, `k`, `tau`; see `results.point_fields`.
+    `M_2`, and those of the magnetic field: `Br`, `Ba`, `p_mag`, `f_mag`, `k`, `tau`; see `PointFields`.
     """
     plan, state = scene.plan, record.point.state
     found = gatherer(scene.model, scene.comm).gather(state.u, state.mu)
@@ -50,12 +50,12 @@ def picture(
     record: Record,
     of: Literal["shell", "strains", "moments", "fields", "magnetic_loads"] = "shell",
 ) -> "Figure | None":
-    """One of the pictures of a run, as in shell.png, strains.png, ...; None also where there is nothing `of` that.
+    """One picture of a run, as in shell.png, strains.png, ...; None also if the scene has no such fields.
 
     Raises
     ------
     NoScreen
-        If there is no screen to draw on.
+        If there is no display.
     """
     found, (row,) = surface(scene, record), rows(scene, [record])
     if found is None:
@@ -65,7 +65,7 @@ def picture(
 
 
 def curve(scene: Scene, records: Sequence[Record], amplitude: str | None = None) -> "Figure":
-    """The path, as in curve.png; by default in the amplitude that varied last."""
+    """The curve of the path, as in curve.png; by default for the amplitude that varied last."""
     found = rows(scene, records)
     return _in_line(curve_figure(found, amplitude or records[-1].amplitude, _caption(scene, found[-1])))
 
@@ -76,12 +76,6 @@ def _caption(scene: Scene, row: Row) -> str:
 
 
 def _in_line(figure: "Figure") -> "Figure":
-    """The same, which a notebook draws also if nobody has imported pyplot."""
-    figure._repr_png_ = partial(_png, figure)  # type: ignore[attr-defined]
+    """The same figure, which a notebook then shows without pyplot."""
+    figure._repr_png_ = partial(png, figure)  # type: ignore[attr-defined]
     return figure
-
-
-def _png(figure: "Figure") -> bytes:
-    content = io.BytesIO()
-    figure.savefig(content, format="png")
-    return content.getvalue()

@@ -17,7 +17,7 @@ class RowMaker:
         self._scene, self._count, self._field_end = scene, 0, 0.0
 
     def row(self, record: Record, wall_s: float) -> Row:
-        """The next row; `wall_s` in seconds since the history began. Collective."""
+        """The next row; `wall_s` is in seconds since the start of the history. Collective."""
         values, point = self._scene.observe(record.point.state), record.point
         if record.label in ("start", "field"):
             self._field_end = values["w_over_h"]
@@ -42,13 +42,13 @@ class RowMaker:
 
 
 def rows(scene: Scene, records: Iterable[Record]) -> list[Row]:
-    """The rows of some records; nobody measured their times, which are nan."""
+    """The rows of some records, with the times nan."""
     maker = RowMaker(scene)
     return [maker.row(record, np.nan) for record in records]
 
 
 def columns(scene: Scene, records: Iterable[Record]) -> dict[str, NDArray[np.generic]]:
-    """The columns of path.csv but for the time, each (records,); `pandas.DataFrame(columns(...))` is a frame.
+    """The columns of path.csv except the time, each (records,), for instance for `pandas.DataFrame`.
 
     Collective.
     """

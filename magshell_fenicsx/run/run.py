@@ -52,25 +52,25 @@ def run(
 ) -> Result:
     """Run a case.
 
-    With `out`, SIGTERM, SIGINT and SIGUSR1 end the run after the point being solved for, and it can be resumed.
+    With `out`, SIGTERM, SIGINT and SIGUSR1 stop the run after the current point, and it can be resumed.
 
     Parameters
     ----------
     out
         Folder for path.csv, summary.json, fields and pictures; None writes nothing.
     say
-        Called with one line of text per accepted point, on rank 0.
+        Called on rank 0 with one line of text per accepted point.
     tell
-        Called with a line on what the run is at, which replaces the one before, on rank 0.
+        Called on rank 0 with a status line, which replaces the one before.
     resume
-        Go on with the run that was interrupted in `out`.
+        Continue the interrupted run in `out`.
     time_limit
-        Seconds after which the run ends in the same way.
+        Seconds after which the run stops in the same way.
 
     Raises
     ------
     CaseError
-        If the case has a fault that shows only now, `out` cannot be written, or has nothing of this case to resume.
+        If building the case finds an error, `out` cannot be written, or it has no run of this case to resume.
     AlreadyComplete
         If the run to be resumed is complete.
     DiskError
@@ -78,7 +78,7 @@ def run(
     """
     start = time.perf_counter()
     watch = Watch(comm, start, time_limit, signals=out is not None)
-    say, tell = (say, tell or _nobody) if comm.rank == 0 else (_nobody, _nobody)
+    say, tell = (say, tell or _ignored) if comm.rank == 0 else (_ignored, _ignored)
     if out is None:
         return _run(case, None, comm, say, tell, watch, start)
     with held_folder(Path(out), comm, make=not resume):
@@ -86,12 +86,12 @@ def run(
         return _run(case, Path(out), comm, say, tell, watch, start)
 
 
-def _nobody(line: str) -> None:
-    """Hears nothing."""
+def _ignored(line: str) -> None:
+    """Print nothing."""
 
 
 def _run(case: Case, folder: Path | None, comm: MPI.Comm, say: Say, tell: Say, watch: Watch, start: float) -> Result:
-    """Run a case in a folder that is ready; `start` in seconds of the clock."""
+    """Run a case in a prepared folder; `start` is in seconds of `time.perf_counter`."""
 
     def doing(what: str) -> None:
         tell(waiting(what, time.perf_counter() - start))
@@ -124,7 +124,7 @@ def _run(case: Case, folder: Path | None, comm: MPI.Comm, say: Say, tell: Say, w
             result.replayed = files.journal.replayed
             try:
                 files.summarise(summary(result, time.perf_counter() - start))
-                if not interrupted:  # who interrupts does not wait for pictures
+                if not interrupted:  # an interrupted run draws no pictures
                     progress.doing("modes and pictures")
                     with result.output:
                         modes_after(result, folder, say)
@@ -135,13 +135,13 @@ def _run(case: Case, folder: Path | None, comm: MPI.Comm, say: Say, tell: Say, w
                 interrupted = interrupted or e
             files.close(complete=not interrupted and not result.stopped)
     if interrupted:
-        go_on = f"; what was found is in {folder}/, and --resume goes on from there" if folder else ""
-        result.stopped = f"{interrupted}{go_on}"
+        hint = f"; the results so far are in {folder}/, and --resume continues from there" if folder else ""
+        result.stopped = f"{interrupted}{hint}"
     return result
 
 
 def _draw(folder: Path, say: Say) -> None:
-    """Draw what is in the folder; without a screen to draw on, say so."""
+    """Draw the pictures of the folder; warn if there is no display."""
     try:
         draw(folder)
     except NoScreen as e:
@@ -149,7 +149,7 @@ def _draw(folder: Path, say: Say) -> None:
 
 
 def _mesh_for_tolerance(case: Case, folder: Path | None, comm: MPI.Comm, say: Say, doing: Say) -> Adapted | None:
-    """The mesh for the case's tolerance, kept in the folder for a run that is resumed; None for the default mesh."""
+    """The mesh for the case's tolerance, saved for a resumed run; None for the default mesh."""
     if case.mesh.tolerance is None:
         return None
     file = folder / MESH if folder else None
@@ -158,7 +158,7 @@ def _mesh_for_tolerance(case: Case, folder: Path | None, comm: MPI.Comm, say: Sa
     try:
         found = adapted(case, comm, say, doing)
     except NoResult as e:
-        say(f"warning: the default mesh is taken, there is no result that the tolerance could be of: {e}")
+        say(f"warning: mesh.tolerance ignored, this run has no scalar result: {e}")
         return None
     if file:
         by_first(comm, partial(write_whole, file, found.to_json()))
@@ -166,7 +166,7 @@ def _mesh_for_tolerance(case: Case, folder: Path | None, comm: MPI.Comm, say: Sa
 
 
 def _sensitivities(result: Result) -> dict[str, float]:
-    """Of the fold that the run ended at, if the case asks for them."""
+    """The sensitivities at the final fold, if the case requests them."""
     scene, loading, last = result.scene, result.scene.case.loading, result.rows[-1]
     if not (isinstance(loading, PathSection) and loading.sensitivities and last["label"] == "fold"):
         return {}
@@ -178,7 +178,7 @@ def _sensitivities(result: Result) -> dict[str, float]:
 
 
 def _follow(result: Result, files: RunFiles | None, say: Say, progress: RunProgress, start: float) -> None:
-    """The history of a scene, point by point."""
+    """Compute the history of a scene and write it point by point."""
     scene, made = result.scene, RowMaker(result.scene)
     for record in follow(scene):
         result.history.add(record)

@@ -1,4 +1,4 @@
-"""What a run is at, as one line of text for people who wait for it."""
+"""The status of a run, as one line of text."""
 
 import time
 from collections.abc import Callable
@@ -25,18 +25,18 @@ WORDS = {"limit": "the first instability", "bifurcation": "the first bifurcation
 
 @dataclass(frozen=True)
 class Aim:
-    """Where a path leads.
+    """The end of a path.
 
     Attributes
     ----------
     column
-        Of path.csv, the load or what is asked for.
+        Column of path.csv: the load, or the quantity with a target.
     end
-        Its value at the end; None where the path ends otherwise.
+        Its value at the end; None if the path ends at another event.
     words
-        What the path ends at then.
+        That event.
     steps
-        Number of steps after which it ends; None where it ends otherwise.
+        Number of steps after which the path ends; None if it ends otherwise.
     """
 
     column: str
@@ -45,27 +45,25 @@ class Aim:
     steps: int | None = None
 
     def part(self, row: Row, steps: int) -> float | None:
-        """What of the way is done at a point, after so many steps; None where the length of the way is not known."""
+        """The completed part of the path at a point, after some steps; None if the end is unknown."""
         if self.steps is not None:
             return steps / self.steps
         return float(row[self.column]) / self.end if self.end else None
 
-    def told(self, row: Row) -> str:
-        """Where a point is on the way.
+    def text(self, row: Row) -> str:
+        """The present value and the end.
 
         Examples
         --------
-        >>> Aim("w_over_h", 20.0).told({"w_over_h": 5.0}), Aim("p_over_pc", words="the first instability").told(
-        ...     {"p_over_pc": 0.25}
-        ... )
-        ('w/h 5 -> 20', 'p/pc 0.25 -> the first instability')
+        >>> Aim("w_over_h", 20.0).text({"w_over_h": 5.0})
+        'w/h 5 -> 20'
         """
         end = self.words if self.end is None else f"{self.end:.4g}"
         return f"{quantity(self.column).plain} {float(row[self.column]) + 0.0:.4g} -> {end}"  # no minus zero
 
 
 def aim(scene: Scene) -> Aim:
-    """Where the path of a scene leads after the field."""
+    """The end of the path that follows the field."""
     case, loading = scene.case, scene.case.loading
     targets: dict[str, float | None] = {"lambda_m": case.lambda_m}
     if isinstance(loading, PressureSection):
@@ -87,12 +85,12 @@ def aim(scene: Scene) -> Aim:
 
 
 def time_left(begun: tuple[float, float], here: tuple[float, float]) -> float | None:
-    """Seconds to the end if the rest goes as fast as what is done; None if nothing is done yet, or all.
+    """Seconds to the end at the average speed so far; None if nothing or everything is done.
 
     Parameters
     ----------
     begun, here
-        Part of the way and seconds, at two of its points.
+        Completed part and time in seconds, at two points of the path.
 
     Examples
     --------
@@ -116,29 +114,29 @@ def clock(seconds: float) -> str:
 
 
 def waiting(what: str, seconds: float) -> str:
-    """What is done, and the time so far."""
+    """The present activity, and the time so far."""
     return f"{what}  {clock(seconds)}"
 
 
 class RunProgress:
-    """Tells what the history of a scene is at; a `solve.progress.Progress`.
+    """Reports the status of a run; a `continuation.listener.Progress`.
 
     Parameters
     ----------
-    tell
-        Called with a line that replaces the one before.
+    report
+        Called with a status line that replaces the one before.
     start
-        When the run began, in seconds of the clock.
+        Start of the run, in seconds of `time.perf_counter`.
     """
 
-    def __init__(self, scene: Scene, tell: Callable[[str], None], start: float) -> None:
-        self._scene, self._tell, self._start, self._aim = scene, tell, start, aim(scene)
+    def __init__(self, scene: Scene, report: Callable[[str], None], start: float) -> None:
+        self._scene, self._report, self._start, self._aim = scene, report, start, aim(scene)
         self._row: Row = {}
         self._points = self._steps = 0
         self._begun = self._here = (0.0, 0.0)
 
     def accepted(self, row: Row, *, known: bool) -> None:
-        """A point was found; `known` if an interrupted run had found it."""
+        """Note a new point; `known` if an interrupted run had found it."""
         now = time.perf_counter()
         self._row, self._points = row, self._points + 1
         on_load = row["label"] not in ("start", "field") or self._loads_by_field
@@ -154,13 +152,13 @@ class RunProgress:
         in_field = self._in_field
         ahead = Aim("lambda_m", self._scene.case.lambda_m) if in_field else self._aim
         left = None if in_field or self._branched else time_left(self._begun, self._here)
-        said = f"  step {step:.2g} h  {clock(now - self._start)}"
+        times = clock(now - self._start)
         if left is not None:
-            said += f", about {clock(max(0.0, left - (now - self._here[1])))} left"
-        self._tell(f"{self._count}  {ahead.told(self._row)}{said}")
+            times += f", about {clock(max(0.0, left - (now - self._here[1])))} left"
+        self._report(f"{self._count}  {ahead.text(self._row)}  step {step:.2g} h  {times}")
 
     def doing(self, what: str) -> None:
-        self._tell(waiting(f"{self._count}  {what}", time.perf_counter() - self._start))
+        self._report(waiting(f"{self._count}  {what}", time.perf_counter() - self._start))
 
     @property
     def _count(self) -> str:
@@ -172,12 +170,12 @@ class RunProgress:
 
     @property
     def _in_field(self) -> bool:
-        """Whether the field grows, before the load."""
+        """Whether the field is still growing, before the load."""
         before_load = self._row["label"] in ("start", "field") and not self._loads_by_field
         return before_load and not isclose(float(self._row["lambda_m"]), self._scene.case.lambda_m)
 
     @property
     def _branched(self) -> bool:
-        """Whether branches come after the path, or not: nobody knows before."""
+        """Whether the case requests branches; their number is not known in advance."""
         loading = self._scene.case.loading
         return isinstance(loading, PathSection) and loading.branches

@@ -1,4 +1,4 @@
-"""What a run found, and summary.json."""
+"""The result of a run, and summary.json."""
 
 from dataclasses import dataclass, field
 from typing import Any
@@ -18,26 +18,26 @@ from magshell_fenicsx.simulate.scene import Scene
 
 @dataclass
 class Result:
-    """What a run found.
+    """The result of a run.
 
     Attributes
     ----------
     rows
         One mapping per accepted point, with the columns of path.csv.
     last
-        The displacement and the amplitudes at the last point.
+        Displacement and amplitudes at the last point.
     singular
-        The same at the located instabilities, by their row.
+        The same at the located instabilities, by row number.
     stopped
         Why the run ended before its target; None if it reached it.
     replayed
-        Number of solves that were taken from a checkpoint.
+        Number of solves taken from a checkpoint.
     sensitivities
-        Of the amplitude at the fold that the run ended at, if the case asks for them; see `sensitivity`.
+        Sensitivities of the amplitude at the final fold, if the case requests them; see `simulate.sensitivity`.
     adapted
-        How the mesh was found, if the case has a tolerance.
+        The mesh and its error estimate, if the case has a tolerance.
     history
-        What of the run `value` is taken from.
+        The records that `value` is taken from.
     """
 
     scene: Scene
@@ -77,7 +77,7 @@ class Result:
 
     @property
     def value(self) -> float | None:
-        """The result that a tolerance is of; None if the run has none."""
+        """The scalar result that mesh.tolerance refers to; None if the run has none."""
         try:
             return self.history.ending(self.scene, self.stopped).value
         except NoResult:
@@ -136,7 +136,7 @@ def summary(result: Result, total_s: float) -> dict[str, Any]:
 
 
 def _dimensions(shell: ShellSection | Surface) -> dict[str, Any]:
-    """Of the shell, where the case has them: in SI, or all in units of its own."""
+    """The dimensions of the shell that the case gives, in SI or in the case's own units."""
     if isinstance(shell, ShellSection):
         lengths, in_si = {"radius": shell.radius, "thickness": shell.thickness}, True
     else:

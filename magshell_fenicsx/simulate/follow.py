@@ -1,4 +1,4 @@
-"""The history of a case: the field first, then the load; every accepted point, and what stopped it."""
+"""The history of a case: first the field, then the load."""
 
 from collections.abc import Iterator
 
@@ -16,7 +16,7 @@ from magshell_fenicsx.simulate.scene import Scene
 
 
 def follow(scene: Scene) -> Iterator[Record]:
-    """Run through the history of a scene.
+    """Compute the history of a scene; yields every accepted point.
 
     Raises
     ------

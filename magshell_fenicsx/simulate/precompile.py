@@ -1,7 +1,8 @@
 """Compile kernels ahead of time, for images and clusters without a compiler at run time.
 
-Those of hemispheres, of their solids, and of any mid-surface under dead loads. Remanences by formula, fields with a
-gradient, other energies than the full one, surfaces with kinks and loads of other solids compile theirs on first use.
+These are the kernels of hemispheres, of their solids, and of any mid-surface under dead loads. Remanences by formula,
+fields with a gradient, approximate energies, surfaces with kinks and loads of other solids compile theirs on the first
+run.
 """
 
 import time
@@ -46,7 +47,7 @@ OCTANT: dict[str, Any] = {  # symmetric in three planes, each a kernel of its ow
 
 
 def precompile(degree: int) -> float:
-    """Compile the kernels of shells of a degree, and of solids; the seconds that it took."""
+    """Compile the kernels of shells of a degree and of solids; return the time in seconds."""
     start = time.perf_counter()
     for data in _cases(degree):
         scene = Scene(Case.from_source(Source("precompile", data)), MPI.COMM_WORLD)

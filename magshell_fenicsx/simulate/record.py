@@ -1,4 +1,4 @@
-"""A point of a history and how it came about."""
+"""A point of a history and its origin."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -10,21 +10,20 @@ Label = Literal["start", "field", "step", "target", "fold", "bifurcation"]
 
 @dataclass(frozen=True)
 class Record:
-    """A point of the history and how it came about.
+    """A point of the history and its origin.
 
     Attributes
     ----------
     label
-        "field": while the field grows; "step": on the way; "target": asked for;
+        "field": during the growth of the field; "step": between targets; "target": a requested point;
         "fold" and "bifurcation": a located instability.
     amplitude
         The amplitude that varied ("" at the start).
     mode
-        Of an instability that a reduced model excludes: "antisymmetric" to the mirror plane of a
-        half shell, or "m = 7" waves around an axisymmetric one. There such a mode becomes unstable,
-        or stable again.
-        Of a bifurcation in the model itself: "symmetric" if the load changes alike in both
-        directions of the branch (a pitchfork), or "asymmetric".
+        For a mode that a reduced model excludes and that becomes unstable or stable here: "antisymmetric" to the
+        mirror plane of a half shell, or "m = 7" waves around an axisymmetric one.
+        For a bifurcation of the model itself: "symmetric" if the load changes equally in both directions of the
+        branch (a pitchfork), or "asymmetric".
     branch
         0 on the path itself, 1 and 2 in the two directions of the branch at its first bifurcation.
     excluded_pivots
@@ -43,4 +42,4 @@ class Record:
 
 
 class Stopped(RuntimeError):
-    """The history ended before its target; the message says where and why."""
+    """The history ended before its target; the message has the place and the reason."""

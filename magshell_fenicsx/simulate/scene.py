@@ -1,4 +1,4 @@
-"""The composition root: from a case, build the mid-surface, the model and its solver."""
+"""A scene: the mid-surface, the model and the solver of a case."""
 
 import time
 from collections import defaultdict
@@ -41,22 +41,19 @@ class Scene:
     Parameters
     ----------
     plan
-        What to make of the case; by default `make_plan` says.
+        The plan of the case; by default `make_plan` makes it.
     terms
-        One's own energies, which a given plan has already. Their amplitudes are `OwnTerm.value` until a state says
-        otherwise, see `trace`.
+        User-defined energies, if no plan is given. The initial values of their amplitudes are `OwnTerm.value`.
 
     Attributes
     ----------
-    case, plan
-        What was asked for, and what was made of it.
     model, newton
         The shell as a system of terms, and the solver of its bordered systems.
     journal, progress
-        Keeps what the solver finds, for a run that is interrupted; is told what the solver is at. Both are set by
-        whoever runs the scene.
+        The record of the solver's results for an interrupted run, and the listener to its status. The caller that
+        runs the scene sets both.
     setup_s
-        Seconds of building, without compiling kernels.
+        Time to build the scene in seconds, without compiling kernels.
     """
 
     def __init__(
@@ -90,11 +87,11 @@ class Scene:
 
     @cached_property
     def watch(self) -> Watch:
-        """Looks at the modes that the model excludes, along its paths. Compiles their kernels."""
+        """The watch over the modes that the model excludes. Its first use compiles their kernels."""
         return Watch(self.model.excluded_modes)
 
     def unloaded(self) -> State:
-        """The undeformed shell: all amplitudes are zero but those that terms have a value for."""
+        """The undeformed shell; amplitudes are zero, except user-defined ones with a value."""
         amplitudes = {t.amplitude for t in self.model.system.terms if t.amplitude}
         given = self._own_amplitudes
         return State(self.model.zero(), {name: given.get(name, 0.0) for name in sorted({*amplitudes, *given})})
@@ -109,7 +106,7 @@ class Scene:
             amplitude = state.mu[t.amplitude] if t.amplitude else 1.0
             energies[t.name.removesuffix(" across")] += model.multiplicity * amplitude * potentials[t.name]
         along, across = state.mu.get("lambda_m", 0.0), state.mu.get("lambda_across", 0.0)
-        sense, split = copysign(1.0, self.case.lambda_m), "membrane" in energies  # of which a solid knows nothing
+        sense, split = copysign(1.0, self.case.lambda_m), "membrane" in energies  # a solid has no such split
         return {
             "p_over_pc": state.mu.get("pressure", 0.0),
             "lambda_m": sense * hypot(along, across) if across else along,
@@ -139,13 +136,13 @@ class Scene:
 
     @property
     def _own_amplitudes(self) -> dict[str, float]:
-        """Those of surface energies, and of parameters that enter them freely, with their values at the start."""
+        """The amplitudes and free parameters of user-defined energies, with their initial values."""
         terms = self.plan.loads.own
         return {term.name: term.value for term in terms} | {p.name: p.value for term in terms for p in term.free}
 
     @property
     def extra_columns(self) -> tuple[str, ...]:
-        """What `observe` tells besides the columns of every run."""
+        """The columns of `observe` besides those of every run."""
         named = tuple(f"{point}_u{axis}" for point in self.case.points for axis in "xyz")
         own = (*self._own_amplitudes, *(column for term in self.plan.loads.own for column in term.observed))
         return (*(["load_factor"] if self.plan.loads.dead else []), *named, *own)

@@ -1,6 +1,6 @@
-"""How the amplitude at a fold, the buckling pressure for instance, depends on everything else.
+"""Sensitivities of the amplitude at a fold, for instance of the buckling pressure.
 
-To first order d mu*/dp = -(phi . R_p)/(phi . R_mu): one dot product for each parameter p.
+The derivative d mu*/dp = -(phi . R_p)/(phi . R_mu) takes one dot product for each parameter p.
 """
 
 from collections.abc import Sequence
@@ -29,12 +29,12 @@ DEFECT_STEP = 1e-3  # in delta/h; central differences of a smooth residual
 
 
 def fold_at(scene: Scene, record: Record) -> Fold:
-    """The fold of a record that is labelled so, with its null vector; collective.
+    """The fold of a record with the label "fold", with its null vector; collective.
 
     Raises
     ------
     ValueError
-        If it is none.
+        If the record has another label.
     FoldLost
         If Newton's method for the fold fails.
     """
@@ -48,9 +48,9 @@ def sensitivities(scene: Scene, fold: Fold) -> dict[str, float]:
 
     Returns
     -------
-    By name of what varies, the rest being fixed:
+    Derivatives by the name of the parameter, with all others fixed:
 
-    - every other amplitude of the scene ("lambda_m", "force", that of one's own term, ...);
+    - every other amplitude of the scene ("lambda_m", "force", that of a user-defined term, ...);
     - "defect.amplitude": the dimple's depth delta/h;
     - "remanence dimple", "remanence rest": a relative change of the remanence of one patch, within the
       dimple's rim or outside it ("remanence" where there is no dimple). Their sum is lambda_m times
@@ -64,7 +64,7 @@ def sensitivities(scene: Scene, fold: Fold) -> dict[str, float]:
 
 
 def _to_defect(scene: Scene, fold: Fold) -> float:
-    """By central differences of the residual: the mesh does not depend on delta, only r0 on it does."""
+    """The derivative in delta/h by central differences of the residual; only r0 on the mesh depends on delta."""
 
     def out_of_balance(change: float) -> float:
         other = Scene(deepened(scene.case, change), scene.comm, terms=scene.plan.own)

@@ -1,4 +1,4 @@
-"""What a step of a programme is followed with."""
+"""The solver of a step of a programme."""
 
 from dataclasses import dataclass, replace
 
@@ -15,14 +15,14 @@ LONGEST = 50.0  # step by arc length, over the first
 
 @dataclass(frozen=True)
 class Stage:
-    """A scene with a solver of its system, or of one that stands for it.
+    """A scene with a solver of its system, or of a substitute system for a step.
 
     Attributes
     ----------
     device
-        Holds what is conjugate to some amplitudes; None where all are loads.
+        Prescribes the conjugates of some amplitudes; None if all are loads.
     along
-        Moves amplitudes together; None where the step drives one of the model's own.
+        Varies several amplitudes together; None if the step varies one amplitude of the model.
     """
 
     scene: Scene
@@ -31,7 +31,7 @@ class Stage:
     along: Along | None = None
 
     def leave(self, state: State) -> State:
-        """A state of the step's system as one of the model."""
+        """A state of the step's system as a state of the model."""
         state = self.along.expand(state) if self.along else state
         return self.device.leave(state) if self.device else state
 
@@ -47,7 +47,7 @@ class Stage:
     def begin(self, name: str, control: Control, state: State, first: float, scale: float = 1.0) -> tuple[Path, Point]:
         """A path from a state in equilibrium; its first step changes the amplitude by about `first`.
 
-        `scale` is as that of `Path`.
+        `scale` is that of `Path`.
         """
         path = self.path(name, control, StepOptions(1.0, 1.0, 1.0), abs(scale))
         start = path.start(state, first)

@@ -26,7 +26,7 @@ CONTROLS: dict[str, Control] = {"volume": "conjugate", "displacement": "conjugat
 
 
 def field(scene: Scene, state: State) -> Iterator[Record]:
-    """The field, up to lambda_m; where it makes the shell unstable, the critical field."""
+    """Increase the field to lambda_m; stop at the critical field if the shell becomes unstable."""
     target, instability = scene.case.lambda_m, None
     path, start = plain(scene).begin("lambda_m", "arc", state, target / 2, target)
     for record in followed(plain(scene), path, start, Goal("limit", [target])):
@@ -80,7 +80,7 @@ def indentation(scene: Scene, loading: IndentationSection, state: State) -> Iter
 def dead(scene: Scene, loading: DeadSection, state: State) -> Iterator[Record]:
     quantity: Quantity = "load" if loading.displacement is None else "conjugate"
     asked = next((value for value in (loading.factor, loading.displacement) if value is not None), 1.0)
-    # a displacement is told as the work of the loads at it
+    # a displacement is prescribed through the work of the loads
     end = asked if quantity == "load" else asked / scene.plan.length * scene.model.load_size
     by_load = quantity == "load"
     first = asked / loading.points if by_load else float(np.copysign(1e-3, asked))
@@ -109,7 +109,7 @@ def rotation(scene: Scene, loading: RotationSection, state: State) -> Iterator[R
 
 
 def _circle(scene: Scene) -> Along:
-    """The model in the angle of the applied field, of full magnitude."""
+    """The amplitudes of the applied field as functions of its angle, at constant magnitude."""
     lambda_m, system = scene.case.lambda_m, scene.model.system
     return Along(
         system,

@@ -1,4 +1,4 @@
-"""A path in any amplitude of a scene, from any state: what a notebook steps through."""
+"""A path in any amplitude of a scene from any state, for notebooks."""
 
 from collections.abc import Iterator, Sequence
 
@@ -26,37 +26,37 @@ def trace(
     first: float | None = None,
     steps: int = MOST_STEPS,
 ) -> Iterator[Record]:
-    """Follow the equilibria of a scene while one amplitude varies and the others stay.
+    """Follow the equilibria of a scene while one amplitude varies and the others are constant.
 
-    The first record is the start, brought into equilibrium by Newton's method at its own amplitudes. As in `follow`,
-    the last may be an instability that a reduced model excludes (`Record.mode`) and that was passed on the way.
+    The first record is the start, after Newton's method at its amplitudes. As in `follow`, the last record may be an
+    earlier instability that a reduced model excludes (`Record.mode`).
 
     Parameters
     ----------
     name
-        The amplitude: "pressure" (p/p_c), "force" (F R/(2 pi D)), "lambda_m", "load", or that of one's own term.
+        The amplitude: "pressure" (p/p_c), "force" (F R/(2 pi D)), "lambda_m", "load", or that of a user-defined term.
     start
-        A point found before, or a state; by default the undeformed shell with all amplitudes zero.
+        A record or a state; by default the undeformed shell with all amplitudes zero.
     control
-        "load": the amplitude is given; "conjugate": the displacement conjugate to it, -Pi_i(u), is
-        (`scene.model.system.potential` gives Pi_i); "arc": by arc length, through folds of both.
+        "load": prescribe the amplitude; "conjugate": prescribe the conjugate displacement -Pi_i(u)
+        (`scene.model.system.potential` gives Pi_i); "arc": prescribe the arc length, which passes folds of both.
     until
-        Where it ends, see `Goal`: "limit" at the first instability or at the last target, "bifurcation",
-        "target" at the last target, "points" after so many steps.
+        The end of the path, see `Goal`: "limit" at the first instability or the last target, "bifurcation",
+        "target" at the last target, "points" after `steps` steps.
     targets
-        Values that shall be met: of what is given or, by arc length, of `quantity`.
+        Values to be reached by the prescribed quantity or, with arc length, by `quantity`.
     quantity
-        "load": the amplitude; "conjugate": -Pi_i(u). Only by arc length.
+        "load": the amplitude; "conjugate": -Pi_i(u). Only with arc length.
     first
-        Change of the amplitude in the first step, whose sign is the direction. By default a tenth of the
-        way to the last target of what is given; by arc length towards conjugate displacements there is none.
+        Change of the amplitude in the first step; its sign is the direction. By default a tenth of the distance to the
+        last target; required for conjugate targets with arc length.
     steps
-        The most that are tried, or with "points" those that are asked for.
+        Largest number of steps; with "points" the number of steps.
 
     Raises
     ------
     ValueError
-        If the scene has no such amplitude, or nothing says how long the first step is.
+        If the scene has no such amplitude, or the length of the first step is unknown.
     Stopped
         If the path is lost, or there is no equilibrium to start from.
     """
@@ -69,7 +69,7 @@ def trace(
     if first is None and targets and of_load:
         first = (targets[-1] - state.mu[name]) / 10
     if first is None and targets and control == "conjugate":
-        first = 1.0  # the targets say how long a step is
+        first = 1.0  # the targets determine the step length
     if not first:
         raise ValueError(f"trace: {name}: give first, the change of the amplitude in the first step, not zero")
     rest = scene.newton.solve(state, name, GivenLoad(name, state.mu[name]))

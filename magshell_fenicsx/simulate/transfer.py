@@ -1,4 +1,4 @@
-"""Carrying displacements from one scene to another with the same kind of model, as a first guess there."""
+"""Transfer of displacements between scenes with the same kind of model, as an initial guess."""
 
 from dataclasses import dataclass
 
@@ -15,16 +15,16 @@ from magshell_fenicsx.models.solid.model import SolidModel
 from magshell_fenicsx.simulate.scene import Scene
 
 Array = NDArray[np.float64]
-NEIGHBOURS = {1: 10, 2: 40, 3: 10}  # nodes that a value is interpolated from, by dimension of the chart
-TINY = 1e-300  # the pole, where a direction is divided by its length, stays where it is
+NEIGHBOURS = {1: 10, 2: 40, 3: 10}  # number of nodes for interpolation, by dimension of the chart
+TINY = 1e-300  # avoids a division by zero at the pole
 ROUNDING = 1e-9
 
 
 def transfer(source: Scene, target: Scene, u: Vector) -> Vector:
     """A displacement of one scene in the unknowns of another; collective.
 
-    On the same mesh it is copied. Else it is interpolated in the chart and scaled like the thickness or,
-    on dimpled spheres, like a shallow shell: see `_Stretch`.
+    On the same mesh it is copied. Otherwise it is interpolated in the chart and scaled with the thickness or, on
+    dimpled spheres, like a shallow shell, see `_Stretch`.
 
     Parameters
     ----------
@@ -33,7 +33,7 @@ def transfer(source: Scene, target: Scene, u: Vector) -> Vector:
 
     Returns
     -------
-    Owned degrees of freedom of `target`, zero where it is held.
+    Owned degrees of freedom of `target`, zero at its supports.
     """
     comm, system = source.model.system.comm, target.model.system
     values = np.concatenate(comm.allgather(u.reshape(-1, source.model.V.dofmap.bs)))
@@ -50,7 +50,7 @@ def transfer(source: Scene, target: Scene, u: Vector) -> Vector:
 
 
 def _interpolated(nodes: Array, values: Array, x: Array, rim: float) -> Array:
-    """Values at x (n, 1 or 2), on either side of the rim from the nodes of that side: derivatives jump there."""
+    """Values at x (n, 1 or 2); derivatives jump at the rim, so each side uses only its own nodes."""
     found: Array = np.zeros((len(x), values.shape[1]))
     from_pole, polar = np.linalg.norm(nodes, axis=1), np.linalg.norm(x, axis=1)
     inside = from_pole < rim * (1 + ROUNDING), polar < rim * (1 + ROUNDING)
@@ -58,7 +58,9 @@ def _interpolated(nodes: Array, values: Array, x: Array, rim: float) -> Array:
     for here, wanted in (inside, outside):
         if wanted.any():
             dim = nodes.shape[1]
-            kernel, degree = ("quintic", 3) if dim < 3 else ("linear", 0)  # cubics may vanish on a surface in space
+            kernel, degree = (
+                ("quintic", 3) if dim < 3 else ("linear", 0)
+            )  # cubic polynomials may vanish on a surface in space
             field = scipy.interpolate.RBFInterpolator(
                 nodes[here], values[here], neighbors=NEIGHBOURS[dim], kernel=kernel, degree=degree
             )
@@ -67,12 +69,12 @@ def _interpolated(nodes: Array, values: Array, x: Array, rim: float) -> Array:
 
 
 def same_mesh(source: Scene, target: Scene) -> bool:
-    """Whether both have the same nodes, in whatever order and on whatever ranks; collective."""
+    """Whether both have the same nodes, in any order and on any ranks; collective."""
     return _matching(source, target) is not None
 
 
 def _matching(source: Scene, target: Scene) -> NDArray[np.int64] | None:
-    """For each node of this rank its number among all nodes of the source; None, on all ranks, if the nodes differ."""
+    """The number of each node of this rank among all nodes of the source; None on all ranks if the nodes differ."""
     comm, nodes, wanted = source.model.system.comm, _all_nodes(source), chart(target)
     distance, number = scipy.spatial.cKDTree(nodes).query(wanted)
     equal = comm.allreduce(len(wanted)) == len(nodes) and comm.allreduce(distance.max(initial=0.0), MPI.MAX) < ROUNDING
@@ -81,11 +83,11 @@ def _matching(source: Scene, target: Scene) -> NDArray[np.int64] | None:
 
 @dataclass(frozen=True)
 class _Stretch:
-    """From the chart of a dimpled sphere to that of another up to the same edge, whose rim is at other polar angle.
+    """The map between the charts of two dimpled spheres with the same edge and different rims.
 
-    The charts are similar up to the rim, and equal at the edge. With the ratio q of the rims, displacements
-    across the surface are scaled by q^2 and those along it by q^3: so do the strains u_n/R + u_t,s + u_n,s^2/2
-    of a shallow shell keep their shape. What is out of proportion in them, Newton's method forgives least.
+    The charts are similar up to the rim and equal at the edge. With the ratio q of the rims, displacements normal to
+    the surface are scaled by q^2 and tangential ones by q^3. This preserves the shape of the strains
+    u_n/R + u_t,s + u_n,s^2/2 of a shallow shell, which Newton's method is most sensitive to.
     """
 
     rim: float
@@ -93,12 +95,12 @@ class _Stretch:
     edge: float
 
     def place(self, x: Array) -> Array:
-        """Where the source has the points x (n, 1 or 2) of the target."""
+        """The points of the source that correspond to points x (n, 1 or 2) of the target."""
         polar = np.linalg.norm(x, axis=1, keepdims=True)
         return np.asarray(x * self._polar(polar) / np.maximum(polar, TINY))
 
     def turn(self, u: Array, x: Array) -> Array:
-        """Displacements (n, 2 or 3) of the source at the places of x, turned and stretched along the surface."""
+        """Displacements u (n, 2 or 3) of the source, rotated and scaled for points x of the target."""
         polar = np.linalg.norm(x, axis=1, keepdims=True)
         azimuth = x / np.maximum(polar, TINY) if x.shape[1] == 2 else np.ones_like(polar)
         there, here = _frame(self._polar(polar), azimuth), _frame(polar, azimuth)
@@ -118,17 +120,17 @@ class _Stretch:
         return np.asarray(np.maximum(slope, 0.5))
 
     def _beyond(self, polar: Array) -> Array:
-        """0 up to the rim, 1 at the edge."""
+        """Grows linearly from 0 at the rim to 1 at the edge."""
         return np.asarray(np.maximum((polar - self.rim) / (self.edge - self.rim), 0.0))
 
 
 def _frame(polar: Array, azimuth: Array) -> tuple[Array, Array]:
-    """Unit vectors of the sphere, across it and along its meridians, for directions of the azimuth (n, 1 or 2)."""
+    """Unit vectors normal to the sphere and along its meridians, for unit vectors (n, 1 or 2) of the azimuth."""
     return np.hstack([np.sin(polar) * azimuth, np.cos(polar)]), np.hstack([np.cos(polar) * azimuth, -np.sin(polar)])
 
 
 def _stretch(source: Scene, target: Scene) -> _Stretch | None:
-    """None where the charts are compared as they are."""
+    """The map between dimpled spheres; None for other surfaces."""
     rims, edges = [], []
     for scene in (target, source):
         embedding, shape = scene.plan.embedding, scene.plan.shape
@@ -146,10 +148,10 @@ def _all_nodes(scene: Scene) -> Array:
 
 
 def chart(scene: Scene) -> Array:
-    """Coordinates (n, 1 or 2) of this rank's nodes in the chart, where a defect does not move them.
+    """Coordinates (n, 1 or 2) of this rank's nodes in the chart, independent of a defect.
 
-    Of a solid with their height in the thickness: its displacements are carried to the same mesh only. Of a mesh file
-    their places (n, 3).
+    For a solid with the height in its thickness: its displacements are carried to the same mesh only. For a mesh file
+    these are positions (n, 3).
     """
     model = scene.model
     if isinstance(model, MeridianModel):
@@ -160,5 +162,5 @@ def chart(scene: Scene) -> Array:
         return places[: model.V.dofmap.index_map.size_local]
     cells, nodes = model.midsurface.charted(model.V), model.V.dofmap.list
     found = np.full((model.V.dofmap.index_map.size_local + model.V.dofmap.index_map.num_ghosts, cells.shape[2]), np.inf)
-    np.minimum.at(found, nodes, cells)  # of a node on a seam, which has two places, the first
+    np.minimum.at(found, nodes, cells)  # the first of the two positions of a node on a seam
     return found[: model.V.dofmap.index_map.size_local]

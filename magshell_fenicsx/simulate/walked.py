@@ -1,4 +1,4 @@
-"""Walking along a path of a scene: its records, the modes that its model excludes, and branches."""
+"""A walk along a path of a scene: its records, the modes that the model excludes, and branches."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
@@ -14,16 +14,16 @@ from magshell_fenicsx.continuation.watch import Crossing
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.stage import LONGEST, Stage
 
-BEYOND = 2.0  # times the load of the first instability that the model excludes a walk goes on
+BEYOND = 2.0  # a walk ends at this multiple of the load of the first excluded instability
 
 
 def followed(
     stage: Stage, path: Path, start: Point, goal: Goal, branches: PathSection | None = None
 ) -> Iterator[Record]:
-    """A walk, what the reduced model excludes on it, and the branches if they are asked for.
+    """The records of a walk, with instabilities that the reduced model excludes, and of requested branches.
 
-    With `until: bifurcation` a mode that the model excludes ends the walk; with `until: limit` the walk goes on to
-    the model's own first instability, if that is below `BEYOND` times the load of the first excluded one.
+    With `until: bifurcation` an excluded instability ends the walk. With `until: limit` the walk continues to the first
+    instability of the model itself, up to `BEYOND` times the load of the first excluded one.
 
     Raises
     ------
@@ -68,7 +68,7 @@ def _followed(
                 at = f"{path.name} = {found.point.state.mu[path.name]:.9g}"
                 lost = f"load control cannot pass the fold at {at}; {lost}"
     if watch.unlocated:
-        why = f"a mode that the reduced model excludes is unstable, but where is not known: {watch.unlocated}"
+        why = f"a mode that the reduced model excludes is unstable from an unknown point on: {watch.unlocated}"
         lost = f"{lost}; {why}" if lost else why
     if lost:
         raise Stopped(lost)
@@ -77,7 +77,7 @@ def _followed(
 
 
 def _branches(stage: Stage, path: Path, crossing: Branching, goal: Goal, steps: int) -> Iterator[Record]:
-    """Both directions of a branch, to the same target as the path or for a number of steps."""
+    """Follow both directions of a branch, to the target of the path or for a number of steps."""
     lost, watch = [], stage.scene.watch
     if goal.until != "target":
         goal = Goal("points", steps=steps)
@@ -100,13 +100,13 @@ def _branches(stage: Stage, path: Path, crossing: Branching, goal: Goal, steps: 
 
 
 def _by_arc(stage: Stage, path: Path) -> Path:
-    """The same path by arc length, in steps as long as the one off it at a bifurcation."""
+    """The same path with arc-length control; its steps are as long as the first step on a branch."""
     scale = path.metric.scale
     return stage.path(path.name, "arc", StepOptions(0.1, LONGEST * 0.1, 1e-6), scale)
 
 
 def _fold_ahead(stage: Stage, path: Path, points: list[Point]) -> list[Record]:
-    """The fold that ended a path under load control, by arc length from its last point, and what comes before it."""
+    """The fold that ended a path under load control, located by arc length, after any excluded instabilities."""
     onward = points[-1].s - points[-2].s if len(points) > 1 else 1.0
     by_arc, start = stage.begin(path.name, "arc", points[-1].state, onward, path.metric.scale)
     stage.scene.watch.begin(by_arc, start, stage.leave)
@@ -122,26 +122,26 @@ def _fold_ahead(stage: Stage, path: Path, points: list[Point]) -> list[Record]:
 
 
 def _excluded(path: Path, crossings: Iterable[Crossing]) -> Iterator[Record]:
-    """Where modes that a reduced model does not see become unstable or stable."""
+    """Records of the points where excluded modes become unstable or stable."""
     for found in crossings:
         yield Record("bifurcation", path.name, found.point, found.label, excluded_pivots=found.unstable)
 
 
 def _why(path: Path, stop: PathStopped, points: list[Point]) -> str:
-    """What the user reads when a path is lost, with the fold in the control named if it is one."""
+    """The message for a lost path; it names a fold in the controlled quantity."""
     here = stop.point
-    said = f"the last point has {path.name} = {here.state.mu[path.name]:.6g}: {stop}"
+    where = f"the last point has {path.name} = {here.state.mu[path.name]:.6g}: {stop}"
     if path.control == "load":
-        return f"load control stopped; {said}. Past a limit point only control: arc or by displacement can follow"
+        return f"load control stopped; {where}. To pass a limit point, use control: arc or control: displacement"
     before = points[-2] if len(points) > 1 else here
     if path.control == "arc" or before.dmu == here.dmu:
-        return f"the controlled path stopped; {said}"
+        return f"the controlled path stopped; {where}"
     # near a fold in the controlled s, (ds/dmu)^2 falls linearly to zero with s
     a, b = before.dmu**-2, here.dmu**-2
     ahead = b * (here.s - before.s) / (a - b) if a > b else np.inf
     if 0 < ahead / (here.s - before.s) < 10:
         return (
             f"the path turns back in the controlled displacement, {ahead / here.s:.2%} beyond the last point: "
-            f"a fold that displacement control cannot pass, but control: arc can; {said}"
+            f"a fold that displacement control cannot pass, but control: arc can; {where}"
         )
-    return f"the controlled path stopped; {said}"
+    return f"the controlled path stopped; {where}"

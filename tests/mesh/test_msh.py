@@ -359,6 +359,6 @@ def test_another_mesh_in_the_same_file_is_another_problem(case_file: Path, tmp_p
         run(Case.load(case_file), tmp_path / "out", resume=True)
     with (case_file.parent / "parts" / "part.msh").open("a", encoding="utf-8") as file:
         file.write("$Comments\nanother\n$EndComments\n")
-    with pytest.raises(CaseError, match="is of another run: mesh_file"):
+    with pytest.raises(CaseError, match="belongs to another run: mesh_file"):
         run(Case.load(case_file), tmp_path / "out", resume=True)
     assert not set(before) & set(keys())

@@ -175,7 +175,7 @@ def test_where_a_path_leads() -> None:
     assert Aim("w_over_h", 20.0).part(row, 7) == 0.25
     assert Aim("w_over_h", words="28 steps", steps=28).part(row, 7) == 0.25
     assert Aim("p_over_pc", words="the first instability").part(row, 7) is None
-    assert Aim("p_over_pc", words="the first instability").told(row) == "p/pc 0.25 -> the first instability"
+    assert Aim("p_over_pc", words="the first instability").text(row) == "p/pc 0.25 -> the first instability"
     assert time_left((0.0, 10.0), (0.25, 20.0)) == 30.0
     assert time_left((0.2, 10.0), (0.4, 20.0)) == pytest.approx(30.0)
     assert time_left((0.0, 10.0), (1.0, 20.0)) is None

@@ -25,7 +25,7 @@ SURFACE = (
     CASES / "pole_indentation.yaml",
     *(f"--set={key}" for key in ("loading.points=40", "mesh.degree=3", "mesh.refinement=0.2", "symmetry=half")),
 )
-GOES_ON = "; what was found is in {out}/, and --resume goes on from there\n"
+GOES_ON = "; the results so far are in {out}/, and --resume continues from there\n"
 
 
 @pytest.fixture(scope="module")

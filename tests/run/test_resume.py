@@ -135,7 +135,7 @@ def test_another_case(tmp_path: Path, ranks: int) -> None:
     assert magshell("run", *MERIDIAN, "--out", tmp_path, "--time-limit", 0).returncode == 3
     done = magshell("run", *MERIDIAN, "--set=shell.radius_to_thickness=100", "--out", tmp_path, "--resume", ranks=ranks)
     assert done.returncode == 2
-    said = f"--resume: {tmp_path} is of another run: shell.radius_to_thickness is 90.0 there and 100.0 here"
+    said = f"--resume: {tmp_path} belongs to another run: shell.radius_to_thickness is 90.0 there and 100.0 here"
     assert done.stderr.count(said) == 1
     assert "Traceback" not in done.stderr
     assert (tmp_path / "checkpoint").exists()

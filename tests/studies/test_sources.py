@@ -145,7 +145,7 @@ def test_points_of_a_sweep(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, edit
     assert len(computed) == 2
     edited()
     assert again("loading.pressure=1e-5:3e-5:3") == [
-        "2 of these again: what the folder has of them is of other sources of magshell_fenicsx, or damaged"
+        "2 of these computed again: their files are of other sources of magshell_fenicsx, or damaged"
     ]
     assert len(computed) == 3
     assert again("loading.pressure=1e-5:3e-5:3") == []
@@ -186,7 +186,7 @@ def test_samples_of_a_study(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, edi
     assert not any("again" in line for line in said)
     edited()
     assert measured() == 4
-    assert said[0] == "2 of 2 again: what the folder has of them is of other sources of magshell_fenicsx"
+    assert said[0] == "2 of 2 computed again: the folder has results of other sources of magshell_fenicsx"
     assert measured() == 0
 
 
@@ -210,7 +210,8 @@ def test_runs_of_a_comparison(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, e
     assert (measured(), measured(), said) == (1, 0, [])
     edited()
     assert measured() == 1
-    assert said == ["shell at refinement 0.5: again, the folder has it of other sources of magshell_fenicsx"]
+    why = "the folder has results of other sources of magshell_fenicsx"
+    assert said == [f"shell at refinement 0.5: computed again, {why}"]
     assert measured() == 0
 
 

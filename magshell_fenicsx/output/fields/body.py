@@ -1,4 +1,4 @@
-"""The deformed solid gathered on rank 0: a `Surface` whose cells are hexahedra."""
+"""The deformed solid on rank 0, as a `Surface` whose cells are hexahedra."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 
 
 class BodyGatherer:
-    """Gathers displacements of one solid; n0 is the direction of the thickness."""
+    """Gathers the displacement of one solid; n0 is the direction of the thickness."""
 
     def __init__(self, model: SolidModel) -> None:
         self._model, self.comm = model, model.V.mesh.comm
@@ -28,7 +28,7 @@ class BodyGatherer:
         self._r0, self._n0 = self._nodes(model.r0), self._nodes(_outwards(model.r0))
 
     def gather(self, u: Vector, mu: Mapping[str, float] | None = None) -> Surface | None:
-        """The body with a displacement, on rank 0; None elsewhere."""
+        """The displaced body on rank 0; None on other ranks."""
         self._model.system.set(u)
         nodes = self._nodes(self._model.u)
         return Surface(self._r0, nodes, self._n0, self._cells, {}) if self.comm.rank == 0 else None
@@ -43,7 +43,7 @@ class BodyGatherer:
 
 
 def _outwards(r0: fem.Function) -> fem.Function:
-    """The unit vector along which the body is swept, at its nodes."""
+    """The unit vector in the direction of the thickness, at the nodes."""
     V = r0.function_space
     element = V.element.basix_element
     by_third = element.tabulate(1, element.points)[3, :, :, 0]

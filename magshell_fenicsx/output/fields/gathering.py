@@ -1,4 +1,4 @@
-"""What gathers a model's nodes on rank 0, for pictures and for ParaView."""
+"""The gatherer of each model: it collects nodal fields on rank 0 for pictures and ParaView."""
 
 from collections.abc import Mapping
 from typing import Protocol
@@ -14,16 +14,16 @@ from magshell_fenicsx.output.fields.surface import RevolvedGatherer, Surface, Su
 
 
 class Gatherer(Protocol):
-    """Gathers displacements of one model; every rank calls."""
+    """Gathers the displacement and fields of one model; collective."""
 
     comm: MPI.Comm
 
     def gather(self, u: Vector, mu: Mapping[str, float] | None = None) -> Surface | None:
-        """The model's nodes with a displacement, and a field of these amplitudes, on rank 0; None elsewhere."""
+        """The displaced nodes with their fields at the amplitudes mu, on rank 0; None on other ranks."""
 
 
 def gatherer(model: ShellModel | MeridianModel | SolidModel, comm: MPI.Comm) -> Gatherer:
-    """What fits a model."""
+    """The gatherer of a model."""
     if isinstance(model, MeridianModel):
         return RevolvedGatherer(model, comm)
     return BodyGatherer(model) if isinstance(model, SolidModel) else SurfaceGatherer(model)

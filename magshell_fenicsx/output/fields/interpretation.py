@@ -1,7 +1,7 @@
-"""The magnetic energy read as loads: pressure, in-plane force, rotational springs, torques.
+"""The magnetic energy as equivalent loads: pressure, in-plane force, rotational springs, torques.
 
-Paper, section "Reduced magneto-elastic energy as load potentials"; for a field that is uniform in
-space, at the nodes of the undeformed surface, dimensionless as there.
+Paper, section "Reduced magneto-elastic energy as load potentials": for a field that is uniform in space, at the nodes
+of the undeformed surface, dimensionless as in the paper.
 """
 
 from dataclasses import dataclass
@@ -17,18 +17,20 @@ Array = NDArray[np.float64]
 def magnetic_loads(
     g: "SurfaceGeometry", field: Magnetisation, r0: Array, h: float | Array
 ) -> tuple[dict[str, Array], "Torque"]:
-    """At points r0 (..., 3) p_mag, k and, of a uniform remanence and thickness, f_mag; and the torque, of u.
+    """The loads p_mag and k at points r0 (..., 3), and the torque as a function of u.
+
+    f_mag is added if the remanence and the thickness are uniform.
 
     Parameters
     ----------
     h
-        The thickness over R; where it varies, (...) at the points.
+        Thickness over R; an array (...) if it varies.
     """
     pattern = field.remanent
     Br = pattern(r0, g.n0) if callable(pattern) else np.broadcast_to(pattern, r0.shape)
     Ba = field.applied
     loads = {"p_mag": magnetic_pressure(g, Br, Ba, h), "k": spring_stiffness(g, Br, Ba)}
-    if not callable(pattern) and isinstance(h, float):  # its divergence is of uniform vectors and thickness
+    if not callable(pattern) and isinstance(h, float):  # the formula of f_mag assumes uniform vectors and thickness
         loads["f_mag"] = in_plane_force(g, Br, Ba, h)
     return loads, torque(g, Br, Ba)
 
@@ -55,10 +57,10 @@ def magnetic_pressure(g: SurfaceGeometry, Br: Array, Ba: Array, h: float | Array
 
 
 def in_plane_force(g: SurfaceGeometry, Br: Array, Ba: Array, h: float) -> Array:
-    """f_mag (..., 3) of uniform Br and Ba.
+    """f_mag (..., 3) for uniform Br and Ba.
 
-    f_c = -h times the surface divergence of (a_c . Ba)(a^a . Br) B0's sign included, which for
-    constant vectors is h [b_ca (n . Ba)(a^a . Br) + tr b (n . Br)(a_c . Ba)].
+    f_c is -h times the surface divergence of -(a_c . Ba)(a^a . Br). For constant vectors this equals
+    h [b_ca (n . Ba)(a^a . Br) + tr b (n . Br)(a_c . Ba)].
     """
     dual = g.dual
     along, normal_Ba = np.einsum("...ai,...i->...a", dual, Br), np.einsum("...i,i->...", g.n0, Ba)
@@ -75,13 +77,13 @@ def spring_stiffness(g: SurfaceGeometry, Br: Array, Ba: Array) -> Array:
 
 @dataclass(frozen=True)
 class Torque:
-    """tau at points with normals n0 (..., 3); `along` holds -(n0 . Br)(a0^a . Ba), (..., 2)."""
+    """The torque tau at points with normals n0 (..., 3); `along` is -(n0 . Br)(a0^a . Ba), (..., 2)."""
 
     n0: Array
     along: Array
 
     def __call__(self, du: Array) -> Array:
-        """tau_c = B0^ij (a0^a . e_j)(n0 . e_i) (u,_a . a0_c) as a vector (..., 3), of u,_1 and u,_2 (..., 2, 3)."""
+        """tau_c = B0^ij (a0^a . e_j)(n0 . e_i) (u,_a . a0_c) as a vector (..., 3), from u,_1 and u,_2 (..., 2, 3)."""
         turned = np.matmul(self.along[..., None, :], du)[..., 0, :]
         return np.asarray(turned - np.sum(turned * self.n0, axis=-1, keepdims=True) * self.n0)
 

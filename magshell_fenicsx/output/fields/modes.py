@@ -1,7 +1,7 @@
-"""Modes and null vectors on the whole deformed shell: fields for ParaView, a table, captions of their panels.
+"""Modes and null vectors on the whole deformed shell: fields for ParaView, a table, captions.
 
-A half is completed by the mirror image that the mode calls for, the coefficients of waves are turned around
-the axis.
+A half shell is completed by the symmetric or antisymmetric mirror image of the mode. The coefficients of waves are
+evaluated around the axis.
 """
 
 import csv
@@ -26,13 +26,13 @@ from magshell_fenicsx.output.store.durable import write_whole
 
 Array = NDArray[np.float64]
 WAVES = "m = "
-RING, MOST_WAVES = 0.02, 80  # height over R of the circle that waves are counted on
-GAP = np.pi / 4  # between its nodes, in a mesh that could show a wave
+RING, MOST_WAVES = 0.02, 80  # half height over R of the ring of nodes on which waves are counted; largest number
+GAP = np.pi / 4  # largest gap between the nodes of the ring
 COLUMNS = ("point", "number", "mode", "eigenvalue")
 
 
 class Mode(Protocol):
-    """What is told of a mode; see `stability.ShellMode`."""
+    """What a mode's files need; see `models.modes.ShellMode`."""
 
     @property
     def label(self) -> str: ...
@@ -49,20 +49,20 @@ def mode_surface(
     vector: Vector,
     azimuth: float = 0.0,
 ) -> Surface | None:
-    """The whole shell displaced by u with a mode as its fields; all ranks call.
+    """The whole shell displaced by u, with a mode as its fields; collective.
 
     Parameters
     ----------
     label, vector
-        "m = 7": coefficients (U + V, V, W) of waves; "antisymmetric": what the other half mirrors with the
-        opposite sign; anything else: in the model's own space and symmetry.
+        "m = 7": the vector has the coefficients (U + V, V, W) of waves; "antisymmetric": the other half is the mirror
+        image with the opposite sign; any other label: the mode has the model's own symmetry.
     azimuth
-        Of the model's frame, rad.
+        Azimuth of the model's frame, rad.
 
     Returns
     -------
-    On rank 0 the surface with the fields "mode" (n, 3), its longest vector of length one, and "mode_w" (n,), its
-    part along -n0; None elsewhere.
+    On rank 0 the surface with the fields "mode" (n, 3), scaled to a largest length of one, and "mode_w" (n,), its
+    component along -n0; None on other ranks.
     """
     if label.startswith(WAVES) and isinstance(model, MeridianModel):
         if gatherer.comm.rank:
@@ -82,12 +82,12 @@ def mode_surface(
 
 
 def mode_file(folder: Path, point: int, name: str, label: str) -> Path:
-    """Where a mode goes.
+    """The file of a mode.
 
     Parameters
     ----------
     name
-        "fold" or "bifurcation" of a null vector, the number of a mode.
+        "fold" or "bifurcation" for a null vector, otherwise the number of the mode.
 
     Examples
     --------
@@ -99,12 +99,12 @@ def mode_file(folder: Path, point: int, name: str, label: str) -> Path:
 
 
 def write_mode(file: Path, surface: Surface, about: About) -> None:
-    """Write what `mode_surface` made; `Warp By Vector` in ParaView, with "mode", moves the shell.
+    """Write the surface of `mode_surface`; in ParaView, `Warp By Vector` with "mode" shows it.
 
     Raises
     ------
     OSError
-        If the disk is full; there is no such file then.
+        If the disk is full; the file is not written then.
     """
     write_whole(file, vtu_content(surface, about))
 
@@ -120,7 +120,7 @@ def mode_table(found: Mapping[int, Sequence[Mode]]) -> bytes:
 
 
 def mode_caption(number: int, mode: Mode) -> str:
-    """Of a panel: number, label and eigenvalue, with matplotlib's mathematics.
+    """The caption of a panel: number, label and eigenvalue, in matplotlib's mathematics.
 
     Examples
     --------
@@ -135,16 +135,16 @@ def mode_caption(number: int, mode: Mode) -> str:
 
 
 def _with_mode(base: Surface, v: Array) -> Surface:
-    """Scaled to a longest vector of one; at the first of the places where its normal part is largest, it is inward."""
+    """Scale a mode to a largest length of one, and inward at the first node where its normal component is largest."""
     inward = -np.einsum("ij,ij->i", v, base.n0)
     size = np.abs(inward)
-    first = np.argmax(size > (1 - 1e-6) * size.max())  # crests and troughs of a wave differ by rounding
+    first = np.argmax(size > (1 - 1e-6) * size.max())  # the crests and troughs of a wave differ only by rounding
     scale = np.copysign(np.linalg.norm(v, axis=1).max(), inward[first])
     return replace(base, fields={"mode": v / scale, "mode_w": inward / scale})
 
 
 def _revolved_wave(model: MeridianModel, u: Vector, m: int, vector: Vector) -> tuple[Surface, Array]:
-    """The surface in twelve sectors or more to a wave, and the wave at its nodes.
+    """The surface with at least twelve sectors per wave, and the wave at its nodes.
 
     v = U cos(m theta) e_rho + V sin(m theta) e_theta + W cos(m theta) e_z.
     """
@@ -159,15 +159,15 @@ def _revolved_wave(model: MeridianModel, u: Vector, m: int, vector: Vector) -> t
         radial * np.sin(theta) + azimuthal * np.cos(theta),
     )
     v = np.stack([x, y, W * np.cos(m * theta)], axis=-1)
-    first = min(len(model.meridian.axis), 1)  # all sectors meet in the pole
+    first = min(len(model.meridian.axis), 1)  # all sectors share the pole
     at_nodes = np.concatenate([v[:first, 0], v[first:].reshape(-1, 3)])
     return Surface(swept.r0, swept.displacement(u), swept.n0, swept.cells, {}), at_nodes
 
 
 def wave_number(surface: Surface) -> int | None:
-    """The number of waves around e3 of a mode, where it is largest.
+    """The number m >= 2 of waves of a mode around e3, on the ring where the mode is largest.
 
-    None if it is not mainly one of m >= 2, or the surface is flat, or does not go around e3 there.
+    None if no single m >= 2 dominates, if the surface is flat, or if the ring is not closed around e3.
     """
     w, height = surface.fields["mode_w"], surface.r0[:, 2]
     if np.ptp(height) < RING:

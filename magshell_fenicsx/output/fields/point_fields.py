@@ -1,4 +1,4 @@
-"""What is told of a shell's points besides their displacement: strains, moments, magnetic fields and loads."""
+"""Fields at a shell's points besides the displacement: strains, moments, magnetic fields and loads."""
 
 from collections.abc import Mapping
 
@@ -13,24 +13,24 @@ Array = NDArray[np.float64]
 
 
 class PointFields:
-    """Fields at points (cells, points of each) of a shell.
+    """Fields of a shell at points (cells, points per cell).
 
     Parameters
     ----------
     r0
         (6, cells, points, 3) jet of the placement; see `strains.TangentFrame`.
     field
-        The magnetisation; None without.
+        The magnetisation, or None.
     thickness
-        (cells, points) what multiplies h there; None for 1.
+        (cells, points) factor of h; None for 1.
 
     Attributes
     ----------
     constant
-        Name -> values (cells, points, ...) of what does not depend on the displacement: of a uniform applied field
-        p_mag, k, f_mag.
+        Name -> values (cells, points, ...) of the fields that do not depend on the displacement: p_mag, k and f_mag
+        of a uniform applied field.
     weight
-        (cells, points) of a cell's value in the mean over the cells that share a point: its area.
+        (cells, points) area; the weight of a cell in the mean over the cells that share a point.
     """
 
     def __init__(self, r0: Array, material: Material, field: Magnetisation | None, thickness: Array | None) -> None:
@@ -46,20 +46,20 @@ class PointFields:
             self.constant, self._torque = magnetic_loads(self._geometry(), field, r0[0], h)
 
     def of(self, u: Array, mu: Mapping[str, float]) -> dict[str, Array]:
-        """The fields of a displacement's jet (6, cells, points, 3) over R, and the amplitudes' values.
+        """The fields of a displacement with the jet u (6, cells, points, 3) over R, at the amplitudes mu.
 
         Returns
         -------
         E, M
-            (..., 3, 3) membrane strain and bending moment over D/R, D that of the thickness h, as tensors in space that
-            are tangent to the undeformed surface.
+            (..., 3, 3) membrane strain and bending moment over D/R, with D of the thickness h, as tensors in space
+            that are tangent to the undeformed surface.
         E_1, E_2, M_1, M_2
             (...) their principal values, the larger first.
         Br, Ba
-            (..., 3) the remanence, moved by the shell, over its magnitude; the applied flux density at the
-            deformed place, over mu_0 E / |Br|: its magnitude is lambda_m.
+            (..., 3) the remanence convected by the shell, over its magnitude; the applied flux density at the
+            deformed point, over mu_0 E / |Br|, so that its magnitude is lambda_m.
         tau
-            (..., 3) torque, of a uniform field.
+            (..., 3) torque, for a uniform field.
         """
         frame = self._frame
         E, M = frame.membrane_strain(u), bending_moment(frame.curvature_change(u), self._nu)
@@ -82,7 +82,7 @@ class PointFields:
 
 
 def _applied(field: Magnetisation, mu: Mapping[str, float], r: Array) -> Array:
-    """The applied flux density (..., 3) at places r (..., 3)."""
+    """The applied flux density (..., 3) at points r (..., 3)."""
     along = mu.get("lambda_m", 0.0)
     uniform = along * field.applied
     if field.across is not None:

@@ -19,14 +19,14 @@ from magshell_fenicsx.models.axisymmetric.revolution import Revolution
 from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.output.fields.point_fields import PointFields
 
-TRIANGLE, LAGRANGE_TRIANGLE, LAGRANGE_HEXAHEDRON = 5, 69, 72  # VTK's numbers; the flat triangle, cells of any order
+TRIANGLE, LAGRANGE_TRIANGLE, LAGRANGE_HEXAHEDRON = 5, 69, 72  # VTK's numbers of cell types
 HEXAHEDRON_NODES = 27
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Surface:
-    """Nodes of the whole mid-surface, or of the whole body of a solid, in lengths of R.
+    """Nodes of the whole mid-surface or of a whole solid; lengths are over R.
 
     Attributes
     ----------
@@ -35,7 +35,7 @@ class Surface:
     cells
         (m, k) node numbers of triangles of the displacement's degree or of hexahedra, in VTK's order.
     fields
-        Name -> (n,), (n, 3) or (n, 3, 3): see `point_fields.PointFields`; of a solid none.
+        Name -> (n,), (n, 3) or (n, 3, 3), see `point_fields.PointFields`; empty for a solid.
     """
 
     r0: Array
@@ -46,7 +46,7 @@ class Surface:
 
     @property
     def is_body(self) -> bool:
-        """Whether its cells are hexahedra."""
+        """Whether the cells are hexahedra."""
         return self.cells.shape[1] == HEXAHEDRON_NODES
 
     @property
@@ -56,20 +56,20 @@ class Surface:
 
 
 class SurfaceGatherer:
-    """Gathers displacements of one model; what does not change is computed and gathered once."""
+    """Gathers displacements and fields of one shell; constant fields are computed and gathered once."""
 
     def __init__(self, model: ShellModel) -> None:
         self._model = model
         domain, degree, map_ = model.V.mesh, model.degree, model.V.dofmap.index_map
         self.comm = domain.comm
-        # VTK's nodes are equidistant, the displacement's are not; there are as many of them on edges and in cells
+        # VTK's nodes are equidistant, the displacement's are not; their numbers on edges and in cells are equal
         element = basix.create_element(
             basix.ElementFamily.P, basix.CellType.triangle, degree, basix.LagrangeVariant.equispaced
         )
         self._places = element.points
         self._table = model.V.element.basix_element.tabulate(2, self._places)[:, :, :, 0]
         self._owned = domain.topology.index_map(2).size_local
-        V = fem.functionspace(domain, basix.ufl.wrap_element(element))  # numbers nodes that two cells share alike
+        V = fem.functionspace(domain, basix.ufl.wrap_element(element))  # numbers each shared node once
         local = V.dofmap.list[: self._owned]
         numbers = V.dofmap.index_map.local_to_global(local.ravel().astype(np.int32)).reshape(local.shape)
         cells = self.comm.gather(numbers[:, np.argsort(perm_vtk(mesh.CellType.triangle, local.shape[1]))])
@@ -83,7 +83,7 @@ class SurfaceGatherer:
         self._constant = {name: self._averaged(values) for name, values in self._fields.constant.items()}
 
     def gather(self, u: Vector, mu: Mapping[str, float] | None = None) -> Surface | None:
-        """The surface with a displacement, and a field of these amplitudes, on rank 0; None elsewhere."""
+        """The displaced surface with its fields at the amplitudes mu, on rank 0; None on other ranks."""
         self._model.system.set(u)
         jet = self._at_nodes(self._model.u)
         found = {name: self._averaged(values) for name, values in self._fields.of(jet, mu or {}).items()}
@@ -103,9 +103,9 @@ class SurfaceGatherer:
         return np.asarray(factor.x.array[V.dofmap.list[: self._owned]] @ values.T)
 
     def _weighted_mean(self, numbers: NDArray[np.int64], size: int) -> "scipy.sparse.csr_matrix | None":
-        """From the nodes of all cells to nodes in global order, on rank 0.
+        """The matrix of the weighted mean, from the nodes of all cells to global nodes, on rank 0.
 
-        Second derivatives jump between cells: the mean over those that share a node is weighted by their areas.
+        Second derivatives jump between cells, so values at a shared node are averaged with the cells' areas as weights.
         """
         parts = self.comm.gather((numbers.ravel(), self._fields.weight.ravel()))
         if self.comm.rank:
@@ -124,7 +124,7 @@ class SurfaceGatherer:
 
 
 class RevolvedGatherer:
-    """The surface that a meridian sweeps, as flat triangles."""
+    """The surface of revolution of a meridian, in flat triangles."""
 
     def __init__(self, model: MeridianModel, comm: MPI.Comm) -> None:
         self.comm, self._model, self._swept = comm, model, Revolution(model)
@@ -133,7 +133,7 @@ class RevolvedGatherer:
         self._constant = self._around(self._fields.constant)
 
     def gather(self, u: Vector, mu: Mapping[str, float] | None = None) -> Surface | None:
-        """The surface with a displacement, and a field of these amplitudes, on rank 0; None elsewhere."""
+        """The displaced surface with its fields at the amplitudes mu, on rank 0; None on other ranks."""
         if self.comm.rank:
             return None
         self._model.system.set(u)
@@ -145,14 +145,15 @@ class RevolvedGatherer:
 
 
 def turned(surface: Surface, azimuth: float) -> Surface:
-    """The surface turned about e3 (rad): from the model's frame back to the user's."""
+    """The surface rotated about e3 by an angle in rad: from the model's frame to the user's."""
     return _moved(surface, rotation(azimuth))
 
 
 def completed(surface: Surface, mirror: Array) -> Surface:
-    """A half surface with its image in a mirror plane: its unit normal (3,), and offset if that is not zero.
+    """A half surface together with its mirror image.
 
-    Seen from outside, the image's triangles run the other way round.
+    `mirror` is the plane's unit normal (3,), followed by its offset if that is not zero. Seen from outside, the
+    image's triangles have the opposite orientation.
     """
     normal, offset = mirror[:3], float(mirror[3:].sum())
     image = _moved(surface, np.eye(3) - 2 * np.outer(normal, normal))
@@ -171,7 +172,7 @@ def completed(surface: Surface, mirror: Array) -> Surface:
 
 
 def _moved(surface: Surface, Q: Array) -> Surface:
-    """Places and vectors v -> v Q, tensors T -> Q^T T Q."""
+    """Transform points and vectors v -> v Q, and tensors T -> Q^T T Q."""
 
     def moved(f: Array) -> Array:
         return f if f.ndim == 1 else f @ Q if f.ndim == 2 else Q.T @ f @ Q

@@ -1,4 +1,4 @@
-"""Fields for ParaView: one .vtu per saved point, with curved triangles, and a .pvd of all; read back for pictures."""
+"""Fields for ParaView: a .vtu file with curved triangles per point, and a .pvd list; pictures read them back."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,23 +15,23 @@ if TYPE_CHECKING:  # VTK takes long to import
     import pyvista
 
 Array = NDArray[np.float64]
-SYMMETRIC = ([0, 1, 2, 0, 1, 0], [0, 1, 2, 1, 2, 2])  # of a tensor: XX, YY, ZZ, XY, YZ, XZ, VTK's order
-FULL = [[0, 3, 5], [3, 1, 4], [5, 4, 2]]  # back
+SYMMETRIC = ([0, 1, 2, 0, 1, 0], [0, 1, 2, 1, 2, 2])  # VTK's order of a symmetric tensor: XX, YY, ZZ, XY, YZ, XZ
+FULL = [[0, 3, 5], [3, 1, 4], [5, 4, 2]]  # from VTK's order to (3, 3)
 OWN_DATA = ("u_over_h", "w_over_h", "r0", "n0")
 
 
 @dataclass(frozen=True)
 class About:
-    """What pictures need to know of a shell besides its points; in every file.
+    """Data of a shell that pictures need besides the nodes; every file has them.
 
     Attributes
     ----------
     h
-        The thickness over R.
+        Thickness over R.
     nu
         Poisson's ratio.
     mirror
-        Unit normal (3,) of the plane that a half is completed by, and its offset if that is not zero; None of a whole.
+        Unit normal (3,) of the mirror plane of a half shell, then its offset if that is not zero; None for a whole one.
     """
 
     h: float
@@ -40,7 +40,7 @@ class About:
 
 
 def unstructured_grid(surface: Surface, h: float) -> "pyvista.UnstructuredGrid":
-    """The deformed surface or body with u/h, w/h, r0, n0 and its fields at its nodes; lengths in R."""
+    """The deformed surface or body with u/h, w/h, r0, n0 and its fields at the nodes; lengths are over R."""
     import pyvista
 
     count = surface.cells.shape[1]
@@ -58,12 +58,12 @@ def unstructured_grid(surface: Surface, h: float) -> "pyvista.UnstructuredGrid":
 
 
 def read_vtu(file: Path) -> tuple[Surface, About]:
-    """What `FieldSeries.write` wrote.
+    """Read a file of `FieldSeries` or `write_mode`.
 
     Raises
     ------
     CaseError
-        If an earlier version wrote it, without what pictures need.
+        If an earlier version wrote it, without the data of `About`.
     """
     import pyvista
 
@@ -71,21 +71,21 @@ def read_vtu(file: Path) -> tuple[Surface, About]:
     cells = grid.cells.reshape(-1, grid.cells[0] + 1)[:, 1:]
     data = {name: np.asarray(grid.point_data[name]) for name in grid.point_data}
     fields = {name: f[:, FULL] if f.shape[1:] == (6,) else f for name, f in data.items() if name not in OWN_DATA}
-    told = {name: np.asarray(grid.field_data[name]) for name in grid.field_data}
-    if "h_over_R" not in told:
+    numbers = {name: np.asarray(grid.field_data[name]) for name in grid.field_data}
+    if "h_over_R" not in numbers:
         raise CaseError(f"{file} is of an earlier version: run the case again")
-    about = About(float(told["h_over_R"][0]), float(told["poisson_ratio"][0]), told.get("mirror"))
+    about = About(float(numbers["h_over_R"][0]), float(numbers["poisson_ratio"][0]), numbers.get("mirror"))
     r0 = data["r0"]
     return Surface(r0, data["u_over_h"] * about.h, data["n0"], cells, fields), about
 
 
 class FieldSeries:
-    """Writes `point_NNNN.vtu` files and keeps `path.pvd` complete after each, also after an interrupted run.
+    """Writes `point_NNNN.vtu` files and updates `path.pvd` after each; continues after an interrupted run.
 
     Attributes
     ----------
     kept
-        Number of points from the first on whose files are there.
+        Number of leading points whose files exist.
     """
 
     def __init__(self, folder: Path, about: About) -> None:
@@ -104,7 +104,7 @@ class FieldSeries:
         Raises
         ------
         OSError
-            If the disk is full; there is no such file then.
+            If the disk is full; the file is not written then.
         """
         write_whole(self._folder / point_file(number), vtu_content(surface, self._about))
         self._numbers.append(number)
@@ -125,9 +125,9 @@ def point_file(number: int) -> str:
 
 
 def vtu_content(surface: Surface, about: About) -> bytes:
-    """The file's content; VTK itself would pass over a full disk.
+    """The content of a .vtu file; VTK's own writer would ignore a full disk.
 
-    Raw, compressed by LZ4, which takes no time: zlib takes ten times as long and saves a tenth more on curved surfaces.
+    LZ4 compression costs almost no time; zlib takes ten times as long and saves only a tenth more on curved surfaces.
     """
     from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter  # type: ignore[import-untyped]
 
@@ -142,5 +142,5 @@ def vtu_content(surface: Surface, about: About) -> bytes:
     writer.SetCompressorTypeToLZ4()
     writer.WriteToOutputStringOn()
     writer.Write()
-    content: bytes | str = writer.GetOutputString()  # text, where the bytes happen to be UTF-8
+    content: bytes | str = writer.GetOutputString()  # VTK returns text if the bytes are valid UTF-8
     return content if isinstance(content, bytes) else content.encode()

@@ -1,4 +1,4 @@
-"""The path as a moving picture: the deformed shell, and a marker on the curve beside it."""
+"""An animation of the path: the deformed shell, and a marker on the curve beside it."""
 
 import io
 from collections.abc import Sequence
@@ -18,16 +18,16 @@ from magshell_fenicsx.output.store.table import Row
 if TYPE_CHECKING:
     from PIL import Image as Pillow
 
-SEEN = 0.1  # extents of the shell that its largest displacement is drawn with at least
+SEEN = 0.1  # least drawn size of the largest displacement, over the shell's extent
 WINDOW = 620  # pixels
-SECONDS = 6.0  # of all frames
-HELD = 1500  # milliseconds of the last
+SECONDS = 6.0  # duration of all frames
+HELD = 1500  # milliseconds of the last frame
 COLOURS = 128
 FOOT = 34  # pixels below the shell
 
 
 def magnification(surfaces: Sequence[Surface]) -> float:
-    """By what displacements are drawn larger: 1, 2, 5, 10, ..., the least with which the largest is seen.
+    """The factor of the drawn displacements: the least of 1, 2, 5, 10, ... with which the largest is visible.
 
     Examples
     --------
@@ -51,16 +51,16 @@ def animated(
     Parameters
     ----------
     surfaces, titles, shown
-        Of each frame: the whole deformed shell, what stands above it and its row.
+        For each frame: the whole deformed shell, the title and the row of path.csv.
     rows
-        Of the whole path.
+        All rows of the path.
     """
     from PIL import Image as Pillow
 
     factor = magnification(surfaces)
     views = _views(surfaces, h, factor)
     frames = _composed(rendered(views), views[0], factor, titles, rows, shown)
-    palette = _palette([frames[i] for i in sorted({0, len(frames) // 2, len(frames) - 1})])  # of all: no flicker
+    palette = _palette([frames[i] for i in sorted({0, len(frames) // 2, len(frames) - 1})])  # the same for all
     first, *others = (Pillow.fromarray(f).quantize(palette=palette, dither=Pillow.Dither.NONE) for f in frames)
     each = round(max(1000 * SECONDS / len(frames), 80), -1)
     durations = [*[each] * len(others), HELD]
@@ -70,7 +70,7 @@ def animated(
 
 
 def _palette(frames: Sequence[Image]) -> "Pillow.Image":
-    """Twice COLOURS: those that cover all, rare ones too, and those that are close where there are many."""
+    """A palette of 2 COLOURS: half of them cover all colours, half resolve the frequent ones."""
     from PIL import Image as Pillow
 
     colours = Pillow.fromarray(np.unique(np.concatenate(frames).reshape(-1, 3), axis=0)[None])
@@ -104,7 +104,7 @@ def _composed(
     rows: Sequence[Row],
     shown: Sequence[Row],
 ) -> list[NDArray[np.uint8]]:
-    """Frames (height, width, 3): what stays is drawn once, title and marker on copies of it."""
+    """Frames (height, width, 3); the fixed parts are drawn once, then the title and the marker on copies."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     high, across = images[0].shape[:2]
@@ -126,9 +126,9 @@ def _composed(
     canvas.draw()
     still = canvas.copy_from_bbox(figure.bbox)
     frames = []
-    for image, said, row in zip(images, titles, shown, strict=True):
+    for image, text, row in zip(images, titles, shown, strict=True):
         canvas.restore_region(still)
-        title.set_text(said)
+        title.set_text(text)
         figure.draw_artist(title)
         if marker:
             marker.set_data(*([x] for x in place(row, amplitude)))

@@ -1,4 +1,4 @@
-"""What stands above pictures, with matplotlib's mathematics."""
+"""Titles of pictures, in matplotlib's mathematics."""
 
 from collections.abc import Sequence
 
@@ -7,18 +7,18 @@ from magshell_fenicsx.quantities.registry import amplitude, quantity
 
 
 def shell_caption(h: float, nu: float, row: Row) -> str:
-    """The shell, its thickness over R and Poisson's ratio, and the field that it is in."""
-    said = rf"$R/h$ = {1 / h:.6g}, $\nu$ = {nu:g}"
-    return said + (f", {_value('lambda_m', row)}" if row["lambda_m"] else "")
+    """R/h, Poisson's ratio and the field, from the thickness h over R and nu."""
+    text = rf"$R/h$ = {1 / h:.6g}, $\nu$ = {nu:g}"
+    return text + (f", {_value('lambda_m', row)}" if row["lambda_m"] else "")
 
 
 def caption(h: float, nu: float, row: Row, own: Sequence[str] = ()) -> str:
-    """A point: the shell and its loads.
+    """The shell and its loads at a point.
 
     Parameters
     ----------
     own
-        Names of one's own amplitudes, columns of the row.
+        Names of user-defined amplitudes, columns of the row.
 
     Examples
     --------
@@ -26,17 +26,17 @@ def caption(h: float, nu: float, row: Row, own: Sequence[str] = ()) -> str:
     >>> caption(0.01, 0.5, row | {"my_springs": 0.02}, own=["my_springs"])
     '$R/h$ = 100, $\\\\nu$ = 0.5, $p/p_\\\\mathrm{c}$ = 0.25, my springs = 0.02'
     """
-    said = [shell_caption(h, nu, row)]
+    parts = [shell_caption(h, nu, row)]
     if row["field_angle"]:
-        said.append(rf"turned by ${row['field_angle']:.4g}\degree$")
+        parts.append(rf"turned by ${row['field_angle']:.4g}\degree$")
     if row["p_over_pc"]:
-        said.append(_value("p_over_pc", row, 5))
+        parts.append(_value("p_over_pc", row, 5))
     if row["amplitude"] == "force":
-        said.append(f"{_value('force', row)}, {_value('w_over_h', row)} {amplitude('force').place}")
+        parts.append(f"{_value('force', row)}, {_value('w_over_h', row)} {amplitude('force').place}")
     if "load_factor" in row:
-        said.append(f"{_value('load_factor', row)}, {_value('w_over_h', row)}")
-    said += [_value(name, row) for name in own if row[name]]
-    return ", ".join(said)
+        parts.append(f"{_value('load_factor', row)}, {_value('w_over_h', row)}")
+    parts += [_value(name, row) for name in own if row[name]]
+    return ", ".join(parts)
 
 
 def _value(name: str, row: Row, digits: int = 4) -> str:

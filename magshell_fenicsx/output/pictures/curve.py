@@ -15,12 +15,12 @@ if TYPE_CHECKING:  # takes long to import
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-NAMED = 5  # instabilities in the legend
-FINE = 16  # drawn pieces between two points
+NAMED = 5  # most instabilities in the legend
+FINE = 16  # drawn segments between two points
 
 
 def smooth(x: Sequence[float], y: Sequence[float]) -> NDArray[np.float64]:
-    """A smooth curve through the points, without overshoot, along their scaled chord: (2, FINE (n - 1) + 1)."""
+    """A smooth curve (2, FINE (n - 1) + 1) through n points without overshoot; the parameter is the scaled chord."""
     xy = np.array([x, y])
     scale = np.ptp(xy, axis=1)
     steps = np.hypot(*(np.diff(xy, axis=1) / np.where(scale > 0, scale, 1)[:, None]))
@@ -32,7 +32,7 @@ def smooth(x: Sequence[float], y: Sequence[float]) -> NDArray[np.float64]:
 def curve_figure(rows: Sequence[Row], amplitude: str, title: str) -> "Figure":
     """Draw the part of the path in which `amplitude` varied, and its branches; instabilities are marked.
 
-    Stable parts are solid, unstable ones dashed. One's own amplitude is drawn over the displacement of the pole.
+    Stable parts are solid, unstable parts dashed. A user-defined amplitude is drawn over the pole's displacement.
     """
     from matplotlib.figure import Figure
 
@@ -44,30 +44,30 @@ def curve_figure(rows: Sequence[Row], amplitude: str, title: str) -> "Figure":
 
 
 def varied(rows: Sequence[Row], amplitude: str) -> Sequence[Row]:
-    """The part of a path in which an amplitude varied last."""
+    """The last part of a path in which an amplitude varied."""
     first = max(i for i, row in enumerate(rows) if row["amplitude"] != amplitude or row is rows[0])
     return rows[0 if amplitude == "lambda_m" else first :]
 
 
 def place(row: Row, amplitude: str) -> tuple[float, float]:
-    """Where a point is in the curve's axes."""
+    """The coordinates of a point in the curve's axes."""
     x, y = axes_of(amplitude)
     return x.on_axis(row), y.on_axis(row)
 
 
 def _unstable(row: Row) -> bool:
-    """In directions that the model sees or excludes, which a path.csv of an earlier version does not count."""
+    """Whether the model, or a mode that it excludes, is unstable; an earlier path.csv has no excluded_pivots."""
     return int(row["negative_pivots"]) + int(row.get("excluded_pivots", 0)) > 0
 
 
 def plot_curve(axes: "Axes", rows: Sequence[Row], amplitude: str) -> None:
-    """The curve of `curve_figure` in axes that are there."""
+    """Draw the curve of `curve_figure` in given axes."""
     part = varied(rows, amplitude)
     x, y = axes_of(amplitude)
     if amplitude == "load" and all(row["w_over_h"] == row["w_pole_over_h"] for row in part):
-        x = quantity("w_pole_over_h")  # moments have no displacement along themselves
-    whose = pole_name(part[0]).replace("$", r"\$")  # as it is written, no mathematics
-    x_label, y_label = (each.label.replace("the pole", whose) for each in (x, y))
+        x = quantity("w_pole_over_h")  # moments have no conjugate displacement
+    pole = pole_name(part[0]).replace("$", r"\$")  # plain text, no mathematics
+    x_label, y_label = (each.label.replace("the pole", pole) for each in (x, y))
     for branch in sorted({int(row["branch"]) for row in part}):
         line = [row for row in part if row["branch"] == branch and row["mode"] in OWN_MODES]
         smooth_x, smooth_y = smooth(*zip(*(place(row, amplitude) for row in line), strict=True))
@@ -81,10 +81,10 @@ def plot_curve(axes: "Axes", rows: Sequence[Row], amplitude: str) -> None:
     marked = [row for row in part if row["label"] in LOCATED]
     for number, row in enumerate(marked, 1):
         mode = f" ({row['mode']})" if row["mode"] else ""
-        said = f"{row['label']}{mode} at {row[y.name]:.5g}"
+        name = f"{row['label']}{mode} at {row[y.name]:.5g}"
         if number > NAMED:
-            said = f"and {len(marked) - NAMED} more" if number == NAMED + 1 else "_"  # which matplotlib leaves out
-        axes.plot(*place(row, amplitude), "o", color="C3", markersize=6, label=said)
+            name = f"and {len(marked) - NAMED} more" if number == NAMED + 1 else "_"  # matplotlib omits "_"
+        axes.plot(*place(row, amplitude), "o", color="C3", markersize=6, label=name)
     axes.set(xlabel=x_label, ylabel=y_label)
     axes.locator_params(axis="x", nbins=6)
     axes.axhline(0, color="0.8", linewidth=0.8, zorder=0)

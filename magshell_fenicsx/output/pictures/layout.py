@@ -11,12 +11,12 @@ if TYPE_CHECKING:  # takes long to import
     from matplotlib.figure import Figure
 
 DPI = 120
-CAPTION, TITLE = 360, 560  # pixels that a panel's caption takes, and a title at least
-QUICKLY = {"compress_level": 3}  # a quarter larger than by default, in a third of the time
+CAPTION, TITLE = 360, 560  # least width of a panel's caption and of a title, pixels
+QUICKLY = {"compress_level": 3}  # files are a quarter larger than by default and take a third of the time
 
 
 def empty_figure(width: int, height: int, title: str) -> "Figure":
-    """An empty picture of so many pixels, with a title."""
+    """An empty picture of a size in pixels, with a title."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(width / DPI, height / DPI), dpi=DPI)
@@ -33,7 +33,7 @@ def axes_in(figure: "Figure", left: float, low: float, width: float, height: flo
 
 
 def beside(image: Image, view: View, title: str) -> "Figure":
-    """One view with its colour bar and the directions of the axes on the right."""
+    """One view with its colour bar and the directions of e1, e2, e3 on the right."""
     figure = with_margin(image, 170, title)
     width, height = (figure.get_size_inches() * DPI).round()
     colour_bar(figure, view, (width - 110, 140, 22, height - 210), "vertical")
@@ -42,7 +42,7 @@ def beside(image: Image, view: View, title: str) -> "Figure":
 
 
 def with_margin(image: Image, margin: int, title: str) -> "Figure":
-    """A figure with an image on its left and so many pixels on its right."""
+    """A figure with an image on the left and a margin in pixels on the right."""
     width, height = max(image.shape[1] + margin, TITLE), max(image.shape[0] + 60, 400)
     figure = empty_figure(width, height, title)
     figure.figimage(image, (width - margin - image.shape[1]) // 2 + 20, (height - 40 - image.shape[0]) // 2)
@@ -50,7 +50,7 @@ def with_margin(image: Image, margin: int, title: str) -> "Figure":
 
 
 def panels(images: Sequence[Image], views: Sequence[View], title: str) -> "Figure":
-    """Two in a row, each with a colour bar below."""
+    """Two images per row, each with a colour bar below."""
     down, across = (max(least, *(image.shape[axis] for image in images)) for axis, least in ((0, 0), (1, CAPTION)))
     rows = -(-len(images) // 2)
     width, height = 2 * across + 120, rows * (down + 110) + 50
@@ -63,7 +63,7 @@ def panels(images: Sequence[Image], views: Sequence[View], title: str) -> "Figur
 
 
 def directions(figure: "Figure", view: View, left: float, low: float) -> None:
-    """Where e1, e2, e3 point in a view, in a square of 100 pixels."""
+    """Draw the directions of e1, e2, e3 in a view, in a square of 100 pixels."""
     axes = axes_in(figure, left, low, 100, 100)
     axes.set(xlim=(-1.5, 1.5), ylim=(-1.5, 1.5))
     axes.set_axis_off()
@@ -73,7 +73,7 @@ def directions(figure: "Figure", view: View, left: float, low: float) -> None:
 
 
 def colour_bar(figure: "Figure", view: View, box: tuple[float, float, float, float], orientation: str) -> None:
-    """A colour bar in a box (left, low, width, height) of pixels, with tips where values lie beyond its limits."""
+    """Draw a colour bar in a box (left, low, width, height) of pixels; its ends are pointed if values exceed them."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
     from matplotlib.ticker import MaxNLocator
@@ -89,7 +89,7 @@ def colour_bar(figure: "Figure", view: View, box: tuple[float, float, float, flo
     )
     if orientation == "vertical":
         bar.set_label(view.caption, fontsize=10)
-    else:  # above: the ticks' common factor is below
+    else:  # above the bar, because the ticks' common factor is below it
         bar.ax.set_title(view.caption, fontsize=10, pad=5)
     bar.ax.tick_params(labelsize=9)
 

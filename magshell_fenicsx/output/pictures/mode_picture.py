@@ -11,18 +11,18 @@ from magshell_fenicsx.output.pictures.layout import png
 from magshell_fenicsx.output.pictures.picture import towards
 from magshell_fenicsx.output.pictures.render import View, rendered, smooth_surface
 
-SHOWN = 0.08  # lengths R that the largest displacement of a mode is drawn with
+SHOWN = 0.08  # drawn size of a mode's largest displacement, over R
 
 
 def draw_modes(surfaces: Sequence[Surface], captions: Sequence[str], title: str) -> bytes:
-    """Draw modes, one panel each: the deformed shell with the mode added, coloured by its normal displacement.
+    """Draw one panel per mode: the deformed shell plus the mode, coloured by the mode's normal displacement.
 
     Parameters
     ----------
     surfaces
-        With the fields "mode" and "mode_w"; see `results.modes`.
+        With the fields "mode" and "mode_w"; see `fields.modes`.
     captions, title
-        Of the panels and of all, with matplotlib's mathematics.
+        Captions of the panels and title of the picture, in matplotlib's mathematics.
 
     Returns
     -------
@@ -33,7 +33,7 @@ def draw_modes(surfaces: Sequence[Surface], captions: Sequence[str], title: str)
     from matplotlib.figure import Figure
 
     first = surfaces[0]
-    camera = towards(first.r0[np.argmax(np.abs(first.fields["mode_w"]))])  # one of all, so that they can be compared
+    camera = towards(first.r0[np.argmax(np.abs(first.fields["mode_w"]))])  # the same camera for all panels
     panels = rendered([_mode(surface, camera) for surface in surfaces])
     columns = int(np.ceil(np.sqrt(len(panels))))
     rows = -(-len(panels) // columns)

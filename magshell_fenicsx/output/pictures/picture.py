@@ -1,4 +1,4 @@
-"""Pictures of the deformed shell: displacement, strains, bending moments, magnetic fields and the loads they make."""
+"""Pictures of the deformed shell: displacement, strains, bending moments, magnetic fields and loads."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -24,13 +24,13 @@ LOADS = {
 }
 STRAINS = {"E_1": "larger principal membrane strain $E_1$", "E_2": "smaller principal membrane strain $E_2$"}
 MOMENTS = {"M_1": "larger principal bending moment $M_1R/D$", "M_2": "smaller principal bending moment $M_2R/D$"}
-CONSTANT = 1e-9  # difference of a load, over that of fields along the normal, that is none
-ROUNDING = {"E_1": 1e-13, "M_1": 1e-8}  # values below are none
-EVERYWHERE, PEAK = 0.997, 1.5  # colours end at this much above what this part of the area is below
+CONSTANT = 1e-9  # a load that varies by less is drawn as constant
+ROUNDING = {"E_1": 1e-13, "M_1": 1e-8}  # smaller values are drawn as zero
+EVERYWHERE, PEAK = 0.997, 1.5  # colour limit: PEAK times this quantile of the area
 FROM_THE_SIDE = np.array([2.2, -3.6, 2.85])
 PANEL, WHOLE = 480, 1000  # pixels
-SEEDS, APART = 70, 0.13  # the most places of arrows; how far they are from each other, over the shell's extent
-FIELDS = {  # colour, caption; length of the longest arrow and thickness over the shell's extent
+SEEDS, APART = 70, 0.13  # largest number of arrows; their least distance over the shell's extent
+FIELDS = {  # colour, caption, length of the longest arrow, thickness; both over the shell's extent
     "Br": ("C3", r"remanence $F\,\hat B^\mathrm{r}$", 0.105, 0.008),
     "Ba": ("C0", r"applied field $\hat B^\mathrm{a}$", 0.15, 0.004),
 }
@@ -38,19 +38,19 @@ FIELDS = {  # colour, caption; length of the longest arrow and thickness over th
 
 @dataclass(frozen=True)
 class Picture:
-    """One picture: the views in it, none if it has nothing to show, and how they are put together."""
+    """One picture: a function for its views (none if there is nothing to show), and one that arranges them."""
 
     views: Callable[[Surface, "pyvista.PolyData", float], list[View]]
     figure: Callable[[Sequence[Image], Sequence[View], str], "Figure"]
 
 
 def figures(surface: Surface, h: float, title: str, names: Sequence[str] = ()) -> dict[str, "Figure"]:
-    """Draw pictures of a whole deformed shell, by default all of `PICTURES`; without those that have nothing to show.
+    """Draw pictures of a whole deformed shell, by default all of `PICTURES`; empty pictures are left out.
 
     Raises
     ------
     NoScreen
-        If there is no screen to draw on.
+        If there is no display.
     """
     smooth = smooth_surface(surface, h)
     views = {name: PICTURES[name].views(surface, smooth, h) for name in names or PICTURES}
@@ -60,13 +60,13 @@ def figures(surface: Surface, h: float, title: str, names: Sequence[str] = ()) -
 
 
 def towards(place: Array) -> Array:
-    """The direction (3,) from which a place (3,) of a shell shows: from above, to the side of it."""
+    """A camera direction (3,) from which a point (3,) of a shell is visible: from above and from the side."""
     heading = np.arctan2(place[1], place[0]) if np.hypot(*place[:2]) > 0.1 else -0.5
     return np.array([4.2 * np.cos(heading - 0.5), 4.2 * np.sin(heading - 0.5), 2.75])
 
 
 def deflected_place(surface: Surface) -> Array:
-    """The place (3,) whose normal displacement is the largest."""
+    """The point (3,) of the largest normal displacement."""
     return np.asarray(surface.r0[np.argmax(np.abs(surface.w))])
 
 
@@ -84,13 +84,13 @@ def _load(smooth: "pyvista.PolyData", name: str) -> View:
     values = np.asarray(smooth.point_data[name])
     values = np.linalg.norm(values, axis=1) if values.ndim == 2 else values
     low, high = float(values.min()), float(values.max())
-    if high - low < CONSTANT:  # no pictures of rounding
+    if high - low < CONSTANT:  # do not colour rounding errors
         low, high = low - 1, high + 1
     return View(smooth, values, (low, high), "viridis", FROM_THE_SIDE, PANEL, LOADS[name])
 
 
 def _principal(captions: dict[str, str]) -> Callable[[Surface, "pyvista.PolyData", float], list[View]]:
-    """Two panels with the same colours, white at zero: a constant field is one colour, whatever its rounding."""
+    """Two panels with the same colours, white at zero, so that rounding of a constant field is invisible."""
 
     def views(surface: Surface, smooth: "pyvista.PolyData", h: float) -> list[View]:
         if not all(name in surface.fields for name in captions):
@@ -98,15 +98,15 @@ def _principal(captions: dict[str, str]) -> Callable[[Surface, "pyvista.PolyData
         camera = towards(deflected_place(surface))
         limit = _limit(surface, *captions)
         return [
-            View(smooth, np.asarray(smooth.point_data[name]), (-limit, limit), "RdBu_r", camera, PANEL, said)
-            for name, said in captions.items()
+            View(smooth, np.asarray(smooth.point_data[name]), (-limit, limit), "RdBu_r", camera, PANEL, caption)
+            for name, caption in captions.items()
         ]
 
     return views
 
 
 def _limit(surface: Surface, first: str, second: str) -> float:
-    """The largest magnitude of two fields, but for peaks of small area such as under a point load."""
+    """The colour limit of two fields: their largest magnitude, without peaks of small area such as at a point load."""
     size = np.maximum(np.abs(surface.fields[first]), np.abs(surface.fields[second]))
     if (largest := float(size.max())) < ROUNDING[first]:
         return 1.0
@@ -119,7 +119,7 @@ def _limit(surface: Surface, first: str, second: str) -> float:
 
 
 def _fields(surface: Surface, smooth: "pyvista.PolyData", h: float) -> list[View]:
-    """Both fields at the same places on the side that is seen; arrows that point into the shell end on it."""
+    """Arrows of both fields at the same points of the visible side; arrows that point into the shell end on it."""
     if not FIELDS.keys() & surface.fields.keys():
         return []
     camera = towards(deflected_place(surface))
@@ -143,7 +143,7 @@ def _fields(surface: Surface, smooth: "pyvista.PolyData", h: float) -> list[View
 
 
 def _spread(r: Array, apart: float) -> NDArray[np.int64]:
-    """The numbers of some of the points (n, 3), each the farthest from those before, as long as it is so far."""
+    """Indices of well separated points of (n, 3): each is the farthest from those before, at least `apart` away."""
     chosen = [int(np.argmax(r[:, 2]))]
     distance = np.full(len(r), np.inf)
     while len(chosen) < SEEDS:
@@ -169,10 +169,10 @@ def _with_legend(images: Sequence[Image], views: Sequence[View], title: str) -> 
     figure = with_margin(image, 190, title)
     width, height = (figure.get_size_inches() * DPI).round()
     drawn = {arrows.colour for arrows in view.arrows}
-    for i, (colour, said, *_) in enumerate(FIELDS.values()):
+    for i, (colour, caption, *_) in enumerate(FIELDS.values()):
         if colour in drawn:
             place = 1 - 15 / width, 1 - (40 + 26 * i) / height
-            figure.text(*place, said, color=colour, fontsize=11, ha="right", va="top")
+            figure.text(*place, caption, color=colour, fontsize=11, ha="right", va="top")
     directions(figure, view, width - 130, 10)
     return figure
 

@@ -1,4 +1,4 @@
-"""The pictures of a run, drawn from its folder alone: path.csv and fields/*.vtu."""
+"""The pictures of a run, drawn from the files of its folder: path.csv and fields/*.vtu."""
 
 import csv
 from collections.abc import Sequence
@@ -23,7 +23,7 @@ from magshell_fenicsx.quantities.registry import quantity
 
 MOST_PANELS = 9
 MOST_FRAMES = 40
-Panel = tuple[Surface, About, str]  # with a mode, and a caption
+Panel = tuple[Surface, About, str]  # the surface with a mode, and its caption
 UNIT = r"stiffness per area $\lambda$ of each mode in $E h/R^2$"
 
 
@@ -36,7 +36,7 @@ class Mode:
 
 
 def plot(folder: Path, point: int | None = None, animation: bool = False) -> list[str]:
-    """What `draw` draws, and if asked for animation.gif, and report.html again; see `draw`."""
+    """Draw the pictures again, also animation.gif if requested, and write report.html again; see `draw`."""
     drawn = draw(folder, point)
     if animation:
         drawn.append(draw_animation(folder))
@@ -47,12 +47,12 @@ def plot(folder: Path, point: int | None = None, animation: bool = False) -> lis
 
 
 def draw(folder: Path, point: int | None = None) -> list[str]:
-    """Draw every picture of a run, also of one that was interrupted.
+    """Draw every picture of a finished or interrupted run.
 
     Parameters
     ----------
     point
-        Draw only this point, as shell_0007.png, strains_0007.png, ...
+        Draw only this point: shell_0007.png, strains_0007.png, ...
 
     Returns
     -------
@@ -61,11 +61,11 @@ def draw(folder: Path, point: int | None = None) -> list[str]:
     Raises
     ------
     CaseError
-        If the folder has no run, or not this point.
+        If the folder has no run, or the run has no such point.
     OSError
         If a file cannot be written.
     NoScreen
-        If there is no screen to draw on.
+        If there is no display.
     """
     rows = _rows(folder)
     drawn: list[str] = []
@@ -91,7 +91,7 @@ def draw(folder: Path, point: int | None = None) -> list[str]:
 
 
 def draw_animation(folder: Path) -> str:
-    """Draw animation.gif, of the part of the path in which the last amplitude varied; see `draw`.
+    """Draw animation.gif: the part of the path in which the last amplitude varied; see `draw`.
 
     Returns
     -------
@@ -110,7 +110,7 @@ def draw_animation(folder: Path) -> str:
 
 
 def _rows(folder: Path) -> list[Row]:
-    """The rows of the points whose fields are there."""
+    """The rows of the points whose field files exist."""
     try:
         rows = read_rows(folder / "path.csv")
     except (FileNotFoundError, NotADirectoryError):
@@ -132,7 +132,7 @@ def _point(folder: Path, row: Row) -> tuple[Surface, About]:
 
 
 def _modes(folder: Path, rows: Sequence[Row]) -> list[tuple[str, bytes]]:
-    """instabilities.png of the null vectors that are there, and modes_NNNN.png of those of stability.csv."""
+    """instabilities.png of the null vectors, and modes_NNNN.png of the modes in stability.csv."""
     found = []
     singular = [row for row in rows if row["label"] in LOCATED]
     if panels := [panel for row in singular if (panel := _null_vector(folder, row))]:
@@ -158,10 +158,10 @@ def _null_vector(folder: Path, row: Row) -> Panel | None:
     if not file.exists():
         return None
     surface, about = read_vtu(file)
-    told = [str(row["mode"])] if row["mode"] else []
+    details = [str(row["mode"])] if row["mode"] else []
     if not label and (m := wave_number(surface)):
-        told.append(f"m = {m}")
-    kind = f" ({', '.join(told)})" if told else ""
+        details.append(f"m = {m}")
+    kind = f" ({', '.join(details)})" if details else ""
     return surface, about, f"{row['label']}{kind}, {_where(row)}"
 
 

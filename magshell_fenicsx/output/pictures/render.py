@@ -1,4 +1,4 @@
-"""Bare views of the deformed shell, drawn by VTK: no text, no colour bar."""
+"""Views of the deformed shell, drawn by VTK without text or colour bar."""
 
 import ctypes
 import os
@@ -24,12 +24,12 @@ MARGIN = 10  # pixels around what is drawn
 
 
 class NoScreen(RuntimeError):
-    """There is nothing to draw the shell on."""
+    """There is no display to draw the shell on."""
 
 
 @dataclass(frozen=True)
 class Arrows:
-    """Arrows at places (n, 3), as vectors (n, 3), in one of matplotlib's colours; `radius` of the shafts."""
+    """Arrows at points (n, 3) with vectors (n, 3); a matplotlib colour, and the radius of the shafts."""
 
     places: Array
     vectors: Array
@@ -46,19 +46,19 @@ class View:
     smooth
         See `smooth_surface`.
     values
-        (points,) that it is coloured by.
+        (points,) values that are shown as colours.
     limits
-        Values of the first and the last colour of `colours`, a map of matplotlib's.
+        Values of the first and the last colour of `colours`, a matplotlib colour map.
     camera
         Direction (3,) from the shell to the eye; e3 is up.
     size
-        Pixels of a side of the window.
+        Side of the window in pixels.
     caption
-        What the colours are.
+        The meaning of the colours.
     arrows
-        That are drawn too.
+        Arrows in the view.
     bounds
-        (xmin, xmax, ymin, ...) that the window shows; None for those of what is drawn.
+        (xmin, xmax, ymin, ...) of the window's content; None fits it to the view.
     """
 
     smooth: "pyvista.PolyData"
@@ -73,7 +73,7 @@ class View:
 
 
 def smooth_surface(surface: Surface, h: float) -> "pyvista.PolyData":
-    """The deformed surface in flat triangles with normals, each curved one divided."""
+    """The deformed surface in flat triangles with normals; curved triangles are divided."""
     import pyvista
     from vtkmodules.vtkFiltersGeometry import vtkDataSetSurfaceFilter  # type: ignore[import-untyped]
 
@@ -82,26 +82,26 @@ def smooth_surface(surface: Surface, h: float) -> "pyvista.PolyData":
     divided.SetNonlinearSubdivisionLevel(2)
     divided.Update()
     smooth = pyvista.PolyData(divided.GetOutput())
-    body = surface.is_body  # which has edges that stay sharp
+    body = surface.is_body  # its edges stay sharp
     return smooth.compute_normals(cell_normals=False, split_vertices=body, feature_angle=60.0, consistent_normals=False)
 
 
 def rendered(views: Sequence[View]) -> list[Image]:
-    """An image (height, width, 3) of each, without the white around all those of its size.
+    """An image (height, width, 3) of each view; images of one window size are cropped alike.
 
     Raises
     ------
     NoScreen
-        If there is no screen to draw on.
+        If there is no display.
     """
     import pyvista
 
     pyvista.OFF_SCREEN = True
     with screen():
-        plotter = pyvista.Plotter(off_screen=True)  # one for all: making it takes as long as a view
+        plotter = pyvista.Plotter(off_screen=True)  # one for all views: creating it takes as long as a view
         try:
             plotter.set_background("white")
-            plotter.enable_anti_aliasing("fxaa")  # as good to look at as multisampling, in half of the time
+            plotter.enable_anti_aliasing("fxaa")  # looks as good as multisampling and takes half the time
             images = [_image(plotter, view) for view in views]
         finally:
             plotter.close()
@@ -111,7 +111,7 @@ def rendered(views: Sequence[View]) -> list[Image]:
 
 
 def _box(drawn: Sequence[NDArray[np.bool_]]) -> tuple[slice, slice]:
-    """The part of some windows in which anything is drawn, with a margin."""
+    """The part of the windows in which anything is drawn, with a margin."""
     anywhere = np.any(drawn, axis=0)
     rows, columns = (np.flatnonzero(anywhere.any(axis=axis)) for axis in (1, 0))
     high, left = (max(at[0] - MARGIN, 0) for at in (rows, columns))
@@ -127,7 +127,7 @@ def _image(plotter: "pyvista.Plotter", view: View) -> Image:
         clim=view.limits,
         cmap=view.colours,
         smooth_shading=True,
-        ambient=0.25,  # colours can be read on what turns away from the light too
+        ambient=0.25,  # keeps colours readable on the dark side
         diffuse=0.8,
         show_scalar_bar=False,
         copy_mesh=False,
@@ -150,14 +150,14 @@ def _arrows(plotter: "pyvista.Plotter", arrows: Arrows) -> "pyvista.Actor":
 
     points, length = pyvista.PolyData(arrows.places), np.linalg.norm(arrows.vectors, axis=1).max()
     points.point_data["v"] = arrows.vectors
-    thickness = arrows.radius / length  # of an arrow of length one, before it is scaled
+    thickness = arrows.radius / length  # relative to an arrow of length one
     shape = pyvista.Arrow(shaft_radius=thickness, tip_radius=2.5 * thickness, tip_length=0.35, shaft_resolution=12)
     glyphs = points.glyph(orient="v", scale="v", geom=shape)
     return plotter.add_mesh(glyphs, color=to_rgb(arrows.colour), ambient=0.35, smooth_shading=False, render=False)
 
 
 def axes_on_screen(camera: Array) -> Array:
-    """e1, e2, e3 to the right and up on a screen that is seen from `camera`, (3, 2)."""
+    """The components (3, 2) of e1, e2, e3 to the right and up on the screen, seen from `camera`."""
     towards = camera / np.linalg.norm(camera)
     right = np.cross([0.0, 0.0, 1.0], towards)
     right /= np.linalg.norm(right)
@@ -166,7 +166,7 @@ def axes_on_screen(camera: Array) -> Array:
 
 @contextmanager
 def screen() -> Iterator[None]:
-    """A display to render on: the user's if it answers, or a virtual one while inside.
+    """A display to render on inside `with`: the user's if it answers, otherwise a virtual one.
 
     Raises
     ------
@@ -180,7 +180,7 @@ def screen() -> Iterator[None]:
     if shutil.which("Xvfb") is None:
         raise NoScreen("no display and no Xvfb to draw the deformed shell on")
     read, write = os.pipe()
-    with_us = ["setpriv", "--pdeathsig", "TERM"] if shutil.which("setpriv") else []  # even if we are killed
+    with_us = ["setpriv", "--pdeathsig", "TERM"] if shutil.which("setpriv") else []  # ends with us
     server = subprocess.Popen(
         [*with_us, "Xvfb", "-displayfd", str(write), "-screen", "0", "1600x1200x24", "-nolisten", "tcp"],
         pass_fds=[write],
@@ -202,11 +202,11 @@ def screen() -> Iterator[None]:
 
 
 def _can_be_opened() -> bool:
-    """Whether there is a server behind the display that is set: where there is none, VTK ends the process."""
+    """Whether the display of the environment answers; if it does not, VTK would end the process."""
     try:
         x11 = ctypes.CDLL("libX11.so.6")
     except OSError:
-        return True  # VTK draws without it
+        return True  # VTK draws without X11
     x11.XOpenDisplay.restype, x11.XCloseDisplay.argtypes = ctypes.c_void_p, [ctypes.c_void_p]
     display = x11.XOpenDisplay(None)
     if display:

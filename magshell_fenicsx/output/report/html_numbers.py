@@ -1,16 +1,16 @@
-"""Numbers as people read them, in HTML."""
+"""Numbers for people, in HTML."""
 
 import math
 from collections.abc import Sequence
 
 from markupsafe import Markup
 
-LEAST, MOST = 1e-3, 1e6  # sizes that need no power of ten
+LEAST, MOST = 1e-3, 1e6  # magnitudes between them are written without a power of ten
 DIGITS = 6
 
 
 def number(value: float, digits: int = DIGITS) -> Markup:
-    """A number with so many significant digits at most.
+    """A number with at most `digits` significant digits.
 
     Examples
     --------
@@ -25,7 +25,7 @@ def number(value: float, digits: int = DIGITS) -> Markup:
 
 
 def column(values: Sequence[float]) -> tuple[int, list[Markup]]:
-    """Numbers with one power of ten and equally many decimals, to stand below each other; nan stays empty.
+    """A column of numbers with a common power of ten and equally many decimals; nan is left empty.
 
     Examples
     --------
@@ -48,5 +48,5 @@ def power(exponent: int) -> Markup:
 
 
 def _signed(text: str) -> Markup:
-    """With a minus as long as a plus, and none before zero."""
+    """Use a typographic minus sign, and none before zero."""
     return Markup(text.removeprefix("-") if not text.strip("-0.") else text.replace("-", "−"))

@@ -1,4 +1,4 @@
-"""report.html: a run in one file, from what stands in its folder."""
+"""report.html: a run in one file, made from the files of its folder."""
 
 import base64
 import csv
@@ -17,7 +17,7 @@ from magshell_fenicsx.output.store.durable import write_whole
 from magshell_fenicsx.quantities.registry import amplitude
 
 NAME, TEMPLATE = "report.html", "report_template.html"
-FOLDED = 30  # points from which on the table of the path is folded
+FOLDED = 30  # a table with at least so many points is folded
 PICTURES = {  # in the order of the report
     "curve.png": "Load over displacement; dashed where the shell is unstable.",
     "shell.png": "The deformed shell at the last point, coloured by the inward displacement w/h.",
@@ -43,12 +43,12 @@ TIMES = {
 
 
 def write_report(folder: Path) -> None:
-    """Write report.html from the summary.json, the path.csv and what pictures there are in a run's folder.
+    """Write report.html from summary.json, path.csv and the pictures in a run's folder.
 
     Raises
     ------
     OSError
-        If there is no summary.json or path.csv, or the report cannot be written; an older one is as it was then.
+        If summary.json or path.csv is missing, or the report cannot be written; an older report stays unchanged.
     """
     write_whole(folder / NAME, report(folder).encode())
 
@@ -63,7 +63,7 @@ def report(folder: Path) -> str:
 
 
 def _content(folder: Path) -> dict[str, Any]:
-    """What the template shows."""
+    """The values of the template."""
     summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
     with (folder / "path.csv").open(encoding="utf-8", newline="") as stream:
         lines = list(csv.DictReader(stream))
@@ -86,7 +86,7 @@ def _content(folder: Path) -> dict[str, Any]:
         "case": yaml.safe_dump(
             summary["case"], sort_keys=False, allow_unicode=True, default_flow_style=None, width=110
         ),
-        "times": [(said, summary["timing"][key]) for key, said in TIMES.items()],
+        "times": [(name, summary["timing"][key]) for key, name in TIMES.items()],
         "number": number,
     }
 
@@ -104,7 +104,7 @@ def _groups(summary: Summary) -> list[tuple[Markup, Markup]]:
 
 
 def _dimensions(summary: Summary) -> list[tuple[Markup, Markup, str]]:
-    """Name, value and unit of what the case gives in units; empty for a case without."""
+    """Name, value and unit of the quantities that the case gives with units."""
     dims, magnetic, loads = summary["dimensions"], summary["case"].get("magnetic") or {}, physical_units(summary)
     stiff = dims["youngs_modulus"] and dims["thickness"]
     named = {
@@ -126,7 +126,7 @@ def _dimensions(summary: Summary) -> list[tuple[Markup, Markup, str]]:
 
 
 def _pictures(folder: Path) -> Iterator[tuple[str, str, bool]]:
-    """Source and caption of what there is, and whether it is a small one."""
+    """Source and caption of each picture in the folder, and whether it is shown small."""
     for pattern, caption in PICTURES.items():
         for file in sorted(folder.glob(pattern)):
             content = base64.b64encode(file.read_bytes()).decode()
@@ -146,9 +146,9 @@ def _instability(line: Line, summary: Summary) -> dict[str, Any]:
 
 
 def _how_to_estimate(case: dict[str, Any]) -> str:
-    """What to do for an error estimate, where a run has none."""
+    """How to get an error estimate, for a run that has none."""
     if "tolerance" in case["mesh"]:
-        return "no result was found that mesh.tolerance could be of, and the default mesh was taken"
+        return "mesh.tolerance was ignored because this run has no scalar result; the default mesh was used"
     if case["model"] == "shell" and case["shell"]["geometry"] in ADAPTED:
         return "give the case mesh: {tolerance: 1e-3} in place of degree and refinement"
     finer = "mesh.degree one higher" if case["shell"]["geometry"] == "mesh" else "mesh.refinement twice as large"

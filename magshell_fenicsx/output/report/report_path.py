@@ -1,4 +1,4 @@
-"""The path as a table of a report: the columns of path.csv that vary, and what they are called."""
+"""The path as a table of the report: the columns of path.csv that vary, with their names."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -10,13 +10,13 @@ from magshell_fenicsx.output.report.html_numbers import column, power
 from magshell_fenicsx.output.store.table import pole_name
 from magshell_fenicsx.quantities.registry import amplitude, quantity
 
-Line = Mapping[str, str]  # of path.csv
-ORDER = ("text", "load", "displacement", "energy", "error", "time", "place", "count")  # of kinds of columns
+Line = Mapping[str, str]  # a row of path.csv
+ORDER = ("text", "load", "displacement", "energy", "error", "time", "place", "count")  # order of the columns by kind
 
 
 @dataclass(frozen=True)
 class Column:
-    """A column of the table: what stands above it and in it."""
+    """A column of the table."""
 
     head: Markup
     unit: Markup
@@ -25,23 +25,23 @@ class Column:
 
 
 def symbol(name: str) -> Markup:
-    """What a column of numbers is called; that of a named point or of one's own amplitude by its name."""
+    """The heading of a column of numbers; a named point or a user-defined amplitude has its own name."""
     known = quantity(name)
     return Markup(known.html) if known.symbol else Markup("{}").format(known.words)
 
 
 def pole_head(line: Line) -> Markup:
-    """What stands above w_pole_over_h: whose displacement it is."""
+    """The heading of w_pole_over_h, with the point that it belongs to."""
     return Markup("{}, {}").format(symbol("w_pole_over_h"), pole_name(line).removeprefix("the "))
 
 
 def path_table(lines: Sequence[Line], length_unit: str) -> list[Column]:
-    """The columns that vary, in the order of people's interest; a displacement that is another one is left out.
+    """The columns that vary, in the order of interest; a displacement equal to an earlier one is left out.
 
     Parameters
     ----------
     length_unit
-        Of the displacements of named points.
+        Unit of the displacements of named points.
     """
     names = [name for name in (lines[0] if lines else ()) if name != "point"]
     order = ["point", *sorted(names, key=lambda name: ORDER.index(quantity(name).kind))]
@@ -72,5 +72,5 @@ def _column(name: str, values: Sequence[str], length_unit: str) -> Column:
 
 
 def _same(values: Sequence[str], others: Sequence[str]) -> bool:
-    """Numbers, but for rounding."""
+    """Whether two columns have equal numbers, up to rounding."""
     return all(isclose(float(a), float(b), rel_tol=1e-9, abs_tol=1e-9) for a, b in zip(values, others, strict=True))

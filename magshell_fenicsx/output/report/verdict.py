@@ -1,4 +1,4 @@
-"""What a run found, in one sentence for its report."""
+"""The result of a run in one sentence, for its report."""
 
 from collections.abc import Mapping, Sequence
 from math import pi
@@ -20,16 +20,16 @@ def located(lines: Sequence[Line]) -> list[Line]:
 
 
 def verdict(summary: Summary, lines: Sequence[Line]) -> Markup:
-    """The result, and where the run stopped early, why."""
+    """The result, and the reason if the run stopped early."""
     until = (summary["case"].get("loading") or {}).get("until", "target")
     first = next((line for line in located(lines) if line["branch"] == "0"), None)
-    said = [_end(summary, lines)] if not first or until in ("target", "points") else []
+    sentences = [_end(summary, lines)] if not first or until in ("target", "points") else []
     if first:
-        said.append(_instability(first, summary))
+        sentences.append(_instability(first, summary))
     if summary["stopped"]:
         points = f"{len(lines)} point{'s' * (len(lines) != 1)}"
-        said.insert(0, Markup("The run stopped early, after {}: {}.").format(points, summary["stopped"]))
-    return Markup(" ").join(said)
+        sentences.insert(0, Markup("The run stopped early, after {}: {}.").format(points, summary["stopped"]))
+    return Markup(" ").join(sentences)
 
 
 def value(line: Line, summary: Summary) -> Markup:
@@ -42,7 +42,7 @@ def value(line: Line, summary: Summary) -> Markup:
 
 
 def physical_units(summary: Summary) -> dict[str, tuple[float, str]]:
-    """What an amplitude of one is with its unit, where the case gives it: the field's by its flux density."""
+    """Amplitude -> (size of one, unit) in SI, where the case gives units; the field by its flux density."""
     dims, of, sizes = summary["dimensions"], summary["dimensionless"], {}
     applied = ((summary["case"].get("magnetic") or {}).get("applied") or {}).get("flux_density")
     if applied and of["lambda_m"]:
@@ -66,12 +66,12 @@ def _instability(line: Line, summary: Summary) -> Markup:
         kind += f" ({line['mode']}{' waves' if line['mode'] not in (*OWN_MODES, 'antisymmetric') else ''})"
     at, place = value(line, summary), _displacement(line)
     if line["amplitude"] == "pressure" and summary["knockdown"] is not None:
-        said = "The shell buckles at the knockdown factor k<sub>d</sub> = {}: a {}, {}."
+        sentence = "The shell buckles at the knockdown factor k<sub>d</sub> = {}: a {}, {}."
     elif line["amplitude"] == "lambda_m":
-        said = "The field makes the shell unstable at the critical {}: a {}, {}."
+        sentence = "The field makes the shell unstable at the critical {}: a {}, {}."
     else:
-        said = "The first instability on the path is at {}: a {}, {}."
-    return Markup(said).format(at, kind, place)
+        sentence = "The first instability on the path is at {}: a {}, {}."
+    return Markup(sentence).format(at, kind, place)
 
 
 def _end(summary: Summary, lines: Sequence[Line]) -> Markup:

@@ -1,1 +1,1 @@
-"""Files that survive an interruption."""
+"""Files that survive an interruption: tables, checkpoints, the folder of results."""

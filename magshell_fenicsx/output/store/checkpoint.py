@@ -1,7 +1,7 @@
-"""DIR/checkpoint: the case, then every result of the solver, each on disk before the next is sought.
+"""DIR/checkpoint: the case, then every result of the solver, each on disk before the next is computed.
 
-Written by rank 0 alone and in one file, so that a full disk stops all ranks together: ADIOS2 (2.10, through
-adios4dolfinx 0.9.3) raises on one rank in `Close` then, and the others wait for it for ever.
+Rank 0 alone writes one file, so that a full disk stops all ranks together. ADIOS2 (2.10, through adios4dolfinx 0.9.3)
+raises on one rank in `Close` then, and the other ranks wait for ever.
 """
 
 import json
@@ -32,12 +32,12 @@ def begin_checkpoint(file: Path, case: Case) -> None:
 
 
 def check_resumable(file: Path, case: Case) -> None:
-    """See that a checkpoint is one of this case and these sources.
+    """Check that a checkpoint belongs to this case and these sources.
 
     Raises
     ------
     CaseError
-        If there is none, or it is of another.
+        If there is no checkpoint, or it belongs to another case or other sources.
     """
     saved = begun_with(file)
     if saved is None:
@@ -46,7 +46,7 @@ def check_resumable(file: Path, case: Case) -> None:
 
 
 def begun_with(file: Path) -> dict[str, Any] | None:
-    """The `identity` of the run that began a checkpoint; None if there is none."""
+    """The `identity` of the run that began a checkpoint; None if there is no checkpoint."""
     try:
         with file.open("rb") as stream:
             head = read_frame(stream)
@@ -56,28 +56,28 @@ def begun_with(file: Path) -> dict[str, Any] | None:
 
 
 def identity(case: Case) -> dict[str, Any]:
-    """All that a run depends on: the case, the files that it names, the program."""
+    """Everything that a run depends on: the case, the files that it names, the program."""
     data = {"case": case.model_dump(mode="json", exclude_none=True), **case.outside, "sources": sources.ours()}
-    return dict(json.loads(json.dumps(data)))  # as it comes back from a file
+    return dict(json.loads(json.dumps(data)))  # as read back from a file
 
 
 class OtherSources(CaseError):
-    """What is there was computed by other sources of this program."""
+    """The saved results were computed by other sources of this program."""
 
 
 def refuse_other(saved: dict[str, Any], case: Case, folder: Path) -> None:
-    """See that what was saved is of this case and these sources.
+    """Check that saved results belong to this case and these sources.
 
     Raises
     ------
     CaseError
-        With the first difference; `OtherSources` if the sources are all of it.
+        With the first difference; `OtherSources` if only the sources differ.
     """
     now = identity(case)
     there, here = saved.get("sources", saved.get("version")), now["sources"]
     known = {key: value for key, value in saved.items() if key not in ("sources", "version")}
     if known != {key: value for key, value in now.items() if key != "sources"}:
-        raise CaseError(f"--resume: {folder} is of another run: {_difference(known, now)}; run without --resume")
+        raise CaseError(f"--resume: {folder} belongs to another run: {_difference(known, now)}; run without --resume")
     if there != here:
         raise OtherSources(
             f"--resume: {folder} was computed by other sources of magshell_fenicsx ({there}; these are {here}); "
@@ -91,16 +91,16 @@ class Checkpoint:
     Parameters
     ----------
     file
-        As `begin_checkpoint` or an earlier run left it; an entry torn by a kill is cut off.
+        The file of `begin_checkpoint` or of an earlier run; an incomplete last entry is cut off.
     V
         The displacement's space.
     comm
-        Of all ranks of the program.
+        The communicator of all ranks.
 
     Attributes
     ----------
     replayed
-        Number of results that were taken from the file.
+        Number of results taken from the file.
     """
 
     def __init__(self, file: Path, V: fem.FunctionSpace, comm: MPI.Comm) -> None:
@@ -113,14 +113,14 @@ class Checkpoint:
             self._append(self._ordering.places.tobytes())
 
     def _begin(self) -> Array | None:
-        """The places of the nodes, if they are there."""
+        """The positions of the nodes, if the file has them."""
         self._reading = self._file.open("rb")
         read_frame(self._reading)
         content = read_frame(self._reading)
         return None if content is None else np.frombuffer(content).reshape(-1, 3)
 
     def replay(self) -> Point | str | None:
-        """The next result of the file; None from its end on."""
+        """The next result in the file; None at its end."""
         if not self._replaying:
             return None
         content = by_first(self._comm, lambda: read_frame(self._reading), "cannot be read")
@@ -147,12 +147,12 @@ class Checkpoint:
         by_first(self._comm, close)
 
     def remove(self) -> None:
-        """Take the file away: the run is complete."""
+        """Delete the file: the run is complete."""
         by_first(self._comm, self._file.unlink)
 
     def _append(self, content: bytes) -> None:
         def write() -> None:
-            if self._writing is None:  # what comes after the last whole entry is torn
+            if self._writing is None:  # cut off an incomplete last entry
                 self._writing = AppendedFile(self._file, self._reading.tell())
             self._writing.append(framed(content))
 
@@ -168,15 +168,15 @@ class Checkpoint:
 
 
 def _encoded(point: Point, u: Array, du: Array) -> bytes:
-    """A line of JSON with the numbers of a point, then both vectors."""
+    """A line of JSON with the numbers of a point, then its two vectors."""
     numbers = {f.name: getattr(point, f.name) for f in fields(point) if f.name not in ("state", "du")}
     return json.dumps({**numbers, "mu": point.state.mu}).encode() + b"\n" + u.tobytes() + du.tobytes()
 
 
 def _difference(there: Any, here: Any, key: str = "") -> str:
-    """The first key with different values, and both."""
+    """The first key with different values, and both values."""
     if isinstance(there, dict) and isinstance(here, dict):
         name = next(name for name in {**there, **here} if there.get(name) != here.get(name))
         return _difference(there.get(name), here.get(name), f"{key}.{name}".removeprefix(".").removeprefix("case."))
-    said = ["nothing" if value is None else json.dumps(value) for value in (there, here)]
-    return f"{key} is {said[0]} there and {said[1]} here"
+    values = ["nothing" if value is None else json.dumps(value) for value in (there, here)]
+    return f"{key} is {values[0]} there and {values[1]} here"

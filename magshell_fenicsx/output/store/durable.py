@@ -1,16 +1,16 @@
-"""Files that a kill, a crash or a full disk leaves readable."""
+"""Files that stay readable after a kill, a crash or a full disk."""
 
 import os
 from pathlib import Path
 
 
 def write_whole(file: Path, content: bytes) -> None:
-    """Write a file so that there is at every moment the whole of the old one or of the new one.
+    """Write a file; at every moment either the complete old file or the complete new one exists.
 
     Raises
     ------
     OSError
-        With the file's name; the old file is as it was.
+        With the file's name; the old file is unchanged.
     """
     unfinished = file.with_name(file.name + ".unfinished")
     try:
@@ -27,7 +27,7 @@ def write_whole(file: Path, content: bytes) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Put the names in a folder on disk."""
+    """Write the directory entries of a folder to disk."""
     number = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(number)
@@ -36,7 +36,7 @@ def sync_folder(folder: Path) -> None:
 
 
 class AppendedFile:
-    """A file that grows by whole pieces.
+    """A file that grows by complete pieces.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ class AppendedFile:
         Raises
         ------
         OSError
-            With the file's name; the file is as long as it was.
+            With the file's name; the file keeps its length.
         """
         left = memoryview(content)
         try:

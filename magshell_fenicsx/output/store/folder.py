@@ -1,4 +1,4 @@
-"""The folder that results go to."""
+"""The output folder: making it, locking it, and disk access through rank 0."""
 
 import fcntl
 import os
@@ -16,11 +16,11 @@ T = TypeVar("T")
 
 
 class DiskError(RuntimeError):
-    """A file could not be written or read; the message says which and why."""
+    """A file could not be written or read; the message has its name and the reason."""
 
 
 def prepare_folder(out: Path, comm: MPI.Comm, make: Callable[[Path], None]) -> Path:
-    """Let rank 0 make a folder ready, and tell all ranks if it cannot.
+    """Let rank 0 prepare a folder; collective.
 
     Raises
     ------
@@ -40,12 +40,12 @@ def prepare_folder(out: Path, comm: MPI.Comm, make: Callable[[Path], None]) -> P
 
 @contextmanager
 def held_folder(out: Path, comm: MPI.Comm, make: bool) -> Iterator[None]:
-    """Keep other runs out of a folder inside `with`: ranks outlive a killed mpirun, for instance.
+    """Lock a folder against other runs inside `with`; ranks of a killed mpirun may still be writing.
 
     Parameters
     ----------
     make
-        Whether to make the folder, where there is none.
+        Whether to create a missing folder.
 
     Raises
     ------
@@ -76,12 +76,12 @@ def held_folder(out: Path, comm: MPI.Comm, make: bool) -> Iterator[None]:
 def by_first(
     comm: MPI.Comm, do: Callable[[], T], failed: Literal["cannot be written", "cannot be read"] = "cannot be written"
 ) -> T:
-    """Let rank 0 write or read; what it gets, on every rank, or what it raises, see `from_first`. Collective.
+    """Let rank 0 write or read; return its result on every rank, see `from_first`. Collective.
 
     Raises
     ------
     DiskError
-        On every rank, if the disk is full for instance.
+        On every rank, for instance if the disk is full.
     """
 
     def done() -> T:

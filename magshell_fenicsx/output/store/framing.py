@@ -4,7 +4,7 @@ import struct
 import zlib
 from typing import BinaryIO
 
-HEAD = struct.Struct("<4sQI")  # mark, length, checksum of what follows
+HEAD = struct.Struct("<4sQI")  # mark, length and checksum of the content
 MARK = b"MSF1"
 
 
@@ -22,7 +22,7 @@ def framed(content: bytes) -> bytes:
 
 
 def read_frame(stream: BinaryIO) -> bytes | None:
-    """The element at the stream's position; None, and no move, if there is no whole one."""
+    """The element at the stream's position; None, with the position unchanged, if there is no complete one."""
     start = stream.tell()
     head = stream.read(HEAD.size)
     if len(head) == HEAD.size:

@@ -10,30 +10,30 @@ from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.continuation.system import Vector
 
 Array = NDArray[np.float64]
-CLOSE = 1e-9  # distance, over the mesh's size, below which two nodes are one
+CLOSE = 1e-9  # nodes at a smaller distance, over the mesh's size, are equal
 
 
 class Ordering:
-    """The nodes of a function space, numbered once and found again by their places.
+    """The nodes of a function space, numbered once and identified by their positions.
 
     Parameters
     ----------
     V
-        On all ranks together, or the same on every rank alone.
+        A space distributed over all ranks, or the same space on every rank.
     comm
-        Of all ranks of the program.
+        The communicator of all ranks.
     known
-        (n, 3) places on the affine mesh in the order to use, on rank 0; None there takes the present one.
+        On rank 0, the (n, 3) positions on the affine mesh in the order to use, or None for the present order.
 
     Raises
     ------
     CaseError
-        On every rank, if these are not the nodes of `known`.
+        On every rank, if the nodes differ from `known`.
 
     Attributes
     ----------
     places
-        (n, 3) places in the order in use.
+        (n, 3) positions in the order in use.
     """
 
     def __init__(self, V: fem.FunctionSpace, comm: MPI.Comm, known: Array | None = None) -> None:
@@ -51,17 +51,17 @@ class Ordering:
         self._parts = self._within.allgather(self._mine)
 
     def _found(self, known: Array, mine: Array, comm: MPI.Comm) -> NDArray[np.int64]:
-        """The numbers of this rank's places among the known ones."""
+        """The numbers of this rank's nodes among the known ones."""
         distance, number = scipy.spatial.cKDTree(known).query(mine)
         parts = self._within.allgather(number)
         one_to_one = np.array_equal(np.sort(np.concatenate(parts)), np.arange(len(known)))
         close = np.all(distance < CLOSE * np.abs(known).max())
         if not comm.allreduce(bool(one_to_one and close), MPI.LAND):
-            raise CaseError("--resume: the mesh is not that of the checkpoint; run without --resume")
+            raise CaseError("--resume: the mesh differs from the checkpoint's; run without --resume")
         return np.asarray(number)
 
     def gather(self, u: Vector) -> Array:
-        """All values of a displacement (n, components), on every rank that is rank 0 of its space; else empty."""
+        """All values (n, components) of a displacement on rank 0 of its space; empty on other ranks."""
         parts = self._within.gather(u)
         whole = np.empty((len(self.places), self._values)) if parts else np.empty((0, self._values))
         for where, part in zip(self._parts, parts or [], strict=False):
@@ -69,5 +69,5 @@ class Ordering:
         return whole
 
     def scatter(self, whole: Array) -> Vector:
-        """The part of this rank of values known to every rank."""
+        """This rank's part of values that every rank has."""
         return np.asarray(whole.reshape(-1, self._values)[self._mine].ravel())

@@ -1,4 +1,4 @@
-"""path.csv: one row per accepted point, on disk before the next point is sought."""
+"""path.csv: one row per accepted point, on disk before the next point is computed."""
 
 import csv
 import io
@@ -13,16 +13,16 @@ COLUMNS = tuple(q.name for q in OF_EVERY_RUN)
 TEXTS = tuple(q.name for q in OF_EVERY_RUN if q.kind == "text")
 Row = dict[str, float | int | str]
 LOCATED = ("fold", "bifurcation")
-OWN_MODES = ("", "symmetric", "asymmetric")  # of an instability within the model; others it excludes
+OWN_MODES = ("", "symmetric", "asymmetric")  # modes of the model itself; it excludes all other modes
 
 
 def pole_name(row: Mapping[str, object]) -> str:
-    """Whose displacement `w_pole_over_h` is: the first named point's, where there is one."""
+    """The point of `w_pole_over_h`: the first named point, or the pole."""
     return next((key.removesuffix("_ux") for key in row if key.endswith("_ux")), "the pole")
 
 
 class PathTable:
-    """Writes rows as they come, after those of an interrupted run.
+    """Writes rows one by one, after the rows of an interrupted run.
 
     Parameters
     ----------
@@ -32,7 +32,7 @@ class PathTable:
     Attributes
     ----------
     kept
-        The whole rows that the file had; what comes after them, torn by a kill, is cut off.
+        The complete rows of an existing file; an incomplete last row is cut off.
     """
 
     def __init__(self, file: Path, extra: Sequence[str] = ()) -> None:
@@ -57,7 +57,7 @@ class PathTable:
         Raises
         ------
         OSError
-            If the disk is full; the file ends with a whole row then.
+            If the disk is full; the file still ends with a complete row.
         """
         if int(row["point"]) >= len(self.kept):
             self._file.append(
@@ -75,7 +75,7 @@ def _line(values: Iterable[Any]) -> str:
 
 
 def read_rows(file: Path) -> list[Row]:
-    """The whole rows of a path.csv, also of a run that was killed."""
+    """The complete rows of a path.csv, also after a kill."""
     text = file.read_text(encoding="utf-8")
     rows = csv.DictReader(io.StringIO(text[: text.rfind("\n") + 1], newline=""))
     return [{key: v if key in TEXTS else _number(v) for key, v in row.items()} for row in rows]

@@ -1,7 +1,7 @@
-"""Fields of a scene as the polynomials that they are on its cells, and their values on another mesh of the same case.
+"""Transfer of fields between meshes of one case, by evaluating the polynomials of each cell.
 
-`transfer` smooths, and scales between shells of different shape. Here source and target have one
-chart: to a higher degree on the same mesh a displacement is carried without any loss.
+`transfer` smooths, and scales between shells of different shape. Here source and target have the same chart, and the
+transfer to a higher degree on the same mesh is exact.
 """
 
 import basix
@@ -15,25 +15,25 @@ from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.transfer import chart
 
 Array = NDArray[np.float64]
-CANDIDATES = 12  # cells with the nearest centres, among which the one that holds a point is sought
-WIDER = 8  # times as many, where none of them does
-NEWTON_STEPS = 4  # for the place in a cell with a curved edge
-INSIDE = 1e-6  # in cells, of the distance from one that holds a point: rounding
-BESIDE = 0.1  # in cells, of a point between an edge of one mesh and the same edge of another, curved otherwise
-FAR = 1.0  # in cells, where a cell's own map is of no use
+CANDIDATES = 12  # number of nearest cells that are searched for a point
+WIDER = 8  # factor of that number if none of them contains the point
+NEWTON_STEPS = 4  # for the position in a cell with a curved edge
+INSIDE = 1e-6  # distance from a cell, in cells, below which a point is inside: rounding
+BESIDE = 0.1  # largest distance, in cells; two meshes approximate a curved edge differently
+FAR = 1.0  # distance, in cells, beyond which a cell's map is not inverted
 
 
 class NotCarried(RuntimeError):
-    """A place of the one mesh is nowhere on the other."""
+    """A point of one mesh is outside the other mesh."""
 
 
 def carry(source: Scene, target: Scene, u: Vector) -> Vector:
-    """A displacement of `source` in the unknowns of `target`, zero where that is held; collective.
+    """A displacement of `source` in the unknowns of `target`, zero at its supports; collective.
 
     Raises
     ------
     NotCarried
-        On every rank, if a node of `target` lies more than a tenth of a cell beside all cells of `source`.
+        On every rank, if a node of `target` is more than a tenth of a cell outside all cells of `source`.
     """
     fields, comm, x = CellFields.of(source), target.comm, chart(target)
     cells, xi, beside = fields.places(x)
@@ -55,12 +55,12 @@ def gathered(scene: Scene, u: Vector) -> Array:
 
 
 class CellFields:
-    """Cells in a chart, to find points in them.
+    """Cells in a chart, in which points can be located.
 
     Parameters
     ----------
     nodes
-        (cells, nodes, 1 or 2) in the chart; with them the element maps its reference cell to the chart.
+        (cells, nodes, 1 or 2) nodes of the map from the reference cell to the chart.
     """
 
     def __init__(self, nodes: Array, element: basix.finite_element.FiniteElement) -> None:
@@ -85,13 +85,16 @@ class CellFields:
         return np.asarray(self._corners.mean(axis=1))
 
     def at(self, values: Array, cells: NDArray[np.int64], xi: Array) -> Array:
-        """Of `gathered` values, those (n, components) at places of `places`."""
+        """The values (n, components) of a `gathered` field at positions found by `places`."""
         return np.asarray(np.einsum("np,npc->nc", self.table(0, xi)[0], values[cells]))
 
     def places(self, x: Array) -> tuple[NDArray[np.int64], Array, Array]:
-        """The cells (n,) that hold points x (n, 1 or 2) of the chart, and where in the reference cell (n, 1 or 2).
+        """Locate points x (n, 1 or 2) of the chart.
 
-        Beside all cells the nearest is meant; the last (n,) says how far beside, in cells, else it is zero.
+        Returns
+        -------
+        The cells (n,), the nearest for a point outside all cells; the positions (n, 1 or 2) in the reference cell; and
+        the distances (n,) from the cells, in cells, zero inside.
         """
         count = min(CANDIDATES, len(self.nodes))
         candidates = self._near.query(x, count)[1].reshape(len(x), count)
@@ -99,7 +102,7 @@ class CellFields:
         cells = candidates[np.arange(len(x)), straight.argmin(axis=0)]
         xi, beside = self._in_cells(x, cells)
         enough = INSIDE
-        while len(far := np.flatnonzero(beside > enough)):  # the one that holds a point may be large, beside small ones
+        while len(far := np.flatnonzero(beside > enough)):  # a large cell may have a distant centre
             candidates = self._near.query(x[far], count)[1].reshape(len(far), count)
             for tried in candidates.T:
                 there, off = self._in_cells(x[far], tried)
@@ -112,7 +115,7 @@ class CellFields:
         return cells, xi, np.where(beside > INSIDE, beside, 0.0)
 
     def _in_cells(self, x: Array, cells: NDArray[np.int64]) -> tuple[Array, Array]:
-        """Places of points in the reference cells of given cells, and how far beside; inf where Newton fails."""
+        """Positions of points in the reference cells of given cells, and distances; inf if Newton's method fails."""
         xi = self._as_if_straight(x, cells)
         beside = np.full(len(x), np.inf)
         near = np.flatnonzero(_beside(xi) < FAR)
@@ -136,13 +139,13 @@ class CellFields:
         return self.nodes[:, : self.nodes.shape[2] + 1]
 
     def _as_if_straight(self, x: Array, cells: NDArray[np.int64]) -> Array:
-        """Places in the reference cell if the cells had straight edges."""
+        """Positions in the reference cells, as if the cells had straight edges."""
         corners = self._corners[cells]
         return _solve(np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2), x - corners[:, 0])
 
 
 def _beside(xi: Array) -> Array:
-    """How far places (n, 1 or 2) are beside the reference cell; negative inside."""
+    """Distance of positions (n, 1 or 2) from the reference cell; negative inside."""
     return np.asarray(np.maximum(-xi.min(axis=1), xi.sum(axis=1) - 1))
 
 

@@ -1,4 +1,4 @@
-"""The mesh that was chosen for a tolerance, how it was found, and the file that keeps it."""
+"""The mesh chosen for a tolerance, the rounds that led to it, and its file."""
 
 import json
 from dataclasses import asdict, dataclass, replace
@@ -16,9 +16,9 @@ from magshell_fenicsx.simulate.scene import Scene
 
 @dataclass(frozen=True)
 class Choice:
-    """A degree and a mesh; without sizes it has the default ones over `refinement`.
+    """A degree and a mesh; without `size` the elements have the default sizes over `refinement`.
 
-    With sizes, `refinement` says how much finer than by default it is in the mean, and scales nothing.
+    With `size`, `refinement` only records the mean refinement relative to the default.
     """
 
     degree: int
@@ -39,7 +39,7 @@ class Choice:
 
 @dataclass(frozen=True)
 class Round:
-    """A mesh that was tried; `estimate` is that of the relative error of the result."""
+    """A mesh that was tried; `estimate` is the estimated relative error of the result."""
 
     degree: int
     refinement: float
@@ -51,17 +51,16 @@ class Round:
 
 @dataclass(frozen=True)
 class Adapted:
-    """What the rounds have found.
+    """The result of all rounds.
 
     Attributes
     ----------
     asked
         The case with the tolerance.
     choice, best
-        The mesh to take, and its round: that of fewest unknowns within the tolerance, or of the least error if
-        there is none.
+        The chosen mesh and its round: the fewest unknowns within the tolerance, or else the least error.
     rounds
-        All in their order.
+        All rounds in order.
     """
 
     asked: Case
@@ -70,12 +69,12 @@ class Adapted:
     rounds: list[Round]
 
     def account(self, result: float | None) -> dict[str, Any]:
-        """For summary.json, after the run on this mesh; no estimate if that ended elsewhere than the rounds did.
+        """The entry of summary.json; without an estimate if the run ended at another result than the rounds.
 
         Parameters
         ----------
         result
-            Of the run (`Ending.value`), None if it has none.
+            Result of the run (`Ending.value`), or None.
         """
         best = self.best
         same = result is not None and abs(result - best.result) <= best.estimate * abs(best.result)
@@ -86,7 +85,7 @@ class Adapted:
         }
 
     def to_json(self) -> bytes:
-        """All but the case, in full precision: a run that is resumed has the same mesh on any number of ranks."""
+        """All except the case, in full precision, so that a resumed run has the same mesh on any number of ranks."""
         size = self.choice.size
         sizes = size and {"points": size.points.tolist(), "sizes": size.sizes.tolist()}
         rounds = [asdict(r) for r in self.rounds]
@@ -94,7 +93,7 @@ class Adapted:
 
     @classmethod
     def from_json(cls, asked: Case, content: bytes) -> "Adapted":
-        """Of the same case."""
+        """Read the content of `to_json` for the same case."""
         known = json.loads(content)
         rounds = [Round(**r) for r in known["rounds"]]
         best, size = rounds[known["best"]], known["size"]

@@ -1,4 +1,4 @@
-"""What a run ends at, and the same on another mesh, without its path."""
+"""The end of a run, and the same end on another mesh without computing the path."""
 
 from dataclasses import dataclass, field
 from typing import Literal
@@ -14,7 +14,7 @@ from magshell_fenicsx.simulate.scene import Scene
 
 
 class NoResult(RuntimeError):
-    """A run ends at nothing that could be compared on two meshes; the message says why."""
+    """A run has no scalar result that could be compared between meshes; the message has the reason."""
 
 
 @dataclass(frozen=True)
@@ -24,16 +24,16 @@ class Ending:
     Attributes
     ----------
     kind
-        A fold or a target, both solved for directly; another instability is found by its path only.
+        A fold or a target can be computed directly; another instability needs the path.
     name
         The amplitude that varied.
     value
-        The result of the run. At an instability the amplitude; at a target the amplitude where the conjugate
+        The result of the run: the amplitude at an instability. At a target, the amplitude if the conjugate
         displacement is prescribed (force at a depth, pressure at a volume), else the conjugate displacement.
     tangent
-        Of the path, in u; the null vector at a fold. It weighs what an error of u does to the value.
+        Tangent of the path in u; at a fold the null vector. It is the weight of an error of u in the value.
     held
-        The prescribed conjugate displacement; None where the load is prescribed.
+        The prescribed conjugate displacement; None if the load is prescribed.
     """
 
     kind: Literal["fold", "target", "instability"]
@@ -46,7 +46,7 @@ class Ending:
 
 @dataclass
 class History:
-    """What of a run's records its ending depends on."""
+    """The records of a run that its end depends on."""
 
     last: Record | None = None
     located: list[Record] = field(default_factory=list)
@@ -60,7 +60,7 @@ class History:
             self.last = record
 
     def ending(self, scene: Scene, stopped: str | None) -> Ending:
-        """The first instability, or the last where folds are passed, or the last target if that is the goal.
+        """The first instability; the last one with `until: bifurcation`; the last target with a target.
 
         Raises
         ------
@@ -82,7 +82,7 @@ class History:
 
 
 def by_path(scene: Scene) -> Ending:
-    """The end of the whole history of a scene.
+    """The end of a scene by computing its whole history.
 
     Raises
     ------
@@ -99,7 +99,7 @@ def by_path(scene: Scene) -> Ending:
 
 
 def from_near(scene: Scene, source: Scene, near: Ending) -> Ending:
-    """The end of a scene by Newton's method from that of another mesh or degree; where that fails, by the path.
+    """The end of a scene by Newton's method from the end on another mesh; if this fails, by the path.
 
     Raises
     ------

@@ -1,10 +1,10 @@
-"""Where on a mesh the error of a result comes from.
+"""Error indicators: the contribution of each cell to the error of a result.
 
-The result J of a run is an amplitude on a path of stationary points, or its conjugate displacement, so
-its first variation in the residual is the path's tangent z: J - J_h = a(e_u, e_z) up to higher order,
-with the tangent stiffness a and the errors e of u and z (dual weighted residuals: R. Becker, R. Rannacher,
-Acta Numerica 10, 2001). Cell by cell that is at most sqrt(|e_u|^2 |e_z|^2) in the energy norm. The
-errors are taken against a solution of higher degree on the same mesh.
+The result J of a run is an amplitude on a path of stationary points, or its conjugate displacement. Its first
+variation with the residual is therefore the path's tangent z: J - J_h = a(e_u, e_z) up to higher order, with the
+tangent stiffness a and the errors e of u and z (dual weighted residuals: R. Becker, R. Rannacher, Acta Numerica 10,
+2001). In each cell this is at most sqrt(|e_u|^2 |e_z|^2) in the energy norm. The errors are estimated with a solution
+of higher degree on the same mesh.
 """
 
 import basix
@@ -21,21 +21,21 @@ Array = NDArray[np.float64]
 
 
 def indicators(coarse: tuple[Scene, Ending], fine: tuple[Scene, Ending]) -> tuple[Array, Array]:
-    """Share of each cell in the error of the result, up to a factor; collective.
+    """Share of each cell in the error of the result, up to a common factor; collective.
 
     Parameters
     ----------
     coarse, fine
-        Scenes of one mesh, the second of higher degree, and their ends.
+        Scenes on one mesh with their ends; the second has a higher degree.
 
     Returns
     -------
-    Centres of the cells (n, 2) in the chart, in one order on any number of ranks, and their shares (n,).
+    Centres of the cells (n, 2) in the chart, in an order independent of the number of ranks, and shares (n,).
     """
     (scene, low), (richer, high) = coarse, fine
     cells, comm = CellFields.of(richer), richer.newton.system.comm
     u, z = (carry(scene, richer, v) for v in (low.state.u, low.tangent))
-    scale = dot(comm, z, high.tangent) / dot(comm, z, z)  # null vectors have no size of their own
+    scale = dot(comm, z, high.tangent) / dot(comm, z, z)  # null vectors have no scale
     energy = _TangentEnergy(richer, cells, high.state.u)
     shares = np.sqrt(energy(high.state.u - u) * energy(high.tangent - scale * z))
     order = np.lexsort(cells.centres.round(9).T)

@@ -1,4 +1,4 @@
-"""Element sizes known at points, as a size function of the whole chart."""
+"""A size function of the whole chart, interpolated from element sizes at points."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -11,13 +11,13 @@ from magshell_fenicsx.mesh.grading import Size
 
 Array = NDArray[np.float64]
 NEIGHBOURS = 3
-LARGEST_CHANGE = 2.5  # of a cell against all others, and of all, in one round
-STEPS = 8  # to an octave of the sizes: rounding does not show in the mesh, whatever the number of ranks
+LARGEST_CHANGE = 2.5  # largest factor in one round, of a cell relative to the mean and of the mean
+STEPS = 8  # sizes per factor of two; coarse steps make the mesh independent of rounding
 
 
 @dataclass(frozen=True)
 class Sampled:
-    """The geometric mean of the sizes at the nearest points, weighed by their inverse distances.
+    """The geometric mean of the sizes at the nearest points, weighted by their inverse distances.
 
     Attributes
     ----------
@@ -41,23 +41,22 @@ class Sampled:
 def equidistributed(
     old: Size, centres: Array, shares: Array, order: float, reduction: float, least: float
 ) -> tuple[Sampled, float]:
-    """Sizes with which all cells have equal shares in the error, and that falls by a factor.
+    """Sizes for which all cells have equal shares in the error, and the error falls by a factor.
 
     Parameters
     ----------
     old
-        Of the mesh whose cells have `centres` (n, 2) and `shares` (n,) of the error.
+        Size function of the mesh whose cells have `centres` (n, 2) and `shares` (n,) of the error.
     order
-        The error falls with this power of the size, and the share of one cell with two more.
+        Power of the size in the error; the share of one cell falls with the power `order` + 2.
     reduction
-        Wanted error over that of the old mesh.
+        Wanted error over the error on the old mesh.
     least
-        Smallest size. Below the thickness a shell has nothing to resolve; a point force would have, but
-        without limit.
+        Smallest size: the thickness, below which only the singularity of a point force remains.
 
     Returns
     -------
-    Sizes, and how many times more cells these make.
+    Sizes, and the factor of the number of cells.
     """
     wish = (np.exp(np.log(shares).mean()) / shares) ** (1 / (order + 2))
     change = _smoothed(centres, np.clip(wish, 1 / LARGEST_CHANGE, LARGEST_CHANGE))

@@ -1,13 +1,13 @@
-"""A mesh for a tolerance of the result: rounds of estimate and remesh, with one path in all.
+"""A mesh for a tolerance of the result: rounds of error estimation and remeshing that need only one path.
 
-    (a) the whole path on a coarse mesh of degree 3, its end there with the degree that goes with the tolerance
-    (b) its end with one degree more: the change of the result estimates the error
-    (c) done if that is at most the tolerance and at least a fifth of it
-    (d) else a mesh on which all cells have equal shares in the error (`indicator`), with as many of them
-        as make the error 0.55 of the tolerance; its end by Newton's method from that of (b); on with (b)
+    (a) Compute the whole path on a coarse mesh of degree 3, then its end with the degree that suits the tolerance.
+    (b) Compute the end with one degree more; the change of the result estimates the error.
+    (c) Stop if the estimate is at most the tolerance and at least a fifth of it.
+    (d) Else make a mesh on which all cells have equal shares in the error (`indicator`) and the expected error is 0.55
+        of the tolerance; compute its end by Newton's method from the end of (b); continue with (b).
 
-The meridian, where cells cost nothing, and grids, whose lines go from edge to edge, are refined as a whole. There,
-and on a surface of a few cells, the error may be far below a loose tolerance.
+Meridians, where cells cost nothing, and grids, whose lines go from edge to edge, are refined uniformly. There, and on
+surfaces of few cells, the error may be far below a loose tolerance.
 """
 
 from collections.abc import Callable
@@ -24,37 +24,37 @@ from magshell_fenicsx.simulate.adapt.indicator import indicators
 from magshell_fenicsx.simulate.adapt.size import equidistributed
 from magshell_fenicsx.simulate.scene import Scene
 
-DEGREES = ((3e-3, 3), (2e-4, 4), (0.0, 5))  # down to a tolerance: the degree with which it takes the least time
+DEGREES = ((3e-3, 3), (2e-4, 4), (0.0, 5))  # the fastest degree for tolerances down to the first number
 CHEAP = 3  # degree of the path
-FIRST = (0.5, 1.0, 2.0)  # refinements of the first mesh: the next if the path is lost on the one before
-SAFETY = 1.25  # the richer solution has an error too
+FIRST = (0.5, 1.0, 2.0)  # refinements of the first mesh, tried until the path has a result
+SAFETY = 1.25  # factor of the estimate for the error of the finer solution
 AIM, LEAST = 0.55, 1 / 5  # estimated error over the tolerance
 MOST_ROUNDS = 6
-COARSEST, FINEST = 0.1, 20.0  # refinement of a meridian
-LINES = 1.25  # least refinement of a grid, which may have few lines to add to
-FEW = 50  # cells of a surface that are not worth making fewer
+COARSEST, FINEST = 0.1, 20.0  # limits of the refinement of a meridian
+LINES = 1.25  # least factor of the refinement of a grid; a smaller one may add no line
+FEW = 50  # a surface with at most so many cells is not coarsened
 
 Say = Callable[[str], None]
 Solved = tuple[Scene, Ending]
 
 
 def adapted(case: Case, comm: MPI.Comm, say: Say = lambda line: None, doing: Say = lambda what: None) -> Adapted:
-    """Find a mesh on which the result of a case has an error below `mesh.tolerance`, relative; collective.
+    """Find a mesh on which the relative error of the result is below `mesh.tolerance`; collective.
 
-    The result is that of `Ending`: k_d or the critical amplitude at an instability; at the last target the load,
-    or the displacement conjugate to a load that is given. It should not be zero.
+    The result is `Ending.value`: k_d or the critical amplitude at an instability; at the last target the load, or the
+    displacement conjugate to a prescribed load. It should not be zero.
 
     Parameters
     ----------
     say
         Called with one line of text per round.
     doing
-        Called with a few words on what is about to be done.
+        Called with a short description of the next activity.
 
     Raises
     ------
     NoResult
-        If the case ends without a result on any first mesh.
+        If the case has no result on any first mesh.
     """
     tolerance = case.mesh.tolerance
     assert tolerance is not None
@@ -92,7 +92,7 @@ def _degree(tolerance: float) -> int:
 
 
 def _first(case: Case, comm: MPI.Comm) -> tuple[Choice, Solved]:
-    """The whole path on the coarsest mesh where it has an end."""
+    """The whole path on the coarsest mesh where it has a result."""
     for refinement in FIRST:
         choice = Choice(CHEAP, refinement)
         scene = choice.scene(case, comm)
@@ -115,9 +115,9 @@ def _judged(choice: Choice, coarse: Solved, fine: Solved) -> Round:
 
 
 def _remeshed(choice: Choice, coarse: Solved, fine: Solved, reduction: float) -> Choice | None:
-    """The same degree on another mesh, for an error so many times the present one; None if there is none."""
+    """The same degree on another mesh, with the error times `reduction`; None if no other mesh is possible."""
     scene, degree = coarse[0], choice.degree
-    order = 2 * degree - 2  # of an energy in the size of the cells
+    order = 2 * degree - 2  # of convergence of an energy
     if scene.plan.axisymmetric or isinstance(scene.plan.shape, Grid):
         change = np.clip(reduction, 1e-3, 1e3) ** (-1 / order)
         if reduction < 1 and not scene.plan.axisymmetric:
@@ -129,6 +129,6 @@ def _remeshed(choice: Choice, coarse: Solved, fine: Solved, reduction: float) ->
         return None
     centres, shares = indicators(coarse, fine)
     size, more = equidistributed(scene.plan.size, centres, shares, order, reduction, scene.plan.material.h)
-    if fine[0].model.system.dofs * more > MOST_UNKNOWNS / 2:  # on an estimate
+    if fine[0].model.system.dofs * more > MOST_UNKNOWNS / 2:  # half of the limit, since this is an estimate
         return None
     return Choice(degree, round(choice.refinement * more**0.5, 3), size)

@@ -1,1 +1,1 @@
-"""The shell beside the solid, or one case beside another."""
+"""Comparison of the shell and the solid model of a case."""

@@ -1,4 +1,4 @@
-"""A case as a shell and as a solid, side by side."""
+"""Comparison of a case as a shell and as a solid."""
 
 import json
 from collections.abc import Callable, Mapping, Sequence
@@ -17,6 +17,7 @@ from magshell_fenicsx.output.store.folder import by_first, held_folder
 from magshell_fenicsx.studies.compare.curves import Difference, amplitude_of, differences, judged, places, time_at
 from magshell_fenicsx.studies.compare.picture import draw_comparison
 from magshell_fenicsx.studies.compare.runs import MODELS, ModelName, ModelRun, NothingLeft, run_model
+from magshell_fenicsx.studies.study.reference import observed_order
 from magshell_fenicsx.studies.sweep.table import write_csv
 
 ONE_PERCENT = 0.01
@@ -24,14 +25,14 @@ ONE_PERCENT = 0.01
 
 @dataclass(frozen=True)
 class Comparison:
-    """What was found.
+    """The result of a comparison.
 
     Attributes
     ----------
     differences
-        Of the finest runs, curve against curve.
+        Differences between the curves of the finest runs.
     content
-        As in compare.json.
+        The content of compare.json.
     """
 
     differences: list[Difference]
@@ -46,20 +47,20 @@ def compare(
     out: Path | str,
     say: Callable[[str], None] = print,
 ) -> Comparison:
-    """Run a case with both models; write compare.csv, compare.json and compare.png, and each run's own folder.
+    """Run a case with both models; write compare.csv, compare.json and compare.png, and a folder for each run.
 
-    Every run is a process of its own. Runs of the same case and sources that are in the folder are kept.
+    Every run is a separate process. Runs of the same case and sources that are in the folder are kept.
 
     Parameters
     ----------
     refinements
-        Of each model's mesh. The finest runs are compared; the error of the others is relative to the limit that
-        the two finest extrapolate to, with the order that the third finest tells.
+        Mesh refinements of each model. The finest runs are compared. Errors are relative to the limit that the
+        three finest runs extrapolate to.
 
     Raises
     ------
     CaseError
-        If one of the models refuses the case.
+        If the case is not valid for one of the models.
     NothingLeft
         If a run left no results.
     """
@@ -105,7 +106,7 @@ def parse_refinements(shell: str, solid: str) -> dict[ModelName, list[float]]:
     Raises
     ------
     CaseError
-        If one is no list of positive numbers.
+        If one is not a list of numbers from 0.1 to 20.
 
     Examples
     --------
@@ -124,7 +125,7 @@ def parse_refinements(shell: str, solid: str) -> dict[ModelName, list[float]]:
 
 
 def _content(runs: dict[ModelName, list[ModelRun]], at: float | None, found: Sequence[Difference]) -> dict[str, Any]:
-    told: dict[ModelName, list[dict[str, Any]]] = {}
+    accounts: dict[ModelName, list[dict[str, Any]]] = {}
     limits: dict[str, float | None] = {}
     seconds: dict[str, float | None] = {}
     name, judgements = judged([run for series in runs.values() for run in series], at)
@@ -132,7 +133,7 @@ def _content(runs: dict[ModelName, list[ModelRun]], at: float | None, found: Seq
         values, judgements = judgements[: len(series)], judgements[len(series) :]
         limit = extrapolated(values, [run.refinement for run in series])
         errors = [abs(v / limit - 1) if v is not None and limit else None for v in values]
-        told[model] = [
+        accounts[model] = [
             {
                 "refinement": run.refinement,
                 "dofs": run.dofs,
@@ -148,7 +149,7 @@ def _content(runs: dict[ModelName, list[ModelRun]], at: float | None, found: Seq
         limits[model] = limit
         measured = [(e, run.cpu_s) for e, run in zip(errors, series, strict=True) if e is not None]
         seconds[model] = time_at(ONE_PERCENT, measured)
-    both = [told[model][-1]["value"] for model in MODELS]
+    both = [accounts[model][-1]["value"] for model in MODELS]
     times = [seconds[model] for model in MODELS]
     return {
         "result": name,
@@ -157,14 +158,14 @@ def _content(runs: dict[ModelName, list[ModelRun]], at: float | None, found: Seq
         "limits": limits,
         "seconds_to_one_percent": seconds,
         "ratio_at_one_percent": times[1] / times[0] if times[0] and times[1] else None,
-        "runs": told,
+        "runs": accounts,
     }
 
 
 def extrapolated(values: Sequence[float | None], refinements: Sequence[float]) -> float | None:
-    """The limit of the last three values, whose error falls like a power of the refinement; None for fewer.
+    """The limit of the last three values by Richardson extrapolation; None for fewer values.
 
-    It is the last of them where they do not tell a power.
+    It is the last value if no order of convergence is observed.
 
     Examples
     --------
@@ -174,14 +175,6 @@ def extrapolated(values: Sequence[float | None], refinements: Sequence[float]) -
     last = [v for v in values[-3:] if v is not None]
     if len(last) < 3:
         return None
-    first, second = last[1] - last[0], last[2] - last[1]
-    if first * second <= 0 or abs(second) >= abs(first):
-        return last[2]
-    a, b, c = refinements[-3:]
-    # e(r) = C r^-p: solve (b^-p - c^-p)/(a^-p - b^-p) = second/first for p by bisection
-    low, high = 0.1, 12.0
-    for _ in range(100):
-        p = (low + high) / 2
-        ratio = (b**-p - c**-p) / (a**-p - b**-p)
-        low, high = (p, high) if ratio > second / first else (low, p)
-    return float(last[2] + second * c**-p / (b**-p - c**-p))
+    h = [1 / r for r in refinements[-3:]]
+    p = observed_order(h, last)
+    return last[2] if p is None else last[2] + (last[2] - last[1]) * h[2] ** p / (h[1] ** p - h[2] ** p)

@@ -1,4 +1,4 @@
-"""Curve against curve, and the one number that a run is judged by."""
+"""Differences between two curves, and the number by which runs are compared."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ from magshell_fenicsx.quantities.registry import amplitude
 from magshell_fenicsx.studies.compare.runs import ModelRun
 from magshell_fenicsx.studies.study.scalar import Scalar
 
-W = "w"  # the displacement in the middle of the thickness since the end of the field
+W = "w"  # displacement of the mid-surface since the end of the field
 
 
 @dataclass(frozen=True)
@@ -22,28 +22,29 @@ class Difference:
 
     @property
     def relative(self) -> float:
-        """Of the solid from the shell."""
+        """Relative difference of the solid from the shell."""
         return self.solid / self.shell - 1
 
 
 def amplitude_of(run: ModelRun) -> str:
-    """What the path's last part varied."""
+    """The amplitude that varied last."""
     return run.rows[-1]["amplitude"]
 
 
 def curve(run: ModelRun) -> tuple[list[float], list[float]]:
-    """Displacement and load along that part, without branches."""
+    """Displacements and loads of the last part of the path, without branches."""
     y = amplitude(amplitude_of(run)).column
     return [float(row[W]) for row in loaded(run)], [float(row[y]) for row in loaded(run)]
 
 
 def loaded(run: ModelRun) -> list[dict[str, str]]:
-    """The rows of that part after the last one before it, with the displacement since then.
+    """The rows of the last part of the path and the row before it, with the displacement since that row.
 
-    The field moves a solid's middle more than a shell's: it also stretches the thickness, nu lambda_m R/h of w/h.
+    The field displaces the mid-surface of a solid by nu lambda_m R/h more (of w/h), since it also stretches the
+    thickness. The displacement since the end of the field excludes this.
     """
     varied = amplitude_of(run)
-    x = "w_point_over_h" if varied == "force" else "w_pole_over_h"  # of both models at the same place
+    x = "w_point_over_h" if varied == "force" else "w_pole_over_h"  # the same point in both models
     first = next(i for i, row in enumerate(run.rows) if row["amplitude"] == varied)
     before = run.rows[max(first - 1, 0)]
     part = [before, *(row for row in run.rows[first:] if row["amplitude"] == varied and row["branch"] == "0")]
@@ -51,9 +52,9 @@ def loaded(run: ModelRun) -> list[dict[str, str]]:
 
 
 def places(runs: Sequence[ModelRun]) -> list[float]:
-    """The whole thicknesses that all runs come to, or the last displacement below the first.
+    """The displacements 1, 2, ... that all runs reach, or their last common one if it is below 1.
 
-    None where a run has no targets: between the long steps of its own a curve is not known well enough.
+    Empty if a run has no targets: its steps are too long to interpolate between them.
     """
     if not all(any(row["label"] == "target" for row in loaded(run)) for run in runs):
         return []
@@ -62,7 +63,7 @@ def places(runs: Sequence[ModelRun]) -> list[float]:
 
 
 def differences(shell: ModelRun, solid: ModelRun) -> list[Difference]:
-    """At the displacements that both come to."""
+    """The differences at the displacements that both runs reach."""
     found = []
     for place in places([shell, solid]):
         loads = [load_at(run, place) for run in (shell, solid)]
@@ -72,12 +73,12 @@ def differences(shell: ModelRun, solid: ModelRun) -> list[Difference]:
 
 
 def load_at(run: ModelRun, w: float) -> float | None:
-    """The load at a displacement; None if the run does not come there."""
+    """The load at a displacement; None if the run does not reach it."""
     return Scalar("", amplitude(amplitude_of(run)).column, W, w).of(run.summary, loaded(run))
 
 
 def judged(runs: Sequence[ModelRun], at: float | None) -> tuple[str, list[float | None]]:
-    """What runs are compared by, and its values: k_d if all have one, else the load at a displacement."""
+    """The name and the values of the compared number: k_d if all runs have it, else the load at a displacement."""
     if all(run.summary["knockdown"] is not None for run in runs):
         return "knockdown", [float(run.summary["knockdown"]) for run in runs]
     if at is None:
@@ -86,7 +87,7 @@ def judged(runs: Sequence[ModelRun], at: float | None) -> tuple[str, list[float 
 
 
 def time_at(error: float, runs: Sequence[tuple[float, float]]) -> float | None:
-    """Seconds to an error, interpolated between runs (error, seconds); None if it is not among them.
+    """Run time in seconds for an error, interpolated between runs (error, seconds); None outside their range.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Shell and solid in one picture: the curves, their difference, error against run time."""
+"""The picture of a comparison: both curves, their difference, error against run time."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -18,7 +18,7 @@ def draw_comparison(
     Parameters
     ----------
     errors
-        Model -> (relative error, CPU seconds) of its coarser runs; empty draws no such panel.
+        Model -> (relative error, CPU seconds) of its coarser runs; without any the panel is left out.
     """
     from matplotlib.figure import Figure
 

@@ -1,4 +1,4 @@
-"""One model of a case as a process of its own, kept in a folder."""
+"""One model of a case, run in a separate process and kept in a folder."""
 
 import csv
 import json
@@ -17,16 +17,16 @@ MODELS: tuple[ModelName, ...] = ("shell", "solid")
 
 @dataclass(frozen=True)
 class ModelRun:
-    """What a run left.
+    """The results of a run.
 
     Attributes
     ----------
     refinement
-        Divides the element sizes of its model.
+        The value of mesh.refinement.
     summary, rows
         The content of summary.json and of path.csv.
     cpu_s, wall_s
-        Of the process, without the compilation of kernels.
+        Times of the process without the compilation of kernels.
     """
 
     model: ModelName
@@ -42,7 +42,7 @@ class ModelRun:
 
 
 class NothingLeft(RuntimeError):
-    """A run left no results; the message says why."""
+    """A run left no results; the message has the reason."""
 
 
 def run_model(
@@ -53,7 +53,7 @@ def run_model(
     folder: Path,
     say: Callable[[str], None] = print,
 ) -> ModelRun:
-    """Run a case with one of the models, unless the folder has that run, of the same sources.
+    """Run a case with one of the models, unless the folder has that run by the same sources.
 
     Raises
     ------
@@ -68,12 +68,13 @@ def run_model(
     kept = json.loads(used.read_text(encoding="utf-8")) if used.exists() else {}
     if kept.get("asked") != asked:
         if {**kept.get("asked", {}), "sources": asked["sources"]} == asked:
-            say(f"{model} at refinement {refinement:g}: again, the folder has it of other sources of magshell_fenicsx")
+            why = "the folder has results of other sources of magshell_fenicsx"
+            say(f"{model} at refinement {refinement:g}: computed again, {why}")
         sets = [part for setting in chosen for part in ("--set", setting)]
         measured = measure("magshell_fenicsx", ["run", str(case), *sets, "--out", str(folder)])
         if not (folder / "summary.json").exists() or measured.code not in (0, 3):
-            said = measured.errors.strip().splitlines()
-            raise NothingLeft(f"model: {model}: {said[-1] if said else f'exit code {measured.code}'}")
+            errors = measured.errors.strip().splitlines()
+            raise NothingLeft(f"model: {model}: {errors[-1] if errors else f'exit code {measured.code}'}")
         by = json.loads((folder / "summary.json").read_text(encoding="utf-8"))["sources"]
         kept = {"asked": {**asked, "sources": by}, "cpu_s": measured.cpu_s, "wall_s": measured.wall_s}
         write_whole(used, (json.dumps(kept, indent=1) + "\n").encode())

@@ -1,7 +1,7 @@
-"""What one Newton iteration takes, piece by piece, in a process of its own.
+"""The run time of the parts of a Newton iteration, measured in a separate process.
 
 `[mpirun -n N] python3 -m magshell_fenicsx.studies.study.iteration REPEATS DEGREE REFINEMENT` prints one line of JSON.
-Every time is in wall seconds of the slowest rank and in CPU seconds of all ranks.
+Times are wall seconds of the slowest rank and CPU seconds of all ranks.
 """
 
 import json
@@ -31,11 +31,11 @@ CASE = {
 }
 MU = {"lambda_m": 1e-3, "pressure": 0.1}
 WAVES = 5 * np.array([[3, 1, 2], [1, -2, 5], [-4, 2, 1]])
-HEIGHT = 1e-4  # thicknesses: every term has a part in a tangent that is positive definite
+HEIGHT = 1e-4  # over h; every term contributes, and the tangent is positive definite
 
 
 def measured(scene: Scene, repeats: int) -> dict[str, float]:
-    """Medians over some iterations after the first, which also orders and sorts."""
+    """Medians over iterations after the first, which also computes the ordering and the sparsity."""
     model, factorisation, comm = scene.model, scene.newton.factorisation, scene.comm
     system = model.system
     r0 = model.r0.x.array[: system.size].reshape(-1, 3)

@@ -1,4 +1,4 @@
-"""One command as a process of its own: its wall time, CPU time and peak memory."""
+"""Wall time, CPU time and peak memory of a command in a separate process."""
 
 import os
 import subprocess
@@ -12,18 +12,18 @@ from tempfile import TemporaryDirectory
 
 @dataclass(frozen=True)
 class Usage:
-    """What a process took.
+    """The resources that a process used.
 
     Attributes
     ----------
     code
         Exit code.
     wall_s, cpu_s
-        Of the whole process; CPU seconds are summed over ranks and everything that they started.
+        Times of the whole process; CPU seconds are summed over ranks and their child processes.
     peak_mb
-        Largest resident memory (2^20 bytes), summed over the ranks; None if a rank died.
+        Peak resident memory (2^20 bytes), summed over the ranks; None if a rank died.
     output, errors
-        What it printed.
+        Standard output and standard error.
     """
 
     code: int
@@ -42,9 +42,9 @@ def measure(
     Parameters
     ----------
     ranks
-        More than one are started by mpirun.
+        Number of ranks; mpirun starts more than one.
     environment
-        Variables to set besides our own.
+        Additional environment variables.
     """
     launcher = ["mpirun", "--map-by", ":OVERSUBSCRIBE", "-n", str(ranks)] if ranks > 1 else []
     with TemporaryDirectory() as scratch:
@@ -66,7 +66,9 @@ def measure(
                 process.wait()
                 raise
             wall_s = time.perf_counter() - start
-        process.returncode = os.waitstatus_to_exitcode(status)  # it is gone: Popen must not wait for it
+        process.returncode = os.waitstatus_to_exitcode(
+            status
+        )  # wait4 has reaped the process, so Popen must not wait for it
         peaks = [int(file.read_text(encoding="utf-8")) for file in Path(scratch).glob("peak.*")]
         return Usage(
             code=process.returncode,

@@ -1,9 +1,9 @@
-"""Runs a module as `python3 -m` does, and leaves the peak memory of this rank in a folder.
+"""Runs a module as `python3 -m` does, and writes the peak memory of this rank to a folder.
 
 `python3 -m magshell_fenicsx.studies.study.meter FOLDER MODULE ARGUMENT...`
 
-The peak is the kernel's VmHWM: that of getrusage is inherited from whoever started the process,
-and of several ranks the starter is only told the largest.
+The peak is the kernel's VmHWM. getrusage is no substitute: a process inherits the peak of its parent, and the parent
+of several ranks gets only the largest.
 """
 
 import os

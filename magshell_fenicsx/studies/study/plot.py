@@ -1,4 +1,4 @@
-"""A study as a picture: error against time, unknowns and memory, and where the time goes."""
+"""The picture of a study: error against time, unknowns and memory, and the shares of the run time."""
 
 from collections.abc import Sequence
 from itertools import cycle
@@ -19,7 +19,7 @@ PARTS = {
     "output_s": "output",
 }
 MARKERS = "osD^vP*X"
-LEAST_SPREAD = 3.0  # of an axis, up and down from its middle: noise must not look like a trend
+LEAST_SPREAD = 3.0  # least factor between the middle and the ends of an axis, so that noise shows no trend
 
 
 def draw_study(rows: Sequence[Row], keys: Sequence[str], title: str, own_error: float | None, file: Path) -> None:
@@ -28,9 +28,9 @@ def draw_study(rows: Sequence[Row], keys: Sequence[str], title: str, own_error: 
     Parameters
     ----------
     keys
-        The swept ones; those of one refinement series differ in the refinement alone.
+        The swept keys; the runs of a series differ only in the refinement.
     own_error
-        Of the reference, drawn as a line below which errors mean nothing.
+        Error of the reference, drawn as a line; smaller errors are meaningless.
     """
     import matplotlib
 
@@ -54,12 +54,12 @@ def draw_study(rows: Sequence[Row], keys: Sequence[str], title: str, own_error: 
 
 
 def _series(rows: Sequence[Row], keys: Sequence[str]) -> dict[str, list[Row]]:
-    """Rows that differ in the mesh size alone, by what they have in common."""
+    """Series of rows that differ only in the mesh size, by a label of their common values."""
     names = [*(key for key in keys if key != REFINEMENT), "ranks"]
-    told = [name for name in names if len({row[name] for row in rows}) > 1]
+    shown = [name for name in names if len({row[name] for row in rows}) > 1]
     found: dict[str, list[Row]] = {}
     for row in sorted(rows, key=lambda r: r["dofs"]):
-        found.setdefault(", ".join(f"{short(name)} {row[name]}" for name in told) or "runs", []).append(row)
+        found.setdefault(", ".join(f"{short(name)} {row[name]}" for name in shown) or "runs", []).append(row)
     return found
 
 
@@ -88,7 +88,7 @@ def _errors(axes: Any, series: dict[str, list[Row]], quantity: str, own_error: f
 
 
 def _parts(axes: Any, series: dict[str, list[Row]]) -> None:
-    """Where the wall time of the runs on the Pareto front goes, as shares: the machine may have been busy."""
+    """Draw the shares of the phases in the wall time, for the runs on the Pareto front."""
     rows = sorted((r for rows in series.values() for r in rows if r["pareto"]), key=lambda r: -r["error"])
     bottom = [0.0] * len(rows)
     places = range(len(rows))

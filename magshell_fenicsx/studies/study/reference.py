@@ -1,25 +1,25 @@
-"""What errors are measured against: a given number, or the finest run with its own error estimate."""
+"""The reference of errors: a given number, or the finest run with its own error estimate."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 from scipy.optimize import brentq
 
-ORDERS = 0.05, 30.0  # between which an observed order is believed
+ORDERS = 0.05, 30.0  # range of credible observed orders
 
 
 @dataclass(frozen=True)
 class Reference:
-    """A value, and what is known of its own error.
+    """A value with its own error.
 
     Attributes
     ----------
     error
-        Relative; None if it is not known.
+        Relative error; None if unknown.
     order
-        Observed order of convergence that the error comes from; None if it was not found.
+        Observed order of convergence for that error; None if there is none.
     source
-        For people.
+        Description of the reference.
     """
 
     value: float
@@ -40,8 +40,8 @@ def extrapolated(h: Sequence[float], values: Sequence[float]) -> tuple[float | N
     h
         Mesh sizes, decreasing.
     values
-        At least three give the order. Where there are two, or where they do not converge
-        monotonically, the error is the last difference and there is no order.
+        At least three values give the order. With two, or without monotonic convergence, the error is the last
+        difference and there is no order.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""From what was measured to the rows of study.csv: errors, and which runs are worth their time."""
+"""The rows of study.csv from the measurements: errors and the Pareto front."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True)
 class Run:
-    """A point on a number of ranks, and what was measured."""
+    """The measurements of a point on a number of ranks."""
 
     point: SweepPoint
     ranks: int
@@ -32,12 +32,12 @@ class Run:
 
 
 def make_rows(runs: Sequence[Run], scalar: Scalar, given: float | None) -> tuple[list[Row], Reference | None]:
-    """All rows, in the order of the runs, and what their errors are measured against.
+    """All rows, in the order of the runs, and the reference of their errors.
 
     Parameters
     ----------
     given
-        The reference; None takes the finest run, whose error is its own estimate.
+        The reference; None takes the finest run, with an estimate of its error.
     """
     rows = [_row(run, scalar) for run in runs]
     reference, finest = None, None
@@ -73,7 +73,7 @@ def _row(run: Run, scalar: Scalar) -> Row:
 
 
 def _estimated(finest: Row, runs: Sequence[Run], rows: Sequence[Row]) -> Reference:
-    """The finest run and its error, from the coarser meshes that have all else in common with it."""
+    """The finest run as reference; its error comes from runs that differ only in the refinement."""
     same = [key for key in runs[0].point.values if key != REFINEMENT] + ["ranks"]
     series = {
         run.point.case.mesh.refinement: row["result"]
@@ -88,12 +88,12 @@ def _estimated(finest: Row, runs: Sequence[Run], rows: Sequence[Row]) -> Referen
 
 
 def clock(rows: Sequence[Row]) -> str:
-    """The time to compare runs by: if all have one rank the CPU's, which no other work on the machine changes."""
+    """The time that compares runs: CPU time for one rank, because other processes affect it less; else wall time."""
     alone = all(row["ranks"] == 1 for row in rows) and any(row["cpu_s"] is not None for row in rows)
     return "cpu_s" if alone else "wall_s"
 
 
 def _beats(a: Row, b: Row, spent: str) -> bool:
-    """Whether a is nowhere worse than b, and somewhere better."""
+    """Whether a is at least as good as b in both time and error, and better in one."""
     here, there = (a[spent], a["error"]), (b[spent], b["error"])
     return here != there and here[0] <= there[0] and here[1] <= there[1]

@@ -1,4 +1,4 @@
-"""A point of a study: the same run several times, each a process of its own, kept on disk."""
+"""The measurements of a point: repeated runs in separate processes, kept on disk."""
 
 import csv
 import json
@@ -23,20 +23,20 @@ Sample = dict[str, float | None]
 
 @dataclass
 class Measured:
-    """What is kept of a point.
+    """The measurements of a point.
 
     Attributes
     ----------
     machine
-        It was measured on.
+        The machine, see `fingerprint`.
     first
-        The run that compiled what was not compiled yet; not among the samples.
+        The first run, which may compile kernels; it is not among the samples.
     samples
         One for each further run, with the keys `TIMES`.
     summary, rows
         summary.json and path.csv of the last run; None and empty if it left none.
     failure
-        Why a run left nothing; None otherwise.
+        Why a run left no results; None otherwise.
     """
 
     machine: dict[str, Any]
@@ -47,23 +47,23 @@ class Measured:
     failure: str | None = None
 
     def typical(self, key: str) -> float | None:
-        """Median over the samples; None where none has it."""
+        """Median over the samples; None if no sample has the key."""
         values = [value for sample in self.samples if (value := sample[key]) is not None]
         return median(values) if values else None
 
 
-Origin = Mapping[str, str | None]  # keys of summary.json that must have these values: sources, and of the mesh file
+Origin = Mapping[str, str | None]  # the sources and the mesh file: keys of summary.json and their values
 
 
 def load(file: Path, machine: dict[str, Any], origin: Origin) -> Measured:
-    """What an earlier study measured on this machine; nothing measured if there is nothing to use."""
+    """The usable measurements of an earlier study on this machine; empty without any."""
     kept = _read(file)
     usable = kept and kept.machine == machine and not kept.failure and _is_of(origin, kept.summary)
     return kept if kept and usable else Measured(machine)
 
 
 def of_others(file: Path, origin: Origin) -> bool:
-    """Whether there are measurements that cannot be used, because another program made them."""
+    """Whether the file has measurements of other sources, which cannot be used."""
     kept = _read(file)
     return kept is not None and kept.summary is not None and not _is_of(origin, kept.summary)
 
@@ -85,12 +85,12 @@ def complete(measured: Measured, arguments: Sequence[str], ranks: int, repeat: i
     Parameters
     ----------
     arguments
-        The case and its settings, as of `magshell run`.
+        The case and its settings, as for `magshell run`.
 
     Raises
     ------
     DiskError
-        If the disk is full; what was written before stays.
+        If the disk is full; earlier files are kept.
     """
     while not measured.failure and len(measured.samples) < repeat:
         sample = _run(measured, arguments, ranks)
@@ -124,5 +124,5 @@ def _run(measured: Measured, arguments: Sequence[str], ranks: int) -> Sample:
 
 
 def _failure(used: Usage) -> str:
-    said = used.errors.strip().splitlines()
-    return f"exit code {used.code}: {said[-1] if said else 'nothing said'}"
+    errors = used.errors.strip().splitlines()
+    return f"exit code {used.code}: {errors[-1] if errors else 'no message'}"

@@ -1,4 +1,4 @@
-"""What `--result` names: one number of a run."""
+"""The number of a run that `--result` names."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -22,9 +22,9 @@ class Scalar:
     Attributes
     ----------
     name
-        As `--result` has it.
+        The text of `--result`.
     column, at, value
-        For a number of the path: the column, and the column and value where it is taken, or "end".
+        For a number of the path: its column, and the column and value at which it is taken, or "end".
     """
 
     name: str
@@ -57,7 +57,7 @@ def parse_scalar(text: str) -> Scalar:
     Raises
     ------
     CaseError
-        If it is not of the form.
+        If the text has another form.
 
     Examples
     --------
@@ -83,15 +83,15 @@ def parse_scalar(text: str) -> Scalar:
 
 
 def _crossing(path: Sequence[Mapping[str, str]], column: str, at: str, value: float) -> float | None:
-    """The column where another first has a value: a cubic through the points around it.
+    """A column at the first point where the column `at` has a value, by cubic interpolation.
 
-    The points are those of one load: the curve has a corner where the field ends. At a requested point of the
-    path the number is that of its row.
+    The interpolation uses points of one load, because the curve has a corner at the end of the field. At a requested
+    point of the path the result is the number in its row.
     """
     x = [float(row[at]) for row in path]
     i = next((i for i in range(len(x) - 1) if (x[i] - value) * (x[i + 1] - value) <= 0 and x[i] != x[i + 1]), None)
     if i is None:
-        met = bool(x) and math.isclose(x[-1], value, rel_tol=1e-9)  # a target is met to the solver's tolerance
+        met = bool(x) and math.isclose(x[-1], value, rel_tol=1e-9)  # a target is reached within the solver's tolerance
         return float(path[-1][column]) if met else None
     first, last = i, i + 1
     if i and path[i]["amplitude"] == path[i + 1]["amplitude"]:

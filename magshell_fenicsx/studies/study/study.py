@@ -1,4 +1,4 @@
-"""Error against run time: a case over meshes, degrees, models and ranks, every run a process of its own."""
+"""Error against run time of a case over meshes, degrees, models and ranks; every run is a separate process."""
 
 import json
 from collections.abc import Callable, Sequence
@@ -14,13 +14,14 @@ from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.output.store.durable import write_whole
 from magshell_fenicsx.output.store.folder import by_first, held_folder
 from magshell_fenicsx.platform import sources
+from magshell_fenicsx.platform.terminal import print_line
 from magshell_fenicsx.studies.study.machine import fingerprint
 from magshell_fenicsx.studies.study.plot import draw_study
 from magshell_fenicsx.studies.study.reference import Reference
 from magshell_fenicsx.studies.study.rows import COLUMNS, Row, Run, make_rows
 from magshell_fenicsx.studies.study.sample import Measured, complete, load, of_others
 from magshell_fenicsx.studies.study.scalar import Scalar, parse_scalar
-from magshell_fenicsx.studies.study.table import repeated, said, write_table
+from magshell_fenicsx.studies.study.table import reference_sentence, repeated, write_table
 from magshell_fenicsx.studies.sweep.axes import parse_axes
 from magshell_fenicsx.studies.sweep.points import make_points
 from magshell_fenicsx.studies.sweep.table import write_csv
@@ -43,12 +44,8 @@ class Study:
 
     @property
     def without_result(self) -> int:
-        """Number of runs that did not give the number asked for."""
+        """Number of runs without the requested result."""
         return sum(row["result"] is None for row in self.rows)
-
-
-def _print(line: str) -> None:
-    print(line, flush=True)
 
 
 def study(
@@ -61,12 +58,12 @@ def study(
     ranks: Sequence[int] = (1,),
     repeat: int = 3,
     out: Path | str = "results/study",
-    say: Callable[[str], None] = _print,
+    say: Callable[[str], None] = print_line,
 ) -> Study:
-    """Measure error and run time at all points of a product; writes study.csv, .json, .md and .png.
+    """Measure error and run time at all points of a product; write study.csv, .json, .md and .png.
 
-    Each run is a process of its own, one at a time: once to compile its kernels, then `repeat` times.
-    Runs that are in the folder and were measured on this machine, with these sources, are kept.
+    Runs are separate processes, one at a time: each point runs once to compile its kernels, then `repeat` times. Runs
+    in the folder are kept if this machine measured them with these sources.
 
     Parameters
     ----------
@@ -75,19 +72,19 @@ def study(
     result
         `knockdown`, `critical_field`, `COLUMN@COLUMN=VALUE` or `COLUMN@end`; see `Scalar`.
     reference
-        What errors are relative to; None takes the finest run, whose own error is estimated.
+        The exact value for the errors; None takes the finest run and estimates its own error.
     ranks
-        Numbers of MPI ranks to run every point on.
+        Numbers of MPI ranks for every point.
     say
         Called with one line per run.
 
     Raises
     ------
     CaseError
-        Before anything is computed: if a point is no valid case, the result has no such name, or `out`
-        cannot be written.
+        Before the first run: if a point is not a valid case, the result has no such name, or `out` cannot be
+        written.
     DiskError
-        If the disk is full; runs that are there are kept.
+        If the disk is full; finished runs are kept.
     """
     scalar, axes = parse_scalar(result), parse_axes(over)
     _check(reference, ranks, repeat)
@@ -99,7 +96,7 @@ def study(
         }
         origins = [{"sources": sources.ours(), **point.case.outside} for point in points]
         if again := sum(of_others(file, origins[i]) for (i, _), file in files.items()):
-            say(f"{again} of {len(files)} again: what the folder has of them is of other sources of magshell_fenicsx")
+            say(f"{again} of {len(files)} computed again: the folder has results of other sources of magshell_fenicsx")
         for number, (point, origin) in enumerate(zip(points, origins, strict=True), 1):
             chosen = [*settings, *(f"{key}={value}" for key, value in point.values.items())]
             arguments = [str(file), *(word for setting in chosen for word in ("--set", setting))]
@@ -107,21 +104,21 @@ def study(
                 run = Run(point, n, load(files[number - 1, n], machine, origin))
                 complete(run.measured, arguments, n, repeat, files[number - 1, n], origin)
                 runs.append(run)
-                say(f"{number:4d}/{len(points)}  {run.label}: {_said(run.measured, scalar)}")
+                say(f"{number:4d}/{len(points)}  {run.label}: {_outcome(run.measured, scalar)}")
         rows, against = make_rows(runs, scalar, reference)
-        told = {
+        content = {
             "case": Path(file).name,
             "settings": list(settings),
             "over": list(over),
             "result": result,
             "reference": asdict(against) if against else None,
-            "reference_said": said(against),
+            "reference_said": reference_sentence(against),
             "repeat": repeat,
             "machine": machine,
         }
         done = Study(rows, against)
-        by_first(MPI.COMM_WORLD, lambda: _write(done, tuple(points[0].values), told, folder))
-    say(said(against))
+        by_first(MPI.COMM_WORLD, lambda: _write(done, tuple(points[0].values), content, folder))
+    say(reference_sentence(against))
     return done
 
 
@@ -150,17 +147,17 @@ def _check(reference: float | None, ranks: Sequence[int], repeat: int) -> None:
         raise CaseError(f"--reference {reference}: must be a finite number")
 
 
-def _write(done: Study, keys: Sequence[str], told: dict[str, Any], folder: Path) -> None:
-    write_whole(folder / "study.json", (json.dumps(told, indent=1) + "\n").encode())
+def _write(done: Study, keys: Sequence[str], content: dict[str, Any], folder: Path) -> None:
+    write_whole(folder / "study.json", (json.dumps(content, indent=1) + "\n").encode())
     write_csv(done.rows, (*keys, *COLUMNS), folder / "study.csv")
-    write_table(done.rows, keys, told, folder / "study.md")
-    repeats = repeated(told["repeat"]).lower()
-    title = f"{told['result']} of {told['case']}\n{told['machine']['cpu']}, kernels compiled, {repeats}"
+    write_table(done.rows, keys, content, folder / "study.md")
+    repeats = repeated(content["repeat"]).lower()
+    title = f"{content['result']} of {content['case']}\n{content['machine']['cpu']}, kernels compiled, {repeats}"
     own_error = done.reference.error if done.reference else None
     draw_study(done.rows, keys, title, own_error, folder / "study.png")
 
 
-def _said(measured: Measured, scalar: Scalar) -> str:
+def _outcome(measured: Measured, scalar: Scalar) -> str:
     if measured.summary is None:
         return f"stopped early: {measured.failure}"
     value = scalar.of(measured.summary, measured.rows)

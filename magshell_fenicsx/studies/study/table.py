@@ -1,4 +1,4 @@
-"""A study for people: study.md."""
+"""The table of a study: study.md."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -19,19 +19,19 @@ SHOWN = (
     *("cells", "dofs", "result", "error", "wall_s", "cpu_s", "jit_s", "setup_s", "assembly_s", "factor_s", "solve_s"),
     *("output_s", "peak_mb", "factorisations", "iterations", "stopped"),
 )
-LEGEND = """Wall and CPU seconds are those of the whole process with its files, kernels compiled; the phases are those
-of summary.json; the peak is the resident memory of all ranks. **Bold**: no other run is both faster and more accurate.
+LEGEND = """Wall and CPU seconds are for the whole process with its files, kernels compiled; the phases are as in
+summary.json; the peak is the resident memory of all ranks. **Bold**: no other run is both faster and more accurate.
 """
 
 
-def write_table(rows: Sequence[Row], keys: Sequence[str], told: dict[str, Any], file: Path) -> None:
+def write_table(rows: Sequence[Row], keys: Sequence[str], content: dict[str, Any], file: Path) -> None:
     """Write study.md.
 
     Parameters
     ----------
     keys
-        The swept ones.
-    told
+        The swept keys.
+    content
         The content of study.json.
     """
     head = [*map(short, keys), "ranks", *(name.replace("_s", " (s)").replace("_mb", " (MB)") for name in SHOWN)]
@@ -41,8 +41,8 @@ def write_table(rows: Sequence[Row], keys: Sequence[str], told: dict[str, Any], 
         lines.append([f"**{cell}**" if row["pareto"] and cell else cell for cell in cells])
     table = "\n".join(f"| {' | '.join(line)} |" for line in lines)
     file.write_text(
-        f"# {told['result']} of {told['case']}: error against run time\n\n"
-        f"{told['reference_said']} {repeated(told['repeat'])} on {described(told['machine'])}.\n"
+        f"# {content['result']} of {content['case']}: error against run time\n\n"
+        f"{content['reference_said']} {repeated(content['repeat'])} on {described(content['machine'])}.\n"
         f"{LEGEND}\n![](study.png)\n\n{table}\n",
         encoding="utf-8",
     )
@@ -59,8 +59,8 @@ def repeated(repeat: int) -> str:
     return f"Medians of {repeat} runs" if repeat > 1 else "One run each"
 
 
-def said(reference: Reference | None) -> str:
-    """What errors are measured against, as a sentence."""
+def reference_sentence(reference: Reference | None) -> str:
+    """The reference of the errors, as a sentence."""
     if reference is None:
         return "No run gave the result."
     value = f"Errors are relative to {reference.value:.10g} ({reference.source}"

@@ -1,8 +1,7 @@
-"""Pieces of a run that are timed inside a process of their own, without files.
+"""Parts of a run, timed in a separate process without writing files.
 
 `[mpirun -n N] python3 -m magshell_fenicsx.studies.study.workload KIND CASE SETTINGS RESULTS`, the last two JSON
-lists, prints one line of JSON. Every time is in wall seconds of the slowest rank and in CPU seconds
-of all ranks.
+lists, prints one line of JSON. Times are wall seconds of the slowest rank and CPU seconds of all ranks.
 """
 
 import json
@@ -26,7 +25,7 @@ REPEATS = 5
 
 
 def path(scene: Scene, results: list[str]) -> Report:
-    """The history from the unloaded shell to its end, and numbers of it."""
+    """The run time of the whole history, and its results."""
     result, made, comm = Result(scene, scene.unloaded()), RowMaker(scene), scene.comm
 
     def solve() -> None:
@@ -54,12 +53,12 @@ def path(scene: Scene, results: list[str]) -> Report:
 
 
 def iteration(scene: Scene, results: list[str]) -> Report:
-    """The pieces of a Newton iteration, medians of several."""
+    """The run times of the parts of a Newton iteration."""
     return {**measured(scene, REPEATS)}
 
 
 def kernels(scene: Scene, results: list[str]) -> Report:
-    """Every kernel that the scene needs, also for the modes that it excludes."""
+    """The number of kernels of the scene, including the modes that it excludes."""
     scene.model.excluded_modes  # noqa: B018  (compiles theirs)
     return {"kernels": len(scene.model.kernels.names)}
 
@@ -68,7 +67,7 @@ KINDS: dict[str, Callable[[Scene, list[str]], Report]] = {"path": path, "iterati
 
 
 def main(kind: str, case: str, settings: str, results: str) -> None:
-    """Build the scene of a case, do the work, print what it took."""
+    """Build the scene of a case, do the work, print the times."""
     comm = MPI.COMM_WORLD
     scene = Scene(Case.load(case, json.loads(settings)), comm)
     report = KINDS[kind](scene, json.loads(results))

@@ -1,4 +1,4 @@
-"""What `--over` says: the keys of a case that vary together, and their values."""
+"""The axes of a sweep, as given by `--over`: keys of a case that vary together, and their values."""
 
 import math
 import re
@@ -9,6 +9,7 @@ import numpy as np
 
 from magshell_fenicsx.case.source import CaseError
 
+MOST_POINTS = 10_000
 FORMS = "write it as key.path=start:stop:count or key.path=value,value,..."
 
 
@@ -19,9 +20,9 @@ class Axis:
     Attributes
     ----------
     keys
-        Keys that take the same value; more than one are tied.
+        Keys that take the same value; several keys are tied.
     values
-        As they would stand in the case file.
+        Values as in the case file.
     """
 
     keys: tuple[str, ...]
@@ -29,7 +30,7 @@ class Axis:
 
     @property
     def name(self) -> str:
-        """The keys as `--over` has them."""
+        """The keys as in `--over`."""
         return "+".join(self.keys)
 
     @property
@@ -42,7 +43,7 @@ class Axis:
 
 
 def along(axes: Sequence[Axis]) -> Axis | None:
-    """The last axis with numbers: curves are drawn and folds are followed along it."""
+    """The last axis with numbers; curves are drawn and folds are followed along it."""
     return next((axis for axis in reversed(axes) if axis.numbers), None)
 
 
@@ -52,7 +53,7 @@ def parse_axes(texts: Sequence[str]) -> list[Axis]:
     Raises
     ------
     CaseError
-        If one is not of the form, or a key is swept twice.
+        If one has another form, or a key is swept twice.
     """
     axes = [parse_axis(text) for text in texts]
     keys = [key for axis in axes for key in axis.keys]
@@ -100,6 +101,3 @@ def _list(text: str, values: str) -> tuple[str, ...]:
     if re.search(r"[\[\]{}]", values):
         raise CaseError(f"--over {text}: only numbers and words can be swept, not sections or lists")
     return items
-
-
-MOST_POINTS = 10_000

@@ -1,7 +1,7 @@
-"""Chains: the points of a sweep along one axis, run one after the other on one rank.
+"""Chains: points of a sweep along one axis, computed one after the other on one rank.
 
-Where the result is a knockdown, the fold of one point is followed to the next; where that fails,
-and at the first point, a full path is.
+If the result is a knockdown, the fold of one point is followed to the next. The first point, and every point where
+this fails, computes the full path.
 """
 
 import time
@@ -26,12 +26,16 @@ from magshell_fenicsx.studies.sweep.outcome import Outcome, outcome_of
 from magshell_fenicsx.studies.sweep.points import SweepPoint
 
 Symmetry = Literal["none", "half", "axisymmetric"]
-SYMMETRIES: tuple[Symmetry, ...] = ("none", "half", "axisymmetric")  # a model of the first holds for the others
+SYMMETRIES: tuple[Symmetry, ...] = (
+    "none",
+    "half",
+    "axisymmetric",
+)  # a model with an earlier symmetry covers the later ones
 
 
 @dataclass(frozen=True)
 class Link:
-    """A point of a chain: its number in the sweep, its place on the axis, and what is run."""
+    """A point of a chain: its number in the sweep, its value on the axis, and its case."""
 
     number: int
     at: float
@@ -51,7 +55,7 @@ def make_chains(
     missing
         Numbers of the points to compute.
     full_paths
-        Make each a chain of its own, and so wherever folds cannot be followed.
+        Put each point into a separate chain, as also happens if folds cannot be followed.
     """
     axis = along(axes)
     if full_paths or axis is None:
@@ -63,9 +67,9 @@ def make_chains(
 
 
 def _chains_of(line: list[int], key: str, points: Sequence[SweepPoint], missing: set[int]) -> list[Chain]:
-    """The missing points of one line, as one chain if their folds can be followed."""
+    """The missing points along the axis, as one chain if their folds can be followed."""
     wanted = [Link(n, float(points[n].values[key]), points[n].case) for n in line if n in missing]
-    one_mesh = key.startswith("magnetic.")  # a solid's state is not carried to another
+    one_mesh = key.startswith("magnetic.")  # a solid's state cannot be transferred to another mesh
     followed = all(_has_knockdown(link.case) and (one_mesh or link.case.model == "shell") for link in wanted)
     if len(wanted) < 2 or not followed:
         return [[link] for link in wanted]
@@ -75,7 +79,7 @@ def _chains_of(line: list[int], key: str, points: Sequence[SweepPoint], missing:
 
 
 def run_chain(chain: Chain) -> Iterator[tuple[int, Outcome]]:
-    """Number and outcome of each point of a chain, on this rank alone."""
+    """Compute a chain on this rank; number and outcome of each point."""
     continuation = None
     for link in chain:
         start, spent, outcome = time.perf_counter(), 0, None
@@ -87,7 +91,7 @@ def run_chain(chain: Chain) -> Iterator[tuple[int, Outcome]]:
 
 
 def _by_fold(continuation: Continuation, link: Link, start: float) -> tuple[Outcome | None, int]:
-    """The outcome, None if the fold could not be followed, and the factorisations."""
+    """The outcome, or None if the fold cannot be followed; and the number of factorisations."""
     try:
         scene = Scene(link.case, MPI.COMM_SELF)
     except MeshError:
@@ -102,7 +106,7 @@ def _by_fold(continuation: Continuation, link: Link, start: float) -> tuple[Outc
 
 
 def _by_path(link: Link, spent: int, start: float, *, go_on: bool) -> tuple[Outcome, Continuation | None]:
-    """The outcome of a full path, and the continuation from its fold if one can go on."""
+    """The outcome of a full path, and the continuation from its fold if there is one."""
     try:
         result = run(link.case, comm=MPI.COMM_SELF)
     except MeshError as e:
@@ -135,7 +139,7 @@ def _row(scene: Scene, fold: Fold) -> Row:
 
 def _has_knockdown(case: Case) -> bool:
     loading = case.loading
-    # with a tolerance the mesh is another for each point; states are carried over between charts that are known
+    # with a tolerance each point has its own mesh; a mesh file has no chart in which states are transferred
     by_one_mesh = case.mesh.tolerance is None and not isinstance(case.shell, MeshSurface)
     return by_one_mesh and isinstance(loading, PressureSection) and loading.until == "limit" and not loading.branches
 

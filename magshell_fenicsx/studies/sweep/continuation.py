@@ -1,4 +1,4 @@
-"""A fold under pressure followed from case to case, each with a scene of its own."""
+"""Continuation of a fold under pressure from case to case, each with its own scene."""
 
 from dataclasses import replace
 
@@ -10,19 +10,18 @@ from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.transfer import transfer
 
 KEPT = 3  # folds, for a quadratic extrapolation
-LEAST_COSINE = 0.5  # between successive null vectors; less is taken for a jump to another fold
+LEAST_COSINE = 0.5  # between successive null vectors; a smaller value means a jump to another fold
 
 
 class Continuation:
     """Follows a fold of the pressure through a parameter p of the case.
 
-    All scenes have the same kind of model. The folds found so far are kept in the unknowns of the
-    last scene.
+    All scenes have the same kind of model. The known folds are stored in the unknowns of the last scene.
 
     Parameters
     ----------
     p, scene, state
-        Where it begins: a fold that a path has located. It is polished.
+        The first fold, located by a path; Newton's method refines it.
 
     Raises
     ------
@@ -41,7 +40,7 @@ class Continuation:
         Raises
         ------
         FoldLost
-            If none is found, or if it is not the first instability as far as that can be known there.
+            If none is found, or if there is evidence that it is not the first instability.
         """
         known = [(q, self._moved(fold, scene)) for q, fold in self._known]
         given = scene.unloaded().mu
@@ -58,7 +57,7 @@ class Continuation:
 
 
 def _check(scene: Scene, fold: Fold, last: Fold) -> None:
-    """Refuse a fold that is not the first instability on the way from no pressure, as far as it shows here."""
+    """Reject a fold that is not the first instability under growing pressure, as far as this state shows."""
     comm, a, b = scene.newton.system.comm, fold.phi, last.phi
     if dot(comm, a, b) < LEAST_COSINE * np.sqrt(dot(comm, a, a) * dot(comm, b, b)):
         raise FoldLost("another fold was found")

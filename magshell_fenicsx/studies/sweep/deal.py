@@ -1,4 +1,4 @@
-"""Dealing out work to the ranks of a communicator."""
+"""Distribution of work to the ranks of a communicator."""
 
 from collections.abc import Iterator
 
@@ -7,10 +7,9 @@ from mpi4py import MPI
 
 
 def deal(count: int, comm: MPI.Intracomm) -> Iterator[int]:
-    """Numbers 0 to count - 1, each to one rank, the next to whoever is free.
+    """Distribute the numbers 0 to count - 1; the next free rank gets the next number. Collective.
 
-    A counter on rank 0 that all ranks increase without its help: every rank works.
-    Collective; a rank's numbers come in increasing order.
+    All ranks increase a counter in the memory of rank 0, which works like the others.
     """
     if comm.size == 1:
         yield from range(count)

@@ -1,4 +1,4 @@
-"""What a sweep keeps of a run, and its file."""
+"""The outcome of a point of a sweep, and its file."""
 
 import json
 from dataclasses import asdict, dataclass
@@ -41,12 +41,12 @@ class Outcome:
     stopped
         Why the run ended before its target; None if it reached it.
     curve
-        Every accepted point, with those columns of `CURVE` that the run has.
+        Every accepted point, with the columns of `CURVE` that the run has.
     found
-        "path": by a run of its own; "fold": the fold of the point before was followed, and the curve
-        has only that.
+        "path": the full path was computed; "fold": the fold of the previous point was followed, and the curve has
+        only this point.
     factorisations
-        Of the model's tangent, attempts that failed included; without the modes that it excludes.
+        Factorisations of the model's tangent, including failed attempts; without those for excluded modes.
     """
 
     knockdown: float | None
@@ -60,7 +60,7 @@ class Outcome:
 
 
 def outcome_of(result: Result, found: Found, factorisations: int, wall_s: float) -> Outcome:
-    """What is kept of a run, or of a fold in the form of one."""
+    """The outcome of a run, or of a fold in the form of a run."""
     limits = sorted(result.limit_points, key=lambda p: p["amplitude"] != "pressure" or p["value"] != result.knockdown)
     return Outcome(
         knockdown=result.knockdown,
@@ -75,7 +75,7 @@ def outcome_of(result: Result, found: Found, factorisations: int, wall_s: float)
 
 
 def save(outcome: Outcome, case: Case, file: Path) -> None:
-    """Write a point's file; a killed sweep leaves the whole of it or nothing."""
+    """Write a point's file; a killed sweep leaves the complete file or none."""
     known = {"case": case.model_dump(mode="json", exclude_none=True), **case.outside, "sources": sources.ours()}
     content = {**known, "outcome": asdict(outcome)}
     unfinished = file.with_suffix(f".{uuid4().hex}")  # two sweeps may write to one folder
@@ -84,7 +84,7 @@ def save(outcome: Outcome, case: Case, file: Path) -> None:
 
 
 def load(file: Path) -> Outcome | None:
-    """Read a point's file; None if there is none that can be used, one of other sources for instance."""
+    """Read a point's file; None if it is missing, damaged or from other sources."""
     try:
         content = json.loads(file.read_text(encoding="utf-8"))
         return Outcome(**content["outcome"]) if content["sources"] == sources.ours() else None

@@ -1,4 +1,4 @@
-"""The points of a sweep: the product of its axes, every one a valid case."""
+"""The points of a sweep: the product of its axes, each a valid case."""
 
 import copy
 import hashlib
@@ -22,9 +22,9 @@ class SweepPoint:
     Attributes
     ----------
     values
-        Swept key -> its value here, as text.
+        Swept key -> its value at this point, as text.
     key
-        Hash of the problem: equal problems have equal keys, in any sweep, whatever program solves them.
+        Hash of the problem; equal problems have equal keys in any sweep and version.
     """
 
     values: dict[str, str]
@@ -33,7 +33,7 @@ class SweepPoint:
 
     @property
     def label(self) -> str:
-        """For people: `energy=full, remanent.polar=45`."""
+        """For example `energy=full, remanent.polar=45`."""
         return ", ".join(f"{short(key)}={value}" for key, value in self.values.items())
 
 
@@ -43,7 +43,7 @@ def make_points(file: Path, axes: Sequence[Axis], settings: Sequence[str] = ()) 
     Raises
     ------
     CaseError
-        If any point is no valid case; nothing has been computed then.
+        If any point is not a valid case; nothing has been computed then.
     """
     source = read_source(file)
     for setting in settings:
@@ -64,7 +64,7 @@ def _point(source: Source, axes: Sequence[Axis], values: Sequence[str]) -> Sweep
         for assignment in assignments:
             override(here, assignment)
         case = Case.from_source(here)
-        make_plan(case)  # finds what only the plan can: no mirror plane for symmetry: half
+        make_plan(case)  # raises the errors of the plan, such as a missing mirror plane
     except CaseError as e:
         message = str(e)
         for assignment in assignments:
@@ -74,7 +74,7 @@ def _point(source: Source, axes: Sequence[Axis], values: Sequence[str]) -> Sweep
 
 
 def identity(case: Case) -> str:
-    """Hash of what is solved: of the resolved case, without a field that is zero, and of its mesh file."""
+    """Hash of the problem: the resolved case, without a zero field, and its mesh file."""
     data = case.model_dump(mode="json") | case.outside
     if not case.lambda_m:
         del data["magnetic"]
@@ -82,6 +82,6 @@ def identity(case: Case) -> str:
 
 
 def short(key: str) -> str:
-    """The last words of a key that people need: `energy`, `remanent.polar`."""
+    """The short name of a key: `energy`, `remanent.polar`."""
     words = key.split(".")
     return ".".join(words[-2:] if words[-1] in ("polar", "azimuth") else words[-1:])

@@ -1,4 +1,4 @@
-"""A case over ranges of its keys: points dealt out to the ranks, what is there already kept."""
+"""A case over ranges of its keys; the ranks share the points, and existing points are kept."""
 
 import sys
 import traceback
@@ -10,6 +10,7 @@ from mpi4py import MPI
 
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.output.store.folder import by_first, prepare_folder
+from magshell_fenicsx.platform.terminal import print_line
 from magshell_fenicsx.studies.sweep.axes import Axis, parse_axes
 from magshell_fenicsx.studies.sweep.chain import make_chains, run_chain
 from magshell_fenicsx.studies.sweep.deal import deal
@@ -18,12 +19,10 @@ from magshell_fenicsx.studies.sweep.points import SweepPoint, identity, make_poi
 from magshell_fenicsx.studies.sweep.sweep_plot import draw_sweep
 from magshell_fenicsx.studies.sweep.table import write_curves, write_sweep
 
-UNUSABLE = "of other sources of magshell_fenicsx, or damaged"
-
 
 @dataclass(frozen=True)
 class Sweep:
-    """A finished sweep: its points in product order, and what came of each."""
+    """A finished sweep: its points in product order, and their outcomes."""
 
     axes: list[Axis]
     points: list[SweepPoint]
@@ -35,42 +34,38 @@ class Sweep:
         return sum(outcome.stopped is not None for outcome in self.outcomes)
 
 
-def _print(line: str) -> None:
-    print(line, flush=True)
-
-
 def sweep(
     file: Path | str,
     over: Sequence[str],
     settings: Sequence[str] = (),
     out: Path | str = "results/sweep",
     comm: MPI.Intracomm = MPI.COMM_WORLD,
-    say: Callable[[str], None] = _print,
+    say: Callable[[str], None] = print_line,
     *,
     full_paths: bool = False,
 ) -> Sweep:
-    """Run a case at all points of a product; collective, every rank is a worker.
+    """Run a case at all points of a product; collective, and every rank works.
 
-    Where the result is a knockdown (`loading: {kind: pressure, until: limit}`), one path is followed
-    to its fold and then the fold along the last axis with numbers; see `Continuation`.
+    If the result is a knockdown (`loading: {kind: pressure, until: limit}`), one path is computed up to its fold, and
+    then the fold is followed along the last axis with numbers; see `Continuation`.
 
     Parameters
     ----------
     over
         `key.path=start:stop:count` or `key.path=value,value`; keys tied with `+`.
     out
-        Folder of sweep.csv, sweep.png and points/; points that are there are kept, if these sources computed them.
+        Folder of sweep.csv, sweep.png and points/; existing points are kept if these sources computed them.
     say
         Called with one line per finished point, on the rank that finished it.
     full_paths
-        Follow a path of its own at every point.
+        Compute the full path at every point.
 
     Raises
     ------
     CaseError
-        Before anything is computed: if a point is no valid case, or `out` cannot be written. If the mesh file changes.
+        Before the first point, if a point is not a valid case or `out` cannot be written; or if the mesh file changes.
     DiskError
-        If the tables of all points cannot be written.
+        If the tables cannot be written.
     """
     axes = parse_axes(over)
     points = make_points(Path(file), axes, settings)
@@ -80,7 +75,7 @@ def sweep(
     if comm.rank == 0:
         say(f"{len(points)} points, {len(missing)} to compute on {comm.size} rank{'s' if comm.size > 1 else ''}")
         if again := sum(files[number].exists() for number in missing):
-            say(f"{again} of these again: what the folder has of them is {UNUSABLE}")
+            say(f"{again} of these computed again: their files are of other sources of magshell_fenicsx, or damaged")
     chains = make_chains(axes, points, missing, full_paths=full_paths)
     try:
         for chain in deal(len(chains), comm):
@@ -89,13 +84,13 @@ def sweep(
                     raise CaseError(f"{file}: its mesh file was changed during the sweep; start it again")
                 save(outcome, points[number].case, files[number])
                 place = f"{missing.index(number) + 1:4d}/{len(missing)}"
-                say(f"{place}  {points[number].label}: {_said(outcome)}, {outcome.wall_s:.1f} s")
+                say(f"{place}  {points[number].label}: {_result(outcome)}, {outcome.wall_s:.1f} s")
     except BaseException:
         if comm.size == 1:
             raise
         traceback.print_exc()
         sys.stderr.flush()
-        comm.Abort(1)  # the others would wait for this rank for ever
+        comm.Abort(1)  # the other ranks would wait for ever
     comm.Barrier()
     outcomes = [found for result in files if (found := load(result))]
     assert len(outcomes) == len(points)
@@ -110,7 +105,7 @@ def sweep(
 
 
 def _missing(points: Sequence[SweepPoint], files: Sequence[Path]) -> list[int]:
-    """Numbers of the points to compute; of equal points the first."""
+    """Numbers of the points to compute; only the first of equal points."""
     first = {point.key: i for i, point in reversed(list(enumerate(points)))}
     return sorted(i for i in first.values() if load(files[i]) is None)
 
@@ -120,7 +115,7 @@ def _ready(out: Path) -> None:
     (out / "sweep.csv").touch()
 
 
-def _said(outcome: Outcome) -> str:
+def _result(outcome: Outcome) -> str:
     found = "no limit point"
     if outcome.knockdown is not None:
         found = f"k_d = {outcome.knockdown:.6f} ({outcome.found})"

@@ -1,4 +1,4 @@
-"""A sweep as a picture: the knockdown factor against a swept number, or the curve of every point."""
+"""The picture of a sweep: the knockdown factor over a swept number, or the curve of every point."""
 
 from collections.abc import Sequence
 from itertools import cycle
@@ -20,7 +20,7 @@ UNITS = {"polar": "degrees", "azimuth": "degrees"}
 
 
 def draw_sweep(axes: Sequence[Axis], points: Sequence[SweepPoint], outcomes: Sequence[Outcome], file: Path) -> None:
-    """Draw one line per combination of the values that are not on the horizontal axis."""
+    """Draw one line for each combination of the values that are not on the horizontal axis."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -40,7 +40,7 @@ def draw_sweep(axes: Sequence[Axis], points: Sequence[SweepPoint], outcomes: Seq
 
 
 def _knockdowns(plot: Any, axes: Sequence[Axis], points: Sequence[SweepPoint], outcomes: Sequence[Outcome]) -> None:
-    """k_d against the last axis with numbers; points without k_d are left out."""
+    """Draw k_d over the last axis with numbers; points without k_d are left out."""
     axis = along(axes) or axes[-1]
     lines: dict[str, list[tuple[float | str, float]]] = {}
     for point, outcome in zip(points, outcomes, strict=True):
@@ -52,13 +52,13 @@ def _knockdowns(plot: Any, axes: Sequence[Axis], points: Sequence[SweepPoint], o
         plot.plot(*zip(*line, strict=True), style, marker=".", label=label) if line else None
     unit = UNITS.get(axis.keys[0].split(".")[-1])
     if axis.numbers:
-        plot.locator_params(axis="x", nbins=5)  # long numbers would touch
+        plot.locator_params(axis="x", nbins=5)  # long numbers would overlap
     plot.set_xlabel(" = ".join(short(key) for key in axis.keys) + (f"  ({unit})" if unit else ""))
     plot.set_ylabel(r"knockdown factor  $k_\mathrm{d}$")
 
 
 def _curves(plot: Any, points: Sequence[SweepPoint], outcomes: Sequence[Outcome]) -> None:
-    """The last varied load against its displacement, for every point."""
+    """Draw the last varied load over its displacement, for every point."""
     amplitude = next((str(o.curve[-1]["amplitude"]) for o in outcomes if len(o.curve) > 1), "force")
     x, y = axes_of(amplitude)
     for point, outcome, style in zip(points, outcomes, cycle(STYLES), strict=False):
@@ -70,9 +70,9 @@ def _curves(plot: Any, points: Sequence[SweepPoint], outcomes: Sequence[Outcome]
 
 
 def loaded(curve: Sequence["Row"], amplitude: str) -> list["Row"]:
-    """The part of a curve in which an amplitude varied, from the point before on.
+    """The part of a curve in which an amplitude varied, and the point before it.
 
-    Instabilities of modes that the model excludes are not in their order in a run: they are left out, as branches are.
+    Branches are left out, and so are instabilities of excluded modes, whose rows are not in the order of the path.
     """
     first = next((i for i, row in enumerate(curve) if row["amplitude"] == amplitude), len(curve))
     part = curve[max(first - 1, 0) :] if first < len(curve) else []

@@ -1,4 +1,4 @@
-"""sweep.csv, one row a point, and curves.csv, one row for every accepted point of every run."""
+"""sweep.csv with one row per point, and curves.csv with one row per accepted point of every run."""
 
 import csv
 from collections.abc import Iterable, Mapping, Sequence
@@ -35,7 +35,7 @@ def write_sweep(points: Sequence[SweepPoint], outcomes: Sequence[Outcome], file:
 
 
 def sweep_row(outcome: Outcome) -> dict[str, Any]:
-    """What sweep.csv says of an outcome; what there is not is empty."""
+    """The row of sweep.csv for an outcome; missing values are None."""
     limit = outcome.limit or {}
     return {
         "k_d": outcome.knockdown,
@@ -56,7 +56,7 @@ def write_curves(points: Sequence[SweepPoint], outcomes: Sequence[Outcome], file
 
 
 def write_csv(rows: Iterable[Mapping[str, Any]], columns: Sequence[str], file: Path) -> None:
-    """Write rows with exact numbers."""
+    """Write rows with numbers in full precision."""
     with file.open("w", newline="", encoding="utf-8") as stream:
         writer = csv.DictWriter(stream, columns, extrasaction="ignore")
         writer.writeheader()
