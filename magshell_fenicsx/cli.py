@@ -52,11 +52,11 @@ def _failure(message: str, code: int) -> typer.Exit:
 
 
 @contextmanager
-def _exit_codes(*invalid: type[Exception], stopped: tuple[type[Exception], ...] = ()) -> Iterator[None]:
+def _exit_codes(invalid: type[Exception] = CaseError, stopped: tuple[type[Exception], ...] = ()) -> Iterator[None]:
     """Turn an invalid input (`CaseError` and `invalid`) or an early stop into a message and its exit code."""
     try:
         yield
-    except (CaseError, *invalid) as e:
+    except (CaseError, invalid) as e:
         raise _failure(str(e), INVALID) from None
     except stopped as e:
         raise _failure(f"stopped early: {e}", STOPPED) from None
