@@ -283,7 +283,7 @@ class Path:
         A coordinate whose force is held has one more instead where dq/dmu > 0.
         """
         pivots = response.negative_pivots
-        held = pivots + (response.softness >= 0) - (self.name not in self.system.coordinates)
+        held = pivots + int(response.softness >= 0) - int(self.name not in self.system.coordinates)
         return Point(state, s, response.du, response.dmu, pivots, held)
 
     def in_steps(self, options: StepOptions) -> "Path":
