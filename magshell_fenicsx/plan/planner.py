@@ -18,7 +18,6 @@ from magshell_fenicsx.mesh.grading import Grading
 from magshell_fenicsx.mesh.grid import Grid
 from magshell_fenicsx.mesh.mirror import CUT, Y0, Mirror
 from magshell_fenicsx.mesh.msh import MeshFile
-from magshell_fenicsx.mesh.shapes import DiscShape, StripShape
 from magshell_fenicsx.mesh.sphere import Dimple
 from magshell_fenicsx.models.axisymmetric.meridian import graded_vertices
 from magshell_fenicsx.models.shell.own_term import OwnTerm
@@ -30,7 +29,7 @@ from magshell_fenicsx.plan.loads import indented, loads, refuse_wide_patch
 from magshell_fenicsx.plan.names import refuse_unfit_ends
 from magshell_fenicsx.plan.outline import Chart, Outline, outline, refuse_beside
 from magshell_fenicsx.plan.own_terms import surface_terms
-from magshell_fenicsx.plan.plan import Plan, Span
+from magshell_fenicsx.plan.plan import Plan
 from magshell_fenicsx.plan.sizes import grading
 from magshell_fenicsx.plan.symmetry import Leaves, askew, left, mirror, unmirrored
 
@@ -52,6 +51,7 @@ def make_plan(case: Case, terms: Sequence[OwnTerm] = ()) -> Plan:
     defect = Dimple(case.defect.amplitude * material.h, case.dimple_half_width) if case.defect else None
     drawn = outline(case, defect)
     place = indented(case, drawn)
+    refuse_unbounded_fields(case, np.zeros((0, 3)) if isinstance(case.shell, MeshSurface) else drawn.sample())
     energies = surface_terms(case, terms)
     axisymmetric, plane = _symmetry(case, drawn, left(case, drawn, place, energies))
     half = plane is not None
@@ -72,7 +72,8 @@ def make_plan(case: Case, terms: Sequence[OwnTerm] = ()) -> Plan:
         x, y = ((*shape.through[i], *(float(image[i]) for image in images)) for i in range(2))
         shape = replace(shape, through=(x, y))
     span = drawn.span if axisymmetric else None
-    _refuse_unreasonable(case, drawn, shape, size, span, half=half)
+    if not span:
+        _refuse_too_large(case, shape, size, half=half)
     conditions = edge_conditions(case.boundary, turn)
     if beyond:
         conditions = {name: c for name, c in conditions.items() if name not in beyond.lost} | {CUT: "symmetry"}
@@ -175,14 +176,7 @@ def _place(case: Case, drawn: Outline, place: Array, turn: float, half: bool) ->
     return drawn.on_half(found) if half else found
 
 
-def _refuse_unreasonable(
-    case: Case, drawn: Outline, shape: Chart, size: Grading, span: Span | None, *, half: bool
-) -> None:
-    if span:
-        refuse_unbounded_fields(case, span.sample())
-        return
-    charted = isinstance(shape, DiscShape | StripShape)
-    refuse_unbounded_fields(case, drawn.sample() if charted else np.zeros((0, 3)))
+def _refuse_too_large(case: Case, shape: Chart, size: Grading, *, half: bool) -> None:
     if isinstance(shape, MeshFile):
         return
     cells = shape.cells * (0.5 if half else 1.0) if isinstance(shape, Grid) else size.cells(shape)
