@@ -201,9 +201,10 @@ class _Search:
             Derivative of the eigenvalue by the load.
         """
         u = point.state.u
-        side = np.random.default_rng(self.path.system.comm.rank).choice([-1.0, 1.0], u.size)  # as rounding does
-        values = [critical_mode(stability, State(v, point.state.mu)).eigenvalue for v in (u, u + side * np.spacing(u))]
-        return float(max(abs(values[0]), SCATTER * abs(values[1] - values[0])) / abs(slope)) if slope else np.inf
+        sides = np.random.default_rng(self.path.system.comm.rank).choice([-1.0, 1.0], (2, u.size))  # as rounding does
+        near = [u, *(u + side * np.spacing(u) for side in sides)]
+        values = [critical_mode(stability, State(v, point.state.mu)).eigenvalue for v in near]
+        return float((abs(values[0]) + SCATTER * np.ptp(values)) / abs(slope)) if slope else np.inf
 
     def bifurcation(self, low: Point, high: Point, stability: Stability) -> Point:
         """The zero of the eigenvalue that changes sign, by the Illinois variant of regula falsi.
