@@ -11,7 +11,8 @@ from dolfinx import fem, mesh
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from magshell_fenicsx.mesh.patch import MeshError, PatchMesh
+from magshell_fenicsx.mesh.midsurface import create_mesh
+from magshell_fenicsx.mesh.patch import MeshError, PatchMesh, as_set, place_text
 from magshell_fenicsx.mesh.quadrilaterals import Quadrilaterals, split, square
 from magshell_fenicsx.platform import compat
 
@@ -89,15 +90,9 @@ def sweep(
     thick = h * (np.ones(len(quads.places)) if factor is None else factor(quads.places))
     z = (heights - MIDDLE) * thick[:, None]
     X = (quads.places[:, None] + z[..., None] * quads.offsets[:, None]).reshape(-1, 3)
-    first, cells = comm.rank == 0, _swept(quads.cells, len(ends) - 1)
+    cells = _swept(quads.cells, len(ends) - 1)
     _refuse_overlap(X, cells)
-    domain = mesh.create_mesh(
-        comm,
-        cells=cells if first else cells[:0],
-        x=X if first else X[:0],
-        e=basix.ufl.element("Lagrange", "hexahedron", 2, shape=(3,)),
-        partitioner=compat.shared_facets(),
-    )
+    domain = create_mesh(comm, basix.ufl.element("Lagrange", "hexahedron", 2, shape=(3,)), cells, X)
     original = domain.topology.original_cell_index
     triangle, layer = original // (3 * (len(ends) - 1)), original % (len(ends) - 1)
     places = {name: patch.embedding(x[None])[0] for name, x in patch.points.items()}
@@ -125,9 +120,9 @@ def _refuse_overlap(X: Array, cells: Numbers) -> None:
     for part in np.array_split(cells, len(cells) // 2000 + 1):
         volumes = np.linalg.det(np.einsum("dqk,ckx->cqdx", tables, X[part]))
         if (volumes <= 0).any():
-            x, y, z = X[part[np.argwhere(volumes <= 0)[0][0]]].mean(axis=0)
+            place = X[part[np.argwhere(volumes <= 0)[0][0]]].mean(axis=0)
             raise MeshError(
-                f"model: solid: the body overlaps itself around ({x:.4g}, {y:.4g}, {z:.4g})/R: half its thickness is "
+                f"model: solid: the body overlaps itself around {place_text(place)}/R: half its thickness is "
                 "more than the radius of curvature, or than a fold leaves beside it"
             )
 
@@ -157,7 +152,7 @@ def _named_faces(domain: mesh.Mesh, quads: Quadrilaterals, levels: int) -> dict[
     chart, level = np.divmod(numbers[corners], levels)
     found = {OUTER: facets[(level == levels - 1).all(axis=1)]}
     for name, pairs in quads.edges.items():
-        wanted = {(a, b) for a, b in np.sort(pairs, axis=1)}
+        wanted = as_set(pairs)
         above = [len(set(c)) == 2 and (min(c), max(c)) in wanted for c in chart]
         found[name] = facets[np.array(above, dtype=bool)]
     return found

@@ -10,6 +10,7 @@ import pickle
 import subprocess
 import sys
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -44,6 +45,7 @@ class Content:
     groups: dict[int, dict[str, list[int]]] = field(default_factory=lambda: {1: {}, 2: {}})
 
 
+@lru_cache(maxsize=1)  # a plan looks for mirror planes in the file that is then built
 def parsed(content: bytes) -> Content:
     """Read the content of a file.
 

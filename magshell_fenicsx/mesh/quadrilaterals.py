@@ -13,7 +13,7 @@ from dolfinx import mesh
 from dolfinx.cpp.io import perm_gmsh
 from numpy.typing import NDArray
 
-from magshell_fenicsx.mesh.patch import Embedding, PatchMesh
+from magshell_fenicsx.mesh.patch import Embedding, PatchMesh, directed_sides
 
 Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
@@ -57,7 +57,7 @@ def split(patch: PatchMesh) -> Quadrilaterals:
     values = geometry.tabulate(1, reference)[..., 0]
     vertices, corners = np.unique(patch.corners, return_inverse=True)
     corners = corners.reshape(-1, 3)
-    pairs = np.concatenate([corners[:, list(side)] for side in SIDES])
+    pairs = directed_sides(corners)
     sides, side_of = np.unique(np.sort(pairs, axis=1), axis=0, return_inverse=True)
     side_of, backwards = side_of.reshape(3, -1), (pairs[:, 0] > pairs[:, 1]).reshape(3, -1)
     numbers = np.empty((len(corners), len(reference)), dtype=np.int64)
@@ -72,7 +72,7 @@ def split(patch: PatchMesh) -> Quadrilaterals:
     nodes = np.empty((numbers.max() + 1, patch.nodes.shape[1]))
     nodes[numbers] = x  # of glued sides either: they have one place in space
     offsets = _mitred(a1, a2, numbers, quads) if nodes.shape[1] == 3 else surface_normal(patch.embedding, nodes)
-    middle_of = {(int(a), int(b)): len(vertices) + 3 * n + 1 for n, (a, b) in enumerate(sides)}
+    middle_of = {(int(sides[n, 0]), int(sides[n, 1])): len(vertices) + 3 * n + 1 for n in range(len(sides))}
 
     def halves(a: int, b: int) -> list[list[int]]:
         middle = middle_of[min(a, b), max(a, b)]

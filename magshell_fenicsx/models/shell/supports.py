@@ -115,7 +115,7 @@ def plane_of(r0: fem.Function, facets: NDArray[np.int32], name: str) -> Mirror:
 
 
 def closing_point(planes: Sequence[Mirror]) -> Array | None:
-    """A point (3,) of all planes, from which the volume beside them is told; None if they have none."""
+    """A point (3,) of all planes, from which the volume beside them is measured; None if they have none."""
     if not planes:
         return np.zeros(3)
     normals, offsets = np.array([p.normal for p in planes]), np.array([p.offset for p in planes])

@@ -120,7 +120,7 @@ class SolidModel(Observed):
         return AntisymmetricModes(self._system(self._held + self._held_on_mirror(self.mirror.in_plane)))
 
     def _closing_point(self, planes: list[Mirror], conditions: Mapping[str, Condition]) -> Array:
-        """From where the volume beside the symmetry planes is told."""
+        """A point of all symmetry planes, from which the volume beside them is measured."""
         found = closing_point(planes)
         if found is None and self.loads.pressure:
             raise MeshError(open_to_pressure(next(name for name, c in conditions.items() if c == "plane")))

@@ -86,7 +86,7 @@ def pressed(shell: dict[str, Any], boundary: dict[str, Any]) -> Case:
 
 
 def test_live_pressure_beside_a_symmetry_plane_anywhere() -> None:
-    """Half of a plate of twice the length, held at x = 0 or beside x = 1: volumes are told from that plane."""
+    """Half of a plate of twice the length, held at x = 0 or beside x = 1: volumes are measured from that plane."""
     found = []
     for edge in ("left", "right"):
         held = dict.fromkeys({"left", "right", "bottom", "top"} - {edge}, "clamped")
