@@ -14,7 +14,7 @@ from magshell_fenicsx.models.shell.parameters import AreaForce, EdgeForce, EdgeM
 from magshell_fenicsx.models.shell.thickness import Thickness
 
 TERMS = ["membrane", "bending", "interior edges", "clamped edges", "magnetic", "pressure"]
-RING_TERMS = ["membrane", "bending", "interior edges", "mirror edges", "magnetic", "load", "moment b 0"]
+RING_TERMS = ["membrane", "bending", "interior edges", "mirror edges", "magnetic", "load", "load moment b 0"]
 FACTORS = {"lambda_m": 0.02, "pressure": 0.3, "load": 0.5}
 
 
