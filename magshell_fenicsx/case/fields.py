@@ -119,6 +119,8 @@ class MagneticSection(Section):
 
     energy: Literal["full", "first", "torque", "second", "second_consistent"] = "full"
     """The full magnetic energy, or an expansion"""
+    remanence: Literal["deformation", "rotation"] = "deformation"
+    """How B^r moves with the material: by F, which stretches it too (the paper's law), or by the rotation of F alone"""
     lambda_m: float | None = Field(default=None, ge=-10, le=10)
     """λ_m = |B^r||B^a|/(μ0 E); negative: the field is reversed; 0: no magnetic term"""
     remanent: RemanentSection = RemanentSection()

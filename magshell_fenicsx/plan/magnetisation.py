@@ -47,4 +47,4 @@ def magnetisation(magnetic: MagneticSection, case: Case, turn: float, to: Direct
     Q = rotation(turn)
     G = Q @ np.array(gradient) @ Q.T if gradient else None
     layers = tuple((layer.fraction, layer.vector(turn)) for layer in section.layers or [])
-    return Magnetisation(remanent, applied, magnetic.energy, G, across, patches, layers)
+    return Magnetisation(remanent, applied, magnetic.energy, G, across, patches, layers, magnetic.remanence)

@@ -21,9 +21,9 @@ from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.energy import Density
 from magshell_fenicsx.models.shell.free import Constants, constants_of
 from magshell_fenicsx.models.shell.kinematics import Jet
+from magshell_fenicsx.models.shell.laws import FULL, LINEAR, magnetic_densities
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.parameters import Magnetisation, Material
-from magshell_fenicsx.models.shell.terms import LINEAR, MAGNETIC_TERMS
 
 INTERIOR = "interior edges"
 Facets = NDArray[np.int32]
@@ -101,9 +101,10 @@ class EnergyFactory:
             return self._cells(name, lambda u: t * density(j0, u, Br, Ba), "lambda_m", linear=name in LINEAR)
 
         Ba = self.constant(field.applied)
-        terms = [term(name, density, Ba) for name, density in MAGNETIC_TERMS[field.energy].items()]
+        terms = [term(name, density, Ba) for name, density in magnetic_densities(field.law, field.energy).items()]
         if field.gradient is not None:
-            terms.append(term("magnetic gradient", densities.magnetic_gradient, self.constant(field.gradient)))
+            density = densities.in_gradient(FULL[field.law])
+            terms.append(term("magnetic gradient", density, self.constant(field.gradient)))
         return terms
 
     def pressure(self) -> Energy:

@@ -21,6 +21,7 @@ class Held:
 # "symmetry" is the mirror plane of a half model, "plane" one that belongs to the shell as it is described
 Condition = Literal["clamped", "simply supported", "free", "symmetry", "plane"] | Held
 MagneticEnergy = Literal["full", "first", "torque", "second", "second_consistent"]
+RemanenceLaw = Literal["deformation", "rotation"]
 
 
 @dataclass(frozen=True)
@@ -76,6 +77,8 @@ class Magnetisation:
         Vectors (3,) on named patches of a mesh, in place of `remanent`; None without.
     layers
         Fractions of the thickness and vectors (3,), from the inner face outwards, of which `remanent` is the average.
+    law
+        Whether the remanence moves with F, as in the paper, or with its rotation R.
     """
 
     remanent: NDArray[np.float64] | Pattern
@@ -85,6 +88,7 @@ class Magnetisation:
     across: NDArray[np.float64] | None = None
     patches: Mapping[str, NDArray[np.float64]] | None = None
     layers: tuple[tuple[float, NDArray[np.float64]], ...] = ()
+    law: RemanenceLaw = "deformation"
 
 
 @dataclass(frozen=True)

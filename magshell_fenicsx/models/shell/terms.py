@@ -1,6 +1,5 @@
 """The densities as terms: each compiled once, and only when a scene calls for it."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -24,24 +23,12 @@ from magshell_fenicsx.models.shell.energy import (
 )
 from magshell_fenicsx.models.shell.free import Constants, constants_of
 from magshell_fenicsx.models.shell.kinematics import CURVED, MOVED, SECOND, Jet
+from magshell_fenicsx.models.shell.laws import FULL, LINEAR, magnetic_densities
 from magshell_fenicsx.models.shell.moment import MomentTerm
 from magshell_fenicsx.models.shell.own_term import OwnTerm
-from magshell_fenicsx.models.shell.parameters import MagneticEnergy, Magnetisation, Material
+from magshell_fenicsx.models.shell.parameters import Magnetisation, Material
 from magshell_fenicsx.models.shell.patterns import pattern_field
 from magshell_fenicsx.models.shell.thickness import thick
-
-MagneticDensity = Callable[[Jet, Jet, Expr, Expr], Expr]
-FIRST: dict[str, MagneticDensity] = {"U1": densities.magnetic_first}
-TORQUE: dict[str, MagneticDensity] = {"Uq": densities.magnetic_torque}
-QUADRATIC: dict[str, MagneticDensity] = {**FIRST, **TORQUE, "Utau": densities.magnetic_tau}
-MAGNETIC_TERMS: dict[MagneticEnergy, dict[str, MagneticDensity]] = {
-    "full": {"magnetic": densities.magnetic},
-    "first": FIRST,
-    "torque": TORQUE,
-    "second": QUADRATIC,
-    "second_consistent": {**QUADRATIC, "couple": densities.magnetic_couple},
-}
-LINEAR = ("U1", "couple")
 
 
 @dataclass(frozen=True)
@@ -127,11 +114,11 @@ class TermFactory:
                 linear=name in LINEAR,
             )
             for amplitude, suffix, Ba in directions
-            for name, of in MAGNETIC_TERMS[field.energy].items()
+            for name, of in magnetic_densities(field.law, field.energy).items()
         ]
         if field.gradient is not None:
             parameters = (Br, self._constant(field.gradient))
-            density = Density(per_area(densities.magnetic_gradient), parameters, parts=MOVED)
+            density = Density(per_area(densities.in_gradient(FULL[field.law])), parameters, parts=MOVED)
             terms.append(self._cells("magnetic gradient", self._thick(density, None), "lambda_m"))
         return terms
 

@@ -20,7 +20,7 @@ from magshell_fenicsx.models.shell.kinematics import SECOND, Jet
 from magshell_fenicsx.models.shell.moment import Counted
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.parameters import Magnetisation
-from magshell_fenicsx.models.solid import densities
+from magshell_fenicsx.models.solid import densities, rotation_law
 from magshell_fenicsx.models.solid.material import NeoHookean
 from magshell_fenicsx.models.solid.remanence import remanence_field
 
@@ -102,18 +102,18 @@ class TermFactory:
 
     def magnetic(self, of: Magnetisation) -> list[SolidTerm]:
         """The terms, linear in the applied field, with the amplitude lambda_m."""
-        pattern = of.remanent
+        pattern, law = of.remanent, densities if of.law == "deformation" else rotation_law
         Br = remanence_field(pattern, self.u.function_space) if callable(pattern) else self._constants(pattern)[0]
         directions = [("lambda_m", "", of.applied)]
         if of.across is not None:
             directions.append(("lambda_across", " across", of.across))
         terms = []
         for amplitude, suffix, Ba in directions:
-            density = Density(densities.magnetic, (Br, *self._constants(Ba, self.h)))
-            terms.append(self._bulk("magnetic" + suffix, density, amplitude, linear=True))
+            density = Density(law.magnetic, (Br, *self._constants(Ba, self.h)))
+            terms.append(self._bulk("magnetic" + suffix, density, amplitude, linear=law is densities))
         if of.gradient is not None:
             parameters = (Br, *self._constants(of.gradient, self.h))
-            density = Density(densities.magnetic_gradient, parameters, VALUE + GRADIENT)
+            density = Density(law.magnetic_gradient, parameters, VALUE + GRADIENT)
             terms.append(self._bulk("magnetic gradient", density, "lambda_m"))
         return terms
 

@@ -56,7 +56,7 @@ class PointFields:
         E_1, E_2, M_1, M_2
             (...) their principal values, the larger first.
         Br, Ba
-            (..., 3) the remanence convected by the shell, over its magnitude; the applied flux density at the
+            (..., 3) the remanence as the shell carries it, over its magnitude; the applied flux density at the
             deformed point, over mu_0 E / |Br|, so that its magnitude is lambda_m.
         tau
             (..., 3) torque, for a uniform field.
@@ -69,7 +69,8 @@ class PointFields:
         found["E_1"], found["E_2"] = principal(E)
         found["M_1"], found["M_2"] = principal(M)
         if self._field:
-            found |= {"Br": frame.convected(self._Br, u), "Ba": _applied(self._field, mu, frame.jet[0] + u[0])}
+            carried = frame.convected if self._field.law == "deformation" else frame.rotated
+            found |= {"Br": carried(self._Br, u), "Ba": _applied(self._field, mu, frame.jet[0] + u[0])}
         if self._torque:
             found["tau"] = self._torque(np.moveaxis(u[1:3], 0, -2))
         return found
