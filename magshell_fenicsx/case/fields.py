@@ -133,6 +133,8 @@ class MagneticSection(Section):
         densities = [self.remanent.flux_density, self.applied.flux_density]
         if self.lambda_m is not None and densities != [None, None]:
             raise ValueError("give lambda_m, or the flux densities of remanent and applied, not both")
+        if self.model_fields_set == {"remanence"}:
+            raise ValueError("remanence: is a law of a field, and there is none: give lambda_m or flux densities too")
         if self.lambda_m is None and None in densities:
             raise ValueError("give lambda_m, or remanent.flux_density and applied.flux_density")
         if self.remanent.flux_density == 0:
