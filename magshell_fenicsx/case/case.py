@@ -108,8 +108,8 @@ class Case(WithParts):
         if isinstance(self.loading, RotationSection):
             if not self.magnetic or not self.lambda_m:
                 raise ValueError("loading.kind: rotation needs a field: magnetic.lambda_m, not zero")
-            if self.magnetic.applied.gradient:
-                raise ValueError("loading.kind: rotation needs a uniform field, without magnetic.applied.gradient")
+            if not self.magnetic.applied.is_uniform:
+                raise ValueError("loading.kind: rotation needs a uniform field: no gradient, no components of it")
             if abs(self.magnetic.applied.vector() @ self.loading.to.vector()) > 1 - 1e-9:
                 raise ValueError("loading.to: must be neither parallel nor opposite to magnetic.applied")
         return self

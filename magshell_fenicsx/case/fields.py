@@ -87,7 +87,7 @@ def layer_average(layers: list[Layer], turn: float = 0.0) -> NDArray[np.float64]
 
 
 class AppliedSection(Direction):
-    """The applied flux density, uniform or linear in space: |B^a| (uniform b + gradient · r/R).
+    """The applied flux density, uniform or linear in space: |B^a| (uniform b + gradient · r/R); or by formula.
 
     The unit vector b has the direction of polar and azimuth, r is the deformed place.
     """
@@ -100,14 +100,24 @@ class AppliedSection(Direction):
         default=None, min_length=3, max_length=3
     )
     """Three rows of three numbers; energy: full alone has it [|B^a|/R]"""
+    components: list[Formula] | None = Field(default=None, min_length=3, max_length=3)
+    """In place of these: formulas of the deformed position x, y, z over R (of a shell that of its mid-surface), twice
+    differentiable; as those of `remanent`; energy: full alone has them [|B^a|]"""
 
     @model_validator(mode="after")
     def _square(self) -> Self:
+        if self.components and (others := {"polar", "azimuth", "uniform", "gradient"} & self.model_fields_set):
+            raise ValueError(f"components are the whole field: leave out {', '.join(sorted(others))}")
         if self.gradient and any(len(row) != 3 for row in self.gradient):
             raise ValueError("gradient is three rows of three numbers")
         if self.uniform == 0 and not self.gradient:
             raise ValueError("uniform: 0 needs a gradient")
         return self
+
+    @property
+    def is_uniform(self) -> bool:
+        """Whether it is the same everywhere."""
+        return not (self.gradient or self.components)
 
 
 class MagneticSection(Section):
@@ -139,8 +149,8 @@ class MagneticSection(Section):
             raise ValueError("give lambda_m, or remanent.flux_density and applied.flux_density")
         if self.remanent.flux_density == 0:
             raise ValueError("a remanence of length zero is no magnetisation: leave the section out")
-        if self.applied.gradient and self.energy != "full":
-            raise ValueError("the approximate energies are of uniform fields; a gradient needs energy: full")
+        if not self.applied.is_uniform and self.energy != "full":
+            raise ValueError("the approximate energies are of uniform fields; gradient and components need energy: full")
         return self
 
     def amplitude(self, youngs_modulus: float | None) -> float:

@@ -10,6 +10,7 @@ import ufl
 from ufl.core.expr import Expr
 
 from magshell_fenicsx.models.shell import kinematics as kin
+from magshell_fenicsx.models.shell.applied import around
 from magshell_fenicsx.models.shell.kinematics import Jet
 
 MagneticDensity = Callable[[Jet, Jet, Expr, Expr], Expr]  # of (r0, u, Br, Ba)
@@ -70,6 +71,16 @@ def in_gradient(law: MagneticDensity) -> MagneticDensity:
         return law(r0, u, Br, ufl.dot(G, r0.r + u.r)) - ufl.dot(ufl.dot(G, u.r), Br)
 
     return magnetic_gradient
+
+
+def in_space(law: MagneticDensity) -> MagneticDensity:
+    """That of a field known by values, of (r0, u, Br, P): P as of `applied.around`; `law` as above."""
+
+    def magnetic_in_space(r0: Jet, u: Jet, Br: Expr, P: Expr) -> Expr:
+        B, change = around(P, u.r)
+        return law(r0, u, Br, B) - ufl.dot(change, Br)
+
+    return magnetic_in_space
 
 
 def magnetic_first(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:

@@ -7,6 +7,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from magshell_fenicsx.models.shell.applied import FieldInSpace
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.patterns import Pattern
 
@@ -68,6 +69,8 @@ class Magnetisation:
         The flux densities over their magnitudes: vectors (3,), or a pattern for the remanent one.
     gradient
         (3, 3) of the applied flux density, which is applied + gradient . r; None if uniform.
+    in_space
+        The applied flux density as a function of the deformed place, in place of `applied` and `gradient`.
     across
         Unit vector (3,) normal to `applied` that the field turns towards, with the amplitude
         "lambda_across"; None if it does not turn.
@@ -89,6 +92,12 @@ class Magnetisation:
     patches: Mapping[str, NDArray[np.float64]] | None = None
     layers: tuple[tuple[float, NDArray[np.float64]], ...] = ()
     law: RemanenceLaw = "deformation"
+    in_space: FieldInSpace | None = None
+
+    @property
+    def uniform(self) -> bool:
+        """Whether the applied flux density is."""
+        return self.gradient is None and self.in_space is None
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,6 @@
 """The densities as terms: each compiled once, and only when a scene calls for it."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -11,6 +12,7 @@ from ufl.core.expr import Expr
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.models.shell import densities, edges
 from magshell_fenicsx.models.shell import kinematics as kin
+from magshell_fenicsx.models.shell.applied import AppliedField
 from magshell_fenicsx.models.shell.antisymmetric import antisymmetric_edge
 from magshell_fenicsx.models.shell.energy import (
     Density,
@@ -103,6 +105,11 @@ class TermFactory:
         """The terms of the chosen energy, linear in the applied field, with the amplitude lambda_m."""
         pattern = field.remanent
         Br = pattern_field(pattern, self.r0) if callable(pattern) else self._constant(pattern)
+        if field.in_space:
+            known = AppliedField(field.in_space, self.r0, self.u, cell_quadrature(self.degree))
+            of = densities.in_space(FULL[field.law])
+            density = self._thick(Density(per_area(of), (Br, known.polynomial), parts=MOVED), None)
+            return [self._cells("magnetic", density, "lambda_m", follow=known.follow)]
         directions = [("lambda_m", "", field.applied)]
         if field.across is not None:
             directions.append(("lambda_across", " across", field.across))
@@ -182,9 +189,17 @@ class TermFactory:
         """Covector and width of a boundary edge."""
         return kin.facet_covector(self._domain), ufl.CellVolume(self._domain) / ufl.FacetArea(self._domain)
 
-    def _cells(self, name: str, density: Density, amplitude: str | None = None, *, linear: bool = False) -> ShellTerm:
+    def _cells(
+        self,
+        name: str,
+        density: Density,
+        amplitude: str | None = None,
+        *,
+        linear: bool = False,
+        follow: Callable[[], None] | None = None,
+    ) -> ShellTerm:
         energy = density.of(*self._jets(), *density.parameters) * self._dx()
-        return ShellTerm(name, density, energy, self.u, self.log, amplitude, linear=linear)
+        return ShellTerm(name, density, energy, self.u, self.log, amplitude, linear=linear, follow=follow)
 
     def _edges(self, name: str, density: Density) -> ShellTerm:
         assert density.facets is not None

@@ -8,6 +8,8 @@ equal stretches too. In units and arguments as `densities`.
 import ufl
 from ufl.core.expr import Expr
 
+from magshell_fenicsx.models.shell.applied import around
+
 STEPS = 3  # from sqrt(3 I): rounding after three, for any stretches from 0.05 to 20
 
 
@@ -20,6 +22,12 @@ def magnetic_gradient(X: Expr, u: Expr, H: Expr, Br: Expr, G: Expr, h: Expr) -> 
     """The part of Ba = G x: -(G x) . R Br at the deformed place x = X + u, without its value at u = 0."""
     turned = rotated(ufl.Identity(3) + H, Br)
     return -(ufl.dot(ufl.dot(G, X + u), turned) - ufl.dot(ufl.dot(G, X), Br)) / h
+
+
+def magnetic_in_space(X: Expr, u: Expr, H: Expr, Br: Expr, P: Expr, h: Expr) -> Expr:
+    """That of a field known by values, without its value at u = 0; P as of `applied.around`."""
+    B, change = around(P, u)
+    return magnetic(X, u, H, Br, B, h) - ufl.dot(change, Br) / h
 
 
 def rotated(F: Expr, v: Expr) -> Expr:

@@ -14,6 +14,7 @@ from ufl.core.expr import Expr
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.terms import DensityTerm
 from magshell_fenicsx.mesh.hexahedra import MIDDLE, OUTER, Body
+from magshell_fenicsx.models.shell.applied import AppliedField
 from magshell_fenicsx.models.shell.energy import per_area
 from magshell_fenicsx.models.shell.free import Constants, constants_of
 from magshell_fenicsx.models.shell.kinematics import SECOND, Jet
@@ -104,6 +105,12 @@ class TermFactory:
         """The terms, linear in the applied field, with the amplitude lambda_m."""
         pattern, law = of.remanent, densities if of.law == "deformation" else rotation_law
         Br = remanence_field(pattern, self.u.function_space) if callable(pattern) else self._constants(pattern)[0]
+        if of.in_space:
+            X = fem.Function(self.u.function_space)
+            X.interpolate(lambda x: x)
+            known = AppliedField(of.in_space, X, self.u, WHOLE)
+            density = Density(law.magnetic_in_space, (Br, known.polynomial, *self._constants(self.h)), VALUE + GRADIENT)
+            return [self._bulk("magnetic", density, "lambda_m", follow=known.follow)]
         directions = [("lambda_m", "", of.applied)]
         if of.across is not None:
             directions.append(("lambda_across", " across", of.across))
@@ -180,11 +187,19 @@ class TermFactory:
                     )
         return found
 
-    def _bulk(self, name: str, density: Density, amplitude: str | None = None, *, linear: bool = False) -> SolidTerm:
+    def _bulk(
+        self,
+        name: str,
+        density: Density,
+        amplitude: str | None = None,
+        *,
+        linear: bool = False,
+        follow: Callable[[], None] | None = None,
+    ) -> SolidTerm:
         domain, u = self.body.mesh, self.u
         dx = ufl.Measure("dx", domain=domain, metadata={"quadrature_degree": density.degree})
         energy = density.of(ufl.SpatialCoordinate(domain), u, ufl.grad(u), *density.parameters) * dx
-        return SolidTerm(name, density, energy, self.u, self.log, amplitude, linear=linear)
+        return SolidTerm(name, density, energy, self.u, self.log, amplitude, linear=linear, follow=follow)
 
     def _on_faces(self, found: Sequence[Density]) -> ufl.Form:
         domain, u = self.body.mesh, self.u

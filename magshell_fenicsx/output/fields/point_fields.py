@@ -41,7 +41,7 @@ class PointFields:
         if field:
             pattern = field.remanent
             self._Br = pattern(r0[0], self.n0) if callable(pattern) else np.broadcast_to(pattern, r0[0].shape)
-        if field and field.gradient is None:
+        if field and field.uniform:
             h = material.h if thickness is None else material.h * thickness
             self.constant, self._torque = magnetic_loads(self._geometry(), field, r0[0], h)
 
@@ -85,6 +85,8 @@ class PointFields:
 def _applied(field: Magnetisation, mu: Mapping[str, float], r: Array) -> Array:
     """The applied flux density (..., 3) at points r (..., 3)."""
     along = mu.get("lambda_m", 0.0)
+    if field.in_space:
+        return np.asarray(along * field.in_space(r.reshape(-1, 3))[0].reshape(r.shape))
     uniform = along * field.applied
     if field.across is not None:
         uniform = uniform + mu.get("lambda_across", 0.0) * field.across
