@@ -79,6 +79,6 @@ def sources_beside(case: Case, r0: Array) -> str | None:
         return None
     x, y, z = r0[np.argmax(np.maximum(*known))]
     return (
-        f"magnetic.applied.components: on the shell div B is up to {found[0]:.3g} and |curl B| up to {found[1]:.3g} "
-        f"|B^a|/R, most of it at (x, y, z) = ({x:.3g}, {y:.3g}, {z:.3g}): magnets and currents elsewhere make no such field"
+        f"magnetic.applied.components: on the shell div B is up to {found[0]:.3g} and curl B up to {found[1]:.3g} "
+        f"B^a/R, most of it at (x, y, z) = ({x:.3g}, {y:.3g}, {z:.3g}): magnets and currents elsewhere make no such field"
     )

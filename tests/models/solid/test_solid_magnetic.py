@@ -9,12 +9,17 @@ from bodies import hemisphere, plate
 from test_solid_derivatives import FIELD, MU, csr, displacement
 
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
+from magshell_fenicsx.case.expressions import with_derivatives
 from magshell_fenicsx.models.shell.parameters import Loads, Magnetisation, Material, RemanenceLaw
 from magshell_fenicsx.models.shell.patterns import radial
 from magshell_fenicsx.models.solid.material import NeoHookean
 from magshell_fenicsx.models.solid.model import SolidModel
+from magshell_fenicsx.plan.magnetisation import FormulasInSpace
 
 H = 0.1
+G = FIELD.gradient
+assert G is not None
+LINEAR = [f"{b} + {g[0]}*x + {g[1]}*y + {g[2]}*z" for b, g in zip(FIELD.applied, G, strict=True)]
 MATERIAL, NEO_HOOKEAN = Material(0.5, H), NeoHookean.of(0.5, 100.0)
 BR, BA = np.array([0.64, 0.48, 0.6]), np.array([0.36, -0.48, 0.8])
 THIN = 1.1**-0.5
@@ -26,6 +31,10 @@ DEFORMATIONS = {
     "sheared far": np.array([[1.0, 4.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]),
     "any": np.array([[0.9, 0.5, -0.1], [-0.6, 0.8, 0.4], [0.2, -0.3, 1.2]]),
 }
+
+
+def formulas(texts: list[str]) -> FormulasInSpace:
+    return FormulasInSpace([with_derivatives(text) for text in texts], np.eye(3))
 
 
 def block(law: RemanenceLaw) -> SolidModel:
@@ -91,3 +100,30 @@ def test_tangent_and_residual(pattern: bool) -> None:
         assert system.residual(u, alone) @ v == pytest.approx(slope, rel=1e-6), term.name
         rate = (system.residual(u + e * v, alone) - system.residual(u - e * v, alone)) / (2 * e)
         assert np.linalg.norm(csr(system.tangent(u, alone)) @ v - rate) <= 1e-6 * np.linalg.norm(rate), term.name
+
+
+@pytest.mark.parametrize("law", ["deformation", "rotation"])
+def test_field_known_by_values(law: RemanenceLaw) -> None:
+    """A linear one is that of its gradient, to 1e-10; one that is no polynomial has its finite differences as tangent."""
+    known = replace(FIELD, law=law, across=None, gradient=None, in_space=formulas(LINEAR))
+    body, loads = hemisphere(0.8, H, half=True), (Loads(magnetic=f) for f in (known, replace(FIELD, law=law, across=None)))
+    here, there = (SolidModel(body, MATERIAL, NEO_HOOKEAN, {"symmetry": "symmetry"}, load).system for load in loads)
+    u = here.held(2e-3 * np.random.default_rng(0).standard_normal(here.size))
+    assert here.potential(u, {}, "lambda_m") == pytest.approx(there.potential(u, {}, "lambda_m"), rel=1e-12)
+    columns = [system.load(u, {}, "lambda_m") for system in (here, there)]
+    assert np.abs(columns[0] - columns[1]).max() <= 1e-10 * np.abs(columns[1]).max()
+    zero, one = {"lambda_m": 0.0}, {"lambda_m": 1.0}
+    K = [csr(system.tangent(u, one).copy()) - csr(system.tangent(u, zero)) for system in (here, there)]
+    assert abs(K[0] - K[1]).max() <= 1e-10 * abs(K[1]).max()
+    wild = Loads(magnetic=replace(known, in_space=formulas(["x*exp(y)", "z**2*y", "1/(2 + x*z)"])))
+    model = SolidModel(body, MATERIAL, NEO_HOOKEAN, {}, wild)
+    magnetic = next(t for t in model.system.terms if t.name == "magnetic")
+    system, e = FiniteElementSystem(model.u, [magnetic], [], model._pattern, 1.0), 1e-5
+    v = np.random.default_rng(2).standard_normal(system.size)
+    slope = (system.potential(u + e * v, {}, "lambda_m") - system.potential(u - e * v, {}, "lambda_m")) / (2 * e)
+    assert system.residual(u, one) @ v == pytest.approx(slope, rel=1e-6)
+    rate = (system.residual(u + e * v, one) - system.residual(u - e * v, one)) / (2 * e)
+    Kv = csr(system.tangent(u, one)) @ v
+    assert np.linalg.norm(Kv - rate) <= 1e-6 * np.linalg.norm(rate)
+    fast = csr(model.system.tangent(u, one).copy()) - csr(model.system.tangent(u, zero))
+    assert np.linalg.norm(fast @ v - rate) <= 1e-6 * np.linalg.norm(rate)
