@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 
-class PointField(fem.Function):
+class PointField(fem.Function):  # type: ignore[misc]  # dolfinx has no types
     """A coefficient of forms with the quadrature of that degree, and a parameter of densities at the same points.
 
     Attributes

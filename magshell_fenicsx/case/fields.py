@@ -150,7 +150,9 @@ class MagneticSection(Section):
         if self.remanent.flux_density == 0:
             raise ValueError("a remanence of length zero is no magnetisation: leave the section out")
         if not self.applied.is_uniform and self.energy != "full":
-            raise ValueError("the approximate energies are of uniform fields; gradient and components need energy: full")
+            raise ValueError(
+                "the approximate energies are of uniform fields; gradient and components need energy: full"
+            )
         return self
 
     def amplitude(self, youngs_modulus: float | None) -> float:

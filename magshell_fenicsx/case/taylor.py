@@ -9,7 +9,9 @@ from numpy.lib.mixins import NDArrayOperatorsMixin
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-Partials = tuple[list[Any], dict[tuple[int, int], Any]]  # first derivatives by each argument, second ones by pairs i <= j
+Partials = tuple[
+    list[Any], dict[tuple[int, int], Any]
+]  # first derivatives by each argument, second ones by pairs i <= j
 
 
 @dataclass(frozen=True)

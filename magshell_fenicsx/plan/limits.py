@@ -52,8 +52,8 @@ def refuse_unbounded_fields(case: Case, r0: Array) -> None:
         )
     if not case.magnetic:
         return
-    sections = {"remanent": case.magnetic.remanent, "applied": case.magnetic.applied}
-    for key, text in ((key, text) for key, section in sections.items() for text in section.components or []):
+    found = {"remanent": case.magnetic.remanent.components, "applied": case.magnetic.applied.components}
+    for key, text in ((key, text) for key, texts in found.items() for text in texts or []):
         bad = r0[~(np.abs(formula(text)(*r0.T)) <= 1e6)]
         if len(bad):
             x, y, z = bad[0]
@@ -80,5 +80,6 @@ def sources_beside(case: Case, r0: Array) -> str | None:
     x, y, z = r0[np.argmax(np.maximum(*known))]
     return (
         f"magnetic.applied.components: on the shell div B is up to {found[0]:.3g} and curl B up to {found[1]:.3g} "
-        f"B^a/R, most of it at (x, y, z) = ({x:.3g}, {y:.3g}, {z:.3g}): magnets and currents elsewhere make no such field"
+        f"B^a/R, most of it at (x, y, z) = ({x:.3g}, {y:.3g}, {z:.3g}): "
+        "magnets and currents elsewhere make no such field"
     )

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.expressions import formula, with_derivatives
-from magshell_fenicsx.case.taylor import Taylor
 from magshell_fenicsx.case.fields import Direction, MagneticSection, layer_average
 from magshell_fenicsx.case.surfaces import MeshSurface
+from magshell_fenicsx.case.taylor import Taylor
 from magshell_fenicsx.mesh.frame import rotation
 from magshell_fenicsx.models.shell.parameters import Magnetisation
 from magshell_fenicsx.models.shell.patterns import Components, InsideAndOutside, Pattern, radial, tangential

@@ -82,7 +82,7 @@ def test_first_order_energy_is_the_work_of_the_loads() -> None:
 
 
 def test_first_order_energy_of_a_remanence_that_does_not_stretch() -> None:
-    """U1 = integral of f_mag . u for u = 0 on the edge, without pressure: f/h is half of that above less that of Ba, Br."""
+    """U1 = integral of f_mag . u for u = 0 on the edge: f/h is half of that above less that of exchanged fields."""
     Ba = np.array([0.48, 0.36, 0.8])
     shell = model(Magnetisation(UP, Ba, "first", law="rotation"))
     surface = SurfaceGatherer(shell).gather(shell.zero())
@@ -103,7 +103,7 @@ def test_first_order_energy_of_a_remanence_that_does_not_stretch() -> None:
 
 
 def test_springs_and_torques_of_a_remanence_that_does_not_stretch() -> None:
-    """Of a plate: k is minus the mean of Ba . Br over all turns of its normal; U_tau = q . tau where no area changes."""
+    """Of a plate: k is the mean over all axes in it; U_tau = q . tau where no area changes."""
     Br, Ba, D = np.array([0.6, 0.0, 0.8]), np.array([0.48, 0.36, 0.8]), np.array([[0.1, 0.3], [-0.2, -0.1]])
     flat = ShellModel(disc(0.8), Material(0.3, H), 2, {}, Loads(magnetic=Magnetisation(Br, Ba, law="rotation")))
     q = np.array([0.05, -0.08])

@@ -108,7 +108,9 @@ class EnergyFactory:
 
         if field.in_space:
             known = AppliedField(field.in_space, self.r0, u, self._quadrature)
-            return [replace(term("magnetic", densities.in_space(FULL[field.law]), known.polynomial), follow=known.follow)]
+            return [
+                replace(term("magnetic", densities.in_space(FULL[field.law]), known.polynomial), follow=known.follow)
+            ]
         Ba = self.constant(field.applied)
         terms = [term(name, density, Ba) for name, density in magnetic_densities(field.law, field.energy).items()]
         if field.gradient is not None:

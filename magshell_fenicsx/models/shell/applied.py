@@ -61,15 +61,15 @@ class AppliedField:
     def __init__(self, of: FieldInSpace, r0: fem.Function, u: fem.Function, degree: int) -> None:
         V = u.function_space
         self.polynomial = PointField(V.mesh, degree, SIZE)
-        self._of, self._u, self._known = of, u, np.full(len(u.x.array), np.nan)
+        self._of, self._u = of, u
+        self._known: Array = np.empty(0)
         self._shape = V.element.basix_element.tabulate(0, self.polynomial.points)[0, :, :, 0]
         self._nodes = V.dofmap.list
         self._r0 = self._at_points(r0)
         B, G, H = self._of(self._r0.reshape(-1, 3))
         known = np.isfinite(G).all(axis=(1, 2)) & np.isfinite(H).all(axis=(1, 2, 3))
-        B0 = np.where(known[:, None], B, np.nan).reshape(self._r0.shape)
-        refuse_unbounded(B0, self._r0, V.mesh.comm, "magnetic.applied")
-        self._B0 = B0
+        self._B0 = np.where(np.reshape(known, (-1, 1)), B, np.nan).reshape(self._r0.shape)
+        refuse_unbounded(self._B0, self._r0, V.mesh.comm, "magnetic.applied")
         self.follow()
 
     def follow(self) -> None:

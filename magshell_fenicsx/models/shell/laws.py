@@ -7,8 +7,18 @@ from magshell_fenicsx.models.shell.parameters import MagneticEnergy, RemanenceLa
 LINEAR = ("U1", "couple")
 FULL: dict[RemanenceLaw, MagneticDensity] = {"deformation": densities.magnetic, "rotation": rotation_law.magnetic}
 _EXPANDED: dict[RemanenceLaw, dict[str, MagneticDensity]] = {
-    law: {"U1": of.magnetic_first, "Uq": of.magnetic_torque, "Utau": of.magnetic_tau, "couple": densities.magnetic_couple}
-    for law, of in (("deformation", densities), ("rotation", rotation_law))
+    "deformation": {
+        "U1": densities.magnetic_first,
+        "Uq": densities.magnetic_torque,
+        "Utau": densities.magnetic_tau,
+        "couple": densities.magnetic_couple,
+    },
+    "rotation": {
+        "U1": rotation_law.magnetic_first,
+        "Uq": rotation_law.magnetic_torque,
+        "Utau": rotation_law.magnetic_tau,
+        "couple": densities.magnetic_couple,
+    },
 }
 _TERMS: dict[MagneticEnergy, tuple[str, ...]] = {
     "first": ("U1",),

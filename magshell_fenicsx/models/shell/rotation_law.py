@@ -1,8 +1,9 @@
 """The magnetic densities of a remanence that turns with the surface and does not stretch: R Br in place of F Br.
 
 R is the rotation of the polar decomposition of F = a_i (x) a0^i + n (x) n0. In the surface, with C = U^2,
-U = (C + J 1)/T, T^2 = tr C + 2 J and J = sqrt(det C), so that R = F U^-1 = (F + J F C^-1)/T, and J F C^-1 = J a^i (x) a0_i:
-no root but of numbers above zero, at equal stretches too. In units and arguments as `densities`.
+U = (C + J 1)/T, T^2 = tr C + 2 J and J = sqrt(det C), so that R = F U^-1 = (F + J F C^-1)/T, and
+J F C^-1 = J a^i (x) a0_i: no root but of numbers above zero, at equal stretches too. In units and arguments as
+`densities`.
 """
 
 import ufl

@@ -12,8 +12,8 @@ from ufl.core.expr import Expr
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.models.shell import densities, edges
 from magshell_fenicsx.models.shell import kinematics as kin
-from magshell_fenicsx.models.shell.applied import AppliedField
 from magshell_fenicsx.models.shell.antisymmetric import antisymmetric_edge
+from magshell_fenicsx.models.shell.applied import AppliedField
 from magshell_fenicsx.models.shell.energy import (
     Density,
     HessianTerm,

@@ -1,8 +1,8 @@
 """The magnetic densities of a remanence that turns with the solid and does not stretch: R Br in place of F Br.
 
 F = R U. With C = U^2 and the invariants i1, i2, i3 of U, the theorem of Cayley and Hamilton gives
-R = (i1 cof F + (i1^2 - i2) F - F C)/(i1 i2 - i3), whose denominator is the product of the sums of two stretches: smooth at
-equal stretches too. In units and arguments as `densities`.
+R = (i1 cof F + (i1^2 - i2) F - F C)/(i1 i2 - i3), whose denominator is the product of the sums of two stretches:
+smooth at equal stretches too. In units and arguments as `densities`.
 """
 
 import ufl

@@ -98,13 +98,13 @@ class Torque:
         """tau_c = B0^ij (a0^a . e_j)(n0 . e_i) (u,_a . a0_c) as a vector (..., 3), from u,_1 and u,_2 (..., 2, 3)."""
         turned = np.matmul(self.along[..., None, :], du)[..., 0, :]
         found = turned - np.sum(turned * self.n0, axis=-1, keepdims=True) * self.n0
-        if self.dual is not None:
+        if self.dual is not None and self.transposed is not None:
             found = found + np.einsum("...ac,...c,...ai->...i", du, self.transposed, self.dual)
         return np.asarray(found)
 
 
 def torque(g: SurfaceGeometry, Br: Array, Ba: Array, *, rotates: bool = False) -> Torque:
-    """The torque as a function of the displacement's derivatives; of a remanence that does not stretch if it rotates."""
+    """The torque as a function of the displacement's derivatives, of a remanence that `rotates` or is convected."""
     along = -np.einsum("...i,...i->...", g.n0, Br)[..., None] * np.einsum("...ai,i->...a", g.dual, Ba)
     if not rotates:
         return Torque(g.n0, along)

@@ -68,7 +68,8 @@ def check(system: FiniteElementSystem, u: np.ndarray, mu: dict[str, float]) -> N
 
 
 @pytest.mark.parametrize(
-    ("made", "name"), [
+    ("made", "name"),
+    [
         (made, name)
         for made, names in (("hemisphere", TERMS), ("ring", RING_TERMS), ("turning", TURNING_TERMS))
         for name in names

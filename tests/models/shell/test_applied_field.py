@@ -91,7 +91,7 @@ def test_force_and_torque_on_a_small_rigid_magnet(law: RemanenceLaw) -> None:
         moment = area * np.cross(Q @ BR, B)
         assert np.linalg.norm(torque - moment) <= 2e-3 * np.linalg.norm(moment)
         # the same in closed form, of the derivatives' own source
-        distance = np.array(middle) + [0.0, 0.0, d]
+        distance = np.array(middle) + d * np.eye(3)[2]
         s, m, M = np.linalg.norm(distance), np.array([0.0, 0.0, 1.0]), Q @ BR
         e = distance / s
         dipoles = 3 / s**4 * ((M @ e) * m + (m @ e) * M + (m @ M) * e - 5 * (m @ e) * (M @ e) * e)

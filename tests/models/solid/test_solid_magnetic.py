@@ -1,4 +1,4 @@
-"""A solid's remanence that turns and does not stretch: against SciPy's polar decomposition, forms and the shell."""
+"""A solid's remanence that does not stretch, and its field by formulas: against SciPy, forms and finite differences."""
 
 from dataclasses import replace
 
@@ -104,10 +104,13 @@ def test_tangent_and_residual(pattern: bool) -> None:
 
 @pytest.mark.parametrize("law", ["deformation", "rotation"])
 def test_field_known_by_values(law: RemanenceLaw) -> None:
-    """A linear one is that of its gradient, to 1e-10; one that is no polynomial has its finite differences as tangent."""
+    """A linear one is that of its gradient, to 1e-10; the tangent of another one, by finite differences."""
     known = replace(FIELD, law=law, across=None, gradient=None, in_space=formulas(LINEAR))
-    body, loads = hemisphere(0.8, H, half=True), (Loads(magnetic=f) for f in (known, replace(FIELD, law=law, across=None)))
-    here, there = (SolidModel(body, MATERIAL, NEO_HOOKEAN, {"symmetry": "symmetry"}, load).system for load in loads)
+    body, built_in = hemisphere(0.8, H, half=True), replace(FIELD, law=law, across=None)
+    here, there = (
+        SolidModel(body, MATERIAL, NEO_HOOKEAN, {"symmetry": "symmetry"}, Loads(magnetic=field)).system
+        for field in (known, built_in)
+    )
     u = here.held(2e-3 * np.random.default_rng(0).standard_normal(here.size))
     assert here.potential(u, {}, "lambda_m") == pytest.approx(there.potential(u, {}, "lambda_m"), rel=1e-12)
     columns = [system.load(u, {}, "lambda_m") for system in (here, there)]
