@@ -1,6 +1,6 @@
 """The field section in the model's frame."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,6 +16,7 @@ from magshell_fenicsx.models.shell.parameters import Magnetisation
 from magshell_fenicsx.models.shell.patterns import Components, InsideAndOutside, Pattern, radial, tangential
 
 Array = NDArray[np.float64]
+SAME = 1e-9  # part of a direction outside a plane: rounding
 
 
 @dataclass(frozen=True)
@@ -35,13 +36,13 @@ class FormulasInSpace:
         )
 
 
-def magnetisation(magnetic: MagneticSection, case: Case, turn: float, to: Direction | None) -> Magnetisation:
+def magnetisation(magnetic: MagneticSection, case: Case, turn: float, to: Sequence[Direction] = ()) -> Magnetisation:
     """What is magnetised and how it is modelled, in a frame turned about e3 (rad).
 
     Parameters
     ----------
     to
-        Where the field turns; None if it does not.
+        Directions that the field turns to.
     """
     section, gradient = magnetic.remanent, magnetic.applied.gradient
     remanent: NDArray[np.float64] | Pattern
@@ -60,10 +61,12 @@ def magnetisation(magnetic: MagneticSection, case: Case, turn: float, to: Direct
     else:
         remanent = section.vector(turn)
     along = magnetic.applied.vector(turn)
-    applied, across = magnetic.applied.uniform * along, None
-    if to is not None:
-        away = to.vector(turn) - (to.vector(turn) @ along) * along
-        across = magnetic.applied.uniform * away / np.linalg.norm(away)
+    basis = [along]
+    for direction in to:
+        away = direction.vector(turn) - np.sum([(direction.vector(turn) @ e) * e for e in basis], axis=0)
+        if np.linalg.norm(away) > SAME:
+            basis.append(away / np.linalg.norm(away))
+    applied, *across = (magnetic.applied.uniform * e for e in basis)
     patches = None
     if section.patches and isinstance(case.shell, MeshSurface):
         patches = {name: direction.vector(turn) for name, direction in section.patches.items()}
@@ -72,4 +75,6 @@ def magnetisation(magnetic: MagneticSection, case: Case, turn: float, to: Direct
     layers = tuple((layer.fraction, layer.vector(turn)) for layer in section.layers or [])
     texts = magnetic.applied.components
     known = FormulasInSpace([with_derivatives(text) for text in texts], Q) if texts else None
-    return Magnetisation(remanent, applied, magnetic.energy, G, across, patches, layers, magnetic.remanence, known)
+    return Magnetisation(
+        remanent, applied, magnetic.energy, G, tuple(across), patches, layers, magnetic.remanence, known
+    )

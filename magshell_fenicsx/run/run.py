@@ -8,9 +8,9 @@ from pathlib import Path
 from mpi4py import MPI
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.loading import PathSection
+from magshell_fenicsx.case.loads.step import PathStep
 from magshell_fenicsx.continuation.factor import has_cholmod
-from magshell_fenicsx.continuation.fold import FoldLost, Guess, find_fold
+from magshell_fenicsx.continuation.fold import FoldLost
 from magshell_fenicsx.continuation.inverse import NoEigenpair
 from magshell_fenicsx.continuation.journal import NoJournal
 from magshell_fenicsx.output.pictures.plot import draw
@@ -30,10 +30,11 @@ from magshell_fenicsx.run.summary import Result, summary
 from magshell_fenicsx.simulate.adapt.choice import Adapted
 from magshell_fenicsx.simulate.adapt.ending import NoResult
 from magshell_fenicsx.simulate.adapt.tolerance import adapted
+from magshell_fenicsx.simulate.barrier import barrier
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.record import Stopped
 from magshell_fenicsx.simulate.scene import Scene
-from magshell_fenicsx.simulate.sensitivity import sensitivities
+from magshell_fenicsx.simulate.sensitivity import fold_at, sensitivities
 
 __all__ = ["Result", "run"]
 
@@ -118,6 +119,7 @@ def _run(case: Case, folder: Path | None, comm: MPI.Comm, say: Say, tell: Say, w
         try:
             _follow(result, files, say, progress, start)
             result.sensitivities = _sensitivities(result)
+            result.barrier = _barrier(result)
         except (Stopped, NoEigenpair) as e:
             result.stopped = str(e)
         except (Interrupted, DiskError) as e:
@@ -169,14 +171,26 @@ def _mesh_for_tolerance(case: Case, folder: Path | None, comm: MPI.Comm, say: Sa
 
 def _sensitivities(result: Result) -> dict[str, float]:
     """The sensitivities at the final fold, if the case requests them."""
-    scene, loading, last = result.scene, result.scene.case.loading, result.rows[-1]
-    if not (isinstance(loading, PathSection) and loading.sensitivities and last["label"] == "fold"):
+    scene, last = result.scene, result.rows[-1]
+    step = scene.case.programme[int(last["step"]) - 1] if last["label"] == "fold" else None
+    if step is None or not (isinstance(step.load, PathStep) and step.load.sensitivities):
         return {}
+    assert result.history.located
+    record = result.history.located[-1]
     try:
-        fold = find_fold(scene.newton, Guess(result.last), str(last["amplitude"]))
+        fold = fold_at(scene, record)
     except FoldLost as e:
         raise Stopped(f"the fold cannot be polished for its sensitivities: {e}") from None
-    return sensitivities(scene, fold)
+    return sensitivities(scene, fold, record)
+
+
+def _barrier(result: Result) -> float | None:
+    """The energy barrier that the last step has passed, if it was to."""
+    steps, begin = result.scene.case.programme, result.history.begin
+    if not steps or steps[-1].until != "zero" or begin is None:
+        return None
+    assert result.history.last
+    return barrier(result.scene, steps[-1], begin.point.state, result.history.last.point.state)
 
 
 def _follow(result: Result, files: RunFiles | None, say: Say, progress: RunProgress, start: float) -> None:

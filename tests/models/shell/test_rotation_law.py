@@ -92,7 +92,7 @@ def test_each_order_alone(energy: Callable[[MagneticEnergy, float], float]) -> N
         assert abs(energy(kind, 0.01) / of_deformation - 1) > 0.1
 
 
-FIELD = replace(TILTED, gradient=G, across=np.array([1.0, 0.0, 0.0]), law="rotation")
+FIELD = replace(TILTED, gradient=G, across=(np.array([1.0, 0.0, 0.0]),), law="rotation")
 
 
 @pytest.mark.parametrize("kind", ["full", "second_consistent"])

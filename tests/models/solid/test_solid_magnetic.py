@@ -105,8 +105,8 @@ def test_tangent_and_residual(pattern: bool) -> None:
 @pytest.mark.parametrize("law", ["deformation", "rotation"])
 def test_field_known_by_values(law: RemanenceLaw) -> None:
     """A linear one is that of its gradient, to 1e-10; the tangent of another one, by finite differences."""
-    known = replace(FIELD, law=law, across=None, gradient=None, in_space=formulas(LINEAR))
-    body, built_in = hemisphere(0.8, H, half=True), replace(FIELD, law=law, across=None)
+    known = replace(FIELD, law=law, across=(), gradient=None, in_space=formulas(LINEAR))
+    body, built_in = hemisphere(0.8, H, half=True), replace(FIELD, law=law, across=())
     here, there = (
         SolidModel(body, MATERIAL, NEO_HOOKEAN, {"symmetry": "symmetry"}, Loads(magnetic=field)).system
         for field in (known, built_in)
