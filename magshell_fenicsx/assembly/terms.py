@@ -50,6 +50,8 @@ class FormTerm:
 
     Attributes
     ----------
+    form
+        The energy.
     residual_form, tangent_form
         Compiled on first use; None for the tangent of a linear energy.
     """
@@ -67,6 +69,7 @@ class FormTerm:
         self.name, self.amplitude, self.linear = name, amplitude, linear
         self._factor = fem.Constant(u.function_space.mesh, 1.0)
         self._u, self._log = u, log
+        self.form = energy
         self._gradient = ufl.derivative(energy, u, ufl.TestFunction(u.function_space))
         self._energy = log.compile(f"{name} energy", energy)
 

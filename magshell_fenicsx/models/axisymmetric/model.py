@@ -11,6 +11,7 @@ import numpy as np
 from dolfinx import fem
 
 from magshell_fenicsx.assembly.kernels import KernelLog
+from magshell_fenicsx.assembly.parameter import make_parameters
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.assembly.terms import FormTerm
 from magshell_fenicsx.continuation.system import Vector
@@ -26,7 +27,6 @@ from magshell_fenicsx.models.axisymmetric.waves import Waves
 from magshell_fenicsx.models.observed import Observed
 from magshell_fenicsx.models.shell import edges
 from magshell_fenicsx.models.shell.energy import Density
-from magshell_fenicsx.models.shell.free import free_parameters
 from magshell_fenicsx.models.shell.moment import Counted
 from magshell_fenicsx.models.shell.parameters import Condition, EdgeMoment, Loads, Material, default_penalty
 from magshell_fenicsx.models.shell.thickness import Thickness
@@ -107,12 +107,7 @@ class MeridianModel(Observed):
         for i, load in enumerate(moments):
             terms.append(self._moment(f"moment {load.edge} {i}", load))
         pattern, held = next(term for term in terms if term.name == INTERIOR), self.supports.held(V)
-        parameters = free_parameters(
-            loads.own,
-            factory.free,
-            lambda term: self._term(factory.own(term)),
-            lambda term: self.kernels.compile_all([factory.observed(term, u)]),
-        )
+        parameters = make_parameters(factory.free, terms, self.u, self.kernels)
         self.system = FiniteElementSystem(self.u, terms, held, pattern, material.h, parameters=parameters)
         self._volume = self.kernels.compile("volume energy", 2 * np.pi * factory.volume_change(jets.revolved(self.u)))
         self._seen = {name: Probe.at(*place, self.r0) for name, place in meridian.points.items()}

@@ -13,6 +13,7 @@ from dolfinx import fem
 from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.kernels import KernelLog
+from magshell_fenicsx.assembly.parameter import make_parameters
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.assembly.sliding import Constraint, held_along
 from magshell_fenicsx.assembly.terms import LinearTerm, Term
@@ -24,7 +25,6 @@ from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes
 from magshell_fenicsx.models.shell.dead_load import SurfaceMeasures, assemble_dead_loads
 from magshell_fenicsx.models.shell.fast_tangent import FastTangent, make_sites
 from magshell_fenicsx.models.shell.folds import FOLD, largest_fold
-from magshell_fenicsx.models.shell.free import free_parameters
 from magshell_fenicsx.models.shell.parameters import (
     Condition,
     EdgeMoment,
@@ -169,9 +169,7 @@ class ShellModel(Observed):
         self._sites = make_sites(self.r0, degree, terms, self.kernels, factory.prestress())
         fast = FastTangent(self.u, self._sites, held + mirrored)
         gradients = FastResidual(self.r0, self.u, degree, terms, self.kernels)
-        parameters = free_parameters(
-            loads.own, factory.free, factory.own, lambda term: self.kernels.compile_all([factory.observed(term)])
-        )
+        parameters = make_parameters(factory.free, terms, self.u, self.kernels)
         self.system = FiniteElementSystem(
             self.u, terms, held + mirrored, interior, material.h, fast, gradients, parameters
         )

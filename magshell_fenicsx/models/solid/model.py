@@ -13,6 +13,7 @@ from dolfinx import fem
 from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.kernels import KernelLog
+from magshell_fenicsx.assembly.parameter import make_parameters
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.assembly.sliding import Constraint, held_along
 from magshell_fenicsx.assembly.terms import LinearTerm, Term
@@ -23,7 +24,6 @@ from magshell_fenicsx.models.observed import Observed
 from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes
 from magshell_fenicsx.models.shell.dead_load import assemble_dead_loads
 from magshell_fenicsx.models.shell.fast_tangent import FastTangent
-from magshell_fenicsx.models.shell.free import free_parameters
 from magshell_fenicsx.models.shell.parameters import Condition, EdgeMoment, Loads, Material
 from magshell_fenicsx.models.shell.supports import closing_point, open_to_pressure
 from magshell_fenicsx.models.solid.loads import BodyMeasures, outer_patch
@@ -131,9 +131,7 @@ class SolidModel(Observed):
 
     def _system(self, held: list[Constraint]) -> FiniteElementSystem:
         fast, factory = FastTangent(self.u, self._sites, held), self.factory
-        parameters = free_parameters(
-            self.loads.own, factory.free, factory.own, lambda term: self.kernels.compile_all([factory.observed(term)])
-        )
+        parameters = make_parameters(factory.free, self._terms, self.u, self.kernels)
         return FiniteElementSystem(
             self.u, self._terms, held, self._pattern, self.material.h, fast, parameters=parameters
         )
