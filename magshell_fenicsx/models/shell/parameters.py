@@ -7,6 +7,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from magshell_fenicsx.models.shell.natural import Natural
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.patterns import Pattern
 
@@ -135,6 +136,7 @@ class Loads:
     magnetic: Magnetisation | None = None
     dead: tuple[DeadLoad, ...] = ()
     own: tuple[OwnTerm, ...] = ()
+    natural: Natural | None = None
 
 
 def default_penalty(degree: int) -> float:

@@ -65,7 +65,12 @@ class ByPatch:
         return np.broadcast_to(self.vectors[: len(r0), None], r0.shape)  # owned cells come first
 
 
-def by_patch(vectors: Mapping[str, Array], patches: Mapping[str, NDArray[np.bool_]], cells: int) -> ByPatch:
+def by_patch(
+    vectors: Mapping[str, Array],
+    patches: Mapping[str, NDArray[np.bool_]],
+    cells: int,
+    key: str = "magnetic.remanent.patches",
+) -> ByPatch:
     """A vector (3,) for each named patch of a mesh, and one for the "rest"; zero without.
 
     Parameters
@@ -74,6 +79,8 @@ def by_patch(vectors: Mapping[str, Array], patches: Mapping[str, NDArray[np.bool
         Name -> whether each cell of this rank belongs to it.
     cells
         How many there are.
+    key
+        Of the case file, for the message.
 
     Raises
     ------
@@ -86,7 +93,7 @@ def by_patch(vectors: Mapping[str, Array], patches: Mapping[str, NDArray[np.bool
             found[patches[name]] = vector
         elif name != "rest":
             there = ", ".join(patches) or "none"
-            raise MeshError(f"magnetic.remanent.patches: {name}: the surface has no such patch, only {there}")
+            raise MeshError(f"{key}: {name}: the surface has no such patch, only {there}")
     return ByPatch(found)
 
 
@@ -99,18 +106,23 @@ def pattern_field(pattern: Pattern, r0: fem.Function) -> fem.Function:
         On every rank, if it has no finite value somewhere.
     """
     V = r0.function_space
-    element = V.element.basix_element
-    values = element.tabulate(1, element.points)
-    nodes = r0.x.array.reshape(-1, 3)[V.dofmap.list]
-    a1, a2 = np.einsum("dvk,cki->dcvi", values[1:, :, :, 0], nodes)
-    m = np.cross(a1, a2)
-    n0 = m / np.linalg.norm(m, axis=-1, keepdims=True)
-    Q = fem.functionspace(V.mesh, ("DG", element.degree, (3,)))
+    nodes, n0 = places(r0)
+    Q = fem.functionspace(V.mesh, ("DG", V.element.basix_element.degree, (3,)))
     field = fem.Function(Q, name="Br")
     vectors = pattern(nodes, n0)
     refuse_unbounded(vectors, nodes, V.mesh.comm)
     field.x.array.reshape(-1, 3)[Q.dofmap.list] = vectors
     return field
+
+
+def places(r0: fem.Function) -> tuple[Array, Array]:
+    """The nodes of every cell and the normals of the cell there, (cells, nodes, 3) each."""
+    V = r0.function_space
+    element = V.element.basix_element
+    nodes = r0.x.array.reshape(-1, 3)[V.dofmap.list]
+    a1, a2 = np.einsum("dvk,cki->dcvi", element.tabulate(1, element.points)[1:, :, :, 0], nodes)
+    m = np.cross(a1, a2)
+    return nodes, np.asarray(m / np.linalg.norm(m, axis=-1, keepdims=True))
 
 
 def refuse_unbounded(vectors: Array, nodes: Array, comm: MPI.Comm) -> None:
