@@ -141,7 +141,7 @@ class FiniteElementSystem:
         self.place(mu)
         if name in self.parameters:
             slopes = self.parameters[name].slopes
-            return self._gradient(u, {}, [(_value(amplitude, mu), slope) for amplitude, slope in slopes.items()])
+            return self._gradient(u, {}, [(_factor(slope, mu), slope) for slope in slopes])
         return self._gradient(u, {t.name: 1.0 for t in self.terms if t.amplitude == name})
 
     def potential(self, u: Vector, mu: Amplitudes, name: str) -> float:
@@ -149,7 +149,7 @@ class FiniteElementSystem:
         self.place(mu)
         if name in self.parameters:
             slopes = self.parameters[name].slopes
-            here = sum(_value(amplitude, mu) * slope.energy() for amplitude, slope in slopes.items())
+            here = sum(_factor(slope, mu) * slope.energy() for slope in slopes)
         else:
             here = sum(t.energy() for t in self.terms if t.amplitude == name)
         return float(self.comm.allreduce(here))
@@ -163,10 +163,10 @@ class FiniteElementSystem:
             name, other = other, name
         parameter = self.parameters[name]
         if other in self.parameters:
-            bends = parameter.bends.get(other, {})
-            here = sum(_value(amplitude, mu) * fem.assemble_scalar(form) for amplitude, form in bends.items())
+            bends = parameter.bends(self.parameters[other].constant)
+            here = sum(_value(amplitude, mu) * fem.assemble_scalar(form) for amplitude, form in bends)
         else:
-            here = parameter.slopes[other].energy() if other in parameter.slopes else 0.0
+            here = sum(slope.energy() for slope in parameter.slopes if slope.amplitude == other)
         return float(self.comm.allreduce(here))
 
     def accept(self, u: Vector) -> None:

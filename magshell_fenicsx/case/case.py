@@ -1,6 +1,6 @@
 """The whole case: its sections and what they must have in common."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -13,11 +13,13 @@ from magshell_fenicsx.case.fields import MagneticSection, layer_average
 from magshell_fenicsx.case.loading import (
     DeadSection,
     FieldSection,
+    GrowthSection,
     IndentationSection,
     LoadingSection,
     RotationSection,
 )
 from magshell_fenicsx.case.messages import explain
+from magshell_fenicsx.case.natural import NaturalSection, measured
 from magshell_fenicsx.case.shell import ShellSection
 from magshell_fenicsx.case.solid import SolidSection
 from magshell_fenicsx.case.source import CaseError, Source, override, read_source
@@ -69,6 +71,8 @@ class Case(WithParts):
     """Name -> place of what is loaded, held or watched [the shell's length; over R if that has no unit]"""
     magnetic: MagneticSection | None = None
     """Remanence and applied field, which is applied before the load"""
+    natural: NaturalSection | None = None
+    """The curvature and the size that the shell would have without stress"""
     loading: LoadingSection | None = None
     """The load after the field; without it the path ends with the field"""
     mesh: MeshSection = MeshSection()
@@ -89,7 +93,7 @@ class Case(WithParts):
             parts = {key: data.get(key) for key in ("points", "mesh", *PARTS)} | {
                 "loading": loads and data.get("loading")
             }
-            for key in texts(parts):
+            for key in (*texts(parts), *measured(data.get("natural"))):
                 raise ValueError(f"{key}: has a unit, but the shell's lengths have none: give all of them one, or none")
         return section
 
@@ -105,6 +109,9 @@ class Case(WithParts):
             )
         if isinstance(self.loading, FieldSection) and not self.lambda_m:
             raise ValueError("loading.kind: field needs magnetic.lambda_m, not zero, for its target or direction")
+        if isinstance(self.loading, GrowthSection) and getattr(self.natural, self.loading.grows, None) is None:
+            raise ValueError(f"loading.{self.loading.grows}: is a factor of natural.{self.loading.grows}: give that too")
+        self._natural_parts()
         if isinstance(self.loading, RotationSection):
             if not self.magnetic or not self.lambda_m:
                 raise ValueError("loading.kind: rotation needs a field: magnetic.lambda_m, not zero")
@@ -148,15 +155,25 @@ class Case(WithParts):
         if shell.geometry in ("hemisphere", "cap") and not 0 <= polar < edge - 1:
             raise ValueError(f"loading.at.polar: {polar:g} is not on the shell: allowed 0 to {edge - 1:g}")
 
+    def _natural_parts(self) -> None:
+        for key in ("curvature", "stretch"):
+            if isinstance(patches := getattr(self.natural, key, None), dict):
+                self._refuse_strange(patches, f"natural.{key}")
+
+    def _refuse_strange(self, patches: Iterable[str], key: str) -> None:
+        """A mesh knows its patches later."""
+        if isinstance(self.shell, MeshSurface):
+            return
+        if self.defect is None and ("dimple" in patches or not isinstance(self.shell, ShellSection)):
+            raise ValueError(f"{key}: the shell has no dimple")
+        if unknown := set(patches) - {"dimple", "rest"}:
+            raise ValueError(f"{key}: {min(unknown)}: a {self.shell.geometry} has only dimple and rest")
+
     def _patches(self) -> None:
         patches = self.magnetic.remanent.patches if self.magnetic else None
         if patches is None or isinstance(self.shell, MeshSurface):
             return
-        geometry = self.shell.geometry
-        if self.defect is None and ("dimple" in patches or not isinstance(self.shell, ShellSection)):
-            raise ValueError("magnetic.remanent.patches: the shell has no dimple")
-        if unknown := set(patches) - {"dimple", "rest"}:
-            raise ValueError(f"magnetic.remanent.patches: {min(unknown)}: a {geometry} has only dimple and rest")
+        self._refuse_strange(patches, "magnetic.remanent.patches")
         if "rest" not in patches:
             raise ValueError("magnetic.remanent: patches needs the patch rest")
 

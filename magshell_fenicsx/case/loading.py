@@ -207,6 +207,42 @@ class FieldSection(PathSection):
         return self
 
 
+class GrowthSection(PathSection):
+    """The natural shape is the load: the curvature or the stretch of `natural` grows from the drawn shape.
+
+    `until: target` ends at a factor of what `natural` gives, the others go on in its direction.
+    """
+
+    kind: Literal["natural"]
+    control: Literal["load", "arc"] = "arc"
+    """What is prescribed step by step: the factor, or arc length, which passes its folds"""
+    until: Until = "target"
+    curvature: float | None = Field(default=None, ge=-1e3, le=1e3)
+    """Factor of natural.curvature"""
+    stretch: float | None = Field(default=None, ge=-1e3, le=1e3)
+    """Factor of natural.stretch less one"""
+
+    @model_validator(mode="after")
+    def _one_grows(self) -> Self:
+        if (self.curvature is None) == (self.stretch is None):
+            raise ValueError("give one of curvature and stretch: the factor that it grows to, or its sign")
+        if abs(self.factor) < LEAST_TARGET:
+            raise ValueError(f"{self.grows}: is a target and must not be zero (at least {LEAST_TARGET:g} in size)")
+        if self.until == "points" and self.control != "arc":
+            raise ValueError("until: points counts steps by arc length: it goes with control: arc")
+        return self
+
+    @property
+    def grows(self) -> str:
+        """The key of `natural` that grows."""
+        return "stretch" if self.curvature is None else "curvature"
+
+    @property
+    def factor(self) -> float:
+        """Its target."""
+        return float(getattr(self, self.grows))
+
+
 class RotationSection(Section):
     """The applied field, at its full magnitude, turns on the shortest way to another direction.
 
@@ -221,5 +257,6 @@ class RotationSection(Section):
 
 
 LoadingSection = Annotated[
-    PressureSection | IndentationSection | FieldSection | RotationSection | DeadSection, Field(discriminator="kind")
+    PressureSection | IndentationSection | FieldSection | GrowthSection | RotationSection | DeadSection,
+    Field(discriminator="kind"),
 ]

@@ -27,6 +27,7 @@ from magshell_fenicsx.models.shell.parameters import (
     PointForce,
 )
 from magshell_fenicsx.plan.magnetisation import magnetisation
+from magshell_fenicsx.plan.natural import natural
 from magshell_fenicsx.plan.outline import Outline
 
 Array = NDArray[np.float64]
@@ -55,7 +56,7 @@ def loads(case: Case, under: str, turn: float, mirror: Mirror | None, own: tuple
     field = magnetisation(magnetic, case, turn, to) if magnetic and case.lambda_m else None
     listed = loading.loads if isinstance(loading, DeadSection) else []
     dead = tuple(_dead(load, case, turn, mirror) for load in listed if not mirror or load.edge not in mirror.lost)
-    return Loads(isinstance(loading, PressureSection), force, field, dead, own)
+    return Loads(isinstance(loading, PressureSection), force, field, dead, own, natural(case, turn))
 
 
 def indented(case: Case, outline: Outline) -> Array | None:

@@ -14,6 +14,7 @@ from magshell_fenicsx.case.expressions import formula
 from magshell_fenicsx.case.loading import DeadLoadSection, DeadSection, IndentationSection, RotationSection
 from magshell_fenicsx.mesh.mirror import ROUNDING, Y0, Mirror
 from magshell_fenicsx.models.shell.own_term import OwnTerm
+from magshell_fenicsx.plan import natural
 from magshell_fenicsx.plan.outline import Outline
 from magshell_fenicsx.plan.turning import scalar_turns, vector_turns
 
@@ -58,6 +59,7 @@ def left(case: Case, outline: Outline, indented: Array | None, terms: Sequence[O
         _shape(case, outline),
         *_supports(case),
         *(_field(case, outline) if case.magnetic and case.lambda_m else []),
+        *_natural(case, outline),
         *_load(case, indented),
         *_named(case, outline),
         *(_energy(term, outline) for term in terms),
@@ -207,6 +209,15 @@ def _field(case: Case, outline: Outline) -> list[Leaves]:
         return images(1.0) or images(-1.0)
 
     return [Leaves(next(iter(askew), None), vectors, mirrors)]
+
+
+def _natural(case: Case, outline: Outline) -> list[Leaves]:
+    if case.natural is None:
+        return []
+    chosen = natural.along(case) if natural.uneven(case) else natural.MERIDIAN
+    fixed = not isinstance(chosen, str) and all(isinstance(v, float | int) for v in chosen)
+    vectors = [_unit(np.array(chosen, dtype=float))] if fixed else []
+    return [Leaves(natural.askew(case, outline), vectors, lambda mirror: natural.mirrored(case, outline, mirror))]
 
 
 def _load(case: Case, indented: Array | None) -> list[Leaves]:

@@ -14,9 +14,9 @@ Array = NDArray[np.float64]
 SAME = 1e-9  # of the largest value: differences that are rounding
 
 
-def scalar_turns(text: str, span: Span) -> bool:
-    """Whether a formula has the same value all around."""
-    f, places = formula(text), _places(span)
+def scalar_turns(text: str, span: Span, length: float = 1.0) -> bool:
+    """Whether a formula has the same value all around; its unit of length is R over `length`."""
+    f, places = formula(text), length * _places(span)
     return _same([f(*(places @ rotation(angle)).T)[:, None] for angle in ANGLES])
 
 

@@ -1,10 +1,11 @@
-"""The history of a case: first the field, then the load."""
+"""The history of a case: the natural shape, then the field, then the load."""
 
 from collections.abc import Iterator
 
 from magshell_fenicsx.case.loading import (
     DeadSection,
     FieldSection,
+    GrowthSection,
     IndentationSection,
     PressureSection,
     RotationSection,
@@ -31,6 +32,17 @@ def follow(scene: Scene) -> Iterator[Record]:
             f"the undeformed shell is unstable in {pivots} directions: mesh.penalty is too small or the mesh too coarse"
         )
     loading = scene.case.loading
+    if isinstance(loading, GrowthSection):
+        yield from steps.natural(scene, loading, state)
+        return
+    natural = scene.model.loads.natural
+    for name in natural.amplitudes if natural else ():
+        grows = GrowthSection.model_validate({"kind": "natural", name.removeprefix("natural_"): 1.0})
+        for record in steps.natural(scene, grows, state):
+            yield record
+            state = record.point.state
+        if state.mu[name] != 1.0:
+            raise Stopped(f"{name} stops at {state.mu[name]:.6g}: the shell becomes unstable as it grows")
     if isinstance(loading, FieldSection):
         yield from steps.field_as_load(scene, loading, state)
         return

@@ -8,6 +8,7 @@ import numpy as np
 from magshell_fenicsx.case.loading import (
     DeadSection,
     FieldSection,
+    GrowthSection,
     IndentationSection,
     PathSection,
     PressureSection,
@@ -44,6 +45,14 @@ def field_as_load(scene: Scene, loading: FieldSection, state: State) -> Iterator
     target = scene.case.lambda_m
     path, start = plain(scene).begin("lambda_m", CONTROLS[loading.control], state, target / loading.points, target)
     targets = _divided(0.0, target, loading.points) if loading.until == "target" else []
+    yield from followed(plain(scene), path, start, _goal(loading, targets, "load", target), branches=loading)
+
+
+def natural(scene: Scene, loading: GrowthSection, state: State) -> Iterator[Record]:
+    """Let the natural curvature or stretch grow."""
+    name, target = f"natural_{loading.grows}", loading.factor
+    path, start = plain(scene).begin(name, CONTROLS[loading.control], state, target / loading.points, target)
+    targets = _divided(state.mu[name], target, loading.points) if loading.until == "target" else []
     yield from followed(plain(scene), path, start, _goal(loading, targets, "load", target), branches=loading)
 
 

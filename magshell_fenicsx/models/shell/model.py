@@ -25,7 +25,7 @@ from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes
 from magshell_fenicsx.models.shell.dead_load import SurfaceMeasures, assemble_dead_loads
 from magshell_fenicsx.models.shell.fast_tangent import FastTangent, make_sites
 from magshell_fenicsx.models.shell.folds import FOLD, largest_fold
-from magshell_fenicsx.models.shell.natural import SIZE, natural_field
+from magshell_fenicsx.models.shell.natural import Shape, natural_field
 from magshell_fenicsx.models.shell.parameters import (
     Condition,
     EdgeMoment,
@@ -85,8 +85,6 @@ class ShellModel(Observed):
         h(x)/h, free to jump from cell to cell; None for 1.
     mirror
         Of a half model.
-    natural
-        The natural shape, see `natural.natural_field`; None if it is the drawn one.
     """
 
     def __init__(
@@ -113,14 +111,13 @@ class ShellModel(Observed):
         self.r0, self.u = midsurface.placement(V), fem.Function(V, name="u")
         self.sigma = default_penalty(degree) if sigma is None else sigma
         self.thickness = factor = thickness_field(thickness, self.r0, midsurface) if thickness else None
-        self.natural = None
+        free, shape = dict[str, fem.Constant](), None
         if loads.natural:
             cells = midsurface.mesh.topology.index_map(2)
             grown = loads.natural.on(midsurface.patches, cells.size_local + cells.num_ghosts)
             loads = self.loads = replace(loads, natural=grown)
-            Q = fem.functionspace(midsurface.mesh, ("DG", degree, (SIZE,)))
-            self.natural = natural_field(grown, *places(self.r0), Q)
-        factory = TermFactory(self.r0, self.u, material, self.sigma, degree, self.kernels, factor, self.natural)
+            shape = Shape.of(natural_field(grown, *places(self.r0), self.V), grown, free)
+        factory = TermFactory(self.r0, self.u, material, self.sigma, degree, self.kernels, factor, shape, free)
         interior = factory.interior_edges(folded=midsurface.read and largest_fold(self.r0, degree) > FOLD)
         terms: list[Term] = [factory.membrane(), factory.bending(), interior]
         held: list[Constraint] = []

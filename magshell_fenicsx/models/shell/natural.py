@@ -15,7 +15,7 @@ from typing import TypeAlias
 
 import numpy as np
 import ufl
-from dolfinx import fem, mesh
+from dolfinx import fem
 from numpy.typing import NDArray
 from ufl.core.expr import Expr
 
@@ -29,7 +29,7 @@ from magshell_fenicsx.models.shell.patterns import Pattern, by_patch
 Array = NDArray[np.float64]
 Varying: TypeAlias = Array | Pattern | Mapping[str, Array]
 STRETCH, CURVATURE = "natural_stretch", "natural_curvature"
-SIZE = 13  # numbers of a field: T and kappa as symmetric tensors in space, and t
+SIZE = 13  # numbers of a field: kappa and T as symmetric tensors in space, and t
 SMALLEST, LARGEST = 0.05, 20.0  # of a natural stretch
 NORMAL = 1e-6  # length in the surface of a unit vector that is normal to it
 
@@ -42,16 +42,22 @@ class Natural:
     ----------
     curvature
         kappa_11, kappa_22, kappa_12 R, positive where the surface bends towards its normal; a vector (3,), a pattern,
-        or vectors of named patches.
+        or vectors of named patches. None: it does not grow, and there is no such amplitude.
     stretch
         The stretches along t1, along t2 and of the thickness, less one; likewise.
     along
         A pattern whose part in the surface is along t1; t2 = n x t1.
     """
 
-    curvature: Varying
-    stretch: Varying
+    curvature: Varying | None
+    stretch: Varying | None
     along: Pattern
+
+    @property
+    def amplitudes(self) -> tuple[str, ...]:
+        """Their names."""
+        given = {CURVATURE: self.curvature, STRETCH: self.stretch}
+        return tuple(name for name, value in given.items() if value is not None)
 
     def on(self, patches: Mapping[str, NDArray[np.bool_]], cells: int) -> "Natural":
         """The same with a vector for each cell where it is given by patches.
@@ -93,8 +99,8 @@ def meridians(r0: Array, n0: Array) -> Array:
     return np.where(off, np.cross(np.stack([-y, x, 0 * x], axis=-1), n0), np.array([1.0, 0.0, 0.0]))
 
 
-def natural_field(natural: Natural, r0: Array, n0: Array, Q: fem.FunctionSpace) -> fem.Function:
-    """The natural shape at the nodes (cells, nodes, 3) of every cell, free to jump between cells; collective.
+def natural_field(natural: Natural, r0: Array, n0: Array, V: fem.FunctionSpace) -> fem.Function:
+    """The natural shape at the nodes (cells, nodes, 3) of every cell of V, free to jump between cells; collective.
 
     Raises
     ------
@@ -103,15 +109,16 @@ def natural_field(natural: Natural, r0: Array, n0: Array, Q: fem.FunctionSpace) 
     """
     said = None
     try:
-        T, kappa, t = natural.at(r0, n0)
         _refuse_unfit(natural, r0, n0)
+        T, kappa, t = natural.at(r0, n0)
     except MeshError as e:
         said = str(e)
-    if problems := [text for text in Q.mesh.comm.allgather(said) if text]:
+    if problems := [text for text in V.mesh.comm.allgather(said) if text]:
         raise MeshError(problems[0])
+    Q = fem.functionspace(V.mesh, ("DG", V.element.basix_element.degree, (SIZE,)))
     field = fem.Function(Q, name="natural")
     rows, columns = [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]
-    values = np.concatenate([T[..., rows, columns], kappa[..., rows, columns], t[..., None]], axis=-1)
+    values = np.concatenate([kappa[..., rows, columns], T[..., rows, columns], t[..., None]], axis=-1)
     field.x.array.reshape(-1, SIZE)[Q.dofmap.list] = values
     return field
 
@@ -163,20 +170,49 @@ class Forms:
         return ufl.dot(nu, ufl.dot(self.metric, nu))
 
 
-def forms(r0: Jet, field: Expr, bent: Expr, stretched: Expr) -> Forms:
-    """The natural forms of the numbers (13,) of a field at the amplitudes of curvature and stretch."""
+@dataclass(frozen=True)
+class Shape:
+    """A natural shape in the densities of a model: its field, see `natural_field`, and its amplitudes; None for 0."""
+
+    field: fem.Function
+    curvature: fem.Constant | None
+    stretch: fem.Constant | None
+
+    @classmethod
+    def of(cls, field: fem.Function, natural: Natural, known: Constants) -> "Shape":
+        """With amplitudes that all terms of a model share, kept in `known`."""
+        domain = field.function_space.mesh
+        found = {name: known.setdefault(name, fem.Constant(domain, 0.0)) for name in natural.amplitudes}
+        return cls(field, found.get(CURVATURE), found.get(STRETCH))
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """The field, and the amplitudes that there are."""
+        return (self.field, *(p for p in (self.curvature, self.stretch) if p is not None))
+
+    def forms(self, r0: Jet, field: Expr, *amplitudes: Expr) -> Forms:
+        """The natural forms at a point where the field and the amplitudes have these values."""
+        given = list(amplitudes)
+        bent, stretched = (given.pop(0) if p is not None else None for p in (self.curvature, self.stretch))
+        return _forms(r0, field, bent, stretched)
+
+
+def _forms(r0: Jet, field: Expr, bent: Expr | None, stretched: Expr | None) -> Forms:
     a0, up, n0 = kin.metric(r0), kin.inverse_metric(r0), kin.normal(r0)
+    kappa = ufl.zero((2, 2)) if bent is None else bent * _covariant(r0, field, 0)
+    if stretched is None:
+        return Forms(ufl.zero((2, 2)), kappa, a0, up, ufl.as_ufl(1), ufl.as_ufl(1))
     b12 = ufl.dot(n0, r0.r12)
     b0 = ufl.as_matrix([[ufl.dot(n0, r0.r11), b12], [b12, ufl.dot(n0, r0.r22)]])
-    T, kappa, t = _covariant(r0, field, 0), _covariant(r0, field, 6), stretched * field[12]
-    mixed = stretched * ufl.dot(up, T)
+    t = stretched * field[12]
+    mixed = stretched * ufl.dot(up, _covariant(r0, field, 6))
     U = ufl.Identity(2) + mixed
     twice = 2 * mixed + ufl.dot(mixed, mixed)  # U^2 - 1
     metric = a0 + ufl.dot(a0, twice)
     grown = (ufl.sym(ufl.dot(b0, twice)) - t * b0) / (1 + t)
     return Forms(
         ufl.dot(a0, twice) / 2,
-        grown + bent * ufl.dot(ufl.transpose(U), ufl.dot(kappa, U)),
+        grown if bent is None else grown + ufl.dot(ufl.transpose(U), ufl.dot(kappa, U)),
         metric,
         ufl.inv(metric),
         ufl.det(U),
@@ -184,25 +220,19 @@ def forms(r0: Jet, field: Expr, bent: Expr, stretched: Expr) -> Forms:
     )
 
 
-def grown(density: Density, field: fem.Function, bent: fem.Constant, stretched: fem.Constant) -> Density:
-    """A density that takes `natural` forms, of the shape with that field and these amplitudes."""
+def grown(density: Density, shape: Shape) -> Density:
+    """A density that takes `natural` forms, of that shape."""
 
     def of(*arguments: Expr) -> Expr:
-        *given, numbers, curvature, stretch = arguments
+        count = len(arguments) - len(shape.parameters)
+        given, (field, *amplitudes) = arguments[:count], arguments[count:]
         r0 = given[0]
         if isinstance(r0, Jet):
-            return density.of(*given, natural=forms(r0, numbers, curvature, stretch))
-        sides = tuple(forms(j, side, curvature, stretch) for j, side in zip(r0, numbers, strict=True))
+            return density.of(*given, natural=shape.forms(r0, field, *amplitudes))
+        sides = tuple(shape.forms(j, side, *amplitudes) for j, side in zip(r0, field, strict=True))
         return density.of(*given, natural=sides)
 
-    parameters: tuple[Parameter, ...] = (*density.parameters, field, bent, stretched)
-    return replace(density, of=of, parameters=parameters)
-
-
-def amplitudes(domain: mesh.Mesh, known: Constants) -> tuple[fem.Constant, fem.Constant]:
-    """Those of curvature and stretch as constants, the same in all terms of a model."""
-    bent, stretched = (known.setdefault(name, fem.Constant(domain, 0.0)) for name in (CURVATURE, STRETCH))
-    return bent, stretched
+    return replace(density, of=of, parameters=(*density.parameters, *shape.parameters))
 
 
 def _covariant(r0: Jet, field: Expr, first: int) -> Expr:
@@ -214,7 +244,9 @@ def _covariant(r0: Jet, field: Expr, first: int) -> Expr:
     return ufl.as_matrix([[ufl.dot(r0.r1, S1), S12], [S12, ufl.dot(r0.r2, S2)]])
 
 
-def _values(value: Varying, r0: Array, n0: Array) -> Array:
+def _values(value: Varying | None, r0: Array, n0: Array) -> Array:
+    if value is None:
+        return np.zeros_like(r0)
     assert not isinstance(value, Mapping)
     return value(r0, n0) if callable(value) else np.broadcast_to(value, r0.shape)
 

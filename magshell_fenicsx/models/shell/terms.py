@@ -25,7 +25,7 @@ from magshell_fenicsx.models.shell.energy import (
 from magshell_fenicsx.models.shell.free import Constants, constants_of
 from magshell_fenicsx.models.shell.kinematics import CURVED, MOVED, SECOND, Jet
 from magshell_fenicsx.models.shell.moment import MomentTerm
-from magshell_fenicsx.models.shell.natural import amplitudes, grown
+from magshell_fenicsx.models.shell.natural import Shape, grown
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.parameters import MagneticEnergy, Magnetisation, Material
 from magshell_fenicsx.models.shell.patterns import pattern_field
@@ -56,7 +56,7 @@ class TermFactory:
     degree: int
     log: KernelLog
     thickness: fem.Function | None = None
-    natural: fem.Function | None = None
+    natural: Shape | None = None
     free: Constants = field(default_factory=dict)  # of parameters that enter freely
 
     def membrane(self) -> ShellTerm:
@@ -182,7 +182,7 @@ class TermFactory:
 
     def _grown(self, density: Density) -> Density:
         """The density of the natural shape, if there is one."""
-        return grown(density, self.natural, *amplitudes(self._domain, self.free)) if self.natural else density
+        return grown(density, self.natural) if self.natural else density
 
     def _nu_h(self) -> tuple[Parameter, Parameter]:
         return self._constant(self.material.nu), self._constant(self.material.h)
