@@ -110,7 +110,9 @@ class Case(WithParts):
         if isinstance(self.loading, FieldSection) and not self.lambda_m:
             raise ValueError("loading.kind: field needs magnetic.lambda_m, not zero, for its target or direction")
         if isinstance(self.loading, GrowthSection) and getattr(self.natural, self.loading.grows, None) is None:
-            raise ValueError(f"loading.{self.loading.grows}: is a factor of natural.{self.loading.grows}: give that too")
+            raise ValueError(
+                f"loading.{self.loading.grows}: is a factor of natural.{self.loading.grows}: give that too"
+            )
         self._natural_parts()
         if isinstance(self.loading, RotationSection):
             if not self.magnetic or not self.lambda_m:

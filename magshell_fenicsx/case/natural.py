@@ -5,24 +5,55 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import BeforeValidator, Field, model_validator
 
+from magshell_fenicsx.case.expressions import formula
 from magshell_fenicsx.case.fields import Formula
 from magshell_fenicsx.parts.section import _NUMBER, Section, in_units
 
-_PER_LENGTH = re.compile(rf"\s*({_NUMBER})[\s*]*(?:/\s*|1\s*/\s*)([^\W\d]+)\s*|\s*({_NUMBER})[\s*]*([^\W\d]+)\s*(\*\*|\^)\s*-1\s*")
+_PER_LENGTH = re.compile(
+    rf"\s*(?P<number>{_NUMBER})[\s*]*(?:1?\s*/\s*(?P<below>[^\W\d]+)|(?P<power>[^\W\d]+)\s*(?:\*\*|\^)\s*-1)\s*"
+)
+PLACE = ("x", "y", "z", "pi")
 
 
 def per_length(value: Any) -> Any:
     """Text such as "5/m" or "5 m^-1" as a number in 1/m; all else, formulas too, as it is."""
-    if not (isinstance(value, str) and (found := _PER_LENGTH.fullmatch(value))):
+    found = _PER_LENGTH.fullmatch(value) if isinstance(value, str) else None
+    unit = found and (found["below"] or found["power"])
+    if not found or unit in PLACE:
         return value
-    number, unit = found[1] or found[4], found[3] or found[6]
-    return value if unit in ("x", "y", "z", "pi") else in_units("1/metre")(f"{number} {unit}**-1")
+    return in_units("1/metre")(f"{found['number']} {unit}**-1")
 
 
-Curvature = Annotated[Annotated[float, Field(ge=-1e9, le=1e9)] | Formula, BeforeValidator(per_length)]
-Stretch = Annotated[float, Field(ge=0.05, le=20)]
-Curvatures = Curvature | Annotated[list[Curvature], Field(min_length=3, max_length=3)]
-Stretches = Stretch | Formula | Annotated[list[Stretch | Formula], Field(min_length=2, max_length=2)]
+def _components(numbers: int, least: float, most: float, *, lengths: bool = False) -> BeforeValidator:
+    """One value, a list of this many, or a mapping of patches to either; a value is a number or a formula."""
+
+    def one(value: Any) -> Any:
+        value = per_length(value) if lengths else value
+        if isinstance(value, str):
+            formula(value)
+        elif isinstance(value, bool) or not isinstance(value, int | float) or not least <= value <= most:
+            raise ValueError(f"{value!r}: allowed are numbers from {least:g} to {most:g}, and formulas of x, y, z")
+        return value
+
+    def some(value: Any) -> Any:
+        if isinstance(value, list) and len(value) != numbers:
+            raise ValueError(f"a list has {numbers} values, this has {len(value)}")
+        return [one(v) for v in value] if isinstance(value, list) else one(value)
+
+    def read(value: Any) -> Any:
+        if not isinstance(value, dict):
+            return value if value is None else some(value)
+        for name, each in value.items():
+            if any(isinstance(v, str) and per_length(v) is v for v in (each if isinstance(each, list) else [each])):
+                raise ValueError(f"{name}: of a patch numbers, no formulas")
+        return {name: some(each) for name, each in value.items()}
+
+    kind = Number | Annotated[list[Number], Field(min_length=numbers, max_length=numbers)]
+    return BeforeValidator(read, json_schema_input_type=kind | dict[str, kind] | None)
+
+
+Number = float | str
+Values = Number | list[Number] | dict[str, Number | list[Number]] | None
 
 
 class NaturalSection(Section):
@@ -34,10 +65,10 @@ class NaturalSection(Section):
     dimple, and for the rest.
     """
 
-    curvature: Curvatures | dict[str, Curvatures] | None = None
+    curvature: Annotated[Values, _components(3, -1e9, 1e9, lengths=True)] = None
     """In addition to the drawn one, per natural length, positive where the surface bends towards its normal: one number
     for all directions (a sphere), or k11, k22, k12 in the frame of `along` [1/length]"""
-    stretch: Stretches | dict[str, Stretches] | None = None
+    stretch: Annotated[Values, _components(2, 0.05, 20)] = None
     """Natural over drawn length: one number for all directions, the thickness too, or two along t1 and t2 of `along`,
     with the thickness as drawn"""
     along: Literal["meridian"] | Annotated[list[float | Formula], Field(min_length=3, max_length=3)] | None = None
@@ -48,12 +79,6 @@ class NaturalSection(Section):
     def _something_grows(self) -> Self:
         if self.curvature is None and self.stretch is None:
             raise ValueError("give curvature, stretch, or both")
-        for key in ("curvature", "stretch"):
-            of_patches = getattr(self, key)
-            if isinstance(of_patches, dict):
-                for name, value in of_patches.items():
-                    if any(isinstance(v, str) for v in (value if isinstance(value, list) else [value])):
-                        raise ValueError(f"{key}.{name}: of a patch numbers, no formulas")
         return self
 
     @property
@@ -69,6 +94,7 @@ def components(value: Any) -> list[float | str]:
 
 def measured(data: Any) -> list[str]:
     """The keys of plain data whose curvature has a unit."""
+
     def units(value: Any) -> bool:
         values = value.values() if isinstance(value, dict) else value if isinstance(value, list) else [value]
         return any(units(v) if isinstance(v, list) else per_length(v) is not v for v in values)

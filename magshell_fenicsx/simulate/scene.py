@@ -140,7 +140,9 @@ class Scene:
         """The amplitudes of the natural shape, of user-defined energies and their parameters, with their initial values."""
         terms, natural = self.plan.loads.own, self.plan.loads.natural
         grown = dict.fromkeys(natural.amplitudes, 0.0) if natural else {}
-        return grown | {term.name: term.value for term in terms} | {p.name: p.value for term in terms for p in term.free}
+        return (
+            grown | {term.name: term.value for term in terms} | {p.name: p.value for term in terms for p in term.free}
+        )
 
     @property
     def extra_columns(self) -> tuple[str, ...]:

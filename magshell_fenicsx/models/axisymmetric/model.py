@@ -20,13 +20,14 @@ from magshell_fenicsx.models.axisymmetric.dead_load import dead_loads, pole_forc
 from magshell_fenicsx.models.axisymmetric.energies import INTERIOR, Energy, EnergyFactory
 from magshell_fenicsx.models.axisymmetric.instability import ExcludedWaves
 from magshell_fenicsx.models.axisymmetric.meridian import Meridian
-from magshell_fenicsx.models.axisymmetric.pattern import thickness_field
+from magshell_fenicsx.models.axisymmetric.pattern import places, thickness_field
 from magshell_fenicsx.models.axisymmetric.probe import Array, Probe
 from magshell_fenicsx.models.axisymmetric.supports import supports
 from magshell_fenicsx.models.axisymmetric.waves import Waves
 from magshell_fenicsx.models.observed import Observed
 from magshell_fenicsx.models.shell import edges
 from magshell_fenicsx.models.shell.energy import Density
+from magshell_fenicsx.models.shell.natural import Shape, natural_field
 from magshell_fenicsx.models.shell.moment import Counted
 from magshell_fenicsx.models.shell.parameters import Condition, EdgeMoment, Loads, Material, default_penalty
 from magshell_fenicsx.models.shell.thickness import Thickness
@@ -83,7 +84,11 @@ class MeridianModel(Observed):
         self.r0, self.u = meridian.placement(V), fem.Function(V, name="u")
         self.sigma = default_penalty(degree) if sigma is None else sigma
         self.thickness = thickness_field(thickness, self.r0) if thickness else None
-        self.factory = factory = EnergyFactory(meridian, self.r0, material, self.sigma, degree, self.thickness)
+        free, shape = dict[str, fem.Constant](), None
+        if loads.natural:
+            shape = Shape.of(natural_field(loads.natural, *places(self.r0), V), loads.natural, free)
+        factory = EnergyFactory(meridian, self.r0, material, self.sigma, degree, self.thickness, shape, free)
+        self.factory = factory
         self.supports = supports(meridian, conditions, pressure=loads.pressure)
         self.energies = [factory.membrane(), factory.bending(), factory.interior_edges()]
         if len(self.supports.clamped):

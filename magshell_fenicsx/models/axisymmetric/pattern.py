@@ -13,7 +13,7 @@ def pattern_field(pattern: Pattern, r0: fem.Function) -> fem.Function:
     V = r0.function_space
     Q = fem.functionspace(V.mesh, ("DG", V.element.basix_element.degree, (3,)))
     field = fem.Function(Q, name="Br")
-    field.x.array.reshape(-1, 3)[Q.dofmap.list] = pattern(_nodes(r0), cell_normals(r0))
+    field.x.array.reshape(-1, 3)[Q.dofmap.list] = pattern(*places(r0))
     return field
 
 
@@ -22,6 +22,11 @@ def thickness_field(thickness: Thickness, r0: fem.Function) -> fem.Function:
     assert thickness.of_position
     nodes = _nodes(r0)
     return nodal_thickness(thickness.of_position(*np.moveaxis(nodes, -1, 0)), nodes, r0.function_space)
+
+
+def places(r0: fem.Function) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The nodes of every cell and the normals there, (cells, nodes, 3) each."""
+    return _nodes(r0), cell_normals(r0)
 
 
 def _nodes(r0: fem.Function) -> NDArray[np.float64]:

@@ -68,9 +68,14 @@ class Natural:
             If there is no such patch.
         """
         given = {"curvature": self.curvature, "stretch": self.stretch}
-        return replace(self, **{
-            key: by_patch(value, patches, cells, f"natural.{key}") for key, value in given.items() if isinstance(value, Mapping)
-        })
+        return replace(
+            self,
+            **{
+                key: by_patch(value, patches, cells, f"natural.{key}")
+                for key, value in given.items()
+                if isinstance(value, Mapping)
+            },
+        )
 
     def at(self, r0: Array, n0: Array) -> tuple[Array, Array, Array]:
         """T and kappa (..., 3, 3) in space, and t (...), at places with these normals (cells, nodes, 3)."""

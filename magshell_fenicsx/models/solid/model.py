@@ -4,7 +4,7 @@ Lengths in R, energies in E h R^2, amplitudes as in `ShellModel`. Displacements 
 of the thickness; the pressure, the volume and the loaded patch are of the outer face.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from functools import cached_property
 
@@ -28,10 +28,11 @@ from magshell_fenicsx.models.shell.parameters import Condition, EdgeMoment, Load
 from magshell_fenicsx.models.shell.supports import closing_point, open_to_pressure
 from magshell_fenicsx.models.solid.loads import BodyMeasures, outer_patch
 from magshell_fenicsx.models.solid.material import NeoHookean
+from magshell_fenicsx.models.solid.natural import body_shape, grown
 from magshell_fenicsx.models.solid.remanence import in_cells
 from magshell_fenicsx.models.solid.sites import make_sites
 from magshell_fenicsx.models.solid.supports import supports
-from magshell_fenicsx.models.solid.terms import TermFactory
+from magshell_fenicsx.models.solid.terms import Density, TermFactory
 
 Array = NDArray[np.float64]
 MIRRORS = ("symmetry", "plane")
@@ -87,7 +88,13 @@ class SolidModel(Observed):
         self.u, self.r0 = fem.Function(V, name="u"), fem.Function(V, name="r0")
         self.r0.interpolate(lambda x: x)
         hinged = tuple(n for n, c in conditions.items() if n in body.faces and c not in ("free", "clamped", *MIRRORS))
-        self.factory = factory = TermFactory(body, self.u, neo_hookean, material.h, self.kernels, hinged)
+        free, growing = dict[str, fem.Constant](), dict[str, Callable[[Density], Density]]()
+        if loads.natural:
+            shape = body_shape(loads.natural, body, V, free)
+            growing["grown"] = lambda density: grown(density, shape)
+        self.factory = factory = TermFactory(
+            body, self.u, neo_hookean, material.h, self.kernels, hinged, free=free, **growing
+        )
         self._pattern = factory.distortion()
         self._held, planes = supports(body, self.r0, conditions)
         origin = self._closing_point([mirror, *planes] if self.multiplicity == 2 else planes, conditions)
