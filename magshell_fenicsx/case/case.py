@@ -9,6 +9,7 @@ from pydantic import Field, ModelWrapValidatorHandler, ValidationError, model_va
 
 from magshell_fenicsx.case.boundary import EDGES, BoundarySection
 from magshell_fenicsx.case.defects import DimpleSection
+from magshell_fenicsx.case.expressions import is_formula
 from magshell_fenicsx.case.fields import MagneticSection, layer_average
 from magshell_fenicsx.case.loading import (
     DeadSection,
@@ -93,7 +94,7 @@ class Case(WithParts):
             parts = {key: data.get(key) for key in ("points", "mesh", *PARTS)} | {
                 "loading": loads and data.get("loading")
             }
-            for key in (*texts(parts), *measured(data.get("natural"))):
+            for key in (*texts(parts, is_formula), *measured(data.get("natural"))):
                 raise ValueError(f"{key}: has a unit, but the shell's lengths have none: give all of them one, or none")
         return section
 

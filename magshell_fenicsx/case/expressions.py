@@ -71,6 +71,15 @@ def formula(text: str) -> Callable[[Array, Array, Array], Array]:
     return evaluate
 
 
+def is_formula(text: str) -> bool:
+    """Whether `formula` takes it."""
+    try:
+        formula(text)
+    except ValueError:
+        return False
+    return True
+
+
 def _steps(tree: ast.Expression) -> list[_Step]:
     """What a stack does in turn: a sum of thousand terms is as many levels deep, too deep for recursion.
 

@@ -1,12 +1,13 @@
 """The mechanical load, applied after the field, how it is controlled, and where its path ends."""
 
 from collections.abc import Mapping
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
+from magshell_fenicsx.case.expressions import is_formula
 from magshell_fenicsx.case.fields import Direction
-from magshell_fenicsx.parts.section import Section, or_number
+from magshell_fenicsx.parts.section import Section, in_units, or_number
 
 Until = Annotated[
     Literal["limit", "bifurcation", "target", "points"],
@@ -20,11 +21,29 @@ Count = Annotated[int, Field(ge=1, le=10000, description="Equal parts to the tar
 LEAST_TARGET = 1e-9
 Finite = Annotated[float, Field(ge=-1e30, le=1e30)]
 Moment = Annotated[float, or_number("newton", Finite), Field(ge=-1e30, le=1e30)]
-DeadPressure = Annotated[float, or_number("pascal", Finite), Field(ge=-1e30, le=1e30)]
 Three = Field(min_length=3, max_length=3)
 Force = Annotated[list[Moment], Three]
-PerLength = Annotated[list[Annotated[float, or_number("newton/metre", Finite), Field(ge=-1e30, le=1e30)]], Three]
-PerArea = Annotated[list[DeadPressure], Three]
+LARGEST = 1e30
+
+
+def _or_formula(unit: str) -> Any:
+    """A number, text with a unit, or a formula of x, y, z."""
+
+    def read(value: Any) -> Any:
+        if isinstance(value, str) and is_formula(value):
+            return value
+        found = in_units(unit)(value)
+        if isinstance(found, bool) or not isinstance(found, int | float) or not abs(found) <= LARGEST:
+            raise ValueError(f"{value!r}: allowed are numbers up to {LARGEST:g} in size, with a unit, and formulas")
+        return found
+
+    return BeforeValidator(read, json_schema_input_type=Finite | str)
+
+
+Varying = float | str
+PerLength = Annotated[list[Annotated[Varying, _or_formula("newton/metre")]], Three]
+PerArea = Annotated[list[Annotated[Varying, _or_formula("pascal")]], Three]
+VaryingPressure = Annotated[Varying, _or_formula("pascal")]
 Wanted = Mapping[str, tuple[str, ...]]  # control -> the targets that it can have
 
 
@@ -118,7 +137,8 @@ class DeadLoadSection(Section):
 
     On an edge: `force` in all, `per_length`, or `moment` per length about the edge's first tangent, which turns
     with the edge. Over the surface (`over: all`, or a patch of a mesh): `per_area`, or `pressure` along the
-    undeformed normal, positive from outside.
+    undeformed normal, positive from outside. What is per length or area may be a formula of the undeformed place
+    x, y, z in the shell's length, such as "cos(2*arctan2(y, x))".
     """
 
     at: str | None = None
@@ -135,7 +155,7 @@ class DeadLoadSection(Section):
     """On an edge, about its tangent with the surface on its left; positive turns the normal outward [force]"""
     per_area: PerArea | None = None
     """Over the surface [force/length²]"""
-    pressure: DeadPressure | None = None
+    pressure: VaryingPressure | None = None
     """Over the surface, against the undeformed normal [force/length²]"""
 
     @model_validator(mode="after")
@@ -154,6 +174,16 @@ class DeadLoadSection(Section):
         if not (any(value) if isinstance(value, list) else value):
             raise ValueError(f"{given[0]}: is zero")
         return self
+
+    @property
+    def vector(self) -> list[Varying] | None:
+        """Its components, if it has a direction in space."""
+        return next((list(v) for v in (self.force, self.per_length, self.per_area) if v is not None), None)
+
+    @property
+    def varies(self) -> bool:
+        """Whether it has a formula."""
+        return isinstance(self.pressure, str) or any(isinstance(v, str) for v in self.vector or [])
 
 
 class DeadSection(PathSection):

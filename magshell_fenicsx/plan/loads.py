@@ -27,6 +27,8 @@ from magshell_fenicsx.models.shell.parameters import (
     PointForce,
 )
 from magshell_fenicsx.plan.magnetisation import magnetisation
+from magshell_fenicsx.models.shell.patterns import Pattern
+from magshell_fenicsx.plan.by_formula import ByFormula, function
 from magshell_fenicsx.plan.natural import natural
 from magshell_fenicsx.plan.outline import Outline
 
@@ -107,6 +109,10 @@ def _dead(load: DeadLoadSection, case: Case, turn: float, mirror: Mirror | None)
     shared = mirror is not None and (load.edge is None or mirror.other(load.edge) == load.edge)
     Q, scales = rotation(turn), case.scales
     E, t, R = scales.E, scales.h, scales.R
+    if load.varies:
+        unit = E * t if load.edge else E * t / R
+        pattern = _pattern(load, Q, R, 1 / unit)
+        return EdgeForce(load.edge, pattern, total=False) if load.edge else AreaForce(_over(load), pattern)
     force = np.asarray((0.5 if shared else 1.0) * (Q @ (load.force or np.zeros(3))) / (E * t * R))
     if load.at is not None:
         return PointForce(load.at, force)
@@ -117,8 +123,21 @@ def _dead(load: DeadLoadSection, case: Case, turn: float, mirror: Mirror | None)
     if load.edge is not None:
         assert load.per_length is not None
         return EdgeForce(load.edge, np.asarray(Q @ load.per_length / (E * t)), total=False)
-    patch = None if load.over == "all" else load.over
     if load.pressure is not None:
-        return AreaForce(patch, load.pressure * R / (E * t))
+        assert isinstance(load.pressure, float | int)
+        return AreaForce(_over(load), load.pressure * R / (E * t))
     assert load.per_area is not None
-    return AreaForce(patch, np.asarray(Q @ load.per_area * R / (E * t)))
+    return AreaForce(_over(load), np.asarray(Q @ load.per_area * R / (E * t)))
+
+
+def _over(load: DeadLoadSection) -> str | None:
+    return None if load.over == "all" else load.over
+
+
+def _pattern(load: DeadLoadSection, Q: Array, length: float, factor: float) -> Pattern:
+    """The load of a formula in the model's frame; a pressure is against the normal."""
+    if load.vector is not None:
+        return ByFormula([function(v) for v in load.vector], Q, length, factor, vectors=True)
+    assert load.pressure is not None
+    p = ByFormula([function(load.pressure)], Q, length, factor)
+    return lambda r0, n0: -p(r0, n0) * n0

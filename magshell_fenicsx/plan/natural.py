@@ -1,13 +1,11 @@
 """The natural shape of a case in the model's frame, and the symmetry that it leaves."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.expressions import formula
 from magshell_fenicsx.case.natural import components
 from magshell_fenicsx.case.shell import ShellSection
 from magshell_fenicsx.case.surfaces import MeshSurface, PlateSurface
@@ -15,28 +13,13 @@ from magshell_fenicsx.mesh.frame import rotation
 from magshell_fenicsx.mesh.mirror import Mirror
 from magshell_fenicsx.models.shell.natural import Natural, Varying, meridians
 from magshell_fenicsx.models.shell.patterns import InsideAndOutside
+from magshell_fenicsx.plan.by_formula import ByFormula, function
 from magshell_fenicsx.plan.outline import Outline
 from magshell_fenicsx.plan.turning import scalar_turns
 
 Array = NDArray[np.float64]
 SAME = 1e-9  # of the largest value: differences that are rounding
 MERIDIAN = "meridian"
-
-
-@dataclass(frozen=True)
-class ByFormula:
-    """Vectors of numbers and formulas of the undeformed place, in a frame and a unit of length of their own."""
-
-    of_position: Sequence[Callable[[Array, Array, Array], Array]]
-    frame: Array
-    length: float
-    factor: float = 1.0
-    vectors: bool = False
-
-    def __call__(self, r0: Array, n0: Array) -> Array:
-        x = np.moveaxis(self.length * r0 @ self.frame, -1, 0)
-        found = self.factor * np.stack([f(*x) for f in self.of_position], axis=-1)
-        return found @ self.frame.T if self.vectors else found
 
 
 def natural(case: Case, turn: float) -> Natural | None:
@@ -52,7 +35,7 @@ def natural(case: Case, turn: float) -> Natural | None:
         if not isinstance(value, dict):
             found = whole(value)
             if any(isinstance(v, str) for v in found):
-                return ByFormula([_function(v) for v in found], Q, R, factor)
+                return ByFormula([function(v) for v in found], Q, R, factor)
             return factor * np.array(found, dtype=float)
         vectors = {name: factor * np.array(whole(each), dtype=float) for name, each in value.items()}
         if isinstance(case.shell, MeshSurface):
@@ -61,7 +44,7 @@ def natural(case: Case, turn: float) -> Natural | None:
         return InsideAndOutside(case.dimple_half_width, vectors.get("dimple", outside), outside)
 
     direction = along(case)
-    pattern = meridians if direction == MERIDIAN else ByFormula([_function(v) for v in direction], Q, R, vectors=True)
+    pattern = meridians if direction == MERIDIAN else ByFormula([function(v) for v in direction], Q, R, vectors=True)
     return Natural(varying(section.curvature, _curvatures, R), varying(section.stretch, _stretches, 1.0), pattern)
 
 
@@ -106,7 +89,7 @@ def mirrored(case: Case, outline: Outline, mirror: Mirror) -> bool:
     x, R, direction = outline.sample(), case.shell.reference, along(case)
 
     def alike(text: float | str, sign: float = 1.0) -> bool:
-        here, there = (_function(text)(*(R * places).T) for places in (x, mirror.image(x)))
+        here, there = (function(text)(*(R * places).T) for places in (x, mirror.image(x)))
         size = np.abs(here).max(initial=0.0)
         return bool(np.isfinite(here).all() and (np.abs(here - sign * there) <= SAME * size).all())
 
@@ -118,7 +101,7 @@ def mirrored(case: Case, outline: Outline, mirror: Mirror) -> bool:
         return True
     if direction == MERIDIAN:
         return mirror.through_e3 or bool(np.hypot(*mirror.normal[:2]) == 0)
-    d, image = (np.stack([_function(v)(*(R * p).T) for v in direction], -1) for p in (x, mirror.image(x)))
+    d, image = (np.stack([function(v)(*(R * p).T) for v in direction], -1) for p in (x, mirror.image(x)))
     return any(bool((np.abs(d @ mirror.reflection - sign * image) <= SAME * np.abs(d).max()).all()) for sign in (1, -1))
 
 
@@ -136,9 +119,3 @@ def _stretches(value: object) -> list[float | str]:
     found = components(value)
     less = [f"{v} - 1" if isinstance(v, str) else v - 1 for v in found]
     return [*less, 0.0] if len(found) == 2 else less * 3
-
-
-def _function(value: float | str) -> Callable[[Array, Array, Array], Array]:
-    if isinstance(value, str):
-        return formula(value)
-    return lambda x, y, z: np.full_like(x, value)

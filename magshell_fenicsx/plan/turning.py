@@ -20,9 +20,9 @@ def scalar_turns(text: str, span: Span, length: float = 1.0) -> bool:
     return _same([f(*(places @ rotation(angle)).T)[:, None] for angle in ANGLES])
 
 
-def vector_turns(components: Sequence[str], span: Span) -> bool:
+def vector_turns(components: Sequence[str], span: Span, length: float = 1.0) -> bool:
     """Whether the vector with these components turns with the meridian and has none across it."""
-    fs, places, found = [formula(text) for text in components], _places(span), []
+    fs, places, found = [formula(text) for text in components], length * _places(span), []
     for Q in map(rotation, ANGLES):
         found.append(np.column_stack([f(*(places @ Q).T) for f in fs]) @ Q.T)
     return _same([*found, found[0] * [1.0, 0.0, 1.0]])

@@ -98,10 +98,10 @@ class PointForce:
 
 @dataclass(frozen=True)
 class EdgeForce:
-    """A dead force (3,) on a named edge: per length over E h or, if `total`, in all over E h R."""
+    """A dead force (3,), or a pattern, on a named edge: per length over E h or, if `total`, in all over E h R."""
 
     edge: str
-    force: NDArray[np.float64]
+    force: NDArray[np.float64] | Pattern
     total: bool
 
 
@@ -115,13 +115,13 @@ class EdgeMoment:
 
 @dataclass(frozen=True)
 class AreaForce:
-    """A dead force (3,) per undeformed area over E h/R, on a patch, or on all.
+    """A dead force (3,), or a pattern, per undeformed area over E h/R, on a patch, or on all.
 
     A number in place of the vector is a pressure along the undeformed normal, positive from outside.
     """
 
     patch: str | None
-    force: NDArray[np.float64] | float
+    force: NDArray[np.float64] | float | Pattern
 
 
 DeadLoad = PointForce | EdgeForce | EdgeMoment | AreaForce

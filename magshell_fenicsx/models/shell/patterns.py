@@ -12,6 +12,7 @@ from magshell_fenicsx.mesh.patch import MeshError
 
 Array = NDArray[np.float64]
 LARGEST = 1e6  # of a remanence's components
+FINER = 2  # degrees of a load by formula above that of the displacement: no part of the error
 # (cells, nodes, 3) positions r0 and normals n0 -> (cells, nodes, 3) vectors
 Pattern = Callable[[Array, Array], Array]
 
@@ -97,8 +98,13 @@ def by_patch(
     return ByPatch(found)
 
 
-def pattern_field(pattern: Pattern, r0: fem.Function) -> fem.Function:
+def pattern_field(pattern: Pattern, r0: fem.Function, finer: int = 0) -> fem.Function:
     """The pattern at the nodes of every cell, free to jump from cell to cell; collective.
+
+    Parameters
+    ----------
+    finer
+        By how much the degree of the field is above that of r0.
 
     Raises
     ------
@@ -106,26 +112,26 @@ def pattern_field(pattern: Pattern, r0: fem.Function) -> fem.Function:
         On every rank, if it has no finite value somewhere.
     """
     V = r0.function_space
-    nodes, n0 = places(r0)
-    Q = fem.functionspace(V.mesh, ("DG", V.element.basix_element.degree, (3,)))
+    Q = fem.functionspace(V.mesh, ("DG", V.element.basix_element.degree + finer, (3,)))
+    nodes, n0 = places(r0, Q.element.basix_element.points)
     field = fem.Function(Q, name="Br")
     vectors = pattern(nodes, n0)
-    refuse_unbounded(vectors, nodes, V.mesh.comm)
+    refuse_unbounded(vectors, nodes, V.mesh.comm, "loading.loads" if finer else "magnetic.remanent")
     field.x.array.reshape(-1, 3)[Q.dofmap.list] = vectors
     return field
 
 
-def places(r0: fem.Function) -> tuple[Array, Array]:
-    """The nodes of every cell and the normals of the cell there, (cells, nodes, 3) each."""
+def places(r0: fem.Function, at: Array | None = None) -> tuple[Array, Array]:
+    """The nodes of every cell, or other reference points (n, 2), and the cell's normals there: (cells, n, 3) each."""
     V = r0.function_space
     element = V.element.basix_element
-    nodes = r0.x.array.reshape(-1, 3)[V.dofmap.list]
-    a1, a2 = np.einsum("dvk,cki->dcvi", element.tabulate(1, element.points)[1:, :, :, 0], nodes)
+    table = element.tabulate(1, element.points if at is None else at)[..., 0]
+    x, a1, a2 = np.einsum("dvk,cki->dcvi", table, r0.x.array.reshape(-1, 3)[V.dofmap.list])
     m = np.cross(a1, a2)
-    return nodes, np.asarray(m / np.linalg.norm(m, axis=-1, keepdims=True))
+    return x, np.asarray(m / np.linalg.norm(m, axis=-1, keepdims=True))
 
 
-def refuse_unbounded(vectors: Array, nodes: Array, comm: MPI.Comm) -> None:
+def refuse_unbounded(vectors: Array, nodes: Array, comm: MPI.Comm, key: str = "magnetic.remanent") -> None:
     """Look at vectors and places (cells, nodes, 3); collective.
 
     Raises
@@ -137,6 +143,6 @@ def refuse_unbounded(vectors: Array, nodes: Array, comm: MPI.Comm) -> None:
     if said := [place for places in comm.allgather(bad) for place in places]:
         x, y, z = said[0]
         raise MeshError(
-            f"magnetic.remanent: has no finite value (or one above {LARGEST:g}) at (x, y, z)/R = "
+            f"{key}: has no finite value (or one above {LARGEST:g}) at (x, y, z)/R = "
             f"({x:.3g}, {y:.3g}, {z:.3g})"
         )
