@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import BeforeValidator, Field, model_validator
 
 from magshell_fenicsx.case.expressions import is_formula
-from magshell_fenicsx.case.fields import Direction
+from magshell_fenicsx.case.fields import Direction, Formula
 from magshell_fenicsx.parts.section import Section, in_units, or_number
 
 Until = Annotated[
@@ -157,10 +157,13 @@ class DeadLoadSection(Section):
     """Over the surface [force/length²]"""
     pressure: VaryingPressure | None = None
     """Over the surface, against the undeformed normal [force/length²]"""
+    potential: Formula | None = None
+    """Over all: energy per undeformed area as a formula of the deformed place x, y, z in the shell's length, whose
+    negative gradient is the force: gravity, springs, a field of force [force/length]"""
 
     @model_validator(mode="after")
     def _one_load_in_one_place(self) -> Self:
-        fitting = {"at": ("force",), "edge": ("force", "per_length", "moment"), "over": ("per_area", "pressure")}
+        fitting = {"at": ("force",), "edge": ("force", "per_length", "moment"), "over": ("per_area", "pressure", "potential")}
         places = [place for place in fitting if getattr(self, place) is not None]
         if len(places) != 1:
             raise ValueError(
@@ -173,6 +176,8 @@ class DeadLoadSection(Section):
         value = getattr(self, given[0])
         if not (any(value) if isinstance(value, list) else value):
             raise ValueError(f"{given[0]}: is zero")
+        if self.potential is not None and self.over != "all":
+            raise ValueError(f"potential: goes with over: all, not with {self.over}")
         return self
 
     @property
@@ -209,9 +214,10 @@ class DeadSection(PathSection):
     def _target_fits_control(self) -> Self:
         wanted = {"load": ("factor",), "displacement": ("displacement",), "arc": ("factor", "displacement")}
         self._check(self.control, self.until, {"factor": self.factor, "displacement": self.displacement}, wanted)
-        if any(load.moment is not None for load in self.loads) and (
-            self.control == "displacement" or self.displacement is not None
-        ):
+        by_place = self.control == "displacement" or self.displacement is not None
+        if by_place and any(load.potential is not None for load in self.loads):
+            raise ValueError("displacement: a potential has none; take control: arc or load with factor")
+        if by_place and any(load.moment is not None for load in self.loads):
             raise ValueError("displacement: a moment has none; take control: arc or load with factor")
         if self.branches and any(load.moment is not None for load in self.loads):
             raise ValueError("branches: not with a moment, whose potential counts the turns along one path")

@@ -3,9 +3,12 @@
 from math import radians
 
 import numpy as np
+import ufl
 from numpy.typing import NDArray
+from ufl.core.expr import Expr
 
 from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.expressions import symbolic
 from magshell_fenicsx.case.loading import (
     DeadLoadSection,
     DeadSection,
@@ -16,6 +19,7 @@ from magshell_fenicsx.case.loading import (
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.mesh.frame import rotation
 from magshell_fenicsx.mesh.mirror import Mirror
+from magshell_fenicsx.models.shell.kinematics import Jet
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.parameters import (
     AreaForce,
@@ -25,6 +29,7 @@ from magshell_fenicsx.models.shell.parameters import (
     Force,
     Loads,
     PointForce,
+    Potential,
 )
 from magshell_fenicsx.plan.magnetisation import magnetisation
 from magshell_fenicsx.models.shell.patterns import Pattern
@@ -33,6 +38,8 @@ from magshell_fenicsx.plan.natural import natural
 from magshell_fenicsx.plan.outline import Outline
 
 Array = NDArray[np.float64]
+SYMBOLIC = {name: getattr(ufl, name) for name in ("sin", "cos", "tan", "exp", "sqrt", "sign")}
+SYMBOLIC |= {"log": ufl.ln, "abs": abs, "arctan2": ufl.atan2}
 
 
 def loads(case: Case, under: str, turn: float, mirror: Mirror | None, own: tuple[OwnTerm, ...]) -> Loads:
@@ -109,6 +116,8 @@ def _dead(load: DeadLoadSection, case: Case, turn: float, mirror: Mirror | None)
     shared = mirror is not None and (load.edge is None or mirror.other(load.edge) == load.edge)
     Q, scales = rotation(turn), case.scales
     E, t, R = scales.E, scales.h, scales.R
+    if load.potential is not None:
+        return Potential(_potential(load.potential, Q, R, 1 / (E * t)))
     if load.varies:
         unit = E * t if load.edge else E * t / R
         pattern = _pattern(load, Q, R, 1 / unit)
@@ -141,3 +150,23 @@ def _pattern(load: DeadLoadSection, Q: Array, length: float, factor: float) -> P
     assert load.pressure is not None
     p = ByFormula([function(load.pressure)], Q, length, factor)
     return lambda r0, n0: -p(r0, n0) * n0
+
+
+def potentials(case: Case, turn: float = 0.0) -> list[OwnTerm]:
+    """The energies of loads that depend on the deformed place, in a frame turned about e3 (rad)."""
+    listed = case.loading.loads if isinstance(case.loading, DeadSection) else []
+    s, Q = case.scales if listed else None, rotation(turn)
+    return [_potential(load.potential, Q, s.R, 1 / (s.E * s.h)) for load in listed if s and load.potential]
+
+
+def _potential(text: str, Q: Array, length: float, factor: float) -> OwnTerm:
+    """Zero where nothing has moved."""
+
+    def at(r: Expr, scale: Expr, size: Expr) -> Expr:
+        x = [scale * sum(float(Q[j, i]) * r[j] for j in range(3) if Q[j, i]) for i in range(3)]
+        return size * symbolic(text, SYMBOLIC, *x)
+
+    def density(r0: Jet, u: Jet, scale: Expr, size: Expr) -> Expr:
+        return at(r0.r + u.r, scale, size) - at(r0.r, scale, size)
+
+    return OwnTerm("potential", density, (length, factor))

@@ -12,7 +12,7 @@ from magshell_fenicsx.models.axisymmetric.energies import Energy, EnergyFactory,
 from magshell_fenicsx.models.axisymmetric.pattern import pattern_field
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.kinematics import Jet
-from magshell_fenicsx.models.shell.parameters import AreaForce, DeadLoad, EdgeForce, EdgeMoment, PointForce
+from magshell_fenicsx.models.shell.parameters import AreaForce, DeadLoad, EdgeForce, EdgeMoment, PointForce, Potential
 from magshell_fenicsx.models.shell.patterns import FINER
 
 
@@ -23,7 +23,7 @@ def dead_loads(loads: Sequence[DeadLoad], factory: EnergyFactory, log: KernelLog
     """
     parts, size = list[tuple[Expr, Integral]](), 0.0
     for load in loads:
-        if isinstance(load, EdgeMoment):
+        if isinstance(load, EdgeMoment | Potential):
             continue
         if isinstance(load, PointForce):
             over = factory.at_pole()

@@ -118,9 +118,9 @@ class EnergyFactory:
         unit = self.constant(self.material.classical_pressure / self.material.h)
         return Energy("pressure", lambda u: unit * self.volume_change(u), "pressure")
 
-    def own(self, term: OwnTerm) -> Energy:
-        """The energy of a part or one's own, with the amplitude of its name; it shares the symmetry."""
-        return self._cells(term.name, self._surface(term, term.density), term.name, linear=term.linear)
+    def own(self, term: OwnTerm, amplitude: str | None = None) -> Energy:
+        """The energy of a part or one's own, with the amplitude of its name or another; it shares the symmetry."""
+        return self._cells(term.name, self._surface(term, term.density), amplitude or term.name, linear=term.linear)
 
     def observed(self, term: OwnTerm, u: Jet) -> dict[str, ufl.Form]:
         """What it observes, of the whole shell."""

@@ -29,7 +29,7 @@ from magshell_fenicsx.models.shell import edges
 from magshell_fenicsx.models.shell.energy import Density
 from magshell_fenicsx.models.shell.natural import Shape, natural_field
 from magshell_fenicsx.models.shell.moment import Counted
-from magshell_fenicsx.models.shell.parameters import Condition, EdgeMoment, Loads, Material, default_penalty
+from magshell_fenicsx.models.shell.parameters import Condition, EdgeMoment, Loads, Material, Potential, default_penalty
 from magshell_fenicsx.models.shell.thickness import Thickness
 
 
@@ -105,8 +105,10 @@ class MeridianModel(Observed):
         if loads.force:
             self.energies.append(pole_force(loads.force.patch, self.force_unit, factory, self.kernels))
         moments = [load for load in loads.dead if isinstance(load, EdgeMoment)]
-        if len(loads.dead) > len(moments):
-            dead, self.load_size = dead_loads(loads.dead, factory, self.kernels)
+        self.energies += [factory.own(load.term, "load") for load in loads.dead if isinstance(load, Potential)]
+        vectors = [load for load in loads.dead if not isinstance(load, EdgeMoment | Potential)]
+        if vectors:
+            dead, self.load_size = dead_loads(vectors, factory, self.kernels)
             self.energies.append(dead)
         terms = [self._term(e) for e in self.energies]
         for i, load in enumerate(moments):

@@ -15,7 +15,7 @@ from magshell_fenicsx.mesh.midsurface import Midsurface
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.energy import edge_quadrature
 from magshell_fenicsx.models.shell.load_vector import Entries, Weighted, entries
-from magshell_fenicsx.models.shell.parameters import AreaForce, DeadLoad, EdgeForce, EdgeMoment, PointForce
+from magshell_fenicsx.models.shell.parameters import AreaForce, DeadLoad, EdgeForce, EdgeMoment, PointForce, Potential
 from magshell_fenicsx.models.shell.patterns import FINER, Pattern, pattern_field
 from magshell_fenicsx.models.shell.point_load import point_entries
 from magshell_fenicsx.models.shell.thickness import patch_of
@@ -104,7 +104,7 @@ def assemble_dead_loads(loads: Sequence[DeadLoad], V: fem.FunctionSpace, on: Mea
             spread(along, dx)
             size += strength * dx.total(V, log)
         else:
-            assert isinstance(load, EdgeMoment)
+            assert isinstance(load, EdgeMoment | Potential)  # no load vectors
     vector = np.zeros(3 * V.dofmap.index_map.size_local)
     for dofs, values in parts:
         np.add.at(vector, dofs, values)

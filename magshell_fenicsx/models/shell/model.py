@@ -33,6 +33,7 @@ from magshell_fenicsx.models.shell.parameters import (
     Held,
     Loads,
     Material,
+    Potential,
     default_penalty,
 )
 from magshell_fenicsx.models.shell.patterns import by_patch, places
@@ -173,6 +174,7 @@ class ShellModel(Observed):
                 factory.edge_moment(f"moment {load.edge} {i}", midsurface.edges[load.edge], load.moment)
                 for i, load in enumerate(moments)
             ]
+        terms += [factory.own(load.term, "load") for load in loads.dead if isinstance(load, Potential)]
         self._sites = make_sites(self.r0, degree, terms, self.kernels, factory.prestress())
         fast = FastTangent(self.u, self._sites, held + mirrored)
         gradients = FastResidual(self.r0, self.u, degree, terms, self.kernels)

@@ -124,7 +124,14 @@ class AreaForce:
     force: NDArray[np.float64] | float | Pattern
 
 
-DeadLoad = PointForce | EdgeForce | EdgeMoment | AreaForce
+@dataclass(frozen=True)
+class Potential:
+    """An energy per undeformed area that depends on the deformed place, with the amplitude "load"."""
+
+    term: OwnTerm
+
+
+DeadLoad = PointForce | EdgeForce | EdgeMoment | AreaForce | Potential
 
 
 @dataclass(frozen=True)

@@ -147,12 +147,12 @@ class TermFactory:
         parameters = (unit, self._constant(origin)) if origin.any() else (unit,)
         return self._cells("pressure", Density(densities.pressure, parameters, parts=MOVED), "pressure")
 
-    def own(self, term: OwnTerm) -> ShellTerm:
-        """The energy of a part or one's own, with the amplitude of its name."""
+    def own(self, term: OwnTerm, amplitude: str | None = None) -> ShellTerm:
+        """The energy of a part or one's own, with the amplitude of its name or another."""
         still = tuple(part for part in term.placed_parts if part not in term.parts)  # asked for of r0 alone
         parameters = self._parameters(term)
         density = Density(per_area(term.density), parameters, parts=(*term.parts, *still), linear=still)
-        return self._cells(term.name, density, term.name, linear=term.linear)
+        return self._cells(term.name, density, amplitude or term.name, linear=term.linear)
 
     def observed(self, term: OwnTerm) -> dict[str, ufl.Form]:
         """What it observes."""

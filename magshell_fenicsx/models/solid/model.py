@@ -24,7 +24,7 @@ from magshell_fenicsx.models.observed import Observed
 from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes
 from magshell_fenicsx.models.shell.dead_load import assemble_dead_loads
 from magshell_fenicsx.models.shell.fast_tangent import FastTangent
-from magshell_fenicsx.models.shell.parameters import Condition, EdgeMoment, Loads, Material
+from magshell_fenicsx.models.shell.parameters import Condition, EdgeMoment, Loads, Material, Potential
 from magshell_fenicsx.models.shell.supports import closing_point, open_to_pressure
 from magshell_fenicsx.models.solid.loads import BodyMeasures, outer_patch
 from magshell_fenicsx.models.solid.material import NeoHookean
@@ -113,6 +113,7 @@ class SolidModel(Observed):
             self._terms.append(self.load_with(assemble_dead_loads(loads.dead, V, on, self.kernels)))
             moments = [load for load in loads.dead if isinstance(load, EdgeMoment)]
             self._terms += [factory.moment(f"moment {m.edge} {i}", m.edge, m.moment) for i, m in enumerate(moments)]
+        self._terms += [factory.own(load.term, "load") for load in loads.dead if isinstance(load, Potential)]
         self._faces = [body.faces[n] for n, c in conditions.items() if c == "symmetry"]
         self.mirror = mirror
         self._sites = make_sites(body, self.r0, self._terms, self.kernels)

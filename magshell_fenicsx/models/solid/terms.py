@@ -129,11 +129,11 @@ class TermFactory:
             for name, density in self._enclosing(classical / self.h, origin).items()
         ]
 
-    def own(self, term: OwnTerm) -> SolidTerm:
-        """The energy of a part or one's own on the outer face, with the amplitude of its name."""
+    def own(self, term: OwnTerm, amplitude: str | None = None) -> SolidTerm:
+        """The energy of a part or one's own on the outer face, with the amplitude of its name or another."""
         density = self._surface(term, term.density)
         energy = self._on_faces([density])
-        return SolidTerm(term.name, density, energy, self.u, self.log, term.name, linear=term.linear)
+        return SolidTerm(term.name, density, energy, self.u, self.log, amplitude or term.name, linear=term.linear)
 
     def observed(self, term: OwnTerm) -> dict[str, ufl.Form]:
         """What it observes on the outer face."""

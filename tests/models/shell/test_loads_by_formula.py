@@ -92,3 +92,37 @@ def test_units_and_refusals() -> None:
             load(PLATE, {"over": "all", "pressure": value}, boundary={"left": "clamped"})
     with pytest.raises(Exception, match=r"loading.loads: has no finite value"):
         ms.Scene(load(PLATE, {"over": "all", "pressure": "1/(x - x)"}, boundary={"left": "clamped"}))
+
+
+def test_potential_is_a_dead_load_where_it_is_linear() -> None:
+    """V = g z is the weight -g e3; it leaves the meridian, V = g x a half."""
+    weight = [{"per_area": [0, 0, -1e-6]}, {"potential": "1e-6*z"}]
+    for model in ({}, {"symmetry": "half", "mesh": {"degree": 3}}, {"model": "solid", "symmetry": "half"}):
+        dead, place = (end(load(CAP, {"over": "all", **w}, boundary={"rim": "clamped"}, **model)) for w in weight)
+        rel = 0.03 if "model" in model else 1e-9  # of the outer face of a solid
+        assert place["w_pole_over_h"] == pytest.approx(dead["w_pole_over_h"], rel=rel)
+        assert place["energy"] == pytest.approx(dead["energy"], rel=2 * rel)
+    plans = [make_plan(load(CAP, {"over": "all", "potential": v}, boundary={"rim": "clamped"})) for v in ("z", "x")]
+    assert [plan.included[0] for plan in plans] == ["meridian", "half shell"]
+
+
+def test_springs_to_a_wall() -> None:
+    """A plate on a foundation k that springs c draw to z = a, V = c (z - a)^2/2: it moves by a c/(k + c)."""
+    case = load(
+        PLATE,
+        {"over": "all", "potential": "3e-3*(z - 0.1)**2/2"},
+        boundary={"left": {"held": ["x"]}, "bottom": {"held": ["y"]}},
+        foundation={"stiffness": 1e-3},
+        points={"middle": [1, 0.5, 0]},
+        mesh={"degree": 2, "size": 0.5},
+        symmetry="none",
+    )
+    assert end(case)["middle_uz"] == pytest.approx(0.075, rel=1e-9)
+
+
+def test_potential_is_refused_where_it_is_none() -> None:
+    """It has no displacement of its own, and no patch."""
+    for more, said in (({"over": "lid"}, "goes with over: all"), ({"over": "all"}, "a potential has none")):
+        loading = {"kind": "dead", "control": "displacement", "displacement": 1, "loads": [{"potential": "z", **more}]}
+        with pytest.raises(ms.CaseError, match=said):
+            ms.Case.from_source(Source("test", {"shell": CAP, "loading": loading, "boundary": {"rim": "clamped"}}))
