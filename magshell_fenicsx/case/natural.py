@@ -59,10 +59,10 @@ Values = Number | list[Number] | dict[str, Number | list[Number]] | None
 class NaturalSection(Section):
     """The curvature and the size that the shell would have without stress: growth, swelling, pre-stretch.
 
-    Both grow with amplitudes of their own, natural_curvature and natural_stretch, from 0 (the shell as drawn) to 1 (what
-    is given here) and beyond: a step of kind: natural drives one; without one, both grow to 1 before the field. Formulas
-    are of the undeformed place x, y, z in the shell's length. A mapping has a value for each patch of a mesh, for the
-    dimple, and for the rest.
+    Both grow with amplitudes of their own, natural_curvature and natural_stretch, from 0 (the shell as drawn) to 1
+    (what is given here) and beyond. A step of kind: natural drives one; before a single load of another kind both grow
+    to 1. Formulas are of the undeformed place x, y, z in the shell's length. A mapping has a value for each patch of a
+    mesh, for the dimple, and for the rest.
     """
 
     curvature: Annotated[Values, _components(3, -1e9, 1e9, lengths=True)] = None

@@ -1,5 +1,6 @@
 """The loads of a case in the model's terms: over E h R and in the model's frame, on the part that is modelled."""
 
+from collections.abc import Mapping
 from math import radians
 
 import numpy as np
@@ -9,13 +10,9 @@ from ufl.core.expr import Expr
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.expressions import symbolic
-from magshell_fenicsx.case.loading import (
-    DeadLoadSection,
-    DeadSection,
-    IndentationSection,
-    PressureSection,
-    RotationSection,
-)
+from magshell_fenicsx.case.loads.dead import DeadLoadSection, DeadSection
+from magshell_fenicsx.case.loads.field import RotationSection
+from magshell_fenicsx.case.loads.indentation import IndentationSection, Place
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.mesh.frame import rotation
 from magshell_fenicsx.mesh.mirror import Mirror
@@ -31,9 +28,9 @@ from magshell_fenicsx.models.shell.parameters import (
     PointForce,
     Potential,
 )
-from magshell_fenicsx.plan.magnetisation import magnetisation
 from magshell_fenicsx.models.shell.patterns import Pattern
 from magshell_fenicsx.plan.by_formula import ByFormula, function
+from magshell_fenicsx.plan.magnetisation import magnetisation
 from magshell_fenicsx.plan.natural import natural
 from magshell_fenicsx.plan.outline import Outline
 
@@ -42,13 +39,13 @@ SYMBOLIC = {name: getattr(ufl, name) for name in ("sin", "cos", "tan", "exp", "s
 SYMBOLIC |= {"log": ufl.ln, "abs": abs, "arctan2": ufl.atan2}
 
 
-def loads(case: Case, under: str, turn: float, mirror: Mirror | None, own: tuple[OwnTerm, ...]) -> Loads:
+def loads(case: Case, under: Mapping[str, str], turn: float, mirror: Mirror | None, own: tuple[OwnTerm, ...]) -> Loads:
     """What loads the shell.
 
     Parameters
     ----------
     under
-        Name of the vertex under an indentation.
+        Amplitude of an indentation -> name of the vertex under it.
     turn
         Azimuth of the model's frame (rad).
     mirror
@@ -57,67 +54,84 @@ def loads(case: Case, under: str, turn: float, mirror: Mirror | None, own: tuple
     own
         See `surface_terms`.
     """
-    loading, magnetic = case.loading, case.magnetic
-    force = None
-    if isinstance(loading, IndentationSection):
-        force = Force(under, loading.patch / case.shell.R_over_h)
-    to = loading.to if isinstance(loading, RotationSection) else None
-    field = magnetisation(magnetic, case, turn, to) if magnetic and case.lambda_m else None
-    listed = loading.loads if isinstance(loading, DeadSection) else []
-    dead = tuple(_dead(load, case, turn, mirror) for load in listed if not mirror or load.edge not in mirror.lost)
-    return Loads(isinstance(loading, PressureSection), force, field, dead, own, natural(case, turn))
+    steps, magnetic = {step.name: step.load for step in case.programme}, case.magnetic
+    forces, dead = dict[str, Force](), dict[str, tuple[DeadLoad, ...]]()
+    for name, load in steps.items():
+        if isinstance(load, IndentationSection):
+            forces[name] = Force(under[name], load.patch / case.shell.R_over_h)
+        elif isinstance(load, DeadSection):
+            here = (one for one in load.loads if not mirror or one.edge not in mirror.lost)
+            dead[name] = tuple(_dead(one, f"{name}_potential_{i}", case, turn, mirror) for i, one in enumerate(here))
+    turned = [load.to for load in case.loads_of(RotationSection)]
+    field = magnetisation(magnetic, case, turn, turned) if magnetic and "lambda_m" in steps else None
+    pressure = "pressure" in steps or any("pressure" in load.hold for load in steps.values())
+    return Loads(pressure, forces, field, dead, own, natural(case, turn))
 
 
-def indented(case: Case, outline: Outline) -> Array | None:
-    """The place (3,) of an indentation, over R; None without one.
+def indented(case: Case, outline: Outline) -> dict[str, Array]:
+    """Amplitude of an indentation -> its place (3,), over R.
 
     Raises
     ------
     CaseError
         If a direction does not say where it is on this geometry, or it is too near to the pole.
     """
-    loading = case.loading
-    if not isinstance(loading, IndentationSection):
-        return None
-    if loading.at.point is not None:
-        return np.asarray(np.array(case.points[loading.at.point]) / case.shell.reference)
-    polar = radians(loading.at.polar)
+    steps = {step.name: step for step in case.programme}
+    return {
+        name: _indented(case, outline, step.load.at, step.key)
+        for name, step in steps.items()
+        if isinstance(step.load, IndentationSection)
+    }
+
+
+def _indented(case: Case, outline: Outline, at: Place, key: str) -> Array:
+    if at.point is not None:
+        return np.asarray(np.array(case.points[at.point]) / case.shell.reference)
+    polar = radians(at.polar)
     if not outline.sphere and polar:
         where = "at its centre or tip, polar: 0, or at a point of points"
-        raise CaseError(f"loading.at.polar: {loading.at.polar:g}: a {case.shell.geometry} is loaded {where}")
+        raise CaseError(f"{key}.at.polar: {at.polar:g}: a {case.shell.geometry} is loaded {where}")
     if outline.highest is None or not (outline.disc or case.shell.geometry == "strip"):
-        raise CaseError(f"loading.at: a {case.shell.geometry} has no pole: give {{point: NAME}}, of points")
+        raise CaseError(f"{key}.at: a {case.shell.geometry} has no pole: give {{point: NAME}}, of points")
     if not outline.sphere:
         return np.asarray(outline.embedding(outline.highest[None])[0])
     if 0 < polar < 1 / case.shell.R_over_h:
-        raise CaseError(f"loading.at.polar: {loading.at.polar:g}: 0, or more than a thickness from the pole")
-    chart = polar * loading.at.vector()[:2] / max(np.hypot(*loading.at.vector()[:2]), 1e-300)
+        raise CaseError(f"{key}.at.polar: {at.polar:g}: 0, or more than a thickness from the pole")
+    chart = polar * at.vector()[:2] / max(np.hypot(*at.vector()[:2]), 1e-300)
     return np.asarray(outline.embedding(chart[None])[0])
 
 
-def refuse_wide_patch(case: Case, outline: Outline, at: Array) -> None:
-    """See that the patch of a force is no wider than the shell around its place `at` in the chart.
+def refuse_wide_patch(case: Case, outline: Outline, at: Mapping[str, Array]) -> None:
+    """See that the patches of forces are no wider than the shell around their places in the chart.
+
+    Parameters
+    ----------
+    at
+        Amplitude -> place.
 
     Raises
     ------
     CaseError
         With the radii that are allowed.
     """
-    assert isinstance(case.loading, IndentationSection)
-    room = outline.edge - float(np.hypot(*at[:2])) if outline.sphere else min(1.0, case.width or 1.0)
-    patch, most = case.loading.patch, room * case.shell.R_over_h
-    if patch and not 0.3 <= patch <= most:
-        raise CaseError(
-            f"loading.patch: {patch:g}: allowed are 0 for a point, or 0.3 to {most:.4g}, where it reaches the edge"
-        )
+    for step in case.programme:
+        if not isinstance(step.load, IndentationSection):
+            continue
+        room = outline.edge - float(np.hypot(*at[step.name][:2])) if outline.sphere else min(1.0, case.width or 1.0)
+        patch, most = step.load.patch, room * case.shell.R_over_h
+        if patch and not 0.3 <= patch <= most:
+            raise CaseError(
+                f"{step.key}.patch: {patch:g}: allowed are 0 for a point, or 0.3 to {most:.4g}, where it "
+                "reaches the edge"
+            )
 
 
-def _dead(load: DeadLoadSection, case: Case, turn: float, mirror: Mirror | None) -> DeadLoad:
+def _dead(load: DeadLoadSection, name: str, case: Case, turn: float, mirror: Mirror | None) -> DeadLoad:
     shared = mirror is not None and (load.edge is None or mirror.other(load.edge) == load.edge)
     Q, scales = rotation(turn), case.scales
     E, t, R = scales.E, scales.h, scales.R
     if load.potential is not None:
-        return Potential(_potential(load.potential, Q, R, 1 / (E * t)))
+        return Potential(_potential(name, load.potential, Q, case))
     if load.varies:
         unit = E * t if load.edge else E * t / R
         pattern = _pattern(load, Q, R, 1 / unit)
@@ -131,12 +145,12 @@ def _dead(load: DeadLoadSection, case: Case, turn: float, mirror: Mirror | None)
         return EdgeForce(load.edge, force, total=True)
     if load.edge is not None:
         assert load.per_length is not None
-        return EdgeForce(load.edge, np.asarray(Q @ load.per_length / (E * t)), total=False)
+        return EdgeForce(load.edge, np.asarray(Q @ np.array(load.per_length, dtype=float) / (E * t)), total=False)
     if load.pressure is not None:
         assert isinstance(load.pressure, float | int)
         return AreaForce(_over(load), load.pressure * R / (E * t))
     assert load.per_area is not None
-    return AreaForce(_over(load), np.asarray(Q @ load.per_area * R / (E * t)))
+    return AreaForce(_over(load), np.asarray(Q @ np.array(load.per_area, dtype=float) * R / (E * t)))
 
 
 def _over(load: DeadLoadSection) -> str | None:
@@ -152,15 +166,15 @@ def _pattern(load: DeadLoadSection, Q: Array, length: float, factor: float) -> P
     return lambda r0, n0: -p(r0, n0) * n0
 
 
-def potentials(case: Case, turn: float = 0.0) -> list[OwnTerm]:
-    """The energies of loads that depend on the deformed place, in a frame turned about e3 (rad)."""
-    listed = case.loading.loads if isinstance(case.loading, DeadSection) else []
-    s, Q = case.scales if listed else None, rotation(turn)
-    return [_potential(load.potential, Q, s.R, 1 / (s.E * s.h)) for load in listed if s and load.potential]
+def potentials(case: Case) -> list[OwnTerm]:
+    """The energies of loads that depend on the deformed place."""
+    texts = [load.potential for step in case.loads_of(DeadSection) for load in step.loads if load.potential]
+    return [_potential(f"potential_{i}", text, np.eye(3), case) for i, text in enumerate(texts)]
 
 
-def _potential(text: str, Q: Array, length: float, factor: float) -> OwnTerm:
+def _potential(name: str, text: str, Q: Array, case: Case) -> OwnTerm:
     """Zero where nothing has moved."""
+    scales = case.scales
 
     def at(r: Expr, scale: Expr, size: Expr) -> Expr:
         x = [scale * sum(float(Q[j, i]) * r[j] for j in range(3) if Q[j, i]) for i in range(3)]
@@ -169,4 +183,4 @@ def _potential(text: str, Q: Array, length: float, factor: float) -> OwnTerm:
     def density(r0: Jet, u: Jet, scale: Expr, size: Expr) -> Expr:
         return at(r0.r + u.r, scale, size) - at(r0.r, scale, size)
 
-    return OwnTerm("potential", density, (length, factor))
+    return OwnTerm(name, density, (scales.R, 1 / (scales.E * scales.h)))

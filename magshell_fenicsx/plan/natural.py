@@ -72,11 +72,8 @@ def askew(case: Case, outline: Outline) -> str | None:
     of_patches = case.natural.curvature.values() if isinstance(case.natural.curvature, dict) else []
     if any(len(c) == 3 and c[2] not in (0, "0") for c in map(components, [k, *of_patches])):
         return "the natural curvature twists: k12 is not zero"
-    if (
-        uneven(case)
-        and direction != MERIDIAN
-        and not (all(isinstance(v, float | int) for v in direction) and np.hypot(*map(float, direction[:2])) == 0)
-    ):
+    upright = [v == 0 for v in direction] == [True, True, False]
+    if uneven(case) and direction != MERIDIAN and not upright:
         return "the natural shape is not along the meridians"
     if outline.span and not all(scalar_turns(text, outline.span, R) for text in case.natural.formulas):
         return "the natural shape differs around e3"

@@ -1,6 +1,6 @@
 """The symmetry that each part of a case leaves; a model takes what all leave."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from math import atan2, hypot, pi
@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 from magshell_fenicsx.case.boundary import HeldSection
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.expressions import formula
-from magshell_fenicsx.case.loading import DeadLoadSection, DeadSection, IndentationSection, RotationSection
+from magshell_fenicsx.case.loads.dead import DeadLoadSection, DeadSection
+from magshell_fenicsx.case.loads.field import RotationSection
+from magshell_fenicsx.case.loads.step import Step
 from magshell_fenicsx.mesh.mirror import ROUNDING, Y0, Mirror
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.plan import natural
@@ -55,14 +57,14 @@ class Leaves:
     energy: str = ""
 
 
-def left(case: Case, outline: Outline, indented: Array | None, terms: Sequence[OwnTerm]) -> list[Leaves]:
-    """What each part of a case leaves; `indented` is the place (3,) of an indentation, over R."""
+def left(case: Case, outline: Outline, indented: Mapping[str, Array], terms: Sequence[OwnTerm]) -> list[Leaves]:
+    """What each part of a case leaves; `indented` is of `plan.loads`."""
     return [
         _shape(case, outline),
         *_supports(case),
         *(_field(case, outline) if case.magnetic and case.lambda_m else []),
         *_natural(case, outline),
-        *_load(case, outline, indented),
+        *_loads(case, outline, indented),
         *_named(case, outline),
         *(_energy(term, outline) for term in terms),
     ]
@@ -185,7 +187,7 @@ def _field(case: Case, outline: Outline) -> list[Leaves]:
     magnetic = case.magnetic
     assert magnetic
     vectors = [d.vector() for d in (*magnetic.remanent.directions(), magnetic.applied)]
-    turning = [case.loading.to.vector()] if isinstance(case.loading, RotationSection) else []
+    turning = [load.to.vector() for load in case.loads_of(RotationSection)]
     remanent, G = magnetic.remanent, np.array(magnetic.applied.gradient or np.zeros((3, 3)))
     fields: list[Callable[[Array], Array]] = [lambda x: np.asarray(x @ G.T)] if G.any() else []
     if remanent.components:
@@ -222,11 +224,14 @@ def _natural(case: Case, outline: Outline) -> list[Leaves]:
     return [Leaves(natural.askew(case, outline), vectors, lambda mirror: natural.mirrored(case, outline, mirror))]
 
 
-def _load(case: Case, outline: Outline, indented: Array | None) -> list[Leaves]:
-    loading, R = case.loading, case.shell.reference
-    if isinstance(loading, IndentationSection):
-        assert indented is not None
-        place = indented
+def _loads(case: Case, outline: Outline, indented: Mapping[str, Array]) -> list[Leaves]:
+    return [leaves for step in case.programme for leaves in _load(case, outline, step.load, indented.get(step.name))]
+
+
+def _load(case: Case, outline: Outline, loading: Step, place: Array | None) -> list[Leaves]:
+    """What a step leaves; `place` of a force, over R."""
+    R = case.shell.reference
+    if place is not None:
         reason = "the force is not at the pole" if _tilted(place) else None
         return [Leaves(reason, [place], lambda mirror: bool(abs(mirror.beyond(place)) < ROUNDING))]
     if isinstance(loading, RotationSection):
@@ -241,9 +246,7 @@ def _load(case: Case, outline: Outline, indented: Array | None) -> list[Leaves]:
 
         def mirrors(mirror: Mirror) -> bool:
             on_plane = all(abs(float(mirror.beyond(x))) < ROUNDING for x in places)
-            return on_plane and all(
-                any(_is_image(a, b, mirror, x, R) for b in loading.loads) for a in loading.loads
-            )
+            return on_plane and all(any(_is_image(a, b, mirror, x, R) for b in loading.loads) for a in loading.loads)
 
         tilted = any(_tilted(v) for v in vectors)
         why = "a load is not along e3, or off the axis" if tilted else "a patch is loaded" if patches else None
@@ -265,12 +268,13 @@ def _is_image(load: DeadLoadSection, other: DeadLoadSection, mirror: Mirror, x: 
     if load.varies or other.varies:
         return _mirrored_formula(load, other, mirror, R * x, R * mirror.image(x))
     edge = load.edge and mirror.other(load.edge)
-    if (edge, load.at, load.over, load.moment, load.pressure) != (
+    if (edge, load.at, load.over, load.moment, load.pressure, load.potential is None) != (
         other.edge,
         other.at,
         other.over,
         other.moment,
         other.pressure,
+        other.potential is None,
     ):
         return False
     for here, there in ((getattr(x, key) for x in (load, other)) for key in ("force", "per_length", "per_area")):

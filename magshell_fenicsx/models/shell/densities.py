@@ -8,8 +8,8 @@ import ufl
 from ufl.core.expr import Expr
 
 from magshell_fenicsx.models.shell import kinematics as kin
-from magshell_fenicsx.models.shell.natural import Forms
 from magshell_fenicsx.models.shell.kinematics import Jet
+from magshell_fenicsx.models.shell.natural import Forms
 
 
 def koiter(S: Expr, up: Expr, nu: Expr) -> Expr:

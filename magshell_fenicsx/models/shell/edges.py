@@ -51,6 +51,7 @@ def two_sided(
     h: Expr,
     sigma: Expr,
     t: tuple[Expr, Expr] | None = None,
+    *,
     natural: Shapes | None = None,
 ) -> Expr:
     """Energy of an interior edge with that jump per length of its parameter.

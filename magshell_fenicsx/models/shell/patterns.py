@@ -143,6 +143,5 @@ def refuse_unbounded(vectors: Array, nodes: Array, comm: MPI.Comm, key: str = "m
     if said := [place for places in comm.allgather(bad) for place in places]:
         x, y, z = said[0]
         raise MeshError(
-            f"{key}: has no finite value (or one above {LARGEST:g}) at (x, y, z)/R = "
-            f"({x:.3g}, {y:.3g}, {z:.3g})"
+            f"{key}: has no finite value (or one above {LARGEST:g}) at (x, y, z)/R = ({x:.3g}, {y:.3g}, {z:.3g})"
         )

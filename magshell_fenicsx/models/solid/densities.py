@@ -10,7 +10,7 @@ from ufl.core.expr import Expr
 
 
 def distortion(X: Expr, u: Expr, H: Expr, shear: Expr, h: Expr, growth: Expr | None = None) -> Expr:
-    """mu/2 (J^(-2/3) F:F - 3): what does not depend on a change of volume; F G^(-1) takes F's place after a growth G."""
+    """mu/2 (J^(-2/3) F:F - 3): what does not depend on a change of volume; of F G^(-1) after a growth G."""
     F = ufl.Identity(3) + H
     if growth is not None:
         return ufl.det(growth) * distortion(X, u, ufl.dot(F, ufl.inv(growth)) - ufl.Identity(3), shear, h)

@@ -11,8 +11,8 @@ from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.mesh.hexahedra import MIDDLE, OUTER, Body
 from magshell_fenicsx.models.shell.dead_load import within
 from magshell_fenicsx.models.shell.load_vector import Entries, Weighted, averaged, smooth
-from magshell_fenicsx.models.shell.thickness import patch_of
 from magshell_fenicsx.models.shell.patterns import Pattern, refuse_unbounded
+from magshell_fenicsx.models.shell.thickness import patch_of
 from magshell_fenicsx.models.solid.remanence import places
 from magshell_fenicsx.models.solid.terms import face_measure
 from magshell_fenicsx.platform import compat

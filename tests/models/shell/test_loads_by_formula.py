@@ -87,7 +87,11 @@ def test_on_an_edge() -> None:
 def test_units_and_refusals() -> None:
     """Text is a number with a unit or a formula; a formula without a value is refused where it has none."""
     assert load(PLATE, {"over": "all", "pressure": "2*x"}, boundary={"left": "clamped"})
-    for value, said in (("5 furlongs", "is not convertible to pascal"), ("import os", "is not"), ("5 Pa", "has a unit")):
+    for value, said in (
+        ("5 furlongs", "is not convertible to pascal"),
+        ("import os", "is not"),
+        ("5 Pa", "has a unit"),
+    ):
         with pytest.raises(ms.CaseError, match=said):
             load(PLATE, {"over": "all", "pressure": value}, boundary={"left": "clamped"})
     with pytest.raises(Exception, match=r"loading.loads: has no finite value"):

@@ -1,6 +1,7 @@
 """The natural shape: closed forms, derivatives, every model against the others, and what a case says of it."""
 
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,8 +14,8 @@ from magshell_fenicsx.assembly.terms import FormTerm
 from magshell_fenicsx.case.source import Source
 from magshell_fenicsx.continuation.system import State, dot
 from magshell_fenicsx.models.shell.natural import Natural
-from magshell_fenicsx.output.fields.point_fields import PointFields
 from magshell_fenicsx.models.shell.parameters import Material
+from magshell_fenicsx.output.fields.point_fields import PointFields
 from magshell_fenicsx.plan.planner import make_plan
 
 CAP = {"geometry": "cap", "polar": 40, "radius": 1, "thickness": 0.02, "poisson_ratio": 0.3}
@@ -132,6 +133,9 @@ def test_derivatives(model: str, symmetry: str, shell: dict[str, Any], size: flo
         system.place(at)
         return sum(system.energies(x).values())
 
+    def moved(name: str, step: float) -> dict[str, float]:
+        return {**mu, name: mu[name] + step}
+
     def rate(of: Any, step: float) -> Any:
         return (8 * (of(step) - of(-step)) - (of(2 * step) - of(-2 * step))) / (12 * step)
 
@@ -142,17 +146,18 @@ def test_derivatives(model: str, symmetry: str, shell: dict[str, Any], size: flo
     change = rate(lambda s: system.residual(u + s * v, mu), e)
     assert np.linalg.norm(system.held(K @ v) - change) <= 1e-6 * np.linalg.norm(change)
     for name in BOTH:
-        at = lambda s, name=name: {**mu, name: mu[name] + s}  # noqa: E731
-        column = system.load(u, mu, name)
+        at, column = partial(moved, name), system.load(u, mu, name)
         assert np.linalg.norm(column) > 1e-6 * np.linalg.norm(R)
-        assert np.linalg.norm(column - rate(lambda s: system.residual(u, at(s)), 1e-3)) <= 1e-6 * np.linalg.norm(column)
-        along = rate(lambda s: system.potential(u + s * v, mu, name), e)
+        change = rate(lambda s, at=at: system.residual(u, at(s)), 1e-3)
+        assert np.linalg.norm(column - change) <= 1e-6 * np.linalg.norm(column)
+        along = rate(lambda s, name=name: system.potential(u + s * v, mu, name), e)
         assert along == pytest.approx(dot(system.comm, column, v), rel=1e-5)
-        assert system.potential(u, mu, name) == pytest.approx(rate(lambda s: energy(u, at(s)), 1e-3), rel=1e-6)
+        slope = rate(lambda s, at=at: energy(u, at(s)), 1e-3)
+        assert system.potential(u, mu, name) == pytest.approx(slope, rel=1e-6)
         for other in BOTH:
-            there = lambda s, other=other: {**mu, other: mu[other] + s}  # noqa: E731
-            expected = rate(lambda s: system.potential(u, there(s), name), 1e-3)
-            assert system.curvature(u, mu, name, other) == pytest.approx(expected, rel=1e-5)
+            there = partial(moved, other)
+            bend = rate(lambda s, there=there, name=name: system.potential(u, there(s), name), 1e-3)
+            assert system.curvature(u, mu, name, other) == pytest.approx(bend, rel=1e-5)
         changed = scipy.sparse.csr_array((system.tangent(u, at(0.1)).getValuesCSR()[2], columns, rows), shape=K.shape)
         assert abs(changed - K).max() > 1e-6 * abs(K).max()
 
