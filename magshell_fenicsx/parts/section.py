@@ -88,7 +88,7 @@ NAMES = {"at", "edge", "over", "kind", "control", "until", "radius"}  # keys wit
 
 
 def texts(part: Any, known: Callable[[str], bool] = lambda text: False, path: str = "") -> Iterator[str]:
-    """The keys of plain data whose numbers are text with a unit; texts that are `known` to be something else are not."""
+    """The keys of plain data whose numbers are text with a unit, without texts `known` to be something else."""
     for key, value in part.items() if isinstance(part, dict) else enumerate(part if isinstance(part, list) else []):
         if isinstance(value, str) and key not in NAMES and not known(value):
             yield f"{path}{key}"

@@ -142,7 +142,7 @@ class Scene:
 
     @property
     def _own_amplitudes(self) -> dict[str, float]:
-        """The amplitudes of the natural shape, of user-defined energies and their parameters, with their initial values."""
+        """The amplitudes of the natural shape and of user-defined energies and parameters, with initial values."""
         terms, natural = self.plan.loads.own, self.plan.loads.natural
         grown = dict.fromkeys(natural.amplitudes, 0.0) if natural else {}
         return (

@@ -38,7 +38,7 @@ class GrowthSection(PathStep):
     @property
     def key(self) -> str:
         """The key of `natural` that grows."""
-        return str(self.grows or next(iter(self._given)))
+        return self.grows or "".join(self._given)
 
     @property
     def amplitude(self) -> str:  # type: ignore[override]

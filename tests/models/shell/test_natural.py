@@ -77,7 +77,7 @@ def test_cap_swells_without_stress() -> None:
 
 
 def test_stretched_and_bent_strip() -> None:
-    """Free of stress, a circle of 1/kappa with kappa per natural length; so is a solid, to the error of its elements."""
+    """Free of stress, a circle with kappa per natural length; so is a solid, to the error of its elements."""
     exact = -(1 - np.cos(1.05))
     for model, mesh, error in (("shell", {"degree": 3, "size": 0.1}, 1e-6), ("solid", {"size": 0.05}, 1e-5)):
         case = load(

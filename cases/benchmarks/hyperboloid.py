@@ -1,0 +1,110 @@
+"""The hyperboloid of Lee and Bathe: energies against those of its meridian, for thin and thinner shells.
+
+`python3 -m benchmarks.hyperboloid` (with PYTHONPATH=cases) writes docs/hyperboloid/README.md.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from dolfinx import fem
+
+from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.continuation.system import State
+from magshell_fenicsx.models.axisymmetric import jets
+from magshell_fenicsx.models.axisymmetric.meridian import make_meridian
+from magshell_fenicsx.models.axisymmetric.model import MeridianModel
+from magshell_fenicsx.models.shell import kinematics as kin
+from magshell_fenicsx.plan.planner import make_plan, meridian_vertices
+from magshell_fenicsx.simulate.follow import follow
+from magshell_fenicsx.simulate.scene import Scene
+
+import ufl
+
+CASE = Path(__file__).parent / "hyperboloid.yaml"
+OUT = CASE.parents[2] / "docs" / "hyperboloid" / "README.md"
+Edge = Literal["clamped", "free"]
+POWER = {"clamped": 1, "free": 3}  # of h in the energy: a membrane, bending
+INTERVALS = 16
+M = 2  # waves of the load around the axis
+TEXT = """# A hyperboloid, thinner and thinner
+
+Lee and Bathe's hyperboloid of revolution, r² = 1 + z² (-1 ≤ z ≤ 1, ν = 1/3), under a dead pressure p cos 2θ, in the linear
+regime. With clamped edges the membrane carries the load, with free edges bending does (inextensional deformation): the
+strain energy U of the whole shell is of the order p²/(E h) and p²/(E h³). `python3 -m benchmarks.hyperboloid`
+writes this page.
+
+The **reference** is another discretisation: the second variation of waves cos 2θ on the meridian
+(`models/axisymmetric/waves.py`), on intervals graded to √h, with free edges on 32 equal ones; **its error** is the difference from half as many. **error** is the relative error of U on uniform triangles (an eighth of the shell, degree 4). The **order** in the
+element's size is that of the last two meshes; clamped edges have layers of the width √h, which uniform meshes do not
+resolve where √h is below the size. The error at a given mesh is bounded as h falls: there is no locking.
+
+"""
+
+
+def reference(edge: Edge, R_over_h: float, refinement: float = 1.0) -> float:
+    """U E h^k/p^2 of the whole shell from the waves m = 2 of the meridian, with k of `POWER`."""
+    h = 1 / R_over_h
+    settings = ["shell.azimuth=null", "boundary={bottom: symmetry, top: clamped}", f"shell.thickness={h}"]
+    load = "loading.loads=[{over: all, pressure: 1.0}]"
+    case = Case.load(CASE, [*settings, load])
+    plan = make_plan(case)
+    span, length = plan.meridian, case.shell.reference
+    assert span
+    vertices = meridian_vertices(plan, refinement)
+    if edge == "free":  # no strong layers, and bending is so soft that rounding grows with the number of intervals
+        vertices = np.linspace(0.0, span.length, round(INTERVALS * refinement) + 1)
+    meridian = make_meridian(span.embedding, vertices, span.names, {}, span.curvature)
+    conditions = {**plan.conditions, "top": edge}
+    model = MeridianModel(meridian, plan.material, 4, conditions, plan.loads)
+    waves, factory = model.excluded_modes.waves, model.factory
+    v = ufl.TestFunction(waves.V)
+    along = jets.wave(v, fem.Constant(meridian.mesh, float(M)))[0].r
+    form = np.pi * factory.area()(-ufl.dot(kin.normal(factory.j0), along))  # of the pressure E h/R
+    f = fem.assemble_vector(fem.form(form)).array.copy()
+    for support in waves.held(M):
+        f[support.dof_indices()[0]] = 0
+    factors = waves.factor_at(State(model.zero(), {"load": 0.0}), M)
+    energy = float(f @ factors.solve(f)) / 2  # over E h R^2 at p = E h/R; half of the shell
+    return 2 * energy * length**4 / h * h ** POWER[edge]
+
+
+def energy(edge: Edge, R_over_h: float, size: float, *settings: str) -> float:
+    """The same from triangles."""
+    h = 1 / R_over_h
+    p = 1e-4 * h ** (POWER[edge] + 1)
+    more = [f"shell.thickness={h}", f"boundary.top={edge}", f"loading.factor={p}", f"mesh.size={size}"]
+    scene = Scene(Case.load(CASE, [*more, *settings]))
+    *_, last = follow(scene)
+    found = scene.observe(last.point.state)
+    whole = 8 * h * scene.plan.length**2 * (found["stretching"] + found["bending"])
+    return float(whole * h ** POWER[edge] / p**2)
+
+
+def rows(edge: Edge, thin: Sequence[float], sizes: Sequence[float]) -> list[str]:
+    """Lines of the table of one kind of edges."""
+    lines = []
+    for R_over_h in thin:
+        exact, finer = reference(edge, R_over_h), reference(edge, R_over_h, 2.0)
+        errors = [abs(energy(edge, R_over_h, size) / finer - 1) for size in sizes]
+        order = np.log(errors[-2] / errors[-1]) / np.log(sizes[-2] / sizes[-1])
+        cells = [f"{R_over_h:g}", f"{finer:.9g}", f"{abs(exact / finer - 1):.0e}", *(f"{e:.1e}" for e in errors)]
+        lines.append(f"| {' | '.join([*cells, f'{order:.1f}'])} |")
+        print(edge, lines[-1], flush=True)
+    return lines
+
+
+def main() -> None:
+    """Write the page."""
+    thin, sizes, text = (10.0, 100.0, 1000.0, 10000.0), (0.4, 0.2, 0.1), TEXT
+    for edge, unit in (("clamped", "p²/(E h)"), ("free", "p²/(E h³)")):
+        head = [f"U over {unit}", "its error", *(f"error, size {size:g}" for size in sizes), "order"]
+        text += f"## {edge.capitalize()} edges\n\n| R/h | {' | '.join(head)} |\n{'| --- ' * (len(head) + 1)}|\n"
+        text += "\n".join(rows(edge, thin, sizes)) + "\n\n"  # type: ignore[arg-type]
+    OUT.parent.mkdir(exist_ok=True)
+    OUT.write_text(text.rstrip() + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
