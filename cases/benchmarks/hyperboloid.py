@@ -74,7 +74,8 @@ def energy(edge: Edge, R_over_h: float, size: float, *settings: str) -> float:
     """The same from triangles."""
     h = 1 / R_over_h
     p = 1e-4 * h ** (POWER[edge] + 1)
-    more = [f"shell.thickness={h}", f"boundary.top={edge}", f"loading.factor={p}", f"mesh.size={size}"]
+    more = [f"shell.thickness={h}", f"boundary.top={edge}", f"mesh.size={size}"]
+    more.append(f'loading.loads=[{{over: all, pressure: "{p}*cos(2*arctan2(y, x))"}}]')
     scene = Scene(Case.load(CASE, [*more, *settings]))
     *_, last = follow(scene)
     found = scene.observe(last.point.state)
