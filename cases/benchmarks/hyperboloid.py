@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+import ufl
 from dolfinx import fem
 
 from magshell_fenicsx.case.case import Case
@@ -20,8 +21,6 @@ from magshell_fenicsx.plan.planner import make_plan, meridian_vertices
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.scene import Scene
 
-import ufl
-
 CASE = Path(__file__).parent / "hyperboloid.yaml"
 OUT = CASE.parents[2] / "docs" / "hyperboloid" / "README.md"
 Edge = Literal["clamped", "free"]
@@ -30,15 +29,20 @@ INTERVALS = 16
 M = 2  # waves of the load around the axis
 TEXT = """# A hyperboloid, thinner and thinner
 
-Lee and Bathe's hyperboloid of revolution, r² = 1 + z² (-1 ≤ z ≤ 1, ν = 1/3), under a dead pressure p cos 2θ, in the linear
-regime. With clamped edges the membrane carries the load, with free edges bending does (inextensional deformation): the
-strain energy U of the whole shell is of the order p²/(E h) and p²/(E h³). `python3 -m benchmarks.hyperboloid`
-writes this page.
+Lee and Bathe's hyperboloid of revolution, r² = 1 + z² (-1 ≤ z ≤ 1, ν = 1/3), under a dead pressure p cos 2θ, in the
+linear regime. With clamped edges the membrane carries the load, with free edges bending does: the strain energy U of
+the whole shell is of the order p²/(E h) and p²/(E h³). `python3 -m benchmarks.hyperboloid` writes this page.
 
 The **reference** is another discretisation: the second variation of waves cos 2θ on the meridian
-(`models/axisymmetric/waves.py`), on intervals graded to √h, with free edges on 32 equal ones; **its error** is the difference from half as many. **error** is the relative error of U on uniform triangles (an eighth of the shell, degree 4). The **order** in the
-element's size is that of the last two meshes; clamped edges have layers of the width √h, which uniform meshes do not
-resolve where √h is below the size. The error at a given mesh is bounded as h falls: there is no locking.
+(`models/axisymmetric/waves.py`), on intervals graded to √h, with free edges on 32 equal ones; **its error** is the
+difference from half as many. **error** is the relative error of U on uniform triangles (an eighth of the shell,
+degree 4), **order** that of the last two meshes in the size of the elements, where it is above the reference's error.
+
+- Both energies tend to a number as h falls, as the theory has it.
+- Free edges: on a fixed mesh the error grows by 20 to 30 with each decade of R/h. So the elements do lock on coarse
+  meshes, by 4 % on the coarsest at R/h = 10 000; it goes away with the ninth power of the size, and 0.1 has none.
+- Clamped edges: uniform meshes do not resolve the layers of the width √h, 0.01 at R/h = 10 000. The error there
+  falls slowly, but is no larger for a thinner shell.
 
 """
 
@@ -89,9 +93,10 @@ def rows(edge: Edge, thin: Sequence[float], sizes: Sequence[float]) -> list[str]
     for R_over_h in thin:
         exact, finer = reference(edge, R_over_h), reference(edge, R_over_h, 2.0)
         errors = [abs(energy(edge, R_over_h, size) / finer - 1) for size in sizes]
-        order = np.log(errors[-2] / errors[-1]) / np.log(sizes[-2] / sizes[-1])
+        slope = np.log(errors[-2] / errors[-1]) / np.log(sizes[-2] / sizes[-1])
+        order = f"{slope:.1f}" if errors[-1] > 2 * abs(exact / finer - 1) else "-"
         cells = [f"{R_over_h:g}", f"{finer:.9g}", f"{abs(exact / finer - 1):.0e}", *(f"{e:.1e}" for e in errors)]
-        lines.append(f"| {' | '.join([*cells, f'{order:.1f}'])} |")
+        lines.append(f"| {' | '.join([*cells, order])} |")
         print(edge, lines[-1], flush=True)
     return lines
 
