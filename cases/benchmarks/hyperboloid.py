@@ -40,8 +40,8 @@ degree 4), **order** that of the last two meshes in the size of the elements, wh
 
 - Both energies tend to a number as h falls, as the theory has it.
 - Free edges: on a fixed mesh the error grows by about 20 to 30 with each decade of R/h. So the elements do lock on
-  coarse meshes, by 4 % on the coarsest at R/h = 10 000. It falls with the sixth power of the size to the next mesh; with
-  0.1 it is below the error of the reference.
+  coarse meshes, by 4 % on the coarsest at R/h = 10 000. It falls with the sixth power of the size to the next mesh;
+  with 0.1 it is below the error of the reference.
 - Clamped edges: uniform meshes do not resolve the layers of the width √h, 0.01 at R/h = 10 000. The error falls slowly
   there; it is below 2 % on all of them.
 
