@@ -54,6 +54,12 @@ SCENES |= {
         ],
     ),
 }
+SCENES |= {
+    "a natural shape": (
+        "natural_strip.yaml",
+        [DEGREE, "--set=natural={curvature: [3, '1 + x', 0.5], stretch: ['1 + 0.1*x', 1]}", "--set=loading.points=2"],
+    ),
+}
 COMPARED = ("p_over_pc", "lambda_m", "force", "w_over_h", "w_pole_over_h", "volume_change", "energy")
 POINTS = ("_ux", "_uy", "_uz")  # of named points
 

@@ -146,14 +146,15 @@ class FiniteElementSystem:
         self.place(mu)
         if name in self.parameters:
             slopes = self.parameters[name].slopes
-            return self._gradient(u, {}, [(mu[amplitude], slope) for amplitude, slope in slopes.items()])
+            return self._gradient(u, {}, [(_factor(slope, mu), slope) for slope in slopes])
         return self._gradient(u, {t.name: 1.0 for t in self.terms if t.amplitude == name})
 
     def potential(self, u: Vector, mu: Amplitudes, name: str) -> float:
         self.set(u)
         self.place(mu)
         if name in self.parameters:
-            here = sum(mu[amplitude] * slope.energy() for amplitude, slope in self.parameters[name].slopes.items())
+            slopes = self.parameters[name].slopes
+            here = sum(_factor(slope, mu) * slope.energy() for slope in slopes)
         else:
             here = sum(t.energy() for t in self.terms if t.amplitude == name)
         return float(self.comm.allreduce(here))
@@ -167,10 +168,10 @@ class FiniteElementSystem:
             name, other = other, name
         parameter = self.parameters[name]
         if other in self.parameters:
-            bends = parameter.bends.get(other, {})
-            here = sum(mu[amplitude] * fem.assemble_scalar(form) for amplitude, form in bends.items())
+            bends = parameter.bends(self.parameters[other].constant)
+            here = sum(_value(amplitude, mu) * fem.assemble_scalar(form) for amplitude, form in bends)
         else:
-            here = parameter.slopes[other].energy() if other in parameter.slopes else 0.0
+            here = sum(slope.energy() for slope in parameter.slopes if slope.amplitude == other)
         return float(self.comm.allreduce(here))
 
     def accept(self, u: Vector) -> None:
@@ -230,4 +231,8 @@ class FiniteElementSystem:
 
 
 def _factor(term: Term, mu: Amplitudes) -> float:
-    return 1.0 if term.amplitude is None else mu[term.amplitude]
+    return _value(term.amplitude, mu)
+
+
+def _value(amplitude: str | None, mu: Amplitudes) -> float:
+    return 1.0 if amplitude is None else mu[amplitude]

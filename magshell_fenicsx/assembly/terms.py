@@ -54,6 +54,8 @@ class FormTerm:
 
     Attributes
     ----------
+    form
+        The energy.
     residual_form, tangent_form
         Compiled on first use; None for the tangent of a linear energy.
     """
@@ -72,6 +74,7 @@ class FormTerm:
         self.name, self.amplitude, self.linear, self._follow = name, amplitude, linear, follow
         self._factor = fem.Constant(u.function_space.mesh, 1.0)
         self._u, self._log = u, log
+        self.form = energy
         self._gradient = ufl.derivative(energy, u, ufl.TestFunction(u.function_space))
         self._energy = log.compile(f"{name} energy", energy)
 

@@ -1,7 +1,7 @@
 """The whole case: its sections and what they must have in common."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, TypeVar
 
@@ -10,12 +10,15 @@ from pydantic import Field, ModelWrapValidatorHandler, ValidationError, model_va
 
 from magshell_fenicsx.case.boundary import EDGES, BoundarySection
 from magshell_fenicsx.case.defects import DimpleSection
+from magshell_fenicsx.case.expressions import is_formula
 from magshell_fenicsx.case.fields import MagneticSection, layer_average
 from magshell_fenicsx.case.loading import Loading, ProgrammeStep, programme
 from magshell_fenicsx.case.loads.dead import DeadSection
+from magshell_fenicsx.case.loads.growth import GrowthSection
 from magshell_fenicsx.case.loads.indentation import IndentationSection
 from magshell_fenicsx.case.loads.step import Step
 from magshell_fenicsx.case.messages import explain
+from magshell_fenicsx.case.natural import NaturalSection, measured
 from magshell_fenicsx.case.programme import refuse_unfit_steps
 from magshell_fenicsx.case.shell import ShellSection
 from magshell_fenicsx.case.solid import SolidSection
@@ -69,6 +72,8 @@ class Case(WithParts):
     """Name -> place of what is loaded, held or watched [the shell's length; over R if that has no unit]"""
     magnetic: MagneticSection | None = None
     """Remanence and applied field, which is applied before the load"""
+    natural: NaturalSection | None = None
+    """The curvature and the size that the shell would have without stress"""
     loading: Loading | None = None
     """The load after the field, without which the path ends with the field; or a list of steps, one after the other,
     in which the field is a step too"""
@@ -91,7 +96,7 @@ class Case(WithParts):
             sources = written if isinstance(written, list) else [written]
             for step, source in zip(programme(section.loading, field=False), sources, strict=False):
                 parts |= {step.key: source} if isinstance(step.load, DeadSection) else {}
-            for key in texts(parts):
+            for key in (*texts(parts, is_formula), *measured(data.get("natural"))):
                 raise ValueError(f"{key}: has a unit, but the shell's lengths have none: give all of them one, or none")
         return section
 
@@ -105,6 +110,10 @@ class Case(WithParts):
                 "magnetic.remanent.layers: the layers cancel: their average is a remanence of length zero, and a shell "
                 "knows no more of them"
             )
+        for load in self.loads_of(GrowthSection):
+            if getattr(self.natural, load.key, None) is None:
+                raise ValueError(f"loading.{load.key}: is a factor of natural.{load.key}: give that too")
+        self._natural_parts()
         return self
 
     @model_validator(mode="after")
@@ -141,15 +150,25 @@ class Case(WithParts):
         if shell.geometry in ("hemisphere", "cap") and not 0 <= polar < edge - 1:
             raise ValueError(f"loading.at.polar: {polar:g} is not on the shell: allowed 0 to {edge - 1:g}")
 
+    def _natural_parts(self) -> None:
+        for key in ("curvature", "stretch"):
+            if isinstance(patches := getattr(self.natural, key, None), dict):
+                self._refuse_strange(patches, f"natural.{key}")
+
+    def _refuse_strange(self, patches: Iterable[str], key: str) -> None:
+        """A mesh knows its patches later."""
+        if isinstance(self.shell, MeshSurface):
+            return
+        if self.defect is None and ("dimple" in patches or not isinstance(self.shell, ShellSection)):
+            raise ValueError(f"{key}: the shell has no dimple")
+        if unknown := set(patches) - {"dimple", "rest"}:
+            raise ValueError(f"{key}: {min(unknown)}: a {self.shell.geometry} has only dimple and rest")
+
     def _patches(self) -> None:
         patches = self.magnetic.remanent.patches if self.magnetic else None
         if patches is None or isinstance(self.shell, MeshSurface):
             return
-        geometry = self.shell.geometry
-        if self.defect is None and ("dimple" in patches or not isinstance(self.shell, ShellSection)):
-            raise ValueError("magnetic.remanent.patches: the shell has no dimple")
-        if unknown := set(patches) - {"dimple", "rest"}:
-            raise ValueError(f"magnetic.remanent.patches: {min(unknown)}: a {geometry} has only dimple and rest")
+        self._refuse_strange(patches, "magnetic.remanent.patches")
         if "rest" not in patches:
             raise ValueError("magnetic.remanent: patches needs the patch rest")
 
@@ -206,8 +225,9 @@ class Case(WithParts):
 
     @property
     def programme(self) -> tuple[ProgrammeStep, ...]:
-        """Its steps; the field that is applied before a single load is the first."""
-        return programme(self.loading, field=bool(self.lambda_m))
+        """Its steps; before a single load the natural shape grows, then the field."""
+        grows = [key for key in ("stretch", "curvature") if getattr(self.natural, key, None) is not None]
+        return programme(self.loading, field=bool(self.lambda_m), natural=grows)
 
     def loads_of(self, kind: type[AnyStep]) -> list[AnyStep]:
         """The loads of a kind among its steps."""

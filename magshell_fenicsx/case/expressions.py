@@ -3,7 +3,7 @@
 import ast
 import operator
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -87,6 +87,29 @@ def _evaluate(steps: list[_Step], x: Any, y: Any, z: Any) -> Any:
             else:
                 stack.append(names[step] if isinstance(step, str) else step)
     return stack[0]
+
+
+def symbolic(text: str, functions: Mapping[str, Callable[..., Any]], x: Any, y: Any, z: Any) -> Any:
+    """A formula of symbols, with the functions that stand for those of `FUNCTIONS`."""
+    formula(text)
+    instead = {FUNCTIONS[name]: functions[name] for name in FUNCTIONS}
+    names, stack = {"x": x, "y": y, "z": z, "pi": float(np.pi)}, list[Any]()
+    for step in _steps(ast.parse(text, mode="eval")):
+        if isinstance(step, tuple):
+            function, count = step
+            stack[-count:] = [instead.get(function, function)(*stack[-count:])]
+        else:
+            stack.append(names[step] if isinstance(step, str) else float(step))
+    return stack[0]
+
+
+def is_formula(text: str) -> bool:
+    """Whether `formula` takes it."""
+    try:
+        formula(text)
+    except ValueError:
+        return False
+    return True
 
 
 def _steps(tree: ast.Expression) -> list[_Step]:

@@ -8,12 +8,14 @@ from pydantic import Discriminator, Field, Tag
 
 from magshell_fenicsx.case.loads.dead import DeadSection
 from magshell_fenicsx.case.loads.field import FieldBefore, FieldSection, RotationSection
+from magshell_fenicsx.case.loads.growth import GrowthSection
 from magshell_fenicsx.case.loads.indentation import IndentationSection
 from magshell_fenicsx.case.loads.pressure import PressureSection
 from magshell_fenicsx.case.loads.step import PathStep, Step, Until
 
 OneStep: TypeAlias = Annotated[
-    PressureSection | IndentationSection | FieldSection | RotationSection | DeadSection, Field(discriminator="kind")
+    PressureSection | IndentationSection | FieldSection | RotationSection | GrowthSection | DeadSection,
+    Field(discriminator="kind"),
 ]
 PROGRAMME = "programme"  # tag of a list of steps; see `messages.UNIONS`
 Loading: TypeAlias = Annotated[
@@ -50,19 +52,26 @@ class ProgrammeStep:
         return self.load.until if isinstance(self.load, PathStep) else "target"
 
 
-def programme(loading: Step | Sequence[Step] | None, *, field: bool) -> tuple[ProgrammeStep, ...]:
-    """The steps of a case: those of a list, or the field and then one load.
+def programme(
+    loading: Step | Sequence[Step] | None, *, field: bool, natural: Sequence[str] = ()
+) -> tuple[ProgrammeStep, ...]:
+    """The steps of a case: those of a list, or the natural shape, the field and then one load.
 
     Parameters
     ----------
     field
         Whether the case has a field.
+    natural
+        What of its natural shape grows, stretch before curvature.
     """
     if isinstance(loading, Sequence):
         return _numbered(loading, [f"loading.{i}" for i in range(len(loading))])
+    grown = [] if isinstance(loading, GrowthSection) else [{"kind": "natural", key: 1.0} for key in natural]
+    growth = [GrowthSection.model_validate(each) for each in grown]
     first = [FieldBefore(kind="field")] if field and not isinstance(loading, FieldSection) else []
     given = [loading] if loading else []
-    return _numbered([*first, *given], [*("magnetic" for _ in first), *("loading" for _ in given)])
+    keys = [*("natural" for _ in growth), *("magnetic" for _ in first), *("loading" for _ in given)]
+    return _numbered([*growth, *first, *given], keys)
 
 
 def _numbered(loads: Sequence[Step], keys: Sequence[str]) -> tuple[ProgrammeStep, ...]:

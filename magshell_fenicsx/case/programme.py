@@ -68,6 +68,6 @@ def _refuse_unfit_hold(step: ProgrammeStep, steps: Sequence[ProgrammeStep]) -> N
         if (
             how == "conjugate"
             and load is not None
-            and (not load.conjugate or (isinstance(load, DeadSection) and load.turns))
+            and (not load.conjugate or (isinstance(load, DeadSection) and (load.turns or load.by_place)))
         ):
             raise ValueError(f"{key}: conjugate: nothing that can be held is conjugate to it; allowed: load")

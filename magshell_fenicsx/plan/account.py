@@ -18,6 +18,11 @@ def account(case: Case, loads: Loads, model: str, mirror: Mirror | None) -> tupl
         included.append(f"magnetic energy ({loads.magnetic.energy}){law}, lambda_m = {case.lambda_m:g}")
     else:
         left_out.append("magnetic energy: " + ("lambda_m is zero" if case.magnetic else "no magnetic section"))
+    if loads.natural:
+        names = " and ".join(name.removeprefix("natural_") for name in loads.natural.amplitudes)
+        included.append(f"natural {names}: strains are measured from there")
+    else:
+        left_out.append("natural shape: as drawn")
     if loads.pressure:
         included.append("live pressure" if case.model == "shell" else "live pressure on the outer face")
     else:

@@ -4,15 +4,19 @@ from collections.abc import Mapping
 from math import radians
 
 import numpy as np
+import ufl
 from numpy.typing import NDArray
+from ufl.core.expr import Expr
 
 from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.expressions import symbolic
 from magshell_fenicsx.case.loads.dead import DeadLoadSection, DeadSection
 from magshell_fenicsx.case.loads.field import RotationSection
 from magshell_fenicsx.case.loads.indentation import IndentationSection, Place
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.mesh.frame import rotation
 from magshell_fenicsx.mesh.mirror import Mirror
+from magshell_fenicsx.models.shell.kinematics import Jet
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.parameters import (
     AreaForce,
@@ -22,11 +26,17 @@ from magshell_fenicsx.models.shell.parameters import (
     Force,
     Loads,
     PointForce,
+    Potential,
 )
+from magshell_fenicsx.models.shell.patterns import Pattern
+from magshell_fenicsx.plan.by_formula import ByFormula, function
 from magshell_fenicsx.plan.magnetisation import magnetisation
+from magshell_fenicsx.plan.natural import natural
 from magshell_fenicsx.plan.outline import Outline
 
 Array = NDArray[np.float64]
+SYMBOLIC = {name: getattr(ufl, name) for name in ("sin", "cos", "tan", "exp", "sqrt", "sign")}
+SYMBOLIC |= {"log": ufl.ln, "abs": abs, "arctan2": ufl.atan2}
 
 
 def loads(case: Case, under: Mapping[str, str], turn: float, mirror: Mirror | None, own: tuple[OwnTerm, ...]) -> Loads:
@@ -51,11 +61,11 @@ def loads(case: Case, under: Mapping[str, str], turn: float, mirror: Mirror | No
             forces[name] = Force(under[name], load.patch / case.shell.R_over_h)
         elif isinstance(load, DeadSection):
             here = (one for one in load.loads if not mirror or one.edge not in mirror.lost)
-            dead[name] = tuple(_dead(one, case, turn, mirror) for one in here)
+            dead[name] = tuple(_dead(one, f"{name}_potential_{i}", case, turn, mirror) for i, one in enumerate(here))
     turned = [load.to for load in case.loads_of(RotationSection)]
     field = magnetisation(magnetic, case, turn, turned) if magnetic and "lambda_m" in steps else None
     pressure = "pressure" in steps or any("pressure" in load.hold for load in steps.values())
-    return Loads(pressure, forces, field, dead, own)
+    return Loads(pressure, forces, field, dead, own, natural(case, turn))
 
 
 def indented(case: Case, outline: Outline) -> dict[str, Array]:
@@ -116,10 +126,16 @@ def refuse_wide_patch(case: Case, outline: Outline, at: Mapping[str, Array]) -> 
             )
 
 
-def _dead(load: DeadLoadSection, case: Case, turn: float, mirror: Mirror | None) -> DeadLoad:
+def _dead(load: DeadLoadSection, name: str, case: Case, turn: float, mirror: Mirror | None) -> DeadLoad:
     shared = mirror is not None and (load.edge is None or mirror.other(load.edge) == load.edge)
     Q, scales = rotation(turn), case.scales
     E, t, R = scales.E, scales.h, scales.R
+    if load.potential is not None:
+        return Potential(_potential(name, load.potential, Q, case))
+    if load.varies:
+        unit = E * t if load.edge else E * t / R
+        pattern = _pattern(load, Q, R, 1 / unit)
+        return EdgeForce(load.edge, pattern, total=False) if load.edge else AreaForce(_over(load), pattern)
     force = np.asarray((0.5 if shared else 1.0) * (Q @ (load.force or np.zeros(3))) / (E * t * R))
     if load.at is not None:
         return PointForce(load.at, force)
@@ -129,9 +145,42 @@ def _dead(load: DeadLoadSection, case: Case, turn: float, mirror: Mirror | None)
         return EdgeForce(load.edge, force, total=True)
     if load.edge is not None:
         assert load.per_length is not None
-        return EdgeForce(load.edge, np.asarray(Q @ load.per_length / (E * t)), total=False)
-    patch = None if load.over == "all" else load.over
+        return EdgeForce(load.edge, np.asarray(Q @ np.array(load.per_length, dtype=float) / (E * t)), total=False)
     if load.pressure is not None:
-        return AreaForce(patch, load.pressure * R / (E * t))
+        assert isinstance(load.pressure, float | int)
+        return AreaForce(_over(load), load.pressure * R / (E * t))
     assert load.per_area is not None
-    return AreaForce(patch, np.asarray(Q @ load.per_area * R / (E * t)))
+    return AreaForce(_over(load), np.asarray(Q @ np.array(load.per_area, dtype=float) * R / (E * t)))
+
+
+def _over(load: DeadLoadSection) -> str | None:
+    return None if load.over == "all" else load.over
+
+
+def _pattern(load: DeadLoadSection, Q: Array, length: float, factor: float) -> Pattern:
+    """The load of a formula in the model's frame; a pressure is against the normal."""
+    if load.vector is not None:
+        return ByFormula([function(v) for v in load.vector], Q, length, factor, vectors=True)
+    assert load.pressure is not None
+    p = ByFormula([function(load.pressure)], Q, length, factor)
+    return lambda r0, n0: -p(r0, n0) * n0
+
+
+def potentials(case: Case) -> list[OwnTerm]:
+    """The energies of loads that depend on the deformed place."""
+    texts = [load.potential for step in case.loads_of(DeadSection) for load in step.loads if load.potential]
+    return [_potential(f"potential_{i}", text, np.eye(3), case) for i, text in enumerate(texts)]
+
+
+def _potential(name: str, text: str, Q: Array, case: Case) -> OwnTerm:
+    """Zero where nothing has moved."""
+    scales = case.scales
+
+    def at(r: Expr, scale: Expr, size: Expr) -> Expr:
+        x = [scale * sum(float(Q[j, i]) * r[j] for j in range(3) if Q[j, i]) for i in range(3)]
+        return size * symbolic(text, SYMBOLIC, *x)
+
+    def density(r0: Jet, u: Jet, scale: Expr, size: Expr) -> Expr:
+        return at(r0.r + u.r, scale, size) - at(r0.r, scale, size)
+
+    return OwnTerm(name, density, (scales.R, 1 / (scales.E * scales.h)))

@@ -26,7 +26,7 @@ from magshell_fenicsx.models.shell.parameters import Condition, Held, Material
 from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.plan.account import account
 from magshell_fenicsx.plan.limits import refuse_too_many, refuse_unbounded_fields, sources_beside
-from magshell_fenicsx.plan.loads import indented, loads, refuse_wide_patch
+from magshell_fenicsx.plan.loads import indented, loads, potentials, refuse_wide_patch
 from magshell_fenicsx.plan.names import refuse_unfit_ends
 from magshell_fenicsx.plan.outline import Chart, Outline, outline, refuse_beside
 from magshell_fenicsx.plan.own_terms import surface_terms
@@ -55,7 +55,7 @@ def make_plan(case: Case, terms: Sequence[OwnTerm] = ()) -> Plan:
     sample = np.zeros((0, 3)) if isinstance(case.shell, MeshSurface) else drawn.sample()
     refuse_unbounded_fields(case, sample)
     energies = surface_terms(case, terms)
-    axisymmetric, plane = _symmetry(case, drawn, left(case, drawn, places, energies))
+    axisymmetric, plane = _symmetry(case, drawn, left(case, drawn, places, (*energies, *potentials(case))))
     half = plane is not None
     turn, beyond = 0.0, plane
     if plane and drawn.round and plane.through_e3:  # the frame is turned into the plane

@@ -16,7 +16,10 @@ from magshell_fenicsx.case.loads.field import RotationSection
 from magshell_fenicsx.case.loads.step import Step
 from magshell_fenicsx.mesh.mirror import ROUNDING, Y0, Mirror
 from magshell_fenicsx.models.shell.own_term import OwnTerm
+from magshell_fenicsx.plan import natural
+from magshell_fenicsx.plan.by_formula import function
 from magshell_fenicsx.plan.outline import Outline
+from magshell_fenicsx.plan.plan import Span
 from magshell_fenicsx.plan.turning import beside, scalar_turns, vector_turns, vectors_of
 
 Array = NDArray[np.float64]
@@ -60,7 +63,8 @@ def left(case: Case, outline: Outline, indented: Mapping[str, Array], terms: Seq
         _shape(case, outline),
         *_supports(case),
         *(_field(case, outline) if case.magnetic and case.lambda_m else []),
-        *_loads(case, indented),
+        *_natural(case, outline),
+        *_loads(case, outline, indented),
         *_named(case, outline),
         *(_energy(term, outline) for term in terms),
     ]
@@ -213,11 +217,20 @@ def _field(case: Case, outline: Outline) -> list[Leaves]:
     return [Leaves(next(iter(askew), None), vectors, mirrors)]
 
 
-def _loads(case: Case, indented: Mapping[str, Array]) -> list[Leaves]:
-    return [leaves for step in case.programme for leaves in _load(case, step.load, indented.get(step.name))]
+def _natural(case: Case, outline: Outline) -> list[Leaves]:
+    if case.natural is None:
+        return []
+    chosen = natural.along(case) if natural.uneven(case) else natural.MERIDIAN
+    fixed = not isinstance(chosen, str) and all(isinstance(v, float | int) for v in chosen)
+    vectors = [_unit(np.array(chosen, dtype=float))] if fixed else []
+    return [Leaves(natural.askew(case, outline), vectors, lambda mirror: natural.mirrored(case, outline, mirror))]
 
 
-def _load(case: Case, loading: Step, place: Array | None) -> list[Leaves]:
+def _loads(case: Case, outline: Outline, indented: Mapping[str, Array]) -> list[Leaves]:
+    return [leaves for step in case.programme for leaves in _load(case, outline, step.load, indented.get(step.name))]
+
+
+def _load(case: Case, outline: Outline, loading: Step, place: Array | None) -> list[Leaves]:
     """What a step leaves; `place` of a force, over R."""
     R = case.shell.reference
     if place is not None:
@@ -226,29 +239,44 @@ def _load(case: Case, loading: Step, place: Array | None) -> list[Leaves]:
     if isinstance(loading, RotationSection):
         return [Leaves("the field turns", [loading.to.vector()])]
     if isinstance(loading, DeadSection):
-        forces = [np.array(v) for load in loading.loads for v in (load.force, load.per_length, load.per_area) if v]
+        fixed = [load for load in loading.loads if not load.varies]
+        forces = [np.array(v) for load in fixed for v in (load.force, load.per_length, load.per_area) if v]
         places = [np.array(case.points[load.at]) / R for load in loading.loads if load.at]
         vectors = [_unit(v) for v in (*forces, *places)]
+        x = outline.sample() if len(fixed) < len(loading.loads) else np.zeros((0, 3))
         patches = any(load.over not in (None, "all") for load in loading.loads)
 
         def mirrors(mirror: Mirror) -> bool:
             on_plane = all(abs(float(mirror.beyond(x))) < ROUNDING for x in places)
-            return on_plane and all(any(_is_image(a, b, mirror) for b in loading.loads) for a in loading.loads)
+            return on_plane and all(any(_is_image(a, b, mirror, x, R) for b in loading.loads) for a in loading.loads)
 
         tilted = any(_tilted(v) for v in vectors)
         why = "a load is not along e3, or off the axis" if tilted else "a patch is loaded" if patches else None
+        span = outline.span
+        if span and not all(_turns(load, span, R) for load in loading.loads if load.varies):
+            why = why or "a load differs around e3"
         return [Leaves(why, vectors, mirrors)]
     return []
 
 
-def _is_image(load: DeadLoadSection, other: DeadLoadSection, mirror: Mirror) -> bool:
+def _turns(load: DeadLoadSection, span: Span, R: float) -> bool:
+    if load.vector is None:
+        return scalar_turns(str(load.pressure), span, R)
+    return vector_turns([str(v) for v in load.vector], span, R)
+
+
+def _is_image(load: DeadLoadSection, other: DeadLoadSection, mirror: Mirror, x: Array, R: float) -> bool:
+    """Whether the plane mirrors one load to the other; x are places (n, 3) for formulas."""
+    if load.varies or other.varies:
+        return _mirrored_formula(load, other, mirror, R * x, R * mirror.image(x))
     edge = load.edge and mirror.other(load.edge)
-    if (edge, load.at, load.over, load.moment, load.pressure) != (
+    if (edge, load.at, load.over, load.moment, load.pressure, load.potential is None) != (
         other.edge,
         other.at,
         other.over,
         other.moment,
         other.pressure,
+        other.potential is None,
     ):
         return False
     for here, there in ((getattr(x, key) for x in (load, other)) for key in ("force", "per_length", "per_area")):
@@ -257,6 +285,17 @@ def _is_image(load: DeadLoadSection, other: DeadLoadSection, mirror: Mirror) -> 
         if here and np.abs(mirror.reflection @ here - there).max() > 1e-10 * np.linalg.norm(here):
             return False
     return True
+
+
+def _mirrored_formula(load: DeadLoadSection, other: DeadLoadSection, mirror: Mirror, x: Array, image: Array) -> bool:
+    edge = load.edge and mirror.other(load.edge)
+    if (edge, load.over, load.vector is None) != (other.edge, other.over, other.vector is None):
+        return False
+    values, images = (
+        np.stack([function(v)(*places.T) for v in (each.vector or [each.pressure or 0.0])], axis=-1)
+        for each, places in ((load, x), (other, image))
+    )
+    return _alike(values if load.vector is None else values @ mirror.reflection, images)
 
 
 def _named(case: Case, outline: Outline) -> list[Leaves]:

@@ -15,21 +15,26 @@ NEAR = 0.1  # over R
 SAME = 1e-9  # of the largest value: differences that are rounding
 
 
-def scalar_turns(text: str, span: Span) -> bool:
-    """Whether a formula has the same value all around."""
-    f, places = formula(text), _places(span)
+def scalar_turns(text: str, span: Span, length: float = 1.0) -> bool:
+    """Whether a formula has the same value all around; its unit of length is R over `length`."""
+    f, places = formula(text), length * _places(span)
     return _same([f(*(places @ rotation(angle)).T)[:, None] for angle in ANGLES])
 
 
-def vector_turns(components: Sequence[str], span: Span, *, in_space: bool = False) -> bool:
+def vector_turns(components: Sequence[str], span: Span, length: float = 1.0, *, in_space: bool = False) -> bool:
     """Whether the vector with these components turns with the meridian and has none across it.
 
     On the surface, and with `in_space` beside it, where it may move to.
+
+    Parameters
+    ----------
+    length
+        R in the unit of the formulas' places.
     """
     vectors, places = vectors_of(components), _places(span)
     if in_space:
         places = beside(places) * [1.0, 0.0, 1.0]
-    found = [vectors(places @ Q) @ Q.T for Q in map(rotation, ANGLES)]
+    found = [vectors(length * places @ Q) @ Q.T for Q in map(rotation, ANGLES)]
     return _same([*found, found[0] * [1.0, 0.0, 1.0]])
 
 

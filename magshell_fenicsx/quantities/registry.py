@@ -100,7 +100,11 @@ OF_EVERY_RUN = (
     ),
     Quantity("step", "step", "Number of the programme's step; 0 is the start.", "count"),
 )
-OF_SOME_RUNS = (Quantity("load_factor", "load factor", "Common factor of all dead loads.", "load"),)
+OF_SOME_RUNS = (
+    Quantity("load_factor", "load factor", "Common factor of all dead loads.", "load"),
+    Quantity("natural_curvature", "natural curvature", "Factor of the natural curvature; 0: as drawn.", "load"),
+    Quantity("natural_stretch", "natural stretch", "Factor of the natural stretch less one; 0: as drawn.", "load"),
+)
 QUANTITIES = {q.name: q for q in (*OF_EVERY_RUN, *OF_SOME_RUNS)}
 AMPLITUDES = {
     a.name: a

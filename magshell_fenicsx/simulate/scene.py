@@ -103,6 +103,7 @@ class Scene:
         model, h, loads = self.model, self.plan.material.h, self.model.loads
         force, sense = loads.forces.get("force"), copysign(1.0, self.case.lambda_m)
         model.system.accept(state.u)
+        model.system.place(state.mu)
         pole = model.deflection(state.u, "pole") / h
         potentials, energies = model.system.energies(state.u), defaultdict[str, float](float)
         for t in model.system.terms:
@@ -141,9 +142,12 @@ class Scene:
 
     @property
     def _own_amplitudes(self) -> dict[str, float]:
-        """The amplitudes and free parameters of user-defined energies, with their initial values."""
-        terms = self.plan.loads.own
-        return {term.name: term.value for term in terms} | {p.name: p.value for term in terms for p in term.free}
+        """The amplitudes of the natural shape and of user-defined energies and parameters, with initial values."""
+        terms, natural = self.plan.loads.own, self.plan.loads.natural
+        grown = dict.fromkeys(natural.amplitudes, 0.0) if natural else {}
+        return (
+            grown | {term.name: term.value for term in terms} | {p.name: p.value for term in terms for p in term.free}
+        )
 
     @property
     def extra_columns(self) -> tuple[str, ...]:

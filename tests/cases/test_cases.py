@@ -323,3 +323,12 @@ def test_figure_of_indentation() -> None:
     """figures/indentation.yaml: mixed reference at w/h = 5."""
     found = result("figures/indentation.yaml", "loading.depth=5", "loading.points=5")
     assert force_at(found, 5) == pytest.approx(8.2762, rel=3e-3)
+
+
+def test_natural_strip() -> None:
+    """A natural curvature of 2 pi/L closes a strip to a circle; a quarter of it lifts the tip by 2 L/pi, to 1e-6."""
+    rows = [row for row in result("natural_strip.yaml").rows if row["label"] == "target"]
+    w = [float(row["w_pole_over_h"]) for row in rows]
+    assert w == pytest.approx([-200 / np.pi, -200 / np.pi, -200 / (3 * np.pi), 0], rel=1e-6, abs=1e-5)
+    assert [float(row["natural_curvature"]) for row in rows] == [0.25, 0.5, 0.75, 1.0]
+    assert abs(float(rows[-1]["energy"])) < 1e-12

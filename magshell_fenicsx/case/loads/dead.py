@@ -3,18 +3,38 @@
 from math import copysign
 from typing import Annotated, Any, ClassVar, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
+from magshell_fenicsx.case.expressions import is_formula
+from magshell_fenicsx.case.fields import Formula
 from magshell_fenicsx.case.loads.step import Count, Now, PathStep, Target, Until
-from magshell_fenicsx.parts.section import Section, or_number
+from magshell_fenicsx.parts.section import Section, in_units, or_number
 
 Finite = Annotated[float, Field(ge=-1e30, le=1e30)]
 Moment = Annotated[float, or_number("newton", Finite), Field(ge=-1e30, le=1e30)]
-DeadPressure = Annotated[float, or_number("pascal", Finite), Field(ge=-1e30, le=1e30)]
 Three = Field(min_length=3, max_length=3)
 Force = Annotated[list[Moment], Three]
-PerLength = Annotated[list[Annotated[float, or_number("newton/metre", Finite), Field(ge=-1e30, le=1e30)]], Three]
-PerArea = Annotated[list[DeadPressure], Three]
+LARGEST = 1e30
+
+
+def _or_formula(unit: str) -> Any:
+    """A number, text with a unit, or a formula of x, y, z."""
+
+    def read(value: Any) -> Any:
+        if isinstance(value, str) and is_formula(value):
+            return value
+        found = in_units(unit)(value)
+        if isinstance(found, bool) or not isinstance(found, int | float) or not abs(found) <= LARGEST:
+            raise ValueError(f"{value!r}: allowed are numbers up to {LARGEST:g} in size, with a unit, and formulas")
+        return found
+
+    return BeforeValidator(read, json_schema_input_type=Finite | str)
+
+
+Varying = float | str
+PerLength = Annotated[list[Annotated[Varying, _or_formula("newton/metre")]], Three]
+PerArea = Annotated[list[Annotated[Varying, _or_formula("pascal")]], Three]
+VaryingPressure = Annotated[Varying, _or_formula("pascal")]
 
 
 class DeadLoadSection(Section):
@@ -22,7 +42,8 @@ class DeadLoadSection(Section):
 
     On an edge: `force` in all, `per_length`, or `moment` per length about the edge's first tangent, which turns
     with the edge. Over the surface (`over: all`, or a patch of a mesh): `per_area`, or `pressure` along the
-    undeformed normal, positive from outside.
+    undeformed normal, positive from outside. What is per length or area may be a formula of the undeformed place
+    x, y, z in the shell's length, such as "cos(2*arctan2(y, x))".
     """
 
     at: str | None = None
@@ -39,12 +60,19 @@ class DeadLoadSection(Section):
     """On an edge, about its tangent with the surface on its left; positive turns the normal outward [force]"""
     per_area: PerArea | None = None
     """Over the surface [force/length²]"""
-    pressure: DeadPressure | None = None
+    pressure: VaryingPressure | None = None
     """Over the surface, against the undeformed normal [force/length²]"""
+    potential: Formula | None = None
+    """Over all: energy per undeformed area as a formula of the deformed place x, y, z in the shell's length, whose
+    negative gradient is the force: gravity, springs, a field of force [force/length]"""
 
     @model_validator(mode="after")
     def _one_load_in_one_place(self) -> Self:
-        fitting = {"at": ("force",), "edge": ("force", "per_length", "moment"), "over": ("per_area", "pressure")}
+        fitting = {
+            "at": ("force",),
+            "edge": ("force", "per_length", "moment"),
+            "over": ("per_area", "pressure", "potential"),
+        }
         places = [place for place in fitting if getattr(self, place) is not None]
         if len(places) != 1:
             raise ValueError(
@@ -57,7 +85,19 @@ class DeadLoadSection(Section):
         value = getattr(self, given[0])
         if not (any(value) if isinstance(value, list) else value):
             raise ValueError(f"{given[0]}: is zero")
+        if self.potential is not None and self.over != "all":
+            raise ValueError(f"potential: goes with over: all, not with {self.over}")
         return self
+
+    @property
+    def vector(self) -> list[Varying] | None:
+        """Its components, if it has a direction in space."""
+        return next((list(v) for v in (self.force, self.per_length, self.per_area) if v is not None), None)
+
+    @property
+    def varies(self) -> bool:
+        """Whether it has a formula of the undeformed place."""
+        return isinstance(self.pressure, str) or any(isinstance(v, str) for v in self.vector or [])
 
 
 class DeadSection(PathStep):
@@ -87,8 +127,10 @@ class DeadSection(PathStep):
 
     @model_validator(mode="after")
     def _moments_have_no_displacement(self) -> Self:
-        if self.turns and (self.control == "displacement" or self.displacement is not None):
-            raise ValueError("displacement: a moment has none; take control: arc or load with factor")
+        if self.control == "displacement" or self.displacement is not None:
+            for has, what in ((self.turns, "moment"), (self.by_place, "potential")):
+                if has:
+                    raise ValueError(f"displacement: a {what} has none; take control: arc or load with factor")
         if self.branches and self.turns:
             raise ValueError("branches: not with a moment, whose potential counts the turns along one path")
         return self
@@ -97,6 +139,11 @@ class DeadSection(PathStep):
     def turns(self) -> bool:
         """Whether a moment is among the loads."""
         return any(load.moment is not None for load in self.loads)
+
+    @property
+    def by_place(self) -> bool:
+        """Whether a potential is among the loads."""
+        return any(load.potential is not None for load in self.loads)
 
     @property
     def place(self) -> Any:

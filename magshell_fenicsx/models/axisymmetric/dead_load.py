@@ -9,9 +9,11 @@ from ufl.core.expr import Expr
 
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.models.axisymmetric.energies import Energy, EnergyFactory, Integral
+from magshell_fenicsx.models.axisymmetric.pattern import pattern_field
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.kinematics import Jet
-from magshell_fenicsx.models.shell.parameters import AreaForce, DeadLoad, EdgeForce, EdgeMoment, PointForce
+from magshell_fenicsx.models.shell.parameters import AreaForce, DeadLoad, EdgeForce, EdgeMoment, PointForce, Potential
+from magshell_fenicsx.models.shell.patterns import FINER
 
 
 def dead_loads(name: str, loads: Sequence[DeadLoad], factory: EnergyFactory, log: KernelLog) -> tuple[Energy, float]:
@@ -21,7 +23,7 @@ def dead_loads(name: str, loads: Sequence[DeadLoad], factory: EnergyFactory, log
     """
     parts, size = list[tuple[Expr, Integral]](), 0.0
     for load in loads:
-        if isinstance(load, EdgeMoment):
+        if isinstance(load, EdgeMoment | Potential):
             continue
         if isinstance(load, PointForce):
             over = factory.at_pole()
@@ -29,6 +31,11 @@ def dead_loads(name: str, loads: Sequence[DeadLoad], factory: EnergyFactory, log
             over = factory.around(factory.meridian.ends[load.edge])
         else:
             over = factory.area()
+        if not isinstance(load, PointForce) and callable(load.force):
+            along = pattern_field(load.force, factory.r0, FINER)
+            parts.append((along, over))
+            size += _integral(ufl.sqrt(ufl.dot(along, along)), over, log)
+            continue
         whole = _whole(over, factory, log)
         if isinstance(load, AreaForce) and isinstance(load.force, float):
             along, strength = -kin.normal(factory.j0) * factory.constant(load.force), abs(load.force)
@@ -53,4 +60,8 @@ def pole_force(name: str, patch: float, unit: float, factory: EnergyFactory, log
 
 def _whole(over: Integral, factory: EnergyFactory, log: KernelLog) -> float:
     """The integral of 1, all around."""
-    return float(2 * np.pi * fem.assemble_scalar(log.compile("load measure", over(factory.constant(1.0)))))
+    return _integral(factory.constant(1.0), over, log)
+
+
+def _integral(f: Expr, over: Integral, log: KernelLog) -> float:
+    return float(2 * np.pi * fem.assemble_scalar(log.compile("load measure", over(f))))

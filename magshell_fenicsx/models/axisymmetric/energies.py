@@ -24,6 +24,7 @@ from magshell_fenicsx.models.shell.energy import Density
 from magshell_fenicsx.models.shell.free import Constants, constants_of
 from magshell_fenicsx.models.shell.kinematics import Jet
 from magshell_fenicsx.models.shell.laws import FULL, LINEAR, magnetic_densities
+from magshell_fenicsx.models.shell.natural import Forms, Shape
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.parameters import Magnetisation, Material
 
@@ -51,6 +52,8 @@ class EnergyFactory:
     ----------
     thickness
         What multiplies h, (1,); None for 1.
+    natural
+        The natural shape; None if it is the drawn one.
     """
 
     meridian: Meridian
@@ -59,15 +62,18 @@ class EnergyFactory:
     sigma: float
     degree: int
     thickness: fem.Function | None = None
+    natural: Shape | None = None
     free: Constants = field(default_factory=dict)  # of parameters that enter freely
 
     def membrane(self) -> Energy:
         j0, t, nu = self.j0, self._t, self.constant(self.material.nu)
-        return self._cells("membrane", lambda u: t * densities.membrane(j0, u, nu))
+        natural = self._natural()
+        return self._cells("membrane", lambda u: t * densities.membrane(j0, u, nu, natural))
 
     def bending(self) -> Energy:
         j0, t, (nu, h) = self.j0, self._t, self._nu_h()
-        return self._cells("bending", lambda u: t * densities.bending(j0, u, nu, t * h))
+        natural = self._natural()
+        return self._cells("bending", lambda u: t * densities.bending(j0, u, nu, t * h, natural))
 
     def interior_edges(self) -> Energy:
         """Folds between cells: the interior edges of the meridian are circles."""
@@ -75,10 +81,12 @@ class EnergyFactory:
         dS = ufl.Measure("dS", domain=self.meridian.mesh)
         t = self.thickness and (self.thickness("+"), self.thickness("-"))
         m, width = self._covector(), ufl.avg(self._width())
+        plus, minus = self._natural("+"), self._natural("-")
+        natural = (plus, minus) if plus and minus else None
 
         def energy(u: Jet) -> ufl.Form:
             r0, v = ((j.side("+"), j.side("-")) for j in (j0, u))
-            return edges.interior(r0, v, (m("+"), m("-")), width, nu, h, sigma, t) * dS
+            return edges.interior(r0, v, (m("+"), m("-")), width, nu, h, sigma, t, natural=natural) * dS
 
         return Energy(INTERIOR, energy)
 
@@ -123,9 +131,9 @@ class EnergyFactory:
         unit = self.constant(self.material.classical_pressure / self.material.h)
         return Energy("pressure", lambda u: unit * self.volume_change(u), "pressure")
 
-    def own(self, term: OwnTerm) -> Energy:
-        """The energy of a part or one's own, with the amplitude of its name; it shares the symmetry."""
-        return self._cells(term.name, self._surface(term, term.density), term.name, linear=term.linear)
+    def own(self, term: OwnTerm, amplitude: str | None = None) -> Energy:
+        """The energy of a part or one's own, with the amplitude of its name or another; it shares the symmetry."""
+        return self._cells(term.name, self._surface(term, term.density), amplitude or term.name, linear=term.linear)
 
     def observed(self, term: OwnTerm, u: Jet) -> dict[str, ufl.Form]:
         """What it observes, of the whole shell."""
@@ -175,6 +183,14 @@ class EnergyFactory:
     def _t(self) -> Expr | float:
         return 1.0 if self.thickness is None else self.thickness[0]
 
+    def _natural(self, side: str = "") -> Forms | None:
+        if self.natural is None:
+            return None
+        field, *amplitudes = self.natural.parameters
+        if not side:
+            return self.natural.forms(self.j0, field, *amplitudes)
+        return self.natural.forms(self.j0.side(side), field(side), *amplitudes)
+
     def _nu_h(self) -> tuple[fem.Constant, fem.Constant]:
         return self.constant(self.material.nu), self.constant(self.material.h)
 
@@ -206,5 +222,5 @@ class EnergyFactory:
     def _ends(self, name: str, density: Callable[..., Expr], facets: Facets, *rest: Expr) -> Energy:
         """The bending energy of ends whose normal does not turn freely."""
         j0, t, nu, h, sigma = self.j0, self._t, *self._nu_h(), self.constant(self.sigma)
-        ds, m, width = self._ds(facets), self._covector(), self._width()
-        return Energy(name, lambda u: t * density(j0, u, m, width, nu, t * h, sigma, *rest) * ds)
+        ds, m, width, natural = self._ds(facets), self._covector(), self._width(), self._natural()
+        return Energy(name, lambda u: t * density(j0, u, m, width, nu, t * h, sigma, *rest, natural=natural) * ds)

@@ -11,6 +11,7 @@ import numpy as np
 from dolfinx import fem
 
 from magshell_fenicsx.assembly.kernels import KernelLog
+from magshell_fenicsx.assembly.parameter import make_parameters
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.assembly.terms import FormTerm
 from magshell_fenicsx.continuation.system import Vector
@@ -19,16 +20,16 @@ from magshell_fenicsx.models.axisymmetric.dead_load import dead_loads, pole_forc
 from magshell_fenicsx.models.axisymmetric.energies import INTERIOR, Energy, EnergyFactory
 from magshell_fenicsx.models.axisymmetric.instability import ExcludedWaves
 from magshell_fenicsx.models.axisymmetric.meridian import Meridian
-from magshell_fenicsx.models.axisymmetric.pattern import thickness_field
+from magshell_fenicsx.models.axisymmetric.pattern import places, thickness_field
 from magshell_fenicsx.models.axisymmetric.probe import Array, Probe
 from magshell_fenicsx.models.axisymmetric.supports import supports
 from magshell_fenicsx.models.axisymmetric.waves import Waves
 from magshell_fenicsx.models.observed import Observed
 from magshell_fenicsx.models.shell import edges
 from magshell_fenicsx.models.shell.energy import Density
-from magshell_fenicsx.models.shell.free import free_parameters
 from magshell_fenicsx.models.shell.moment import Counted
-from magshell_fenicsx.models.shell.parameters import Condition, EdgeMoment, Loads, Material, default_penalty
+from magshell_fenicsx.models.shell.natural import Shape, natural_field
+from magshell_fenicsx.models.shell.parameters import Condition, EdgeMoment, Loads, Material, Potential, default_penalty
 from magshell_fenicsx.models.shell.thickness import Thickness
 
 
@@ -83,7 +84,11 @@ class MeridianModel(Observed):
         self.r0, self.u = meridian.placement(V), fem.Function(V, name="u")
         self.sigma = default_penalty(degree) if sigma is None else sigma
         self.thickness = thickness_field(thickness, self.r0) if thickness else None
-        self.factory = factory = EnergyFactory(meridian, self.r0, material, self.sigma, degree, self.thickness)
+        free, shape = dict[str, fem.Constant](), None
+        if loads.natural:
+            shape = Shape.of(natural_field(loads.natural, *places(self.r0), V), loads.natural, free)
+        factory = EnergyFactory(meridian, self.r0, material, self.sigma, degree, self.thickness, shape, free)
+        self.factory = factory
         self.supports = supports(meridian, conditions, pressure=loads.pressure)
         self.energies = [factory.membrane(), factory.bending(), factory.interior_edges()]
         if len(self.supports.clamped):
@@ -101,7 +106,8 @@ class MeridianModel(Observed):
             self.energies.append(pole_force(name, force.patch, self.force_unit, factory, self.kernels))
         self.load_size = {}
         for name, dead in loads.dead.items():
-            if not all(isinstance(load, EdgeMoment) for load in dead):
+            self.energies += [factory.own(load.term, name) for load in dead if isinstance(load, Potential)]
+            if not all(isinstance(load, EdgeMoment | Potential) for load in dead):
                 energy, self.load_size[name] = dead_loads(name, dead, factory, self.kernels)
                 self.energies.append(energy)
         terms = [self._term(e) for e in self.energies]
@@ -109,12 +115,7 @@ class MeridianModel(Observed):
             moments = [load for load in dead if isinstance(load, EdgeMoment)]
             terms += [self._moment(f"{name} moment {load.edge} {i}", load, name) for i, load in enumerate(moments)]
         pattern, held = next(term for term in terms if term.name == INTERIOR), self.supports.held(V)
-        parameters = free_parameters(
-            loads.own,
-            factory.free,
-            lambda term: self._term(factory.own(term)),
-            lambda term: self.kernels.compile_all([factory.observed(term, u)]),
-        )
+        parameters = make_parameters(factory.free, terms, self.u, self.kernels)
         self.system = FiniteElementSystem(self.u, terms, held, pattern, material.h, parameters=parameters)
         self._volume = self.kernels.compile("volume energy", 2 * np.pi * factory.volume_change(jets.revolved(self.u)))
         self._seen = {name: Probe.at(*place, self.r0) for name, place in meridian.points.items()}

@@ -7,39 +7,42 @@ from numpy.typing import NDArray
 from magshell_fenicsx.models.shell.patterns import Pattern
 from magshell_fenicsx.models.shell.thickness import Thickness, nodal_thickness
 
+Array = NDArray[np.float64]
 
-def pattern_field(pattern: Pattern, r0: fem.Function) -> fem.Function:
-    """The pattern at the nodes of every cell, free to jump from cell to cell; along (e_rho, e_theta, e_z)."""
+
+def pattern_field(pattern: Pattern, r0: fem.Function, finer: int = 0) -> fem.Function:
+    """The pattern along (e_rho, e_theta, e_z) at the nodes of every cell; see `shell.patterns.pattern_field`."""
     V = r0.function_space
-    Q = fem.functionspace(V.mesh, ("DG", V.element.basix_element.degree, (3,)))
+    Q = fem.functionspace(V.mesh, ("DG", V.element.basix_element.degree + finer, (3,)))
     field = fem.Function(Q, name="Br")
-    field.x.array.reshape(-1, 3)[Q.dofmap.list] = pattern(_nodes(r0), cell_normals(r0))
+    field.x.array.reshape(-1, 3)[Q.dofmap.list] = pattern(*places(r0, Q.element.basix_element.points))
     return field
 
 
 def thickness_field(thickness: Thickness, r0: fem.Function) -> fem.Function:
     """h(x)/h at the nodes of every cell; see `models.shell.thickness`."""
     assert thickness.of_position
-    nodes = _nodes(r0)
+    nodes, _ = places(r0)
     return nodal_thickness(thickness.of_position(*np.moveaxis(nodes, -1, 0)), nodes, r0.function_space)
 
 
-def _nodes(r0: fem.Function) -> NDArray[np.float64]:
-    """Undeformed places (cells, nodes, 3) at the azimuth 0."""
-    return np.insert(r0.x.array.reshape(-1, 2)[r0.function_space.dofmap.list], 1, 0.0, axis=-1)
-
-
-def cell_normals(r0: fem.Function) -> NDArray[np.float64]:
-    """Undeformed unit normal at each node of each cell, (cells, nodes, 3) along (e_rho, e_theta, e_z)."""
+def places(r0: fem.Function, at: Array | None = None) -> tuple[Array, Array]:
+    """The nodes of every cell, or other reference points (n, 1), and the normals there: (cells, n, 3) each."""
     V = r0.function_space
     element = V.element.basix_element
-    slopes = element.tabulate(1, element.points)[1, :, :, 0]
-    rho_s, z_s = np.moveaxis(r0.x.array.reshape(-1, 2)[V.dofmap.list], -1, 0) @ slopes.T
-    return np.asarray(np.stack([-z_s, 0 * z_s, rho_s], axis=-1) / np.hypot(rho_s, z_s)[..., None])
+    table = element.tabulate(1, element.points if at is None else at)[..., 0]
+    (rho, z), (rho_s, z_s) = (np.moveaxis(v, -1, 0) for v in np.einsum("dvk,cki->dcvi", table, _nodes(r0)))
+    normals = np.stack([-z_s, 0 * z_s, rho_s], axis=-1) / np.hypot(rho_s, z_s)[..., None]
+    return np.stack([rho, 0 * rho, z], axis=-1), np.asarray(normals)
 
 
-def nodal_normals(r0: fem.Function) -> NDArray[np.float64]:
+def _nodes(r0: fem.Function) -> Array:
+    """rho and z (cells, nodes, 2)."""
+    return np.asarray(r0.x.array.reshape(-1, 2)[r0.function_space.dofmap.list])
+
+
+def nodal_normals(r0: fem.Function) -> Array:
     """Unit normals (nodes, 3) at the azimuth 0, averaged over the cells that meet."""
     normals = np.zeros((len(r0.x.array) // 2, 3))
-    np.add.at(normals, r0.function_space.dofmap.list, cell_normals(r0))
+    np.add.at(normals, r0.function_space.dofmap.list, places(r0)[1])
     return np.asarray(normals / np.linalg.norm(normals, axis=1)[:, None])

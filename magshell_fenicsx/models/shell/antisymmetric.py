@@ -19,10 +19,20 @@ from magshell_fenicsx.models.shell import densities
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.edges import edge_density
 from magshell_fenicsx.models.shell.kinematics import Jet
+from magshell_fenicsx.models.shell.natural import Forms
 
 
 def antisymmetric_edge(
-    r0: Jet, u: Jet, v: Jet, m: Expr, width: Expr, nu: Expr, h: Expr, sigma: Expr, mirror: Expr
+    r0: Jet,
+    u: Jet,
+    v: Jet,
+    m: Expr,
+    width: Expr,
+    nu: Expr,
+    h: Expr,
+    sigma: Expr,
+    mirror: Expr,
+    natural: Forms | None = None,
 ) -> Expr:
     """Half the energy of an edge between the half with u + v and the mirror image of that with u - v.
 
@@ -39,9 +49,9 @@ def antisymmetric_edge(
         return -ufl.dot(mirrored(kin.normal(there)) - kin.normal(here), r_nu)
 
     sides = (u + v, u - v)
-    J = jump(r0 + sides[0], r0 + sides[1]) - jump(r0, r0)
-    M = sum(densities.normal_moment(r0, side, nu1, nu2, nu, h) for side in sides) / 2
-    return edge_density(M, J, width, nu, h, sigma) * stretch / 2
+    J = jump(r0 + sides[0], r0 + sides[1]) - (natural.kink(nu1, nu2) if natural else 1) * jump(r0, r0)
+    moments = [densities.normal_moment(r0, side, nu1, nu2, nu, h, natural) for side in sides]
+    return edge_density((moments[0][0] + moments[1][0]) / 2, moments[0][1], J, width, sigma) * stretch / 2
 
 
 class AntisymmetricModes:

@@ -15,7 +15,8 @@ from magshell_fenicsx.mesh.midsurface import Midsurface
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.energy import edge_quadrature
 from magshell_fenicsx.models.shell.load_vector import Entries, Weighted, entries
-from magshell_fenicsx.models.shell.parameters import AreaForce, DeadLoad, EdgeForce, EdgeMoment, PointForce
+from magshell_fenicsx.models.shell.parameters import AreaForce, DeadLoad, EdgeForce, EdgeMoment, PointForce, Potential
+from magshell_fenicsx.models.shell.patterns import FINER, Pattern, pattern_field
 from magshell_fenicsx.models.shell.point_load import point_entries
 from magshell_fenicsx.models.shell.thickness import patch_of
 
@@ -36,6 +37,9 @@ class Measures(Protocol):
 
     def area(self, patch: str | None) -> Weighted:
         """Undeformed area of a named patch, or of all."""
+
+    def field(self, pattern: Pattern) -> Expr:
+        """A pattern on the undeformed mid-surface."""
 
     def at_point(self, name: str, force: NDArray[np.float64]) -> Entries:
         """The load vector of a force at a named vertex."""
@@ -68,18 +72,31 @@ def assemble_dead_loads(loads: Sequence[DeadLoad], V: fem.FunctionSpace, on: Mea
     def spread(along: Expr, measure: Weighted) -> None:
         parts.append(entries(V, along, measure, log))
 
+    def spread_pattern(pattern: Pattern, measure: Weighted) -> float:
+        """The integral of its size."""
+        along = on.field(pattern)
+        spread(along, measure)
+        form = log.compile("load size", ufl.sqrt(ufl.dot(along, along)) * measure)
+        return float(V.mesh.comm.allreduce(fem.assemble_scalar(form)))
+
     for load in loads:
         if isinstance(load, PointForce):
             parts.append(on.at_point(load.point, load.force))
             size += float(np.linalg.norm(load.force))
         elif isinstance(load, EdgeForce):
             ds = on.edge(load.edge)
+            if callable(load.force):
+                size += spread_pattern(load.force, ds)
+                continue
             length = ds.total(V, log)
             force = np.asarray(load.force / length) if load.total else load.force
             spread(constant(force), ds)
             size += float(np.linalg.norm(force)) * length
         elif isinstance(load, AreaForce):
             dx = on.area(load.patch)
+            if callable(load.force):
+                size += spread_pattern(load.force, dx)
+                continue
             if isinstance(load.force, float):
                 along, strength = -constant(load.force) * on.normal, abs(load.force)
             else:
@@ -87,7 +104,7 @@ def assemble_dead_loads(loads: Sequence[DeadLoad], V: fem.FunctionSpace, on: Mea
             spread(along, dx)
             size += strength * dx.total(V, log)
         else:
-            assert isinstance(load, EdgeMoment)
+            assert isinstance(load, EdgeMoment | Potential)  # no load vectors
     vector = np.zeros(3 * V.dofmap.index_map.size_local)
     for dofs, values in parts:
         np.add.at(vector, dofs, values)
@@ -106,7 +123,7 @@ class SurfaceMeasures:
     """`Measures` of a mid-surface."""
 
     def __init__(self, r0: fem.Function, midsurface: Midsurface, degree: int) -> None:
-        self._V, self._midsurface, self._degree = r0.function_space, midsurface, degree
+        self._V, self._midsurface, self._degree, self._r0 = r0.function_space, midsurface, degree, r0
         self._j0 = kin.jet(r0, midsurface.mesh)
         self.normal = kin.normal(self._j0)
 
@@ -124,6 +141,9 @@ class SurfaceMeasures:
         if patch is not None:
             weight = weight * within(domain, patch_of(self._midsurface.patches, patch))
         return Weighted(weight, dx)
+
+    def field(self, pattern: Pattern) -> Expr:
+        return pattern_field(pattern, self._r0, FINER)
 
     def at_point(self, name: str, force: NDArray[np.float64]) -> Entries:
         return point_entries(self._V, self._midsurface.points[name], force)

@@ -12,6 +12,7 @@ from ufl.core.expr import Expr
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.applied import around
 from magshell_fenicsx.models.shell.kinematics import Jet
+from magshell_fenicsx.models.shell.natural import Forms
 
 MagneticDensity = Callable[[Jet, Jet, Expr, Expr], Expr]  # of (r0, u, Br, Ba)
 
@@ -27,31 +28,49 @@ def bending_stiffness(h: Expr, nu: Expr) -> Expr:
     return h**2 / (12 * (1 - nu**2))
 
 
-def membrane(r0: Jet, u: Jet, nu: Expr) -> Expr:
-    """Stretching density, paper Eq. (eqn:energy), first term."""
-    return koiter(kin.membrane_strain(r0, u), kin.inverse_metric(r0), nu) / (2 * (1 - nu**2))
+def membrane(r0: Jet, u: Jet, nu: Expr, natural: Forms | None = None) -> Expr:
+    """Stretching density, paper Eq. (eqn:energy), first term; of the strain from the `natural` forms."""
+    E, up = kin.membrane_strain(r0, u), kin.inverse_metric(r0)
+    if natural is None:
+        return koiter(E, up, nu) / (2 * (1 - nu**2))
+    return natural.thickness * natural.area * koiter(E - natural.strain, natural.up, nu) / (2 * (1 - nu**2))
 
 
-def prestress(r0: Jet, u: Jet, v: Jet, nu: Expr, E: Expr) -> Expr:
+def prestress(r0: Jet, u: Jet, v: Jet, nu: Expr, E: Expr, natural: Forms | None = None) -> Expr:
     """S : (v_i . v_j)/2 with the membrane stress S of the strain E_11, E_12, E_22: what it adds to the energy of v."""
-    up = kin.inverse_metric(r0)
+    up = natural.up if natural else kin.inverse_metric(r0)
     strain, square = kin.mixed(ufl.as_matrix([[E[0], E[1]], [E[1], E[2]]]), up), kin.mixed(kin.metric(v), up)
     contracted = (1 - nu) * ufl.tr(ufl.dot(strain, square)) + nu * ufl.tr(strain) * ufl.tr(square)
-    return contracted / (2 * (1 - nu**2))
+    whole = contracted / (2 * (1 - nu**2))
+    return natural.thickness * natural.area * whole if natural else whole
 
 
-def bending(r0: Jet, u: Jet, nu: Expr, h: Expr) -> Expr:
-    """Bending density, paper Eq. (eqn:energy), second term."""
+def bending(r0: Jet, u: Jet, nu: Expr, h: Expr, natural: Forms | None = None) -> Expr:
+    """Bending density, paper Eq. (eqn:energy), second term; of the change from the `natural` curvature."""
     K = kin.curvature_change(r0, u)
-    return bending_stiffness(h, nu) / 2 * koiter(K, kin.inverse_metric(r0), nu)
+    if natural is None:
+        return bending_stiffness(h, nu) / 2 * koiter(K, kin.inverse_metric(r0), nu)
+    stiffness = natural.thickness**3 * natural.area * bending_stiffness(h, nu)
+    return stiffness / 2 * koiter(K - natural.bend, natural.up, nu)
 
 
-def normal_moment(r0: Jet, u: Jet, nu1: Expr, nu2: Expr, nu: Expr, h: Expr) -> Expr:
-    """M_nunu = D [(1 - nu) K_nunu + nu tr K] for the unit conormal nu^1, nu^2."""
+def normal_moment(
+    r0: Jet, u: Jet, nu1: Expr, nu2: Expr, nu: Expr, h: Expr, natural: Forms | None = None
+) -> tuple[Expr, Expr]:
+    """M_nunu = D [(1 - nu) K_nunu + nu tr K] for the unit conormal nu^1, nu^2, and D; M_nunu works on b_nunu."""
     K = kin.curvature_change(r0, u)
-    K_nunu = K[0, 0] * nu1**2 + 2 * K[0, 1] * nu1 * nu2 + K[1, 1] * nu2**2
-    trace = ufl.tr(kin.mixed(K, kin.inverse_metric(r0)))
-    return bending_stiffness(h, nu) * ((1 - nu) * K_nunu + nu * trace)
+    if natural is None:
+        K_nunu = K[0, 0] * nu1**2 + 2 * K[0, 1] * nu1 * nu2 + K[1, 1] * nu2**2
+        trace = ufl.tr(kin.mixed(K, kin.inverse_metric(r0)))
+        D = bending_stiffness(h, nu)
+        return D * ((1 - nu) * K_nunu + nu * trace), D
+    K = K - natural.bend
+    covector = ufl.dot(kin.metric(r0), ufl.as_vector([nu1, nu2]))
+    raised = ufl.dot(natural.up, covector)
+    square = ufl.dot(raised, covector)  # 1 but for the natural stretch
+    D = natural.thickness**3 * natural.area * bending_stiffness(h, nu)
+    M = (1 - nu) * ufl.dot(raised, ufl.dot(K, raised)) + nu * square * ufl.tr(kin.mixed(K, natural.up))
+    return D * M, D * square**2
 
 
 def magnetic(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:

@@ -17,13 +17,15 @@ from ufl.core.expr import Expr
 from magshell_fenicsx.models.shell import densities
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.kinematics import Jet
+from magshell_fenicsx.models.shell.natural import Forms
 
 Sides = tuple[Jet, Jet]
+Shapes = tuple[Forms, Forms]
 
 
-def edge_density(M: Expr, J: Expr, width: Expr, nu: Expr, h: Expr, sigma: Expr) -> Expr:
+def edge_density(M: Expr, D: Expr, J: Expr, width: Expr, sigma: Expr) -> Expr:
     """{M} J + sigma D/(2 h_e) J^2."""
-    return M * J + sigma * densities.bending_stiffness(h, nu) / (2 * width) * J**2
+    return M * J + sigma * D / (2 * width) * J**2
 
 
 def fold_jump(plus: Jet, minus: Jet, nu_plus: tuple[Expr, Expr], nu_minus: tuple[Expr, Expr]) -> Expr:
@@ -49,6 +51,8 @@ def two_sided(
     h: Expr,
     sigma: Expr,
     t: tuple[Expr, Expr] | None = None,
+    *,
+    natural: Shapes | None = None,
 ) -> Expr:
     """Energy of an interior edge with that jump per length of its parameter.
 
@@ -62,30 +66,49 @@ def two_sided(
         h_e: half the height of the flat triangles over the edge, averaged.
     t
         What multiplies the thickness h on both sides, each (1,); None for 1.
+    natural
+        The natural forms on both sides; None if they are those of r0.
     """
     conormals = [kin.conormal(j, covector) for j, covector in zip(r0, m, strict=True)]
     stretch = (conormals[0][2] + conormals[1][2]) / 2
-    if t is None:
-        M = sum(densities.normal_moment(r0[i], u[i], *conormals[i][:2], nu, h) for i in range(2)) / 2
-        return edge_density(M, J, width, nu, h, sigma) * stretch
-    M = sum(t[i][0] * densities.normal_moment(r0[i], u[i], *conormals[i][:2], nu, t[i][0] * h) for i in range(2)) / 2
-    D = sum(t[i][0] * densities.bending_stiffness(t[i][0] * h, nu) for i in range(2)) / 2
-    return (M * J + sigma * D / (2 * width) * J**2) * stretch
+    factors = (1, 1) if t is None else (t[0][0], t[1][0])
+    moments = [
+        densities.normal_moment(r0[i], u[i], *conormals[i][:2], nu, factors[i] * h, natural and natural[i])
+        for i in range(2)
+    ]
+    M = sum(factor * moment for factor, (moment, _) in zip(factors, moments, strict=True)) / 2
+    D = moments[0][1]
+    if t or natural:
+        D = sum(factor * stiffness for factor, (_, stiffness) in zip(factors, moments, strict=True)) / 2
+    return edge_density(M, D, J, width, sigma) * stretch
 
 
-def interior(r0: Sides, u: Sides, m: tuple[Expr, Expr], *rest: Any) -> Expr:
+def interior(r0: Sides, u: Sides, m: tuple[Expr, Expr], *rest: Any, natural: Shapes | None = None) -> Expr:
     """Energy of an interior edge between cells that meet smoothly, or nearly so; `rest` as in `two_sided`."""
     nus = [kin.conormal(j, covector)[:2] for j, covector in zip(r0, m, strict=True)]
-    J = fold_jump(r0[0] + u[0], r0[1] + u[1], *nus) - fold_jump(*r0, *nus)
-    return two_sided(J, r0, u, m, *rest)
+    J0 = fold_jump(*r0, *nus)
+    if natural:
+        J0 *= sum(shape.kink(*nu) for shape, nu in zip(natural, nus, strict=True)) / 2
+    J = fold_jump(r0[0] + u[0], r0[1] + u[1], *nus) - J0
+    return two_sided(J, r0, u, m, *rest, natural=natural)
 
 
-def folded(r0: Sides, u: Sides, m: tuple[Expr, Expr], *rest: Any) -> Expr:
-    """The same across a fold of the undeformed surface: the jump is the change of the angle, whatever its size."""
+def folded(r0: Sides, u: Sides, m: tuple[Expr, Expr], *rest: Any, natural: Shapes | None = None) -> Expr:
+    """The same across a fold of the undeformed surface: the jump is the change of the angle, whatever its size.
+
+    b_nunu is the angle times the natural stretch across the fold, which a `natural` kink has as a narrow bend has it.
+    """
     sine0, cosine0 = fold_angle(*r0, m[0])
     sine, cosine = fold_angle(r0[0] + u[0], r0[1] + u[1], m[0])
-    J = ufl.atan2(sine * cosine0 - cosine * sine0, cosine * cosine0 + sine * sine0)
-    return two_sided(J, r0, u, m, *rest)
+    stretched = 1
+    if natural:
+        nus = [kin.conormal(j, covector)[:2] for j, covector in zip(r0, m, strict=True)]
+        stretched = sum(ufl.sqrt(shape.along(*nu)) for shape, nu in zip(natural, nus, strict=True)) / 2
+        bent = sum(shape.kink(*nu) for shape, nu in zip(natural, nus, strict=True)) / (2 * stretched)
+        angle = bent * ufl.atan2(sine0, cosine0)
+        sine0, cosine0 = ufl.sin(angle), ufl.cos(angle)
+    J = stretched * ufl.atan2(sine * cosine0 - cosine * sine0, cosine * cosine0 + sine * sine0)
+    return two_sided(J, r0, u, m, *rest, natural=natural)
 
 
 def turning(r0: Jet, u: Jet, m: Expr, width: Expr, intensity: Expr, past: Expr) -> Expr:
@@ -103,22 +126,26 @@ def turning(r0: Jet, u: Jet, m: Expr, width: Expr, intensity: Expr, past: Expr) 
     return -intensity * angle * length
 
 
-def clamped(r0: Jet, u: Jet, m: Expr, width: Expr, nu: Expr, h: Expr, sigma: Expr) -> Expr:
+def clamped(
+    r0: Jet, u: Jet, m: Expr, width: Expr, nu: Expr, h: Expr, sigma: Expr, natural: Forms | None = None
+) -> Expr:
     """Energy of a clamped edge per length of its parameter: the outer normal is held at n0."""
     nu1, nu2, stretch = kin.conormal(r0, m)
     r = r0 + u
     J = -ufl.dot(kin.normal(r0) - kin.normal(r), r.r1 * nu1 + r.r2 * nu2)
-    M = densities.normal_moment(r0, u, nu1, nu2, nu, h)
-    return edge_density(M, J, width, nu, h, sigma) * stretch
+    M, D = densities.normal_moment(r0, u, nu1, nu2, nu, h, natural)
+    return edge_density(M, D, J, width, sigma) * stretch
 
 
-def symmetric(r0: Jet, u: Jet, m: Expr, width: Expr, nu: Expr, h: Expr, sigma: Expr, mirror: Expr) -> Expr:
+def symmetric(
+    r0: Jet, u: Jet, m: Expr, width: Expr, nu: Expr, h: Expr, sigma: Expr, mirror: Expr, natural: Forms | None = None
+) -> Expr:
     """Energy of an edge on a mirror plane with that normal per length of its parameter: half of an interior edge's."""
     nu1, nu2, stretch = kin.conormal(r0, m)
 
     def mirror_jump(j: Jet) -> Expr:
         return 2 * ufl.dot(kin.normal(j), mirror) * ufl.dot(mirror, j.r1 * nu1 + j.r2 * nu2)
 
-    J = mirror_jump(r0 + u) - mirror_jump(r0)
-    M = densities.normal_moment(r0, u, nu1, nu2, nu, h)
-    return edge_density(M, J, width, nu, h, sigma) * stretch / 2
+    J = mirror_jump(r0 + u) - (natural.kink(nu1, nu2) if natural else 1) * mirror_jump(r0)
+    M, D = densities.normal_moment(r0, u, nu1, nu2, nu, h, natural)
+    return edge_density(M, D, J, width, sigma) * stretch / 2

@@ -13,6 +13,7 @@ from dolfinx import fem
 from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.kernels import KernelLog
+from magshell_fenicsx.assembly.parameter import make_parameters
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.assembly.sliding import Constraint, held_along
 from magshell_fenicsx.assembly.terms import LinearTerm, Term
@@ -24,7 +25,7 @@ from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes
 from magshell_fenicsx.models.shell.dead_load import SurfaceMeasures, assemble_dead_loads
 from magshell_fenicsx.models.shell.fast_tangent import FastTangent, make_sites
 from magshell_fenicsx.models.shell.folds import FOLD, largest_fold
-from magshell_fenicsx.models.shell.free import free_parameters
+from magshell_fenicsx.models.shell.natural import Shape, natural_field
 from magshell_fenicsx.models.shell.parameters import (
     Condition,
     EdgeMoment,
@@ -32,9 +33,10 @@ from magshell_fenicsx.models.shell.parameters import (
     Held,
     Loads,
     Material,
+    Potential,
     default_penalty,
 )
-from magshell_fenicsx.models.shell.patterns import by_patch
+from magshell_fenicsx.models.shell.patterns import by_patch, places
 from magshell_fenicsx.models.shell.point_load import patch_entries, point_entries, vertex_normal
 from magshell_fenicsx.models.shell.residual import FastResidual
 from magshell_fenicsx.models.shell.supports import (
@@ -111,7 +113,13 @@ class ShellModel(Observed):
         self.r0, self.u = midsurface.placement(V), fem.Function(V, name="u")
         self.sigma = default_penalty(degree) if sigma is None else sigma
         self.thickness = factor = thickness_field(thickness, self.r0, midsurface) if thickness else None
-        factory = TermFactory(self.r0, self.u, material, self.sigma, degree, self.kernels, factor)
+        free, shape = dict[str, fem.Constant](), None
+        if loads.natural:
+            cells = midsurface.mesh.topology.index_map(2)
+            grown = loads.natural.on(midsurface.patches, cells.size_local + cells.num_ghosts)
+            loads = self.loads = replace(loads, natural=grown)
+            shape = Shape.of(natural_field(grown, *places(self.r0), self.V), grown, free)
+        factory = TermFactory(self.r0, self.u, material, self.sigma, degree, self.kernels, factor, shape, free)
         interior = factory.interior_edges(folded=midsurface.read and largest_fold(self.r0, degree) > FOLD)
         terms: list[Term] = [factory.membrane(), factory.bending(), interior]
         held: list[Constraint] = []
@@ -167,12 +175,11 @@ class ShellModel(Observed):
                 factory.edge_moment(f"{name} moment {load.edge} {i}", midsurface.edges[load.edge], load.moment, name)
                 for i, load in enumerate(moments)
             ]
+            terms += [factory.own(load.term, name) for load in dead if isinstance(load, Potential)]
         self._sites = make_sites(self.r0, degree, terms, self.kernels, factory.prestress())
         fast = FastTangent(self.u, self._sites, held + mirrored)
         gradients = FastResidual(self.r0, self.u, degree, terms, self.kernels)
-        parameters = free_parameters(
-            loads.own, factory.free, factory.own, lambda term: self.kernels.compile_all([factory.observed(term)])
-        )
+        parameters = make_parameters(factory.free, terms, self.u, self.kernels)
         self.system = FiniteElementSystem(
             self.u, terms, held + mirrored, interior, material.h, fast, gradients, parameters
         )

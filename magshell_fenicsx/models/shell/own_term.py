@@ -104,19 +104,6 @@ class OwnTerm:
         """Its parameters that are amplitudes."""
         return tuple(p for p in self.parameters if isinstance(p, Free))
 
-    def derivative(self, *names: str) -> Callable[..., Expr]:
-        """The derivative of the density in free parameters, one after the other."""
-        places = {p.name: i for i, p in enumerate(self.parameters) if isinstance(p, Free)}
-
-        def derived(r0: Jet, u: Jet, *parameters: Expr) -> Expr:
-            variables = [ufl.variable(p) for p in parameters]
-            found = self.density(r0, u, *variables)
-            for name in names:
-                found = ufl.diff(found, variables[places[name]])
-            return found
-
-        return derived
-
     @cached_property
     def linear(self) -> bool:
         """Whether the density is linear in the displacement: its second derivatives vanish identically."""

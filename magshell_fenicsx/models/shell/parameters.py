@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.models.shell.applied import FieldInSpace
+from magshell_fenicsx.models.shell.natural import Natural
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.patterns import Pattern
 
@@ -111,10 +112,10 @@ class PointForce:
 
 @dataclass(frozen=True)
 class EdgeForce:
-    """A dead force (3,) on a named edge: per length over E h or, if `total`, in all over E h R."""
+    """A dead force (3,), or a pattern, on a named edge: per length over E h or, if `total`, in all over E h R."""
 
     edge: str
-    force: NDArray[np.float64]
+    force: NDArray[np.float64] | Pattern
     total: bool
 
 
@@ -128,16 +129,23 @@ class EdgeMoment:
 
 @dataclass(frozen=True)
 class AreaForce:
-    """A dead force (3,) per undeformed area over E h/R, on a patch, or on all.
+    """A dead force (3,), or a pattern, per undeformed area over E h/R, on a patch, or on all.
 
     A number in place of the vector is a pressure along the undeformed normal, positive from outside.
     """
 
     patch: str | None
-    force: NDArray[np.float64] | float
+    force: NDArray[np.float64] | float | Pattern
 
 
-DeadLoad = PointForce | EdgeForce | EdgeMoment | AreaForce
+@dataclass(frozen=True)
+class Potential:
+    """An energy per undeformed area that depends on the deformed place, with the amplitude "load"."""
+
+    term: OwnTerm
+
+
+DeadLoad = PointForce | EdgeForce | EdgeMoment | AreaForce | Potential
 
 
 @dataclass(frozen=True)
@@ -155,6 +163,7 @@ class Loads:
     magnetic: Magnetisation | None = None
     dead: Mapping[str, tuple[DeadLoad, ...]] = field(default_factory=dict)
     own: tuple[OwnTerm, ...] = ()
+    natural: Natural | None = None
 
     @property
     def all_dead(self) -> tuple[DeadLoad, ...]:

@@ -12,6 +12,7 @@ from magshell_fenicsx.mesh.patch import MeshError
 
 Array = NDArray[np.float64]
 LARGEST = 1e6  # of a remanence's components
+FINER = 2  # degrees of a load by formula above that of the displacement: no part of the error
 # (cells, nodes, 3) positions r0 and normals n0 -> (cells, nodes, 3) vectors
 Pattern = Callable[[Array, Array], Array]
 
@@ -65,7 +66,12 @@ class ByPatch:
         return np.broadcast_to(self.vectors[: len(r0), None], r0.shape)  # owned cells come first
 
 
-def by_patch(vectors: Mapping[str, Array], patches: Mapping[str, NDArray[np.bool_]], cells: int) -> ByPatch:
+def by_patch(
+    vectors: Mapping[str, Array],
+    patches: Mapping[str, NDArray[np.bool_]],
+    cells: int,
+    key: str = "magnetic.remanent.patches",
+) -> ByPatch:
     """A vector (3,) for each named patch of a mesh, and one for the "rest"; zero without.
 
     Parameters
@@ -74,6 +80,8 @@ def by_patch(vectors: Mapping[str, Array], patches: Mapping[str, NDArray[np.bool
         Name -> whether each cell of this rank belongs to it.
     cells
         How many there are.
+    key
+        Of the case file, for the message.
 
     Raises
     ------
@@ -86,12 +94,17 @@ def by_patch(vectors: Mapping[str, Array], patches: Mapping[str, NDArray[np.bool
             found[patches[name]] = vector
         elif name != "rest":
             there = ", ".join(patches) or "none"
-            raise MeshError(f"magnetic.remanent.patches: {name}: the surface has no such patch, only {there}")
+            raise MeshError(f"{key}: {name}: the surface has no such patch, only {there}")
     return ByPatch(found)
 
 
-def pattern_field(pattern: Pattern, r0: fem.Function) -> fem.Function:
+def pattern_field(pattern: Pattern, r0: fem.Function, finer: int = 0) -> fem.Function:
     """The pattern at the nodes of every cell, free to jump from cell to cell; collective.
+
+    Parameters
+    ----------
+    finer
+        By how much the degree of the field is above that of r0.
 
     Raises
     ------
@@ -99,18 +112,23 @@ def pattern_field(pattern: Pattern, r0: fem.Function) -> fem.Function:
         On every rank, if it has no finite value somewhere.
     """
     V = r0.function_space
-    element = V.element.basix_element
-    values = element.tabulate(1, element.points)
-    nodes = r0.x.array.reshape(-1, 3)[V.dofmap.list]
-    a1, a2 = np.einsum("dvk,cki->dcvi", values[1:, :, :, 0], nodes)
-    m = np.cross(a1, a2)
-    n0 = m / np.linalg.norm(m, axis=-1, keepdims=True)
-    Q = fem.functionspace(V.mesh, ("DG", element.degree, (3,)))
+    Q = fem.functionspace(V.mesh, ("DG", V.element.basix_element.degree + finer, (3,)))
+    nodes, n0 = places(r0, Q.element.basix_element.points)
     field = fem.Function(Q, name="Br")
     vectors = pattern(nodes, n0)
-    refuse_unbounded(vectors, nodes, V.mesh.comm)
+    refuse_unbounded(vectors, nodes, V.mesh.comm, "loading.loads" if finer else "magnetic.remanent")
     field.x.array.reshape(-1, 3)[Q.dofmap.list] = vectors
     return field
+
+
+def places(r0: fem.Function, at: Array | None = None) -> tuple[Array, Array]:
+    """The nodes of every cell, or other reference points (n, 2), and the cell's normals there: (cells, n, 3) each."""
+    V = r0.function_space
+    element = V.element.basix_element
+    table = element.tabulate(1, element.points if at is None else at)[..., 0]
+    x, a1, a2 = np.einsum("dvk,cki->dcvi", table, r0.x.array.reshape(-1, 3)[V.dofmap.list])
+    m = np.cross(a1, a2)
+    return x, np.asarray(m / np.linalg.norm(m, axis=-1, keepdims=True))
 
 
 def refuse_unbounded(vectors: Array, nodes: Array, comm: MPI.Comm, key: str = "magnetic.remanent") -> None:

@@ -106,6 +106,57 @@ class TangentFrame:
         return np.asarray(np.einsum("...ija,...a->...ij", self.in_space, S))
 
 
+@dataclass(frozen=True)
+class NaturalFrame:
+    """Natural forms at points in their frames, at given amplitudes; see `natural.Forms`.
+
+    Attributes
+    ----------
+    strain, bend
+        (..., 3) (a_n - a0)/2 and b_n - b0, the latter times R.
+    inverse
+        (..., 2, 2) of the stretch tensor U.
+    thickness
+        (...) h_n over h.
+    """
+
+    strain: Array
+    bend: Array
+    inverse: Array
+    thickness: Array
+
+    @classmethod
+    def of(cls, frame: TangentFrame, T: Array, kappa: Array, t: Array, bent: float, stretched: float) -> "NaturalFrame":
+        """From the tensors of `natural.Natural.at`, times R, and the amplitudes."""
+        t0 = frame.t
+        inside = [np.einsum("...ai,...ij,...bj->...ab", t0, S, t0) for S in (stretched * T, bent * kappa)]
+        b = np.einsum("d...i,...i->...d", frame.jet[3:], frame.n0)
+        b0, s = _matrix(_times(frame.in_frame, b)), (1 + stretched * t)[..., None, None]
+        U = np.eye(2) + inside[0]
+        bend = (b0 @ U @ U + U @ U @ b0) / (2 * s) - b0 + U @ inside[1] @ U
+        strain = inside[0] + inside[0] @ inside[0] / 2
+        return cls(_components(strain), _components(bend), np.linalg.inv(U), s[..., 0, 0])
+
+    def elastic(self, E: Array) -> Array:
+        """U^-1 (E - E_n) U^-1, (..., 3): the strain of the natural shell."""
+        return _components(self.inverse @ _matrix(E - self.strain) @ self.inverse)
+
+    def moment(self, K: Array, nu: float) -> Array:
+        """M/D (..., 3), what works on K; D of the drawn thickness."""
+        up = self.inverse @ self.inverse
+        mixed = up @ _matrix(K - self.bend)
+        M = (1 - nu) * mixed @ up + nu * np.trace(mixed, axis1=-2, axis2=-1)[..., None, None] * up
+        return _components((self.thickness**3 / np.linalg.det(self.inverse))[..., None, None] * M)
+
+
+def _matrix(S: Array) -> Array:
+    return np.stack([S[..., :2], S[..., 1:]], axis=-2)
+
+
+def _components(S: Array) -> Array:
+    return np.stack([S[..., 0, 0], S[..., 0, 1], S[..., 1, 1]], axis=-1)
+
+
 def bending_moment(K: Array, nu: float) -> Array:
     """M/D = (1 - nu) K + nu tr K, in the unit of K, of K_11, K_12, K_22 (..., 3) in an orthonormal frame."""
     trace = K[..., :1] + K[..., 2:]

@@ -27,6 +27,7 @@ from magshell_fenicsx.models.shell.free import Constants, constants_of
 from magshell_fenicsx.models.shell.kinematics import CURVED, MOVED, SECOND, Jet
 from magshell_fenicsx.models.shell.laws import FULL, LINEAR, magnetic_densities
 from magshell_fenicsx.models.shell.moment import MomentTerm
+from magshell_fenicsx.models.shell.natural import Shape, grown
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.parameters import ACROSS, Magnetisation, Material
 from magshell_fenicsx.models.shell.patterns import pattern_field
@@ -44,41 +45,46 @@ class TermFactory:
     degree: int
     log: KernelLog
     thickness: fem.Function | None = None
+    natural: Shape | None = None
     free: Constants = field(default_factory=dict)  # of parameters that enter freely
 
     def membrane(self) -> ShellTerm:
         density = Density(per_area(densities.membrane), (self._constant(self.material.nu),))
-        return self._cells("membrane", self._thick(density, None))
+        return self._cells("membrane", self._thick(self._grown(density), None))
 
     def prestress(self) -> Density:
         """The part of the tangent that membrane stress makes; its last parameter but the thickness is the strain."""
         strain = fem.Function(fem.functionspace(self._domain, ("DG", 0, (3,))))
-        return self._thick(Density(per_area(densities.prestress), (self._constant(self.material.nu), strain)), None)
+        density = Density(per_area(densities.prestress), (self._constant(self.material.nu), strain))
+        return self._thick(self._grown(density), None)
 
     def bending(self) -> ShellTerm:
-        return self._cells("bending", self._thick(Density(per_area(densities.bending), self._nu_h(), parts=CURVED), 1))
+        density = Density(per_area(densities.bending), self._nu_h(), parts=CURVED)
+        return self._cells("bending", self._thick(self._grown(density), 1))
 
     def interior_edges(self, *, folded: bool = False) -> ShellTerm:
         """With `folded`, for a surface whose cells meet at angles that are not small."""
         parameters = self._penalised() if self.thickness is None else (*self._penalised(), self.thickness)
-        density = Density(edges.folded if folded else edges.interior, parameters, CURVED, SECOND, sides=2)
+        of = edges.folded if folded else edges.interior
+        density = self._grown(Density(of, parameters, CURVED, SECOND, sides=2))
         r0, u = ((j.side("+"), j.side("-")) for j in self._jets())
         m = kin.facet_covector(self._domain)
         width = ufl.avg(ufl.CellVolume(self._domain)) / ufl.avg(ufl.FacetArea(self._domain))
-        sided = [(p("+"), p("-")) if isinstance(p, fem.Function) else p for p in parameters]
+        sided = [(p("+"), p("-")) if isinstance(p, fem.Function) else p for p in density.parameters]
         energy = density.of(r0, u, (m("+"), m("-")), width, *sided)
         measure = ufl.dS(domain=self._domain, metadata=self._edge_rule())
         return ShellTerm("interior edges", density, energy * measure, self.u, self.log)
 
     def clamped_edges(self, facets: NDArray[np.int32]) -> ShellTerm:
         density = Density(edges.clamped, self._penalised(), CURVED, SECOND, facets)
-        return self._edges("clamped edges", self._thick(density, 1))
+        return self._edges("clamped edges", self._thick(self._grown(density), 1))
 
     def mirror_edges(
         self, facets: NDArray[np.int32], normal: NDArray[np.float64], name: str = "mirror edges"
     ) -> ShellTerm:
         parameters = (*self._penalised(), self._constant(normal))
-        return self._edges(name, self._thick(Density(edges.symmetric, parameters, CURVED, SECOND, facets), 1))
+        density = Density(edges.symmetric, parameters, CURVED, SECOND, facets)
+        return self._edges(name, self._thick(self._grown(density), 1))
 
     def edge_moment(self, name: str, facets: NDArray[np.int32], intensity: float, amplitude: str) -> MomentTerm:
         """A moment per length about the edge's first tangent; in E h R."""
@@ -95,10 +101,10 @@ class TermFactory:
     def antisymmetric_edges(self, facets: NDArray[np.int32], normal: NDArray[np.float64]) -> HessianTerm:
         """The mirror plane's edges under antisymmetric displacements."""
         parameters = (*self._penalised(), self._constant(normal))
-        density = Density(antisymmetric_edge, parameters, CURVED, facets=facets)
+        density = self._grown(Density(antisymmetric_edge, parameters, CURVED, facets=facets))
         v = fem.Function(self.u.function_space)
         jets = (*self._jets(), kin.jet(v, self._domain))
-        energy = density.of(*jets, *self._edge_geometry(), *parameters) * self._ds(facets)
+        energy = density.of(*jets, *self._edge_geometry(), *density.parameters) * self._ds(facets)
         return HessianTerm("antisymmetric edges", density, energy, v, self.log)
 
     def magnetic(self, field: Magnetisation) -> list[ShellTerm]:
@@ -134,12 +140,12 @@ class TermFactory:
         parameters = (unit, self._constant(origin)) if origin.any() else (unit,)
         return self._cells("pressure", Density(densities.pressure, parameters, parts=MOVED), "pressure")
 
-    def own(self, term: OwnTerm) -> ShellTerm:
-        """The energy of a part or one's own, with the amplitude of its name."""
+    def own(self, term: OwnTerm, amplitude: str | None = None) -> ShellTerm:
+        """The energy of a part or one's own, with the amplitude of its name or another."""
         still = tuple(part for part in term.placed_parts if part not in term.parts)  # asked for of r0 alone
         parameters = self._parameters(term)
         density = Density(per_area(term.density), parameters, parts=(*term.parts, *still), linear=still)
-        return self._cells(term.name, density, term.name, linear=term.linear)
+        return self._cells(term.name, density, amplitude or term.name, linear=term.linear)
 
     def observed(self, term: OwnTerm) -> dict[str, ufl.Form]:
         """What it observes."""
@@ -166,6 +172,10 @@ class TermFactory:
     def _thick(self, density: Density, h_at: int | None) -> Density:
         """The density with the thickness as it varies, if it does; `h_at` as of `thickness.thick`."""
         return density if self.thickness is None else thick(density, self.thickness, h_at)
+
+    def _grown(self, density: Density) -> Density:
+        """The density of the natural shape, if there is one."""
+        return grown(density, self.natural) if self.natural else density
 
     def _nu_h(self) -> tuple[Parameter, Parameter]:
         return self._constant(self.material.nu), self._constant(self.material.h)

@@ -11,15 +11,20 @@ from ufl.core.expr import Expr
 from magshell_fenicsx.models.shell.applied import around
 
 
-def distortion(X: Expr, u: Expr, H: Expr, shear: Expr, h: Expr) -> Expr:
-    """mu/2 (J^(-2/3) F:F - 3): what does not depend on a change of volume."""
+def distortion(X: Expr, u: Expr, H: Expr, shear: Expr, h: Expr, growth: Expr | None = None) -> Expr:
+    """mu/2 (J^(-2/3) F:F - 3): what does not depend on a change of volume; of F G^(-1) after a growth G."""
     F = ufl.Identity(3) + H
+    if growth is not None:
+        return ufl.det(growth) * distortion(X, u, ufl.dot(F, ufl.inv(growth)) - ufl.Identity(3), shear, h)
     return shear / (2 * h) * (ufl.det(F) ** (-2 / 3) * ufl.inner(F, F) - 3)
 
 
-def compression(X: Expr, u: Expr, H: Expr, bulk: Expr, h: Expr) -> Expr:
-    """kappa/2 (J - 1)^2."""
-    return bulk / (2 * h) * (ufl.det(ufl.Identity(3) + H) - 1) ** 2
+def compression(X: Expr, u: Expr, H: Expr, bulk: Expr, h: Expr, growth: Expr | None = None) -> Expr:
+    """kappa/2 (J - 1)^2; J/det G takes the place of J after a growth G."""
+    J = ufl.det(ufl.Identity(3) + H)
+    if growth is not None:
+        return ufl.det(growth) * bulk / (2 * h) * (J / ufl.det(growth) - 1) ** 2
+    return bulk / (2 * h) * (J - 1) ** 2
 
 
 def magnetic(X: Expr, u: Expr, H: Expr, Br: Expr, Ba: Expr, h: Expr) -> Expr:

@@ -5,12 +5,15 @@ import ufl
 from dolfinx import fem
 from mpi4py import MPI
 from numpy.typing import NDArray
+from ufl.core.expr import Expr
 
 from magshell_fenicsx.assembly.kernels import KernelLog
-from magshell_fenicsx.mesh.hexahedra import OUTER, Body
+from magshell_fenicsx.mesh.hexahedra import MIDDLE, OUTER, Body
 from magshell_fenicsx.models.shell.dead_load import within
 from magshell_fenicsx.models.shell.load_vector import Entries, Weighted, averaged, smooth
+from magshell_fenicsx.models.shell.patterns import Pattern, refuse_unbounded
 from magshell_fenicsx.models.shell.thickness import patch_of
+from magshell_fenicsx.models.solid.remanence import places
 from magshell_fenicsx.models.solid.terms import face_measure
 from magshell_fenicsx.platform import compat
 
@@ -41,6 +44,15 @@ class BodyMeasures:
         if patch is not None:
             weight = weight * within(body.mesh, patch_of(body.patches, patch))
         return Weighted(weight, ufl.Measure("dx", domain=body.mesh, metadata={"quadrature_degree": 4}))
+
+    def field(self, pattern: Pattern) -> Expr:
+        nodes, normals = places(self._V)
+        z = self._body.at_nodes(self._V, (self._body.heights - MIDDLE) * self._body.thickness)[self._V.dofmap.list]
+        field = fem.Function(fem.functionspace(self._V.mesh, ("DG", self._V.element.basix_element.degree, (3,))))
+        vectors = pattern(nodes - z[..., None] * normals, normals)
+        refuse_unbounded(vectors, nodes, self._V.mesh.comm, "loading.loads")
+        field.x.array.reshape(-1, 3)[field.function_space.dofmap.list] = vectors
+        return field
 
     def at_point(self, name: str, force: Array) -> Entries:
         """Over a patch of the radius h, or of the elements around the point where these are larger."""

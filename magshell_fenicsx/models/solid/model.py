@@ -4,7 +4,7 @@ Lengths in R, energies in E h R^2, amplitudes as in `ShellModel`. Displacements 
 of the thickness; the pressure, the volume and the loaded patch are of the outer face.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from functools import cached_property
 
@@ -13,6 +13,7 @@ from dolfinx import fem
 from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.kernels import KernelLog
+from magshell_fenicsx.assembly.parameter import make_parameters
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.assembly.sliding import Constraint, held_along
 from magshell_fenicsx.assembly.terms import LinearTerm, Term
@@ -23,15 +24,15 @@ from magshell_fenicsx.models.observed import Observed
 from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes
 from magshell_fenicsx.models.shell.dead_load import assemble_dead_loads
 from magshell_fenicsx.models.shell.fast_tangent import FastTangent
-from magshell_fenicsx.models.shell.free import free_parameters
-from magshell_fenicsx.models.shell.parameters import Condition, EdgeMoment, Loads, Material
+from magshell_fenicsx.models.shell.parameters import Condition, EdgeMoment, Loads, Material, Potential
 from magshell_fenicsx.models.shell.supports import closing_point, open_to_pressure
 from magshell_fenicsx.models.solid.loads import BodyMeasures, outer_patch
 from magshell_fenicsx.models.solid.material import NeoHookean
+from magshell_fenicsx.models.solid.natural import body_shape, grown
 from magshell_fenicsx.models.solid.remanence import in_cells
 from magshell_fenicsx.models.solid.sites import make_sites
 from magshell_fenicsx.models.solid.supports import supports
-from magshell_fenicsx.models.solid.terms import TermFactory
+from magshell_fenicsx.models.solid.terms import Density, TermFactory
 
 Array = NDArray[np.float64]
 MIRRORS = ("symmetry", "plane")
@@ -87,7 +88,13 @@ class SolidModel(Observed):
         self.u, self.r0 = fem.Function(V, name="u"), fem.Function(V, name="r0")
         self.r0.interpolate(lambda x: x)
         hinged = tuple(n for n, c in conditions.items() if n in body.faces and c not in ("free", "clamped", *MIRRORS))
-        self.factory = factory = TermFactory(body, self.u, neo_hookean, material.h, self.kernels, hinged)
+        free, growing = dict[str, fem.Constant](), dict[str, Callable[[Density], Density]]()
+        if loads.natural:
+            shape = body_shape(loads.natural, body, V, free)
+            growing["grown"] = lambda density: grown(density, shape)
+        self.factory = factory = TermFactory(
+            body, self.u, neo_hookean, material.h, self.kernels, hinged, free=free, **growing
+        )
         self._pattern = factory.distortion()
         self._held, planes = supports(body, self.r0, conditions)
         origin = self._closing_point([mirror, *planes] if self.multiplicity == 2 else planes, conditions)
@@ -110,6 +117,7 @@ class SolidModel(Observed):
             self._terms += [
                 factory.moment(f"{name} moment {m.edge} {i}", m.edge, m.moment, name) for i, m in enumerate(moments)
             ]
+            self._terms += [factory.own(load.term, name) for load in dead if isinstance(load, Potential)]
         self._faces = [body.faces[n] for n, c in conditions.items() if c == "symmetry"]
         self.mirror = mirror
         self._sites = make_sites(body, self.r0, self._terms, self.kernels)
@@ -135,9 +143,7 @@ class SolidModel(Observed):
 
     def _system(self, held: list[Constraint]) -> FiniteElementSystem:
         fast, factory = FastTangent(self.u, self._sites, held), self.factory
-        parameters = free_parameters(
-            self.loads.own, factory.free, factory.own, lambda term: self.kernels.compile_all([factory.observed(term)])
-        )
+        parameters = make_parameters(factory.free, self._terms, self.u, self.kernels)
         return FiniteElementSystem(
             self.u, self._terms, held, self._pattern, self.material.h, fast, parameters=parameters
         )

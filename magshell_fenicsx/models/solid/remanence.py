@@ -21,17 +21,23 @@ def remanence_field(pattern: Pattern, V: fem.FunctionSpace) -> fem.Function:
     MeshError
         On every rank, if it has no finite value somewhere.
     """
-    element = V.element.basix_element
-    along = element.tabulate(1, element.points)[:, :, :, 0]
-    nodes = V.tabulate_dof_coordinates()[V.dofmap.list]
-    a1, a2 = np.einsum("dvk,cki->dcvi", along[1:3], nodes)  # in the surface, for its normal at this height
-    m = np.cross(a1, a2)
-    Q = fem.functionspace(V.mesh, ("DG", element.degree, (3,)))
+    nodes, normals = places(V)
+    Q = fem.functionspace(V.mesh, ("DG", V.element.basix_element.degree, (3,)))
     field = fem.Function(Q, name="Br")
-    vectors = pattern(nodes, m / np.linalg.norm(m, axis=-1, keepdims=True))
+    vectors = pattern(nodes, normals)
     refuse_unbounded(vectors, nodes, V.mesh.comm)
     field.x.array.reshape(-1, 3)[Q.dofmap.list] = vectors
     return field
+
+
+def places(V: fem.FunctionSpace) -> tuple[Array, Array]:
+    """The nodes of every cell, and the normals of the surface at their height, (cells, nodes, 3) each."""
+    element = V.element.basix_element
+    along = element.tabulate(1, element.points)[:, :, :, 0]
+    nodes = V.tabulate_dof_coordinates()[V.dofmap.list]
+    a1, a2 = np.einsum("dvk,cki->dcvi", along[1:3], nodes)
+    m = np.cross(a1, a2)
+    return nodes, np.asarray(m / np.linalg.norm(m, axis=-1, keepdims=True))
 
 
 def in_cells(field: Magnetisation, body: Body) -> Array | Pattern:

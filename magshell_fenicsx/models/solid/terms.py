@@ -87,10 +87,12 @@ class TermFactory:
     h: float
     log: KernelLog
     hinged: tuple[str, ...] = ()
+    grown: Callable[[Density], Density] = lambda density: density  # takes the body's natural shape
     free: Constants = field(default_factory=dict)  # of parameters that enter freely
 
     def distortion(self) -> SolidTerm:
-        return self._bulk("distortion", Density(densities.distortion, self._constants(self.material.shear, self.h)))
+        density = Density(densities.distortion, self._constants(self.material.shear, self.h))
+        return self._bulk("distortion", self.grown(density))
 
     def compression(self) -> SolidTerm:
         """With two quadrature points in each direction: more constraints on J than that would lock the element.
@@ -99,7 +101,7 @@ class TermFactory:
         Mech. Eng. 15, 1978), so the tangent is that of displacements alone and its inertia tells stability.
         """
         parameters = self._constants(self.material.bulk, self.h)
-        return self._bulk("compression", Density(densities.compression, parameters, degree=REDUCED))
+        return self._bulk("compression", self.grown(Density(densities.compression, parameters, degree=REDUCED)))
 
     def magnetic(self, of: Magnetisation) -> list[SolidTerm]:
         """The terms, linear in the applied field, with the amplitude lambda_m."""
@@ -133,11 +135,11 @@ class TermFactory:
             for name, density in self._enclosing(classical / self.h, origin).items()
         ]
 
-    def own(self, term: OwnTerm) -> SolidTerm:
-        """The energy of a part or one's own on the outer face, with the amplitude of its name."""
+    def own(self, term: OwnTerm, amplitude: str | None = None) -> SolidTerm:
+        """The energy of a part or one's own on the outer face, with the amplitude of its name or another."""
         density = self._surface(term, term.density)
         energy = self._on_faces([density])
-        return SolidTerm(term.name, density, energy, self.u, self.log, term.name, linear=term.linear)
+        return SolidTerm(term.name, density, energy, self.u, self.log, amplitude or term.name, linear=term.linear)
 
     def observed(self, term: OwnTerm) -> dict[str, ufl.Form]:
         """What it observes on the outer face."""

@@ -5,8 +5,9 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from magshell_fenicsx.models.shell.natural import CURVATURE, STRETCH, Natural
 from magshell_fenicsx.models.shell.parameters import ACROSS, Magnetisation, Material
-from magshell_fenicsx.models.shell.strains import TangentFrame, bending_moment, principal
+from magshell_fenicsx.models.shell.strains import NaturalFrame, TangentFrame, bending_moment, principal
 from magshell_fenicsx.output.fields.interpretation import SurfaceGeometry, Torque, magnetic_loads
 
 Array = NDArray[np.float64]
@@ -33,8 +34,16 @@ class PointFields:
         (cells, points) area; the weight of a cell in the mean over the cells that share a point.
     """
 
-    def __init__(self, r0: Array, material: Material, field: Magnetisation | None, thickness: Array | None) -> None:
+    def __init__(
+        self,
+        r0: Array,
+        material: Material,
+        field: Magnetisation | None,
+        thickness: Array | None,
+        natural: Natural | None = None,
+    ) -> None:
         self._frame, self._nu, self._field, self._thickness = TangentFrame.of(r0), material.nu, field, thickness
+        self._natural = natural and natural.at(r0[0], self._frame.n0)
         self.constant: dict[str, Array] = {}
         self._torque: Torque | None = None
         self.n0, self.weight = self._frame.n0, self._frame.area
@@ -52,7 +61,9 @@ class PointFields:
         -------
         E, M
             (..., 3, 3) membrane strain and bending moment over D/R, with D of the thickness h, as tensors in space
-            that are tangent to the undeformed surface.
+            that are tangent to the undeformed surface; the strain from the natural shape, if there is one.
+        E_total
+            (..., 3, 3) the strain from the drawn shape, if there is a natural one.
         E_1, E_2, M_1, M_2
             (...) their principal values, the larger first.
         Br, Ba
@@ -61,11 +72,16 @@ class PointFields:
         tau
             (..., 3) torque, for a uniform field.
         """
-        frame = self._frame
-        E, M = frame.membrane_strain(u), bending_moment(frame.curvature_change(u), self._nu)
+        frame, total = self._frame, {}
+        E, K = frame.membrane_strain(u), frame.curvature_change(u)
+        M = bending_moment(K, self._nu)
+        if self._natural:
+            total["E_total"] = frame.tensor(E)
+            shape = NaturalFrame.of(frame, *self._natural, mu.get(CURVATURE, 0.0), mu.get(STRETCH, 0.0))
+            E, M = shape.elastic(E), shape.moment(K, self._nu)
         if self._thickness is not None:
             M *= self._thickness[..., None] ** 3
-        found = {"E": frame.tensor(E), "M": frame.tensor(M)}
+        found = {"E": frame.tensor(E), "M": frame.tensor(M), **total}
         found["E_1"], found["E_2"] = principal(E)
         found["M_1"], found["M_2"] = principal(M)
         if self._field:

@@ -76,7 +76,7 @@ class SurfaceGatherer:
         self._cells = np.concatenate(cells) if self.comm.rank == 0 else numbers
         r = self._at_nodes(model.r0)
         factor = None if model.thickness is None else self._thickness(model.thickness)
-        self._fields = PointFields(r, model.material, model.loads.magnetic, factor)
+        self._fields = PointFields(r, model.material, model.loads.magnetic, factor, model.loads.natural)
         self._mean = self._weighted_mean(numbers, map_.size_global)
         n0 = self._averaged(self._fields.n0)
         self._r0, self._n0 = self._averaged(r[0]), n0 / np.linalg.norm(n0, axis=1)[:, None]
@@ -129,7 +129,9 @@ class RevolvedGatherer:
     def __init__(self, model: MeridianModel, comm: MPI.Comm) -> None:
         self.comm, self._model, self._swept = comm, model, Revolution(model)
         factor = None if model.thickness is None else self._swept.scalars(model.thickness)
-        self._fields = PointFields(self._swept.jets(model.r0), model.material, model.loads.magnetic, factor)
+        self._fields = PointFields(
+            self._swept.jets(model.r0), model.material, model.loads.magnetic, factor, model.loads.natural
+        )
         self._constant = self._around(self._fields.constant)
 
     def gather(self, u: Vector, mu: Mapping[str, float] | None = None) -> Surface | None:

@@ -1,0 +1,273 @@
+"""The natural shape: the metric and the curvature that a shell would have without stress.
+
+With the stretch tensor U of the surface, the stretch s of its thickness and the curvature kappa,
+
+    a_n = U a0 U,    b_n = sym(b0 U^2)/s + U kappa U,    h_n = s h,
+
+so that grown alike in all directions, U = s = lambda, a shell is free of stress as its enlarged image. Membrane and
+bending energy are those of a shell with these forms, per area of the natural surface; U = 1 + mu_s T and
+s = 1 + mu_s t grow with the amplitude "natural_stretch", kappa with "natural_curvature".
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import TypeAlias
+
+import numpy as np
+import ufl
+from dolfinx import fem
+from numpy.typing import NDArray
+from ufl.core.expr import Expr
+
+from magshell_fenicsx.mesh.patch import MeshError
+from magshell_fenicsx.models.shell import kinematics as kin
+from magshell_fenicsx.models.shell.energy import Density, Parameter
+from magshell_fenicsx.models.shell.free import Constants
+from magshell_fenicsx.models.shell.kinematics import Jet
+from magshell_fenicsx.models.shell.patterns import Pattern, by_patch
+
+Array = NDArray[np.float64]
+Varying: TypeAlias = Array | Pattern | Mapping[str, Array]
+STRETCH, CURVATURE = "natural_stretch", "natural_curvature"
+SIZE = 13  # numbers of a field: kappa and T as symmetric tensors in space, and t
+SMALLEST, LARGEST = 0.05, 20.0  # of a natural stretch
+NORMAL = 1e-6  # length in the surface of a unit vector that is normal to it
+
+
+@dataclass(frozen=True)
+class Natural:
+    """The natural shape at both amplitudes equal to one.
+
+    Attributes
+    ----------
+    curvature
+        kappa_11, kappa_22, kappa_12 R, positive where the surface bends towards its normal; a vector (3,), a pattern,
+        or vectors of named patches. None: it does not grow, and there is no such amplitude.
+    stretch
+        The stretches along t1, along t2 and of the thickness, less one; likewise.
+    along
+        A pattern whose part in the surface is along t1; t2 = n x t1.
+    """
+
+    curvature: Varying | None
+    stretch: Varying | None
+    along: Pattern
+
+    @property
+    def amplitudes(self) -> tuple[str, ...]:
+        """Their names."""
+        given = {CURVATURE: self.curvature, STRETCH: self.stretch}
+        return tuple(name for name, value in given.items() if value is not None)
+
+    def on(self, patches: Mapping[str, NDArray[np.bool_]], cells: int) -> "Natural":
+        """The same with a vector for each cell where it is given by patches.
+
+        Raises
+        ------
+        MeshError
+            If there is no such patch.
+        """
+        given = {"curvature": self.curvature, "stretch": self.stretch}
+        return replace(
+            self,
+            **{
+                key: by_patch(value, patches, cells, f"natural.{key}")
+                for key, value in given.items()
+                if isinstance(value, Mapping)
+            },
+        )
+
+    def at(self, r0: Array, n0: Array) -> tuple[Array, Array, Array]:
+        """T and kappa (..., 3, 3) in space, and t (...), at places with these normals (cells, nodes, 3)."""
+        stretch, curvature = (_values(value, r0, n0) for value in (self.stretch, self.curvature))
+        t1, t2 = self._frame(r0, n0, (stretch[..., 0] != stretch[..., 1]) | _uneven(curvature))
+        return _tensor(stretch[..., :2], t1, t2), _tensor(curvature, t1, t2), stretch[..., 2]
+
+    def _frame(self, r0: Array, n0: Array, needed: NDArray[np.bool_]) -> tuple[Array, Array]:
+        """t1 and t2 (cells, nodes, 3); zero where nobody needs them and they are not there."""
+        d = self.along(r0, n0)
+        d = d - np.einsum("...i,...i->...", d, n0)[..., None] * n0
+        length = np.linalg.norm(d, axis=-1, keepdims=True)
+        if (bad := needed & ~(length[..., 0] > NORMAL)).any():
+            x, y, z = r0[bad][0]
+            raise MeshError(
+                f"natural.along: has no direction in the surface at (x, y, z)/R = ({x:.3g}, {y:.3g}, {z:.3g})"
+            )
+        t1 = np.where(length > NORMAL, d / np.maximum(length, 1e-300), 0.0)
+        return t1, np.cross(n0, t1)
+
+
+def meridians(r0: Array, n0: Array) -> Array:
+    """Along the meridians, across circles about e3: e_theta x n; on the axis, where there are none, e1."""
+    x, y = r0[..., 0], r0[..., 1]
+    off = np.hypot(x, y)[..., None] > NORMAL
+    return np.where(off, np.cross(np.stack([-y, x, 0 * x], axis=-1), n0), np.array([1.0, 0.0, 0.0]))
+
+
+def natural_field(natural: Natural, r0: Array, n0: Array, V: fem.FunctionSpace) -> fem.Function:
+    """The natural shape at the nodes (cells, nodes, 3) of every cell of V, free to jump between cells; collective.
+
+    Raises
+    ------
+    MeshError
+        On every rank, if a number is not finite, a stretch is out of bounds, or the frame has no direction.
+    """
+    said = None
+    try:
+        _refuse_unfit(natural, r0, n0)
+        T, kappa, t = natural.at(r0, n0)
+    except MeshError as e:
+        said = str(e)
+    if problems := [text for text in V.mesh.comm.allgather(said) if text]:
+        raise MeshError(problems[0])
+    Q = fem.functionspace(V.mesh, ("DG", V.element.basix_element.degree, (SIZE,)))
+    field = fem.Function(Q, name="natural")
+    rows, columns = [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]
+    values = np.concatenate([kappa[..., rows, columns], T[..., rows, columns], t[..., None]], axis=-1)
+    field.x.array.reshape(-1, SIZE)[Q.dofmap.list] = values
+    return field
+
+
+def _refuse_unfit(natural: Natural, r0: Array, n0: Array) -> None:
+    stretch, curvature = 1 + _values(natural.stretch, r0, n0), _values(natural.curvature, r0, n0)
+    fine = {
+        f"stretch: is not within {SMALLEST:g} to {LARGEST:g}": (stretch >= SMALLEST) & (stretch <= LARGEST),
+        "curvature: has no finite value (or one above 1e6/R)": np.abs(curvature) <= 1e6,
+    }
+    for what, good in fine.items():
+        if not good.all():
+            x, y, z = r0[~good.all(axis=-1)][0]
+            raise MeshError(f"natural.{what} at (x, y, z)/R = ({x:.3g}, {y:.3g}, {z:.3g})")
+
+
+@dataclass(frozen=True)
+class Forms:
+    """The natural shape at a point as surface tensors in coordinates, (2, 2) each.
+
+    Attributes
+    ----------
+    strain
+        (a_n - a0)/2.
+    bend
+        b_n - b0.
+    metric, up
+        a_n and its inverse.
+    area
+        Natural over undeformed area.
+    thickness
+        h_n over h.
+    """
+
+    strain: Expr
+    bend: Expr
+    metric: Expr
+    up: Expr
+    area: Expr
+    thickness: Expr
+
+    def kink(self, nu1: Expr, nu2: Expr) -> Expr:
+        """Natural over undeformed b_nunu where the curvature is across an edge with that conormal."""
+        return self.along(nu1, nu2) / self.thickness
+
+    def along(self, nu1: Expr, nu2: Expr) -> Expr:
+        """The natural length, squared, of a vector with these components."""
+        nu = ufl.as_vector([nu1, nu2])
+        return ufl.dot(nu, ufl.dot(self.metric, nu))
+
+
+@dataclass(frozen=True)
+class Shape:
+    """A natural shape in the densities of a model: its field, see `natural_field`, and its amplitudes; None for 0."""
+
+    field: fem.Function
+    curvature: fem.Constant | None
+    stretch: fem.Constant | None
+
+    @classmethod
+    def of(cls, field: fem.Function, natural: Natural, known: Constants) -> "Shape":
+        """With amplitudes that all terms of a model share, kept in `known`."""
+        domain = field.function_space.mesh
+        found = {name: known.setdefault(name, fem.Constant(domain, 0.0)) for name in natural.amplitudes}
+        return cls(field, found.get(CURVATURE), found.get(STRETCH))
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """The field, and the amplitudes that there are."""
+        return (self.field, *(p for p in (self.curvature, self.stretch) if p is not None))
+
+    def forms(self, r0: Jet, field: Expr, *amplitudes: Expr) -> Forms:
+        """The natural forms at a point where the field and the amplitudes have these values."""
+        given = list(amplitudes)
+        bent, stretched = (given.pop(0) if p is not None else None for p in (self.curvature, self.stretch))
+        return _forms(r0, field, bent, stretched)
+
+
+def _forms(r0: Jet, field: Expr, bent: Expr | None, stretched: Expr | None) -> Forms:
+    a0, up, n0 = kin.metric(r0), kin.inverse_metric(r0), kin.normal(r0)
+    kappa = ufl.zero((2, 2)) if bent is None else bent * _covariant(r0, field, 0)
+    if stretched is None:
+        return Forms(ufl.zero((2, 2)), kappa, a0, up, ufl.as_ufl(1), ufl.as_ufl(1))
+    b12 = ufl.dot(n0, r0.r12)
+    b0 = ufl.as_matrix([[ufl.dot(n0, r0.r11), b12], [b12, ufl.dot(n0, r0.r22)]])
+    t = stretched * field[12]
+    mixed = stretched * ufl.dot(up, _covariant(r0, field, 6))
+    U = ufl.Identity(2) + mixed
+    twice = 2 * mixed + ufl.dot(mixed, mixed)  # U^2 - 1
+    metric = a0 + ufl.dot(a0, twice)
+    grown = (ufl.sym(ufl.dot(b0, twice)) - t * b0) / (1 + t)
+    return Forms(
+        ufl.dot(a0, twice) / 2,
+        grown if bent is None else grown + ufl.dot(ufl.transpose(U), ufl.dot(kappa, U)),
+        metric,
+        ufl.inv(metric),
+        ufl.det(U),
+        1 + t,
+    )
+
+
+def grown(density: Density, shape: Shape) -> Density:
+    """A density that takes `natural` forms, of that shape."""
+
+    def of(*arguments: Expr) -> Expr:
+        count = len(arguments) - len(shape.parameters)
+        given, (field, *amplitudes) = arguments[:count], arguments[count:]
+        r0 = given[0]
+        if isinstance(r0, Jet):
+            return density.of(*given, natural=shape.forms(r0, field, *amplitudes))
+        sides = tuple(shape.forms(j, side, *amplitudes) for j, side in zip(r0, field, strict=True))
+        return density.of(*given, natural=sides)
+
+    return replace(density, of=of, parameters=(*density.parameters, *shape.parameters))
+
+
+def _covariant(r0: Jet, field: Expr, first: int) -> Expr:
+    """The components in the surface's coordinates of a symmetric tensor in space."""
+    xx, yy, zz, xy, xz, yz = (field[first + i] for i in range(6))
+    S = ufl.as_matrix([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    S1, S2 = ufl.dot(S, r0.r1), ufl.dot(S, r0.r2)
+    S12 = ufl.dot(r0.r1, S2)
+    return ufl.as_matrix([[ufl.dot(r0.r1, S1), S12], [S12, ufl.dot(r0.r2, S2)]])
+
+
+def _values(value: Varying | None, r0: Array, n0: Array) -> Array:
+    if value is None:
+        return np.zeros_like(r0)
+    assert not isinstance(value, Mapping)
+    return value(r0, n0) if callable(value) else np.broadcast_to(value, r0.shape)
+
+
+def _uneven(curvature: Array) -> NDArray[np.bool_]:
+    return np.asarray((curvature[..., 0] != curvature[..., 1]) | (curvature[..., 2] != 0))
+
+
+def _tensor(components: Array, t1: Array, t2: Array) -> Array:
+    """Of S_11, S_22 and perhaps S_12 in a frame; S_22 times the unit tensor, exactly, where it is isotropic."""
+
+    def product(a: Array, b: Array) -> Array:
+        return np.asarray(a[..., :, None] * b[..., None, :])
+
+    first, second = components[..., 0, None, None], components[..., 1, None, None]
+    found = second * np.eye(3) + (first - second) * product(t1, t1)
+    if components.shape[-1] == 3:
+        found = found + components[..., 2, None, None] * (product(t1, t2) + product(t2, t1))
+    return np.asarray(found)
