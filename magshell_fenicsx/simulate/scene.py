@@ -92,13 +92,14 @@ class Scene:
 
     def unloaded(self) -> State:
         """The undeformed shell; amplitudes are zero, except user-defined ones with a value."""
-        amplitudes = {t.amplitude for t in self.model.system.terms if t.amplitude}
+        amplitudes = {t.amplitude for t in self.model.system.terms if t.amplitude} | self.motions
         given = self._own_amplitudes
         return State(self.model.zero(), {name: given.get(name, 0.0) for name in sorted({*amplitudes, *given})})
 
     def observe(self, state: State) -> dict[str, float]:
         """The physical columns of a table row: loads, displacements over h, volume, energies over E h R^2."""
         model, h, force = self.model, self.plan.material.h, self.model.loads.force
+        model.system.place(state.mu)
         model.system.accept(state.u)
         pole = model.deflection(state.u, "pole") / h
         potentials, energies = model.system.energies(state.u), defaultdict[str, float](float)
@@ -124,7 +125,7 @@ class Scene:
             "magnetic": sum(energies[name] for name in ("magnetic", "magnetic gradient", "U1", "Uq", "Utau", "couple")),
             **{name: energies[name] for name in ("U1", "Uq", "Utau")},
             **self._observe_points(state),
-            **{name: state.mu[name] for name in self._own_amplitudes},
+            **{name: state.mu[name] for name in (*self._own_amplitudes, *self.motions)},
             **{
                 column: state.mu[term.name]
                 * model.multiplicity
@@ -139,6 +140,11 @@ class Scene:
         """The amplitudes and free parameters of user-defined energies, with their initial values."""
         terms = self.plan.loads.own
         return {term.name: term.value for term in terms} | {p.name: p.value for term in terms for p in term.free}
+
+    @property
+    def motions(self) -> frozenset[str]:
+        """The amplitudes of supports that move."""
+        return frozenset(move.motion.name for move in self.plan.loads.moves)
 
     @property
     def extra_columns(self) -> tuple[str, ...]:

@@ -7,6 +7,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from magshell_fenicsx.assembly.motion import Motion
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.patterns import Pattern
 
@@ -127,6 +128,14 @@ DeadLoad = PointForce | EdgeForce | EdgeMoment | AreaForce
 
 
 @dataclass(frozen=True)
+class Move:
+    """A motion of supports: edges, points or patches that are held."""
+
+    names: tuple[str, ...]
+    motion: Motion
+
+
+@dataclass(frozen=True)
 class Loads:
     """What loads the shell; None or False: no term, no kernel."""
 
@@ -135,6 +144,7 @@ class Loads:
     magnetic: Magnetisation | None = None
     dead: tuple[DeadLoad, ...] = ()
     own: tuple[OwnTerm, ...] = ()
+    moves: tuple[Move, ...] = ()
 
 
 def default_penalty(degree: int) -> float:
