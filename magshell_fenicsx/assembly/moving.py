@@ -55,7 +55,7 @@ class Moving:
     def __init__(self, r0: fem.Function, bodies: Sequence[Body]) -> None:
         self._axes = list(PLANE[r0.function_space.dofmap.index_map_bs])
         self._r0, self._bodies = r0, bodies
-        places = self._in_space(r0.x.array)
+        places = in_space(r0.x.array, len(self._axes))
         self._places = [places[body.dofs // len(self._axes)] for body in bodies]
         self.names = frozenset(name for body in bodies for name in body.names)
         V = r0.function_space
@@ -105,7 +105,7 @@ class Moving:
 
     def times(self, A: Array, v: Array) -> Array:
         """A matrix (3, 3) times the vectors of all nodes."""
-        return np.ascontiguousarray((self._in_space(v) @ A.T)[:, self._axes]).ravel()
+        return np.ascontiguousarray((in_space(v, len(self._axes)) @ A.T)[:, self._axes]).ravel()
 
     def _with(self, *names: str) -> Iterator[tuple[Body, Array]]:
         """Bodies that all these motions move, with the places of their nodes."""
@@ -113,11 +113,13 @@ class Moving:
             if body.names.issuperset(names):
                 yield body, places
 
-    def _in_space(self, v: Array) -> Array:
-        found = np.zeros((len(v) // len(self._axes), 3))
-        found[:, self._axes] = v.reshape(-1, len(self._axes))
-        return found
-
     def _components(self, body: Body, vectors: Array) -> Array:
         axes = np.array(self._axes)[body.dofs % len(self._axes)]
         return np.asarray(vectors[np.arange(len(axes)), axes])
+
+
+def in_space(v: Array, components: int) -> Array:
+    """Vectors (n, 3) of nodes with all components, or with those of the plane of a meridian."""
+    found = np.zeros((len(v) // components, 3))
+    found[:, PLANE[components]] = v.reshape(-1, components)
+    return found

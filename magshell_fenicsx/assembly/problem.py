@@ -111,6 +111,7 @@ class FiniteElementSystem:
                 term.compile_tangent()
             self._K = fem_petsc.create_matrix(pattern.tangent_form)
             self._K.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+            self._unheld = fem_petsc.create_matrix(pattern.tangent_form) if moving else None
 
     def set(self, u: Vector) -> None:
         """Copy a displacement into the Function of the terms."""
@@ -160,10 +161,10 @@ class FiniteElementSystem:
         parts = [self._summed(self._gradient({name: factor})) for name, factor in factors.items()]
         return np.asarray(np.sum([self.noise.on_vector(part, first) for part in parts], axis=0))
 
-    def forces(self, u: Vector, mu: Amplitudes) -> Vector:
-        """dPi/du at all nodes: at supports the forces of these on the shell."""
+    def forces(self, u: Vector, mu: Amplitudes, name: str = "") -> Vector:
+        """dPi/du at all nodes, of all terms or of one: of all at supports the forces of these on the shell."""
         self._at(u, mu)
-        return self._summed(self._gradient(self._factors(mu)), held=False)
+        return self._summed(self._gradient({name: 1.0} if name else self._factors(mu)), held=False)
 
     def load(self, u: Vector, mu: Amplitudes, name: str) -> Vector:
         self._at(u, mu)
@@ -237,7 +238,7 @@ class FiniteElementSystem:
         """This rank's part of the tangent without supports times a vector, both with ghosts."""
         if self._assembler:
             return self._assembler.times(v, factors)
-        K = self._of_forms(factors, [])
+        K = self._of_forms(self._unheld, factors, [])
         given, found = K.createVecRight(), np.zeros_like(v)
         given.array[:] = v[: self.size]
         found[: self.size] = (K * given).array
@@ -264,21 +265,21 @@ class FiniteElementSystem:
             whole = [(weight, self._with_ghosts(v, mu)) for weight, v in stress]
             self._at(u, mu)
             factors = self._factors(mu)
-            K = self._assembler.tangent(factors, whole) if self._assembler else self._of_forms(factors, self.clamped)
+            K = self._assembler.tangent(factors, whole) if self._assembler else self._of_forms(self._K, factors, self.clamped)
             if self.projection:
                 K = self.projection.tangent(K)
             if self.noise:
                 self.noise.on_matrix(K)
             return K
 
-    def _of_forms(self, factors: Mapping[str, float], held: list[fem.DirichletBC]) -> PETSc.Mat:
+    def _of_forms(self, K: PETSc.Mat, factors: Mapping[str, float], held: list[fem.DirichletBC]) -> PETSc.Mat:
         """The tangent from the terms' own forms."""
-        self._K.zeroEntries()
+        K.zeroEntries()
         for t in self.terms:
             if factor := factors.get(t.name):
-                t.add_tangent(self._K, factor, held)
-        compat.finish_matrix(self._K, self.u.function_space, held)
-        return self._K
+                t.add_tangent(K, factor, held)
+        compat.finish_matrix(K, self.u.function_space, held)
+        return K
 
     def _factors(self, mu: Amplitudes) -> dict[str, float]:
         return {t.name: 1.0 if t.amplitude is None else mu[t.amplitude] for t in self.terms}

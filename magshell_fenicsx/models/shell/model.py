@@ -77,7 +77,7 @@ class ShellModel(Observed):
 
     Attributes
     ----------
-    system, multiplicity, normals, loads, load_size
+    system, multiplicity, normals, loads, load_size, supports
         See `Observed`.
     kernels
         Names and compile time of the forms in use.
@@ -85,8 +85,6 @@ class ShellModel(Observed):
         h(x)/h, free to jump from cell to cell; None for 1.
     mirror
         Of a half model.
-    supports
-        Name of an edge, point or patch -> what it holds.
     """
 
     def __init__(
@@ -132,6 +130,7 @@ class ShellModel(Observed):
             mirrored.append(held_along(V, 1, facets("symmetry"), mirror.normal))
         clamped = [name for name, c in conditions.items() if c == "clamped" and name in midsurface.edges]
         self.supports: dict[str, Support] = {}
+        on_planes: dict[str, Support] = {}
         for name, condition in conditions.items():
             components = condition.components if isinstance(condition, Held) else (0, 1, 2)
             if condition in ("free", "symmetry"):
@@ -140,6 +139,7 @@ class ShellModel(Observed):
                 planes.append(plane := plane_of(self.r0, midsurface.edges[name], name))
                 terms.append(factory.mirror_edges(midsurface.edges[name], plane.normal, f"{name} mirror edges"))
                 held.append(held_along(V, 1, midsurface.edges[name], plane.normal))
+                on_planes[name] = Support.of(held_on(V, 1, midsurface.edges[name], components), f"{name} mirror edges")
                 continue
             edge, turn = "", None
             if name in clamped:
@@ -153,6 +153,7 @@ class ShellModel(Observed):
                 here = held_at_vertex(V, midsurface.points[name], components)
             held += here
             self.supports[name] = Support.of(here, edge, turn)
+        self.supports |= on_planes
         closing = closing_point(planes)
         if closing is None and loads.pressure:
             raise MeshError(open_to_pressure(next(name for name, c in conditions.items() if c == "plane")))

@@ -24,6 +24,7 @@ from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes
 from magshell_fenicsx.models.shell.dead_load import assemble_dead_loads
 from magshell_fenicsx.models.shell.fast_tangent import FastTangent
 from magshell_fenicsx.models.shell.free import free_parameters
+from magshell_fenicsx.models.shell.moved import moving
 from magshell_fenicsx.models.shell.parameters import Condition, EdgeMoment, Loads, Material
 from magshell_fenicsx.models.shell.supports import closing_point, open_to_pressure
 from magshell_fenicsx.models.solid.loads import BodyMeasures, outer_patch
@@ -57,7 +58,7 @@ class SolidModel(Observed):
 
     Attributes
     ----------
-    system, multiplicity, normals, kernels
+    system, multiplicity, normals, kernels, supports
         As of `ShellModel`.
     degree
         Of the displacement: 2.
@@ -89,7 +90,7 @@ class SolidModel(Observed):
         hinged = tuple(n for n, c in conditions.items() if n in body.faces and c not in ("free", "clamped", *MIRRORS))
         self.factory = factory = TermFactory(body, self.u, neo_hookean, material.h, self.kernels, hinged)
         self._pattern = factory.distortion()
-        self._held, planes = supports(body, self.r0, conditions)
+        self._held, planes, self.supports = supports(body, self.r0, conditions)
         origin = self._closing_point([mirror, *planes] if self.multiplicity == 2 else planes, conditions)
         self._terms: list[Term] = [self._pattern, factory.compression()]
         if loads.magnetic:
@@ -109,6 +110,7 @@ class SolidModel(Observed):
         self._faces = [body.faces[n] for n, c in conditions.items() if c == "symmetry"]
         self.mirror = mirror
         self._sites = make_sites(body, self.r0, self._terms, self.kernels)
+        self._moving = moving(self.r0, self.supports, loads)
         self.system = self._system(self._held + self._held_on_mirror([mirror.normal]))
         self.observe(self.kernels.compile("volume energy", factory.volume_change(origin)), body.points)
 
@@ -130,10 +132,13 @@ class SolidModel(Observed):
         return [held_along(self.V, 2, facets, along) for facets in self._faces for along in directions]
 
     def _system(self, held: list[Constraint]) -> FiniteElementSystem:
-        fast, factory = FastTangent(self.u, self._sites, held), self.factory
+        near, factory, moving = None, self.factory, self._moving
+        if moving:
+            near = moving.cells, make_sites(self.body, self.r0, self._terms, self.kernels, moving.cells)
+        fast = FastTangent(self.u, self._sites, held, near)
         parameters = free_parameters(
             self.loads.own, factory.free, factory.own, lambda term: self.kernels.compile_all([factory.observed(term)])
         )
         return FiniteElementSystem(
-            self.u, self._terms, held, self._pattern, self.material.h, fast, parameters=parameters
+            self.u, self._terms, held, self._pattern, self.material.h, fast, parameters=parameters, moving=moving
         )
