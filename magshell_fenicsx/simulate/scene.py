@@ -187,7 +187,7 @@ def build_meridian_model(case: Case, plan: Plan) -> MeridianModel:
     model = MeridianModel(
         meridian, plan.material, case.mesh.degree, plan.conditions, plan.loads, case.mesh.penalty, plan.thickness
     )
-    model.supports.refuse_loose(model.r0)
+    model.held.refuse_loose(model.r0)
     return model
 
 
