@@ -86,5 +86,6 @@ def _box(places: Array, mirror: Mirror | None, comm: MPI.Comm) -> Array:
     """Corners (2, 3) of a box around places (n, 3) of all ranks, and around their mirror images."""
     if mirror:
         places = np.concatenate([places, mirror.image(places)])
-    low = comm.allreduce(places.min(axis=0, initial=np.inf), MPI.MIN)
-    return np.array([low, comm.allreduce(places.max(axis=0, initial=-np.inf), MPI.MAX)])
+    corners = np.array([places.min(axis=0, initial=np.inf), places.max(axis=0, initial=-np.inf)])
+    all_corners = np.array(comm.allgather(corners))
+    return np.array([all_corners[:, 0].min(axis=0), all_corners[:, 1].max(axis=0)])
