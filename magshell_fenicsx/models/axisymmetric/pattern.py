@@ -4,7 +4,7 @@ import numpy as np
 from dolfinx import fem
 from numpy.typing import NDArray
 
-from magshell_fenicsx.models.shell.patterns import Pattern
+from magshell_fenicsx.models.shell.patterns import Pattern, inside
 from magshell_fenicsx.models.shell.thickness import Thickness, nodal_thickness
 
 
@@ -13,7 +13,7 @@ def pattern_field(pattern: Pattern, r0: fem.Function) -> fem.Function:
     V = r0.function_space
     Q = fem.functionspace(V.mesh, ("DG", V.element.basix_element.degree, (3,)))
     field = fem.Function(Q, name="Br")
-    field.x.array.reshape(-1, 3)[Q.dofmap.list] = pattern(_nodes(r0), cell_normals(r0))
+    field.x.array.reshape(-1, 3)[Q.dofmap.list] = pattern(inside(_nodes(r0)), cell_normals(r0))
     return field
 
 

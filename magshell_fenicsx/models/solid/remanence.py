@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.mesh.hexahedra import Body
 from magshell_fenicsx.models.shell.parameters import Magnetisation
-from magshell_fenicsx.models.shell.patterns import ByPatch, Pattern, by_patch, refuse_unbounded
+from magshell_fenicsx.models.shell.patterns import ByPatch, Pattern, by_patch, inside, refuse_unbounded
 
 Array = NDArray[np.float64]
 
@@ -28,9 +28,9 @@ def remanence_field(pattern: Pattern, V: fem.FunctionSpace) -> fem.Function:
     m = np.cross(a1, a2)
     Q = fem.functionspace(V.mesh, ("DG", element.degree, (3,)))
     field = fem.Function(Q, name="Br")
-    vectors = pattern(nodes, m / np.linalg.norm(m, axis=-1, keepdims=True))
-    refuse_unbounded(vectors, nodes, V.mesh.comm)
-    field.x.array.reshape(-1, 3)[Q.dofmap.list] = vectors
+    n0 = m / np.linalg.norm(m, axis=-1, keepdims=True)
+    refuse_unbounded(pattern(nodes, n0), nodes, V.mesh.comm)
+    field.x.array.reshape(-1, 3)[Q.dofmap.list] = pattern(inside(nodes), n0)
     return field
 
 
