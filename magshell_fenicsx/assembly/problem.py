@@ -265,7 +265,11 @@ class FiniteElementSystem:
             whole = [(weight, self._with_ghosts(v, mu)) for weight, v in stress]
             self._at(u, mu)
             factors = self._factors(mu)
-            K = self._assembler.tangent(factors, whole) if self._assembler else self._of_forms(self._K, factors, self.clamped)
+            K = (
+                self._assembler.tangent(factors, whole)
+                if self._assembler
+                else self._of_forms(self._K, factors, self.clamped)
+            )
             if self.projection:
                 K = self.projection.tangent(K)
             if self.noise:

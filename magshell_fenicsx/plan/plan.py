@@ -92,6 +92,8 @@ class Plan:
     thickness: Thickness | None = None
     length: float = 1.0
     own: tuple[OwnTerm, ...] = ()
+    supports: tuple[str, ...] = ()
+    reactions: bool = False
 
     @property
     def axisymmetric(self) -> bool:

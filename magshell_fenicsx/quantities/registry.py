@@ -1,10 +1,10 @@
 """Every amplitude and every column of path.csv, in the order of the file."""
 
 import re
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import replace
 
-from magshell_fenicsx.quantities.quantity import Amplitude, Kind, Quantity
+from magshell_fenicsx.quantities.quantity import Amplitude, Quantity
 
 
 def _energy(name: str, words: str, meaning: str, symbol: str = "") -> Quantity:
@@ -62,7 +62,7 @@ OF_EVERY_RUN = (
     Quantity(
         "negative_pivots",
         "unstable directions",
-        "Number of unstable directions of the model with all amplitudes fixed.",
+        "Number of unstable directions of the model, with all amplitudes fixed except those whose conjugate is held.",
         "count",
     ),
     Quantity(
@@ -98,8 +98,19 @@ OF_EVERY_RUN = (
         "Number of unstable directions that the model's symmetry excludes.",
         "count",
     ),
+    Quantity("step", "step", "Number of the programme's step; 0 is the start.", "count"),
 )
-OF_SOME_RUNS = (Quantity("load_factor", "load factor", "Common factor of all dead loads.", "load"),)
+OF_SOME_RUNS = (
+    Quantity("load_factor", "load factor", "Common factor of all dead loads.", "load"),
+    Quantity("motion", "motion", "Factor of the motion of supports; the step may give it another name.", "load"),
+    Quantity(
+        "reaction",
+        "reaction",
+        "Reaction of the supports that move, along their motion; of several motions reaction_NAME. In the case's unit of "
+        "force (N with units), of rotations alone in that of a moment.",
+        "reaction",
+    ),
+)
 QUANTITIES = {q.name: q for q in (*OF_EVERY_RUN, *OF_SOME_RUNS)}
 AMPLITUDES = {
     a.name: a
@@ -112,7 +123,7 @@ AMPLITUDES = {
     )
 }
 # names of terms, and of amplitudes that only the solvers use
-INTERNAL = ("push", "lambda_across", "membrane", "couple")
+INTERNAL = ("push", "lambda_across", "lambda_third", "membrane", "couple")
 TAKEN = frozenset((*QUANTITIES, *AMPLITUDES, *INTERNAL))
 
 
@@ -123,20 +134,39 @@ def register(quantities: Iterable[Quantity]) -> None:
 
 def quantity(name: str) -> Quantity:
     """The quantity of a column; a named point's displacement or a user-defined amplitude has its own name."""
-    kind: Kind = "place" if re.search(r"_u[xyz]$", name) else "load"
-    return QUANTITIES.get(name) or Quantity(name, name.replace("_", " "), "", kind)
+    if name in QUANTITIES:
+        return QUANTITIES[name]
+    if again := re.fullmatch(r"(force|load)_(\d+)", name):
+        of = QUANTITIES[AMPLITUDES[again[1]].column]
+        return replace(of, name=name, words=f"{of.words} {again[2]}", symbol=of.symbol and f"F_{again[2]} R/(2πD)")
+    if again := re.fullmatch(r"w_((force|load)(_\d+)?)_over_h", name):
+        return _w(name, f"at {again[1].replace('_', ' ')}", f"Displacement conjugate to {again[1]}, as w_over_h.")
+    if name.startswith("reaction_"):
+        return replace(QUANTITIES["reaction"], name=name, words=name.replace("_", " "))
+    kinds: dict[str, Kind] = {"u": "place", "f": "reaction", "m": "moment"}
+    ending = re.search(r"_([ufm])[xyz]$", name)
+    return Quantity(name, name.replace("_", " "), "", kinds[ending[1]] if ending else "load")
 
 
 def amplitude(name: str) -> Amplitude:
-    """The amplitude with a name; a user-defined one has a column of the same name."""
+    """The amplitude with a name; a user-defined one has a column of the same name.
+
+    A second force or list of dead loads has its own columns: force_2 and w_force_2_over_h.
+    """
+    if again := re.fullmatch(r"(force|load)_\d+", name):
+        return Amplitude(name, name, f"w_{name}_over_h", AMPLITUDES[again[1]].place)
     return AMPLITUDES.get(name) or Amplitude(name, name)
 
 
-def axes_of(name: str) -> tuple[Quantity, Quantity]:
+def axes_of(name: str, columns: Collection[str] = ()) -> tuple[Quantity, Quantity]:
     """The quantities on the x and y axis of an amplitude's curve: its displacement and its value.
 
-    An angle is on the x axis, and the displacement on the y axis.
+    An angle is on the x axis, and the displacement on the y axis. So is the factor of a motion, with its reaction, which
+    is among the columns of the path.
     """
+    for reaction in (f"reaction_{name}", "reaction"):
+        if name not in AMPLITUDES and reaction in columns:
+            return quantity(name), quantity(reaction)
     varied = amplitude(name)
     over, drawn = quantity(varied.conjugate), quantity(varied.column)
     if varied.conjugate == "w_over_h":

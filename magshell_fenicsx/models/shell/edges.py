@@ -103,9 +103,7 @@ def turning(r0: Jet, u: Jet, m: Expr, width: Expr, intensity: Expr, past: Expr) 
     return -intensity * angle * length
 
 
-def clamped(
-    r0: Jet, u: Jet, m: Expr, width: Expr, nu: Expr, h: Expr, sigma: Expr, turn: Expr | None = None
-) -> Expr:
+def clamped(r0: Jet, u: Jet, m: Expr, width: Expr, nu: Expr, h: Expr, sigma: Expr, turn: Expr | None = None) -> Expr:
     """Energy of a clamped edge per length of its parameter: the outer normal is held at n0, or at `turn` n0."""
     nu1, nu2, stretch = kin.conormal(r0, m)
     r, n0 = r0 + u, kin.normal(r0)

@@ -51,7 +51,7 @@ def varied(rows: Sequence[Row], amplitude: str) -> Sequence[Row]:
 
 def place(row: Row, amplitude: str) -> tuple[float, float]:
     """The coordinates of a point in the curve's axes."""
-    x, y = axes_of(amplitude)
+    x, y = axes_of(amplitude, row)
     return x.on_axis(row), y.on_axis(row)
 
 
@@ -63,7 +63,7 @@ def _unstable(row: Row) -> bool:
 def plot_curve(axes: "Axes", rows: Sequence[Row], amplitude: str) -> None:
     """Draw the curve of `curve_figure` in given axes."""
     part = varied(rows, amplitude)
-    x, y = axes_of(amplitude)
+    x, y = axes_of(amplitude, part[0])
     if amplitude == "load" and all(row["w_over_h"] == row["w_pole_over_h"] for row in part):
         x = quantity("w_pole_over_h")  # moments have no conjugate displacement
     pole = pole_name(part[0]).replace("$", r"\$")  # plain text, no mathematics
