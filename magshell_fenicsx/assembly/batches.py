@@ -64,8 +64,8 @@ def cell_batches(V: fem.FunctionSpace, degree: int, chosen: Chosen = None) -> li
     X, w = cell_rule(degree)
     rule = Rule((X,), (Table.tabulate(V.element.basix_element, X),), w)
     cells = np.arange(V.mesh.topology.index_map(2).size_local, dtype=np.int32)
-    cells = cells if chosen is None else cells[chosen[cells]]
-    return [Batch((part,), rule, np.empty((len(part), 0))) for part in _chunks(cells, len(w))]
+    counted = cells if chosen is None else cells[chosen[cells]]
+    return [Batch((part,), rule, np.empty((len(part), 0))) for part in _chunks(counted, len(w))]
 
 
 def interior_batches(V: fem.FunctionSpace, degree: int, chosen: Chosen = None) -> list[Batch]:

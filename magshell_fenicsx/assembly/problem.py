@@ -226,8 +226,10 @@ class FiniteElementSystem:
     def _turning_column(self, mu: Amplitudes, name: str) -> NDArray[np.float64]:
         """The part of it that normals of edges make, which turn with the motion."""
         assert self.moving
-        parts = [self._turned_column(edge, A) for edge, A in self.moving.turning(mu, name)]
-        return sum(parts, np.zeros_like(self.u.x.array))
+        found: NDArray[np.float64] = np.zeros_like(self.u.x.array)
+        for edge, A in self.moving.turning(mu, name):
+            found += self._turned_column(edge, A)
+        return found
 
     def _turned_column(self, edge: str, A: NDArray[np.float64]) -> NDArray[np.float64]:
         assert self.moving
@@ -293,7 +295,7 @@ class FiniteElementSystem:
     ) -> NDArray[np.float64]:
         """This rank's part of the gradient of the terms with these factors, by name, plus further terms."""
         with self.assembly:
-            b = np.zeros_like(self.u.x.array)
+            b: NDArray[np.float64] = np.zeros_like(self.u.x.array)
             if self.gradients and factors:
                 self.gradients.add(b, factors)
             for factor, term in [*((factors.get(t.name, 0.0), t) for t in self._own_residual), *besides]:

@@ -4,7 +4,7 @@ import re
 from collections.abc import Collection, Iterable
 from dataclasses import replace
 
-from magshell_fenicsx.quantities.quantity import Amplitude, Quantity
+from magshell_fenicsx.quantities.quantity import Amplitude, Kind, Quantity
 
 
 def _energy(name: str, words: str, meaning: str, symbol: str = "") -> Quantity:
@@ -106,8 +106,8 @@ OF_SOME_RUNS = (
     Quantity(
         "reaction",
         "reaction",
-        "Reaction of the supports that move, along their motion; of several motions reaction_NAME. In the case's unit of "
-        "force (N with units), of rotations alone in that of a moment.",
+        "Reaction of the supports that move, along their motion; of several motions reaction_NAME. In the case's unit "
+        "of force (N with units), of rotations alone in that of a moment.",
         "reaction",
     ),
 )
@@ -161,8 +161,8 @@ def amplitude(name: str) -> Amplitude:
 def axes_of(name: str, columns: Collection[str] = ()) -> tuple[Quantity, Quantity]:
     """The quantities on the x and y axis of an amplitude's curve: its displacement and its value.
 
-    An angle is on the x axis, and the displacement on the y axis. So is the factor of a motion, with its reaction, which
-    is among the columns of the path.
+    An angle is on the x axis, and the displacement on the y axis. So is the factor of a motion, with its reaction on
+    the y axis if that is among the columns of the path.
     """
     for reaction in (f"reaction_{name}", "reaction"):
         if name not in AMPLITUDES and reaction in columns:

@@ -41,7 +41,7 @@ def scene(kind: str) -> Scene:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_derivatives_by_the_amplitudes(kind: str) -> None:
-    """Central differences of energy, residual and conjugates at a rough state; all of them change with the amplitude."""
+    """Central differences of energy, residual and conjugates at a rough state; all change with the amplitude."""
     system, step = scene(kind).model.system, 1e-5
     rng = np.random.default_rng(1)
     u = system.held(1e-3 * rng.standard_normal(system.size))

@@ -96,7 +96,8 @@ def supports(meridian: Meridian, conditions: Mapping[str, Condition], *, pressur
         both = tuple(i for i, part in enumerate((HORIZONTAL, {AXIAL})) if held >= part)
         if both:
             named[name] = here, both
-    return Supports(meridian.axis, *(np.unique(np.concatenate([np.empty(0, np.int32), *f])) for f in found), named)
+    parts = [np.unique(np.concatenate([np.empty(0, np.int32), *f])) for f in found]
+    return Supports(meridian.axis, parts[0], parts[1], parts[2], named)
 
 
 def _refuse_slanting(meridian: Meridian, name: str, *, pressure: bool) -> None:

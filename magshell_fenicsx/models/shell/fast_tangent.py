@@ -64,7 +64,8 @@ class FastTangent:
     ) -> None:
         V, clamped = u.function_space, [c for c in held if isinstance(c, fem.DirichletBC)]
         self._u, self._sites, self._nodes = u, sites, V.dofmap.list
-        self._moving, self._near = moving or (None, ())
+        self._moving = moving[0] if moving else None
+        self._near = moving[1] if moving else ()
         self._matrix = BlockMatrix(V, [batch.cells for site in sites for batch in site.coupling], clamped)
         cells, functions = V.dofmap.list.shape
         self._same = np.empty((cells, 9, functions * (functions + 1) // 2))

@@ -126,9 +126,9 @@ def make_sites(
     for degree in sorted({t.density.degree for t in found if t.density.where == "body"}):
         points, w = basix.make_quadrature(basix.CellType.hexahedron, degree)
         cells = np.arange(V.mesh.topology.index_map(3).size_local, dtype=np.int32)
-        cells = cells if chosen is None else cells[chosen[cells]]
+        counted = cells if chosen is None else cells[chosen[cells]]
         here = [t for t in found if t.density.where == "body" and t.density.degree == degree]
-        sites.append(Site(X, cells, _rule(V, points, w), here, log))
+        sites.append(Site(X, counted, _rule(V, points, w), here, log))
     for term in found:
         if term.density.where == "body":
             continue
@@ -136,9 +136,9 @@ def make_sites(
         points, w = term.density.rule
         for facet in np.flatnonzero(V.mesh.comm.allreduce(np.bincount(numbers, minlength=6))):
             rule = _rule(V, _on_facet(points, facet), w)
-            cells = around[numbers == facet]
-            cells = cells if chosen is None else cells[chosen[cells]]
-            sites.append(Site(X, cells, rule, [term], log, facet))
+            there = around[numbers == facet]
+            counted = there if chosen is None else there[chosen[there]]
+            sites.append(Site(X, counted, rule, [term], log, facet))
     return sites
 
 
