@@ -158,17 +158,21 @@ def amplitude(name: str) -> Amplitude:
     return AMPLITUDES.get(name) or Amplitude(name, name)
 
 
-def axes_of(name: str, columns: Collection[str] = ()) -> tuple[Quantity, Quantity]:
+def axes_of(name: str, row: Collection[str] = ()) -> tuple[Quantity, Quantity]:
     """The quantities on the x and y axis of an amplitude's curve: its displacement and its value.
 
-    An angle is on the x axis, and the displacement on the y axis. So is the factor of a motion, with its reaction on
-    the y axis if that is among the columns of the path.
+    An angle is on the x axis, and the displacement on the y axis; so is the factor of a motion, with its reaction.
+
+    Parameters
+    ----------
+    row
+        The columns that there are: where w_over_h belongs to another load, this one has a column of its own.
     """
     for reaction in (f"reaction_{name}", "reaction"):
-        if name not in AMPLITUDES and reaction in columns:
+        if name not in AMPLITUDES and reaction in row:
             return quantity(name), quantity(reaction)
-    varied = amplitude(name)
-    over, drawn = quantity(varied.conjugate), quantity(varied.column)
+    varied, own = amplitude(name), f"w_{name}_over_h"
+    over, drawn = quantity(own if own in row else varied.conjugate), quantity(varied.column)
     if varied.conjugate == "w_over_h":
         over = replace(over, note=varied.place)
     return (drawn, over) if name == "angle" else (over, drawn)
