@@ -50,7 +50,7 @@ def test_shortened_strip() -> None:
     assert onset["mode"] == "symmetric"
     assert float(onset["reaction"]) == pytest.approx(EULER, rel=1e-3)
     assert float(onset["shortening"]) == pytest.approx(EULER * EPS, rel=1e-3)
-    assert float(onset["load_error"]) < 1e-8
+    assert float(onset["load_error"]) < 1e-4 * float(onset["shortening"])
     for branch in (1, 2):
         for shortening in (0.005, 0.01):
             force, deflection, moment = elastica(shortening)
