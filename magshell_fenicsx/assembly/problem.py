@@ -114,7 +114,12 @@ class FiniteElementSystem:
             self._unheld = fem_petsc.create_matrix(pattern.tangent_form) if moving else None
 
     def set(self, u: Vector) -> None:
-        """Copy a displacement into the Function of the terms."""
+        """Copy a displacement into the Function of the terms, which follow it."""
+        self._copy(u)
+        for term in self.terms:
+            term.follow()
+
+    def _copy(self, u: Vector) -> None:
         self.u.x.array[: self.size] = u
         self.u.x.scatter_forward()
 
@@ -127,11 +132,14 @@ class FiniteElementSystem:
 
     def _at(self, u: Vector, mu: Amplitudes) -> None:
         """Set the displacement and the free parameters of the terms."""
-        self.set(u)
+        self._copy(u)
         self.place(mu)
+        for term in self.terms:
+            term.follow()
 
     def _with_ghosts(self, u: Vector, mu: Amplitudes) -> NDArray[np.float64]:
-        self._at(u, mu)
+        self._copy(u)
+        self.place(mu)
         return np.array(self.u.x.array)
 
     def held(self, u: Vector) -> Vector:

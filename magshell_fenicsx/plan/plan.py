@@ -75,6 +75,8 @@ class Plan:
         R in the unit that results are told in.
     own
         One's own energies; `loads` has them too, after those of the case's parts.
+    warning
+        What is unphysical, if anything.
     """
 
     material: Material
@@ -94,6 +96,7 @@ class Plan:
     own: tuple[OwnTerm, ...] = ()
     supports: tuple[str, ...] = ()
     reactions: bool = False
+    warning: str | None = None
 
     @property
     def axisymmetric(self) -> bool:
