@@ -1,5 +1,6 @@
 """The same path on 1 and 3 ranks, of two scenes on 2 as well."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -54,17 +55,28 @@ SCENES |= {
         ],
     ),
 }
+MOVES = "[{supports: [right], translation: [0, 0, 0.02], rotation: {axis: [0.1, -1, 0], angle: 10, point: [1, 0, 0]}}]"
 SCENES |= {
     "a natural shape": (
         "natural_strip.yaml",
         [DEGREE, "--set=natural={curvature: [3, '1 + x', 0.5], stretch: ['1 + 0.1*x', 1]}", "--set=loading.points=2"],
     ),
+    "an edge that is lifted and turned": (
+        "shortened_strip.yaml",
+        [
+            f"--set=loading={{kind: edge, moves: {MOVES}, control: load, points: 1}}",
+            "--set=shell.width=0.3",
+            "--set=shell.thickness=0.02",
+            "--set=points={middle: [0.5, 0.15, 0]}",
+            "--set=symmetry=none",
+        ],
+    ),
 }
 COMPARED = ("p_over_pc", "lambda_m", "force", "w_over_h", "w_pole_over_h", "volume_change", "energy")
-POINTS = ("_ux", "_uy", "_uz")  # of named points
+VECTORS = ("u", "f", "m")  # columns NAME_ux, ...: of named points, and reactions
 
 
-ON_TWO = ("half shell, force", "a moment")
+ON_TWO = ("half shell, force", "a moment", "an edge that is lifted and turned")
 
 
 @pytest.mark.parametrize("scene", [s if s == "a moment" else pytest.param(s, marks=pytest.mark.slow) for s in SCENES])
@@ -83,12 +95,12 @@ def test_same_path(tmp_path: Path, scene: str) -> None:
         assert len(other) == len(paths[0])
         for key in ("label", "negative_pivots"):
             assert [row[key] for row in other] == [row[key] for row in paths[0]]
-        named = [key for key in paths[0][0] if key[-3:] in POINTS]
-        moved = max((abs(float(row[key])) for row in paths[0] for key in named), default=0.0)
-        for key in [*COMPARED, *named]:  # a component that is zero by symmetry counts beside the others
-            a, b = ([float(row[key]) for row in path] for path in (paths[0], other))
-            scale = moved if key in named else max(map(abs, a))
-            assert b == pytest.approx(a, rel=0, abs=max(1e-8 * scale, 1e-18)), key
+        vectors = [[key for key in paths[0][0] if re.search(f"_{kind}[xyz]$", key)] for kind in VECTORS]
+        for group in [*([key] for key in COMPARED), *vectors]:  # a component that is zero counts beside the others
+            scale = max((abs(float(row[key])) for row in paths[0] for key in group), default=0.0)
+            for key in group:
+                a, b = ([float(row[key]) for row in path] for path in (paths[0], other))
+                assert b == pytest.approx(a, rel=0, abs=max(1e-8 * scale, 1e-18)), key
     one = fields[0]
     for other_surface in fields[1:]:
         same = cKDTree(other_surface.r0).query(one.r0)[1]

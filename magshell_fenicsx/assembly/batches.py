@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 from dolfinx import fem
@@ -55,23 +56,36 @@ class Batch:
         return len(self.cells[0]) * len(self.rule.weights)
 
 
-def cell_batches(V: fem.FunctionSpace, degree: int) -> list[Batch]:
+Chosen: TypeAlias = NDArray[np.bool_] | None  # local cells that count, None for all; an edge counts with one of them
+
+
+def cell_batches(V: fem.FunctionSpace, degree: int, chosen: Chosen = None) -> list[Batch]:
     """Batches of the owned cells."""
     X, w = cell_rule(degree)
     rule = Rule((X,), (Table.tabulate(V.element.basix_element, X),), w)
     cells = np.arange(V.mesh.topology.index_map(2).size_local, dtype=np.int32)
-    return [Batch((part,), rule, np.empty((len(part), 0))) for part in _chunks(cells, len(w))]
+    counted = cells if chosen is None else cells[chosen[cells]]
+    return [Batch((part,), rule, np.empty((len(part), 0))) for part in _chunks(counted, len(w))]
 
 
-def interior_batches(V: fem.FunctionSpace, degree: int) -> list[Batch]:
+def interior_batches(V: fem.FunctionSpace, degree: int, chosen: Chosen = None) -> list[Batch]:
     """Batches of the owned interior edges."""
     cells, edges, backwards = interior_edges(V)
-    return list(_edge_batches(V, degree, cells, np.column_stack([edges, backwards])))
+    return list(_edge_batches(V, degree, *_counted(cells, np.column_stack([edges, backwards]), chosen)))
 
 
-def boundary_batches(V: fem.FunctionSpace, degree: int, facets: NDArray[np.int32]) -> list[Batch]:
+def boundary_batches(
+    V: fem.FunctionSpace, degree: int, facets: NDArray[np.int32], chosen: Chosen = None
+) -> list[Batch]:
     """Batches of those boundary edges that this rank owns."""
-    return list(_edge_batches(V, degree, *boundary_edges(V, facets)))
+    return list(_edge_batches(V, degree, *_counted(*boundary_edges(V, facets), chosen)))
+
+
+def _counted(
+    cells: NDArray[np.int32], kinds: NDArray[np.int32], chosen: Chosen
+) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    which = slice(None) if chosen is None else chosen[cells].any(axis=1)
+    return cells[which], kinds[which]
 
 
 def interior_edges(V: fem.FunctionSpace) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.bool_]]:

@@ -10,11 +10,12 @@ from dolfinx.la import InsertMode
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
+from magshell_fenicsx.assembly.moving import Moving
 from magshell_fenicsx.assembly.parameter import Parameter
 from magshell_fenicsx.assembly.sliding import Constraint, Projection, Sliding
 from magshell_fenicsx.assembly.terms import FormTerm, Term
 from magshell_fenicsx.continuation.noise import Noise
-from magshell_fenicsx.continuation.system import Amplitudes, Vector, Weighted
+from magshell_fenicsx.continuation.system import Amplitudes, State, Vector, Weighted
 from magshell_fenicsx.continuation.timing import Stopwatch
 from magshell_fenicsx.platform import compat
 
@@ -29,6 +30,9 @@ class TangentAssembler(Protocol):
 
         `stress` is that of `System.tangent`, of displacements with ghosts.
         """
+
+    def times(self, v: NDArray[np.float64], factors: Mapping[str, float]) -> NDArray[np.float64]:
+        """This rank's part of the matrix without supports times a vector with ghosts, exact where nodes move."""
 
 
 class ResidualAssembler(Protocol):
@@ -65,6 +69,9 @@ class FiniteElementSystem:
         Computes the residual, instead of the terms' forms.
     parameters
         Free parameters of terms, by name.
+    moving
+        Nodes among the held ones whose displacement E(mu) is prescribed. Increments of u are zero there, and
+        whatever u holds there is replaced by E(mu).
     """
 
     def __init__(
@@ -77,6 +84,7 @@ class FiniteElementSystem:
         assembler: TangentAssembler | None = None,
         gradients: ResidualAssembler | None = None,
         parameters: Mapping[str, Parameter] | None = None,
+        moving: Moving | None = None,
     ) -> None:
         V = u.function_space
         self.u, self.terms, self.length = u, terms, length
@@ -84,7 +92,8 @@ class FiniteElementSystem:
         sliding = [c for c in held if isinstance(c, Sliding)]
         self.projection = Projection(V, sliding, clamped) if sliding else None
         self.parameters = parameters or {}
-        self.coordinates = frozenset(self.parameters)
+        self.moving = moving
+        self.coordinates = frozenset(self.parameters) | (moving.names if moving else frozenset())
         self.comm = V.mesh.comm
         self.size = V.dofmap.index_map.size_local * V.dofmap.index_map_bs
         self.dofs = V.dofmap.index_map.size_global * V.dofmap.index_map_bs
@@ -102,6 +111,7 @@ class FiniteElementSystem:
                 term.compile_tangent()
             self._K = fem_petsc.create_matrix(pattern.tangent_form)
             self._K.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+            self._unheld = fem_petsc.create_matrix(pattern.tangent_form) if moving else None
 
     def set(self, u: Vector) -> None:
         """Copy a displacement into the Function of the terms, which follow it."""
@@ -113,8 +123,23 @@ class FiniteElementSystem:
         self.u.x.array[: self.size] = u
         self.u.x.scatter_forward()
 
-    def _with_ghosts(self, u: Vector) -> NDArray[np.float64]:
+    def placed(self, state: State) -> State:
+        """The state with the displacement of the nodes that move."""
+        if self.moving is None:
+            return state
+        self._at(state.u, state.mu)
+        return State(np.array(self.u.x.array[: self.size]), state.mu)
+
+    def _at(self, u: Vector, mu: Amplitudes) -> None:
+        """Set the displacement and the free parameters of the terms."""
         self._copy(u)
+        self.place(mu)
+        for term in self.terms:
+            term.follow()
+
+    def _with_ghosts(self, u: Vector, mu: Amplitudes) -> NDArray[np.float64]:
+        self._copy(u)
+        self.place(mu)
         return np.array(self.u.x.array)
 
     def held(self, u: Vector) -> Vector:
@@ -129,41 +154,50 @@ class FiniteElementSystem:
             self.projection.project(u)
 
     def place(self, mu: Amplitudes) -> None:
-        """Set the free parameters of the terms."""
+        """Set the free parameters of the terms, and move the nodes that move."""
         for name, parameter in self.parameters.items():
             parameter.constant.value = mu[name]
+        if self.moving:
+            self.moving.put(self.u.x.array, mu)
 
     def residual(self, u: Vector, mu: Amplitudes) -> Vector:
-        self.place(mu)
-        factors = {t.name: _factor(t, mu) for t in self.terms}
+        self._at(u, mu)
+        factors = self._factors(mu)
         if self.noise is None:
-            return self._gradient(u, factors)
+            return self._summed(self._gradient(factors))
         first = self.u.function_space.dofmap.index_map.local_range[0] * self.u.function_space.dofmap.index_map_bs
-        parts = [self._gradient(u, {name: factor}) for name, factor in factors.items()]
+        parts = [self._summed(self._gradient({name: factor})) for name, factor in factors.items()]
         return np.asarray(np.sum([self.noise.on_vector(part, first) for part in parts], axis=0))
 
+    def forces(self, u: Vector, mu: Amplitudes, name: str = "") -> Vector:
+        """dPi/du at all nodes, of all terms or of one: of all at supports the forces of these on the shell."""
+        self._at(u, mu)
+        return self._summed(self._gradient({name: 1.0} if name else self._factors(mu)), held=False)
+
     def load(self, u: Vector, mu: Amplitudes, name: str) -> Vector:
-        self.place(mu)
-        if name in self.parameters:
-            slopes = self.parameters[name].slopes
-            return self._gradient(u, {}, [(_factor(slope, mu), slope) for slope in slopes])
-        return self._gradient(u, {t.name: 1.0 for t in self.terms if t.amplitude == name})
+        self._at(u, mu)
+        return self._summed(self._column(mu, name))
 
     def potential(self, u: Vector, mu: Amplitudes, name: str) -> float:
-        self.set(u)
-        self.place(mu)
-        if name in self.parameters:
+        self._at(u, mu)
+        if self.moving and name in self.moving.names:
+            here = float(self._gradient(self._factors(mu)) @ self.moving.rate(mu, name))
+            for edge, A in self.moving.turning(mu, name):
+                here += float(self._gradient({edge: 1.0}) @ self.moving.along(A, self.u.x.array))
+        elif name in self.parameters:
             slopes = self.parameters[name].slopes
-            here = sum(_factor(slope, mu) * slope.energy() for slope in slopes)
+            here = sum(_value(slope.amplitude, mu) * slope.energy() for slope in slopes)
         else:
             here = sum(t.energy() for t in self.terms if t.amplitude == name)
         return float(self.comm.allreduce(here))
 
     def curvature(self, u: Vector, mu: Amplitudes, name: str, other: str) -> float:
-        if not {name, other} & set(self.parameters):
+        if not {name, other} & self.coordinates:
             return 0.0  # amplitudes that multiply their terms
-        self.set(u)
-        self.place(mu)
+        self._at(u, mu)
+        if self.moving and {name, other} & self.moving.names:
+            here = self._motion_curvature(self.moving, mu, *sorted((name, other), key=self.moving.names.__contains__))
+            return float(self.comm.allreduce(here))
         if name not in self.parameters:
             name, other = other, name
         parameter = self.parameters[name]
@@ -173,6 +207,53 @@ class FiniteElementSystem:
         else:
             here = sum(slope.energy() for slope in parameter.slopes if slope.amplitude == other)
         return float(self.comm.allreduce(here))
+
+    def _motion_curvature(self, moving: Moving, mu: Amplitudes, other: str, name: str) -> float:
+        """This rank's part of d2Pi/dmu_i dmu_j, the second amplitude that of a motion."""
+        found = moving.rate(mu, name) @ self._column(mu, other)
+        if other not in moving.names:
+            return float(found)
+        R, r = self._gradient(self._factors(mu)), self.u.x.array
+        found += moving.rate(mu, other) @ self._turning_column(mu, name) + moving.bend(mu, name, other) @ R
+        rates = dict(moving.turning(mu, other))
+        for edge, A in moving.turning(mu, name):
+            if edge in rates:
+                found += moving.along(A, r) @ self._turned_column(edge, rates[edge])
+        for edge, B in moving.turning_twice(mu, (name, other)):
+            found += moving.along(B, r) @ self._gradient({edge: 1.0})
+        return float(found)
+
+    def _column(self, mu: Amplitudes, name: str) -> NDArray[np.float64]:
+        """This rank's part of d2Pi/du dmu at all nodes, of the displacement that is set."""
+        if self.moving and name in self.moving.names:
+            return self._times(self.moving.rate(mu, name), self._factors(mu)) + self._turning_column(mu, name)
+        if name in self.parameters:
+            slopes = self.parameters[name].slopes
+            return self._gradient({}, [(_value(slope.amplitude, mu), slope) for slope in slopes])
+        return self._gradient({t.name: 1.0 for t in self.terms if t.amplitude == name})
+
+    def _turning_column(self, mu: Amplitudes, name: str) -> NDArray[np.float64]:
+        """The part of it that normals of edges make, which turn with the motion."""
+        assert self.moving
+        found: NDArray[np.float64] = np.zeros_like(self.u.x.array)
+        for edge, A in self.moving.turning(mu, name):
+            found += self._turned_column(edge, A)
+        return found
+
+    def _turned_column(self, edge: str, A: NDArray[np.float64]) -> NDArray[np.float64]:
+        assert self.moving
+        turned = self._times(self.moving.along(A, self.u.x.array), {edge: 1.0})
+        return turned + self.moving.times(A.T, self._gradient({edge: 1.0}))
+
+    def _times(self, v: NDArray[np.float64], factors: Mapping[str, float]) -> NDArray[np.float64]:
+        """This rank's part of the tangent without supports times a vector, both with ghosts."""
+        if self._assembler:
+            return self._assembler.times(v, factors)
+        K = self._of_forms(self._unheld, factors, [])
+        given, found = K.createVecRight(), np.zeros_like(v)
+        given.array[:] = v[: self.size]
+        found[: self.size] = (K * given).array
+        return found
 
     def accept(self, u: Vector) -> None:
         """Accept u as a point of the path; moments count full turns from here."""
@@ -192,46 +273,54 @@ class FiniteElementSystem:
 
     def tangent(self, u: Vector, mu: Amplitudes, stress: Sequence[Weighted] = ()) -> PETSc.Mat:
         with self.assembly:
-            whole = [(weight, self._with_ghosts(v)) for weight, v in stress]
-            self.set(u)
-            self.place(mu)
-            factors = {t.name: _factor(t, mu) for t in self.terms}
-            K = self._assembler.tangent(factors, whole) if self._assembler else self._of_forms(factors)
+            whole = [(weight, self._with_ghosts(v, mu)) for weight, v in stress]
+            self._at(u, mu)
+            factors = self._factors(mu)
+            K = (
+                self._assembler.tangent(factors, whole)
+                if self._assembler
+                else self._of_forms(self._K, factors, self.clamped)
+            )
             if self.projection:
                 K = self.projection.tangent(K)
             if self.noise:
                 self.noise.on_matrix(K)
             return K
 
-    def _of_forms(self, factors: Mapping[str, float]) -> PETSc.Mat:
+    def _of_forms(self, K: PETSc.Mat, factors: Mapping[str, float], held: list[fem.DirichletBC]) -> PETSc.Mat:
         """The tangent from the terms' own forms."""
-        self._K.zeroEntries()
+        K.zeroEntries()
         for t in self.terms:
-            if factor := factors[t.name]:
-                t.add_tangent(self._K, factor, self.clamped)
-        compat.finish_matrix(self._K, self.u.function_space, self.clamped)
-        return self._K
+            if factor := factors.get(t.name):
+                t.add_tangent(K, factor, held)
+        compat.finish_matrix(K, self.u.function_space, held)
+        return K
+
+    def _factors(self, mu: Amplitudes) -> dict[str, float]:
+        return {t.name: _value(t.amplitude, mu) for t in self.terms}
 
     def _gradient(
-        self, u: Vector, factors: Mapping[str, float], besides: Sequence[tuple[float, Term]] = ()
+        self, factors: Mapping[str, float], besides: Sequence[tuple[float, Term]] = ()
     ) -> NDArray[np.float64]:
-        """The gradient of the terms with these factors, by name, plus further terms."""
+        """This rank's part of the gradient of the terms with these factors, by name, plus further terms."""
         with self.assembly:
-            self.set(u)
-            b = self._b.x.array
-            b[:] = 0
+            b: NDArray[np.float64] = np.zeros_like(self.u.x.array)
             if self.gradients and factors:
                 self.gradients.add(b, factors)
             for factor, term in [*((factors.get(t.name, 0.0), t) for t in self._own_residual), *besides]:
                 if factor:
                     term.add_residual(b, factor)
+            return b
+
+    def _summed(self, part: NDArray[np.float64], *, held: bool = True) -> Vector:
+        """The sum of all ranks' parts; zero at supports if `held`."""
+        with self.assembly:
+            b = self._b.x.array
+            b[:] = part
             self._b.x.scatter_reverse(InsertMode.add)
-            self._hold(b)
+            if held:
+                self._hold(b)
             return np.array(b[: self.size])
-
-
-def _factor(term: Term, mu: Amplitudes) -> float:
-    return _value(term.amplitude, mu)
 
 
 def _value(amplitude: str | None, mu: Amplitudes) -> float:

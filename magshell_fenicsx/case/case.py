@@ -14,6 +14,7 @@ from magshell_fenicsx.case.expressions import is_formula
 from magshell_fenicsx.case.fields import MagneticSection, layer_average
 from magshell_fenicsx.case.loading import Loading, ProgrammeStep, programme
 from magshell_fenicsx.case.loads.dead import DeadSection
+from magshell_fenicsx.case.loads.edge import EdgeSection, refuse_unheld
 from magshell_fenicsx.case.loads.growth import GrowthSection
 from magshell_fenicsx.case.loads.indentation import IndentationSection
 from magshell_fenicsx.case.loads.step import Step
@@ -81,6 +82,8 @@ class Case(WithParts):
     """Elements"""
     stability: StabilitySection | None = None
     """Lowest modes after the run"""
+    reactions: bool | None = None
+    """Forces and moments of every support as columns of path.csv; by default where a support moves"""
     symmetry: Literal["auto", "none", "half", "axisymmetric"] = "auto"
     """The part that is modelled: the smallest that the case allows (auto), all (none), one side of a mirror plane
     that shape, supports, fields and load share (half), the meridian of what is closed around e3 and has an edge
@@ -95,7 +98,7 @@ class Case(WithParts):
             written = data.get("loading")
             sources = written if isinstance(written, list) else [written]
             for step, source in zip(programme(section.loading, field=False), sources, strict=False):
-                parts |= {step.key: source} if isinstance(step.load, DeadSection) else {}
+                parts |= {step.key: source} if isinstance(step.load, DeadSection | EdgeSection) else {}
             for key in (*texts(parts, is_formula), *measured(data.get("natural"))):
                 raise ValueError(f"{key}: has a unit, but the shell's lengths have none: give all of them one, or none")
         return section
@@ -220,6 +223,9 @@ class Case(WithParts):
 
     @model_validator(mode="after")
     def _programme_fits(self) -> Self:
+        for step in self.programme:
+            if isinstance(step.load, EdgeSection):
+                refuse_unheld(step.key, step.load, self.boundary.conditions())
         refuse_unfit_steps(self.programme, self.magnetic, self.lambda_m, whole=isinstance(self.loading, list))
         return self
 

@@ -7,6 +7,7 @@ from typing import Annotated, Any, TypeAlias
 from pydantic import Discriminator, Field, Tag
 
 from magshell_fenicsx.case.loads.dead import DeadSection
+from magshell_fenicsx.case.loads.edge import EdgeSection
 from magshell_fenicsx.case.loads.field import FieldBefore, FieldSection, RotationSection
 from magshell_fenicsx.case.loads.growth import GrowthSection
 from magshell_fenicsx.case.loads.indentation import IndentationSection
@@ -14,7 +15,7 @@ from magshell_fenicsx.case.loads.pressure import PressureSection
 from magshell_fenicsx.case.loads.step import PathStep, Step, Until
 
 OneStep: TypeAlias = Annotated[
-    PressureSection | IndentationSection | FieldSection | RotationSection | GrowthSection | DeadSection,
+    PressureSection | IndentationSection | FieldSection | RotationSection | GrowthSection | DeadSection | EdgeSection,
     Field(discriminator="kind"),
 ]
 PROGRAMME = "programme"  # tag of a list of steps; see `messages.UNIONS`

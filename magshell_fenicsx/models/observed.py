@@ -10,6 +10,7 @@ from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.assembly.terms import LinearTerm
 from magshell_fenicsx.continuation.system import Vector
 from magshell_fenicsx.models.shell.dead_load import DeadLoads
+from magshell_fenicsx.models.shell.moved import Support
 from magshell_fenicsx.models.shell.parameters import Loads, Material
 from magshell_fenicsx.models.shell.point_load import point_entries
 
@@ -25,10 +26,14 @@ class Observed:
         What the solvers see.
     multiplicity
         2 for a half model, whose integrals and forces are those of one half; else 1.
+    u, r0
+        Displacement and placement.
     normals
         n0 (3,) at the named points.
     loads, load_size
         What loads it; and by amplitude the sum of the sizes of dead loads over E h R, see `DeadLoads`.
+    supports
+        Name of an edge, point or patch -> what it holds.
     observed
         Column -> the form that a term observes, see `OwnTerm.observed`; of the modelled part.
     """
@@ -38,8 +43,10 @@ class Observed:
     multiplicity: int
     normals: Mapping[str, Array]
     u: fem.Function
+    r0: fem.Function
     loads: Loads
     load_size: dict[str, float]
+    supports: Mapping[str, Support]
     observed: Mapping[str, fem.Form]
 
     def observe(self, volume: fem.Form, points: Mapping[str, Array]) -> None:

@@ -84,13 +84,25 @@ def or_number(unit: str, number: Any = float) -> BeforeValidator:
     return BeforeValidator(in_units(unit), json_schema_input_type=number | with_unit(unit))
 
 
-NAMES = {"at", "edge", "over", "kind", "control", "until", "radius"}  # keys with text that is no quantity
+NAMES = {
+    "at",
+    "edge",
+    "over",
+    "kind",
+    "control",
+    "until",
+    "radius",
+    "name",
+    "supports",
+}  # keys with text that is no quantity
 
 
 def texts(part: Any, known: Callable[[str], bool] = lambda text: False, path: str = "") -> Iterator[str]:
     """The keys of plain data whose numbers are text with a unit, without texts `known` to be something else."""
     for key, value in part.items() if isinstance(part, dict) else enumerate(part if isinstance(part, list) else []):
-        if isinstance(value, str) and key not in NAMES and not known(value):
+        if key in NAMES:
+            continue
+        if isinstance(value, str) and not known(value):
             yield f"{path}{key}"
         yield from texts(value, known, f"{path}{key}.")
 

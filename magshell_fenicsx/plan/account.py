@@ -34,6 +34,9 @@ def account(case: Case, loads: Loads, model: str, mirror: Mirror | None) -> tupl
         left_out.append("force: none")
     if dead := loads.all_dead:
         included.append(f"{len(dead)} dead load{'s' * (len(dead) > 1)}")
+    if loads.moves:
+        moved = dict.fromkeys(name for move in loads.moves for name in move.names)
+        included.append(f"supports that move: {', '.join(names)}")
     for key, part in PARTS.items():
         if key in case.parts:
             included.append(case.parts[key].account(case.scales))

@@ -31,6 +31,7 @@ from magshell_fenicsx.models.shell.parameters import (
 from magshell_fenicsx.models.shell.patterns import Pattern
 from magshell_fenicsx.plan.by_formula import ByFormula, function
 from magshell_fenicsx.plan.magnetisation import magnetisation
+from magshell_fenicsx.plan.moves import moves
 from magshell_fenicsx.plan.natural import natural
 from magshell_fenicsx.plan.outline import Outline
 
@@ -65,7 +66,7 @@ def loads(case: Case, under: Mapping[str, str], turn: float, mirror: Mirror | No
     turned = [load.to for load in case.loads_of(RotationSection)]
     field = magnetisation(magnetic, case, turn, turned) if magnetic and "lambda_m" in steps else None
     pressure = "pressure" in steps or any("pressure" in load.hold for load in steps.values())
-    return Loads(pressure, forces, field, dead, own, natural(case, turn))
+    return Loads(pressure, forces, field, dead, own, natural=natural(case, turn), moves=moves(case, turn))
 
 
 def indented(case: Case, outline: Outline) -> dict[str, Array]:

@@ -94,6 +94,8 @@ class Plan:
     thickness: Thickness | None = None
     length: float = 1.0
     own: tuple[OwnTerm, ...] = ()
+    supports: tuple[str, ...] = ()
+    reactions: bool = False
     warning: str | None = None
 
     @property

@@ -85,6 +85,7 @@ def make_plan(case: Case, terms: Sequence[OwnTerm] = ()) -> Plan:
     if not span:
         _refuse_too_large(case, shape, size, half=half)
     conditions = edge_conditions(case.boundary, turn)
+    supports = tuple(name for name, condition in conditions.items() if condition != "free")
     if beyond:
         conditions = {name: c for name, c in conditions.items() if name not in beyond.lost} | {CUT: "symmetry"}
     all_loads = loads(case, under, turn, beyond, energies)
@@ -108,6 +109,8 @@ def make_plan(case: Case, terms: Sequence[OwnTerm] = ()) -> Plan:
         thickness=_thickness(case, turn),
         length=case.shell.reference,
         own=tuple(terms),
+        supports=supports,
+        reactions=bool(all_loads.moves) if case.reactions is None else case.reactions,
         warning=sources_beside(case, sample if len(sample) else drawn.sample()),
     )
 

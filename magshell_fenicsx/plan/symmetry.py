@@ -12,12 +12,14 @@ from magshell_fenicsx.case.boundary import HeldSection
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.expressions import formula
 from magshell_fenicsx.case.loads.dead import DeadLoadSection, DeadSection
+from magshell_fenicsx.case.loads.edge import EdgeSection
 from magshell_fenicsx.case.loads.field import RotationSection
 from magshell_fenicsx.case.loads.step import Step
 from magshell_fenicsx.mesh.mirror import ROUNDING, Y0, Mirror
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.plan import natural
 from magshell_fenicsx.plan.by_formula import function
+from magshell_fenicsx.plan.moves import held_vectors, mirrored, sideways
 from magshell_fenicsx.plan.outline import Outline
 from magshell_fenicsx.plan.plan import Span
 from magshell_fenicsx.plan.turning import beside, scalar_turns, vector_turns, vectors_of
@@ -238,6 +240,9 @@ def _load(case: Case, outline: Outline, loading: Step, place: Array | None) -> l
         return [Leaves(reason, [place], lambda mirror: bool(abs(mirror.beyond(place)) < ROUNDING))]
     if isinstance(loading, RotationSection):
         return [Leaves("the field turns", [loading.to.vector()])]
+    if isinstance(loading, EdgeSection):
+        edge = loading
+        return [Leaves(sideways(edge), held_vectors(edge), lambda mirror: mirrored(edge, R, mirror))]
     if isinstance(loading, DeadSection):
         fixed = [load for load in loading.loads if not load.varies]
         forces = [np.array(v) for load in fixed for v in (load.force, load.per_length, load.per_area) if v]

@@ -8,7 +8,10 @@ HEAD = """
 ## The columns of path.csv
 
 One row for each accepted point. The numbers are dimensionless: multiply a number by its unit to get the quantity in SI.
-Named points add `NAME_ux`, `NAME_uy` and `NAME_uz`, in the unit of the shell's lengths. A user-defined energy adds a
+Named points add `NAME_ux`, `NAME_uy` and `NAME_uz`, in the unit of the shell's lengths. Where supports move, or with
+`reactions: true`, every support adds its reaction on the shell: the forces `NAME_fx`, `NAME_fy` and `NAME_fz`, and the
+moments `NAME_mx`, `NAME_my` and `NAME_mz` about the middle of the support's bounding box, where the support is now; in
+N and N m if the case has units, else in its own (over E R² and E R³ if it has no lengths). A user-defined energy adds a
 column with its name: its amplitude.
 """
 AMPLITUDES_HEAD = """

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
-Kind = Literal["load", "displacement", "energy", "error", "time", "place", "count", "text"]
+Kind = Literal["load", "displacement", "energy", "error", "time", "place", "reaction", "moment", "count", "text"]
 PLAIN = str.maketrans({"λ": "lambda", "π": "pi", "Δ": "d", "τ": "tau", "²": "^2", "³": "^3"})
 LATEX = str.maketrans({"λ": r"\lambda ", "π": r"\pi ", "Δ": r"\Delta ", "τ": r"\tau ", "²": "^2", "³": "^3"})
 

@@ -4,7 +4,7 @@ import re
 from collections.abc import Collection, Iterable
 from dataclasses import replace
 
-from magshell_fenicsx.quantities.quantity import Amplitude, Quantity
+from magshell_fenicsx.quantities.quantity import Amplitude, Kind, Quantity
 
 
 def _energy(name: str, words: str, meaning: str, symbol: str = "") -> Quantity:
@@ -104,6 +104,14 @@ OF_SOME_RUNS = (
     Quantity("load_factor", "load factor", "Common factor of all dead loads.", "load"),
     Quantity("natural_curvature", "natural curvature", "Factor of the natural curvature; 0: as drawn.", "load"),
     Quantity("natural_stretch", "natural stretch", "Factor of the natural stretch less one; 0: as drawn.", "load"),
+    Quantity("motion", "motion", "Factor of the motion of supports; the step may give it another name.", "load"),
+    Quantity(
+        "reaction",
+        "reaction",
+        "Reaction of the supports that move, along their motion; of several motions reaction_NAME. In the case's unit "
+        "of force (N with units), of rotations alone in that of a moment.",
+        "reaction",
+    ),
 )
 QUANTITIES = {q.name: q for q in (*OF_EVERY_RUN, *OF_SOME_RUNS)}
 AMPLITUDES = {
@@ -135,7 +143,11 @@ def quantity(name: str) -> Quantity:
         return replace(of, name=name, words=f"{of.words} {again[2]}", symbol=of.symbol and f"F_{again[2]} R/(2πD)")
     if again := re.fullmatch(r"w_((force|load)(_\d+)?)_over_h", name):
         return _w(name, f"at {again[1].replace('_', ' ')}", f"Displacement conjugate to {again[1]}, as w_over_h.")
-    return Quantity(name, name.replace("_", " "), "", "place" if re.search(r"_u[xyz]$", name) else "load")
+    if name.startswith("reaction_"):
+        return replace(QUANTITIES["reaction"], name=name, words=name.replace("_", " "))
+    kinds: dict[str, Kind] = {"u": "place", "f": "reaction", "m": "moment"}
+    ending = re.search(r"_([ufm])[xyz]$", name)
+    return Quantity(name, name.replace("_", " "), "", kinds[ending[1]] if ending else "load")
 
 
 def amplitude(name: str) -> Amplitude:
@@ -151,13 +163,16 @@ def amplitude(name: str) -> Amplitude:
 def axes_of(name: str, row: Collection[str] = ()) -> tuple[Quantity, Quantity]:
     """The quantities on the x and y axis of an amplitude's curve: its displacement and its value.
 
-    An angle is on the x axis, and the displacement on the y axis.
+    An angle is on the x axis, and the displacement on the y axis; so is the factor of a motion, with its reaction.
 
     Parameters
     ----------
     row
         The columns that there are: where w_over_h belongs to another load, this one has a column of its own.
     """
+    for reaction in (f"reaction_{name}", "reaction"):
+        if name not in AMPLITUDES and reaction in row:
+            return quantity(name), quantity(reaction)
     varied, own = amplitude(name), f"w_{name}_over_h"
     over, drawn = quantity(own if own in row else varied.conjugate), quantity(varied.column)
     if varied.conjugate == "w_over_h":

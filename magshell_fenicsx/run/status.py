@@ -12,6 +12,7 @@ from magshell_fenicsx.case.loads.dead import DeadSection
 from magshell_fenicsx.case.loads.field import RotationSection
 from magshell_fenicsx.case.loads.step import PathStep
 from magshell_fenicsx.continuation.point import Point
+from magshell_fenicsx.models.reacting import motion_columns
 from magshell_fenicsx.output.store.table import Row
 from magshell_fenicsx.quantities.registry import amplitude, quantity
 from magshell_fenicsx.simulate.scene import Scene
@@ -82,6 +83,8 @@ def aim(scene: Scene, step: ProgrammeStep) -> Aim:
     target, value = load.target
     if target.quantity == "load":
         return Aim(varied.column, value * (scene.case.lambda_m if step.name == "lambda_m" else 1.0))
+    if step.name in scene.motions:
+        return Aim(motion_columns(scene.plan.loads)[step.name], value)
     own = f"w_{step.name}_over_h"
     in_h = scene.plan.length * scene.plan.material.h if isinstance(load, DeadSection) else 1.0
     return Aim(own if own in scene.extra_columns else target.column, value / in_h)

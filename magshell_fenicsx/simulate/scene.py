@@ -22,6 +22,7 @@ from magshell_fenicsx.mesh.midsurface import Midsurface, distribute
 from magshell_fenicsx.mesh.mirror import Y0
 from magshell_fenicsx.models.axisymmetric.meridian import make_meridian
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
+from magshell_fenicsx.models.reacting import columns, motion_columns, motion_size, observed_reactions
 from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.supports import refuse_loose
@@ -94,7 +95,7 @@ class Scene:
 
     def unloaded(self) -> State:
         """The undeformed shell; amplitudes are zero, except user-defined ones with a value."""
-        amplitudes = {t.amplitude for t in self.model.system.terms if t.amplitude}
+        amplitudes = {t.amplitude for t in self.model.system.terms if t.amplitude} | self.motions
         given = self._own_amplitudes
         return State(self.model.zero(), {name: given.get(name, 0.0) for name in sorted({*amplitudes, *given})})
 
@@ -102,6 +103,7 @@ class Scene:
         """The physical columns of a table row: loads, displacements over h, volume, energies over E h R^2."""
         model, h, loads = self.model, self.plan.material.h, self.model.loads
         force, sense = loads.forces.get("force"), copysign(1.0, self.case.lambda_m)
+        model.system.place(state.mu)
         model.system.accept(state.u)
         model.system.place(state.mu)
         pole = model.deflection(state.u, "pole") / h
@@ -131,6 +133,7 @@ class Scene:
             **{f"w_{name}_over_h": model.loaded_deflection(state.u, name) / h for name in self._also_displaced},
             **self._observe_points(state),
             **{name: state.mu[name] for name in self._own_amplitudes},
+            **self._observe_supports(state),
             **{
                 column: state.mu[term.name]
                 * model.multiplicity
@@ -150,12 +153,37 @@ class Scene:
         )
 
     @property
+    def motions(self) -> frozenset[str]:
+        """The amplitudes of supports that move."""
+        return frozenset(move.motion.name for move in self.plan.loads.moves)
+
+    @property
     def extra_columns(self) -> tuple[str, ...]:
         """The columns of `observe` besides those of every run."""
         named = tuple(f"{point}_u{axis}" for point in self.case.points for axis in "xyz")
         own = (*self._own_amplitudes, *(column for term in self.plan.loads.own for column in term.observed))
         factors = (self._column(name) for name in (*self.plan.loads.forces, *self.plan.loads.dead) if name != "force")
-        return (*factors, *(f"w_{name}_over_h" for name in self._also_displaced), *named, *own)
+        displaced = (f"w_{name}_over_h" for name in self._also_displaced)
+        return (*factors, *displaced, *named, *own, *self._support_columns)
+
+    @property
+    def _support_columns(self) -> tuple[str, ...]:
+        """The factors of motions, their reactions, and those of all supports."""
+        motions = motion_columns(self.plan.loads)
+        return (*motions, *motions.values(), *(columns(self.plan.supports) if self.plan.reactions else ()))
+
+    def _observe_supports(self, state: State) -> dict[str, float]:
+        """Forces and moments in the case's units."""
+        model, plan, R = self.model, self.plan, self.plan.length
+        force = (self.case.shell.modulus or 1.0) * plan.material.h * R**2
+        found = {name: state.mu[name] for name in motion_columns(plan.loads)}
+        for name, column in motion_columns(plan.loads).items():
+            potential = model.system.potential(state.u, state.mu, name)
+            found[column] = potential / -self.conjugate_unit(name)
+        if plan.reactions:
+            frame = rotation(plan.azimuth)
+            found |= observed_reactions(model, state, plan.mirror, frame, force, R)
+        return found
 
     @property
     def _also_displaced(self) -> tuple[str, ...]:
@@ -177,6 +205,14 @@ class Scene:
         model, material = self.model, self.plan.material
         if name == "pressure":
             return -material.classical_pressure / material.h / model.multiplicity
+        if name in self.motions:
+            force = (self.case.shell.modulus or 1.0) * material.h * self.plan.length**2
+            arm = (
+                1.0
+                if any(m.motion.shift.any() for m in self.plan.loads.moves if m.motion.name == name)
+                else self.plan.length
+            )
+            return -motion_size(self.plan.loads, name) / (force * arm * model.multiplicity)
         if name in model.loads.forces:
             return model.force_unit * material.h
         return model.load_size.get(name, 0.0) / self.plan.length
@@ -215,7 +251,7 @@ def build_meridian_model(case: Case, plan: Plan) -> MeridianModel:
     model = MeridianModel(
         meridian, plan.material, case.mesh.degree, plan.conditions, plan.loads, case.mesh.penalty, plan.thickness
     )
-    model.supports.refuse_loose(model.r0)
+    model.held.refuse_loose(model.r0)
     return model
 
 

@@ -39,7 +39,8 @@ class Stage:
     def leave(self, state: State) -> State:
         """A state of the step's system as a state of the model."""
         state = self.along.expand(state) if self.along else state
-        return self.device.leave(state) if self.device else state
+        state = self.device.leave(state) if self.device else state
+        return self.scene.model.system.placed(state)
 
     def point(self, point: Point) -> Point:
         """A point of the step's path with the model's displacement and amplitudes."""

@@ -90,9 +90,9 @@ class EnergyFactory:
 
         return Energy(INTERIOR, energy)
 
-    def clamped_edges(self, facets: Facets) -> Energy:
-        """The normal is held at n0 at some ends."""
-        return self._ends("clamped edges", edges.clamped, facets)
+    def clamped_edges(self, name: str, facets: Facets, turn: fem.Constant | None = None) -> Energy:
+        """The normal is held at an end, which may turn."""
+        return self._ends(name, edges.clamped, facets, *([] if turn is None else [turn]))
 
     def mirror_edges(self, facets: Facets) -> Energy:
         """A plane normal to e3 mirrors the shell at some ends."""

@@ -28,8 +28,10 @@ from magshell_fenicsx.models.observed import Observed
 from magshell_fenicsx.models.shell import edges
 from magshell_fenicsx.models.shell.energy import Density
 from magshell_fenicsx.models.shell.moment import Counted
+from magshell_fenicsx.models.shell.moved import Support, moving, rotation_of
 from magshell_fenicsx.models.shell.natural import Shape, natural_field
 from magshell_fenicsx.models.shell.parameters import Condition, EdgeMoment, Loads, Material, Potential, default_penalty
+from magshell_fenicsx.models.shell.supports import held_on
 from magshell_fenicsx.models.shell.thickness import Thickness
 
 
@@ -53,8 +55,10 @@ class MeridianModel(Observed):
 
     Attributes
     ----------
-    system, multiplicity, normals
+    system, multiplicity, normals, supports
         See `Observed`; u = (U, W) along e_rho and e_z.
+    held
+        Where the displacement is zero.
     energies
         The terms, as functions of the displacement's jet.
     factory
@@ -89,12 +93,18 @@ class MeridianModel(Observed):
             shape = Shape.of(natural_field(loads.natural, *places(self.r0), V), loads.natural, free)
         factory = EnergyFactory(meridian, self.r0, material, self.sigma, degree, self.thickness, shape, free)
         self.factory = factory
-        self.supports = supports(meridian, conditions, pressure=loads.pressure)
+        self.held = supports(meridian, conditions, pressure=loads.pressure)
         self.energies = [factory.membrane(), factory.bending(), factory.interior_edges()]
-        if len(self.supports.clamped):
-            self.energies.append(factory.clamped_edges(self.supports.clamped))
-        if len(self.supports.mirror):
-            self.energies.append(factory.mirror_edges(self.supports.mirror))
+        self.supports = {}
+        for name, (facets, components) in self.held.named.items():
+            edge, turn = "", None
+            if conditions[name] == "clamped":
+                several = list(conditions.values()).count("clamped") > 1
+                edge, turn = f"{name} clamped edges" if several else "clamped edges", rotation_of(loads, name, V)
+                self.energies.append(factory.clamped_edges(edge, facets, turn))
+            self.supports[name] = Support.of(held_on(V, 0, facets, components), edge, turn)
+        if len(self.held.mirror):
+            self.energies.append(factory.mirror_edges(self.held.mirror))
         if loads.magnetic:
             self.energies += factory.magnetic(loads.magnetic, self.u)
         if loads.pressure:
@@ -114,9 +124,17 @@ class MeridianModel(Observed):
         for name, dead in loads.dead.items():
             moments = [load for load in dead if isinstance(load, EdgeMoment)]
             terms += [self._moment(f"{name} moment {load.edge} {i}", load, name) for i, load in enumerate(moments)]
-        pattern, held = next(term for term in terms if term.name == INTERIOR), self.supports.held(V)
+        pattern, held = next(term for term in terms if term.name == INTERIOR), self.held.held(V)
         parameters = make_parameters(factory.free, terms, self.u, self.kernels)
-        self.system = FiniteElementSystem(self.u, terms, held, pattern, material.h, parameters=parameters)
+        self.system = FiniteElementSystem(
+            self.u,
+            terms,
+            held,
+            pattern,
+            material.h,
+            parameters=parameters,
+            moving=moving(self.r0, self.supports, loads),
+        )
         self._volume = self.kernels.compile("volume energy", 2 * np.pi * factory.volume_change(jets.revolved(self.u)))
         self._seen = {name: Probe.at(*place, self.r0) for name, place in meridian.points.items()}
         self.normals = {name: probe.normal for name, probe in self._seen.items()}
@@ -124,7 +142,7 @@ class MeridianModel(Observed):
     @cached_property
     def excluded_modes(self) -> ExcludedWaves:
         """The waves around the axis, which an axisymmetric model does not see. Compiles kernels."""
-        return ExcludedWaves(Waves(self.system, self.energies, self.meridian, self.supports, self.kernels))
+        return ExcludedWaves(Waves(self.system, self.energies, self.meridian, self.held, self.kernels))
 
     def displacement(self, u: Vector, point: str) -> Array:
         """u/R (3,) at a named point."""

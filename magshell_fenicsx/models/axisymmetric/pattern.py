@@ -4,7 +4,7 @@ import numpy as np
 from dolfinx import fem
 from numpy.typing import NDArray
 
-from magshell_fenicsx.models.shell.patterns import Pattern
+from magshell_fenicsx.models.shell.patterns import Pattern, inside
 from magshell_fenicsx.models.shell.thickness import Thickness, nodal_thickness
 
 Array = NDArray[np.float64]
@@ -15,7 +15,8 @@ def pattern_field(pattern: Pattern, r0: fem.Function, finer: int = 0) -> fem.Fun
     V = r0.function_space
     Q = fem.functionspace(V.mesh, ("DG", V.element.basix_element.degree + finer, (3,)))
     field = fem.Function(Q, name="Br")
-    field.x.array.reshape(-1, 3)[Q.dofmap.list] = pattern(*places(r0, Q.element.basix_element.points))
+    nodes, normals = places(r0, Q.element.basix_element.points)
+    field.x.array.reshape(-1, 3)[Q.dofmap.list] = pattern(inside(nodes), normals)
     return field
 
 

@@ -26,15 +26,17 @@ class Supports:
         The point on the axis, which no axisymmetric displacement moves off it.
     horizontal, axial
         Where the displacements normal to e3 and along e3 are zero.
-    clamped, mirror
-        Where the normal is held, and where a plane normal to e3 mirrors the shell.
+    mirror
+        Where a plane normal to e3 mirrors the shell.
+    named
+        Name of an end, or of a point on the axis -> facets, and the components of (U, W) that are held there.
     """
 
     axis: Facets
     horizontal: Facets
     axial: Facets
-    clamped: Facets
     mirror: Facets
+    named: Mapping[str, tuple[Facets, tuple[int, ...]]]
 
     def held(self, V: fem.FunctionSpace) -> list[fem.DirichletBC]:
         """Of the axisymmetric displacement (U, W)."""
@@ -76,15 +78,14 @@ def supports(meridian: Meridian, conditions: Mapping[str, Condition], *, pressur
     MeshError
         If an end lies in no plane of symmetry, or in one that is open to a live `pressure`.
     """
-    horizontal, axial, clamped, mirror = found = [list[Facets]() for _ in range(4)]
+    horizontal, axial, mirror = found = [list[Facets]() for _ in range(3)]
+    named: dict[str, tuple[Facets, tuple[int, ...]]] = {}
     for name, condition in conditions.items():
         here = meridian.ends.get(name, meridian.axis)
         held = set(condition.components) if isinstance(condition, Held) else set()
         if condition in ("clamped", "simply supported"):
             held = {*HORIZONTAL, AXIAL}
-        if condition == "clamped":
-            clamped.append(here)
-        elif condition == "plane":
+        if condition == "plane":
             _refuse_slanting(meridian, name, pressure=pressure)
             mirror.append(here)
             held = {AXIAL}
@@ -92,7 +93,11 @@ def supports(meridian: Meridian, conditions: Mapping[str, Condition], *, pressur
             horizontal.append(here)
         if AXIAL in held:
             axial.append(here)
-    return Supports(meridian.axis, *(np.unique(np.concatenate([np.empty(0, np.int32), *f])) for f in found))
+        both = tuple(i for i, part in enumerate((HORIZONTAL, {AXIAL})) if held >= part)
+        if both:
+            named[name] = here, both
+    parts = [np.unique(np.concatenate([np.empty(0, np.int32), *f])) for f in found]
+    return Supports(meridian.axis, parts[0], parts[1], parts[2], named)
 
 
 def _refuse_slanting(meridian: Meridian, name: str, *, pressure: bool) -> None:

@@ -127,12 +127,21 @@ def turning(r0: Jet, u: Jet, m: Expr, width: Expr, intensity: Expr, past: Expr) 
 
 
 def clamped(
-    r0: Jet, u: Jet, m: Expr, width: Expr, nu: Expr, h: Expr, sigma: Expr, natural: Forms | None = None
+    r0: Jet,
+    u: Jet,
+    m: Expr,
+    width: Expr,
+    nu: Expr,
+    h: Expr,
+    sigma: Expr,
+    turn: Expr | None = None,
+    *,
+    natural: Forms | None = None,
 ) -> Expr:
-    """Energy of a clamped edge per length of its parameter: the outer normal is held at n0."""
+    """Energy of a clamped edge per length of its parameter: the outer normal is held at n0, or at `turn` n0."""
     nu1, nu2, stretch = kin.conormal(r0, m)
-    r = r0 + u
-    J = -ufl.dot(kin.normal(r0) - kin.normal(r), r.r1 * nu1 + r.r2 * nu2)
+    r, n0 = r0 + u, kin.normal(r0)
+    J = -ufl.dot((n0 if turn is None else ufl.dot(turn, n0)) - kin.normal(r), r.r1 * nu1 + r.r2 * nu2)
     M, D = densities.normal_moment(r0, u, nu1, nu2, nu, h, natural)
     return edge_density(M, D, J, width, sigma) * stretch
 

@@ -9,7 +9,8 @@ from dolfinx import fem
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
-from magshell_fenicsx.assembly.batches import Batch, boundary_batches, cell_batches, interior_batches
+from magshell_fenicsx.assembly.batches import Batch, Chosen, boundary_batches, cell_batches, interior_batches
+from magshell_fenicsx.assembly.elements import add_coupled, add_own
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.scatter import BlockMatrix
 from magshell_fenicsx.assembly.sliding import Constraint
@@ -50,11 +51,21 @@ class FastTangent:
         Where they live; others may live there too.
     held
         Of which components of u are zero; other directions are the system's.
+    moving
+        Local cells with nodes that move, and the terms' sites on these cells and their edges alone.
     """
 
-    def __init__(self, u: fem.Function, sites: Sequence[TangentSite], held: Sequence[Constraint]) -> None:
+    def __init__(
+        self,
+        u: fem.Function,
+        sites: Sequence[TangentSite],
+        held: Sequence[Constraint],
+        moving: tuple[NDArray[np.bool_], Sequence[TangentSite]] | None = None,
+    ) -> None:
         V, clamped = u.function_space, [c for c in held if isinstance(c, fem.DirichletBC)]
-        self._u, self._sites = u, sites
+        self._u, self._sites, self._nodes = u, sites, V.dofmap.list
+        self._moving = moving[0] if moving else None
+        self._near = moving[1] if moving else ()
         self._matrix = BlockMatrix(V, [batch.cells for site in sites for batch in site.coupling], clamped)
         cells, functions = V.dofmap.list.shape
         self._same = np.empty((cells, 9, functions * (functions + 1) // 2))
@@ -73,31 +84,53 @@ class FastTangent:
         first = 0
         for site in self._sites:
             if stress and isinstance(site, Site):
-                site.replace_strain(self._u.x.array, stress)
+                site.replace_strain(self._u.x.array, stress, self._moving)
             site.add(self._u.x.array, factors, self._same, partial(self._couple, first))
             first += len(site.coupling)
         self._matrix.add_cells(self._same)
         return self._matrix.assemble()
+
+    def times(self, v: Array, factors: Mapping[str, float]) -> Array:
+        """This rank's part of the matrix without supports times a vector with ghosts, exact where nodes move."""
+        found, x = np.zeros((len(v) // 3, 3)), v.reshape(-1, 3)
+        same = np.zeros(self._same.shape)
+        for site in self._near:
+
+            def couple(batch: int, K: Array, site: TangentSite = site) -> None:
+                here, there = (self._nodes[cells] for cells in site.coupling[batch].cells)
+                add_coupled(found, K, here, there, x)
+
+            site.add(self._u.x.array, factors, same, couple)
+        add_own(found, same[self._moving], self._nodes[self._moving], x)  # others have no node that moves
+        return found.ravel()
 
     def _couple(self, first: int, batch: int, K: Array) -> None:
         self._matrix.add_coupling(first + batch, K)
 
 
 def make_sites(
-    r0: fem.Function, degree: int, terms: Iterable[Term], log: KernelLog, prestress: Density | None = None
+    r0: fem.Function,
+    degree: int,
+    terms: Iterable[Term],
+    log: KernelLog,
+    prestress: Density | None = None,
+    chosen: Chosen = None,
 ) -> list[Site]:
-    """The sites of some terms: all cells and all interior edges together, boundary edges term by term. Collective."""
+    """The sites of some terms: all cells and all interior edges together, boundary edges term by term. Collective.
+
+    `chosen` are the local cells that count, with their edges; None for all.
+    """
     V = r0.function_space
     found = [t for t in terms if isinstance(t, ShellTerm | HessianTerm) and not t.linear]
     cells = [t for t in found if t.density.facets is None and t.density.sides == 1]
     interior = [t for t in found if t.density.sides == 2]
     sites = []
     if cells:
-        sites.append(Site(r0, cell_batches(V, cell_quadrature(degree)), 1, cells, log, prestress))
+        sites.append(Site(r0, cell_batches(V, cell_quadrature(degree), chosen), 1, cells, log, prestress))
     if interior:
-        sites.append(Site(r0, interior_batches(V, edge_quadrature(degree)), 2, interior, log))
+        sites.append(Site(r0, interior_batches(V, edge_quadrature(degree), chosen), 2, interior, log))
     for term in found:
         if term.density.facets is not None:
-            batches = boundary_batches(V, edge_quadrature(degree), term.density.facets)
+            batches = boundary_batches(V, edge_quadrature(degree), term.density.facets, chosen)
             sites.append(Site(r0, batches, 1, [term], log))
     return sites

@@ -25,6 +25,7 @@ from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes
 from magshell_fenicsx.models.shell.dead_load import SurfaceMeasures, assemble_dead_loads
 from magshell_fenicsx.models.shell.fast_tangent import FastTangent, make_sites
 from magshell_fenicsx.models.shell.folds import FOLD, largest_fold
+from magshell_fenicsx.models.shell.moved import Support, moving, rotation_of
 from magshell_fenicsx.models.shell.natural import Shape, natural_field
 from magshell_fenicsx.models.shell.parameters import (
     Condition,
@@ -78,7 +79,7 @@ class ShellModel(Observed):
 
     Attributes
     ----------
-    system, multiplicity, normals, loads, load_size
+    system, multiplicity, normals, loads, load_size, supports
         See `Observed`.
     kernels
         Names and compile time of the forms in use.
@@ -132,28 +133,39 @@ class ShellModel(Observed):
             ]
             return np.unique(np.concatenate(found)).astype(np.int32) if found else np.empty(0, np.int32)
 
-        if "clamped" in conditions.values():
-            terms.append(factory.clamped_edges(facets("clamped")))
-            held.append(_held(V, facets("clamped")))
-        if "simply supported" in conditions.values():
-            held.append(_held(V, facets("simply supported")))
         if "symmetry" in conditions.values():
             planes.append(mirror)
             terms.append(factory.mirror_edges(facets("symmetry"), mirror.normal))
             mirrored.append(held_along(V, 1, facets("symmetry"), mirror.normal))
+        clamped = [name for name, c in conditions.items() if c == "clamped" and name in midsurface.edges]
+        self.supports: dict[str, Support] = {}
+        on_planes: dict[str, Support] = {}
         for name, condition in conditions.items():
             components = condition.components if isinstance(condition, Held) else (0, 1, 2)
-            if name not in midsurface.edges and name in midsurface.patches:
-                cells = np.flatnonzero(midsurface.patches[name]).astype(np.int32)
-                held += held_on(V, 2, cells, components)
-            elif isinstance(condition, Held) and name in midsurface.edges:
-                held += held_on(V, 1, midsurface.edges[name], components)
-            elif isinstance(condition, Held):
-                held += held_at_vertex(V, midsurface.points[name], components)
-            elif condition == "plane":
+            if condition in ("free", "symmetry"):
+                continue
+            if condition == "plane":
                 planes.append(plane := plane_of(self.r0, midsurface.edges[name], name))
                 terms.append(factory.mirror_edges(midsurface.edges[name], plane.normal, f"{name} mirror edges"))
                 held.append(held_along(V, 1, midsurface.edges[name], plane.normal))
+                on_planes[name] = Support.of(held_on(V, 1, midsurface.edges[name], components), f"{name} mirror edges")
+                continue
+            edge, turn = "", None
+            if name in clamped:
+                edge, turn = (
+                    f"{name} clamped edges" if len(clamped) > 1 else "clamped edges",
+                    rotation_of(loads, name, V),
+                )
+                terms.append(factory.clamped_edges(edge, midsurface.edges[name], turn))
+            if name in midsurface.edges:
+                here = held_on(V, 1, midsurface.edges[name], components)
+            elif name in midsurface.patches:
+                here = held_on(V, 2, np.flatnonzero(midsurface.patches[name]).astype(np.int32), components)
+            else:
+                here = held_at_vertex(V, midsurface.points[name], components)
+            held += here
+            self.supports[name] = Support.of(here, edge, turn)
+        self.supports |= on_planes
         closing = closing_point(planes)
         if closing is None and loads.pressure:
             raise MeshError(open_to_pressure(next(name for name, c in conditions.items() if c == "plane")))
@@ -177,11 +189,16 @@ class ShellModel(Observed):
             ]
             terms += [factory.own(load.term, name) for load in dead if isinstance(load, Potential)]
         self._sites = make_sites(self.r0, degree, terms, self.kernels, factory.prestress())
-        fast = FastTangent(self.u, self._sites, held + mirrored)
+        self.moving = moving(self.r0, self.supports, loads)
+        self._near = None
+        if self.moving:
+            near = make_sites(self.r0, degree, terms, self.kernels, chosen=self.moving.cells)
+            self._near = self.moving.cells, near
+        fast = FastTangent(self.u, self._sites, held + mirrored, self._near)
         gradients = FastResidual(self.r0, self.u, degree, terms, self.kernels)
         parameters = make_parameters(factory.free, terms, self.u, self.kernels)
         self.system = FiniteElementSystem(
-            self.u, terms, held + mirrored, interior, material.h, fast, gradients, parameters
+            self.u, terms, held + mirrored, interior, material.h, fast, gradients, parameters, self.moving
         )
         self._factory, self._interior, self._held, self.mirror = factory, interior, held, mirror
         self._on_mirror = facets("symmetry")
@@ -200,7 +217,15 @@ class ShellModel(Observed):
         system = self.system
         return AntisymmetricModes(
             FiniteElementSystem(
-                self.u, terms, held, self._interior, system.length, fast, system.gradients, system.parameters
+                self.u,
+                terms,
+                held,
+                self._interior,
+                system.length,
+                fast,
+                system.gradients,
+                system.parameters,
+                self.moving,
             )
         )
 
@@ -211,8 +236,3 @@ class ShellModel(Observed):
         else:
             entries = point_entries(self.V, x, inward)
         return LinearTerm(name, entries[0], self.force_unit * entries[1], self.u, name)
-
-
-def _held(V: fem.FunctionSpace, facets: NDArray[np.int32]) -> fem.DirichletBC:
-    """u = 0 on an edge."""
-    return fem.dirichletbc(np.zeros(3), fem.locate_dofs_topological(V, 1, facets), V)

@@ -7,6 +7,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from magshell_fenicsx.assembly.motion import Motion
 from magshell_fenicsx.models.shell.applied import FieldInSpace
 from magshell_fenicsx.models.shell.natural import Natural
 from magshell_fenicsx.models.shell.own_term import OwnTerm
@@ -149,6 +150,14 @@ DeadLoad = PointForce | EdgeForce | EdgeMoment | AreaForce | Potential
 
 
 @dataclass(frozen=True)
+class Move:
+    """A motion of supports: edges, points or patches that are held."""
+
+    names: tuple[str, ...]
+    motion: Motion
+
+
+@dataclass(frozen=True)
 class Loads:
     """What loads the shell; what is empty, None or False has no term and no kernel.
 
@@ -164,6 +173,7 @@ class Loads:
     dead: Mapping[str, tuple[DeadLoad, ...]] = field(default_factory=dict)
     own: tuple[OwnTerm, ...] = ()
     natural: Natural | None = None
+    moves: tuple[Move, ...] = ()
 
     @property
     def all_dead(self) -> tuple[DeadLoad, ...]:

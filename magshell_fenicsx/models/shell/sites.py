@@ -100,13 +100,21 @@ class Site:
                 couple(number, contraction.cross(blocks))
         self._replaced = False
 
-    def replace_strain(self, u: Array, by: Sequence[tuple[float, Array]]) -> None:
-        """Take the weighted sum of other displacements' membrane strains in place of that of u, in the next `add`."""
+    def replace_strain(
+        self, u: Array, by: Sequence[tuple[float, Array]], besides: NDArray[np.bool_] | None = None
+    ) -> None:
+        """Take the weighted sum of other displacements' membrane strains in place of that of u, in the next `add`.
+
+        Some local cells keep theirs: those whose nodes move, which the other displacements do not know.
+        """
         if self._prestress is None:
             return
         for number, (batch, r0) in enumerate(zip(self.batches, self._placements, strict=True)):
             strains = [w * _strain(r0, self._jets(batch, v)) for w, v in (*by, (-1.0, u))]
-            self._prestress.vary(number, np.sum(strains, axis=0))
+            strain = np.sum(strains, axis=0)
+            if besides is not None:
+                strain[np.repeat(besides[batch.cells[0]], len(batch.rule.weights))] = 0.0
+            self._prestress.vary(number, strain)
         self._replaced = True
 
     def _jets(self, batch: Batch, field: Array) -> Array:

@@ -33,7 +33,7 @@ def held_on(
     found = []
     for space in (V.sub(i) for i in axes):
         dofs = fem.locate_dofs_topological(space, dim, entities)
-        found.append(fem.dirichletbc(0.0, dofs if nodes is None else dofs[nodes[dofs // 3]], space))
+        found.append(fem.dirichletbc(0.0, dofs if nodes is None else dofs[nodes[dofs // V.dofmap.bs]], space))
     return found
 
 

@@ -75,9 +75,11 @@ class TermFactory:
         measure = ufl.dS(domain=self._domain, metadata=self._edge_rule())
         return ShellTerm("interior edges", density, energy * measure, self.u, self.log)
 
-    def clamped_edges(self, facets: NDArray[np.int32]) -> ShellTerm:
-        density = Density(edges.clamped, self._penalised(), CURVED, SECOND, facets)
-        return self._edges("clamped edges", self._thick(self._grown(density), 1))
+    def clamped_edges(self, name: str, facets: NDArray[np.int32], turn: fem.Constant | None = None) -> ShellTerm:
+        """`turn` is the rotation of an edge that moves."""
+        parameters = (*self._penalised(), *([] if turn is None else [turn]))
+        density = Density(edges.clamped, parameters, CURVED, SECOND, facets)
+        return self._edges(name, self._thick(self._grown(density), 1))
 
     def mirror_edges(
         self, facets: NDArray[np.int32], normal: NDArray[np.float64], name: str = "mirror edges"

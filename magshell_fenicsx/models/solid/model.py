@@ -24,6 +24,7 @@ from magshell_fenicsx.models.observed import Observed
 from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes
 from magshell_fenicsx.models.shell.dead_load import assemble_dead_loads
 from magshell_fenicsx.models.shell.fast_tangent import FastTangent
+from magshell_fenicsx.models.shell.moved import moving
 from magshell_fenicsx.models.shell.parameters import Condition, EdgeMoment, Loads, Material, Potential
 from magshell_fenicsx.models.shell.supports import closing_point, open_to_pressure
 from magshell_fenicsx.models.solid.loads import BodyMeasures, outer_patch
@@ -58,7 +59,7 @@ class SolidModel(Observed):
 
     Attributes
     ----------
-    system, multiplicity, normals, kernels
+    system, multiplicity, normals, kernels, supports
         As of `ShellModel`.
     degree
         Of the displacement: 2.
@@ -96,7 +97,7 @@ class SolidModel(Observed):
             body, self.u, neo_hookean, material.h, self.kernels, hinged, free=free, **growing
         )
         self._pattern = factory.distortion()
-        self._held, planes = supports(body, self.r0, conditions)
+        self._held, planes, self.supports = supports(body, self.r0, conditions)
         origin = self._closing_point([mirror, *planes] if self.multiplicity == 2 else planes, conditions)
         self._terms: list[Term] = [self._pattern, factory.compression()]
         if loads.magnetic:
@@ -121,6 +122,7 @@ class SolidModel(Observed):
         self._faces = [body.faces[n] for n, c in conditions.items() if c == "symmetry"]
         self.mirror = mirror
         self._sites = make_sites(body, self.r0, self._terms, self.kernels)
+        self._moving = moving(self.r0, self.supports, loads)
         self.system = self._system(self._held + self._held_on_mirror([mirror.normal]))
         self.observe(self.kernels.compile("volume energy", factory.volume_change(origin)), body.points)
 
@@ -142,8 +144,11 @@ class SolidModel(Observed):
         return [held_along(self.V, 2, facets, along) for facets in self._faces for along in directions]
 
     def _system(self, held: list[Constraint]) -> FiniteElementSystem:
-        fast, factory = FastTangent(self.u, self._sites, held), self.factory
+        near, factory, moving = None, self.factory, self._moving
+        if moving:
+            near = moving.cells, make_sites(self.body, self.r0, self._terms, self.kernels, moving.cells)
+        fast = FastTangent(self.u, self._sites, held, near)
         parameters = make_parameters(factory.free, self._terms, self.u, self.kernels)
         return FiniteElementSystem(
-            self.u, self._terms, held, self._pattern, self.material.h, fast, parameters=parameters
+            self.u, self._terms, held, self._pattern, self.material.h, fast, parameters=parameters, moving=moving
         )

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.mesh.hexahedra import Body
 from magshell_fenicsx.models.shell.parameters import Magnetisation
-from magshell_fenicsx.models.shell.patterns import ByPatch, Pattern, by_patch, refuse_unbounded
+from magshell_fenicsx.models.shell.patterns import ByPatch, Pattern, by_patch, inside, refuse_unbounded
 
 Array = NDArray[np.float64]
 
@@ -24,9 +24,8 @@ def remanence_field(pattern: Pattern, V: fem.FunctionSpace) -> fem.Function:
     nodes, normals = places(V)
     Q = fem.functionspace(V.mesh, ("DG", V.element.basix_element.degree, (3,)))
     field = fem.Function(Q, name="Br")
-    vectors = pattern(nodes, normals)
-    refuse_unbounded(vectors, nodes, V.mesh.comm)
-    field.x.array.reshape(-1, 3)[Q.dofmap.list] = vectors
+    refuse_unbounded(pattern(nodes, normals), nodes, V.mesh.comm)
+    field.x.array.reshape(-1, 3)[Q.dofmap.list] = pattern(inside(nodes), normals)
     return field
 
 

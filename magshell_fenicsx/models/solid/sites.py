@@ -116,16 +116,19 @@ class Site:
         return density.of(vector(g, 0), vector(z, 0), ufl.dot(by_reference, inverse), *frame, *parameters) * g[12]
 
 
-def make_sites(body: Body, X: fem.Function, terms: Sequence[Term], log: KernelLog) -> list[Site]:
-    """The sites of the terms that have a tangent, one for each quadrature. Collective."""
+def make_sites(
+    body: Body, X: fem.Function, terms: Sequence[Term], log: KernelLog, chosen: NDArray[np.bool_] | None = None
+) -> list[Site]:
+    """The sites of the terms that have a tangent, one for each quadrature, on all or some local cells. Collective."""
     V = X.function_space
     found = [t for t in terms if isinstance(t, SolidTerm) and not t.linear]
     sites = []
     for degree in sorted({t.density.degree for t in found if t.density.where == "body"}):
         points, w = basix.make_quadrature(basix.CellType.hexahedron, degree)
         cells = np.arange(V.mesh.topology.index_map(3).size_local, dtype=np.int32)
+        counted = cells if chosen is None else cells[chosen[cells]]
         here = [t for t in found if t.density.where == "body" and t.density.degree == degree]
-        sites.append(Site(X, cells, _rule(V, points, w), here, log))
+        sites.append(Site(X, counted, _rule(V, points, w), here, log))
     for term in found:
         if term.density.where == "body":
             continue
@@ -133,7 +136,9 @@ def make_sites(body: Body, X: fem.Function, terms: Sequence[Term], log: KernelLo
         points, w = term.density.rule
         for facet in np.flatnonzero(V.mesh.comm.allreduce(np.bincount(numbers, minlength=6))):
             rule = _rule(V, _on_facet(points, facet), w)
-            sites.append(Site(X, around[numbers == facet], rule, [term], log, facet))
+            there = around[numbers == facet]
+            counted = there if chosen is None else there[chosen[there]]
+            sites.append(Site(X, counted, rule, [term], log, facet))
     return sites
 
 

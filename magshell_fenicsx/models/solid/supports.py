@@ -8,6 +8,7 @@ from dolfinx import fem
 from magshell_fenicsx.assembly.sliding import Constraint, held_along
 from magshell_fenicsx.mesh.hexahedra import MIDDLE, Body
 from magshell_fenicsx.mesh.mirror import Mirror
+from magshell_fenicsx.models.shell.moved import Support
 from magshell_fenicsx.models.shell.parameters import Condition, Held
 from magshell_fenicsx.models.shell.supports import held_at_vertex, held_on, plane_of
 
@@ -17,8 +18,8 @@ ROUNDING = 1e-9
 
 def supports(
     body: Body, r0: fem.Function, conditions: Mapping[str, Condition]
-) -> tuple[list[Constraint], list[Mirror]]:
-    """What is held, and the planes of symmetry, but for the mirror plane of a half model; collective.
+) -> tuple[list[Constraint], list[Mirror], dict[str, Support]]:
+    """What is held, the planes of symmetry but the mirror plane of a half model, and each support; collective.
 
     Raises
     ------
@@ -29,6 +30,8 @@ def supports(
     in_middle = np.abs(body.at_nodes(V, body.heights) - MIDDLE) < ROUNDING
     held: list[Constraint] = []
     planes: list[Mirror] = []
+    named: dict[str, Support] = {}
+    on_planes: dict[str, Support] = {}
     for name, condition in conditions.items():
         components = condition.components if isinstance(condition, Held) else ALL
         if condition in ("free", "symmetry"):
@@ -37,10 +40,14 @@ def supports(
         if condition == "plane":
             planes.append(plane := plane_of(r0, body.faces[name], name))
             held.append(held_along(V, 2, body.faces[name], plane.normal))
-        elif name in body.faces:
-            held += held_on(V, 2, body.faces[name], components, nodes)
+            on_planes[name] = Support.of(held_on(V, 2, body.faces[name], ALL))
+            continue
+        if name in body.faces:
+            here = held_on(V, 2, body.faces[name], components, nodes)
         elif name in body.patches:
-            held += held_on(V, 3, np.flatnonzero(body.patches[name]).astype(np.int32), components, nodes)
+            here = held_on(V, 3, np.flatnonzero(body.patches[name]).astype(np.int32), components, nodes)
         else:
-            held += held_at_vertex(V, body.points[name], components)
-    return held, planes
+            here = held_at_vertex(V, body.points[name], components)
+        held += here
+        named[name] = Support.of(here)
+    return held, planes, named | on_planes

@@ -11,7 +11,18 @@ from magshell_fenicsx.output.store.table import pole_name
 from magshell_fenicsx.quantities.registry import amplitude, quantity
 
 Line = Mapping[str, str]  # a row of path.csv
-ORDER = ("text", "load", "displacement", "energy", "error", "time", "place", "count")  # order of the columns by kind
+ORDER = (
+    "text",
+    "load",
+    "displacement",
+    "energy",
+    "error",
+    "time",
+    "place",
+    "reaction",
+    "moment",
+    "count",
+)  # order of the columns by kind
 
 
 @dataclass(frozen=True)
@@ -67,7 +78,8 @@ def _column(name: str, values: Sequence[str], length_unit: str) -> Column:
     exponent, cells = column([float(value) for value in values])
     size = power(exponent) if exponent else Markup()
     head = Markup("{} {}").format(symbol(name), known.note) if known.note else symbol(name)
-    unit = length_unit if known.kind == "place" else known.shown_unit
+    in_case = {"place": "m", "reaction": "N", "moment": "N m"}  # columns in the case's units
+    unit = (in_case[known.kind] if length_unit else "") if known.kind in in_case else known.shown_unit
     return Column(head, Markup("{} {}").format(size, unit), cells)
 
 

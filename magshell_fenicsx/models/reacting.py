@@ -1,0 +1,51 @@
+"""Reactions of supports, and those along motions, as columns of path.csv in the case's units."""
+
+from collections.abc import Iterable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magshell_fenicsx.continuation.system import State
+from magshell_fenicsx.mesh.mirror import Mirror
+from magshell_fenicsx.models.observed import Observed
+from magshell_fenicsx.models.reactions import reactions
+from magshell_fenicsx.models.shell.parameters import Loads
+
+Array = NDArray[np.float64]
+
+
+def columns(supports: Iterable[str]) -> tuple[str, ...]:
+    """The columns of supports: forces and moments along the axes."""
+    return tuple(f"{name}_{kind}{axis}" for name in supports for kind in "fm" for axis in "xyz")
+
+
+def motion_columns(loads: Loads) -> dict[str, str]:
+    """Amplitude of a motion -> the column of its reaction."""
+    names = list(dict.fromkeys(move.motion.name for move in loads.moves))
+    return {name: "reaction" if len(names) == 1 else f"reaction_{name}" for name in names}
+
+
+def motion_size(loads: Loads, name: str) -> float:
+    """The sum of the lengths of the translations of an amplitude, over R; without any of the angles (rad)."""
+    motions = [move.motion for move in loads.moves if move.motion.name == name for _ in move.names]
+    shifts = float(sum(np.linalg.norm(motion.shift) for motion in motions))
+    return shifts or float(sum(np.linalg.norm(motion.turn) for motion in motions))
+
+
+def observed_reactions(
+    model: Observed, state: State, mirror: Mirror | None, frame: Array, force: float, length: float
+) -> dict[str, float]:
+    """The values of `columns` of all supports, sorted by support; collective.
+
+    Parameters
+    ----------
+    frame
+        The model's frame, see `mesh.frame.rotation`.
+    force, length
+        E h R and R in the case's units.
+    """
+    found: dict[str, float] = {}
+    for name, one in reactions(model, state, mirror).items():
+        values = np.concatenate([force * one.force @ frame, force * length * one.moment @ frame])
+        found |= dict(zip(columns([name]), (float(v) for v in values), strict=True))
+    return found

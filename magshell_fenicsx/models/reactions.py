@@ -1,0 +1,91 @@
+"""Forces and moments of supports on the shell, from the residual at the nodes that they hold."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from mpi4py import MPI
+from numpy.typing import NDArray
+
+from magshell_fenicsx.assembly.moving import in_space
+from magshell_fenicsx.continuation.system import State
+from magshell_fenicsx.mesh.mirror import Mirror
+from magshell_fenicsx.models.observed import Observed
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Reaction:
+    """What a support does to the whole shell.
+
+    Attributes
+    ----------
+    force, moment
+        (3,) over E h R and E h R^2, the moment about `point`.
+    point
+        (3,) over R: the middle of the support's bounding box, where the support is now.
+    """
+
+    force: Array
+    moment: Array
+    point: Array
+
+    def image(self, S: Array, point: Array) -> "Reaction":
+        """What the mirror image of the support does; `S` mirrors vectors, and `point` is the image of the point."""
+        return Reaction(S @ self.force, -S @ self.moment, point)
+
+
+def reactions(model: Observed, state: State, mirror: Mirror | None = None) -> dict[str, Reaction]:
+    """The reactions of all supports in the model's frame; collective.
+
+    A node of two supports belongs to the first. A clamped edge also makes a couple: its energy is invariant if shell
+    and edge turn together, so the couple is minus the moment of that energy's gradient.
+
+    Parameters
+    ----------
+    mirror
+        The plane of a half model: the reactions are those of the whole shell.
+    """
+    system, comm = model.system, model.system.comm
+    R, taken = system.forces(state.u, state.mu), np.zeros(system.size, dtype=bool)
+    axes = system.u.function_space.dofmap.index_map_bs
+    r = in_space(model.r0.x.array[: system.size] + system.u.x.array[: system.size], axes)
+    found: dict[str, Reaction] = {}
+    for name, support in model.supports.items():
+        dofs = support.dofs[support.dofs < system.size]
+        box = _box(r[np.unique(dofs // axes)], mirror if mirror and mirror.other(name) == name else None, comm)
+        point, held = box.mean(axis=0), np.zeros(system.size)
+        dofs = dofs[~taken[dofs]]
+        held[dofs], taken[dofs] = R[dofs], True
+        F, arm = in_space(held, axes), r - point
+        M = np.cross(arm, F).sum(axis=0)
+        if support.edge:
+            M = M - np.cross(arm, in_space(system.forces(state.u, state.mu, support.edge), axes)).sum(axis=0)
+        force, moment = comm.allreduce(np.array([F.sum(axis=0), M]))
+        if axes == 2:  # around the axis
+            force, moment, point = force * [0.0, 0.0, 1.0], 0 * moment, point * [0.0, 0.0, 1.0]
+        found[name] = Reaction(force, moment, point)
+    return _of_whole(found, mirror) if mirror else found
+
+
+def _of_whole(half: Mapping[str, Reaction], mirror: Mirror) -> dict[str, Reaction]:
+    """The reactions of the whole shell from those of a half."""
+    found, S = dict(half), mirror.reflection
+    for lost, kept in mirror.lost.items():
+        if kept in half:
+            found[lost] = half[kept].image(S, mirror.image(half[kept].point))
+    for name, one in half.items():
+        if mirror.other(name) == name:
+            other = one.image(S, one.point)
+            found[name] = Reaction(one.force + other.force, one.moment + other.moment, one.point)
+    return found
+
+
+def _box(places: Array, mirror: Mirror | None, comm: MPI.Comm) -> Array:
+    """Corners (2, 3) of a box around places (n, 3) of all ranks, and around their mirror images."""
+    if mirror:
+        places = np.concatenate([places, mirror.image(places)])
+    corners = np.array([places.min(axis=0, initial=np.inf), places.max(axis=0, initial=-np.inf)])
+    all_corners = np.array(comm.allgather(corners))
+    return np.array([all_corners[:, 0].min(axis=0), all_corners[:, 1].max(axis=0)])
