@@ -254,6 +254,7 @@ def test_gripper() -> None:
     assert row["tip_uz"] / 3e-3 == pytest.approx(0.66996, rel=1.5e-3)
 
 
+@pytest.mark.slow
 def test_turning_field_ends_where_the_tilted_one_does() -> None:
     """Turning the field from 150 to 90 degrees and applying it at 90 degrees give the same strip."""
     turning = "loading={kind: rotation, to: {polar: 0}, points: 4}"

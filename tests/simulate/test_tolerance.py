@@ -112,6 +112,7 @@ def test_equal_shares() -> None:
     assert more == pytest.approx(np.mean(change**-2.0), rel=0.05)
 
 
+@pytest.mark.slow
 def test_the_mesh_is_kept_for_a_run_that_is_resumed() -> None:
     case = buckling(1e-2)
     mesh = adapted(case, COMM)
@@ -121,7 +122,7 @@ def test_the_mesh_is_kept_for_a_run_that_is_resumed() -> None:
         assert again.choice.applied(case)[1].size(x) == mesh.choice.applied(case)[1].size(x)
 
 
-def test_summary_has_the_estimate_and_the_rounds(tmp_path: Path) -> None:
+def test_summary_has_the_estimate_and_the_rounds(tmp_path: Path, no_pictures: None) -> None:
     case = buckling(1e-2, symmetry="auto")
     lines: list[str] = []
     result = run(case, tmp_path, say=lines.append)
@@ -156,6 +157,7 @@ def test_refused(setting: str, said: str) -> None:
         Case.load(CASES / "dimple_buckling.yaml", ["mesh.tolerance=1e-3", setting])
 
 
+@pytest.mark.slow
 def test_a_tolerance_on_a_grid() -> None:
     """A closed cylinder dented at one side, a seam in its chart: against degree 5 on 2.5 times as many cells."""
     data = {
