@@ -59,7 +59,7 @@ POINTS = ("_ux", "_uy", "_uz")  # of named points
 
 
 ON_TWO = ("half shell, force", "a moment")
-QUICKEST = "a mesh with a fold and two patches"
+QUICKEST = "symmetry planes, a force at a point"
 
 
 @pytest.mark.parametrize("scene", [s if s == QUICKEST else pytest.param(s, marks=pytest.mark.slow) for s in SCENES])

@@ -59,6 +59,7 @@ def past_the_fold(symmetry: str, degree: int) -> tuple[Scene, dict[str, Record]]
     """cases/dimple_buckling.yaml: a point before its fold, the fold, and one past it."""
     loading = "loading={kind: pressure, control: arc, until: points, points: 7}"
     settings = [loading, f"symmetry={symmetry}", f"mesh.degree={degree}"]
+    settings += ["mesh.refinement=0.5"] if symmetry == "half" else []
     scene = Scene(Case.load(CASES / "dimple_buckling.yaml", settings))
     records = [record for record in follow(scene) if not record.mode]
     (fold,) = [i for i, record in enumerate(records) if record.label == "fold"]
@@ -212,9 +213,9 @@ COARSE = ["--set=mesh.degree=3", "--set=mesh.refinement=0.3", "--set=loading.dep
 @pytest.mark.slow
 @pytest.mark.parametrize("symmetry", ["axisymmetric", "half", "none"])
 def test_same_modes_on_one_two_and_three_ranks(tmp_path: Path, symmetry: str) -> None:
-    """Two for the whole shell."""
+    """Two for the whole shell, three for the others."""
     tables = []
-    for ranks in (1, 2) if symmetry == "none" else (1, 3) if symmetry == "axisymmetric" else (1, 2, 3):
+    for ranks in (1, 2) if symmetry == "none" else (1, 3):
         out = tmp_path / str(ranks)
         settings = [*COARSE, f"--set=symmetry={symmetry}", "--set=stability.modes=5"]
         done = magshell("run", CASES / "pole_indentation.yaml", *settings, "--out", out, ranks=ranks)
