@@ -59,7 +59,6 @@ def past_the_fold(symmetry: str, degree: int) -> tuple[Scene, dict[str, Record]]
     """cases/dimple_buckling.yaml: a point before its fold, the fold, and one past it."""
     loading = "loading={kind: pressure, control: arc, until: points, points: 7}"
     settings = [loading, f"symmetry={symmetry}", f"mesh.degree={degree}"]
-    settings += ["mesh.refinement=0.5"] if symmetry == "half" else []
     scene = Scene(Case.load(CASES / "dimple_buckling.yaml", settings))
     records = [record for record in follow(scene) if not record.mode]
     (fold,) = [i for i, record in enumerate(records) if record.label == "fold"]
