@@ -41,6 +41,8 @@ def describe(case: Case) -> str:
         lines.append(f"mesh: found by the run, for a relative error of its result below {case.mesh.tolerance:g}")
     left_out = plan.left_out or ["nothing"]
     lines += ["built:", *(f"  {item}" for item in plan.included), "left out:", *(f"  {item}" for item in left_out)]
+    if plan.warning:
+        lines.append(f"warning: {plan.warning}")
     return "\n".join(lines)
 
 

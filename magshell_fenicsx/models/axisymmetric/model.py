@@ -91,7 +91,7 @@ class MeridianModel(Observed):
         if len(self.supports.mirror):
             self.energies.append(factory.mirror_edges(self.supports.mirror))
         if loads.magnetic:
-            self.energies += factory.magnetic(loads.magnetic)
+            self.energies += factory.magnetic(loads.magnetic, self.u)
         if loads.pressure:
             self.energies.append(factory.pressure())
         self.energies += [factory.own(term) for term in loads.own]
@@ -131,7 +131,7 @@ class MeridianModel(Observed):
 
     def _term(self, e: Energy) -> FormTerm:
         energy = 2 * np.pi * e.of(jets.revolved(self.u))
-        return FormTerm(e.name, energy, self.u, self.kernels, e.amplitude, linear=e.linear)
+        return FormTerm(e.name, energy, self.u, self.kernels, e.amplitude, linear=e.linear, follow=e.follow)
 
     def _moment(self, name: str, load: EdgeMoment, amplitude: str) -> Counted:
         facets, constant = self.meridian.ends[load.edge], self.factory.constant
