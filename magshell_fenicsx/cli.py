@@ -9,10 +9,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
-
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.platform.completion import case_files, left_to_the_shell
+from magshell_fenicsx.platform.plain import typer
 from magshell_fenicsx.platform.version import __version__
 
 app = typer.Typer(

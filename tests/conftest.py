@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import cache
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +51,16 @@ def shell() -> Callable[..., ShellModel]:
         )
 
     return make
+
+
+@pytest.fixture
+def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Runs in this process draw nothing, which saves two seconds each."""
+    draw_nothing(monkeypatch)
+
+
+def draw_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(import_module("magshell_fenicsx.run.run"), "draw", lambda folder: [])
 
 
 def random_displacement(model: ShellModel, size: float, seed: int = 0) -> Any:

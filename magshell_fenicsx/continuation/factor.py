@@ -11,6 +11,7 @@ from magshell_fenicsx.continuation.timing import Stopwatch
 PREFIX = "magshell_factor_"
 # PETSc's error numbers (petscerror.h) after which MUMPS replaces CHOLMOD
 INDEFINITE, MISSING = 81, 92
+CALM = 2  # a change of the method costs an analysis of the matrix, about as long as its factors
 REFUSED = 76  # CHOLMOD's own error: the matrix is too large for its integers or for the memory; MUMPS is tried
 
 
@@ -18,8 +19,8 @@ class Factorisation:
     """Factors of the latest tangent; symbolic work is kept between calls.
 
     On one rank CHOLMOD is tried first: it takes half the time, and its success proves that there is no negative
-    pivot. Otherwise MUMPS computes LDL^T and counts the negative pivots. After its first failure CHOLMOD is not
-    used again, and its memory is released.
+    pivot. Otherwise MUMPS computes LDL^T and counts the negative pivots. CHOLMOD is tried again after
+    `CALM` successive matrices in which MUMPS counts none. The memory of the other one is released.
 
     Attributes
     ----------
@@ -41,7 +42,8 @@ class Factorisation:
         self._mumps: PETSc.PC | None = None
         self._pc: PETSc.PC | None = None
         self._rhs: PETSc.Vec | None = None
-        self._definite = comm.size == 1
+        self._definite = self._has_cholmod = comm.size == 1
+        self._calm = 0  # successive matrices of MUMPS without a negative pivot
         self._edge: Edge | None = None
 
     def factor(self, tangent: Tangent) -> None:
@@ -79,11 +81,13 @@ class Factorisation:
     def _factor_definite(self, K: PETSc.Mat) -> bool:
         """Try CHOLMOD; False if K is not positive definite, or if CHOLMOD cannot be used."""
         if self._cholmod is None or not self._cholmod.is_of(K):
+            self._pc = self._mumps = None
             self._cholmod = _Definite(K)
         try:
             self._cholmod.factor()
         except PETSc.Error as e:
-            self._cholmod, self._definite = None, False
+            self._cholmod, self._definite, self._calm = None, False, 0
+            self._has_cholmod = e.ierr == INDEFINITE
             if e.ierr not in (INDEFINITE, MISSING, REFUSED):
                 raise
             return False
@@ -104,6 +108,8 @@ class Factorisation:
             F.setMumpsIcntl(8, 0)  # no scaling: a tenth faster, and the tangent's entries are of similar size
         _renew(self._mumps, K)
         self._pc, self.negative_pivots = self._mumps, self._mumps.getFactorMatrix().getInertia()[0]
+        self._calm = 0 if self.negative_pivots else self._calm + 1
+        self._definite = self._has_cholmod and self._calm >= CALM
 
     def times(self, x: Vector) -> Vector:
         """The matrix last factored times x."""

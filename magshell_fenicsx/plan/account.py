@@ -36,7 +36,7 @@ def account(case: Case, loads: Loads, model: str, mirror: Mirror | None) -> tupl
         included.append(f"{len(dead)} dead load{'s' * (len(dead) > 1)}")
     if loads.moves:
         moved = dict.fromkeys(name for move in loads.moves for name in move.names)
-        included.append(f"supports that move: {', '.join(names)}")
+        included.append(f"supports that move: {', '.join(moved)}")
     for key, part in PARTS.items():
         if key in case.parts:
             included.append(case.parts[key].account(case.scales))

@@ -105,6 +105,7 @@ def test_pinched_cylinder_up_to_a_tenth_of_the_load() -> None:
         assert along_curve(computed(result(*begun).rows, obstacle.columns[column]), calculix) < 2e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("file", "folds"), [("hinged_roof_12.7.yaml", [0.7421, 0.1729]), ("hinged_roof_6.35.yaml", [0.1953, -0.1288])]
 )
@@ -118,7 +119,7 @@ def test_roofs_snap_through_and_back(file: str, folds: list[float]) -> None:
     assert found == pytest.approx(folds, abs=5e-3)
 
 
-@pytest.mark.parametrize("which", ["bending", "reversal"])
+@pytest.mark.parametrize("which", ["bending", pytest.param("reversal", marks=pytest.mark.slow)])
 def test_hard_magnetic_cantilevers_are_run(which: str, tmp_path: object, monkeypatch: pytest.MonkeyPatch) -> None:
     """Measured by Zhao et al. (JMPS 124, 2019), a few per cent: within 0.1 of the length, on average 0.04.
 

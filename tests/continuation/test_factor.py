@@ -105,6 +105,19 @@ def test_mumps_takes_over_where_cholmod_cannot(monkeypatch: pytest.MonkeyPatch, 
     assert factors.solve(np.ones(2)) == pytest.approx([0.5, 0.25])
 
 
+def test_cholmod_comes_back() -> None:
+    """After two matrices that MUMPS finds definite; one that is not in between begins the count again."""
+    factors, used = Factorisation(MPI.COMM_SELF), []
+    K = matrix([2.0, 4.0])
+    for last in (4.0, -4.0, 1.0, -2.0, 3.0, 5.0, 6.0, 7.0, -1.0):
+        fill(K, [2.0, last])
+        factors.factor(K)
+        assert factors.solve(np.ones(2)) == pytest.approx([0.5, 1 / last])
+        assert factors.negative_pivots == (last < 0)
+        used.append(factors._pc.getFactorSolverType())
+    assert used == ["cholmod", *5 * ["mumps"], "cholmod", "cholmod", "mumps"]
+
+
 def test_other_errors_of_cholmod_are_raised(monkeypatch: pytest.MonkeyPatch) -> None:
     """55: PETSc is out of memory."""
     with pytest.raises(PETSc.Error) as raised:

@@ -189,6 +189,7 @@ def result(asked: ms.Case, column: str) -> float:
     return scene.observe((located or records[-1:])[0].point.state)[column]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("column", FOUND)
 def test_an_order_3_mesh_file_of_a_hemisphere(column: str, tmp_path: Path) -> None:
     """F(10) and k_d on the triangles of the built-in half, cubic in place of exact; by half and whole."""

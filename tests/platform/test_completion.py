@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import pytest
-from command import magshell
+from command import started as magshell
 from conftest import CASES
 
 from magshell_fenicsx.case.examples import examples

@@ -16,7 +16,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from command import magshell
+from command import started
 from conftest import CASES
 
 from magshell_fenicsx.case.case import Case
@@ -80,7 +80,7 @@ def test_terminal_and_pipe(tmp_path: Path) -> None:
     """What stays on a terminal is what a pipe gets, which has no control characters."""
     terminal = Terminal("run", *QUICK, "--out", tmp_path)
     terminal.read()
-    piped = magshell("run", *QUICK, "--out", tmp_path)
+    piped = started("run", *QUICK, "--out", tmp_path)
     assert terminal.process.returncode == piped.returncode == 0
     assert terminal.screen == piped.stdout.split("\n")
     assert not set("\r\x1b") & set(piped.stdout)

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import pyvista
 from command import magshell, read_path
-from conftest import CASES
+from conftest import CASES, draw_nothing
 from interrupted import check_fields, check_same_path, processes, start, wait_for_rows, whole_lines
 from mpi4py import MPI
 
@@ -31,7 +31,9 @@ GOES_ON = "; the results so far are in {out}/, and --resume continues from there
 @pytest.fixture(scope="module")
 def reference(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("whole")
-    assert magshell("run", *LONG, "--out", out).returncode == 0
+    with pytest.MonkeyPatch.context() as undrawn:
+        draw_nothing(undrawn)
+        assert magshell("run", *LONG, "--out", out).returncode == 0
     return out
 
 
@@ -49,15 +51,9 @@ def check_goes_on(out: Path, reference: Path, case: tuple[Path | str, ...] = LON
     assert not (out / "checkpoint").exists()
 
 
-@pytest.mark.parametrize(
-    ("ranks", "number"),
-    [
-        pytest.param(2, signal.SIGTERM, marks=pytest.mark.slow),
-        (0, signal.SIGINT),
-        pytest.param(2, signal.SIGUSR1, marks=pytest.mark.slow),
-    ],
-)
-def test_signal(tmp_path: Path, reference: Path, ranks: int, number: signal.Signals) -> None:
+@pytest.mark.slow
+@pytest.mark.parametrize(("ranks", "number"), [(2, signal.SIGTERM), (0, signal.SIGINT), (2, signal.SIGUSR1)])
+def test_signal(tmp_path: Path, reference: Path, no_pictures: None, ranks: int, number: signal.Signals) -> None:
     """Also if only one rank of two gets it; mpirun passes SIGUSR1 to all."""
     out = tmp_path / "out"
     run = start("run", *LONG, "--out", out, ranks=ranks)
@@ -86,7 +82,7 @@ def test_second_interrupt_stops_at_once() -> None:
     assert signal.signal(signal.SIGINT, found) is signal.default_int_handler
 
 
-def test_time_limit(tmp_path: Path, reference: Path) -> None:
+def test_time_limit(tmp_path: Path, reference: Path, no_pictures: None) -> None:
     done = magshell("run", *LONG, "--out", tmp_path, "--time-limit", 0)
     assert done.returncode == 3
     assert done.stderr == "stopped early: interrupted by the time limit of 0 s" + GOES_ON.format(out=tmp_path)

@@ -48,9 +48,8 @@ def whole(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
     return Whole(case, out, first, time.monotonic() - begun - first)
 
 
-@pytest.mark.parametrize(
-    "whole", ["meridian", *(pytest.param(name, marks=pytest.mark.slow) for name in ("half", "solid"))], indirect=True
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("whole", ["meridian", "half", "solid"], indirect=True)
 def test_killed_twice(whole: Whole, tmp_path: Path) -> None:
     """kill -9 after three rows, resumed on two ranks, killed after two more, resumed on one."""
     out, seen = tmp_path / "out", b""
@@ -119,7 +118,7 @@ def test_killed_at_random_moments(whole: Whole, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("whole", ["meridian"], indirect=True)
-def test_torn_files(whole: Whole, tmp_path: Path) -> None:
+def test_torn_files(whole: Whole, tmp_path: Path, no_pictures: None) -> None:
     """Half a row and half an entry, as a crash of the machine leaves them, are cut off."""
     out = tmp_path / "out"
     run = start("run", *whole.case, "--out", out)
@@ -146,16 +145,17 @@ def test_complete_already(whole: Whole) -> None:
     assert "mesh.degree is 4 there and 3 here" in done.stderr
 
 
-@pytest.mark.parametrize("ranks", [0, 2])
-def test_another_case(tmp_path: Path, ranks: int) -> None:
+def test_another_case(tmp_path: Path, no_pictures: None) -> None:
     """And a run that was stopped keeps its checkpoint."""
     assert magshell("run", *MERIDIAN, "--out", tmp_path, "--time-limit", 0).returncode == 3
-    done = magshell("run", *MERIDIAN, "--set=shell.radius_to_thickness=100", "--out", tmp_path, "--resume", ranks=ranks)
-    assert done.returncode == 2
     said = f"--resume: {tmp_path} belongs to another run: shell.radius_to_thickness is 90.0 there and 100.0 here"
-    assert done.stderr.count(said) == 1
-    assert "Traceback" not in done.stderr
-    assert (tmp_path / "checkpoint").exists()
+    other = (*MERIDIAN, "--set=shell.radius_to_thickness=100")
+    for ranks in (0, 2):
+        done = magshell("run", *other, "--out", tmp_path, "--resume", ranks=ranks)
+        assert done.returncode == 2
+        assert done.stderr.count(said) == 1
+        assert "Traceback" not in done.stderr
+        assert (tmp_path / "checkpoint").exists()
 
 
 def test_nothing_to_resume(tmp_path: Path) -> None:

@@ -212,9 +212,9 @@ COARSE = ["--set=mesh.degree=3", "--set=mesh.refinement=0.3", "--set=loading.dep
 @pytest.mark.slow
 @pytest.mark.parametrize("symmetry", ["axisymmetric", "half", "none"])
 def test_same_modes_on_one_two_and_three_ranks(tmp_path: Path, symmetry: str) -> None:
-    """Two for the whole shell."""
+    """Two for the whole shell, three for the others."""
     tables = []
-    for ranks in (1, 2) if symmetry == "none" else (1, 3) if symmetry == "axisymmetric" else (1, 2, 3):
+    for ranks in (1, 2) if symmetry == "none" else (1, 3):
         out = tmp_path / str(ranks)
         settings = [*COARSE, f"--set=symmetry={symmetry}", "--set=stability.modes=5"]
         done = magshell("run", CASES / "pole_indentation.yaml", *settings, "--out", out, ranks=ranks)

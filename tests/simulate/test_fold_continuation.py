@@ -30,14 +30,15 @@ def outcomes(file: Path, over: str, settings: list[str], out: Path, *, full_path
     return sweep(file, [over], settings, out, say=lambda line: None, full_paths=full_paths).outcomes
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("over", "most"),
     [
         ("magnetic.lambda_m=-0.001:0.002:7", 5),
-        pytest.param("shell.defect.amplitude=1.4:3:9", 5, marks=pytest.mark.slow),
-        pytest.param("shell.radius_to_thickness=90:150:5", 5, marks=pytest.mark.slow),
-        pytest.param("shell.poisson_ratio=0.1:0.5:5", 5, marks=pytest.mark.slow),
-        pytest.param("shell.defect.width=2.8:3.6:5", 6, marks=pytest.mark.slow),
+        ("shell.defect.amplitude=1.4:3:9", 5),
+        ("shell.radius_to_thickness=90:150:5", 5),
+        ("shell.poisson_ratio=0.1:0.5:5", 5),
+        ("shell.defect.width=2.8:3.6:5", 6),
     ],
 )
 def test_meridian_chains(tmp_path: Path, over: str, most: int) -> None:

@@ -42,7 +42,7 @@ def test_volume_snaps_back() -> None:
 @pytest.mark.parametrize(
     ("R_over_h", "lambda_m", "mode", "first", "fold"),
     [
-        (300, 0.00184, "m = 28", 1.0145, 1.093385),
+        pytest.param(300, 0.00184, "m = 28", 1.0145, 1.093385, marks=pytest.mark.slow),
         pytest.param(1000, 0.0005, "m = 53", 0.9937, 1.0123, marks=pytest.mark.slow),
     ],
 )
@@ -104,6 +104,7 @@ def test_indentation_through_its_fold_in_displacement() -> None:
     assert held[top + 2] == 1
 
 
+@pytest.mark.slow
 def test_strip_bends_to_both_sides() -> None:
     """Elastica: q = pi^2/4, and at a tip angle of 90 degrees q = K(1/2)^2 and tip deflection 2 sin 45/sqrt(q)."""
     found = result("strip_buckling.yaml")

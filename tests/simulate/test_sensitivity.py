@@ -41,6 +41,7 @@ def derivative(f: Callable[[float], float], step: float) -> float:
     return (8 * (f(step) - f(-step)) - (f(2 * step) - f(-2 * step))) / (12 * step)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("settings", SHELLS)
 def test_field_and_defect(settings: list[str]) -> None:
     found = sensitivities(*fold_of(*settings))

@@ -11,7 +11,7 @@ from pathlib import Path
 import basix
 import numpy as np
 import pytest
-from command import magshell
+from command import started
 from conftest import CASES
 from mpi4py import MPI
 
@@ -50,6 +50,11 @@ def check(case: Case, reference: float) -> Adapted:
     assert tolerance / 10 < error < tolerance
     assert error < mesh.best.estimate
     return mesh
+
+
+@pytest.fixture(scope="module")
+def half_mesh() -> Adapted:
+    return adapted(buckling(1e-2), COMM)
 
 
 @pytest.mark.parametrize("tolerance", [1e-2, 1e-3, 1e-4, 1e-5, 1e-6])
@@ -112,16 +117,16 @@ def test_equal_shares() -> None:
     assert more == pytest.approx(np.mean(change**-2.0), rel=0.05)
 
 
-def test_the_mesh_is_kept_for_a_run_that_is_resumed() -> None:
-    case = buckling(1e-2)
-    mesh = adapted(case, COMM)
+@pytest.mark.slow
+def test_the_mesh_is_kept_for_a_run_that_is_resumed(half_mesh: Adapted) -> None:
+    case, mesh = buckling(1e-2), half_mesh
     again = Adapted.from_json(case, mesh.to_json())
     assert replace(again, choice=mesh.choice) == mesh
     for x in np.random.default_rng(0).uniform(-1, 1, (20, 2)):
         assert again.choice.applied(case)[1].size(x) == mesh.choice.applied(case)[1].size(x)
 
 
-def test_summary_has_the_estimate_and_the_rounds(tmp_path: Path) -> None:
+def test_summary_has_the_estimate_and_the_rounds(tmp_path: Path, no_pictures: None) -> None:
     case = buckling(1e-2, symmetry="auto")
     lines: list[str] = []
     result = run(case, tmp_path, say=lines.append)
@@ -156,6 +161,7 @@ def test_refused(setting: str, said: str) -> None:
         Case.load(CASES / "dimple_buckling.yaml", ["mesh.tolerance=1e-3", setting])
 
 
+@pytest.mark.slow
 def test_a_tolerance_on_a_grid() -> None:
     """A closed cylinder dented at one side, a seam in its chart: against degree 5 on 2.5 times as many cells."""
     data = {
@@ -172,15 +178,14 @@ def test_a_tolerance_on_a_grid() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("ranks", [2, 3])
-def test_in_parallel(ranks: int, tmp_path: Path) -> None:
+def test_in_parallel(ranks: int, half_mesh: Adapted, tmp_path: Path) -> None:
     """The same meshes and the same estimates on any number of ranks."""
-    mesh = adapted(buckling(1e-2), COMM)
     settings = ["--set", "mesh.tolerance=1e-2", "--set", "symmetry=half", "--out", str(tmp_path)]
-    done = magshell("run", str(CASES / "dimple_buckling.yaml"), *settings, ranks=ranks)
+    done = started("run", CASES / "dimple_buckling.yaml", *settings, ranks=ranks, pictures=False)
     assert done.returncode == 0, done.stderr
     rounds = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))["tolerance"]["rounds"]
-    assert [(r["cells"], r["dofs"]) for r in rounds] == [(r.cells, r.dofs) for r in mesh.rounds]
-    for there, here in zip(rounds, mesh.rounds, strict=True):
+    assert [(r["cells"], r["dofs"]) for r in rounds] == [(r.cells, r.dofs) for r in half_mesh.rounds]
+    for there, here in zip(rounds, half_mesh.rounds, strict=True):
         assert there["result"] == pytest.approx(here.result, rel=1e-9)
         assert there["estimate"] == pytest.approx(here.estimate, rel=1e-6)
 

@@ -88,7 +88,7 @@ def test_an_interrupted_run_of_an_edited_program(copied: Path, tmp_path: Path) -
     assert (tmp_path / "out" / "checkpoint").read_bytes() == before
 
 
-def test_a_complete_run_of_other_sources(tmp_path: Path, edited: Any) -> None:
+def test_a_complete_run_of_other_sources(tmp_path: Path, edited: Any, no_pictures: None) -> None:
     """Is not complete; the benchmarks, which keep theirs, compute it again and say so."""
     case = Case.load(BUCKLING, QUICK)
     run(case, tmp_path)
@@ -117,7 +117,7 @@ def test_what_differs_is_told(tmp_path: Path, edited: Any) -> None:
         checkpoint.refuse_other({"version": "0.1.0", "case": known["case"]}, case, tmp_path)
 
 
-def test_the_mesh_for_a_tolerance(tmp_path: Path, edited: Any) -> None:
+def test_the_mesh_for_a_tolerance(tmp_path: Path, edited: Any, no_pictures: None) -> None:
     """Is not taken over from other sources."""
     case = Case.load(BUCKLING, ["mesh.tolerance=1e-2"])
     assert run(case, tmp_path, time_limit=0).stopped

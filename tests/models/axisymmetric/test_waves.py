@@ -145,6 +145,7 @@ def test_no_wave_before_the_fold() -> None:
     assert crossings(model, found) == []
 
 
+@pytest.mark.slow
 def test_perfect_hemisphere_buckles_in_waves_at_its_edge() -> None:
     """The full shell's tangent (44 589 unknowns) has its first two negative pivots between 0.8405 and 0.8418."""
     model = hemisphere(90, 0.5, Loads(pressure=True))

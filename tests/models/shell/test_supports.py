@@ -110,6 +110,7 @@ def test_live_pressure_between_parallel_symmetry_planes() -> None:
         Scene(pressed(PLATE, edges))
 
 
+@pytest.mark.slow
 def test_sectors_between_oblique_symmetry_planes() -> None:
     """Of a cylinder under dead pressure: all have the energy per angle of a quarter between x = 0 and y = 0."""
     loading = {"kind": "dead", "loads": [{"over": "all", "pressure": 1e-4}], "factor": 1, "points": 1}

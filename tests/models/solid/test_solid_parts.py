@@ -285,6 +285,7 @@ def test_a_bracket_from_a_mesh_file() -> None:
     assert -scene.observe(last.point.state)["tip_uz"] == pytest.approx(beams, rel=H)
 
 
+@pytest.mark.slow
 def test_patches_of_a_mesh_file() -> None:
     """The gripper on a hub that is clamped: its arms are elasticas at q = 4, which rise by 0.66996."""
     case = ms.Case.load(CASES / "gripper.yaml", ["model=solid", "mesh.degree=2", "loading.points=2"])
@@ -318,6 +319,7 @@ def test_a_step_in_the_thickness_is_refused() -> None:
         ms.Case.load(CASES / "bracket.yaml", settings)
 
 
+@pytest.mark.slow
 def test_derivatives_of_a_fold() -> None:
     """In lambda_m and in the dimple's depth, by folds found at other values of these; of both patches together."""
     settings = ["shell.radius_to_thickness=20", "mesh.refinement=0.25", "symmetry=half", "magnetic.lambda_m=0.001"]
