@@ -1,11 +1,11 @@
-"""Direct factorisation of the symmetric tangent, its inertia, and the work."""
+"""Direct factorisation of the tangent, its inertia, and the work."""
 
 import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
 from magshell_fenicsx.continuation.edge import Edge
-from magshell_fenicsx.continuation.system import Edged, Tangent, Vector
+from magshell_fenicsx.continuation.system import Edged, Skewed, Tangent, Vector, symmetric_part
 from magshell_fenicsx.continuation.timing import Stopwatch
 
 PREFIX = "magshell_factor_"
@@ -19,7 +19,8 @@ class Factorisation:
 
     On one rank CHOLMOD is tried first: it takes half the time, and its success proves that there is no negative
     pivot. Otherwise MUMPS computes LDL^T and counts the negative pivots. After its first failure CHOLMOD is not
-    used again, and its memory is released.
+    used again, and its memory is released. A skewed tangent K + N takes two factorisations: that of K for the
+    inertia, and LU of the sum for the solutions.
 
     Attributes
     ----------
@@ -28,9 +29,12 @@ class Factorisation:
     solving
         Time spent on solving with the factors.
     matrix
-        The matrix last factored; K if that was an edged one.
+        The matrix last factored; K, or K + N, if that was an edged one.
     negative_pivots
-        Unstable directions of the latest factored tangent (Sylvester's law of inertia).
+        Unstable directions of the latest factored tangent (Sylvester's law of inertia). Of a skewed one those of K,
+        less one where det (K + N) has the other sign: then it has been singular once less often.
+    skewed
+        Whether that tangent was a skewed one.
     """
 
     def __init__(self, comm: MPI.Comm) -> None:
@@ -43,6 +47,7 @@ class Factorisation:
         self._rhs: PETSc.Vec | None = None
         self._definite = comm.size == 1
         self._edge: Edge | None = None
+        self.skewed = False
 
     def factor(self, tangent: Tangent) -> None:
         """Factor a matrix; an edged one by the factors of its K and k back-solves.
@@ -52,13 +57,16 @@ class Factorisation:
         PETSc.Error
             If MUMPS fails, for example for lack of memory, or if CHOLMOD fails for a reason other than the matrix.
         """
-        K = tangent.K if isinstance(tangent, Edged) else tangent
+        K, inner = symmetric_part(tangent), tangent.K if isinstance(tangent, Edged) else tangent
+        self.skewed = isinstance(inner, Skewed)
         with self.stopwatch:
             self.matrix, self._edge = K, None
             if self._rhs is None:
                 self._rhs, self._solution = K.createVecs()
             if not (self._definite and self._factor_definite(K)):
                 self._factor_any(K)
+            if isinstance(inner, Skewed):
+                self._factor_sum(inner)
         self.count += 1
         if isinstance(tangent, Edged):
             self._edge = Edge(tangent, self.comm, self._inner, self._product)
@@ -104,6 +112,22 @@ class Factorisation:
             F.setMumpsIcntl(8, 0)  # no scaling: a tenth faster, and the tangent's entries are of similar size
         _renew(self._mumps, K)
         self._pc, self.negative_pivots = self._mumps, self._mumps.getFactorMatrix().getInertia()[0]
+
+    def _factor_sum(self, tangent: Skewed) -> None:
+        """LU of K + N, for the solutions, and the sign of its determinant."""
+        self.matrix = whole = tangent.K.copy()
+        for option in (PETSc.Mat.Option.SYMMETRIC, PETSc.Mat.Option.SYMMETRY_ETERNAL):
+            whole.setOption(option, False)
+        whole.axpy(1.0, tangent.N, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
+        self._pc = pc = _new_pc(whole, "mumps", "lu")
+        pc.setFactorSetUpSolverType()
+        F = pc.getFactorMatrix()
+        F.setMumpsIcntl(33, 1)  # the determinant
+        F.setMumpsIcntl(14, 50)
+        _renew(pc, whole)
+        even = self.comm.bcast(F.getMumpsRinfog(12) > 0.0 if self.comm.rank == 0 else None)
+        if self.negative_pivots % 2 == even:
+            self.negative_pivots -= 1
 
     def times(self, x: Vector) -> Vector:
         """The matrix last factored times x."""
@@ -175,14 +199,14 @@ def _entries(K: PETSc.Mat) -> float:
     return float(K.getInfo()["nz_used"])
 
 
-def _new_pc(K: PETSc.Mat, solver: str) -> PETSc.PC:
+def _new_pc(K: PETSc.Mat, solver: str, kind: str = "cholesky") -> PETSc.PC:
     if solver == "cholmod":  # its simplicial method factors indefinite matrices without an error
         given = PETSc.Options(PREFIX)
         given["mat_cholmod_supernodal_switch"], given["mat_cholmod_print"] = 0.0, 0
     pc = PETSc.PC().create(K.comm)
     pc.setOptionsPrefix(PREFIX)
     pc.setOperators(K)
-    pc.setType("cholesky")
+    pc.setType(kind)
     pc.setFactorSolverType(solver)
     pc.setFromOptions()
     return pc

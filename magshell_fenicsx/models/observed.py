@@ -29,6 +29,8 @@ class Observed:
         n0 (3,) at the named points.
     loads, load_size
         What loads it, and the sum of the sizes of the dead loads over E h R; see `DeadLoads`.
+    without_potential
+        Names of the edges at which a live pressure has none; see `openings`.
     observed
         Column -> the form that a term observes, see `OwnTerm.observed`; of the modelled part.
     """
@@ -40,6 +42,7 @@ class Observed:
     u: fem.Function
     loads: Loads
     load_size: float = 0.0
+    without_potential: tuple[str, ...] = ()
     observed: Mapping[str, fem.Form]
 
     def observe(self, volume: fem.Form, points: Mapping[str, Array]) -> None:

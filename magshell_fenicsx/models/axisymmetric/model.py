@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from functools import cached_property
 
 import numpy as np
+import ufl
 from dolfinx import fem
 
 from magshell_fenicsx.assembly.kernels import KernelLog
@@ -21,7 +22,7 @@ from magshell_fenicsx.models.axisymmetric.instability import ExcludedWaves
 from magshell_fenicsx.models.axisymmetric.meridian import Meridian
 from magshell_fenicsx.models.axisymmetric.pattern import thickness_field
 from magshell_fenicsx.models.axisymmetric.probe import Array, Probe
-from magshell_fenicsx.models.axisymmetric.supports import supports
+from magshell_fenicsx.models.axisymmetric.supports import openings, supports
 from magshell_fenicsx.models.axisymmetric.waves import Waves
 from magshell_fenicsx.models.observed import Observed
 from magshell_fenicsx.models.shell import edges
@@ -84,7 +85,7 @@ class MeridianModel(Observed):
         self.sigma = default_penalty(degree) if sigma is None else sigma
         self.thickness = thickness_field(thickness, self.r0) if thickness else None
         self.factory = factory = EnergyFactory(meridian, self.r0, material, self.sigma, degree, self.thickness)
-        self.supports = supports(meridian, conditions, pressure=loads.pressure)
+        self.supports = supports(meridian, conditions)
         self.energies = [factory.membrane(), factory.bending(), factory.interior_edges()]
         if len(self.supports.clamped):
             self.energies.append(factory.clamped_edges(self.supports.clamped))
@@ -92,7 +93,12 @@ class MeridianModel(Observed):
             self.energies.append(factory.mirror_edges(self.supports.mirror))
         if loads.magnetic:
             self.energies += factory.magnetic(loads.magnetic)
-        if loads.pressure:
+        volume = factory.volume_change
+        beside, self.without_potential = openings(meridian, conditions)
+        if loads.pressure and beside:
+            self.energies.append(factory.pressure_beside_edges(potential=not self.without_potential))
+            volume = factory.swept_volume
+        elif loads.pressure:
             self.energies.append(factory.pressure())
         self.energies += [factory.own(term) for term in loads.own]
         u = jets.revolved(self.u)
@@ -114,7 +120,7 @@ class MeridianModel(Observed):
             lambda term: self.kernels.compile_all([factory.observed(term, u)]),
         )
         self.system = FiniteElementSystem(self.u, terms, held, pattern, material.h, parameters=parameters)
-        self._volume = self.kernels.compile("volume energy", 2 * np.pi * factory.volume_change(jets.revolved(self.u)))
+        self._volume = self.kernels.compile("volume energy", 2 * np.pi * volume(jets.revolved(self.u)))
         self._seen = {name: Probe.at(*place, self.r0) for name, place in meridian.points.items()}
         self.normals = {name: probe.normal for name, probe in self._seen.items()}
 
@@ -128,8 +134,9 @@ class MeridianModel(Observed):
         return self._seen[point](u)
 
     def _term(self, e: Energy) -> FormTerm:
-        energy = 2 * np.pi * e.of(jets.revolved(self.u))
-        return FormTerm(e.name, energy, self.u, self.kernels, e.amplitude, linear=e.linear)
+        u, v = jets.revolved(self.u), jets.revolved(ufl.TestFunction(self.V))
+        work = 2 * np.pi * e.work(u, v) if e.work else None
+        return FormTerm(e.name, 2 * np.pi * e.of(u), self.u, self.kernels, e.amplitude, linear=e.linear, work=work)
 
     def _moment(self, name: str, load: EdgeMoment) -> Counted:
         facets, constant = self.meridian.ends[load.edge], self.factory.constant

@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.axisymmetric.meridian import Meridian
+from magshell_fenicsx.models.shell.openings import moving, without_potential
 from magshell_fenicsx.models.shell.parameters import Condition, Held
-from magshell_fenicsx.models.shell.supports import RIGHT, STRAIGHT, no_mirror, open_to_pressure
+from magshell_fenicsx.models.shell.supports import RIGHT, STRAIGHT, no_mirror
 
 Facets = NDArray[np.int32]
 HORIZONTAL, AXIAL = {0, 1}, 2  # components of the displacement
@@ -68,13 +69,13 @@ class Supports:
             raise MeshError(f"boundary: the shell is not held: it is free to {motion}")
 
 
-def supports(meridian: Meridian, conditions: Mapping[str, Condition], *, pressure: bool = False) -> Supports:
+def supports(meridian: Meridian, conditions: Mapping[str, Condition]) -> Supports:
     """The supports that conditions of named ends make, and those of a named point on the axis.
 
     Raises
     ------
     MeshError
-        If an end lies in no plane of symmetry, or in one that is open to a live `pressure`.
+        If an end lies in no plane of symmetry.
     """
     horizontal, axial, clamped, mirror = found = [list[Facets]() for _ in range(4)]
     for name, condition in conditions.items():
@@ -85,7 +86,7 @@ def supports(meridian: Meridian, conditions: Mapping[str, Condition], *, pressur
         if condition == "clamped":
             clamped.append(here)
         elif condition == "plane":
-            _refuse_slanting(meridian, name, pressure=pressure)
+            _refuse_slanting(meridian, name)
             mirror.append(here)
             held = {AXIAL}
         if held >= HORIZONTAL:
@@ -95,14 +96,24 @@ def supports(meridian: Meridian, conditions: Mapping[str, Condition], *, pressur
     return Supports(meridian.axis, *(np.unique(np.concatenate([np.empty(0, np.int32), *f])) for f in found))
 
 
-def _refuse_slanting(meridian: Meridian, name: str, *, pressure: bool) -> None:
-    """See that the surface crosses the plane of an end at right angles, and a live pressure a plane through 0."""
+def openings(meridian: Meridian, conditions: Mapping[str, Condition]) -> tuple[bool, tuple[str, ...]]:
+    """Whether p V from the origin would load an edge too, and the ends where a live pressure has no potential."""
+
+    def ring(name: str) -> NDArray[np.float64]:
+        [(rho, z)] = meridian.section(np.array([meridian.parameter(name)]))
+        return np.array([[rho, 0, z], [0, rho, z], [-rho, 0, z]])
+
+    moved = moving({name: {name} for name in meridian.ends}, conditions)
+    beside = [name for name, c in conditions.items() if c == "plane" and abs(ring(name)[0, 2]) > STRAIGHT]
+    return bool(moved or beside), without_potential(moved, conditions, ring)
+
+
+def _refuse_slanting(meridian: Meridian, name: str) -> None:
+    """See that the surface crosses the plane of an end at right angles."""
     s = meridian.parameter(name)
     (rho, z), (rho_near, z_near) = meridian.section(np.array([s, s + (STRAIGHT if s == 0 else -STRAIGHT)]))
     if abs(z_near - z) < RIGHT * np.hypot(rho_near - rho, z_near - z):
         raise MeshError(no_mirror(name))
-    if pressure and abs(z) > STRAIGHT:
-        raise MeshError(open_to_pressure(name))
 
 
 def _zero(V: fem.FunctionSpace, facets: Facets, component: int) -> fem.DirichletBC:

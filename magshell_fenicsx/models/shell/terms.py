@@ -141,6 +141,16 @@ class TermFactory:
         parameters = (unit, self._constant(origin)) if origin.any() else (unit,)
         return self._cells("pressure", Density(densities.pressure, parameters, parts=MOVED), "pressure")
 
+    def pressure_beside_edges(self, *, potential: bool) -> ShellTerm:
+        """The same where edges move that lie in no planes with a common point, with a potential or without."""
+        unit = self._constant(self.material.classical_pressure / self.material.h)
+        work = None if potential else densities.following
+        return self._cells("pressure", Density(densities.swept, (unit,), parts=MOVED, work=work), "pressure")
+
+    def swept_volume(self) -> ufl.Form:
+        """Delta V/R^3 of the modelled part where edges move."""
+        return densities.swept(*self._jets()) * self._dx()
+
     def own(self, term: OwnTerm) -> ShellTerm:
         """The energy of a part or one's own, with the amplitude of its name."""
         still = tuple(part for part in term.placed_parts if part not in term.parts)  # asked for of r0 alone
@@ -196,8 +206,11 @@ class TermFactory:
         return kin.facet_covector(self._domain), ufl.CellVolume(self._domain) / ufl.FacetArea(self._domain)
 
     def _cells(self, name: str, density: Density, amplitude: str | None = None, *, linear: bool = False) -> ShellTerm:
-        energy = density.of(*self._jets(), *density.parameters) * self._dx()
-        return ShellTerm(name, density, energy, self.u, self.log, amplitude, linear=linear)
+        energy, work = density.of(*self._jets(), *density.parameters) * self._dx(), None
+        if density.work:
+            v = kin.jet(ufl.TestFunction(self.u.function_space), self._domain)
+            work = density.work(*self._jets(), v, *density.parameters) * self._dx()
+        return ShellTerm(name, density, energy, self.u, self.log, amplitude, linear=linear, work=work)
 
     def _edges(self, name: str, density: Density) -> ShellTerm:
         assert density.facets is not None

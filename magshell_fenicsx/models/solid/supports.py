@@ -4,6 +4,7 @@ from collections.abc import Mapping
 
 import numpy as np
 from dolfinx import fem
+from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.sliding import Constraint, held_along
 from magshell_fenicsx.mesh.hexahedra import MIDDLE, Body
@@ -26,14 +27,14 @@ def supports(
         On every rank, if an edge lies in no plane of symmetry.
     """
     V = r0.function_space
-    in_middle = np.abs(body.at_nodes(V, body.heights) - MIDDLE) < ROUNDING
+    middle = in_middle(body, V)
     held: list[Constraint] = []
     planes: list[Mirror] = []
     for name, condition in conditions.items():
         components = condition.components if isinstance(condition, Held) else ALL
         if condition in ("free", "symmetry"):
             continue
-        nodes = None if condition == "clamped" else in_middle
+        nodes = None if condition == "clamped" else middle
         if condition == "plane":
             planes.append(plane := plane_of(r0, body.faces[name], name))
             held.append(held_along(V, 2, body.faces[name], plane.normal))
@@ -44,3 +45,8 @@ def supports(
         else:
             held += held_at_vertex(V, body.points[name], components)
     return held, planes
+
+
+def in_middle(body: Body, V: fem.FunctionSpace) -> NDArray[np.bool_]:
+    """Which nodes, ghosts included, lie in the middle of the thickness."""
+    return np.asarray(np.abs(body.at_nodes(V, body.heights) - MIDDLE) < ROUNDING)
