@@ -137,6 +137,14 @@ class Factorisation:
         """The solution with the latest factors."""
         return self._edge.solve(rhs) if self._edge else self._inner(rhs)
 
+    def solve_transposed(self, rhs: Vector) -> Vector:
+        """The same with the transposed matrix, of a tangent without edge."""
+        assert self._pc is not None
+        rhs_, x = self.matrix.createVecs()
+        rhs_.setArray(rhs)
+        self._pc.applyTranspose(rhs_, x)
+        return np.array(x.array_r)
+
     def _product(self, x: Vector) -> Vector:
         v, y = self.matrix.createVecs()
         v.setArray(x)

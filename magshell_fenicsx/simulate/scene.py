@@ -23,6 +23,7 @@ from magshell_fenicsx.mesh.mirror import Y0
 from magshell_fenicsx.models.axisymmetric.meridian import make_meridian
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.shell.model import ShellModel
+from magshell_fenicsx.models.shell.openings import no_potential
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.supports import refuse_loose
 from magshell_fenicsx.models.shell.thickness import Thickness, refuse_unfit
@@ -89,6 +90,12 @@ class Scene:
     def watch(self) -> Watch:
         """The watch over the modes that the model excludes. Its first use compiles their kernels."""
         return Watch(self.model.excluded_modes)
+
+    @property
+    def left_out(self) -> list[str]:
+        """What the model lacks, for people."""
+        open_at = self.model.without_potential if self.plan.loads.pressure else ()
+        return [*self.plan.left_out, *([no_potential(open_at)] if open_at else [])]
 
     def unloaded(self) -> State:
         """The undeformed shell; amplitudes are zero, except user-defined ones with a value."""

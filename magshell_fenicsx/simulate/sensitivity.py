@@ -69,8 +69,8 @@ def _to_defect(scene: Scene, fold: Fold) -> float:
     def out_of_balance(change: float) -> float:
         other = Scene(deepened(scene.case, change), scene.comm, terms=scene.plan.own)
         assert same_mesh(scene, other)
-        u, phi = (transfer(scene, other, v) for v in (fold.state.u, fold.phi))
-        moved = replace(fold, state=State(u, fold.state.mu), phi=phi)
+        u, left = (transfer(scene, other, v) for v in (fold.state.u, fold.left))
+        moved = replace(fold, state=State(u, fold.state.mu), left=left)
         return sensitivity(other.model.system, moved, other.model.system.residual(u, fold.state.mu))
 
     return (out_of_balance(DEFECT_STEP) - out_of_balance(-DEFECT_STEP)) / (2 * DEFECT_STEP)

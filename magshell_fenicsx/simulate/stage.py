@@ -8,6 +8,7 @@ from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.path import Control, Path, StepOptions
 from magshell_fenicsx.continuation.point import Point
 from magshell_fenicsx.continuation.system import State
+from magshell_fenicsx.simulate.record import Stopped
 from magshell_fenicsx.simulate.scene import Scene
 
 LONGEST = 50.0  # step by arc length, over the first
@@ -41,7 +42,19 @@ class Stage:
         return replace(point, state=self.leave(point.state), du=du)
 
     def path(self, name: str, control: Control, options: StepOptions, scale: float = 1.0) -> Path:
-        """A path of the step's system."""
+        """A path of the step's system.
+
+        Raises
+        ------
+        Stopped
+            If the volume is prescribed where none is conjugate to the pressure.
+        """
+        open_at = self.scene.model.without_potential
+        if control == "conjugate" and name == "pressure" and open_at:
+            raise Stopped(
+                f"control by volume: a pressure that follows the free edge {open_at[0]} is conjugate to no volume: "
+                "use control: arc or control: load"
+            )
         return Path(self.newton, name, control, options, scale, self.scene.journal, self.scene.progress)
 
     def begin(self, name: str, control: Control, state: State, first: float, scale: float = 1.0) -> tuple[Path, Point]:

@@ -48,7 +48,8 @@ def field_as_load(scene: Scene, loading: FieldSection, state: State) -> Iterator
 
 
 def pressure(scene: Scene, loading: PressureSection, state: State) -> Iterator[Record]:
-    path, start = plain(scene).begin("pressure", CONTROLS[loading.control], state, 0.1)
+    chosen = "control" in loading.model_fields_set or not scene.model.without_potential
+    path, start = plain(scene).begin("pressure", CONTROLS[loading.control] if chosen else "arc", state, 0.1)
     targets: list[float] = []
     if loading.pressure is not None:
         targets = _divided(0.0, loading.pressure, loading.points)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.axisymmetric.meridian import Meridian
-from magshell_fenicsx.models.shell.openings import moving, without_potential
+from magshell_fenicsx.models.shell.openings import ring_openings
 from magshell_fenicsx.models.shell.parameters import Condition, Held
 from magshell_fenicsx.models.shell.supports import RIGHT, STRAIGHT, no_mirror
 
@@ -98,14 +98,10 @@ def supports(meridian: Meridian, conditions: Mapping[str, Condition]) -> Support
 
 def openings(meridian: Meridian, conditions: Mapping[str, Condition]) -> tuple[bool, tuple[str, ...]]:
     """Whether p V from the origin would load an edge too, and the ends where a live pressure has no potential."""
-
-    def ring(name: str) -> NDArray[np.float64]:
-        [(rho, z)] = meridian.section(np.array([meridian.parameter(name)]))
-        return np.array([[rho, 0, z], [0, rho, z], [-rho, 0, z]])
-
-    moved = moving({name: {name} for name in meridian.ends}, conditions)
-    beside = [name for name, c in conditions.items() if c == "plane" and abs(ring(name)[0, 2]) > STRAIGHT]
-    return bool(moved or beside), without_potential(moved, conditions, ring)
+    places = {name: meridian.section(np.array([meridian.parameter(name)]))[0] for name in meridian.ends}
+    moved, open_at = ring_openings(places, conditions)
+    beside = [name for name, c in conditions.items() if c == "plane" and abs(places[name][1]) > STRAIGHT]
+    return bool(moved or beside), open_at
 
 
 def _refuse_slanting(meridian: Meridian, name: str) -> None:

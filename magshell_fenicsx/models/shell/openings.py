@@ -86,6 +86,17 @@ def openings(
     return names, without_potential(names, conditions, places)
 
 
+def ring_openings(ends: Mapping[str, Array], conditions: Mapping[str, Condition]) -> tuple[list[str], tuple[str, ...]]:
+    """The same of a meridian with ends at (rho, z)."""
+
+    def ring(name: str) -> Array:
+        rho, z = ends[name]
+        return np.array([[rho, 0, z], [0, rho, z], [-rho, 0, z]])
+
+    names = moving({name: {name} for name in ends}, conditions)
+    return names, without_potential(names, conditions, ring)
+
+
 def no_potential(names: Sequence[str]) -> str:
     """What is said of such edges."""
     where = f"edge{'s' * (len(names) > 1)} {', '.join(names)}"
