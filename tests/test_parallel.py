@@ -53,12 +53,23 @@ SCENES |= {
             "--set=mesh.size=40",
         ],
     ),
+    "a tube open to a pressure": (
+        "benchmarks/pinched_cylinder.yaml",
+        [
+            "--set=shell={geometry: cylinder, radius: 1, length: 1, thickness: 0.05, poisson_ratio: 0.3}",
+            "--set=boundary={bottom: clamped}",
+            "--set=points={A: [1, 0, 1]}",
+            "--set=loading={kind: pressure, control: load, until: target, pressure: 0.05, points: 1}",
+            "--set=mesh={degree: 2, size: 0.4}",
+            "--set=symmetry=none",
+        ],
+    ),
 }
 COMPARED = ("p_over_pc", "lambda_m", "force", "w_over_h", "w_pole_over_h", "volume_change", "energy")
 POINTS = ("_ux", "_uy", "_uz")  # of named points
 
 
-ON_TWO = ("half shell, force", "a moment")
+ON_TWO = ("half shell, force", "a moment", "a tube open to a pressure")
 
 
 @pytest.mark.parametrize("scene", [s if s == "a moment" else pytest.param(s, marks=pytest.mark.slow) for s in SCENES])

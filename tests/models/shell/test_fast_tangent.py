@@ -17,7 +17,7 @@ from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.assembly.terms import FormTerm
 from magshell_fenicsx.case.source import Source
-from magshell_fenicsx.continuation.system import followed
+from magshell_fenicsx.continuation.system import Skewed, followed
 from magshell_fenicsx.models.shell import densities, kinematics
 from magshell_fenicsx.models.shell.energy import cell_quadrature
 from magshell_fenicsx.models.shell.fast_tangent import FastTangent, make_sites
@@ -48,7 +48,9 @@ def pattern(system: FiniteElementSystem) -> FormTerm:
     return found
 
 
-def csr(K: PETSc.Mat) -> scipy.sparse.csr_array:
+def csr(K: PETSc.Mat | Skewed) -> scipy.sparse.csr_array:
+    if isinstance(K, Skewed):
+        return csr(K.K) + csr(K.N)
     rows, columns, values = K.getValuesCSR()
     return scipy.sparse.csr_array((values, columns, rows), shape=K.size)
 
