@@ -1,8 +1,9 @@
 """The whole case: its sections and what they must have in common."""
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, TypeVar
 
 import numpy as np
 from pydantic import Field, ModelWrapValidatorHandler, ValidationError, model_validator
@@ -10,14 +11,12 @@ from pydantic import Field, ModelWrapValidatorHandler, ValidationError, model_va
 from magshell_fenicsx.case.boundary import EDGES, BoundarySection
 from magshell_fenicsx.case.defects import DimpleSection
 from magshell_fenicsx.case.fields import MagneticSection, layer_average
-from magshell_fenicsx.case.loading import (
-    DeadSection,
-    FieldSection,
-    IndentationSection,
-    LoadingSection,
-    RotationSection,
-)
+from magshell_fenicsx.case.loading import Loading, ProgrammeStep, programme
+from magshell_fenicsx.case.loads.dead import DeadSection
+from magshell_fenicsx.case.loads.indentation import IndentationSection
+from magshell_fenicsx.case.loads.step import Step
 from magshell_fenicsx.case.messages import explain
+from magshell_fenicsx.case.programme import refuse_unfit_steps
 from magshell_fenicsx.case.shell import ShellSection
 from magshell_fenicsx.case.solid import SolidSection
 from magshell_fenicsx.case.source import CaseError, Source, override, read_source
@@ -28,6 +27,7 @@ from magshell_fenicsx.parts.registered import PARTS, WithParts
 from magshell_fenicsx.parts.section import Section, or_number, texts
 
 SOLID_DEGREE = 2
+AnyStep = TypeVar("AnyStep", bound=Step)
 
 
 class MeshSection(Section):
@@ -69,8 +69,9 @@ class Case(WithParts):
     """Name -> place of what is loaded, held or watched [the shell's length; over R if that has no unit]"""
     magnetic: MagneticSection | None = None
     """Remanence and applied field, which is applied before the load"""
-    loading: LoadingSection | None = None
-    """The load after the field; without it the path ends with the field"""
+    loading: Loading | None = None
+    """The load after the field, without which the path ends with the field; or a list of steps, one after the other,
+    in which the field is a step too"""
     mesh: MeshSection = MeshSection()
     """Elements"""
     stability: StabilitySection | None = None
@@ -85,10 +86,11 @@ class Case(WithParts):
     def _units_go_with_those_of_the_shell(cls, data: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
         section = handler(data)
         if isinstance(data, dict) and not section.shell.with_units:
-            loads = section.loading if isinstance(section.loading, DeadSection) else None
-            parts = {key: data.get(key) for key in ("points", "mesh", *PARTS)} | {
-                "loading": loads and data.get("loading")
-            }
+            parts = {key: data.get(key) for key in ("points", "mesh", *PARTS)}
+            written = data.get("loading")
+            sources = written if isinstance(written, list) else [written]
+            for step, source in zip(programme(section.loading, field=False), sources, strict=False):
+                parts |= {step.key: source} if isinstance(step.load, DeadSection) else {}
             for key in texts(parts):
                 raise ValueError(f"{key}: has a unit, but the shell's lengths have none: give all of them one, or none")
         return section
@@ -103,34 +105,25 @@ class Case(WithParts):
                 "magnetic.remanent.layers: the layers cancel: their average is a remanence of length zero, and a shell "
                 "knows no more of them"
             )
-        if isinstance(self.loading, FieldSection) and not self.lambda_m:
-            raise ValueError("loading.kind: field needs magnetic.lambda_m, not zero, for its target or direction")
-        if isinstance(self.loading, RotationSection):
-            if not self.magnetic or not self.lambda_m:
-                raise ValueError("loading.kind: rotation needs a field: magnetic.lambda_m, not zero")
-            if self.magnetic.applied.gradient:
-                raise ValueError("loading.kind: rotation needs a uniform field, without magnetic.applied.gradient")
-            if abs(self.magnetic.applied.vector() @ self.loading.to.vector()) > 1 - 1e-9:
-                raise ValueError("loading.to: must be neither parallel nor opposite to magnetic.applied")
         return self
 
     @model_validator(mode="after")
     def _named_parts_are_there(self) -> Self:
         """Points, and the edges and patches of geometries whose names are known."""
-        shell, loading = self.shell, self.loading
+        shell = self.shell
         if "pole" in self.points:
             raise ValueError("points.pole: is taken, by the point that w_pole_over_h is of; choose another name")
-        if "load" in self.points:
-            raise ValueError("points.load: is taken, by the point that is indented; choose another name")
-        loads = loading.loads if isinstance(loading, DeadSection) else []
-        for key in (*(["loads of kind: dead"] if loads else []), *self.parts):
+        for point in self.points:
+            if re.fullmatch(r"load(_\d+)?", point):
+                raise ValueError(f"points.{point}: is taken, by the point that is indented; choose another name")
+        dead = self.loads_of(DeadSection)
+        for key in (*(["loads of kind: dead"] if dead else []), *self.parts):
             if shell.modulus is None:
                 raise ValueError(f"shell.youngs_modulus is needed for {key}")
-        indented = []
-        if isinstance(loading, IndentationSection):
-            indented = [loading.at.point]
-            self._on_shell(loading.at.polar)
-        for name in (*(load.at for load in loads), *indented):
+        indented = self.loads_of(IndentationSection)
+        for load in indented:
+            self._on_shell(load.at.polar)
+        for name in (*(load.at for step in dead for load in step.loads), *(load.at.point for load in indented)):
             if name is not None and name not in self.points:
                 raise ValueError(f"loading: at: {name}: name it in points, with its place")
         if isinstance(shell, ShellSection):
@@ -180,7 +173,7 @@ class Case(WithParts):
             if self.solid:
                 raise ValueError("solid belongs to model: solid")
             return self
-        magnetic, loading = self.magnetic, self.loading
+        magnetic = self.magnetic
         if isinstance(self.thickness_factor, dict):
             raise ValueError("shell.thickness_factor: of a solid a formula: a step in the thickness is no swept body")
         if magnetic and magnetic.energy != "full":
@@ -192,7 +185,7 @@ class Case(WithParts):
                 raise ValueError(f"mesh.{key}: not of a solid, which has degree {SOLID_DEGREE}; {finer} makes it finer")
         if self.symmetry == "axisymmetric":
             raise ValueError("symmetry: axisymmetric: a solid is whole or half")
-        if isinstance(loading, IndentationSection) and not loading.patch:
+        if any(not load.patch for load in self.loads_of(IndentationSection)):
             raise ValueError(
                 "loading.patch: 0: a point force sinks into a solid without limit; give the patch its radius over h "
                 "(of the paper's indenter, 0.2 mm at R = 25.2 mm, with R/h = 90: 0.714)"
@@ -203,6 +196,20 @@ class Case(WithParts):
                 f"{self.shell.poisson_ratio:g}, which says all"
             )
         return self
+
+    @model_validator(mode="after")
+    def _programme_fits(self) -> Self:
+        refuse_unfit_steps(self.programme, self.magnetic, self.lambda_m, whole=isinstance(self.loading, list))
+        return self
+
+    @property
+    def programme(self) -> tuple[ProgrammeStep, ...]:
+        """Its steps; the field that is applied before a single load is the first."""
+        return programme(self.loading, field=bool(self.lambda_m))
+
+    def loads_of(self, kind: type[AnyStep]) -> list[AnyStep]:
+        """The loads of a kind among its steps."""
+        return [step.load for step in self.programme if isinstance(step.load, kind)]
 
     @property
     def parts(self) -> dict[str, Part]:

@@ -9,6 +9,8 @@ from pydantic.fields import FieldInfo
 
 from magshell_fenicsx.case.source import Location, Source, dotted
 
+UNIONS = ("one", "programme", "a word", "a gas")  # tags of unions without a key
+
 
 def explain(error: Any, source: Source, case: type[BaseModel]) -> str:
     """One line for one of pydantic's errors."""
@@ -27,8 +29,8 @@ def explain(error: Any, source: Source, case: type[BaseModel]) -> str:
     if kind == "missing":
         return f"{place}: {key}: is missing{_meaning(location, source.data, case)}"
     if kind.startswith("union_tag"):
-        models = _models(case.model_fields[key].annotation)
-        tag, tags = error["ctx"].get("tag"), [tag for m in models for tag in _tags(m)]
+        models = [m for m in _models(case.model_fields[str(location[0])].annotation) if _tag_key([m])]
+        tag, tags = error["ctx"].get("tag"), dict.fromkeys(tag for m in models for tag in _tags(m))
         said = "is missing" if tag is None else shown(tag)
         return f"{place}: {key}.{_tag_key(models)}: {said}; allowed: {', '.join(tags)}"
     if kind in ("model_type", "model_attributes_type"):
@@ -50,9 +52,17 @@ def shown(value: Any) -> str:
 
 
 def _without_tag(loc: Location, case: type[BaseModel]) -> Location:
-    """Pydantic puts the `kind` of a section that has several after its name: take it out."""
+    """Pydantic puts what distinguishes the members of a union after their key: take it out."""
     section = case.model_fields.get(str(loc[0])) if loc else None
-    return (loc[0], *loc[2:]) if section and len(_models(section.annotation)) > 1 else loc
+    if not section or len(_models(section.annotation)) < 2:
+        return loc
+    models = _models(section.annotation)
+    tags = {*UNIONS, *(tag for m in models if _tag_key([m]) for tag in _tags(m))}
+    kept, rest = [loc[0]], list(loc[1:])
+    while rest and (rest[0] in tags or isinstance(rest[0], int)):
+        kept += [rest[0]] if isinstance(rest[0], int) else []
+        rest.pop(0)
+    return (*kept, *(key for key in rest if key not in UNIONS))
 
 
 def _allowed_keys(location: Location, data: Any, case: type[BaseModel]) -> list[str]:
@@ -90,8 +100,8 @@ def _models(annotation: Any) -> list[type[BaseModel]]:
 
 
 def _tag_key(models: list[type[BaseModel]]) -> str:
-    """The key that selects one of several section classes."""
-    return next(key for key in ("kind", "geometry") if all(key in m.model_fields for m in models))
+    """The key that selects one of several section classes; empty without one."""
+    return next((key for key in ("kind", "geometry") if all(key in m.model_fields for m in models)), "")
 
 
 def _tags(model: type[BaseModel]) -> list[str]:

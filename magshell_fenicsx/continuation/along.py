@@ -16,12 +16,23 @@ class Along:
         Name of the amplitude t.
     curves
         Amplitude of the inner system -> f_i with its first two derivatives.
+    begin
+        t of the states that `contract` gets.
     """
 
-    def __init__(self, system: System, name: str, curves: Mapping[str, Curve]) -> None:
+    def __init__(self, system: System, name: str, curves: Mapping[str, Curve], begin: float = 0.0) -> None:
         self.comm, self.size, self.length = system.comm, system.size, system.length
         self.coordinates = system.coordinates
-        self._system, self._name, self._curves = system, name, curves
+        self._system, self._name, self._curves, self._begin = system, name, curves, begin
+
+    def on(self, system: System) -> "Along":
+        """The same curves on another system."""
+        return Along(system, self._name, self._curves, self._begin)
+
+    def contract(self, state: State) -> State:
+        """A state of the inner system with t in place of its amplitudes."""
+        others = {name: value for name, value in state.mu.items() if name not in self._curves}
+        return State(state.u, {self._name: self._begin, **others})
 
     def expand(self, state: State) -> State:
         """The state with the amplitudes of the inner system."""

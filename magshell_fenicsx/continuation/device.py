@@ -3,13 +3,15 @@
 For example, a sealed volume has an unknown pressure, and a body pressed on with a given force an unknown position.
 The Legendre transform
 
-    L(u, mu_f; mu) = Pi(u; mu_f, mu) + sum_f mu_f q_f
+    L(u, mu_f; mu) = Pi(u; mu_f, mu) + sum_f int q_f dmu_f
 
-is stationary in u and in the amplitudes mu_f where Pi is in equilibrium and -dPi/dmu_f = q_f. So a device is a system
-like any other, with the unknowns u and y_f = mu_f length/scale_f. Its inertia is that of the shell in the device.
+is stationary in u and in the amplitudes mu_f where Pi is in equilibrium and -dPi/dmu_f = q_f(mu_f). A constant q_f
+holds the conjugate; a q_f that falls with mu_f is a spring or a gas. So a device is a system like any other, with the
+unknowns u and y_f = mu_f length/scale_f. Its inertia is that of the shell in the device.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from copy import copy
 from math import log2
 
 import numpy as np
@@ -18,6 +20,8 @@ from magshell_fenicsx.continuation.edge import join, split
 from magshell_fenicsx.continuation.factor import Factorisation
 from magshell_fenicsx.continuation.system import Amplitudes, Edged, State, System, Vector, Weighted, max_abs
 
+Conjugate = Callable[[float], tuple[float, float]]  # mu -> q and dq/dmu
+
 
 class Device:
     """A system under a loading device.
@@ -25,16 +29,28 @@ class Device:
     Parameters
     ----------
     held
-        Amplitude that becomes unknown -> the value of -dPi/dmu that is held.
+        Amplitude that becomes unknown -> its conjugate: a value of -dPi/dmu, or a function q(mu) that does not rise.
     scale
         Amplitude -> a value that counts as of order one.
     """
 
-    def __init__(self, system: System, held: Mapping[str, float], scale: Mapping[str, float]) -> None:
+    def __init__(self, system: System, held: Mapping[str, float | Conjugate], scale: Mapping[str, float]) -> None:
         self.comm, self.length, self.coordinates = system.comm, system.length, system.coordinates
-        self._system, self._names, self._held = system, list(held), np.array(list(held.values()))
+        self._system, self._names = system, list(held)
+        self._held: list[Conjugate] = [q if callable(q) else constant(q) for q in held.values()]
         self._unit = np.array([scale[name] / system.length for name in held])
         self.size = system.size + len(held) * (self.comm.rank == self.comm.size - 1)
+
+    def on(self, system: System) -> "Device":
+        """The same device on another system."""
+        other = copy(self)
+        other._system = system
+        other.size = system.size + self.size - self._system.size
+        return other
+
+    def padded(self, u: Vector) -> Vector:
+        """A vector of the inner system with zeros for the amplitudes."""
+        return join(u, np.zeros(len(self._names)), self.comm)
 
     def enter(self, state: State) -> State:
         """A state of the inner system as a state of the device."""
@@ -52,8 +68,9 @@ class Device:
 
     def residual(self, u: Vector, mu: Amplitudes) -> Vector:
         v, whole = self._split(u, mu)
-        rows = [self._system.potential(v, whole, name) for name in self._names]
-        return join(self._system.residual(v, whole), (np.array(rows) + self._held) * self._unit, self.comm)
+        held = [q(whole[name])[0] for name, q in zip(self._names, self._held, strict=True)]
+        rows = np.array([self._system.potential(v, whole, name) for name in self._names]) + held
+        return join(self._system.residual(v, whole), rows * self._unit, self.comm)
 
     def load(self, u: Vector, mu: Amplitudes, name: str) -> Vector:
         v, whole = self._split(u, mu)
@@ -70,6 +87,7 @@ class Device:
         v, whole = self._split(u, mu)
         columns = [unit * self._system.load(v, whole, name) for name, unit in zip(self._names, self._unit, strict=True)]
         D = np.array([[self._system.curvature(v, whole, i, j) for j in self._names] for i in self._names])
+        D += np.diag([q(whole[name])[1] for name, q in zip(self._names, self._held, strict=True)])
         below = [(weight, self.displacement(w)) for weight, w in stress]
         K = self._system.tangent(v, whole, below)
         assert not isinstance(K, Edged)  # a device of a device is one device
@@ -79,6 +97,11 @@ class Device:
     def _split(self, x: Vector, mu: Amplitudes) -> tuple[Vector, dict[str, float]]:
         u, y = split(x, len(self._names), self.comm)
         return u, {**mu, **dict(zip(self._names, (float(v) for v in y * self._unit), strict=True))}
+
+
+def constant(q: float) -> Conjugate:
+    """A conjugate that is held."""
+    return lambda mu: (q, 0.0)
 
 
 def natural_scale(system: System, factors: Factorisation, state: State, name: str) -> float:

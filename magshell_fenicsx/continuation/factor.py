@@ -1,5 +1,7 @@
 """Direct factorisation of the tangent, its inertia, and the work."""
 
+from collections.abc import Callable
+
 import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -47,6 +49,7 @@ class Factorisation:
         self._rhs: PETSc.Vec | None = None
         self._definite = comm.size == 1
         self._edge: Edge | None = None
+        self._edged: Edged | None = None
         self.skewed = False
 
     def factor(self, tangent: Tangent) -> None:
@@ -68,6 +71,7 @@ class Factorisation:
             if isinstance(inner, Skewed):
                 self._factor_sum(inner)
         self.count += 1
+        self._edged = tangent if isinstance(tangent, Edged) else None
         if isinstance(tangent, Edged):
             self._edge = Edge(tangent, self.comm, self._inner, self._product)
             self.negative_pivots += self._edge.negative_pivots
@@ -138,12 +142,20 @@ class Factorisation:
         return self._edge.solve(rhs) if self._edge else self._inner(rhs)
 
     def solve_transposed(self, rhs: Vector) -> Vector:
-        """The same with the transposed matrix, of a tangent without edge."""
+        """The same with the transposed matrix."""
+
+        def of(operation: Callable[[PETSc.Vec, PETSc.Vec], None]) -> Callable[[Vector], Vector]:
+            def applied(x: Vector) -> Vector:
+                v, y = self.matrix.createVecs()
+                v.setArray(x)
+                operation(v, y)
+                return np.array(y.array_r)
+
+            return applied
+
         assert self._pc is not None
-        rhs_, x = self.matrix.createVecs()
-        rhs_.setArray(rhs)
-        self._pc.applyTranspose(rhs_, x)
-        return np.array(x.array_r)
+        solve, times = of(self._pc.applyTranspose), of(self.matrix.multTranspose)
+        return Edge(self._edged, self.comm, solve, times).solve(rhs) if self._edged else solve(rhs)
 
     def _product(self, x: Vector) -> Vector:
         v, y = self.matrix.createVecs()

@@ -11,6 +11,9 @@ class Progress(Protocol):
     def trying(self, here: Point, length: float) -> None:
         """A step of a length in s from an accepted point begins."""
 
+    def beginning(self, step: int) -> None:
+        """A step of the programme begins at the last accepted point; its number is from 1."""
+
     def doing(self, what: str) -> None:
         """Some other long action begins; `what` describes it in a few words."""
 
@@ -19,6 +22,9 @@ class NoProgress:
     """Reports nothing."""
 
     def trying(self, here: Point, length: float) -> None:
+        pass
+
+    def beginning(self, step: int) -> None:
         pass
 
     def doing(self, what: str) -> None:

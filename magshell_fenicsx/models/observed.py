@@ -28,7 +28,7 @@ class Observed:
     normals
         n0 (3,) at the named points.
     loads, load_size
-        What loads it, and the sum of the sizes of the dead loads over E h R; see `DeadLoads`.
+        What loads it; and by amplitude the sum of the sizes of dead loads over E h R, see `DeadLoads`.
     without_potential
         Names of the edges at which a live pressure has none; see `openings`.
     observed
@@ -41,7 +41,7 @@ class Observed:
     normals: Mapping[str, Array]
     u: fem.Function
     loads: Loads
-    load_size: float = 0.0
+    load_size: dict[str, float]
     without_potential: tuple[str, ...] = ()
     observed: Mapping[str, fem.Form]
 
@@ -52,10 +52,10 @@ class Observed:
         V = self.system.u.function_space
         self._probes = {name: point_entries(V, x, np.ones(3))[0] for name, x in points.items()}
 
-    def load_with(self, dead: DeadLoads) -> LinearTerm:
-        """The term of the dead loads but the moments."""
-        self.load_size = dead.size
-        return LinearTerm("load", *dead.entries, self.u, "load")
+    def load_with(self, name: str, dead: DeadLoads) -> LinearTerm:
+        """The term of the dead loads of an amplitude, except the moments."""
+        self.load_size[name] = dead.size
+        return LinearTerm(name, *dead.entries, self.u, name)
 
     def zero(self) -> Vector:
         """The undeformed displacement."""
@@ -74,18 +74,17 @@ class Observed:
         here = u[self._probes[point]].reshape(-1, 3).sum(axis=0)
         return np.asarray(self.system.comm.allreduce(here))
 
-    def loaded_deflection(self, u: Vector) -> float:
-        """w/R conjugate to the force: at its point, or averaged over its patch; of dead loads along themselves.
+    def loaded_deflection(self, u: Vector, name: str) -> float:
+        """w/R conjugate to a force: at its point, or averaged over its patch; of dead loads along themselves.
 
         Moments alone have none: that of the pole.
         """
-        if self.loads.dead and not self.load_size:
+        size = self.load_size.get(name, 0.0) if name in self.loads.dead else self.force_unit
+        if not size:
             return self.deflection(u, "pole")
-        if self.loads.dead:
-            self.system.set(u)
-            load = next(term for term in self.system.terms if term.name == "load")
-            return -float(self.system.comm.allreduce(load.energy())) / self.load_size
-        return -self.system.potential(u, {}, "force") / self.force_unit
+        self.system.set(u)
+        load = next(term for term in self.system.terms if term.name == name)
+        return -float(self.system.comm.allreduce(load.energy())) / size
 
     @property
     def force_unit(self) -> float:

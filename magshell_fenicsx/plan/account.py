@@ -21,13 +21,13 @@ def account(case: Case, loads: Loads, model: str, mirror: Mirror | None) -> tupl
         included.append("live pressure" if case.model == "shell" else "live pressure on the outer face")
     else:
         left_out.append("pressure: not loaded by it (the volume is only reported)")
-    if loads.force:
-        patch = loads.force.patch * case.shell.R_over_h
+    for force in loads.forces.values():
+        patch = force.patch * case.shell.R_over_h
         included.append(f"force on a patch of radius {patch:g} h" if patch else "force at a point")
-    else:
+    if not loads.forces:
         left_out.append("force: none")
-    if loads.dead:
-        included.append(f"{len(loads.dead)} dead load{'s' * (len(loads.dead) > 1)}")
+    if dead := loads.all_dead:
+        included.append(f"{len(dead)} dead load{'s' * (len(dead) > 1)}")
     for key, part in PARTS.items():
         if key in case.parts:
             included.append(case.parts[key].account(case.scales))

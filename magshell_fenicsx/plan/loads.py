@@ -1,18 +1,15 @@
 """The loads of a case in the model's terms: over E h R and in the model's frame, on the part that is modelled."""
 
+from collections.abc import Mapping
 from math import radians
 
 import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.loading import (
-    DeadLoadSection,
-    DeadSection,
-    IndentationSection,
-    PressureSection,
-    RotationSection,
-)
+from magshell_fenicsx.case.loads.dead import DeadLoadSection, DeadSection
+from magshell_fenicsx.case.loads.field import RotationSection
+from magshell_fenicsx.case.loads.indentation import IndentationSection, Place
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.mesh.frame import rotation
 from magshell_fenicsx.mesh.mirror import Mirror
@@ -32,13 +29,13 @@ from magshell_fenicsx.plan.outline import Outline
 Array = NDArray[np.float64]
 
 
-def loads(case: Case, under: str, turn: float, mirror: Mirror | None, own: tuple[OwnTerm, ...]) -> Loads:
+def loads(case: Case, under: Mapping[str, str], turn: float, mirror: Mirror | None, own: tuple[OwnTerm, ...]) -> Loads:
     """What loads the shell.
 
     Parameters
     ----------
     under
-        Name of the vertex under an indentation.
+        Amplitude of an indentation -> name of the vertex under it.
     turn
         Azimuth of the model's frame (rad).
     mirror
@@ -47,59 +44,76 @@ def loads(case: Case, under: str, turn: float, mirror: Mirror | None, own: tuple
     own
         See `surface_terms`.
     """
-    loading, magnetic = case.loading, case.magnetic
-    force = None
-    if isinstance(loading, IndentationSection):
-        force = Force(under, loading.patch / case.shell.R_over_h)
-    to = loading.to if isinstance(loading, RotationSection) else None
-    field = magnetisation(magnetic, case, turn, to) if magnetic and case.lambda_m else None
-    listed = loading.loads if isinstance(loading, DeadSection) else []
-    dead = tuple(_dead(load, case, turn, mirror) for load in listed if not mirror or load.edge not in mirror.lost)
-    return Loads(isinstance(loading, PressureSection), force, field, dead, own)
+    steps, magnetic = {step.name: step.load for step in case.programme}, case.magnetic
+    forces, dead = dict[str, Force](), dict[str, tuple[DeadLoad, ...]]()
+    for name, load in steps.items():
+        if isinstance(load, IndentationSection):
+            forces[name] = Force(under[name], load.patch / case.shell.R_over_h)
+        elif isinstance(load, DeadSection):
+            here = (one for one in load.loads if not mirror or one.edge not in mirror.lost)
+            dead[name] = tuple(_dead(one, case, turn, mirror) for one in here)
+    turned = [load.to for load in case.loads_of(RotationSection)]
+    field = magnetisation(magnetic, case, turn, turned) if magnetic and "lambda_m" in steps else None
+    pressure = "pressure" in steps or any("pressure" in load.hold for load in steps.values())
+    return Loads(pressure, forces, field, dead, own)
 
 
-def indented(case: Case, outline: Outline) -> Array | None:
-    """The place (3,) of an indentation, over R; None without one.
+def indented(case: Case, outline: Outline) -> dict[str, Array]:
+    """Amplitude of an indentation -> its place (3,), over R.
 
     Raises
     ------
     CaseError
         If a direction does not say where it is on this geometry, or it is too near to the pole.
     """
-    loading = case.loading
-    if not isinstance(loading, IndentationSection):
-        return None
-    if loading.at.point is not None:
-        return np.asarray(np.array(case.points[loading.at.point]) / case.shell.reference)
-    polar = radians(loading.at.polar)
+    steps = {step.name: step for step in case.programme}
+    return {
+        name: _indented(case, outline, step.load.at, step.key)
+        for name, step in steps.items()
+        if isinstance(step.load, IndentationSection)
+    }
+
+
+def _indented(case: Case, outline: Outline, at: Place, key: str) -> Array:
+    if at.point is not None:
+        return np.asarray(np.array(case.points[at.point]) / case.shell.reference)
+    polar = radians(at.polar)
     if not outline.sphere and polar:
         where = "at its centre or tip, polar: 0, or at a point of points"
-        raise CaseError(f"loading.at.polar: {loading.at.polar:g}: a {case.shell.geometry} is loaded {where}")
+        raise CaseError(f"{key}.at.polar: {at.polar:g}: a {case.shell.geometry} is loaded {where}")
     if outline.highest is None or not (outline.disc or case.shell.geometry == "strip"):
-        raise CaseError(f"loading.at: a {case.shell.geometry} has no pole: give {{point: NAME}}, of points")
+        raise CaseError(f"{key}.at: a {case.shell.geometry} has no pole: give {{point: NAME}}, of points")
     if not outline.sphere:
         return np.asarray(outline.embedding(outline.highest[None])[0])
     if 0 < polar < 1 / case.shell.R_over_h:
-        raise CaseError(f"loading.at.polar: {loading.at.polar:g}: 0, or more than a thickness from the pole")
-    chart = polar * loading.at.vector()[:2] / max(np.hypot(*loading.at.vector()[:2]), 1e-300)
+        raise CaseError(f"{key}.at.polar: {at.polar:g}: 0, or more than a thickness from the pole")
+    chart = polar * at.vector()[:2] / max(np.hypot(*at.vector()[:2]), 1e-300)
     return np.asarray(outline.embedding(chart[None])[0])
 
 
-def refuse_wide_patch(case: Case, outline: Outline, at: Array) -> None:
-    """See that the patch of a force is no wider than the shell around its place `at` in the chart.
+def refuse_wide_patch(case: Case, outline: Outline, at: Mapping[str, Array]) -> None:
+    """See that the patches of forces are no wider than the shell around their places in the chart.
+
+    Parameters
+    ----------
+    at
+        Amplitude -> place.
 
     Raises
     ------
     CaseError
         With the radii that are allowed.
     """
-    assert isinstance(case.loading, IndentationSection)
-    room = outline.edge - float(np.hypot(*at[:2])) if outline.sphere else min(1.0, case.width or 1.0)
-    patch, most = case.loading.patch, room * case.shell.R_over_h
-    if patch and not 0.3 <= patch <= most:
-        raise CaseError(
-            f"loading.patch: {patch:g}: allowed are 0 for a point, or 0.3 to {most:.4g}, where it reaches the edge"
-        )
+    for step in case.programme:
+        if not isinstance(step.load, IndentationSection):
+            continue
+        room = outline.edge - float(np.hypot(*at[step.name][:2])) if outline.sphere else min(1.0, case.width or 1.0)
+        patch, most = step.load.patch, room * case.shell.R_over_h
+        if patch and not 0.3 <= patch <= most:
+            raise CaseError(
+                f"{step.key}.patch: {patch:g}: allowed are 0 for a point, or 0.3 to {most:.4g}, where it "
+                "reaches the edge"
+            )
 
 
 def _dead(load: DeadLoadSection, case: Case, turn: float, mirror: Mirror | None) -> DeadLoad:

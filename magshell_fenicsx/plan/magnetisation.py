@@ -1,5 +1,7 @@
 """The field section in the model's frame."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -11,14 +13,16 @@ from magshell_fenicsx.mesh.frame import rotation
 from magshell_fenicsx.models.shell.parameters import Magnetisation
 from magshell_fenicsx.models.shell.patterns import Components, InsideAndOutside, Pattern, radial, tangential
 
+SAME = 1e-9  # part of a direction outside a plane: rounding
 
-def magnetisation(magnetic: MagneticSection, case: Case, turn: float, to: Direction | None) -> Magnetisation:
+
+def magnetisation(magnetic: MagneticSection, case: Case, turn: float, to: Sequence[Direction] = ()) -> Magnetisation:
     """What is magnetised and how it is modelled, in a frame turned about e3 (rad).
 
     Parameters
     ----------
     to
-        Where the field turns; None if it does not.
+        Directions that the field turns to.
     """
     section, gradient = magnetic.remanent, magnetic.applied.gradient
     remanent: NDArray[np.float64] | Pattern
@@ -37,14 +41,16 @@ def magnetisation(magnetic: MagneticSection, case: Case, turn: float, to: Direct
     else:
         remanent = section.vector(turn)
     along = magnetic.applied.vector(turn)
-    applied, across = magnetic.applied.uniform * along, None
-    if to is not None:
-        away = to.vector(turn) - (to.vector(turn) @ along) * along
-        across = magnetic.applied.uniform * away / np.linalg.norm(away)
+    basis = [along]
+    for direction in to:
+        away = direction.vector(turn) - np.sum([(direction.vector(turn) @ e) * e for e in basis], axis=0)
+        if np.linalg.norm(away) > SAME:
+            basis.append(away / np.linalg.norm(away))
+    applied, *across = (magnetic.applied.uniform * e for e in basis)
     patches = None
     if section.patches and isinstance(case.shell, MeshSurface):
         patches = {name: direction.vector(turn) for name, direction in section.patches.items()}
     Q = rotation(turn)
     G = Q @ np.array(gradient) @ Q.T if gradient else None
     layers = tuple((layer.fraction, layer.vector(turn)) for layer in section.layers or [])
-    return Magnetisation(remanent, applied, magnetic.energy, G, across, patches, layers)
+    return Magnetisation(remanent, applied, magnetic.energy, G, tuple(across), patches, layers)

@@ -28,7 +28,7 @@ def refuse_unfit(
         by_patch(loads.magnetic.patches, patch.patches, len(patch.cells))
     for name in (thickness and thickness.patches) or {}:
         patch_of(patch.patches, name)
-    for load in loads.dead:
+    for load in loads.all_dead:
         if isinstance(load, AreaForce) and load.patch is not None:
             patch_of(patch.patches, load.patch)
 

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from magshell_fenicsx.case.boundary import BoundarySection, EdgeCondition, HeldSection
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.expressions import formula
-from magshell_fenicsx.case.loading import DeadSection, IndentationSection
+from magshell_fenicsx.case.loads.dead import DeadSection
+from magshell_fenicsx.case.loads.indentation import IndentationSection
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.case.surfaces import MeshSurface
 from magshell_fenicsx.mesh.frame import rotation
@@ -30,7 +31,7 @@ from magshell_fenicsx.plan.names import refuse_unfit_ends
 from magshell_fenicsx.plan.outline import Chart, Outline, outline, refuse_beside
 from magshell_fenicsx.plan.own_terms import surface_terms
 from magshell_fenicsx.plan.plan import Plan
-from magshell_fenicsx.plan.sizes import grading
+from magshell_fenicsx.plan.sizes import Loaded, grading
 from magshell_fenicsx.plan.symmetry import Leaves, askew, left, mirror, unmirrored
 
 Array = NDArray[np.float64]
@@ -50,22 +51,30 @@ def make_plan(case: Case, terms: Sequence[OwnTerm] = ()) -> Plan:
     material = Material(case.shell.poisson_ratio, 1 / case.shell.R_over_h)
     defect = Dimple(case.defect.amplitude * material.h, case.dimple_half_width) if case.defect else None
     drawn = outline(case, defect)
-    place = indented(case, drawn)
+    places = indented(case, drawn)
     refuse_unbounded_fields(case, np.zeros((0, 3)) if isinstance(case.shell, MeshSurface) else drawn.sample())
     energies = surface_terms(case, terms)
-    axisymmetric, plane = _symmetry(case, drawn, left(case, drawn, place, energies))
+    axisymmetric, plane = _symmetry(case, drawn, left(case, drawn, places, energies))
     half = plane is not None
     turn, beyond = 0.0, plane
     if plane and drawn.round and plane.through_e3:  # the frame is turned into the plane
         turn, beyond = plane.azimuth, Y0
-    points = _points(case, drawn, place, turn, half)
-    under = "load" if "load" in points else "pole"
-    if place is not None:
-        refuse_wide_patch(case, drawn, points[under])
-    loading = case.loading
-    at = [load.at for load in loading.loads if load.at] if isinstance(loading, DeadSection) else []
-    names = [under] if isinstance(loading, IndentationSection) else at
-    size = grading(case, drawn, material.h, defect, [points[name] for name in names])
+    points = _named_points(case, drawn, turn, half)
+    under = dict[str, str]()
+    for name, place in places.items():
+        load = _place(case, drawn, name, place, turn, half)
+        candidates = (point for point in ("pole", *under.values()) if point in points)
+        same = (point for point in candidates if np.array_equal(points[point], load))
+        under[name] = next(same, name.replace("force", "load"))
+        points[under[name]] = load
+    refuse_wide_patch(case, drawn, {name: points[point] for name, point in under.items()})
+    loaded: list[Loaded] = [
+        (points[load.at], []) for step in case.loads_of(DeadSection) for load in step.loads if load.at
+    ]
+    for point in dict.fromkeys(under.values()):
+        there = (step.load for step in case.programme if under.get(step.name) == point)
+        loaded.append((points[point], [load for load in there if isinstance(load, IndentationSection)]))
+    size = grading(case, drawn, material.h, defect, loaded)
     shape = drawn.chart(beyond, size)
     if isinstance(shape, Grid) and beyond:  # what a point needs, its image needs too
         images = [drawn.inverse(beyond.image(drawn.embedding(x[None])[0])) for x in points.values()]
@@ -77,14 +86,14 @@ def make_plan(case: Case, terms: Sequence[OwnTerm] = ()) -> Plan:
     conditions = edge_conditions(case.boundary, turn)
     if beyond:
         conditions = {name: c for name, c in conditions.items() if name not in beyond.lost} | {CUT: "symmetry"}
-    loaded = loads(case, under, turn, beyond, energies)
+    all_loads = loads(case, under, turn, beyond, energies)
     if span:
-        refuse_unfit_ends([name for name in span.names if name], points, conditions, loaded)
+        refuse_unfit_ends([name for name in span.names if name], points, conditions, all_loads)
     model = "meridian" if axisymmetric else f"{'half' if half else 'full'} {case.model}"
-    included, left_out = account(case, loaded, model, plane)
+    included, left_out = account(case, all_loads, model, plane)
     return Plan(
         material=material,
-        loads=loaded,
+        loads=all_loads,
         conditions=conditions,
         meridian=span,
         mirror=beyond,
@@ -144,8 +153,8 @@ def _symmetry(case: Case, drawn: Outline, parts: list[Leaves]) -> tuple[bool, Mi
     return False, plane
 
 
-def _points(case: Case, drawn: Outline, place: Array | None, turn: float, half: bool) -> Points:
-    """Named vertices in the chart, "pole" and "load" among them."""
+def _named_points(case: Case, drawn: Outline, turn: float, half: bool) -> Points:
+    """Named vertices in the chart, "pole" among them."""
     Q, R = rotation(turn), case.shell.reference
 
     def chart(name: str, x: Array) -> Array:
@@ -158,19 +167,15 @@ def _points(case: Case, drawn: Outline, place: Array | None, turn: float, half: 
         points["pole"] = next(iter(points.values()))
     elif drawn.highest is not None:
         points["pole"] = drawn.highest
-    if place is None:
-        return points
-    load = _place(case, drawn, place, turn, half)
-    if "pole" not in points or not np.array_equal(load, points["pole"]):
-        points["load"] = load
     return points
 
 
-def _place(case: Case, drawn: Outline, place: Array, turn: float, half: bool) -> Array:
-    loading = case.loading
-    assert isinstance(loading, IndentationSection)
-    if loading.at.point is None and drawn.sphere:
-        polar, theta = radians(loading.at.polar), radians(loading.at.azimuth) - turn
+def _place(case: Case, drawn: Outline, name: str, place: Array, turn: float, half: bool) -> Array:
+    """The place of an indentation in the chart."""
+    load = next(step.load for step in case.programme if step.name == name)
+    assert isinstance(load, IndentationSection)
+    if load.at.point is None and drawn.sphere:
+        polar, theta = radians(load.at.polar), radians(load.at.azimuth) - turn
         return polar * np.array([np.cos(theta), 0.0 if half else np.sin(theta)]) if polar else np.zeros(2)
     found = drawn.inverse(rotation(turn) @ place)
     return drawn.on_half(found) if half else found

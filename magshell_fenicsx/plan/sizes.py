@@ -7,29 +7,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.loading import DeadSection, IndentationSection, PressureSection
+from magshell_fenicsx.case.loads.dead import DeadSection
+from magshell_fenicsx.case.loads.indentation import IndentationSection
+from magshell_fenicsx.case.loads.pressure import PressureSection
 from magshell_fenicsx.case.surfaces import MeshSurface
 from magshell_fenicsx.mesh.grading import Disc, Feature, Grading, Line, Ring
 from magshell_fenicsx.mesh.sphere import Dimple
 from magshell_fenicsx.plan.outline import Outline
 
 Array = NDArray[np.float64]
+Loaded = tuple[Array, Sequence[IndentationSection]]  # place in the chart, and the indentations there
 
 
-def grading(case: Case, outline: Outline, h: float, defect: Dimple | None, loaded: Sequence[Array]) -> Grading:
+def grading(case: Case, outline: Outline, h: float, defect: Dimple | None, loaded: Sequence[Loaded]) -> Grading:
     """Sizes for 1e-4 in k_d and 1e-3 in F at degree 4; the case's own size is everywhere the same.
 
     Parameters
     ----------
     loaded
-        The places of concentrated loads in the chart.
+        The concentrated loads.
     """
     if case.mesh.size is not None or isinstance(case.shell, MeshSurface):
         return Grading([], _uniform(case, h))
-    indentation = case.loading if isinstance(case.loading, IndentationSection) else None
     features = [*_rim(case, outline, h), *(_dimple(case, h, defect) if defect else [])]
-    for place in loaded:
-        features += _load(case, h, place, indentation)
+    for place, indentations in loaded:
+        features += _load(case, h, place, indentations)
     return Grading(features, _largest(case, outline, h, defect) / case.mesh.refinement)
 
 
@@ -44,14 +46,14 @@ def _largest(case: Case, outline: Outline, h: float, defect: Dimple | None) -> f
         return min(2 * sqrt(h), 0.35)
     if not outline.disc or case.shell.geometry == "disc":
         return min(0.25, 0.5 * (case.width or 1.0))
-    if isinstance(case.loading, DeadSection):
-        return min(2 * sqrt(h), 0.35)
+    dead = 2 * sqrt(h) if case.loads_of(DeadSection) else 0.35
     # without a dimple a sphere buckles anywhere, in waves of about 3.6 sqrt(Rh)
-    return 1.2 * sqrt(h) if defect is None and isinstance(case.loading, PressureSection) else 0.35
+    live = 1.2 * sqrt(h) if defect is None and case.loads_of(PressureSection) else 0.35
+    return min(dead, live) if dead < 0.35 else live
 
 
 def _growth(case: Case) -> float:
-    if not isinstance(case.loading, IndentationSection):
+    if not case.loads_of(IndentationSection):
         return 0.4
     return 0.5 if case.model == "solid" else 0.6  # far from the ridge degree 2 needs more than degree 4
 
@@ -66,7 +68,7 @@ def _rim(case: Case, outline: Outline, h: float) -> list[Feature]:
         return [Line(axis, place, size, _growth(case)) for axis, place in fixed]
     if not outline.disc or case.shell.geometry == "disc":
         return []
-    indented = (2.0 if case.model == "solid" else 2.8) if isinstance(case.loading, IndentationSection) else 1.4
+    indented = (2.0 if case.model == "solid" else 2.8) if case.loads_of(IndentationSection) else 1.4
     return [Ring(outline.edge, indented * sqrt(h) / case.mesh.refinement, _growth(case))]
 
 
@@ -75,14 +77,14 @@ def _dimple(case: Case, h: float, defect: Dimple) -> list[Feature]:
     return [Disc((0.0, 0.0), defect.phi_o + 0.7 * sqrt(h), size, _growth(case))]
 
 
-def _load(case: Case, h: float, place: Array, indentation: IndentationSection | None) -> list[Feature]:
+def _load(case: Case, h: float, place: Array, indentations: Sequence[IndentationSection]) -> list[Feature]:
     """Of an indentation the dent too: by mirror buckling the radius of its ridge is about sqrt(2 R w)."""
     x, y = map(float, place)
-    patch = indentation.patch if indentation else 0.0
+    patch = min((load.patch for load in indentations), default=0.0)
     # finer than h the point force's logarithmic stretch would be resolved, which has no limit
     features: list[Feature] = [Disc((x, y), patch * h, max(patch * h / 2, h), _growth(case))]
-    if indentation:
-        depth = abs(indentation.depth) if indentation.depth else 10.0
+    if indentations:
+        depth = max(abs(load.depth) if load.depth else 10.0 for load in indentations)
         dent = (1.0 if case.model == "solid" else 0.85) * sqrt(2 * depth * h) + 0.5 * sqrt(h)
         features.insert(0, Disc((x, y), dent, sqrt(h) / case.mesh.refinement, _growth(case)))
     return features

@@ -1,6 +1,6 @@
 """The symmetry that each part of a case leaves; a model takes what all leave."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from math import atan2, hypot, pi
@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 from magshell_fenicsx.case.boundary import HeldSection
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.expressions import formula
-from magshell_fenicsx.case.loading import DeadLoadSection, DeadSection, IndentationSection, RotationSection
+from magshell_fenicsx.case.loads.dead import DeadLoadSection, DeadSection
+from magshell_fenicsx.case.loads.field import RotationSection
+from magshell_fenicsx.case.loads.step import Step
 from magshell_fenicsx.mesh.mirror import ROUNDING, Y0, Mirror
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.plan.outline import Outline
@@ -52,13 +54,13 @@ class Leaves:
     energy: str = ""
 
 
-def left(case: Case, outline: Outline, indented: Array | None, terms: Sequence[OwnTerm]) -> list[Leaves]:
-    """What each part of a case leaves; `indented` is the place (3,) of an indentation, over R."""
+def left(case: Case, outline: Outline, indented: Mapping[str, Array], terms: Sequence[OwnTerm]) -> list[Leaves]:
+    """What each part of a case leaves; `indented` is of `plan.loads`."""
     return [
         _shape(case, outline),
         *_supports(case),
         *(_field(case, outline) if case.magnetic and case.lambda_m else []),
-        *_load(case, indented),
+        *_loads(case, indented),
         *_named(case, outline),
         *(_energy(term, outline) for term in terms),
     ]
@@ -181,7 +183,7 @@ def _field(case: Case, outline: Outline) -> list[Leaves]:
     magnetic = case.magnetic
     assert magnetic
     vectors = [d.vector() for d in (*magnetic.remanent.directions(), magnetic.applied)]
-    turning = [case.loading.to.vector()] if isinstance(case.loading, RotationSection) else []
+    turning = [load.to.vector() for load in case.loads_of(RotationSection)]
     remanent, G = magnetic.remanent, np.array(magnetic.applied.gradient or np.zeros((3, 3)))
     fields: list[Callable[[Array], Array]] = [lambda x: np.asarray(x @ G.T)] if G.any() else []
     if remanent.components:
@@ -209,11 +211,14 @@ def _field(case: Case, outline: Outline) -> list[Leaves]:
     return [Leaves(next(iter(askew), None), vectors, mirrors)]
 
 
-def _load(case: Case, indented: Array | None) -> list[Leaves]:
-    loading, R = case.loading, case.shell.reference
-    if isinstance(loading, IndentationSection):
-        assert indented is not None
-        place = indented
+def _loads(case: Case, indented: Mapping[str, Array]) -> list[Leaves]:
+    return [leaves for step in case.programme for leaves in _load(case, step.load, indented.get(step.name))]
+
+
+def _load(case: Case, loading: Step, place: Array | None) -> list[Leaves]:
+    """What a step leaves; `place` of a force, over R."""
+    R = case.shell.reference
+    if place is not None:
         reason = "the force is not at the pole" if _tilted(place) else None
         return [Leaves(reason, [place], lambda mirror: bool(abs(mirror.beyond(place)) < ROUNDING))]
     if isinstance(loading, RotationSection):

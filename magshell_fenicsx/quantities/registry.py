@@ -4,7 +4,7 @@ import re
 from collections.abc import Iterable
 from dataclasses import replace
 
-from magshell_fenicsx.quantities.quantity import Amplitude, Kind, Quantity
+from magshell_fenicsx.quantities.quantity import Amplitude, Quantity
 
 
 def _energy(name: str, words: str, meaning: str, symbol: str = "") -> Quantity:
@@ -62,7 +62,7 @@ OF_EVERY_RUN = (
     Quantity(
         "negative_pivots",
         "unstable directions",
-        "Number of unstable directions of the model with all amplitudes fixed.",
+        "Number of unstable directions of the model, with all amplitudes fixed except those whose conjugate is held.",
         "count",
     ),
     Quantity(
@@ -98,6 +98,7 @@ OF_EVERY_RUN = (
         "Number of unstable directions that the model's symmetry excludes.",
         "count",
     ),
+    Quantity("step", "step", "Number of the programme's step; 0 is the start.", "count"),
 )
 OF_SOME_RUNS = (Quantity("load_factor", "load factor", "Common factor of all dead loads.", "load"),)
 QUANTITIES = {q.name: q for q in (*OF_EVERY_RUN, *OF_SOME_RUNS)}
@@ -112,7 +113,7 @@ AMPLITUDES = {
     )
 }
 # names of terms, and of amplitudes that only the solvers use
-INTERNAL = ("push", "lambda_across", "membrane", "couple")
+INTERNAL = ("push", "lambda_across", "lambda_third", "membrane", "couple")
 TAKEN = frozenset((*QUANTITIES, *AMPLITUDES, *INTERNAL))
 
 
@@ -123,12 +124,23 @@ def register(quantities: Iterable[Quantity]) -> None:
 
 def quantity(name: str) -> Quantity:
     """The quantity of a column; a named point's displacement or a user-defined amplitude has its own name."""
-    kind: Kind = "place" if re.search(r"_u[xyz]$", name) else "load"
-    return QUANTITIES.get(name) or Quantity(name, name.replace("_", " "), "", kind)
+    if name in QUANTITIES:
+        return QUANTITIES[name]
+    if again := re.fullmatch(r"(force|load)_(\d+)", name):
+        of = QUANTITIES[AMPLITUDES[again[1]].column]
+        return replace(of, name=name, words=f"{of.words} {again[2]}", symbol=of.symbol and f"F_{again[2]} R/(2πD)")
+    if again := re.fullmatch(r"w_((force|load)(_\d+)?)_over_h", name):
+        return _w(name, f"at {again[1].replace('_', ' ')}", f"Displacement conjugate to {again[1]}, as w_over_h.")
+    return Quantity(name, name.replace("_", " "), "", "place" if re.search(r"_u[xyz]$", name) else "load")
 
 
 def amplitude(name: str) -> Amplitude:
-    """The amplitude with a name; a user-defined one has a column of the same name."""
+    """The amplitude with a name; a user-defined one has a column of the same name.
+
+    A second force or list of dead loads has its own columns: force_2 and w_force_2_over_h.
+    """
+    if again := re.fullmatch(r"(force|load)_\d+", name):
+        return Amplitude(name, name, f"w_{name}_over_h", AMPLITUDES[again[1]].place)
     return AMPLITUDES.get(name) or Amplitude(name, name)
 
 

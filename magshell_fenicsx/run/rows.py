@@ -15,11 +15,12 @@ class RowMaker:
 
     def __init__(self, scene: Scene) -> None:
         self._scene, self._count, self._field_end = scene, 0, 0.0
+        self._listed = isinstance(scene.case.loading, list)  # alone, a field as the load is no field before it
 
     def row(self, record: Record, wall_s: float) -> Row:
         """The next row; `wall_s` is in seconds since the start of the history. Collective."""
         values, point = self._scene.observe(record.point.state), record.point
-        if record.label in ("start", "field"):
+        if record.label in ("start", "field") or (self._listed and record.amplitude in ("lambda_m", "angle")):
             self._field_end = values["w_over_h"]
         self._count += 1
         return {
@@ -38,6 +39,7 @@ class RowMaker:
             "error_over_h": point.error,
             "load_error": point.load_error,
             "excluded_pivots": record.excluded_pivots,
+            "step": record.step,
         }
 
 

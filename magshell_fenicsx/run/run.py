@@ -8,9 +8,9 @@ from pathlib import Path
 from mpi4py import MPI
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.loading import PathSection
+from magshell_fenicsx.case.loads.step import PathStep
 from magshell_fenicsx.continuation.factor import has_cholmod
-from magshell_fenicsx.continuation.fold import FoldLost, Guess, find_fold
+from magshell_fenicsx.continuation.fold import FoldLost
 from magshell_fenicsx.continuation.inverse import NoEigenpair
 from magshell_fenicsx.continuation.journal import NoJournal
 from magshell_fenicsx.output.pictures.plot import draw
@@ -33,7 +33,7 @@ from magshell_fenicsx.simulate.adapt.tolerance import adapted
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.record import Stopped
 from magshell_fenicsx.simulate.scene import Scene
-from magshell_fenicsx.simulate.sensitivity import sensitivities
+from magshell_fenicsx.simulate.sensitivity import fold_at, sensitivities
 
 __all__ = ["Result", "run"]
 
@@ -167,14 +167,17 @@ def _mesh_for_tolerance(case: Case, folder: Path | None, comm: MPI.Comm, say: Sa
 
 def _sensitivities(result: Result) -> dict[str, float]:
     """The sensitivities at the final fold, if the case requests them."""
-    scene, loading, last = result.scene, result.scene.case.loading, result.rows[-1]
-    if not (isinstance(loading, PathSection) and loading.sensitivities and last["label"] == "fold"):
+    scene, last = result.scene, result.rows[-1]
+    step = scene.case.programme[int(last["step"]) - 1] if last["label"] == "fold" else None
+    if step is None or not (isinstance(step.load, PathStep) and step.load.sensitivities):
         return {}
+    assert result.history.located
+    record = result.history.located[-1]
     try:
-        fold = find_fold(scene.newton, Guess(result.last), str(last["amplitude"]))
+        fold = fold_at(scene, record)
     except FoldLost as e:
         raise Stopped(f"the fold cannot be polished for its sensitivities: {e}") from None
-    return sensitivities(scene, fold)
+    return sensitivities(scene, fold, record)
 
 
 def _follow(result: Result, files: RunFiles | None, say: Say, progress: RunProgress, start: float) -> None:

@@ -3,21 +3,17 @@
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from math import acos, degrees, isclose
+from math import acos, degrees
 
 import numpy as np
 
-from magshell_fenicsx.case.loading import (
-    DeadSection,
-    FieldSection,
-    IndentationSection,
-    PathSection,
-    PressureSection,
-    RotationSection,
-)
+from magshell_fenicsx.case.loading import ProgrammeStep
+from magshell_fenicsx.case.loads.dead import DeadSection
+from magshell_fenicsx.case.loads.field import RotationSection
+from magshell_fenicsx.case.loads.step import PathStep
 from magshell_fenicsx.continuation.point import Point
 from magshell_fenicsx.output.store.table import Row
-from magshell_fenicsx.quantities.registry import quantity
+from magshell_fenicsx.quantities.registry import amplitude, quantity
 from magshell_fenicsx.simulate.scene import Scene
 
 WORDS = {"limit": "the first instability", "bifurcation": "the first bifurcation"}
@@ -44,11 +40,20 @@ class Aim:
     words: str = ""
     steps: int | None = None
 
-    def part(self, row: Row, steps: int) -> float | None:
-        """The completed part of the path at a point, after some steps; None if the end is unknown."""
+    def part(self, first: Row, row: Row, steps: int) -> float | None:
+        """The completed part of the path at a point, after some steps; None if the end is unknown.
+
+        Parameters
+        ----------
+        first
+            The point where the path begins.
+        """
         if self.steps is not None:
             return steps / self.steps
-        return float(row[self.column]) / self.end if self.end else None
+        begin = float(first[self.column])
+        if self.end is None or self.end == begin:
+            return None
+        return (float(row[self.column]) - begin) / (self.end - begin)
 
     def text(self, row: Row) -> str:
         """The present value and the end.
@@ -62,26 +67,24 @@ class Aim:
         return f"{quantity(self.column).plain} {float(row[self.column]) + 0.0:.4g} -> {end}"  # no minus zero
 
 
-def aim(scene: Scene) -> Aim:
-    """The end of the path that follows the field."""
-    case, loading = scene.case, scene.case.loading
-    targets: dict[str, float | None] = {"lambda_m": case.lambda_m}
-    if isinstance(loading, PressureSection):
-        targets = {"p_over_pc": loading.pressure, "volume_change": loading.volume_change}
-    elif isinstance(loading, IndentationSection):
-        targets = {"force": loading.force, "w_over_h": loading.depth}
-    elif isinstance(loading, DeadSection):
-        far = loading.displacement
-        h = scene.plan.length * scene.plan.material.h
-        targets = {"load_factor": loading.factor, "w_over_h": None if far is None else far / h}
-    elif isinstance(loading, RotationSection) and case.magnetic:
-        targets = {"field_angle": degrees(acos(case.magnetic.applied.vector() @ loading.to.vector()))}
-    until, load = loading.until if isinstance(loading, PathSection) else "target", next(iter(targets))
-    if until == "points" and isinstance(loading, PathSection):
-        return Aim(load, words=f"{loading.points} steps", steps=loading.points)
-    if until != "target":
-        return Aim(load, words=WORDS[until])
-    return next(Aim(column, end) for column, end in targets.items() if end is not None)
+def aim(scene: Scene, step: ProgrammeStep) -> Aim:
+    """The end of a step."""
+    load, varied = step.load, amplitude(step.name)
+    if isinstance(load, RotationSection):
+        before, after = scene.directions[step.number - 1 : step.number + 1]
+        first = scene.directions[0]
+        there = degrees(acos(float(np.clip(after @ first, -1, 1))))
+        return Aim(varied.column, there if before @ first > 1 - 1e-9 else None, "its last direction")
+    if step.until == "points":
+        return Aim(varied.column, words=f"{load.points} steps", steps=load.points)
+    if step.until != "target" or load.target is None:
+        return Aim(varied.column, words=WORDS.get(step.until, ""))
+    target, value = load.target
+    if target.quantity == "load":
+        return Aim(varied.column, value * (scene.case.lambda_m if step.name == "lambda_m" else 1.0))
+    own = f"w_{step.name}_over_h"
+    in_h = scene.plan.length * scene.plan.material.h if isinstance(load, DeadSection) else 1.0
+    return Aim(own if own in scene.extra_columns else target.column, value / in_h)
 
 
 def time_left(begun: tuple[float, float], here: tuple[float, float]) -> float | None:
@@ -130,32 +133,39 @@ class RunProgress:
     """
 
     def __init__(self, scene: Scene, report: Callable[[str], None], start: float) -> None:
-        self._scene, self._report, self._start, self._aim = scene, report, start, aim(scene)
+        self._scene, self._report, self._start = scene, report, start
+        self._aims = [aim(scene, step) for step in scene.case.programme]
         self._row: Row = {}
+        self._first: Row = {}
+        self._step = 1
         self._points = self._steps = 0
         self._begun = self._here = (0.0, 0.0)
+
+    def beginning(self, step: int) -> None:
+        """Note that a step of the programme begins at the last point; its number is from 1."""
+        self._step, self._first, self._steps = step, self._row, 0
+        self._begun = self._here = (0.0, self._here[1])
 
     def accepted(self, row: Row, *, known: bool) -> None:
         """Note a new point; `known` if an interrupted run had found it."""
         now = time.perf_counter()
         self._row, self._points = row, self._points + 1
-        on_load = row["label"] not in ("start", "field") or self._loads_by_field
-        self._steps += on_load and row["label"] == "step"
-        part = self._aim.part(row, self._steps)
+        self._steps += row["label"] == "step"
+        part = self._aim.part(self._first, row, self._steps) if self._first and self._aim else None
         self._here = (part or 0.0, now)
-        if known or not on_load or self._points == 1:
+        if known:
             self._begun = self._here
 
     def trying(self, here: Point, length: float) -> None:
         now, h = time.perf_counter(), self._scene.plan.material.h
         step = float(np.abs(here.du).max(initial=0.0)) * abs(length) / h
-        in_field = self._in_field
-        ahead = Aim("lambda_m", self._scene.case.lambda_m) if in_field else self._aim
-        left = None if in_field or self._branched else time_left(self._begun, self._here)
+        left = None if self._branched else time_left(self._begun, self._here)
         times = clock(now - self._start)
         if left is not None:
             times += f", about {clock(max(0.0, left - (now - self._here[1])))} left"
-        self._report(f"{self._count}  {ahead.text(self._row)}  step {step:.2g} h  {times}")
+        of = f" in step {self._step} of {len(self._aims)}" if isinstance(self._scene.case.loading, list) else ""
+        ahead = self._aim.text(self._row) if self._aim else ""
+        self._report(f"{self._count}{of}  {ahead}  step {step:.2g} h  {times}")
 
     def doing(self, what: str) -> None:
         self._report(waiting(f"{self._count}  {what}", time.perf_counter() - self._start))
@@ -165,17 +175,12 @@ class RunProgress:
         return f"{self._points} point{'s' * (self._points != 1)}"
 
     @property
-    def _loads_by_field(self) -> bool:
-        return isinstance(self._scene.case.loading, FieldSection | None)
-
-    @property
-    def _in_field(self) -> bool:
-        """Whether the field is still growing, before the load."""
-        before_load = self._row["label"] in ("start", "field") and not self._loads_by_field
-        return before_load and not isclose(float(self._row["lambda_m"]), self._scene.case.lambda_m)
+    def _aim(self) -> Aim | None:
+        return self._aims[self._step - 1] if self._aims else None
 
     @property
     def _branched(self) -> bool:
         """Whether the case requests branches; their number is not known in advance."""
-        loading = self._scene.case.loading
-        return isinstance(loading, PathSection) and loading.branches
+        steps = self._scene.case.programme
+        load = steps[self._step - 1].load if steps else None
+        return isinstance(load, PathStep) and load.branches

@@ -1,18 +1,12 @@
-"""The history of a case: first the field, then the load."""
+"""The history of a case: the steps of its programme, one after the other."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 
-from magshell_fenicsx.case.loading import (
-    DeadSection,
-    FieldSection,
-    IndentationSection,
-    PressureSection,
-    RotationSection,
-)
 from magshell_fenicsx.continuation.point import Point
-from magshell_fenicsx.simulate import steps
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
+from magshell_fenicsx.simulate.steps import LOCATED, records_of
 
 
 def follow(scene: Scene) -> Iterator[Record]:
@@ -21,28 +15,27 @@ def follow(scene: Scene) -> Iterator[Record]:
     Raises
     ------
     Stopped
-        If the path is lost, or the field alone makes the shell unstable.
+        If a path is lost, a step before the last ends at an instability, or the field alone makes the shell unstable.
     """
-    state = scene.unloaded()
+    state, steps = scene.unloaded(), scene.case.programme
     pivots = scene.newton.factor_at(state).negative_pivots
     yield Record("start", "", Point(state, 0.0, 0.0 * state.u, 0.0, pivots, pivots, 0, 1))
     if pivots:
         raise Stopped(
             f"the undeformed shell is unstable in {pivots} directions: mesh.penalty is too small or the mesh too coarse"
         )
-    loading = scene.case.loading
-    if isinstance(loading, FieldSection):
-        yield from steps.field_as_load(scene, loading, state)
-        return
-    if scene.model.loads.magnetic:
-        for record in steps.field(scene, state):
-            yield record
-            state = record.point.state
-    if isinstance(loading, PressureSection):
-        yield from steps.pressure(scene, loading, state)
-    elif isinstance(loading, IndentationSection):
-        yield from steps.indentation(scene, loading, state)
-    elif isinstance(loading, DeadSection):
-        yield from steps.dead(scene, loading, state)
-    elif isinstance(loading, RotationSection):
-        yield from steps.rotation(scene, loading, state)
+    for step in steps:
+        where = f"step {step.number} of {len(steps)} ({step.kind}): " if isinstance(scene.case.loading, list) else ""
+        scene.progress.beginning(step.number)
+        records, last = records_of(scene, step, state), ""
+        try:
+            while True:
+                record = next(records)
+                last = record.label
+                yield replace(record, step=step.number)
+        except StopIteration as end:
+            state = end.value
+        except Stopped as e:
+            raise Stopped(f"{where}{e}") from None
+        if step is not steps[-1] and step.until in ("limit", "bifurcation") and last in LOCATED:
+            raise Stopped(f"{where}ends at a {last}, from which the next step cannot start")

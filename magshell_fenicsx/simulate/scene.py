@@ -4,7 +4,7 @@ import time
 from collections import defaultdict
 from collections.abc import Sequence
 from functools import cached_property
-from math import atan2, copysign, degrees, hypot, nan
+from math import copysign, nan
 
 import numpy as np
 from mpi4py import MPI
@@ -32,6 +32,8 @@ from magshell_fenicsx.plan.body import layers, neo_hookean
 from magshell_fenicsx.plan.plan import Plan
 from magshell_fenicsx.plan.planner import make_plan, meridian_vertices
 from magshell_fenicsx.platform.first import from_first
+from magshell_fenicsx.quantities.registry import amplitude
+from magshell_fenicsx.simulate.direction import directions, field_angle, field_size
 
 Array = NDArray[np.float64]
 
@@ -105,21 +107,22 @@ class Scene:
 
     def observe(self, state: State) -> dict[str, float]:
         """The physical columns of a table row: loads, displacements over h, volume, energies over E h R^2."""
-        model, h, force = self.model, self.plan.material.h, self.model.loads.force
+        model, h, loads = self.model, self.plan.material.h, self.model.loads
+        force, sense = loads.forces.get("force"), copysign(1.0, self.case.lambda_m)
         model.system.accept(state.u)
         pole = model.deflection(state.u, "pole") / h
         potentials, energies = model.system.energies(state.u), defaultdict[str, float](float)
         for t in model.system.terms:
             amplitude = state.mu[t.amplitude] if t.amplitude else 1.0
-            energies[t.name.removesuffix(" across")] += model.multiplicity * amplitude * potentials[t.name]
-        along, across = state.mu.get("lambda_m", 0.0), state.mu.get("lambda_across", 0.0)
-        sense, split = copysign(1.0, self.case.lambda_m), "membrane" in energies  # a solid has no such split
+            name = t.name.removesuffix(" across").removesuffix(" third")
+            energies[name] += model.multiplicity * amplitude * potentials[t.name]
+        split = "membrane" in energies  # a solid has no such split
         return {
             "p_over_pc": state.mu.get("pressure", 0.0),
-            "lambda_m": sense * hypot(along, across) if across else along,
-            "field_angle": degrees(atan2(sense * across, sense * along)) if across else 0.0,
-            "force": state.mu.get("force", 0.0),
-            "w_over_h": model.loaded_deflection(state.u) / h if force or model.loads.dead else pole,
+            "lambda_m": field_size(state.mu, sense),
+            "field_angle": field_angle(state.mu, sense),
+            "force": 0.0,
+            "w_over_h": model.loaded_deflection(state.u, loads.displaced) / h if loads.displaced else pole,
             "w_pole_over_h": pole,
             "w_point_over_h": model.deflection(state.u, force.point) / h if force else pole,
             "volume_change": model.volume_change(state.u),
@@ -130,6 +133,8 @@ class Scene:
             else nan,
             "magnetic": sum(energies[name] for name in ("magnetic", "magnetic gradient", "U1", "Uq", "Utau", "couple")),
             **{name: energies[name] for name in ("U1", "Uq", "Utau")},
+            **{self._column(name): state.mu[name] for name in (*loads.forces, *loads.dead)},
+            **{f"w_{name}_over_h": model.loaded_deflection(state.u, name) / h for name in self._also_displaced},
             **self._observe_points(state),
             **{name: state.mu[name] for name in self._own_amplitudes},
             **{
@@ -152,11 +157,36 @@ class Scene:
         """The columns of `observe` besides those of every run."""
         named = tuple(f"{point}_u{axis}" for point in self.case.points for axis in "xyz")
         own = (*self._own_amplitudes, *(column for term in self.plan.loads.own for column in term.observed))
-        return (*(["load_factor"] if self.plan.loads.dead else []), *named, *own)
+        factors = (self._column(name) for name in (*self.plan.loads.forces, *self.plan.loads.dead) if name != "force")
+        return (*factors, *(f"w_{name}_over_h" for name in self._also_displaced), *named, *own)
+
+    @property
+    def _also_displaced(self) -> tuple[str, ...]:
+        """Amplitudes with a displacement besides the one of the column w_over_h."""
+        loads = self.plan.loads
+        return tuple(name for name in (*loads.forces, *loads.dead) if name != loads.displaced)
+
+    @staticmethod
+    def _column(name: str) -> str:
+        return amplitude(name).column
+
+    @cached_property
+    def directions(self) -> Array:
+        """See `direction.directions`."""
+        return directions(self.case.programme, self.plan.loads.magnetic, self.plan.azimuth)
+
+    def conjugate_unit(self, name: str) -> float:
+        """-dPi/dmu of one unit of a target: ΔV/R³ of a pressure, w/h of a force, the shell's length of dead loads."""
+        model, material = self.model, self.plan.material
+        if name == "pressure":
+            return -material.classical_pressure / material.h / model.multiplicity
+        if name in model.loads.forces:
+            return model.force_unit * material.h
+        return model.load_size.get(name, 0.0) / self.plan.length
 
     def _observe_points(self, state: State) -> dict[str, float]:
-        """The load factor, and the displacements of named points in the unit of the shell's lengths."""
-        found = {"load_factor": state.mu["load"]} if self.plan.loads.dead else {}
+        """The displacements of named points in the unit of the shell's lengths."""
+        found: dict[str, float] = {}
         for point in self.case.points:
             u = self.plan.length * self.model.displacement(state.u, point) @ rotation(self.plan.azimuth)
             found |= {f"{point}_u{axis}": float(c) for axis, c in zip("xyz", u, strict=True)}

@@ -22,6 +22,8 @@ from magshell_fenicsx.models.shell.terms import TermFactory
 from magshell_fenicsx.models.solid.model import SolidModel
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.scene import Scene
+from magshell_fenicsx.simulate.stage import Stage, plain
+from magshell_fenicsx.simulate.steps import stage_of
 from magshell_fenicsx.simulate.transfer import same_mesh, transfer
 
 DEFECT = "defect.amplitude"
@@ -40,11 +42,22 @@ def fold_at(scene: Scene, record: Record) -> Fold:
     """
     if record.label != "fold":
         raise ValueError(f"this record is no fold, but a {record.label}")
-    return find_fold(scene.newton, Guess(record.point.state), record.amplitude)
+    stage = stage_at(scene, record)
+    return find_fold(stage.newton, Guess(stage.enter(record.point.state)), record.amplitude)
 
 
-def sensitivities(scene: Scene, fold: Fold) -> dict[str, float]:
+def stage_at(scene: Scene, record: Record) -> Stage:
+    """The solver of a record's step, which holds what the step holds."""
+    return stage_of(scene, scene.case.programme[record.step - 1], record.point.state) if record.step else plain(scene)
+
+
+def sensitivities(scene: Scene, fold: Fold, record: Record | None = None) -> dict[str, float]:
     """Derivatives of a fold's amplitude (p/p_c for pressure, so d k_d); collective.
+
+    Parameters
+    ----------
+    record
+        The record of the fold, if its step holds conjugates.
 
     Returns
     -------
@@ -56,22 +69,27 @@ def sensitivities(scene: Scene, fold: Fold) -> dict[str, float]:
       dimple's rim or outside it ("remanence" where there is no dimple). Their sum is lambda_m times
       the derivative in lambda_m.
     """
-    system, state = scene.model.system, fold.state
+    stage = stage_at(scene, record) if record else plain(scene)
+    system, state = stage.newton.system, fold.state
     columns = {name: system.load(state.u, state.mu, name) for name in state.mu if name != fold.name}
-    columns |= _remanence_columns(scene, fold)
+    by_patch = _remanence_columns(scene, replace(fold, state=stage.leave(state)))
+    columns |= {name: stage.padded(column) for name, column in by_patch.items()}
     found = {name: sensitivity(system, fold, column) for name, column in columns.items()}
-    return found | ({DEFECT: _to_defect(scene, fold)} if scene.case.defect else {})
+    return found | ({DEFECT: _to_defect(stage, fold)} if scene.case.defect else {})
 
 
-def _to_defect(scene: Scene, fold: Fold) -> float:
+def _to_defect(stage: Stage, fold: Fold) -> float:
     """The derivative in delta/h by central differences of the residual; only r0 on the mesh depends on delta."""
+
+    scene, size = stage.scene, stage.scene.model.system.size
 
     def out_of_balance(change: float) -> float:
         other = Scene(deepened(scene.case, change), scene.comm, terms=scene.plan.own)
         assert same_mesh(scene, other)
-        u, left = (transfer(scene, other, v) for v in (fold.state.u, fold.left))
-        moved = replace(fold, state=State(u, fold.state.mu), left=left)
-        return sensitivity(other.model.system, moved, other.model.system.residual(u, fold.state.mu))
+        vectors = (fold.state.u, fold.left)
+        u, left = (np.concatenate([transfer(scene, other, v[:size]), v[size:]]) for v in vectors)
+        moved, system = replace(fold, state=State(u, fold.state.mu), left=left), stage.on(other).newton.system
+        return sensitivity(system, moved, system.residual(u, fold.state.mu))
 
     return (out_of_balance(DEFECT_STEP) - out_of_balance(-DEFECT_STEP)) / (2 * DEFECT_STEP)
 

@@ -1,13 +1,14 @@
 """The solver of a step of a programme."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
-from magshell_fenicsx.continuation.along import Along
-from magshell_fenicsx.continuation.device import Device
+from magshell_fenicsx.continuation.along import Along, Curve
+from magshell_fenicsx.continuation.device import Conjugate, Device, natural_scale
 from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.path import Control, Path, StepOptions
 from magshell_fenicsx.continuation.point import Point
-from magshell_fenicsx.continuation.system import State
+from magshell_fenicsx.continuation.system import State, System, Vector
 from magshell_fenicsx.simulate.record import Stopped
 from magshell_fenicsx.simulate.scene import Scene
 
@@ -31,6 +32,11 @@ class Stage:
     device: Device | None = None
     along: Along | None = None
 
+    def enter(self, state: State) -> State:
+        """A state of the model as a state of the step's system."""
+        state = self.device.enter(state) if self.device else state
+        return self.along.contract(state) if self.along else state
+
     def leave(self, state: State) -> State:
         """A state of the step's system as a state of the model."""
         state = self.along.expand(state) if self.along else state
@@ -41,6 +47,17 @@ class Stage:
         du = self.device.displacement(point.du) if self.device else point.du
         return replace(point, state=self.leave(point.state), du=du)
 
+    def on(self, scene: Scene) -> "Stage":
+        """The same step on another scene, with the same values of what is held."""
+        system: System = scene.model.system
+        device = self.device.on(system) if self.device else None
+        along = self.along.on(device or system) if self.along else None
+        return Stage(scene, scene.newton.on(along or device or system), device, along)
+
+    def padded(self, u: Vector) -> Vector:
+        """A vector of the model as one of the step's system."""
+        return self.device.padded(u) if self.device else u
+
     def path(self, name: str, control: Control, options: StepOptions, scale: float = 1.0) -> Path:
         """A path of the step's system.
 
@@ -49,25 +66,68 @@ class Stage:
         Stopped
             If the volume is prescribed where none is conjugate to the pressure.
         """
-        open_at = self.scene.model.without_potential
-        if control == "conjugate" and name == "pressure" and open_at:
-            raise Stopped(
-                f"control by volume: a pressure that follows the free edge {open_at[0]} is conjugate to no volume: "
-                "use control: arc or control: load"
-            )
+        if control == "conjugate":
+            _refuse_open(self.scene, name)
         return Path(self.newton, name, control, options, scale, self.scene.journal, self.scene.progress)
 
     def begin(self, name: str, control: Control, state: State, first: float, scale: float = 1.0) -> tuple[Path, Point]:
-        """A path from a state in equilibrium; its first step changes the amplitude by about `first`.
+        """A path from a state of the model in equilibrium; its first step changes the amplitude by about `first`.
 
         `scale` is that of `Path`.
         """
+        return self.resume(name, control, self.enter(state), first, scale)
+
+    def resume(self, name: str, control: Control, state: State, first: float, scale: float = 1.0) -> tuple[Path, Point]:
+        """The same from a state of the step's system."""
         path = self.path(name, control, StepOptions(1.0, 1.0, 1.0), abs(scale))
         start = path.start(state, first)
         step = abs(first / start.dmu)
         return path.in_steps(StepOptions(step, (LONGEST if control == "arc" else 2) * step, 1e-5 * step)), start
 
 
+def _refuse_open(scene: Scene, name: str) -> None:
+    if name == "pressure" and (open_at := scene.model.without_potential):
+        raise Stopped(
+            f"a volume cannot be held or prescribed: a pressure that follows the free edge {open_at[0]} is conjugate "
+            "to none: use control: arc or control: load"
+        )
+
+
 def plain(scene: Scene) -> Stage:
     """A stage in which all other amplitudes are loads."""
     return Stage(scene, scene.newton)
+
+
+def staged(
+    scene: Scene,
+    state: State,
+    held: Mapping[str, float | Conjugate] | None = None,
+    curves: tuple[str, Mapping[str, Curve], float] | None = None,
+) -> Stage:
+    """The stage of a step.
+
+    Parameters
+    ----------
+    state
+        A state in equilibrium.
+    held
+        Amplitude -> its conjugate, see `Device`.
+    curves
+        Name of an amplitude, the amplitudes that are functions of it, and its value at the state.
+
+    Raises
+    ------
+    Stopped
+        If the volume is held where none is conjugate to the pressure.
+    """
+    for name in held or ():
+        _refuse_open(scene, name)
+    system: System = scene.model.system
+    device, along = None, None
+    if held:
+        factors = scene.newton.factor_at(state)
+        scale = {name: natural_scale(system, factors, state, name) for name in held}
+        system = device = Device(system, held, scale)
+    if curves:
+        system = along = Along(system, *curves)
+    return Stage(scene, scene.newton.on(system) if held or curves else scene.newton, device, along)

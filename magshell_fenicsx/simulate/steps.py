@@ -1,36 +1,102 @@
-"""The steps of a history, one for each kind of load."""
+"""The steps of a programme: what is held, what is driven, and the records of the way."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
+from math import acos
 
 import numpy as np
 
-from magshell_fenicsx.case.loading import (
-    DeadSection,
-    FieldSection,
-    IndentationSection,
-    PathSection,
-    PressureSection,
-    RotationSection,
-)
-from magshell_fenicsx.continuation.along import Along
-from magshell_fenicsx.continuation.path import Control, Quantity, StepOptions
+from magshell_fenicsx.case.loading import ProgrammeStep
+from magshell_fenicsx.case.loads.field import FieldBefore, FieldSection, RotationSection
+from magshell_fenicsx.case.loads.step import Gas, Now, PathStep
+from magshell_fenicsx.continuation.device import Conjugate
+from magshell_fenicsx.continuation.path import StepOptions
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.continuation.walk import MOST_STEPS, Goal
+from magshell_fenicsx.simulate.direction import circle, field_angle, field_at, straight
+from magshell_fenicsx.simulate.gas import gas
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
-from magshell_fenicsx.simulate.stage import Stage, plain
-from magshell_fenicsx.simulate.walked import followed
+from magshell_fenicsx.simulate.stage import Stage, staged
+from magshell_fenicsx.simulate.walked import Records, followed
 
-CONTROLS: dict[str, Control] = {"volume": "conjugate", "displacement": "conjugate", "load": "load", "arc": "arc"}
+LOCATED = ("fold", "bifurcation")
 
 
-def field(scene: Scene, state: State) -> Iterator[Record]:
-    """Increase the field to lambda_m; stop at the critical field if the shell becomes unstable."""
-    target, instability = scene.case.lambda_m, None
-    path, start = plain(scene).begin("lambda_m", "arc", state, target / 2, target)
-    for record in followed(plain(scene), path, start, Goal("limit", [target])):
-        located = record.label in ("fold", "bifurcation")
+def records_of(scene: Scene, step: ProgrammeStep, state: State) -> Records:
+    """The records of a step; its return value is the state at its end.
+
+    Raises
+    ------
+    Stopped
+        If the path is lost, or a field that should be stable is not.
+    """
+    load = step.load
+    if isinstance(load, RotationSection):
+        return (yield from _rotation(scene, step, load, state))
+    assert isinstance(load, PathStep)
+    stage = stage_of(scene, step, state)
+    drive = load.drive(_now(scene, step, state))
+    if step.name == "pressure" and scene.model.without_potential and "control" not in load.model_fields_set:
+        drive = replace(drive, control="arc")
+    path, start = stage.begin(step.name, drive.control, state, drive.first, drive.scale)
+    if drive.step is not None:
+        path = path.in_steps(StepOptions(drive.step, 2 * drive.step, 1e-4 * drive.step))
+    if drive.end is not None and not drive.targets and load.until == "target":  # it is there
+        yield Record("target", step.name, stage.point(start))
+        return state
+    steps = load.points if load.until == "points" else MOST_STEPS
+    goal = Goal(load.until, drive.targets, drive.quantity, steps, drive.first)
+    if not isinstance(load, FieldBefore):
+        return (yield from followed(stage, path, start, goal, branches=load))
+    return (yield from _field_before(followed(stage, path, start, replace(goal, until="limit")), drive.end or 0.0))
+
+
+def stage_of(scene: Scene, step: ProgrammeStep, state: State) -> Stage:
+    """The solver of a step, from any state of it."""
+    direction = scene.directions[step.number - 1]
+    curves = None
+    if isinstance(step.load, FieldSection) and direction[1:].any():
+        curves = (step.name, straight(direction), float(direction @ field_at(state)))
+    return staged(scene, state, _held(scene, step, state), curves)
+
+
+def _held(scene: Scene, step: ProgrammeStep, state: State) -> dict[str, float | Conjugate]:
+    """What is held besides loads, with the values of a state."""
+    held = dict[str, float | Conjugate]()
+    for name, how in step.load.hold.items():
+        if isinstance(how, Gas):
+            held[name] = gas(scene, how.gas, state)
+        elif how == "conjugate":
+            held[name] = -scene.model.system.potential(state.u, state.mu, name)
+    return held
+
+
+def _now(scene: Scene, step: ProgrammeStep, state: State) -> Now:
+    """The amplitude of a step where it begins."""
+    driven = any(step.name == other.name for other in scene.case.programme[: step.number - 1])
+    if isinstance(step.load, FieldSection):
+        value = float(scene.directions[step.number - 1] @ field_at(state))
+        return Now(value, 0.0, 0.0, driven, scene.case.lambda_m)
+    conjugate = -scene.model.system.potential(state.u, state.mu, step.name)
+    return Now(state.mu[step.name], conjugate, scene.conjugate_unit(step.name), driven, 1.0)
+
+
+class _Walked:
+    """Records to iterate over once; `end` is the state at their end."""
+
+    def __init__(self, records: Records) -> None:
+        self._records, self.end = records, State(np.empty(0), {})
+
+    def __iter__(self) -> Iterator[Record]:
+        self.end = yield from self._records
+
+
+def _field_before(records: Records, target: float) -> Records:
+    """The records of a field that must not make the shell unstable."""
+    instability, walked = None, _Walked(records)
+    for record in walked:
+        located = record.label in LOCATED
         instability = instability or (record if located else None)
         yield record if located else replace(record, label="field")
     if instability is not None:
@@ -38,95 +104,21 @@ def field(scene: Scene, state: State) -> Iterator[Record]:
             f"the field alone makes the shell unstable: critical field lambda_m = "
             f"{instability.point.state.mu['lambda_m']:.9g} of {target:g} ({instability.mode or instability.label})"
         )
+    return walked.end
 
 
-def field_as_load(scene: Scene, loading: FieldSection, state: State) -> Iterator[Record]:
-    target = scene.case.lambda_m
-    path, start = plain(scene).begin("lambda_m", CONTROLS[loading.control], state, target / loading.points, target)
-    targets = _divided(0.0, target, loading.points) if loading.until == "target" else []
-    yield from followed(plain(scene), path, start, _goal(loading, targets, "load", target), branches=loading)
-
-
-def pressure(scene: Scene, loading: PressureSection, state: State) -> Iterator[Record]:
-    chosen = "control" in loading.model_fields_set or not scene.model.without_potential
-    path, start = plain(scene).begin("pressure", CONTROLS[loading.control] if chosen else "arc", state, 0.1)
-    targets: list[float] = []
-    if loading.pressure is not None:
-        targets = _divided(0.0, loading.pressure, loading.points)
-    elif loading.volume_change is not None:
-        unit = -scene.plan.material.classical_pressure / scene.plan.material.h / scene.model.multiplicity
-        now = -scene.newton.system.potential(state.u, state.mu, "pressure")
-        targets = _divided(now, loading.volume_change * unit, loading.points)
-    quantity: Quantity = "load" if loading.pressure is not None else "conjugate"
-    yield from followed(plain(scene), path, start, _goal(loading, targets, quantity), branches=loading)
-
-
-def indentation(scene: Scene, loading: IndentationSection, state: State) -> Iterator[Record]:
-    unit = scene.model.force_unit * scene.plan.material.h  # of -Pi_F = F w at F R/(2 pi D) = 1, w = h
-    asked = next((value for value in (loading.force, loading.depth) if value is not None), 1.0)
-    quantity: Quantity = "conjugate" if loading.force is None else "load"
-    first = asked / loading.points if loading.control == "load" else float(np.copysign(1.0, asked))
-    path, start = plain(scene).begin("force", CONTROLS[loading.control], state, first)
-    if loading.control == "displacement":
-        path = path.in_steps(StepOptions(unit, 2 * unit, 1e-3 * unit))
-    targets: list[float] = []
-    if loading.until == "target":
-        end = asked if quantity == "load" else unit * asked
-        # the field may have moved the point past the first targets already
-        now = 0.0 if quantity == "load" else -scene.newton.system.potential(state.u, state.mu, "force")
-        targets = [t for t in _divided(0.0, end, loading.points) if (t - now) * end > 0]
-    yield from followed(plain(scene), path, start, _goal(loading, targets, quantity, asked), branches=loading)
-
-
-def dead(scene: Scene, loading: DeadSection, state: State) -> Iterator[Record]:
-    quantity: Quantity = "load" if loading.displacement is None else "conjugate"
-    asked = next((value for value in (loading.factor, loading.displacement) if value is not None), 1.0)
-    # a displacement is prescribed through the work of the loads
-    end = asked if quantity == "load" else asked / scene.plan.length * scene.model.load_size
-    by_load = quantity == "load"
-    first = asked / loading.points if by_load else float(np.copysign(1e-3, asked))
-    path, start = plain(scene).begin("load", CONTROLS[loading.control], state, first)
-    if loading.control == "displacement" and not by_load:
-        step = abs(end) / loading.points
-        path = path.in_steps(StepOptions(step, 2 * step, 1e-4 * step))
-    targets = _divided(0.0, end, loading.points) if loading.until == "target" else []
-    yield from followed(plain(scene), path, start, _goal(loading, targets, quantity, asked), branches=loading)
-
-
-def rotation(scene: Scene, loading: RotationSection, state: State) -> Iterator[Record]:
-    magnetic = scene.case.magnetic
-    assert magnetic is not None
-    total = float(np.arccos(magnetic.applied.vector() @ loading.to.vector()))
-    step, circle = total / loading.points, _circle(scene)
-    stage = Stage(scene, scene.newton.on(circle), along=circle)
-    others = {name: mu for name, mu in state.mu.items() if not name.startswith("lambda")}
-    path, start = stage.begin("angle", "arc", State(state.u, {"angle": 0.0, **others}), step, step)
-    for record in followed(stage, path, start, Goal("limit", _divided(0.0, total, loading.points))):
+def _rotation(scene: Scene, step: ProgrammeStep, load: RotationSection, state: State) -> Records:
+    before, after = scene.directions[step.number - 1 : step.number + 1]
+    size, total = float(before @ field_at(state)), acos(float(before @ after))
+    if size == 0:
+        raise Stopped("the field is zero and cannot turn")
+    stage = staged(scene, state, _held(scene, step, state), ("angle", circle(size, before, after), 0.0))
+    path, start = stage.begin("angle", "arc", state, total / load.points, total / load.points)
+    targets = [float(t) for t in np.linspace(0.0, total, load.points + 1)[1:]]
+    walked = _Walked(followed(stage, path, start, Goal("limit", targets)))
+    for record in walked:
         yield record
-        if record.label in ("fold", "bifurcation"):
-            mu, kind = record.point.state.mu, record.mode or record.label
-            angle = np.degrees(np.arctan2(mu["lambda_across"], mu["lambda_m"]) % (2 * np.pi))
+        if record.label in LOCATED:
+            angle, kind = field_angle(record.point.state.mu) % 360, record.mode or record.label
             raise Stopped(f"the turning field makes the shell unstable at {angle:.4g} degrees: {kind}")
-
-
-def _circle(scene: Scene) -> Along:
-    """The amplitudes of the applied field as functions of its angle, at constant magnitude."""
-    lambda_m, system = scene.case.lambda_m, scene.model.system
-    return Along(
-        system,
-        "angle",
-        {
-            "lambda_m": lambda t: (lambda_m * np.cos(t), -lambda_m * np.sin(t), -lambda_m * np.cos(t)),
-            "lambda_across": lambda t: (lambda_m * np.sin(t), lambda_m * np.cos(t), -lambda_m * np.sin(t)),
-        },
-    )
-
-
-def _divided(start: float, end: float, points: int) -> list[float]:
-    """`points` equidistant targets, the last of them `end`."""
-    return [float(t) for t in np.linspace(start, end, points + 1)[1:]]
-
-
-def _goal(loading: PathSection, targets: Sequence[float], quantity: Quantity, sense: float = 1.0) -> Goal:
-    steps = loading.points if loading.until == "points" else MOST_STEPS
-    return Goal(loading.until, targets, quantity, steps, sense)
+    return walked.end

@@ -1,14 +1,15 @@
 """A walk along a path of a scene: its records, the modes that the model excludes, and branches."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Generator, Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
 
-from magshell_fenicsx.case.loading import PathSection
+from magshell_fenicsx.case.loads.step import PathStep
 from magshell_fenicsx.continuation.branch import Branching, branching
 from magshell_fenicsx.continuation.path import Path, StepOptions
 from magshell_fenicsx.continuation.point import PathStopped, Point
+from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.continuation.walk import Goal, Walk
 from magshell_fenicsx.continuation.watch import Crossing
 from magshell_fenicsx.simulate.record import Record, Stopped
@@ -17,9 +18,10 @@ from magshell_fenicsx.simulate.stage import LONGEST, Stage
 BEYOND = 2.0  # a walk ends at this multiple of the load of the first excluded instability
 
 
-def followed(
-    stage: Stage, path: Path, start: Point, goal: Goal, branches: PathSection | None = None
-) -> Iterator[Record]:
+Records = Generator[Record, None, State]  # records, and the model's state at the end
+
+
+def followed(stage: Stage, path: Path, start: Point, goal: Goal, branches: PathStep | None = None) -> Records:
     """The records of a walk, with instabilities that the reduced model excludes, and of requested branches.
 
     With `until: bifurcation` an excluded instability ends the walk. With `until: limit` the walk continues to the first
@@ -30,15 +32,16 @@ def followed(
     Stopped
         If the path is lost.
     """
-    for record in _followed(stage, path, start, goal, branches):
+    walk = Walk(path, start, goal)
+    for record in _followed(stage, walk, branches):
         yield replace(record, point=stage.point(record.point))
+    return stage.leave(walk.points[-1].state)
 
 
-def _followed(
-    stage: Stage, path: Path, start: Point, goal: Goal, branches: PathSection | None = None
-) -> Iterator[Record]:
+def _followed(stage: Stage, walk: Walk, branches: PathStep | None) -> Iterator[Record]:
     stage.scene.progress.doing("looking for modes that the model excludes")
-    walk, crossing, lost, watch = Walk(path, start, goal), None, "", stage.scene.watch
+    path, start, goal = walk.path, walk.points[0], walk.goal
+    crossing, lost, watch = None, "", stage.scene.watch
     furthest = np.inf  # amplitude, once an excluded mode is unstable
     watch.begin(path, start, stage.leave)
     try:
@@ -108,7 +111,7 @@ def _by_arc(stage: Stage, path: Path) -> Path:
 def _fold_ahead(stage: Stage, path: Path, points: list[Point]) -> list[Record]:
     """The fold that ended a path under load control, located by arc length, after any excluded instabilities."""
     onward = points[-1].s - points[-2].s if len(points) > 1 else 1.0
-    by_arc, start = stage.begin(path.name, "arc", points[-1].state, onward, path.metric.scale)
+    by_arc, start = stage.resume(path.name, "arc", points[-1].state, onward, path.metric.scale)
     stage.scene.watch.begin(by_arc, start, stage.leave)
     found: list[Record] = []
     try:

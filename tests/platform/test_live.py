@@ -155,26 +155,32 @@ def test_time_left_of_a_resumed_run(monkeypatch: pytest.MonkeyPatch) -> None:
     told: list[str] = []
     clock = iter(range(0, 1000, 10))
     monkeypatch.setattr(time, "perf_counter", lambda: next(clock))
-    progress = RunProgress(SimpleNamespace(case=case, plan=plan), told.append, -30.0)  # type: ignore[arg-type]
+    scene = SimpleNamespace(case=case, plan=plan, extra_columns=())
+    progress = RunProgress(scene, told.append, -30.0)  # type: ignore[arg-type]
     here = SimpleNamespace(du=np.array([0.0, -0.5]))
-    row = {"lambda_m": 0.00092, "w_over_h": -0.03}
-    for label, w, known in (("field", -0.03, True), ("step", 8.0, True), ("step", 12.0, False), ("step", 14.0, False)):
-        progress.accepted({**row, "label": label, "w_over_h": w}, known=known)
+    row = {"lambda_m": 0.0, "w_over_h": 0.0}
+    progress.accepted({**row, "label": "start"}, known=True)
+    progress.beginning(1)
+    progress.accepted({**row, "label": "field", "lambda_m": 0.00092}, known=True)
+    progress.trying(here, 0.02)  # type: ignore[arg-type]
+    progress.beginning(2)
+    for w, known in ((8.0, True), (12.0, False), (14.0, False)):
+        progress.accepted({**row, "label": "step", "w_over_h": w}, known=known)
         progress.trying(here, 0.02)  # type: ignore[arg-type]
     assert told == [
-        "1 point  lambda_m 0.00092 -> 0.00184  step 1 h  0:40",
-        "2 points  w/h 8 -> 20  step 1 h  1:00",
-        "3 points  w/h 12 -> 20  step 1 h  1:20, about 0:30 left",  # 4 of 12 took 20 s: 40 s, 10 s ago
-        "4 points  w/h 14 -> 20  step 1 h  1:40, about 0:30 left",
+        "2 points  lambda_m 0.00092 -> 0.00184  step 1 h  0:50",
+        "3 points  w/h 8 -> 20  step 1 h  1:10",
+        "4 points  w/h 12 -> 20  step 1 h  1:30, about 0:30 left",  # 4 of 12 took 20 s: 40 s, 10 s ago
+        "5 points  w/h 14 -> 20  step 1 h  1:50, about 0:30 left",
     ]
 
 
 def test_where_a_path_leads() -> None:
     """To a value, through a number of steps, or nobody knows how far."""
     row = {"p_over_pc": 0.25, "w_over_h": 5.0}
-    assert Aim("w_over_h", 20.0).part(row, 7) == 0.25
-    assert Aim("w_over_h", words="28 steps", steps=28).part(row, 7) == 0.25
-    assert Aim("p_over_pc", words="the first instability").part(row, 7) is None
+    assert Aim("w_over_h", 21.0).part({"w_over_h": 1.0}, row, 7) == 0.2
+    assert Aim("w_over_h", words="28 steps", steps=28).part(row, row, 7) == 0.25
+    assert Aim("p_over_pc", words="the first instability").part(row, row, 7) is None
     assert Aim("p_over_pc", words="the first instability").text(row) == "p/pc 0.25 -> the first instability"
     assert time_left((0.0, 10.0), (0.25, 20.0)) == 30.0
     assert time_left((0.2, 10.0), (0.4, 20.0)) == pytest.approx(30.0)

@@ -14,8 +14,8 @@ from magshell_fenicsx.models.shell.kinematics import Jet
 from magshell_fenicsx.models.shell.parameters import AreaForce, DeadLoad, EdgeForce, EdgeMoment, PointForce
 
 
-def dead_loads(loads: Sequence[DeadLoad], factory: EnergyFactory, log: KernelLog) -> tuple[Energy, float]:
-    """All but the moments, with the amplitude "load", and the sum of their sizes over E h R.
+def dead_loads(name: str, loads: Sequence[DeadLoad], factory: EnergyFactory, log: KernelLog) -> tuple[Energy, float]:
+    """All except the moments, with an amplitude's name, and the sum of their sizes over E h R.
 
     Vectors are along e3, and points are on the axis.
     """
@@ -41,14 +41,14 @@ def dead_loads(loads: Sequence[DeadLoad], factory: EnergyFactory, log: KernelLog
     def energy(u: Jet) -> ufl.Form:
         return sum((over(-ufl.dot(along, u.r)) for along, over in parts[1:]), parts[0][1](-ufl.dot(parts[0][0], u.r)))
 
-    return Energy("load", energy, "load", linear=True), size
+    return Energy(name, energy, name, linear=True), size
 
 
-def pole_force(patch: float, unit: float, factory: EnergyFactory, log: KernelLog) -> Energy:
-    """A force against e3 at the pole, or spread over a patch of that radius, with the amplitude "force"."""
+def pole_force(name: str, patch: float, unit: float, factory: EnergyFactory, log: KernelLog) -> Energy:
+    """A force against e3 at the pole, or spread over a patch of that radius."""
     over = factory.patch(patch) if patch else factory.at_pole()
     share = factory.constant(unit / _whole(over, factory, log))
-    return Energy("force", lambda u: over(share * u.r[2]), "force", linear=True)
+    return Energy(name, lambda u: over(share * u.r[2]), name, linear=True)
 
 
 def _whole(over: Integral, factory: EnergyFactory, log: KernelLog) -> float:

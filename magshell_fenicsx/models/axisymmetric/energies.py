@@ -97,10 +97,10 @@ class EnergyFactory:
         """A plane normal to e3 mirrors the shell at some ends."""
         return self._ends("mirror edges", edges.symmetric, facets, self.constant(np.array([0.0, 0.0, 1.0])))
 
-    def moment(self, name: str, facets: Facets, density: Density) -> Energy:
-        """A moment per length about an edge, with the amplitude "load"; `density` as of `TermFactory.edge_moment`."""
+    def moment(self, name: str, facets: Facets, density: Density, amplitude: str) -> Energy:
+        """A moment per length about an edge; `density` as of `TermFactory.edge_moment`."""
         j0, ds, m, width = self.j0, self._ds(facets), self._covector(), self._width()
-        return Energy(name, lambda u: density.of(j0, u, m, width, *density.parameters) * ds, "load")
+        return Energy(name, lambda u: density.of(j0, u, m, width, *density.parameters) * ds, amplitude)
 
     def magnetic(self, field: Magnetisation) -> list[Energy]:
         """The terms of the chosen energy for axisymmetric fields; all have the amplitude lambda_m."""

@@ -103,15 +103,17 @@ class MeridianModel(Observed):
         self.energies += [factory.own(term) for term in loads.own]
         u = jets.revolved(self.u)
         self.observed = self.kernels.compile_all(factory.observed(term, u) for term in loads.own)
-        if loads.force:
-            self.energies.append(pole_force(loads.force.patch, self.force_unit, factory, self.kernels))
-        moments = [load for load in loads.dead if isinstance(load, EdgeMoment)]
-        if len(loads.dead) > len(moments):
-            dead, self.load_size = dead_loads(loads.dead, factory, self.kernels)
-            self.energies.append(dead)
+        for name, force in loads.forces.items():
+            self.energies.append(pole_force(name, force.patch, self.force_unit, factory, self.kernels))
+        self.load_size = {}
+        for name, dead in loads.dead.items():
+            if not all(isinstance(load, EdgeMoment) for load in dead):
+                energy, self.load_size[name] = dead_loads(name, dead, factory, self.kernels)
+                self.energies.append(energy)
         terms = [self._term(e) for e in self.energies]
-        for i, load in enumerate(moments):
-            terms.append(self._moment(f"moment {load.edge} {i}", load))
+        for name, dead in loads.dead.items():
+            moments = [load for load in dead if isinstance(load, EdgeMoment)]
+            terms += [self._moment(f"{name} moment {load.edge} {i}", load, name) for i, load in enumerate(moments)]
         pattern, held = next(term for term in terms if term.name == INTERIOR), self.supports.held(V)
         parameters = free_parameters(
             loads.own,
@@ -138,13 +140,13 @@ class MeridianModel(Observed):
         work = 2 * np.pi * e.work(u, v) if e.work else None
         return FormTerm(e.name, 2 * np.pi * e.of(u), self.u, self.kernels, e.amplitude, linear=e.linear, work=work)
 
-    def _moment(self, name: str, load: EdgeMoment) -> Counted:
+    def _moment(self, name: str, load: EdgeMoment, amplitude: str) -> Counted:
         facets, constant = self.meridian.ends[load.edge], self.factory.constant
         past = constant(np.array([1.0, 0.0]))
         density = Density(edges.turning, (constant(load.moment), past), facets=facets)
-        e = self.factory.moment(name, facets, density)
+        e = self.factory.moment(name, facets, density, amplitude)
         self.energies.append(e)
         length = 2 * np.pi * self.meridian.section(np.array([self.meridian.parameter(load.edge)]))[0, 0]
-        term = Counted(name, 2 * np.pi * e.of(jets.revolved(self.u)), self.u, self.kernels, "load")
+        term = Counted(name, 2 * np.pi * e.of(jets.revolved(self.u)), self.u, self.kernels, amplitude)
         term.count_from(past, load.moment * length)
         return term

@@ -102,6 +102,7 @@ class ShellModel(Observed):
             remanent = by_patch(loads.magnetic.patches, midsurface.patches, cells)
             loads = replace(loads, magnetic=replace(loads.magnetic, remanent=remanent))
         self.midsurface, self.material, self.degree, self.loads = midsurface, material, degree, loads
+        self.load_size = {}
         self.multiplicity = 2 if "symmetry" in conditions.values() else 1
         self.kernels = KernelLog()
         self.V = V = fem.functionspace(midsurface.mesh, ("Lagrange", degree, (3,)))
@@ -156,14 +157,14 @@ class ShellModel(Observed):
         terms += [factory.own(term) for term in loads.own]
         self.observed = self.kernels.compile_all(factory.observed(term) for term in loads.own)
         self.normals = {name: vertex_normal(self.r0, x) for name, x in midsurface.points.items()}
-        if loads.force:
-            terms.append(self._force(loads.force))
-        if loads.dead:
-            on = SurfaceMeasures(self.r0, midsurface, degree)
-            terms.append(self.load_with(assemble_dead_loads(loads.dead, V, on, self.kernels)))
-            moments = [load for load in loads.dead if isinstance(load, EdgeMoment)]
+        terms += [self._force(name, force) for name, force in loads.forces.items()]
+        on = SurfaceMeasures(self.r0, midsurface, degree) if loads.dead else None
+        for name, dead in loads.dead.items():
+            assert on
+            terms.append(self.load_with(name, assemble_dead_loads(dead, V, on, self.kernels)))
+            moments = [load for load in dead if isinstance(load, EdgeMoment)]
             terms += [
-                factory.edge_moment(f"moment {load.edge} {i}", midsurface.edges[load.edge], load.moment)
+                factory.edge_moment(f"{name} moment {load.edge} {i}", midsurface.edges[load.edge], load.moment, name)
                 for i, load in enumerate(moments)
             ]
         self._sites = make_sites(self.r0, degree, terms, self.kernels, factory.prestress())
@@ -196,13 +197,13 @@ class ShellModel(Observed):
             )
         )
 
-    def _force(self, force: Force) -> LinearTerm:
+    def _force(self, name: str, force: Force) -> LinearTerm:
         x, inward = self.midsurface.points[force.point], -self.normals[force.point]
         if force.patch:
             entries = patch_entries(self.r0, x, force.patch, inward, self.degree, self.kernels)
         else:
             entries = point_entries(self.V, x, inward)
-        return LinearTerm("force", entries[0], self.force_unit * entries[1], self.u, "force")
+        return LinearTerm(name, entries[0], self.force_unit * entries[1], self.u, name)
 
 
 def _held(V: fem.FunctionSpace, facets: NDArray[np.int32]) -> fem.DirichletBC:

@@ -1,7 +1,7 @@
 """What a shell is made of and what loads it, dimensionless."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -20,6 +20,7 @@ class Held:
 
 # "symmetry" is the mirror plane of a half model, "plane" one that belongs to the shell as it is described
 Condition = Literal["clamped", "simply supported", "free", "symmetry", "plane"] | Held
+ACROSS = ("lambda_across", "lambda_third")
 MagneticEnergy = Literal["full", "first", "torque", "second", "second_consistent"]
 
 
@@ -68,8 +69,8 @@ class Magnetisation:
     gradient
         (3, 3) of the applied flux density, which is applied + gradient . r; None if uniform.
     across
-        Unit vector (3,) normal to `applied` that the field turns towards, with the amplitude
-        "lambda_across"; None if it does not turn.
+        Vectors (3,), normal to `applied` and to each other, that the field turns towards, with the amplitudes of
+        `ACROSS`.
     energy
         The full energy, or which of the paper's approximations takes its place.
     patches
@@ -82,7 +83,7 @@ class Magnetisation:
     applied: NDArray[np.float64]
     energy: MagneticEnergy = "full"
     gradient: NDArray[np.float64] | None = None
-    across: NDArray[np.float64] | None = None
+    across: tuple[NDArray[np.float64], ...] = ()
     patches: Mapping[str, NDArray[np.float64]] | None = None
     layers: tuple[tuple[float, NDArray[np.float64]], ...] = ()
 
@@ -128,13 +129,29 @@ DeadLoad = PointForce | EdgeForce | EdgeMoment | AreaForce
 
 @dataclass(frozen=True)
 class Loads:
-    """What loads the shell; None or False: no term, no kernel."""
+    """What loads the shell; what is empty, None or False has no term and no kernel.
+
+    Attributes
+    ----------
+    forces, dead
+        Amplitude -> the force, or the dead loads that grow together.
+    """
 
     pressure: bool = False
-    force: Force | None = None
+    forces: Mapping[str, Force] = field(default_factory=dict)
     magnetic: Magnetisation | None = None
-    dead: tuple[DeadLoad, ...] = ()
+    dead: Mapping[str, tuple[DeadLoad, ...]] = field(default_factory=dict)
     own: tuple[OwnTerm, ...] = ()
+
+    @property
+    def all_dead(self) -> tuple[DeadLoad, ...]:
+        """The dead loads of all amplitudes."""
+        return tuple(load for loads in self.dead.values() for load in loads)
+
+    @property
+    def displaced(self) -> str | None:
+        """The amplitude with the displacement that the column w_over_h has; None if that is the pole's."""
+        return next(iter((*self.forces, *self.dead)), None)
 
 
 def default_penalty(degree: int) -> float:

@@ -64,7 +64,7 @@ def refuse_unknown(
         if name not in allowed:
             there = ", ".join(sorted(allowed)) or "none"
             raise MeshError(f"boundary.{name}: the surface has no such edge, only {there}")
-    for load in loads.dead:
+    for load in loads.all_dead:
         edge = getattr(load, "edge", None)
         if edge is not None and edge not in edges:
             there = ", ".join(sorted(edges)) or "none"

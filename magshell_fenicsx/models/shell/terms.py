@@ -26,7 +26,7 @@ from magshell_fenicsx.models.shell.free import Constants, constants_of
 from magshell_fenicsx.models.shell.kinematics import CURVED, MOVED, SECOND, Jet
 from magshell_fenicsx.models.shell.moment import MomentTerm
 from magshell_fenicsx.models.shell.own_term import OwnTerm
-from magshell_fenicsx.models.shell.parameters import MagneticEnergy, Magnetisation, Material
+from magshell_fenicsx.models.shell.parameters import ACROSS, MagneticEnergy, Magnetisation, Material
 from magshell_fenicsx.models.shell.patterns import pattern_field
 from magshell_fenicsx.models.shell.thickness import thick
 
@@ -91,15 +91,15 @@ class TermFactory:
         parameters = (*self._penalised(), self._constant(normal))
         return self._edges(name, self._thick(Density(edges.symmetric, parameters, CURVED, SECOND, facets), 1))
 
-    def edge_moment(self, name: str, facets: NDArray[np.int32], intensity: float) -> MomentTerm:
-        """A moment per length about the edge's first tangent, with the amplitude "load"; in E h R."""
+    def edge_moment(self, name: str, facets: NDArray[np.int32], intensity: float, amplitude: str) -> MomentTerm:
+        """A moment per length about the edge's first tangent; in E h R."""
         past = self._constant(np.array([1.0, 0.0]))
         density = Density(edges.turning, (self._constant(intensity), past), facets=facets)
         energy = density.of(*self._jets(), *self._edge_geometry(), *density.parameters) * self._ds(facets)
         along = kin.conormal(self._jets()[0], self._edge_geometry()[0])[2]
         length = self.log.compile(f"{name} length", along * self._ds(facets))
         total = self._domain.comm.allreduce(fem.assemble_scalar(length))
-        term = MomentTerm(name, density, energy, self.u, self.log, "load")
+        term = MomentTerm(name, density, energy, self.u, self.log, amplitude)
         term.count_from(past, intensity * total)
         return term
 
@@ -117,8 +117,7 @@ class TermFactory:
         pattern = field.remanent
         Br = pattern_field(pattern, self.r0) if callable(pattern) else self._constant(pattern)
         directions = [("lambda_m", "", field.applied)]
-        if field.across is not None:
-            directions.append(("lambda_across", " across", field.across))
+        directions += [(name, name.replace("lambda_", " "), Ba) for name, Ba in zip(ACROSS, field.across, strict=False)]
         terms = [
             self._cells(
                 name + suffix,

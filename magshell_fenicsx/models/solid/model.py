@@ -104,14 +104,18 @@ class SolidModel(Observed):
             self._terms += factory.pressure(material.classical_pressure, origin, potential=potential)
         self._terms += [factory.own(term) for term in loads.own]
         self.observed = self.kernels.compile_all(factory.observed(term) for term in loads.own)
-        if loads.force:
-            patch = outer_patch(body, V, loads.force.point, loads.force.patch, self.kernels)
-            self._terms.append(LinearTerm("force", patch[0], self.force_unit * patch[1], self.u, "force"))
-        if loads.dead:
-            on = BodyMeasures(body, V, self.kernels)
-            self._terms.append(self.load_with(assemble_dead_loads(loads.dead, V, on, self.kernels)))
-            moments = [load for load in loads.dead if isinstance(load, EdgeMoment)]
-            self._terms += [factory.moment(f"moment {m.edge} {i}", m.edge, m.moment) for i, m in enumerate(moments)]
+        self.load_size = {}
+        for name, force in loads.forces.items():
+            patch = outer_patch(body, V, force.point, force.patch, self.kernels)
+            self._terms.append(LinearTerm(name, patch[0], self.force_unit * patch[1], self.u, name))
+        on = BodyMeasures(body, V, self.kernels) if loads.dead else None
+        for name, dead in loads.dead.items():
+            assert on
+            self._terms.append(self.load_with(name, assemble_dead_loads(dead, V, on, self.kernels)))
+            moments = [load for load in dead if isinstance(load, EdgeMoment)]
+            self._terms += [
+                factory.moment(f"{name} moment {m.edge} {i}", m.edge, m.moment, name) for i, m in enumerate(moments)
+            ]
         self._faces = [body.faces[n] for n, c in conditions.items() if c == "symmetry"]
         self.mirror = mirror
         self._sites = make_sites(body, self.r0, self._terms, self.kernels)

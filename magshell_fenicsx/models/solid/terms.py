@@ -19,7 +19,7 @@ from magshell_fenicsx.models.shell.free import Constants, constants_of
 from magshell_fenicsx.models.shell.kinematics import SECOND, Jet
 from magshell_fenicsx.models.shell.moment import Counted
 from magshell_fenicsx.models.shell.own_term import OwnTerm
-from magshell_fenicsx.models.shell.parameters import Magnetisation
+from magshell_fenicsx.models.shell.parameters import ACROSS, Magnetisation
 from magshell_fenicsx.models.solid import densities
 from magshell_fenicsx.models.solid.material import NeoHookean
 from magshell_fenicsx.models.solid.remanence import remanence_field
@@ -108,8 +108,7 @@ class TermFactory:
         pattern = of.remanent
         Br = remanence_field(pattern, self.u.function_space) if callable(pattern) else self._constants(pattern)[0]
         directions = [("lambda_m", "", of.applied)]
-        if of.across is not None:
-            directions.append(("lambda_across", " across", of.across))
+        directions += [(name, name.replace("lambda_", " "), Ba) for name, Ba in zip(ACROSS, of.across, strict=False)]
         terms = []
         for amplitude, suffix, Ba in directions:
             density = Density(densities.magnetic, (Br, *self._constants(Ba, self.h)))
@@ -163,15 +162,15 @@ class TermFactory:
         """Delta V/R^3 under the outer face of the modelled part."""
         return self._on_faces(list(self._enclosing(1.0, origin).values()))
 
-    def moment(self, name: str, edge: str, intensity: float) -> EndMoment:
-        """A moment per length in E h R about the first tangent of an edge, with the amplitude "load"."""
+    def moment(self, name: str, edge: str, intensity: float, amplitude: str) -> EndMoment:
+        """A moment per length in E h R about the first tangent of an edge."""
         Q = fem.functionspace(self.body.mesh, ("Lagrange", 2, (1,)))
         weight, past = fem.Function(Q), self._constants(np.array([1.0, 0.0]))[0]
         body = self.body
         weight.x.array[:] = body.at_nodes(Q, 6 * body.heights * (1 - body.heights) / body.thickness)
         parameters = (weight, *self._constants(intensity), past)
         density = Density(densities.turning, parameters, where="end", facets=self.body.faces[edge])
-        term = EndMoment(name, density, self._on_faces([density]), self.u, self.log, "load")
+        term = EndMoment(name, density, self._on_faces([density]), self.u, self.log, amplitude)
         length = self.log.compile("end length", weight[0] * face_measure(self.body.mesh, [self.body.faces[edge]])(1))
         term.count_from(past, intensity * self.body.mesh.comm.allreduce(fem.assemble_scalar(length)))
         return term

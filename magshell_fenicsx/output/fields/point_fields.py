@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.models.shell.parameters import Magnetisation, Material
+from magshell_fenicsx.models.shell.parameters import ACROSS, Magnetisation, Material
 from magshell_fenicsx.models.shell.strains import TangentFrame, bending_moment, principal
 from magshell_fenicsx.output.fields.interpretation import SurfaceGeometry, Torque, magnetic_loads
 
@@ -85,6 +85,6 @@ def _applied(field: Magnetisation, mu: Mapping[str, float], r: Array) -> Array:
     """The applied flux density (..., 3) at points r (..., 3)."""
     along = mu.get("lambda_m", 0.0)
     uniform = along * field.applied
-    if field.across is not None:
-        uniform = uniform + mu.get("lambda_across", 0.0) * field.across
+    for name, across in zip(ACROSS, field.across, strict=False):
+        uniform = uniform + mu.get(name, 0.0) * across
     return np.broadcast_to(uniform, r.shape) if field.gradient is None else uniform + along * r @ field.gradient.T

@@ -21,7 +21,8 @@ def located(lines: Sequence[Line]) -> list[Line]:
 
 def verdict(summary: Summary, lines: Sequence[Line]) -> Markup:
     """The result, and the reason if the run stopped early."""
-    until = (summary["case"].get("loading") or {}).get("until", "target")
+    loading = summary["case"].get("loading") or {}
+    until = (loading[-1] if isinstance(loading, list) else loading).get("until", "target")
     first = next((line for line in located(lines) if line["branch"] == "0"), None)
     sentences = [_end(summary, lines)] if not first or until in ("target", "points") else []
     if first:

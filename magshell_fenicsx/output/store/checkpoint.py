@@ -135,8 +135,10 @@ class Checkpoint:
         if isinstance(found, str):
             self._append(json.dumps({"failure": found}).encode())
             return
-        u, du = (self._ordering.gather(v) for v in (found.state.u, found.du))
-        self._append(_encoded(found, u, du))
+        size = self._ordering.size
+        beyond = [self._comm.bcast(v[size:].tolist(), root=self._comm.size - 1) for v in (found.state.u, found.du)]
+        u, du = (self._ordering.gather(v[:size]) for v in (found.state.u, found.du))
+        self._append(_encoded(found, u, du, beyond))
 
     def close(self) -> None:
         def close() -> None:
@@ -164,13 +166,16 @@ class Checkpoint:
         if "failure" in known:
             return str(known["failure"])
         u, du = (self._ordering.scatter(v) for v in np.split(np.frombuffer(data), 2))
+        beyond = known.pop("beyond")
+        if self._ordering.last:  # the numbers of a loading device
+            u, du = (np.concatenate([v, more]) for v, more in zip((u, du), beyond, strict=True))
         return Point(State(u, known.pop("mu")), du=du, **known)
 
 
-def _encoded(point: Point, u: Array, du: Array) -> bytes:
-    """A line of JSON with the numbers of a point, then its two vectors."""
+def _encoded(point: Point, u: Array, du: Array, beyond: list[list[float]]) -> bytes:
+    """A line of JSON with the numbers of a point, then its two vectors; `beyond` has their numbers without a node."""
     numbers = {f.name: getattr(point, f.name) for f in fields(point) if f.name not in ("state", "du")}
-    return json.dumps({**numbers, "mu": point.state.mu}).encode() + b"\n" + u.tobytes() + du.tobytes()
+    return json.dumps({**numbers, "mu": point.state.mu, "beyond": beyond}).encode() + b"\n" + u.tobytes() + du.tobytes()
 
 
 def _difference(there: Any, here: Any, key: str = "") -> str:

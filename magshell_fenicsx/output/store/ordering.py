@@ -34,6 +34,8 @@ class Ordering:
     ----------
     places
         (n, 3) positions in the order in use.
+    size, last
+        Number of values on this rank, and whether it is the last rank of the space.
     """
 
     def __init__(self, V: fem.FunctionSpace, comm: MPI.Comm, known: Array | None = None) -> None:
@@ -49,6 +51,7 @@ class Ordering:
         else:
             self.places, self._mine = known, self._found(known, mine, comm)
         self._parts = self._within.allgather(self._mine)
+        self.size, self.last = len(self._mine) * self._values, self._within.rank == self._within.size - 1
 
     def _found(self, known: Array, mine: Array, comm: MPI.Comm) -> NDArray[np.int64]:
         """The numbers of this rank's nodes among the known ones."""

@@ -1,9 +1,8 @@
 """The end of a run, and the same end on another mesh without computing the path."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
-from magshell_fenicsx.case.loading import DeadSection, IndentationSection, PathSection, PressureSection
 from magshell_fenicsx.continuation.control import GivenConjugate, GivenLoad, Row
 from magshell_fenicsx.continuation.fold import FoldLost, Guess, find_fold
 from magshell_fenicsx.continuation.system import State, System, Vector
@@ -11,6 +10,8 @@ from magshell_fenicsx.simulate.adapt.carry import NotCarried, carry
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
+
+FIELDS = ("lambda_m", "angle")  # amplitudes whose value is prescribed
 
 
 class NoResult(RuntimeError):
@@ -24,7 +25,8 @@ class Ending:
     Attributes
     ----------
     kind
-        A fold or a target can be computed directly; another instability needs the path.
+        A fold or a target can be computed directly; a target with another conjugate held ("held") and another
+        instability need the path.
     name
         The amplitude that varied.
     value
@@ -36,7 +38,7 @@ class Ending:
         The prescribed conjugate displacement; None if the load is prescribed.
     """
 
-    kind: Literal["fold", "target", "instability"]
+    kind: Literal["fold", "target", "held", "instability"]
     name: str
     value: float
     state: State
@@ -67,13 +69,15 @@ class History:
         NoResult
             If the history stopped before its target and not at an instability, or has no load.
         """
-        loading = scene.case.loading
-        until = loading.until if isinstance(loading, PathSection) else "target"
+        steps = scene.case.programme
+        until = steps[-1].until if steps else "target"
         if until in ("target", "points") and not stopped and self.last and self.last.amplitude:
-            return _target(scene, self.last)
+            found = _target(scene, self.last)
+            return replace(found, kind="held") if any(how != "load" for how in steps[-1].load.hold.values()) else found
         if not self.located:
             raise NoResult(stopped or "the case has neither a load nor a field")
-        end = self.located[-1 if until == "bifurcation" else 0]
+        in_last = [record for record in self.located if record.step == self.located[-1].step]
+        end = in_last[-1 if until == "bifurcation" else 0]
         if end.amplitude not in end.point.state.mu:
             raise NoResult("an instability of a turning field is not a single load")
         own_fold = end.label == "fold" and not end.mode
@@ -106,7 +110,7 @@ def from_near(scene: Scene, source: Scene, near: Ending) -> Ending:
     NoResult
         See `History.ending`.
     """
-    if near.kind == "instability":
+    if near.kind in ("held", "instability"):
         return by_path(scene)
     try:
         u, tangent = (carry(source, scene, v) for v in (near.state.u, near.tangent))
@@ -138,13 +142,10 @@ def _equilibrium(scene: Scene, guess: State, near: Ending) -> Ending | None:
 
 
 def _target(scene: Scene, record: Record) -> Ending:
-    system, state, loading = scene.newton.system, record.point.state, scene.case.loading
+    system, state, target = scene.newton.system, record.point.state, scene.case.programme[-1].load.target
     name = "lambda_across" if record.amplitude == "angle" else record.amplitude
-    given = loading.pressure if isinstance(loading, PressureSection) else 0.0
-    if isinstance(loading, IndentationSection | DeadSection):
-        given = loading.force if isinstance(loading, IndentationSection) else loading.factor
-    given_load = given is not None
-    held = None if given_load else -system.potential(state.u, state.mu, name)
+    by_conjugate = target is None or target[0].quantity == "conjugate"
+    held = -system.potential(state.u, state.mu, name) if by_conjugate and record.amplitude not in FIELDS else None
     return Ending("target", name, _value(system, state, name, held), state, record.point.du, held)
 
 

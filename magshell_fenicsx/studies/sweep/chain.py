@@ -12,7 +12,7 @@ from typing import Literal
 from mpi4py import MPI
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.loading import PressureSection
+from magshell_fenicsx.case.loads.pressure import PressureSection
 from magshell_fenicsx.case.surfaces import MeshSurface
 from magshell_fenicsx.continuation.fold import Fold, FoldLost
 from magshell_fenicsx.mesh.patch import MeshError

@@ -87,4 +87,4 @@ def indent(model: MeridianModel, depths: list[float]) -> list[float]:
     return [point.state.mu["force"] for point, reached in points if reached]
 
 
-POLE_FORCE = Loads(force=Force("pole"))
+POLE_FORCE = Loads(forces={"force": Force("pole")})

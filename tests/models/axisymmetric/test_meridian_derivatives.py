@@ -33,7 +33,7 @@ def ring() -> MeridianModel:
     dead = (EdgeForce("b", np.array([0.0, 0.0, 0.1]), total=False), AreaForce(None, 0.02), EdgeMoment("b", 0.03))
     meridian = make_meridian(trumpet, np.linspace(0, 1, 4), ("a", "b"), {"pole": (1.0, 0.0)})
     thickness = Thickness(lambda x, y, z: 1 + 0.5 * z**2)
-    loads = Loads(magnetic=ALONG_AXIS, dead=dead)
+    loads = Loads(magnetic=ALONG_AXIS, dead={"load": dead})
     return MeridianModel(meridian, Material(0.3, 0.05), 4, {"a": "plane"}, loads, thickness=thickness)
 
 

@@ -37,12 +37,12 @@ def test_pole_indentation() -> None:
 
 
 def test_patch_carries_the_whole_force_and_tends_to_the_point() -> None:
-    models = [hemisphere(90, 0.5, Loads(force=Force("pole", patch / 90))) for patch in (2.0, 0.5)]
+    models = [hemisphere(90, 0.5, Loads(forces={"force": Force("pole", patch / 90)})) for patch in (2.0, 0.5)]
     for model in models:
         down = model.zero()
         down[1::2] = -1
         assert -model.system.load(down, {}, "force") @ down == pytest.approx(model.force_unit, rel=1e-12)
-        assert model.loaded_deflection(down) == pytest.approx(1.0, rel=1e-12)
+        assert model.loaded_deflection(down, "force") == pytest.approx(1.0, rel=1e-12)
     point, *patches = (indent(model, [1.5])[0] for model in [hemisphere(90, 0.5, POLE_FORCE), *models])
     assert point < patches[1] < patches[0] < 1.02 * point
 

@@ -109,10 +109,10 @@ def test_force_has_the_load_vector_of_its_work() -> None:
     """Pi_F = -F w, and its column is minus the gradient of w."""
     surface = hemisphere()
     for force in (Force("load"), Force("load", patch=0.7)):
-        model = ShellModel(surface, Material(0.3, 0.05), 3, {}, Loads(force=force))
+        model = ShellModel(surface, Material(0.3, 0.05), 3, {}, Loads(forces={"force": force}))
         u = random_displacement(model, 1e-3)
         load = model.system.load(u, {}, "force")
-        assert -load @ u == pytest.approx(model.force_unit * model.loaded_deflection(u), rel=1e-12)
+        assert -load @ u == pytest.approx(model.force_unit * model.loaded_deflection(u, "force"), rel=1e-12)
         # a unit translation along the inward normal has w = 1, so the total force is F along it
         inward = -model.normals["load"]
         assert -load.reshape(-1, 3).sum(axis=0) == pytest.approx(model.force_unit * inward, rel=1e-12, abs=1e-15)

@@ -77,7 +77,7 @@ def test_terms_together(shell: Shells, half: bool, energy: str, degree: int) -> 
 
 @pytest.mark.parametrize("condition", ["free", "simply supported", "clamped"])
 def test_edge_conditions_and_dead_load(condition: Condition) -> None:
-    loads = Loads(pressure=True, force=Force("load"))
+    loads = Loads(pressure=True, forces={"force": Force("load")})
     model = ShellModel(hemisphere(0.8), Material(0.3, 0.05), 3, {"rim": condition}, loads)
     assert difference(model.system, random_displacement(model, 1e-3), MU) <= 1e-12
 

@@ -26,7 +26,7 @@ from magshell_fenicsx.models.shell.terms import TermFactory
 from magshell_fenicsx.models.shell.thickness import Thickness
 
 MATERIAL = Material(0.3, 0.05)
-MOMENT = Loads(dead=(EdgeMoment("right", 0.01),))
+MOMENT = Loads(dead={"load": (EdgeMoment("right", 0.01),)})
 
 
 def panel(size: float = 0.5) -> Midsurface:
@@ -65,7 +65,7 @@ SHELLS: dict[str, Callable[[], ShellModel]] = {
         Loads(pressure=True),
     ),
     "two terms on an edge": lambda: ShellModel(
-        panel(), MATERIAL, 3, {"bottom": "plane"}, Loads(dead=(EdgeMoment("bottom", 0.01),))
+        panel(), MATERIAL, 3, {"bottom": "plane"}, Loads(dead={"load": (EdgeMoment("bottom", 0.01),)})
     ),
     "folded": lambda: ShellModel(box(1.8), MATERIAL, 3, {"left": "clamped"}, Loads()),
     "thickness": lambda: ShellModel(
@@ -161,7 +161,7 @@ def test_dead_loads_add_up_to_their_resultants() -> None:
         AreaForce(None, np.array([1.0, 0.0, 0.0])),
         AreaForce(None, 2.0),
     )
-    model = ShellModel(panel(), MATERIAL, 4, {}, Loads(dead=loads))
+    model = ShellModel(panel(), MATERIAL, 4, {}, Loads(dead={"load": loads}))
     entries = -model.system.load(model.zero(), {}, "load").reshape(-1, 3).sum(axis=0)
     pressure = -2.0 * np.array([np.sin(1), 1 - np.cos(1), 0.0])
     assert entries == pytest.approx(np.array([1.0, 2.0, 3.0]) + np.array([1.0, 1.0, 1.0]) + pressure, abs=1e-7)
@@ -174,7 +174,7 @@ def bent(thickness: Thickness | None, h: float, degree: int = 3) -> float:
         grid_mesh(Grid((0.0, 0.0), (1.0, 0.1), 0.1), {"pole": np.array([1.0, 0.05])}, flat), MPI.COMM_SELF
     )
     force = 1e-9
-    loads = Loads(dead=(EdgeForce("right", np.array([0.0, 0.0, force]), total=True),))
+    loads = Loads(dead={"load": (EdgeForce("right", np.array([0.0, 0.0, force]), total=True),)})
     model = ShellModel(surface, Material(0.0, h), degree, {"left": "clamped"}, loads, thickness=thickness)
     found = BorderedNewton(model.system).solve(State(model.zero(), {"load": 0.0}), "load", GivenLoad("load", 1.0))
     return float(model.displacement(found.state.u, "pole")[2]) / force

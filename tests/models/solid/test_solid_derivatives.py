@@ -25,7 +25,7 @@ FIELD = Magnetisation(
     np.array([0.6, 0.0, 0.8]),
     np.array([0.0, 0.28, 0.96]),
     gradient=np.array([[1.0, 0.2, 0.0], [0.2, 0.5, 0.3], [0.0, 0.3, -1.5]]),
-    across=np.array([1.0, 0.0, 0.0]),
+    across=(np.array([1.0, 0.0, 0.0]),),
 )
 
 
@@ -36,7 +36,7 @@ def model(request: pytest.FixtureRequest) -> SolidModel:
     body = hemisphere(0.6 if uniform else 0.9, h, layers=1 if uniform else 3, half=True, dimple=dimple)
     conditions = {"rim": "clamped" if uniform else "simply supported", "symmetry": "symmetry"}
     field = FIELD if uniform else replace(FIELD, remanent=radial)
-    loads = Loads(pressure=True, magnetic=field, dead=() if uniform else (EdgeMoment("rim", 0.7),))
+    loads = Loads(pressure=True, magnetic=field, dead={} if uniform else {"load": (EdgeMoment("rim", 0.7),)})
     return SolidModel(body, Material(0.5, h), NeoHookean.of(0.5, 100.0), conditions, loads)  # type: ignore[arg-type]
 
 

@@ -96,7 +96,7 @@ def test_loads_add_up_to_their_resultants(load: Any) -> None:
         points={"A": [1.0, 0.0, 1.0]},
         factor=lambda x: 1 + 0.3 * x[:, 2],
     )
-    model = SolidModel(body, Material(0.3, H), NeoHookean.of(0.3, 100.0), {}, Loads(dead=(load,)))
+    model = SolidModel(body, Material(0.3, H), NeoHookean.of(0.3, 100.0), {}, Loads(dead={"load": (load,)}))
     X = model.r0.x.array.reshape(-1, 3)
     for axis, force in zip(np.eye(3), (1.0, 2.0, 3.0), strict=True):
         assert resultant(model, np.tile(axis, (len(X), 1))) == pytest.approx(force, rel=1e-3)
@@ -105,7 +105,7 @@ def test_loads_add_up_to_their_resultants(load: Any) -> None:
 def test_a_moment_turns_the_end_about_its_edge() -> None:
     """Its work on a small rotation about y is the moment per length times the length, the sign as the shell's."""
     body = body_of(STRIP, 0.2, layers=2)
-    moment = Loads(dead=(EdgeMoment("right", 3.0),))
+    moment = Loads(dead={"load": (EdgeMoment("right", 3.0),)})
     model = SolidModel(body, Material(0.3, H), NeoHookean.of(0.3, 100.0), {}, moment)
     X = model.r0.x.array.reshape(-1, 3)
     assert resultant(model, np.cross([0.0, 1.0, 0.0], X)) == pytest.approx(3.0 * WIDTH, rel=1e-9)

@@ -1,0 +1,73 @@
+"""What the steps of a programme must have in common."""
+
+from collections.abc import Sequence
+
+from magshell_fenicsx.case.fields import MagneticSection
+from magshell_fenicsx.case.loading import ProgrammeStep
+from magshell_fenicsx.case.loads.dead import DeadSection
+from magshell_fenicsx.case.loads.field import FieldBefore, FieldSection, RotationSection
+from magshell_fenicsx.case.loads.step import LEAST_TARGET, Gas, Step
+
+SAME = 1e-9  # cosine of directions: rounding
+
+
+def refuse_unfit_steps(
+    steps: Sequence[ProgrammeStep], magnetic: MagneticSection | None, lambda_m: float, *, whole: bool
+) -> None:
+    """See that each step has its field, a way to go, and known amplitudes to hold.
+
+    Parameters
+    ----------
+    whole
+        Whether the steps are all that happens; otherwise the field is applied first.
+
+    Raises
+    ------
+    ValueError
+        With the key and what is allowed.
+    """
+    driven: set[str] = set()
+    field = magnetic.applied.vector() if magnetic else None
+    for step in steps:
+        load, key = step.load, step.key
+        if isinstance(load, FieldSection) and not isinstance(load, FieldBefore) and not lambda_m:
+            raise ValueError(f"{key}.kind: field needs magnetic.lambda_m, not zero, for its target or direction")
+        if isinstance(load, RotationSection):
+            if magnetic is None or field is None or not lambda_m:
+                raise ValueError(f"{key}.kind: rotation needs a field: magnetic.lambda_m, not zero")
+            if whole and "lambda_m" not in driven:
+                raise ValueError(f"{key}.kind: rotation needs a field: a step of kind: field before it")
+            if magnetic.applied.gradient:
+                raise ValueError(f"{key}.kind: rotation needs a uniform field, without magnetic.applied.gradient")
+            if abs(field @ load.to.vector()) > 1 - SAME:
+                where = "magnetic.applied" if "angle" not in driven else "the field at its beginning"
+                raise ValueError(f"{key}.to: must be neither parallel nor opposite to {where}")
+            field = load.to.vector()
+        if step.name not in driven and load.target and load.target[1] == 0:
+            raise ValueError(
+                f"{key}: the target must not be zero (at least {LEAST_TARGET:g} in size): the first step of a load "
+                "begins there"
+            )
+        driven.add(step.name)
+        _refuse_unfit_hold(step, steps)
+
+
+def _refuse_unfit_hold(step: ProgrammeStep, steps: Sequence[ProgrammeStep]) -> None:
+    loads: dict[str, Step | None] = {"pressure": None, **{other.name: other.load for other in steps}}
+    loads.pop("angle", None)
+    allowed = sorted(set(loads) - {step.name})
+    for name, how in step.load.hold.items():
+        key = f"{step.key}.hold.{name}"
+        if name == step.name:
+            raise ValueError(f"{key}: this step drives {name}; allowed: {', '.join(allowed) or 'none'}")
+        if name not in loads:
+            raise ValueError(f"{key}: the programme has no such amplitude; allowed: {', '.join(allowed) or 'none'}")
+        load = loads[name]
+        if isinstance(how, Gas) and name != "pressure":
+            raise ValueError(f"{key}: a gas holds the pressure, not {name}; allowed: load, conjugate")
+        if (
+            how == "conjugate"
+            and load is not None
+            and (not load.conjugate or (isinstance(load, DeadSection) and load.turns))
+        ):
+            raise ValueError(f"{key}: conjugate: nothing that can be held is conjugate to it; allowed: load")

@@ -1,0 +1,68 @@
+"""The direction of the applied field in a programme, and the curves of its components."""
+
+from collections.abc import Mapping, Sequence
+from math import atan2, copysign, cos, degrees, hypot, sin
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magshell_fenicsx.case.loading import ProgrammeStep
+from magshell_fenicsx.case.loads.field import RotationSection
+from magshell_fenicsx.continuation.along import Curve
+from magshell_fenicsx.continuation.system import State
+from magshell_fenicsx.models.shell.parameters import ACROSS, Magnetisation
+
+Array = NDArray[np.float64]
+FIELD = ("lambda_m", *ACROSS)  # amplitudes of the field's components
+
+
+def directions(programme: Sequence[ProgrammeStep], field: Magnetisation | None, turn: float) -> Array:
+    """Unit vectors (steps + 1, components) of the field before each step and after the last, in a turned frame."""
+    if field is None:
+        return np.ones((len(programme) + 1, 1))
+    basis = np.array([field.applied, *field.across])
+    basis = basis / np.linalg.norm(basis, axis=1, keepdims=True).clip(1e-300)
+    found = [np.eye(len(basis))[0]]
+    for step in programme:
+        found.append(basis @ step.load.to.vector(turn) if isinstance(step.load, RotationSection) else found[-1])
+    return np.array(found)
+
+
+def field_at(state: State) -> Array:
+    """The components of the field."""
+    return np.array([state.mu[name] for name in FIELD if name in state.mu])
+
+
+def straight(direction: Array) -> dict[str, Curve]:
+    """The components of a field t along a direction."""
+
+    def curve(c: float) -> Curve:
+        return lambda t: (c * t, c, 0.0)
+
+    return {name: curve(float(c)) for name, c in zip(FIELD, direction, strict=False)}
+
+
+def circle(size: float, before: Array, after: Array) -> dict[str, Curve]:
+    """The components of a field that has turned by t (rad) from one direction towards another."""
+    away = after - (before @ after) * before
+    away = away / np.linalg.norm(away)
+
+    def curve(b: float, a: float) -> Curve:
+        return lambda t: (b * cos(t) + a * sin(t), a * cos(t) - b * sin(t), -b * cos(t) - a * sin(t))
+
+    parts = zip(FIELD, size * before, size * away, strict=False)
+    return {name: curve(float(b), float(a)) for name, b, a in parts}
+
+
+def field_size(mu: Mapping[str, float], sense: float) -> float:
+    """The magnitude of the field with the sign of the case's field, or with its own where it has not turned."""
+    along, across, third = (mu.get(name, 0.0) for name in FIELD)
+    return copysign(hypot(along, across, third), sense) if across or third else along
+
+
+def field_angle(mu: Mapping[str, float], sense: float = 1.0) -> float:
+    """The angle between the field and its first direction (degrees); `sense` is the sign of the case's field."""
+    along, across, third = (mu.get(name, 0.0) for name in FIELD)
+    if not (across or third):
+        return 0.0
+    return degrees(atan2(hypot(across, third) if third else sense * across, sense * along))
