@@ -37,8 +37,6 @@ def refuse_unfit_steps(
                 raise ValueError(f"{key}.kind: rotation needs a field: magnetic.lambda_m, not zero")
             if whole and "lambda_m" not in driven:
                 raise ValueError(f"{key}.kind: rotation needs a field: a step of kind: field before it")
-            if magnetic.applied.gradient:
-                raise ValueError(f"{key}.kind: rotation needs a uniform field, without magnetic.applied.gradient")
             if abs(field @ load.to.vector()) > 1 - SAME:
                 where = "magnetic.applied" if "angle" not in driven else "the field at its beginning"
                 raise ValueError(f"{key}.to: must be neither parallel nor opposite to {where}")

@@ -12,6 +12,7 @@ from magshell_fenicsx.case.surfaces import MeshSurface
 from magshell_fenicsx.mesh.frame import rotation
 from magshell_fenicsx.models.shell.parameters import Magnetisation
 from magshell_fenicsx.models.shell.patterns import Components, InsideAndOutside, Pattern, radial, tangential
+from magshell_fenicsx.plan.turned import basis as turned_basis
 
 SAME = 1e-9  # part of a direction outside a plane: rounding
 
@@ -53,4 +54,5 @@ def magnetisation(magnetic: MagneticSection, case: Case, turn: float, to: Sequen
     Q = rotation(turn)
     G = Q @ np.array(gradient) @ Q.T if gradient else None
     layers = tuple((layer.fraction, layer.vector(turn)) for layer in section.layers or [])
-    return Magnetisation(remanent, applied, magnetic.energy, G, tuple(across), patches, layers)
+    turned = turned_basis(G, [along, *(direction.vector(turn) for direction in to)]) if G is not None else ()
+    return Magnetisation(remanent, applied, magnetic.energy, G, tuple(across), patches, layers, tuple(basis), turned)

@@ -33,7 +33,7 @@ from magshell_fenicsx.plan.plan import Plan
 from magshell_fenicsx.plan.planner import make_plan, meridian_vertices
 from magshell_fenicsx.platform.first import from_first
 from magshell_fenicsx.quantities.registry import amplitude
-from magshell_fenicsx.simulate.direction import directions, field_angle, field_size
+from magshell_fenicsx.simulate.direction import directions, field_angle, field_size, turned
 
 Array = NDArray[np.float64]
 
@@ -115,6 +115,7 @@ class Scene:
         for t in model.system.terms:
             amplitude = state.mu[t.amplitude] if t.amplitude else 1.0
             name = t.name.removesuffix(" across").removesuffix(" third")
+            name = "magnetic gradient" if name.startswith("magnetic gradient") else name
             energies[name] += model.multiplicity * amplitude * potentials[t.name]
         split = "membrane" in energies  # a solid has no such split
         return {
@@ -174,6 +175,11 @@ class Scene:
     def directions(self) -> Array:
         """See `direction.directions`."""
         return directions(self.case.programme, self.plan.loads.magnetic, self.plan.azimuth)
+
+    @cached_property
+    def turned(self) -> list[Array]:
+        """See `direction.turned`."""
+        return turned(self.directions, self.plan.loads.magnetic)
 
     def conjugate_unit(self, name: str) -> float:
         """-dPi/dmu of one unit of a target: ΔV/R³ of a pressure, w/h of a force, the shell's length of dead loads."""

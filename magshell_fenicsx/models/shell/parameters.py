@@ -71,6 +71,10 @@ class Magnetisation:
     across
         Vectors (3,), normal to `applied` and to each other, that the field turns towards, with the amplitudes of
         `ACROSS`.
+    axes
+        Unit vectors along `applied` and `across`.
+    turned
+        Matrices (3, 3) that the gradient of a turning field is a sum of besides `gradient`, orthonormal; see `gradients`.
     energy
         The full energy, or which of the paper's approximations takes its place.
     patches
@@ -86,6 +90,14 @@ class Magnetisation:
     across: tuple[NDArray[np.float64], ...] = ()
     patches: Mapping[str, NDArray[np.float64]] | None = None
     layers: tuple[tuple[float, NDArray[np.float64]], ...] = ()
+    axes: tuple[NDArray[np.float64], ...] = ()
+    turned: tuple[NDArray[np.float64], ...] = ()
+
+    @property
+    def gradients(self) -> dict[str, NDArray[np.float64]]:
+        """Amplitude -> the part of the field's gradient that it multiplies."""
+        parts = {f"lambda_gradient_{i}": B for i, B in enumerate(self.turned, 1)}
+        return {} if self.gradient is None else {"lambda_m": self.gradient, **parts}
 
 
 @dataclass(frozen=True)

@@ -128,10 +128,10 @@ class TermFactory:
             for amplitude, suffix, Ba in directions
             for name, of in MAGNETIC_TERMS[field.energy].items()
         ]
-        if field.gradient is not None:
-            parameters = (Br, self._constant(field.gradient))
-            density = Density(per_area(densities.magnetic_gradient), parameters, parts=MOVED)
-            terms.append(self._cells("magnetic gradient", self._thick(density, None), "lambda_m"))
+        for name, G in field.gradients.items():
+            density = Density(per_area(densities.magnetic_gradient), (Br, self._constant(G)), parts=MOVED)
+            suffix = name.removeprefix("lambda_m").replace("lambda_gradient_", " ")
+            terms.append(self._cells("magnetic gradient" + suffix, self._thick(density, None), name))
         return terms
 
     def pressure(self, origin: NDArray[np.float64]) -> ShellTerm:

@@ -113,10 +113,10 @@ class TermFactory:
         for amplitude, suffix, Ba in directions:
             density = Density(densities.magnetic, (Br, *self._constants(Ba, self.h)))
             terms.append(self._bulk("magnetic" + suffix, density, amplitude, linear=True))
-        if of.gradient is not None:
-            parameters = (Br, *self._constants(of.gradient, self.h))
-            density = Density(densities.magnetic_gradient, parameters, VALUE + GRADIENT)
-            terms.append(self._bulk("magnetic gradient", density, "lambda_m"))
+        for name, G in of.gradients.items():
+            density = Density(densities.magnetic_gradient, (Br, *self._constants(G, self.h)), VALUE + GRADIENT)
+            suffix = name.removeprefix("lambda_m").replace("lambda_gradient_", " ")
+            terms.append(self._bulk("magnetic gradient" + suffix, density, name))
         return terms
 
     def pressure(self, classical: float, origin: Array | None, *, potential: bool = True) -> list[SolidTerm]:
