@@ -74,7 +74,7 @@ class Magnetisation:
     axes
         Unit vectors along `applied` and `across`.
     turned
-        Matrices (3, 3) that the gradient of a turning field is a sum of besides `gradient`, orthonormal; see `gradients`.
+        Orthonormal matrices (3, 3): the gradient of a turning field is a sum of them and of `gradient`.
     energy
         The full energy, or which of the paper's approximations takes its place.
     patches
