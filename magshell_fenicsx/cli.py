@@ -120,6 +120,8 @@ def run(
     gc.freeze()  # the process ends soon: another garbage collection takes longer than importing dolfinx
     if result.knockdown is not None:
         _print_line(f"knockdown factor k_d = {result.knockdown:.9g}")
+    if result.barrier is not None:
+        _print_line(f"energy barrier = {result.barrier:.9g} E h R^2")
     _print_line(f"results in {folder}/")
     if result.stopped:
         raise _failure(f"stopped early: {result.stopped}", STOPPED)

@@ -132,17 +132,25 @@ def override(source: Source, assignment: str) -> None:
     if not equals or not path.strip():
         raise CaseError(f"--set {assignment}: write it as key.path=value, for example --set mesh.degree=3")
     keys = path.strip().split(".")
-    section = source.data
-    for key in keys[:-1]:
-        section = section.setdefault(key, {})
-        if not isinstance(section, dict):
-            raise CaseError(f"--set {assignment}: {key} is a value, not a section")
+    section: Any = source.data
+    location: list[str | int] = []
+    for i, key in enumerate(keys):
+        if isinstance(section, list):
+            if not key.isdigit() or int(key) >= len(section):
+                raise CaseError(
+                    f"--set {assignment}: {key}: {keys[i - 1]} is a list with items 0 to {len(section) - 1}"
+                )
+        elif not isinstance(section, dict):
+            raise CaseError(f"--set {assignment}: {keys[i - 1]} is a value, not a section")
+        location.append(int(key) if isinstance(section, list) else key)
+        if i < len(keys) - 1:
+            section = section[int(key)] if isinstance(section, list) else section.setdefault(key, {})
     given = Source(f"--set {assignment}", {})
     _walk(_parsed(given, lambda: yaml.compose(text, Loader=_Loader)) or yaml.ScalarNode("", ""), (), given)
-    section[keys[-1]] = _parsed(given, lambda: yaml.load(text, Loader=_Loader))
+    section[location[-1]] = _parsed(given, lambda: yaml.load(text, Loader=_Loader))
     for length in range(1, len(keys) + 1):
-        if length == len(keys) or tuple(keys[:length]) not in source.places:
-            source.places[tuple(keys[:length])] = f"--set {assignment}"
+        if length == len(keys) or tuple(location[:length]) not in source.places:
+            source.places[tuple(location[:length])] = f"--set {assignment}"
 
 
 def dotted(location: Location) -> str:

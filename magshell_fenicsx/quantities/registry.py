@@ -1,7 +1,7 @@
 """Every amplitude and every column of path.csv, in the order of the file."""
 
 import re
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import replace
 
 from magshell_fenicsx.quantities.quantity import Amplitude, Quantity
@@ -145,13 +145,18 @@ def amplitude(name: str) -> Amplitude:
     return AMPLITUDES.get(name) or Amplitude(name, name)
 
 
-def axes_of(name: str) -> tuple[Quantity, Quantity]:
+def axes_of(name: str, row: Collection[str] = ()) -> tuple[Quantity, Quantity]:
     """The quantities on the x and y axis of an amplitude's curve: its displacement and its value.
 
     An angle is on the x axis, and the displacement on the y axis.
+
+    Parameters
+    ----------
+    row
+        The columns that there are: where w_over_h belongs to another load, this one has a column of its own.
     """
-    varied = amplitude(name)
-    over, drawn = quantity(varied.conjugate), quantity(varied.column)
+    varied, own = amplitude(name), f"w_{name}_over_h"
+    over, drawn = quantity(own if own in row else varied.conjugate), quantity(varied.column)
     if varied.conjugate == "w_over_h":
         over = replace(over, note=varied.place)
     return (drawn, over) if name == "angle" else (over, drawn)

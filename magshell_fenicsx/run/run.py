@@ -30,6 +30,7 @@ from magshell_fenicsx.run.summary import Result, summary
 from magshell_fenicsx.simulate.adapt.choice import Adapted
 from magshell_fenicsx.simulate.adapt.ending import NoResult
 from magshell_fenicsx.simulate.adapt.tolerance import adapted
+from magshell_fenicsx.simulate.barrier import barrier
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.record import Stopped
 from magshell_fenicsx.simulate.scene import Scene
@@ -116,6 +117,7 @@ def _run(case: Case, folder: Path | None, comm: MPI.Comm, say: Say, tell: Say, w
         try:
             _follow(result, files, say, progress, start)
             result.sensitivities = _sensitivities(result)
+            result.barrier = _barrier(result)
         except (Stopped, NoEigenpair) as e:
             result.stopped = str(e)
         except (Interrupted, DiskError) as e:
@@ -178,6 +180,15 @@ def _sensitivities(result: Result) -> dict[str, float]:
     except FoldLost as e:
         raise Stopped(f"the fold cannot be polished for its sensitivities: {e}") from None
     return sensitivities(scene, fold, record)
+
+
+def _barrier(result: Result) -> float | None:
+    """The energy barrier that the last step has passed, if it was to."""
+    steps, begin = result.scene.case.programme, result.history.begin
+    if not steps or steps[-1].until != "zero" or begin is None:
+        return None
+    assert result.history.last
+    return barrier(result.scene, steps[-1], begin.point.state, result.history.last.point.state)
 
 
 def _follow(result: Result, files: RunFiles | None, say: Say, progress: RunProgress, start: float) -> None:

@@ -38,6 +38,8 @@ class Result:
         The mesh and its error estimate, if the case has a tolerance.
     history
         The records that `value` is taken from.
+    barrier
+        The energy barrier over E h R^2 of a last step with `until: zero`; None without.
     """
 
     scene: Scene
@@ -50,6 +52,7 @@ class Result:
     output: Stopwatch = field(default_factory=Stopwatch)
     adapted: Adapted | None = None
     history: History = field(default_factory=History)
+    barrier: float | None = None
 
     @property
     def limit_points(self) -> list[dict[str, Any]]:
@@ -113,6 +116,7 @@ def summary(result: Result, total_s: float) -> dict[str, Any]:
         "limit_points": result.limit_points,
         "sensitivities": result.sensitivities,
         "knockdown": result.knockdown,
+        "barrier": result.barrier,
         "most_excluded_pivots": max((int(row["excluded_pivots"]) for row in result.rows), default=0),
         "points": len(result.rows),
         "mesh": {"cells": scene.cells, "dofs": model.system.dofs, "degree": model.degree},

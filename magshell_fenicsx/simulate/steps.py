@@ -46,7 +46,8 @@ def records_of(scene: Scene, step: ProgrammeStep, state: State) -> Records:
         yield Record("target", step.name, stage.point(start))
         return state
     steps = load.points if load.until == "points" else MOST_STEPS
-    goal = Goal(load.until, drive.targets, drive.quantity, steps, drive.first)
+    until = "target" if load.until == "zero" else load.until
+    goal = Goal(until, drive.targets, drive.quantity, steps, drive.first)
     if not isinstance(load, FieldBefore):
         return (yield from followed(stage, path, start, goal, branches=load))
     return (yield from _field_before(followed(stage, path, start, replace(goal, until="limit")), drive.end or 0.0))
@@ -60,10 +61,10 @@ def stage_of(scene: Scene, step: ProgrammeStep, state: State) -> Stage:
         parts, field = scene.turned[step.number - 1 : step.number], scene.plan.loads.magnetic
         assert field
         curves = (step.name, straight(direction, field, next(iter(parts), None)), float(direction @ field_at(state)))
-    return staged(scene, state, _held(scene, step, state), curves)
+    return staged(scene, state, held_by(scene, step, state), curves)
 
 
-def _held(scene: Scene, step: ProgrammeStep, state: State) -> dict[str, float | Conjugate]:
+def held_by(scene: Scene, step: ProgrammeStep, state: State) -> dict[str, float | Conjugate]:
     """What is held besides loads, with the values of a state."""
     held = dict[str, float | Conjugate]()
     for name, how in step.load.hold.items():
@@ -117,7 +118,7 @@ def _rotation(scene: Scene, step: ProgrammeStep, load: RotationSection, state: S
     curves, field = circle(size, before, after), scene.plan.loads.magnetic
     if scene.turned and field:
         curves |= turning(size, before, after, field, scene.turned[step.number - 1])
-    stage = staged(scene, state, _held(scene, step, state), ("angle", curves, 0.0))
+    stage = staged(scene, state, held_by(scene, step, state), ("angle", curves, 0.0))
     path, start = stage.begin("angle", "arc", state, total / load.points, total / load.points)
     targets = [float(t) for t in np.linspace(0.0, total, load.points + 1)[1:]]
     walked = _Walked(followed(stage, path, start, Goal("limit", targets)))

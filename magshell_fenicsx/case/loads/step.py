@@ -9,11 +9,12 @@ from pydantic import Discriminator, Field, Tag, model_validator
 from magshell_fenicsx.parts.section import Pressure, Section
 
 Until = Annotated[
-    Literal["limit", "bifurcation", "target", "points"],
+    Literal["limit", "bifurcation", "target", "points", "zero"],
     Field(
         description="Where the path ends: at the first instability (limit; past one that a half or a meridian excludes "
         "it goes on to the model's own, up to twice the load), at the first bifurcation, through folds, at the target, "
-        "or after `points` steps by arc length"
+        "after `points` steps by arc length, or where the load has risen and fallen back to zero: the top of an energy "
+        "barrier, whose height is `barrier` in summary.json (zero)"
     ),
 ]
 Count = Annotated[int, Field(ge=1, le=10000, description="Equal parts to the target, each a row; or steps")]
@@ -173,10 +174,11 @@ class PathStep(Step):
         if self.until == "target" and (len(given) > 1 or not set(given) <= set(fitting) or not (given or self._end)):
             names = " or ".join(fitting) or "another control"
             raise ValueError(f"until: target with control: {self.control} needs {names} (and nothing else) as target")
-        if self.until in ("limit", "bifurcation") and given:
+        if self.until in ("limit", "bifurcation", "zero") and given:
             raise ValueError(f"{next(iter(given))} is a target: it goes with until: target")
-        if self.until == "points" and by != "arc":
-            raise ValueError("until: points counts steps by arc length: it goes with control: arc")
+        if self.until in ("points", "zero") and by != "arc":
+            why = "counts steps by arc length" if self.until == "points" else "passes the largest load"
+            raise ValueError(f"until: {self.until} {why}: it goes with control: arc")
         return self
 
     @property
@@ -236,6 +238,8 @@ class PathStep(Step):
             begin = here if now.driven else self.begin(here)
             found = [float(t) for t in np.linspace(begin, end, self.points + 1)[1:]]
             found = [t for t in found if (t - here) * change > 0]
+        if self.until == "zero":
+            found = [0.0]
         first, step = self.first(change, now, by_load=by_load), self.step(None if goal is None else change, now)
         return Drive(self.prescribed, quantity, end, found, first, self.scale(now), step)
 

@@ -9,19 +9,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.output.fields.surface import Surface
-from magshell_fenicsx.output.pictures.curve import place, plot_curve
+from magshell_fenicsx.output.pictures.curve import Part, drawn_parts, place, plot_curve
 from magshell_fenicsx.output.pictures.layout import axes_in, colour_bar, empty_figure
 from magshell_fenicsx.output.pictures.picture import deflected_place, towards
 from magshell_fenicsx.output.pictures.render import Image, View, rendered, smooth_surface
 from magshell_fenicsx.output.store.table import Row
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.lines import Line2D
     from PIL import Image as Pillow
 
 SEEN = 0.1  # least drawn size of the largest displacement, over the shell's extent
 WINDOW = 620  # pixels
 SECONDS = 6.0  # duration of all frames
 HELD = 1500  # milliseconds of the last frame
+MOST_CURVES = 4  # beside each other
 COLOURS = 128
 FOOT = 34  # pixels below the shell
 
@@ -114,14 +117,14 @@ def _composed(
     canvas = FigureCanvasAgg(figure)
     colour_bar(figure, view, (across + 30, 90, 16, height - 180), "vertical")
     figure.text(15 / (across + 600), 12 / height, _scale(factor), fontsize=9)
-    axes = axes_in(figure, across + 230, 70, 350, height - 140)
-    amplitude = str(rows[-1]["amplitude"])
-    marker = None
-    if amplitude:
-        plot_curve(axes, rows, amplitude)
-        (marker,) = axes.plot([], [], "o", color="k", markersize=8, animated=True)
-    else:
-        axes.set_axis_off()
+    parts = drawn_parts(rows, str(rows[-1]["amplitude"]))[-MOST_CURVES:] if rows[-1]["amplitude"] else []
+    room = (height - 70) // max(len(parts), 1)
+    markers: dict[int, tuple[Axes, Part, Line2D]] = {}
+    for i, part in enumerate(reversed(parts)):  # from below
+        axes = axes_in(figure, across + 230, 70 + i * room, 350, room - 70)
+        plot_curve(axes, part)
+        marker = axes.plot([], [], "o", color="k", markersize=8, animated=True)[0]
+        markers |= {int(row["point"]): (axes, part, marker) for row in part.rows}
     title = figure.text(15 / (across + 600), 1 - 12 / height, "", fontsize=10, va="top", animated=True)
     canvas.draw()
     still = canvas.copy_from_bbox(figure.bbox)
@@ -130,8 +133,9 @@ def _composed(
         canvas.restore_region(still)
         title.set_text(text)
         figure.draw_artist(title)
-        if marker:
-            marker.set_data(*([x] for x in place(row, amplitude)))
+        if row["point"] in markers:
+            axes, part, marker = markers[int(row["point"])]
+            marker.set_data(*([x] for x in place(row, part.amplitude)))
             axes.draw_artist(marker)
         frame = np.array(canvas.buffer_rgba())[:, :, :3]
         frame[height - low - high : height - low, 10 : 10 + across] = image

@@ -31,7 +31,7 @@ def caption(h: float, nu: float, row: Row, own: Sequence[str] = ()) -> str:
         parts.append(rf"turned by ${row['field_angle']:.4g}\degree$")
     if row["p_over_pc"]:
         parts.append(_value("p_over_pc", row, 5))
-    if row["amplitude"] == "force":
+    if row.get("force"):
         parts.append(f"{_value('force', row)}, {_value('w_over_h', row)} {amplitude('force').place}")
     if "load_factor" in row:
         parts.append(f"{_value('load_factor', row)}, {_value('w_over_h', row)}")

@@ -1,7 +1,8 @@
 """The load-displacement or pressure-volume curve as a picture."""
 
 from collections.abc import Sequence
-from itertools import groupby
+from dataclasses import dataclass
+from itertools import groupby, zip_longest
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -9,6 +10,7 @@ import scipy
 from numpy.typing import NDArray
 
 from magshell_fenicsx.output.store.table import LOCATED, OWN_MODES, Row, pole_name
+from magshell_fenicsx.quantities.registry import amplitude as registered
 from magshell_fenicsx.quantities.registry import axes_of, quantity
 
 if TYPE_CHECKING:  # takes long to import
@@ -32,15 +34,49 @@ def smooth(x: Sequence[float], y: Sequence[float]) -> NDArray[np.float64]:
 def curve_figure(rows: Sequence[Row], amplitude: str, title: str) -> "Figure":
     """Draw the part of the path in which `amplitude` varied, and its branches; instabilities are marked.
 
-    Stable parts are solid, unstable parts dashed. A user-defined amplitude is drawn over the pole's displacement.
+    Of a programme each step is drawn. Stable parts are solid, unstable parts dashed. A user-defined amplitude is drawn
+    over the pole's displacement.
     """
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(4.6, 3.4), dpi=200, layout="constrained")
-    axes = figure.subplots()
-    plot_curve(axes, rows, amplitude)
-    axes.set_title(title, fontsize=9)
+    parts = drawn_parts(rows, amplitude)
+    wide = min(len(parts), 3)
+    high = -(-len(parts) // wide)
+    figure = Figure(figsize=(4.6 * wide, 3.4 * high), dpi=200, layout="constrained")
+    for axes, part in zip_longest(figure.subplots(high, wide, squeeze=False).flat, parts):
+        if part is None:
+            axes.set_axis_off()
+            continue
+        plot_curve(axes, part)
+        axes.set_title(part.title or title, fontsize=9)
+    if len(parts) > 1:
+        figure.suptitle(title, fontsize=10)
     return figure
+
+
+@dataclass(frozen=True)
+class Part:
+    """The rows in which an amplitude varied, with the one before them."""
+
+    amplitude: str
+    rows: Sequence[Row]
+    title: str = ""
+
+
+def drawn_parts(rows: Sequence[Row], amplitude: str) -> list[Part]:
+    """The steps of a programme, or the last part in which the amplitude varied."""
+    steps = sorted({int(row.get("step", 0)) for row in rows if row["label"] != "field"} - {0})
+    if len(steps) < 2:
+        return [Part(amplitude, varied(rows, amplitude))]
+    parts = []
+    for step in steps:
+        first = next(i for i, row in enumerate(rows) if row["step"] == step)
+        before = max((i for i in range(first) if rows[i]["branch"] == 0), default=0)
+        within = [row for row in rows[first:] if row["step"] == step]
+        name = str(within[0]["amplitude"])
+        varying = quantity(registered(name).column).words
+        parts.append(Part(name, [rows[before], *within], f"step {step}: {varying}"))
+    return parts
 
 
 def varied(rows: Sequence[Row], amplitude: str) -> Sequence[Row]:
@@ -51,7 +87,7 @@ def varied(rows: Sequence[Row], amplitude: str) -> Sequence[Row]:
 
 def place(row: Row, amplitude: str) -> tuple[float, float]:
     """The coordinates of a point in the curve's axes."""
-    x, y = axes_of(amplitude)
+    x, y = axes_of(amplitude, row)
     return x.on_axis(row), y.on_axis(row)
 
 
@@ -60,10 +96,10 @@ def _unstable(row: Row) -> bool:
     return int(row["negative_pivots"]) + int(row.get("excluded_pivots", 0)) > 0
 
 
-def plot_curve(axes: "Axes", rows: Sequence[Row], amplitude: str) -> None:
-    """Draw the curve of `curve_figure` in given axes."""
-    part = varied(rows, amplitude)
-    x, y = axes_of(amplitude)
+def plot_curve(axes: "Axes", of: Part) -> None:
+    """Draw a part of a path in given axes."""
+    part, amplitude = of.rows, of.amplitude
+    x, y = axes_of(amplitude, part[0])
     if amplitude == "load" and all(row["w_over_h"] == row["w_pole_over_h"] for row in part):
         x = quantity("w_pole_over_h")  # moments have no conjugate displacement
     pole = pole_name(part[0]).replace("$", r"\$")  # plain text, no mathematics

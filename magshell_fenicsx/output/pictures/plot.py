@@ -11,7 +11,7 @@ from magshell_fenicsx.output.fields.surface import Surface, completed
 from magshell_fenicsx.output.fields.vtu import About, point_file, read_vtu
 from magshell_fenicsx.output.pictures.animation import animated
 from magshell_fenicsx.output.pictures.captions import caption, shell_caption
-from magshell_fenicsx.output.pictures.curve import curve_figure, varied
+from magshell_fenicsx.output.pictures.curve import curve_figure, drawn_parts
 from magshell_fenicsx.output.pictures.layout import png
 from magshell_fenicsx.output.pictures.mode_picture import draw_modes
 from magshell_fenicsx.output.pictures.picture import figures
@@ -91,7 +91,7 @@ def draw(folder: Path, point: int | None = None) -> list[str]:
 
 
 def draw_animation(folder: Path) -> str:
-    """Draw animation.gif: the part of the path in which the last amplitude varied; see `draw`.
+    """Draw animation.gif: all steps of a programme, or the part in which the last amplitude varied; see `draw`.
 
     Returns
     -------
@@ -99,7 +99,8 @@ def draw_animation(folder: Path) -> str:
     """
     rows = _rows(folder)
     amplitude = str(rows[-1]["amplitude"])
-    part = varied(rows, amplitude) if amplitude else rows
+    parts = drawn_parts(rows, amplitude) if amplitude else []
+    part = rows if len(parts) != 1 else parts[0].rows
     count = min(len(part), MOST_FRAMES)
     chosen = [part[round(i * (len(part) - 1) / max(count - 1, 1))] for i in range(count)]
     surfaces, abouts = zip(*(_point(folder, row) for row in chosen), strict=True)

@@ -48,9 +48,10 @@ class Ending:
 
 @dataclass
 class History:
-    """The records of a run that its end depends on."""
+    """The records of a run that its end depends on; `begin` is the last one before the last step."""
 
     last: Record | None = None
+    begin: Record | None = None
     located: list[Record] = field(default_factory=list)
 
     def add(self, record: Record) -> None:
@@ -59,6 +60,8 @@ class History:
         if record.label in ("fold", "bifurcation"):
             self.located.append(record)
         else:
+            if self.last and record.step != self.last.step:
+                self.begin = self.last
             self.last = record
 
     def ending(self, scene: Scene, stopped: str | None) -> Ending:
@@ -71,7 +74,7 @@ class History:
         """
         steps = scene.case.programme
         until = steps[-1].until if steps else "target"
-        if until in ("target", "points") and not stopped and self.last and self.last.amplitude:
+        if until in ("target", "points", "zero") and not stopped and self.last and self.last.amplitude:
             found = _target(scene, self.last)
             return replace(found, kind="held") if any(how != "load" for how in steps[-1].load.hold.values()) else found
         if not self.located:

@@ -12,7 +12,7 @@ from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.output.store.table import COLUMNS, OWN_MODES, TEXTS
 
 NUMBERS = tuple(column for column in COLUMNS if column not in TEXTS)
-FORMS = "write knockdown, critical_field, COLUMN@COLUMN=VALUE or COLUMN@end, with columns of path.csv"
+FORMS = "write knockdown, barrier, critical_field, COLUMN@COLUMN=VALUE or COLUMN@end, with columns of path.csv"
 
 
 @dataclass(frozen=True)
@@ -40,8 +40,8 @@ class Scalar:
         summary, rows
             The content of summary.json and of path.csv.
         """
-        if self.name == "knockdown":
-            return _number(summary["knockdown"])
+        if self.name in ("knockdown", "barrier"):
+            return _number(summary[self.name])
         if self.name == "critical_field":
             points = (point["value"] for point in summary["limit_points"] if point["amplitude"] == "lambda_m")
             return _number(next(points, None))
@@ -64,7 +64,7 @@ def parse_scalar(text: str) -> Scalar:
     >>> parse_scalar("force@w_over_h=10")
     Scalar(name='force@w_over_h=10', column='force', at='w_over_h', value=10.0)
     """
-    if text in ("knockdown", "critical_field"):
+    if text in ("knockdown", "barrier", "critical_field"):
         return Scalar(text)
     column, _, place = text.partition("@")
     at, _, number = place.partition("=")

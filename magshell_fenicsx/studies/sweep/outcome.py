@@ -36,6 +36,8 @@ class Outcome:
     ----------
     knockdown
         k_d; None if there is no instability under pressure.
+    barrier
+        The energy barrier over E h R²; None if the case does not ask for one.
     limit
         The first limit point (the one of k_d) as in summary.json; None if there is none.
     stopped
@@ -57,6 +59,7 @@ class Outcome:
     curve: list[Row]
     found: Found
     factorisations: int
+    barrier: float | None = None
 
 
 def outcome_of(result: Result, found: Found, factorisations: int, wall_s: float) -> Outcome:
@@ -71,6 +74,7 @@ def outcome_of(result: Result, found: Found, factorisations: int, wall_s: float)
         curve=[{key: row[key] for key in CURVE if key in row} for row in result.rows],
         found=found,
         factorisations=factorisations,
+        barrier=result.barrier,
     )
 
 

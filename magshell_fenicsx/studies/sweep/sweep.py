@@ -119,6 +119,8 @@ def _result(outcome: Outcome) -> str:
     found = "no limit point"
     if outcome.knockdown is not None:
         found = f"k_d = {outcome.knockdown:.6f} ({outcome.found})"
+    elif outcome.barrier is not None:
+        found = f"barrier = {outcome.barrier:.6g} E h R^2"
     elif outcome.limit:
         found = f"{outcome.limit['kind']} at {outcome.limit['amplitude']} = {outcome.limit['value']:.6g}"
     return f"{found}, stopped early: {outcome.stopped}" if outcome.stopped else found

@@ -1,4 +1,4 @@
-"""The picture of a sweep: the knockdown factor over a swept number, or the curve of every point."""
+"""The picture of a sweep: the knockdown factor or the energy barrier over a swept number, or all curves."""
 
 from collections.abc import Sequence
 from itertools import cycle
@@ -27,8 +27,11 @@ def draw_sweep(axes: Sequence[Axis], points: Sequence[SweepPoint], outcomes: Seq
     import matplotlib.pyplot as plt
 
     figure, plot = plt.subplots(figsize=(7.2, 4.2), layout="constrained")
-    if any(outcome.knockdown is not None for outcome in outcomes):
-        _knockdowns(plot, axes, points, outcomes)
+    knockdowns, barriers = [o.knockdown for o in outcomes], [o.barrier for o in outcomes]
+    if any(value is not None for value in barriers):
+        _values(plot, axes, points, barriers, r"energy barrier  ($E h R^2$)")
+    elif any(value is not None for value in knockdowns):
+        _values(plot, axes, points, knockdowns, r"knockdown factor  $k_\mathrm{d}$")
     else:
         _curves(plot, points, outcomes)
     labels = plot.get_legend_handles_labels()[1]
@@ -39,22 +42,24 @@ def draw_sweep(axes: Sequence[Axis], points: Sequence[SweepPoint], outcomes: Seq
     plt.close(figure)
 
 
-def _knockdowns(plot: Any, axes: Sequence[Axis], points: Sequence[SweepPoint], outcomes: Sequence[Outcome]) -> None:
-    """Draw k_d over the last axis with numbers; points without k_d are left out."""
+def _values(
+    plot: Any, axes: Sequence[Axis], points: Sequence[SweepPoint], values: Sequence[float | None], label: str
+) -> None:
+    """Draw a number of each point over the last axis with numbers; points without it are left out."""
     axis = along(axes) or axes[-1]
     lines: dict[str, list[tuple[float | str, float]]] = {}
-    for point, outcome in zip(points, outcomes, strict=True):
+    for point, value in zip(points, values, strict=True):
         line = lines.setdefault(_label(point, axis), [])
-        if outcome.knockdown is not None:
+        if value is not None:
             x = point.values[axis.keys[0]]
-            line.append((float(x) if axis.numbers else x, outcome.knockdown))
-    for (label, line), style in zip(lines.items(), cycle(STYLES), strict=False):
-        plot.plot(*zip(*line, strict=True), style, marker=".", label=label) if line else None
+            line.append((float(x) if axis.numbers else x, value))
+    for (name, line), style in zip(lines.items(), cycle(STYLES), strict=False):
+        plot.plot(*zip(*line, strict=True), style, marker=".", label=name) if line else None
     unit = UNITS.get(axis.keys[0].split(".")[-1])
     if axis.numbers:
         plot.locator_params(axis="x", nbins=5)  # long numbers would overlap
     plot.set_xlabel(" = ".join(short(key) for key in axis.keys) + (f"  ({unit})" if unit else ""))
-    plot.set_ylabel(r"knockdown factor  $k_\mathrm{d}$")
+    plot.set_ylabel(label)
 
 
 def _curves(plot: Any, points: Sequence[SweepPoint], outcomes: Sequence[Outcome]) -> None:

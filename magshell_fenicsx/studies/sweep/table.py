@@ -22,6 +22,7 @@ COLUMNS = (
     "dofs",
     "wall_s",
     "point",
+    "barrier",
 )
 
 
@@ -45,6 +46,7 @@ def sweep_row(outcome: Outcome) -> dict[str, Any]:
         "factorisations": outcome.factorisations,
         "dofs": outcome.dofs,
         "wall_s": outcome.wall_s,
+        "barrier": outcome.barrier,
     }
 
 
