@@ -105,12 +105,17 @@ class FiniteElementSystem:
             self._K.setOption(PETSc.Mat.Option.SYMMETRIC, True)
 
     def set(self, u: Vector) -> None:
-        """Copy a displacement into the Function of the terms."""
+        """Copy a displacement into the Function of the terms, which follow it."""
+        self._copy(u)
+        for term in self.terms:
+            term.follow()
+
+    def _copy(self, u: Vector) -> None:
         self.u.x.array[: self.size] = u
         self.u.x.scatter_forward()
 
     def _with_ghosts(self, u: Vector) -> NDArray[np.float64]:
-        self.set(u)
+        self._copy(u)
         return np.array(self.u.x.array)
 
     def held(self, u: Vector) -> Vector:

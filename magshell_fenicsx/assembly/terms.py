@@ -1,5 +1,6 @@
 """A potential Pi(u) with its amplitude: energy, residual and tangent."""
 
+from collections.abc import Callable
 from functools import cached_property
 from typing import Generic, Protocol, TypeVar
 
@@ -27,6 +28,9 @@ class Term(Protocol):
     def energy(self) -> float:
         """Pi(u) on this rank's part."""
 
+    def follow(self) -> None:
+        """Renew what the energy knows of the present u."""
+
     def accept(self) -> None:
         """Accept the present u as a point of the path; turns are counted from here."""
 
@@ -46,7 +50,7 @@ class Term(Protocol):
 class FormTerm:
     """A potential given by its UFL energy; both derivatives are automatic.
 
-    `linear` says that the energy is linear in u, so that it has no tangent.
+    `linear` says that the energy is linear in u, so that it has no tangent; `follow` renews its coefficients.
 
     A load may have no potential. Then `work`, its virtual work, takes the place of the energy's gradient, and the
     energy is only reported. The derivative of the work is no symmetric form.
@@ -69,8 +73,9 @@ class FormTerm:
         *,
         linear: bool = False,
         work: ufl.Form | None = None,
+        follow: Callable[[], None] | None = None,
     ) -> None:
-        self.name, self.amplitude, self.linear = name, amplitude, linear
+        self.name, self.amplitude, self.linear, self._follow = name, amplitude, linear, follow
         self.has_potential = work is None
         self._factor = fem.Constant(u.function_space.mesh, 1.0)
         self._u, self._log = u, log
@@ -103,6 +108,11 @@ class FormTerm:
 
     def energy(self) -> float:
         return float(fem.assemble_scalar(self._energy))
+
+    def follow(self) -> None:
+        """Renew coefficients that depend on u."""
+        if self._follow:
+            self._follow()
 
     def accept(self) -> None:
         """Its energy has no history."""
@@ -142,8 +152,9 @@ class DensityTerm(FormTerm, Generic[Density]):
         *,
         linear: bool = False,
         work: ufl.Form | None = None,
+        follow: Callable[[], None] | None = None,
     ) -> None:
-        super().__init__(name, energy, u, log, amplitude, linear=linear, work=work)
+        super().__init__(name, energy, u, log, amplitude, linear=linear, work=work, follow=follow)
         self.density = density
 
 
@@ -158,6 +169,9 @@ class LinearTerm:
 
     def energy(self) -> float:
         return -float(self._entries @ self._u.x.array[self._dofs])
+
+    def follow(self) -> None:
+        """It depends on nothing else."""
 
     def accept(self) -> None:
         """Its energy has no history."""

@@ -177,7 +177,9 @@ class Case(WithParts):
         if isinstance(self.thickness_factor, dict):
             raise ValueError("shell.thickness_factor: of a solid a formula: a step in the thickness is no swept body")
         if magnetic and magnetic.energy != "full":
-            raise ValueError(f"magnetic.energy: {magnetic.energy}: not of a solid, whose full energy is linear in F")
+            raise ValueError(
+                f"magnetic.energy: {magnetic.energy}: the expansions are of a shell; a solid has the full energy"
+            )
         for key in self.mesh.model_fields_set & {"degree", "penalty"}:
             if key != "degree" or self.mesh.degree != SOLID_DEGREE:
                 read = isinstance(self.shell, MeshSurface)

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from magshell_fenicsx.case.taylor import Taylor
+
 Array = NDArray[np.float64]
 FUNCTIONS = {name: getattr(np, name) for name in ("sin", "cos", "tan", "exp", "log", "sqrt", "abs", "sign", "arctan2")}
 NAMES = ("x", "y", "z", "pi")
@@ -33,6 +35,23 @@ def formula(text: str) -> Callable[[Array, Array, Array], Array]:
     ValueError
         If the text is anything but arithmetic of x, y, z, pi and the known functions.
     """
+    steps = _read(text)
+    return lambda x, y, z: np.broadcast_to(np.asarray(_evaluate(steps, x, y, z), dtype=np.float64), x.shape)
+
+
+def with_derivatives(text: str) -> Callable[[Array], Taylor]:
+    """The same with its first and second derivatives, a function of places (n, 3)."""
+    steps = _read(text)
+
+    def evaluate(x: Array) -> Taylor:
+        coordinates = Taylor.coordinates(x)
+        found = _evaluate(steps, *coordinates)
+        return found if isinstance(found, Taylor) else found + 0.0 * coordinates[0]  # a number
+
+    return evaluate
+
+
+def _read(text: str) -> list[_Step]:
     said = text if len(text) <= 60 else f"{text[:57]}..."
     try:
         tree = ast.parse(text, mode="eval")
@@ -55,20 +74,19 @@ def formula(text: str) -> Callable[[Array, Array, Array], Array]:
             known = name in FUNCTIONS and not node.keywords and len(node.args) == FUNCTIONS[name].nin
         if not known:
             raise ValueError(f"{said!r}: allowed are numbers, {', '.join(NAMES)}, + - * / **, {', '.join(FUNCTIONS)}")
-    steps = _steps(tree)
+    return _steps(tree)
 
-    def evaluate(x: Array, y: Array, z: Array) -> Array:
-        names, stack = {"x": x, "y": y, "z": z, "pi": np.float64(np.pi)}, list[Any]()
-        with np.errstate(all="ignore"):
-            for step in steps:
-                if isinstance(step, tuple):
-                    function, count = step
-                    stack[-count:] = [function(*stack[-count:])]
-                else:
-                    stack.append(names[step] if isinstance(step, str) else step)
-        return np.broadcast_to(np.asarray(stack[0], dtype=np.float64), x.shape)
 
-    return evaluate
+def _evaluate(steps: list[_Step], x: Any, y: Any, z: Any) -> Any:
+    names, stack = {"x": x, "y": y, "z": z, "pi": np.float64(np.pi)}, list[Any]()
+    with np.errstate(all="ignore"):
+        for step in steps:
+            if isinstance(step, tuple):
+                function, count = step
+                stack[-count:] = [function(*stack[-count:])]
+            else:
+                stack.append(names[step] if isinstance(step, str) else step)
+    return stack[0]
 
 
 def _steps(tree: ast.Expression) -> list[_Step]:

@@ -87,7 +87,7 @@ def layer_average(layers: list[Layer], turn: float = 0.0) -> NDArray[np.float64]
 
 
 class AppliedSection(Direction):
-    """The applied flux density, uniform or linear in space: |B^a| (uniform b + gradient · r/R).
+    """The applied flux density, uniform or linear in space: |B^a| (uniform b + gradient · r/R); or by formula.
 
     The unit vector b has the direction of polar and azimuth, r is the deformed place.
     """
@@ -100,14 +100,24 @@ class AppliedSection(Direction):
         default=None, min_length=3, max_length=3
     )
     """Three rows of three numbers; energy: full alone has it [|B^a|/R]"""
+    components: list[Formula] | None = Field(default=None, min_length=3, max_length=3)
+    """In place of these: formulas of the deformed position x, y, z over R (of a shell that of its mid-surface), twice
+    differentiable; as those of `remanent`; energy: full alone has them [|B^a|]"""
 
     @model_validator(mode="after")
     def _square(self) -> Self:
+        if self.components and (others := {"polar", "azimuth", "uniform", "gradient"} & self.model_fields_set):
+            raise ValueError(f"components are the whole field: leave out {', '.join(sorted(others))}")
         if self.gradient and any(len(row) != 3 for row in self.gradient):
             raise ValueError("gradient is three rows of three numbers")
         if self.uniform == 0 and not self.gradient:
             raise ValueError("uniform: 0 needs a gradient")
         return self
+
+    @property
+    def is_uniform(self) -> bool:
+        """Whether it is the same everywhere."""
+        return not (self.gradient or self.components)
 
 
 class MagneticSection(Section):
@@ -119,6 +129,8 @@ class MagneticSection(Section):
 
     energy: Literal["full", "first", "torque", "second", "second_consistent"] = "full"
     """The full magnetic energy, or an expansion"""
+    remanence: Literal["deformation", "rotation"] = "deformation"
+    """How B^r moves with the material: by F, which stretches it too (the paper's law), or by the rotation of F alone"""
     lambda_m: float | None = Field(default=None, ge=-10, le=10)
     """λ_m = |B^r||B^a|/(μ0 E); negative: the field is reversed; 0: no magnetic term"""
     remanent: RemanentSection = RemanentSection()
@@ -131,12 +143,16 @@ class MagneticSection(Section):
         densities = [self.remanent.flux_density, self.applied.flux_density]
         if self.lambda_m is not None and densities != [None, None]:
             raise ValueError("give lambda_m, or the flux densities of remanent and applied, not both")
+        if self.model_fields_set == {"remanence"}:
+            raise ValueError("remanence: is a law of a field, and there is none: give lambda_m or flux densities too")
         if self.lambda_m is None and None in densities:
             raise ValueError("give lambda_m, or remanent.flux_density and applied.flux_density")
         if self.remanent.flux_density == 0:
             raise ValueError("a remanence of length zero is no magnetisation: leave the section out")
-        if self.applied.gradient and self.energy != "full":
-            raise ValueError("the approximate energies are of uniform fields; a gradient needs energy: full")
+        if not self.applied.is_uniform and self.energy != "full":
+            raise ValueError(
+                "the approximate energies are of uniform fields; gradient and components need energy: full"
+            )
         return self
 
     def amplitude(self, youngs_modulus: float | None) -> float:

@@ -14,7 +14,8 @@ def account(case: Case, loads: Loads, model: str, mirror: Mirror | None) -> tupl
     included = [model, "membrane and bending energy" if case.model == "shell" else _elastic(case)]
     left_out = []
     if loads.magnetic:
-        included.append(f"magnetic energy ({loads.magnetic.energy}), lambda_m = {case.lambda_m:g}")
+        law = "" if loads.magnetic.law == "deformation" else ", remanence that turns and does not stretch"
+        included.append(f"magnetic energy ({loads.magnetic.energy}){law}, lambda_m = {case.lambda_m:g}")
     else:
         left_out.append("magnetic energy: " + ("lambda_m is zero" if case.magnetic else "no magnetic section"))
     if loads.pressure:

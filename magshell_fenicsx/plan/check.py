@@ -47,6 +47,8 @@ def describe(case: Case) -> str:
         left_out.append(no_potential(open_at))
     left_out = left_out or ["nothing"]
     lines += ["built:", *(f"  {item}" for item in plan.included), "left out:", *(f"  {item}" for item in left_out)]
+    if plan.warning:
+        lines.append(f"warning: {plan.warning}")
     return "\n".join(lines)
 
 

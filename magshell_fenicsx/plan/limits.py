@@ -4,13 +4,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.expressions import formula
+from magshell_fenicsx.case.expressions import formula, with_derivatives
 from magshell_fenicsx.case.messages import shown
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.plan.body import layers
 
 Array = NDArray[np.float64]
 MOST_UNKNOWNS = 2_000_000  # whose factors fill the memory of a large workstation
+SOURCES = 1e-9  # of the field's derivatives: rounding
 SMALLEST_FIELD, LARGEST_FIELD = 1e-12, 10.0  # of lambda_m: rounding, and a thousand times what destabilises a shell
 
 
@@ -37,7 +38,7 @@ def refuse_too_many(case: Case, cells: float, hint: str = "") -> None:
 
 
 def refuse_unbounded_fields(case: Case, r0: Array) -> None:
-    """Look at lambda_m and, at the points `r0` (n, 3), at the formulas of the remanence.
+    """Look at lambda_m and, at the points `r0` (n, 3), at the formulas of the remanence and of the applied field.
 
     Raises
     ------
@@ -49,11 +50,36 @@ def refuse_unbounded_fields(case: Case, r0: Array) -> None:
             f"magnetic: lambda_m is {case.lambda_m:.4g}; allowed are 0 and, of either sign, "
             f"{SMALLEST_FIELD:g} to {LARGEST_FIELD:g}"
         )
-    for text in (case.magnetic and case.magnetic.remanent.components) or []:
+    if not case.magnetic:
+        return
+    found = {"remanent": case.magnetic.remanent.components, "applied": case.magnetic.applied.components}
+    for key, text in ((key, text) for key, texts in found.items() for text in texts or []):
         bad = r0[~(np.abs(formula(text)(*r0.T)) <= 1e6)]
         if len(bad):
             x, y, z = bad[0]
             raise CaseError(
-                f"magnetic.remanent.components: {shown(text)}: has no finite value (or one above 1e6) "
+                f"magnetic.{key}.components: {shown(text)}: has no finite value (or one above 1e6) "
                 f"at (x, y, z) = ({x:.3g}, {y:.3g}, {z:.3g})"
             )
+
+
+def sources_beside(case: Case, r0: Array) -> str | None:
+    """What is unphysical in formulas of the applied field at the points `r0` (n, 3); None if nothing is.
+
+    A field of magnets and currents elsewhere has neither a divergence nor a curl.
+    """
+    components = case.magnetic.applied.components if case.magnetic and case.lambda_m else None
+    if not components:
+        return None
+    G = np.stack([with_derivatives(text)(r0).gradient for text in components])
+    divergence, curl = np.abs(np.trace(G)), np.linalg.norm(G - G.swapaxes(0, 1), axis=(0, 1)) / np.sqrt(2)
+    known = np.nan_to_num(divergence), np.nan_to_num(curl)
+    found = [float(values.max()) for values in known]
+    if max(found) <= SOURCES * np.nan_to_num(np.abs(G)).max():
+        return None
+    x, y, z = r0[np.argmax(np.maximum(*known))]
+    return (
+        f"magnetic.applied.components: on the shell div B is up to {found[0]:.3g} and curl B up to {found[1]:.3g} "
+        f"B^a/R, most of it at (x, y, z) = ({x:.3g}, {y:.3g}, {z:.3g}): "
+        "magnets and currents elsewhere make no such field"
+    )

@@ -75,6 +75,8 @@ class Plan:
         R in the unit that results are told in.
     own
         One's own energies; `loads` has them too, after those of the case's parts.
+    warning
+        What is unphysical, if anything.
     """
 
     material: Material
@@ -92,6 +94,7 @@ class Plan:
     thickness: Thickness | None = None
     length: float = 1.0
     own: tuple[OwnTerm, ...] = ()
+    warning: str | None = None
 
     @property
     def axisymmetric(self) -> bool:

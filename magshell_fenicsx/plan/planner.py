@@ -25,7 +25,7 @@ from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.parameters import Condition, Held, Material
 from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.plan.account import account
-from magshell_fenicsx.plan.limits import refuse_too_many, refuse_unbounded_fields
+from magshell_fenicsx.plan.limits import refuse_too_many, refuse_unbounded_fields, sources_beside
 from magshell_fenicsx.plan.loads import indented, loads, refuse_wide_patch
 from magshell_fenicsx.plan.names import refuse_unfit_ends
 from magshell_fenicsx.plan.outline import Chart, Outline, outline, refuse_beside
@@ -52,7 +52,8 @@ def make_plan(case: Case, terms: Sequence[OwnTerm] = ()) -> Plan:
     defect = Dimple(case.defect.amplitude * material.h, case.dimple_half_width) if case.defect else None
     drawn = outline(case, defect)
     places = indented(case, drawn)
-    refuse_unbounded_fields(case, np.zeros((0, 3)) if isinstance(case.shell, MeshSurface) else drawn.sample())
+    sample = np.zeros((0, 3)) if isinstance(case.shell, MeshSurface) else drawn.sample()
+    refuse_unbounded_fields(case, sample)
     energies = surface_terms(case, terms)
     axisymmetric, plane = _symmetry(case, drawn, left(case, drawn, places, energies))
     half = plane is not None
@@ -107,6 +108,7 @@ def make_plan(case: Case, terms: Sequence[OwnTerm] = ()) -> Plan:
         thickness=_thickness(case, turn),
         length=case.shell.reference,
         own=tuple(terms),
+        warning=sources_beside(case, sample if len(sample) else drawn.sample()),
     )
 
 

@@ -17,7 +17,7 @@ from magshell_fenicsx.case.loads.step import Step
 from magshell_fenicsx.mesh.mirror import ROUNDING, Y0, Mirror
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.plan.outline import Outline
-from magshell_fenicsx.plan.turning import scalar_turns, vector_turns
+from magshell_fenicsx.plan.turning import beside, scalar_turns, vector_turns, vectors_of
 
 Array = NDArray[np.float64]
 Vectors = Sequence[Array]
@@ -182,21 +182,23 @@ def _field(case: Case, outline: Outline) -> list[Leaves]:
     """Remanence and applied field must both be symmetric to a plane, or both antisymmetric."""
     magnetic = case.magnetic
     assert magnetic
-    vectors = [d.vector() for d in (*magnetic.remanent.directions(), magnetic.applied)]
+    known = magnetic.applied.components
+    vectors = [d.vector() for d in (*magnetic.remanent.directions(), *([] if known else [magnetic.applied]))]
     turning = [load.to.vector() for load in case.loads_of(RotationSection)]
     remanent, G = magnetic.remanent, np.array(magnetic.applied.gradient or np.zeros((3, 3)))
     fields: list[Callable[[Array], Array]] = [lambda x: np.asarray(x @ G.T)] if G.any() else []
-    if remanent.components:
-        texts = [formula(text) for text in remanent.components]
-        fields.append(lambda x: np.stack([f(*x.T) for f in texts], axis=-1))
+    fields += [vectors_of(texts) for texts in (remanent.components, known) if texts]
     askew = ["a field is not along e3"] if any(_tilted(v) for v in vectors) else []
     if remanent.components and not (outline.span and vector_turns(remanent.components, outline.span)):
         askew.append("the formula of the remanence differs around e3")
+    if known and not (outline.span and vector_turns(known, outline.span, in_space=True)):
+        askew.append("the formula of the applied field differs around e3")
     if np.abs(G - np.diag([G[0, 0], G[0, 0], G[2, 2]])).max() > PARALLEL:
         askew.append("the gradient of the applied field is not diag(a, a, b)")
 
     def mirrors(mirror: Mirror) -> bool:
         S, x = mirror.reflection, outline.sample() if fields else np.zeros((0, 3))
+        x = beside(x) if known else x
 
         def images(sign: float) -> bool:
             uniform = all(np.abs(S @ v - sign * v).max() <= 1e-10 for v in (*vectors, *turning))

@@ -1,6 +1,6 @@
 """Whether a formula of x, y, z is the same along every meridian."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,7 @@ from magshell_fenicsx.plan.plan import Span
 
 ANGLES = [2.399963 * i for i in range(90)]  # the golden angle: nothing periodic meets them all
 Array = NDArray[np.float64]
+NEAR = 0.1  # over R
 SAME = 1e-9  # of the largest value: differences that are rounding
 
 
@@ -20,12 +21,27 @@ def scalar_turns(text: str, span: Span) -> bool:
     return _same([f(*(places @ rotation(angle)).T)[:, None] for angle in ANGLES])
 
 
-def vector_turns(components: Sequence[str], span: Span) -> bool:
-    """Whether the vector with these components turns with the meridian and has none across it."""
-    fs, places, found = [formula(text) for text in components], _places(span), []
-    for Q in map(rotation, ANGLES):
-        found.append(np.column_stack([f(*(places @ Q).T) for f in fs]) @ Q.T)
+def vector_turns(components: Sequence[str], span: Span, *, in_space: bool = False) -> bool:
+    """Whether the vector with these components turns with the meridian and has none across it.
+
+    On the surface, and with `in_space` beside it, where it may move to.
+    """
+    vectors, places = vectors_of(components), _places(span)
+    if in_space:
+        places = beside(places) * [1.0, 0.0, 1.0]
+    found = [vectors(places @ Q) @ Q.T for Q in map(rotation, ANGLES)]
     return _same([*found, found[0] * [1.0, 0.0, 1.0]])
+
+
+def vectors_of(components: Sequence[str]) -> Callable[[Array], Array]:
+    """The vectors (n, 3) with these components at places (n, 3)."""
+    fs = [formula(text) for text in components]
+    return lambda x: np.stack([f(*x.T) for f in fs], axis=-1)
+
+
+def beside(x: Array) -> Array:
+    """Places (n, 3), and others near them."""
+    return np.vstack([x, x + NEAR * np.random.default_rng(2026).uniform(-1, 1, x.shape)])
 
 
 def _places(span: Span) -> Array:

@@ -102,6 +102,8 @@ def _run(case: Case, folder: Path | None, comm: MPI.Comm, say: Say, tell: Say, w
     scene = found.choice.scene(case, comm) if found else Scene(case, comm)
     result = Result(scene, scene.unloaded(), adapted=found)
     say(f"{', '.join(scene.plan.included)}: {scene.cells} cells, {scene.model.system.dofs} unknowns")
+    if scene.plan.warning:
+        say(f"warning: {scene.plan.warning}")
     if fast_blas() is None:
         say("warning: PETSc uses the reference BLAS; install OpenBLAS to factor seven times faster")
     if comm.size == 1 and not has_cholmod():

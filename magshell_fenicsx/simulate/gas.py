@@ -32,7 +32,9 @@ def gas(scene: Scene, section: GasSection, state: State) -> Conjugate:
         ambient = float(section.ambient or 0.0) / (scene.plan.material.classical_pressure * case.shell.youngs_modulus)
     first, now = section.volume or volume(case), state.mu["pressure"]
     changed = -scene.model.system.potential(state.u, state.mu, "pressure") / unit
-    if not (now < ambient and first + changed > 0):
+    if first + changed <= 0:
+        raise CaseError(f"hold.pressure.gas.volume: {first:.4g}: the shell has shrunk by {-changed:.4g} R^3 already")
+    if now >= ambient:
         raise CaseError(f"hold.pressure.gas: the pressure, {now:.4g} p_c, is not below the ambient {ambient:.4g} p_c")
     content = (ambient - now) * (first + changed)
 

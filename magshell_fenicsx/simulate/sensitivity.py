@@ -136,6 +136,7 @@ def _magnetic_column(scene: Scene, fold: Fold, field: Magnetisation) -> Vector:
     column.x.array[:] = 0
     for term in terms:
         assert term.amplitude
+        term.follow()
         term.add_residual(column.x.array, fold.state.mu[term.amplitude])
     column.x.scatter_reverse(InsertMode.add)
     for held in system.clamped:
@@ -149,8 +150,8 @@ def _magnetic_terms(scene: Scene, field: Magnetisation) -> Sequence[FormTerm]:
     if isinstance(model, MeridianModel):
         u = jets.revolved(model.u)
         return [
-            FormTerm(e.name, 2 * np.pi * e.of(u), model.u, log, e.amplitude, linear=e.linear)
-            for e in model.factory.magnetic(field)
+            FormTerm(e.name, 2 * np.pi * e.of(u), model.u, log, e.amplitude, linear=e.linear, follow=e.follow)
+            for e in model.factory.magnetic(field, model.u)
         ]
     if isinstance(model, SolidModel):
         return replace(model.factory, log=log).magnetic(field)

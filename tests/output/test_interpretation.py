@@ -7,7 +7,7 @@ f_mag = -3 (h/R) cos phi P e3, P the projection on the tangent plane.
 import numpy as np
 import pytest
 import ufl
-from conftest import hemisphere
+from conftest import disc, hemisphere
 from dolfinx import fem
 
 from magshell_fenicsx import Case, Scene
@@ -19,7 +19,8 @@ from magshell_fenicsx.models.shell.patterns import radial
 from magshell_fenicsx.output.fields.gathering import gatherer
 from magshell_fenicsx.output.fields.surface import SurfaceGatherer
 
-UP, H = np.array([0.0, 0.0, 1.0]), 0.05
+UP = E3 = np.array([0.0, 0.0, 1.0])
+H = 0.05
 
 
 def model(field: Magnetisation) -> ShellModel:
@@ -78,6 +79,47 @@ def test_first_order_energy_is_the_work_of_the_loads() -> None:
     p = ufl.dot(ufl.dot(P, Br), A)
     work = (ufl.dot(f, v) - p * ufl.dot(v, n0)) * kin.area_ratio(r0) * ufl.dx(metadata={"quadrature_degree": 8})
     assert fem.assemble_scalar(fem.form(work)) == pytest.approx(U1, rel=1e-4)
+
+
+def test_first_order_energy_of_a_remanence_that_does_not_stretch() -> None:
+    """U1 = integral of f_mag . u for u = 0 on the edge: f/h is half of that above less that of exchanged fields."""
+    Ba = np.array([0.48, 0.36, 0.8])
+    shell = model(Magnetisation(UP, Ba, "first", law="rotation"))
+    surface = SurfaceGatherer(shell).gather(shell.zero())
+    assert surface is not None
+    n = surface.n0
+    P = np.eye(3) - n[:, :, None] * n[:, None]
+    expected = H / 2 * ((n @ Ba)[:, None] * (P @ UP) - (n @ UP)[:, None] * (P @ Ba))
+    assert np.abs(surface.fields["p_mag"]).max() == 0
+    assert surface.fields["f_mag"] == pytest.approx(expected, abs=2e-3 * H)
+    x, y, z = shell.r0.x.array.reshape(-1, 3).T
+    u = (z[:, None] * np.column_stack([x * z, y + z, 0.5 + x])).ravel()
+    U1 = shell.system.potential(u, {}, "lambda_m")
+    n0, Br, A = kin.normal(kin.jet(shell.r0, shell.V.mesh)), ufl.as_vector(UP.tolist()), ufl.as_vector(Ba.tolist())
+    f = (ufl.dot(n0, A) * (Br - ufl.dot(n0, Br) * n0) - ufl.dot(n0, Br) * (A - ufl.dot(n0, A) * n0)) / 2
+    area = kin.area_ratio(kin.jet(shell.r0, shell.V.mesh))
+    work = ufl.dot(f, shell.u) * area * ufl.dx(metadata={"quadrature_degree": 8})
+    assert fem.assemble_scalar(fem.form(work)) == pytest.approx(U1, rel=1e-4)
+
+
+def test_springs_and_torques_of_a_remanence_that_does_not_stretch() -> None:
+    """Of a plate: k is the mean over all axes in it; U_tau = q . tau where no area changes."""
+    Br, Ba, D = np.array([0.6, 0.0, 0.8]), np.array([0.48, 0.36, 0.8]), np.array([[0.1, 0.3], [-0.2, -0.1]])
+    flat = ShellModel(disc(0.8), Material(0.3, H), 2, {}, Loads(magnetic=Magnetisation(Br, Ba, law="rotation")))
+    q = np.array([0.05, -0.08])
+    u = (flat.r0.x.array.reshape(-1, 3)[:, :2] @ np.vstack([D, q]).T).ravel()
+    surface = SurfaceGatherer(flat).gather(u)
+    assert surface is not None
+    mean = (2 * Ba[2] * Br[2] + Ba[:2] @ Br[:2]) / 2
+    assert surface.fields["k"] == pytest.approx(-mean, abs=1e-12)
+    parts = {}
+    for kind in ("torque", "second"):
+        field = Magnetisation(Br, Ba, kind, law="rotation")  # type: ignore[arg-type]
+        other = ShellModel(disc(0.8), Material(0.3, H), 2, {}, Loads(magnetic=field))
+        parts |= other.system.energies(u)
+    area = 3 * flat.volume_change(np.tile(E3, len(u) // 3))
+    assert surface.fields["tau"] @ [*q, 0.0] == pytest.approx(parts["Utau"] / area, rel=1e-10)
+    assert parts["Uq"] / area != pytest.approx(-surface.fields["k"][0] / 2 * (q @ q))  # it differs between axes
 
 
 def test_springs_of_a_radial_remanence() -> None:

@@ -13,6 +13,7 @@ from interrupted import check_fields, check_same_path, kill, start, wait_for_row
 from mpi4py import MPI
 
 from magshell_fenicsx.output.store.folder import held_folder
+from magshell_fenicsx.output.store.table import read_rows
 
 INDENTATION, BUCKLING = CASES / "pole_indentation.yaml", CASES / "dimple_buckling.yaml"
 MERIDIAN = (BUCKLING, "--set=magnetic.lambda_m=0.00184", "--set=mesh.refinement=0.5")
@@ -23,7 +24,8 @@ SOLID = (
     *("--set=shell.radius_to_thickness=20", "--set=mesh.refinement=0.4"),
     *("--set=loading.depth=3", "--set=loading.points=6"),
 )
-CASE = {"meridian": MERIDIAN, "half": HALF, "long": LONG, "solid": SOLID}
+PROGRAMME = (CASES / "programme.yaml", "--set=symmetry=half", "--set=mesh.degree=2", "--set=mesh.refinement=0.4")
+CASE = {"meridian": MERIDIAN, "programme": PROGRAMME, "half": HALF, "long": LONG, "solid": SOLID}
 
 
 @dataclass(frozen=True)
@@ -70,6 +72,21 @@ def test_killed_twice(whole: Whole, tmp_path: Path) -> None:
     assert b["replayed"] == 0 < a["replayed"]
     assert a["factorisations"] < b["factorisations"]
     assert a["knockdown"] == pytest.approx(b["knockdown"], rel=1e-9)
+
+
+@pytest.mark.parametrize("whole", [pytest.param("programme", marks=pytest.mark.slow)], indirect=True)
+def test_killed_in_a_step_that_holds_a_volume(whole: Whole, tmp_path: Path) -> None:
+    """kill -9 in step 3 of 5 on two ranks, resumed on three, killed again, resumed on one."""
+    out = tmp_path / "out"
+    third = [row["step"] for row in read_rows(whole.out / "path.csv")].index(3)
+    for ranks, rows in ((2, third + 2), (3, third + 4)):
+        run = start("run", *whole.case, "--out", out, *(["--resume"] if out.exists() else []), ranks=ranks)
+        wait_for_rows(run, out, rows)
+        kill(run, ranks)
+    done = magshell("run", *whole.case, "--out", out, "--resume")
+    assert done.returncode == 0, done.stderr
+    check_same_path(out, whole.out)
+    check_fields(out)
 
 
 @pytest.mark.slow

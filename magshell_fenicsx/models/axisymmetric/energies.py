@@ -5,7 +5,7 @@ axisymmetric displacement and the waves added to it.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import ufl
@@ -18,12 +18,14 @@ from magshell_fenicsx.models.axisymmetric.meridian import Meridian
 from magshell_fenicsx.models.axisymmetric.pattern import pattern_field
 from magshell_fenicsx.models.shell import densities, edges
 from magshell_fenicsx.models.shell import kinematics as kin
+from magshell_fenicsx.models.shell.applied import AppliedField
+from magshell_fenicsx.models.shell.densities import MagneticDensity
 from magshell_fenicsx.models.shell.energy import Density
 from magshell_fenicsx.models.shell.free import Constants, constants_of
 from magshell_fenicsx.models.shell.kinematics import Jet
+from magshell_fenicsx.models.shell.laws import FULL, LINEAR, magnetic_densities
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.parameters import Magnetisation, Material
-from magshell_fenicsx.models.shell.terms import LINEAR, MAGNETIC_TERMS
 
 INTERIOR = "interior edges"
 Facets = NDArray[np.int32]
@@ -42,6 +44,7 @@ class Energy:
     amplitude: str | None = None
     linear: bool = False
     work: Callable[[Jet, Jet], ufl.Form] | None = None
+    follow: Callable[[], None] | None = None
 
     def added(self, u: Jet, v: Jet) -> ufl.Form:
         """A form with the Hessian in v, at v = 0, of the energy of u + v; of a work that of its symmetric part."""
@@ -102,18 +105,27 @@ class EnergyFactory:
         j0, ds, m, width = self.j0, self._ds(facets), self._covector(), self._width()
         return Energy(name, lambda u: density.of(j0, u, m, width, *density.parameters) * ds, amplitude)
 
-    def magnetic(self, field: Magnetisation) -> list[Energy]:
-        """The terms of the chosen energy for axisymmetric fields; all have the amplitude lambda_m."""
+    def magnetic(self, field: Magnetisation, u: fem.Function) -> list[Energy]:
+        """The terms of the chosen energy for axisymmetric fields; all have the amplitude lambda_m.
+
+        A field in space is known at the displacement u, of the meridian.
+        """
         j0, t, pattern = self.j0, self._t, field.remanent
         Br = pattern_field(pattern, self.r0) if callable(pattern) else self.constant(pattern)
 
-        def term(name: str, density: Callable[[Jet, Jet, Expr, Expr], Expr], Ba: Expr) -> Energy:
+        def term(name: str, density: MagneticDensity, Ba: Expr) -> Energy:
             return self._cells(name, lambda u: t * density(j0, u, Br, Ba), "lambda_m", linear=name in LINEAR)
 
+        if field.in_space:
+            known = AppliedField(field.in_space, self.r0, u, self._quadrature)
+            return [
+                replace(term("magnetic", densities.in_space(FULL[field.law]), known.polynomial), follow=known.follow)
+            ]
         Ba = self.constant(field.applied)
-        terms = [term(name, density, Ba) for name, density in MAGNETIC_TERMS[field.energy].items()]
+        terms = [term(name, density, Ba) for name, density in magnetic_densities(field.law, field.energy).items()]
         if field.gradient is not None:
-            terms.append(term("magnetic gradient", densities.magnetic_gradient, self.constant(field.gradient)))
+            density = densities.in_gradient(FULL[field.law])
+            terms.append(term("magnetic gradient", density, self.constant(field.gradient)))
         return terms
 
     def pressure(self) -> Energy:
@@ -190,8 +202,11 @@ class EnergyFactory:
         return self.constant(self.material.nu), self.constant(self.material.h)
 
     def _dx(self) -> ufl.Measure:
-        # one point more than the surface's 2k: on the axis the densities are rational
-        return ufl.Measure("dx", domain=self.meridian.mesh, metadata={"quadrature_degree": 2 * self.degree + 2})
+        return ufl.Measure("dx", domain=self.meridian.mesh, metadata={"quadrature_degree": self._quadrature})
+
+    @property
+    def _quadrature(self) -> int:
+        return 2 * self.degree + 2  # one point more than the surface's 2k: on the axis the densities are rational
 
     def _ds(self, facets: Facets) -> ufl.Measure:
         tags = mesh.meshtags(self.meridian.mesh, 0, facets, np.ones_like(facets))

@@ -92,7 +92,7 @@ class MeridianModel(Observed):
         if len(self.supports.mirror):
             self.energies.append(factory.mirror_edges(self.supports.mirror))
         if loads.magnetic:
-            self.energies += factory.magnetic(loads.magnetic)
+            self.energies += factory.magnetic(loads.magnetic, self.u)
         volume = factory.volume_change
         beside, self.without_potential = openings(meridian, conditions)
         if loads.pressure and beside:
@@ -137,8 +137,8 @@ class MeridianModel(Observed):
 
     def _term(self, e: Energy) -> FormTerm:
         u, v = jets.revolved(self.u), jets.revolved(ufl.TestFunction(self.V))
-        work = 2 * np.pi * e.work(u, v) if e.work else None
-        return FormTerm(e.name, 2 * np.pi * e.of(u), self.u, self.kernels, e.amplitude, linear=e.linear, work=work)
+        work, energy = 2 * np.pi * e.work(u, v) if e.work else None, 2 * np.pi * e.of(u)
+        return FormTerm(e.name, energy, self.u, self.kernels, e.amplitude, linear=e.linear, work=work, follow=e.follow)
 
     def _moment(self, name: str, load: EdgeMoment, amplitude: str) -> Counted:
         facets, constant = self.meridian.ends[load.edge], self.factory.constant

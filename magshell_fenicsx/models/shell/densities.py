@@ -4,11 +4,16 @@ All in units of E h per undeformed area (lengths in R), so that the membrane ene
 of order one; `h` is then h/R. An energy is the integral of density times area_ratio(r0).
 """
 
+from collections.abc import Callable
+
 import ufl
 from ufl.core.expr import Expr
 
 from magshell_fenicsx.models.shell import kinematics as kin
+from magshell_fenicsx.models.shell.applied import around
 from magshell_fenicsx.models.shell.kinematics import Jet
+
+MagneticDensity = Callable[[Jet, Jet, Expr, Expr], Expr]  # of (r0, u, Br, Ba)
 
 
 def koiter(S: Expr, up: Expr, nu: Expr) -> Expr:
@@ -56,9 +61,26 @@ def magnetic(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:
     return -ufl.dot(Ba, u.r1 * ufl.dot(up1, Br) + u.r2 * ufl.dot(up2, Br) + (n - n0) * ufl.dot(n0, Br))
 
 
-def magnetic_gradient(r0: Jet, u: Jet, Br: Expr, G: Expr) -> Expr:
-    """The part of Ba = G r: -(G r) . F Br at the deformed position, without its value at u = 0."""
-    return magnetic(r0, u, Br, ufl.dot(G, r0.r + u.r)) - ufl.dot(ufl.dot(G, u.r), Br)
+def in_gradient(law: MagneticDensity) -> MagneticDensity:
+    """The part of Ba = G r, of (r0, u, Br, G): -(G r) . F Br at the deformed position, without its value at u = 0.
+
+    `law` is `magnetic`, or has R in place of F.
+    """
+
+    def magnetic_gradient(r0: Jet, u: Jet, Br: Expr, G: Expr) -> Expr:
+        return law(r0, u, Br, ufl.dot(G, r0.r + u.r)) - ufl.dot(ufl.dot(G, u.r), Br)
+
+    return magnetic_gradient
+
+
+def in_space(law: MagneticDensity) -> MagneticDensity:
+    """That of a field known by values, of (r0, u, Br, P): P as of `applied.around`; `law` as above."""
+
+    def magnetic_in_space(r0: Jet, u: Jet, Br: Expr, P: Expr) -> Expr:
+        B, change = around(P, u.r)
+        return law(r0, u, Br, B) - ufl.dot(change, Br)
+
+    return magnetic_in_space
 
 
 def magnetic_first(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:
@@ -72,14 +94,14 @@ def magnetic_first(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:
 def magnetic_torque(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:
     """Uq, quadratic in the rotation q_i = n0 . u,_i: rotational springs; paper Eq. (eq:terms)."""
     n0 = kin.normal(r0)
-    q = _rotation(r0, u)
+    q = rotation(r0, u)
     return ufl.dot(q, q) * ufl.dot(n0, Ba) * ufl.dot(n0, Br) / 2
 
 
 def magnetic_tau(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:
     """Utau: torques from the surface gradient of u, q^c U_ac with a the derivative; paper Eq. (eq:terms)."""
     up1, up2 = kin.dual_basis(r0)
-    q = _rotation(r0, u)
+    q = rotation(r0, u)
     turned = ufl.dot(q, u.r1) * ufl.dot(up1, Ba) + ufl.dot(q, u.r2) * ufl.dot(up2, Ba)
     return -turned * ufl.dot(kin.normal(r0), Br)
 
@@ -90,11 +112,11 @@ def magnetic_couple(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:
     With it, U1 + Uq + Utau is the second-order Taylor polynomial of the full energy.
     """
     n0 = kin.normal(r0)
-    q = _rotation(r0, u)
+    q = rotation(r0, u)
     return ufl.dot(q, Ba) * ufl.dot(n0, Br) - ufl.dot(n0, Ba) * ufl.dot(q, Br)
 
 
-def _rotation(r0: Jet, u: Jet) -> Expr:
+def rotation(r0: Jet, u: Jet) -> Expr:
     """q^i a0_i with q_i = n0 . u,_i, tangent to the undeformed surface."""
     up1, up2 = kin.dual_basis(r0)
     n0 = kin.normal(r0)

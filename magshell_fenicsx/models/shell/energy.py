@@ -135,6 +135,9 @@ class HessianTerm:
     def energy(self) -> float:
         return 0.0
 
+    def follow(self) -> None:
+        """It depends on nothing else."""
+
     def accept(self) -> None:
         """It has no energy, and so no history."""
 

@@ -16,6 +16,7 @@ from ufl.constantvalue import Zero
 from ufl.core.expr import Expr
 
 from magshell_fenicsx.assembly.kernels import KernelLog
+from magshell_fenicsx.assembly.point_field import PointField
 from magshell_fenicsx.assembly.point_kernels import Points
 from magshell_fenicsx.models.shell.energy import Density, ShellTerm
 from magshell_fenicsx.models.shell.kinematics import Jet
@@ -70,10 +71,12 @@ class PointGradient:
         points = self._points = Points(max(min(count, chunk), 1))
         self._u, placement, place = (points.field(size) for size in (self._size, self._size, geometry.shape[1]))
         self._known = [(placement, r0), (place, geometry)]
+        self._following: list[tuple[fem.Function, Array]] = []
         W, work, v = ufl.zero(), ufl.zero(), points.field(self._size)
         for term in terms:
             parameters, varying = parameters_at(points, term.density.parameters, term.density.sides)
             self._known += [(here, values(field)) for here, field in varying]
+            self._following += [(here, values(field)) for here, field in varying if isinstance(field, PointField)]
             if term.density.work:
                 work += _energy(term.density, [placement, self._u, v], place, parts, parameters)
             else:
@@ -90,10 +93,9 @@ class PointGradient:
 
     def evaluate(self, chunk: slice) -> Array:
         """The derivatives by what was filled in, in the same order; the array is reused by the next call."""
-        if self._loaded != chunk:
-            for field, values in self._known:
-                fill(field, values[chunk])
-            self._loaded = chunk
+        for field, values in self._known if self._loaded != chunk else self._following:
+            fill(field, values[chunk])
+        self._loaded = chunk
         return self._points.evaluate(self._gradient, chunk.stop - chunk.start)
 
 

@@ -7,6 +7,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from magshell_fenicsx.models.shell.applied import FieldInSpace
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.patterns import Pattern
 
@@ -22,6 +23,7 @@ class Held:
 Condition = Literal["clamped", "simply supported", "free", "symmetry", "plane"] | Held
 ACROSS = ("lambda_across", "lambda_third")
 MagneticEnergy = Literal["full", "first", "torque", "second", "second_consistent"]
+RemanenceLaw = Literal["deformation", "rotation"]
 
 
 @dataclass(frozen=True)
@@ -68,6 +70,8 @@ class Magnetisation:
         The flux densities over their magnitudes: vectors (3,), or a pattern for the remanent one.
     gradient
         (3, 3) of the applied flux density, which is applied + gradient . r; None if uniform.
+    in_space
+        The applied flux density as a function of the deformed place, in place of `applied` and `gradient`.
     across
         Vectors (3,), normal to `applied` and to each other, that the field turns towards, with the amplitudes of
         `ACROSS`.
@@ -81,6 +85,8 @@ class Magnetisation:
         Vectors (3,) on named patches of a mesh, in place of `remanent`; None without.
     layers
         Fractions of the thickness and vectors (3,), from the inner face outwards, of which `remanent` is the average.
+    law
+        Whether the remanence moves with F, as in the paper, or with its rotation R.
     """
 
     remanent: NDArray[np.float64] | Pattern
@@ -90,6 +96,8 @@ class Magnetisation:
     across: tuple[NDArray[np.float64], ...] = ()
     patches: Mapping[str, NDArray[np.float64]] | None = None
     layers: tuple[tuple[float, NDArray[np.float64]], ...] = ()
+    law: RemanenceLaw = "deformation"
+    in_space: FieldInSpace | None = None
     axes: tuple[NDArray[np.float64], ...] = ()
     turned: tuple[NDArray[np.float64], ...] = ()
 
@@ -98,6 +106,11 @@ class Magnetisation:
         """Amplitude -> the part of the field's gradient that it multiplies."""
         parts = {f"lambda_gradient_{i}": B for i, B in enumerate(self.turned, 1)}
         return {} if self.gradient is None else {"lambda_m": self.gradient, **parts}
+
+    @property
+    def uniform(self) -> bool:
+        """Whether the applied flux density is."""
+        return self.gradient is None and self.in_space is None
 
 
 @dataclass(frozen=True)

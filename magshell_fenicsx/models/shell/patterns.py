@@ -113,8 +113,8 @@ def pattern_field(pattern: Pattern, r0: fem.Function) -> fem.Function:
     return field
 
 
-def refuse_unbounded(vectors: Array, nodes: Array, comm: MPI.Comm) -> None:
-    """Look at vectors and places (cells, nodes, 3); collective.
+def refuse_unbounded(vectors: Array, nodes: Array, comm: MPI.Comm, key: str = "magnetic.remanent") -> None:
+    """Look at vectors and places (cells, nodes, 3) of a key of the case; collective.
 
     Raises
     ------
@@ -125,6 +125,5 @@ def refuse_unbounded(vectors: Array, nodes: Array, comm: MPI.Comm) -> None:
     if said := [place for places in comm.allgather(bad) for place in places]:
         x, y, z = said[0]
         raise MeshError(
-            f"magnetic.remanent: has no finite value (or one above {LARGEST:g}) at (x, y, z)/R = "
-            f"({x:.3g}, {y:.3g}, {z:.3g})"
+            f"{key}: has no finite value (or one above {LARGEST:g}) at (x, y, z)/R = ({x:.3g}, {y:.3g}, {z:.3g})"
         )

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.assembly.batches import Batch
 from magshell_fenicsx.assembly.contraction import Blocks, Contraction
 from magshell_fenicsx.assembly.kernels import KernelLog
+from magshell_fenicsx.assembly.point_field import PointField
 from magshell_fenicsx.assembly.point_kernels import Pair, Pairs, Points, point_hessian
 from magshell_fenicsx.assembly.shape_tables import PARTS
 from magshell_fenicsx.models.shell.energy import Density, HessianTerm, Parameter, ShellTerm
@@ -200,7 +201,12 @@ def parameters_at(
 
 
 def at_points(field: fem.Function, X: Array, cells: NDArray[np.int32]) -> Array:
-    """(cells * points, components) of a field that varies over the cells, at reference points (points, 2)."""
+    """(cells * points, components) of a field that varies over the cells, at reference points (points, 2).
+
+    A `PointField` is known at its own points, in consecutive cells, and what is returned follows it.
+    """
+    if isinstance(field, PointField):
+        return field.at(cells)
     Q, size = field.function_space, field.ufl_shape[0]
     values = Q.element.basix_element.tabulate(0, X)[0, :, :, 0]
     nodal = field.x.array.reshape(-1, size)[Q.dofmap.list[cells]]
@@ -209,7 +215,8 @@ def at_points(field: fem.Function, X: Array, cells: NDArray[np.int32]) -> Array:
 
 def _on_sides(field: fem.Function, batch: Batch, sides: range) -> Array:
     """(points, sides * components) on the edges, or in the cells, of a batch."""
-    return np.hstack([at_points(field, batch.rule.points[side], batch.cells[side]) for side in sides])
+    found = [at_points(field, batch.rule.points[side], batch.cells[side]) for side in sides]
+    return np.hstack(found) if len(found) > 1 else found[0]
 
 
 def fill(field: fem.Function, values: Array) -> None:

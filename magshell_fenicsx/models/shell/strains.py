@@ -83,9 +83,23 @@ class TangentFrame:
 
     def convected(self, v: Array, u: Array) -> Array:
         """F v with F = a_i (x) a0^i + n (x) n0, of vectors (..., 3): how a remanence moves with the shell."""
-        along = np.einsum("...ia,...ij,...j->...a", self.dual, self.t, v)
-        moved = np.einsum("...a,a...j->...j", along, self.jet[1:3] + u[1:3])
-        return np.asarray(moved + _dot(self.n0, v)[..., None] * self.normal(u))
+        return self._carried(self._deformed(u), v, u)
+
+    def rotated(self, v: Array, u: Array) -> Array:
+        """R v with the rotation R of F, of vectors (..., 3); see `rotation_law`."""
+        f, n = self._deformed(u), self.normal(u)
+        cofactor = np.stack([np.cross(f[..., 1, :], n), np.cross(n, f[..., 0, :])], axis=-2)
+        T = np.sqrt(np.sum(f * (f + cofactor), axis=(-2, -1)))
+        return self._carried((f + cofactor) / T[..., None, None], v, u)
+
+    def _deformed(self, u: Array) -> Array:
+        """F t_1, F t_2 (..., 2, 3)."""
+        return np.asarray(np.einsum("...ia,a...j->...ij", self.dual, self.jet[1:3] + u[1:3]))
+
+    def _carried(self, t: Array, v: Array, u: Array) -> Array:
+        """The vector that has the components of v in t and along the deformed normal."""
+        in_surface = np.einsum("...ik,...k,...ij->...j", self.t, v, t)
+        return np.asarray(in_surface + _dot(self.n0, v)[..., None] * self.normal(u))
 
     def tensor(self, S: Array) -> Array:
         """S_11, S_12, S_22 (..., 3) in the frame as a tensor in space, (..., 3, 3)."""

@@ -13,6 +13,7 @@ from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.models.shell import densities, edges
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.antisymmetric import antisymmetric_edge
+from magshell_fenicsx.models.shell.applied import AppliedField
 from magshell_fenicsx.models.shell.energy import (
     Density,
     HessianTerm,
@@ -24,24 +25,12 @@ from magshell_fenicsx.models.shell.energy import (
 )
 from magshell_fenicsx.models.shell.free import Constants, constants_of
 from magshell_fenicsx.models.shell.kinematics import CURVED, MOVED, SECOND, Jet
+from magshell_fenicsx.models.shell.laws import FULL, LINEAR, magnetic_densities
 from magshell_fenicsx.models.shell.moment import MomentTerm
 from magshell_fenicsx.models.shell.own_term import OwnTerm
-from magshell_fenicsx.models.shell.parameters import ACROSS, MagneticEnergy, Magnetisation, Material
+from magshell_fenicsx.models.shell.parameters import ACROSS, Magnetisation, Material
 from magshell_fenicsx.models.shell.patterns import pattern_field
 from magshell_fenicsx.models.shell.thickness import thick
-
-MagneticDensity = Callable[[Jet, Jet, Expr, Expr], Expr]
-FIRST: dict[str, MagneticDensity] = {"U1": densities.magnetic_first}
-TORQUE: dict[str, MagneticDensity] = {"Uq": densities.magnetic_torque}
-QUADRATIC: dict[str, MagneticDensity] = {**FIRST, **TORQUE, "Utau": densities.magnetic_tau}
-MAGNETIC_TERMS: dict[MagneticEnergy, dict[str, MagneticDensity]] = {
-    "full": {"magnetic": densities.magnetic},
-    "first": FIRST,
-    "torque": TORQUE,
-    "second": QUADRATIC,
-    "second_consistent": {**QUADRATIC, "couple": densities.magnetic_couple},
-}
-LINEAR = ("U1", "couple")
 
 
 @dataclass(frozen=True)
@@ -116,6 +105,11 @@ class TermFactory:
         """The terms of the chosen energy, linear in the applied field, with the amplitude lambda_m."""
         pattern = field.remanent
         Br = pattern_field(pattern, self.r0) if callable(pattern) else self._constant(pattern)
+        if field.in_space:
+            known = AppliedField(field.in_space, self.r0, self.u, cell_quadrature(self.degree))
+            of = densities.in_space(FULL[field.law])
+            density = self._thick(Density(per_area(of), (Br, known.polynomial), parts=MOVED), None)
+            return [self._cells("magnetic", density, "lambda_m", follow=known.follow)]
         directions = [("lambda_m", "", field.applied)]
         directions += [(name, name.replace("lambda_", " "), Ba) for name, Ba in zip(ACROSS, field.across, strict=False)]
         terms = [
@@ -126,10 +120,11 @@ class TermFactory:
                 linear=name in LINEAR,
             )
             for amplitude, suffix, Ba in directions
-            for name, of in MAGNETIC_TERMS[field.energy].items()
+            for name, of in magnetic_densities(field.law, field.energy).items()
         ]
         for name, G in field.gradients.items():
-            density = Density(per_area(densities.magnetic_gradient), (Br, self._constant(G)), parts=MOVED)
+            parameters = (Br, self._constant(G))
+            density = Density(per_area(densities.in_gradient(FULL[field.law])), parameters, parts=MOVED)
             suffix = name.removeprefix("lambda_m").replace("lambda_gradient_", " ")
             terms.append(self._cells("magnetic gradient" + suffix, self._thick(density, None), name))
         return terms
@@ -204,12 +199,20 @@ class TermFactory:
         """Covector and width of a boundary edge."""
         return kin.facet_covector(self._domain), ufl.CellVolume(self._domain) / ufl.FacetArea(self._domain)
 
-    def _cells(self, name: str, density: Density, amplitude: str | None = None, *, linear: bool = False) -> ShellTerm:
+    def _cells(
+        self,
+        name: str,
+        density: Density,
+        amplitude: str | None = None,
+        *,
+        linear: bool = False,
+        follow: Callable[[], None] | None = None,
+    ) -> ShellTerm:
         energy, work = density.of(*self._jets(), *density.parameters) * self._dx(), None
         if density.work:
             v = kin.jet(ufl.TestFunction(self.u.function_space), self._domain)
             work = density.work(*self._jets(), v, *density.parameters) * self._dx()
-        return ShellTerm(name, density, energy, self.u, self.log, amplitude, linear=linear, work=work)
+        return ShellTerm(name, density, energy, self.u, self.log, amplitude, linear=linear, work=work, follow=follow)
 
     def _edges(self, name: str, density: Density) -> ShellTerm:
         assert density.facets is not None

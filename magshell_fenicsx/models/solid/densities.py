@@ -8,6 +8,8 @@ the undeformed outward normal of the mid-surface and t the edge's tangent, which
 import ufl
 from ufl.core.expr import Expr
 
+from magshell_fenicsx.models.shell.applied import around
+
 
 def distortion(X: Expr, u: Expr, H: Expr, shear: Expr, h: Expr) -> Expr:
     """mu/2 (J^(-2/3) F:F - 3): what does not depend on a change of volume."""
@@ -29,6 +31,12 @@ def magnetic_gradient(X: Expr, u: Expr, H: Expr, Br: Expr, G: Expr, h: Expr) -> 
     """The part of Ba = G x: -(G x) . F Br at the deformed place x = X + u, without its value at u = 0."""
     F = ufl.Identity(3) + H
     return -(ufl.dot(ufl.dot(G, X + u), ufl.dot(F, Br)) - ufl.dot(ufl.dot(G, X), Br)) / h
+
+
+def magnetic_in_space(X: Expr, u: Expr, H: Expr, Br: Expr, P: Expr, h: Expr) -> Expr:
+    """That of a field known by values, without its value at u = 0; P as of `applied.around`."""
+    B, change = around(P, u)
+    return magnetic(X, u, H, Br, B, h) - ufl.dot(change, Br) / h
 
 
 def enclosed(x: Expr, x1: Expr, x2: Expr) -> Expr:

@@ -14,13 +14,14 @@ from ufl.core.expr import Expr
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.terms import DensityTerm
 from magshell_fenicsx.mesh.hexahedra import MIDDLE, OUTER, Body
+from magshell_fenicsx.models.shell.applied import AppliedField
 from magshell_fenicsx.models.shell.energy import per_area
 from magshell_fenicsx.models.shell.free import Constants, constants_of
 from magshell_fenicsx.models.shell.kinematics import SECOND, Jet
 from magshell_fenicsx.models.shell.moment import Counted
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.parameters import ACROSS, Magnetisation
-from magshell_fenicsx.models.solid import densities
+from magshell_fenicsx.models.solid import densities, rotation_law
 from magshell_fenicsx.models.solid.material import NeoHookean
 from magshell_fenicsx.models.solid.remanence import remanence_field
 
@@ -105,16 +106,22 @@ class TermFactory:
 
     def magnetic(self, of: Magnetisation) -> list[SolidTerm]:
         """The terms, linear in the applied field, with the amplitude lambda_m."""
-        pattern = of.remanent
+        pattern, law = of.remanent, densities if of.law == "deformation" else rotation_law
         Br = remanence_field(pattern, self.u.function_space) if callable(pattern) else self._constants(pattern)[0]
+        if of.in_space:
+            X = fem.Function(self.u.function_space)
+            X.interpolate(lambda x: x)
+            known = AppliedField(of.in_space, X, self.u, WHOLE)
+            density = Density(law.magnetic_in_space, (Br, known.polynomial, *self._constants(self.h)), VALUE + GRADIENT)
+            return [self._bulk("magnetic", density, "lambda_m", follow=known.follow)]
         directions = [("lambda_m", "", of.applied)]
         directions += [(name, name.replace("lambda_", " "), Ba) for name, Ba in zip(ACROSS, of.across, strict=False)]
         terms = []
         for amplitude, suffix, Ba in directions:
-            density = Density(densities.magnetic, (Br, *self._constants(Ba, self.h)))
-            terms.append(self._bulk("magnetic" + suffix, density, amplitude, linear=True))
+            density = Density(law.magnetic, (Br, *self._constants(Ba, self.h)))
+            terms.append(self._bulk("magnetic" + suffix, density, amplitude, linear=law is densities))
         for name, G in of.gradients.items():
-            density = Density(densities.magnetic_gradient, (Br, *self._constants(G, self.h)), VALUE + GRADIENT)
+            density = Density(law.magnetic_gradient, (Br, *self._constants(G, self.h)), VALUE + GRADIENT)
             suffix = name.removeprefix("lambda_m").replace("lambda_gradient_", " ")
             terms.append(self._bulk("magnetic gradient" + suffix, density, name))
         return terms
@@ -195,11 +202,19 @@ class TermFactory:
                     )
         return found
 
-    def _bulk(self, name: str, density: Density, amplitude: str | None = None, *, linear: bool = False) -> SolidTerm:
+    def _bulk(
+        self,
+        name: str,
+        density: Density,
+        amplitude: str | None = None,
+        *,
+        linear: bool = False,
+        follow: Callable[[], None] | None = None,
+    ) -> SolidTerm:
         domain, u = self.body.mesh, self.u
         dx = ufl.Measure("dx", domain=domain, metadata={"quadrature_degree": density.degree})
         energy = density.of(ufl.SpatialCoordinate(domain), u, ufl.grad(u), *density.parameters) * dx
-        return SolidTerm(name, density, energy, self.u, self.log, amplitude, linear=linear)
+        return SolidTerm(name, density, energy, self.u, self.log, amplitude, linear=linear, follow=follow)
 
     def _on_faces(self, found: Sequence[Density], v: Expr | None = None) -> ufl.Form:
         """The sum of energies, or of virtual works of v."""

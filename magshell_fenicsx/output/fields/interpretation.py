@@ -1,7 +1,8 @@
 """The magnetic energy as equivalent loads: pressure, in-plane force, rotational springs, torques.
 
 Paper, section "Reduced magneto-elastic energy as load potentials": for a field that is uniform in space, at the nodes
-of the undeformed surface, dimensionless as in the paper.
+of the undeformed surface, dimensionless as in the paper. For a remanence that does not stretch, the same of its
+expansion: no pressure, a spring that differs between axes (k is the mean), a torque of the symmetric gradient too.
 """
 
 from dataclasses import dataclass
@@ -29,10 +30,15 @@ def magnetic_loads(
     pattern = field.remanent
     Br = pattern(r0, g.n0) if callable(pattern) else np.broadcast_to(pattern, r0.shape)
     Ba = field.applied
+    rotates = field.law == "rotation"
     loads = {"p_mag": magnetic_pressure(g, Br, Ba, h), "k": spring_stiffness(g, Br, Ba)}
+    if rotates:
+        loads = {"p_mag": 0 * loads["p_mag"], "k": loads["k"] - (Br @ Ba + loads["k"]) / 2}
     if not callable(pattern) and isinstance(h, float):  # the formula of f_mag assumes uniform vectors and thickness
         loads["f_mag"] = in_plane_force(g, Br, Ba, h)
-    return loads, torque(g, Br, Ba)
+        if rotates:
+            loads["f_mag"] = (loads["f_mag"] - in_plane_force(g, Ba, pattern, h)) / 2
+    return loads, torque(g, Br, Ba, rotates=rotates)
 
 
 @dataclass(frozen=True)
@@ -77,17 +83,32 @@ def spring_stiffness(g: SurfaceGeometry, Br: Array, Ba: Array) -> Array:
 
 @dataclass(frozen=True)
 class Torque:
-    """The torque tau at points with normals n0 (..., 3); `along` is -(n0 . Br)(a0^a . Ba), (..., 2)."""
+    """The torque tau at points with normals n0 (..., 3); `along` is -(n0 . Br)(a0^a . Ba), (..., 2).
+
+    For a remanence that does not stretch, that and half of (n0 . Ba)(a0^a . Br); `dual` and `transposed` are then the
+    dual basis (..., 2, 3) and half of (n0 . Ba) Br, (..., 3).
+    """
 
     n0: Array
     along: Array
+    dual: Array | None = None
+    transposed: Array | None = None
 
     def __call__(self, du: Array) -> Array:
         """tau_c = B0^ij (a0^a . e_j)(n0 . e_i) (u,_a . a0_c) as a vector (..., 3), from u,_1 and u,_2 (..., 2, 3)."""
         turned = np.matmul(self.along[..., None, :], du)[..., 0, :]
-        return np.asarray(turned - np.sum(turned * self.n0, axis=-1, keepdims=True) * self.n0)
+        found = turned - np.sum(turned * self.n0, axis=-1, keepdims=True) * self.n0
+        if self.dual is not None and self.transposed is not None:
+            found = found + np.einsum("...ac,...c,...ai->...i", du, self.transposed, self.dual)
+        return np.asarray(found)
 
 
-def torque(g: SurfaceGeometry, Br: Array, Ba: Array) -> Torque:
-    """The torque as a function of the displacement's derivatives."""
-    return Torque(g.n0, -np.einsum("...i,...i->...", g.n0, Br)[..., None] * np.einsum("...ai,i->...a", g.dual, Ba))
+def torque(g: SurfaceGeometry, Br: Array, Ba: Array, *, rotates: bool = False) -> Torque:
+    """The torque as a function of the displacement's derivatives, of a remanence that `rotates` or is convected."""
+    along = -np.einsum("...i,...i->...", g.n0, Br)[..., None] * np.einsum("...ai,i->...a", g.dual, Ba)
+    if not rotates:
+        return Torque(g.n0, along)
+    in_surface = Br - np.einsum("...i,...i->...", g.n0, Br)[..., None] * g.n0
+    half = (g.n0 @ Ba / 2)[..., None]
+    along = along + half * np.einsum("...ai,...i->...a", g.dual, Br)
+    return Torque(g.n0, along, g.dual, half * in_surface)

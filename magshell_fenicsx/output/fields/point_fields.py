@@ -41,7 +41,7 @@ class PointFields:
         if field:
             pattern = field.remanent
             self._Br = pattern(r0[0], self.n0) if callable(pattern) else np.broadcast_to(pattern, r0[0].shape)
-        if field and field.gradient is None:
+        if field and field.uniform:
             h = material.h if thickness is None else material.h * thickness
             self.constant, self._torque = magnetic_loads(self._geometry(), field, r0[0], h)
 
@@ -56,7 +56,7 @@ class PointFields:
         E_1, E_2, M_1, M_2
             (...) their principal values, the larger first.
         Br, Ba
-            (..., 3) the remanence convected by the shell, over its magnitude; the applied flux density at the
+            (..., 3) the remanence as the shell carries it, over its magnitude; the applied flux density at the
             deformed point, over mu_0 E / |Br|, so that its magnitude is lambda_m.
         tau
             (..., 3) torque, for a uniform field.
@@ -69,7 +69,8 @@ class PointFields:
         found["E_1"], found["E_2"] = principal(E)
         found["M_1"], found["M_2"] = principal(M)
         if self._field:
-            found |= {"Br": frame.convected(self._Br, u), "Ba": _applied(self._field, mu, frame.jet[0] + u[0])}
+            carried = frame.convected if self._field.law == "deformation" else frame.rotated
+            found |= {"Br": carried(self._Br, u), "Ba": _applied(self._field, mu, frame.jet[0] + u[0])}
         if self._torque:
             found["tau"] = self._torque(np.moveaxis(u[1:3], 0, -2))
         return found
@@ -83,7 +84,10 @@ class PointFields:
 
 def _applied(field: Magnetisation, mu: Mapping[str, float], r: Array) -> Array:
     """The applied flux density (..., 3) at points r (..., 3)."""
-    uniform = mu.get("lambda_m", 0.0) * field.applied
+    along = mu.get("lambda_m", 0.0)
+    if field.in_space:
+        return np.asarray(along * field.in_space(r.reshape(-1, 3))[0].reshape(r.shape))
+    uniform = along * field.applied
     for name, across in zip(ACROSS, field.across, strict=False):
         uniform = uniform + mu.get(name, 0.0) * across
     parts = (mu.get(name, 0.0) * r @ G.T for name, G in field.gradients.items())

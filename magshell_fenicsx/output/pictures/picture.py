@@ -131,7 +131,7 @@ def _fields(surface: Surface, smooth: "pyvista.PolyData", h: float) -> list[View
     arrows = []
     for name, (colour, _, size, thickness) in FIELDS.items():
         vectors = surface.fields[name][seeds]
-        length = np.linalg.norm(vectors, axis=1)
+        length = np.nan_to_num(np.linalg.norm(vectors, axis=1))  # a formula may end somewhere
         if not (longest := length.max()):
             continue
         shown, vectors = length > 1e-3 * longest, vectors * (size * extent / longest)

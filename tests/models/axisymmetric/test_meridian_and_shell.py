@@ -24,6 +24,8 @@ def displacement(phi: Array) -> tuple[Array, Array]:
     "field",
     [
         Magnetisation(E3, E3, "second"),
+        Magnetisation(tangential, E3, "second_consistent", law="rotation"),
+        Magnetisation(tangential, E3, gradient=np.diag([0.5, 0.5, -1.0]), law="rotation"),
         Magnetisation(InsideAndOutside(0.5, -E3, E3), E3, gradient=np.diag([0.5, 0.5, -1.0])),
     ],
 )

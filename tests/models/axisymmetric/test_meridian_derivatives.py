@@ -3,18 +3,19 @@
 import numpy as np
 import pytest
 import scipy.sparse
-from meridian_scenes import ALONG_AXIS, hemisphere
+from meridian_scenes import ALONG_AXIS, E3, hemisphere
 from petsc4py import PETSc
 
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.models.axisymmetric.meridian import make_meridian
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
-from magshell_fenicsx.models.shell.parameters import AreaForce, EdgeForce, EdgeMoment, Loads, Material
+from magshell_fenicsx.models.shell.parameters import AreaForce, EdgeForce, EdgeMoment, Loads, Magnetisation, Material
+from magshell_fenicsx.models.shell.patterns import tangential
 from magshell_fenicsx.models.shell.thickness import Thickness
 
 TERMS = ["membrane", "bending", "interior edges", "clamped edges", "magnetic", "pressure"]
-RING_TERMS = ["membrane", "bending", "interior edges", "mirror edges", "magnetic", "load", "moment b 0"]
+RING_TERMS = ["membrane", "bending", "interior edges", "mirror edges", "magnetic", "load", "load moment b 0"]
 FACTORS = {"lambda_m": 0.02, "pressure": 0.3, "load": 0.5}
 
 
@@ -37,7 +38,14 @@ def ring() -> MeridianModel:
     return MeridianModel(meridian, Material(0.3, 0.05), 4, {"a": "plane"}, loads, thickness=thickness)
 
 
-MODELS = {"hemisphere": coarse, "ring": ring}
+def turning() -> MeridianModel:
+    """A remanence along the meridians that does not stretch, in a field that varies."""
+    field = Magnetisation(tangential, E3, gradient=np.diag([0.5, 0.5, -1.0]), law="rotation")
+    return hemisphere(20, 0.3, Loads(magnetic=field), dimple=(1.0, 2.0), refinement=0.15)
+
+
+MODELS = {"hemisphere": coarse, "ring": ring, "turning": turning}
+TURNING_TERMS = ["magnetic", "magnetic gradient"]
 
 
 def check(system: FiniteElementSystem, u: np.ndarray, mu: dict[str, float]) -> None:
@@ -60,7 +68,12 @@ def check(system: FiniteElementSystem, u: np.ndarray, mu: dict[str, float]) -> N
 
 
 @pytest.mark.parametrize(
-    ("made", "name"), [*(("hemisphere", name) for name in TERMS), *(("ring", name) for name in RING_TERMS)]
+    ("made", "name"),
+    [
+        (made, name)
+        for made, names in (("hemisphere", TERMS), ("ring", RING_TERMS), ("turning", TURNING_TERMS))
+        for name in names
+    ],
 )
 def test_term_alone(made: str, name: str) -> None:
     model = MODELS[made]()

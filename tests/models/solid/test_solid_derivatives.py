@@ -20,7 +20,7 @@ from magshell_fenicsx.models.solid.terms import face_measure
 
 MU = {"pressure": 0.3, "lambda_m": 0.4, "lambda_across": -0.7, "load": 0.2}
 EVERYWHERE = {"distortion", "compression", "magnetic", "magnetic across", "magnetic gradient", "pressure"}
-AT_ENDS = {"pressure whole", "pressure upper", "moment rim 0"}
+AT_ENDS = {"pressure whole", "pressure upper", "load moment rim 0"}
 FIELD = Magnetisation(
     np.array([0.6, 0.0, 0.8]),
     np.array([0.0, 0.28, 0.96]),

@@ -1,0 +1,59 @@
+"""Whole runs with both laws of the remanence, and in fields by formulas."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+from command import magshell, read_path
+from conftest import CASES
+
+from magshell_fenicsx import Case, run
+
+STRIP, SOLID = CASES / "magnetic_strip.yaml", ["model=solid", "mesh.size=0.1"]
+# grad(z + x^3/3 - x z^2)
+CUBIC = "magnetic.applied={components: ['x**2 - z**2', '0', '1 - 2*x*z']}"
+
+
+def tip(settings: Sequence[str]) -> float:
+    return float(run(Case.load(STRIP, settings), None).rows[-1]["w_over_h"])
+
+
+def thin(R_over_h: float) -> list[str]:
+    """The same elastica: q = 12 lambda_m (L/h)^2 = 4."""
+    return [f"shell.radius_to_thickness={R_over_h}", f"magnetic.lambda_m={4 / 12 / R_over_h**2}"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("model", ["shell", "solid"])
+def test_laws_agree_where_nothing_stretches(model: str) -> None:
+    """A strip bends far and stretches by 3e-7 at L/h = 1000: to 1e-6. At 100 they are 30 times as far apart."""
+    coarse = SOLID if model == "solid" else ["mesh.refinement=0.4"]
+    apart = []
+    for R_over_h in (1000, 100):
+        found = [tip([*thin(R_over_h), *coarse, f"magnetic.remanence={law}"]) for law in ("deformation", "rotation")]
+        apart.append(abs(found[1] / found[0] - 1))
+    assert apart[0] < 1e-6
+    assert 30 * apart[0] < apart[1] < 1e-4
+
+
+def test_uniform_field_as_formulas() -> None:
+    coarse = ["mesh.refinement=0.4"]
+    as_formulas = tip([*coarse, "magnetic.applied={components: ['0', '0', '1']}"])
+    assert as_formulas == pytest.approx(tip(coarse), rel=1e-10)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("model", ["shell", "solid"])
+def test_ranks(tmp_path: Path, model: str) -> None:
+    """In a field by formulas, with a remanence that does not stretch: the state at the same field, to 1e-9."""
+    coarse = SOLID if model == "solid" else ["mesh.refinement=0.4"]
+    settings = [f"--set={s}" for s in (*coarse, "symmetry=none", "magnetic.remanence=rotation", CUBIC)]
+    paths = []
+    for ranks in (1, 2, 3):
+        done = magshell("run", STRIP, *settings, "--out", tmp_path / str(ranks), ranks=ranks)
+        assert done.returncode == 0, done.stderr
+        paths.append(read_path(tmp_path / str(ranks)))
+    for other in paths[1:]:
+        assert len(other) == len(paths[0])
+        for key in ("lambda_m", "w_over_h", "energy", "magnetic"):  # arc length places the points before that to 1e-8
+            assert float(other[-1][key]) == pytest.approx(float(paths[0][-1][key]), rel=1e-9)
