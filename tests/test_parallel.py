@@ -54,6 +54,17 @@ SCENES |= {
             "--set=mesh.size=40",
         ],
     ),
+    "a tube open to a pressure": (
+        "benchmarks/pinched_cylinder.yaml",
+        [
+            "--set=shell={geometry: cylinder, radius: 1, length: 1, thickness: 0.05, poisson_ratio: 0.3}",
+            "--set=boundary={bottom: clamped}",
+            "--set=points={A: [1, 0, 1]}",
+            "--set=loading={kind: pressure, control: load, until: target, pressure: 0.05, points: 1}",
+            "--set=mesh={degree: 2, size: 0.4}",
+            "--set=symmetry=none",
+        ],
+    ),
 }
 MOVES = "[{supports: [right], translation: [0, 0, 0.02], rotation: {axis: [0.1, -1, 0], angle: 10, point: [1, 0, 0]}}]"
 SCENES |= {
@@ -76,7 +87,7 @@ COMPARED = ("p_over_pc", "lambda_m", "force", "w_over_h", "w_pole_over_h", "volu
 VECTORS = ("u", "f", "m")  # columns NAME_ux, ...: of named points, and reactions
 
 
-ON_TWO = ("half shell, force", "a moment", "an edge that is lifted and turned")
+ON_TWO = ("half shell, force", "a moment", "an edge that is lifted and turned", "a tube open to a pressure")
 QUICKEST = "symmetry planes, a force at a point"
 
 

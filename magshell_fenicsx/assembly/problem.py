@@ -15,7 +15,7 @@ from magshell_fenicsx.assembly.parameter import Parameter
 from magshell_fenicsx.assembly.sliding import Constraint, Projection, Sliding
 from magshell_fenicsx.assembly.terms import FormTerm, Term
 from magshell_fenicsx.continuation.noise import Noise
-from magshell_fenicsx.continuation.system import Amplitudes, State, Vector, Weighted
+from magshell_fenicsx.continuation.system import Amplitudes, Skewed, State, Vector, Weighted
 from magshell_fenicsx.continuation.timing import Stopwatch
 from magshell_fenicsx.platform import compat
 
@@ -103,6 +103,7 @@ class FiniteElementSystem:
         self._fixed = fixed_dofs[fixed_dofs < self.size]
         self._b = fem.Function(V)
         self._assembler, self.gradients = assembler, gradients
+        self._N: PETSc.Mat | None = None
         self._own_residual = [t for t in terms if gradients is None or t.name not in gradients.names]
         for term in self._own_residual:
             term.compile_residual()
@@ -271,7 +272,7 @@ class FiniteElementSystem:
         self.set(u)
         return float(self.comm.allreduce(fem.assemble_scalar(form)))
 
-    def tangent(self, u: Vector, mu: Amplitudes, stress: Sequence[Weighted] = ()) -> PETSc.Mat:
+    def tangent(self, u: Vector, mu: Amplitudes, stress: Sequence[Weighted] = ()) -> PETSc.Mat | Skewed:
         with self.assembly:
             whole = [(weight, self._with_ghosts(v, mu)) for weight, v in stress]
             self._at(u, mu)
@@ -285,7 +286,21 @@ class FiniteElementSystem:
                 K = self.projection.tangent(K)
             if self.noise:
                 self.noise.on_matrix(K)
-            return K
+            N = self._skew(factors)
+            return Skewed(K, N) if N else K
+
+    def _skew(self, factors: Mapping[str, float]) -> PETSc.Mat | None:
+        """The skew part of the tangent, of loads without potential; None without."""
+        loads = [t for t in self.terms if isinstance(t, FormTerm) and not t.has_potential and factors[t.name]]
+        if not loads:
+            return None
+        if self._N is None:
+            self._N = fem_petsc.create_matrix(loads[0].skew_form)
+        self._N.zeroEntries()
+        for t in loads:
+            t.add_skew(self._N, factors[t.name], self.clamped)
+        self._N.assemble()
+        return self.projection.both_sides(self._N) if self.projection else self._N
 
     def _of_forms(self, K: PETSc.Mat, factors: Mapping[str, float], held: list[fem.DirichletBC]) -> PETSc.Mat:
         """The tangent from the terms' own forms."""

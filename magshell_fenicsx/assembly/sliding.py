@@ -78,9 +78,13 @@ class Projection:
             self._K.setOption(option, True)
         return self._K
 
+    def both_sides(self, M: PETSc.Mat) -> PETSc.Mat:
+        """P M P. Collective."""
+        return M.ptap(self._blocks(self._P, 1.0))
+
     def mass(self, M: PETSc.Mat) -> PETSc.Mat:
-        """P M P; held directions then have no finite eigenvalue. Collective."""
-        found = M.ptap(self._blocks(self._P, 1.0))
+        """P M P, symmetric; held directions then have no finite eigenvalue. Collective."""
+        found = self.both_sides(M)
         found.setOption(PETSc.Mat.Option.SYMMETRIC, True)
         return found
 

@@ -52,12 +52,17 @@ class FormTerm:
 
     `linear` says that the energy is linear in u, so that it has no tangent; `follow` renews its coefficients.
 
+    A load may have no potential. Then `work`, its virtual work, takes the place of the energy's gradient, and the
+    energy is only reported. The derivative of the work is no symmetric form.
+
     Attributes
     ----------
     form
         The energy.
     residual_form, tangent_form
         Compiled on first use; None for the tangent of a linear energy.
+    skew_form
+        What the symmetric tangent lacks; None for a potential.
     """
 
     def __init__(
@@ -69,13 +74,15 @@ class FormTerm:
         amplitude: str | None = None,
         *,
         linear: bool = False,
+        work: ufl.Form | None = None,
         follow: Callable[[], None] | None = None,
     ) -> None:
         self.name, self.amplitude, self.linear, self._follow = name, amplitude, linear, follow
+        self.has_potential = work is None
         self._factor = fem.Constant(u.function_space.mesh, 1.0)
         self._u, self._log = u, log
         self.form = energy
-        self._gradient = ufl.derivative(energy, u, ufl.TestFunction(u.function_space))
+        self._gradient = work if work is not None else ufl.derivative(energy, u, ufl.TestFunction(u.function_space))
         self._energy = log.compile(f"{name} energy", energy)
 
     @cached_property
@@ -86,8 +93,21 @@ class FormTerm:
     def tangent_form(self) -> fem.Form | None:
         if self.linear:
             return None
-        hessian = ufl.derivative(self._gradient, self._u, ufl.TrialFunction(self._u.function_space))
+        hessian = self._hessian
+        if not self.has_potential:
+            hessian = 0.5 * (hessian + ufl.adjoint(hessian))
         return self._log.compile(f"{self.name} tangent", self._factor * hessian)
+
+    @cached_property
+    def skew_form(self) -> fem.Form | None:
+        if self.has_potential:
+            return None
+        hessian = self._hessian
+        return self._log.compile(f"{self.name} skew tangent", self._factor / 2 * (hessian - ufl.adjoint(hessian)))
+
+    @property
+    def _hessian(self) -> ufl.Form:
+        return ufl.derivative(self._gradient, self._u, ufl.TrialFunction(self._u.function_space))
 
     def energy(self) -> float:
         return float(fem.assemble_scalar(self._energy))
@@ -115,6 +135,11 @@ class FormTerm:
             self._factor.value = factor
             compat.add_matrix(K, self.tangent_form, clamped)
 
+    def add_skew(self, N: PETSc.Mat, factor: float, clamped: list[fem.DirichletBC]) -> None:
+        """Add factor times the skew part of the derivative of the work, of a load without potential."""
+        self._factor.value = factor
+        compat.add_matrix(N, self.skew_form, clamped)
+
 
 class DensityTerm(FormTerm, Generic[Density]):
     """A form that keeps its density."""
@@ -129,9 +154,10 @@ class DensityTerm(FormTerm, Generic[Density]):
         amplitude: str | None = None,
         *,
         linear: bool = False,
+        work: ufl.Form | None = None,
         follow: Callable[[], None] | None = None,
     ) -> None:
-        super().__init__(name, energy, u, log, amplitude, linear=linear, follow=follow)
+        super().__init__(name, energy, u, log, amplitude, linear=linear, work=work, follow=follow)
         self.density = density
 
 

@@ -46,7 +46,7 @@ class MeshSection(Section):
     penalty: float | None = Field(default=None, ge=1e-3, le=1e9)
     """σ of the interior penalty; by default 5 k²"""
     tolerance: float | None = Field(default=None, ge=1e-6, le=0.1)
-    """Relative error of the run's result; chooses degree and refinement"""
+    """Relative error of the run's result; chooses degree and refinement, of a solid refinement and layers"""
 
     @model_validator(mode="after")
     def _tolerance_chooses_the_mesh(self) -> Self:
@@ -202,7 +202,7 @@ class Case(WithParts):
             raise ValueError(
                 f"magnetic.energy: {magnetic.energy}: the expansions are of a shell; a solid has the full energy"
             )
-        for key in self.mesh.model_fields_set & {"degree", "penalty", "tolerance"}:
+        for key in self.mesh.model_fields_set & {"degree", "penalty"}:
             if key != "degree" or self.mesh.degree != SOLID_DEGREE:
                 read = isinstance(self.shell, MeshSurface)
                 finer = "a file with smaller elements" if read else "mesh.refinement"

@@ -37,8 +37,10 @@ def refuse_unfit_steps(
                 raise ValueError(f"{key}.kind: rotation needs a field: magnetic.lambda_m, not zero")
             if whole and "lambda_m" not in driven:
                 raise ValueError(f"{key}.kind: rotation needs a field: a step of kind: field before it")
-            if not magnetic.applied.is_uniform:
-                raise ValueError(f"{key}.kind: rotation needs a uniform field: no gradient, no components of it")
+            if magnetic.applied.components:
+                raise ValueError(
+                    f"{key}.kind: rotation: not with magnetic.applied.components, formulas that do not turn"
+                )
             if abs(field @ load.to.vector()) > 1 - SAME:
                 where = "magnetic.applied" if "angle" not in driven else "the field at its beginning"
                 raise ValueError(f"{key}.to: must be neither parallel nor opposite to {where}")

@@ -18,7 +18,17 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from magshell_fenicsx.continuation.newton import BorderedNewton
-from magshell_fenicsx.continuation.system import Edged, State, System, Tangent, Vector, Weighted, dot, followed, max_abs
+from magshell_fenicsx.continuation.system import (
+    State,
+    System,
+    Tangent,
+    Vector,
+    Weighted,
+    dot,
+    followed,
+    max_abs,
+    symmetric_part,
+)
 
 TOLERANCE = 1e-9  # of u with its component along a direction held, in lengths of the system
 MOST_TANGENTS, CONTRACTION = 8, 0.3
@@ -42,7 +52,7 @@ class _Spring:
 
 def _sprung(tangent: Tangent, shape: Vector, comm: MPI.Comm) -> _Spring:
     """Add the spring to a tangent, which is then regular at a simple fold."""
-    K = tangent.K if isinstance(tangent, Edged) else tangent
+    K = symmetric_part(tangent)
     size, first = np.abs(shape[: K.getLocalSize()[0]]), K.getOwnershipRange()[0]  # without the entries of an edge
     _, owner = comm.allreduce((float(size.max(initial=0.0)), comm.rank), MPI.MAXLOC)
     e = np.zeros_like(shape)

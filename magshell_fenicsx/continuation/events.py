@@ -117,6 +117,8 @@ class _Search:
     def crossing(self, low: Point, high: Point) -> Point | None:
         """The bifurcation between two points, as the solution of a regular system; None if there is no solution."""
         path = self.path
+        if path.newton.factorisation.skewed:
+            return None  # the regular system needs a symmetric tangent
         try:
             modes = [critical_mode(path.newton, end.state) for end in (low, high)]
         except NoEigenpair:

@@ -1,11 +1,13 @@
-"""Direct factorisation of the symmetric tangent, its inertia, and the work."""
+"""Direct factorisation of the tangent, its inertia, and the work."""
+
+from collections.abc import Callable
 
 import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
 from magshell_fenicsx.continuation.edge import Edge
-from magshell_fenicsx.continuation.system import Edged, Tangent, Vector
+from magshell_fenicsx.continuation.system import Edged, Skewed, Tangent, Vector, symmetric_part
 from magshell_fenicsx.continuation.timing import Stopwatch
 
 PREFIX = "magshell_factor_"
@@ -20,7 +22,8 @@ class Factorisation:
 
     On one rank CHOLMOD is tried first: it takes half the time, and its success proves that there is no negative
     pivot. Otherwise MUMPS computes LDL^T and counts the negative pivots. CHOLMOD is tried again after
-    `CALM` successive matrices in which MUMPS counts none. The memory of the other one is released.
+    `CALM` successive matrices in which MUMPS counts none. The memory of the other one is released. A skewed tangent
+    K + N takes two factorisations: that of K for the inertia, and LU of the sum for the solutions.
 
     Attributes
     ----------
@@ -29,9 +32,12 @@ class Factorisation:
     solving
         Time spent on solving with the factors.
     matrix
-        The matrix last factored; K if that was an edged one.
+        The matrix last factored; K, or K + N, if that was an edged one.
     negative_pivots
-        Unstable directions of the latest factored tangent (Sylvester's law of inertia).
+        Unstable directions of the latest factored tangent (Sylvester's law of inertia). Of a skewed one those of K,
+        less one where det (K + N) has the other sign: then it has been singular once less often.
+    skewed
+        Whether that tangent was a skewed one.
     """
 
     def __init__(self, comm: MPI.Comm) -> None:
@@ -45,6 +51,8 @@ class Factorisation:
         self._definite = self._has_cholmod = comm.size == 1
         self._calm = 0  # successive matrices of MUMPS without a negative pivot
         self._edge: Edge | None = None
+        self._edged: Edged | None = None
+        self.skewed = False
 
     def factor(self, tangent: Tangent) -> None:
         """Factor a matrix; an edged one by the factors of its K and k back-solves.
@@ -54,14 +62,18 @@ class Factorisation:
         PETSc.Error
             If MUMPS fails, for example for lack of memory, or if CHOLMOD fails for a reason other than the matrix.
         """
-        K = tangent.K if isinstance(tangent, Edged) else tangent
+        K, inner = symmetric_part(tangent), tangent.K if isinstance(tangent, Edged) else tangent
+        self.skewed = isinstance(inner, Skewed)
         with self.stopwatch:
             self.matrix, self._edge = K, None
             if self._rhs is None:
                 self._rhs, self._solution = K.createVecs()
             if not (self._definite and self._factor_definite(K)):
                 self._factor_any(K)
+            if isinstance(inner, Skewed):
+                self._factor_sum(inner)
         self.count += 1
+        self._edged = tangent if isinstance(tangent, Edged) else None
         if isinstance(tangent, Edged):
             self._edge = Edge(tangent, self.comm, self._inner, self._product)
             self.negative_pivots += self._edge.negative_pivots
@@ -111,6 +123,22 @@ class Factorisation:
         self._calm = 0 if self.negative_pivots else self._calm + 1
         self._definite = self._has_cholmod and self._calm >= CALM
 
+    def _factor_sum(self, tangent: Skewed) -> None:
+        """LU of K + N, for the solutions, and the sign of its determinant."""
+        self.matrix = whole = tangent.K.copy()
+        for option in (PETSc.Mat.Option.SYMMETRIC, PETSc.Mat.Option.SYMMETRY_ETERNAL):
+            whole.setOption(option, False)
+        whole.axpy(1.0, tangent.N, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
+        self._pc = pc = _new_pc(whole, "mumps", "lu")
+        pc.setFactorSetUpSolverType()
+        F = pc.getFactorMatrix()
+        F.setMumpsIcntl(33, 1)  # the determinant
+        F.setMumpsIcntl(14, 50)
+        _renew(pc, whole)
+        even = self.comm.bcast(F.getMumpsRinfog(12) > 0.0 if self.comm.rank == 0 else None)
+        if self.negative_pivots % 2 == even:
+            self.negative_pivots -= 1
+
     def times(self, x: Vector) -> Vector:
         """The matrix last factored times x."""
         return self._edge.times(x) if self._edge else self._product(x)
@@ -118,6 +146,22 @@ class Factorisation:
     def solve(self, rhs: Vector) -> Vector:
         """The solution with the latest factors."""
         return self._edge.solve(rhs) if self._edge else self._inner(rhs)
+
+    def solve_transposed(self, rhs: Vector) -> Vector:
+        """The same with the transposed matrix."""
+
+        def of(operation: Callable[[PETSc.Vec, PETSc.Vec], None]) -> Callable[[Vector], Vector]:
+            def applied(x: Vector) -> Vector:
+                v, y = self.matrix.createVecs()
+                v.setArray(x)
+                operation(v, y)
+                return np.array(y.array_r)
+
+            return applied
+
+        assert self._pc is not None
+        solve, times = of(self._pc.applyTranspose), of(self.matrix.multTranspose)
+        return Edge(self._edged, self.comm, solve, times).solve(rhs) if self._edged else solve(rhs)
 
     def _product(self, x: Vector) -> Vector:
         v, y = self.matrix.createVecs()
@@ -181,14 +225,14 @@ def _entries(K: PETSc.Mat) -> float:
     return float(K.getInfo()["nz_used"])
 
 
-def _new_pc(K: PETSc.Mat, solver: str) -> PETSc.PC:
+def _new_pc(K: PETSc.Mat, solver: str, kind: str = "cholesky") -> PETSc.PC:
     if solver == "cholmod":  # its simplicial method factors indefinite matrices without an error
         given = PETSc.Options(PREFIX)
         given["mat_cholmod_supernodal_switch"], given["mat_cholmod_print"] = 0.0, 0
     pc = PETSc.PC().create(K.comm)
     pc.setOptionsPrefix(PREFIX)
     pc.setOperators(K)
-    pc.setType("cholesky")
+    pc.setType(kind)
     pc.setFactorSolverType(solver)
     pc.setFromOptions()
     return pc

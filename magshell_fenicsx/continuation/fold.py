@@ -40,6 +40,8 @@ class Fold:
     phi
         Null vector of K; its largest entry is one in magnitude, and the displacement conjugate to
         the amplitude grows along it.
+    left
+        Null vector of the transposed K: `phi`, but for loads without potential.
     curvature
         Second derivative of the amplitude along the path in units of `phi` times the system's length;
         negative where the amplitude is largest.
@@ -52,6 +54,7 @@ class Fold:
     state: State
     name: str
     phi: Vector
+    left: Vector
     curvature: float
     unstable: int
     iterations: int
@@ -96,6 +99,7 @@ def find_fold(newton: BorderedNewton, guess: Guess, name: str) -> Fold:
         state=state,
         name=name,
         phi=phi,
+        left=_left(newton, state, phi) if newton.factorisation.skewed else phi,
         curvature=-dot(system.comm, phi, cubic) * system.length**2 / pull,
         unstable=tangent.unstable,
         iterations=len(steps),
@@ -104,12 +108,12 @@ def find_fold(newton: BorderedNewton, guess: Guess, name: str) -> Fold:
 
 
 def sensitivity(system: System, fold: Fold, column: Vector) -> float:
-    """Derivative of the fold's amplitude in a parameter p, from R_p at the fold: -(phi . R_p)/(phi . R_mu).
+    """Derivative of the fold's amplitude in a parameter p, from R_p at the fold: -(left . R_p)/(left . R_mu).
 
     For another amplitude, R_p is its load column.
     """
-    pull = dot(system.comm, fold.phi, system.load(fold.state.u, fold.state.mu, fold.name))
-    return -dot(system.comm, fold.phi, column) / pull
+    pull = dot(system.comm, fold.left, system.load(fold.state.u, fold.state.mu, fold.name))
+    return -dot(system.comm, fold.left, column) / pull
 
 
 def predict_fold(system: System, known: Sequence[tuple[float, Fold]], p: float, others: Amplitudes) -> Guess:
@@ -143,6 +147,15 @@ def _extrapolated(known: Sequence[tuple[float, Fold]], p: float, others: Amplitu
 def _first_shape(newton: BorderedNewton, state: State, name: str) -> Vector:
     """Near a fold the response to the load is nearly the null vector."""
     return newton.factor_at(state).solve(newton.system.load(state.u, state.mu, name))
+
+
+def _left(newton: BorderedNewton, state: State, v: Vector) -> Vector:
+    """The null vector of the transposed tangent, by inverse iteration."""
+    factors = newton.factor_at(state)
+    for _ in range(3):
+        v = factors.solve_transposed(v)
+        v = np.asarray(v / max_abs(newton.system.comm, v))
+    return v
 
 
 def _step(system: System, state: State, name: str, tangent: AugmentedTangent) -> tuple[Vector, float]:

@@ -86,13 +86,17 @@ class _Space:
         inverse = self._sums(V @ W.T)
         if not np.isfinite(inverse).all():
             raise NoEigenpair("the tangent's factors give no finite numbers")
-        theta, Y = np.linalg.eigh((inverse + inverse.T) / 2)  # ascending, of K^-1
-        pairs = [self._pair(theta[i], Y[:, i]) for i in {0, k}]
+        if self._factors.skewed:
+            theta, Y = _real_pairs(inverse)
+        else:
+            theta, Y = np.linalg.eigh((inverse + inverse.T) / 2)  # ascending, of K^-1
+        pairs = [self._pair(theta[i], Y[:, i]) for i in {0, len(theta) - 1}]
         pair = self._nearest(pairs)
         if self._count == MOST_VECTORS:
             far = np.argsort(-np.abs(theta))[:KEPT]
-            V[:KEPT], W[:KEPT] = Y[:, far].T @ V, Y[:, far].T @ W
-            self._count = KEPT
+            kept = np.linalg.qr(Y[:, far])[0] if self._factors.skewed else Y[:, far]
+            self._count = kept.shape[1]
+            V[: self._count], W[: self._count] = kept.T @ V, kept.T @ W
         return pair
 
     def _pair(self, theta: float, y: NDArray[np.float64]) -> tuple[float, Vector, Vector]:
@@ -117,3 +121,12 @@ class _Space:
     def _sums(self, here: NDArray[np.float64]) -> NDArray[np.float64]:
         """Inner products over all ranks."""
         return np.asarray(self._comm.allreduce(here))
+
+
+def _real_pairs(A: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The eigenpairs of a small matrix, ascending; real eigenvalues alone if there are any, else real parts."""
+    theta, Y = np.linalg.eig(A)
+    real = theta.imag == 0.0
+    theta, Y = (theta[real], Y[:, real]) if real.any() else (theta, Y)
+    order = np.argsort(theta.real)
+    return theta.real[order], Y.real[:, order] / np.linalg.norm(Y.real[:, order], axis=0)

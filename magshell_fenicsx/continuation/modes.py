@@ -12,7 +12,7 @@ from slepc4py import SLEPc
 
 from magshell_fenicsx.continuation.factor import Factorisation
 from magshell_fenicsx.continuation.inverse import NoEigenpair, nearest_to_zero
-from magshell_fenicsx.continuation.system import Vector
+from magshell_fenicsx.continuation.system import Tangent, Vector, symmetric_part
 
 TOLERANCE = 1e-10  # of an eigenvalue, relative to its distance from the shift
 MARGIN = 1e-6  # eigenvalues closer than this, in the same relative measure, count as one multiple eigenvalue
@@ -80,15 +80,15 @@ def lowest_modes(K: PETSc.Mat, M: PETSc.Mat, count: int) -> list[Mode]:
     raise ModesNotFound(f"{missed} eigenvalues below {above:g} stay hidden from Lanczos")
 
 
-def null_vector(K: PETSc.Mat) -> Vector:
-    """The eigenvector of length one of the eigenvalue nearest to zero of a symmetric K.
+def null_vector(K: Tangent) -> Vector:
+    """The eigenvector of length one of the eigenvalue nearest to zero of a tangent.
 
     Raises
     ------
     ModesNotFound
         See `nearest_to_zero`.
     """
-    factorisation = Factorisation(K.comm.tompi4py())
+    factorisation = Factorisation(symmetric_part(K).comm.tompi4py())
     factorisation.factor(K)
     try:
         return nearest_to_zero(factorisation)[1]

@@ -16,8 +16,16 @@ Direction = tuple[Vector, float]  # (du, dmu)
 
 
 @dataclass(frozen=True)
+class Skewed:
+    """The matrix K + N of a load without potential: K symmetric, N skew."""
+
+    K: PETSc.Mat
+    N: PETSc.Mat
+
+
+@dataclass(frozen=True)
 class Edged:
-    """The symmetric matrix [K C; C^T D]: a tangent with k more unknowns, which are numbers.
+    """The symmetric matrix [K C; C^T D]: a tangent with k more unknowns, which are numbers; K may be skewed.
 
     Attributes
     ----------
@@ -27,13 +35,20 @@ class Edged:
         Number of the unknowns that enforce a constraint. Each adds one negative pivot that is no unstable direction.
     """
 
-    K: PETSc.Mat
+    K: PETSc.Mat | Skewed
     C: Sequence[Vector]
     D: NDArray[np.float64]
     multipliers: int
 
 
-Tangent: TypeAlias = PETSc.Mat | Edged
+Tangent: TypeAlias = PETSc.Mat | Skewed | Edged
+
+
+def symmetric_part(tangent: Tangent) -> PETSc.Mat:
+    """The symmetric matrix of u in a tangent, itself and no copy."""
+    while isinstance(tangent, Skewed | Edged):
+        tangent = tangent.K
+    return tangent
 
 
 class System(Protocol):
@@ -71,7 +86,7 @@ class System(Protocol):
         """d2Pi/dmu_i dmu_j, on every rank; zero between amplitudes that multiply their terms."""
 
     def tangent(self, u: Vector, mu: Amplitudes, stress: Sequence[Weighted] = ()) -> Tangent:
-        """d2Pi/du2, assembled; the matrix is reused by the next call.
+        """d2Pi/du2, assembled, or dR/du where a load has no potential; the matrix is reused by the next call.
 
         Parameters
         ----------

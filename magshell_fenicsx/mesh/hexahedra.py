@@ -18,7 +18,7 @@ from magshell_fenicsx.platform import compat
 
 Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
-OUTER = "outer"  # face
+OUTER = ""  # face: a name that no edge has, while an annulus has an edge "outer"
 MIDDLE = 0.5  # of the thickness
 
 
@@ -31,7 +31,7 @@ class Body:
     mesh
         Hexahedra with geometry of degree 2; the third coordinate of their reference cell runs outwards.
     faces
-        Name -> facets (local numbers): "outer", and those above each named edge of the mid-surface.
+        Name -> facets (local numbers): those of `OUTER`, and those above each named edge of the mid-surface.
     points, normals
         Name -> (3,) position of a node in the middle of the thickness, and the mid-surface's normal there.
     patches

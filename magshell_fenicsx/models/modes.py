@@ -20,7 +20,7 @@ from ufl.core.expr import Expr
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.assembly.sliding import Projection
 from magshell_fenicsx.continuation.modes import lowest_modes, null_vector
-from magshell_fenicsx.continuation.system import State, Vector
+from magshell_fenicsx.continuation.system import State, Tangent, Vector, symmetric_part
 from magshell_fenicsx.models.axisymmetric import jets
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.shell import kinematics as kin
@@ -56,7 +56,7 @@ class _Family:
     """Modes that share a tangent, what is held, and an inner product (name and form)."""
 
     label: str
-    tangent: Callable[[State], PETSc.Mat]
+    tangent: Callable[[State], Tangent]
     held: list[fem.DirichletBC]
     product: tuple[str, ufl.Form]
     projection: Projection | None = None
@@ -72,6 +72,8 @@ class ShellModes:
     def lowest(self, state: State, count: int) -> list[ShellMode]:
         """The lowest modes, ascending: of every family `count`, and all that are negative.
 
+        Of a tangent that is not symmetric, those of its symmetric part.
+
         Waves count once, though each has a twin turned by a quarter of its length. Compiles a mass matrix
         when it is first called, and the waves' kernels.
 
@@ -84,7 +86,7 @@ class ShellModes:
         for family in _families(self.model):
             M = _mass_matrix(self._product(family), family.held)
             M = family.projection.mass(M) if family.projection else M
-            modes = lowest_modes(family.tangent(state), M, count)
+            modes = lowest_modes(symmetric_part(family.tangent(state)), M, count)
             found += [ShellMode(family.label, mode.eigenvalue, mode.vector) for mode in modes]
         return sorted(found, key=lambda mode: mode.eigenvalue)
 

@@ -34,6 +34,8 @@ class Observed:
         What loads it; and by amplitude the sum of the sizes of dead loads over E h R, see `DeadLoads`.
     supports
         Name of an edge, point or patch -> what it holds.
+    without_potential
+        Names of the edges at which a live pressure has none; see `openings`.
     observed
         Column -> the form that a term observes, see `OwnTerm.observed`; of the modelled part.
     """
@@ -47,6 +49,7 @@ class Observed:
     loads: Loads
     load_size: dict[str, float]
     supports: Mapping[str, Support]
+    without_potential: tuple[str, ...] = ()
     observed: Mapping[str, fem.Form]
 
     def observe(self, volume: fem.Form, points: Mapping[str, Array]) -> None:

@@ -7,7 +7,9 @@ from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.mesh.msh import MeshFile
 from magshell_fenicsx.mesh.patch import MeshError, PatchMesh
+from magshell_fenicsx.models.shell.openings import no_potential, ring_openings
 from magshell_fenicsx.plan.body import layers
+from magshell_fenicsx.plan.names import open_edges
 from magshell_fenicsx.plan.plan import Plan
 from magshell_fenicsx.plan.planner import make_plan, meridian_vertices
 
@@ -31,6 +33,7 @@ def describe(case: Case) -> str:
         "Lambda_m = lambda_m R/h": case.lambda_m / plan.material.h,
     }
     lines = [f"{name} = {value:.6g}" for name, value in numbers.items()]
+    patch = None
     if case.mesh.tolerance is None:
         patch = None if plan.axisymmetric else _meshed(plan)
         cells, unknowns = _count(case, plan, patch)
@@ -39,11 +42,24 @@ def describe(case: Case) -> str:
             lines += _surface(patch)
     else:
         lines.append(f"mesh: found by the run, for a relative error of its result below {case.mesh.tolerance:g}")
-    left_out = plan.left_out or ["nothing"]
+    left_out = list(plan.left_out)
+    if plan.loads.pressure and (open_at := _open(plan, patch)):
+        left_out.append(no_potential(open_at))
+    left_out = left_out or ["nothing"]
     lines += ["built:", *(f"  {item}" for item in plan.included), "left out:", *(f"  {item}" for item in left_out)]
     if plan.warning:
         lines.append(f"warning: {plan.warning}")
     return "\n".join(lines)
+
+
+def _open(plan: Plan, patch: PatchMesh | None) -> tuple[str, ...]:
+    """The edges at which a live pressure has no potential."""
+    span = plan.meridian
+    if span is None:
+        return open_edges(patch or _meshed(plan), plan.conditions)
+    places = span.sample()[[0, -1]][:, [0, 2]]
+    ends = {name: np.asarray(place) for name, place in zip(span.names, places, strict=True) if name}
+    return ring_openings(ends, plan.conditions)[1]
 
 
 def _planned(case: Case) -> Plan:

@@ -14,6 +14,7 @@ from magshell_fenicsx.case.taylor import Taylor
 from magshell_fenicsx.mesh.frame import rotation
 from magshell_fenicsx.models.shell.parameters import Magnetisation
 from magshell_fenicsx.models.shell.patterns import Components, InsideAndOutside, Pattern, radial, tangential
+from magshell_fenicsx.plan.turned import basis as turned_basis
 
 Array = NDArray[np.float64]
 SAME = 1e-9  # part of a direction outside a plane: rounding
@@ -75,6 +76,17 @@ def magnetisation(magnetic: MagneticSection, case: Case, turn: float, to: Sequen
     layers = tuple((layer.fraction, layer.vector(turn)) for layer in section.layers or [])
     texts = magnetic.applied.components
     known = FormulasInSpace([with_derivatives(text) for text in texts], Q) if texts else None
+    turned = turned_basis(G, [along, *(direction.vector(turn) for direction in to)]) if G is not None else ()
     return Magnetisation(
-        remanent, applied, magnetic.energy, G, tuple(across), patches, layers, magnetic.remanence, known
+        remanent,
+        applied,
+        magnetic.energy,
+        G,
+        tuple(across),
+        patches,
+        layers,
+        magnetic.remanence,
+        known,
+        tuple(basis),
+        turned,
     )

@@ -125,7 +125,8 @@ AMPLITUDES = {
     )
 }
 # names of terms, and of amplitudes that only the solvers use
-INTERNAL = ("push", "lambda_across", "lambda_third", "membrane", "couple")
+GRADIENTS = tuple(f"lambda_gradient_{i}" for i in range(1, 10))
+INTERNAL = ("push", "lambda_across", "lambda_third", *GRADIENTS, "membrane", "couple")
 TAKEN = frozenset((*QUANTITIES, *AMPLITUDES, *INTERNAL))
 
 

@@ -107,7 +107,7 @@ def summary(result: Result, total_s: float) -> dict[str, Any]:
         "dimensions": _dimensions(scene.case.shell),
         "model": {
             "included": scene.plan.included,
-            "left_out": scene.plan.left_out,
+            "left_out": scene.left_out,
             "kernels": model.kernels.names,
             "forms": len(model.kernels.names),
             "penalty": model.sigma,

@@ -11,6 +11,7 @@ from magshell_fenicsx.case.loads.field import RotationSection
 from magshell_fenicsx.continuation.along import Curve
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.models.shell.parameters import ACROSS, Magnetisation
+from magshell_fenicsx.plan.turned import along, at_angle
 
 Array = NDArray[np.float64]
 FIELD = ("lambda_m", *ACROSS)  # amplitudes of the field's components
@@ -20,8 +21,7 @@ def directions(programme: Sequence[ProgrammeStep], field: Magnetisation | None, 
     """Unit vectors (steps + 1, components) of the field before each step and after the last, in a turned frame."""
     if field is None:
         return np.ones((len(programme) + 1, 1))
-    basis = np.array([field.applied, *field.across])
-    basis = basis / np.linalg.norm(basis, axis=1, keepdims=True).clip(1e-300)
+    basis = np.array(field.axes)
     found = [np.eye(len(basis))[0]]
     for step in programme:
         found.append(basis @ step.load.to.vector(turn) if isinstance(step.load, RotationSection) else found[-1])
@@ -33,13 +33,24 @@ def field_at(state: State) -> Array:
     return np.array([state.mu[name] for name in FIELD if name in state.mu])
 
 
-def straight(direction: Array) -> dict[str, Curve]:
-    """The components of a field t along a direction."""
+def turned(directions: Array, field: Magnetisation | None) -> list[Array]:
+    """Harmonics (5, 3, 3) of the gradient of a field of size one, from each direction of `directions` to the next."""
+    if field is None or field.gradient is None or not field.turned:
+        return []
+    return [parts for _, parts in along(field.gradient, list(directions @ np.array(field.axes)))]
+
+
+def straight(direction: Array, field: Magnetisation, parts: Array | None) -> dict[str, Curve]:
+    """The components of a field t along a direction, and of its gradient; `parts` are its harmonics there."""
 
     def curve(c: float) -> Curve:
         return lambda t: (c * t, c, 0.0)
 
-    return {name: curve(float(c)) for name, c in zip(FIELD, direction, strict=False)}
+    found = dict(zip(FIELD, direction, strict=False))
+    if parts is not None and field.gradient is not None:
+        rest = at_angle(parts, 0.0) - direction[0] * field.gradient
+        found |= {name: np.sum(rest * B) for name, B in field.gradients.items() if name != FIELD[0]}
+    return {name: curve(float(c)) for name, c in found.items()}
 
 
 def circle(size: float, before: Array, after: Array) -> dict[str, Curve]:
@@ -54,15 +65,35 @@ def circle(size: float, before: Array, after: Array) -> dict[str, Curve]:
     return {name: curve(float(b), float(a)) for name, b, a in parts}
 
 
+def turning(size: float, before: Array, after: Array, field: Magnetisation, parts: Array) -> dict[str, Curve]:
+    """The components of the gradient of the field of `circle`; lambda_m has `Magnetisation.gradient` in its own."""
+    away = after - (before @ after) * before
+    away = away / np.linalg.norm(away)
+    assert field.gradient is not None
+    rest = parts - np.multiply.outer([0.0, before[0], away[0], 0.0, 0.0], field.gradient)
+
+    def curve(k: Array) -> Curve:
+        def of(t: float) -> tuple[float, float, float]:
+            c, s, c2, s2 = cos(t), sin(t), cos(2 * t), sin(2 * t)
+            slope = k @ [0.0, -s, c, -2 * s2, 2 * c2]
+            return float(k @ [1.0, c, s, c2, s2]), float(slope), float(k @ [0.0, -c, -s, -4 * c2, -4 * s2])
+
+        return of
+
+    return {
+        name: curve(size * np.sum(rest * B, axis=(1, 2))) for name, B in field.gradients.items() if name != FIELD[0]
+    }
+
+
 def field_size(mu: Mapping[str, float], sense: float) -> float:
     """The magnitude of the field with the sign of the case's field, or with its own where it has not turned."""
-    along, across, third = (mu.get(name, 0.0) for name in FIELD)
-    return copysign(hypot(along, across, third), sense) if across or third else along
+    first, across, third = (mu.get(name, 0.0) for name in FIELD)
+    return copysign(hypot(first, across, third), sense) if across or third else first
 
 
 def field_angle(mu: Mapping[str, float], sense: float = 1.0) -> float:
     """The angle between the field and its first direction (degrees); `sense` is the sign of the case's field."""
-    along, across, third = (mu.get(name, 0.0) for name in FIELD)
+    first, across, third = (mu.get(name, 0.0) for name in FIELD)
     if not (across or third):
         return 0.0
-    return degrees(atan2(hypot(across, third) if third else sense * across, sense * along))
+    return degrees(atan2(hypot(across, third) if third else sense * across, sense * first))

@@ -24,6 +24,7 @@ from magshell_fenicsx.models.axisymmetric.meridian import make_meridian
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.reacting import columns, motion_columns, motion_size, observed_reactions
 from magshell_fenicsx.models.shell.model import ShellModel
+from magshell_fenicsx.models.shell.openings import no_potential
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.supports import refuse_loose
 from magshell_fenicsx.models.shell.thickness import Thickness, refuse_unfit
@@ -33,7 +34,7 @@ from magshell_fenicsx.plan.plan import Plan
 from magshell_fenicsx.plan.planner import make_plan, meridian_vertices
 from magshell_fenicsx.platform.first import from_first
 from magshell_fenicsx.quantities.registry import amplitude
-from magshell_fenicsx.simulate.direction import directions, field_angle, field_size
+from magshell_fenicsx.simulate.direction import directions, field_angle, field_size, turned
 
 Array = NDArray[np.float64]
 
@@ -93,6 +94,12 @@ class Scene:
         """The watch over the modes that the model excludes. Its first use compiles their kernels."""
         return Watch(self.model.excluded_modes)
 
+    @property
+    def left_out(self) -> list[str]:
+        """What the model lacks, for people."""
+        open_at = self.model.without_potential if self.plan.loads.pressure else ()
+        return [*self.plan.left_out, *([no_potential(open_at)] if open_at else [])]
+
     def unloaded(self) -> State:
         """The undeformed shell; amplitudes are zero, except user-defined ones with a value."""
         amplitudes = {t.amplitude for t in self.model.system.terms if t.amplitude} | self.motions
@@ -111,6 +118,7 @@ class Scene:
         for t in model.system.terms:
             amplitude = state.mu[t.amplitude] if t.amplitude else 1.0
             name = t.name.removesuffix(" across").removesuffix(" third")
+            name = "magnetic gradient" if name.startswith("magnetic gradient") else name
             energies[name] += model.multiplicity * amplitude * potentials[t.name]
         split = "membrane" in energies  # a solid has no such split
         return {
@@ -199,6 +207,11 @@ class Scene:
     def directions(self) -> Array:
         """See `direction.directions`."""
         return directions(self.case.programme, self.plan.loads.magnetic, self.plan.azimuth)
+
+    @cached_property
+    def turned(self) -> list[Array]:
+        """See `direction.turned`."""
+        return turned(self.directions, self.plan.loads.magnetic)
 
     def conjugate_unit(self, name: str) -> float:
         """-dPi/dmu of one unit of a target: ΔV/R³ of a pressure, w/h of a force, the shell's length of dead loads."""

@@ -86,9 +86,9 @@ def _to_defect(stage: Stage, fold: Fold) -> float:
     def out_of_balance(change: float) -> float:
         other = Scene(deepened(scene.case, change), scene.comm, terms=scene.plan.own)
         assert same_mesh(scene, other)
-        vectors = (fold.state.u, fold.phi)
-        u, phi = (np.concatenate([transfer(scene, other, v[:size]), v[size:]]) for v in vectors)
-        moved, system = replace(fold, state=State(u, fold.state.mu), phi=phi), stage.on(other).newton.system
+        vectors = (fold.state.u, fold.left)
+        u, left = (np.concatenate([transfer(scene, other, v[:size]), v[size:]]) for v in vectors)
+        moved, system = replace(fold, state=State(u, fold.state.mu), left=left), stage.on(other).newton.system
         return sensitivity(system, moved, system.residual(u, fold.state.mu))
 
     return (out_of_balance(DEFECT_STEP) - out_of_balance(-DEFECT_STEP)) / (2 * DEFECT_STEP)

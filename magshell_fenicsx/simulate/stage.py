@@ -9,6 +9,7 @@ from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.path import Control, Path, StepOptions
 from magshell_fenicsx.continuation.point import Point
 from magshell_fenicsx.continuation.system import State, System, Vector
+from magshell_fenicsx.simulate.record import Stopped
 from magshell_fenicsx.simulate.scene import Scene
 
 LONGEST = 50.0  # step by arc length, over the first
@@ -59,7 +60,15 @@ class Stage:
         return self.device.padded(u) if self.device else u
 
     def path(self, name: str, control: Control, options: StepOptions, scale: float = 1.0) -> Path:
-        """A path of the step's system."""
+        """A path of the step's system.
+
+        Raises
+        ------
+        Stopped
+            If the volume is prescribed where none is conjugate to the pressure.
+        """
+        if control == "conjugate":
+            _refuse_open(self.scene, name)
         return Path(self.newton, name, control, options, scale, self.scene.journal, self.scene.progress)
 
     def begin(self, name: str, control: Control, state: State, first: float, scale: float = 1.0) -> tuple[Path, Point]:
@@ -75,6 +84,14 @@ class Stage:
         start = path.start(state, first)
         step = abs(first / start.dmu)
         return path.in_steps(StepOptions(step, (LONGEST if control == "arc" else 2) * step, 1e-5 * step)), start
+
+
+def _refuse_open(scene: Scene, name: str) -> None:
+    if name == "pressure" and (open_at := scene.model.without_potential):
+        raise Stopped(
+            f"a volume cannot be held or prescribed: a pressure that follows the free edge {open_at[0]} is conjugate "
+            "to none: use control: arc or control: load"
+        )
 
 
 def plain(scene: Scene) -> Stage:
@@ -98,7 +115,14 @@ def staged(
         Amplitude -> its conjugate, see `Device`.
     curves
         Name of an amplitude, the amplitudes that are functions of it, and its value at the state.
+
+    Raises
+    ------
+    Stopped
+        If the volume is held where none is conjugate to the pressure.
     """
+    for name in held or ():
+        _refuse_open(scene, name)
     system: System = scene.model.system
     device, along = None, None
     if held:

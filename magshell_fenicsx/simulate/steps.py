@@ -13,7 +13,7 @@ from magshell_fenicsx.continuation.device import Conjugate
 from magshell_fenicsx.continuation.path import StepOptions
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.continuation.walk import MOST_STEPS, Goal
-from magshell_fenicsx.simulate.direction import circle, field_angle, field_at, straight
+from magshell_fenicsx.simulate.direction import circle, field_angle, field_at, straight, turning
 from magshell_fenicsx.simulate.gas import gas
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
@@ -37,6 +37,8 @@ def records_of(scene: Scene, step: ProgrammeStep, state: State) -> Records:
     assert isinstance(load, PathStep)
     stage = stage_of(scene, step, state)
     drive = load.drive(_now(scene, step, state))
+    if step.name == "pressure" and scene.model.without_potential and "control" not in load.model_fields_set:
+        drive = replace(drive, control="arc")
     path, start = stage.begin(step.name, drive.control, state, drive.first, drive.scale)
     if drive.step is not None:
         path = path.in_steps(StepOptions(drive.step, 2 * drive.step, 1e-4 * drive.step))
@@ -55,8 +57,10 @@ def stage_of(scene: Scene, step: ProgrammeStep, state: State) -> Stage:
     """The solver of a step, from any state of it."""
     direction = scene.directions[step.number - 1]
     curves = None
-    if isinstance(step.load, FieldSection) and direction[1:].any():
-        curves = (step.name, straight(direction), float(direction @ field_at(state)))
+    if isinstance(step.load, FieldSection) and (direction[1:].any() or scene.turned):
+        parts, field = scene.turned[step.number - 1 : step.number], scene.plan.loads.magnetic
+        assert field
+        curves = (step.name, straight(direction, field, next(iter(parts), None)), float(direction @ field_at(state)))
     return staged(scene, state, held_by(scene, step, state), curves)
 
 
@@ -111,7 +115,10 @@ def _rotation(scene: Scene, step: ProgrammeStep, load: RotationSection, state: S
     size, total = float(before @ field_at(state)), acos(float(before @ after))
     if size == 0:
         raise Stopped("the field is zero and cannot turn")
-    stage = staged(scene, state, held_by(scene, step, state), ("angle", circle(size, before, after), 0.0))
+    curves, field = circle(size, before, after), scene.plan.loads.magnetic
+    if scene.turned and field:
+        curves |= turning(size, before, after, field, scene.turned[step.number - 1])
+    stage = staged(scene, state, held_by(scene, step, state), ("angle", curves, 0.0))
     path, start = stage.begin("angle", "arc", state, total / load.points, total / load.points)
     targets = [float(t) for t in np.linspace(0.0, total, load.points + 1)[1:]]
     walked = _Walked(followed(stage, path, start, Goal("limit", targets)))

@@ -10,6 +10,7 @@ from petsc4py import PETSc
 
 from magshell_fenicsx.continuation import factor
 from magshell_fenicsx.continuation.factor import Factorisation
+from magshell_fenicsx.continuation.system import Skewed
 
 
 def matrix(diagonal: list[float]) -> PETSc.Mat:
@@ -41,6 +42,26 @@ def test_null_vector_survives_an_exactly_singular_matrix() -> None:
     factors.factor(matrix([3.0, 0.0]))
     v = factors.solve(np.ones(2))
     assert abs(v[1]) > 1e10 * abs(v[0])
+
+
+@pytest.mark.parametrize(("across", "unstable"), [(1.0, 0), (0.1, 1)])
+def test_inertia_of_a_skewed_tangent(across: float, unstable: int) -> None:
+    """Of [-0.1 c; -c 1], whose determinant is c^2 - 0.1: K alone has a negative pivot, a large c makes up for it."""
+    N, factors = matrix([0.0, 0.0]), Factorisation(MPI.COMM_SELF)
+    N.setOption(PETSc.Mat.Option.NEW_NONZERO_ALLOCATION_ERR, False)
+    N.setValue(0, 1, across)
+    N.setValue(1, 0, -across)
+    N.assemble()
+    K = matrix([-0.1, 1.0])
+    factors.factor(Skewed(K, N))
+    A = np.array([[-0.1, across], [-across, 1.0]])
+    assert factors.negative_pivots == unstable
+    assert factors.skewed
+    assert factors.solve(np.array([1.0, 2.0])) == pytest.approx(np.linalg.solve(A, [1.0, 2.0]))
+    assert factors.solve_transposed(np.array([1.0, 2.0])) == pytest.approx(np.linalg.solve(A.T, [1.0, 2.0]))
+    factors.factor(K)
+    assert (factors.skewed, factors.negative_pivots) == (False, 1)
+    assert factors.solve(np.ones(2)) == pytest.approx([-10.0, 1.0])
 
 
 def indefinite(n: int) -> PETSc.Mat:

@@ -35,13 +35,23 @@ Integral = Callable[[Expr], ufl.Form]
 
 @dataclass(frozen=True)
 class Energy:
-    """One term: its energy per radian as a function of the displacement's jet; see `Term`."""
+    """One term: its energy per radian as a function of the displacement's jet; see `Term`.
+
+    `work` of the jets of u and v is the virtual work of a load without potential, quadratic in u.
+    """
 
     name: str
     of: Callable[[Jet], ufl.Form]
     amplitude: str | None = None
     linear: bool = False
+    work: Callable[[Jet, Jet], ufl.Form] | None = None
     follow: Callable[[], None] | None = None
+
+    def added(self, u: Jet, v: Jet) -> ufl.Form:
+        """A form with the Hessian in v, at v = 0, of the energy of u + v; of a work that of its symmetric part."""
+        if self.work is None:
+            return self.of(u + v)
+        return 0.25 * (self.work(u + v, v) - self.work(u - v, v))
 
 
 @dataclass(frozen=True)
@@ -130,6 +140,19 @@ class EnergyFactory:
         """Amplitude p/p_c; potential p Delta V, of a live pressure."""
         unit = self.constant(self.material.classical_pressure / self.material.h)
         return Energy("pressure", lambda u: unit * self.volume_change(u), "pressure")
+
+    def pressure_beside_edges(self, *, potential: bool) -> Energy:
+        """The same where an end moves or lies in another plane than z = 0, with a potential or without."""
+        j0, unit = self.j0, self.constant(self.material.classical_pressure / self.material.h)
+
+        def work(u: Jet, v: Jet) -> ufl.Form:
+            return densities.following(j0, u, v, unit) * self._dx()
+
+        return Energy("pressure", lambda u: unit * self.swept_volume(u), "pressure", work=None if potential else work)
+
+    def swept_volume(self, u: Jet) -> ufl.Form:
+        """Delta V/R^3 per radian where an end moves."""
+        return densities.swept(self.j0, u) * self._dx()
 
     def own(self, term: OwnTerm, amplitude: str | None = None) -> Energy:
         """The energy of a part or one's own, with the amplitude of its name or another; it shares the symmetry."""

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from functools import cached_property
 
 import numpy as np
+import ufl
 from dolfinx import fem
 
 from magshell_fenicsx.assembly.kernels import KernelLog
@@ -22,7 +23,7 @@ from magshell_fenicsx.models.axisymmetric.instability import ExcludedWaves
 from magshell_fenicsx.models.axisymmetric.meridian import Meridian
 from magshell_fenicsx.models.axisymmetric.pattern import places, thickness_field
 from magshell_fenicsx.models.axisymmetric.probe import Array, Probe
-from magshell_fenicsx.models.axisymmetric.supports import supports
+from magshell_fenicsx.models.axisymmetric.supports import openings, supports
 from magshell_fenicsx.models.axisymmetric.waves import Waves
 from magshell_fenicsx.models.observed import Observed
 from magshell_fenicsx.models.shell import edges
@@ -93,7 +94,7 @@ class MeridianModel(Observed):
             shape = Shape.of(natural_field(loads.natural, *places(self.r0), V), loads.natural, free)
         factory = EnergyFactory(meridian, self.r0, material, self.sigma, degree, self.thickness, shape, free)
         self.factory = factory
-        self.held = supports(meridian, conditions, pressure=loads.pressure)
+        self.held = supports(meridian, conditions)
         self.energies = [factory.membrane(), factory.bending(), factory.interior_edges()]
         self.supports = {}
         for name, (facets, components) in self.held.named.items():
@@ -107,7 +108,12 @@ class MeridianModel(Observed):
             self.energies.append(factory.mirror_edges(self.held.mirror))
         if loads.magnetic:
             self.energies += factory.magnetic(loads.magnetic, self.u)
-        if loads.pressure:
+        volume = factory.volume_change
+        beside, self.without_potential = openings(meridian, conditions)
+        if loads.pressure and beside:
+            self.energies.append(factory.pressure_beside_edges(potential=not self.without_potential))
+            volume = factory.swept_volume
+        elif loads.pressure:
             self.energies.append(factory.pressure())
         self.energies += [factory.own(term) for term in loads.own]
         u = jets.revolved(self.u)
@@ -135,7 +141,7 @@ class MeridianModel(Observed):
             parameters=parameters,
             moving=moving(self.r0, self.supports, loads),
         )
-        self._volume = self.kernels.compile("volume energy", 2 * np.pi * factory.volume_change(jets.revolved(self.u)))
+        self._volume = self.kernels.compile("volume energy", 2 * np.pi * volume(jets.revolved(self.u)))
         self._seen = {name: Probe.at(*place, self.r0) for name, place in meridian.points.items()}
         self.normals = {name: probe.normal for name, probe in self._seen.items()}
 
@@ -149,8 +155,9 @@ class MeridianModel(Observed):
         return self._seen[point](u)
 
     def _term(self, e: Energy) -> FormTerm:
-        energy = 2 * np.pi * e.of(jets.revolved(self.u))
-        return FormTerm(e.name, energy, self.u, self.kernels, e.amplitude, linear=e.linear, follow=e.follow)
+        u, v = jets.revolved(self.u), jets.revolved(ufl.TestFunction(self.V))
+        work, energy = 2 * np.pi * e.work(u, v) if e.work else None, 2 * np.pi * e.of(u)
+        return FormTerm(e.name, energy, self.u, self.kernels, e.amplitude, linear=e.linear, work=work, follow=e.follow)
 
     def _moment(self, name: str, load: EdgeMoment, amplitude: str) -> Counted:
         facets, constant = self.meridian.ends[load.edge], self.factory.constant

@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.axisymmetric.meridian import Meridian
+from magshell_fenicsx.models.shell.openings import ring_openings
 from magshell_fenicsx.models.shell.parameters import Condition, Held
-from magshell_fenicsx.models.shell.supports import RIGHT, STRAIGHT, no_mirror, open_to_pressure
+from magshell_fenicsx.models.shell.supports import RIGHT, STRAIGHT, no_mirror
 
 Facets = NDArray[np.int32]
 HORIZONTAL, AXIAL = {0, 1}, 2  # components of the displacement
@@ -70,13 +71,13 @@ class Supports:
             raise MeshError(f"boundary: the shell is not held: it is free to {motion}")
 
 
-def supports(meridian: Meridian, conditions: Mapping[str, Condition], *, pressure: bool = False) -> Supports:
+def supports(meridian: Meridian, conditions: Mapping[str, Condition]) -> Supports:
     """The supports that conditions of named ends make, and those of a named point on the axis.
 
     Raises
     ------
     MeshError
-        If an end lies in no plane of symmetry, or in one that is open to a live `pressure`.
+        If an end lies in no plane of symmetry.
     """
     horizontal, axial, mirror = found = [list[Facets]() for _ in range(3)]
     named: dict[str, tuple[Facets, tuple[int, ...]]] = {}
@@ -86,7 +87,7 @@ def supports(meridian: Meridian, conditions: Mapping[str, Condition], *, pressur
         if condition in ("clamped", "simply supported"):
             held = {*HORIZONTAL, AXIAL}
         if condition == "plane":
-            _refuse_slanting(meridian, name, pressure=pressure)
+            _refuse_slanting(meridian, name)
             mirror.append(here)
             held = {AXIAL}
         if held >= HORIZONTAL:
@@ -100,14 +101,20 @@ def supports(meridian: Meridian, conditions: Mapping[str, Condition], *, pressur
     return Supports(meridian.axis, parts[0], parts[1], parts[2], named)
 
 
-def _refuse_slanting(meridian: Meridian, name: str, *, pressure: bool) -> None:
-    """See that the surface crosses the plane of an end at right angles, and a live pressure a plane through 0."""
+def openings(meridian: Meridian, conditions: Mapping[str, Condition]) -> tuple[bool, tuple[str, ...]]:
+    """Whether p V from the origin would load an edge too, and the ends where a live pressure has no potential."""
+    places = {name: meridian.section(np.array([meridian.parameter(name)]))[0] for name in meridian.ends}
+    moved, open_at = ring_openings(places, conditions)
+    beside = [name for name, c in conditions.items() if c == "plane" and abs(places[name][1]) > STRAIGHT]
+    return bool(moved or beside), open_at
+
+
+def _refuse_slanting(meridian: Meridian, name: str) -> None:
+    """See that the surface crosses the plane of an end at right angles."""
     s = meridian.parameter(name)
     (rho, z), (rho_near, z_near) = meridian.section(np.array([s, s + (STRAIGHT if s == 0 else -STRAIGHT)]))
     if abs(z_near - z) < RIGHT * np.hypot(rho_near - rho, z_near - z):
         raise MeshError(no_mirror(name))
-    if pressure and abs(z) > STRAIGHT:
-        raise MeshError(open_to_pressure(name))
 
 
 def _zero(V: fem.FunctionSpace, facets: Facets, component: int) -> fem.DirichletBC:

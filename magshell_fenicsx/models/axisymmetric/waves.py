@@ -157,7 +157,7 @@ class Waves:
     def _second(self, e: Energy) -> ufl.Form:
         v, u = fem.Function(self.V), jets.revolved(self._system.u)
         cosine, sine = jets.wave(v, self._m)
-        energy = np.pi * (e.of(u + cosine) + e.of(u + sine))
+        energy = np.pi * (e.added(u, cosine) + e.added(u, sine))
         gradient = ufl.derivative(energy, v, ufl.TestFunction(self.V))
         hessian = ufl.derivative(gradient, v, ufl.TrialFunction(self.V))
         return self._factor * ufl.replace(hessian, {v: ufl.zero(3)})  # at v = 0 most of it vanishes

@@ -152,3 +152,18 @@ def volume(r0: Jet, u: Jet, origin: Expr | None = None) -> Expr:
 def pressure(r0: Jet, u: Jet, unit: Expr, origin: Expr | None = None) -> Expr:
     """Pi/p of a live pressure in that unit; per area of the coordinates as `volume`."""
     return unit * volume(r0, u, origin)
+
+
+def swept(r0: Jet, u: Jet, unit: Expr | float = 1.0) -> Expr:
+    """The volume that the surface sweeps when its points move straight to r0 + u; per area of the coordinates.
+
+    It is the work of p = 1 in that unit, and its potential wherever there is one: whatever the edges are, no
+    origin and no faces that close the volume enter.
+    """
+    mean = kin.area_vector(r0) + (ufl.cross(r0.r1, u.r2) + ufl.cross(u.r1, r0.r2)) / 2 + kin.area_vector(u) / 3
+    return unit * ufl.dot(u.r, mean)
+
+
+def following(r0: Jet, u: Jet, v: Jet, unit: Expr | float = 1.0) -> Expr:
+    """v . n da: the virtual work of p = 1 in that unit; per area of the coordinates."""
+    return unit * ufl.dot(v.r, kin.area_vector(r0 + u))

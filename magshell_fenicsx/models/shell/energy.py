@@ -41,6 +41,8 @@ class Density:
         Boundary edges that it lives on; None elsewhere.
     sides
         2 on interior edges.
+    work
+        Of (r0, u, v, *parameters), linear in v: the virtual work of a load without potential, on cells.
     """
 
     of: Callable[..., Expr]
@@ -49,6 +51,7 @@ class Density:
     linear: tuple[str, ...] = ()
     facets: NDArray[np.int32] | None = None
     sides: int = 1
+    work: Callable[..., Expr] | None = None
 
     @property
     def on_edges(self) -> bool:
@@ -65,7 +68,7 @@ class Density:
         Parameters
         ----------
         jets
-            Of r0, u and what else it takes, each on every side.
+            Of r0, u and what else it takes, each on every side; with the jet of v the virtual work is meant.
         edge
             The covector on every side and the width; None on cells.
         parameters
@@ -74,7 +77,8 @@ class Density:
         arguments = [*jets, *(edge[:1] if edge else ())]
         sided = [tuple(each) if self.sides == 2 else each[0] for each in arguments]
         fields = [_halves(p) if self.sides == 2 and isinstance(p, fem.Function) else p for p in parameters]
-        return self.of(*sided, *(edge[1:] if edge else ()), *fields)
+        of = self.work if self.work and len(jets) == 3 else self.of
+        return of(*sided, *(edge[1:] if edge else ()), *fields)
 
 
 def _halves(field: fem.Function) -> tuple[Expr, Expr]:

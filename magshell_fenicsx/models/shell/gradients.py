@@ -12,6 +12,7 @@ import ufl
 from dolfinx import fem
 from mpi4py import MPI
 from numpy.typing import NDArray
+from ufl.constantvalue import Zero
 from ufl.core.expr import Expr
 
 from magshell_fenicsx.assembly.kernels import KernelLog
@@ -27,7 +28,7 @@ FRAME = 4  # numbers of a cell's frame, see `cell_frames`
 
 
 class PointGradient:
-    """dW/du of the sum of some terms' densities at points.
+    """dW/du of the sum of some terms' densities at points, or the virtual work's derivative in v.
 
     Parameters
     ----------
@@ -71,14 +72,18 @@ class PointGradient:
         self._u, placement, place = (points.field(size) for size in (self._size, self._size, geometry.shape[1]))
         self._known = [(placement, r0), (place, geometry)]
         self._following: list[tuple[fem.Function, Array]] = []
-        W = ufl.zero()
+        W, work, v = ufl.zero(), ufl.zero(), points.field(self._size)
         for term in terms:
             parameters, varying = parameters_at(points, term.density.parameters, term.density.sides)
             self._known += [(here, values(field)) for here, field in varying]
             self._following += [(here, values(field)) for here, field in varying if isinstance(field, PointField)]
-            W += _energy(term.density, placement, self._u, place, parts, parameters)
+            if term.density.work:
+                work += _energy(term.density, [placement, self._u, v], place, parts, parameters)
+            else:
+                W += _energy(term.density, [placement, self._u], place, parts, parameters)
         name = f"{', '.join(term.name for term in terms)} gradient"
-        self._gradient = log.compile_expression(name, ufl.diff(W, self._u), comm)
+        gradients = [ufl.diff(w, z) for w, z in ((W, self._u), (work, v)) if not isinstance(w, Zero)]
+        self._gradient = log.compile_expression(name, sum(gradients[1:], gradients[0]), comm)
         self._loaded: slice | None = None
 
     def room(self, chunk: slice) -> Array:
@@ -109,22 +114,21 @@ def in_own_coordinates(jet: Jet, frame: Sequence[Expr | Array]) -> Jet:
 
 def _energy(
     density: Density,
-    r0: fem.Function,
-    u: fem.Function,
+    fields: Sequence[fem.Function],
     place: fem.Function,
     parts: Sequence[str],
     parameters: Sequence[fem.Constant | fem.Function],
 ) -> Expr:
-    """Per area of the reference cell, or per parameter (from 0 to 1) of the edge."""
+    """Per area of the reference cell, or per parameter (from 0 to 1) of the edge; of r0, u and perhaps v."""
     sides = range(density.sides)
     frames = [[place[FRAME * side + i] for i in range(FRAME)] for side in sides]
-    r0_jets = [_jet(r0, side, parts) for side in sides]
-    u_jets = [in_own_coordinates(_jet(u, side, parts), frames[side]) for side in sides]
+    r0_jets = [_jet(fields[0], side, parts) for side in sides]
+    others = [[in_own_coordinates(_jet(f, side, parts), frames[side]) for side in sides] for f in fields[1:]]
     if not density.on_edges:
-        return frames[0][-1] * density.at([r0_jets, u_jets], None, parameters)
+        return frames[0][-1] * density.at([r0_jets, *others], None, parameters)
     first = FRAME * density.sides
     m = [ufl.as_vector([place[first + 2 * side], place[first + 2 * side + 1]]) for side in sides]
-    return density.at([r0_jets, u_jets], (m, place[first + 2 * density.sides]), parameters)
+    return density.at([r0_jets, *others], (m, place[first + 2 * density.sides]), parameters)
 
 
 def _jet(field: fem.Function, side: int, parts: Sequence[str]) -> Jet:

@@ -19,7 +19,6 @@ from magshell_fenicsx.assembly.sliding import Constraint, held_along
 from magshell_fenicsx.assembly.terms import LinearTerm, Term
 from magshell_fenicsx.mesh.midsurface import Midsurface
 from magshell_fenicsx.mesh.mirror import Y0, Mirror
-from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.observed import Observed
 from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes
 from magshell_fenicsx.models.shell.dead_load import SurfaceMeasures, assemble_dead_loads
@@ -27,6 +26,7 @@ from magshell_fenicsx.models.shell.fast_tangent import FastTangent, make_sites
 from magshell_fenicsx.models.shell.folds import FOLD, largest_fold
 from magshell_fenicsx.models.shell.moved import Support, moving, rotation_of
 from magshell_fenicsx.models.shell.natural import Shape, natural_field
+from magshell_fenicsx.models.shell.openings import openings
 from magshell_fenicsx.models.shell.parameters import (
     Condition,
     EdgeMoment,
@@ -44,7 +44,6 @@ from magshell_fenicsx.models.shell.supports import (
     closing_point,
     held_at_vertex,
     held_on,
-    open_to_pressure,
     plane_of,
     refuse_unknown,
 )
@@ -74,8 +73,7 @@ class ShellModel(Observed):
     Raises
     ------
     MeshError
-        On every rank, if the surface has no such edge, point or patch, an edge lies in no plane of symmetry, or
-        in one that is open to a live pressure.
+        On every rank, if the surface has no such edge, point or patch, or an edge lies in no plane of symmetry.
 
     Attributes
     ----------
@@ -167,12 +165,14 @@ class ShellModel(Observed):
             self.supports[name] = Support.of(here, edge, turn)
         self.supports |= on_planes
         closing = closing_point(planes)
-        if closing is None and loads.pressure:
-            raise MeshError(open_to_pressure(next(name for name, c in conditions.items() if c == "plane")))
-        closing = np.zeros(3) if closing is None else closing
+        moved, self.without_potential = openings(self.r0, midsurface.edges, conditions)
+        volume = factory.volume_change(np.zeros(3) if closing is None else closing)
         if loads.magnetic:
             terms += factory.magnetic(loads.magnetic)
-        if loads.pressure:
+        if loads.pressure and (moved or closing is None):
+            terms.append(factory.pressure_beside_edges(potential=not self.without_potential))
+            volume = factory.swept_volume()
+        elif loads.pressure and closing is not None:
             terms.append(factory.pressure(closing))
         terms += [factory.own(term) for term in loads.own]
         self.observed = self.kernels.compile_all(factory.observed(term) for term in loads.own)
@@ -202,7 +202,7 @@ class ShellModel(Observed):
         )
         self._factory, self._interior, self._held, self.mirror = factory, interior, held, mirror
         self._on_mirror = facets("symmetry")
-        self.observe(self.kernels.compile("volume energy", factory.volume_change(closing)), midsurface.points)
+        self.observe(self.kernels.compile("volume energy", volume), midsurface.points)
 
     @cached_property
     def excluded_modes(self) -> AntisymmetricModes | None:

@@ -77,6 +77,10 @@ class Magnetisation:
     across
         Vectors (3,), normal to `applied` and to each other, that the field turns towards, with the amplitudes of
         `ACROSS`.
+    axes
+        Unit vectors along `applied` and `across`.
+    turned
+        Orthonormal matrices (3, 3): the gradient of a turning field is a sum of them and of `gradient`.
     energy
         The full energy, or which of the paper's approximations takes its place.
     patches
@@ -96,6 +100,14 @@ class Magnetisation:
     layers: tuple[tuple[float, NDArray[np.float64]], ...] = ()
     law: RemanenceLaw = "deformation"
     in_space: FieldInSpace | None = None
+    axes: tuple[NDArray[np.float64], ...] = ()
+    turned: tuple[NDArray[np.float64], ...] = ()
+
+    @property
+    def gradients(self) -> dict[str, NDArray[np.float64]]:
+        """Amplitude -> the part of the field's gradient that it multiplies."""
+        parts = {f"lambda_gradient_{i}": B for i, B in enumerate(self.turned, 1)}
+        return {} if self.gradient is None else {"lambda_m": self.gradient, **parts}
 
     @property
     def uniform(self) -> bool:

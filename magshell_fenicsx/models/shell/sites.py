@@ -58,7 +58,10 @@ class Site:
         self._geometry = self._points.field(2 * sides + 1)
         self._placements = [self._jets(batch, r0.x.array) for batch in batches]
         self._kernels = {
-            t.name: Kernel(t.name, t.density, self._points, batches, of_v=isinstance(t, HessianTerm)) for t in terms
+            t.name: Kernel(
+                t.name, t.density, self._points, batches, of_v=isinstance(t, HessianTerm) or bool(t.density.work)
+            )
+            for t in terms
         }
         self._prestress = Kernel("prestress", prestress, self._points, batches, of_v=True) if prestress else None
         self._replaced = False
@@ -144,6 +147,8 @@ class Kernel:
         jets = [[_jet(field, side) for side in range(sides)] for field in ((r0, u, z) if of_v else (r0, u))]
         m = [ufl.as_vector([geometry[2 * side], geometry[2 * side + 1]]) for side in range(sides)]
         W = density.at(jets, (m, geometry[2 * sides]) if density.on_edges else None, self._parameters)
+        if density.work:  # the Hessian of dW(v)/2 along v is the symmetric part of the derivative of the work
+            W = ufl.dot(ufl.diff(W, u), z) / 2
         self._hessian = point_hessian(name, W, z, PARTS, self.pairs, log, comm, at_zero=of_v)
 
     def vary(self, number: int, values: Array) -> None:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
-from magshell_fenicsx.continuation.system import Amplitudes
+from magshell_fenicsx.continuation.system import Amplitudes, symmetric_part
 from magshell_fenicsx.mesh.mirror import Mirror
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.shell.parameters import Condition, Held, Loads
@@ -69,15 +69,6 @@ def refuse_unknown(
         if edge is not None and edge not in edges:
             there = ", ".join(sorted(edges)) or "none"
             raise MeshError(f"loading.loads: edge: {edge}: the surface has only {there}")
-
-
-def open_to_pressure(name: str) -> str:
-    """What is said of an edge where the energy p V of a live pressure would load the edge too."""
-    return (
-        f"loading.kind: pressure: the edge {name} must be held (clamped or hinged), or lie in a symmetry plane, and "
-        "all these planes have a common point; kind: dead with {over: all, pressure: ..} has no such limit "
-        "(not on a strip)"
-    )
 
 
 def no_mirror(name: str) -> str:
@@ -164,7 +155,7 @@ def refuse_loose(system: FiniteElementSystem, r0: fem.Function, amplitudes: Ampl
     if not len(free):
         return
     free /= np.sqrt(system.comm.allreduce((free**2).sum(axis=1)))[:, None]
-    K = system.tangent(np.zeros(system.size), amplitudes)
+    K = symmetric_part(system.tangent(np.zeros(system.size), amplitudes))
     out, energies = K.createVecLeft(), []
     for v in free:
         given = K.createVecRight()

@@ -130,10 +130,11 @@ class TermFactory:
             for amplitude, suffix, Ba in directions
             for name, of in magnetic_densities(field.law, field.energy).items()
         ]
-        if field.gradient is not None:
-            parameters = (Br, self._constant(field.gradient))
+        for name, G in field.gradients.items():
+            parameters = (Br, self._constant(G))
             density = Density(per_area(densities.in_gradient(FULL[field.law])), parameters, parts=MOVED)
-            terms.append(self._cells("magnetic gradient", self._thick(density, None), "lambda_m"))
+            suffix = name.removeprefix("lambda_m").replace("lambda_gradient_", " ")
+            terms.append(self._cells("magnetic gradient" + suffix, self._thick(density, None), name))
         return terms
 
     def pressure(self, origin: NDArray[np.float64]) -> ShellTerm:
@@ -141,6 +142,16 @@ class TermFactory:
         unit = self._constant(self.material.classical_pressure / self.material.h)
         parameters = (unit, self._constant(origin)) if origin.any() else (unit,)
         return self._cells("pressure", Density(densities.pressure, parameters, parts=MOVED), "pressure")
+
+    def pressure_beside_edges(self, *, potential: bool) -> ShellTerm:
+        """The same where edges move that lie in no planes with a common point, with a potential or without."""
+        unit = self._constant(self.material.classical_pressure / self.material.h)
+        work = None if potential else densities.following
+        return self._cells("pressure", Density(densities.swept, (unit,), parts=MOVED, work=work), "pressure")
+
+    def swept_volume(self) -> ufl.Form:
+        """Delta V/R^3 of the modelled part where edges move."""
+        return densities.swept(*self._jets()) * self._dx()
 
     def own(self, term: OwnTerm, amplitude: str | None = None) -> ShellTerm:
         """The energy of a part or one's own, with the amplitude of its name or another."""
@@ -209,8 +220,11 @@ class TermFactory:
         linear: bool = False,
         follow: Callable[[], None] | None = None,
     ) -> ShellTerm:
-        energy = density.of(*self._jets(), *density.parameters) * self._dx()
-        return ShellTerm(name, density, energy, self.u, self.log, amplitude, linear=linear, follow=follow)
+        energy, work = density.of(*self._jets(), *density.parameters) * self._dx(), None
+        if density.work:
+            v = kin.jet(ufl.TestFunction(self.u.function_space), self._domain)
+            work = density.work(*self._jets(), v, *density.parameters) * self._dx()
+        return ShellTerm(name, density, energy, self.u, self.log, amplitude, linear=linear, work=work, follow=follow)
 
     def _edges(self, name: str, density: Density) -> ShellTerm:
         assert density.facets is not None

@@ -55,9 +55,30 @@ def pressure(X: Expr, X1: Expr, X2: Expr, u: Expr, u1: Expr, u2: Expr, unit: Exp
     return unit * (enclosed(X + u, X1 + u1, X2 + u2) - enclosed(X, X1, X2))
 
 
+def swept(X: Expr, X1: Expr, X2: Expr, u: Expr, u1: Expr, u2: Expr, unit: Expr | float = 1.0) -> Expr:
+    """As `shell.densities.swept`: the volume that a face sweeps, per area of its coordinates."""
+    mean = ufl.cross(X1, X2) + (ufl.cross(X1, u2) + ufl.cross(u1, X2)) / 2 + ufl.cross(u1, u2) / 3
+    return unit * ufl.dot(u, mean)
+
+
+def following(X: Expr, X1: Expr, X2: Expr, u: Expr, u1: Expr, u2: Expr, v: Expr, unit: Expr) -> Expr:
+    """v . n da: the virtual work of p = 1 in that unit, per area of the face's coordinates."""
+    return unit * ufl.dot(v, ufl.cross(X1 + u1, X2 + u2))
+
+
 def sealing(X: Expr, u: Expr, H: Expr, n: Expr, t: Expr, unit: Expr, origin: Expr | None = None) -> Expr:
-    """The same on a part of an end, per undeformed area."""
+    """`pressure` on a part of an end, per undeformed area."""
     return pressure(X, t, n, u, ufl.dot(H, t), ufl.dot(H, n), unit, origin)
+
+
+def swept_end(X: Expr, u: Expr, H: Expr, n: Expr, t: Expr, unit: Expr) -> Expr:
+    """`swept` on a part of an end, per undeformed area."""
+    return swept(X, t, n, u, ufl.dot(H, t), ufl.dot(H, n), unit)
+
+
+def following_end(X: Expr, u: Expr, H: Expr, n: Expr, t: Expr, v: Expr, unit: Expr) -> Expr:
+    """`following` on a part of an end, per undeformed area."""
+    return following(X, t, n, u, ufl.dot(H, t), ufl.dot(H, n), v, unit)
 
 
 def turning(X: Expr, u: Expr, H: Expr, n: Expr, t: Expr, weight: Expr, intensity: Expr, past: Expr) -> Expr:

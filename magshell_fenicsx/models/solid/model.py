@@ -17,22 +17,22 @@ from magshell_fenicsx.assembly.parameter import make_parameters
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.assembly.sliding import Constraint, held_along
 from magshell_fenicsx.assembly.terms import LinearTerm, Term
-from magshell_fenicsx.mesh.hexahedra import Body, quadratic
+from magshell_fenicsx.mesh.hexahedra import OUTER, Body, quadratic
 from magshell_fenicsx.mesh.mirror import Y0, Mirror
-from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.observed import Observed
 from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes
 from magshell_fenicsx.models.shell.dead_load import assemble_dead_loads
 from magshell_fenicsx.models.shell.fast_tangent import FastTangent
 from magshell_fenicsx.models.shell.moved import moving
+from magshell_fenicsx.models.shell.openings import openings
 from magshell_fenicsx.models.shell.parameters import Condition, EdgeMoment, Loads, Material, Potential
-from magshell_fenicsx.models.shell.supports import closing_point, open_to_pressure
+from magshell_fenicsx.models.shell.supports import closing_point
 from magshell_fenicsx.models.solid.loads import BodyMeasures, outer_patch
 from magshell_fenicsx.models.solid.material import NeoHookean
 from magshell_fenicsx.models.solid.natural import body_shape, grown
 from magshell_fenicsx.models.solid.remanence import in_cells
 from magshell_fenicsx.models.solid.sites import make_sites
-from magshell_fenicsx.models.solid.supports import supports
+from magshell_fenicsx.models.solid.supports import in_middle, supports
 from magshell_fenicsx.models.solid.terms import Density, TermFactory
 
 Array = NDArray[np.float64]
@@ -54,8 +54,7 @@ class SolidModel(Observed):
     Raises
     ------
     MeshError
-        On every rank, if an edge lies in no plane of symmetry, if these planes leave a live pressure open, or if a
-        patch is not there or unknown to the mesh.
+        On every rank, if an edge lies in no plane of symmetry, or if a patch is not there or unknown to the mesh.
 
     Attributes
     ----------
@@ -98,12 +97,19 @@ class SolidModel(Observed):
         )
         self._pattern = factory.distortion()
         self._held, planes, self.supports = supports(body, self.r0, conditions)
-        origin = self._closing_point([mirror, *planes] if self.multiplicity == 2 else planes, conditions)
+        origin = closing_point([mirror, *planes] if self.multiplicity == 2 else planes)
+        ends = {name: facets for name, facets in body.faces.items() if name != OUTER}
+        moved, self.without_potential = openings(self.r0, ends, conditions, in_middle(body, V))
+        if loads.pressure and moved:
+            origin = None
+        elif not loads.pressure and origin is None:
+            origin = np.zeros(3)
         self._terms: list[Term] = [self._pattern, factory.compression()]
         if loads.magnetic:
             self._terms += factory.magnetic(loads.magnetic)
         if loads.pressure:
-            self._terms += factory.pressure(material.classical_pressure, origin)
+            potential = not self.without_potential
+            self._terms += factory.pressure(material.classical_pressure, origin, potential=potential)
         self._terms += [factory.own(term) for term in loads.own]
         self.observed = self.kernels.compile_all(factory.observed(term) for term in loads.own)
         self.load_size = {}
@@ -132,13 +138,6 @@ class SolidModel(Observed):
         if self.multiplicity == 1:
             return None
         return AntisymmetricModes(self._system(self._held + self._held_on_mirror(self.mirror.in_plane)))
-
-    def _closing_point(self, planes: list[Mirror], conditions: Mapping[str, Condition]) -> Array:
-        """A point of all symmetry planes, from which the volume beside them is measured."""
-        found = closing_point(planes)
-        if found is None and self.loads.pressure:
-            raise MeshError(open_to_pressure(next(name for name, c in conditions.items() if c == "plane")))
-        return np.zeros(3) if found is None else found
 
     def _held_on_mirror(self, directions: Iterable[Array]) -> list[Constraint]:
         return [held_along(self.V, 2, facets, along) for facets in self._faces for along in directions]

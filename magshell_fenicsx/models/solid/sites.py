@@ -71,10 +71,11 @@ class Site:
         self._varying: dict[str, list[tuple[fem.Function, list[Array]]]] = {}
         for term in terms:
             pairs = Pairs(tuple(combinations_with_replacement(term.density.parts, 2)))
-            W = self._density(term)
+            z = self._points.field(3 * PARTS) if term.density.work else self._u
+            W = self._density(term, z)
             self._pairs[term.name] = pairs
             self._hessians[term.name] = point_hessian(
-                term.name, W, self._u, PARTS, pairs, log, V.mesh.comm, at_zero=False
+                term.name, W, z, PARTS, pairs, log, V.mesh.comm, at_zero=z is not self._u
             )
         wanted = sorted({pair for pairs in self._pairs.values() for pair in pairs.same})
         self._coupled = Pairs(tuple(wanted))
@@ -97,9 +98,11 @@ class Site:
         """(cells, points, 4, 3) of a field."""
         return batch.rule.tables[0].jets(field.reshape(-1, 3)[self._dofs[batch.cells[0]]])
 
-    def _density(self, term: SolidTerm) -> Any:
+    def _density(self, term: SolidTerm, v: fem.Function) -> Any:
+        """A function of u, or of u and v with the Hessian in v that its virtual work has in symmetric part."""
         density, g, z = term.density, self._g, self._u
-        parameters, varying = parameters_at(self._points, density.parameters, 1)
+        here, varying = parameters_at(self._points, density.parameters, 1)
+        of = density.work or density.of
         self._varying[term.name] = [
             (here, [at_points(field, batch.rule.points[0], batch.cells[0]) for batch in self._batches])
             for here, field in varying
@@ -108,12 +111,16 @@ class Site:
         def vector(f: fem.Function, part: int) -> Any:
             return ufl.as_vector([f[3 * part + c] for c in range(3)])
 
+        def second(W: Any) -> Any:
+            return ufl.dot(ufl.diff(W, z), v) / 2 if density.work else W
+
+        parameters = [vector(v, 0), *here] if density.work else here
         if density.where == "outer":
-            return density.of(*(vector(f, part) for f in (g, z) for part in range(3)), *parameters)
+            return second(of(*(vector(f, part) for f in (g, z) for part in range(3)), *parameters))
         by_reference = ufl.as_matrix([[z[3 * part + c] for part in range(1, PARTS)] for c in range(3)])
         inverse = ufl.as_matrix([[g[3 + 3 * i + j] for j in range(3)] for i in range(3)])
         frame = [ufl.as_vector([g[i + c] for c in range(3)]) for i in (13, 16)] if density.where == "end" else []
-        return density.of(vector(g, 0), vector(z, 0), ufl.dot(by_reference, inverse), *frame, *parameters) * g[12]
+        return second(of(vector(g, 0), vector(z, 0), ufl.dot(by_reference, inverse), *frame, *parameters)) * g[12]
 
 
 def make_sites(

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 
 import numpy as np
 from dolfinx import fem
+from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.sliding import Constraint, held_along
 from magshell_fenicsx.mesh.hexahedra import MIDDLE, Body
@@ -27,7 +28,7 @@ def supports(
         On every rank, if an edge lies in no plane of symmetry.
     """
     V = r0.function_space
-    in_middle = np.abs(body.at_nodes(V, body.heights) - MIDDLE) < ROUNDING
+    middle = in_middle(body, V)
     held: list[Constraint] = []
     planes: list[Mirror] = []
     named: dict[str, Support] = {}
@@ -36,7 +37,7 @@ def supports(
         components = condition.components if isinstance(condition, Held) else ALL
         if condition in ("free", "symmetry"):
             continue
-        nodes = None if condition == "clamped" else in_middle
+        nodes = None if condition == "clamped" else middle
         if condition == "plane":
             planes.append(plane := plane_of(r0, body.faces[name], name))
             held.append(held_along(V, 2, body.faces[name], plane.normal))
@@ -51,3 +52,8 @@ def supports(
         held += here
         named[name] = Support.of(here)
     return held, planes, named | on_planes
+
+
+def in_middle(body: Body, V: fem.FunctionSpace) -> NDArray[np.bool_]:
+    """Which nodes, ghosts included, lie in the middle of the thickness."""
+    return np.asarray(np.abs(body.at_nodes(V, body.heights) - MIDDLE) < ROUNDING)

@@ -52,6 +52,8 @@ class Density:
         Those that it lives on.
     upper
         Whether it lives on the outer half of these alone.
+    work
+        On faces: the virtual work of a load without potential; it takes v before the parameters.
     """
 
     of: Callable[..., Expr]
@@ -61,6 +63,7 @@ class Density:
     where: Literal["body", "outer", "end"] = "body"
     facets: Facets = field(default_factory=lambda: np.empty(0, dtype=np.int32))
     upper: bool = False
+    work: Callable[..., Expr] | None = None
 
     @property
     def rule(self) -> tuple[Array, Array]:
@@ -119,20 +122,29 @@ class TermFactory:
         for amplitude, suffix, Ba in directions:
             density = Density(law.magnetic, (Br, *self._constants(Ba, self.h)))
             terms.append(self._bulk("magnetic" + suffix, density, amplitude, linear=law is densities))
-        if of.gradient is not None:
-            parameters = (Br, *self._constants(of.gradient, self.h))
-            density = Density(law.magnetic_gradient, parameters, VALUE + GRADIENT)
-            terms.append(self._bulk("magnetic gradient", density, "lambda_m"))
+        for name, G in of.gradients.items():
+            density = Density(law.magnetic_gradient, (Br, *self._constants(G, self.h)), VALUE + GRADIENT)
+            suffix = name.removeprefix("lambda_m").replace("lambda_gradient_", " ")
+            terms.append(self._bulk("magnetic gradient" + suffix, density, name))
         return terms
 
-    def pressure(self, classical: float, origin: Array) -> list[SolidTerm]:
+    def pressure(self, classical: float, origin: Array | None, *, potential: bool = True) -> list[SolidTerm]:
         """Amplitude p/p_c, `classical` being p_c/E; on the outer face, and above the middle line of hinged ends.
 
-        `origin` is a point of all symmetry planes.
+        `origin` is a point of all symmetry planes; None where edges move, with a `potential` or without.
         """
+        v = None if potential else ufl.TestFunction(self.u.function_space)
         return [
-            SolidTerm(name, density, self._on_faces([density]), self.u, self.log, "pressure")
-            for name, density in self._enclosing(classical / self.h, origin).items()
+            SolidTerm(
+                name,
+                density,
+                self._on_faces([density]),
+                self.u,
+                self.log,
+                "pressure",
+                work=None if v is None else self._on_faces([density], v),
+            )
+            for name, density in self._enclosing(classical / self.h, origin, potential=potential).items()
         ]
 
     def own(self, term: OwnTerm, amplitude: str | None = None) -> SolidTerm:
@@ -155,7 +167,7 @@ class TermFactory:
         parameters = constants_of(term, self.u.function_space.mesh, self.free)
         return Density(on_face, parameters, ON_FACE, where="outer", facets=self.body.faces[OUTER])
 
-    def volume_change(self, origin: Array) -> ufl.Form:
+    def volume_change(self, origin: Array | None) -> ufl.Form:
         """Delta V/R^3 under the outer face of the modelled part."""
         return self._on_faces(list(self._enclosing(1.0, origin).values()))
 
@@ -172,10 +184,13 @@ class TermFactory:
         term.count_from(past, intensity * self.body.mesh.comm.allreduce(fem.assemble_scalar(length)))
         return term
 
-    def _enclosing(self, unit: float, origin: Array) -> dict[str, Density]:
+    def _enclosing(self, unit: float, origin: Array | None, *, potential: bool = True) -> dict[str, Density]:
         """p times the change of the volume under the outer face, down to the middle line where an end is hinged."""
-        parameters, faces = self._constants(unit, *([origin] if origin.any() else [])), self.body.faces
-        found = {"pressure": Density(densities.pressure, parameters, ON_FACE, WHOLE, "outer", faces[OUTER])}
+        moved, faces = origin is None, self.body.faces
+        parameters = self._constants(unit, *([origin] if origin is not None and origin.any() else []))
+        of, on_end = (densities.swept, densities.swept_end) if moved else (densities.pressure, densities.sealing)
+        work, end_work = (None, None) if potential else (densities.following, densities.following_end)
+        found = {"pressure": Density(of, parameters, ON_FACE, WHOLE, "outer", faces[OUTER], work=work)}
         if self.hinged:
             facets = np.unique(np.concatenate([faces[name] for name in self.hinged]))
             links = self.body.mesh.topology.connectivity(2, 3)
@@ -183,8 +198,9 @@ class TermFactory:
             parts = {"whole": low > MIDDLE - ROUNDING, "upper": (low < MIDDLE - ROUNDING) & (high > MIDDLE + ROUNDING)}
             for name, inside in parts.items():
                 if self.body.mesh.comm.allreduce(int(inside.sum())):
+                    here, upper = facets[inside], name == "upper"
                     found[f"pressure {name}"] = Density(
-                        densities.sealing, parameters, VALUE + GRADIENT, WHOLE, "end", facets[inside], name == "upper"
+                        on_end, parameters, VALUE + GRADIENT, WHOLE, "end", here, upper, end_work
                     )
         return found
 
@@ -202,19 +218,23 @@ class TermFactory:
         energy = density.of(ufl.SpatialCoordinate(domain), u, ufl.grad(u), *density.parameters) * dx
         return SolidTerm(name, density, energy, self.u, self.log, amplitude, linear=linear, follow=follow)
 
-    def _on_faces(self, found: Sequence[Density]) -> ufl.Form:
+    def _on_faces(self, found: Sequence[Density], v: Expr | None = None) -> ufl.Form:
+        """The sum of energies, or of virtual works of v."""
         domain, u = self.body.mesh, self.u
         X, J, H = ufl.SpatialCoordinate(domain), ufl.Jacobian(domain), ufl.grad(u)
         ds, forms = face_measure(domain, [density.facets for density in found]), []
         for tag, density in enumerate(found, 1):
+            of = density.of if v is None else density.work
+            assert of
+            parameters = density.parameters if v is None else (v, *density.parameters)
             if density.where == "outer":
                 area = ufl.cross(J[:, 0], J[:, 1])
                 given = X, J[:, 0], J[:, 1], u, ufl.dot(H, J[:, 0]), ufl.dot(H, J[:, 1])
-                forms.append(density.of(*given, *density.parameters) / ufl.sqrt(ufl.dot(area, area)) * ds(tag))
+                forms.append(of(*given, *parameters) / ufl.sqrt(ufl.dot(area, area)) * ds(tag))
                 continue
             n = J[:, 2] / ufl.sqrt(ufl.dot(J[:, 2], J[:, 2]))
             t = ufl.cross(n, ufl.FacetNormal(domain))
-            per_area = density.of(X, u, H, n, t / ufl.sqrt(ufl.dot(t, t)), *density.parameters)
+            per_area = of(X, u, H, n, t / ufl.sqrt(ufl.dot(t, t)), *parameters)
             points, weights = density.rule
             rule = {"quadrature_rule": "custom"} | {
                 "quadrature_points": tuple(tuple(x) for x in points),

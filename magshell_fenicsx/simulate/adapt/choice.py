@@ -8,6 +8,7 @@ import numpy as np
 from mpi4py import MPI
 
 from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.solid import SolidSection
 from magshell_fenicsx.plan.plan import Plan
 from magshell_fenicsx.plan.planner import make_plan
 from magshell_fenicsx.simulate.adapt.size import Sampled
@@ -18,17 +19,21 @@ from magshell_fenicsx.simulate.scene import Scene
 class Choice:
     """A degree and a mesh; without `size` the elements have the default sizes over `refinement`.
 
-    With `size`, `refinement` only records the mean refinement relative to the default.
+    With `size`, `refinement` only records the mean refinement relative to the default. `layers` are those of a solid.
     """
 
     degree: int
     refinement: float
     size: Sampled | None = None
+    layers: int | None = None
 
     def applied(self, asked: Case) -> tuple[Case, Plan]:
         """The case on this mesh, and its plan."""
         mesh = asked.mesh.model_copy(update={"degree": self.degree, "refinement": self.refinement})
         case = asked.model_copy(update={"mesh": mesh})
+        if self.layers:
+            solid = (asked.solid or SolidSection()).model_copy(update={"layers": self.layers})
+            case = case.model_copy(update={"solid": solid})
         plan = make_plan(case)
         return case, replace(plan, size=self.size) if self.size else plan
 
@@ -47,6 +52,7 @@ class Round:
     dofs: int
     result: float
     estimate: float
+    layers: int | None = None
 
 
 @dataclass(frozen=True)
@@ -98,4 +104,4 @@ class Adapted:
         rounds = [Round(**r) for r in known["rounds"]]
         best, size = rounds[known["best"]], known["size"]
         sampled = Sampled(*(np.array(size[key]) for key in ("points", "sizes"))) if size else None
-        return cls(asked, Choice(best.degree, best.refinement, sampled), best, rounds)
+        return cls(asked, Choice(best.degree, best.refinement, sampled, best.layers), best, rounds)

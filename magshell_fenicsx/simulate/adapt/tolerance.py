@@ -22,6 +22,7 @@ from magshell_fenicsx.simulate.adapt.choice import Adapted, Choice, Round
 from magshell_fenicsx.simulate.adapt.ending import Ending, NoResult, by_path, from_near
 from magshell_fenicsx.simulate.adapt.indicator import indicators
 from magshell_fenicsx.simulate.adapt.size import equidistributed
+from magshell_fenicsx.simulate.adapt.solid import adapted_solid
 from magshell_fenicsx.simulate.scene import Scene
 
 DEGREES = ((3e-3, 3), (2e-4, 4), (0.0, 5))  # the fastest degree for tolerances down to the first number
@@ -58,6 +59,8 @@ def adapted(case: Case, comm: MPI.Comm, say: Say = lambda line: None, doing: Say
     """
     tolerance = case.mesh.tolerance
     assert tolerance is not None
+    if case.model == "solid":
+        return adapted_solid(case, comm, say, doing)
     doing(f"a mesh for the tolerance {tolerance:g}: the path on a coarse one")
     choice, coarse = _first(case, comm)
     for degree in range(CHEAP + 1, _degree(tolerance) + 1):

@@ -85,7 +85,7 @@ def test_edge_conditions_and_dead_load(condition: Condition) -> None:
 def test_remanence_that_varies_field_that_varies_and_turns() -> None:
     """A pattern, a gradient (which needs u itself), and a field with a part across."""
     G = np.array([[0.5, 0.2, -0.1], [0.2, -0.7, 0.3], [0.1, 0.3, 1.2]])
-    field = Magnetisation(tangential, np.array([0.0, 0.6, 0.8]), "full", G, np.array([1.0, 0.0, 0.0]))
+    field = Magnetisation(tangential, np.array([0.0, 0.6, 0.8]), "full", G, (np.array([1.0, 0.0, 0.0]),))
     model = ShellModel(hemisphere(0.8), Material(0.3, 0.05), 3, {}, Loads(magnetic=field))
     for mu in (MU, {"lambda_m": 0.0, "lambda_across": 1.0}, {"lambda_m": 10.0, "lambda_across": 0.0}):
         assert difference(model.system, random_displacement(model, 1e-3), mu) <= 1e-12

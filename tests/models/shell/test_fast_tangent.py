@@ -17,7 +17,7 @@ from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.assembly.terms import FormTerm
 from magshell_fenicsx.case.source import Source
-from magshell_fenicsx.continuation.system import followed
+from magshell_fenicsx.continuation.system import Skewed, followed
 from magshell_fenicsx.models.shell import densities, kinematics
 from magshell_fenicsx.models.shell.energy import cell_quadrature
 from magshell_fenicsx.models.shell.fast_tangent import FastTangent, make_sites
@@ -48,7 +48,9 @@ def pattern(system: FiniteElementSystem) -> FormTerm:
     return found
 
 
-def csr(K: PETSc.Mat) -> scipy.sparse.csr_array:
+def csr(K: PETSc.Mat | Skewed) -> scipy.sparse.csr_array:
+    if isinstance(K, Skewed):
+        return csr(K.K) + csr(K.N)
     rows, columns, values = K.getValuesCSR()
     return scipy.sparse.csr_array((values, columns, rows), shape=K.size)
 
@@ -104,7 +106,7 @@ def test_remanence_that_varies_field_that_varies_and_turns() -> None:
     """A pattern, a gradient, and a field with a part across."""
     G = np.array([[0.5, 0.2, -0.1], [0.2, -0.7, 0.3], [0.1, 0.3, 1.2]])
     across = np.array([1.0, 0.0, 0.0])
-    field = Magnetisation(tangential, np.array([0.0, 0.6, 0.8]), "full", G, across)
+    field = Magnetisation(tangential, np.array([0.0, 0.6, 0.8]), "full", G, (across,))
     model = ShellModel(hemisphere(0.8), Material(0.3, 0.05), 3, {}, Loads(magnetic=field))
     system, u = model.system, random_displacement(model, 1e-3)
     for mu in (MU, {"lambda_m": 0.0, "lambda_across": 1.0}, {"lambda_m": 10.0, "lambda_across": 0.0}):

@@ -58,7 +58,11 @@ def varying(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
 SHELLS: dict[str, Callable[[], ShellModel]] = {
     "moment": lambda: ShellModel(panel(), MATERIAL, 3, {"left": "clamped"}, MOMENT),
     "planes": lambda: ShellModel(
-        panel(), MATERIAL, 3, {"bottom": "plane", "left": "plane", "top": Held((0, 1))}, Loads(pressure=True)
+        panel(),
+        MATERIAL,
+        3,
+        {"bottom": "plane", "left": "plane", "top": Held((0, 1)), "right": Held((0, 1))},
+        Loads(pressure=True),
     ),
     "two terms on an edge": lambda: ShellModel(
         panel(), MATERIAL, 3, {"bottom": "plane"}, Loads(dead={"load": (EdgeMoment("bottom", 0.01),)})

@@ -27,7 +27,6 @@ BUCKLING, INDENTATION = CASES / "solid_buckling.yaml", CASES / "solid_indentatio
         (BUCKLING, "mesh.degree=4", "mesh.refinement makes it finer"),
         (CASES / "bracket.yaml", "model=solid", "mesh.degree: not of a solid, which has degree 2; a file with smaller"),
         (BUCKLING, "mesh.penalty=4", "mesh.penalty: not of a solid"),
-        (BUCKLING, "mesh.tolerance=0.01", "mesh.tolerance: not of a solid"),
         (BUCKLING, "symmetry=axisymmetric", "a solid is whole or half"),
         (BUCKLING, "solid={layers: 0}", "solid.layers: 0: must be greater than or equal to 1"),
         (INDENTATION, "loading.patch=0", "a point force sinks into a solid without limit"),

@@ -5,15 +5,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scipy.sparse
-from bodies import hemisphere
+from bodies import body_of, hemisphere
+from dolfinx import fem
 from petsc4py import PETSc
 
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
+from magshell_fenicsx.mesh.hexahedra import OUTER
 from magshell_fenicsx.mesh.sphere import Dimple
 from magshell_fenicsx.models.shell.parameters import EdgeMoment, Loads, Magnetisation, Material
 from magshell_fenicsx.models.shell.patterns import radial
 from magshell_fenicsx.models.solid.material import NeoHookean
 from magshell_fenicsx.models.solid.model import SolidModel
+from magshell_fenicsx.models.solid.terms import face_measure
 
 MU = {"pressure": 0.3, "lambda_m": 0.4, "lambda_across": -0.7, "load": 0.2}
 EVERYWHERE = {"distortion", "compression", "magnetic", "magnetic across", "magnetic gradient", "pressure"}
@@ -87,3 +90,10 @@ def test_pressure_is_conservative_and_its_conjugate_is_the_enclosed_volume(model
     V, s = model.volume_change(-stretched), 1.1  # -X brings the face to the origin: -V
     assert model.volume_change((s - 1) * stretched) == pytest.approx(-V * (s**3 - 1), rel=1e-10)
     assert pytest.approx(2 * np.pi / 3 * 1.05**3, rel=0.02) == -V  # the dimple takes 1 %
+
+
+def test_the_outer_face_of_an_annulus() -> None:
+    """It is not the end above the edge that is named outer: the area is that of the ring, pi (1 - 0.25)."""
+    body = body_of({"geometry": "annulus", "radius": 1.0, "inner_radius": 0.5, "thickness": 0.1}, 0.3)
+    area = fem.form(fem.Constant(body.mesh, 1.0) * face_measure(body.mesh, [body.faces[OUTER]])(1))
+    assert fem.assemble_scalar(area) == pytest.approx(0.75 * np.pi, rel=1e-3)

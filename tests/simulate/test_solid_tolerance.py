@@ -1,0 +1,35 @@
+"""The mesh of a solid for a tolerance, against a mesh three times as fine."""
+
+from typing import Any
+
+import pytest
+from mpi4py import MPI
+
+from magshell_fenicsx import Case
+from magshell_fenicsx.case.source import Source
+from magshell_fenicsx.simulate.adapt.choice import Adapted
+from magshell_fenicsx.simulate.adapt.ending import by_path
+from magshell_fenicsx.simulate.adapt.tolerance import adapted
+from magshell_fenicsx.simulate.scene import Scene
+
+
+def plate(mesh: dict[str, Any], layers: int = 1) -> Case:
+    shell = {"geometry": "disc", "radius_to_thickness": 10, "poisson_ratio": 0.3}
+    loading = {"kind": "pressure", "control": "load", "until": "target", "pressure": 0.01, "points": 1}
+    data = {"model": "solid", "shell": shell, "boundary": {"rim": "clamped"}, "loading": loading, "mesh": mesh}
+    return Case.from_source(Source("test", {**data, "solid": {"layers": layers}}))
+
+
+@pytest.mark.slow
+def test_error_of_a_clamped_disc() -> None:
+    """It is below the estimate, and that is below the tolerance."""
+    case, told = plate({"tolerance": 0.02}), list[str]()
+    found = adapted(case, MPI.COMM_WORLD, told.append)
+    assert found.best.estimate <= 0.02
+    assert len(told) == len(found.rounds)
+    exact = by_path(Scene(plate({"refinement": 3 * found.best.refinement}, 3))).value
+    error = abs(found.best.result / exact - 1)
+    assert 0 < error <= found.best.estimate
+    again = Adapted.from_json(case, found.to_json())
+    assert again.choice == found.choice
+    assert Scene(again.choice.applied(case)[0]).cells == found.best.cells
