@@ -131,6 +131,8 @@ class Walk:
         path, quantity, targets = self.path, self.goal.quantity, self.goal.targets
         a, b = path.value(quantity, low.state), path.value(quantity, high.state)
         for target in targets:
+            if a == target and (b - a) * self.goal.sense < 0:  # a shorter step sees the load rise first
+                raise PathStopped(f"{path.name} falls from the start", low)
             if (target - a) * (target - b) < 0 or b == target:
                 s = low.s + (target - a) / (b - a) * (high.s - low.s)
                 guess = path.between(s, low, path.seen_from(low, high))

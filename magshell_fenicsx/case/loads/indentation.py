@@ -8,6 +8,8 @@ from pydantic import Field, model_validator
 from magshell_fenicsx.case.fields import Direction
 from magshell_fenicsx.case.loads.step import Count, Now, PathStep, Target, Until
 
+LEAST_HUMP = 0.01  # F of the first step towards the top of an energy barrier
+
 
 class Place(Direction):
     """A direction from the centre of a hemisphere or cap, `polar: 0` of a pole, centre or tip; or a named point."""
@@ -53,6 +55,8 @@ class IndentationSection(PathStep):
         return self.at, self.patch
 
     def first(self, change: float, now: Now, *, by_load: bool) -> float:
+        if self.until == "zero":
+            return LEAST_HUMP
         return change / self.points if self.control == "load" else copysign(1.0, change)
 
     def step(self, change: float | None, now: Now) -> float | None:
