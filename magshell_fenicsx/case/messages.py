@@ -56,13 +56,9 @@ def _without_tag(loc: Location, case: type[BaseModel]) -> Location:
     section = case.model_fields.get(str(loc[0])) if loc else None
     if not section or len(_models(section.annotation)) < 2:
         return loc
-    models = _models(section.annotation)
-    tags = {*UNIONS, *(tag for m in models if _tag_key([m]) for tag in _tags(m))}
-    kept, rest = [loc[0]], list(loc[1:])
-    while rest and (rest[0] in tags or isinstance(rest[0], int)):
-        kept += [rest[0]] if isinstance(rest[0], int) else []
-        rest.pop(0)
-    return (*kept, *(key for key in rest if key not in UNIONS))
+    rest = [key for key in loc[1:] if key not in UNIONS]
+    item = rest[:1] if rest and isinstance(rest[0], int) else []
+    return (loc[0], *item, *rest[len(item) + 1 :])
 
 
 def _allowed_keys(location: Location, data: Any, case: type[BaseModel]) -> list[str]:

@@ -110,7 +110,7 @@ class MeridianModel(Observed):
             self.energies += factory.magnetic(loads.magnetic, self.u)
         volume = factory.volume_change
         beside, self.without_potential = openings(meridian, conditions)
-        if loads.pressure and beside:
+        if loads.pressure and (beside or loads.moves):
             self.energies.append(factory.pressure_beside_edges(potential=not self.without_potential))
             volume = factory.swept_volume
         elif loads.pressure:

@@ -169,7 +169,7 @@ class ShellModel(Observed):
         volume = factory.volume_change(np.zeros(3) if closing is None else closing)
         if loads.magnetic:
             terms += factory.magnetic(loads.magnetic)
-        if loads.pressure and (moved or closing is None):
+        if loads.pressure and (moved or loads.moves or closing is None):
             terms.append(factory.pressure_beside_edges(potential=not self.without_potential))
             volume = factory.swept_volume()
         elif loads.pressure and closing is not None:

@@ -100,7 +100,7 @@ class SolidModel(Observed):
         origin = closing_point([mirror, *planes] if self.multiplicity == 2 else planes)
         ends = {name: facets for name, facets in body.faces.items() if name != OUTER}
         moved, self.without_potential = openings(self.r0, ends, conditions, in_middle(body, V))
-        if loads.pressure and moved:
+        if loads.pressure and (moved or loads.moves):
             origin = None
         elif not loads.pressure and origin is None:
             origin = np.zeros(3)

@@ -165,7 +165,7 @@ def test_dead_loads_add_up_to_their_resultants() -> None:
     entries = -model.system.load(model.zero(), {}, "load").reshape(-1, 3).sum(axis=0)
     pressure = -2.0 * np.array([np.sin(1), 1 - np.cos(1), 0.0])
     assert entries == pytest.approx(np.array([1.0, 2.0, 3.0]) + np.array([1.0, 1.0, 1.0]) + pressure, abs=1e-7)
-    assert model.load_size == pytest.approx(np.sqrt(14) + 1 + 1 + 1 + 2, rel=1e-7)
+    assert model.load_size["load"] == pytest.approx(np.sqrt(14) + 1 + 1 + 1 + 2, rel=1e-7)
 
 
 def bent(thickness: Thickness | None, h: float, degree: int = 3) -> float:

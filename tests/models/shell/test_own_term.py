@@ -188,7 +188,7 @@ def test_weight_is_a_dead_load_on_any_surface() -> None:
             },
         )
     )
-    (dead,) = make_plan(case).loads.dead
+    (dead,) = make_plan(case).loads.all_dead
     assert isinstance(dead, AreaForce)
     system = Scene(case, terms=[OwnTerm("own", weight, (dead.force,))]).model.system
     u = system.held(1e-2 * np.random.default_rng(0).standard_normal(system.size))
