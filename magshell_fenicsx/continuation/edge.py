@@ -64,12 +64,12 @@ class Edge:
 
 
 def join(u: Vector, y: Vector, comm: MPI.Comm) -> Vector:
-    """(u, y), with y on the last rank."""
-    return np.concatenate([u, y]) if comm.rank == comm.size - 1 else u
+    """(u, y), with y on the last rank; a new array on every rank."""
+    return np.concatenate([u, y if comm.rank == comm.size - 1 else y[:0]])
 
 
 def split(x: Vector, k: int, comm: MPI.Comm) -> tuple[Vector, Vector]:
-    """u on this rank, and y (k,) on every rank."""
+    """u on this rank, a new view on every rank, and y (k,) on every rank."""
     last = comm.size - 1
-    u, y = (x[: x.size - k], x[x.size - k :]) if comm.rank == last else (x, None)
-    return u, np.asarray(comm.bcast(y, root=last))
+    own = x.size - k * (comm.rank == last)
+    return x[:own], np.asarray(comm.bcast(x[own:], root=last))

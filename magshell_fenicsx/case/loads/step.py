@@ -99,8 +99,6 @@ class Drive:
         See `continuation.path.Path`.
     step
         The first step of a prescribed conjugate; None: it follows from `first`.
-    least
-        The smallest step over the first.
     """
 
     control: Control
@@ -110,7 +108,6 @@ class Drive:
     first: float
     scale: float = 1.0
     step: float | None = None
-    least: float = 1e-4
 
 
 class Step(Section):
