@@ -19,6 +19,7 @@ Quantity = Literal["load", "conjugate"]
 Control = Quantity | Literal["arc"]
 MOST_LEAPS = 3  # longer steps that are tried if rounding hides a point
 MANY = 2  # after so many hard solves the tangent takes the stress extrapolated from the last point: a tenth more time
+SHORTER = 1 - 1e-9  # rounding must not decide whether one step reaches a target
 SEEN = 1e-6  # in lengths of the system: smaller displacements count as zero
 
 
@@ -180,7 +181,7 @@ class Path:
         for target in targets:
             while here.s != target:
                 way = target - here.s
-                pieces = max(1.0, np.ceil(abs(way) / step)) if np.isfinite(way) else np.inf
+                pieces = max(1.0, np.ceil(SHORTER * abs(way) / step)) if np.isfinite(way) else np.inf
                 length = abs(way) / pieces if pieces < 3 else step  # no tiny step before a target
                 s = target if pieces == 1 else here.s + np.copysign(length, way)
                 found = self._try(s, before, here)
