@@ -101,8 +101,9 @@ class AppliedSection(Direction):
     )
     """Three rows of three numbers; energy: full alone has it [|B^a|/R]"""
     components: list[Formula] | None = Field(default=None, min_length=3, max_length=3)
-    """In place of these: formulas of the deformed position x, y, z over R (of a shell that of its mid-surface), twice
-    differentiable; as those of `remanent`; energy: full alone has them [|B^a|]"""
+    """Formulas of the deformed position x, y, z over R, in place of the other keys. On a shell the position is that of
+    the mid-surface. They are written as those of `remanent`, must be twice differentiable, and need energy: full
+    [|B^a|]"""
 
     @model_validator(mode="after")
     def _square(self) -> Self:

@@ -53,10 +53,15 @@ def straight(direction: Array, field: Magnetisation, parts: Array | None) -> dic
     return {name: curve(float(c)) for name, c in found.items()}
 
 
+def _away(before: Array, after: Array) -> Array:
+    """The unit vector in the plane of two directions that is normal to the first, on the side of the second."""
+    rest = after - (before @ after) * before
+    return np.asarray(rest / np.linalg.norm(rest))
+
+
 def circle(size: float, before: Array, after: Array) -> dict[str, Curve]:
     """The components of a field that has turned by t (rad) from one direction towards another."""
-    away = after - (before @ after) * before
-    away = away / np.linalg.norm(away)
+    away = _away(before, after)
 
     def curve(b: float, a: float) -> Curve:
         return lambda t: (b * cos(t) + a * sin(t), a * cos(t) - b * sin(t), -b * cos(t) - a * sin(t))
@@ -67,8 +72,7 @@ def circle(size: float, before: Array, after: Array) -> dict[str, Curve]:
 
 def turning(size: float, before: Array, after: Array, field: Magnetisation, parts: Array) -> dict[str, Curve]:
     """The components of the gradient of the field of `circle`; lambda_m has `Magnetisation.gradient` in its own."""
-    away = after - (before @ after) * before
-    away = away / np.linalg.norm(away)
+    away = _away(before, after)
     assert field.gradient is not None
     rest = parts - np.multiply.outer([0.0, before[0], away[0], 0.0, 0.0], field.gradient)
 

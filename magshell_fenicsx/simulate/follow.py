@@ -7,6 +7,7 @@ from magshell_fenicsx.continuation.point import Point
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.steps import LOCATED, records_of
+from magshell_fenicsx.simulate.walked import Walked
 
 
 def follow(scene: Scene) -> Iterator[Record]:
@@ -27,15 +28,13 @@ def follow(scene: Scene) -> Iterator[Record]:
     for step in steps:
         where = f"step {step.number} of {len(steps)} ({step.kind}): " if isinstance(scene.case.loading, list) else ""
         scene.progress.beginning(step.number)
-        records, last = records_of(scene, step, state), ""
+        walked, last = Walked(records_of(scene, step, state)), ""
         try:
-            while True:
-                record = next(records)
+            for record in walked:
                 last = record.label
                 yield replace(record, step=step.number)
-        except StopIteration as end:
-            state = end.value
         except Stopped as e:
             raise Stopped(f"{where}{e}") from None
+        state = walked.end
         if step is not steps[-1] and step.until in ("limit", "bifurcation") and last in LOCATED:
             raise Stopped(f"{where}ends at a {last}, from which the next step cannot start")

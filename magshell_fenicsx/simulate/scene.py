@@ -112,7 +112,6 @@ class Scene:
         force, sense = loads.forces.get("force"), copysign(1.0, self.case.lambda_m)
         model.system.place(state.mu)
         model.system.accept(state.u)
-        model.system.place(state.mu)
         pole = model.deflection(state.u, "pole") / h
         potentials, energies = model.system.energies(state.u), defaultdict[str, float](float)
         for t in model.system.terms:
@@ -184,10 +183,10 @@ class Scene:
         """Forces and moments in the case's units."""
         model, plan, R = self.model, self.plan, self.plan.length
         force = (self.case.shell.modulus or 1.0) * plan.material.h * R**2
-        found = {name: state.mu[name] for name in motion_columns(plan.loads)}
+        found: dict[str, float] = {}
         for name, column in motion_columns(plan.loads).items():
             potential = model.system.potential(state.u, state.mu, name)
-            found[column] = potential / -self.conjugate_unit(name)
+            found |= {name: state.mu[name], column: potential / -self.conjugate_unit(name)}
         if plan.reactions:
             frame = rotation(plan.azimuth)
             found |= observed_reactions(model, state, plan.mirror, frame, force, R)

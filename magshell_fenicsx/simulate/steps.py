@@ -1,6 +1,5 @@
 """The steps of a programme: what is held, what is driven, and the records of the way."""
 
-from collections.abc import Iterator
 from dataclasses import replace
 from math import acos
 
@@ -18,7 +17,7 @@ from magshell_fenicsx.simulate.gas import gas
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.stage import Stage, staged
-from magshell_fenicsx.simulate.walked import Records, followed
+from magshell_fenicsx.simulate.walked import Records, Walked, followed
 
 LOCATED = ("fold", "bifurcation")
 
@@ -85,19 +84,9 @@ def _now(scene: Scene, step: ProgrammeStep, state: State) -> Now:
     return Now(state.mu[step.name], conjugate, scene.conjugate_unit(step.name), driven, 1.0)
 
 
-class _Walked:
-    """Records to iterate over once; `end` is the state at their end."""
-
-    def __init__(self, records: Records) -> None:
-        self._records, self.end = records, State(np.empty(0), {})
-
-    def __iter__(self) -> Iterator[Record]:
-        self.end = yield from self._records
-
-
 def _field_before(records: Records, target: float) -> Records:
     """The records of a field that must not make the shell unstable."""
-    instability, walked = None, _Walked(records)
+    instability, walked = None, Walked(records)
     for record in walked:
         located = record.label in LOCATED
         instability = instability or (record if located else None)
@@ -121,7 +110,7 @@ def _rotation(scene: Scene, step: ProgrammeStep, load: RotationSection, state: S
     stage = staged(scene, state, held_by(scene, step, state), ("angle", curves, 0.0))
     path, start = stage.begin("angle", "arc", state, total / load.points, total / load.points)
     targets = [float(t) for t in np.linspace(0.0, total, load.points + 1)[1:]]
-    walked = _Walked(followed(stage, path, start, Goal("limit", targets)))
+    walked = Walked(followed(stage, path, start, Goal("limit", targets)))
     for record in walked:
         yield record
         if record.label in LOCATED:

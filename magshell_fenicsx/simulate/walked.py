@@ -21,6 +21,16 @@ BEYOND = 2.0  # a walk ends at this multiple of the load of the first excluded i
 Records = Generator[Record, None, State]  # records, and the model's state at the end
 
 
+class Walked:
+    """Records to iterate over once; `end` is the state at their end."""
+
+    def __init__(self, records: Records) -> None:
+        self._records, self.end = records, State(np.empty(0), {})
+
+    def __iter__(self) -> Iterator[Record]:
+        self.end = yield from self._records
+
+
 def followed(stage: Stage, path: Path, start: Point, goal: Goal, branches: PathStep | None = None) -> Records:
     """The records of a walk, with instabilities that the reduced model excludes, and of requested branches.
 

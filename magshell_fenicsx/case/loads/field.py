@@ -28,9 +28,6 @@ class FieldSection(PathStep):
     def _end(self) -> float | None:
         return 1.0
 
-    def first(self, change: float, now: Now, *, by_load: bool) -> float:
-        return change / self.points
-
     def scale(self, now: Now) -> float:
         return now.size
 

@@ -4,7 +4,7 @@ from typing import ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
-from magshell_fenicsx.case.loads.step import Now, PathStep, Target, Until
+from magshell_fenicsx.case.loads.step import PathStep, Target, Until
 
 
 class GrowthSection(PathStep):
@@ -43,6 +43,3 @@ class GrowthSection(PathStep):
     @property
     def amplitude(self) -> str:  # type: ignore[override]
         return f"natural_{self.key}"
-
-    def first(self, change: float, now: Now, *, by_load: bool) -> float:
-        return change / self.points

@@ -203,7 +203,7 @@ class PathStep(Step):
         return next(iter(self.targets.values())), self._end
 
     def first(self, change: float, now: Now, *, by_load: bool) -> float:
-        """Change of the amplitude in the first step, whose sign is that of `change`.
+        """Change of the amplitude in the first step, by default one of equal parts; its sign is that of `change`.
 
         Parameters
         ----------
@@ -212,7 +212,7 @@ class PathStep(Step):
         by_load
             Whether it is a change of the amplitude.
         """
-        raise NotImplementedError
+        return change / self.points
 
     def step(self, change: float | None, now: Now) -> float | None:
         """The first step of a prescribed conjugate; None: it follows from `first`."""

@@ -48,7 +48,7 @@ class Energy:
     follow: Callable[[], None] | None = None
 
     def added(self, u: Jet, v: Jet) -> ufl.Form:
-        """A form with the Hessian in v, at v = 0, of the energy of u + v; of a work that of its symmetric part."""
+        """A form with the Hessian in v, at v = 0, of the energy of u + v; a work gives its symmetric part."""
         if self.work is None:
             return self.of(u + v)
         return 0.25 * (self.work(u + v, v) - self.work(u - v, v))

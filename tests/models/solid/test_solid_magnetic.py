@@ -104,7 +104,7 @@ def test_tangent_and_residual(pattern: bool) -> None:
 
 @pytest.mark.parametrize("law", ["deformation", "rotation"])
 def test_field_known_by_values(law: RemanenceLaw) -> None:
-    """A linear one is that of its gradient, to 1e-10; the tangent of another one, by finite differences."""
+    """A linear field equals the built-in gradient to 1e-10. The tangent of another field: finite differences."""
     known = replace(FIELD, law=law, across=(), gradient=None, in_space=formulas(LINEAR))
     body, built_in = hemisphere(0.8, H, half=True), replace(FIELD, law=law, across=())
     here, there = (
