@@ -43,6 +43,8 @@ def _components(numbers: int, least: float, most: float, *, lengths: bool = Fals
     def read(value: Any) -> Any:
         if not isinstance(value, dict):
             return value if value is None else some(value)
+        if not value:
+            raise ValueError("a mapping names at least one patch")
         for name, each in value.items():
             if any(isinstance(v, str) and per_length(v) is v for v in (each if isinstance(each, list) else [each])):
                 raise ValueError(f"{name}: of a patch numbers, no formulas")
