@@ -25,7 +25,8 @@ MOST_ITERATIONS = 40
 CLOSE = 1e-3  # in lengths of the system: after a shorter step Newton's method itself goes on
 NEAR_ONE = 2.0  # there the deflation must change the step by less than this factor
 BENT = 0.5  # part of a step that the linear model may leave unexplained
-LEAST, MOST_LEAST = 1e-3, 4  # so many successive steps shortened to less than this part end the search
+LEAST = 1e-3  # where a shorter part of a step would be needed, a singular tangent is near
+LEAP, MOST_LEAPS = 1.0, 4  # in lengths of the system: a step over it
 
 
 @dataclass(frozen=True)
@@ -35,17 +36,24 @@ class Deflation:
     metric: Metric
     known: Sequence[Vector]
 
-    def factor(self, u: Vector, d: Vector) -> float:
-        """tau for Newton's step d at u."""
-        slope = 0.0
+    def value(self, u: Vector) -> float:
+        """M at u."""
+        sizes = (self.metric.norm(u - v, 0.0) for v in self.known)
+        return float(np.prod([size**-POWER + SHIFT if size else np.inf for size in sizes]))
+
+    def slope(self, u: Vector, d: Vector) -> float:
+        """d . grad M/M at u."""
+        found = 0.0
         for v in self.known:
-            away = u - v
-            size = self.metric.inner((away, 0.0), (away, 0.0))
-            if size == 0.0:
-                return 0.0  # Newton's step is zero here too
-            pole = size ** (-POWER / 2)
-            slope -= POWER * pole / size * self.metric.inner((away, 0.0), (d, 0.0)) / (pole + SHIFT)
-        return 1 / (1 - slope) if slope != 1 else np.inf
+            away = (u - v, 0.0)
+            size = self.metric.norm(*away)
+            found -= POWER * self.metric.inner(away, (d, 0.0)) / (size**2 * (1 + SHIFT * size**POWER)) if size else np.inf
+        return found
+
+    def factor(self, u: Vector, d: Vector) -> float:
+        """tau for Newton's step d at u; zero at a known solution."""
+        rest = 1 - self.slope(u, d)
+        return 1 / rest if rest else np.inf
 
 
 def deflated(newton: BorderedNewton, guess: State, name: str, row: Row, known: Sequence[Vector] = ()) -> State | None:
@@ -60,29 +68,33 @@ def deflated(newton: BorderedNewton, guess: State, name: str, row: Row, known: S
     known
         The displacements of the known solutions.
     """
-    system, state, part, shortened = newton.system, guess, 1.0, 0
+    system, state, part, leaps = newton.system, guess, 1.0, 0
     deflation = Deflation(Metric(system, 1.0), known)
     residual = system.residual(state.u, state.mu), row.residual(state)
     for _ in range(MOST_ITERATIONS):
         matrix = Bordered(system, newton.factor_at(state), state, name, row)
         d = matrix.solve(-residual[0], -residual[1])
-        tau, size = deflation.factor(state.u, d[0]), matrix.size(d)
+        tau, size, M = deflation.factor(state.u, d[0]), matrix.size(d), deflation.value(state.u)
         if not np.isfinite(size) or not np.isfinite(tau) or tau == 0.0:
             return None
         if size <= CLOSE and 1 / NEAR_ONE < tau < NEAR_ONE:
             return state.with_(state.u + d[0], name, state.mu[name] + d[1])
-        part = min(1.0, 4 * part)
-        while True:
-            step = part * tau
-            ahead = state.with_(state.u + step * d[0], name, state.mu[name] + step * d[1])
+        part, bent = min(1.0, 4 * part), np.inf
+        while bent > BENT:
+            leaps += (leap := part < LEAST)
+            if leaps > MOST_LEAPS:
+                return None
+            part = LEAP / (abs(tau) * size) if leap else part
+            ahead = state.with_(state.u + part * tau * d[0], name, state.mu[name] + part * tau * d[1])
             residual = system.residual(ahead.u, ahead.mu), row.residual(ahead)
-            rest = plus(matrix.solve(-residual[0], -residual[1]), step - 1, d)
-            bent = np.sqrt(matrix.inner(rest, rest) / matrix.inner(d, d)) / abs(step)
-            if bent <= BENT or part < LEAST:
+            left = matrix.solve(-residual[0], -residual[1])
+            left = plus(left, tau * deflation.slope(state.u, left[0]), d)  # the next step with the same matrix, over M
+            ratio = deflation.value(ahead.u) / M
+            rest = ratio * left[0] + (part - 1) * tau * d[0], ratio * left[1] + (part - 1) * tau * d[1]
+            bent = np.sqrt(matrix.inner(rest, rest) / matrix.inner(d, d)) / abs(part * tau)
+            if leap:
                 break
-            part *= float(np.clip(0.8 * BENT / bent, 0.1, 0.5)) if np.isfinite(bent) else 0.1
-        shortened = shortened + 1 if part < LEAST else 0
-        if shortened == MOST_LEAST:
-            return None
-        state = ahead
+            if not bent <= BENT:
+                part *= float(np.clip(0.8 * BENT / bent, 0.1, 0.5)) if np.isfinite(bent) else 0.1
+        part, state = min(part, 1.0), ahead
     return None

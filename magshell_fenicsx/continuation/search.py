@@ -81,7 +81,9 @@ def further(
     queue += search.along_mode(start, displacement)
     found = 0
     for number, guess in enumerate(queue, 1):  # the queue grows
-        for attempt in (search.by_newton, search.by_release):
+        attempts = [search.by_newton, search.by_release]
+        while attempts:
+            attempt = attempts.pop(0)
             path.progress.doing(f"searching: guess {number} of at most {limits.guesses}, solutions found: {found}")
             point = path.recorded(lambda a=attempt, g=guess: OVER if limits.over() else a(g))
             if point == OVER:
@@ -94,7 +96,7 @@ def further(
             yield point
             if found == limits.solutions:
                 return
-            break
+            attempts = [search.by_newton]  # which may find another one now
         if number == limits.guesses:
             return
 
