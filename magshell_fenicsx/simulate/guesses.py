@@ -19,6 +19,7 @@ DEPTHS = 0.9, 0.03, 0.8, 0.2  # of the dents, over the height of the shell above
 WIDTH = 0.2  # of half a fold, over sqrt(2 h H)
 CLEAR = 3.0  # such widths between a fold and the supports
 LEAST = 2.0  # shells of a smaller height, over h, are flat
+ROUNDING = 1e-9
 THIN = 1e-6  # a smaller mean square distance from a plane or a line, over the largest, is zero
 
 
@@ -59,7 +60,9 @@ def _plane(scene: Scene, x: Array) -> tuple[Array, float]:
         along = np.outer(axes[:, 2], axes[:, 2]) if size[2] > 0 else np.zeros((3, 3))
         across = np.eye(3) - along
         size, axes = np.linalg.eigh(across @ spread @ across + along * np.trace(spread))
-    return axes[:, 0], float(level @ axes[:, 0])
+    normal = np.where(np.abs(axes[:, 0]) < ROUNDING, 0.0, axes[:, 0])
+    normal /= np.linalg.norm(normal) * np.sign(normal[np.argmax(np.abs(normal))])
+    return normal, float(level @ normal)
 
 
 def _moments(scene: Scene, x: Array) -> tuple[Array, Array]:

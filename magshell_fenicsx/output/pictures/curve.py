@@ -123,9 +123,11 @@ def plot_curve(axes: "Axes", of: Part) -> None:
             name = f"and {len(marked) - NAMED} more" if number == NAMED + 1 else "_"  # matplotlib omits "_"
         axes.plot(*place(row, amplitude), "o", color="C3", markersize=6, label=name)
     for row in (row for row in part if row["label"] == SOLUTION):
-        name = f"solution {row['branch']}" if int(row["branch"]) <= NAMED else "_"
-        inside = "none" if _unstable(row) else "C2"  # filled where it is stable
-        axes.plot(*place(row, amplitude), "s", color="C2", markerfacecolor=inside, markersize=6, label=name)
+        name, inside = ("unstable", "none") if _unstable(row) else ("stable", "C2")
+        known = axes.get_legend_handles_labels()[1]
+        label = f"{name} solution" if f"{name} solution" not in known else "_"
+        axes.plot(*place(row, amplitude), "s", color="C2", markerfacecolor=inside, markersize=6, label=label)
+        axes.annotate(str(row["branch"]), place(row, amplitude), (0, 6), textcoords="offset points", fontsize=8)
     axes.set(xlabel=x_label, ylabel=y_label)
     axes.locator_params(axis="x", nbins=6)
     axes.axhline(0, color="0.8", linewidth=0.8, zorder=0)

@@ -34,6 +34,6 @@ def solutions_figure(surfaces: Sequence[Surface], rows: Sequence[Row], h: float,
         smooth = smooth_surface(surface, h)
         limit = float(np.abs(surface.w).max() / h) or 1.0
         name = f"solution {row['branch']}" if row["label"] == SOLUTION else "end of the path"
-        caption = rf"$w/h$, {name}, {stability(row)}"
+        caption = f"$w/h$, {name}: {stability(row).split()[0]}"
         views.append(View(smooth, smooth.point_data["w_over_h"], (-limit, limit), "RdBu_r", camera, PANEL, caption))
     return panels(rendered(views), views, title)
