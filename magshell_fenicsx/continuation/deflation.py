@@ -47,7 +47,9 @@ class Deflation:
         for v in self.known:
             away = (u - v, 0.0)
             size = self.metric.norm(*away)
-            found -= POWER * self.metric.inner(away, (d, 0.0)) / (size**2 * (1 + SHIFT * size**POWER)) if size else np.inf
+            found -= (
+                POWER * self.metric.inner(away, (d, 0.0)) / (size**2 * (1 + SHIFT * size**POWER)) if size else np.inf
+            )
         return found
 
     def factor(self, u: Vector, d: Vector) -> float:
@@ -80,7 +82,7 @@ def deflated(newton: BorderedNewton, guess: State, name: str, row: Row, known: S
         if size <= CLOSE and 1 / NEAR_ONE < tau < NEAR_ONE:
             return state.with_(state.u + d[0], name, state.mu[name] + d[1])
         part, bent = min(1.0, 4 * part), np.inf
-        while bent > BENT:
+        while not bent <= BENT:
             leaps += (leap := part < LEAST)
             if leaps > MOST_LEAPS:
                 return None

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from functools import cached_property, partial
 
 import numpy as np
+from petsc4py import PETSc
 
 from magshell_fenicsx.continuation.branch import largest
 from magshell_fenicsx.continuation.deflation import deflated
@@ -85,7 +86,7 @@ def further(
         while attempts:
             attempt = attempts.pop(0)
             path.progress.doing(f"searching: guess {number} of at most {limits.guesses}, solutions found: {found}")
-            point = path.recorded(lambda a=attempt, g=guess: OVER if limits.over() else a(g))
+            point = path.recorded(partial(_unless, limits.over, attempt, guess))
             if point == OVER:
                 return
             if isinstance(point, str):
@@ -99,6 +100,14 @@ def further(
             attempts = [search.by_newton]  # which may find another one now
         if number == limits.guesses:
             return
+
+
+def _unless(over: Callable[[], bool], attempt: Callable[[Guess], Point | str], guess: Guess) -> Point | str:
+    """The result of an attempt; states without meaning, far from equilibrium, may have no factors."""
+    try:
+        return OVER if over() else attempt(guess)
+    except (NoEigenpair, PETSc.Error, np.linalg.LinAlgError) as e:
+        return str(e)
 
 
 class _Search:
@@ -119,20 +128,14 @@ class _Search:
 
     def by_newton(self, guess: Guess) -> Point | str:
         """The solution that deflated Newton's method finds from a guess."""
-        try:
-            return self._accepted(guess.state)
-        except NoEigenpair as e:
-            return str(e)
+        return self._accepted(guess.state)
 
     def by_release(self, guess: Guess) -> Point | str:
         """The first solution on the path of a force that holds the guess."""
-        try:
-            for state in released(self._newton, guess.state, guess.direction):
-                found = self._accepted(state)
-                if not isinstance(found, str):
-                    return found
-        except NoEigenpair as e:
-            return str(e)
+        for state in released(self._newton, guess.state, guess.direction):
+            found = self._accepted(state)
+            if not isinstance(found, str):
+                return found
         return "the force does not fall to zero"
 
     def along_mode(self, state: State, displacement: Callable[[Vector], Vector]) -> list[Guess]:

@@ -86,7 +86,12 @@ OF_EVERY_RUN = (
     Quantity(
         "field_angle", "field angle", "Angle by which the field has turned.", "load", unit="degrees", si="degrees"
     ),
-    Quantity("branch", "branch", "0 is the path, 1 and 2 leave it at its first bifurcation; of a solution its number.", "count"),
+    Quantity(
+        "branch",
+        "branch",
+        "0 is the path, 1 and 2 leave it at its first bifurcation; of a solution its number.",
+        "count",
+    ),
     _w("w_point_over_h", "of the loaded point", "Inward displacement of the loaded point itself."),
     Quantity(
         "error_over_h", "error of u", "Estimate of the algebraic error: the next Newton step.", "error", "", "h", "m"

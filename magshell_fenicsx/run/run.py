@@ -118,6 +118,9 @@ def _run(case: Case, folder: Path | None, comm: MPI.Comm, say: Say, tell: Say, w
         scene.journal = Stoppable(files.journal if files else NoJournal(), watch)
         try:
             _follow(result, files, say, progress, start)
+            for step in scene.case.programme:
+                if step.load.search and not any(int(result.rows[i]["step"]) == step.number for i in result.found):
+                    say(f"warning: the search at the end of step {step.number} has found no further solution")
             result.sensitivities = _sensitivities(result)
             result.barrier = _barrier(result)
         except (Stopped, NoEigenpair) as e:

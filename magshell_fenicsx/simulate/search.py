@@ -75,7 +75,7 @@ def _solutions(stage: Stage, name: str, state: State, search: SearchSection) -> 
     made = [partial(dents.settled, number) for number in range(dents.count)]
     limits = Limits(search.solutions, search.guesses, over)
     excluded = scene.model.excluded_modes
-    for number, found in zip(count(1), further(path, stage.enter(state), made, limits, stage.displaced)):
+    for number, found in zip(count(1), further(path, stage.enter(state), made, limits, stage.displaced), strict=False):
         point = stage.point(found)
         unstable = sum(excluded.counts(point.state)) if excluded else 0
         yield Record("solution", name, point, branch=number, excluded_pivots=unstable)

@@ -13,6 +13,7 @@ from interrupted import check_same_path
 import magshell_fenicsx as ms
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.continuation.walk import Goal, Walk
+from magshell_fenicsx.output.pictures.plot import plot
 from magshell_fenicsx.output.store.table import read_rows
 from magshell_fenicsx.run.summary import solutions
 from magshell_fenicsx.simulate.guesses import dented
@@ -40,7 +41,7 @@ def crossings(scene: ms.Scene, name: str, start: State, first: float, most: int)
     """The first states on a path by arc length at which an amplitude has its value at the start again."""
     path, here = plain(scene).begin(name, "arc", start, first, 10 * first)
     walk = Walk(path, here, Goal("points", [start.mu[name]]))
-    return [point.state for _, (_, point) in zip(range(most), (it for it in walk if it[0] == "target"))]
+    return [point.state for _, (_, point) in zip(range(most), (it for it in walk if it[0] == "target"), strict=False)]
 
 
 def test_a_roof_has_snapped_through() -> None:
@@ -74,6 +75,10 @@ def test_a_search_that_is_stopped_goes_on(no_pictures: None, tmp_path: Path) -> 
     assert resumed.replayed
     assert len(resumed.found) == 2
     check_same_path(out, whole)
+    assert {"curve.png", "solutions.png", "report.html"} <= set(plot(out))
+    report = (out / "report.html").read_text(encoding="utf-8")
+    assert "A search has found 2 further solutions, 1 of them stable." in report
+    assert "unstable in 1 direction<" in report
 
 
 def test_a_search_whose_time_is_over_ends_the_run_well() -> None:
@@ -96,9 +101,7 @@ def test_solid_roof() -> None:
 def test_dents_are_mirror_images() -> None:
     """Above the fold the dented shell is the shell mirrored in a plane, below it is the shell itself."""
     half, meridian = (
-        ms.Scene(
-            ms.Case.load(CASES / "snapped.yaml", ["mesh.refinement=0.4", "mesh.degree=3", f"symmetry={symmetry}"])
-        )
+        ms.Scene(ms.Case.load(CASES / "snapped.yaml", ["mesh.refinement=0.4", "mesh.degree=3", f"symmetry={symmetry}"]))
         for symmetry in ("half", "axisymmetric")
     )
     depths = []

@@ -30,7 +30,9 @@ def verdict(summary: Summary, lines: Sequence[Line]) -> Markup:
     if found := summary.get("solutions"):
         stable = sum(it["stable"] for it in found)
         more = "further solution" + "s" * (len(found) != 1)
-        sentences.append(Markup("A search has found {} {}, {} of them stable.").format(len(found), more, stable or "none"))
+        sentences.append(
+            Markup("A search has found {} {}, {} of them stable.").format(len(found), more, stable or "none")
+        )
     if summary["stopped"]:
         points = f"{len(lines)} point{'s' * (len(lines) != 1)}"
         sentences.insert(0, Markup("The run stopped early, after {}: {}.").format(points, summary["stopped"]))
