@@ -1,7 +1,8 @@
 """The whole case: its sections and what they must have in common."""
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, TypeVar
 
@@ -229,11 +230,17 @@ class Case(WithParts):
         refuse_unfit_steps(self.programme, self.magnetic, self.lambda_m, whole=isinstance(self.loading, list))
         return self
 
-    @property
+    @cached_property
     def programme(self) -> tuple[ProgrammeStep, ...]:
         """Its steps; before a single load the natural shape grows, then the field."""
         grows = [key for key in ("stretch", "curvature") if getattr(self.natural, key, None) is not None]
         return programme(self.loading, field=bool(self.lambda_m), natural=grows)
+
+    def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
+        """A copy with some sections changed, which makes its programme anew."""
+        copied = super().model_copy(update=update, deep=deep)
+        copied.__dict__.pop("programme", None)
+        return copied
 
     def loads_of(self, kind: type[AnyStep]) -> list[AnyStep]:
         """The loads of a kind among its steps."""
