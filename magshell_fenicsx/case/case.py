@@ -99,7 +99,8 @@ class Case(WithParts):
             written = data.get("loading")
             sources = written if isinstance(written, list) else [written]
             for step, source in zip(programme(section.loading, field=False), sources, strict=False):
-                parts |= {step.key: source} if isinstance(step.load, DeadSection | EdgeSection) else {}
+                if isinstance(step.load, DeadSection | EdgeSection) and isinstance(source, dict):
+                    parts[step.key] = {key: value for key, value in source.items() if key != "hold"}
             for key in (*texts(parts, is_formula), *measured(data.get("natural"))):
                 raise ValueError(f"{key}: has a unit, but the shell's lengths have none: give all of them one, or none")
         return section

@@ -144,7 +144,7 @@ class Scene:
         }
 
     def energies(self, state: State) -> dict[str, float]:
-        """The energy of each term at an accepted point, with its amplitude, over E h R^2; the same field's are added."""
+        """The energy of each term at an accepted point, over E h R^2; all parts of one field together."""
         model, found = self.model, defaultdict[str, float](float)
         model.system.place(state.mu)
         model.system.accept(state.u)

@@ -11,6 +11,7 @@ from conftest import CASES
 from interrupted import check_same_path
 
 import magshell_fenicsx as ms
+from magshell_fenicsx.continuation.path import Quantity
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.continuation.walk import Goal, Walk
 from magshell_fenicsx.output.pictures.plot import plot
@@ -37,10 +38,12 @@ def apart(scene: ms.Scene, a: State, b: State) -> float:
     return float(np.abs(a.u - b.u).max()) / scene.model.system.length
 
 
-def crossings(scene: ms.Scene, name: str, start: State, first: float, most: int) -> Sequence[State]:
-    """The first states on a path by arc length at which an amplitude has its value at the start again."""
+def crossings(
+    scene: ms.Scene, name: str, start: State, first: float, most: int, quantity: Quantity = "load"
+) -> Sequence[State]:
+    """The first states on a path by arc length at which an amplitude, or its conjugate, is as at the start again."""
     path, here = plain(scene).begin(name, "arc", start, first, 10 * first)
-    walk = Walk(path, here, Goal("points", [start.mu[name]]))
+    walk = Walk(path, here, Goal("points", [path.value(quantity, start)], quantity))
     return [point.state for _, (_, point) in zip(range(most), (it for it in walk if it[0] == "target"), strict=False)]
 
 
@@ -59,6 +62,25 @@ def test_a_roof_has_snapped_through() -> None:
     assert [apart(scene, a.point.state, b) < 1e-8 for a, b in zip(by_hand, found, strict=True)] == [True, True]
     back = list(ms.solutions(scene, by_hand[1], most=1, guesses=8))  # from the snapped roof
     assert min(apart(scene, back[0].point.state, other) for other in (result.last, found[0])) < 1e-8
+
+
+def test_what_a_step_holds_stays_held() -> None:
+    """Sze's thin roof snaps back: under one displacement of its middle it has three equilibria, the second unstable."""
+    push, more = (f"{{kind: dead, loads: [{{at: C, force: [-{size}, 0, 0]}}], " for size in (750, 7.5))
+    first = push + "control: displacement, until: target, displacement: 15.875, points: 4}"
+    second = (
+        more + "control: load, until: target, factor: 1, points: 1, hold: {load: conjugate}, search: {solutions: 2}}"
+    )
+    settings = ["mesh={degree: 3, size: 127}", f"loading=[{first}, {second}]"]
+    result = ms.run(ms.Case.load(CASES / "benchmarks/hinged_roof_6.35.yaml", settings))
+    scene, found = result.scene, list(result.found.values())
+    assert [row["w_over_h"] for row in result.rows[-3:]] == pytest.approx([2.5] * 3, rel=1e-9)
+    assert [row["negative_pivots"] for row in result.rows[-3:]] == [0, 1, 0]
+    alone = State(result.last.u, {"load": result.last.mu["load"] + 0.01, "load_2": 0.0})
+    on_path = crossings(scene, "load", alone, -0.05, 2, "conjugate")
+    for here, there in zip(found, on_path, strict=True):
+        assert apart(scene, here, there) < 1e-8
+        assert here.mu["load"] + 0.01 == pytest.approx(there.mu["load"], rel=1e-8)
 
 
 def test_a_search_that_is_stopped_goes_on(no_pictures: None, tmp_path: Path) -> None:
