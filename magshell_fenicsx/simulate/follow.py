@@ -11,8 +11,13 @@ from magshell_fenicsx.simulate.steps import LOCATED, records_of
 from magshell_fenicsx.simulate.walked import Walked
 
 
-def follow(scene: Scene) -> Iterator[Record]:
+def follow(scene: Scene, *, search: bool = True) -> Iterator[Record]:
     """Compute the history of a scene; yields every accepted point.
+
+    Parameters
+    ----------
+    search
+        Whether steps search for the further solutions that they request.
 
     Raises
     ------
@@ -37,7 +42,7 @@ def follow(scene: Scene) -> Iterator[Record]:
         except Stopped as e:
             raise Stopped(f"{where}{e}") from None
         begin, state = state, walked.end
-        for record in searched(scene, step, begin, state):
+        for record in searched(scene, step, begin, state) if search else ():
             yield replace(record, step=step.number)
         if step is not steps[-1] and step.until in ("limit", "bifurcation") and last in LOCATED:
             raise Stopped(f"{where}ends at a {last}, from which the next step cannot start")
