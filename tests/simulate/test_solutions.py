@@ -83,6 +83,7 @@ def test_what_a_step_holds_stays_held() -> None:
         assert here.mu["load"] + 0.01 == pytest.approx(there.mu["load"], rel=1e-8)
 
 
+@pytest.mark.slow
 def test_a_search_that_is_stopped_goes_on(no_pictures: None, tmp_path: Path) -> None:
     def stop(line: str) -> None:
         if " solution " in line:
