@@ -36,6 +36,10 @@ SCENES = {
 ROOF = ["--set=loading.control=load", "--set=loading.factor=0.3", "--set=loading.points=2"]
 SCENES |= {
     "symmetry planes, a force at a point": ("benchmarks/hinged_roof_12.7.yaml", ROOF),
+    "further solutions": (
+        "benchmarks/hinged_roof_12.7.yaml",
+        [*ROOF, "--set=loading.points=1", "--set=loading.search={solutions: 2}", "--set=mesh={degree: 3, size: 127}"],
+    ),
     "a moment": ("benchmarks/cantilever_end_moment.yaml", [*ROOF, "--set=loading.factor=0.1"]),
     "a mesh with a fold and two patches": (
         "bracket.yaml",
