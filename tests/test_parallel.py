@@ -13,6 +13,8 @@ from magshell_fenicsx.output.fields.vtu import read_vtu
 
 DEGREE = "--set=mesh.degree=3"
 COARSE, COARSER = ["--set=mesh.refinement=0.5"], ["--set=mesh.refinement=0.3"]
+CUBIC = "components: ['x**2 - z**2', '0', '1 - 2*x*z']"  # grad(z + x^3/3 - x z^2)
+LAW = ["--set=magnetic.remanence=rotation", f"--set=magnetic.applied={{{CUBIC}}}"]
 SCENES = {
     "half shell, force": (
         "pole_indentation.yaml",
@@ -21,15 +23,16 @@ SCENES = {
     "meridian": ("pole_indentation.yaml", [DEGREE]),
     "half solid, field, force": (
         "solid_indentation.yaml",
-        [*COARSER, "--set=shell.radius_to_thickness=20", "--set=loading.depth=1", "--set=loading.points=1"],
+        [*COARSER, "--set=shell.radius_to_thickness=20", "--set=loading.depth=1", "--set=loading.points=1", *LAW],
     ),
     "full shell, field, pressure": (
         "dimple_buckling.yaml",
         [
             *COARSER,
             "--set=mesh.degree=2",
-            "--set=magnetic={lambda_m: 1e-3, remanent: {polar: 45}, applied: {polar: 45, azimuth: 90}}",
-            "--set=loading={kind: pressure, until: target, pressure: 0.2, points: 2}",
+            "--set=magnetic={lambda_m: 1e-3, remanent: {polar: 45, azimuth: 90}}",
+            *LAW,
+            "--set=loading={kind: pressure, control: load, until: target, pressure: 0.1, points: 1}",
         ],
     ),
 }

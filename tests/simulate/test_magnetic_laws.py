@@ -1,17 +1,13 @@
 """Whole runs with both laws of the remanence, and in fields by formulas."""
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import pytest
-from command import magshell, read_path
 from conftest import CASES
 
 from magshell_fenicsx import Case, run
 
 STRIP, SOLID = CASES / "magnetic_strip.yaml", ["model=solid", "mesh.size=0.1"]
-# grad(z + x^3/3 - x z^2)
-CUBIC = "magnetic.applied={components: ['x**2 - z**2', '0', '1 - 2*x*z']}"
 
 
 def tip(settings: Sequence[str]) -> float:
@@ -40,21 +36,3 @@ def test_uniform_field_as_formulas() -> None:
     coarse = ["mesh.refinement=0.4"]
     as_formulas = tip([*coarse, "magnetic.applied={components: ['0', '0', '1']}"])
     assert as_formulas == pytest.approx(tip(coarse), rel=1e-10)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("model", ["shell", "solid"])
-def test_ranks(tmp_path: Path, model: str) -> None:
-    """In a field by formulas, with a remanence that does not stretch: the state at the same field, to 1e-9."""
-    coarse = ["model=solid", "mesh.size=0.25"] if model == "solid" else ["mesh.refinement=0.3", "mesh.degree=3"]
-    slight = ["magnetic.lambda_m=1e-5", "loading={kind: field, control: load, points: 1}"]
-    settings = [f"--set={s}" for s in (*coarse, *slight, "symmetry=none", "magnetic.remanence=rotation", CUBIC)]
-    paths = []
-    for ranks in (1, 3):
-        done = magshell("run", STRIP, *settings, "--out", tmp_path / str(ranks), ranks=ranks)
-        assert done.returncode == 0, done.stderr
-        paths.append(read_path(tmp_path / str(ranks)))
-    for other in paths[1:]:
-        assert len(other) == len(paths[0])
-        for key in ("lambda_m", "w_over_h", "energy", "magnetic"):
-            assert float(other[-1][key]) == pytest.approx(float(paths[0][-1][key]), rel=1e-9)
