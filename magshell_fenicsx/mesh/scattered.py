@@ -15,9 +15,11 @@ import scipy
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-NEIGHBOURS, MOST_NEIGHBOURS = 80, 150  # values in a patch
+NEIGHBOURS = 80  # values in a patch
 TRIED = 60  # patches that estimate the noise
-INNER = 0.55  # part of its radius up to which a patch covers the surface
+INNER = 0.7  # part of its radius up to which a patch covers the surface
+SAME = 1e-9  # distance over R of one place
+FLAT = 0.1  # height of a patch over its width, below which polynomials along the surface are enough
 DEPENDENT = 1e-6  # relative size below which a polynomial depends on others
 LAMBDAS = np.logspace(-13, 3, 161)  # over the largest eigenvalue of a kernel
 
@@ -55,10 +57,8 @@ class Scattered:
             return np.asarray(total / weights)
 
 
-def scattered(
-    places: Array, values: Array, cover: Array, *, noise: float | None = None, least: float = 0.0
-) -> Scattered:
-    """A smooth function through values (n,) at n different places (n, 3).
+def scattered(places: Array, values: Array, cover: Array, *, noise: float | None = None) -> Scattered:
+    """A smooth function through values (n,) at places (n, 3); of several values at one place the first counts.
 
     Parameters
     ----------
@@ -66,11 +66,12 @@ def scattered(
         Places (m, 3) all over the surface: patches reach them and their neighbourhoods.
     noise
         Standard deviation of the values' noise; None to estimate it, 0 to interpolate.
-    least
-        Radius that patches have at least, unless that makes them too large.
     """
     tree = scipy.spatial.cKDTree(places)
-    centres, radii = _balls(tree, np.vstack([cover, places]), least)
+    if len(same := tree.query_pairs(SAME, output_type="ndarray")):
+        places, values = (np.delete(f, same.max(axis=1), axis=0) for f in (places, values))
+        tree = scipy.spatial.cKDTree(places)
+    centres, radii = _balls(tree, np.vstack([cover, places]))
     parts = [
         (_Part.of(places[inside], centre), values[inside])
         for centre, inside in zip(centres, tree.query_ball_point(centres, radii), strict=True)
@@ -81,10 +82,9 @@ def scattered(
     return replace(found, residual=float(np.sqrt(np.mean((found(places) - values) ** 2))))
 
 
-def _balls(tree: "scipy.spatial.cKDTree", cover: Array, least: float) -> tuple[Array, Array]:
+def _balls(tree: "scipy.spatial.cKDTree", cover: Array) -> tuple[Array, Array]:
     """Balls with enough places of the tree in each, whose inner parts hold all places of `cover`."""
-    reach, most = (tree.query(cover, [min(count, tree.n)])[0][:, 0] for count in (NEIGHBOURS, MOST_NEIGHBOURS))
-    reach = np.maximum(reach, np.minimum(least, most)) * (1 + 1e-9)
+    reach = tree.query(cover, [min(NEIGHBOURS, tree.n)])[0][:, 0] * (1 + 1e-9)
     around, bare, chosen = scipy.spatial.cKDTree(cover), np.ones(len(cover), dtype=bool), []
     for i in range(len(cover)):
         if bare[i]:
@@ -111,7 +111,7 @@ class _Spline:
 
 @dataclass(frozen=True)
 class _Part:
-    """Places of a patch in lengths of `scale`, and the two axes (2, 3) in which they extend most."""
+    """Places of a patch in lengths of `scale`, and the axes along which they extend."""
 
     places: Array
     centre: Array
@@ -122,7 +122,8 @@ class _Part:
     def of(cls, places: Array, centre: Array) -> "_Part":
         scale = float(np.linalg.norm(places - centre, axis=1).max())
         y = (places - centre) / scale
-        return cls(y, centre, scale, np.linalg.svd(y - y.mean(axis=0), full_matrices=False)[2][:2])
+        _, sizes, axes = np.linalg.svd(y - y.mean(axis=0), full_matrices=False)
+        return cls(y, centre, scale, axes[sizes > FLAT * sizes[0]])
 
     @cached_property
     def polynomials(self) -> Array:
@@ -167,7 +168,8 @@ def _kernel(x: Array, y: Array) -> Array:
 
 def _quadratics(y: Array, axes: Array) -> Array:
     t = y @ axes.T
-    return np.column_stack([np.ones(len(y)), t, t**2, t[:, 0] * t[:, 1]])
+    products = [t[:, i] * t[:, j] for i in range(t.shape[1]) for j in range(i + 1)]
+    return np.column_stack([np.ones(len(y)), t, *products])
 
 
 def _wendland(r: Array) -> Array:

@@ -1,0 +1,47 @@
+"""A measured imperfection."""
+
+import hashlib
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import Field, PrivateAttr
+
+from magshell_fenicsx.case.imperfections.place import ImperfectionSection
+
+
+class FileSection(ImperfectionSection):
+    """Reads a file; its path is from the folder of the case."""
+
+    _folder: Path = PrivateAttr(default_factory=Path)
+
+    def model_post_init(self, context: Any, /) -> None:
+        self._folder = Path((context or {}).get("folder", "")).absolute()
+
+    def path(self, file: str) -> Path:
+        """Where a file is."""
+        return self._folder / file
+
+
+class DataSection(FileSection):
+    """w0 measured at places of the surface, scattered or on a grid, with noise and holes; a smooth function goes through it.
+
+    Columns of the file: x, y, z, w0; or polar, azimuth, w0 (spheres); or azimuth, z, w0 (cylinders), angles in degrees; or x, y, z of
+    the real surface. Without a unit in the header, as in "x [mm], w0 [um]", places are in the shell's length and w0 is over h.
+    """
+
+    kind: Literal["data"]
+    file: str
+    """CSV with a header or .npz, its path from the folder of the case"""
+    amplitude: float = Field(default=1.0, ge=-1e3, le=1e3)
+    """Factor of w0"""
+    noise: float | None = Field(default=None, ge=0, le=50)
+    """Standard deviation of the noise in w0; 0: w0 is exact; estimated by default [h]"""
+
+    @cached_property
+    def digest(self) -> str | None:
+        """Hash of the file's content; None if it cannot be read."""
+        try:
+            return hashlib.sha256(self.path(self.file).read_bytes()).hexdigest()
+        except OSError:
+            return None
