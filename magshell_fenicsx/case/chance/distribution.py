@@ -124,4 +124,6 @@ def _certain(value: Any) -> Any:
     return value
 
 
-Distribution = Annotated[DistributionSection, BeforeValidator(_certain, json_schema_input_type=float | DistributionSection)]
+Distribution = Annotated[
+    DistributionSection, BeforeValidator(_certain, json_schema_input_type=float | DistributionSection)
+]
