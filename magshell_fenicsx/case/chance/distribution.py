@@ -59,8 +59,8 @@ class DistributionSection(Section):
             raise ValueError(f"a lognormal number is positive: its mean must be too, here {self._mean:g}")
         if self.kind in ("normal", "lognormal") and np.diff(self._probabilities)[0] < LEAST_PART:
             raise ValueError(
-                f"almost no number lies between above and below, here {low:g} and {high:g}: choose bounds closer to the "
-                f"mean, {self._mean:g}"
+                f"almost no number lies between above and below, here {low:g} and {high:g}: choose bounds closer to "
+                f"the mean, {self._mean:g}"
             )
         if self.weights is not None and (len(self.weights) != len(self.values or []) or not sum(self.weights)):
             raise ValueError("weights: one for each of the values, not all zero")

@@ -19,7 +19,7 @@ from magshell_fenicsx.studies.ensemble.known import KnownFolds
 from magshell_fenicsx.studies.ensemble.picture import draw_ensemble
 from magshell_fenicsx.studies.ensemble.report import report
 from magshell_fenicsx.studies.ensemble.samples import Sample, make_samples
-from magshell_fenicsx.studies.ensemble.solve import FAILED, solve
+from magshell_fenicsx.studies.ensemble.solve import FAILED, serves, solve
 from magshell_fenicsx.studies.ensemble.statistics import statistics
 from magshell_fenicsx.studies.ensemble.table import STATUS, WITHOUT, Row, make_row, value, write_samples
 from magshell_fenicsx.studies.study.scalar import Scalar, parse_scalar
@@ -100,7 +100,9 @@ def ensemble(
     if merge:
         by_first(comm, lambda: _copy(every, [Path(place) for place in merge], folder))
     missing = (
-        [] if merge else by_first(comm, lambda: [key for key in every if _known(folder, key) is None], "cannot be read")
+        []
+        if merge
+        else by_first(comm, lambda: [key for key in every if _known(folder, key, scalar) is None], "cannot be read")
     )
     if comm.rank == 0:
         ranks = f"{comm.size} rank{'s' if comm.size > 1 else ''}"
@@ -129,7 +131,7 @@ def _compute(
     try:
         for i in deal(len(samples), comm):
             sample = samples[i]
-            outcome = solve(sample.case, sample.values, known)
+            outcome = solve(sample, scalar, known)
             save(outcome, sample.case, _file(folder, sample.key))
             found = value(outcome, scalar)
             told = f"no {scalar.name}" if found is None else f"{scalar.name} = {found:.9g} ({outcome.found})"
@@ -166,10 +168,11 @@ def _file(folder: Path, key: str) -> Path:
     return folder / "points" / f"{key}.json"
 
 
-def _known(folder: Path, key: str) -> Outcome | None:
+def _known(folder: Path, key: str, scalar: Scalar) -> Outcome | None:
     """A usable outcome in the folder; an error may have been of the machine, and is tried again."""
     found = load(_file(folder, key))
-    return None if found and (found.stopped or "").startswith(FAILED) else found
+    failed = found and (found.stopped or "").startswith(FAILED)
+    return found if found and serves(found, scalar) and not failed else None
 
 
 def _refuse_strange(places: Sequence[Path], every: dict[str, Sample]) -> None:

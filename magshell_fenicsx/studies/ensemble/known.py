@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.fold import Fold, FoldLost, Guess, find_fold
 from magshell_fenicsx.continuation.system import State, Vector
-from magshell_fenicsx.run.summary import Result
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.transfer import chart, matching
 from magshell_fenicsx.studies.ensemble.samples import Values
@@ -37,18 +36,18 @@ class KnownFolds:
     def __bool__(self) -> bool:
         return bool(self._known)
 
-    def begin(self, values: Values, result: Result) -> Fold:
-        """Polish the fold at the end of a path, and keep it.
+    def polished(self, values: Values, scene: Scene, guess: Guess) -> Fold:
+        """The fold near a guess with its null vector, to 1e-9; it is kept.
 
         Raises
         ------
         FoldLost
-            If Newton's method leads elsewhere.
+            If none is found, or it is not seen to be the first instability.
         """
-        record, scene = result.history.located[-1], result.scene
-        fold = find_fold(scene.newton, Guess(result.last, record.point.du), "pressure")
-        refuse_later(scene, fold, record.point.du)
-        self._keep(values, scene, fold)
+        assert guess.phi is not None
+        fold = find_fold(scene.newton, guess, "pressure")
+        refuse_later(scene, fold, guess.phi)
+        self._known = [*self._known, _Known(values, chart(scene), fold.state.u, fold.value, fold.phi)][-MOST:]
         return fold
 
     def follow(self, values: Values, scene: Scene) -> Fold:
@@ -57,7 +56,7 @@ class KnownFolds:
         Raises
         ------
         FoldLost
-            If no known fold is on this mesh, none is found, or it is not seen to be the first instability.
+            If no known fold is on this mesh; and see `polished`.
         """
         given = scene.unloaded().mu
         if given.keys() - {"pressure", "lambda_m"}:
@@ -70,15 +69,8 @@ class KnownFolds:
             if order is None:
                 continue
             u, phi = (v.reshape(len(nodes), -1)[order].ravel() for v in (known.u, known.phi))
-            guess = Guess(State(u, given | {"pressure": known.pressure}), phi)
-            fold = find_fold(scene.newton, guess, "pressure")
-            refuse_later(scene, fold, phi)
-            self._keep(values, scene, fold)
-            return fold
+            return self.polished(values, scene, Guess(State(u, given | {"pressure": known.pressure}), phi))
         raise FoldLost("no fold is known on this mesh")
-
-    def _keep(self, values: Values, scene: Scene, fold: Fold) -> None:
-        self._known = [*self._known, _Known(values, chart(scene), fold.state.u, fold.value, fold.phi)][-MOST:]
 
     def _distance(self, a: Values, b: Values) -> float:
         """The distance of two samples, each number over its scatter; with other words infinite."""

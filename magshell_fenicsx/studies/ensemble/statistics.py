@@ -70,7 +70,7 @@ def _weibull(values: Array) -> dict[str, Any] | None:
 def distance(values: Array, found: Weibull) -> float:
     """The largest difference between the empirical and the fitted distribution function (Kolmogorov and Smirnov)."""
     below, n = found.below(np.sort(values)), len(values)
-    return float(max(np.max(np.arange(1, n + 1) / n - below), np.max(below - np.arange(n) / n)))
+    return float(np.max([np.arange(1, n + 1) / n - below, below - np.arange(n) / n]))
 
 
 def correlations(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
