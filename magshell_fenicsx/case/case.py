@@ -10,6 +10,7 @@ from pydantic import Field, ModelWrapValidatorHandler, ValidationError, model_va
 
 from magshell_fenicsx.case.boundary import EDGES, BoundarySection
 from magshell_fenicsx.case.defects import DimpleSection
+from magshell_fenicsx.case.ensemble import EnsembleSection
 from magshell_fenicsx.case.expressions import is_formula
 from magshell_fenicsx.case.fields import MagneticSection, layer_average
 from magshell_fenicsx.case.loading import Loading, ProgrammeStep, programme
@@ -82,6 +83,8 @@ class Case(WithParts):
     """Elements"""
     stability: StabilitySection | None = None
     """Lowest modes after the run"""
+    ensemble: EnsembleSection | None = None
+    """What is random, for `magshell ensemble`"""
     reactions: bool | None = None
     """Forces and moments of every support as columns of path.csv; by default where a support moves"""
     symmetry: Literal["auto", "none", "half", "axisymmetric"] = "auto"

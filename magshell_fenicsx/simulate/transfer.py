@@ -75,7 +75,11 @@ def same_mesh(source: Scene, target: Scene) -> bool:
 
 def _matching(source: Scene, target: Scene) -> NDArray[np.int64] | None:
     """The number of each node of this rank among all nodes of the source; None on all ranks if the nodes differ."""
-    comm, nodes, wanted = source.model.system.comm, _all_nodes(source), chart(target)
+    return matching(_all_nodes(source), chart(target), source.model.system.comm)
+
+
+def matching(nodes: Array, wanted: Array, comm: MPI.Comm = MPI.COMM_SELF) -> NDArray[np.int64] | None:
+    """The number of each of this rank's places `wanted` among all `nodes`; None on all ranks if they differ."""
     distance, number = scipy.spatial.cKDTree(nodes).query(wanted)
     equal = comm.allreduce(len(wanted)) == len(nodes) and comm.allreduce(distance.max(initial=0.0), MPI.MAX) < ROUNDING
     return np.asarray(number) if equal else None
