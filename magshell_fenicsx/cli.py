@@ -289,9 +289,10 @@ def check(case: CaseFile, set_: Settings = None) -> None:
     """Validate a case; print what would be built and what is left out."""
     from magshell_fenicsx.case.case import Case
     from magshell_fenicsx.plan.check import describe
+    from magshell_fenicsx.simulate.perfect import with_modes
 
     with _exit_codes():
-        _print_line(describe(Case.load(case, set_ or [])))
+        _print_line(describe(with_modes(Case.load(case, set_ or []), MPI.COMM_WORLD)))
 
 
 def _names() -> list[str]:

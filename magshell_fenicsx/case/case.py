@@ -13,8 +13,10 @@ from magshell_fenicsx.case.boundary import EDGES, BoundarySection
 from magshell_fenicsx.case.ensemble import EnsembleSection
 from magshell_fenicsx.case.expressions import is_formula
 from magshell_fenicsx.case.fields import MagneticSection, layer_average
+from magshell_fenicsx.case.imperfections.data import FileSection
 from magshell_fenicsx.case.imperfections.dimple import DimpleSection
 from magshell_fenicsx.case.imperfections.place import ImperfectionSection
+from magshell_fenicsx.case.imperfections.random import RandomSection
 from magshell_fenicsx.case.loading import Loading, ProgrammeStep, programme
 from magshell_fenicsx.case.loads.dead import DeadSection
 from magshell_fenicsx.case.loads.edge import EdgeSection, refuse_unheld
@@ -293,7 +295,10 @@ class Case(WithParts):
         """Key of each imperfection below `shell` -> section; `defect` is one of them."""
         shell = self.shell
         defect = shell.defect if isinstance(shell, ShellSection | CapSurface | RevolutionSurface) else None
-        listed = {f"imperfections.{i}": section for i, section in enumerate(shell.imperfections)}
+        listed = dict[str, ImperfectionSection]()
+        for i, section in enumerate(shell.imperfections):
+            drawn = section.drawn if isinstance(section, RandomSection) and section.dimples else {"": section}
+            listed |= {f"imperfections.{i}.{key}".rstrip("."): item for key, item in drawn.items()}
         return {"defect": defect} if defect else dict(listed)
 
     @property
@@ -319,8 +324,10 @@ class Case(WithParts):
 
     @property
     def outside(self) -> dict[str, str | None]:
-        """What is solved besides the case's own keys: the hash of its mesh file, if it has one."""
-        return {"mesh_file": self.shell.digest} if isinstance(self.shell, MeshSurface) else {}
+        """What is solved besides the case's own keys: the hashes of its mesh file and of its other files."""
+        mesh = {"mesh_file": self.shell.digest} if isinstance(self.shell, MeshSurface) else {}
+        files = {key: s.digest for key, s in self.imperfections.items() if isinstance(s, FileSection) and s.file}
+        return mesh | {f"{key}.file": digest for key, digest in files.items()}
 
     @classmethod
     def load(cls, file: str | Path, settings: Sequence[str] = ()) -> "Case":

@@ -106,6 +106,7 @@ def make_plan(case: Case, terms: Sequence[OwnTerm] = ()) -> Plan:
         refuse_unfit_ends([name for name in span.names if name], points, conditions, all_loads)
     model = "meridian" if axisymmetric else f"{'half' if half else 'full'} {case.model}"
     included, left_out = account(case, all_loads, model, plane)
+    included += [f"{key}: {flaw.account}" for key, flaw in found.items() if flaw.account]
     return Plan(
         material=material,
         loads=all_loads,

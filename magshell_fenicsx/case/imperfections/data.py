@@ -11,16 +11,28 @@ from magshell_fenicsx.case.imperfections.place import ImperfectionSection
 
 
 class FileSection(ImperfectionSection):
-    """Reads a file; its path is from the folder of the case."""
+    """May read a file; its path is from the folder of the case."""
+
+    file: str | None = None
+    """From the folder of the case"""
 
     _folder: Path = PrivateAttr(default_factory=Path)
 
     def model_post_init(self, context: Any, /) -> None:
         self._folder = Path((context or {}).get("folder", "")).absolute()
 
-    def path(self, file: str) -> Path:
-        """Where a file is."""
-        return self._folder / file
+    @property
+    def path(self) -> Path:
+        """Where the file is."""
+        return self._folder / (self.file or "")
+
+    @cached_property
+    def digest(self) -> str | None:
+        """Hash of the file's content; None if it cannot be read."""
+        try:
+            return hashlib.sha256(self.path.read_bytes()).hexdigest()
+        except OSError:
+            return None
 
 
 class DataSection(FileSection):
@@ -37,11 +49,3 @@ class DataSection(FileSection):
     """Factor of w0"""
     noise: float | None = Field(default=None, ge=0, le=50)
     """Standard deviation of the noise in w0; 0: w0 is exact; estimated by default [h]"""
-
-    @cached_property
-    def digest(self) -> str | None:
-        """Hash of the file's content; None if it cannot be read."""
-        try:
-            return hashlib.sha256(self.path(self.file).read_bytes()).hexdigest()
-        except OSError:
-            return None

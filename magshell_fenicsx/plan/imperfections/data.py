@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 MOST_H, MOST_R, FAR = 50.0, 0.5, 0.5  # largest |w0| over h and over R; distance over R beyond which a place is not of this shell
 SAME = 0.2  # of the typical distance of neighbours, below which values are averaged
 HOLE, GAPS = 3.0, 4.0  # largest hole: radius over sqrt(R h), or over the typical distance of neighbours
-SMALLEST, SHOWN = 0.45, 1.2  # element size over sqrt(R h), and over the length of the sharpest bend
+SMALLEST, SHOWN = 0.45, 2.0  # element size over sqrt(R h), and over the length of the sharpest bend
 
 
 @dataclass(frozen=True)
@@ -54,13 +54,13 @@ def data(section: DataSection, case: Case, drawn: Outline, key: str) -> Flaw:
     """
     shell = case.shell.model_dump_json(exclude={"imperfections"})
     mesh = case.outside.get("mesh_file")
-    this = (section.digest, str(section.path(section.file)), str(section.noise), shell, mesh)
+    this = (section.digest, str(section.path), str(section.noise), shell, mesh)
     if this not in _known:
         if len(_known) > 3:
             _known.clear()
         lengths = Lengths(1 / case.shell.R_over_h, case.shell.reference, case.shell.with_units)
         try:
-            scan = read_scan(section.path(section.file), lengths)
+            scan = read_scan(section.path, lengths)
             _known[this] = _fitted(section, scan, case.shell.geometry, drawn, lengths)
         except ScanError as e:
             raise CaseError(f"shell.{key}.file: {section.file}: {e}") from None

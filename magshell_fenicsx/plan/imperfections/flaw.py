@@ -34,6 +34,8 @@ class Flaw:
         How far it reaches from its centre, as `distance` tells.
     rim
         Whether the curvature jumps there.
+    account
+        What it was made from, for people.
     """
 
     deviation: Deviation
@@ -42,6 +44,7 @@ class Flaw:
     distance: Distance | None = None
     reach: float = inf
     rim: bool = False
+    account: str = ""
 
     def inside(self, places: Array) -> NDArray[np.bool_]:
         """Whether places (n, 3) are within its rim."""

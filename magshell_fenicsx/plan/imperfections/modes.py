@@ -66,7 +66,7 @@ def modes(section: ModesSection, case: Case, drawn: Outline, key: str) -> Flaw:
     """
     h = 1 / case.shell.R_over_h
     if section.file is not None and section.shapes is None:
-        section.become((_read(section.path(section.file), drawn, f"shell.{key}.file: {section.file}"),))
+        section.become((_read(section.path, drawn, f"shell.{key}.file: {section.file}"),))
     shapes = section.shapes or ()
     amplitudes = tuple(a * h for a in section.amplitudes[: len(shapes)])
     origin = section.file or "computed"

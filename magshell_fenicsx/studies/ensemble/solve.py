@@ -23,6 +23,7 @@ from magshell_fenicsx.run.summary import Result
 from magshell_fenicsx.simulate.adapt.carry import NotCarried, carry
 from magshell_fenicsx.simulate.adapt.ending import NoResult, by_path
 from magshell_fenicsx.simulate.adapt.tolerance import CHEAP
+from magshell_fenicsx.simulate.perfect import with_modes
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.studies.ensemble.known import KnownFolds
 from magshell_fenicsx.studies.ensemble.samples import Sample
@@ -61,6 +62,7 @@ def _ways(case: Case, scalar: Scalar) -> list[Way]:
 
 def _first_found(ways: list[Way], sample: Sample, known: KnownFolds) -> Outcome:
     *quick, last = ways
+    with_modes(sample.case, MPI.COMM_SELF)
     for way in quick:
         try:
             return way(sample, known)

@@ -19,6 +19,7 @@ from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.output.store.table import Row
 from magshell_fenicsx.plan.planner import make_plan
 from magshell_fenicsx.run.run import Result, run
+from magshell_fenicsx.simulate.perfect import with_modes
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.studies.sweep.axes import Axis, along
 from magshell_fenicsx.studies.sweep.continuation import Continuation
@@ -93,7 +94,7 @@ def run_chain(chain: Chain) -> Iterator[tuple[int, Outcome]]:
 def _by_fold(continuation: Continuation, link: Link, start: float) -> tuple[Outcome | None, int]:
     """The outcome, or None if the fold cannot be followed; and the number of factorisations."""
     try:
-        scene = Scene(link.case, MPI.COMM_SELF)
+        scene = Scene(with_modes(link.case, MPI.COMM_SELF), MPI.COMM_SELF)
     except MeshError:
         return None, 0
     factorisation = scene.newton.factorisation
