@@ -292,7 +292,7 @@ def check(case: CaseFile, set_: Settings = None) -> None:
     from magshell_fenicsx.simulate.perfect import with_modes
 
     with _exit_codes():
-        _print_line(describe(with_modes(Case.load(case, set_ or []), MPI.COMM_WORLD)))
+        _print_line(describe(with_modes(Case.load(case, set_ or []), _world())))
 
 
 def _names() -> list[str]:

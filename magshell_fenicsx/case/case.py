@@ -110,7 +110,11 @@ class Case(WithParts):
                 f"shell.imperfections.{i}.at.point": item["at"].get("point") if "at" in item else None
                 for i, item in enumerate(data["shell"].get("imperfections") or [])
             }
-            for key in (*texts(parts, is_formula), *(key for key, place in places.items() if [*texts(place)]), *measured(data.get("natural"))):
+            for key in (
+                *texts(parts, is_formula),
+                *(key for key, place in places.items() if [*texts(place)]),
+                *measured(data.get("natural")),
+            ):
                 raise ValueError(f"{key}: has a unit, but the shell's lengths have none: give all of them one, or none")
         return section
 
@@ -297,9 +301,11 @@ class Case(WithParts):
         defect = shell.defect if isinstance(shell, ShellSection | CapSurface | RevolutionSurface) else None
         listed = dict[str, ImperfectionSection]()
         for i, section in enumerate(shell.imperfections):
-            drawn = section.drawn if isinstance(section, RandomSection) and section.dimples else {"": section}
-            listed |= {f"imperfections.{i}.{key}".rstrip("."): item for key, item in drawn.items()}
-        return {"defect": defect} if defect else dict(listed)
+            if isinstance(section, RandomSection) and section.dimples:
+                listed |= {f"imperfections.{i}.{key}": dimple for key, dimple in section.drawn.items()}
+            else:
+                listed[f"imperfections.{i}"] = section
+        return {"defect": defect} if defect else listed
 
     @property
     def dimples(self) -> dict[str, str]:

@@ -1,9 +1,9 @@
 """A smooth function of place through values at scattered places, noise included.
 
-Each patch of the surface has a spline of its own that minimises sum (f - w)^2 + lambda |f|^2 in the seminorm of the kernel
--r^5 (Duchon 1977). The weights of the patches add up to one (Wendland, *Scattered Data Approximation*, 2005, chapter 15), so that
-the function is twice continuously differentiable. Generalised cross-validation over all patches estimates the noise
-(Craven and Wahba 1979); the lambda of each patch then has the least estimated risk (Mallows 1973).
+Each patch of the surface has a spline of its own that minimises sum (f - w)^2 + lambda |f|^2 in the seminorm of the
+kernel -r^5 (Duchon 1977). The weights of the patches add up to one (Wendland, *Scattered Data Approximation*, 2005,
+chapter 15), so that the function is twice continuously differentiable. Generalised cross-validation over all patches
+estimates the noise (Craven and Wahba 1979); the lambda of each patch then has the least estimated risk (Mallows 1973).
 """
 
 from collections.abc import Sequence
@@ -73,7 +73,7 @@ def scattered(places: Array, values: Array, cover: Array, *, noise: float | None
         tree = scipy.spatial.cKDTree(places)
     centres, radii = _balls(tree, np.vstack([cover, places]))
     parts = [
-        (_Part.of(places[inside], centre), values[inside])
+        (_Part.of(places[inside], np.asarray(centre)), values[inside])
         for centre, inside in zip(centres, tree.query_ball_point(centres, radii), strict=True)
     ]
     if noise is None:
@@ -90,7 +90,7 @@ def _balls(tree: "scipy.spatial.cKDTree", cover: Array) -> tuple[Array, Array]:
         if bare[i]:
             chosen.append(i)
             bare[around.query_ball_point(cover[i], INNER * reach[i])] = False
-    return cover[chosen], reach[chosen]
+    return np.asarray(cover[chosen]), np.asarray(reach[chosen])
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ class _Spline:
     polynomial: Array
 
     def __call__(self, x: Array) -> Array:
-        y = (x - self.centre) / self.scale
+        y = np.asarray((x - self.centre) / self.scale)
         return np.asarray(_kernel(y, self.places) @ self.kernel + _quadratics(y, self.axes) @ self.polynomial)
 
 
@@ -121,7 +121,7 @@ class _Part:
     @classmethod
     def of(cls, places: Array, centre: Array) -> "_Part":
         scale = float(np.linalg.norm(places - centre, axis=1).max())
-        y = (places - centre) / scale
+        y = np.asarray((places - centre) / scale)
         _, sizes, axes = np.linalg.svd(y - y.mean(axis=0), full_matrices=False)
         return cls(y, centre, scale, axes[sizes > FLAT * sizes[0]])
 
@@ -147,7 +147,7 @@ class _Part:
             smoothing = tried[np.argmin(left**2 @ parts**2 - 2 * noise**2 * left.sum(axis=1))]
         kernel = modes @ (parts / (sizes + smoothing)) * self.scale**5
         rest = values - _kernel(self.places, self.places) @ kernel - smoothing / self.scale**5 * kernel
-        polynomial = np.linalg.lstsq(_quadratics(self.places, self.axes), rest, rcond=DEPENDENT)[0]
+        polynomial = np.asarray(np.linalg.lstsq(_quadratics(self.places, self.axes), rest, rcond=DEPENDENT)[0])
         return _Spline(self.places, self.centre, self.scale, self.axes, kernel, polynomial)
 
 

@@ -11,12 +11,12 @@ from magshell_fenicsx.case.imperfections.modes import ModesSection, Shape
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.continuation.modes import ModesNotFound
 from magshell_fenicsx.continuation.system import State
-from magshell_fenicsx.mesh.frame import rotation
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.axisymmetric.pattern import nodal_normals
 from magshell_fenicsx.models.modes import ShellMode, ShellModes
 from magshell_fenicsx.models.shell.model import ShellModel
-from magshell_fenicsx.plan.imperfections.modes import on_meridian, on_surface
+from magshell_fenicsx.plan.imperfections.flaw import in_frame
+from magshell_fenicsx.plan.imperfections.modes import Mirrored, on_meridian, on_surface
 from magshell_fenicsx.platform import compat
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.record import Stopped
@@ -41,6 +41,10 @@ def with_modes(case: Case, comm: MPI.Comm) -> Case:
         if isinstance(section, ModesSection) and section.file is None and section.shapes is None
     ]
     if wanted:
+        if case.patches:
+            raise CaseError(
+                "shell.imperfections: kind: modes: the perfect shell has no dimple that patches are named after"
+            )
         count, bare = max(len(section.amplitudes) for section in wanted), perfect(case)
         this = f"{count} {bare.model_dump_json()} {bare.outside}"
         if this not in _known:
@@ -97,11 +101,11 @@ def _shape(scene: Scene, state: State, mode: ShellMode) -> Shape:
         return _wave(model, mode)
     assert isinstance(model, ShellModel)
     x, w = _at_nodes(scene, model, mode)
-    if model.multiplicity == 2:
-        sign = -1.0 if mode.label == "antisymmetric" else 1.0
-        x, w = np.vstack([x, model.mirror.image(x)]), np.concatenate([w, sign * w])
-    x = x @ rotation(scene.plan.azimuth)
-    return on_surface(x, w, x)
+    if model.multiplicity == 1:
+        return on_surface(x, w, x)
+    sign, mirror = -1.0 if mode.label == "antisymmetric" else 1.0, model.mirror
+    whole = on_surface(np.vstack([x, mirror.image(x)]), np.concatenate([w, sign * w]), x)
+    return in_frame(Mirrored(whole, mirror, sign), -scene.plan.azimuth)
 
 
 def _wave(model: MeridianModel, mode: ShellMode) -> Shape:

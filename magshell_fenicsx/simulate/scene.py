@@ -72,7 +72,9 @@ class Scene:
     ) -> None:
         start = time.perf_counter()
         if any(isinstance(s, ModesSection) and not (s.file or s.shapes) for s in case.imperfections.values()):
-            raise CaseError("shell.imperfections: kind: modes: compute them first, by simulate.perfect.with_modes(case, comm)")
+            raise CaseError(
+                "shell.imperfections: kind: modes: compute them first, by simulate.perfect.with_modes(case, comm)"
+            )
         self.case, self.plan, self.comm = case, plan or make_plan(case, terms), comm
         self.model: ShellModel | MeridianModel | SolidModel
         if self.plan.axisymmetric:

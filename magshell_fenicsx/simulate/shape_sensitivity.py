@@ -6,6 +6,7 @@ stay, r0 alone depends on an imperfection.
 
 from dataclasses import dataclass, replace
 from math import degrees
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -84,15 +85,23 @@ def _unit(case: Case, key: str, name: str) -> float:
 
 def changed(case: Case, key: str, name: str, change: float) -> Case:
     """The case with another number of an imperfection, such as "at.polar" of "imperfections.0"."""
-    section = case.imperfections[key]
-    parent = section.at if name.startswith("at.") and isinstance(section, DimpleSection | GaussianSection) else section
-    last = name.rpartition(".")[2]
-    new = parent.model_copy(update={last: getattr(parent, last) + change})
-    if parent is not section:
-        new = section.model_copy(update={"at": new})
-    which, _, number = key.partition(".")
-    whole = [new if i == int(number) else s for i, s in enumerate(case.shell.imperfections)] if number else new
-    return case.model_copy(update={"shell": case.shell.model_copy(update={which: whole})})
+    new = _changed(case.imperfections[key], name, change)
+    if key == "defect":
+        return case.model_copy(update={"shell": case.shell.model_copy(update={"defect": new})})
+    whole = [
+        new if other == key else section for other, section in case.imperfections.items()
+    ]  # random dimples one by one
+    return case.model_copy(update={"shell": case.shell.model_copy(update={"imperfections": whole})})
+
+
+def _changed(part: Any, path: str, change: float) -> Any:
+    """A number, or a section or a list with another number somewhere in it."""
+    if not path:
+        return part + change
+    first, _, rest = path.partition(".")
+    if isinstance(part, list):
+        return [_changed(item, rest, change) if i == int(first) else item for i, item in enumerate(part)]
+    return part.model_copy(update={first: _changed(getattr(part, first), rest, change)})
 
 
 @dataclass(frozen=True)

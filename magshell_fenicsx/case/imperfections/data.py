@@ -36,10 +36,11 @@ class FileSection(ImperfectionSection):
 
 
 class DataSection(FileSection):
-    """w0 measured at places of the surface, scattered or on a grid, with noise and holes; a smooth function goes through it.
+    """w0 measured at places of the surface, scattered or on a grid, with noise and holes; a smooth function fits it.
 
-    Columns of the file: x, y, z, w0; or polar, azimuth, w0 (spheres); or azimuth, z, w0 (cylinders), angles in degrees; or x, y, z of
-    the real surface. Without a unit in the header, as in "x [mm], w0 [um]", places are in the shell's length and w0 is over h.
+    Columns of the file: x, y, z, w0; or polar, azimuth, w0 (spheres); or azimuth, z, w0 (cylinders), angles in
+    degrees; or x, y, z of the real surface. A header such as x [mm], w0 [um] has units; without one, places are in
+    the shell's length and w0 is over h.
     """
 
     kind: Literal["data"]

@@ -1,7 +1,7 @@
 """The dimple of the paper."""
 
 from math import pi, sqrt
-from typing import ClassVar, Literal
+from typing import Literal
 
 from pydantic import Field
 
@@ -15,8 +15,6 @@ class DimpleSection(ImperfectionSection):
     elsewhere the straight distance over R.
     """
 
-    parameters: ClassVar[tuple[str, ...]] = ("amplitude", "width", "at.polar", "at.azimuth")
-
     kind: Literal["dimple"]
     amplitude: float = Field(ge=-50, le=50)
     """Depth δ, inwards; a bump is negative [h]"""
@@ -24,6 +22,10 @@ class DimpleSection(ImperfectionSection):
     """Half-width φ̄o = φo (√(12(1 - ν²)) R/h)^(1/2)"""
     at: At = At()
     """Its centre"""
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        return ("amplitude", "width", "at.polar", "at.azimuth")
 
     def half_width(self, R_over_h: float, nu: float) -> float:
         """phi_o (rad)."""

@@ -1,7 +1,7 @@
 """A Gaussian dimple."""
 
 from math import exp, sqrt
-from typing import ClassVar, Literal
+from typing import Literal
 
 from pydantic import Field
 
@@ -12,8 +12,6 @@ from magshell_fenicsx.case.imperfections.place import At, ImperfectionSection, h
 class GaussianSection(ImperfectionSection):
     """w0 = -δ exp(-(φ/φg)²) around a place, with the distance φ of a dimple; smooth everywhere."""
 
-    parameters: ClassVar[tuple[str, ...]] = ("amplitude", "width", "at.polar", "at.azimuth")
-
     kind: Literal["gaussian"]
     amplitude: float = Field(ge=-50, le=50)
     """Depth δ, inwards; a bump is negative [h]"""
@@ -21,6 +19,10 @@ class GaussianSection(ImperfectionSection):
     """φg (√(12(1 - ν²)) R/h)^(1/2), as the half-width of a dimple"""
     at: At = At()
     """Its centre"""
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        return ("amplitude", "width", "at.polar", "at.azimuth")
 
     def half_width(self, R_over_h: float, nu: float) -> float:
         """phi_g (rad)."""

@@ -29,8 +29,14 @@ class ModesSection(FileSection):
     @model_validator(mode="after")
     def _one_mode_in_a_file(self) -> Self:
         if self.file is not None and len(self.amplitudes) > 1:
-            raise ValueError("amplitudes: a file has one mode: give one amplitude, and an item of the list for each file")
+            raise ValueError(
+                "amplitudes: a file has one mode: give one amplitude, and an item of the list for each file"
+            )
         return self
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        return tuple(f"amplitudes.{i}" for i in range(len(self.amplitudes)))
 
     @property
     def shapes(self) -> tuple[Shape, ...] | None:

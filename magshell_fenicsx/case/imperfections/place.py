@@ -1,6 +1,6 @@
 """Where a local imperfection is, and what all imperfections have in common."""
 
-from typing import Annotated, ClassVar, Self
+from typing import Annotated, Self
 
 from pydantic import Field, model_validator
 
@@ -26,8 +26,10 @@ class At(Direction):
 class ImperfectionSection(Section):
     """Base of all kinds: w0 along the outward normal of the perfect surface."""
 
-    parameters: ClassVar[tuple[str, ...]] = ("amplitude",)
-    """Numbers that a knockdown factor is differentiated by, as paths of keys below the section"""
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Numbers that a knockdown factor is differentiated by, as paths of keys below the section."""
+        return ("amplitude",)
 
     kind: str
 

@@ -15,8 +15,8 @@ from magshell_fenicsx.case.imperfections.place import ImperfectionSection, half_
 class RandomSection(ImperfectionSection):
     """A Gaussian random field of a given size and length of correlation, or random dimples.
 
-    The field has the covariance δ² exp(-d²/(2 ℓ²)) of two places at the straight distance d. It and the dimples depend on the
-    seed alone, not on mesh, machine or ranks.
+    The field has the covariance δ² exp(-d²/(2 ℓ²)) of two places at the straight distance d. It and the dimples
+    depend on the seed alone, not on mesh, machine or ranks.
     """
 
     kind: Literal["random"]

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.imperfections.data import DataSection
 from magshell_fenicsx.case.source import CaseError
+from magshell_fenicsx.mesh.patch import place_text
 from magshell_fenicsx.mesh.scattered import Scattered, scattered
 from magshell_fenicsx.plan.imperfections.feet import feet
 from magshell_fenicsx.plan.imperfections.flaw import Flaw
@@ -17,7 +18,11 @@ from magshell_fenicsx.plan.imperfections.scan import Lengths, Scan, ScanError, r
 from magshell_fenicsx.plan.outline import Outline
 
 Array = NDArray[np.float64]
-MOST_H, MOST_R, FAR = 50.0, 0.5, 0.5  # largest |w0| over h and over R; distance over R beyond which a place is not of this shell
+MOST_H, MOST_R, FAR = (
+    50.0,
+    0.5,
+    0.5,
+)  # largest |w0| over h and over R; distance over R beyond which a place is not of this shell
 SAME = 0.2  # of the typical distance of neighbours, below which values are averaged
 HOLE, GAPS = 3.0, 4.0  # largest hole: radius over sqrt(R h), or over the typical distance of neighbours
 SMALLEST, SHOWN = 0.45, 2.0  # element size over sqrt(R h), and over the length of the sharpest bend
@@ -72,25 +77,30 @@ def _fitted(section: DataSection, scan: Scan, geometry: str, drawn: Outline, len
     h, surface = lengths.h, drawn.sample()
     places, w0 = _on_surface(scan, geometry, drawn, surface)
     if not np.abs(w0).max() <= min(MOST_H * h, MOST_R):
-        unit = "; without a unit in the header, w0 is over h" if scan.w0 is not None else ": are they in the shell's frame?"
+        unit = (
+            "; without a unit in the header, w0 is over h"
+            if scan.w0 is not None
+            else ": are they in the shell's frame?"
+        )
         raise ScanError(f"w0 reaches {np.abs(w0).max() / h:.4g} h; allowed at most {min(MOST_H, MOST_R / h):.4g}{unit}")
     given = len(w0)
     tree = scipy.spatial.cKDTree(places)
     spacing = float(np.median(tree.query(places, [9])[0])) / 1.7
     gaps = tree.query(surface)[0]
     if gaps.max() > max(HOLE * sqrt(h), GAPS * spacing):
-        where = ", ".join(f"{c:.3g}" for c in surface[np.argmax(gaps)])
+        where = place_text(surface[np.argmax(gaps)])
         raise ScanError(
-            f"no value lies within {gaps.max():.3g} R of the place ({where}) over R, where the hole is too large to guess; "
-            "give values there, w0 = 0 where the shell is perfect"
+            f"no value lies within {gaps.max():.3g} R of the place {where} over R, where the hole is too large to "
+            "guess; give values there, w0 = 0 where the shell is perfect"
         )
     places, w0 = _merged(places, w0, SAME * spacing)
     noise = None if section.noise is None else section.noise * h
     function = scattered(places, w0, surface, noise=noise)
     estimated = "estimated" if noise is None else "given"
     account = (
-        f"{given} values, w0 from {w0.min() / h:.4g} to {w0.max() / h:.4g} h, residual of the fit {function.residual / h:.3g} h, "
-        f"noise {function.noise / h:.3g} h ({estimated}), largest gap {gaps.max():.3g} R"
+        f"{given} values, w0 from {w0.min() / h:.4g} to {w0.max() / h:.4g} h, "
+        f"residual of the fit {function.residual / h:.3g} h, noise {function.noise / h:.3g} h ({estimated}), "
+        f"largest gap {gaps.max():.3g} R"
     )
     lost = f", {scan.lost} rows without a number left out" if scan.lost else ""
     return _Fit(function, max(SHOWN * _bend(function, surface, sqrt(h)), SMALLEST * sqrt(h)), account + lost)
@@ -112,8 +122,8 @@ def _on_surface(scan: Scan, geometry: str, drawn: Outline, surface: Array) -> tu
     if away.max() > FAR:
         row = int(np.argmax(away))
         raise ScanError(
-            f"the place ({', '.join(f'{c:.4g}' for c in x[row])}) over R is {away[row]:.3g} R from the shell: give the columns "
-            "their unit, such as x [mm], or turn and move them to the shell's frame"
+            f"the place {place_text(x[row])} over R is {away[row]:.3g} R from the shell: give the columns their unit, "
+            "such as x [mm], or turn and move them to the shell's frame"
         )
     places, heights = feet(drawn, x)
     if w0 is None:
@@ -121,8 +131,8 @@ def _on_surface(scan: Scan, geometry: str, drawn: Outline, surface: Array) -> tu
     if np.abs(heights).max() > 0.02 + 2 * np.abs(w0).max():
         row = int(np.argmax(np.abs(heights)))
         raise ScanError(
-            f"the place ({', '.join(f'{c:.4g}' for c in x[row])}) over R is {abs(heights[row]):.3g} R from the shell, but "
-            f"w0 there is {w0[row]:.3g} R: the unit of one of them is wrong, or it is the place of another shell"
+            f"the place {place_text(x[row])} over R is {abs(heights[row]):.3g} R from the shell, but w0 there "
+            f"is {w0[row]:.3g} R: the unit of one of them is wrong, or it is the place of another shell"
         )
     return places, w0
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.imperfections.modes import ModesSection, Shape
 from magshell_fenicsx.case.source import CaseError
+from magshell_fenicsx.mesh.mirror import Mirror
 from magshell_fenicsx.mesh.scattered import Scattered, scattered
 from magshell_fenicsx.plan.imperfections.flaw import Flaw
 from magshell_fenicsx.plan.outline import Outline
@@ -28,7 +29,7 @@ class Modes:
 
     def __call__(self, places: Array) -> Array:
         w = [a * shape(places) for a, shape in zip(self.amplitudes, self.shapes, strict=True)]
-        return -np.sum(w, axis=0)
+        return np.asarray(-np.sum(w, axis=0)) if w else np.zeros(len(places))
 
 
 @dataclass(frozen=True)
@@ -40,17 +41,33 @@ class Round:
 
     def __call__(self, places: Array) -> Array:
         x, y, z = places.T
-        return self.f(np.column_stack([np.hypot(x, y), 0 * z, z])) * np.cos(self.m * np.arctan2(y, x))
+        f = self.f(np.column_stack([np.hypot(x, y), 0 * z, z]))
+        return np.asarray(f * np.cos(self.m * np.arctan2(y, x)))
+
+
+@dataclass(frozen=True)
+class Mirrored:
+    """A mode on one side of a plane, and its image with a sign on the other: symmetric to the last digit."""
+
+    shape: Shape
+    mirror: Mirror
+    sign: float
+
+    def __call__(self, places: Array) -> Array:
+        other = self.mirror.beyond(places) < 0
+        here = np.where(other[:, None], self.mirror.image(places), places)
+        return np.asarray(self.shape(here) * np.where(other, self.sign, 1.0))
 
 
 def on_surface(places: Array, w: Array, cover: Array) -> Scattered:
     """A mode from its inward displacements (n,) at places (n, 3), scaled to 1."""
-    return scattered(places, w / _largest(places, w), cover, noise=0)
+    return scattered(places, np.asarray(w / _largest(places, w)), cover, noise=0)
 
 
 def on_meridian(rho: Array, z: Array, w: Array, m: int) -> Round:
-    """A wave around e3 from its inward displacements (n,) along the meridian; across the axis it is continued by its parity."""
-    f, places = w / _largest(np.column_stack([rho, z]), w), np.column_stack([rho, 0 * z, z])
+    """A wave around e3 from its inward displacements (n,) along the meridian, with its parity across the axis."""
+    places = np.column_stack([rho, 0 * z, z])
+    f = np.asarray(w / _largest(places, w))
     if rho.min() < ON_AXIS:
         places, f = np.vstack([places, places * [-1.0, 1.0, 1.0]]), np.concatenate([f, (-1) ** m * f])
     return Round(scattered(places, f, places, noise=0), m)
@@ -71,7 +88,9 @@ def modes(section: ModesSection, case: Case, drawn: Outline, key: str) -> Flaw:
     amplitudes = tuple(a * h for a in section.amplitudes[: len(shapes)])
     origin = section.file or "computed"
     words = ", ".join(f"{a:g} h" for a in section.amplitudes)
-    return Flaw(Modes(shapes, amplitudes), 1.2 * sqrt(h), account=f"{words} of {len(section.amplitudes)} modes, {origin}")
+    return Flaw(
+        Modes(shapes, amplitudes), 1.2 * sqrt(h), account=f"{words} of {len(section.amplitudes)} modes, {origin}"
+    )
 
 
 def _read(file: Path, drawn: Outline, key: str) -> Scattered:

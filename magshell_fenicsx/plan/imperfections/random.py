@@ -20,10 +20,10 @@ AT_ONCE = 4096  # places
 
 @dataclass(frozen=True)
 class Waves:
-    """w0(x) = delta sqrt(2/N) sum_j cos(k_j . x/length + phase_j), k_j normal, phase_j uniform (Shinozuka and Deodatis 1996).
+    """w0(x) = delta sqrt(2/N) sum_j cos(k_j . x/length + phase_j), k_j normal, phase_j uniform.
 
-    The mean over seeds is zero, the covariance is delta^2 exp(-d^2/(2 length^2)). The bits of PCG64 are the same on every
-    machine and in every version of NumPy.
+    The mean over seeds is zero, the covariance is delta^2 exp(-d^2/(2 length^2)) (Shinozuka and Deodatis 1996). The
+    bits of PCG64 are the same on every machine and in every version of NumPy.
     """
 
     delta: float

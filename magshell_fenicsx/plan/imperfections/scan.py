@@ -47,7 +47,9 @@ class Lengths:
         if unit is None:
             return self.h if name == "w0" else 1 / self.R
         if not self.si:
-            raise ScanError(f"column {name}: has the unit {unit}, but the shell's lengths have none; h and R are allowed")
+            raise ScanError(
+                f"column {name}: has the unit {unit}, but the shell's lengths have none; h and R are allowed"
+            )
         try:
             return float(in_units("metre", bare=True)(unit)) / self.R
         except ValueError as e:
@@ -84,11 +86,13 @@ def read_scan(file: Path, lengths: Lengths) -> Scan:
     if len(units) < len(columns):
         raise ScanError(f"has a column twice: {', '.join(columns)}")
     known = {name: np.asarray(v, dtype=float) for name, v in zip(units, columns.values(), strict=True)}
-    wanted = next((names for names in PLACES if set(names) <= known.keys() and ("w0" in known or len(names) == 3)), None)
+    wanted = next(
+        (names for names in PLACES if set(names) <= known.keys() and ("w0" in known or len(names) == 3)), None
+    )
     if wanted is None:
         raise ScanError(
-            f"has the columns {', '.join(map(repr, columns))}; needed are x, y, z, w0, or x, y, z of the real surface, or "
-            "polar, azimuth, w0 of a sphere, or azimuth, z, w0 of a cylinder"
+            f"has the columns {', '.join(map(repr, columns))}; needed are x, y, z, w0, or x, y, z of the real "
+            "surface, or polar, azimuth, w0 of a sphere, or azimuth, z, w0 of a cylinder"
         )
     names = [*wanted, *(["w0"] if "w0" in known else [])]
     if "w0" in units and units["w0"] is None and any(units[name] for name in wanted if name not in ANGLES):
@@ -142,7 +146,9 @@ def _csv(file: Path) -> dict[str, Array]:
                 rows = np.genfromtxt(stream, delimiter=mark, ndmin=2, comments="#")
             except ValueError as e:
                 raise ScanError(f"has rows of different lengths: {str(e).splitlines()[-1].strip()}") from None
-    names = [name.strip() for name in (header.split(mark) if mark else re.findall(r"\w+(?:\s*[\[(][^\])]*[\])])?", header))]
+    names = [
+        name.strip() for name in (header.split(mark) if mark else re.findall(r"\w+(?:\s*[\[(][^\])]*[\])])?", header))
+    ]
     if not names or rows.size == 0:
         raise ScanError("has no rows of numbers below a header such as x,y,z,w0")
     if rows.shape[1] != len(names):

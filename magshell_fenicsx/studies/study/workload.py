@@ -15,8 +15,8 @@ from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.run.rows import RowMaker
 from magshell_fenicsx.run.summary import Result
 from magshell_fenicsx.simulate.follow import follow
-from magshell_fenicsx.simulate.record import Stopped
 from magshell_fenicsx.simulate.perfect import with_modes
+from magshell_fenicsx.simulate.record import Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.studies.study.iteration import measured, timed
 from magshell_fenicsx.studies.study.scalar import parse_scalar
