@@ -41,6 +41,7 @@ from magshell_fenicsx.plan.symmetry import Leaves, askew, left, mirror, unmirror
 
 Array = NDArray[np.float64]
 Points = dict[str, Array]
+SAME_RIM = 0.02  # of the element size
 
 
 def make_plan(case: Case, terms: Sequence[OwnTerm] = ()) -> Plan:
@@ -164,7 +165,7 @@ def imperfect(perfect: Outline, found: Mapping[str, Flaw], turn: float) -> Outli
 def _matched(shape: Chart, local: Sequence[Spot]) -> Chart | RimmedGrid:
     """The shape with element edges along the rims."""
     circles = tuple(dict.fromkeys(spot.radius for spot in local if spot.circle and spot.jumps))
-    rims = _different([spot.rim for spot in local if spot.rim is not None])
+    rims = _different([spot for spot in local if spot.rim is not None])
     if isinstance(shape, Grid):
         return RimmedGrid(shape, rims) if rims else shape
     if isinstance(shape, DiscShape):
@@ -172,9 +173,13 @@ def _matched(shape: Chart, local: Sequence[Spot]) -> Chart | RimmedGrid:
     return replace(shape, rims=rims) if isinstance(shape, StripShape) else shape
 
 
-def _different(rims: list[Array]) -> tuple[Array, ...]:
-    """Each curve once."""
-    return tuple(rim for i, rim in enumerate(rims) if not any(np.allclose(rim, other) for other in rims[:i]))
+def _different(local: Sequence[Spot]) -> tuple[Array, ...]:
+    """Their rims; of several that are nearly the same, the first."""
+    kept: list[Array] = []
+    for spot in local:
+        if all(np.abs(spot.rim - other).max() > SAME_RIM * spot.size for other in kept):
+            kept.append(spot.rim)
+    return tuple(kept)
 
 
 def _symmetry(case: Case, drawn: Outline, parts: list[Leaves]) -> tuple[bool, Mirror | None]:

@@ -13,7 +13,7 @@ from magshell_fenicsx.plan.imperfections.flaw import Flaw
 from magshell_fenicsx.plan.outline import Outline
 
 Array = NDArray[np.float64]
-CORNERS = 96  # of a closed curve: a cubic spline through them is exact to 1e-8 of its size
+CORNERS = 192  # of a closed curve: a cubic spline through them is exact to 1e-8 of its size
 STEPS, HALVINGS = 60, 50
 WIDEST = 4.0  # distance in the chart over the distance on the surface
 AXIS = 1e-9  # over R
@@ -84,8 +84,8 @@ def contour(key: str, flaw: Flaw, drawn: Outline, turn: float, centre: Array, pa
     outside = np.stack([beyond(np.full(CORNERS, t)) for t in tried]) >= 0
     if not outside.any(axis=0).all():
         raise CaseError(
-            f"shell.{key}.width: its width over R, {flaw.reach:.3g}, is too much for this place of the shell: it would "
-            "reach around it"
+            f"shell.{key}.width: its width over R, {flaw.reach:.3g}, is too much for this place: it would reach "
+            "around the shell or its axis"
         )
     high = tried[outside.argmax(axis=0)]
     low = high - tried[0]
