@@ -41,9 +41,9 @@ def with_modes(case: Case, comm: MPI.Comm) -> Case:
         if isinstance(section, ModesSection) and section.file is None and section.shapes is None
     ]
     if wanted:
-        if case.patches:
+        if case.dimples and case.patches:
             raise CaseError(
-                "shell.imperfections: kind: modes: the perfect shell has no dimple that patches are named after"
+                "shell.imperfections: kind: modes: the perfect shell has no dimple, of which a patch is named"
             )
         count, bare = max(len(section.amplitudes) for section in wanted), perfect(case)
         this = f"{count} {bare.model_dump_json()} {bare.outside}"

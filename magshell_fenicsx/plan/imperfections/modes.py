@@ -86,11 +86,9 @@ def modes(section: ModesSection, case: Case, drawn: Outline, key: str) -> Flaw:
         section.become((_read(section.path, drawn, f"shell.{key}.file: {section.file}"),))
     shapes = section.shapes or ()
     amplitudes = tuple(a * h for a in section.amplitudes[: len(shapes)])
-    origin = section.file or "computed"
-    words = ", ".join(f"{a:g} h" for a in section.amplitudes)
-    return Flaw(
-        Modes(shapes, amplitudes), 1.2 * sqrt(h), account=f"{words} of {len(section.amplitudes)} modes, {origin}"
-    )
+    names = [f"mode {i}{f' (m = {s.m})' if isinstance(s, Round) else ''}" for i, s in enumerate(shapes, 1)]
+    words = [f"{a:g} h of {section.file or name}" for a, name in zip(section.amplitudes, names, strict=False)]
+    return Flaw(Modes(shapes, amplitudes), 1.2 * sqrt(h), account=", ".join(words) or "modes that the run computes")
 
 
 def _read(file: Path, drawn: Outline, key: str) -> Scattered:
