@@ -1,5 +1,6 @@
 """Modes of the perfect shell as imperfections."""
 
+import warnings
 from dataclasses import dataclass
 from math import sqrt
 from pathlib import Path
@@ -97,7 +98,9 @@ def _read(file: Path, drawn: Outline, key: str) -> Scattered:
     try:
         if not file.is_file():
             raise ValueError("there is no such file")
-        found = pyvista.read(file).point_data
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # the error follows
+            found = pyvista.read(file).point_data
         r0, w = (np.asarray(found[name], dtype=float) for name in ("r0", "mode_w"))
     except Exception as e:  # VTK and pyvista raise many types
         raise CaseError(f"{key}: is no mode file that a run writes (fields/mode_*.vtu): {e}") from None
