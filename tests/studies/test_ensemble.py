@@ -88,7 +88,7 @@ def test_a_known_fold_leads_to_the_knockdown_of_the_path() -> None:
 
 @pytest.mark.slow
 def test_the_path_of_degree_3_leads_to_the_knockdown_of_the_path() -> None:
-    (sample,) = drawn("symmetry=none", "mesh.refinement=0.4", "shell.radius_to_thickness=20", numbers=range(1))
+    (sample,) = drawn("symmetry=none", "mesh.refinement=0.6", "shell.radius_to_thickness=20", numbers=range(1))
     lower, path = solving._by_lower_degree(sample, KnownFolds()), solving._by_path(sample, KnownFolds())
     assert lower.knockdown == pytest.approx(path.knockdown, rel=1e-9)
 
