@@ -29,7 +29,8 @@ def explain(error: Any, source: Source, case: type[BaseModel]) -> str:
     if kind == "missing":
         return f"{place}: {key}: is missing{_meaning(location, source.data, case)}"
     if kind.startswith("union_tag"):
-        models = [m for m in _models(case.model_fields[str(location[0])].annotation) if _tag_key([m])]
+        field = _found(location, source.data, case)[1] or case.model_fields[str(location[0])]
+        models = [m for m in _models(field.annotation) if _tag_key([m])]
         tag, tags = error["ctx"].get("tag"), dict.fromkeys(tag for m in models for tag in _tags(m))
         said = "is missing" if tag is None else shown(tag)
         return f"{place}: {key}.{_tag_key(models)}: {said}; allowed: {', '.join(tags)}"
@@ -53,12 +54,16 @@ def shown(value: Any) -> str:
 
 def _without_tag(loc: Location, case: type[BaseModel]) -> Location:
     """Pydantic puts what distinguishes the members of a union after their key: take it out."""
-    section = case.model_fields.get(str(loc[0])) if loc else None
-    if not section or len(_models(section.annotation)) < 2:
-        return loc
-    rest = [key for key in loc[1:] if key not in UNIONS]
-    item = rest[:1] if rest and isinstance(rest[0], int) else []
-    return (loc[0], *item, *rest[len(item) + 1 :])
+    models, kept = [case], list[str | int]()
+    for key in loc:
+        if len(models) > 1 and not isinstance(key, int):
+            models = [m for m in models if _tag_key([m]) and key in _tags(m)] or models
+            continue
+        kept.append(key)
+        if isinstance(key, str) and models:
+            field = models[0].model_fields.get(key)
+            models = _models(field.annotation) if field else []
+    return tuple(kept)
 
 
 def _allowed_keys(location: Location, data: Any, case: type[BaseModel]) -> list[str]:

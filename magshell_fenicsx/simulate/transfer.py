@@ -8,8 +8,9 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.system import Vector
+from magshell_fenicsx.mesh.deviation import Deviated
 from magshell_fenicsx.mesh.shapes import DiscShape
-from magshell_fenicsx.mesh.sphere import SphereEmbedding
+from magshell_fenicsx.mesh.sphere import sphere
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.solid.model import SolidModel
 from magshell_fenicsx.simulate.scene import Scene
@@ -138,10 +139,10 @@ def _stretch(source: Scene, target: Scene) -> _Stretch | None:
     rims, edges = [], []
     for scene in (target, source):
         embedding, shape = scene.plan.embedding, scene.plan.shape
-        if not isinstance(embedding, SphereEmbedding) or embedding.defect is None:
+        spherical = isinstance(embedding, Deviated) and embedding.perfect is sphere
+        if not spherical or not isinstance(shape, DiscShape) or len(shape.circles) != 1 or shape.rims:
             return None
-        assert isinstance(shape, DiscShape)
-        rims.append(embedding.defect.phi_o)
+        rims.append(shape.circles[0])
         edges.append(shape.radius)
     return _Stretch(rims[0], rims[1], edges[0]) if abs(edges[0] - edges[1]) < ROUNDING else None
 

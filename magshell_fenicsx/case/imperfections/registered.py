@@ -1,0 +1,12 @@
+"""The kinds of imperfections."""
+
+from typing import Annotated
+
+from pydantic import Field
+
+from magshell_fenicsx.case.imperfections.dimple import DimpleSection
+from magshell_fenicsx.case.imperfections.formula import FormulaSection
+from magshell_fenicsx.case.imperfections.gaussian import GaussianSection
+
+Imperfection = Annotated[DimpleSection | GaussianSection | FormulaSection, Field(discriminator="kind")]
+Imperfections = Annotated[list[Imperfection], Field(max_length=1000)]
