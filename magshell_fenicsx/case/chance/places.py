@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-MOST_TRIES, MOST_STARTS = 1000, 100  # for one place; with all places anew
+MOST_TRIES, MOST_STARTS = 300, 30  # for one place; with all places anew
 DENSEST = pi / 12**0.5  # part of the plane that equal discs can cover
 
 

@@ -79,7 +79,7 @@ def _sample(source: Source, number: int, drawn: dict[str, str], deleted: int) ->
     ranked = sorted(defects, key=lambda defect: abs(defect["amplitude"]))
     if deleted:
         if len(defects) <= deleted:
-            raise CaseError(f"--delete-weakest {deleted}: the sample has only {len(defects)} defects with an amplitude")
+            raise CaseError(f"--delete-weakest {deleted}: the sample has only {len(defects)} defects")
         gone = {id(defect) for defect in ranked[:deleted]}
         shell = here.data["shell"]
         shell["imperfections"] = [item for item in shell["imperfections"] if id(item) not in gone]

@@ -112,6 +112,7 @@ def _outcome(result: Result, found: Found) -> Outcome:
     """With all columns of path.csv that every run has."""
     outcome = outcome_of(result, found, result.scene.newton.factorisation.count, 0.0)
     curve = [
-        {key: v if isinstance(v := row[key], str) else float(v) for key in COLUMNS if key in row} for row in result.rows
+        {key: v if isinstance(v := row[key], str | int) else float(v) for key in COLUMNS if key in row}
+        for row in result.rows
     ]
     return replace(outcome, curve=curve)

@@ -11,7 +11,7 @@ from magshell_fenicsx.studies.ensemble.table import RESULT, SEVEREST, WITHOUT, R
 from magshell_fenicsx.studies.ensemble.weibull import LEVEL, Weibull, fit, intervals
 
 Array = NDArray[np.float64]
-RESAMPLED = 400
+RESAMPLED = 300
 LEAST = 3  # samples for a correlation
 
 

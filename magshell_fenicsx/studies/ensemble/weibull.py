@@ -16,9 +16,9 @@ Array = NDArray[np.float64]
 
 LEAST = 8  # different values for three parameters
 SPANS = 1e-3, 1e2  # distances of the location below the least value, in standard deviations
-GRID, ROUNDS = 15, 8  # locations that are tried at once, and how often the grid is refined around the best
+GRID, ROUNDS = 9, 9  # locations that are tried at once, and how often the grid is refined around the best
 SHAPES = 1.0, 1e3
-STEPS = 8  # of Newton's method, which begins close
+STEPS = 5  # of Newton's method, which begins close
 LEVEL = 0.95
 
 
@@ -58,9 +58,9 @@ def fit(values: Sequence[float] | Array) -> Weibull | None:
         The sample (n,).
     """
     x = np.sort(np.asarray(values, dtype=float))
-    spread = float(x.std())
-    if len(np.unique(x)) < LEAST or spread <= 0:
+    if len(np.unique(x)) < LEAST:
         return None
+    spread = float(x.std())
     low, high = np.log(SPANS)
     ends, best = (low, high), 0.0
     for _ in range(ROUNDS):
