@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case, MeshSection
 from magshell_fenicsx.case.imperfections.modes import ModesSection, Shape
+from magshell_fenicsx.case.loads.pressure import PressureSection
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.continuation.modes import ModesNotFound
 from magshell_fenicsx.continuation.system import State
@@ -57,22 +58,34 @@ def with_modes(case: Case, comm: MPI.Comm) -> Case:
 
 
 def perfect(case: Case) -> Case:
-    """The case without imperfections, as a shell on the smallest model."""
+    """The case without imperfections, as a shell on the smallest model and the default mesh, whatever its own.
+
+    A pressure at its end goes on to the first instability.
+    """
     shell = case.shell
     changed: dict[str, Any] = {"imperfections": []}
     if "defect" in type(shell).model_fields:
         changed["defect"] = None
-    mesh = MeshSection(**{key: getattr(case.mesh, key) for key in case.mesh.model_fields_set - {"tolerance"}})
     return case.model_copy(
         update={
             "shell": shell.model_copy(update=changed),
-            "mesh": mesh,
+            "mesh": MeshSection(),
+            "loading": _to_the_limit(case),
             "model": "shell",
             "solid": None,
             "symmetry": "auto",
             "stability": None,
         }
     )
+
+
+def _to_the_limit(case: Case) -> Any:
+    """The loading, with a pressure at its end that has no target."""
+    several = isinstance(case.loading, list)
+    *before, last = case.loading if isinstance(case.loading, list) else [case.loading]
+    if isinstance(last, PressureSection):
+        last = PressureSection(kind="pressure", control=last.control, hold=last.hold)
+    return [*before, last] if several else last
 
 
 def perfect_modes(case: Case, count: int, comm: MPI.Comm) -> tuple[Shape, ...]:
@@ -86,6 +99,8 @@ def perfect_modes(case: Case, count: int, comm: MPI.Comm) -> tuple[Shape, ...]:
                 break
     except Stopped:  # the last point that was reached
         pass
+    if not any(state.mu.values()):
+        raise CaseError("shell.imperfections: kind: modes: are those of a shell under a load, and there is none")
     try:
         found = ShellModes(scene.model).lowest(state, count)[:count]
     except ModesNotFound as e:

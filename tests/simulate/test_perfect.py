@@ -16,7 +16,7 @@ from magshell_fenicsx.plan.imperfections.modes import Round
 from magshell_fenicsx.plan.imperfections.registered import flaws
 from magshell_fenicsx.plan.outline import outline
 from magshell_fenicsx.run.run import run
-from magshell_fenicsx.simulate.perfect import perfect, perfect_modes, with_modes
+from magshell_fenicsx.simulate.perfect import perfect_modes, with_modes
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.shape_sensitivity import changed
 
@@ -75,7 +75,7 @@ def test_modes_of_half_and_full_shells() -> None:
     panel = Case.from_source(Source("panel.yaml", data))
     x = outline(panel).sample()
     whole = perfect_modes(panel.model_copy(update={"symmetry": "none"}), 2, MPI.COMM_SELF)
-    halves = perfect_modes(perfect(panel), 2, MPI.COMM_SELF)
+    halves = perfect_modes(panel, 2, MPI.COMM_SELF)
     for one, other in zip(whole, halves, strict=True):
         assert np.abs(other(x)).max() == pytest.approx(1, abs=0.04)
         assert alike(one(x), other(x), 0.02)

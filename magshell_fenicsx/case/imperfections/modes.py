@@ -13,9 +13,10 @@ Shape = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 
 class ModesSection(FileSection):
-    """The lowest modes of the perfect shell where it first becomes unstable under the case's loads, or at their end.
+    """The lowest modes of the perfect shell where it first becomes unstable under the case's loads.
 
-    Of each its displacement along the normal, inwards positive, over the largest one.
+    A pressure goes on to there, whatever its target; under other loads without an instability they are those at the
+    end. Of each its displacement along the normal, inwards positive, over the largest one.
     """
 
     kind: Literal["modes"]

@@ -117,7 +117,7 @@ def test_what_is_refused(tmp_path: Path) -> None:
         ("x,y,z,w0", (x, w / H**2), "w0 reaches .* h; allowed at most 25; without a unit in the header, w0 is over h"),
         ("x,y,z,w0", (25.2 * x, w), "R from the shell: give the columns their unit, such as x"),
         ("x,y,z,w0", (x + 0.2 * n, w), "the unit of one of them is wrong"),
-        ("x,y,z", (x + [0.0, 0.0, 0.6],), "R from the shell|frame|no value lies within"),
+        ("x,y,z", (x + np.array([0.0, 0.0, 0.6]),), "R from the shell|frame|no value lies within"),
         ("x,y,z,w0", (x[hole], w[hole]), "no value lies within .* give values there"),
         ("polar,azimuth,w0", (x[:, :2], w), "polar and azimuth are of a sphere"),
     ):
