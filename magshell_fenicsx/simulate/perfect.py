@@ -81,11 +81,14 @@ def perfect(case: Case) -> Case:
 
 def _to_the_limit(case: Case) -> Any:
     """The loading, with a pressure at its end that has no target."""
-    several = isinstance(case.loading, list)
-    *before, last = case.loading if isinstance(case.loading, list) else [case.loading]
-    if isinstance(last, PressureSection):
-        last = PressureSection(kind="pressure", control=last.control, hold=last.hold)
-    return [*before, last] if several else last
+    loading = case.loading
+
+    def freed(load: Any) -> Any:
+        if not isinstance(load, PressureSection):
+            return load
+        return PressureSection(kind="pressure", control=load.control, hold=load.hold)
+
+    return [*loading[:-1], freed(loading[-1])] if isinstance(loading, list) else freed(loading)
 
 
 def perfect_modes(case: Case, count: int, comm: MPI.Comm) -> tuple[Shape, ...]:

@@ -6,6 +6,7 @@ from math import sqrt
 from pathlib import Path
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
@@ -19,6 +20,7 @@ from magshell_fenicsx.plan.outline import Outline
 Array = NDArray[np.float64]
 EQUAL = 1e-4  # part of the largest value within which crests and troughs are equally large
 ON_AXIS = 1e-9  # over R
+BESIDE = 0.3  # over R, largest distance of a place of the shell from the nodes of a mode
 
 
 @dataclass(frozen=True)
@@ -106,7 +108,10 @@ def _read(file: Path, drawn: Outline, key: str) -> Scattered:
         raise CaseError(f"{key}: is no mode file that a run writes (fields/mode_*.vtu): {e}") from None
     if r0.shape != (len(w), 3) or not (np.isfinite(r0).all() and np.isfinite(w).all() and np.abs(w).max() > 0):
         raise CaseError(f"{key}: the mode has no finite displacement")
-    return on_surface(r0, w, drawn.sample())
+    sample = drawn.sample()
+    if scipy.spatial.cKDTree(r0).query(sample)[0].max() > BESIDE:
+        raise CaseError(f"{key}: is the mode of another shell: it does not reach all places of this one")
+    return on_surface(r0, w, sample)
 
 
 def _largest(places: Array, w: Array) -> float:
