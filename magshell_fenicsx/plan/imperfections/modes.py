@@ -98,8 +98,6 @@ def _read(file: Path, drawn: Outline, key: str) -> Scattered:
     import pyvista  # VTK takes long to import
 
     try:
-        if not file.is_file():
-            raise ValueError("there is no such file")
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # the error follows
             found = pyvista.read(file).point_data
