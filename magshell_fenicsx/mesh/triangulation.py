@@ -45,8 +45,8 @@ def triangulate(shape: Shape, size: Size, points: Mapping[str, Array], embedding
     else:
         raise MeshError(
             f"gmsh leaves an element without area around {place_text(embedding(bad[:1])[0])}, over R: rims of dimples "
-            "that nearly touch, or a rim that nearly touches an edge; move one of them a little, or use kind: gaussian, "
-            "which has no rim"
+            "nearly touch, or a rim nearly touches an edge; move one of them a little, or use kind: gaussian, which has "
+            "no rim"
         )
     one = _glue(shape, nodes)
     edges = {name: one[lines[on[lines].all(axis=1)]] for name, on in shape.on_edges(nodes).items()}
