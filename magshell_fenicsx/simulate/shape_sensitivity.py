@@ -90,9 +90,7 @@ def changed(case: Case, key: str, name: str, change: float) -> Case:
     new = _changed(case.imperfections[key], name, change)
     if key == "defect":
         return case.model_copy(update={"shell": case.shell.model_copy(update={"defect": new})})
-    whole = [
-        new if other == key else section for other, section in case.imperfections.items()
-    ]  # random dimples one by one
+    whole = [new if other == key else section for other, section in case.imperfections.items()]
     return case.model_copy(update={"shell": case.shell.model_copy(update={"imperfections": whole})})
 
 
@@ -131,8 +129,9 @@ class _Mirrored:
 
 def _deviation(scene: Scene, case: Case, key: str) -> Deviation:
     """The deviation of an imperfection of another case, in the frame of the scene's model."""
-    plan, found = scene.plan, flaws(case, outline(case))[key].deviation
-    turned = in_frame(found, plan.azimuth)
+    plan, number = scene.plan, list(scene.case.imperfections).index(key)
+    found = list(flaws(case, outline(case)).values())[number]  # the other case has random dimples one by one
+    turned = in_frame(found.deviation, plan.azimuth)
     return _Mirrored(turned, plan.mirror) if plan.mirror else turned
 
 

@@ -36,7 +36,7 @@ def case(tmp_path: Path) -> Path:
 @pytest.mark.usefixtures("no_pictures")
 def test_all_kinds_checked_and_run(case: Path) -> None:
     said = magshell("check", case).stdout
-    for words in ("full shell", "0.1 h of mode 1 (m = 6), 0.05 h of mode 2 (m = 7)", "random field of seed 1, 0.05 h"):
+    for words in ("full shell", "0.1 h of mode 1 (m = 6), 0.05 h of mode 2 (m = 7)", "random field of 0.05 h, seed 1"):
         assert words in said
     assert "scan.csv: 400 values, w0 from -" in said
     one, three = case.parent / "one", case.parent / "three"

@@ -50,3 +50,6 @@ class DataSection(FileSection):
     """Factor of w0"""
     noise: float | None = Field(default=None, ge=0, le=50)
     """Standard deviation of the noise in w0; 0: w0 is exact; estimated by default [h]"""
+
+    def account(self) -> str:
+        return f"data of {self.file}"

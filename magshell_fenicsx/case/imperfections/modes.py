@@ -35,6 +35,9 @@ class ModesSection(FileSection):
             )
         return self
 
+    def account(self) -> str:
+        return f"modes of {', '.join(f'{a:g}' for a in self.amplitudes)} h"
+
     @property
     def parameters(self) -> tuple[str, ...]:
         return tuple(f"amplitudes.{i}" for i in range(len(self.amplitudes)))

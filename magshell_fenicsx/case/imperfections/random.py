@@ -37,6 +37,9 @@ class RandomSection(ImperfectionSection):
             _ = self.drawn  # refuses what has no room
         return self
 
+    def account(self) -> str:
+        return f"random field of {self.amplitude:g} h, seed {self.seed}"
+
     def correlation_length(self, R_over_h: float, nu: float) -> float:
         """ℓ over R."""
         assert self.length

@@ -51,5 +51,4 @@ def random_field(section: RandomSection, case: Case, drawn: Outline, key: str) -
     assert section.amplitude is not None
     shell = case.shell
     length = section.correlation_length(shell.R_over_h, shell.poisson_ratio)
-    account = f"random field of seed {section.seed}, {section.amplitude:g} h, length of correlation {length:.4g} R"
-    return Flaw(Waves(section.amplitude / shell.R_over_h, length, section.seed), length, account=account)
+    return Flaw(Waves(section.amplitude / shell.R_over_h, length, section.seed), length)
