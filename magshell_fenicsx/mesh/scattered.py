@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 NEIGHBOURS = 80  # values in a patch
 TRIED = 60  # patches that estimate the noise
+ACROSS = 2.5  # radius of a patch in a hole over the distance of the nearest value: it reaches across
 INNER = 0.7  # part of its radius up to which a patch covers the surface
 SAME = 1e-9  # distance over R of one place
 FLAT = 0.1  # height of a patch over its width, below which polynomials along the surface are enough
@@ -74,7 +75,7 @@ def scattered(places: Array, values: Array, cover: Array, *, noise: float | None
     centres, radii = _balls(tree, np.vstack([cover, places]))
     parts = [
         (_Part.of(places[inside], np.asarray(centre)), values[inside])
-        for centre, inside in zip(centres, tree.query_ball_point(centres, radii), strict=True)
+        for centre, inside in zip(centres, map(_some, tree.query_ball_point(centres, radii)), strict=True)
     ]
     if noise is None:
         noise = _noise(parts[:: max(1, len(parts) // TRIED)])
@@ -84,13 +85,21 @@ def scattered(places: Array, values: Array, cover: Array, *, noise: float | None
 
 def _balls(tree: "scipy.spatial.cKDTree", cover: Array) -> tuple[Array, Array]:
     """Balls with enough places of the tree in each, whose inner parts hold all places of `cover`."""
-    reach = tree.query(cover, [min(NEIGHBOURS, tree.n)])[0][:, 0] * (1 + 1e-9)
+    first, last = tree.query(cover, [1, min(NEIGHBOURS, tree.n)])[0].T
+    reach = np.maximum(last, ACROSS * first) * (1 + 1e-9)
     around, bare, chosen = scipy.spatial.cKDTree(cover), np.ones(len(cover), dtype=bool), []
     for i in range(len(cover)):
         if bare[i]:
             chosen.append(i)
             bare[around.query_ball_point(cover[i], INNER * reach[i])] = False
     return np.asarray(cover[chosen]), np.asarray(reach[chosen])
+
+
+def _some(inside: list[int]) -> NDArray[np.int64]:
+    """Of too many values around a hole a part, drawn evenly."""
+    if len(inside) <= 2 * NEIGHBOURS:
+        return np.array(inside)
+    return np.sort(np.random.default_rng(len(inside)).permutation(inside)[: 2 * NEIGHBOURS])
 
 
 @dataclass(frozen=True)

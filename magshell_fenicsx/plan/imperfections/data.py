@@ -148,7 +148,7 @@ def _merged(places: Array, w0: Array, distance: float) -> tuple[Array, Array]:
 def _bend(function: Scattered, x: Array, length: float) -> float:
     """1/k of the shortest wave sin(k x) that a function resembles, from its second differences over a length over R."""
     x = x[:: max(1, len(x) // 2000)]
-    w, d = function(x), 0.3 * length
+    w, d = function(x), 0.7 * length
     bent = sum(np.abs(function(x + d * e) - 2 * w + function(x - d * e)) for e in np.eye(3)) / d**2
     largest = float(np.nanmax(bent))
     return float(np.sqrt(np.ptp(w) / 2 / largest)) if largest > 0 else inf
