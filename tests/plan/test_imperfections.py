@@ -193,3 +193,17 @@ def test_patches_within_each_rim() -> None:
     places = np.column_stack([np.sin(angle), 0 * angle, np.cos(angle)])[:, None]
     found = plan.loads.magnetic.remanent(places, places)  # type: ignore[operator]
     assert found[:, 0] == pytest.approx(np.array([[1, 0, 0], [0, 0, -1], [0, 0, 1]]), abs=1e-12)
+
+
+def test_a_mesh_file_moves_along_its_normals() -> None:
+    """On the flat faces of the bracket by w0 = 0.01 sin(3 y), and at its fold along the mean of their normals."""
+    case = Case.load(CASES / "bracket.yaml", ["shell.imperfections=[{kind: formula, w0: sin(3*y)}]"])
+    plan = make_plan(case)
+    patch = plan.triangulated()
+    x, moved = patch.nodes[:, :3], patch.embedding(patch.nodes)
+    w0, fold = 0.01 * np.sin(3 * x[:, 1]), np.linalg.norm(x[:, [0, 2]] - [0.0, 1.0], axis=1) < 1e-9
+    assert fold.sum() > 2
+    assert np.linalg.norm(moved - x, axis=1) == pytest.approx(np.abs(w0), abs=1e-12)
+    straight = np.abs(moved - x).max(axis=1)
+    assert straight[~fold] == pytest.approx(np.abs(w0[~fold]), abs=1e-12)
+    assert straight[fold] == pytest.approx(np.abs(w0[fold]) / np.sqrt(2), abs=1e-12)

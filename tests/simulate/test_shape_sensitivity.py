@@ -29,5 +29,5 @@ def test_of_the_meridian(kind: str) -> None:
             u, phi = (transfer(scene, other, v) for v in (fold.state.u, fold.phi))
             return find_fold(other.newton, Guess(State(u, fold.state.mu), phi), "pressure").value
 
-        by_folds = (8 * (value(0.02) - value(-0.02)) - (value(0.04) - value(-0.04))) / 0.24
+        by_folds = (8 * (value(0.005) - value(-0.005)) - (value(0.01) - value(-0.01))) / 0.06
         assert derivative == pytest.approx(by_folds, rel=1e-4), name
