@@ -1,8 +1,8 @@
 """The fold ahead of a stable point of a path, estimated from the softest mode there.
 
 Along the softest mode phi (of length one, K phi = lambda phi) with the amplitude a, and with mu varied by m,
-equilibrium is lambda a + c a^2/2 = b m with c = Pi'''(phi, phi, phi) and b = -phi . R_mu = lambda phi . du/dmu. Its fold is at
-a = -lambda/c, m = -lambda^2/(2 b c); all other modes follow mu linearly.
+equilibrium is lambda a + c a^2/2 = b m with c = Pi'''(phi, phi, phi) and b = -phi . R_mu = lambda phi . du/dmu. The
+fold is at a = -lambda/c, m = -lambda^2/(2 b c); all other modes follow mu linearly.
 """
 
 import numpy as np
@@ -15,7 +15,7 @@ from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.point import Point
 from magshell_fenicsx.continuation.system import dot
 
-FAR = 0.5  # of the amplitude: a fold further ahead is not estimated well
+FAR = 0.6  # of the amplitude: a fold further ahead is not estimated well
 
 
 def fold_ahead(newton: BorderedNewton, point: Point, name: str) -> Guess | None:
