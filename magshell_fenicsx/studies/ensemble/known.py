@@ -36,17 +36,19 @@ class KnownFolds:
     def __bool__(self) -> bool:
         return bool(self._known)
 
-    def polished(self, values: Values, scene: Scene, guess: Guess) -> Fold:
-        """The fold near a guess with its null vector, to 1e-9; it is kept.
+    def polished(self, values: Values, scene: Scene, guess: Guess, expected: Vector | None = None) -> Fold:
+        """The fold near a guess, to 1e-9; it is kept.
+
+        A guess from another sample has the null vector that the fold must resemble. One from the path of this sample
+        has a soft mode, which may be a mixture of the modes of several defects: there the inertia decides.
 
         Raises
         ------
         FoldLost
             If none is found, or it is not seen to be the first instability.
         """
-        assert guess.phi is not None
         fold = find_fold(scene.newton, guess, "pressure")
-        refuse_later(scene, fold, guess.phi)
+        refuse_later(scene, fold, fold.phi if expected is None else expected)
         self._known = [*self._known, _Known(values, chart(scene), fold.state.u, fold.value, fold.phi)][-MOST:]
         return fold
 
@@ -69,7 +71,7 @@ class KnownFolds:
             if order is None:
                 continue
             u, phi = (v.reshape(len(nodes), -1)[order].ravel() for v in (known.u, known.phi))
-            return self.polished(values, scene, Guess(State(u, given | {"pressure": known.pressure}), phi))
+            return self.polished(values, scene, Guess(State(u, given | {"pressure": known.pressure}), phi), phi)
         raise FoldLost("no fold is known on this mesh")
 
     def _distance(self, a: Values, b: Values) -> float:

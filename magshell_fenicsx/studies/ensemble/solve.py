@@ -1,29 +1,26 @@
 """The outcome of one sample, by the cheapest way that leads to it.
 
-A knockdown is the fold of the nearest known sample on the same mesh, continued; else the fold at the end of the path of
-degree 3, carried to the case's degree; else the fold at the end of the path. Each ends in Newton's method for the fold,
-so that a knockdown is the same to 1e-9 by all ways. Every other result needs the path.
+A knockdown is the fold of the nearest known sample on the same mesh, continued; else the fold that Newton's method
+finds from one of the first points of the path; else the fold at its end. Each ends in Newton's method for the fold, so
+that a knockdown is the same to 1e-9 by all ways. Every other result needs the path.
 """
 
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 from mpi4py import MPI
 
-from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.continuation.ahead import fold_ahead
 from magshell_fenicsx.continuation.fold import Fold, FoldLost, Guess
-from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.output.store.table import COLUMNS
-from magshell_fenicsx.plan.planner import make_plan
+from magshell_fenicsx.run.rows import RowMaker
 from magshell_fenicsx.run.run import run
 from magshell_fenicsx.run.summary import Result
-from magshell_fenicsx.simulate.adapt.carry import NotCarried, carry
-from magshell_fenicsx.simulate.adapt.ending import NoResult, by_path
-from magshell_fenicsx.simulate.adapt.tolerance import CHEAP
+from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.perfect import with_modes
+from magshell_fenicsx.simulate.record import Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.studies.ensemble.known import KnownFolds
 from magshell_fenicsx.studies.ensemble.samples import Sample
@@ -31,16 +28,15 @@ from magshell_fenicsx.studies.study.scalar import Scalar
 from magshell_fenicsx.studies.sweep.chain import fold_row, has_knockdown
 from magshell_fenicsx.studies.sweep.outcome import Found, Outcome, outcome_of
 
+MOST_TRIES = 2  # points of the path from which the fold ahead is tried
 FAILED = "failed: "  # what `stopped` begins with if an error ended the sample
-
-Way = Callable[[Sample, KnownFolds], Outcome]
 
 
 def solve(sample: Sample, scalar: Scalar, known: KnownFolds) -> Outcome:
     """Compute a sample on this rank; an error ends the sample, not the ensemble."""
     start, cpu = time.perf_counter(), time.process_time()
     try:
-        found = _first_found(_ways(sample.case, scalar), sample, known)
+        found = _found(sample, scalar, known)
     except Exception as e:  # whatever it is, the other samples go on, and the table names it
         why = f"{FAILED}{'' if isinstance(e, MeshError) else f'{type(e).__name__}: '}{e}"
         found = Outcome(None, None, " ".join(why.split()), None, 0.0, [], "path", 0)
@@ -53,54 +49,39 @@ def serves(outcome: Outcome, scalar: Scalar) -> bool:
     return outcome.found == "path" or scalar.name == "knockdown"
 
 
-def _ways(case: Case, scalar: Scalar) -> list[Way]:
-    if scalar.name != "knockdown" or not has_knockdown(case):
-        return [_by_path]
-    lower = case.model == "shell" and case.mesh.degree > CHEAP and not make_plan(case).axisymmetric
-    return [_by_known_fold, *([_by_lower_degree] if lower else []), _by_path]
-
-
-def _first_found(ways: list[Way], sample: Sample, known: KnownFolds) -> Outcome:
-    *quick, last = ways
+def _found(sample: Sample, scalar: Scalar, known: KnownFolds) -> Outcome:
     with_modes(sample.case, MPI.COMM_SELF)
-    for way in quick:
-        try:
-            return way(sample, known)
-        except (FoldLost, NotCarried, NoResult):
-            continue
-    return last(sample, known)
-
-
-def _by_known_fold(sample: Sample, known: KnownFolds) -> Outcome:
-    if not known:
-        raise FoldLost("no fold is known")
+    if scalar.name != "knockdown" or not has_knockdown(sample.case):
+        return _outcome(run(sample.case, comm=MPI.COMM_SELF), "path")
     scene = Scene(sample.case, MPI.COMM_SELF)
-    return _of_fold(scene, known.follow(sample.values, scene))
+    try:
+        return _of_fold(scene, known.follow(sample.values, scene))
+    except FoldLost:
+        return _along_path(sample, scene, known)
 
 
-def _by_lower_degree(sample: Sample, known: KnownFolds) -> Outcome:
-    mesh = sample.case.mesh.model_copy(update={"degree": CHEAP})
-    source = Scene(sample.case.model_copy(update={"mesh": mesh}), MPI.COMM_SELF)
-    near = by_path(source)
-    if near.kind != "fold" or near.name != "pressure":
-        raise FoldLost("the path ends at another instability")
-    scene = Scene(sample.case, MPI.COMM_SELF)
-    u, phi = (carry(source, scene, v) for v in (near.state.u, near.tangent))
-    found = _of_fold(scene, known.polished(sample.values, scene, Guess(State(u, dict(near.state.mu)), phi)))
-    return replace(found, factorisations=found.factorisations + source.newton.factorisation.count)
-
-
-def _by_path(sample: Sample, known: KnownFolds) -> Outcome:
-    result = run(sample.case, comm=MPI.COMM_SELF)
-    last, located = result.rows[-1], result.history.located
-    if has_knockdown(sample.case) and located and last["label"] == "fold" and last["p_over_pc"] == result.knockdown:
-        try:
-            guess = Guess(result.last, located[-1].point.du)
-            fold = known.polished(sample.values, result.scene, guess)
-        except FoldLost:
-            pass  # the path has located it to 1e-8
-        else:
-            result.rows[-1] = {**last, **fold_row(result.scene, fold)}
+def _along_path(sample: Sample, scene: Scene, known: KnownFolds) -> Outcome:
+    """The fold from the first point of the path that leads to it, or the end of the path."""
+    result, made, tries = Result(scene, scene.unloaded()), RowMaker(scene), MOST_TRIES
+    try:
+        for record in follow(scene):
+            result.rows.append(made.row(record, 0.0))
+            if record.amplitude != "pressure" or record.mode or record.label == "bifurcation":
+                continue
+            guess = Guess(record.point.state, record.point.du) if record.label == "fold" else None
+            if record.label == "step" and tries and not record.point.negative_pivots:
+                guess = fold_ahead(scene.newton, record.point, "pressure")
+                tries -= guess is not None
+            if guess is None:
+                continue
+            try:
+                fold = known.polished(sample.values, scene, guess)
+            except FoldLost:
+                continue
+            if record.label == "fold" or fold.value > record.point.state.mu["pressure"]:
+                return _of_fold(scene, fold)
+    except Stopped as e:
+        result.stopped = str(e)
     return _outcome(result, "path")
 
 
