@@ -33,6 +33,7 @@ def case(tmp_path: Path) -> Path:
     return file
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_pictures")
 def test_all_kinds_checked_and_run(case: Path) -> None:
     said = magshell("check", case).stdout

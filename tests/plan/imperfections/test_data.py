@@ -81,7 +81,7 @@ def test_one_map_in_four_files(tmp_path: Path, way: str) -> None:
     lengths = {"thickness": "0.5 mm", "radius": "25 mm", "length": "37.5 mm"} if way == "lengths" else {}
     case = made({**CYLINDER, **lengths}, tmp_path)
     drawn = outline(case)
-    x, n = places(drawn, 900)
+    x, n = places(drawn, 600)
     w = wave(x)
     theta, z = np.degrees(np.arctan2(x[:, 1], x[:, 0])), x[:, 2]
     if way == "lengths":
@@ -92,14 +92,14 @@ def test_one_map_in_four_files(tmp_path: Path, way: str) -> None:
         write(tmp_path, *(("x,y,z", x + H * w[:, None] * n) if way == "real surface" else ("x,y,z,w0", x, w)))
     flaw = read(case)
     elsewhere, _ = places(drawn, 300)
-    assert flaw.deviation(elsewhere) / H == pytest.approx(wave(elsewhere), abs=5e-3)
-    assert flaw.account.startswith("scan.csv: 900 values, w0 from -")
+    assert flaw.deviation(elsewhere) / H == pytest.approx(wave(elsewhere), abs=1e-2)
+    assert flaw.account.startswith("scan.csv: 600 values, w0 from -")
     assert "residual of the fit" in flaw.account
 
 
 def test_factor_and_noise(tmp_path: Path) -> None:
     case = made(CYLINDER, tmp_path, amplitude=2.0)
-    x, _ = places(outline(case), 1200)
+    x, _ = places(outline(case), 700)
     write(tmp_path, "x,y,z,w0", x, wave(x) + 0.05 * RNG.standard_normal(len(x)))
     flaw, again = read(case), read(made(CYLINDER, tmp_path, noise=0.05))
     for found, factor in ((flaw, 2), (again, 1)):
