@@ -18,7 +18,7 @@ from magshell_fenicsx.models.shell.patterns import tangential
 from magshell_fenicsx.models.shell.residual import FastResidual
 
 Shells = Callable[..., ShellModel]
-DEGREES = [2, 3, pytest.param(4, marks=pytest.mark.slow), pytest.param(5, marks=pytest.mark.slow)]
+DEGREES, HIGH = [2, 3], [2, pytest.param(5, marks=pytest.mark.slow)]
 TERMS = {
     "membrane": "full",
     "bending": "full",
@@ -65,9 +65,8 @@ def test_term_alone(shell: Shells, name: str, degree: int) -> None:
     assert np.abs(found - 1 - reference).max() <= 1e-12 * np.abs(reference).max()
 
 
-@pytest.mark.parametrize("degree", DEGREES)
-@pytest.mark.parametrize("energy", ["full", "second_consistent"])
-@pytest.mark.parametrize("half", [False, True])
+@pytest.mark.parametrize("degree", HIGH)
+@pytest.mark.parametrize(("energy", "half"), [("full", False), ("second_consistent", True)])
 def test_terms_together(shell: Shells, half: bool, energy: str, degree: int) -> None:
     """And the load columns, of one amplitude's terms only."""
     model = shell(degree, half=half, energy=energy)

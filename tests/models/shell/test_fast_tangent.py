@@ -27,7 +27,7 @@ from magshell_fenicsx.models.shell.patterns import tangential
 from magshell_fenicsx.simulate.follow import follow
 
 Shells = Callable[..., ShellModel]
-DEGREES = [2, 3, pytest.param(4, marks=pytest.mark.slow), pytest.param(5, marks=pytest.mark.slow)]
+DEGREES, HIGH = [2, 3], [2, pytest.param(5, marks=pytest.mark.slow)]
 TERMS = {
     "membrane": "full",
     "bending": "full",
@@ -78,9 +78,8 @@ def test_term_alone(shell: Shells, name: str, degree: int) -> None:
     assert abs(K - reference).max() <= 1e-12 * abs(reference).max()
 
 
-@pytest.mark.parametrize("degree", DEGREES)
-@pytest.mark.parametrize("energy", ["full", "second_consistent"])
-@pytest.mark.parametrize("half", [False, True])
+@pytest.mark.parametrize("degree", HIGH)
+@pytest.mark.parametrize(("energy", "half"), [("full", False), ("second_consistent", True)])
 def test_terms_together(shell: Shells, half: bool, energy: str, degree: int) -> None:
     model = shell(degree, half=half, energy=energy)
     for seed, amplitudes in enumerate(({"lambda_m": 0.0, "pressure": 0.0}, MU)):
