@@ -43,6 +43,6 @@ def test_the_deviation_is_a_field(model: str) -> None:
     w0, away = surface.fields["w0_over_h"], (np.linalg.norm(surface.r0, axis=1) - 1) / scene.plan.material.h
     assert w0.min() == pytest.approx(-1.64, abs=1e-9)
     if model != "solid":
-        assert w0 == pytest.approx(away, abs=1e-4)  # a mean over cells that share a node
+        assert w0 == pytest.approx(away, abs=1e-3)  # r0 is a polynomial between its nodes
     else:
         assert np.abs(away - w0).max() < 0.52

@@ -38,7 +38,7 @@ class DimpleSection(ImperfectionSection):
         phi_o, depth = self.half_width(R_over_h, nu), abs(self.amplitude) / R_over_h
         if phi_o >= 0.9 * pi:
             raise ValueError(_wide(phi_o, 0.9 * pi))
-        refuse_steep("the dimple", depth, 8 / sqrt(27) * depth / phi_o)  # steepest at phi_o/sqrt(3)
+        refuse_steep(depth, 8 / sqrt(27) * depth / phi_o)  # steepest at phi_o/sqrt(3)
 
     def refuse_wide(self, R_over_h: float, nu: float, edge: float) -> None:
         """See that it fits on a sphere up to the polar angle `edge` (rad).
@@ -52,12 +52,12 @@ class DimpleSection(ImperfectionSection):
             raise ValueError(_wide(phi_o, 0.9 * edge))
 
 
-def refuse_steep(name: str, depth: float, slope: float) -> None:
+def refuse_steep(depth: float, slope: float) -> None:
     """Refuse a local imperfection by its depth over R and its steepest slope."""
     if depth > 0.5:
-        raise ValueError(f"{name} is {depth:.2g} radii deep; it must stay below half a radius")
+        raise ValueError(f"the dimple is {depth:.2g} radii deep; it must stay below half a radius")
     if slope > 2:
-        raise ValueError(f"{name}'s steepest slope is {slope:.3g}: too steep for a shell, at most 2")
+        raise ValueError(f"the dimple's steepest slope is {slope:.3g}: too steep for a shell, at most 2")
 
 
 def _wide(phi_o: float, most: float) -> str:

@@ -33,4 +33,4 @@ class GaussianSection(ImperfectionSection):
 
     def refuse_unfit(self, R_over_h: float, nu: float) -> None:
         depth = abs(self.amplitude) / R_over_h
-        refuse_steep("the dimple", depth, sqrt(2) * exp(-0.5) * depth / self.half_width(R_over_h, nu))
+        refuse_steep(depth, sqrt(2) * exp(-0.5) * depth / self.half_width(R_over_h, nu))
