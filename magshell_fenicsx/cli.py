@@ -188,6 +188,55 @@ def study(
 
 
 @app.command()
+def ensemble(
+    case: CaseFile,
+    samples: Annotated[int, typer.Option(min=1, metavar="N", help="number of samples")],
+    seed: Annotated[int, typer.Option(min=0, metavar="S", help="of the random numbers; sample k depends on S and k")],
+    set_: Settings = None,
+    result: Annotated[
+        str, typer.Option(metavar="NAME", help="knockdown, critical_field, force@w_over_h=10, energy@end, ...")
+    ] = "knockdown",
+    delete_weakest: Annotated[
+        int, typer.Option(min=0, metavar="N", help="also compute each sample without its N weakest defects")
+    ] = 0,
+    part: Annotated[
+        str | None, typer.Option(metavar="I/N", help="compute only every N-th sample, from the I-th: one of N jobs")
+    ] = None,
+    merge: Annotated[
+        list[Path] | None,
+        typer.Option(metavar="DIR", help="take the samples of the jobs' folders, compute none; repeat it"),
+    ] = None,
+    out: Annotated[Path | None, _folder("results/<case name>_ensemble/")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="continue the interrupted ensemble in that folder")] = False,
+) -> None:
+    """Run random samples of a case (its section `ensemble`) and fit their statistics; keep finished samples."""
+    from magshell_fenicsx.output.store.folder import DiskError
+    from magshell_fenicsx.studies.ensemble.ensemble import ensemble as run_ensemble
+
+    folder = out or Path("results") / f"{case.stem}_ensemble"
+    with _exit_codes(stopped=(DiskError,)):
+        done = run_ensemble(
+            case,
+            set_ or [],
+            samples=samples,
+            seed=seed,
+            result=result,
+            out=folder,
+            part=part,
+            merge=merge or [],
+            delete_weakest=delete_weakest,
+            resume=resume,
+        )
+    if (mean := done.content["mean"]) is not None:
+        _print_line(f"mean {result} = {mean:.6g} of {len(done.rows) - done.without_result} samples")
+    _print_line(f"results in {folder}/")
+    if done.without_result:
+        raise _failure(
+            f"{done.without_result} of {len(done.rows)} samples have no {result}; samples.csv says why", STOPPED
+        )
+
+
+@app.command()
 def compare(
     case: CaseFile,
     set_: Settings = None,
@@ -240,9 +289,10 @@ def check(case: CaseFile, set_: Settings = None) -> None:
     """Validate a case; print what would be built and what is left out."""
     from magshell_fenicsx.case.case import Case
     from magshell_fenicsx.plan.check import describe
+    from magshell_fenicsx.simulate.perfect import with_modes
 
     with _exit_codes():
-        _print_line(describe(Case.load(case, set_ or [])))
+        _print_line(describe(with_modes(Case.load(case, set_ or []), _world())))
 
 
 def _names() -> list[str]:

@@ -11,12 +11,15 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
+from magshell_fenicsx.mesh.deviation import Deviated
 from magshell_fenicsx.mesh.midsurface import Midsurface, distribute
+from magshell_fenicsx.mesh.patch import Embedding
 from magshell_fenicsx.mesh.shapes import DiscShape
-from magshell_fenicsx.mesh.sphere import Dimple, SphereEmbedding, flat
+from magshell_fenicsx.mesh.sphere import flat, sphere
 from magshell_fenicsx.mesh.triangulation import triangulate
 from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.shell.parameters import Condition, Loads, MagneticEnergy, Magnetisation, Material
+from magshell_fenicsx.plan.imperfections.dimple import Dimple
 
 CASES = Path(__file__).parents[1] / "cases"
 TILTED = Magnetisation(np.array([0.6, 0.0, 0.8]), np.array([0.0, 0.28, 0.96]))
@@ -25,9 +28,13 @@ TILTED = Magnetisation(np.array([0.6, 0.0, 0.8]), np.array([0.0, 0.28, 0.96]))
 def hemisphere(size: float = 0.5, *, half: bool = False, dimple: Dimple | None = None) -> Midsurface:
     """A coarse hemisphere; the size holds everywhere."""
     points = {"pole": np.zeros(2), "load": np.array([np.pi / 4, 0.0])}
-    circle = dimple.phi_o if dimple else None
-    shape = DiscShape(np.pi / 2, half, circle)
-    return distribute(triangulate(shape, lambda x: size, points, SphereEmbedding(dimple)), MPI.COMM_SELF)
+    shape = DiscShape(np.pi / 2, half, (dimple.phi_o,) if dimple else ())
+    return distribute(triangulate(shape, lambda x: size, points, spherical(dimple)), MPI.COMM_SELF)
+
+
+def spherical(dimple: Dimple | None) -> Embedding:
+    """The sphere with a dimple at its pole."""
+    return Deviated(sphere, sphere, (dimple,)) if dimple else sphere
 
 
 def disc(size: float, *, half: bool = False) -> Midsurface:

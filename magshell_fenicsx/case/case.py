@@ -3,6 +3,7 @@
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
+from math import pi, radians
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, TypeVar
 
@@ -10,9 +11,13 @@ import numpy as np
 from pydantic import Field, ModelWrapValidatorHandler, ValidationError, model_validator
 
 from magshell_fenicsx.case.boundary import EDGES, BoundarySection
-from magshell_fenicsx.case.defects import DimpleSection
+from magshell_fenicsx.case.ensemble import EnsembleSection
 from magshell_fenicsx.case.expressions import is_formula
 from magshell_fenicsx.case.fields import MagneticSection, layer_average
+from magshell_fenicsx.case.imperfections.data import FileSection
+from magshell_fenicsx.case.imperfections.dimple import DimpleSection
+from magshell_fenicsx.case.imperfections.place import ImperfectionSection
+from magshell_fenicsx.case.imperfections.random import RandomSection
 from magshell_fenicsx.case.loading import Loading, ProgrammeStep, programme
 from magshell_fenicsx.case.loads.dead import DeadSection
 from magshell_fenicsx.case.loads.edge import EdgeSection, refuse_unheld
@@ -83,6 +88,8 @@ class Case(WithParts):
     """Elements"""
     stability: StabilitySection | None = None
     """Lowest modes after the run"""
+    ensemble: EnsembleSection | None = None
+    """What is random, for `magshell ensemble`"""
     reactions: bool | None = None
     """Forces and moments of every support as columns of path.csv; by default where a support moves"""
     symmetry: Literal["auto", "none", "half", "axisymmetric"] = "auto"
@@ -101,7 +108,15 @@ class Case(WithParts):
             for step, source in zip(programme(section.loading, field=False), sources, strict=False):
                 if isinstance(step.load, DeadSection | EdgeSection) and isinstance(source, dict):
                     parts[step.key] = {key: value for key, value in source.items() if key != "hold"}
-            for key in (*texts(parts, is_formula), *measured(data.get("natural"))):
+            places = {
+                f"shell.imperfections.{i}.at.point": item["at"].get("point") if "at" in item else None
+                for i, item in enumerate(data["shell"].get("imperfections") or [])
+            }
+            for key in (
+                *texts(parts, is_formula),
+                *(key for key, place in places.items() if [*texts(place)]),
+                *measured(data.get("natural")),
+            ):
                 raise ValueError(f"{key}: has a unit, but the shell's lengths have none: give all of them one, or none")
         return section
 
@@ -119,6 +134,21 @@ class Case(WithParts):
             if getattr(self.natural, load.key, None) is None:
                 raise ValueError(f"loading.{load.key}: is a factor of natural.{load.key}: give that too")
         self._natural_parts()
+        return self
+
+    @model_validator(mode="after")
+    def _imperfections_fit(self) -> Self:
+        shell = self.shell
+        if getattr(shell, "defect", None) and shell.imperfections:
+            raise ValueError("shell.imperfections: give these or defect; a dimple of the list is the same as defect")
+        for key, section in self.imperfections.items():
+            try:
+                section.refuse_unfit(shell.R_over_h, shell.poisson_ratio)
+                if isinstance(section, DimpleSection) and shell.geometry in ("hemisphere", "cap"):
+                    edge = radians(shell.polar) if isinstance(shell, CapSurface) else pi / 2
+                    section.refuse_wide(shell.R_over_h, shell.poisson_ratio, edge)
+            except ValueError as e:
+                raise ValueError(f"shell.{key}: {e}") from None
         return self
 
     @model_validator(mode="after")
@@ -155,19 +185,27 @@ class Case(WithParts):
         if shell.geometry in ("hemisphere", "cap") and not 0 <= polar < edge - 1:
             raise ValueError(f"loading.at.polar: {polar:g} is not on the shell: allowed 0 to {edge - 1:g}")
 
+    @property
+    def patches(self) -> dict[str, Iterable[str]]:
+        """Keys with values by patch -> the names of these."""
+        found = {f"natural.{key}": getattr(self.natural, key, None) for key in ("curvature", "stretch")}
+        found["magnetic.remanent.patches"] = self.magnetic.remanent.patches if self.magnetic else None
+        return {key: patches for key, patches in found.items() if isinstance(patches, dict)}
+
     def _natural_parts(self) -> None:
-        for key in ("curvature", "stretch"):
-            if isinstance(patches := getattr(self.natural, key, None), dict):
-                self._refuse_strange(patches, f"natural.{key}")
+        for key in ("natural.curvature", "natural.stretch"):
+            if key in self.patches:
+                self._refuse_strange(self.patches[key], key)
 
     def _refuse_strange(self, patches: Iterable[str], key: str) -> None:
         """A mesh knows its patches later."""
         if isinstance(self.shell, MeshSurface):
             return
-        if self.defect is None and ("dimple" in patches or not isinstance(self.shell, ShellSection)):
+        if not self.dimples and ("dimple" in patches or not isinstance(self.shell, ShellSection)):
             raise ValueError(f"{key}: the shell has no dimple")
-        if unknown := set(patches) - {"dimple", "rest"}:
-            raise ValueError(f"{key}: {min(unknown)}: a {self.shell.geometry} has only dimple and rest")
+        if unknown := set(patches) - {*(self.dimples or ["dimple"]), "rest"}:
+            there = ", ".join(self.dimples or ["dimple"])
+            raise ValueError(f"{key}: {min(unknown)}: a {self.shell.geometry} has only {there} and rest")
 
     def _patches(self) -> None:
         patches = self.magnetic.remanent.patches if self.magnetic else None
@@ -265,15 +303,23 @@ class Case(WithParts):
         return self.mesh.degree if self.model == "shell" else SOLID_DEGREE
 
     @property
-    def defect(self) -> DimpleSection | None:
-        """The dimple at the pole."""
-        return self.shell.defect if isinstance(self.shell, ShellSection | CapSurface | RevolutionSurface) else None
+    def imperfections(self) -> dict[str, ImperfectionSection]:
+        """Key of each imperfection below `shell` -> section; `defect` is one of them."""
+        shell = self.shell
+        defect = shell.defect if isinstance(shell, ShellSection | CapSurface | RevolutionSurface) else None
+        listed = dict[str, ImperfectionSection]()
+        for i, section in enumerate(shell.imperfections):
+            if isinstance(section, RandomSection) and section.dimples:
+                listed |= {f"imperfections.{i}.{key}": dimple for key, dimple in section.drawn.items()}
+            else:
+                listed[f"imperfections.{i}"] = section
+        return {"defect": defect} if defect else listed
 
     @property
-    def dimple_half_width(self) -> float:
-        """phi_o (rad)."""
-        assert self.defect
-        return self.defect.half_width(self.shell.R_over_h, self.shell.poisson_ratio)
+    def dimples(self) -> dict[str, str]:
+        """Names of the patches within the rims of dimples -> keys of `imperfections`."""
+        keys = [key for key, section in self.imperfections.items() if isinstance(section, DimpleSection)]
+        return {"dimple" if i == 0 else f"dimple_{i + 1}": key for i, key in enumerate(keys)}
 
     @property
     def thickness_factor(self) -> str | dict[str, float] | None:
@@ -292,8 +338,10 @@ class Case(WithParts):
 
     @property
     def outside(self) -> dict[str, str | None]:
-        """What is solved besides the case's own keys: the hash of its mesh file, if it has one."""
-        return {"mesh_file": self.shell.digest} if isinstance(self.shell, MeshSurface) else {}
+        """What is solved besides the case's own keys: the hashes of its mesh file and of its other files."""
+        mesh = {"mesh_file": self.shell.digest} if isinstance(self.shell, MeshSurface) else {}
+        files = {key: s.digest for key, s in self.imperfections.items() if isinstance(s, FileSection) and s.file}
+        return mesh | {f"{key}.file": digest for key, digest in files.items()}
 
     @classmethod
     def load(cls, file: str | Path, settings: Sequence[str] = ()) -> "Case":

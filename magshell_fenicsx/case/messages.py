@@ -29,7 +29,9 @@ def explain(error: Any, source: Source, case: type[BaseModel]) -> str:
     if kind == "missing":
         return f"{place}: {key}: is missing{_meaning(location, source.data, case)}"
     if kind.startswith("union_tag"):
-        models = [m for m in _models(case.model_fields[str(location[0])].annotation) if _tag_key([m])]
+        keys = location[:-1] if isinstance(location[-1], int) else location
+        field = _found(keys, source.data, case)[1] or case.model_fields[str(location[0])]
+        models = [m for m in _models(field.annotation) if _tag_key([m])]
         tag, tags = error["ctx"].get("tag"), dict.fromkeys(tag for m in models for tag in _tags(m))
         said = "is missing" if tag is None else shown(tag)
         return f"{place}: {key}.{_tag_key(models)}: {said}; allowed: {', '.join(tags)}"
@@ -53,12 +55,16 @@ def shown(value: Any) -> str:
 
 def _without_tag(loc: Location, case: type[BaseModel]) -> Location:
     """Pydantic puts what distinguishes the members of a union after their key: take it out."""
-    section = case.model_fields.get(str(loc[0])) if loc else None
-    if not section or len(_models(section.annotation)) < 2:
-        return loc
-    rest = [key for key in loc[1:] if key not in UNIONS]
-    item = rest[:1] if rest and isinstance(rest[0], int) else []
-    return (loc[0], *item, *rest[len(item) + 1 :])
+    models, kept = [case], list[str | int]()
+    for key in loc:
+        if len(models) > 1 and not isinstance(key, int):
+            models = [m for m in models if _tag_key([m]) and key in _tags(m)][:1] or models
+            continue
+        kept.append(key)
+        if isinstance(key, str) and models:
+            field = models[0].model_fields.get(key)
+            models = _models(field.annotation) if field else []
+    return tuple(kept)
 
 
 def _allowed_keys(location: Location, data: Any, case: type[BaseModel]) -> list[str]:
@@ -75,14 +81,16 @@ def _meaning(location: Location, data: Any, case: type[BaseModel]) -> str:
 
 def _found(location: Location, data: Any, case: type[BaseModel]) -> tuple[type[BaseModel], FieldInfo | None]:
     """The innermost section at a location; and the last key, if it is one of a section."""
-    model, field = case, None
+    model, field, models = case, None, list[type[BaseModel]]()
     for key in location:
         if isinstance(data, dict):
             data = data.get(key)
         else:
             data = data[key] if isinstance(data, list) and isinstance(key, int) else None
         field = model.model_fields.get(str(key))  # None: of a list or mapping of sections, or a part of a union
-        if field and (models := _models(field.annotation)):
+        if field or not isinstance(key, int):
+            models = _models(field.annotation) if field else []
+        if models:
             tag = data.get(_tag_key(models)) if len(models) > 1 and isinstance(data, dict) else None
             model = next((m for m in models if tag is not None and tag in _tags(m)), models[0])
     return model, field

@@ -1,11 +1,11 @@
 """The shell: geometry, thickness, material, defect."""
 
-from math import pi
 from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
-from magshell_fenicsx.case.defects import DimpleSection
+from magshell_fenicsx.case.imperfections.dimple import DimpleSection
+from magshell_fenicsx.case.imperfections.registered import Imperfections
 from magshell_fenicsx.parts.section import Length, Pressure, Section
 
 
@@ -30,7 +30,9 @@ class ShellSection(Section):
     poisson_ratio: float = Field(gt=-1, le=0.5)
     """Poisson's ratio ν"""
     defect: DimpleSection | None = None
-    """Of a hemisphere"""
+    """One dimple of a hemisphere; for more, or elsewhere, see imperfections"""
+    imperfections: Imperfections = Field(default=[])
+    """Deviations of the mid-surface along its normal, added up"""
     width: float | None = Field(default=None, gt=0, le=10)
     """Of a strip, which must have one [length of the strip]"""
 
@@ -47,9 +49,7 @@ class ShellSection(Section):
         if (self.width is None) == (self.geometry == "strip"):
             raise ValueError("width (over the length) belongs to geometry: strip, and only to it")
         if self.defect and self.geometry != "hemisphere":
-            raise ValueError("a dimple needs geometry: hemisphere")
-        if self.defect:
-            self.defect.refuse_unfit(self.R_over_h, self.poisson_ratio, pi / 2)
+            raise ValueError("a defect needs geometry: hemisphere; elsewhere give imperfections")
         if self.width is not None and self.width * self.R_over_h < 1:
             raise ValueError(
                 f"the strip is narrower than its thickness; width must be at least {1 / self.R_over_h:.4g}"

@@ -9,6 +9,9 @@ from typing import Any
 import yaml
 
 Location = tuple[str | int, ...]
+INSTEAD: dict[Location, str] = {
+    ("shell", "imperfections"): "defect"
+}  # a key of a setting -> the key beside it that it takes the place of
 LARGEST, MOST_ENTRIES, DEEPEST = 1_000_000, 10_000, 20  # bytes, keys and items, levels: far beyond any case
 
 
@@ -148,6 +151,9 @@ def override(source: Source, assignment: str) -> None:
     given = Source(f"--set {assignment}", {})
     _walk(_parsed(given, lambda: yaml.compose(text, Loader=_Loader)) or yaml.ScalarNode("", ""), (), given)
     section[location[-1]] = _parsed(given, lambda: yaml.load(text, Loader=_Loader))
+    replaced = INSTEAD.get(tuple(location), "")
+    if not source.places.get((*location[:-1], replaced), "--set").startswith("--set"):
+        section.pop(replaced, None)
     for length in range(1, len(keys) + 1):
         if length == len(keys) or tuple(location[:length]) not in source.places:
             source.places[tuple(location[:length])] = f"--set {assignment}"

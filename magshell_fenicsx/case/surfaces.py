@@ -12,9 +12,10 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import BeforeValidator, Field, ModelWrapValidatorHandler, PrivateAttr, model_validator
 
-from magshell_fenicsx.case.defects import DimpleSection
 from magshell_fenicsx.case.expressions import formula
 from magshell_fenicsx.case.fields import Formula
+from magshell_fenicsx.case.imperfections.dimple import DimpleSection
+from magshell_fenicsx.case.imperfections.registered import Imperfections
 from magshell_fenicsx.parts.section import Section, in_units, or_number, texts
 
 Positive = Annotated[float, Field(gt=0)]
@@ -37,6 +38,8 @@ class SurfaceSection(Section):
     """Poisson's ratio ν"""
     thickness_factor: Formula | dict[str, Annotated[float, Field(gt=0, le=100)]] | None = None
     """Multiplies h: a formula of x, y, z over R, or of a mesh patch -> number"""
+    imperfections: Imperfections = Field(default=[])
+    """Deviations of the mid-surface along its normal, added up"""
 
     _with_units: bool = PrivateAttr(default=False)
 
@@ -122,7 +125,7 @@ class CapSurface(RoundSection):
     hole: float | None = Field(default=None, ge=0.1)
     """Angle of the hole's edge from e3 [degree]"""
     defect: DimpleSection | None = None
-    """At the pole of a cap without a hole"""
+    """One dimple; for more see imperfections"""
 
     @model_validator(mode="after")
     def _hole_within(self) -> Self:
@@ -130,10 +133,6 @@ class CapSurface(RoundSection):
             raise ValueError(f"hole: {self.hole:g}: must be smaller than polar, {self.polar:g}")
         if self.hole is None and self.azimuth is not None:
             raise ValueError("azimuth: a part of a cap needs a hole around the pole")
-        if self.defect and self.hole is not None:
-            raise ValueError("defect: a dimple is at the pole, where this cap has a hole")
-        if self.defect:
-            self.defect.refuse_unfit(self.R_over_h, self.poisson_ratio, radians(self.polar))
         return self
 
 
@@ -240,7 +239,7 @@ class RevolutionSurface(SurfaceSection):
     """The curve; its largest r is the reference length R"""
     azimuth: Azimuth = None
     defect: DimpleSection | None = None
-    """At the pole, where the profile ends; φ is there the distance from the pole along the meridian over R"""
+    """One dimple; for more see imperfections"""
 
     @property
     def reference(self) -> float:
@@ -257,11 +256,6 @@ class RevolutionSurface(SurfaceSection):
         _refuse_overturned(self.azimuth)
         if self.azimuth is not None and self.profile.curve[-1, 0] == 0:
             raise ValueError("azimuth: a part of a surface with a pole cannot be built")
-        if self.defect and self.profile.curve[-1, 0] != 0:
-            raise ValueError("defect: a dimple is at the pole, and this profile does not end on the axis")
-        if self.defect:
-            length = np.hypot(*np.diff(self.profile.curve, axis=0).T).sum() / self.reference
-            self.defect.refuse_unfit(self.R_over_h, self.poisson_ratio, float(length))
         return self
 
 

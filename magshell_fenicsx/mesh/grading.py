@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from math import inf, log1p, pi, sqrt
 from typing import Protocol
 
@@ -16,6 +17,10 @@ PER_AREA = 4 / sqrt(3)  # triangles of size one per unit area
 
 class Feature(Protocol):
     """A place with small elements around it."""
+
+    @property
+    def size(self) -> float:
+        """The smallest."""
 
     def across(self, axis: int, x: float) -> float:
         """Wanted distance of grid lines across an axis, at a coordinate."""
@@ -98,7 +103,17 @@ class Grading:
     largest: float
 
     def __call__(self, x: NDArray[np.float64]) -> float:
-        return min([self.largest, *(feature(x) for feature in self.features)])
+        centre, radius, size, growth = self._discs
+        around = size + growth * np.maximum(0.0, np.hypot(*(x - centre).T) - radius)
+        others = (feature(x) for feature in self.features if not isinstance(feature, Disc))
+        return float(min([self.largest, around.min(initial=inf), *others]))
+
+    @cached_property
+    def _discs(self) -> tuple[NDArray[np.float64], ...]:
+        """Centres (n, 2), radii, sizes and growths (n,): there may be hundreds."""
+        discs = [f for f in self.features if isinstance(f, Disc)]
+        numbers = np.array([[*f.centre, f.radius, f.size, f.growth] for f in discs]).reshape(-1, 5).T
+        return numbers[:2].T, *numbers[2:]
 
     def across(self, axis: int, x: float) -> float:
         """Wanted distance of grid lines, see `Feature`."""
@@ -109,4 +124,5 @@ class Grading:
         share = 0.5 if shape.half else 1.0  # features lie on the mirror line
         around = share * sum(feature.cells(shape.reach) for feature in self.features)
         inner, outer = PER_AREA * shape.area / self.largest**2, 2 * shape.reach / self.largest  # of a thin strip
-        return inner + outer + around
+        finest = min([self.largest, *(feature.size for feature in self.features)])
+        return min(inner + outer + around, outer + PER_AREA * shape.area / finest**2)

@@ -5,7 +5,7 @@ The shape itself is the vector field r0. It is interpolated at the nodes of the 
 rigid motions are exact.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -17,10 +17,10 @@ from dolfinx.cpp.io import perm_gmsh
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from magshell_fenicsx.mesh.patch import PatchMesh, as_set, check_orientation
+from magshell_fenicsx.mesh.deviation import Deviated
+from magshell_fenicsx.mesh.nodal_normals import ORDERS
+from magshell_fenicsx.mesh.patch import Embedding, PatchMesh, as_set, check_orientation
 from magshell_fenicsx.platform import compat
-
-ORDERS = {3: 1, 6: 2, 10: 3}  # nodes of a triangle -> its order
 
 
 @dataclass(frozen=True)
@@ -44,13 +44,26 @@ class Midsurface:
 
     def charted(self, V: fem.FunctionSpace) -> NDArray[np.float64]:
         """Chart coordinates (cells, nodes, 2 | 3) of the nodes of each cell of this rank, in its own chart."""
-        return at_reference_points(
-            self._patch.nodes, self._patch.cells[self._original_cells], compat.interpolation_points(V)
-        )
+        return self._charted(compat.interpolation_points(V))[..., :3]
+
+    def _charted(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The same at reference points (q, 2), with the normals of a mesh file that has imperfections."""
+        return at_reference_points(self._patch.nodes, self._patch.cells[self._original_cells], points)
+
+    def deviation(self, points: NDArray[np.float64]) -> NDArray[np.float64] | None:
+        """w0 over R at reference points (q, 2) of each cell, (cells, q); None where there are no imperfections."""
+        chart, embedding = self._charted(points), self._patch.embedding
+        if not isinstance(embedding, Deviated):
+            return None
+        return embedding.w0(chart.reshape(-1, chart.shape[-1])).reshape(chart.shape[:2])
+
+    def reshaped(self, embedding: Embedding) -> PatchMesh:
+        """The triangulation with another map to space."""
+        return replace(self._patch, embedding=embedding)
 
     def placement(self, V: fem.FunctionSpace) -> fem.Function:
         """The undeformed placement r0 in the Lagrange space `V` (vector valued)."""
-        chart, r0 = self.charted(V), fem.Function(V, name="r0")
+        chart, r0 = self._charted(compat.interpolation_points(V)), fem.Function(V, name="r0")
         places = self._patch.embedding(chart.reshape(-1, chart.shape[-1]))
         r0.x.array.reshape(-1, 3)[V.dofmap.list] = places.reshape(*chart.shape[:2], 3)
         r0.x.scatter_forward()
@@ -59,7 +72,7 @@ class Midsurface:
     @property
     def read(self) -> bool:
         """Whether it comes from a mesh file, and so may have facets or folds."""
-        return self._patch.nodes.shape[1] == 3
+        return self._patch.nodes.shape[1] != 2
 
     @cached_property
     def patches(self) -> dict[str, NDArray[np.bool_]]:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.mesh.mirror import Mirror, cut
 from magshell_fenicsx.mesh.msh_format import Content, parsed
+from magshell_fenicsx.mesh.nodal_normals import nodal_normals
 from magshell_fenicsx.mesh.patch import MeshError, PatchMesh, place_text
 from magshell_fenicsx.mesh.soundness import border_edges, oriented
 
@@ -25,15 +26,23 @@ class MeshFile:
     ----------
     scale
         Factor from its coordinates to lengths over R.
+    normals
+        Whether nodes are places followed by normals, (n, 6), which the triangles around a node have on average.
     """
 
     path: Path
     scale: float
+    normals: bool = False
 
 
 def in_space(x: Array) -> Array:
     """The embedding of a mesh whose nodes are given in space."""
-    return x
+    return x[..., :3]
+
+
+def normals(x: Array) -> Array:
+    """Unit normals (n, 3) of nodes (n, 6)."""
+    return np.asarray(x[:, 3:] / np.linalg.norm(x[:, 3:], axis=1)[:, None])
 
 
 def read_msh(file: MeshFile, points: Mapping[str, Array], mirror: Mirror | None = None) -> PatchMesh:
@@ -72,17 +81,19 @@ def _whole(file: MeshFile) -> PatchMesh:
             raise MeshError(f"{file.path}: the physical curve {name} is not part of the surface")
     cells = oriented(nodes, cells)
     edges = border_edges(nodes, cells, edges)
+    if file.normals:
+        nodes = np.column_stack([nodes, nodal_normals(nodes, cells)])
     return PatchMesh(nodes, cells, in_space, edges, patches=patches)
 
 
 def _vertices(nodes: Array, cells: NDArray[np.int64], points: Mapping[str, Array]) -> dict[str, Array]:
     corners = nodes[np.unique(cells[:, :3])]
-    highest = corners[np.lexsort(np.round(corners, 9).T)[-1]]
+    highest = corners[np.lexsort(np.round(corners[:, :3], 9).T)[-1]]
     found = {"pole": highest}
     for name, x in points.items():
-        distance = np.linalg.norm(corners - x, axis=1)
+        distance = np.linalg.norm(corners[:, :3] - x[:3], axis=1)
         nearest = corners[np.argmin(distance)]
-        if distance.min() > NEAR * np.ptp(corners, axis=0).max():
+        if distance.min() > NEAR * np.ptp(corners[:, :3], axis=0).max():
             raise MeshError(f"the point {name} is no vertex of the mesh; the nearest, over R, is {place_text(nearest)}")
         found[name] = nearest
     return found

@@ -68,10 +68,15 @@ def split(patch: PatchMesh) -> Quadrilaterals:
     inner = np.setdiff1d(np.arange(len(reference)), [0, 1, 2, *np.ravel(on_sides)])
     below = len(vertices) + 3 * len(sides)
     numbers[:, inner] = below + len(inner) * np.arange(len(corners))[:, None] + np.arange(len(inner))
-    x, a1, a2 = np.einsum("dqk,ckx->dcqx", values, patch.nodes[patch.cells[:, to_dolfinx]])
+    ordered = patch.cells[:, to_dolfinx]
+    x = np.einsum("qk,ckx->cqx", values[0], patch.nodes[ordered])
     nodes = np.empty((numbers.max() + 1, patch.nodes.shape[1]))
     nodes[numbers] = x  # of glued sides either: they have one place in space
-    offsets = _mitred(a1, a2, numbers, quads) if nodes.shape[1] == 3 else surface_normal(patch.embedding, nodes)
+    if nodes.shape[1] == 2:
+        offsets = surface_normal(patch.embedding, nodes)
+    else:
+        a1, a2 = np.einsum("dqk,ckx->dcqx", values[1:], patch.embedding(patch.nodes)[ordered])
+        offsets = _mitred(a1, a2, numbers, quads)
     middle_of = {(int(sides[n, 0]), int(sides[n, 1])): len(vertices) + 3 * n + 1 for n in range(len(sides))}
 
     def halves(a: int, b: int) -> list[list[int]]:

@@ -11,8 +11,6 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from magshell_fenicsx.mesh.sphere import Dimple
-
 Array = NDArray[np.float64]
 ROUNDS = 4  # iterations for a spline's parameter, which converges to the arc length as the square of its steps
 
@@ -126,6 +124,11 @@ class Revolved:
         theta, (r, z) = chart[:, 0] / self.rho, self.profile(chart[:, 1]).T
         return np.column_stack([r * np.cos(theta), r * np.sin(theta), z])
 
+    def normal(self, chart: Array) -> Array:
+        """Outward normals (n, 3)."""
+        theta, (along_r, along_z) = chart[:, 0] / self.rho, self.profile.tangent(chart[:, 1]).T
+        return np.column_stack([along_z * np.cos(theta), along_z * np.sin(theta), -along_r])
+
     def inverse(self, x: Array, first: float) -> Array:
         """Chart (2,) of a point (3,), theta in [first, first + 2 pi)."""
         theta = np.arctan2(x[1], x[0])
@@ -135,23 +138,37 @@ class Revolved:
 
 @dataclass(frozen=True)
 class Capped:
-    """Chart t (cos theta, sin theta), t from the pole at the profile's end -> space, with a dimple along the normal."""
+    """Chart t (cos theta, sin theta), t from the pole at the profile's end -> space."""
 
     profile: Profile
-    defect: Dimple | None = None
 
     def __call__(self, chart: Array) -> Array:
         t = np.hypot(chart[:, 0], chart[:, 1])
-        s = self.profile.length - t
-        r, z = self.profile(s).T
-        if self.defect:
-            (along_r, along_z), w0 = self.profile.tangent(s).T, self.defect(t)
-            r, z = r + w0 * along_z, z - w0 * along_r
-        direction = np.where(t[:, None] > 0, chart / np.maximum(t, 1e-300)[:, None], 0.0)
-        return np.column_stack([r[:, None] * direction, z])
+        r, z = self.profile(self.profile.length - t).T
+        return np.column_stack([r[:, None] * _direction(chart, t), z])
+
+    def normal(self, chart: Array) -> Array:
+        """Outward normals (n, 3)."""
+        t = np.hypot(chart[:, 0], chart[:, 1])
+        along_r, along_z = self.profile.tangent(self.profile.length - t).T
+        return np.column_stack([along_z[:, None] * _direction(chart, t), -along_r])
+
+    def from_pole(self, places: Array) -> Array:
+        """Length (n,) of the meridian from the pole to places (n, 3) of the surface."""
+        rz = np.column_stack([np.hypot(places[:, 0], places[:, 1]), places[:, 2]])
+        coarse = np.linspace(0, self.profile.length, 2001, dtype=np.float64)
+        s = coarse[scipy.spatial.cKDTree(self.profile(coarse)).query(rz)[1]]
+        for _ in range(ROUNDS):  # Newton's method, whose residual vanishes on the surface
+            s = np.clip(s + np.sum((rz - self.profile(s)) * self.profile.tangent(s), axis=1), 0, self.profile.length)
+        return np.asarray(self.profile.length - s)
 
     def inverse(self, x: Array) -> Array:
         """Chart (2,) of a point (3,)."""
         rho = np.hypot(x[0], x[1])
         t = self.profile.length - self.profile.foot(np.array([rho, x[2]]))
         return t * x[:2] / rho if rho > 0 else np.zeros(2)
+
+
+def _direction(chart: Array, t: Array) -> Array:
+    """cos theta and sin theta, (n, 2); zero at the pole."""
+    return np.where(t[:, None] > 0, chart / np.maximum(t, 1e-300)[:, None], 0.0)

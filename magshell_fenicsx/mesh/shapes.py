@@ -1,14 +1,16 @@
 """The plane shapes that gmsh triangulates: the chart of the mid-surface, or one half of it."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import pi
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 Faces = list[tuple[int, int]]
+Glued = tuple[int, float, float]  # an axis, and the coordinates across it
 
 
 class Shape(Protocol):
@@ -23,6 +25,14 @@ class Shape(Protocol):
     @property
     def half(self) -> bool: ...
 
+    @property
+    def rims(self) -> tuple[Array, ...]:
+        """Closed curves, points (n, 2) each, that elements follow."""
+
+    @property
+    def glued(self) -> tuple[Glued, ...]:
+        """The pairs of opposite sides that are one line of the surface."""
+
     def faces(self, occ: Any) -> Faces:
         """Make the shape's faces with gmsh's OpenCASCADE kernel; elements follow their common edges."""
 
@@ -36,16 +46,20 @@ class DiscShape:
 
     Attributes
     ----------
-    circle
-        Radius of an inner circle that element edges follow (the rim of a dimple).
+    circles
+        Radii of inner circles that element edges follow (rims of dimples).
+    rims
+        Other closed curves that they follow, points (n, 2) each; parts beyond the edge are left out.
     edge
         Name of its outer edge.
     """
 
     radius: float
     half: bool
-    circle: float | None = None
+    circles: tuple[float, ...] = ()
     edge: str = "rim"
+    rims: tuple[Array, ...] = ()
+    glued: ClassVar[tuple[Glued, ...]] = ()
 
     @property
     def area(self) -> float:
@@ -56,9 +70,8 @@ class DiscShape:
         return self.radius
 
     def faces(self, occ: Any) -> Faces:
-        discs = [
-            (2, occ.addDisk(0, 0, 0, r, r)) for r in ([self.radius, self.circle] if self.circle else [self.radius])
-        ]
+        discs = [(2, occ.addDisk(0, 0, 0, r, r)) for r in (self.radius, *self.circles)]
+        discs += within(occ, self.rims, lambda: (2, occ.addDisk(0, 0, 0, self.radius, self.radius)))
         if not self.half:
             return discs
         above = (2, occ.addRectangle(-2 * self.radius, 0, 0, 4 * self.radius, 2 * self.radius))
@@ -77,6 +90,8 @@ class StripShape:
 
     width: float
     half: bool
+    rims: tuple[Array, ...] = ()
+    glued: ClassVar[tuple[Glued, ...]] = ()
 
     @property
     def area(self) -> float:
@@ -88,7 +103,11 @@ class StripShape:
 
     def faces(self, occ: Any) -> Faces:
         below = 0 if self.half else -self.width / 2
-        return [(2, occ.addRectangle(0, below, 0, 1, self.width / 2 - below))]
+
+        def strip() -> tuple[int, int]:
+            return 2, occ.addRectangle(0, below, 0, 1, self.width / 2 - below)
+
+        return [strip(), *within(occ, self.rims, strip)]
 
     def on_edges(self, x: Array) -> dict[str, NDArray[np.bool_]]:
         edges = {
@@ -99,3 +118,14 @@ class StripShape:
         if self.half:
             edges["symmetry"] = np.abs(x[:, 1]) < 1e-9
         return edges
+
+
+def within(occ: Any, rims: Sequence[Array], whole: Callable[[], tuple[int, int]]) -> Faces:
+    """The faces within closed curves, points (n, 2) each, as far as they belong to a face that `whole` makes."""
+    found: Faces = []
+    for points in rims:
+        tags = [occ.addPoint(x, y, 0) for x, y in points]
+        loop = occ.addCurveLoop([occ.addSpline([*tags, tags[0]])])
+        found += occ.intersect([(2, occ.addPlaneSurface([loop]))], [whole()])[0]
+        occ.remove([(0, tag) for tag in tags])
+    return found

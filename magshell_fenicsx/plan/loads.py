@@ -28,7 +28,7 @@ from magshell_fenicsx.models.shell.parameters import (
     PointForce,
     Potential,
 )
-from magshell_fenicsx.models.shell.patterns import Pattern
+from magshell_fenicsx.models.shell.patterns import Inside, Pattern
 from magshell_fenicsx.plan.by_formula import ByFormula, function
 from magshell_fenicsx.plan.magnetisation import magnetisation
 from magshell_fenicsx.plan.moves import moves
@@ -40,7 +40,14 @@ SYMBOLIC = {name: getattr(ufl, name) for name in ("sin", "cos", "tan", "exp", "s
 SYMBOLIC |= {"log": ufl.ln, "abs": abs, "arctan2": ufl.atan2}
 
 
-def loads(case: Case, under: Mapping[str, str], turn: float, mirror: Mirror | None, own: tuple[OwnTerm, ...]) -> Loads:
+def loads(
+    case: Case,
+    under: Mapping[str, str],
+    turn: float,
+    mirror: Mirror | None,
+    own: tuple[OwnTerm, ...],
+    within: Mapping[str, Inside],
+) -> Loads:
     """What loads the shell.
 
     Parameters
@@ -54,6 +61,8 @@ def loads(case: Case, under: Mapping[str, str], turn: float, mirror: Mirror | No
         halves; the loads of an edge of the other half are left out.
     own
         See `surface_terms`.
+    within
+        Of `Plan`.
     """
     steps, magnetic = {step.name: step.load for step in case.programme}, case.magnetic
     forces, dead = dict[str, Force](), dict[str, tuple[DeadLoad, ...]]()
@@ -64,9 +73,9 @@ def loads(case: Case, under: Mapping[str, str], turn: float, mirror: Mirror | No
             here = (one for one in load.loads if not mirror or one.edge not in mirror.lost)
             dead[name] = tuple(_dead(one, f"{name}_potential_{i}", case, turn, mirror) for i, one in enumerate(here))
     turned = [load.to for load in case.loads_of(RotationSection)]
-    field = magnetisation(magnetic, case, turn, turned) if magnetic and "lambda_m" in steps else None
+    field = magnetisation(magnetic, case, turn, within, turned) if magnetic and "lambda_m" in steps else None
     pressure = "pressure" in steps or any("pressure" in load.hold for load in steps.values())
-    return Loads(pressure, forces, field, dead, own, natural=natural(case, turn), moves=moves(case, turn))
+    return Loads(pressure, forces, field, dead, own, natural=natural(case, turn, within), moves=moves(case, turn))
 
 
 def indented(case: Case, outline: Outline) -> dict[str, Array]:

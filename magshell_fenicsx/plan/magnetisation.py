@@ -1,6 +1,6 @@
 """The field section in the model's frame."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +13,7 @@ from magshell_fenicsx.case.surfaces import MeshSurface
 from magshell_fenicsx.case.taylor import Taylor
 from magshell_fenicsx.mesh.frame import rotation
 from magshell_fenicsx.models.shell.parameters import Magnetisation
-from magshell_fenicsx.models.shell.patterns import Components, InsideAndOutside, Pattern, radial, tangential
+from magshell_fenicsx.models.shell.patterns import Components, Inside, Pattern, WithinRims, radial, tangential
 from magshell_fenicsx.plan.turned import basis as turned_basis
 
 Array = NDArray[np.float64]
@@ -37,11 +37,15 @@ class FormulasInSpace:
         )
 
 
-def magnetisation(magnetic: MagneticSection, case: Case, turn: float, to: Sequence[Direction] = ()) -> Magnetisation:
+def magnetisation(
+    magnetic: MagneticSection, case: Case, turn: float, within: Mapping[str, Inside], to: Sequence[Direction] = ()
+) -> Magnetisation:
     """What is magnetised and how it is modelled, in a frame turned about e3 (rad).
 
     Parameters
     ----------
+    within
+        Of `Plan`.
     to
         Directions that the field turns to.
     """
@@ -56,9 +60,10 @@ def magnetisation(magnetic: MagneticSection, case: Case, turn: float, to: Sequen
     elif section.layers:
         remanent = layer_average(section.layers, turn)
     elif section.patches and not isinstance(case.shell, MeshSurface):
-        rest = section.patches["rest"].vector(turn)
-        inside = section.patches.get("dimple")
-        remanent = InsideAndOutside(case.dimple_half_width, inside.vector(turn), rest) if inside else rest
+        vectors = {name: direction.vector(turn) for name, direction in section.patches.items()}
+        rest = vectors.pop("rest")
+        rims = tuple((inside, vectors.get(name, rest)) for name, inside in within.items())
+        remanent = WithinRims(rims, rest) if vectors else rest
     else:
         remanent = section.vector(turn)
     along = magnetic.applied.vector(turn)

@@ -1,6 +1,6 @@
 """The natural shape of a case in the model's frame, and the symmetry that it leaves."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,7 @@ from magshell_fenicsx.case.surfaces import MeshSurface, PlateSurface
 from magshell_fenicsx.mesh.frame import rotation
 from magshell_fenicsx.mesh.mirror import Mirror
 from magshell_fenicsx.models.shell.natural import Natural, Varying, meridians
-from magshell_fenicsx.models.shell.patterns import InsideAndOutside
+from magshell_fenicsx.models.shell.patterns import Inside, WithinRims
 from magshell_fenicsx.plan.by_formula import ByFormula, function
 from magshell_fenicsx.plan.outline import Outline
 from magshell_fenicsx.plan.turning import scalar_turns
@@ -22,8 +22,8 @@ SAME = 1e-9  # of the largest value: differences that are rounding
 MERIDIAN = "meridian"
 
 
-def natural(case: Case, turn: float) -> Natural | None:
-    """The natural shape in a frame turned about e3 (rad); None if the case has none."""
+def natural(case: Case, turn: float, within: Mapping[str, Inside]) -> Natural | None:
+    """The natural shape in a frame turned about e3 (rad); None if the case has none; `within` is of `Plan`."""
     section = case.natural
     if section is None:
         return None
@@ -41,7 +41,7 @@ def natural(case: Case, turn: float) -> Natural | None:
         if isinstance(case.shell, MeshSurface):
             return vectors
         outside = vectors.get("rest", np.zeros(3))
-        return InsideAndOutside(case.dimple_half_width, vectors.get("dimple", outside), outside)
+        return WithinRims(tuple((inside, vectors.get(name, outside)) for name, inside in within.items()), outside)
 
     direction = along(case)
     pattern = meridians if direction == MERIDIAN else ByFormula([function(v) for v in direction], Q, R, vectors=True)

@@ -21,14 +21,15 @@ from magshell_fenicsx.case.surfaces import (
     Surface,
     TorusSurface,
 )
+from magshell_fenicsx.mesh.deviation import Deviated, Deviation
 from magshell_fenicsx.mesh.grading import Grading
 from magshell_fenicsx.mesh.grid import Grid
 from magshell_fenicsx.mesh.mirror import Y0, Mirror
-from magshell_fenicsx.mesh.msh import MeshFile, in_space, read_msh
+from magshell_fenicsx.mesh.msh import MeshFile, in_space, normals, read_msh
 from magshell_fenicsx.mesh.patch import Embedding, MeshError
 from magshell_fenicsx.mesh.revolved import Arc, Capped, Profile, Revolved, Segment, Spline
 from magshell_fenicsx.mesh.shapes import DiscShape, Shape, StripShape
-from magshell_fenicsx.mesh.sphere import Dimple, SphereEmbedding, flat
+from magshell_fenicsx.mesh.sphere import flat, sphere, upwards
 from magshell_fenicsx.plan.mirrors import grid_mirrors, lines_on, mesh_mirrors
 from magshell_fenicsx.plan.plan import Span
 
@@ -47,6 +48,8 @@ class Outline:
     ----------
     chart
         What is meshed, for a mirror plane in the model's frame or None, and element sizes (of grids).
+    normal
+        Chart -> outward unit normals.
     inverse
         Chart (2,) of a place (3,); of a mesh file the place itself.
     highest
@@ -61,18 +64,22 @@ class Outline:
     mirrors
         Its planes, but for those through e3 of what is `round`; of a mesh file for vectors that a plane should
         hold, and whether its edges suffice (see `mesh_mirrors`).
+    from_pole
+        Places -> length of the meridian from the pole; None but for a pole of a surface of revolution.
     span
         The meridian; None if it is closed, or the surface is none of revolution.
     """
 
     chart: Callable[[Mirror | None, Grading], Chart]
     embedding: Embedding
+    normal: Embedding
     inverse: Callable[[Array], Array]
     highest: Array | None
     edge: float = inf
     sphere: bool = False
     round: bool = False
     mirrors: Callable[[Sequence[Array], bool], Sequence[Mirror]] = lambda vectors, loosely: []
+    from_pole: Callable[[Array], Array] | None = None
     span: Span | None = None
 
     def on_half(self, chart: Array) -> Array:
@@ -91,7 +98,7 @@ class Outline:
         """Places (n, 3) all over the surface, with its centre, edges and axes among them."""
         shape = self.chart(None, ANY)
         if isinstance(shape, MeshFile):
-            return read_msh(shape, {}).nodes
+            return in_space(read_msh(shape, {}).nodes)
         t = np.linspace(0, 1, 41)
         if isinstance(shape, DiscShape):
             rho, theta = np.meshgrid(shape.reach * t, 2 * np.pi * t)
@@ -104,43 +111,63 @@ class Outline:
         return self.embedding(np.column_stack([x.ravel(), y.ravel()]))
 
     @property
+    def perfect(self) -> Embedding:
+        """Chart -> the surface without its imperfections."""
+        return self.embedding.perfect if isinstance(self.embedding, Deviated) else self.embedding
+
+    def deviated(self, deviations: tuple[Deviation, ...], circles: tuple[float, ...], largest: float) -> "Outline":
+        """The outline with imperfections; the curvature jumps on circles around the pole, `largest` cells show them."""
+        if not deviations:
+            return self
+        span = self.span and replace(
+            self.span,
+            embedding=Deviated(self.span.embedding, self.span.normal, deviations),
+            circles=circles,
+            largest=largest / 2,
+        )
+        return replace(self, embedding=Deviated(self.embedding, self.normal, deviations), span=span)
+
+    @property
     def disc(self) -> bool:
         """Whether it is of revolution about e3, up to its pole."""
         return self.edge < inf
 
 
-def outline(case: Case, defect: Dimple | None) -> Outline:
-    """The outline of a case's shell."""
+def outline(case: Case) -> Outline:
+    """The outline of a case's perfect shell."""
     shell = case.shell
     if isinstance(shell, MeshSurface):
-        file = MeshFile(shell.path, (shell.unit or 1.0) / shell.reference)
+        file = MeshFile(shell.path, (shell.unit or 1.0) / shell.reference, bool(shell.imperfections))
 
         def planes(vectors: Sequence[Array], loosely: bool) -> list[Mirror]:
             try:
-                return _either_half(mesh_mirrors(read_msh(file, {}), vectors, loosely=loosely))
+                bare = replace(file, normals=False)
+                return _either_half(mesh_mirrors(read_msh(bare, {}), vectors, loosely=loosely))
             except MeshError:  # for whoever builds it to report
                 return []
 
-        return Outline(lambda mirror, size: file, in_space, lambda x: x, None, mirrors=planes)
+        return Outline(lambda mirror, size: file, in_space, normals, lambda x: x, None, mirrors=planes)
     if isinstance(shell, ShellSection) and shell.width is not None:
         width = shell.width
         tip = np.array([1.0, 0.0])
-        return Outline(lambda m, size: StripShape(width, m is not None), flat, _plane, tip, mirrors=lambda *_: [Y0])
+        return Outline(
+            lambda m, size: StripShape(width, m is not None), flat, upwards, _plane, tip, mirrors=lambda *_: [Y0]
+        )
     if isinstance(shell, ShellSection) and shell.geometry == "disc":
-        return _disc(1.0, "rim", flat, _plane)
+        return _disc(1.0, "rim", flat, upwards, _plane)
     if isinstance(shell, ShellSection) or (isinstance(shell, CapSurface) and shell.hole is None):
         hemisphere = isinstance(shell, ShellSection)
         edge, name = (pi / 2, "equator") if hemisphere else (radians(shell.polar), "rim")  # type: ignore[union-attr]
-        return _disc(edge, name, SphereEmbedding(defect), _of_sphere, defect.phi_o if defect else None, sphere=True)
+        return _disc(edge, name, sphere, sphere, _of_sphere, sphere=True)
     if isinstance(shell, PlateSurface):
         high = np.array([1.0, shell.width / shell.reference])
-        return _grid(Grid((0.0, 0.0), (1.0, float(high[1])), 1.0), flat, lambda x: np.clip(x[:2], 0.0, high), high)
+        grid = Grid((0.0, 0.0), (1.0, float(high[1])), 1.0)
+        return _grid(grid, flat, upwards, lambda x: np.clip(x[:2], 0.0, high), high)
     profile, names = _profile(shell)
     if names[1] is None:
-        perfect = Capped(profile)
-        circle = defect.phi_o if defect else None
-        bent = _curvature(profile)
-        return _disc(profile.length, names[0], Capped(profile, defect), perfect.inverse, circle, curvature=bent)
+        capped, bent = Capped(profile), _curvature(profile)
+        drawn = _disc(profile.length, names[0], capped, capped.normal, capped.inverse, curvature=bent)
+        return replace(drawn, from_pole=capped.from_pole)
     return _ring(shell, profile, (names[0], names[1]))
 
 
@@ -154,7 +181,8 @@ def refuse_beside(name: str, x: Array, outline: Outline, R: float) -> None:
     """
     found = outline.inverse(x)
     there = x if len(found) == 3 else outline.embedding(found[None])[0]
-    if np.linalg.norm(there - x) > ON_SURFACE:
+    perfect = outline.perfect(found[None])[0] if len(found) == 2 else x
+    if min(float(np.linalg.norm(place - x)) for place in (there, perfect)) > ON_SURFACE:
         near = ", ".join(f"{c * R:.8g}" for c in there)
         raise CaseError(f"points.{name}: is not on the surface; a place near it that is: [{near}]")
 
@@ -163,14 +191,14 @@ def _disc(
     edge: float,
     name: str,
     embedding: Embedding,
+    normal: Embedding,
     inverse: Callable[[Array], Array],
-    circle: float | None = None,
     *,
     sphere: bool = False,
     curvature: float = 1.0,
 ) -> Outline:
     def chart(mirror: Mirror | None, size: Grading) -> Chart:
-        return DiscShape(edge, mirror is not None, circle, name)
+        return DiscShape(edge, mirror is not None, edge=name)
 
     def within(x: Array) -> Array:
         found = inverse(x)
@@ -180,8 +208,8 @@ def _disc(
     def place(chart: Array) -> tuple[float, float]:
         return float(np.hypot(*chart)), float(np.arctan2(chart[1], chart[0]))
 
-    span = Span(edge, circle, (None, name), embedding, place, curvature)
-    return Outline(chart, embedding, within, np.zeros(2), edge, sphere, round=True, span=span)
+    span = Span(edge, (), (None, name), embedding, normal, place, curvature)
+    return Outline(chart, embedding, normal, within, np.zeros(2), edge, sphere, round=True, span=span)
 
 
 def _ring(shell: Surface, profile: Profile, names: tuple[str, str]) -> Outline:
@@ -200,14 +228,18 @@ def _ring(shell: Surface, profile: Profile, names: tuple[str, str]) -> Outline:
         r, z = profile(profile.length - chart[:, 0]).T  # from its end: the normal points outwards
         return np.column_stack([r, 0 * r, z])
 
+    def normal(chart: Array) -> Array:
+        along_r, along_z = profile.tangent(profile.length - chart[:, 0]).T
+        return np.column_stack([along_z, 0 * along_z, -along_r])
+
     def place(chart: Array) -> tuple[float, float]:
         return profile.length - float(chart[1]), float(chart[0]) / rho
 
     span = None
     if glued == (True, False):
-        span = Span(profile.length, None, (names[1], names[0]), section, place, _curvature(profile))
+        span = Span(profile.length, (), (names[1], names[0]), section, normal, place, _curvature(profile))
     grid = Grid(low, high, 1.0, ("left", "right", *names), glued)
-    return _grid(grid, embedding, inverse, np.array(low if any(glued) else high), span)
+    return _grid(grid, embedding, embedding.normal, inverse, np.array(low if any(glued) else high), span)
 
 
 def _curvature(profile: Profile) -> float:
@@ -218,7 +250,12 @@ def _curvature(profile: Profile) -> float:
 
 
 def _grid(
-    grid: Grid, embedding: Embedding, inverse: Callable[[Array], Array], highest: Array, span: Span | None = None
+    grid: Grid,
+    embedding: Embedding,
+    normal: Embedding,
+    inverse: Callable[[Array], Array],
+    highest: Array,
+    span: Span | None = None,
 ) -> Outline:
     def chart(mirror: Mirror | None, size: Grading) -> Chart:
         through = lines_on(mirror, grid, embedding) if mirror else grid.through
@@ -227,7 +264,7 @@ def _grid(
     def planes(vectors: Sequence[Array], loosely: bool) -> list[Mirror]:
         return _either_half(grid_mirrors(grid, embedding))
 
-    return Outline(chart, embedding, inverse, highest, round=grid.glued[0], mirrors=planes, span=span)
+    return Outline(chart, embedding, normal, inverse, highest, round=grid.glued[0], mirrors=planes, span=span)
 
 
 def _either_half(planes: Sequence[Mirror]) -> list[Mirror]:

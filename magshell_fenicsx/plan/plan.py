@@ -1,7 +1,8 @@
 """What a scene is built from."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from math import inf
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,10 +12,12 @@ from magshell_fenicsx.mesh.grid import Grid, grid_mesh
 from magshell_fenicsx.mesh.mirror import Mirror, cut
 from magshell_fenicsx.mesh.msh import MeshFile, read_msh
 from magshell_fenicsx.mesh.patch import Embedding, PatchMesh
+from magshell_fenicsx.mesh.rimmed import RimmedGrid
 from magshell_fenicsx.mesh.shapes import Shape
 from magshell_fenicsx.mesh.triangulation import triangulate
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.parameters import Condition, Loads, Material
+from magshell_fenicsx.models.shell.patterns import Inside
 from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.plan.names import refuse_unfit
 
@@ -27,24 +30,28 @@ class Span:
     ----------
     length
         Of its chart, which starts at 0.
-    circle
-        Where the curvature jumps; None if nowhere.
+    circles
+        Where the curvature jumps.
     names
         Of its ends; None for the pole.
-    embedding
-        Chart (n, 2), its second coordinate 0 -> the plane of e1 and e3.
+    embedding, normal
+        Chart (n, 2), its second coordinate 0 -> the plane of e1 and e3, and the normal of the perfect surface there.
     place
         Chart (2,) of the surface -> parameter of this one and azimuth (rad).
     curvature
         The largest of the meridian over 1/R, at least 1.
+    largest
+        Size of cells that shows the imperfections.
     """
 
     length: float
-    circle: float | None
+    circles: tuple[float, ...]
     names: tuple[str | None, str]
     embedding: Embedding
+    normal: Embedding
     place: Callable[[NDArray[np.float64]], tuple[float, float]]
     curvature: float = 1.0
+    largest: float = inf
 
     def sample(self) -> NDArray[np.float64]:
         """Places (n, 3) along it, its ends among them."""
@@ -77,6 +84,8 @@ class Plan:
         One's own energies; `loads` has them too, after those of the case's parts.
     warning
         What is unphysical, if anything.
+    within
+        Name of the patch of each dimple -> whether places (n, 3) are within its rim.
     """
 
     material: Material
@@ -85,7 +94,7 @@ class Plan:
     meridian: Span | None
     mirror: Mirror | None
     azimuth: float
-    shape: Shape | Grid | MeshFile
+    shape: Shape | Grid | MeshFile | PatchMesh
     embedding: Embedding
     points: dict[str, NDArray[np.float64]]
     size: Size
@@ -97,6 +106,7 @@ class Plan:
     supports: tuple[str, ...] = ()
     reactions: bool = False
     warning: str | None = None
+    within: Mapping[str, Inside] = field(default_factory=dict)
 
     @property
     def axisymmetric(self) -> bool:
@@ -126,7 +136,12 @@ class Plan:
 
     def _made(self) -> PatchMesh:
         if isinstance(self.shape, MeshFile):
-            return read_msh(self.shape, self.points, self.mirror)
+            return replace(read_msh(self.shape, self.points, self.mirror), embedding=self.embedding)
+        if isinstance(self.shape, PatchMesh):
+            return replace(self.shape, embedding=self.embedding)
+        if isinstance(self.shape, RimmedGrid):
+            patch = triangulate(self.shape, self.size, self.points, self.embedding)
+            return cut(patch, self.mirror) if self.mirror else patch
         if isinstance(self.shape, Grid):
             patch = grid_mesh(self.shape, self.points, self.embedding)
             return cut(patch, self.mirror) if self.mirror else patch

@@ -1,8 +1,8 @@
 """From a case to what must be built for it, without building anything: the parts added up."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from math import radians
+from math import inf, radians
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,12 +19,17 @@ from magshell_fenicsx.mesh.grading import Grading
 from magshell_fenicsx.mesh.grid import Grid
 from magshell_fenicsx.mesh.mirror import CUT, Y0, Mirror
 from magshell_fenicsx.mesh.msh import MeshFile
-from magshell_fenicsx.mesh.sphere import Dimple
+from magshell_fenicsx.mesh.rimmed import RimmedGrid
+from magshell_fenicsx.mesh.shapes import DiscShape, StripShape
 from magshell_fenicsx.models.axisymmetric.meridian import graded_vertices
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.parameters import Condition, Held, Material
 from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.plan.account import account
+from magshell_fenicsx.plan.imperfections.flaw import Flaw, in_frame
+from magshell_fenicsx.plan.imperfections.registered import flaws
+from magshell_fenicsx.plan.imperfections.rims import MOST_RIMS, Spot, spots
+from magshell_fenicsx.plan.imperfections.symmetry import leaves
 from magshell_fenicsx.plan.limits import refuse_too_many, refuse_unbounded_fields, sources_beside
 from magshell_fenicsx.plan.loads import indented, loads, potentials, refuse_wide_patch
 from magshell_fenicsx.plan.names import refuse_unfit_ends
@@ -36,6 +41,7 @@ from magshell_fenicsx.plan.symmetry import Leaves, askew, left, mirror, unmirror
 
 Array = NDArray[np.float64]
 Points = dict[str, Array]
+SAME_RIM = 0.02  # of the element size
 
 
 def make_plan(case: Case, terms: Sequence[OwnTerm] = ()) -> Plan:
@@ -49,13 +55,16 @@ def make_plan(case: Case, terms: Sequence[OwnTerm] = ()) -> Plan:
         If the meridian has no such edge or point.
     """
     material = Material(case.shell.poisson_ratio, 1 / case.shell.R_over_h)
-    defect = Dimple(case.defect.amplitude * material.h, case.dimple_half_width) if case.defect else None
-    drawn = outline(case, defect)
+    perfect = outline(case)
+    found = flaws(case, perfect)
+    drawn = imperfect(perfect, found, 0.0)
     places = indented(case, drawn)
     sample = np.zeros((0, 3)) if isinstance(case.shell, MeshSurface) else drawn.sample()
     refuse_unbounded_fields(case, sample)
     energies = surface_terms(case, terms)
-    axisymmetric, plane = _symmetry(case, drawn, left(case, drawn, places, (*energies, *potentials(case))))
+    parts = left(case, drawn, places, (*energies, *potentials(case)))
+    parts += leaves(found, perfect, each=bool(case.patches))
+    axisymmetric, plane = _symmetry(case, drawn, parts)
     half = plane is not None
     turn, beyond = 0.0, plane
     if plane and drawn.round and plane.through_e3:  # the frame is turned into the plane
@@ -75,12 +84,16 @@ def make_plan(case: Case, terms: Sequence[OwnTerm] = ()) -> Plan:
     for point in dict.fromkeys(under.values()):
         there = (step.load for step in case.programme if under.get(step.name) == point)
         loaded.append((points[point], [load for load in there if isinstance(load, IndentationSection)]))
-    size = grading(case, drawn, material.h, defect, loaded)
+    local = [] if isinstance(case.shell, MeshSurface) else spots(found.items(), perfect, turn)
+    everywhere = min((flaw.size for flaw in found.values() if flaw.centre is None), default=inf)
+    size = grading(case, drawn, material.h, local, everywhere, loaded)
+    drawn = imperfect(perfect, found, turn)
     shape = drawn.chart(beyond, size)
     if isinstance(shape, Grid) and beyond:  # what a point needs, its image needs too
         images = [drawn.inverse(beyond.image(drawn.embedding(x[None])[0])) for x in points.values()]
         x, y = ((*shape.through[i], *(float(image[i]) for image in images)) for i in range(2))
         shape = replace(shape, through=(x, y))
+    shape = _matched(shape, local)
     span = drawn.span if axisymmetric else None
     if not span:
         _refuse_too_large(case, shape, size, half=half)
@@ -88,11 +101,13 @@ def make_plan(case: Case, terms: Sequence[OwnTerm] = ()) -> Plan:
     supports = tuple(name for name, condition in conditions.items() if condition != "free")
     if beyond:
         conditions = {name: c for name, c in conditions.items() if name not in beyond.lost} | {CUT: "symmetry"}
-    all_loads = loads(case, under, turn, beyond, energies)
+    within = {name: in_frame(found[key].inside, turn) for name, key in case.dimples.items()}
+    all_loads = loads(case, under, turn, beyond, energies, within)
     if span:
         refuse_unfit_ends([name for name in span.names if name], points, conditions, all_loads)
     model = "meridian" if axisymmetric else f"{'half' if half else 'full'} {case.model}"
     included, left_out = account(case, all_loads, model, plane)
+    included += [f"{key}: {flaw.account}" for key, flaw in found.items() if flaw.account]
     return Plan(
         material=material,
         loads=all_loads,
@@ -109,6 +124,7 @@ def make_plan(case: Case, terms: Sequence[OwnTerm] = ()) -> Plan:
         thickness=_thickness(case, turn),
         length=case.shell.reference,
         own=tuple(terms),
+        within=within,
         supports=supports,
         reactions=bool(all_loads.moves) if case.reactions is None else case.reactions,
         warning=sources_beside(case, sample if len(sample) else drawn.sample()),
@@ -136,7 +152,35 @@ def meridian_vertices(plan: Plan, refinement: float) -> Array:
     assert span
     pole = span.names[0] is None
     h = plan.material.h / span.curvature
-    return graded_vertices(span.length, span.circle, h, refinement=refinement, axis=pole)
+    return graded_vertices(span.length, span.circles, h, refinement=refinement, axis=pole, largest=span.largest)
+
+
+def imperfect(perfect: Outline, found: Mapping[str, Flaw], turn: float) -> Outline:
+    """The shell with its imperfections, in a frame turned about e3 (rad)."""
+    circles = tuple(flaw.reach for flaw in found.values() if flaw.rim) if perfect.disc else ()
+    shown = min((flaw.size for flaw in found.values()), default=inf)
+    return perfect.deviated(tuple(in_frame(flaw.deviation, turn) for flaw in found.values()), circles, shown)
+
+
+def _matched(shape: Chart, local: Sequence[Spot]) -> Chart | RimmedGrid:
+    """The shape with element edges along the rims."""
+    circles = tuple(dict.fromkeys(spot.radius for spot in local if spot.circle and spot.jumps))
+    rims = _different([(spot.rim, spot.size) for spot in local if spot.rim is not None])
+    rims = rims if len(rims) <= MOST_RIMS else ()
+    if isinstance(shape, Grid):
+        return RimmedGrid(shape, rims) if rims else shape
+    if isinstance(shape, DiscShape):
+        return replace(shape, circles=tuple(r for r in circles if r < shape.radius), rims=rims)
+    return replace(shape, rims=rims) if isinstance(shape, StripShape) else shape
+
+
+def _different(rims: Sequence[tuple[Array, float]]) -> tuple[Array, ...]:
+    """Curves with the element size there; of several that are nearly the same, the first."""
+    kept: list[Array] = []
+    for rim, size in rims:
+        if all(np.abs(rim - other).max() > SAME_RIM * size for other in kept):
+            kept.append(rim)
+    return tuple(kept)
 
 
 def _symmetry(case: Case, drawn: Outline, parts: list[Leaves]) -> tuple[bool, Mirror | None]:
@@ -186,7 +230,7 @@ def _place(case: Case, drawn: Outline, name: str, place: Array, turn: float, hal
     return drawn.on_half(found) if half else found
 
 
-def _refuse_too_large(case: Case, shape: Chart, size: Grading, *, half: bool) -> None:
+def _refuse_too_large(case: Case, shape: Chart | RimmedGrid, size: Grading, *, half: bool) -> None:
     if isinstance(shape, MeshFile):
         return
     cells = shape.cells * (0.5 if half else 1.0) if isinstance(shape, Grid) else size.cells(shape)

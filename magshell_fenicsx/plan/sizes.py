@@ -12,27 +12,31 @@ from magshell_fenicsx.case.loads.indentation import IndentationSection
 from magshell_fenicsx.case.loads.pressure import PressureSection
 from magshell_fenicsx.case.surfaces import MeshSurface
 from magshell_fenicsx.mesh.grading import Disc, Feature, Grading, Line, Ring
-from magshell_fenicsx.mesh.sphere import Dimple
+from magshell_fenicsx.plan.imperfections.rims import Spot, images
 from magshell_fenicsx.plan.outline import Outline
 
 Array = NDArray[np.float64]
 Loaded = tuple[Array, Sequence[IndentationSection]]  # place in the chart, and the indentations there
 
 
-def grading(case: Case, outline: Outline, h: float, defect: Dimple | None, loaded: Sequence[Loaded]) -> Grading:
+def grading(
+    case: Case, outline: Outline, h: float, spots: Sequence[Spot], everywhere: float, loaded: Sequence[Loaded]
+) -> Grading:
     """Sizes for 1e-4 in k_d and 1e-3 in F at degree 4; the case's own size is everywhere the same.
 
     Parameters
     ----------
+    spots, everywhere
+        The local imperfections, and the largest size that shows the others.
     loaded
         The concentrated loads.
     """
     if case.mesh.size is not None or isinstance(case.shell, MeshSurface):
         return Grading([], _uniform(case, h))
-    features = [*_rim(case, outline, h), *(_dimple(case, h, defect) if defect else [])]
+    features = [*_rim(case, outline, h), *_imperfections(case, outline, h, spots)]
     for place, indentations in loaded:
         features += _load(case, h, place, indentations)
-    return Grading(features, _largest(case, outline, h, defect) / case.mesh.refinement)
+    return Grading(features, min(_largest(case, outline, h, local=bool(spots)), everywhere) / case.mesh.refinement)
 
 
 def _uniform(case: Case, h: float) -> float:
@@ -41,14 +45,14 @@ def _uniform(case: Case, h: float) -> float:
     return size / case.mesh.refinement
 
 
-def _largest(case: Case, outline: Outline, h: float, defect: Dimple | None) -> float:
+def _largest(case: Case, outline: Outline, h: float, *, local: bool) -> float:
     if outline.grid:
         return min(2 * sqrt(h), 0.35)
     if not outline.disc or case.shell.geometry == "disc":
         return min(0.25, 0.5 * (case.width or 1.0))
     dead = 2 * sqrt(h) if case.loads_of(DeadSection) else 0.35
-    # without a dimple a sphere buckles anywhere, in waves of about 3.6 sqrt(Rh)
-    live = 1.2 * sqrt(h) if defect is None and case.loads_of(PressureSection) else 0.35
+    # without a local imperfection a sphere buckles anywhere, in waves of about 3.6 sqrt(Rh)
+    live = 1.2 * sqrt(h) if not local and case.loads_of(PressureSection) else 0.35
     return min(dead, live) if dead < 0.35 else live
 
 
@@ -72,9 +76,13 @@ def _rim(case: Case, outline: Outline, h: float) -> list[Feature]:
     return [Ring(outline.edge, indented * sqrt(h) / case.mesh.refinement, _growth(case))]
 
 
-def _dimple(case: Case, h: float, defect: Dimple) -> list[Feature]:
-    size = 0.45 * sqrt(h) / case.mesh.refinement
-    return [Disc((0.0, 0.0), defect.phi_o + 0.7 * sqrt(h), size, _growth(case))]
+def _imperfections(case: Case, outline: Outline, h: float, spots: Sequence[Spot]) -> list[Feature]:
+    """Small elements on each and a little around it."""
+    return [
+        Disc((float(x), float(y)), spot.radius + 0.7 * sqrt(h), spot.size / case.mesh.refinement, _growth(case))
+        for spot in spots
+        for x, y in images(spot, outline)
+    ]
 
 
 def _load(case: Case, h: float, place: Array, indentations: Sequence[IndentationSection]) -> list[Feature]:

@@ -32,6 +32,7 @@ from magshell_fenicsx.simulate.adapt.ending import NoResult
 from magshell_fenicsx.simulate.adapt.tolerance import adapted
 from magshell_fenicsx.simulate.barrier import barrier
 from magshell_fenicsx.simulate.follow import follow
+from magshell_fenicsx.simulate.perfect import with_modes
 from magshell_fenicsx.simulate.record import Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.sensitivity import fold_at, sensitivities
@@ -97,6 +98,7 @@ def _run(case: Case, folder: Path | None, comm: MPI.Comm, say: Say, tell: Say, w
     def doing(what: str) -> None:
         tell(waiting(what, time.perf_counter() - start))
 
+    with_modes(case, comm)
     found = _mesh_for_tolerance(case, folder, comm, say, doing)
     doing("mesh and kernels")
     scene = found.choice.scene(case, comm) if found else Scene(case, comm)

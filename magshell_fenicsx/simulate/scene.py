@@ -11,6 +11,8 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.imperfections.modes import ModesSection
+from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.continuation.journal import Journal, NoJournal
 from magshell_fenicsx.continuation.listener import NoProgress, Progress
 from magshell_fenicsx.continuation.newton import BorderedNewton
@@ -69,6 +71,10 @@ class Scene:
         terms: Sequence[OwnTerm] = (),
     ) -> None:
         start = time.perf_counter()
+        if any(isinstance(s, ModesSection) and not (s.file or s.shapes) for s in case.imperfections.values()):
+            raise CaseError(
+                "shell.imperfections: kind: modes: compute them first, by simulate.perfect.with_modes(case, comm)"
+            )
         self.case, self.plan, self.comm = case, plan or make_plan(case, terms), comm
         self.model: ShellModel | MeridianModel | SolidModel
         if self.plan.axisymmetric:

@@ -11,23 +11,19 @@ from dolfinx.la import InsertMode
 
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.terms import FormTerm
-from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.continuation.fold import Fold, Guess, find_fold, sensitivity
-from magshell_fenicsx.continuation.system import State, Vector
+from magshell_fenicsx.continuation.system import Vector
 from magshell_fenicsx.models.axisymmetric import jets
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.shell.parameters import Magnetisation
-from magshell_fenicsx.models.shell.patterns import Array, InsideAndOutside, Pattern
+from magshell_fenicsx.models.shell.patterns import Array, Pattern, WithinRims
 from magshell_fenicsx.models.shell.terms import TermFactory
 from magshell_fenicsx.models.solid.model import SolidModel
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.scene import Scene
+from magshell_fenicsx.simulate.shape_sensitivity import to_imperfections
 from magshell_fenicsx.simulate.stage import Stage, plain
 from magshell_fenicsx.simulate.steps import stage_of
-from magshell_fenicsx.simulate.transfer import same_mesh, transfer
-
-DEFECT = "defect.amplitude"
-DEFECT_STEP = 1e-3  # in delta/h; central differences of a smooth residual
 
 
 def fold_at(scene: Scene, record: Record) -> Fold:
@@ -64,9 +60,9 @@ def sensitivities(scene: Scene, fold: Fold, record: Record | None = None) -> dic
     Derivatives by the name of the parameter, with all others fixed:
 
     - every other amplitude of the scene ("lambda_m", "force", that of a user-defined term, ...);
-    - "defect.amplitude": the dimple's depth delta/h;
-    - "remanence dimple", "remanence rest": a relative change of the remanence of one patch, within the
-      dimple's rim or outside it ("remanence" where there is no dimple). Their sum is lambda_m times
+    - "defect.amplitude", "imperfections.0.width", ...: see `shape_sensitivity`;
+    - "remanence dimple", "remanence rest": a relative change of the remanence of one patch, within a
+      dimple's rim or outside all ("remanence" where there is no dimple). Their sum is lambda_m times
       the derivative in lambda_m.
     """
     stage = stage_at(scene, record) if record else plain(scene)
@@ -75,30 +71,7 @@ def sensitivities(scene: Scene, fold: Fold, record: Record | None = None) -> dic
     by_patch = _remanence_columns(scene, replace(fold, state=stage.leave(state)))
     columns |= {name: stage.padded(column) for name, column in by_patch.items()}
     found = {name: sensitivity(system, fold, column) for name, column in columns.items()}
-    return found | ({DEFECT: _to_defect(stage, fold)} if scene.case.defect else {})
-
-
-def _to_defect(stage: Stage, fold: Fold) -> float:
-    """The derivative in delta/h by central differences of the residual; only r0 on the mesh depends on delta."""
-
-    scene, size = stage.scene, stage.scene.model.system.size
-
-    def out_of_balance(change: float) -> float:
-        other = Scene(deepened(scene.case, change), scene.comm, terms=scene.plan.own)
-        assert same_mesh(scene, other)
-        vectors = (fold.state.u, fold.left)
-        u, left = (np.concatenate([transfer(scene, other, v[:size]), v[size:]]) for v in vectors)
-        moved, system = replace(fold, state=State(u, fold.state.mu), left=left), stage.on(other).newton.system
-        return sensitivity(system, moved, system.residual(u, fold.state.mu))
-
-    return (out_of_balance(DEFECT_STEP) - out_of_balance(-DEFECT_STEP)) / (2 * DEFECT_STEP)
-
-
-def deepened(case: Case, change: float) -> Case:
-    """The case with its dimple deeper by `change` thicknesses."""
-    assert case.defect
-    defect = case.defect.model_copy(update={"amplitude": case.defect.amplitude + change})
-    return case.model_copy(update={"shell": case.shell.model_copy(update={"defect": defect})})
+    return found | to_imperfections(stage, fold)
 
 
 @dataclass(frozen=True)
@@ -106,7 +79,7 @@ class _Within:
     """A remanence in one patch, zero elsewhere."""
 
     whole: Array | Pattern
-    patch: InsideAndOutside
+    patch: WithinRims
 
     def __call__(self, r0: Array, n0: Array) -> Array:
         vectors = self.whole(r0, n0) if callable(self.whole) else self.whole
@@ -118,10 +91,15 @@ def _remanence_columns(scene: Scene, fold: Fold) -> dict[str, Vector]:
     field = scene.model.loads.magnetic
     if field is None:
         return {}
-    if not scene.case.defect:
+    within, one = scene.plan.within, np.ones(3)
+    if not within:
         return {"remanence": _magnetic_column(scene, fold, field)}
-    rim, one = scene.case.dimple_half_width, np.ones(3)
-    patches = {"dimple": InsideAndOutside(rim, one, 0 * one), "rest": InsideAndOutside(rim, 0 * one, one)}
+
+    def only(patch: str) -> WithinRims:
+        rims = tuple((inside, one if name == patch else 0 * one) for name, inside in within.items())
+        return WithinRims(rims, one if patch == "rest" else 0 * one)
+
+    patches = {patch: only(patch) for patch in (*within, "rest")}
     return {
         f"remanence {name}": _magnetic_column(scene, fold, replace(field, remanent=_Within(field.remanent, patch)))
         for name, patch in patches.items()

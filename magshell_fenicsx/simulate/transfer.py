@@ -8,8 +8,9 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.system import Vector
+from magshell_fenicsx.mesh.deviation import Deviated
 from magshell_fenicsx.mesh.shapes import DiscShape
-from magshell_fenicsx.mesh.sphere import SphereEmbedding
+from magshell_fenicsx.mesh.sphere import sphere
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.solid.model import SolidModel
 from magshell_fenicsx.simulate.scene import Scene
@@ -75,7 +76,11 @@ def same_mesh(source: Scene, target: Scene) -> bool:
 
 def _matching(source: Scene, target: Scene) -> NDArray[np.int64] | None:
     """The number of each node of this rank among all nodes of the source; None on all ranks if the nodes differ."""
-    comm, nodes, wanted = source.model.system.comm, _all_nodes(source), chart(target)
+    return matching(_all_nodes(source), chart(target), source.model.system.comm)
+
+
+def matching(nodes: Array, wanted: Array, comm: MPI.Comm = MPI.COMM_SELF) -> NDArray[np.int64] | None:
+    """The number of each of this rank's places `wanted` among all `nodes`; None on all ranks if they differ."""
     distance, number = scipy.spatial.cKDTree(nodes).query(wanted)
     equal = comm.allreduce(len(wanted)) == len(nodes) and comm.allreduce(distance.max(initial=0.0), MPI.MAX) < ROUNDING
     return np.asarray(number) if equal else None
@@ -134,10 +139,10 @@ def _stretch(source: Scene, target: Scene) -> _Stretch | None:
     rims, edges = [], []
     for scene in (target, source):
         embedding, shape = scene.plan.embedding, scene.plan.shape
-        if not isinstance(embedding, SphereEmbedding) or embedding.defect is None:
+        spherical = isinstance(embedding, Deviated) and embedding.perfect is sphere
+        if not spherical or not isinstance(shape, DiscShape) or len(shape.circles) != 1 or shape.rims:
             return None
-        assert isinstance(shape, DiscShape)
-        rims.append(embedding.defect.phi_o)
+        rims.append(shape.circles[0])
         edges.append(shape.radius)
     return _Stretch(rims[0], rims[1], edges[0]) if abs(edges[0] - edges[1]) < ROUNDING else None
 

@@ -11,10 +11,10 @@ from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.continuation.fold import Fold, Guess, find_fold
 from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
-from magshell_fenicsx.models.shell.patterns import InsideAndOutside
+from magshell_fenicsx.models.shell.patterns import WithinRims
 from magshell_fenicsx.run.run import run
 from magshell_fenicsx.simulate.scene import Scene
-from magshell_fenicsx.simulate.sensitivity import DEFECT, sensitivities
+from magshell_fenicsx.simulate.sensitivity import sensitivities
 
 MERIDIAN = ["magnetic.lambda_m=0.001"]
 HALF = [*MERIDIAN, "symmetry=half", "mesh.degree=3", "mesh.refinement=0.3", "magnetic.applied.polar=30"]
@@ -47,7 +47,7 @@ def test_field_and_defect(settings: list[str]) -> None:
     found = sensitivities(*fold_of(*settings))
     for name, key, value, step in (
         ("lambda_m", "magnetic.lambda_m", 0.001, 5e-5),
-        (DEFECT, "shell.defect.amplitude", 1.64, 0.02),
+        ("defect.amplitude", "shell.defect.amplitude", 1.64, 0.02),
     ):
         expected = derivative(lambda d, k=key, v=value: knockdown(*settings, f"{k}={v + d}"), step)  # type: ignore[misc]
         assert found[name] == pytest.approx(expected, rel=1e-4), name
@@ -71,10 +71,10 @@ def test_remanence_of_the_dimple() -> None:
     model, field = scene.model, scene.model.loads.magnetic
     assert isinstance(model, MeridianModel)
     assert field
-    rim, B = scene.case.dimple_half_width, np.array([0.0, 0.0, 1.0])
+    rim, B = scene.plan.within["dimple"], np.array([0.0, 0.0, 1.0])
 
     def stronger(change: float) -> float:
-        loads = replace(model.loads, magnetic=replace(field, remanent=InsideAndOutside(rim, (1 + change) * B, B)))
+        loads = replace(model.loads, magnetic=replace(field, remanent=WithinRims(((rim, (1 + change) * B),), B)))
         other = MeridianModel(model.meridian, model.material, model.degree, model.conditions, loads)
         return find_fold(BorderedNewton(other.system), Guess(fold.state, fold.phi), "pressure").value
 
@@ -85,4 +85,4 @@ def test_remanence_of_the_dimple() -> None:
 def test_without_a_field_only_the_defect_counts() -> None:
     """No other amplitude is there, and nothing is magnetised."""
     scene, fold = fold_of("magnetic.lambda_m=0")
-    assert list(sensitivities(scene, fold)) == [DEFECT]
+    assert list(sensitivities(scene, fold)) == ["defect.amplitude", "defect.width"]

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from math import sqrt
+from math import inf, sqrt
 
 import basix.ufl
 import numpy as np
@@ -101,29 +101,34 @@ def make_meridian(
     return Meridian(domain, axis, ends, embedding, points or {"pole": (0.0, 0.0)}, curvature)
 
 
-def graded_vertices(end: float, circle: float | None, h: float, *, refinement: float = 1.0, axis: bool = True) -> Array:
+def graded_vertices(
+    end: float, circles: Sequence[float], h: float, *, refinement: float = 1.0, axis: bool = True, largest: float = inf
+) -> Array:
     """Vertices for 1e-7 in k_d at degree 4: cells of a fraction of sqrt(h), finer on the axis, if 0 is there.
 
     Parameters
     ----------
     end
         Value of the parameter at the outer edge.
-    circle
-        Where the curvature jumps, the rim of a dimple: a vertex is put there.
+    circles
+        Where the curvature jumps, rims of dimples: a vertex is put there.
     h
         Thickness over R.
+    largest
+        Of the cells, whatever the thickness.
 
     Notes
     -----
     A point force bends the shell like s^2 log s. On the axis the cells shrink to a thickness
     whatever the refinement: the logarithmic stretch under an ideal point has no limit.
     """
-    largest, smallest, growth = 0.2 * sqrt(h) / refinement, h, 0.3 / refinement
+    smallest, growth = h, 0.3 / refinement
+    largest = min(0.2 * sqrt(h), largest) / refinement
 
     def size(s: Array) -> Array:
         return np.minimum(smallest + growth * s, largest) if axis else np.full_like(s, largest)
 
-    corners = [0.0, end] if circle is None or circle >= end else [0.0, circle, end]
+    corners = [0.0, *sorted({circle for circle in circles if circle < end}), end]
     return _equidistributed(corners, size)
 
 

@@ -16,6 +16,7 @@ FINER = 2  # degrees of a load by formula above that of the displacement: no par
 INSIDE = 1e-10  # of the way from a node to the middle of its cell
 # (cells, nodes, 3) positions r0 and normals n0 -> (cells, nodes, 3) vectors
 Pattern = Callable[[Array, Array], Array]
+Inside = Callable[[Array], NDArray[np.bool_]]  # places (n, 3) -> whether they are within a rim
 
 
 def radial(r0: Array, n0: Array) -> Array:
@@ -44,17 +45,18 @@ class Components:
 
 
 @dataclass(frozen=True)
-class InsideAndOutside:
-    """One vector within the colatitude `phi_o` (rad), another in the rest; the rim separates cells."""
+class WithinRims:
+    """A vector within each rim, another in the rest; rims separate cells, and the first of two that overlap counts."""
 
-    phi_o: float
-    inside: Array
+    within: tuple[tuple[Inside, Array], ...]
     outside: Array
 
     def __call__(self, r0: Array, n0: Array) -> Array:
-        centre = r0.mean(axis=1, keepdims=True)
-        phi = np.arctan2(np.hypot(centre[..., 0], centre[..., 1]), centre[..., 2])
-        return np.broadcast_to(np.where(phi[..., None] < self.phi_o, self.inside, self.outside), r0.shape)
+        centre = r0.mean(axis=1)
+        found = np.tile(self.outside, (len(r0), 1))
+        for inside, vector in reversed(self.within):
+            found[inside(centre)] = vector
+        return np.broadcast_to(found[:, None], r0.shape)
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.run.rows import RowMaker
 from magshell_fenicsx.run.summary import Result
 from magshell_fenicsx.simulate.follow import follow
+from magshell_fenicsx.simulate.perfect import with_modes
 from magshell_fenicsx.simulate.record import Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.studies.study.iteration import measured, timed
@@ -69,7 +70,7 @@ KINDS: dict[str, Callable[[Scene, list[str]], Report]] = {"path": path, "iterati
 def main(kind: str, case: str, settings: str, results: str) -> None:
     """Build the scene of a case, do the work, print the times."""
     comm = MPI.COMM_WORLD
-    scene = Scene(Case.load(case, json.loads(settings)), comm)
+    scene = Scene(with_modes(Case.load(case, json.loads(settings)), comm), comm)
     report = KINDS[kind](scene, json.loads(results))
     if comm.rank == 0:
         model = scene.model

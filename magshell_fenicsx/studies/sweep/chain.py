@@ -19,6 +19,7 @@ from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.output.store.table import Row
 from magshell_fenicsx.plan.planner import make_plan
 from magshell_fenicsx.run.run import Result, run
+from magshell_fenicsx.simulate.perfect import with_modes
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.studies.sweep.axes import Axis, along
 from magshell_fenicsx.studies.sweep.continuation import Continuation
@@ -70,7 +71,7 @@ def _chains_of(line: list[int], key: str, points: Sequence[SweepPoint], missing:
     """The missing points along the axis, as one chain if their folds can be followed."""
     wanted = [Link(n, float(points[n].values[key]), points[n].case) for n in line if n in missing]
     one_mesh = key.startswith("magnetic.")  # a solid's state cannot be transferred to another mesh
-    followed = all(_has_knockdown(link.case) and (one_mesh or link.case.model == "shell") for link in wanted)
+    followed = all(has_knockdown(link.case) and (one_mesh or link.case.model == "shell") for link in wanted)
     if len(wanted) < 2 or not followed:
         return [[link] for link in wanted]
     common = min((_symmetry(points[number].case) for number in line), key=SYMMETRIES.index)
@@ -93,7 +94,7 @@ def run_chain(chain: Chain) -> Iterator[tuple[int, Outcome]]:
 def _by_fold(continuation: Continuation, link: Link, start: float) -> tuple[Outcome | None, int]:
     """The outcome, or None if the fold cannot be followed; and the number of factorisations."""
     try:
-        scene = Scene(link.case, MPI.COMM_SELF)
+        scene = Scene(with_modes(link.case, MPI.COMM_SELF), MPI.COMM_SELF)
     except MeshError:
         return None, 0
     factorisation = scene.newton.factorisation
@@ -101,7 +102,7 @@ def _by_fold(continuation: Continuation, link: Link, start: float) -> tuple[Outc
         fold = continuation.follow(link.at, scene)
     except FoldLost:
         return None, factorisation.count
-    result = Result(scene, fold.state, [_row(scene, fold)])
+    result = Result(scene, fold.state, [fold_row(scene, fold)])
     return outcome_of(result, "fold", factorisation.count, time.perf_counter() - start), factorisation.count
 
 
@@ -126,7 +127,8 @@ def _begun(at: float, result: Result) -> Continuation | None:
         return None
 
 
-def _row(scene: Scene, fold: Fold) -> Row:
+def fold_row(scene: Scene, fold: Fold) -> Row:
+    """A fold as a row of path.csv."""
     return {
         "label": "fold",
         "amplitude": fold.name,
@@ -137,7 +139,8 @@ def _row(scene: Scene, fold: Fold) -> Row:
     }
 
 
-def _has_knockdown(case: Case) -> bool:
+def has_knockdown(case: Case) -> bool:
+    """Whether its result is a fold of the pressure that can be followed to another case."""
     loading = case.loading
     # with a tolerance each point has its own mesh; a mesh file has no chart in which states are transferred
     by_one_mesh = case.mesh.tolerance is None and not isinstance(case.shell, MeshSurface)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from magshell_fenicsx.continuation.fold import Fold, FoldLost, Guess, find_fold, predict_fold
-from magshell_fenicsx.continuation.system import State, dot
+from magshell_fenicsx.continuation.system import State, Vector, dot
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.transfer import transfer
 
@@ -31,7 +31,7 @@ class Continuation:
 
     def __init__(self, p: float, scene: Scene, state: State) -> None:
         fold = find_fold(scene.newton, Guess(state), "pressure")
-        _check(scene, fold, fold)
+        refuse_later(scene, fold, fold.phi)
         self._known, self._scene = [(p, fold)], scene
 
     def follow(self, p: float, scene: Scene) -> Fold:
@@ -47,7 +47,7 @@ class Continuation:
         others = {**given, **({"lambda_m": scene.case.lambda_m} if "lambda_m" in given else {})}
         guess = predict_fold(scene.newton.system, known, p, others)
         fold = find_fold(scene.newton, guess, "pressure")
-        _check(scene, fold, known[-1][1])
+        refuse_later(scene, fold, known[-1][1].phi)
         self._known, self._scene = [*known, (p, fold)][-KEPT:], scene
         return fold
 
@@ -56,9 +56,20 @@ class Continuation:
         return replace(fold, state=State(u, fold.state.mu), phi=phi)
 
 
-def _check(scene: Scene, fold: Fold, last: Fold) -> None:
-    """Reject a fold that is not the first instability under growing pressure, as far as this state shows."""
-    comm, a, b = scene.newton.system.comm, fold.phi, last.phi
+def refuse_later(scene: Scene, fold: Fold, expected: Vector) -> None:
+    """Reject a fold that is not the first instability under growing pressure, as far as this state shows.
+
+    Parameters
+    ----------
+    expected
+        The null vector of the fold that it was continued from.
+
+    Raises
+    ------
+    FoldLost
+        If its null vector is another, it is no maximum, or the shell is unstable there in another direction.
+    """
+    comm, a, b = scene.newton.system.comm, fold.phi, expected
     if dot(comm, a, b) < LEAST_COSINE * np.sqrt(dot(comm, a, a) * dot(comm, b, b)):
         raise FoldLost("another fold was found")
     if fold.value <= 0 or fold.curvature >= 0:

@@ -49,6 +49,8 @@ class Outcome:
         only this point.
     factorisations
         Factorisations of the model's tangent, including failed attempts; without those for excluded modes.
+    cpu_s
+        CPU time of a sample of an ensemble.
     """
 
     knockdown: float | None
@@ -60,6 +62,7 @@ class Outcome:
     found: Found
     factorisations: int
     barrier: float | None = None
+    cpu_s: float = 0.0
 
 
 def outcome_of(result: Result, found: Found, factorisations: int, wall_s: float) -> Outcome:

@@ -3,16 +3,17 @@
 from dataclasses import dataclass
 
 import numpy as np
+from conftest import spherical
 
 from magshell_fenicsx.continuation.events import Instability, instabilities
 from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.path import Path, StepOptions
 from magshell_fenicsx.continuation.point import Point
 from magshell_fenicsx.continuation.system import State
-from magshell_fenicsx.mesh.sphere import Dimple, SphereEmbedding
 from magshell_fenicsx.models.axisymmetric.meridian import graded_vertices, make_meridian
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.shell.parameters import Condition, Force, Loads, Magnetisation, Material
+from magshell_fenicsx.plan.imperfections.dimple import Dimple
 
 E3 = np.array([0.0, 0.0, 1.0])
 ALONG_AXIS = Magnetisation(E3, E3)
@@ -33,11 +34,9 @@ def hemisphere(
     """A hemisphere with a dimple of depth (over h) and dimensionless width."""
     h = 1 / R_over_h
     phi_o = dimple[1] * np.sqrt(h) / (12 * (1 - nu**2)) ** 0.25 if dimple else None
-    defect = Dimple(dimple[0] * h, phi_o) if dimple else None
-    vertices = graded_vertices(np.pi / 2, phi_o, h, refinement=refinement)
-    return MeridianModel(
-        make_meridian(SphereEmbedding(defect), vertices), Material(nu, h), degree, {"rim": condition}, loads, sigma
-    )
+    placed = spherical(Dimple(dimple[0] * h, phi_o) if dimple and phi_o else None)
+    vertices = graded_vertices(np.pi / 2, [phi_o] if phi_o else [], h, refinement=refinement)
+    return MeridianModel(make_meridian(placed, vertices), Material(nu, h), degree, {"rim": condition}, loads, sigma)
 
 
 def unloaded(model: MeridianModel) -> State:

@@ -5,11 +5,11 @@ import pytest
 from conftest import hemisphere as triangulated
 from meridian_scenes import E3, hemisphere
 
-from magshell_fenicsx.mesh.sphere import Dimple
 from magshell_fenicsx.models.axisymmetric.revolution import Revolution
 from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.shell.parameters import Loads, Magnetisation, Material
-from magshell_fenicsx.models.shell.patterns import InsideAndOutside, tangential
+from magshell_fenicsx.models.shell.patterns import WithinRims, tangential
+from magshell_fenicsx.plan.imperfections.dimple import Dimple
 
 Array = np.ndarray
 DIMPLE = Dimple(0.05, 0.5)
@@ -26,7 +26,7 @@ def displacement(phi: Array) -> tuple[Array, Array]:
         Magnetisation(E3, E3, "second"),
         Magnetisation(tangential, E3, "second_consistent", law="rotation"),
         Magnetisation(tangential, E3, gradient=np.diag([0.5, 0.5, -1.0]), law="rotation"),
-        Magnetisation(InsideAndOutside(0.5, -E3, E3), E3, gradient=np.diag([0.5, 0.5, -1.0])),
+        Magnetisation(WithinRims(((Dimple(0.05, 0.5).within, -E3),), E3), E3, gradient=np.diag([0.5, 0.5, -1.0])),
     ],
 )
 def test_energies_and_volume(field: Magnetisation) -> None:

@@ -8,9 +8,9 @@ from magshell_fenicsx import Case, Scene
 from magshell_fenicsx.case.source import Source
 from magshell_fenicsx.continuation.events import critical_mode
 from magshell_fenicsx.continuation.system import State
-from magshell_fenicsx.mesh.sphere import Dimple
 from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.shell.parameters import Loads, Material
+from magshell_fenicsx.plan.imperfections.dimple import Dimple
 from magshell_fenicsx.simulate.follow import follow
 
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from conftest import hemisphere
 
-from magshell_fenicsx.mesh.sphere import Dimple
 from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.shell.parameters import Loads, Magnetisation, Material
+from magshell_fenicsx.plan.imperfections.dimple import Dimple
 
 Shells = Callable[..., ShellModel]
 

@@ -6,10 +6,10 @@ from conftest import hemisphere
 
 from magshell_fenicsx.case.expressions import formula
 from magshell_fenicsx.case.fields import Layer, layer_average
-from magshell_fenicsx.mesh.sphere import Dimple
 from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.shell.parameters import Loads, Magnetisation, Material
-from magshell_fenicsx.models.shell.patterns import Components, InsideAndOutside, Pattern, radial, tangential
+from magshell_fenicsx.models.shell.patterns import Components, Pattern, WithinRims, radial, tangential
+from magshell_fenicsx.plan.imperfections.dimple import Dimple
 
 UP = np.array([0.0, 0, 1])
 SIZE = 0.02
@@ -50,7 +50,8 @@ def test_patches_jump_at_the_rim() -> None:
     c = np.cos(phi_o)
     uniform = -2 * np.pi * 2 / 3
     cap = -2 * np.pi * (2 / 3 - c + c**3 / 3)
-    assert swelling(model(InsideAndOutside(phi_o, -UP, UP), circle=phi_o)) == pytest.approx(uniform - 2 * cap, rel=1e-4)
+    jumps = WithinRims(((Dimple(0.0, phi_o).within, -UP),), UP)
+    assert swelling(model(jumps, circle=phi_o)) == pytest.approx(uniform - 2 * cap, rel=1e-4)
 
 
 def test_layers_count_by_their_average() -> None:

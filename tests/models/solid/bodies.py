@@ -3,22 +3,24 @@
 from typing import Any
 
 import numpy as np
+from conftest import spherical
 from mpi4py import MPI
 
 from magshell_fenicsx import Case
 from magshell_fenicsx.case.source import Source
 from magshell_fenicsx.mesh.hexahedra import Body, sweep
 from magshell_fenicsx.mesh.shapes import DiscShape
-from magshell_fenicsx.mesh.sphere import Dimple, SphereEmbedding, flat
+from magshell_fenicsx.mesh.sphere import flat
 from magshell_fenicsx.mesh.triangulation import triangulate
+from magshell_fenicsx.plan.imperfections.dimple import Dimple
 from magshell_fenicsx.plan.planner import make_plan
 
 
 def hemisphere(size: float, h: float, *, layers: int = 1, half: bool = False, dimple: Dimple | None = None) -> Body:
     """A body around the hemisphere of radius 1; the triangles' size holds everywhere."""
-    shape = DiscShape(np.pi / 2, half, dimple.phi_o if dimple else None)
+    shape = DiscShape(np.pi / 2, half, (dimple.phi_o,) if dimple else ())
     points = {"pole": np.zeros(2)}
-    return sweep(triangulate(shape, lambda x: size, points, SphereEmbedding(dimple)), h, layers, MPI.COMM_SELF)
+    return sweep(triangulate(shape, lambda x: size, points, spherical(dimple)), h, layers, MPI.COMM_SELF)
 
 
 def plate(size: float, h: float, *, layers: int = 1, half: bool = False) -> Body:

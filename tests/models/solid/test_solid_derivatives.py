@@ -11,12 +11,12 @@ from petsc4py import PETSc
 
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.mesh.hexahedra import OUTER
-from magshell_fenicsx.mesh.sphere import Dimple
 from magshell_fenicsx.models.shell.parameters import EdgeMoment, Loads, Magnetisation, Material
 from magshell_fenicsx.models.shell.patterns import radial
 from magshell_fenicsx.models.solid.material import NeoHookean
 from magshell_fenicsx.models.solid.model import SolidModel
 from magshell_fenicsx.models.solid.terms import face_measure
+from magshell_fenicsx.plan.imperfections.dimple import Dimple
 
 MU = {"pressure": 0.3, "lambda_m": 0.4, "lambda_across": -0.7, "load": 0.2}
 EVERYWHERE = {"distortion", "compression", "magnetic", "magnetic across", "magnetic gradient", "pressure"}

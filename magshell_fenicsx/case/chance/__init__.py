@@ -1,0 +1,1 @@
+"""Random quantities of a case file: distributions of numbers, and random places."""

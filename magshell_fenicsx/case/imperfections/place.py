@@ -1,0 +1,52 @@
+"""Where a local imperfection is, and what all imperfections have in common."""
+
+from typing import Annotated, Self
+
+from pydantic import Field, model_validator
+
+from magshell_fenicsx.case.fields import Direction
+from magshell_fenicsx.parts.section import Section, or_number
+
+Coordinates = Annotated[list[Annotated[float, or_number("metre")]], Field(min_length=3, max_length=3)]
+
+
+class At(Direction):
+    """A direction from the centre of a sphere, `polar: 0` of a pole or a centre; or a place of the perfect surface."""
+
+    point: Coordinates | None = None
+    """Place on the perfect surface, on any shape [the shell's length; over R if that has no unit]"""
+
+    @model_validator(mode="after")
+    def _one_way(self) -> Self:
+        if self.point is not None and {"polar", "azimuth"} & self.model_fields_set:
+            raise ValueError("give a point, or polar and azimuth")
+        return self
+
+    def words(self) -> str:
+        """Where it is."""
+        if self.point is not None:
+            return f"at ({', '.join(f'{x:g}' for x in self.point)})"
+        return f"at polar {self.polar:g}, azimuth {self.azimuth:g}" if self.polar else "at the pole"
+
+
+class ImperfectionSection(Section):
+    """Base of all kinds: w0 along the outward normal of the perfect surface."""
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Numbers that a knockdown factor is differentiated by, as paths of keys below the section."""
+        return ("amplitude",)
+
+    kind: str
+
+    def account(self) -> str:
+        """Its words in the account of what is built."""
+        return self.kind
+
+    def refuse_unfit(self, R_over_h: float, nu: float) -> None:
+        """See that a shell can have it; raises ValueError otherwise."""
+
+
+def half_width(width: float, R_over_h: float, nu: float) -> float:
+    """Width of an imperfection over R (rad), from the width over (h R)^(1/2)/(12 (1 - nu^2))^(1/4)."""
+    return float(width / (12 * (1 - nu**2) * R_over_h**2) ** 0.25)

@@ -1,0 +1,155 @@
+"""The modes of the perfect shell that a case has as imperfections: computed once, before the case is planned."""
+
+from typing import Any
+
+import numpy as np
+from mpi4py import MPI
+from numpy.typing import NDArray
+
+from magshell_fenicsx.case.case import Case, MeshSection
+from magshell_fenicsx.case.imperfections.modes import ModesSection, Shape
+from magshell_fenicsx.case.loads.pressure import PressureSection
+from magshell_fenicsx.case.source import CaseError
+from magshell_fenicsx.continuation.modes import ModesNotFound
+from magshell_fenicsx.continuation.system import State
+from magshell_fenicsx.models.axisymmetric.model import MeridianModel
+from magshell_fenicsx.models.axisymmetric.pattern import nodal_normals
+from magshell_fenicsx.models.modes import ShellMode, ShellModes
+from magshell_fenicsx.models.shell.model import ShellModel
+from magshell_fenicsx.plan.imperfections.flaw import in_frame
+from magshell_fenicsx.plan.imperfections.modes import Mirrored, on_meridian, on_surface
+from magshell_fenicsx.platform import compat
+from magshell_fenicsx.simulate.follow import follow
+from magshell_fenicsx.simulate.record import Stopped
+from magshell_fenicsx.simulate.scene import Scene
+from magshell_fenicsx.simulate.steps import LOCATED
+
+Array = NDArray[np.float64]
+_known: dict[str, tuple[Shape, ...]] = {}  # a sweep has many cases with one perfect shell
+
+
+def with_modes(case: Case, comm: MPI.Comm) -> Case:
+    """The case, with the modes that it has as imperfections; collective.
+
+    Raises
+    ------
+    CaseError
+        If the perfect shell cannot be built, or its modes are not found.
+    """
+    wanted = [
+        section
+        for section in case.imperfections.values()
+        if isinstance(section, ModesSection) and section.file is None and section.shapes is None
+    ]
+    if wanted:
+        if case.dimples and case.patches:
+            raise CaseError(
+                "shell.imperfections: kind: modes: the perfect shell has no dimple, of which a patch is named"
+            )
+        count, bare = max(len(section.amplitudes) for section in wanted), perfect(case)
+        this = f"{count} {bare.model_dump_json()} {bare.outside}"
+        if this not in _known:
+            if len(_known) > 3:
+                _known.clear()
+            _known[this] = perfect_modes(bare, count, comm)
+        for section in wanted:
+            section.become(_known[this])
+    return case
+
+
+def perfect(case: Case) -> Case:
+    """The case without imperfections, as a shell on the smallest model and the default mesh, whatever its own.
+
+    A pressure at its end goes on to the first instability.
+    """
+    shell = case.shell
+    changed: dict[str, Any] = {"imperfections": []}
+    if "defect" in type(shell).model_fields:
+        changed["defect"] = None
+    return case.model_copy(
+        update={
+            "shell": shell.model_copy(update=changed),
+            "mesh": MeshSection(),
+            "loading": _to_the_limit(case),
+            "model": "shell",
+            "solid": None,
+            "symmetry": "auto",
+            "stability": None,
+        }
+    )
+
+
+def _to_the_limit(case: Case) -> Any:
+    """The loading, with a pressure at its end that has no target."""
+    loading = case.loading
+
+    def freed(load: Any) -> Any:
+        if not isinstance(load, PressureSection):
+            return load
+        return PressureSection(kind="pressure", control=load.control, hold=load.hold)
+
+    return [*loading[:-1], freed(loading[-1])] if isinstance(loading, list) else freed(loading)
+
+
+def perfect_modes(case: Case, count: int, comm: MPI.Comm) -> tuple[Shape, ...]:
+    """The lowest modes of a shell at its first instability, or at the end of its history without one; collective."""
+    scene = Scene(case, comm)
+    state = scene.unloaded()
+    try:
+        for record in follow(scene):
+            state = record.point.state
+            if record.label in LOCATED:
+                break
+    except Stopped:  # the last point that was reached
+        pass
+    if not any(state.mu.values()):
+        raise CaseError("shell.imperfections: kind: modes: are those of a shell under a load, and there is none")
+    try:
+        found = ShellModes(scene.model).lowest(state, count)[:count]
+    except ModesNotFound as e:
+        raise CaseError(f"shell.imperfections: the modes of the perfect shell are not found: {e}") from None
+    if len(found) < count:
+        raise CaseError(f"shell.imperfections: amplitudes: the perfect shell has only {len(found)} modes, not {count}")
+    return tuple(_shape(scene, state, mode) for mode in found)
+
+
+def _shape(scene: Scene, state: State, mode: ShellMode) -> Shape:
+    model = scene.model
+    if isinstance(model, MeridianModel):
+        return _wave(model, mode)
+    assert isinstance(model, ShellModel)
+    x, w = _at_nodes(scene, model, mode)
+    if model.multiplicity == 1:
+        return on_surface(x, w, x)
+    sign, mirror = -1.0 if mode.label == "antisymmetric" else 1.0, model.mirror
+    whole = on_surface(np.vstack([x, mirror.image(x)]), np.concatenate([w, sign * w]), x)
+    return in_frame(Mirrored(whole, mirror, sign), -scene.plan.azimuth)
+
+
+def _wave(model: MeridianModel, mode: ShellMode) -> Shape:
+    """From the coefficients (U + V, V, W) of a wave, or (U, W) of an axisymmetric mode."""
+    m = int(mode.label.removeprefix("m = ") or 0)
+    V = model.excluded_modes.waves.V if m else model.V
+    order, own = (np.argsort(space.tabulate_dof_coordinates()[:, 0]) for space in (V, model.V))
+    values = mode.vector.reshape(len(order), -1)[order]
+    along = np.column_stack([values[:, 0] - values[:, 1], values[:, 2]]) if m else values
+    normal = nodal_normals(model.r0)[own][:, [0, 2]]
+    rho, z = model.r0.x.array.reshape(-1, 2)[own].T
+    return on_meridian(rho, z, -np.einsum("ij,ij->i", along, normal), m)
+
+
+def _at_nodes(scene: Scene, model: ShellModel, mode: ShellMode) -> tuple[Array, Array]:
+    """All nodes (n, 3) and the inward displacements (n,) there, on every rank."""
+    V, comm = model.V, scene.comm
+    model.system.set(mode.vector)
+    dofs = V.dofmap.list[: V.mesh.topology.index_map(2).size_local]
+    numbers = V.dofmap.index_map.local_to_global(dofs.ravel().astype(np.int32))
+    table = V.element.basix_element.tabulate(1, compat.interpolation_points(V))[:, :, :, 0]
+    r0, v = (f.x.array.reshape(-1, 3)[dofs] for f in (model.r0, model.u))
+    _, r_1, r_2 = np.matmul(table[:, None], r0)
+    parts = comm.allgather((numbers, *(a.reshape(-1, 3) for a in (r0, v, np.cross(r_1, r_2)))))
+    where, x, v, n = (np.concatenate(part) for part in zip(*parts, strict=True))
+    total = np.column_stack([np.bincount(where, c) for c in n.T])
+    n0 = total / np.linalg.norm(total, axis=1)[:, None]
+    first = np.unique(where, return_index=True)[1]
+    return x[first], -np.einsum("ij,ij->i", v[first], n0)

@@ -1,0 +1,1 @@
+"""Random samples of a case, and their statistics."""

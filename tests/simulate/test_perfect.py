@@ -1,0 +1,104 @@
+"""Modes of the perfect shell as imperfections: the same by several ways, and the law of a symmetric bifurcation."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from command import magshell
+from mpi4py import MPI
+from numpy.typing import NDArray
+
+from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.imperfections.modes import ModesSection
+from magshell_fenicsx.case.source import CaseError, Source
+from magshell_fenicsx.plan.imperfections.modes import Round
+from magshell_fenicsx.plan.imperfections.registered import flaws
+from magshell_fenicsx.plan.outline import outline
+from magshell_fenicsx.run.run import run
+from magshell_fenicsx.simulate.perfect import perfect_modes, with_modes
+from magshell_fenicsx.simulate.scene import Scene
+from magshell_fenicsx.simulate.shape_sensitivity import changed
+
+Array = NDArray[np.float64]
+HEMISPHERE = {"geometry": "hemisphere", "radius_to_thickness": 12, "poisson_ratio": 0.3}
+
+
+def case(*amplitudes: float, folder: Path = Path(), **item: Any) -> Case:
+    items = [{"kind": "modes", "amplitudes": list(amplitudes), **item}] if amplitudes else []
+    data = {"shell": {**HEMISPHERE, "imperfections": items}, "boundary": {"equator": "clamped"}}
+    return Case.from_source(Source("case.yaml", data | {"loading": {"kind": "pressure"}}, folder=folder))
+
+
+def alike(here: Array, there: Array, tolerance: float) -> bool:
+    """Equal but for the sign, which a mode has not."""
+    return bool(min(np.abs(here - there).max(), np.abs(here + there).max()) < tolerance)
+
+
+@pytest.mark.slow
+def test_two_thirds_law() -> None:
+    """At a symmetric, unstable bifurcation 1 - k_d/k_c falls as the imperfection to the power of 2/3 (Koiter 1945)."""
+    critical, first, second = (run(case(*amplitude)).knockdown for amplitude in ((), (0.005,), (0.01,)))
+    assert critical
+    assert first
+    assert second
+    exponent = np.log2((critical - second) / (critical - first))
+    assert exponent == pytest.approx(2 / 3, abs=0.01)
+
+
+@pytest.mark.usefixtures("no_pictures")
+def test_a_mode_computed_and_from_the_file_of_a_run(tmp_path: Path) -> None:
+    """The file has the mode on the nodes of the deformed surface, which other code evaluates."""
+    (tmp_path / "perfect.yaml").write_text(
+        f"shell: {HEMISPHERE}\nboundary: {{equator: clamped}}\nloading: {{kind: pressure}}\n"
+    )
+    assert magshell("run", tmp_path / "perfect.yaml", "--out", tmp_path / "out").returncode == 0
+    (file,) = (tmp_path / "out/fields").glob("mode_*_bifurcation_m4.vtu")
+    read, computed = case(0.1, file=f"out/fields/{file.name}", folder=tmp_path), with_modes(case(0.1), MPI.COMM_SELF)
+    (shape,) = computed.shell.imperfections[0].shapes  # type: ignore[union-attr]
+    assert isinstance(shape, Round)
+    assert shape.m == 4
+    x = outline(read).sample()
+    x = x[x[:, 2] > 0.05]
+    one, other = (next(iter(flaws(c, outline(c)).values())).deviation(x) * 12 for c in (read, computed))
+    assert np.abs(other).max() == pytest.approx(0.1, rel=0.05)
+    assert alike(one, other, 1e-3)
+    assert read.outside["imperfections.0.file"]
+
+
+def test_modes_of_half_and_full_shells() -> None:
+    """A panel by half and whole: two meshes, the same lowest modes, exactly even or odd in the plane of the half."""
+    shell = {"geometry": "cylinder", "radius": 1.0, "length": 0.8, "azimuth": [-30, 30], "thickness": 0.05}
+    edges = dict.fromkeys(("left", "right", "bottom", "top"), "clamped")
+    load = {"kind": "pressure", "control": "load", "until": "target", "pressure": 0.05}
+    data = {"shell": {**shell, "poisson_ratio": 0.3}, "boundary": edges, "loading": load, "mesh": {"degree": 3}}
+    panel = Case.from_source(Source("panel.yaml", data))
+    x = outline(panel).sample()
+    whole = perfect_modes(panel.model_copy(update={"symmetry": "none"}), 2, MPI.COMM_SELF)
+    halves = perfect_modes(panel, 2, MPI.COMM_SELF)
+    for one, other in zip(whole, halves, strict=True):
+        assert np.abs(other(x)).max() == pytest.approx(1, abs=0.04)
+        assert alike(one(x), other(x), 0.02)
+    images = x * [1.0, -1.0, 1.0], [0.0, 0.0, 0.8] + x * [1.0, 1.0, -1.0]
+    assert all(
+        any(np.allclose(np.abs(f(image)), np.abs(f(x)), rtol=1e-9, atol=1e-12) for image in images) for f in halves
+    )
+
+
+def test_amplitudes_are_parameters() -> None:
+    found = changed(case(0.1, 0.2), "imperfections.0", "amplitudes.1", 0.05).shell.imperfections[0]
+    assert isinstance(found, ModesSection)
+    assert found.amplitudes == [0.1, 0.25]
+    assert found.parameters == ("amplitudes.0", "amplitudes.1")
+
+
+def test_what_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(CaseError, match="a file has one mode"):
+        case(0.1, 0.2, file="mode.vtu")
+    with pytest.raises(CaseError, match="with_modes"):
+        Scene(case(0.1))
+    (tmp_path / "mode.vtu").write_text("no file of VTK")
+    for name in ("mode.vtu", "other.vtu"):
+        read = case(0.1, file=name, folder=tmp_path)
+        with pytest.raises(CaseError, match=rf"shell\.imperfections\.0\.file: {name}: is no mode file"):
+            flaws(read, outline(read))

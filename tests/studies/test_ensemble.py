@@ -1,0 +1,194 @@
+"""Ensembles: every way to a sample gives the same number, ranks and parts do not matter, nothing is dropped."""
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from command import magshell
+from conftest import CASES
+
+from magshell_fenicsx import CaseError
+from magshell_fenicsx.case.source import override, read_source
+from magshell_fenicsx.studies.ensemble import ensemble as module
+from magshell_fenicsx.studies.ensemble import solve as solving
+from magshell_fenicsx.studies.ensemble.known import KnownFolds
+from magshell_fenicsx.studies.ensemble.samples import Sample, make_samples
+from magshell_fenicsx.studies.study.scalar import parse_scalar
+from magshell_fenicsx.studies.sweep.outcome import Outcome
+
+DIMPLE = CASES / "dimple_buckling.yaml"
+RANDOM = (
+    "ensemble={keys: {shell.defect.amplitude: {kind: lognormal, mean: 1, deviation: 0.3, below: 3}, "
+    "magnetic.lambda_m: {kind: normal, mean: 5e-4, deviation: 1e-4}}}"
+)
+COARSE = ["mesh.degree=3", "mesh.refinement=0.5"]
+THREE = ("--samples", 3, "--seed", 1, *(f"--set={s}" for s in (RANDOM, *COARSE)))
+KNOCKDOWN = parse_scalar("knockdown")
+
+
+def drawn(*settings: str, numbers: range = range(4), deleted: int = 0) -> list[Sample]:
+    source = read_source(DIMPLE)
+    for setting in (RANDOM, *settings):
+        override(source, setting)
+    return make_samples(source, 1, numbers, deleted)
+
+
+def read(file: Path) -> list[dict[str, str]]:
+    with file.open(encoding="utf-8") as stream:
+        return list(csv.DictReader(stream))
+
+
+def same(one: list[dict[str, str]], two: list[dict[str, str]]) -> None:
+    """The drawn values are equal, the results to 1e-9."""
+    assert len(one) == len(two)
+    for a, b in zip(one, two, strict=True):
+        assert [a[key] for key in ("sample", "point", "status")] == [b[key] for key in ("sample", "point", "status")]
+        assert float(b["result"]) == pytest.approx(float(a["result"]), rel=1e-9)
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory: pytest.TempPathFactory) -> list[dict[str, str]]:
+    """The table of one rank."""
+    folder = tmp_path_factory.mktemp("alone")
+    assert magshell("ensemble", DIMPLE, *THREE, "--out", folder).returncode == 0
+    return read(folder / "samples.csv")
+
+
+@pytest.fixture
+def analytic(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Samples whose knockdown is a formula of the amplitude; the numbers of those that were computed."""
+    done: list[int] = []
+
+    def solve(sample: Sample, scalar: Any, known: KnownFolds) -> Outcome:
+        done.append(sample.number)
+        if sample.number == 7:
+            raise KeyboardInterrupt
+        amplitude = sample.values["shell.defect.amplitude"]
+        return Outcome(1 / (1 + amplitude), None, None, 100, 0.1, [{"label": "fold"}], "fold", 3, None, 0.1)
+
+    monkeypatch.setattr(module, "solve", solve)
+    return done
+
+
+def test_a_known_fold_leads_to_the_knockdown_of_the_path() -> None:
+    """Same numbers to 1e-9 from the fold of another sample and from the path, with fewer factorisations."""
+    first, second = drawn(*COARSE, numbers=range(2))
+    known = KnownFolds()
+    solving.solve(first, KNOCKDOWN, known)
+    near, path = solving.solve(second, KNOCKDOWN, known), solving.solve(second, KNOCKDOWN, KnownFolds())
+    assert (near.found, path.found) == ("fold", "path")
+    assert near.knockdown == pytest.approx(path.knockdown, rel=1e-9)
+    assert near.factorisations < path.factorisations / 4
+    other = solving.solve(second, parse_scalar("w_pole_over_h@end"), known)  # every other result takes the path
+    assert other.found == "path"
+
+
+@pytest.mark.slow
+def test_the_path_of_degree_3_leads_to_the_knockdown_of_the_path() -> None:
+    (sample,) = drawn("symmetry=none", "mesh.refinement=0.6", "shell.radius_to_thickness=20", numbers=range(1))
+    lower, path = solving._by_lower_degree(sample, KnownFolds()), solving._by_path(sample, KnownFolds())
+    assert lower.knockdown == pytest.approx(path.knockdown, rel=1e-9)
+
+
+def test_interrupted_and_resumed(tmp_path: Path, analytic: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        module.ensemble(DIMPLE, [RANDOM], samples=10, seed=1, out=tmp_path)
+    assert len(list((tmp_path / "points").iterdir())) == 7
+    with pytest.raises(CaseError, match="has no sample of this ensemble"):
+        module.ensemble(DIMPLE, [RANDOM], samples=7, seed=2, out=tmp_path, resume=True)
+    short = module.ensemble(DIMPLE, [RANDOM], samples=7, seed=1, out=tmp_path, resume=True)
+    assert analytic == list(range(8))
+    assert [row["sample"] for row in short.rows] == list(range(7))
+    amplitudes = np.array([float(row["shell.defect.amplitude"]) for row in read(tmp_path / "samples.csv")])
+    assert [row["result"] for row in short.rows] == pytest.approx(1 / (1 + amplitudes))
+    assert short.content["mean"] == pytest.approx(np.mean(1 / (1 + amplitudes)))
+    assert short.content["correlations"]["severest.amplitude"]["spearman"] == pytest.approx(-1)
+
+
+def test_parts_make_the_whole(tmp_path: Path, analytic: list[int]) -> None:
+    folders = [tmp_path / str(i) for i in (1, 2)]
+    for i, folder in enumerate(folders, 1):
+        part = module.ensemble(DIMPLE, [RANDOM], samples=7, seed=1, out=folder, part=f"{i}/2")
+        assert [row["sample"] for row in part.rows] == list(range(i - 1, 7, 2))
+        assert (folder / f"samples_{i}_of_2.csv").exists()
+    whole = module.ensemble(DIMPLE, [RANDOM], samples=7, seed=1, out=tmp_path / "whole")
+    del analytic[:]
+    merged = module.ensemble(DIMPLE, [RANDOM], samples=7, seed=1, out=tmp_path / "merged", merge=folders)
+    assert analytic == []
+    assert merged.rows == whole.rows
+    half = module.ensemble(DIMPLE, [RANDOM], samples=7, seed=1, out=tmp_path / "half", merge=folders[:1])
+    assert half.content["counts"] == {"samples": 7, "found": 4, "missing": 3}
+    assert half.without_result == 3
+
+
+def test_failed_samples_are_counted_and_listed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In table, summary and report; an error may have been of the machine, and is tried again."""
+
+    def run(case: Any, comm: Any) -> Any:
+        raise RuntimeError("out of luck")
+
+    monkeypatch.setattr(solving, "run", run)
+    done = magshell(
+        "ensemble",
+        DIMPLE,
+        "--samples",
+        2,
+        "--seed",
+        1,
+        "--out",
+        tmp_path,
+        *(f"--set={s}" for s in (RANDOM, *COARSE)),
+        "--result",
+        "energy@end",
+    )
+    assert done.returncode == 3
+    assert "2 of 2 samples have no energy@end; samples.csv says why" in done.stderr
+    rows = read(tmp_path / "samples.csv")
+    assert [(row["status"], row["why"]) for row in rows] == [("failed", "failed: RuntimeError: out of luck")] * 2
+    summary = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
+    assert summary["counts"] == {"samples": 2, "failed": 2}
+    assert summary["weibull"] is None
+    assert "| 1 | failed | failed: RuntimeError: out of luck |" in (tmp_path / "report.md").read_text(encoding="utf-8")
+    monkeypatch.undo()
+    again = module.ensemble(DIMPLE, [RANDOM, *COARSE], samples=1, seed=1, out=tmp_path, result="energy@end")
+    assert again.rows[0]["status"] == "found"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ranks", [2, 3])
+def test_ranks_give_the_table_of_one(tmp_path: Path, ranks: int, alone: list[dict[str, str]]) -> None:
+    """In any order, with other folds to begin with."""
+    done = magshell("ensemble", DIMPLE, *THREE, "--out", tmp_path, ranks=ranks)
+    assert done.returncode == 0, done.stderr
+    same(alone, read(tmp_path / "samples.csv"))
+    assert (tmp_path / "ensemble.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize(
+    ("settings", "options", "message"),
+    [
+        ([], {}, "dimple_buckling.yaml: ensemble: is missing: it says which keys are random"),
+        (["ensemble={keys: {mesh.degre: 3}}"], {}, "mesh.degre: unknown key; did you mean degree?"),
+        (["ensemble={keys: {mesh.degree: 9}}"], {}, "mesh.degree: 9: must be less than or equal to 5"),
+        (
+            ["ensemble={keys: {shell.defect.amplitude: {kind: lognormal, mean: 50, deviation: 500}}}"],
+            {},
+            "of seed 1; bounds keep a distribution in",
+        ),
+        ([RANDOM], {"part": "3/2"}, "--part 3/2: write it as i/n"),
+        ([RANDOM], {"part": "1/9"}, "--part 1/9"),
+        ([RANDOM], {"samples": 0}, "--samples 0: must be 1 to"),
+        ([RANDOM], {"seed": -1}, "--seed -1: must not be negative"),
+        ([RANDOM], {"result": "w"}, "--result w: w is no column"),
+        ([RANDOM], {"merge": ["/nowhere"]}, "/nowhere: has no sample of this ensemble"),
+        ([RANDOM], {"delete_weakest": 1}, "--delete-weakest 1: the sample has only 1 defect"),
+    ],
+)
+def test_bad_input(settings: list[str], options: dict[str, Any], message: str, tmp_path: Path) -> None:
+    with pytest.raises(CaseError) as e:
+        module.ensemble(DIMPLE, settings, **{"samples": 4, "seed": 1, "out": tmp_path / "out", **options})
+    assert message in str(e.value)
+    assert not (tmp_path / "out").exists()
