@@ -54,6 +54,17 @@ SCENES |= {
             "--set=mesh.size=40",
         ],
     ),
+    "a dimple across the seam of a cylinder": (
+        "pole_indentation.yaml",
+        [
+            "--set=shell={geometry: cylinder, radius: 100, length: 100, thickness: 2, poisson_ratio: 0.3, "
+            "imperfections: [{kind: dimple, amplitude: 1, width: 3, at: {point: [100, 0, 50]}}]}",
+            "--set=boundary={bottom: clamped, top: clamped}",
+            "--set=loading={kind: pressure, control: load, until: target, pressure: 0.1, points: 2}",
+            "--set=symmetry=none",
+            "--set=mesh={degree: 2, refinement: 0.4}",
+        ],
+    ),
     "a tube open to a pressure": (
         "benchmarks/pinched_cylinder.yaml",
         [

@@ -105,10 +105,14 @@ class Case(WithParts):
             for step, source in zip(programme(section.loading, field=False), sources, strict=False):
                 parts |= {step.key: source} if isinstance(step.load, DeadSection | EdgeSection) else {}
             places = {
-                f"shell.imperfections.{i}.at": (item.get("at") or {}).get("point")
+                f"shell.imperfections.{i}.at.point": item["at"].get("point") if "at" in item else None
                 for i, item in enumerate(data["shell"].get("imperfections") or [])
             }
-            for key in (*texts(parts, is_formula), *texts(places), *measured(data.get("natural"))):
+            for key in (
+                *texts(parts, is_formula),
+                *(key for key, place in places.items() if [*texts(place)]),
+                *measured(data.get("natural")),
+            ):
                 raise ValueError(f"{key}: has a unit, but the shell's lengths have none: give all of them one, or none")
         return section
 

@@ -29,7 +29,8 @@ def explain(error: Any, source: Source, case: type[BaseModel]) -> str:
     if kind == "missing":
         return f"{place}: {key}: is missing{_meaning(location, source.data, case)}"
     if kind.startswith("union_tag"):
-        field = _found(location, source.data, case)[1] or case.model_fields[str(location[0])]
+        keys = location[:-1] if isinstance(location[-1], int) else location
+        field = _found(keys, source.data, case)[1] or case.model_fields[str(location[0])]
         models = [m for m in _models(field.annotation) if _tag_key([m])]
         tag, tags = error["ctx"].get("tag"), dict.fromkeys(tag for m in models for tag in _tags(m))
         said = "is missing" if tag is None else shown(tag)
@@ -57,7 +58,7 @@ def _without_tag(loc: Location, case: type[BaseModel]) -> Location:
     models, kept = [case], list[str | int]()
     for key in loc:
         if len(models) > 1 and not isinstance(key, int):
-            models = [m for m in models if _tag_key([m]) and key in _tags(m)] or models
+            models = [m for m in models if _tag_key([m]) and key in _tags(m)][:1] or models
             continue
         kept.append(key)
         if isinstance(key, str) and models:
@@ -80,14 +81,16 @@ def _meaning(location: Location, data: Any, case: type[BaseModel]) -> str:
 
 def _found(location: Location, data: Any, case: type[BaseModel]) -> tuple[type[BaseModel], FieldInfo | None]:
     """The innermost section at a location; and the last key, if it is one of a section."""
-    model, field = case, None
+    model, field, models = case, None, list[type[BaseModel]]()
     for key in location:
         if isinstance(data, dict):
             data = data.get(key)
         else:
             data = data[key] if isinstance(data, list) and isinstance(key, int) else None
         field = model.model_fields.get(str(key))  # None: of a list or mapping of sections, or a part of a union
-        if field and (models := _models(field.annotation)):
+        if field or not isinstance(key, int):
+            models = _models(field.annotation) if field else []
+        if models:
             tag = data.get(_tag_key(models)) if len(models) > 1 and isinstance(data, dict) else None
             model = next((m for m in models if tag is not None and tag in _tags(m)), models[0])
     return model, field

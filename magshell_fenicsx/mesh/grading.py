@@ -18,6 +18,10 @@ PER_AREA = 4 / sqrt(3)  # triangles of size one per unit area
 class Feature(Protocol):
     """A place with small elements around it."""
 
+    @property
+    def size(self) -> float:
+        """The smallest."""
+
     def across(self, axis: int, x: float) -> float:
         """Wanted distance of grid lines across an axis, at a coordinate."""
 
@@ -120,4 +124,5 @@ class Grading:
         share = 0.5 if shape.half else 1.0  # features lie on the mirror line
         around = share * sum(feature.cells(shape.reach) for feature in self.features)
         inner, outer = PER_AREA * shape.area / self.largest**2, 2 * shape.reach / self.largest  # of a thin strip
-        return inner + outer + around
+        finest = min([self.largest, *(feature.size for feature in self.features)])
+        return min(inner + outer + around, outer + PER_AREA * shape.area / finest**2)

@@ -11,6 +11,7 @@ from dolfinx import fem, mesh
 from mpi4py import MPI
 from numpy.typing import NDArray
 
+from magshell_fenicsx.mesh.deviation import Deviated
 from magshell_fenicsx.mesh.midsurface import create_mesh
 from magshell_fenicsx.mesh.patch import MeshError, PatchMesh, as_set, place_text
 from magshell_fenicsx.mesh.quadrilaterals import Quadrilaterals, split, square
@@ -41,6 +42,8 @@ class Body:
     chart, heights, thickness
         Of each node of the geometry: the chart's coordinates (n, d) under it, where it is in the thickness, from 0 to
         1, and h(x) over R; see `at_nodes`.
+    w0
+        Of each node of the geometry: the deviation over R of the mid-surface under it; None without imperfections.
     """
 
     mesh: mesh.Mesh
@@ -52,6 +55,7 @@ class Body:
     chart: Array
     heights: Array
     thickness: Array
+    w0: Array | None = None
 
     def at_nodes(self, V: fem.FunctionSpace, values: Array) -> Array:
         """What is known at the nodes of the geometry, at those of a quadratic space."""
@@ -108,6 +112,7 @@ def sweep(
         quads.nodes[node],
         heights[level],
         thick[node],
+        patch.embedding.w0(quads.nodes)[node] if isinstance(patch.embedding, Deviated) else None,
     )
 
 

@@ -44,17 +44,15 @@ class Midsurface:
 
     def charted(self, V: fem.FunctionSpace) -> NDArray[np.float64]:
         """Chart coordinates (cells, nodes, 2 | 3) of the nodes of each cell of this rank, in its own chart."""
-        return self._charted(V)[..., :3]
+        return self._charted(compat.interpolation_points(V))[..., :3]
 
-    def _charted(self, V: fem.FunctionSpace) -> NDArray[np.float64]:
-        """The same, with the normals of a mesh file that has imperfections."""
-        return at_reference_points(
-            self._patch.nodes, self._patch.cells[self._original_cells], compat.interpolation_points(V)
-        )
+    def _charted(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The same at reference points (q, 2), with the normals of a mesh file that has imperfections."""
+        return at_reference_points(self._patch.nodes, self._patch.cells[self._original_cells], points)
 
-    def deviation(self, V: fem.FunctionSpace) -> NDArray[np.float64] | None:
-        """w0 over R at the nodes of each cell of this rank, (cells, nodes); None where there are no imperfections."""
-        chart, embedding = self._charted(V), self._patch.embedding
+    def deviation(self, points: NDArray[np.float64]) -> NDArray[np.float64] | None:
+        """w0 over R at reference points (q, 2) of each cell, (cells, q); None where there are no imperfections."""
+        chart, embedding = self._charted(points), self._patch.embedding
         if not isinstance(embedding, Deviated):
             return None
         return embedding.w0(chart.reshape(-1, chart.shape[-1])).reshape(chart.shape[:2])
@@ -65,7 +63,7 @@ class Midsurface:
 
     def placement(self, V: fem.FunctionSpace) -> fem.Function:
         """The undeformed placement r0 in the Lagrange space `V` (vector valued)."""
-        chart, r0 = self._charted(V), fem.Function(V, name="r0")
+        chart, r0 = self._charted(compat.interpolation_points(V)), fem.Function(V, name="r0")
         places = self._patch.embedding(chart.reshape(-1, chart.shape[-1]))
         r0.x.array.reshape(-1, 3)[V.dofmap.list] = places.reshape(*chart.shape[:2], 3)
         r0.x.scatter_forward()

@@ -26,6 +26,10 @@ class Shape(Protocol):
     def half(self) -> bool: ...
 
     @property
+    def rims(self) -> tuple[Array, ...]:
+        """Closed curves, points (n, 2) each, that elements follow."""
+
+    @property
     def glued(self) -> tuple[Glued, ...]:
         """The pairs of opposite sides that are one line of the surface."""
 

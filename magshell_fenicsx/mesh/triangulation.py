@@ -1,6 +1,7 @@
 """Triangulating a plane shape by gmsh, with cubic edges."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,10 @@ from magshell_fenicsx.mesh.patch import Embedding, MeshError, PatchMesh, place_t
 from magshell_fenicsx.mesh.shapes import Shape
 
 Array = NDArray[np.float64]
+Numbers = NDArray[np.int64]
 BOX = 1e-6  # gmsh's boxes are larger than what is in them by 1e-7
+ATTEMPTS, GROWTH = 7, 0.4
+WIDER, WIDEN = 2, 3e-3  # after how many attempts rims are made wider, and by how much: no part of the error
 ORDER, TRIANGLE10, LINE4 = 3, 21, 26  # gmsh's numbers of the cubic elements
 
 
@@ -23,7 +27,7 @@ def triangulate(shape: Shape, size: Size, points: Mapping[str, Array], embedding
     Parameters
     ----------
     size
-        Wanted element size at a point.
+        Wanted element size at a point; smaller ones are made where curves nearly touch.
     points
         Named points (2,) that must be vertices.
     embedding
@@ -34,6 +38,27 @@ def triangulate(shape: Shape, size: Size, points: Mapping[str, Array], embedding
     MeshError
         If gmsh cannot mesh the shape.
     """
+    for attempt in range(ATTEMPTS):
+        nodes, cells, lines = _meshed(shape, size, points)
+        bad = _overturned(nodes[cells])
+        if not len(bad):
+            break
+        size = _smaller(size, bad)
+        if attempt == WIDER:  # curves that touch leave cusps: they shall overlap
+            shape = replace(shape, rims=tuple(x + WIDEN * (x - x.mean(axis=0)) for x in shape.rims))  # type: ignore[type-var]
+    else:
+        raise MeshError(
+            f"gmsh leaves an element without area around {place_text(embedding(bad[:1])[0])}, over R: rims of "
+            "dimples nearly touch, or a rim nearly touches an edge; move one of them a little, or use kind: gaussian, "
+            "which has no rim"
+        )
+    one = _glue(shape, nodes)
+    edges = {name: one[lines[on[lines].all(axis=1)]] for name, on in shape.on_edges(nodes).items()}
+    return PatchMesh(nodes, cells, embedding, edges, dict(points), one=one if shape.glued else None)
+
+
+def _meshed(shape: Shape, size: Size, points: Mapping[str, Array]) -> tuple[Array, Numbers, Numbers]:
+    """Nodes (n, 2), cubic triangles (m, 10) and vertices of lines (k, 2)."""
     import gmsh
 
     gmsh.initialize(readConfigFiles=False, interruptible=False)  # ~/.gmshrc may change meshes, and run commands
@@ -44,7 +69,7 @@ def triangulate(shape: Shape, size: Size, points: Mapping[str, Array], embedding
         gmsh.model.add("chart")
         occ = gmsh.model.occ
         faces = shape.faces(occ)
-        occ.fragment(faces, [(0, occ.addPoint(*x, 0)) for x in _with_images(shape, points)])
+        occ.fragment(faces, [(0, occ.addPoint(x[0], x[1], 0)) for x in _with_images(shape, points)])
         occ.synchronize()
         for axis, low, high in shape.glued:
             _make_periodic(gmsh.model, axis, low, high)
@@ -64,10 +89,13 @@ def triangulate(shape: Shape, size: Size, points: Mapping[str, Array], embedding
     # gmsh's inner node misses the quadratic part of a curved edge by 2 % of its sagitta's scale, and with it
     # an order of convergence in h; this place reproduces quadratics (Lenoir, SIAM J. Numer. Anal. 23, 1986)
     nodes[cells[:, 9]] = nodes[cells[:, 3:9]].sum(axis=1) / 4 - nodes[cells[:, :3]].sum(axis=1) / 6
-    _refuse_overturned(nodes[cells], embedding)
-    one = _glue(shape, nodes)
-    edges = {name: one[lines[on[lines].all(axis=1)]] for name, on in shape.on_edges(nodes).items()}
-    return PatchMesh(nodes, cells, embedding, edges, dict(points), one=one if shape.glued else None)
+    return nodes, cells, lines
+
+
+def _smaller(size: Size, places: Array) -> Size:
+    """Half the size at places (n, 2), growing from there."""
+    there = np.array([size(x) / 2 for x in places])
+    return lambda x: min(size(x), float((there + GROWTH * np.hypot(*(places - x).T)).min()))
 
 
 def _with_images(shape: Shape, points: Mapping[str, Array]) -> list[Array]:
@@ -109,18 +137,11 @@ def _glue(shape: Shape, nodes: Array) -> NDArray[np.int64]:
     return one
 
 
-def _refuse_overturned(nodes: Array, embedding: Embedding) -> None:
-    """Look at the corners of cubic triangles (m, 10, 2): rims that nearly touch may leave no room for an element."""
+def _overturned(nodes: Array) -> Array:
+    """The corners (k, 2) of cubic triangles (m, 10, 2) that are turned over there."""
     x = nodes.transpose(1, 0, 2)
-    ends = ((0, 3, 4, 1), (1, 5, 6, 2), (2, 7, 8, 0))  # nodes along each side, in its direction
-    leave = [-5.5 * x[a] + 9 * x[p] - 4.5 * x[q] + x[b] for a, p, q, b in ends]  # derivatives at its beginning
-    arrive = [-x[a] + 4.5 * x[p] - 9 * x[q] + 5.5 * x[b] for a, p, q, b in ends]
-    for i in range(3):
-        into, out = -arrive[i - 1], leave[i]
-        turned = out[:, 0] * into[:, 1] - out[:, 1] * into[:, 0]
-        if (turned <= 0).any():
-            place = place_text(embedding(x[ends[i][0]][turned <= 0][:1])[0])
-            raise MeshError(
-                f"gmsh leaves an element without area around {place}, over R: rims of dimples that nearly touch, or "
-                "a rim that nearly touches an edge; move one of them a little, or use kind: gaussian, which has no rim"
-            )
+    sides = ((0, 3, 4, 1), (1, 5, 6, 2), (2, 7, 8, 0))  # nodes along each, in its direction
+    out = [-5.5 * x[a] + 9 * x[p] - 4.5 * x[q] + x[b] for a, p, q, b in sides]  # derivatives at the beginning
+    into = [-x[a] + 4.5 * x[p] - 9 * x[q] + 5.5 * x[b] for a, p, q, b in sides]
+    turned = [into[i - 1][:, 0] * out[i][:, 1] - into[i - 1][:, 1] * out[i][:, 0] <= 0 for i in range(3)]
+    return np.concatenate([x[sides[i][0]][turned[i]] for i in range(3)])

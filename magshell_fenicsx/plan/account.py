@@ -1,12 +1,17 @@
 """What a model has and what is left out, in words."""
 
+from collections import Counter
 from math import degrees
 
 from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.surfaces import MeshSurface
 from magshell_fenicsx.mesh.mirror import Mirror, plane_text
 from magshell_fenicsx.models.shell.parameters import Loads
 from magshell_fenicsx.parts.registered import PARTS
 from magshell_fenicsx.plan.body import layers, neo_hookean
+from magshell_fenicsx.plan.imperfections.rims import MOST_RIMS
+
+SHOWN = 6  # of many imperfections
 
 
 def account(case: Case, loads: Loads, model: str, mirror: Mirror | None) -> tuple[list[str], list[str]]:
@@ -37,6 +42,8 @@ def account(case: Case, loads: Loads, model: str, mirror: Mirror | None) -> tupl
     if loads.moves:
         moved = dict.fromkeys(name for move in loads.moves for name in move.names)
         included.append(f"supports that move: {', '.join(moved)}")
+    if case.imperfections:
+        included.append(_imperfections(case))
     for key, part in PARTS.items():
         if key in case.parts:
             included.append(case.parts[key].account(case.scales))
@@ -52,6 +59,19 @@ def account(case: Case, loads: Loads, model: str, mirror: Mirror | None) -> tupl
             f"the other half: mirror plane {plane} (modes antisymmetric to it are looked for along the path)"
         )
     return included, left_out
+
+
+def _imperfections(case: Case) -> str:
+    """All of a few; of many how many there are of each kind."""
+    found = [section.account() for section in case.imperfections.values()]
+    if len(found) > SHOWN:
+        kinds = Counter(section.kind for section in case.imperfections.values())
+        found = [f"{count} of kind {kind}" for kind, count in kinds.items()]
+    beside = ""
+    if case.dimples and (isinstance(case.shell, MeshSurface) or len(case.dimples) > MOST_RIMS):
+        why = "of a mesh file" if isinstance(case.shell, MeshSurface) else f"of more than {MOST_RIMS}"
+        beside = f"; elements lie across the rims of dimples, {why}: k_d is then less exact"
+    return f"imperfections: {', '.join(found)}{beside}"
 
 
 def _elastic(case: Case) -> str:

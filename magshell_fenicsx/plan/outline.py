@@ -141,7 +141,8 @@ def outline(case: Case) -> Outline:
 
         def planes(vectors: Sequence[Array], loosely: bool) -> list[Mirror]:
             try:
-                return _either_half(mesh_mirrors(read_msh(file, {}), vectors, loosely=loosely))
+                bare = replace(file, normals=False)
+                return _either_half(mesh_mirrors(read_msh(bare, {}), vectors, loosely=loosely))
             except MeshError:  # for whoever builds it to report
                 return []
 

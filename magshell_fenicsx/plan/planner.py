@@ -28,7 +28,7 @@ from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.plan.account import account
 from magshell_fenicsx.plan.imperfections.flaw import Flaw, in_frame
 from magshell_fenicsx.plan.imperfections.registered import flaws
-from magshell_fenicsx.plan.imperfections.rims import Spot, spots
+from magshell_fenicsx.plan.imperfections.rims import MOST_RIMS, Spot, spots
 from magshell_fenicsx.plan.imperfections.symmetry import leaves
 from magshell_fenicsx.plan.limits import refuse_too_many, refuse_unbounded_fields, sources_beside
 from magshell_fenicsx.plan.loads import indented, loads, potentials, refuse_wide_patch
@@ -41,6 +41,7 @@ from magshell_fenicsx.plan.symmetry import Leaves, askew, left, mirror, unmirror
 
 Array = NDArray[np.float64]
 Points = dict[str, Array]
+SAME_RIM = 0.02  # of the element size
 
 
 def make_plan(case: Case, terms: Sequence[OwnTerm] = ()) -> Plan:
@@ -163,7 +164,8 @@ def imperfect(perfect: Outline, found: Mapping[str, Flaw], turn: float) -> Outli
 def _matched(shape: Chart, local: Sequence[Spot]) -> Chart | RimmedGrid:
     """The shape with element edges along the rims."""
     circles = tuple(dict.fromkeys(spot.radius for spot in local if spot.circle and spot.jumps))
-    rims = _different([spot.rim for spot in local if spot.rim is not None])
+    rims = _different([(spot.rim, spot.size) for spot in local if spot.rim is not None])
+    rims = rims if len(rims) <= MOST_RIMS else ()
     if isinstance(shape, Grid):
         return RimmedGrid(shape, rims) if rims else shape
     if isinstance(shape, DiscShape):
@@ -171,9 +173,13 @@ def _matched(shape: Chart, local: Sequence[Spot]) -> Chart | RimmedGrid:
     return replace(shape, rims=rims) if isinstance(shape, StripShape) else shape
 
 
-def _different(rims: list[Array]) -> tuple[Array, ...]:
-    """Each curve once."""
-    return tuple(rim for i, rim in enumerate(rims) if not any(np.allclose(rim, other) for other in rims[:i]))
+def _different(rims: Sequence[tuple[Array, float]]) -> tuple[Array, ...]:
+    """Curves with the element size there; of several that are nearly the same, the first."""
+    kept: list[Array] = []
+    for rim, size in rims:
+        if all(np.abs(rim - other).max() > SAME_RIM * size for other in kept):
+            kept.append(rim)
+    return tuple(kept)
 
 
 def _symmetry(case: Case, drawn: Outline, parts: list[Leaves]) -> tuple[bool, Mirror | None]:

@@ -1,7 +1,7 @@
 """Sensitivities of the amplitude at a fold to the numbers of each imperfection.
 
-They come from central differences of the residual, R_p = (R(r0(p + s)) - R(r0(p - s)))/(2 s): where the chart's nodes
-stay, r0 alone depends on an imperfection.
+They come from central differences of the residual, R_p = (R(r0 + s dr0/dp) - R(r0 - s dr0/dp))/(2 s): where the chart's
+nodes stay, r0 alone depends on an imperfection. A rim makes r0 rough in p beside it, but R is smooth in r0.
 """
 
 from dataclasses import dataclass, replace
@@ -27,7 +27,7 @@ from magshell_fenicsx.simulate.stage import Stage
 from magshell_fenicsx.simulate.transfer import same_mesh, transfer
 
 Array = NDArray[np.float64]
-STEP = 1e-3  # of h, of a width or of the angle of a half-width
+STEP, TINY = 1e-3, 1e-6  # of h, of a width or of the angle of a half-width: for the residual, and for dr0/dp
 
 
 def to_imperfections(stage: Stage, fold: Fold) -> dict[str, float]:
@@ -59,10 +59,12 @@ def _derivative(stage: Stage, fold: Fold, key: str, name: str) -> float:
     scene, size = stage.scene, stage.scene.model.system.size
     if scene.plan.axisymmetric and name.startswith("at."):
         return 0.0
-    step = STEP * _unit(scene.case, key, name)
+    unit = _unit(scene.case, key, name)
+    step, tiny = STEP * unit, TINY * unit
+    further, back = (_deviation(scene, changed(scene.case, key, name, c), key) for c in (tiny, -tiny))
 
     def out_of_balance(change: float) -> float:
-        other = _reshaped(scene, changed(scene.case, key, name, change))
+        other = reshaped(scene, Along(further, back, change / (2 * tiny)))
         assert same_mesh(scene, other)
         vectors = (fold.state.u, fold.left)
         u, left = (np.concatenate([transfer(scene, other, v[:size]), v[size:]]) for v in vectors)
@@ -96,6 +98,18 @@ def changed(case: Case, key: str, name: str, change: float) -> Case:
 
 
 @dataclass(frozen=True)
+class Along:
+    """A deviation along the derivative of another one, by the difference of two of its values."""
+
+    further: Deviation
+    back: Deviation
+    factor: float
+
+    def __call__(self, places: Array) -> Array:
+        return np.asarray(self.factor * (self.further(places) - self.back(places)))
+
+
+@dataclass(frozen=True)
 class _Mirrored:
     """The mean of a deviation and its image: what half of a shell sees of it."""
 
@@ -106,17 +120,20 @@ class _Mirrored:
         return np.asarray((self.deviation(places) + self.deviation(self.mirror.image(places))) / 2)
 
 
-def _reshaped(scene: Scene, case: Case) -> Scene:
-    """The scene on the same mesh in the chart, with the imperfections of another case."""
+def _deviation(scene: Scene, case: Case, key: str) -> Deviation:
+    """The deviation of an imperfection of another case, in the frame of the scene's model."""
+    plan, found = scene.plan, flaws(case, outline(case))[key].deviation
+    turned = in_frame(found, plan.azimuth)
+    return _Mirrored(turned, plan.mirror) if plan.mirror else turned
+
+
+def reshaped(scene: Scene, deviation: Deviation) -> Scene:
+    """The scene on the same mesh in the chart, with one more deviation."""
     plan, model = scene.plan, scene.model
-    found = flaws(case, outline(case)).values()
-    deviations = tuple(in_frame(flaw.deviation, plan.azimuth) for flaw in found)
-    if plan.mirror:
-        deviations = tuple(_Mirrored(deviation, plan.mirror) for deviation in deviations)
 
     def moved(embedding: object) -> Deviated:
         assert isinstance(embedding, Deviated)
-        return replace(embedding, deviations=deviations)
+        return replace(embedding, deviations=(*embedding.deviations, deviation))
 
     embedding = moved(plan.embedding)
     meridian = plan.meridian and replace(plan.meridian, embedding=moved(plan.meridian.embedding))

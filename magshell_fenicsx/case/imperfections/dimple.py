@@ -29,6 +29,9 @@ class DimpleSection(ImperfectionSection):
         """phi_o (rad)."""
         return self.width / sqrt(sqrt(12 * (1 - nu**2)) * R_over_h)
 
+    def account(self) -> str:
+        return f"dimple of {self.amplitude:g} h {self.at.words()}"
+
     def refuse_unfit(self, R_over_h: float, nu: float) -> None:
         phi_o, depth = self.half_width(R_over_h, nu), abs(self.amplitude) / R_over_h
         if phi_o >= 0.9 * pi:

@@ -16,3 +16,6 @@ class FormulaSection(ImperfectionSection):
     """Outwards, of x, y, z over R [h]"""
     amplitude: float = Field(default=1.0, ge=-1e3, le=1e3)
     """Factor of the formula"""
+
+    def account(self) -> str:
+        return f"w0/h = {self.amplitude:g} ({self.w0})"

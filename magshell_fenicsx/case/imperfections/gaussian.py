@@ -26,6 +26,9 @@ class GaussianSection(ImperfectionSection):
         """phi_g (rad)."""
         return half_width(self.width, R_over_h, nu)
 
+    def account(self) -> str:
+        return f"Gaussian dimple of {self.amplitude:g} h {self.at.words()}"
+
     def refuse_unfit(self, R_over_h: float, nu: float) -> None:
         depth = abs(self.amplitude) / R_over_h
         refuse_steep("the dimple", depth, sqrt(2) * exp(-0.5) * depth / self.half_width(R_over_h, nu))

@@ -22,6 +22,12 @@ class At(Direction):
             raise ValueError("give a point, or polar and azimuth")
         return self
 
+    def words(self) -> str:
+        """Where it is."""
+        if self.point is not None:
+            return f"at ({', '.join(f'{x:g}' for x in self.point)})"
+        return f"at polar {self.polar:g}, azimuth {self.azimuth:g}" if self.polar else "at the pole"
+
 
 class ImperfectionSection(Section):
     """Base of all kinds: w0 along the outward normal of the perfect surface."""
@@ -30,6 +36,10 @@ class ImperfectionSection(Section):
     """Numbers that a knockdown factor is differentiated by, as paths of keys below the section"""
 
     kind: str
+
+    def account(self) -> str:
+        """Its words in the account of what is built."""
+        return self.kind
 
     def refuse_unfit(self, R_over_h: float, nu: float) -> None:
         """See that a shell can have it; raises ValueError otherwise."""

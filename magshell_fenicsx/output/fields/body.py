@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.system import Vector
 from magshell_fenicsx.models.solid.model import SolidModel
-from magshell_fenicsx.output.fields.surface import Surface
+from magshell_fenicsx.output.fields.surface import W0, Surface
 
 Array = NDArray[np.float64]
 
@@ -25,13 +25,17 @@ class BodyGatherer:
         numbers = V.dofmap.index_map.local_to_global(cells.ravel().astype(np.int32)).reshape(cells.shape)
         to_vtk = np.argsort(perm_vtk(mesh.CellType.hexahedron, cells.shape[1]))
         self._cells = self._on_first(numbers[:, to_vtk])
+        self._fields: dict[str, Array] = {}
+        if model.body.w0 is not None:
+            owned = model.body.at_nodes(V, model.body.w0)[: V.dofmap.index_map.size_local]
+            self._fields[W0] = self._on_first(owned / model.material.h)
         self._r0, self._n0 = self._nodes(model.r0), self._nodes(_outwards(model.r0))
 
     def gather(self, u: Vector, mu: Mapping[str, float] | None = None) -> Surface | None:
         """The displaced body on rank 0; None on other ranks."""
         self._model.system.set(u)
         nodes = self._nodes(self._model.u)
-        return Surface(self._r0, nodes, self._n0, self._cells, {}) if self.comm.rank == 0 else None
+        return Surface(self._r0, nodes, self._n0, self._cells, self._fields) if self.comm.rank == 0 else None
 
     def _nodes(self, f: fem.Function) -> Array:
         """Values at the owned nodes of all ranks, in global order, on rank 0."""

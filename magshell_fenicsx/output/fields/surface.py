@@ -13,6 +13,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.system import Vector
+from magshell_fenicsx.mesh.deviation import Deviated
 from magshell_fenicsx.mesh.frame import rotation
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.axisymmetric.revolution import Revolution
@@ -21,6 +22,7 @@ from magshell_fenicsx.output.fields.point_fields import PointFields
 
 TRIANGLE, LAGRANGE_TRIANGLE, LAGRANGE_HEXAHEDRON = 5, 69, 72  # VTK's numbers of cell types
 HEXAHEDRON_NODES = 27
+W0 = "w0_over_h"  # the imperfections: the deviation of the drawn surface from the perfect one
 Array = NDArray[np.float64]
 
 
@@ -35,7 +37,8 @@ class Surface:
     cells
         (m, k) node numbers of triangles of the displacement's degree or of hexahedra, in VTK's order.
     fields
-        Name -> (n,), (n, 3) or (n, 3, 3), see `point_fields.PointFields`; empty for a solid.
+        Name -> (n,), (n, 3) or (n, 3, 3), see `point_fields.PointFields`, and w0_over_h where there are
+        imperfections; of a solid that alone.
     """
 
     r0: Array
@@ -78,6 +81,9 @@ class SurfaceGatherer:
         factor = None if model.thickness is None else self._thickness(model.thickness)
         self._fields = PointFields(r, model.material, model.loads.magnetic, factor, model.loads.natural)
         self._mean = self._weighted_mean(numbers, map_.size_global)
+        deviation = model.midsurface.deviation(self._places)
+        if deviation is not None:
+            self._fields.constant[W0] = np.asarray(deviation[: self._owned] / model.material.h)
         n0 = self._averaged(self._fields.n0)
         self._r0, self._n0 = self._averaged(r[0]), n0 / np.linalg.norm(n0, axis=1)[:, None]
         self._constant = {name: self._averaged(values) for name, values in self._fields.constant.items()}
@@ -132,6 +138,10 @@ class RevolvedGatherer:
         self._fields = PointFields(
             self._swept.jets(model.r0), model.material, model.loads.magnetic, factor, model.loads.natural
         )
+        if isinstance(model.meridian.embedding, Deviated):
+            s = np.sort(model.meridian.mesh.geometry.x[:, 0])
+            w0 = model.meridian.embedding.w0(np.column_stack([s, 0 * s])) / model.material.h
+            self._fields.constant[W0] = np.column_stack([w0[:-1], w0[1:]])
         self._constant = self._around(self._fields.constant)
 
     def gather(self, u: Vector, mu: Mapping[str, float] | None = None) -> Surface | None:

@@ -13,8 +13,9 @@ from magshell_fenicsx.plan.imperfections.flaw import Flaw
 from magshell_fenicsx.plan.outline import Outline
 
 Array = NDArray[np.float64]
-CORNERS = 96  # of a closed curve: a cubic spline through them is exact to 1e-8 of its size
-STEPS, HALVINGS = 60, 50
+CORNERS = 128  # of a closed curve: a cubic spline through them is exact to 1e-6 of its size
+STEPS, ROUNDS = 40, 12
+MOST_RIMS = 60  # more would take gmsh minutes
 WIDEST = 4.0  # distance in the chart over the distance on the surface
 AXIS = 1e-9  # over R
 
@@ -78,22 +79,26 @@ def contour(key: str, flaw: Flaw, drawn: Outline, turn: float, centre: Array, pa
     rays = np.column_stack([np.cos(angles), np.sin(angles)])
 
     def beyond(t: Array) -> Array:
-        return distance(drawn.perfect(centre + t[:, None] * rays) @ Q) - wanted
+        """On each ray the distance at (..., corners) of the chart, less the one that is wanted."""
+        chart = centre + t[..., None] * rays
+        return distance(drawn.perfect(chart.reshape(-1, 2)) @ Q).reshape(t.shape) - wanted
 
     tried = np.linspace(0, WIDEST * wanted, STEPS + 1)[1:]
-    outside = np.stack([beyond(np.full(CORNERS, t)) for t in tried]) >= 0
+    outside = beyond(np.tile(tried[:, None], CORNERS)) >= 0
     if not outside.any(axis=0).all():
         raise CaseError(
-            f"shell.{key}.width: its width over R, {flaw.reach:.3g}, is too much for this place of the shell: it would "
-            "reach around it"
+            f"shell.{key}.width: its width over R, {flaw.reach:.3g}, is too much for this place: it would reach "
+            "around the shell or its axis"
         )
     high = tried[outside.argmax(axis=0)]
-    low = high - tried[0]
-    for _ in range(HALVINGS):
-        middle = (low + high) / 2
-        within = beyond(middle) < 0
-        low, high = np.where(within, middle, low), np.where(within, high, middle)
-    return np.asarray(centre + ((low + high) / 2)[:, None] * rays)
+    low, below, above = high - tried[0], beyond(high - tried[0]), beyond(high)
+    for _ in range(ROUNDS):  # of the rule of false position, where the end that stays counts half
+        middle = high - above * (high - low) / (above - below)
+        found = beyond(middle)
+        crossed = found * above < 0
+        low, below = np.where(crossed, high, low), np.where(crossed, above, below / 2)
+        high, above = middle, np.where(found == 0, 1e-300, found)
+    return np.asarray(centre + high[:, None] * rays)
 
 
 def images(spot: Spot, drawn: Outline) -> list[Array]:

@@ -1,6 +1,7 @@
 """The symmetry that the imperfections of a case leave, by their values."""
 
 from collections.abc import Mapping
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,10 +32,13 @@ def leaves(found: Mapping[str, Flaw], drawn: Outline, *, each: bool) -> list[Lea
     """
     if not found:
         return []
-    x, grouped = _sample(found, drawn), [[flaw] for flaw in found.values()] if each else [list(found.values())]
+    grouped = [[flaw] for flaw in found.values()] if each else [list(found.values())]
     groups = [[flaw.deviation for flaw in group] for group in grouped]
 
+    sample = cache(lambda: _sample(found, drawn))
+
     def mirrors(mirror: Mirror) -> bool:
+        x = sample()
         return all(_same(_w0(group, x), _w0(group, mirror.image(x))) for group in groups)
 
     centres = [flaw.centre for flaw in found.values() if flaw.centre is not None]

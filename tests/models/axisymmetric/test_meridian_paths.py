@@ -50,7 +50,7 @@ def test_patch_carries_the_whole_force_and_tends_to_the_point() -> None:
 def test_clamped_plate() -> None:
     """w0 = p R^4/(64 D) (Timoshenko)."""
     h, nu, p_over_pc = 1 / 50, 0.3, 1e-5
-    meridian = make_meridian(flat, graded_vertices(1.0, None, h))
+    meridian = make_meridian(flat, graded_vertices(1.0, [], h))
     model = MeridianModel(meridian, Material(nu, h), 4, {"rim": "clamped"}, Loads(pressure=True))
     path = Path(BorderedNewton(model.system), "pressure", "load", StepOptions(p_over_pc, p_over_pc, p_over_pc))
     ((point, _),) = path.towards(path.start(unloaded(model)), [p_over_pc])
