@@ -218,3 +218,15 @@ def test_bad_input(settings: list[str], options: dict[str, Any], message: str, t
         module.ensemble(DIMPLE, settings, **{"samples": 4, "seed": 1, "out": tmp_path / "out", **options})
     assert message in str(e.value)
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+def test_random_dimples(tmp_path: Path) -> None:
+    """The case's mesh against one with elements half as large (0.350848)."""
+    settings = ["--samples", 2, "--seed", 1, "--part", "2/2"]
+    done = magshell("ensemble", CASES / "random_dimples.yaml", *settings, "--out", tmp_path)
+    assert done.returncode == 0, done.stderr
+    (row,) = read(tmp_path / "samples_2_of_2.csv")
+    assert float(row["result"]) == pytest.approx(0.350848, rel=5e-3)
+    assert float(row["severest.amplitude"]) == pytest.approx(1.1290330023384831)
+    assert row["found"] == "fold"
