@@ -29,7 +29,7 @@ def fold_ahead(newton: BorderedNewton, point: Point, name: str) -> Guess | None:
         mode = critical_mode(newton, state)
     except NoEigenpair:
         return None
-    rate, phi = point.du / point.dmu, mode.vector
+    rate, phi = np.asarray(point.du / point.dmu), mode.vector
     along, cubic = dot(comm, phi, rate), dot(comm, phi, third(system, state, phi))
     pull = mode.eigenvalue * along
     if mode.eigenvalue <= 0 or not cubic * pull:

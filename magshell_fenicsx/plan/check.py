@@ -45,6 +45,8 @@ def describe(case: Case) -> str:
     left_out = list(plan.left_out)
     if plan.loads.pressure and (open_at := _open(plan, patch)):
         left_out.append(no_potential(open_at))
+    if case.ensemble:
+        left_out.append("ensemble: random values (magshell ensemble alone draws them)")
     left_out = left_out or ["nothing"]
     lines += ["built:", *(f"  {item}" for item in plan.included), "left out:", *(f"  {item}" for item in left_out)]
     if plan.warning:

@@ -12,6 +12,8 @@ from conftest import CASES
 
 from magshell_fenicsx import CaseError
 from magshell_fenicsx.case.source import override, read_source
+from magshell_fenicsx.continuation.fold import FoldLost
+from magshell_fenicsx.run.run import run
 from magshell_fenicsx.studies.ensemble import ensemble as module
 from magshell_fenicsx.studies.ensemble import solve as solving
 from magshell_fenicsx.studies.ensemble.known import KnownFolds
@@ -26,7 +28,12 @@ RANDOM = (
 )
 COARSE = ["mesh.degree=3", "mesh.refinement=0.5"]
 THREE = ("--samples", 3, "--seed", 1, *(f"--set={s}" for s in (RANDOM, *COARSE)))
+SMALL = ("symmetry=none", "mesh={degree: 3, refinement: 0.3}", "shell.radius_to_thickness=30", "shell.defect=null")
 KNOCKDOWN = parse_scalar("knockdown")
+
+
+def lost(*arguments: Any) -> Any:
+    raise FoldLost("on purpose")
 
 
 def drawn(*settings: str, numbers: range = range(4), deleted: int = 0) -> list[Sample]:
@@ -78,19 +85,38 @@ def test_a_known_fold_leads_to_the_knockdown_of_the_path() -> None:
     first, second = drawn(*COARSE, numbers=range(2))
     known = KnownFolds()
     solving.solve(first, KNOCKDOWN, known)
-    near, path = solving.solve(second, KNOCKDOWN, known), solving.solve(second, KNOCKDOWN, KnownFolds())
-    assert (near.found, path.found) == ("fold", "path")
-    assert near.knockdown == pytest.approx(path.knockdown, rel=1e-9)
-    assert near.factorisations < path.factorisations / 4
+    near, alone = solving.solve(second, KNOCKDOWN, known), solving.solve(second, KNOCKDOWN, KnownFolds())
+    assert near.knockdown == pytest.approx(alone.knockdown, rel=1e-9)
+    path = run(second.case)
+    assert near.knockdown == pytest.approx(path.knockdown, rel=2e-8)  # located to 1e-8
+    assert near.factorisations < path.scene.newton.factorisation.count / 4
     other = solving.solve(second, parse_scalar("w_pole_over_h@end"), known)  # every other result takes the path
     assert other.found == "path"
 
 
 @pytest.mark.slow
-def test_the_path_of_degree_3_leads_to_the_knockdown_of_the_path() -> None:
-    (sample,) = drawn("symmetry=none", "mesh.refinement=0.6", "shell.radius_to_thickness=20", numbers=range(1))
-    lower, path = solving._by_lower_degree(sample, KnownFolds()), solving._by_path(sample, KnownFolds())
-    assert lower.knockdown == pytest.approx(path.knockdown, rel=1e-9)
+def test_a_fold_ahead_is_the_fold_of_the_path(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two random defects on a full shell; the path located its fold without any guess."""
+    defects = "defects: {count: 2, amplitude: 1, width: 3, polar: [0, 50], distance: 40}"
+    (sample,) = drawn(f"ensemble={{{defects}}}", *SMALL, numbers=range(1))
+    ahead = solving.solve(sample, KNOCKDOWN, KnownFolds())
+    monkeypatch.setattr(solving, "MOST_TRIES", 0)
+    monkeypatch.setattr(KnownFolds, "polished", lost)
+    path = solving.solve(sample, KNOCKDOWN, KnownFolds())
+    assert (ahead.found, path.found) == ("fold", "path")
+    assert ahead.knockdown == pytest.approx(path.knockdown, rel=1e-7)
+    assert ahead.factorisations < path.factorisations
+
+
+def test_the_weakest_defects_are_deleted() -> None:
+    """The others stay as they are."""
+    defects = "defects: {count: 4, amplitude: {kind: uniform, above: 0.5, below: 2}, width: 3, polar: [0, 60]}"
+    settings = (f"ensemble={{{defects}}}", *SMALL)
+    (whole,), (less,) = (drawn(*settings, numbers=range(1), deleted=n) for n in (0, 2))
+    every, kept = whole.case.shell.imperfections, less.case.shell.imperfections
+    assert [item for item in every if item in kept] == kept
+    assert sorted(item.amplitude for item in kept) == sorted(item.amplitude for item in every)[2:]
+    assert whole.severest["amplitude"] == max(item.amplitude for item in every)
 
 
 def test_interrupted_and_resumed(tmp_path: Path, analytic: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -127,10 +153,10 @@ def test_parts_make_the_whole(tmp_path: Path, analytic: list[int]) -> None:
 def test_failed_samples_are_counted_and_listed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """In table, summary and report; an error may have been of the machine, and is tried again."""
 
-    def run(case: Any, comm: Any) -> Any:
+    def unlucky(case: Any, comm: Any) -> Any:
         raise RuntimeError("out of luck")
 
-    monkeypatch.setattr(solving, "run", run)
+    monkeypatch.setattr(solving, "run", unlucky)
     done = magshell(
         "ensemble",
         DIMPLE,
@@ -192,3 +218,15 @@ def test_bad_input(settings: list[str], options: dict[str, Any], message: str, t
         module.ensemble(DIMPLE, settings, **{"samples": 4, "seed": 1, "out": tmp_path / "out", **options})
     assert message in str(e.value)
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+def test_random_dimples(tmp_path: Path) -> None:
+    """The case's mesh against one with elements half as large (0.350848)."""
+    settings = ["--samples", 2, "--seed", 1, "--part", "2/2"]
+    done = magshell("ensemble", CASES / "random_dimples.yaml", *settings, "--out", tmp_path)
+    assert done.returncode == 0, done.stderr
+    (row,) = read(tmp_path / "samples_2_of_2.csv")
+    assert float(row["result"]) == pytest.approx(0.350848, rel=5e-3)
+    assert float(row["severest.amplitude"]) == pytest.approx(1.1290330023384831)
+    assert row["found"] == "fold"

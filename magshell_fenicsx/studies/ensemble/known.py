@@ -13,7 +13,7 @@ from magshell_fenicsx.studies.ensemble.samples import Values
 from magshell_fenicsx.studies.sweep.continuation import refuse_later
 
 Array = NDArray[np.float64]
-MOST = 50  # folds that are kept
+MOST = 20  # folds that are kept
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class KnownFolds:
             given = given | {"lambda_m": scene.case.lambda_m}
         nodes = chart(scene)
         for known in sorted(self._known, key=lambda known: self._distance(values, known.values)):
-            order = matching(known.nodes, nodes)
+            order = matching(known.nodes, nodes) if known.nodes.shape == nodes.shape else None
             if order is None:
                 continue
             u, phi = (v.reshape(len(nodes), -1)[order].ravel() for v in (known.u, known.phi))
