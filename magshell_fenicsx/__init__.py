@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from magshell_fenicsx.simulate.follow import follow
     from magshell_fenicsx.simulate.record import Record, Stopped
     from magshell_fenicsx.simulate.scene import Scene
+    from magshell_fenicsx.simulate.search import solutions
     from magshell_fenicsx.simulate.sensitivity import fold_at, sensitivities
     from magshell_fenicsx.simulate.trace import trace
 
@@ -52,6 +53,7 @@ __all__ = [
     "polydata",
     "run",
     "sensitivities",
+    "solutions",
     "surface",
     "trace",
 ]
@@ -68,6 +70,7 @@ _ROOMS = {
     "simulate.follow": "follow",
     "simulate.record": "Record Stopped",
     "simulate.scene": "Scene",
+    "simulate.search": "solutions",
     "simulate.sensitivity": "fold_at sensitivities",
     "simulate.trace": "trace",
 }

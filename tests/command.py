@@ -20,10 +20,10 @@ main()
 
 
 def magshell(*arguments: str | Path | float, ranks: int = 0) -> subprocess.CompletedProcess[str]:
-    """Run `magshell ...`: in this process, which saves two seconds, or under mpirun if `ranks` is given."""
+    """Run `magshell ...`: in this process, which saves two seconds, or undrawn under mpirun if `ranks` is given."""
     words = [str(word) for word in arguments]
     if ranks:
-        return started(*words, ranks=ranks)
+        return started(*words, ranks=ranks, pictures=False)
     done = CliRunner(mix_stderr=False).invoke(app, words, prog_name="magshell")
     gc.unfreeze()  # a run freezes what it leaves, as its process ends soon
     if done.exception and not isinstance(done.exception, SystemExit):

@@ -15,7 +15,7 @@ from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.scene import Scene
 
-SCENES, TEN = 60, 10
+SCENES, TEN = 50, 10
 COARSE = ["symmetry=half", "mesh.degree=2", "mesh.refinement=0.3"]
 
 

@@ -1,7 +1,8 @@
 """The whole case: its sections and what they must have in common."""
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from functools import cached_property
 from math import pi, radians
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, TypeVar
@@ -100,7 +101,8 @@ class Case(WithParts):
             written = data.get("loading")
             sources = written if isinstance(written, list) else [written]
             for step, source in zip(programme(section.loading, field=False), sources, strict=False):
-                parts |= {step.key: source} if isinstance(step.load, DeadSection | EdgeSection) else {}
+                if isinstance(step.load, DeadSection | EdgeSection) and isinstance(source, dict):
+                    parts[step.key] = {key: value for key, value in source.items() if key != "hold"}
             places = {
                 f"shell.imperfections.{i}.at.point": item["at"].get("point") if "at" in item else None
                 for i, item in enumerate(data["shell"].get("imperfections") or [])
@@ -262,11 +264,17 @@ class Case(WithParts):
         refuse_unfit_steps(self.programme, self.magnetic, self.lambda_m, whole=isinstance(self.loading, list))
         return self
 
-    @property
+    @cached_property
     def programme(self) -> tuple[ProgrammeStep, ...]:
         """Its steps; before a single load the natural shape grows, then the field."""
         grows = [key for key in ("stretch", "curvature") if getattr(self.natural, key, None) is not None]
         return programme(self.loading, field=bool(self.lambda_m), natural=grows)
+
+    def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
+        """A copy with some sections changed, which makes its programme anew."""
+        copied = super().model_copy(update=update, deep=deep)
+        copied.__dict__.pop("programme", None)
+        return copied
 
     def loads_of(self, kind: type[AnyStep]) -> list[AnyStep]:
         """The loads of a kind among its steps."""

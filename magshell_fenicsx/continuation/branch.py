@@ -48,7 +48,7 @@ def branching(path: Path, bifurcation: Point) -> Branching | None:
         mode = critical_mode(path.newton, state).vector
     except NoEigenpair:
         return None
-    mode = np.asarray(mode * path.system.length / _largest(path.system.comm, mode))
+    mode = np.asarray(mode * path.system.length / largest(path.system.comm, mode))
     found = None
     for size in SIZES:
         starts = [_step_off(path, state, mode, signed) for signed in (size, -size)]
@@ -62,7 +62,7 @@ def branching(path: Path, bifurcation: Point) -> Branching | None:
     return found
 
 
-def _largest(comm: MPI.Comm, v: Vector) -> float:
+def largest(comm: MPI.Comm, v: Vector) -> float:
     """The entry of largest magnitude with its sign, which is the same on any number of ranks."""
     here = float(v[np.argmax(np.abs(v))]) if v.size else 0.0
     return float(max(comm.allgather(here), key=abs))

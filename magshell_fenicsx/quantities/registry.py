@@ -17,7 +17,7 @@ def _w(name: str, note: str, meaning: str) -> Quantity:
 
 OF_EVERY_RUN = (
     Quantity("point", "point", "Number of the accepted point.", "count"),
-    Quantity("label", "what", "start, field, step, target, fold or bifurcation.", "text"),
+    Quantity("label", "what", "start, field, step, target, fold, bifurcation or solution.", "text"),
     Quantity("amplitude", "varied", "The amplitude that varied.", "text"),
     Quantity(
         "p_over_pc",
@@ -86,7 +86,12 @@ OF_EVERY_RUN = (
     Quantity(
         "field_angle", "field angle", "Angle by which the field has turned.", "load", unit="degrees", si="degrees"
     ),
-    Quantity("branch", "branch", "0 is the path, 1 and 2 leave it at its first bifurcation.", "count"),
+    Quantity(
+        "branch",
+        "branch",
+        "0 is the path, 1 and 2 leave it at its first bifurcation; of a solution its number.",
+        "count",
+    ),
     _w("w_point_over_h", "of the loaded point", "Inward displacement of the loaded point itself."),
     Quantity(
         "error_over_h", "error of u", "Estimate of the algebraic error: the next Newton step.", "error", "", "h", "m"

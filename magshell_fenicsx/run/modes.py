@@ -63,7 +63,7 @@ class _Writer:
     def modes(self, shell: ShellModes, wanted: StabilitySection) -> None:
         points = self.result.singular
         if wanted.at == "end":
-            points = {len(self.result.rows) - 1: self.result.last}
+            points = {self.result.end: self.result.last}
         found: dict[int, list[ShellMode]] = {}
         for number, state in points.items():
             try:

@@ -18,7 +18,7 @@ from magshell_fenicsx.output.pictures.render import NoScreen
 from magshell_fenicsx.output.report.report import write_report
 from magshell_fenicsx.output.store.durable import write_whole
 from magshell_fenicsx.output.store.folder import DiskError, by_first, held_folder
-from magshell_fenicsx.output.store.table import LOCATED, Row
+from magshell_fenicsx.output.store.table import LOCATED, SOLUTION, Row
 from magshell_fenicsx.platform.environment import fast_blas
 from magshell_fenicsx.quantities.registry import quantity
 from magshell_fenicsx.run.files import MESH, RunFiles, open_folder
@@ -118,6 +118,9 @@ def _run(case: Case, folder: Path | None, comm: MPI.Comm, say: Say, tell: Say, w
         scene.journal = Stoppable(files.journal if files else NoJournal(), watch)
         try:
             _follow(result, files, say, progress, start)
+            for step in scene.case.programme:
+                if step.load.search and not any(int(result.rows[i]["step"]) == step.number for i in result.found):
+                    say(f"warning: the search at the end of step {step.number} has found no further solution")
             result.sensitivities = _sensitivities(result)
             result.barrier = _barrier(result)
         except (Stopped, NoEigenpair) as e:
@@ -171,7 +174,7 @@ def _mesh_for_tolerance(case: Case, folder: Path | None, comm: MPI.Comm, say: Sa
 
 def _sensitivities(result: Result) -> dict[str, float]:
     """The sensitivities at the final fold, if the case requests them."""
-    scene, last = result.scene, result.rows[-1]
+    scene, last = result.scene, result.rows[result.end]
     step = scene.case.programme[int(last["step"]) - 1] if last["label"] == "fold" else None
     if step is None or not (isinstance(step.load, PathStep) and step.load.sensitivities):
         return {}
@@ -200,7 +203,10 @@ def _follow(result: Result, files: RunFiles | None, say: Say, progress: RunProgr
         result.history.add(record)
         row = made.row(record, time.perf_counter() - start)
         result.rows.append(row)
-        result.last = record.point.state
+        if record.label == SOLUTION:
+            result.found[len(result.rows) - 1] = record.point.state
+        else:
+            result.last, result.end = record.point.state, len(result.rows) - 1
         if record.label in LOCATED:
             result.singular[len(result.rows) - 1] = record.point.state
         if files:

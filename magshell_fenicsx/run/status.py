@@ -13,7 +13,7 @@ from magshell_fenicsx.case.loads.field import RotationSection
 from magshell_fenicsx.case.loads.step import PathStep
 from magshell_fenicsx.continuation.point import Point
 from magshell_fenicsx.models.reacting import motion_columns
-from magshell_fenicsx.output.store.table import Row
+from magshell_fenicsx.output.store.table import SOLUTION, Row
 from magshell_fenicsx.quantities.registry import amplitude, quantity
 from magshell_fenicsx.simulate.scene import Scene
 
@@ -152,7 +152,10 @@ class RunProgress:
     def accepted(self, row: Row, *, known: bool) -> None:
         """Note a new point; `known` if an interrupted run had found it."""
         now = time.perf_counter()
-        self._row, self._points = row, self._points + 1
+        self._points += 1
+        if row["label"] == SOLUTION:
+            return
+        self._row = row
         self._steps += row["label"] == "step"
         part = self._aim.part(self._first, row, self._steps) if self._first and self._aim else None
         self._here = (part or 0.0, now)

@@ -3,9 +3,11 @@
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+
 from magshell_fenicsx.case.shell import ShellSection
 from magshell_fenicsx.case.surfaces import Surface
-from magshell_fenicsx.continuation.system import State
+from magshell_fenicsx.continuation.system import State, dot
 from magshell_fenicsx.continuation.timing import Stopwatch
 from magshell_fenicsx.output.store.table import LOCATED, Row
 from magshell_fenicsx.platform import sources
@@ -25,7 +27,7 @@ class Result:
     rows
         One mapping per accepted point, with the columns of path.csv.
     last
-        Displacement and amplitudes at the last point.
+        Displacement and amplitudes at the last point of the path.
     singular
         The same at the located instabilities, by row number.
     stopped
@@ -38,6 +40,10 @@ class Result:
         The mesh and its error estimate, if the case has a tolerance.
     history
         The records that `value` is taken from.
+    end
+        Number of the row of `last`.
+    found
+        The states of the solutions that searches have found, by row number.
     barrier
         The energy barrier over E h R^2 of a last step with `until: zero`; None without.
     """
@@ -53,6 +59,8 @@ class Result:
     adapted: Adapted | None = None
     history: History = field(default_factory=History)
     barrier: float | None = None
+    end: int = 0
+    found: dict[int, State] = field(default_factory=dict)
 
     @property
     def limit_points(self) -> list[dict[str, Any]]:
@@ -117,6 +125,7 @@ def summary(result: Result, total_s: float) -> dict[str, Any]:
         "sensitivities": result.sensitivities,
         "knockdown": result.knockdown,
         "barrier": result.barrier,
+        "solutions": solutions(result),
         "most_excluded_pivots": max((int(row["excluded_pivots"]) for row in result.rows), default=0),
         "points": len(result.rows),
         "mesh": {"cells": scene.cells, "dofs": model.system.dofs, "degree": model.degree},
@@ -137,6 +146,31 @@ def summary(result: Result, total_s: float) -> dict[str, Any]:
         "blas": fast_blas() or "reference",
         "versions": versions(),
     }
+
+
+def solutions(result: Result) -> list[dict[str, Any]]:
+    """What searches have found; the residual is over the sum of the sizes of all terms' forces. Collective."""
+    system, found = result.scene.model.system, []
+    for number, state in result.found.items():
+        row = result.rows[number]
+        residual = system.residual(state.u, state.mu)
+        forces = (
+            (state.mu[t.amplitude] if t.amplitude else 1.0) * system.forces(state.u, state.mu, t.name)
+            for t in system.terms
+        )
+        sizes = [np.sqrt(dot(system.comm, v, v)) for v in (residual, *forces)]
+        keys = ("p_over_pc", "w_over_h", "w_pole_over_h", "volume_change", "energy", "negative_pivots")
+        found.append(
+            {
+                "point": number,
+                "step": row["step"],
+                "solution": row["branch"],
+                "stable": not int(row["negative_pivots"]) + int(row["excluded_pivots"]),
+                **{key: row[key] for key in (*keys, "excluded_pivots", "error_over_h")},
+                "residual": sizes[0] / sum(sizes[1:]),
+            }
+        )
+    return found
 
 
 def _dimensions(shell: ShellSection | Surface) -> dict[str, Any]:

@@ -15,7 +15,8 @@ def barrier(scene: Scene, step: ProgrammeStep, begin: State, end: State) -> floa
     each amplitude whose conjugate q is held.
     """
     held = held_by(scene, step, begin)
-    change = scene.observe(end)["energy"] - scene.observe(begin)["energy"]
+    before, after = (sum(scene.energies(state).values()) for state in (begin, end))
+    change = after - before
     for name, q in held.items():
         a, b = begin.mu[name], end.mu[name]
         work = quad(lambda mu, q=q: q(mu)[0], a, b)[0] if callable(q) else q * (b - a)

@@ -6,12 +6,18 @@ from dataclasses import replace
 from magshell_fenicsx.continuation.point import Point
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
+from magshell_fenicsx.simulate.search import searched
 from magshell_fenicsx.simulate.steps import LOCATED, records_of
 from magshell_fenicsx.simulate.walked import Walked
 
 
-def follow(scene: Scene) -> Iterator[Record]:
+def follow(scene: Scene, *, search: bool = True) -> Iterator[Record]:
     """Compute the history of a scene; yields every accepted point.
+
+    Parameters
+    ----------
+    search
+        Whether steps search for the further solutions that they request.
 
     Raises
     ------
@@ -35,6 +41,8 @@ def follow(scene: Scene) -> Iterator[Record]:
                 yield replace(record, step=step.number)
         except Stopped as e:
             raise Stopped(f"{where}{e}") from None
-        state = walked.end
+        begin, state = state, walked.end
+        for record in searched(scene, step, begin, state) if search else ():
+            yield replace(record, step=step.number)
         if step is not steps[-1] and step.until in ("limit", "bifurcation") and last in LOCATED:
             raise Stopped(f"{where}ends at a {last}, from which the next step cannot start")

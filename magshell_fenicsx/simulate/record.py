@@ -5,7 +5,7 @@ from typing import Literal
 
 from magshell_fenicsx.continuation.point import Point
 
-Label = Literal["start", "field", "step", "target", "fold", "bifurcation"]
+Label = Literal["start", "field", "step", "target", "fold", "bifurcation", "solution"]
 
 
 @dataclass(frozen=True)
@@ -16,7 +16,8 @@ class Record:
     ----------
     label
         "field": during the growth of the field; "step": between targets; "target": a requested point;
-        "fold" and "bifurcation": a located instability.
+        "fold" and "bifurcation": a located instability; "solution": a further equilibrium at the amplitudes of the
+        point where its step ends.
     amplitude
         The amplitude that varied ("" at the start).
     mode
@@ -25,7 +26,8 @@ class Record:
         For a bifurcation of the model itself: "symmetric" if the load changes equally in both directions of the
         branch (a pitchfork), or "asymmetric".
     branch
-        0 on the path itself, 1 and 2 in the two directions of the branch at its first bifurcation.
+        0 on the path itself, 1 and 2 in the two directions of the branch at its first bifurcation; of a solution its
+        number.
     excluded_pivots
         Number of unstable directions that the model excludes; see `continuation.watch.Watch`.
     step

@@ -110,15 +110,8 @@ class Scene:
         """The physical columns of a table row: loads, displacements over h, volume, energies over E h R^2."""
         model, h, loads = self.model, self.plan.material.h, self.model.loads
         force, sense = loads.forces.get("force"), copysign(1.0, self.case.lambda_m)
-        model.system.place(state.mu)
-        model.system.accept(state.u)
+        energies = self.energies(state)
         pole = model.deflection(state.u, "pole") / h
-        potentials, energies = model.system.energies(state.u), defaultdict[str, float](float)
-        for t in model.system.terms:
-            amplitude = state.mu[t.amplitude] if t.amplitude else 1.0
-            name = t.name.removesuffix(" across").removesuffix(" third")
-            name = "magnetic gradient" if name.startswith("magnetic gradient") else name
-            energies[name] += model.multiplicity * amplitude * potentials[t.name]
         split = "membrane" in energies  # a solid has no such split
         return {
             "p_over_pc": state.mu.get("pressure", 0.0),
@@ -149,6 +142,19 @@ class Scene:
                 for column in term.observed
             },
         }
+
+    def energies(self, state: State) -> dict[str, float]:
+        """The energy of each term at an accepted point, over E h R^2; all parts of one field together."""
+        model, found = self.model, defaultdict[str, float](float)
+        model.system.place(state.mu)
+        model.system.accept(state.u)
+        potentials = model.system.energies(state.u)
+        for t in model.system.terms:
+            amplitude = state.mu[t.amplitude] if t.amplitude else 1.0
+            name = t.name.removesuffix(" across").removesuffix(" third")
+            name = "magnetic gradient" if name.startswith("magnetic gradient") else name
+            found[name] += model.multiplicity * amplitude * potentials[t.name]
+        return found
 
     @property
     def _own_amplitudes(self) -> dict[str, float]:

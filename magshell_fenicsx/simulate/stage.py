@@ -59,6 +59,10 @@ class Stage:
         """A vector of the model as one of the step's system."""
         return self.device.padded(u) if self.device else u
 
+    def displaced(self, x: Vector) -> Vector:
+        """A vector of the step's system with zeros for the unknown amplitudes."""
+        return self.device.padded(self.device.displacement(x)) if self.device else x
+
     def path(self, name: str, control: Control, options: StepOptions, scale: float = 1.0) -> Path:
         """A path of the step's system.
 

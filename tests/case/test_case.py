@@ -4,6 +4,7 @@ from pathlib import Path
 from textwrap import dedent
 
 import pytest
+from conftest import CASES
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.fields import MU_0
@@ -135,3 +136,10 @@ def test_every_mistake_is_told_at_once(file: Path) -> None:
     with pytest.raises(CaseError) as error:
         Case.load(file, ["shell.poisson_ratio=0.7", "mesh.degree=9"])
     assert len(str(error.value).splitlines()) == 2
+
+
+def test_a_copy_has_a_programme_of_its_own() -> None:
+    case = Case.load(CASES / "probing.yaml")
+    assert case.programme is case.programme
+    assert len(case.programme) == 2
+    assert case.model_copy(update={"loading": None}).programme == ()

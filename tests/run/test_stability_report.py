@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import pyvista
-from command import magshell
+from command import started
 from conftest import CASES
 
 from magshell_fenicsx import Case, Record, Scene
@@ -65,10 +65,9 @@ def past_the_fold(symmetry: str, degree: int) -> tuple[Scene, dict[str, Record]]
     return scene, {"before": records[fold - 1], "fold": records[fold], "past": records[-1]}
 
 
-@pytest.mark.parametrize(("symmetry", "degree"), [("auto", 4), pytest.param("half", 3, marks=pytest.mark.slow)])
-def test_lowest_stiffness_changes_sign_at_the_fold(symmetry: str, degree: int) -> None:
+def test_lowest_stiffness_changes_sign_at_the_fold() -> None:
     """k_d = 0.3262 of the independent axisymmetric solver; as many negative eigenvalues as negative pivots."""
-    scene, records = past_the_fold(symmetry, degree)
+    scene, records = past_the_fold("auto", 4)
     shell = ShellModes(scene.model)
     lowest = {}
     for name, record in records.items():
@@ -210,20 +209,21 @@ COARSE = ["--set=mesh.degree=3", "--set=mesh.refinement=0.3", "--set=loading.dep
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("symmetry", ["axisymmetric", "half", "none"])
-def test_same_modes_on_one_two_and_three_ranks(tmp_path: Path, symmetry: str) -> None:
-    """Two for the whole shell, three for the others."""
+@pytest.mark.parametrize("symmetry", ["axisymmetric", "half"])
+def test_same_modes_on_one_rank_and_three(tmp_path: Path, symmetry: str) -> None:
+    """The same table on one rank and on three, with pictures on the meridian."""
     tables = []
-    for ranks in (1, 2) if symmetry == "none" else (1, 3):
+    for ranks in (1, 3):
         out = tmp_path / str(ranks)
-        settings = [*COARSE, f"--set=symmetry={symmetry}", "--set=stability.modes=5"]
-        done = magshell("run", CASES / "pole_indentation.yaml", *settings, "--out", out, ranks=ranks)
+        settings = [*COARSE, f"--set=symmetry={symmetry}", "--set=stability.modes=3"]
+        drawn = symmetry == "axisymmetric"
+        done = started("run", CASES / "pole_indentation.yaml", *settings, "--out", out, ranks=ranks, pictures=drawn)
         assert done.returncode == 0, done.stderr
         tables.append(table(out))
-        assert len(list((out / "fields").glob("mode_*.vtu"))) == 5
-        assert list(out.glob("modes_*.png"))
+        assert len(list((out / "fields").glob("mode_*.vtu"))) == 3
+        assert bool(list(out.glob("modes_*.png"))) == drawn
     eigenvalues = [[float(row["eigenvalue"]) for row in rows] for rows in tables]
-    assert len(eigenvalues[0]) >= 5
+    assert len(eigenvalues[0]) >= 3
     for other in eigenvalues[1:]:
         assert other == pytest.approx(eigenvalues[0], rel=1e-8, abs=1e-9)
 

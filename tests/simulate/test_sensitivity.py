@@ -17,7 +17,7 @@ from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.sensitivity import sensitivities
 
 MERIDIAN = ["magnetic.lambda_m=0.001"]
-HALF = [*MERIDIAN, "symmetry=half", "mesh.degree=3", "mesh.refinement=0.4", "magnetic.applied.polar=30"]
+HALF = [*MERIDIAN, "symmetry=half", "mesh.degree=3", "mesh.refinement=0.3", "magnetic.applied.polar=30"]
 SHELLS = [pytest.param(MERIDIAN, id="meridian"), pytest.param(HALF, id="half", marks=pytest.mark.slow)]
 
 

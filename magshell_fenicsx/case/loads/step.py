@@ -6,6 +6,7 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self
 import numpy as np
 from pydantic import Discriminator, Field, Tag, model_validator
 
+from magshell_fenicsx.case.loads.search import SearchSection
 from magshell_fenicsx.parts.section import Pressure, Section
 
 Until = Annotated[
@@ -127,6 +128,8 @@ class Step(Section):
     hold: dict[str, Hold] = Field(default_factory=dict)
     """Amplitude of another step, or pressure -> what is constant in this step: the load itself (default), its
     conjugate displacement (of the pressure the volume, of a force the displacement), or a gas under the shell"""
+    search: SearchSection | None = None
+    """Search for further solutions at the end of the step"""
 
     @property
     def place(self) -> Any:

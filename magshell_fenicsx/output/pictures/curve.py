@@ -9,7 +9,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from magshell_fenicsx.output.store.table import LOCATED, OWN_MODES, Row, pole_name
+from magshell_fenicsx.output.store.table import LOCATED, OWN_MODES, SOLUTION, Row, pole_name
 from magshell_fenicsx.quantities.registry import amplitude as registered
 from magshell_fenicsx.quantities.registry import axes_of, quantity
 
@@ -104,8 +104,9 @@ def plot_curve(axes: "Axes", of: Part) -> None:
         x = quantity("w_pole_over_h")  # moments have no conjugate displacement
     pole = pole_name(part[0]).replace("$", r"\$")  # plain text, no mathematics
     x_label, y_label = (each.label.replace("the pole", pole) for each in (x, y))
-    for branch in sorted({int(row["branch"]) for row in part}):
-        line = [row for row in part if row["branch"] == branch and row["mode"] in OWN_MODES]
+    path = [row for row in part if row["label"] != SOLUTION]
+    for branch in sorted({int(row["branch"]) for row in path}):
+        line = [row for row in path if row["branch"] == branch and row["mode"] in OWN_MODES]
         smooth_x, smooth_y = smooth(*zip(*(place(row, amplitude) for row in line), strict=True))
         unstable = [_unstable(row) and row["label"] not in LOCATED for row in line]
         for dashed, pieces in groupby(range(1, len(line)), key=unstable.__getitem__):
@@ -121,6 +122,12 @@ def plot_curve(axes: "Axes", of: Part) -> None:
         if number > NAMED:
             name = f"and {len(marked) - NAMED} more" if number == NAMED + 1 else "_"  # matplotlib omits "_"
         axes.plot(*place(row, amplitude), "o", color="C3", markersize=6, label=name)
+    for row in (row for row in part if row["label"] == SOLUTION):
+        name, inside = ("unstable", "none") if _unstable(row) else ("stable", "C2")
+        known = axes.get_legend_handles_labels()[1]
+        label = f"{name} solution" if f"{name} solution" not in known else "_"
+        axes.plot(*place(row, amplitude), "s", color="C2", markerfacecolor=inside, markersize=6, label=label)
+        axes.annotate(str(row["branch"]), place(row, amplitude), (0, 6), textcoords="offset points", fontsize=8)
     axes.set(xlabel=x_label, ylabel=y_label)
     axes.locator_params(axis="x", nbins=6)
     axes.axhline(0, color="0.8", linewidth=0.8, zorder=0)

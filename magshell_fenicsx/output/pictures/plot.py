@@ -15,9 +15,10 @@ from magshell_fenicsx.output.pictures.curve import curve_figure, drawn_parts
 from magshell_fenicsx.output.pictures.layout import png
 from magshell_fenicsx.output.pictures.mode_picture import draw_modes
 from magshell_fenicsx.output.pictures.picture import figures
+from magshell_fenicsx.output.pictures.solutions import searched, solutions_figure
 from magshell_fenicsx.output.report.report import write_report
 from magshell_fenicsx.output.store.durable import write_whole
-from magshell_fenicsx.output.store.table import LOCATED, OWN_MODES, Row, read_rows
+from magshell_fenicsx.output.store.table import LOCATED, OWN_MODES, SOLUTION, Row, read_rows
 from magshell_fenicsx.quantities.registry import amplitude as registered
 from magshell_fenicsx.quantities.registry import quantity
 
@@ -76,7 +77,7 @@ def draw(folder: Path, point: int | None = None) -> list[str]:
 
     if point is not None and not 0 <= point < len(rows):
         raise CaseError(f"--point {point}: {folder} has points 0 to {len(rows) - 1}")
-    row = rows[-1 if point is None else point]
+    row = _on_path(rows)[-1] if point is None else rows[point]
     surface, about = _point(folder, row)
     suffix = "" if point is None else f"_{point:04d}"
     title, amplitude = caption(about.h, about.nu, row), str(row["amplitude"])
@@ -87,6 +88,10 @@ def draw(folder: Path, point: int | None = None) -> list[str]:
     if point is None:
         for name, content in _modes(folder, rows):
             write(name, content)
+        if found := searched(rows):
+            surfaces = [_point(folder, each)[0] for each in found[:MOST_PANELS]]
+            title = caption(about.h, about.nu, found[0])
+            write("solutions.png", png(solutions_figure(surfaces, found[:MOST_PANELS], about.h, title)))
     return drawn
 
 
@@ -97,7 +102,7 @@ def draw_animation(folder: Path) -> str:
     -------
     The name of the file.
     """
-    rows = _rows(folder)
+    rows = _on_path(_rows(folder))
     amplitude = str(rows[-1]["amplitude"])
     parts = drawn_parts(rows, amplitude) if amplitude else []
     part = rows if len(parts) != 1 else parts[0].rows
@@ -120,6 +125,11 @@ def _rows(folder: Path) -> list[Row]:
     if not rows:
         raise CaseError(f"{folder} has no point to draw: no fields/{point_file(0)}")
     return rows
+
+
+def _on_path(rows: Sequence[Row]) -> list[Row]:
+    """The rows without the solutions of searches."""
+    return [row for row in rows if row["label"] != SOLUTION]
 
 
 def _file(folder: Path, row: Row) -> Path:

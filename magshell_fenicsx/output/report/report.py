@@ -14,12 +14,14 @@ from magshell_fenicsx.output.report.html_numbers import number
 from magshell_fenicsx.output.report.report_path import Line, path_table, pole_head, symbol
 from magshell_fenicsx.output.report.verdict import Summary, bending_stiffness, located, physical_units, value, verdict
 from magshell_fenicsx.output.store.durable import write_whole
+from magshell_fenicsx.output.store.table import stability
 from magshell_fenicsx.quantities.registry import amplitude
 
 NAME, TEMPLATE = "report.html", "report_template.html"
 FOLDED = 30  # a table with at least so many points is folded
 PICTURES = {  # in the order of the report
     "curve.png": "Load over displacement; dashed where the shell is unstable.",
+    "solutions.png": "The end of the path, and the solutions that the search has found.",
     "shell.png": "The deformed shell at the last point, coloured by the inward displacement w/h.",
     "animation.gif": "The shell along the path.",
     "magnetic_loads.png": "The magnetic energy read as loads on the deformed shell, at the last point.",
@@ -77,6 +79,7 @@ def _content(folder: Path) -> dict[str, Any]:
         "pictures": list(_pictures(folder)),
         "pole": pole_head(lines[0] if lines else {}),
         "instabilities": [_instability(line, summary) for line in located(lines)],
+        "solutions": [_solution(it) for it in summary.get("solutions", [])],
         "sensitivities": [(name, number(v)) for name, v in summary["sensitivities"].items()],
         "sensitive": symbol(amplitude(lines[-1]["amplitude"]).column) if summary["sensitivities"] else "",
         "how_to_estimate": _how_to_estimate(summary["case"]),
@@ -143,6 +146,11 @@ def _instability(line: Line, summary: Summary) -> dict[str, Any]:
         "w": number(float(line["w_over_h"])),
         "pole": number(float(line["w_pole_over_h"])),
     }
+
+
+def _solution(it: dict[str, Any]) -> list[Markup | str]:
+    numbers = (number(it[key]) for key in ("w_over_h", "w_pole_over_h", "volume_change", "energy"))
+    return [f"{it['point']}", f"{it['solution']}", stability(it), *numbers, number(it["residual"], 2)]
 
 
 def _how_to_estimate(case: dict[str, Any]) -> str:

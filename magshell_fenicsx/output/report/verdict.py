@@ -27,6 +27,12 @@ def verdict(summary: Summary, lines: Sequence[Line]) -> Markup:
     sentences = [_end(summary, lines)] if not first or until in ("target", "points") else []
     if first:
         sentences.append(_instability(first, summary))
+    if found := summary.get("solutions"):
+        stable = sum(it["stable"] for it in found)
+        more = "further solution" + "s" * (len(found) != 1)
+        sentences.append(
+            Markup("A search has found {} {}, {} of them stable.").format(len(found), more, stable or "none")
+        )
     if summary["stopped"]:
         points = f"{len(lines)} point{'s' * (len(lines) != 1)}"
         sentences.insert(0, Markup("The run stopped early, after {}: {}.").format(points, summary["stopped"]))

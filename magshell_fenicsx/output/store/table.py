@@ -13,12 +13,28 @@ COLUMNS = tuple(q.name for q in OF_EVERY_RUN)
 TEXTS = tuple(q.name for q in OF_EVERY_RUN if q.kind == "text")
 Row = dict[str, float | int | str]
 LOCATED = ("fold", "bifurcation")
+SOLUTION = "solution"  # label of what a search found
 OWN_MODES = ("", "symmetric", "asymmetric")  # modes of the model itself; it excludes all other modes
 
 
 def pole_name(row: Mapping[str, object]) -> str:
     """The point of `w_pole_over_h`: the first named point, or the pole."""
     return next((key.removesuffix("_ux") for key in row if key.endswith("_ux")), "the pole")
+
+
+def stability(row: Mapping[str, object]) -> str:
+    """Whether a point is stable, in words.
+
+    Examples
+    --------
+    >>> stability({"negative_pivots": 1, "excluded_pivots": 2}), stability({"negative_pivots": 0, "excluded_pivots": 0})
+    ('unstable in 1 direction and 2 that the model excludes', 'stable')
+    """
+    own, excluded = (int(str(row.get(key, 0))) for key in ("negative_pivots", "excluded_pivots"))
+    if not own + excluded:
+        return "stable"
+    first = f"unstable in {own} direction{'s' * (own != 1)}" if own else "unstable in"
+    return first + (f"{' and' * bool(own)} {excluded} that the model excludes" if excluded else "")
 
 
 class PathTable:

@@ -98,7 +98,7 @@ def by_path(scene: Scene) -> Ending:
     """
     history, stopped = History(), None
     try:
-        for record in follow(scene):
+        for record in follow(scene, search=False):
             history.add(record)
     except Stopped as e:
         stopped = str(e)

@@ -117,7 +117,7 @@ def _by_path(link: Link, spent: int, start: float, *, go_on: bool) -> tuple[Outc
 
 
 def _begun(at: float, result: Result) -> Continuation | None:
-    last = result.rows[-1]
+    last = result.rows[result.end]
     if last["label"] != "fold" or last["amplitude"] != "pressure" or last["p_over_pc"] != result.knockdown:
         return None
     try:
