@@ -16,7 +16,7 @@ from magshell_fenicsx.case.expressions import is_formula
 from magshell_fenicsx.case.fields import MagneticSection, layer_average
 from magshell_fenicsx.case.imperfections.data import FileSection
 from magshell_fenicsx.case.imperfections.dimple import DimpleSection
-from magshell_fenicsx.case.imperfections.place import ImperfectionSection
+from magshell_fenicsx.case.imperfections.place import ImperfectionSection, places_with_units
 from magshell_fenicsx.case.imperfections.random import RandomSection
 from magshell_fenicsx.case.loading import Loading, ProgrammeStep, programme
 from magshell_fenicsx.case.loads.dead import DeadSection
@@ -108,15 +108,7 @@ class Case(WithParts):
             for step, source in zip(programme(section.loading, field=False), sources, strict=False):
                 if isinstance(step.load, DeadSection | EdgeSection) and isinstance(source, dict):
                     parts[step.key] = {key: value for key, value in source.items() if key != "hold"}
-            places = {
-                f"shell.imperfections.{i}.at.point": item["at"].get("point") if "at" in item else None
-                for i, item in enumerate(data["shell"].get("imperfections") or [])
-            }
-            for key in (
-                *texts(parts, is_formula),
-                *(key for key, place in places.items() if [*texts(place)]),
-                *measured(data.get("natural")),
-            ):
+            for key in (*texts(parts, is_formula), *measured(data.get("natural")), *places_with_units(data["shell"])):
                 raise ValueError(f"{key}: has a unit, but the shell's lengths have none: give all of them one, or none")
         return section
 

@@ -19,11 +19,13 @@ def knockdown(file: str, *settings: str) -> float:
     return found
 
 
+@pytest.mark.slow
 def test_a_dimple_far_from_the_edge_is_as_at_the_pole() -> None:
     """The clamped edge changes k_d at 40 degrees by 1.1e-4."""
     assert knockdown("dimple_buckling.yaml", ONE, "mesh.refinement=0.5") == pytest.approx(POLAR, rel=5e-4)
 
 
+@pytest.mark.slow
 def test_two_dimples() -> None:
     """Own value on a mesh 1.5 times as fine as the default; alone, the one at the pole has 0.326."""
     assert knockdown("two_dimples.yaml", "mesh.refinement=0.5") == pytest.approx(0.30881, rel=5e-4)

@@ -1,11 +1,11 @@
 """Where a local imperfection is, and what all imperfections have in common."""
 
-from typing import Annotated, Self
+from typing import Annotated, Any, Self
 
 from pydantic import Field, model_validator
 
 from magshell_fenicsx.case.fields import Direction
-from magshell_fenicsx.parts.section import Section, or_number
+from magshell_fenicsx.parts.section import Section, or_number, texts
 
 Coordinates = Annotated[list[Annotated[float, or_number("metre")]], Field(min_length=3, max_length=3)]
 
@@ -45,6 +45,13 @@ class ImperfectionSection(Section):
 
     def refuse_unfit(self, R_over_h: float, nu: float) -> None:
         """See that a shell can have it; raises ValueError otherwise."""
+
+
+def places_with_units(shell: dict[str, Any]) -> list[str]:
+    """The keys of imperfections' places in plain data of a shell that are text with a unit."""
+    items = shell.get("imperfections") or []
+    points = {i: item["at"].get("point") for i, item in enumerate(items) if "at" in item}
+    return [f"shell.imperfections.{i}.at.point" for i, point in points.items() if [*texts(point)]]
 
 
 def half_width(width: float, R_over_h: float, nu: float) -> float:
