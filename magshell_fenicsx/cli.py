@@ -23,6 +23,13 @@ CaseFile = Annotated[Path, typer.Argument(metavar="CASE.yaml", help="the case fi
 Settings = Annotated[
     list[str] | None, typer.Option("--set", metavar="KEY.PATH=VALUE", help="replace a key of the case")
 ]
+Over = Annotated[
+    list[str],
+    typer.Option(metavar="KEY.PATH=START:STOP:COUNT", help="or =VALUE,VALUE; repeat for a product, tie keys with +"),
+]
+Result = Annotated[
+    str, typer.Option(metavar="NAME", help="knockdown, critical_field, force@w_over_h=10, energy@end, ...")
+]
 
 INVALID, STOPPED = 2, 3
 
@@ -129,12 +136,7 @@ def run(
 @app.command()
 def sweep(
     case: CaseFile,
-    over: Annotated[
-        list[str],
-        typer.Option(
-            metavar="KEY.PATH=START:STOP:COUNT", help="or =VALUE,VALUE; repeat for a product, tie keys with +"
-        ),
-    ],
+    over: Over,
     set_: Settings = None,
     out: Annotated[Path | None, _folder("results/<case name>_sweep/")] = None,
     full_paths: Annotated[
@@ -156,15 +158,8 @@ def sweep(
 @app.command()
 def study(
     case: CaseFile,
-    over: Annotated[
-        list[str],
-        typer.Option(
-            metavar="KEY.PATH=VALUE,VALUE", help="or =START:STOP:COUNT; repeat for a product, tie keys with +"
-        ),
-    ],
-    result: Annotated[
-        str, typer.Option(metavar="NAME", help="knockdown, critical_field, force@w_over_h=10, energy@end, ...")
-    ],
+    over: Over,
+    result: Result,
     set_: Settings = None,
     reference: Annotated[float | None, typer.Option(help="exact value for the errors; default the finest run")] = None,
     ranks: Annotated[str, typer.Option(metavar="N,N", help="numbers of MPI ranks for each point")] = "1",
@@ -193,9 +188,7 @@ def ensemble(
     samples: Annotated[int, typer.Option(min=1, metavar="N", help="number of samples")],
     seed: Annotated[int, typer.Option(min=0, metavar="S", help="of the random numbers; sample k depends on S and k")],
     set_: Settings = None,
-    result: Annotated[
-        str, typer.Option(metavar="NAME", help="knockdown, critical_field, force@w_over_h=10, energy@end, ...")
-    ] = "knockdown",
+    result: Result = "knockdown",
     delete_weakest: Annotated[
         int, typer.Option(min=0, metavar="N", help="also compute each sample without its N weakest defects")
     ] = 0,

@@ -26,6 +26,7 @@ from magshell_fenicsx.case.loads.indentation import IndentationSection
 from magshell_fenicsx.case.loads.step import Step
 from magshell_fenicsx.case.messages import explain
 from magshell_fenicsx.case.natural import NaturalSection, measured
+from magshell_fenicsx.case.patches import refuse_strange
 from magshell_fenicsx.case.programme import refuse_unfit_steps
 from magshell_fenicsx.case.shell import ShellSection
 from magshell_fenicsx.case.solid import SolidSection
@@ -125,7 +126,6 @@ class Case(WithParts):
         for load in self.loads_of(GrowthSection):
             if getattr(self.natural, load.key, None) is None:
                 raise ValueError(f"loading.{load.key}: is a factor of natural.{load.key}: give that too")
-        self._natural_parts()
         return self
 
     @model_validator(mode="after")
@@ -167,7 +167,8 @@ class Case(WithParts):
             for name in self.boundary.conditions():
                 if name not in edges and name not in self.points:
                     raise ValueError(f"boundary.{name}: a {shell.geometry} has no such edge, only {', '.join(edges)}")
-        self._patches()
+        for key, patches in self.patches.items():
+            refuse_strange(key, patches, shell, self.dimples)
         return self
 
     def _on_shell(self, polar: float) -> None:
@@ -183,29 +184,6 @@ class Case(WithParts):
         found = {f"natural.{key}": getattr(self.natural, key, None) for key in ("curvature", "stretch")}
         found["magnetic.remanent.patches"] = self.magnetic.remanent.patches if self.magnetic else None
         return {key: patches for key, patches in found.items() if isinstance(patches, dict)}
-
-    def _natural_parts(self) -> None:
-        for key in ("natural.curvature", "natural.stretch"):
-            if key in self.patches:
-                self._refuse_strange(self.patches[key], key)
-
-    def _refuse_strange(self, patches: Iterable[str], key: str) -> None:
-        """A mesh knows its patches later."""
-        if isinstance(self.shell, MeshSurface):
-            return
-        if not self.dimples and ("dimple" in patches or not isinstance(self.shell, ShellSection)):
-            raise ValueError(f"{key}: the shell has no dimple")
-        if unknown := set(patches) - {*(self.dimples or ["dimple"]), "rest"}:
-            there = ", ".join(self.dimples or ["dimple"])
-            raise ValueError(f"{key}: {min(unknown)}: a {self.shell.geometry} has only {there} and rest")
-
-    def _patches(self) -> None:
-        patches = self.magnetic.remanent.patches if self.magnetic else None
-        if patches is None or isinstance(self.shell, MeshSurface):
-            return
-        self._refuse_strange(patches, "magnetic.remanent.patches")
-        if "rest" not in patches:
-            raise ValueError("magnetic.remanent: patches needs the patch rest")
 
     @model_validator(mode="after")
     def _mesh_fits(self) -> Self:

@@ -1,11 +1,11 @@
 """The distribution of a random number."""
 
-from math import inf, log, sqrt
+from math import inf, log, nextafter, sqrt
+from statistics import NormalDist
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
-from scipy.special import ndtr, ndtri
 
 from magshell_fenicsx.parts.section import Section
 
@@ -82,7 +82,8 @@ class DistributionSection(Section):
             return self._with_unit(low + part * (high - low))
         first, last = self._probabilities
         centre, width = self._normal
-        x = centre + width * float(ndtri(first + part * (last - first)))
+        inner = min(max(first + part * (last - first), nextafter(0, 1)), nextafter(1, 0))
+        x = centre + width * NormalDist().inv_cdf(inner)
         return self._with_unit(float(np.clip(np.exp(x) if self.kind == "lognormal" else x, low, high)))
 
     @property
@@ -110,8 +111,8 @@ class DistributionSection(Section):
         ends = np.array(self._bounds)
         with np.errstate(divide="ignore"):
             ends = np.log(np.maximum(ends, 0.0)) if self.kind == "lognormal" else ends
-        first, last = ndtr((ends - centre) / width)
-        return float(first), float(last)
+        first, last = (NormalDist(centre, width).cdf(end) for end in ends)
+        return first, last
 
     def _with_unit(self, value: Value) -> Value:
         return value if self.unit is None else f"{value!r} {self.unit}"
