@@ -3,12 +3,10 @@
 from math import pi, sqrt
 from typing import Literal
 
-from pydantic import Field
-
-from magshell_fenicsx.case.imperfections.place import At, ImperfectionSection
+from magshell_fenicsx.case.imperfections.place import LocalSection
 
 
-class DimpleSection(ImperfectionSection):
+class DimpleSection(LocalSection):
     """w0 = -δ (1 - (φ/φo)²)² around a place, within the distance φo.
 
     On spheres φ is the angle from the place, at a pole of revolution the distance along the meridian over R,
@@ -16,20 +14,6 @@ class DimpleSection(ImperfectionSection):
     """
 
     kind: Literal["dimple"]
-    amplitude: float = Field(ge=-50, le=50)
-    """Depth δ, inwards; a bump is negative [h]"""
-    width: float = Field(ge=0.05, le=50)
-    """Half-width φ̄o = φo (√(12(1 - ν²)) R/h)^(1/2)"""
-    at: At = At()
-    """Its centre"""
-
-    @property
-    def parameters(self) -> tuple[str, ...]:
-        return ("amplitude", "width", "at.polar", "at.azimuth")
-
-    def half_width(self, R_over_h: float, nu: float) -> float:
-        """phi_o (rad)."""
-        return self.width / sqrt(sqrt(12 * (1 - nu**2)) * R_over_h)
 
     def account(self) -> str:
         return f"dimple of {self.amplitude:g} h {self.at.words()}"

@@ -3,30 +3,14 @@
 from math import exp, sqrt
 from typing import Literal
 
-from pydantic import Field
-
 from magshell_fenicsx.case.imperfections.dimple import refuse_steep
-from magshell_fenicsx.case.imperfections.place import At, ImperfectionSection, half_width
+from magshell_fenicsx.case.imperfections.place import LocalSection
 
 
-class GaussianSection(ImperfectionSection):
+class GaussianSection(LocalSection):
     """w0 = -δ exp(-(φ/φg)²) around a place, with the distance φ of a dimple; smooth everywhere."""
 
     kind: Literal["gaussian"]
-    amplitude: float = Field(ge=-50, le=50)
-    """Depth δ, inwards; a bump is negative [h]"""
-    width: float = Field(ge=0.05, le=50)
-    """φg (√(12(1 - ν²)) R/h)^(1/2), as the half-width of a dimple"""
-    at: At = At()
-    """Its centre"""
-
-    @property
-    def parameters(self) -> tuple[str, ...]:
-        return ("amplitude", "width", "at.polar", "at.azimuth")
-
-    def half_width(self, R_over_h: float, nu: float) -> float:
-        """phi_g (rad)."""
-        return half_width(self.width, R_over_h, nu)
 
     def account(self) -> str:
         return f"Gaussian dimple of {self.amplitude:g} h {self.at.words()}"

@@ -1,5 +1,6 @@
 """Where a local imperfection is, and what all imperfections have in common."""
 
+from math import sqrt
 from typing import Annotated, Any, Self
 
 from pydantic import Field, model_validator
@@ -47,6 +48,25 @@ class ImperfectionSection(Section):
         """See that a shell can have it; raises ValueError otherwise."""
 
 
+class LocalSection(ImperfectionSection):
+    """Base of those around a place."""
+
+    amplitude: float = Field(ge=-50, le=50)
+    """Depth δ, inwards; a bump is negative [h]"""
+    width: float = Field(ge=0.05, le=50)
+    """Half-width φo of a dimple, φg of a Gaussian one, times (√(12(1 - ν²)) R/h)^(1/2)"""
+    at: At = At()
+    """Its centre"""
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        return ("amplitude", "width", "at.polar", "at.azimuth")
+
+    def half_width(self, R_over_h: float, nu: float) -> float:
+        """Over R (rad)."""
+        return half_width(self.width, R_over_h, nu)
+
+
 def places_with_units(shell: dict[str, Any]) -> list[str]:
     """The keys of imperfections' places in plain data of a shell that are text with a unit."""
     items = shell.get("imperfections") or []
@@ -56,4 +76,4 @@ def places_with_units(shell: dict[str, Any]) -> list[str]:
 
 def half_width(width: float, R_over_h: float, nu: float) -> float:
     """Width of an imperfection over R (rad), from the width over (h R)^(1/2)/(12 (1 - nu^2))^(1/4)."""
-    return float(width / (12 * (1 - nu**2) * R_over_h**2) ** 0.25)
+    return width / sqrt(sqrt(12 * (1 - nu**2)) * R_over_h)

@@ -1,8 +1,6 @@
 """Random samples of a case; the ranks share them, existing ones are kept."""
 
 import json
-import sys
-import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,7 +21,7 @@ from magshell_fenicsx.studies.ensemble.solve import FAILED, serves, solve
 from magshell_fenicsx.studies.ensemble.statistics import statistics
 from magshell_fenicsx.studies.ensemble.table import STATUS, WITHOUT, Row, make_row, value, write_samples
 from magshell_fenicsx.studies.study.scalar import Scalar, parse_scalar
-from magshell_fenicsx.studies.sweep.deal import deal
+from magshell_fenicsx.studies.sweep.deal import deal, together
 from magshell_fenicsx.studies.sweep.outcome import Outcome, load, save
 
 MOST_SAMPLES = 100_000
@@ -128,7 +126,7 @@ def _compute(
     samples: Sequence[Sample], scalar: Scalar, folder: Path, comm: MPI.Intracomm, say: Callable[[str], None]
 ) -> None:
     known = KnownFolds()
-    try:
+    with together(comm):
         for i in deal(len(samples), comm):
             sample = samples[i]
             outcome = solve(sample, scalar, known)
@@ -137,13 +135,6 @@ def _compute(
             told = f"no {scalar.name}" if found is None else f"{scalar.name} = {found:.9g} ({outcome.found})"
             why = f", {outcome.stopped}" if outcome.stopped else ""
             say(f"{i + 1:5d}/{len(samples)}  sample {sample.number}: {told}{why}, {outcome.cpu_s:.1f} s")
-    except BaseException:
-        if comm.size == 1:
-            raise
-        traceback.print_exc()
-        sys.stderr.flush()
-        comm.Abort(1)  # the other ranks would wait for ever
-    comm.Barrier()
 
 
 def _numbers(samples: int, seed: int, part: str | None) -> range:

@@ -1,6 +1,9 @@
 """Distribution of work to the ranks of a communicator."""
 
+import sys
+import traceback
 from collections.abc import Iterator
+from contextlib import contextmanager
 
 import numpy as np
 from mpi4py import MPI
@@ -28,3 +31,17 @@ def deal(count: int, comm: MPI.Intracomm) -> Iterator[int]:
             break
         yield int(number[0])
     window.Free()
+
+
+@contextmanager
+def together(comm: MPI.Intracomm) -> Iterator[None]:
+    """Wait at the end for all ranks; an error on one of several ends all, which would wait for it for ever."""
+    try:
+        yield
+    except BaseException:
+        if comm.size == 1:
+            raise
+        traceback.print_exc()
+        sys.stderr.flush()
+        comm.Abort(1)
+    comm.Barrier()

@@ -1,7 +1,5 @@
 """A case over ranges of its keys; the ranks share the points, and existing points are kept."""
 
-import sys
-import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +11,7 @@ from magshell_fenicsx.output.store.folder import by_first, prepare_folder
 from magshell_fenicsx.platform.terminal import print_line
 from magshell_fenicsx.studies.sweep.axes import Axis, parse_axes
 from magshell_fenicsx.studies.sweep.chain import make_chains, run_chain
-from magshell_fenicsx.studies.sweep.deal import deal
+from magshell_fenicsx.studies.sweep.deal import deal, together
 from magshell_fenicsx.studies.sweep.outcome import Outcome, load, save
 from magshell_fenicsx.studies.sweep.points import SweepPoint, identity, make_points
 from magshell_fenicsx.studies.sweep.sweep_plot import draw_sweep
@@ -77,7 +75,7 @@ def sweep(
         if again := sum(files[number].exists() for number in missing):
             say(f"{again} of these computed again: their files are of other sources of magshell_fenicsx, or damaged")
     chains = make_chains(axes, points, missing, full_paths=full_paths)
-    try:
+    with together(comm):
         for chain in deal(len(chains), comm):
             for number, outcome in run_chain(chains[chain]):
                 if identity(points[number].case) != points[number].key:
@@ -85,13 +83,6 @@ def sweep(
                 save(outcome, points[number].case, files[number])
                 place = f"{missing.index(number) + 1:4d}/{len(missing)}"
                 say(f"{place}  {points[number].label}: {_result(outcome)}, {outcome.wall_s:.1f} s")
-    except BaseException:
-        if comm.size == 1:
-            raise
-        traceback.print_exc()
-        sys.stderr.flush()
-        comm.Abort(1)  # the other ranks would wait for ever
-    comm.Barrier()
     outcomes = [found for result in files if (found := load(result))]
     assert len(outcomes) == len(points)
 
