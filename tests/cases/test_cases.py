@@ -191,6 +191,7 @@ def test_cylinder_waves() -> None:
     assert found.rows[-1]["label"] == "bifurcation"
 
 
+@pytest.mark.slow
 def test_bracket() -> None:
     """w = F b^2 (a + b/3)/(E I) (Bernoulli): the fold of the mesh is part of the undeformed shape."""
     found = result("bracket.yaml")
@@ -326,6 +327,7 @@ def test_figure_of_indentation() -> None:
     assert force_at(found, 5) == pytest.approx(8.2762, rel=3e-3)
 
 
+@pytest.mark.slow
 def test_natural_strip() -> None:
     """A natural curvature of 2 pi/L closes a strip to a circle; a quarter of it lifts the tip by 2 L/pi, to 1e-6."""
     rows = [row for row in result("natural_strip.yaml").rows if row["label"] == "target"]

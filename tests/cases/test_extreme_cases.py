@@ -93,6 +93,7 @@ def test_slivers() -> None:
     assert long.condition_undeformed > 1e12
 
 
+@pytest.mark.slow
 def test_table(tmp_path: Path) -> None:
     """A row of numbers in both files; all variants name a case that is there."""
     row = line(Variant("nothing", ("magnetic={lambda_m: 0.00184}",), "w_pole_over_h"))

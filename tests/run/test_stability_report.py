@@ -228,6 +228,7 @@ def test_same_modes_on_one_rank_and_three(tmp_path: Path, symmetry: str) -> None
         assert other == pytest.approx(eigenvalues[0], rel=1e-8, abs=1e-9)
 
 
+@pytest.mark.slow
 def test_files_at_instabilities(tmp_path: Path) -> None:
     found = run(Case.load(CASES / "dimple_buckling.yaml", ["stability={modes: 2, at: instabilities}"]), tmp_path)
     number = len(found.rows) - 1

@@ -113,6 +113,7 @@ def test_stability_under_a_held_volume() -> None:
     assert counts["load"][-1] == 1
 
 
+@pytest.mark.slow
 def test_a_gas_keeps_pressure_times_volume() -> None:
     """Boyle's law; with little gas the shell is nearly sealed, with much of it nearly under a constant pressure."""
     ends = {}

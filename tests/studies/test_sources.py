@@ -73,6 +73,7 @@ def test_every_file_of_the_package_counts(copied: Path) -> None:
     assert len(set(known)) == 7
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_of_an_edited_program(copied: Path, tmp_path: Path) -> None:
     """In a copy of the package, one file of which is changed: one message, exit code 2, nothing is lost."""
     words = ("run", BUCKLING, *(f"--set={setting}" for setting in QUICK), "--out", tmp_path / "out")
@@ -129,6 +130,7 @@ def test_the_mesh_for_a_tolerance(tmp_path: Path, edited: Any, no_pictures: None
     assert (tmp_path / MESH).read_bytes() != b"of these sources"
 
 
+@pytest.mark.slow
 def test_points_of_a_sweep(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, edited: Any) -> None:
     """Are computed again, and it is said how many and why; then they are kept again."""
     said, computed = [], []

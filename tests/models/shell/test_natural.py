@@ -48,6 +48,7 @@ def swells(case: ms.Case, centre: list[float]) -> dict[str, float]:
     return found
 
 
+@pytest.mark.slow
 def test_hemisphere_swells_without_stress() -> None:
     """On a mirror plane, with h/R = 0.02: u = (lambda - 1) r0, to rounding."""
     case = load(
@@ -60,6 +61,7 @@ def test_hemisphere_swells_without_stress() -> None:
     assert swells(case, [0, 0])["volume_change"] == pytest.approx((1.3**3 - 1) * 2 * np.pi / 3, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_cap_swells_without_stress() -> None:
     """On its triangles, held in a statically determinate way, with a free edge."""
     s, c = float(np.sin(np.radians(40))), float(np.cos(np.radians(40)))
@@ -76,6 +78,7 @@ def test_cap_swells_without_stress() -> None:
     swells(case, [0, 0, 1])
 
 
+@pytest.mark.slow
 def test_stretched_and_bent_strip() -> None:
     """Free of stress, a circle with kappa per natural length; so is a solid, to the error of its elements."""
     exact = -(1 - np.cos(1.05))
@@ -93,6 +96,7 @@ def test_stretched_and_bent_strip() -> None:
         assert found["energy"] < 1e-11
 
 
+@pytest.mark.slow
 def test_bilayer() -> None:
     """Timoshenko 1925: two equal layers of a beam that grow apart by a strain e bend to kappa = 3 e/(2 h)."""
     e, layers = 1e-4, {"layers": 2}
@@ -112,6 +116,7 @@ def test_bilayer() -> None:
     assert abs(found["w_pole_over_h"]) / 50 == pytest.approx((1 - np.cos(kappa)) / kappa, rel=2e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("model", "symmetry", "shell", "size"),
     [("shell", "none", CAP, 1e-3), ("shell", "axisymmetric", CAP, 1e-3), ("solid", "none", STRIP, 1e-5)],

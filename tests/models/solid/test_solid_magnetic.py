@@ -78,6 +78,7 @@ def test_derivatives_at_equal_stretches() -> None:
         assert slope == pytest.approx(-BA @ np.cross([0.2, -0.5, 0.7], BR) * volume, rel=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pattern", [False, True])
 def test_tangent_and_residual(pattern: bool) -> None:
     """With gradient and a part across: points against forms, and these against finite differences."""
@@ -102,6 +103,7 @@ def test_tangent_and_residual(pattern: bool) -> None:
         assert np.linalg.norm(csr(system.tangent(u, alone)) @ v - rate) <= 1e-6 * np.linalg.norm(rate), term.name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("law", ["deformation", "rotation"])
 def test_field_known_by_values(law: RemanenceLaw) -> None:
     """A linear field equals the built-in gradient to 1e-10. The tangent of another field: finite differences."""
