@@ -18,7 +18,7 @@ make bench            error, time and memory of a fixed set into results/bench.j
 make studies          error against run time of two cases into docs/study/: 10 minutes
 make test             lint and all tests; with ROOT=sid the tests that are not marked slow, on Debian unstable
                       (LIMIT=seconds)
-make fast             lint and the tests that are not marked slow
+make fast             lint and the tests that are not marked slow (TESTS="tests/simulate ...": of these folders)
                       (both: OPENBLAS_CORETYPE=Haswell, Nehalem, ... rounds as on another processor)
 make lint             ruff and mypy
 make image            the Docker image magshell_fenicsx
@@ -72,7 +72,7 @@ test: $(if $(ROOT),,lint)
 
 fast: lint
 	$(CORE_TYPE)
-	$(ENV) $(PYTEST) -m 'not slow'
+	$(ENV) $(PYTEST) -m 'not slow' $(TESTS)
 
 lint:
 	$(ENV) ruff check --exclude .env .

@@ -9,7 +9,7 @@ from pydantic.fields import FieldInfo
 
 from magshell_fenicsx.case.source import Location, Source, dotted
 
-UNIONS = ("one", "programme", "a word", "a gas")  # tags of unions without a key
+NO_KEYS = ("a word", "a gas")  # tags of a union that has no sections to choose from
 
 
 def explain(error: Any, source: Source, case: type[BaseModel]) -> str:
@@ -57,6 +57,8 @@ def _without_tag(loc: Location, case: type[BaseModel]) -> Location:
     """Pydantic puts what distinguishes the members of a union after their key: take it out."""
     models, kept = [case], list[str | int]()
     for key in loc:
+        if key in NO_KEYS:
+            continue
         if len(models) > 1 and not isinstance(key, int):
             models = [m for m in models if _tag_key([m]) and key in _tags(m)][:1] or models
             continue

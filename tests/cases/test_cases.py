@@ -278,7 +278,7 @@ def test_strip_against_its_field_buckles() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("lambda_m", "k_d"), [(0, 0.326233289), (0.00184, 0.552053778), (-0.00184, 0.120723848)])
+@pytest.mark.parametrize(("lambda_m", "k_d"), [(0.00184, 0.552053778), (-0.00184, 0.120723848)])
 def test_solid_buckling(lambda_m: float, k_d: float) -> None:
     """The axisymmetric shell's k_d; the solid's is above it, 0.8 %, 0.8 % and 1.3 % (docs/solid) and 0.3 % of mesh."""
     found = result("solid_buckling.yaml", f"magnetic.lambda_m={lambda_m}")

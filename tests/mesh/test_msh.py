@@ -135,7 +135,7 @@ def built_in() -> float:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("order", "tolerance"), [(1, 0.03), (2, 3e-3), (3, 3e-3)])
+@pytest.mark.parametrize(("order", "tolerance"), [(1, 0.03), (3, 3e-3)])
 def test_same_answer_as_the_built_in_geometry(model: Any, tmp_path: Path, order: int, tolerance: float) -> None:
     """A pinched clamped cylinder in a field; flat facets err by h^2, the others by the mesh."""
     panel(model, order, 0.12)

@@ -37,7 +37,6 @@ def outcomes(file: Path, over: str, settings: list[str], out: Path, *, full_path
         ("magnetic.lambda_m=-0.001:0.002:5", 5),
         ("shell.defect.amplitude=1.4:3:5", 6),
         ("shell.radius_to_thickness=90:150:5", 5),
-        ("shell.poisson_ratio=0.1:0.5:5", 5),
         ("shell.defect.width=2.8:3.6:5", 6),
     ],
 )

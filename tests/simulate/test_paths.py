@@ -38,13 +38,10 @@ def test_volume_snaps_back() -> None:
     assert w[-2] > 30
 
 
-@pytest.mark.parametrize("control", ["volume", "arc"])
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    ("R_over_h", "lambda_m", "mode", "first", "fold"),
-    [
-        pytest.param(300, 0.00184, "m = 28", 1.0145, 1.093385, marks=pytest.mark.slow),
-        pytest.param(1000, 0.0005, "m = 53", 0.9937, 1.0123, marks=pytest.mark.slow),
-    ],
+    ("R_over_h", "lambda_m", "mode", "first", "fold", "control"),
+    [(300, 0.00184, "m = 28", 1.0145, 1.093385, "arc"), (1000, 0.0005, "m = 53", 0.9937, 1.0123, "volume")],
 )
 def test_waves_before_the_fold(
     R_over_h: int, lambda_m: float, mode: str, first: float, fold: float, control: str

@@ -63,15 +63,13 @@ def test_knockdown_on_the_meridian(tolerance: float) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("tolerance", "lambda_m"), [(1e-2, 0.0), (1e-3, 0.0), (1e-3, -0.00184), (1e-4, -0.00184), (1e-4, 0.00184)]
-)
+@pytest.mark.parametrize(("tolerance", "lambda_m"), [(1e-2, 0.0), (1e-3, -0.00184), (1e-4, 0.00184)])
 def test_knockdown(tolerance: float, lambda_m: float) -> None:
     check(buckling(tolerance, lambda_m), KNOCKDOWN[lambda_m])
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("tolerance", [1e-2, 1e-3, 1e-4])
+@pytest.mark.parametrize("tolerance", [1e-2, 1e-3])
 def test_force(tolerance: float) -> None:
     check(indentation(tolerance), FORCE)
 

@@ -226,14 +226,13 @@ def test_every_point_of_the_figures_is_valid(name: str, count: int) -> None:
 @pytest.mark.slow
 def test_figure_has_its_numbers_and_its_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Paper, figure b: the first-order energy gives an almost null change, the torque energy most of it."""
-    over = ("magnetic.lambda_m=0,0.00184", "magnetic.energy=full,first,torque", "magnetic.applied.polar=0,45")
+    over = ("magnetic.lambda_m=0,0.00184", "magnetic.energy=full,first,torque", "magnetic.applied.polar=0")
     monkeypatch.setitem(FIGURES, "tilted", replace(FIGURES["tilted"], over=over))
     figures.make("tilted", tmp_path)
     rows = read(tmp_path / "tilted.csv")
     change = {(row["magnetic.energy"], row["magnetic.applied.polar"]): float(row["delta_k_d"]) for row in rows}
-    assert len(rows) == len(change) == 6
+    assert len(rows) == len(change) == 3
     assert change["full", "0"] == pytest.approx(0.552053778 - 0.326233289, rel=1e-3)
-    for angle in ("0", "45"):
-        assert abs(change["first", angle]) < 0.06 * change["full", angle]
-        assert change["torque", angle] == pytest.approx(change["full", angle], rel=0.15)
+    assert abs(change["first", "0"]) < 0.06 * change["full", "0"]
+    assert change["torque", "0"] == pytest.approx(change["full", "0"], rel=0.15)
     assert (tmp_path / "tilted.png").stat().st_size > 10_000
