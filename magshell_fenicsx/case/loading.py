@@ -18,7 +18,7 @@ OneStep: TypeAlias = Annotated[
     PressureSection | IndentationSection | FieldSection | RotationSection | GrowthSection | DeadSection | EdgeSection,
     Field(discriminator="kind"),
 ]
-PROGRAMME = "programme"  # tag of a list of steps; see `messages.UNIONS`
+PROGRAMME = "programme"  # tag of a list of steps
 Loading: TypeAlias = Annotated[
     Annotated[OneStep, Tag("one")] | Annotated[list[OneStep], Tag(PROGRAMME), Field(min_length=1, max_length=1000)],
     Discriminator(lambda data: PROGRAMME if isinstance(data, list) else "one"),
