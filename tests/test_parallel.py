@@ -41,7 +41,7 @@ SCENES |= {
     "symmetry planes, a force at a point": ("benchmarks/hinged_roof_12.7.yaml", ROOF),
     "further solutions": (
         "benchmarks/hinged_roof_12.7.yaml",
-        [*ROOF, "--set=loading.points=1", "--set=loading.search={solutions: 2}", "--set=mesh={degree: 3, size: 127}"],
+        [*ROOF, "--set=loading.points=1", "--set=loading.search={solutions: 1}", "--set=mesh={degree: 3, size: 127}"],
     ),
     "a moment": ("benchmarks/cantilever_end_moment.yaml", [*ROOF, "--set=loading.factor=0.1"]),
     "a mesh with a fold and two patches": (
@@ -106,7 +106,7 @@ COMPARED = ("p_over_pc", "lambda_m", "force", "w_over_h", "w_pole_over_h", "volu
 VECTORS = ("u", "f", "m")  # columns NAME_ux, ...: of named points, and reactions
 
 
-ON_TWO = ("a moment", "an edge that is lifted and turned")
+ON_TWO = ("an edge that is lifted and turned",)
 QUICKEST = "symmetry planes, a force at a point"
 
 

@@ -186,7 +186,7 @@ def test_ranks_do_not_matter() -> None:
     found = []
     for ranks in (1, 3):
         command = ["mpirun", "--map-by", ":OVERSUBSCRIBE", "-n", str(ranks), sys.executable, "-c", SHARED]
-        settings = [*COARSE, "magnetic.lambda_m=0"]
+        settings = [*COARSE, "mesh.refinement=0.25", "magnetic.lambda_m=0"]
         done = subprocess.run([*command, COPLANAR, *settings], capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stderr
         found.append(json.loads(done.stdout))

@@ -56,28 +56,28 @@ def varying(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
 
 
 SHELLS: dict[str, Callable[[], ShellModel]] = {
-    "moment": lambda: ShellModel(panel(), MATERIAL, 3, {"left": "clamped"}, MOMENT),
+    "moment": lambda: ShellModel(panel(), MATERIAL, 2, {"left": "clamped"}, MOMENT),
     "planes": lambda: ShellModel(
         panel(),
         MATERIAL,
-        3,
+        2,
         {"bottom": "plane", "left": "plane", "top": Held((0, 1)), "right": Held((0, 1))},
         Loads(pressure=True),
     ),
     "two terms on an edge": lambda: ShellModel(
-        panel(), MATERIAL, 3, {"bottom": "plane"}, Loads(dead={"load": (EdgeMoment("bottom", 0.01),)})
+        panel(), MATERIAL, 2, {"bottom": "plane"}, Loads(dead={"load": (EdgeMoment("bottom", 0.01),)})
     ),
-    "folded": lambda: ShellModel(box(1.8), MATERIAL, 3, {"left": "clamped"}, Loads()),
+    "folded": lambda: ShellModel(box(1.8), MATERIAL, 2, {"left": "clamped"}, Loads()),
     "thickness": lambda: ShellModel(
         panel(),
         MATERIAL,
-        3,
+        2,
         {"left": "clamped", "bottom": "plane"},
         Loads(magnetic=replace(TILTED, gradient=np.diag([1.0, 0.5, -1.5]))),
         thickness=Thickness(varying),
     ),
     "folded, two thicknesses": lambda: ShellModel(
-        box(1.2), MATERIAL, 3, {"left": "clamped"}, Loads(), thickness=Thickness(patches={"left half": 0.5})
+        box(1.2), MATERIAL, 2, {"left": "clamped"}, Loads(), thickness=Thickness(patches={"left half": 0.5})
     ),
 }
 MU = {"load": 0.7, "pressure": 0.3, "lambda_m": 0.4}
