@@ -1,6 +1,6 @@
 """The energy barrier that a probing force passes: its work from zero, over its largest value, back to zero."""
 
-from scipy.integrate import quad
+import scipy
 
 from magshell_fenicsx.case.loading import ProgrammeStep
 from magshell_fenicsx.continuation.system import State
@@ -19,6 +19,6 @@ def barrier(scene: Scene, step: ProgrammeStep, begin: State, end: State) -> floa
     change = after - before
     for name, q in held.items():
         a, b = begin.mu[name], end.mu[name]
-        work = quad(lambda mu, q=q: q(mu)[0], a, b)[0] if callable(q) else q * (b - a)
+        work = scipy.integrate.quad(lambda mu, q=q: q(mu)[0], a, b)[0] if callable(q) else q * (b - a)
         change += scene.model.multiplicity * work
     return float(change)

@@ -5,8 +5,8 @@ from functools import cached_property
 from math import sqrt
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.special import ndtri
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.imperfections.random import RandomSection
@@ -35,7 +35,7 @@ class Waves:
         """(4, N): the components of k and the phase."""
         bits = np.random.PCG64(self.seed).random_raw(4 * WAVES).reshape(4, WAVES)
         uniform = ((bits >> np.uint64(11)) + 0.5) / 2.0**53
-        return np.vstack([ndtri(uniform[:3]) / self.length, 2 * np.pi * uniform[3:]])
+        return np.vstack([scipy.special.ndtri(uniform[:3]) / self.length, 2 * np.pi * uniform[3:]])
 
     def __call__(self, places: Array) -> Array:
         w0 = np.empty(len(places))
