@@ -139,10 +139,9 @@ class Plan:
             return replace(read_msh(self.shape, self.points, self.mirror), embedding=self.embedding)
         if isinstance(self.shape, PatchMesh):
             return replace(self.shape, embedding=self.embedding)
-        if isinstance(self.shape, RimmedGrid):
-            patch = triangulate(self.shape, self.size, self.points, self.embedding)
-            return cut(patch, self.mirror) if self.mirror else patch
         if isinstance(self.shape, Grid):
             patch = grid_mesh(self.shape, self.points, self.embedding)
-            return cut(patch, self.mirror) if self.mirror else patch
-        return triangulate(self.shape, self.size, self.points, self.embedding)
+        else:
+            patch = triangulate(self.shape, self.size, self.points, self.embedding)
+        whole = isinstance(self.shape, Grid | RimmedGrid)  # other shapes are made as halves
+        return cut(patch, self.mirror) if self.mirror and whole else patch

@@ -4,7 +4,6 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import cached_property, partial
-from itertools import count
 
 from magshell_fenicsx.case.loading import ProgrammeStep
 from magshell_fenicsx.case.loads.search import SearchSection
@@ -75,7 +74,7 @@ def _solutions(stage: Stage, name: str, state: State, search: SearchSection) -> 
     made = [partial(dents.settled, number) for number in range(dents.count)]
     limits = Limits(search.solutions, search.guesses, over)
     excluded = scene.model.excluded_modes
-    for number, found in zip(count(1), further(path, stage.enter(state), made, limits, stage.displaced), strict=False):
+    for number, found in enumerate(further(path, stage.enter(state), made, limits, stage.displaced), 1):
         point = stage.point(found)
         unstable = sum(excluded.counts(point.state)) if excluded else 0
         yield Record("solution", name, point, branch=number, excluded_pivots=unstable)

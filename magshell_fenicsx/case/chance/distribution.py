@@ -83,7 +83,7 @@ class DistributionSection(Section):
         first, last = self._probabilities
         centre, width = self._normal
         inner = min(max(first + part * (last - first), nextafter(0, 1)), nextafter(1, 0))
-        x = centre + width * NormalDist().inv_cdf(inner)
+        x = NormalDist(centre, width).inv_cdf(inner)
         return self._with_unit(float(np.clip(np.exp(x) if self.kind == "lognormal" else x, low, high)))
 
     @property

@@ -38,17 +38,11 @@ class Dimple:
         phi = self.distance(places)
         return np.where(phi < self.phi_o, -self.delta * (1 - (phi / self.phi_o) ** 2) ** 2, 0.0)
 
-    def within(self, places: Array) -> NDArray[np.bool_]:
-        """Whether places (n, 3) are within its rim."""
-        return np.asarray(self.distance(places) < self.phi_o)
-
 
 def dimple(section: DimpleSection, case: Case, drawn: Outline, key: str) -> Flaw:
     """See `Flaw`."""
     shell = case.shell
-    phi_o, (place, distance) = (
-        section.half_width(shell.R_over_h, shell.poisson_ratio),
-        located(case, drawn, section.at, key),
-    )
+    phi_o = section.half_width(shell.R_over_h, shell.poisson_ratio)
+    place, distance = located(case, drawn, section.at, key)
     deviation = Dimple(section.amplitude / shell.R_over_h, phi_o, distance)
     return Flaw(deviation, 0.45 / sqrt(shell.R_over_h), place, distance, phi_o, rim=True)

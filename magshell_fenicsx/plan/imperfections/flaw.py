@@ -31,7 +31,7 @@ class Flaw:
     distance
         From its centre.
     reach
-        How far it reaches from its centre, as `distance` tells.
+        How far it reaches from its centre, in the measure of `distance`.
     rim
         Whether the curvature jumps there.
     account

@@ -31,10 +31,8 @@ class Gaussian:
 def gaussian(section: GaussianSection, case: Case, drawn: Outline, key: str) -> Flaw:
     """See `Flaw`."""
     shell = case.shell
-    phi_g, (place, distance) = (
-        section.half_width(shell.R_over_h, shell.poisson_ratio),
-        located(case, drawn, section.at, key),
-    )
+    phi_g = section.half_width(shell.R_over_h, shell.poisson_ratio)
+    place, distance = located(case, drawn, section.at, key)
     deviation = Gaussian(section.amplitude / shell.R_over_h, phi_g, distance)
     size = min(0.45 / sqrt(shell.R_over_h), 0.4 * phi_g)
     return Flaw(deviation, size, place, distance, REACH * phi_g)

@@ -1,4 +1,4 @@
-"""A Gaussian random field: a sum of plane waves in space, of which the surface takes its values."""
+"""A Gaussian random field: a sum of plane waves in space, evaluated on the surface."""
 
 from dataclasses import dataclass
 from functools import cached_property

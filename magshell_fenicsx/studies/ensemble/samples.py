@@ -12,7 +12,6 @@ from magshell_fenicsx.plan.planner import make_plan
 from magshell_fenicsx.studies.sweep.points import identity
 
 Values = dict[str, Any]
-DEFECTS = "shell.imperfections"
 
 
 @dataclass(frozen=True)
