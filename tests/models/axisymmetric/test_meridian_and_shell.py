@@ -9,7 +9,8 @@ from magshell_fenicsx.models.axisymmetric.revolution import Revolution
 from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.shell.parameters import Loads, Magnetisation, Material
 from magshell_fenicsx.models.shell.patterns import WithinRims, tangential
-from magshell_fenicsx.plan.imperfections.dimple import Dimple
+from magshell_fenicsx.plan.imperfections.dimple import AT_POLE, Dimple
+from magshell_fenicsx.plan.imperfections.flaw import Flaw
 
 Array = np.ndarray
 DIMPLE = Dimple(0.05, 0.5)
@@ -26,7 +27,7 @@ def displacement(phi: Array) -> tuple[Array, Array]:
         Magnetisation(E3, E3, "second"),
         Magnetisation(tangential, E3, "second_consistent", law="rotation"),
         Magnetisation(tangential, E3, gradient=np.diag([0.5, 0.5, -1.0]), law="rotation"),
-        Magnetisation(WithinRims(((Dimple(0.05, 0.5).within, -E3),), E3), E3, gradient=np.diag([0.5, 0.5, -1.0])),
+        Magnetisation(WithinRims(((Flaw(DIMPLE, distance=AT_POLE, reach=DIMPLE.phi_o).inside, -E3),), E3), E3, gradient=np.diag([0.5, 0.5, -1.0])),
     ],
 )
 def test_energies_and_volume(field: Magnetisation) -> None:

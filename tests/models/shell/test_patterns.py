@@ -9,7 +9,8 @@ from magshell_fenicsx.case.fields import Layer, layer_average
 from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.shell.parameters import Loads, Magnetisation, Material
 from magshell_fenicsx.models.shell.patterns import Components, Pattern, WithinRims, radial, tangential
-from magshell_fenicsx.plan.imperfections.dimple import Dimple
+from magshell_fenicsx.plan.imperfections.dimple import AT_POLE, Dimple
+from magshell_fenicsx.plan.imperfections.flaw import Flaw
 
 UP = np.array([0.0, 0, 1])
 SIZE = 0.02
@@ -50,7 +51,8 @@ def test_patches_jump_at_the_rim() -> None:
     c = np.cos(phi_o)
     uniform = -2 * np.pi * 2 / 3
     cap = -2 * np.pi * (2 / 3 - c + c**3 / 3)
-    jumps = WithinRims(((Dimple(0.0, phi_o).within, -UP),), UP)
+    cap_only = Flaw(Dimple(0.0, phi_o), distance=AT_POLE, reach=phi_o)
+    jumps = WithinRims(((cap_only.inside, -UP),), UP)
     assert swelling(model(jumps, circle=phi_o)) == pytest.approx(uniform - 2 * cap, rel=1e-4)
 
 
