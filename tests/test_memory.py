@@ -17,14 +17,13 @@ from magshell_fenicsx.simulate.scene import Scene
 SCENES, TEN = int(sys.argv[1]) if __name__ == "__main__" else 20, 10
 COARSE = ["symmetry=half", "mesh.degree=2", "mesh.refinement=0.3"]
 
+NAMES = ("arena", "ordblks", "smblks", "hblks", "hblkhd", "usmblks", "fsmblks", "uordblks", "fordblks", "keepcost")
+
 
 class Allocated(ctypes.Structure):
     """What glibc's mallinfo2 returns."""
 
-    _fields_ = tuple(
-        (name, ctypes.c_size_t)
-        for name in "arena ordblks smblks hblks hblkhd usmblks fsmblks uordblks fordblks keepcost".split()
-    )
+    _fields_ = tuple((name, ctypes.c_size_t) for name in NAMES)
 
 
 def in_use() -> int:

@@ -14,6 +14,7 @@ from magshell_fenicsx.plan.imperfections.flaw import Flaw
 
 Array = np.ndarray
 DIMPLE = Dimple(0.05, 0.5)
+REACH = Flaw(DIMPLE, distance=AT_POLE, reach=DIMPLE.phi_o)
 
 
 def displacement(phi: Array) -> tuple[Array, Array]:
@@ -27,7 +28,7 @@ def displacement(phi: Array) -> tuple[Array, Array]:
         Magnetisation(E3, E3, "second"),
         Magnetisation(tangential, E3, "second_consistent", law="rotation"),
         Magnetisation(tangential, E3, gradient=np.diag([0.5, 0.5, -1.0]), law="rotation"),
-        Magnetisation(WithinRims(((Flaw(DIMPLE, distance=AT_POLE, reach=DIMPLE.phi_o).inside, -E3),), E3), E3, gradient=np.diag([0.5, 0.5, -1.0])),
+        Magnetisation(WithinRims(((REACH.inside, -E3),), E3), E3, gradient=np.diag([0.5, 0.5, -1.0])),
     ],
 )
 def test_energies_and_volume(field: Magnetisation) -> None:
