@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.assembly.terms import LinearTerm
-from magshell_fenicsx.continuation.system import Vector
+from magshell_fenicsx.continuation.system import State, Vector
+from magshell_fenicsx.models.shell.contact import Pressing, Region
 from magshell_fenicsx.models.shell.dead_load import DeadLoads
 from magshell_fenicsx.models.shell.moved import Support
 from magshell_fenicsx.models.shell.parameters import Loads, Material
@@ -38,6 +39,8 @@ class Observed:
         Names of the edges at which a live pressure has none; see `openings`.
     observed
         Column -> the form that a term observes, see `OwnTerm.observed`; of the modelled part.
+    contacts
+        Approach of a body -> what is known of its contact, and the integrals of its pressure.
     """
 
     system: FiniteElementSystem
@@ -51,6 +54,7 @@ class Observed:
     supports: Mapping[str, Support]
     without_potential: tuple[str, ...] = ()
     observed: Mapping[str, fem.Form]
+    contacts: dict[str, tuple[Pressing, Mapping[str, fem.Form]]]
 
     def observe(self, volume: fem.Form, points: Mapping[str, Array]) -> None:
         """Take the volume change's form (of the modelled part), and the named vertices' places (3,)."""
@@ -80,6 +84,13 @@ class Observed:
         """u/R (3,) at a named vertex."""
         here = u[self._probes[point]].reshape(-1, 3).sum(axis=0)
         return np.asarray(self.system.comm.allreduce(here))
+
+    def touching(self, state: State, approach: str) -> Region:
+        """Where a body touches."""
+        known, forms = self.contacts[approach]
+        self.system.place(state.mu)
+        pressure, moment = (self.system.integral(state.u, forms[name]) for name in ("pressure", "radius"))
+        return known.region(self.system.comm, moment / pressure if pressure else 0.0)
 
     def loaded_deflection(self, u: Vector, name: str) -> float:
         """w/R conjugate to a force: at its point, or averaged over its patch; of dead loads along themselves.

@@ -26,6 +26,7 @@ from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.parameters import Condition, Held, Material
 from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.plan.account import account
+from magshell_fenicsx.plan.bodies.registered import body_leaves, contacts
 from magshell_fenicsx.plan.imperfections.flaw import Flaw, in_frame
 from magshell_fenicsx.plan.imperfections.registered import flaws
 from magshell_fenicsx.plan.imperfections.rims import MOST_RIMS, Spot, spots
@@ -64,6 +65,7 @@ def make_plan(case: Case, terms: Sequence[OwnTerm] = ()) -> Plan:
     energies = surface_terms(case, terms)
     parts = left(case, drawn, places, (*energies, *potentials(case)))
     parts += leaves(found, perfect, each=bool(case.patches))
+    parts += [body_leaves(contact) for contact in contacts(case, perfect, drawn, 0.0)]
     axisymmetric, plane = _symmetry(case, drawn, parts)
     half = plane is not None
     turn, beyond = 0.0, plane
@@ -102,7 +104,8 @@ def make_plan(case: Case, terms: Sequence[OwnTerm] = ()) -> Plan:
     if beyond:
         conditions = {name: c for name, c in conditions.items() if name not in beyond.lost} | {CUT: "symmetry"}
     within = {name: in_frame(found[key].inside, turn) for name, key in case.dimples.items()}
-    all_loads = loads(case, under, turn, beyond, energies, within)
+    bodies = contacts(case, perfect, imperfect(perfect, found, 0.0), turn)
+    all_loads = replace(loads(case, under, turn, beyond, energies, within), contacts=bodies)
     if span:
         refuse_unfit_ends([name for name in span.names if name], points, conditions, all_loads)
     model = "meridian" if axisymmetric else f"{'half' if half else 'full'} {case.model}"
@@ -152,7 +155,10 @@ def meridian_vertices(plan: Plan, refinement: float) -> Array:
     assert span
     pole = span.names[0] is None
     h = plan.material.h / span.curvature
-    return graded_vertices(span.length, span.circles, h, refinement=refinement, axis=pole, largest=span.largest)
+    on_axis = min([h, *(contact.size / 3 for contact in plan.loads.contacts)])
+    return graded_vertices(
+        span.length, span.circles, h, refinement=refinement, axis=pole, largest=span.largest, on_axis=on_axis
+    )
 
 
 def imperfect(perfect: Outline, found: Mapping[str, Flaw], turn: float) -> Outline:

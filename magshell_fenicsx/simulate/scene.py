@@ -35,7 +35,7 @@ from magshell_fenicsx.plan.body import layers, neo_hookean
 from magshell_fenicsx.plan.plan import Plan
 from magshell_fenicsx.plan.planner import make_plan, meridian_vertices
 from magshell_fenicsx.platform.first import from_first
-from magshell_fenicsx.quantities.registry import amplitude
+from magshell_fenicsx.quantities.registry import amplitude, contact_columns
 from magshell_fenicsx.simulate.direction import directions, field_angle, field_size, turned
 
 Array = NDArray[np.float64]
@@ -108,7 +108,7 @@ class Scene:
 
     def unloaded(self) -> State:
         """The undeformed shell; amplitudes are zero, except user-defined ones with a value."""
-        amplitudes = {t.amplitude for t in self.model.system.terms if t.amplitude} | self.motions
+        amplitudes = {t.amplitude for t in self.model.system.terms if t.amplitude} | self.motions | {*self.model.contacts}
         given = self._own_amplitudes
         return State(self.model.zero(), {name: given.get(name, 0.0) for name in sorted({*amplitudes, *given})})
 
@@ -140,6 +140,7 @@ class Scene:
             **self._observe_points(state),
             **{name: state.mu[name] for name in self._own_amplitudes},
             **self._observe_supports(state),
+            **self._observe_contacts(state),
             **{
                 column: state.mu[term.name]
                 * model.multiplicity
@@ -183,7 +184,8 @@ class Scene:
         own = (*self._own_amplitudes, *(column for term in self.plan.loads.own for column in term.observed))
         factors = (self._column(name) for name in (*self.plan.loads.forces, *self.plan.loads.dead) if name != "force")
         displaced = (f"w_{name}_over_h" for name in self._also_displaced)
-        return (*factors, *displaced, *named, *own, *self._support_columns)
+        contacts = (column for name in self.model.contacts for column in contact_columns(name) if column != "force")
+        return (*factors, *displaced, *named, *own, *self._support_columns, *contacts)
 
     @property
     def _support_columns(self) -> tuple[str, ...]:
@@ -202,6 +204,16 @@ class Scene:
         if plan.reactions:
             frame = rotation(plan.azimuth)
             found |= observed_reactions(model, state, plan.mirror, frame, force, R)
+        return found
+
+    def _observe_contacts(self, state: State) -> dict[str, float]:
+        """Approach, force, penetration and radii of each body."""
+        model, h, found = self.model, self.plan.material.h, dict[str, float]()
+        for name in model.contacts:
+            at, force = model.touching(state, name), model.system.potential(state.u, state.mu, name)
+            values = (state.mu[name], -force / self.conjugate_unit(name), at.penetration / h)
+            radii = (at.radius, at.inner, at.outer)
+            found |= dict(zip(contact_columns(name), (*values, *radii), strict=True))
         return found
 
     @property
@@ -237,6 +249,8 @@ class Scene:
                 else self.plan.length
             )
             return -motion_size(self.plan.loads, name) / (force * arm * model.multiplicity)
+        if name in model.contacts:
+            return -model.force_unit * material.h
         if name in model.loads.forces:
             return model.force_unit * material.h
         return model.load_size.get(name, 0.0) / self.plan.length

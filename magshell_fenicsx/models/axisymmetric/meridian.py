@@ -102,7 +102,14 @@ def make_meridian(
 
 
 def graded_vertices(
-    end: float, circles: Sequence[float], h: float, *, refinement: float = 1.0, axis: bool = True, largest: float = inf
+    end: float,
+    circles: Sequence[float],
+    h: float,
+    *,
+    refinement: float = 1.0,
+    axis: bool = True,
+    largest: float = inf,
+    on_axis: float | None = None,
 ) -> Array:
     """Vertices for 1e-7 in k_d at degree 4: cells of a fraction of sqrt(h), finer on the axis, if 0 is there.
 
@@ -116,13 +123,15 @@ def graded_vertices(
         Thickness over R.
     largest
         Of the cells, whatever the thickness.
+    on_axis
+        Size of the cells on the axis, by default h.
 
     Notes
     -----
     A point force bends the shell like s^2 log s. On the axis the cells shrink to a thickness
     whatever the refinement: the logarithmic stretch under an ideal point has no limit.
     """
-    smallest, growth = h, 0.3 / refinement
+    smallest, growth = on_axis or h, 0.3 / refinement
     largest = min(0.2 * sqrt(h), largest) / refinement
 
     def size(s: Array) -> Array:

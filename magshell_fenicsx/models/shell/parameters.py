@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.motion import Motion
 from magshell_fenicsx.models.shell.applied import FieldInSpace
+from magshell_fenicsx.models.shell.contact import Contact
 from magshell_fenicsx.models.shell.natural import Natural
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.patterns import Pattern
@@ -186,6 +187,7 @@ class Loads:
     own: tuple[OwnTerm, ...] = ()
     natural: Natural | None = None
     moves: tuple[Move, ...] = ()
+    contacts: tuple[Contact, ...] = ()
 
     @property
     def all_dead(self) -> tuple[DeadLoad, ...]:

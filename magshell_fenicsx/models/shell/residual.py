@@ -53,9 +53,9 @@ class FastResidual:
         on_cells = [term for term in found if not term.density.on_edges]
         on_edges = [term for term in found if term.density.on_edges]
         self._sites: list[_Site] = []
-        for amplitude in dict.fromkeys(term.amplitude for term in on_cells):
-            together = [term for term in on_cells if term.amplitude == amplitude]
-            self._sites.append(_Cells(r0, cell_quadrature(degree), together, log))
+        for kind in dict.fromkeys((term.amplitude, term.density.quadrature) for term in on_cells):
+            together = [term for term in on_cells if (term.amplitude, term.density.quadrature) == kind]
+            self._sites.append(_Cells(r0, kind[1] or cell_quadrature(degree), together, log))
         if on_edges:
             self._sites.append(_Edges(r0, edge_quadrature(degree), on_edges, log))
         self.names = frozenset(term.name for term in found)
