@@ -26,7 +26,7 @@ from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.parameters import Condition, Held, Material
 from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.plan.account import account
-from magshell_fenicsx.plan.bodies.registered import body_leaves, contacts
+from magshell_fenicsx.plan.bodies.registered import body_leaves, contacts, pressed
 from magshell_fenicsx.plan.imperfections.flaw import Flaw, in_frame
 from magshell_fenicsx.plan.imperfections.registered import flaws
 from magshell_fenicsx.plan.imperfections.rims import MOST_RIMS, Spot, spots
@@ -88,7 +88,9 @@ def make_plan(case: Case, terms: Sequence[OwnTerm] = ()) -> Plan:
         loaded.append((points[point], [load for load in there if isinstance(load, IndentationSection)]))
     local = [] if isinstance(case.shell, MeshSurface) else spots(found.items(), perfect, turn)
     everywhere = min((flaw.size for flaw in found.values() if flaw.centre is None), default=inf)
-    size = grading(case, drawn, material.h, local, everywhere, loaded)
+    bodies = contacts(case, perfect, drawn, turn)
+    touched = [(drawn.inverse(c.front), pressed(case, c.body), c.size) for c in bodies]
+    size = grading(case, drawn, material.h, local, everywhere, loaded, touched)
     drawn = imperfect(perfect, found, turn)
     shape = drawn.chart(beyond, size)
     if isinstance(shape, Grid) and beyond:  # what a point needs, its image needs too
@@ -104,7 +106,6 @@ def make_plan(case: Case, terms: Sequence[OwnTerm] = ()) -> Plan:
     if beyond:
         conditions = {name: c for name, c in conditions.items() if name not in beyond.lost} | {CUT: "symmetry"}
     within = {name: in_frame(found[key].inside, turn) for name, key in case.dimples.items()}
-    bodies = contacts(case, perfect, imperfect(perfect, found, 0.0), turn)
     all_loads = replace(loads(case, under, turn, beyond, energies, within), contacts=bodies)
     if span:
         refuse_unfit_ends([name for name in span.names if name], points, conditions, all_loads)

@@ -15,7 +15,7 @@ from magshell_fenicsx.assembly.sheets import Sheet
 from magshell_fenicsx.assembly.terms import Term
 from magshell_fenicsx.models.shell.energy import Density, ShellTerm, cell_quadrature, edge_quadrature
 from magshell_fenicsx.models.shell.gradients import FRAME, PointGradient, in_own_coordinates
-from magshell_fenicsx.models.shell.kinematics import CURVED, Jet
+from magshell_fenicsx.models.shell.kinematics import CURVED, FIRST, Jet
 from magshell_fenicsx.models.shell.sites import NAMES, at_points
 
 Array = NDArray[np.float64]
@@ -79,7 +79,7 @@ class _Cells:
         self.names = [term.name for term in terms]
         X, w = cell_rule(degree)
         table = Table.tabulate(V.element.basix_element, X)
-        parts = [name for name in NAMES if any(name in term.density.parts for term in terms)]
+        parts = [name for name in NAMES if name in FIRST or any(name in term.density.parts for term in terms)]
         self._sheet, self._each = Sheet(table, w, [NAMES.index(part) for part in parts]), len(w)
         cells = np.arange(V.mesh.topology.index_map(2).size_local, dtype=np.int32)
         frames = cell_frames(V.mesh)

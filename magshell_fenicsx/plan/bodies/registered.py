@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.loads.contact import ContactSection
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.case.surfaces import MeshSurface
 from magshell_fenicsx.mesh.frame import rotation
@@ -32,8 +33,9 @@ KINDS: dict[str, Callable[[Any, Placed], Distance]] = {
     "rod": rod,
     "box": box,
 }
-NATURAL = 5e5  # default stiffness over D/(R h)^2: plate and ball then penetrate less than 1e-3 h
+NATURAL = 1e6  # default stiffness over D/(R h)^2: plate and ball then penetrate less than 1e-3 h
 POINTED = 15.0  # times as stiff is the penalty of a body that touches in a spot, times 1 + R/its radius
+SHALLOW = 4.0  # of h: for more the penalty grows in proportion
 WITHIN = 1e-6  # penetration over h that is rounding
 
 
@@ -72,7 +74,8 @@ def _contact(case: Case, perfect: Outline, drawn: Outline, turn: float, name: st
     placed = place_body(section, key, here, normal, h / 2, Q, case.shell.reference)
     distance = KINDS[section.kind](section, placed)
     D, size = h**2 / (12 * (1 - case.shell.poisson_ratio**2)), section.blunt / placed.R
-    k = section.stiffness or NATURAL * D / h**2 * (1.0 if size == inf else POINTED * (1 + 1 / size))
+    pointed, deep = 1.0 if size == inf else POINTED * (1 + 1 / size), max(1.0, pressed(case, name) / SHALLOW)
+    k = section.stiffness or NATURAL * D / h**2 * pointed * deep
     found = Contact(
         name, case.approaches[name], distance, placed.direction, placed.front(0.0), k, section.penetration, size
     )
@@ -84,6 +87,12 @@ def _contact(case: Case, perfect: Outline, drawn: Outline, turn: float, name: st
             + ("give a place `at` that it reaches first, or its `position`" if section.position is None else "move it back")
         )
     return found
+
+
+def pressed(case: Case, body: str) -> float:
+    """The largest approach over h that a target asks for; 0 without."""
+    steps = (step.load for step in case.programme if step.name == case.approaches[body])
+    return max((abs(load.approach or 0.0) for load in steps if isinstance(load, ContactSection)), default=0.0)
 
 
 def place_normal(case: Case, perfect: Outline, chart: Array) -> Array:
