@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.expressions import formula
 from magshell_fenicsx.case.loads.contact import ContactSection
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.case.surfaces import MeshSurface
@@ -71,7 +72,13 @@ def _contact(case: Case, perfect: Outline, drawn: Outline, turn: float, name: st
     normal = place_normal(case, perfect, chart)
     Q = rotation(turn)
     here = place if len(chart) == 3 else drawn.embedding(chart[None])[0]
-    placed = place_body(section, key, here, normal, h / 2, Q, case.shell.reference)
+    factor = case.thickness_factor
+    varies = formula(factor) if isinstance(factor, str) else None
+
+    def half(x: Array) -> Array:
+        return np.broadcast_to(h / 2 * (varies(*x.T) if varies else 1.0), len(x))
+
+    placed = place_body(section, key, here, normal, float(half(here[None])[0]), Q, case.shell.reference)
     distance = KINDS[section.kind](section, placed)
     D, size = h**2 / (12 * (1 - case.shell.poisson_ratio**2)), section.blunt / placed.R
     pointed, deep = 1.0 if size == inf else POINTED * (1 + 1 / size), max(1.0, pressed(case, name) / SHALLOW)
@@ -79,7 +86,7 @@ def _contact(case: Case, perfect: Outline, drawn: Outline, turn: float, name: st
     found = Contact(
         name, case.approaches[name], distance, placed.direction, placed.front(0.0), k, section.penetration, size
     )
-    depth = -least_gap(found, drawn, Q, h)
+    depth = -least_gap(found, drawn, Q, half)
     if depth > WITHIN * h:
         raise CaseError(
             f"{key}.{'at' if section.position is None else 'position'}: the body penetrates the undeformed shell by "

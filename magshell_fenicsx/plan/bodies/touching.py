@@ -13,11 +13,19 @@ ROUNDS, FINER = 6, 0.2  # refinements of a search, and how much smaller its rang
 AROUND = 1.5  # half the side, over R, of the cube in which bodies may overlap
 
 
-def least_gap(contact: Contact, drawn: Outline, Q: Array, h: float) -> float:
-    """The least gap over R between a body and the face of the undeformed shell; Q turns into the body's frame."""
+def least_gap(contact: Contact, drawn: Outline, Q: Array, half: Callable[[Array], Array]) -> float:
+    """The least gap over R between a body and the face of the undeformed shell.
+
+    Parameters
+    ----------
+    Q
+        Turns places into the body's frame.
+    half
+        Half the thickness over R at places (n, 3).
+    """
 
     def gap(x: Array) -> Array:
-        return contact.gap(x @ Q.T, 0.0, h / 2)[0]
+        return contact.gap(x @ Q.T, 0.0, half(x))[0]
 
     chart = drawn.charts()
     if chart is None:
