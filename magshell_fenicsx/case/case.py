@@ -114,7 +114,12 @@ class Case(WithParts):
             for step, source in zip(programme(section.loading, field=False), sources, strict=False):
                 if isinstance(step.load, DeadSection | EdgeSection) and isinstance(source, dict):
                     parts[step.key] = {key: value for key, value in source.items() if key != "hold"}
-            for key in (*texts(parts, is_formula), *measured(data.get("natural")), *places_with_units(data["shell"]), *with_units(data.get("bodies"))):
+            for key in (
+                *texts(parts, is_formula),
+                *measured(data.get("natural")),
+                *places_with_units(data["shell"]),
+                *with_units(data.get("bodies")),
+            ):
                 raise ValueError(f"{key}: has a unit, but the shell's lengths have none: give all of them one, or none")
         return section
 

@@ -138,7 +138,12 @@ OF_CONTACTS = (
         "h",
         "m",
     ),
-    Quantity("contact_radius", "contact radius", "Mean distance of the pressure from the body's axis.", "place"),
+    Quantity(
+        "contact_radius",
+        "contact radius",
+        "Mean distance of the pressure from the body's axis, in the shell's length; over R if that has no unit.",
+        "place",
+    ),
     Quantity("contact_inner", "contact from", "Least distance of the pressure from the body's axis.", "place"),
     Quantity("contact_outer", "contact to", "Largest distance of the pressure from the body's axis.", "place"),
 )

@@ -108,7 +108,9 @@ class Scene:
 
     def unloaded(self) -> State:
         """The undeformed shell; amplitudes are zero, except user-defined ones with a value."""
-        amplitudes = {t.amplitude for t in self.model.system.terms if t.amplitude} | self.motions | {*self.model.contacts}
+        amplitudes = (
+            {t.amplitude for t in self.model.system.terms if t.amplitude} | self.motions | {*self.model.contacts}
+        )
         given = self._own_amplitudes
         return State(self.model.zero(), {name: given.get(name, 0.0) for name in sorted({*amplitudes, *given})})
 
@@ -212,7 +214,7 @@ class Scene:
         for name in model.contacts:
             at, force = model.touching(state, name), model.system.potential(state.u, state.mu, name)
             values = (state.mu[name], -force / self.conjugate_unit(name), at.penetration / h)
-            radii = (at.radius, at.inner, at.outer)
+            radii = (self.plan.length * radius for radius in (at.radius, at.inner, at.outer))
             found |= dict(zip(contact_columns(name), (*values, *radii), strict=True))
         return found
 

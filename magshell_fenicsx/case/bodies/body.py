@@ -38,6 +38,11 @@ class BodySection(Section):
     """Largest penetration that is allowed; where it is more the run stops [h]"""
 
     @property
+    def ahead(self) -> float:
+        """How far its front is from its reference point, in the case's unit."""
+        return 0.0
+
+    @property
     def blunt(self) -> float:
         """Radius of what touches, in the case's unit; infinite for a plane."""
         return float(getattr(self, "radius", inf))

@@ -20,6 +20,10 @@ class BoxSection(BodySection):
     """Along the first size, of any length; its part across the approach counts, and there must be one"""
 
     @property
+    def ahead(self) -> float:
+        return self.size[2] / 2
+
+    @property
     def blunt(self) -> float:
         return min(self.size[:2]) / 2
 

@@ -13,3 +13,7 @@ class CylinderSection(BodySection):
     """[the shell's length; over R if that has no unit]"""
     axis: Axis
     """Along the cylinder, of any length, not along the approach"""
+
+    @property
+    def ahead(self) -> float:
+        return self.radius

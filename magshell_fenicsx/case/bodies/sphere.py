@@ -11,3 +11,7 @@ class SphereSection(BodySection):
     kind: Literal["sphere"]
     radius: Size
     """[the shell's length; over R if that has no unit]"""
+
+    @property
+    def ahead(self) -> float:
+        return self.radius

@@ -79,7 +79,8 @@ class SurfaceGatherer:
         self._cells = np.concatenate(cells) if self.comm.rank == 0 else numbers
         r = self._at_nodes(model.r0)
         factor = None if model.thickness is None else self._thickness(model.thickness)
-        self._fields = PointFields(r, model.material, model.loads.magnetic, factor, model.loads.natural)
+        loads = model.loads
+        self._fields = PointFields(r, model.material, loads.magnetic, factor, loads.natural, loads.contacts)
         self._mean = self._weighted_mean(numbers, map_.size_global)
         deviation = model.midsurface.deviation(self._places)
         if deviation is not None:
@@ -135,9 +136,8 @@ class RevolvedGatherer:
     def __init__(self, model: MeridianModel, comm: MPI.Comm) -> None:
         self.comm, self._model, self._swept = comm, model, Revolution(model)
         factor = None if model.thickness is None else self._swept.scalars(model.thickness)
-        self._fields = PointFields(
-            self._swept.jets(model.r0), model.material, model.loads.magnetic, factor, model.loads.natural
-        )
+        r, loads = self._swept.jets(model.r0), model.loads
+        self._fields = PointFields(r, model.material, loads.magnetic, factor, loads.natural, loads.contacts)
         if isinstance(model.meridian.embedding, Deviated):
             s = np.sort(model.meridian.mesh.geometry.x[:, 0])
             w0 = model.meridian.embedding.w0(np.column_stack([s, 0 * s])) / model.material.h

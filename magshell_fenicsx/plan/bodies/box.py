@@ -33,4 +33,4 @@ def box(section: BoxSection, placed: Placed) -> Box:
     half, d = np.array(section.size) / placed.R / 2, placed.direction
     first = placed.across(section.axis)
     axes = np.stack([first, np.cross(d, first), d])
-    return Box(placed.front(half[2]) - half[2] * d, axes, half, section.edge / placed.R)
+    return Box(placed.centre, axes, half, section.edge / placed.R)

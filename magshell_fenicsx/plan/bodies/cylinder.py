@@ -28,5 +28,4 @@ class Cylinder:
 
 def cylinder(section: CylinderSection, placed: Placed) -> Cylinder:
     """See `Placed`."""
-    radius = section.radius / placed.R
-    return Cylinder(placed.front(radius) - radius * placed.direction, placed.across(section.axis), radius)
+    return Cylinder(placed.centre, placed.across(section.axis), section.radius / placed.R)

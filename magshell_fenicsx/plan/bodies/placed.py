@@ -19,12 +19,10 @@ class Placed:
     ----------
     key
         Of the case file, for messages.
-    touching
-        Place (3,) on the face of the undeformed shell where it touches first.
+    front, centre
+        The place (3,) of its surface that goes ahead, and its reference point behind that.
     direction
         Unit vector (3,) of the approach.
-    position
-        Its reference point if that is given.
     Q
         Turns vectors of the case into the model's frame.
     R
@@ -32,15 +30,11 @@ class Placed:
     """
 
     key: str
-    touching: Array
+    front: Array
+    centre: Array
     direction: Array
-    position: Array | None
     Q: Array
     R: float
-
-    def front(self, ahead: float) -> Array:
-        """The place (3,) that goes ahead, `ahead` of the reference point; over R."""
-        return self.touching if self.position is None else self.position + ahead * self.direction
 
     def across(self, axis: list[float]) -> Array:
         """The unit vector along the part of an axis that is across the approach.
@@ -57,9 +51,7 @@ class Placed:
         return np.asarray(v / size)
 
 
-def place_body(
-    section: BodySection, key: str, place: Array, normal: Array, half: float, Q: Array, R: float
-) -> Placed:
+def place_body(section: BodySection, key: str, place: Array, normal: Array, half: float, Q: Array, R: float) -> Placed:
     """Where a body is.
 
     Parameters
@@ -72,5 +64,8 @@ def place_body(
     out = normal if section.side == "outside" else -normal
     d = -out if section.direction is None else np.array(section.direction, dtype=float)
     d = d / np.linalg.norm(d)
-    position = None if section.position is None else Q @ (np.array(section.position) / R)
-    return Placed(key, Q @ (place + half * out), Q @ d, position, Q, R)
+    d, ahead = Q @ d, section.ahead / R
+    front = Q @ (place + half * out)
+    if section.position is not None:
+        front = Q @ (np.array(section.position) / R) + ahead * d
+    return Placed(key, front, front - ahead * d, d, Q, R)

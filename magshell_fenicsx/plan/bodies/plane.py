@@ -25,4 +25,4 @@ class Plane:
 
 def plane(section: PlaneSection, placed: Placed) -> Plane:
     """See `Placed`."""
-    return Plane(placed.front(0.0), placed.direction)
+    return Plane(placed.front, placed.direction)

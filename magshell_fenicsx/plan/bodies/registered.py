@@ -83,15 +83,17 @@ def _contact(case: Case, perfect: Outline, drawn: Outline, turn: float, name: st
     D, size = h**2 / (12 * (1 - case.shell.poisson_ratio**2)), section.blunt / placed.R
     pointed, deep = 1.0 if size == inf else POINTED * (1 + 1 / size), max(1.0, pressed(case, name) / SHALLOW)
     k = section.stiffness or NATURAL * D / h**2 * pointed * deep
-    found = Contact(
-        name, case.approaches[name], distance, placed.direction, placed.front(0.0), k, section.penetration, size
-    )
+    found = Contact(name, case.approaches[name], distance, placed.direction, placed.front, k, section.penetration, size)
     depth = -least_gap(found, drawn, Q, half)
     if depth > WITHIN * h:
         raise CaseError(
             f"{key}.{'at' if section.position is None else 'position'}: the body penetrates the undeformed shell by "
             f"{depth / h:.4g} h at approach 0; "
-            + ("give a place `at` that it reaches first, or its `position`" if section.position is None else "move it back")
+            + (
+                "give a place `at` that it reaches first, or its `position`"
+                if section.position is None
+                else "move it back"
+            )
         )
     return found
 

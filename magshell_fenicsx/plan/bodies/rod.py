@@ -37,4 +37,4 @@ class Rod:
 
 def rod(section: RodSection, placed: Placed) -> Rod:
     """See `Placed`."""
-    return Rod(placed.front(0.0), placed.direction, section.radius / placed.R, section.edge / placed.R)
+    return Rod(placed.front, placed.direction, section.radius / placed.R, section.edge / placed.R)

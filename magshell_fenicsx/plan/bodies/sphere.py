@@ -27,5 +27,4 @@ class Sphere:
 
 def sphere(section: SphereSection, placed: Placed) -> Sphere:
     """See `Placed`."""
-    radius = section.radius / placed.R
-    return Sphere(placed.front(radius) - radius * placed.direction, radius)
+    return Sphere(placed.centre, section.radius / placed.R)
