@@ -272,7 +272,7 @@ class Case(WithParts):
     @cached_property
     def approaches(self) -> dict[str, str]:
         """Body -> name of its approach, the amplitude; a single one needs no name beside it."""
-        steps = self.loading if isinstance(self.loading, list) else [self.loading]
+        steps: list[Step | None] = [*self.loading] if isinstance(self.loading, list) else [self.loading]
         alone = len(self.bodies) == 1 and not any(isinstance(step, IndentationSection) for step in steps)
         return {name: "approach" if alone else f"approach_{name}" for name in self.bodies}
 

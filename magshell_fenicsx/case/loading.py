@@ -94,7 +94,7 @@ def _numbered(loads: Sequence[Step], keys: Sequence[str], approaches: Mapping[st
     steps = []
     for number, (load, key) in enumerate(zip(loads, keys, strict=True), 1):
         if isinstance(load, ContactSection):
-            body = load.body or next(iter(approaches), "")
+            body = str(load.body or next(iter(approaches), ""))
             steps.append(ProgrammeStep(number, approaches.get(body, load.amplitude), key, load))
             continue
         places = known.setdefault(load.amplitude, [])

@@ -122,10 +122,10 @@ class Outline:
         shape = self.chart(None, ANY)
         if isinstance(shape, DiscShape):
             return np.asarray(chart / max(float(np.hypot(*chart)) / self.edge, 1.0))
-        low, high = (
-            (shape.low, shape.high) if isinstance(shape, Grid) else ((0, -shape.width / 2), (1, shape.width / 2))
-        )  # type: ignore[union-attr]
-        return np.clip(chart, low, high)
+        if isinstance(shape, StripShape):
+            return np.clip(chart, [0, -shape.width / 2], [1, shape.width / 2])
+        assert isinstance(shape, Grid)
+        return np.clip(chart, shape.low, shape.high)
 
     @property
     def perfect(self) -> Embedding:

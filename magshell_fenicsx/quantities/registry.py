@@ -148,8 +148,7 @@ OF_CONTACTS = (
     Quantity("contact_outer", "contact to", "Largest distance of the pressure from the body's axis.", "place"),
 )
 CONTACT = ("approach_over_h", "force", "penetration_over_h", "contact_radius", "contact_inner", "contact_outer")
-OF_SOME_RUNS = (*OF_SOME_RUNS, *OF_CONTACTS)
-QUANTITIES = {q.name: q for q in (*OF_EVERY_RUN, *OF_SOME_RUNS)}
+QUANTITIES = {q.name: q for q in (*OF_EVERY_RUN, *OF_SOME_RUNS, *OF_CONTACTS)}
 AMPLITUDES = {
     a.name: a
     for a in (

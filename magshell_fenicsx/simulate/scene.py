@@ -15,7 +15,7 @@ from magshell_fenicsx.case.imperfections.modes import ModesSection
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.continuation.journal import Journal, NoJournal
 from magshell_fenicsx.continuation.listener import NoProgress, Progress
-from magshell_fenicsx.continuation.newton import BorderedNewton
+from magshell_fenicsx.continuation.newton import BorderedNewton, NewtonOptions
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.continuation.watch import Watch
 from magshell_fenicsx.mesh.frame import rotation
@@ -85,7 +85,9 @@ class Scene:
             self.model = build_model(case, self.plan, comm)
         if not (self.plan.fixed or isinstance(self.model, MeridianModel)):
             refuse_loose(self.model.system, self.model.r0, self.unloaded().mu)
-        self.newton = BorderedNewton(self.model.system)
+        # a body's penetration changes over far less than h: factors of a state near by are no tangent's
+        options = NewtonOptions(fresh=0.0) if self.model.contacts else None
+        self.newton = BorderedNewton(self.model.system, options)
         self.journal: Journal = NoJournal()
         self.progress: Progress = NoProgress()
         self.setup_s = time.perf_counter() - start - self.model.kernels.seconds

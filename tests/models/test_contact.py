@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 
 from magshell_fenicsx import Case, Scene
-from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.models.shell.contact import penalty
 from magshell_fenicsx.simulate.follow import follow
 
@@ -18,7 +17,8 @@ HEMISPHERE = {"geometry": "hemisphere", "radius_to_thickness": 40, "poisson_rati
 BALL = {"kind": "sphere", "radius": 0.3, "stiffness": 1e3}
 COARSE = {"degree": 2, "refinement": 0.3}
 KINDS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
-    "meridian": ({"rod": {"kind": "rod", "radius": 0.1, "edge": 0.05, "stiffness": 1e3}}, {"mesh": {"refinement": 0.5}}),
+    "meridian": ({"rod": {"kind": "rod", "radius": 0.1, "edge": 0.05, "stiffness": 1e3}},
+                 {"mesh": {"refinement": 0.5}}),
     "half": ({"ball": BALL}, {"symmetry": "half", "mesh": COARSE}),
     "full": (
         {"ball": {**BALL, "at": {"polar": 40, "azimuth": 70}}, "roller": {

@@ -178,7 +178,7 @@ class EnergyFactory:
             return lambda v: of(j0, v, *parameters) * kin.area_ratio(j0) * dx
 
         of_radius = pressed_radius(self.constant(contact.front), self.constant(contact.direction))
-        seen = {"pressure": contact_pressure, "radius": of_radius}
+        seen: dict[str, Callable[..., Expr]] = {"pressure": contact_pressure, "radius": of_radius}
         integrals = {name: 2 * np.pi * over(of)(jets.revolved(u)) for name, of in seen.items()}
         return Energy(f"contact {contact.body}", over(contact_energy), follow=known.follow), known, integrals
 

@@ -182,8 +182,8 @@ class TermFactory:
         term = self._cells(f"contact {contact.body}", density, follow=known.follow)
         arguments, dx = (*self._jets(), *parameters), self._dx(rule)
         of_radius = pressed_radius(self._constant(contact.front), self._constant(contact.direction))
-        densities = {"pressure": contact_pressure, "radius": of_radius}
-        return term, known, {name: per_area(of)(*arguments) * dx for name, of in densities.items()}
+        seen: dict[str, Callable[..., Expr]] = {"pressure": contact_pressure, "radius": of_radius}
+        return term, known, {name: per_area(of)(*arguments) * dx for name, of in seen.items()}
 
     def _parameters(self, term: OwnTerm) -> tuple[fem.Constant, ...]:
         return constants_of(term, self._domain, self.free)

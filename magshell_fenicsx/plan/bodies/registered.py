@@ -11,7 +11,6 @@ from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.expressions import formula
 from magshell_fenicsx.case.loads.contact import ContactSection
 from magshell_fenicsx.case.source import CaseError
-from magshell_fenicsx.case.surfaces import MeshSurface
 from magshell_fenicsx.mesh.frame import rotation
 from magshell_fenicsx.mesh.mirror import Mirror
 from magshell_fenicsx.models.shell.contact import Contact, Distance
@@ -120,7 +119,7 @@ def body_leaves(contact: Contact) -> Leaves:
         return bool(np.abs(S @ d - d).max() < scale and np.abs(other - g).max() < scale * (1 + np.abs(g).max()))
 
     turns = all(alike(Q, x @ Q.T) for Q in (rotation(1.0), rotation(2.5)))
-    tilted = [v for v in (contact.front, d, *([contact.distance.axis] if hasattr(contact.distance, "axis") else []))]
+    tilted = [contact.front, d, *([contact.distance.axis] if hasattr(contact.distance, "axis") else [])]
 
     def mirrors(mirror: Mirror) -> bool:
         return alike(mirror.reflection, mirror.image(x))
