@@ -243,7 +243,9 @@ class Case(WithParts):
 
     @model_validator(mode="after")
     def _bodies_fit(self) -> Self:
-        for body in self.bodies.values():
+        for name, body in self.bodies.items():
+            if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,39}", name):
+                raise ValueError(f"bodies.{name}: a name is a letter, then letters, digits and _; at most 40")
             if body.at.point is None:
                 self._on_shell(body.at.polar)
         if self.bodies and self.model == "solid":

@@ -9,7 +9,6 @@ from magshell_fenicsx.case.bodies.cylinder import CylinderSection
 from magshell_fenicsx.case.bodies.plane import PlaneSection
 from magshell_fenicsx.case.bodies.rod import RodSection
 from magshell_fenicsx.case.bodies.sphere import SphereSection
-from magshell_fenicsx.case.loads.edge import Name
 
 Body = Annotated[PlaneSection | SphereSection | CylinderSection | RodSection | BoxSection, Field(discriminator="kind")]
-Bodies = Annotated[dict[Name, Body], Field(max_length=100)]
+Bodies = Annotated[dict[str, Body], Field(max_length=100)]
