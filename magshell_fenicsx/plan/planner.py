@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from math import inf, radians
+from math import inf, radians, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,11 +37,12 @@ from magshell_fenicsx.plan.names import refuse_unfit_ends
 from magshell_fenicsx.plan.outline import Chart, Outline, outline, refuse_beside
 from magshell_fenicsx.plan.own_terms import surface_terms
 from magshell_fenicsx.plan.plan import Plan
-from magshell_fenicsx.plan.sizes import Loaded, grading
+from magshell_fenicsx.plan.sizes import Loaded, grading, travel
 from magshell_fenicsx.plan.symmetry import Leaves, askew, left, mirror, unmirrored
 
 Array = NDArray[np.float64]
 Points = dict[str, Array]
+PRESSED = 0.08  # of sqrt(Rh): cells of a meridian that show the ring of a contact
 SAME_RIM = 0.02  # of the element size
 
 
@@ -89,7 +90,7 @@ def make_plan(case: Case, terms: Sequence[OwnTerm] = ()) -> Plan:
     local = [] if isinstance(case.shell, MeshSurface) else spots(found.items(), perfect, turn)
     everywhere = min((flaw.size for flaw in found.values() if flaw.centre is None), default=inf)
     bodies = contacts(case, perfect, drawn, turn)
-    touched = [(drawn.inverse(c.front), pressed(case, c.body), c.size) for c in bodies]
+    touched = [(drawn.inverse(c.front), travel(material.h, pressed(case, c.body), c.size), c.size) for c in bodies]
     size = grading(case, drawn, material.h, local, everywhere, loaded, touched)
     drawn = imperfect(perfect, found, turn)
     shape = drawn.chart(beyond, size)
@@ -131,6 +132,7 @@ def make_plan(case: Case, terms: Sequence[OwnTerm] = ()) -> Plan:
         within=within,
         supports=supports,
         reactions=bool(all_loads.moves) if case.reactions is None else case.reactions,
+        pressed=tuple((size, reach) for _, reach, size in touched),
         warning=sources_beside(case, sample if len(sample) else drawn.sample()),
     )
 
@@ -156,9 +158,15 @@ def meridian_vertices(plan: Plan, refinement: float) -> Array:
     assert span
     pole = span.names[0] is None
     h = plan.material.h / span.curvature
-    on_axis = min([h, *(contact.size / 3 for contact in plan.loads.contacts)])
+    reach = max((one[1] for one in plan.pressed), default=0.0)
     return graded_vertices(
-        span.length, span.circles, h, refinement=refinement, axis=pole, largest=span.largest, on_axis=on_axis
+        span.length,
+        span.circles,
+        min([h, *(size / 3 for size, _ in plan.pressed)]),
+        refinement=refinement,
+        axis=pole,
+        largest=min(0.2 * sqrt(h), span.largest),
+        pressed=((reach if pole else span.length), PRESSED * sqrt(h)) if reach else None,
     )
 
 

@@ -17,7 +17,7 @@ from magshell_fenicsx.plan.outline import Outline
 
 Array = NDArray[np.float64]
 RING = 0.35  # of sqrt(Rh): elements that show the ring of a contact
-Pressed = tuple[Array, float, float]  # place in the chart, approach over h, size of the body over R
+Pressed = tuple[Array, float, float]  # place in the chart, how far from there the body presses, its size; over R
 Loaded = tuple[Array, Sequence[IndentationSection]]  # place in the chart, and the indentations there
 
 
@@ -109,10 +109,13 @@ def _load(case: Case, h: float, place: Array, indentations: Sequence[Indentation
     return features
 
 
-def _contact(case: Case, h: float, place: Array, approach: float, size: float) -> list[Feature]:
-    """The pressure acts in a ring that travels: of a plane to sqrt(2 R a), and a dent in it has a ridge like that."""
+def travel(h: float, approach: float, size: float) -> float:
+    """How far from the first contact a body presses: a plane in a ring up to sqrt(2 R a), others on their front."""
+    return min(1.1 * sqrt(2 * (approach or 10.0) * h) + 0.5 * sqrt(h), size + sqrt(h))
+
+
+def _contact(case: Case, h: float, place: Array, reach: float, size: float) -> list[Feature]:
     x, y = map(float, place)
     centre, finer = (x, y), sqrt(h) / case.mesh.refinement
-    travel = min(1.1 * sqrt(2 * (approach or 10.0) * h) + 0.5 * sqrt(h), size + sqrt(h))
     small = [Disc(centre, 1.5 * size, max(size / 3, 0.1 * h), 0.4)] if size < sqrt(h) else []
-    return [Disc(centre, travel, RING * finer, _growth(case)), *small]
+    return [Disc(centre, reach, RING * finer, _growth(case)), *small]

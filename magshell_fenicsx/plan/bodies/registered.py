@@ -35,7 +35,6 @@ KINDS: dict[str, Callable[[Any, Placed], Distance]] = {
 }
 NATURAL = 1e6  # default stiffness over D/(R h)^2: plate and ball then penetrate less than 1e-3 h
 POINTED = 15.0  # times as stiff is the penalty of a body that touches in a spot, times 1 + R/its radius
-SHALLOW = 4.0  # of h: for more the penalty grows in proportion
 WITHIN = 1e-6  # penetration over h that is rounding
 
 
@@ -80,8 +79,7 @@ def _contact(case: Case, perfect: Outline, drawn: Outline, turn: float, name: st
     placed = place_body(section, key, here, normal, float(half(here[None])[0]), Q, case.shell.reference)
     distance = KINDS[section.kind](section, placed)
     D, size = h**2 / (12 * (1 - case.shell.poisson_ratio**2)), section.blunt / placed.R
-    pointed, deep = 1.0 if size == inf else POINTED * (1 + 1 / size), max(1.0, pressed(case, name) / SHALLOW)
-    k = section.stiffness or NATURAL * D / h**2 * pointed * deep
+    k = section.stiffness or NATURAL * D / h**2 * (1.0 if size == inf else POINTED * (1 + 1 / size))
     found = Contact(name, case.approaches[name], distance, placed.direction, placed.front, k, section.penetration, size)
     depth = -least_gap(found, drawn, Q, half)
     if depth > WITHIN * h:
