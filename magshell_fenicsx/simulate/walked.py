@@ -72,7 +72,7 @@ def _followed(stage: Stage, walk: Walk, branches: PathStep | None) -> Iterator[R
             if abs(point.state.mu[path.name]) > furthest:
                 break
     except PathStopped as e:
-        lost = _why(path, e, walk.points)
+        lost = _why(path, e, walk.points) + stage.scene.nowhere()
     yield from _excluded(path, watch.end())
     if lost and path.control == "load":
         for found in _fold_ahead(stage, path, walk.points):

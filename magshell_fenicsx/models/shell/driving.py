@@ -13,7 +13,7 @@ from magshell_fenicsx.assembly.terms import FormTerm, Term
 from magshell_fenicsx.models.shell.applied import AppliedField
 
 
-@dataclass(frozen=True)
+@dataclass
 class Amplitude:
     """The value of an amplitude in a field, which takes the place of a constant in a form."""
 
