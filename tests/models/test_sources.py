@@ -3,10 +3,13 @@
 from functools import cache
 from typing import Any
 
+import magpylib
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from magshell_fenicsx import Case, Scene
+from magshell_fenicsx.continuation.system import State
 
 MM = 1e-3
 PLATE = {"geometry": "plate", "length": "30 mm", "width": "12 mm", "thickness": "1 mm", "youngs_modulus": "1 MPa"}
@@ -125,3 +128,43 @@ def _times(K: Any, v: np.ndarray) -> np.ndarray:
     x = K.createVecRight()
     x.array[:] = v
     return np.array((K * x).array)
+
+
+def test_force_and_torque_on_a_magnetised_cap() -> None:
+    """Those of magpylib, of the magnet on the dipoles of a rigid cap: 40 x 80 of them, by Gauss's rule."""
+    R, h, polar, J = 25 * MM, 0.25 * MM, np.pi / 6, np.array([0.06, 0.0, 0.08])
+    here = np.array([6 * MM, -3 * MM, 40 * MM])
+    axes = {"x": [1, 0, 0], "y": [0, 1, 0], "z": [0, 0, 1]}
+    steps = [{"kind": "field"}]
+    steps += [{"kind": "source", "name": f"move_{k}", "move": [5e-3 * x for x in e]} for k, e in axes.items()]
+    steps += [{"kind": "source", "name": f"turn_{k}", "turn": {"axis": e, "angle": 20}} for k, e in axes.items()]
+    magnet = {**MAGNET, "position": here.tolist(), "axis": {"polar": 35, "azimuth": 70}}
+    cap = made(
+        {"geometry": "cap", "radius": "25 mm", "polar": 30, "thickness": "0.25 mm", "youngs_modulus": "1 TPa"},
+        {"rim": "clamped"},
+        magnetic={
+            "remanent": {"polar": float(np.degrees(np.arctan2(0.6, 0.8))), "flux_density": "100 mT"},
+            "applied": {"sources": [magnet]},
+        },
+        loading=steps,
+        mesh={"degree": 4, "refinement": 0.3},
+    )
+    mu = {**cap.unloaded().mu, "lambda_m": cap.case.lambda_m}
+    found = cap.observe(State(cap.model.zero(), mu))
+    force = [found[f"source_force_move_{k}"] for k in axes]
+    torque = [found[f"source_torque_turn_{k}"] for k in axes]
+
+    s, weights = np.polynomial.legendre.leggauss(40)
+    theta, weight = (s + 1) * polar / 2, weights * polar / 2
+    phi = 2 * np.pi * np.arange(80) / 80
+    places = R * np.array([[np.sin(t) * np.cos(p), np.sin(t) * np.sin(p), np.cos(t)] for t in theta for p in phi])
+    volumes = np.repeat(h * R**2 * np.sin(theta) * weight * 2 * np.pi / 80, 80)
+    body = [
+        magpylib.misc.Dipole(moment=v * J / magpylib.mu_0, position=x) for v, x in zip(volumes, places, strict=True)
+    ]
+    own = magpylib.magnet.Cylinder(dimension=(20 * MM, 10 * MM), polarization=(0, 0, 1.3), position=here)
+    own.orientation = Rotation.from_euler("ZY", [70, 35], degrees=True)
+    F, T = np.sum(magpylib.getFT(own, body, pivot=here), axis=1)
+    print(force, F, torque, T)
+    assert np.linalg.norm(force + F) <= 1e-3 * np.linalg.norm(F)
+    assert np.linalg.norm(torque + T) <= 1e-3 * np.linalg.norm(T)
