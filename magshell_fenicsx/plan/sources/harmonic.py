@@ -38,11 +38,13 @@ class Harmonic:
     def __call__(self, x: Array) -> tuple[Array, Array, Array]:
         d = self.distance(x)
         outside = np.isfinite(d) & (d > 0)
+        B, G, H = (np.full((len(x), *shape), np.nan) for shape in ((3,), (3, 3), (3, 3, 3)))
+        if not outside.any():
+            return B, G, H
         points, first, second = stencil()
         step = STEP * d[outside]
         found = self.values((x[outside, None] + step[:, None, None] * points).reshape(-1, 3))
         flat = np.reshape(found, (len(step), 3 * len(points)))
-        B, G, H = (np.full((len(x), *shape), np.nan) for shape in ((3,), (3, 3), (3, 3, 3)))
         B[outside] = flat[:, :3]
         G[outside] = (flat @ first / step[:, None]).reshape(-1, 3, 3)
         H[outside] = (flat @ second / step[:, None] ** 2).reshape(-1, 3, 3, 3)
