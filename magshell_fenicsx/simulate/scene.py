@@ -108,10 +108,10 @@ class Scene:
         return Watch(self.model.excluded_modes)
 
     def nowhere(self) -> str:
-        """What the field lacked where it was last needed, in words after a message; collective."""
+        """Where a step since the beginning of a walk has found no field, in words after a message; collective."""
         found = [known.lost for known in self.model.fields if known.lost]
         said = [each for part in self.model.system.comm.allgather(found) for each in part]
-        return f"; {said[0]}" if said else ""
+        return f"; on this way a step has found no field: {said[0]}" if said else ""
 
     @property
     def left_out(self) -> list[str]:

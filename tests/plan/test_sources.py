@@ -20,6 +20,7 @@ from magshell_fenicsx.plan.formulas_in_space import FormulasInSpace
 from magshell_fenicsx.plan.planner import make_plan
 from magshell_fenicsx.plan.sources.field import in_space
 from magshell_fenicsx.simulate.follow import follow
+from magshell_fenicsx.simulate.record import Stopped
 
 STRIP: dict[str, Any] = {
     "shell": {"geometry": "strip", "radius": "30 mm", "width": 0.2, "thickness": "1 mm", "youngs_modulus": "1 MPa"}
@@ -88,9 +89,9 @@ def test_sphere_is_a_dipole() -> None:
         np.testing.assert_allclose(found, 1.3 * r**3 * known, atol=1e-8 * np.abs(1.3 * r**3 * known).max())
 
 
-def written(folder: Path, form: str, b: np.ndarray, G: np.ndarray) -> str:
+def written(folder: Path, form: str, b: np.ndarray, G: np.ndarray, top: float = 33.0) -> str:
     """A grid of b + G r/R in mT around the strip, in a file."""
-    axes = [np.linspace(-12.0, 42.0, 5), np.linspace(-9.0, 9.0, 4), np.array([-33.0, -20, 0, 11, 33])]  # mm
+    axes = [np.linspace(-12.0, 42.0, 5), np.linspace(-9.0, 9.0, 4), np.array([-33.0, -20, -1, 1, top])]  # mm
     x = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
     B = b + x / (1e3 * L) @ G.T
     file = folder / f"grid.{form}"
@@ -225,3 +226,26 @@ def test_without_magpylib(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(CaseError, match="pip install --no-deps magpylib"):
         make_plan(case([{"kind": "cylinder", **OWN, **KINDS["cylinder"][0]}]))
     make_plan(case([{"kind": "formula", "components": ["0", "0", "1"]}]))
+
+
+def test_shell_leaves_the_grid(tmp_path: Path) -> None:
+    """The points up to there stay; the message says where it is."""
+    file = written(tmp_path, "csv", FIELD, 0 * SLOPE, top=11.0)
+    scene = Scene(case([{"kind": "grid", "file": file, "strength": 3.0}], tmp_path, loading={"kind": "field"}))
+    points = []
+    with pytest.raises(Stopped, match="on this way a step has found no field: the shell's point .* is beyond the grid of"):
+        for record in follow(scene):
+            points.append(scene.observe(record.point.state)["tip_uz"])
+    assert 9e-3 < points[-1] < 11.2e-3  # the outermost quadrature point is not the tip
+
+
+def test_magnet_in_the_way() -> None:
+    """It is driven into the strip."""
+    steps = [{"kind": "field", "points": 1}, {"kind": "source", "move": [0, 0, "30 mm"], "points": 2}]
+    low = {"kind": "cylinder", **ALONG, "strength": 1e-6, "position": [0.02, 0, -0.03]}
+    scene = Scene(case([low], loading=steps))
+    seen = []
+    with pytest.raises(Stopped, match="is inside magnetic.applied.sources.0"):
+        for record in follow(scene):
+            seen.append(scene.observe(record.point.state)["source"])
+    assert 0.7 < seen[-1] < 25 / 30

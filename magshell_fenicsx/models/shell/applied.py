@@ -60,7 +60,7 @@ class AppliedField:
     mu
         The amplitudes of the driven fields, to be set before `follow`.
     lost
-        Where the field was not finite at the last change; empty elsewhere.
+        Where the field was not finite, since a walk began and emptied this.
     """
 
     def __init__(
@@ -101,7 +101,7 @@ class AppliedField:
         x = self._r0 + u
         B, G, H = self._values(x.reshape(-1, 3))
         bad = ~np.isfinite(B).all(axis=1)
-        self.lost = self._where(x.reshape(-1, 3)[bad][0]) if bad.any() else ""
+        self.lost = self._where(x.reshape(-1, 3)[bad][0]) if bad.any() else self.lost
         second = H[:, :, *PAIRS] * np.where(PAIRS[0] == PAIRS[1], 0.5, 1.0)
         flat = [a.reshape(*u.shape[:2], -1) for a in (u, self._B0, B, G, second)]
         self.polynomial.renew(np.concatenate(flat, axis=-1))

@@ -43,7 +43,7 @@ class Driven:
 
     def at(self, x: Array, mu: Mapping[str, float]) -> "Here":
         """The field at places."""
-        Q, t = _carried(self.motions, mu)
+        Q, t = carried(self.motions, mu)
         B, G, H = self.of((x - t) @ Q)
         turned = (
             B @ Q.T,
@@ -111,12 +111,12 @@ class Here:
         own = motions[number]
         A = np.cross(np.eye(3), own.turn)
         v = own.shift - A @ own.centre
-        Q, t = _carried(motions[number + 1 :], self.mu)
+        Q, t = carried(motions[number + 1 :], self.mu)
         A = Q @ A @ Q.T
         return A, Q @ v - A @ t
 
 
-def _carried(motions: Sequence[Motion], mu: Mapping[str, float]) -> tuple[Array, Array]:
+def carried(motions: Sequence[Motion], mu: Mapping[str, float]) -> tuple[Array, Array]:
     """x -> Q x + t of all motions together."""
     origin, *ends = moved(motions, mu, np.vstack([np.zeros(3), np.eye(3)])).x
     return np.column_stack(ends) - origin[:, None], np.asarray(origin)
