@@ -1,11 +1,13 @@
 """Sources of the field in every model: derivatives by u, place, angle and strength; force and torque on a rigid cap."""
 
 from functools import cache
+from itertools import pairwise
 from typing import Any
 
 import magpylib
 import numpy as np
 import pytest
+import scipy
 from scipy.spatial.transform import Rotation
 
 from magshell_fenicsx import Case, Scene
@@ -165,6 +167,25 @@ def test_force_and_torque_on_a_magnetised_cap() -> None:
     own = magpylib.magnet.Cylinder(dimension=(20 * MM, 10 * MM), polarization=(0, 0, 1.3), position=here)
     own.orientation = Rotation.from_euler("ZY", [70, 35], degrees=True)
     F, T = np.sum(magpylib.getFT(own, body, pivot=here), axis=1)
-    print(force, F, torque, T)
     assert np.linalg.norm(force + F) <= 1e-3 * np.linalg.norm(F)
     assert np.linalg.norm(torque + T) <= 1e-3 * np.linalg.norm(T)
+
+
+@pytest.mark.parametrize("kind", ["shell", "solid"])
+def test_newton_is_quadratic(kind: str) -> None:
+    """Full steps with the tangent at each iterate: each error is at most a fixed multiple of the last one squared."""
+    system = scene(kind).model.system
+    mu = dict.fromkeys(scene(kind).unloaded().mu, 0.3) | {"lambda_m": 3e-4}
+    u, sizes = np.zeros(system.size), list[float]()
+    for _ in range(30):
+        rows, columns, values = system.tangent(u, mu).getValuesCSR()
+        K = scipy.sparse.csr_array((values, columns, rows), shape=(u.size, u.size))
+        du = scipy.sparse.linalg.spsolve(K.tocsc(), system.residual(u, mu))
+        u = u - du
+        sizes.append(float(np.abs(du).max()))
+        if sizes[-1] < 1e-12:
+            break
+    near = [size for size in sizes if size < 2e-3]
+    assert len(near) >= 4
+    assert all(after <= 1e4 * before**2 + 1e-14 for before, after in pairwise(near))
+    assert near[-1] < 1e-12
