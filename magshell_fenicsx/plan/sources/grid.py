@@ -107,9 +107,10 @@ def _size(unit: str | None, name: str) -> float:
 def _vtk(file: Path) -> tuple[Array, Array]:
     import pyvista
 
-    if not file.exists():
-        raise ScanError("cannot be read: No such file or directory")
-    data = pyvista.read(file)
+    try:
+        data = pyvista.read(file)
+    except OSError as e:
+        raise ScanError(f"cannot be read: {e.strerror or e}") from None
     if "B" not in data.point_data or np.shape(data.point_data["B"]) != (data.n_points, 3):
         raise ScanError("has no vector B at its points")
     return np.array(data.points, dtype=float), np.array(data.point_data["B"], dtype=float)
