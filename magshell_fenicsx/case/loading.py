@@ -12,10 +12,18 @@ from magshell_fenicsx.case.loads.field import FieldBefore, FieldSection, Rotatio
 from magshell_fenicsx.case.loads.growth import GrowthSection
 from magshell_fenicsx.case.loads.indentation import IndentationSection
 from magshell_fenicsx.case.loads.pressure import PressureSection
+from magshell_fenicsx.case.loads.source import SourceStep
 from magshell_fenicsx.case.loads.step import PathStep, Step, Until
 
 OneStep: TypeAlias = Annotated[
-    PressureSection | IndentationSection | FieldSection | RotationSection | GrowthSection | DeadSection | EdgeSection,
+    PressureSection
+    | IndentationSection
+    | FieldSection
+    | RotationSection
+    | GrowthSection
+    | DeadSection
+    | EdgeSection
+    | SourceStep,
     Field(discriminator="kind"),
 ]
 PROGRAMME = "programme"  # tag of a list of steps

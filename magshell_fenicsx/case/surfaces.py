@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import BeforeValidator, Field, ModelWrapValidatorHandler, PrivateAttr, model_validator
 
 from magshell_fenicsx.case.expressions import formula
-from magshell_fenicsx.case.fields import Formula
+from magshell_fenicsx.case.expressions import Formula
 from magshell_fenicsx.case.imperfections.dimple import DimpleSection
 from magshell_fenicsx.case.imperfections.registered import Imperfections
 from magshell_fenicsx.parts.section import Section, in_units, or_number, texts

@@ -16,7 +16,7 @@ from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.shell.parameters import Loads, Magnetisation, Material, RemanenceLaw
 from magshell_fenicsx.models.shell.patterns import tangential
-from magshell_fenicsx.plan.magnetisation import FormulasInSpace
+from magshell_fenicsx.plan.formulas_in_space import FormulasInSpace
 
 MATERIAL, MU, LAWS = Material(0.3, 0.05), {"lambda_m": 0.4}, ["deformation", "rotation"]
 BR, BA = np.array([0.6, 0.0, 0.8]), np.array([0.0, 0.28, 0.96])

@@ -15,7 +15,7 @@ from magshell_fenicsx.models.shell.parameters import Loads, Magnetisation, Mater
 from magshell_fenicsx.models.shell.patterns import radial
 from magshell_fenicsx.models.solid.material import NeoHookean
 from magshell_fenicsx.models.solid.model import SolidModel
-from magshell_fenicsx.plan.magnetisation import FormulasInSpace
+from magshell_fenicsx.plan.formulas_in_space import FormulasInSpace
 
 H = 0.1
 G = FIELD.gradient
