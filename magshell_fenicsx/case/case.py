@@ -14,6 +14,7 @@ from magshell_fenicsx.case.boundary import EDGES, BoundarySection
 from magshell_fenicsx.case.ensemble import EnsembleSection
 from magshell_fenicsx.case.expressions import is_formula
 from magshell_fenicsx.case.fields import MagneticSection, layer_average
+from magshell_fenicsx.case.frequencies import FrequenciesSection
 from magshell_fenicsx.case.imperfections.data import FileSection
 from magshell_fenicsx.case.imperfections.dimple import DimpleSection
 from magshell_fenicsx.case.imperfections.place import ImperfectionSection, places_with_units
@@ -89,6 +90,8 @@ class Case(WithParts):
     """Elements"""
     stability: StabilitySection | None = None
     """Lowest modes after the run"""
+    frequencies: FrequenciesSection | None = None
+    """Natural frequencies at points of the path"""
     ensemble: EnsembleSection | None = None
     """What is random, for `magshell ensemble`"""
     reactions: bool | None = None
@@ -305,6 +308,14 @@ class Case(WithParts):
     def lambda_m(self) -> float:
         """|Br||Ba|/(mu_0 E); 0 without a field."""
         return self.magnetic.amplitude(self.shell.youngs_modulus) if self.magnetic else 0.0
+
+    @property
+    def time_unit(self) -> float | None:
+        """R √(ρ/E), that times are over: in seconds where the case has units; None without a density."""
+        shell = self.shell
+        if shell.density is None or shell.youngs_modulus is None:
+            return None
+        return float(shell.reference * np.sqrt(shell.density / shell.youngs_modulus))
 
     @property
     def outside(self) -> dict[str, str | None]:
