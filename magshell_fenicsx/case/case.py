@@ -239,7 +239,9 @@ class Case(WithParts):
         for step in self.programme:
             if isinstance(step.load, EdgeSection):
                 refuse_unheld(step.key, step.load, self.boundary.conditions())
-        refuse_unfit_steps(self.programme, self.magnetic, self.lambda_m, whole=isinstance(self.loading, list))
+        density = self.time_unit is not None and self.shell.with_units
+        whole = isinstance(self.loading, list)
+        refuse_unfit_steps(self.programme, self.magnetic, self.lambda_m, whole=whole, density=density)
         return self
 
     @cached_property

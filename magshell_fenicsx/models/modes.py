@@ -12,25 +12,16 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
 
-import numpy as np
 import ufl
 from dolfinx import fem
-from dolfinx.fem import petsc as fem_petsc
-from petsc4py import PETSc
-from ufl.core.expr import Expr
 
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.assembly.sliding import Projection
 from magshell_fenicsx.continuation.modes import lowest_modes, null_vector
 from magshell_fenicsx.continuation.system import State, Tangent, Vector, symmetric_part
-from magshell_fenicsx.models.axisymmetric import jets
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
-from magshell_fenicsx.models.shell import kinematics as kin
-from magshell_fenicsx.models.shell.model import ShellModel
-from magshell_fenicsx.models.solid.model import SolidModel
-from magshell_fenicsx.platform import compat
+from magshell_fenicsx.models.mass import Model, mass_matrix, of_displacements, of_waves, thickness
 
-Model = ShellModel | MeridianModel | SolidModel
 TORSION = "torsion"  # label of vibrations around the axis, which a meridian has no displacement for
 EXCLUDED = ("antisymmetric", "m = ")  # what labels of modes begin with that a reduced model does not see
 
@@ -105,7 +96,7 @@ class ShellModes:
     def _lowest(self, families: Iterable[_Family], state: State, count: int) -> list[ShellMode]:
         found = []
         for family in families:
-            M = _mass_matrix(self._product(family), family.held)
+            M = mass_matrix(self._product(family), family.held)
             M = family.projection.mass(M) if family.projection else M
             modes = lowest_modes(symmetric_part(family.tangent(state)), M, count)
             found += [ShellMode(family.label, m.eigenvalue, m.vector) for m in modes if family.contains(m.vector)]
@@ -140,8 +131,8 @@ def _families(model: Model, *, vibrating: bool = False) -> Iterator[_Family]:
 
     If `vibrating`, the inner product is that of the mass, and torsion is a family of the meridian.
     """
-    weight, name = (_thickness(model), "weighted ") if vibrating and _thickness(model) else (1.0, "")
-    mass = f"{name}mass", _of_displacements(model, weight)
+    weight, name = (thickness(model), "weighted ") if vibrating and thickness(model) else (1.0, "")
+    mass = f"{name}mass", of_displacements(model, weight)
 
     def of(label: str, system: FiniteElementSystem) -> _Family:
         return _Family(label, lambda state: system.tangent(state.u, state.mu), system.clamped, mass, system.projection)
@@ -149,7 +140,7 @@ def _families(model: Model, *, vibrating: bool = False) -> Iterator[_Family]:
     yield of("", model.system)
     if isinstance(model, MeridianModel):
         waves = model.excluded_modes.waves
-        wave_mass = f"{name}wave mass", _of_waves(model, weight)
+        wave_mass = f"{name}wave mass", of_waves(model, weight)
         if vibrating:
             yield _Family(TORSION, partial(waves.tangent, m=0), waves.held(0), wave_mass, contains=_turns)
         for m in range(1, waves.largest + 1):
@@ -162,43 +153,3 @@ def _turns(coefficients: Vector) -> bool:
     """Whether a wave m = 0 turns around the axis; the others of m = 0 are the meridian's own."""
     P, V, W = coefficients.reshape(-1, 3).T
     return bool(V @ V > (P - V) @ (P - V) + W @ W)
-
-
-def _thickness(model: Model) -> Expr | None:
-    """What multiplies the thickness of a shell; a solid has it in its shape."""
-    return None if isinstance(model, SolidModel) or model.thickness is None else model.thickness[0]
-
-
-def _of_displacements(model: Model, weight: Expr | float) -> ufl.Form:
-    """The weighted integral of u . v over the undeformed mid-surface of what is modelled."""
-    product = weight * ufl.dot(ufl.TrialFunction(model.V), ufl.TestFunction(model.V))
-    return _integral(model, 2 * np.pi * product if isinstance(model, MeridianModel) else product)
-
-
-def _of_waves(model: MeridianModel, weight: Expr | float) -> ufl.Form:
-    """The same of two waves with the coefficients (U + V, V, W); it does not depend on m."""
-    V = model.excluded_modes.waves.V
-    cosine, sine = zip(*(jets.wave(f, 1) for f in (ufl.TrialFunction(V), ufl.TestFunction(V))), strict=True)
-    return _integral(model, weight * np.pi * sum(ufl.dot(a.r, b.r) for a, b in (cosine, sine)))
-
-
-def _integral(model: Model, f: Expr) -> ufl.Form:
-    """Over the undeformed area, of a solid averaged over the thickness; on a meridian per radian."""
-    domain, degree = model.V.mesh, model.degree
-    dx = ufl.Measure("dx", domain=domain, metadata={"quadrature_degree": 2 * degree + 2})
-    if isinstance(model, SolidModel):
-        return f / model.material.h * dx
-    j0 = jets.revolved(model.r0) if isinstance(model, MeridianModel) else kin.jet(model.r0, domain)
-    return f * kin.area_ratio(j0) * dx
-
-
-def _mass_matrix(product: fem.Form, held: list[fem.DirichletBC]) -> PETSc.Mat:
-    """The matrix of an inner product, with zero rows and columns at held degrees of freedom.
-
-    So held degrees of freedom have no finite eigenvalue, whatever the tangent's diagonal is there.
-    """
-    M = fem_petsc.create_matrix(product)
-    M.setOption(PETSc.Mat.Option.IGNORE_ZERO_ENTRIES, True)  # the tangent has no entries of held ones
-    compat.add_matrix(M, product, held)
-    M.assemble()
-    return M

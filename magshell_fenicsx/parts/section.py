@@ -114,6 +114,8 @@ _EXAMPLES = {
     "newton": "20 mN",
     "newton/metre": "5 N/m",
     "kilogram/metre**3": "2000 kg/m^3",
+    "second": "2.5 s",
+    "1/second": "20 Hz",
 }
 
 
