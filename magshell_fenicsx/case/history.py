@@ -51,6 +51,7 @@ class WaveHistory(Section):
     """Up and down around a mean value, which it has at first."""
 
     kind: Literal["triangle", "sine"]
+    """With corners, or without"""
     size: Level
     """Largest distance from the mean"""
     period: Time

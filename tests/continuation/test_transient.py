@@ -104,7 +104,7 @@ def test_same_motion_as_petsc() -> None:
 
 def test_energy_is_conserved() -> None:
     """1000 steps, 20 a period: the potential is of degree 4, as a membrane's."""
-    toy, integrator = column(1.0, loaded=False)
+    _, integrator = column(1.0, loaded=False)
 
     def energy(now: Motion) -> float:
         u, v = now.u

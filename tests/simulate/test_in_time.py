@@ -51,7 +51,7 @@ def test_a_cantilever_swings() -> None:
 
 @pytest.mark.parametrize("symmetry", ["axisymmetric", "half", "none"])
 def test_a_sudden_pressure_doubles_the_deflection(symmetry: str) -> None:
-    """1.9 to 2.1 of the static w; work = kinetic + stored + dissipated; with drag it comes to rest at the static state."""
+    """1.9 to 2.1 of the static w; work = kinetic + stored + dissipated; with drag it comes to rest in equilibrium."""
     static = {"kind": "pressure", "control": "load", "until": "target", "pressure": 1e-4, "points": 1}
     w = columns_of(case_of(PLATE, static, symmetry=symmetry))["w_pole_over_h"][-1]
     sudden = {"pressure": {"kind": "step", "to": 1e-4}}
@@ -102,7 +102,7 @@ MISTAKES = [
 
 @pytest.mark.parametrize(("given", "message"), MISTAKES)
 def test_mistakes(given: dict[str, Any], message: str) -> None:
-    with pytest.raises(CaseError, match=".*") as error:
+    with pytest.raises(CaseError) as error:
         case_of(PLATE, {"kind": "time", "duration": 1.0, **given})
     assert message in str(error.value)
 
