@@ -16,7 +16,8 @@ from magshell_fenicsx.case.boundary import EDGES, BoundarySection
 from magshell_fenicsx.case.ensemble import EnsembleSection
 from magshell_fenicsx.case.expressions import is_formula
 from magshell_fenicsx.case.fields import MagneticSection, layer_average
-from magshell_fenicsx.case.imperfections.data import FileSection
+from magshell_fenicsx.case.file import FileKeys
+from magshell_fenicsx.case.frequencies import FrequenciesSection
 from magshell_fenicsx.case.imperfections.dimple import DimpleSection
 from magshell_fenicsx.case.imperfections.place import ImperfectionSection, places_with_units
 from magshell_fenicsx.case.imperfections.random import RandomSection
@@ -34,6 +35,7 @@ from magshell_fenicsx.case.programme import refuse_unfit_steps
 from magshell_fenicsx.case.shell import ShellSection
 from magshell_fenicsx.case.solid import SolidSection
 from magshell_fenicsx.case.source import CaseError, Source, override, read_source
+from magshell_fenicsx.case.sources.source import SourceSection
 from magshell_fenicsx.case.stability import StabilitySection
 from magshell_fenicsx.case.surfaces import CapSurface, MeshSurface, RevolutionSurface, Surface, SurfaceSection
 from magshell_fenicsx.parts.part import Part, Scales
@@ -94,6 +96,8 @@ class Case(WithParts):
     """Elements"""
     stability: StabilitySection | None = None
     """Lowest modes after the run"""
+    frequencies: FrequenciesSection | None = None
+    """Natural frequencies at points of the path"""
     ensemble: EnsembleSection | None = None
     """What is random, for `magshell ensemble`"""
     reactions: bool | None = None
@@ -127,6 +131,10 @@ class Case(WithParts):
     def _sections_fit(self) -> Self:
         if self.magnetic and self.magnetic.lambda_m is None and self.shell.youngs_modulus is None:
             raise ValueError("shell.youngs_modulus is needed to turn flux densities into lambda_m")
+        if self.magnetic and self.magnetic.applied.sources and not self.shell.with_units:
+            raise ValueError(
+                "magnetic.applied.sources: are in metres and tesla: give youngs_modulus and the shell's lengths units"
+            )
         layers = self.magnetic.remanent.layers if self.magnetic else None
         if layers and self.model == "shell" and np.linalg.norm(layer_average(layers)) < 1e-9:
             raise ValueError(
@@ -252,9 +260,9 @@ class Case(WithParts):
             raise ValueError("bodies: press on a shell; of a solid give a force on a patch (kind: indentation, patch)")
         for step in self.programme:
             if isinstance(step.load, ContactSection):
-                name, known = step.load.body, ", ".join(self.bodies) or "none: give it in bodies"
-                if (name is None and len(self.bodies) != 1) or (name is not None and name not in self.bodies):
-                    raise ValueError(f"{step.key}.body: {name or 'is missing'}; allowed: {known}")
+                moved, known = step.load.body, ", ".join(self.bodies) or "none: give it in bodies"
+                if (moved is None and len(self.bodies) != 1) or (moved is not None and moved not in self.bodies):
+                    raise ValueError(f"{step.key}.body: {moved or 'is missing'}; allowed: {known}")
         return self
 
     @model_validator(mode="after")
@@ -262,7 +270,9 @@ class Case(WithParts):
         for step in self.programme:
             if isinstance(step.load, EdgeSection):
                 refuse_unheld(step.key, step.load, self.boundary.conditions())
-        refuse_unfit_steps(self.programme, self.magnetic, self.lambda_m, whole=isinstance(self.loading, list))
+        density = self.time_unit is not None and self.shell.with_units
+        whole = isinstance(self.loading, list)
+        refuse_unfit_steps(self.programme, self.magnetic, self.lambda_m, whole=whole, density=density)
         return self
 
     @cached_property
@@ -340,10 +350,25 @@ class Case(WithParts):
         return self.magnetic.amplitude(self.shell.youngs_modulus) if self.magnetic else 0.0
 
     @property
+    def sources(self) -> Sequence[SourceSection]:
+        """Of the applied field."""
+        return (self.magnetic.applied.sources if self.magnetic else None) or []
+
+    @property
+    def time_unit(self) -> float | None:
+        """R √(ρ/E), that times are over: in seconds where the case has units; None without a density."""
+        shell = self.shell
+        if shell.density is None or shell.youngs_modulus is None:
+            return None
+        return float(shell.reference * np.sqrt(shell.density / shell.youngs_modulus))
+
+    @property
     def outside(self) -> dict[str, str | None]:
         """What is solved besides the case's own keys: the hashes of its mesh file and of its other files."""
         mesh = {"mesh_file": self.shell.digest} if isinstance(self.shell, MeshSurface) else {}
-        files = {key: s.digest for key, s in self.imperfections.items() if isinstance(s, FileSection) and s.file}
+        sections = dict[str, object](self.imperfections)
+        sections |= {f"magnetic.applied.sources.{i}": source for i, source in enumerate(self.sources)}
+        files = {key: s.digest for key, s in sections.items() if isinstance(s, FileKeys) and s.file}
         return mesh | {f"{key}.file": digest for key, digest in files.items()}
 
     @classmethod

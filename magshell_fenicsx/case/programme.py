@@ -5,14 +5,22 @@ from collections.abc import Sequence
 from magshell_fenicsx.case.fields import MagneticSection
 from magshell_fenicsx.case.loading import ProgrammeStep
 from magshell_fenicsx.case.loads.dead import DeadSection
+from magshell_fenicsx.case.loads.edge import EdgeSection
 from magshell_fenicsx.case.loads.field import FieldBefore, FieldSection, RotationSection
+from magshell_fenicsx.case.loads.source import SourceStep, refuse_unknown_source
 from magshell_fenicsx.case.loads.step import LEAST_TARGET, Gas, Step
+from magshell_fenicsx.case.loads.time import TimeSection, refuse_unfit_time
 
 SAME = 1e-9  # cosine of directions: rounding
 
 
 def refuse_unfit_steps(
-    steps: Sequence[ProgrammeStep], magnetic: MagneticSection | None, lambda_m: float, *, whole: bool
+    steps: Sequence[ProgrammeStep],
+    magnetic: MagneticSection | None,
+    lambda_m: float,
+    *,
+    whole: bool,
+    density: bool = False,
 ) -> None:
     """See that each step has its field, a way to go, and known amplitudes to hold.
 
@@ -20,6 +28,8 @@ def refuse_unfit_steps(
     ----------
     whole
         Whether the steps are all that happens; otherwise the field is applied first.
+    density
+        Whether times may have units.
 
     Raises
     ------
@@ -27,19 +37,31 @@ def refuse_unfit_steps(
         With the key and what is allowed.
     """
     driven: set[str] = set()
+    amplitudes, moved = {step.name for step in steps}, {s.name for s in steps if isinstance(s.load, EdgeSection)}
     field = magnetic.applied.vector() if magnetic else None
     for step in steps:
         load, key = step.load, step.key
         if isinstance(load, FieldSection) and not isinstance(load, FieldBefore) and not lambda_m:
             raise ValueError(f"{key}.kind: field needs magnetic.lambda_m, not zero, for its target or direction")
+        if isinstance(load, SourceStep):
+            sources = magnetic.applied.sources if magnetic else None
+            refuse_unknown_source(key, load, sources or [])
+            if whole and "lambda_m" not in driven:
+                raise ValueError(f"{key}.kind: source needs the field of its source: a step of kind: field before it")
+            others = [other.load for other in steps if isinstance(other.load, SourceStep) and other.name != step.name]
+            same = (other for other in others if other.number(sources or []) == load.number(sources or []))
+            if load.to and any(other.move or other.to for other in same):
+                raise ValueError(f"{key}.to: another step moves the same source: give move")
         if isinstance(load, RotationSection):
             if magnetic is None or field is None or not lambda_m:
                 raise ValueError(f"{key}.kind: rotation needs a field: magnetic.lambda_m, not zero")
             if whole and "lambda_m" not in driven:
                 raise ValueError(f"{key}.kind: rotation needs a field: a step of kind: field before it")
-            if magnetic.applied.components:
+            if magnetic.applied.components or magnetic.applied.sources:
+                what = "components, formulas" if magnetic.applied.components else "sources, magnets and fields"
                 raise ValueError(
-                    f"{key}.kind: rotation: not with magnetic.applied.components, formulas that do not turn"
+                    f"{key}.kind: rotation: not with magnetic.applied.{what} that do not turn"
+                    + ("; kind: source turns a source" if magnetic.applied.sources else "")
                 )
             if abs(field @ load.to.vector()) > 1 - SAME:
                 where = "magnetic.applied" if "angle" not in driven else "the field at its beginning"
@@ -50,6 +72,16 @@ def refuse_unfit_steps(
                 f"{key}: the target must not be zero (at least {LEAST_TARGET:g} in size): the first step of a load "
                 "begins there"
             )
+        after = steps[step.number - 2].load if step.number > 1 else None
+        if isinstance(after, TimeSection) and after.until == "duration" and not isinstance(load, TimeSection):
+            raise ValueError(f"{key}: begins in equilibrium: the step of kind: time before it needs until: rest")
+        if isinstance(load, TimeSection):
+            if "field" in load.history and (not lambda_m or "angle" in driven):
+                why = "not after kind: rotation" if lambda_m else "needs magnetic.lambda_m, not zero"
+                raise ValueError(f"{key}.history.field: {why}")
+            flux = magnetic is not None and magnetic.applied.flux_density not in (None, 0.0)
+            refuse_unfit_time(key, load, amplitudes - moved, density=density, measured=flux)
+            driven.update(load.drives)
         driven.add(step.name)
         _refuse_unfit_hold(step, steps)
 

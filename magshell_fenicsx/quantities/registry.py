@@ -117,6 +117,20 @@ OF_SOME_RUNS = (
         "of force (N with units), of rotations alone in that of a moment.",
         "reaction",
     ),
+    Quantity(
+        "source", "source", "Factor of a source's motion or strength; the step may give it another name.", "load"
+    ),
+    Quantity(
+        "source_force",
+        "force on the source",
+        "Force of the shell on a source that is driven, along its motion; of several source_force_NAME.",
+        "reaction",
+        si="N",
+    ),
+    Quantity("source_torque", "torque on the source", "The same about the axis of its turn.", "reaction", si="N m"),
+    Quantity(
+        "source_work", "work of the source", "The same of its strength: -dΠ/d(factor of the field).", "reaction", si="J"
+    ),
 )
 OF_CONTACTS = (
     Quantity(
@@ -148,7 +162,18 @@ OF_CONTACTS = (
     Quantity("contact_outer", "contact to", "Largest distance of the pressure from the body's axis.", "place"),
 )
 CONTACT = ("approach_over_h", "force", "penetration_over_h", "contact_radius", "contact_inner", "contact_outer")
-QUANTITIES = {q.name: q for q in (*OF_EVERY_RUN, *OF_SOME_RUNS, *OF_CONTACTS)}
+IN_TIME = (  # of runs with a step of kind: time
+    Quantity(
+        "time", "time", "Time of the motion; in seconds, or the case's own unit, with shell.density.", "time", "t"
+    ),
+    _energy("kinetic", "kinetic", "Kinetic energy."),
+    _energy("stored", "stored", "Energy of the shell itself: all terms but the potentials of loads."),
+    _energy("dissipated", "dissipated", "Energy lost by drag and viscosity; none in static steps."),
+    _energy(
+        "work", "work", "Work of the loads in steps of kind: time, kinetic + stored + dissipated less what was stored."
+    ),
+)
+QUANTITIES = {q.name: q for q in (*OF_EVERY_RUN, *OF_SOME_RUNS, *OF_CONTACTS, *IN_TIME)}
 AMPLITUDES = {
     a.name: a
     for a in (
@@ -158,11 +183,13 @@ AMPLITUDES = {
         Amplitude("lambda_m", "lambda_m"),
         Amplitude("angle", "field_angle"),
         Amplitude("approach", "approach_over_h", "force", ""),
+        Amplitude("time", "time"),
     )
 }
 # names of terms, and of amplitudes that only the solvers use
 GRADIENTS = tuple(f"lambda_gradient_{i}" for i in range(1, 10))
 INTERNAL = ("push", "lambda_across", "lambda_third", *GRADIENTS, "membrane", "couple")
+OF_SOURCES = ("source_force", "source_torque", "source_work")
 TAKEN = frozenset((*QUANTITIES, *AMPLITUDES, *INTERNAL))
 
 
@@ -183,8 +210,9 @@ def quantity(name: str) -> Quantity:
     if again := re.fullmatch(rf"({'|'.join(CONTACT)})_([A-Za-z]\w*)", name):
         of = QUANTITIES[again[1]]
         return replace(of, name=name, words=f"{of.words} {again[2]}", note="")
-    if name.startswith("reaction_"):
-        return replace(QUANTITIES["reaction"], name=name, words=name.replace("_", " "))
+    for column in ("reaction", *OF_SOURCES):
+        if name.startswith(f"{column}_"):
+            return replace(QUANTITIES[column], name=name, words=name.replace("_", " "))
     kinds: dict[str, Kind] = {"u": "place", "f": "reaction", "m": "moment"}
     ending = re.search(r"_([ufm])[xyz]$", name)
     return Quantity(name, name.replace("_", " "), "", kinds[ending[1]] if ending else "load")
@@ -210,18 +238,20 @@ def contact_columns(approach: str) -> tuple[str, ...]:
 def axes_of(name: str, row: Collection[str] = ()) -> tuple[Quantity, Quantity]:
     """The quantities on the x and y axis of an amplitude's curve: its displacement and its value.
 
-    An angle is on the x axis, and the displacement on the y axis; so is the factor of a motion, with its reaction.
+    An angle, the time and the factor of a motion are on the x axis, and the displacement or the reaction on the y axis.
 
     Parameters
     ----------
     row
         The columns that there are: where w_over_h belongs to another load, this one has a column of its own.
     """
-    for reaction in (f"reaction_{name}", "reaction"):
-        if name not in AMPLITUDES and reaction in row:
+    own_name = tuple(f"{column}_{name}" for column in ("reaction", *OF_SOURCES))
+    for reaction in (*own_name, "reaction", *OF_SOURCES) if name not in AMPLITUDES else ():
+        if reaction in row:
             return quantity(name), quantity(reaction)
     varied, own = amplitude(name), f"w_{name}_over_h"
     over, drawn = quantity(own if own in row else varied.conjugate), quantity(varied.column)
     if varied.conjugate == "w_over_h":
         over = replace(over, note=varied.place)
-    return (drawn, over) if name == "angle" or varied.column.startswith("approach_over_h") else (over, drawn)
+    sideways = name in ("angle", "time") or varied.column.startswith("approach_over_h")
+    return (drawn, over) if sideways else (over, drawn)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.imperfections.modes import ModesSection
+from magshell_fenicsx.case.loads.time import TimeSection
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.continuation.journal import Journal, NoJournal
 from magshell_fenicsx.continuation.listener import NoProgress, Progress
@@ -24,7 +25,14 @@ from magshell_fenicsx.mesh.midsurface import Midsurface, distribute
 from magshell_fenicsx.mesh.mirror import Y0
 from magshell_fenicsx.models.axisymmetric.meridian import make_meridian
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
-from magshell_fenicsx.models.reacting import columns, motion_columns, motion_size, observed_reactions
+from magshell_fenicsx.models.reacting import (
+    columns,
+    motion_columns,
+    motion_size,
+    observed_reactions,
+    source_columns,
+    source_size,
+)
 from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.shell.openings import no_potential
 from magshell_fenicsx.models.shell.own_term import OwnTerm
@@ -35,7 +43,7 @@ from magshell_fenicsx.plan.body import layers, neo_hookean
 from magshell_fenicsx.plan.plan import Plan
 from magshell_fenicsx.plan.planner import make_plan, meridian_vertices
 from magshell_fenicsx.platform.first import from_first
-from magshell_fenicsx.quantities.registry import amplitude, contact_columns
+from magshell_fenicsx.quantities.registry import IN_TIME, amplitude, contact_columns
 from magshell_fenicsx.simulate.direction import directions, field_angle, field_size, turned
 
 Array = NDArray[np.float64]
@@ -102,6 +110,12 @@ class Scene:
         """The watch over the modes that the model excludes. Its first use compiles their kernels."""
         return Watch(self.model.excluded_modes)
 
+    def nowhere(self) -> str:
+        """Where a step since the beginning of a walk has found no field, in words after a message; collective."""
+        found = [known.lost for known in self.model.fields if known.lost]
+        said = [each for part in self.model.system.comm.allgather(found) for each in part]
+        return f"; on this way a step has found no field: {said[0]}" if said else ""
+
     @property
     def left_out(self) -> list[str]:
         """What the model lacks, for people."""
@@ -110,9 +124,8 @@ class Scene:
 
     def unloaded(self) -> State:
         """The undeformed shell; amplitudes are zero, except user-defined ones with a value."""
-        amplitudes = (
-            {t.amplitude for t in self.model.system.terms if t.amplitude} | self.motions | {*self.model.contacts}
-        )
+        own = {*self.motions, *self.sources, *self.model.contacts}
+        amplitudes = {t.amplitude for t in self.model.system.terms if t.amplitude} | own
         given = self._own_amplitudes
         return State(self.model.zero(), {name: given.get(name, 0.0) for name in sorted({*amplitudes, *given})})
 
@@ -145,6 +158,7 @@ class Scene:
             **{name: state.mu[name] for name in self._own_amplitudes},
             **self._observe_supports(state),
             **self._observe_contacts(state),
+            **self._observe_sources(state),
             **{
                 column: state.mu[term.name]
                 * model.multiplicity
@@ -182,14 +196,27 @@ class Scene:
         return frozenset(move.motion.name for move in self.plan.loads.moves)
 
     @property
+    def sources(self) -> dict[str, str]:
+        """See `source_columns`."""
+        return source_columns(self.plan.loads)
+
+    @property
     def extra_columns(self) -> tuple[str, ...]:
         """The columns of `observe` besides those of every run."""
         named = tuple(f"{point}_u{axis}" for point in self.case.points for axis in "xyz")
         own = (*self._own_amplitudes, *(column for term in self.plan.loads.own for column in term.observed))
         factors = (self._column(name) for name in (*self.plan.loads.forces, *self.plan.loads.dead) if name != "force")
         displaced = (f"w_{name}_over_h" for name in self._also_displaced)
+        clock = tuple(q.name for q in IN_TIME) if self.case.loads_of(TimeSection) else ()
+        sources = (*self.sources, *self.sources.values())
         contacts = (column for name in self.model.contacts for column in contact_columns(name) if column != "force")
-        return (*factors, *displaced, *named, *own, *self._support_columns, *contacts)
+        return (*factors, *displaced, *named, *own, *self._support_columns, *sources, *contacts, *clock)
+
+    def stored(self, state: State, energy: float) -> float:
+        """The energy of the shell itself: without the potentials of the loads."""
+        system, of = self.model.system, self.model.multiplicity
+        loads = (name for name in state.mu if name not in system.coordinates)
+        return energy - of * sum(state.mu[name] * system.potential(state.u, state.mu, name) for name in loads)
 
     @property
     def _support_columns(self) -> tuple[str, ...]:
@@ -218,6 +245,14 @@ class Scene:
             values = (state.mu[name], -force / self.conjugate_unit(name), at.penetration / h)
             radii = (self.plan.length * radius for radius in (at.radius, at.inner, at.outer))
             found |= dict(zip(contact_columns(name), (*values, *radii), strict=True))
+        return found
+
+    def _observe_sources(self, state: State) -> dict[str, float]:
+        """The amplitudes of sources, and their conjugates in SI."""
+        found: dict[str, float] = {}
+        for name, column in self.sources.items():
+            potential = self.model.system.potential(state.u, state.mu, name)
+            found |= {name: state.mu[name], column: -potential / self.conjugate_unit(name)}
         return found
 
     @property
@@ -255,6 +290,10 @@ class Scene:
             return -motion_size(self.plan.loads, name) / (force * arm * model.multiplicity)
         if name in model.contacts:
             return -model.force_unit * material.h
+        if name in self.sources:
+            force = (self.case.shell.modulus or 1.0) * material.h * self.plan.length**2
+            arm = 1.0 if self.sources[name].startswith("source_force") else self.plan.length
+            return source_size(self.plan.loads, name) / (force * arm * model.multiplicity)
         if name in model.loads.forces:
             return model.force_unit * material.h
         return model.load_size.get(name, 0.0) / self.plan.length

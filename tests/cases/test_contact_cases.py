@@ -31,7 +31,7 @@ ONE = ("loading.approach=1", "loading.points=1")
 
 @pytest.mark.slow
 def test_plate() -> None:
-    """Flat up to a fold near 2.55 h, back to one at 2.50 h, then a dimple in a ring, whose radius is that of a mirrored cap.
+    """Flat up to a fold near 2.55 h, back to one at 2.50 h, then a dimple in a ring with the radius of a mirrored cap.
 
     The plane of the plate cuts the sphere at sqrt(2 R a); a mirrored cap of the depth w has the radius sqrt(R w).
     """

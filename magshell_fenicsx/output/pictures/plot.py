@@ -2,16 +2,19 @@
 
 import csv
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from magshell_fenicsx.case.source import CaseError
+from magshell_fenicsx.output.fields.frequencies import read_frequencies
 from magshell_fenicsx.output.fields.modes import mode_caption, mode_file, wave_number
+from magshell_fenicsx.output.fields.outlines import read_outlines
 from magshell_fenicsx.output.fields.surface import Surface, completed
 from magshell_fenicsx.output.fields.vtu import About, point_file, read_vtu
 from magshell_fenicsx.output.pictures.animation import animated
 from magshell_fenicsx.output.pictures.captions import caption, shell_caption
 from magshell_fenicsx.output.pictures.curve import curve_figure, drawn_parts
+from magshell_fenicsx.output.pictures.frequencies import frequencies_figure
 from magshell_fenicsx.output.pictures.layout import png
 from magshell_fenicsx.output.pictures.mode_picture import draw_modes
 from magshell_fenicsx.output.pictures.picture import figures
@@ -88,6 +91,8 @@ def draw(folder: Path, point: int | None = None) -> list[str]:
     if point is None:
         for name, content in _modes(folder, rows):
             write(name, content)
+        if frequencies := read_frequencies(folder):
+            write("frequencies.png", png(frequencies_figure(frequencies, rows, title)))
         if found := searched(rows):
             surfaces = [_point(folder, each)[0] for each in found[:MOST_PANELS]]
             title = caption(about.h, about.nu, found[0])
@@ -139,6 +144,7 @@ def _file(folder: Path, row: Row) -> Path:
 def _point(folder: Path, row: Row) -> tuple[Surface, About]:
     """The whole deformed shell at a point."""
     surface, about = read_vtu(_file(folder, row))
+    surface = replace(surface, outlines=read_outlines(folder / "fields", int(row["point"])))
     return surface if about.mirror is None else completed(surface, about.mirror), about
 
 
