@@ -96,6 +96,14 @@ class Observed:
         pressure, moment = (self.system.integral(state.u, forms[name]) for name in ("pressure", "radius"))
         return known.region(self.system.comm, moment / pressure if pressure else 0.0)
 
+    def cell_pressures(self, state: State) -> Array | None:
+        """The pressure of all bodies in each local cell, see `Pressing`; None without bodies."""
+        if not self.contacts:
+            return None
+        self.system.place(state.mu)
+        self.system.set(state.u)
+        return np.asarray(sum(known.cell_pressures() for known, _ in self.contacts.values()))
+
     def loaded_deflection(self, u: Vector, name: str) -> float:
         """w/R conjugate to a force: at its point, or averaged over its patch; of dead loads along themselves.
 

@@ -76,8 +76,8 @@ class PointFields:
             deformed point, over mu_0 E / |Br|, so that its magnitude is lambda_m.
         tau
             (..., 3) torque, for a uniform field.
-        gap_over_h, contact_pressure
-            (...) the least gap to a body, and the pressure of all over E h/R.
+        gap_over_h
+            (...) the least gap to a body.
         """
         frame, total = self._frame, {}
         E, K = frame.membrane_strain(u), frame.curvature_change(u)
@@ -97,16 +97,13 @@ class PointFields:
         if self._torque:
             found["tau"] = self._torque(np.moveaxis(u[1:3], 0, -2))
         if self._contacts:
-            found |= self._touching(frame.jet[0] + u[0], mu)
+            found["gap_over_h"] = self._gap(frame.jet[0] + u[0], mu)
         return found
 
-    def _touching(self, r: Array, mu: Mapping[str, float]) -> dict[str, Array]:
+    def _gap(self, r: Array, mu: Mapping[str, float]) -> Array:
         h, factor = self._h, 1.0 if self._thickness is None else self._thickness.ravel()
-        places = r.reshape(-1, 3)
-        gaps = [c.gap(places, h * mu.get(c.amplitude, 0.0), h / 2 * factor)[0] for c in self._contacts]
-        pressure = sum((c.pressure(gap, h) for c, gap in zip(self._contacts, gaps, strict=True)), np.zeros(len(places)))
-        least = np.min(gaps, axis=0) / h
-        return {"gap_over_h": least.reshape(r.shape[:-1]), "contact_pressure": pressure.reshape(r.shape[:-1])}
+        gaps = [c.gap(r.reshape(-1, 3), h * mu.get(c.amplitude, 0.0), h / 2 * factor)[0] for c in self._contacts]
+        return np.asarray(np.min(gaps, axis=0) / h).reshape(r.shape[:-1])
 
     def _geometry(self) -> SurfaceGeometry:
         r0 = self._frame.jet

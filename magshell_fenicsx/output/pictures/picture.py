@@ -117,7 +117,7 @@ def _principal(captions: dict[str, str]) -> Callable[[Surface, "pyvista.PolyData
 
 def _contact(surface: Surface, smooth: "pyvista.PolyData", h: float) -> list[View]:
     """The gap and the pressure of bodies, from above them."""
-    if "gap_over_h" not in surface.fields:
+    if not CONTACT.keys() <= surface.fields.keys():
         return []
     camera = towards(surface.r0[np.argmin(surface.fields["gap_over_h"])])
     most = float(surface.fields["contact_pressure"].max()) or 1.0
