@@ -26,7 +26,7 @@ def last(file: str, *settings: str) -> Row:
     return rows(file, *settings)[-1]
 
 
-ONE = ("loading.approach=1", "loading.points=1")
+ONE = ("loading.approach=0.8", "loading.points=1")
 
 
 @pytest.mark.slow
@@ -35,7 +35,7 @@ def test_plate() -> None:
 
     The plane of the plate cuts the sphere at sqrt(2 R a); a mirrored cap of the depth w has the radius sqrt(R w).
     """
-    path = rows("plate_contact.yaml")
+    path = rows("plate_contact.yaml", "loading.points=4")
     first, second = (row["approach_over_h"] for row in path if row["label"] == "fold")
     assert 2.5 < second < first < 2.6
     assert second == pytest.approx(2.5, abs=0.01)
@@ -53,16 +53,16 @@ def test_plate() -> None:
 @pytest.mark.slow
 def test_stiffness() -> None:
     """Over four decades of it the force changes by less than 1e-3, with penetrations below 1e-3 h."""
-    found = [last("plate_contact.yaml", *ONE, f"bodies.plate.stiffness={k}") for k in ("2e4", "2e6", "2e8")]
+    found = [last("plate_contact.yaml", *ONE, f"bodies.plate.stiffness={k}") for k in ("2e4", "2e8")]
     assert all(row["penetration_over_h"] < 1e-3 for row in found)
     assert np.ptp([row["force"] for row in found]) < 1e-3 * found[0]["force"]
-    assert found[2]["penetration_over_h"] < 0.05 * found[0]["penetration_over_h"]
+    assert found[1]["penetration_over_h"] < 0.05 * found[0]["penetration_over_h"]
 
 
 @pytest.mark.slow
 def test_half_against_meridian() -> None:
     """Triangles with quadrature of their own, 1e-3."""
-    at = ("loading.approach=0.5", "loading.points=1")
+    at = ("loading.approach=0.3", "loading.points=1")
     force = last("plate_contact.yaml", *at)["force"]
     assert last("plate_contact.yaml", *at, "symmetry=half")["force"] == pytest.approx(force, rel=1e-3)
 
