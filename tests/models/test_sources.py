@@ -15,7 +15,13 @@ from magshell_fenicsx.continuation.system import State
 
 MM = 1e-3
 PLATE = {"geometry": "plate", "length": "30 mm", "width": "12 mm", "thickness": "1 mm", "youngs_modulus": "1 MPa"}
-RING = {"geometry": "annulus", "radius": "30 mm", "inner_radius": "12 mm", "thickness": "1 mm", "youngs_modulus": "1 MPa"}
+RING = {
+    "geometry": "annulus",
+    "radius": "30 mm",
+    "inner_radius": "12 mm",
+    "thickness": "1 mm",
+    "youngs_modulus": "1 MPa",
+}
 MAGNET = {"kind": "cylinder", "diameter": "20 mm", "height": "10 mm", "polarization": "1.3 T"}
 ASIDE = {**MAGNET, "position": [0.035, 0.006, -0.02], "axis": {"polar": 25.0}, "name": "magnet"}
 COIL = {"kind": "coil", "diameter": "30 mm", "current": "500 A", "position": [0.01, 0.0, 0.03], "axis": {"polar": 60.0}}
@@ -109,7 +115,7 @@ def test_tangent(kind: str) -> None:
     u, v = (system.held(size * rng.standard_normal(system.size)) for size in (1e-4, 1.0))
     moved = []
     for size in (0.1, 0.7):
-        mu = {name: size for name in scene(kind).unloaded().mu} | {"lambda_m": 2.0}
+        mu = dict.fromkeys(scene(kind).unloaded().mu, size) | {"lambda_m": 2.0}
         none = {**mu, "lambda_m": 0.0}
 
         def rate(of: Any) -> Any:
