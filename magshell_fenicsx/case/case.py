@@ -15,6 +15,7 @@ from magshell_fenicsx.case.ensemble import EnsembleSection
 from magshell_fenicsx.case.expressions import is_formula
 from magshell_fenicsx.case.fields import MagneticSection, layer_average
 from magshell_fenicsx.case.file import FileKeys
+from magshell_fenicsx.case.frequencies import FrequenciesSection
 from magshell_fenicsx.case.imperfections.dimple import DimpleSection
 from magshell_fenicsx.case.imperfections.place import ImperfectionSection, places_with_units
 from magshell_fenicsx.case.imperfections.random import RandomSection
@@ -90,6 +91,8 @@ class Case(WithParts):
     """Elements"""
     stability: StabilitySection | None = None
     """Lowest modes after the run"""
+    frequencies: FrequenciesSection | None = None
+    """Natural frequencies at points of the path"""
     ensemble: EnsembleSection | None = None
     """What is random, for `magshell ensemble`"""
     reactions: bool | None = None
@@ -241,7 +244,9 @@ class Case(WithParts):
         for step in self.programme:
             if isinstance(step.load, EdgeSection):
                 refuse_unheld(step.key, step.load, self.boundary.conditions())
-        refuse_unfit_steps(self.programme, self.magnetic, self.lambda_m, whole=isinstance(self.loading, list))
+        density = self.time_unit is not None and self.shell.with_units
+        whole = isinstance(self.loading, list)
+        refuse_unfit_steps(self.programme, self.magnetic, self.lambda_m, whole=whole, density=density)
         return self
 
     @cached_property
@@ -315,6 +320,14 @@ class Case(WithParts):
     def sources(self) -> Sequence[SourceSection]:
         """Of the applied field."""
         return (self.magnetic.applied.sources if self.magnetic else None) or []
+
+    @property
+    def time_unit(self) -> float | None:
+        """R √(ρ/E), that times are over: in seconds where the case has units; None without a density."""
+        shell = self.shell
+        if shell.density is None or shell.youngs_modulus is None:
+            return None
+        return float(shell.reference * np.sqrt(shell.density / shell.youngs_modulus))
 
     @property
     def outside(self) -> dict[str, str | None]:

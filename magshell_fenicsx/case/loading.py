@@ -14,6 +14,7 @@ from magshell_fenicsx.case.loads.indentation import IndentationSection
 from magshell_fenicsx.case.loads.pressure import PressureSection
 from magshell_fenicsx.case.loads.source import SourceStep
 from magshell_fenicsx.case.loads.step import PathStep, Step, Until
+from magshell_fenicsx.case.loads.time import TimeSection
 
 OneStep: TypeAlias = Annotated[
     PressureSection
@@ -23,7 +24,8 @@ OneStep: TypeAlias = Annotated[
     | GrowthSection
     | DeadSection
     | EdgeSection
-    | SourceStep,
+    | SourceStep
+    | TimeSection,
     Field(discriminator="kind"),
 ]
 PROGRAMME = "programme"  # tag of a list of steps
@@ -77,7 +79,8 @@ def programme(
         return _numbered(loading, [f"loading.{i}" for i in range(len(loading))])
     grown = [] if isinstance(loading, GrowthSection) else [{"kind": "natural", key: 1.0} for key in natural]
     growth = [GrowthSection.model_validate(each) for each in grown]
-    first = [FieldBefore(kind="field")] if field and not isinstance(loading, FieldSection) else []
+    drives = isinstance(loading, FieldSection) or (isinstance(loading, TimeSection) and "field" in loading.history)
+    first = [FieldBefore(kind="field")] if field and not drives else []
     given = [loading] if loading else []
     keys = [*("natural" for _ in growth), *("magnetic" for _ in first), *("loading" for _ in given)]
     return _numbered([*growth, *first, *given], keys)

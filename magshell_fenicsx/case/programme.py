@@ -5,15 +5,22 @@ from collections.abc import Sequence
 from magshell_fenicsx.case.fields import MagneticSection
 from magshell_fenicsx.case.loading import ProgrammeStep
 from magshell_fenicsx.case.loads.dead import DeadSection
+from magshell_fenicsx.case.loads.edge import EdgeSection
 from magshell_fenicsx.case.loads.field import FieldBefore, FieldSection, RotationSection
 from magshell_fenicsx.case.loads.source import SourceStep, refuse_unknown_source
 from magshell_fenicsx.case.loads.step import LEAST_TARGET, Gas, Step
+from magshell_fenicsx.case.loads.time import TimeSection, refuse_unfit_time
 
 SAME = 1e-9  # cosine of directions: rounding
 
 
 def refuse_unfit_steps(
-    steps: Sequence[ProgrammeStep], magnetic: MagneticSection | None, lambda_m: float, *, whole: bool
+    steps: Sequence[ProgrammeStep],
+    magnetic: MagneticSection | None,
+    lambda_m: float,
+    *,
+    whole: bool,
+    density: bool = False,
 ) -> None:
     """See that each step has its field, a way to go, and known amplitudes to hold.
 
@@ -21,6 +28,8 @@ def refuse_unfit_steps(
     ----------
     whole
         Whether the steps are all that happens; otherwise the field is applied first.
+    density
+        Whether times may have units.
 
     Raises
     ------
@@ -28,6 +37,7 @@ def refuse_unfit_steps(
         With the key and what is allowed.
     """
     driven: set[str] = set()
+    amplitudes, moved = {step.name for step in steps}, {s.name for s in steps if isinstance(s.load, EdgeSection)}
     field = magnetic.applied.vector() if magnetic else None
     for step in steps:
         load, key = step.load, step.key
@@ -62,6 +72,16 @@ def refuse_unfit_steps(
                 f"{key}: the target must not be zero (at least {LEAST_TARGET:g} in size): the first step of a load "
                 "begins there"
             )
+        after = steps[step.number - 2].load if step.number > 1 else None
+        if isinstance(after, TimeSection) and after.until == "duration" and not isinstance(load, TimeSection):
+            raise ValueError(f"{key}: begins in equilibrium: the step of kind: time before it needs until: rest")
+        if isinstance(load, TimeSection):
+            if "field" in load.history and (not lambda_m or "angle" in driven):
+                why = "not after kind: rotation" if lambda_m else "needs magnetic.lambda_m, not zero"
+                raise ValueError(f"{key}.history.field: {why}")
+            flux = magnetic is not None and magnetic.applied.flux_density not in (None, 0.0)
+            refuse_unfit_time(key, load, amplitudes - moved, density=density, measured=flux)
+            driven.update(load.drives)
         driven.add(step.name)
         _refuse_unfit_hold(step, steps)
 

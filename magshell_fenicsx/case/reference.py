@@ -112,6 +112,8 @@ def _allowed(part: Schema, titles: dict[str, str]) -> str:
         return f"text such as `{part['examples'][0]}`" if "examples" in part else "text"
     if kind == "boolean":
         return "`true`, `false`"
+    if kind == "array" and "prefixItems" in part:
+        return f"[{', '.join(_allowed(one, titles) for one in part['prefixItems'])}]"
     if kind == "array":
         few, most = part.get("minItems"), part.get("maxItems")
         count = f"{few} × " if few == most and few else ""

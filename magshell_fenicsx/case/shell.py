@@ -6,7 +6,7 @@ from pydantic import Field, model_validator
 
 from magshell_fenicsx.case.imperfections.dimple import DimpleSection
 from magshell_fenicsx.case.imperfections.registered import Imperfections
-from magshell_fenicsx.parts.section import Length, Pressure, Section
+from magshell_fenicsx.parts.section import Density, Length, Pressure, Section
 
 
 class ShellSection(Section):
@@ -29,6 +29,8 @@ class ShellSection(Section):
     """Young's modulus E, 1 Pa to 1e13 Pa; only flux densities need it"""
     poisson_ratio: float = Field(gt=-1, le=0.5)
     """Poisson's ratio ν"""
+    density: Density | None = Field(default=None, gt=0)
+    """Density ρ; with it frequencies are in hertz"""
     defect: DimpleSection | None = None
     """One dimple of a hemisphere; for more, or elsewhere, see imperfections"""
     imperfections: Imperfections = Field(default=[])
@@ -48,6 +50,8 @@ class ShellSection(Section):
             raise ValueError(f"radius/thickness is {self.R_over_h:.4g}; a thin shell needs 10 to 1e5")
         if (self.width is None) == (self.geometry == "strip"):
             raise ValueError("width (over the length) belongs to geometry: strip, and only to it")
+        if self.density is not None and (self.youngs_modulus is None or self.radius is None):
+            raise ValueError("density turns frequencies into hertz: that needs youngs_modulus, radius and thickness")
         if self.defect and self.geometry != "hemisphere":
             raise ValueError("a defect needs geometry: hemisphere; elsewhere give imperfections")
         if self.width is not None and self.width * self.R_over_h < 1:

@@ -35,6 +35,8 @@ class SurfaceSection(Section):
     """Young's modulus E; dead loads and flux densities need it [force/length²]"""
     poisson_ratio: float = Field(gt=-1, le=0.5)
     """Poisson's ratio ν"""
+    density: Annotated[float, or_number("kilogram/metre**3", Positive), Field(gt=0)] | None = None
+    """Density ρ; with it frequencies are in hertz [mass/length³]"""
     thickness_factor: Formula | dict[str, Annotated[float, Field(gt=0, le=100)]] | None = None
     """Multiplies h: a formula of x, y, z over R, or of a mesh patch -> number"""
     imperfections: Imperfections = Field(default=[])
@@ -59,6 +61,8 @@ class SurfaceSection(Section):
     def _thin(self) -> Self:
         if not 3 <= self.R_over_h <= 1e6:
             raise ValueError(f"the reference length is {self.R_over_h:.4g} thicknesses; a thin shell needs 3 to 1e6")
+        if self.density is not None and self.youngs_modulus is None:
+            raise ValueError("density turns frequencies into hertz: that needs youngs_modulus")
         if isinstance(self.thickness_factor, dict) and not isinstance(self, MeshSurface):
             raise ValueError("thickness_factor: patches have names only with geometry: mesh")
         return self
@@ -83,7 +87,7 @@ class SurfaceSection(Section):
         return self.youngs_modulus
 
 
-MEASURES = ("thickness", "youngs_modulus", "radius", "length", "width", "inner_radius", "tube_radius")
+MEASURES = ("thickness", "youngs_modulus", "density", "radius", "length", "width", "inner_radius", "tube_radius")
 
 
 def _refuse_overturned(azimuth: list[float] | None) -> None:

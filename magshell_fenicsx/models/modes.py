@@ -4,31 +4,25 @@ Each solves K phi = lambda M phi with M the inner product of displacements over 
 lambda is the stiffness per area with which the shell resists phi. Lengths in R and energies in E h R^2 make
 its unit E h/R^2. A shallow wave of the best length on a sphere under pressure has lambda = 1 - (p/p_c)^2 in
 this unit, but for its tangential part.
+
+With the mass of the shell as M, lambda is omega^2 rho R^2/E of small vibrations.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
 
-import numpy as np
 import ufl
 from dolfinx import fem
-from dolfinx.fem import petsc as fem_petsc
-from petsc4py import PETSc
-from ufl.core.expr import Expr
 
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.assembly.sliding import Projection
 from magshell_fenicsx.continuation.modes import lowest_modes, null_vector
 from magshell_fenicsx.continuation.system import State, Tangent, Vector, symmetric_part
-from magshell_fenicsx.models.axisymmetric import jets
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
-from magshell_fenicsx.models.shell import kinematics as kin
-from magshell_fenicsx.models.shell.model import ShellModel
-from magshell_fenicsx.models.solid.model import SolidModel
-from magshell_fenicsx.platform import compat
+from magshell_fenicsx.models.mass import Model, mass_matrix, of_displacements, of_waves, thickness
 
-Model = ShellModel | MeridianModel | SolidModel
+TORSION = "torsion"  # label of vibrations around the axis, which a meridian has no displacement for
 EXCLUDED = ("antisymmetric", "m = ")  # what labels of modes begin with that a reduced model does not see
 
 
@@ -53,13 +47,14 @@ class ShellMode:
 
 @dataclass(frozen=True)
 class _Family:
-    """Modes that share a tangent, what is held, and an inner product (name and form)."""
+    """Modes that share a tangent, what is held, and an inner product (name and form); `contains` selects them."""
 
     label: str
     tangent: Callable[[State], Tangent]
     held: list[fem.DirichletBC]
     product: tuple[str, ufl.Form]
     projection: Projection | None = None
+    contains: Callable[[Vector], bool] = lambda vector: True
 
 
 @dataclass
@@ -82,12 +77,29 @@ class ShellModes:
         ModesNotFound
             See `continuation.modes.lowest_modes`.
         """
+        return self._lowest(_families(self.model), state, count)
+
+    def vibrations(self, state: State, count: int) -> list[ShellMode]:
+        """The `count` lowest natural modes, ascending, and all that are unstable; eigenvalues are omega^2 rho R^2/E.
+
+        The mass is consistent, without rotary inertia, and that of the drawn shell. On the meridian vibrations around
+        the axis are among them. Otherwise as `lowest`.
+
+        Raises
+        ------
+        ModesNotFound
+            See `continuation.modes.lowest_modes`.
+        """
+        found = self._lowest(_families(self.model, vibrating=True), state, count)
+        return found[: max(count, sum(mode.eigenvalue < 0 for mode in found))]
+
+    def _lowest(self, families: Iterable[_Family], state: State, count: int) -> list[ShellMode]:
         found = []
-        for family in _families(self.model):
-            M = _mass_matrix(self._product(family), family.held)
+        for family in families:
+            M = mass_matrix(self._product(family), family.held)
             M = family.projection.mass(M) if family.projection else M
             modes = lowest_modes(symmetric_part(family.tangent(state)), M, count)
-            found += [ShellMode(family.label, mode.eigenvalue, mode.vector) for mode in modes]
+            found += [ShellMode(family.label, m.eigenvalue, m.vector) for m in modes if family.contains(m.vector)]
         return sorted(found, key=lambda mode: mode.eigenvalue)
 
     def null_vector(self, state: State, label: str) -> Vector:
@@ -114,10 +126,13 @@ class ShellModes:
         return self._products[name]
 
 
-def _families(model: Model) -> Iterator[_Family]:
-    """The modes that the model sees, then those that it excludes, whose kernels are compiled by then."""
+def _families(model: Model, *, vibrating: bool = False) -> Iterator[_Family]:
+    """The modes that the model sees, then those that it excludes, whose kernels are compiled by then.
 
-    mass = "mass", _of_displacements(model)
+    If `vibrating`, the inner product is that of the mass, and torsion is a family of the meridian.
+    """
+    weight, name = (thickness(model), "weighted ") if vibrating and thickness(model) else (1.0, "")
+    mass = f"{name}mass", of_displacements(model, weight)
 
     def of(label: str, system: FiniteElementSystem) -> _Family:
         return _Family(label, lambda state: system.tangent(state.u, state.mu), system.clamped, mass, system.projection)
@@ -125,43 +140,16 @@ def _families(model: Model) -> Iterator[_Family]:
     yield of("", model.system)
     if isinstance(model, MeridianModel):
         waves = model.excluded_modes.waves
-        wave_mass = "wave mass", _of_waves(model)
+        wave_mass = f"{name}wave mass", of_waves(model, weight)
+        if vibrating:
+            yield _Family(TORSION, partial(waves.tangent, m=0), waves.held(0), wave_mass, contains=_turns)
         for m in range(1, waves.largest + 1):
             yield _Family(f"m = {m}", partial(waves.tangent, m=m), waves.held(m), wave_mass)
     elif model.excluded_modes is not None:
         yield of("antisymmetric", model.excluded_modes.system)
 
 
-def _of_displacements(model: Model) -> ufl.Form:
-    """The integral of u . v over the undeformed mid-surface of what is modelled."""
-    product = ufl.dot(ufl.TrialFunction(model.V), ufl.TestFunction(model.V))
-    return _integral(model, 2 * np.pi * product if isinstance(model, MeridianModel) else product)
-
-
-def _of_waves(model: MeridianModel) -> ufl.Form:
-    """The same of two waves with the coefficients (U + V, V, W); it does not depend on m."""
-    V = model.excluded_modes.waves.V
-    cosine, sine = zip(*(jets.wave(f, 1) for f in (ufl.TrialFunction(V), ufl.TestFunction(V))), strict=True)
-    return _integral(model, np.pi * sum(ufl.dot(a.r, b.r) for a, b in (cosine, sine)))
-
-
-def _integral(model: Model, f: Expr) -> ufl.Form:
-    """Over the undeformed area, of a solid averaged over the thickness; on a meridian per radian."""
-    domain, degree = model.V.mesh, model.degree
-    dx = ufl.Measure("dx", domain=domain, metadata={"quadrature_degree": 2 * degree + 2})
-    if isinstance(model, SolidModel):
-        return f / model.material.h * dx
-    j0 = jets.revolved(model.r0) if isinstance(model, MeridianModel) else kin.jet(model.r0, domain)
-    return f * kin.area_ratio(j0) * dx
-
-
-def _mass_matrix(product: fem.Form, held: list[fem.DirichletBC]) -> PETSc.Mat:
-    """The matrix of an inner product, with zero rows and columns at held degrees of freedom.
-
-    So held degrees of freedom have no finite eigenvalue, whatever the tangent's diagonal is there.
-    """
-    M = fem_petsc.create_matrix(product)
-    M.setOption(PETSc.Mat.Option.IGNORE_ZERO_ENTRIES, True)  # the tangent has no entries of held ones
-    compat.add_matrix(M, product, held)
-    M.assemble()
-    return M
+def _turns(coefficients: Vector) -> bool:
+    """Whether a wave m = 0 turns around the axis; the others of m = 0 are the meridian's own."""
+    P, V, W = coefficients.reshape(-1, 3).T
+    return bool(V @ V > (P - V) @ (P - V) + W @ W)

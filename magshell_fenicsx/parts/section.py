@@ -113,6 +113,9 @@ _EXAMPLES = {
     "tesla": "60 mT",
     "newton": "20 mN",
     "newton/metre": "5 N/m",
+    "kilogram/metre**3": "2000 kg/m^3",
+    "second": "2.5 s",
+    "1/second": "20 Hz",
 }
 
 
@@ -123,3 +126,4 @@ def _example(unit: str) -> str:
 Length = Annotated[float, _quantity("metre")]
 Pressure = Annotated[float, _quantity("pascal")]
 FluxDensity = Annotated[float, _quantity("tesla")]
+Density = Annotated[float, _quantity("kilogram/metre**3")]

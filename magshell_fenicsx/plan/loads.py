@@ -13,6 +13,7 @@ from magshell_fenicsx.case.expressions import symbolic
 from magshell_fenicsx.case.loads.dead import DeadLoadSection, DeadSection
 from magshell_fenicsx.case.loads.field import RotationSection
 from magshell_fenicsx.case.loads.indentation import IndentationSection, Place
+from magshell_fenicsx.case.loads.time import TimeSection
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.mesh.frame import rotation
 from magshell_fenicsx.mesh.mirror import Mirror
@@ -72,9 +73,10 @@ def loads(
         elif isinstance(load, DeadSection):
             here = (one for one in load.loads if not mirror or one.edge not in mirror.lost)
             dead[name] = tuple(_dead(one, f"{name}_potential_{i}", case, turn, mirror) for i, one in enumerate(here))
+    driven = {*steps, *(name for load in case.loads_of(TimeSection) for name in load.drives)}
     turned = [load.to for load in case.loads_of(RotationSection)]
-    field = magnetisation(magnetic, case, turn, within, turned) if magnetic and "lambda_m" in steps else None
-    pressure = "pressure" in steps or any("pressure" in load.hold for load in steps.values())
+    field = magnetisation(magnetic, case, turn, within, turned) if magnetic and "lambda_m" in driven else None
+    pressure = "pressure" in driven or any("pressure" in load.hold for load in steps.values())
     return Loads(pressure, forces, field, dead, own, natural=natural(case, turn, within), moves=moves(case, turn))
 
 

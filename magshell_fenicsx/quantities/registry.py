@@ -130,7 +130,18 @@ OF_SOME_RUNS = (
         "source_work", "work of the source", "The same of its strength: -dΠ/d(factor of the field).", "reaction", si="J"
     ),
 )
-QUANTITIES = {q.name: q for q in (*OF_EVERY_RUN, *OF_SOME_RUNS)}
+IN_TIME = (  # of runs with a step of kind: time
+    Quantity(
+        "time", "time", "Time of the motion; in seconds, or the case's own unit, with shell.density.", "time", "t"
+    ),
+    _energy("kinetic", "kinetic", "Kinetic energy."),
+    _energy("stored", "stored", "Energy of the shell itself: all terms but the potentials of loads."),
+    _energy("dissipated", "dissipated", "Energy lost by drag and viscosity; none in static steps."),
+    _energy(
+        "work", "work", "Work of the loads in steps of kind: time, kinetic + stored + dissipated less what was stored."
+    ),
+)
+QUANTITIES = {q.name: q for q in (*OF_EVERY_RUN, *OF_SOME_RUNS, *IN_TIME)}
 AMPLITUDES = {
     a.name: a
     for a in (
@@ -139,6 +150,7 @@ AMPLITUDES = {
         Amplitude("load", "load_factor", "w_over_h", "along the loads"),
         Amplitude("lambda_m", "lambda_m"),
         Amplitude("angle", "field_angle"),
+        Amplitude("time", "time"),
     )
 }
 # names of terms, and of amplitudes that only the solvers use
@@ -183,7 +195,7 @@ def amplitude(name: str) -> Amplitude:
 def axes_of(name: str, row: Collection[str] = ()) -> tuple[Quantity, Quantity]:
     """The quantities on the x and y axis of an amplitude's curve: its displacement and its value.
 
-    An angle is on the x axis, and the displacement on the y axis; so is the factor of a motion, with its reaction.
+    An angle, the time and the factor of a motion are on the x axis, and the displacement or the reaction on the y axis.
 
     Parameters
     ----------
@@ -198,4 +210,4 @@ def axes_of(name: str, row: Collection[str] = ()) -> tuple[Quantity, Quantity]:
     over, drawn = quantity(own if own in row else varied.conjugate), quantity(varied.column)
     if varied.conjugate == "w_over_h":
         over = replace(over, note=varied.place)
-    return (drawn, over) if name == "angle" else (over, drawn)
+    return (drawn, over) if name in ("angle", "time") else (over, drawn)

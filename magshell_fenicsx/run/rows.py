@@ -1,6 +1,6 @@
 """Records of a history as rows of path.csv, and as columns."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,12 +9,15 @@ from magshell_fenicsx.output.store.table import COLUMNS, Row
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.scene import Scene
 
+CLOCK = ("time", "dissipated", "work")
+
 
 class RowMaker:
     """Makes the rows of one history, in the order of its records."""
 
     def __init__(self, scene: Scene) -> None:
         self._scene, self._count, self._field_end = scene, 0, 0.0
+        self._clock, self._begun, self._step = dict.fromkeys(CLOCK, 0.0), dict.fromkeys(CLOCK, 0.0), 0
         self._listed = isinstance(scene.case.loading, list)  # alone, a field as the load is no field before it
 
     def row(self, record: Record, wall_s: float) -> Row:
@@ -40,7 +43,19 @@ class RowMaker:
             "load_error": point.load_error,
             "excluded_pivots": record.excluded_pivots,
             "step": record.step,
+            **self._in_time(record, values),
         }
+
+    def _in_time(self, record: Record, values: Mapping[str, float]) -> dict[str, float]:
+        """The columns of a motion: time and sums go on from earlier steps."""
+        if "time" not in self._scene.extra_columns:
+            return {}
+        if record.step != self._step:
+            self._begun, self._step = dict(self._clock), record.step
+        since = {name: record.clock.get(name, 0.0) for name in CLOCK}
+        self._clock = {name: self._begun[name] + since[name] for name in CLOCK}
+        stored = self._scene.stored(record.point.state, values["energy"])
+        return {**self._clock, "kinetic": record.clock.get("kinetic", 0.0), "stored": stored}
 
 
 def rows(scene: Scene, records: Iterable[Record]) -> list[Row]:

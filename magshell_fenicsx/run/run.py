@@ -22,6 +22,7 @@ from magshell_fenicsx.output.store.table import LOCATED, SOLUTION, Row
 from magshell_fenicsx.platform.environment import fast_blas
 from magshell_fenicsx.quantities.registry import quantity
 from magshell_fenicsx.run.files import MESH, RunFiles, open_folder
+from magshell_fenicsx.run.frequencies import frequencies_after, wanted
 from magshell_fenicsx.run.interrupt import Interrupted, Stoppable, Watch
 from magshell_fenicsx.run.modes import modes_after
 from magshell_fenicsx.run.rows import RowMaker
@@ -137,6 +138,7 @@ def _run(case: Case, folder: Path | None, comm: MPI.Comm, say: Say, tell: Say, w
                     progress.doing("modes and pictures")
                     with result.output:
                         modes_after(result, folder, say)
+                        frequencies_after(result, folder, say)
                         by_first(comm, partial(_draw, folder, say))
                     files.summarise(summary(result, time.perf_counter() - start))  # with the time of the pictures
                 by_first(comm, partial(write_report, folder))
@@ -209,6 +211,8 @@ def _follow(result: Result, files: RunFiles | None, say: Say, progress: RunProgr
             result.found[len(result.rows) - 1] = record.point.state
         else:
             result.last, result.end = record.point.state, len(result.rows) - 1
+        if wanted(scene.case, len(result.rows) - 1):
+            result.kept[len(result.rows) - 1] = record.point.state
         if record.label in LOCATED:
             result.singular[len(result.rows) - 1] = record.point.state
         if files:

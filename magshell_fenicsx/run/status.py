@@ -11,6 +11,7 @@ from magshell_fenicsx.case.loading import ProgrammeStep
 from magshell_fenicsx.case.loads.dead import DeadSection
 from magshell_fenicsx.case.loads.field import RotationSection
 from magshell_fenicsx.case.loads.step import PathStep
+from magshell_fenicsx.case.loads.time import TimeSection
 from magshell_fenicsx.continuation.point import Point
 from magshell_fenicsx.models.reacting import motion_columns
 from magshell_fenicsx.output.store.table import SOLUTION, Row
@@ -76,6 +77,8 @@ def aim(scene: Scene, step: ProgrammeStep) -> Aim:
         first = scene.directions[0]
         there = degrees(acos(float(np.clip(after @ first, -1, 1))))
         return Aim(varied.column, there if before @ first > 1 - 1e-9 else None, "its last direction")
+    if isinstance(load, TimeSection):
+        return Aim("time", words="the end", steps=load.points)
     if step.until == "points":
         return Aim(varied.column, words=f"{load.points} steps", steps=load.points)
     if step.until != "target" or load.target is None:

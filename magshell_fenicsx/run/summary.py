@@ -9,6 +9,7 @@ from magshell_fenicsx.case.shell import ShellSection
 from magshell_fenicsx.case.surfaces import Surface
 from magshell_fenicsx.continuation.system import State, dot
 from magshell_fenicsx.continuation.timing import Stopwatch
+from magshell_fenicsx.models.modes import ShellMode
 from magshell_fenicsx.output.store.table import LOCATED, Row
 from magshell_fenicsx.platform import sources
 from magshell_fenicsx.platform.environment import fast_blas, versions
@@ -42,6 +43,10 @@ class Result:
         The records that `value` is taken from.
     end
         Number of the row of `last`.
+    kept
+        States at the points whose frequencies are requested, by row number; not of the start and the end.
+    frequencies
+        The natural modes, by row number.
     found
         The states of the solutions that searches have found, by row number.
     barrier
@@ -61,6 +66,8 @@ class Result:
     barrier: float | None = None
     end: int = 0
     found: dict[int, State] = field(default_factory=dict)
+    kept: dict[int, State] = field(default_factory=dict)
+    frequencies: dict[int, list[ShellMode]] = field(default_factory=dict)
 
     @property
     def limit_points(self) -> list[dict[str, Any]]:
@@ -125,6 +132,10 @@ def summary(result: Result, total_s: float) -> dict[str, Any]:
         "sensitivities": result.sensitivities,
         "knockdown": result.knockdown,
         "barrier": result.barrier,
+        "frequencies": [
+            {"point": number, "omega2": [mode.eigenvalue for mode in modes]}
+            for number, modes in result.frequencies.items()
+        ],
         "solutions": solutions(result),
         "most_excluded_pivots": max((int(row["excluded_pivots"]) for row in result.rows), default=0),
         "points": len(result.rows),

@@ -1,6 +1,7 @@
 """A point of a history and its origin."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Literal
 
 from magshell_fenicsx.continuation.point import Point
@@ -32,6 +33,8 @@ class Record:
         Number of unstable directions that the model excludes; see `continuation.watch.Watch`.
     step
         Number of the programme's step, from 1; 0 at the start.
+    clock
+        Of a step in time: the columns time, kinetic, dissipated and work, since its begin.
     """
 
     label: Label
@@ -41,6 +44,7 @@ class Record:
     branch: int = 0
     excluded_pivots: int = 0
     step: int = 0
+    clock: Mapping[str, float] = field(default_factory=dict)
 
 
 class Stopped(RuntimeError):

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.imperfections.modes import ModesSection
+from magshell_fenicsx.case.loads.time import TimeSection
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.continuation.journal import Journal, NoJournal
 from magshell_fenicsx.continuation.listener import NoProgress, Progress
@@ -42,7 +43,7 @@ from magshell_fenicsx.plan.body import layers, neo_hookean
 from magshell_fenicsx.plan.plan import Plan
 from magshell_fenicsx.plan.planner import make_plan, meridian_vertices
 from magshell_fenicsx.platform.first import from_first
-from magshell_fenicsx.quantities.registry import amplitude
+from magshell_fenicsx.quantities.registry import IN_TIME, amplitude
 from magshell_fenicsx.simulate.direction import directions, field_angle, field_size, turned
 
 Array = NDArray[np.float64]
@@ -202,7 +203,15 @@ class Scene:
         own = (*self._own_amplitudes, *(column for term in self.plan.loads.own for column in term.observed))
         factors = (self._column(name) for name in (*self.plan.loads.forces, *self.plan.loads.dead) if name != "force")
         displaced = (f"w_{name}_over_h" for name in self._also_displaced)
-        return (*factors, *displaced, *named, *own, *self._support_columns, *self.sources, *self.sources.values())
+        clock = tuple(q.name for q in IN_TIME) if self.case.loads_of(TimeSection) else ()
+        sources = (*self.sources, *self.sources.values())
+        return (*factors, *displaced, *named, *own, *self._support_columns, *sources, *clock)
+
+    def stored(self, state: State, energy: float) -> float:
+        """The energy of the shell itself: without the potentials of the loads."""
+        system, of = self.model.system, self.model.multiplicity
+        loads = (name for name in state.mu if name not in system.coordinates)
+        return energy - of * sum(state.mu[name] * system.potential(state.u, state.mu, name) for name in loads)
 
     @property
     def _support_columns(self) -> tuple[str, ...]:

@@ -8,6 +8,7 @@ import numpy as np
 from magshell_fenicsx.case.loading import ProgrammeStep
 from magshell_fenicsx.case.loads.field import FieldBefore, FieldSection, RotationSection
 from magshell_fenicsx.case.loads.step import Gas, Now, PathStep
+from magshell_fenicsx.case.loads.time import TimeSection
 from magshell_fenicsx.continuation.device import Conjugate
 from magshell_fenicsx.continuation.path import StepOptions
 from magshell_fenicsx.continuation.system import State
@@ -17,6 +18,7 @@ from magshell_fenicsx.simulate.gas import gas
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.stage import Stage, staged
+from magshell_fenicsx.simulate.transient import motion
 from magshell_fenicsx.simulate.walked import Records, Walked, followed
 
 LOCATED = ("fold", "bifurcation")
@@ -31,6 +33,8 @@ def records_of(scene: Scene, step: ProgrammeStep, state: State) -> Records:
         If the path is lost, or a field that should be stable is not.
     """
     load = step.load
+    if isinstance(load, TimeSection):
+        return (yield from motion(scene, load, state))
     if isinstance(load, RotationSection):
         return (yield from _rotation(scene, step, load, state))
     assert isinstance(load, PathStep)

@@ -41,3 +41,18 @@ def test_probing() -> None:
     assert np.all(np.diff(found) < 0)
     # near the fold the barrier grows with the distance to the power of 3/2
     assert np.log(found[2] / found[3]) / np.log(5) == pytest.approx(1.5, abs=0.1)
+
+
+@pytest.mark.slow
+def test_arch_snap() -> None:
+    """Measured: the middle snaps through 5 mm at 6.1 to 6.4 mT, above the static fold at 5.53 mT; here coarse."""
+    mesh = "mesh={degree: 3, size: 30 mm}"
+    time = ["loading.3.duration=1.0 s", "loading.3.points=50", "loading.3.tolerance=1e-2"]
+    rows = run(Case.load(CASES / "arch_snap.yaml", [mesh, "loading.1.points=3", *time])).rows
+    moving = [row for row in rows if row["step"] == 4]
+    w = np.array([moving[0]["middle_uz"] - row["middle_uz"] for row in moving])
+    at = int(np.argmax(w > 5e-3))
+    field = 16.25 / 2.5 * np.interp(5e-3, w[at - 1 : at + 1], [row["time"] for row in moving[at - 1 : at + 1]])
+    assert 5.9 < field < 6.4
+    energy = [row["kinetic"] + row["stored"] + row["dissipated"] - row["work"] for row in moving]
+    assert np.ptp(energy) < 0.05 * max(row["work"] for row in moving)

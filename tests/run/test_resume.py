@@ -95,10 +95,10 @@ def test_killed_in_a_step_that_holds_a_volume(whole: Whole, tmp_path: Path) -> N
 @pytest.mark.slow
 @pytest.mark.parametrize("whole", ["long"], indirect=True)
 def test_killed_at_random_moments(whole: Whole, tmp_path: Path) -> None:
-    """kill -9 at five random moments; on one rank and on two in turn."""
+    """kill -9 at three random moments; on one rank, on two, and on one."""
     rng, kills, folders, seen = random.Random(4), 0, 0, b""
     out = tmp_path / "0"
-    while kills < 5:
+    while kills < 3:
         ranks = 2 * (kills % 2)
         resume = ["--resume"] if (out / "checkpoint").exists() else []
         run = start("run", *whole.case, "--out", out, *resume, ranks=ranks)

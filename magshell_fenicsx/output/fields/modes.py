@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.continuation.system import Vector
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.axisymmetric.revolution import Revolution
+from magshell_fenicsx.models.modes import TORSION
 from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.solid.model import SolidModel
 from magshell_fenicsx.output.fields.gathering import Gatherer
@@ -54,8 +55,8 @@ def mode_surface(
     Parameters
     ----------
     label, vector
-        "m = 7": the vector has the coefficients (U + V, V, W) of waves; "antisymmetric": the other half is the mirror
-        image with the opposite sign; any other label: the mode has the model's own symmetry.
+        "m = 7", "torsion": the vector has the coefficients (U + V, V, W) of waves; "antisymmetric": the other
+        half is the mirror image with the opposite sign; any other label: the mode has the model's own symmetry.
     azimuth
         Azimuth of the model's frame, rad.
 
@@ -64,10 +65,11 @@ def mode_surface(
     On rank 0 the surface with the fields "mode" (n, 3), scaled to a largest length of one, and "mode_w" (n,), its
     component along -n0; None on other ranks.
     """
-    if label.startswith(WAVES) and isinstance(model, MeridianModel):
+    if (label.startswith(WAVES) or label == TORSION) and isinstance(model, MeridianModel):
         if gatherer.comm.rank:
             return None
-        return _with_mode(*_revolved_wave(model, u, int(label.removeprefix(WAVES)), vector))
+        m = 0 if label == TORSION else int(label.removeprefix(WAVES))
+        return _with_mode(*_revolved_wave(model, u, m, vector))
     base, mode = gatherer.gather(u), gatherer.gather(vector)
     if base is None or mode is None:
         return None
@@ -146,19 +148,20 @@ def _with_mode(base: Surface, v: Array) -> Surface:
 def _revolved_wave(model: MeridianModel, u: Vector, m: int, vector: Vector) -> tuple[Surface, Array]:
     """The surface with at least twelve sectors per wave, and the wave at its nodes.
 
-    v = U cos(m theta) e_rho + V sin(m theta) e_theta + W cos(m theta) e_z.
+    v = U cos(m theta) e_rho + V sin(m theta) e_theta + W cos(m theta) e_z; of m = 0, torsion, V e_theta.
     """
     sectors = max(96, 12 * m)
     swept = Revolution(model, sectors)
     nodes = model.excluded_modes.waves.V.tabulate_dof_coordinates()[:, 0]
     U_and_V, V, W = vector.reshape(-1, 3)[np.argsort(nodes)[:: model.degree]].T[:, :, None]
     theta = np.arange(sectors) * 2 * np.pi / sectors
-    radial, azimuthal = (U_and_V - V) * np.cos(m * theta), V * np.sin(m * theta)
+    cosine, sine = (np.cos(m * theta), np.sin(m * theta)) if m else (0 * theta, 1 + 0 * theta)
+    radial, azimuthal = (U_and_V - V) * cosine, V * sine
     x, y = (
         radial * np.cos(theta) - azimuthal * np.sin(theta),
         radial * np.sin(theta) + azimuthal * np.cos(theta),
     )
-    v = np.stack([x, y, W * np.cos(m * theta)], axis=-1)
+    v = np.stack([x, y, W * cosine], axis=-1)
     first = min(len(model.meridian.axis), 1)  # all sectors share the pole
     at_nodes = np.concatenate([v[:first, 0], v[first:].reshape(-1, 3)])
     return Surface(swept.r0, swept.displacement(u), swept.n0, swept.cells, {}), at_nodes

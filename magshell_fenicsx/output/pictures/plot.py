@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from magshell_fenicsx.case.source import CaseError
+from magshell_fenicsx.output.fields.frequencies import read_frequencies
 from magshell_fenicsx.output.fields.modes import mode_caption, mode_file, wave_number
 from magshell_fenicsx.output.fields.outlines import read_outlines
 from magshell_fenicsx.output.fields.surface import Surface, completed
@@ -13,6 +14,7 @@ from magshell_fenicsx.output.fields.vtu import About, point_file, read_vtu
 from magshell_fenicsx.output.pictures.animation import animated
 from magshell_fenicsx.output.pictures.captions import caption, shell_caption
 from magshell_fenicsx.output.pictures.curve import curve_figure, drawn_parts
+from magshell_fenicsx.output.pictures.frequencies import frequencies_figure
 from magshell_fenicsx.output.pictures.layout import png
 from magshell_fenicsx.output.pictures.mode_picture import draw_modes
 from magshell_fenicsx.output.pictures.picture import figures
@@ -89,6 +91,8 @@ def draw(folder: Path, point: int | None = None) -> list[str]:
     if point is None:
         for name, content in _modes(folder, rows):
             write(name, content)
+        if frequencies := read_frequencies(folder):
+            write("frequencies.png", png(frequencies_figure(frequencies, rows, title)))
         if found := searched(rows):
             surfaces = [_point(folder, each)[0] for each in found[:MOST_PANELS]]
             title = caption(about.h, about.nu, found[0])

@@ -4,12 +4,14 @@ import base64
 import csv
 import json
 from collections.abc import Iterator
+from math import isnan
 from pathlib import Path
 from typing import Any
 
 import yaml
 from markupsafe import Markup
 
+from magshell_fenicsx.output.fields.frequencies import Frequency, read_frequencies
 from magshell_fenicsx.output.report.html_numbers import number
 from magshell_fenicsx.output.report.report_path import Line, path_table, pole_head, symbol
 from magshell_fenicsx.output.report.verdict import Summary, bending_stiffness, located, physical_units, value, verdict
@@ -29,6 +31,7 @@ PICTURES = {  # in the order of the report
     "moments.png": "Bending moments at the last point.",
     "fields.png": "Fields on the deformed shell at the last point.",
     "instabilities.png": "Null vectors at the instabilities, on the deformed shell: how it buckles.",
+    "frequencies.png": "Natural frequencies squared along the path; below zero the shell is unstable.",
     "modes_*.png": "The modes of least stiffness, on the deformed shell.",
 }
 SMALL = ("curve.png", "shell.png")  # beside each other
@@ -80,6 +83,7 @@ def _content(folder: Path) -> dict[str, Any]:
         "pole": pole_head(lines[0] if lines else {}),
         "instabilities": [_instability(line, summary) for line in located(lines)],
         "solutions": [_solution(it) for it in summary.get("solutions", [])],
+        "frequencies": [_frequency(it) for it in read_frequencies(folder)],
         "sensitivities": [(name, number(v)) for name, v in summary["sensitivities"].items()],
         "sensitive": symbol(amplitude(lines[-1]["amplitude"]).column) if summary["sensitivities"] else "",
         "how_to_estimate": _how_to_estimate(summary["case"]),
@@ -151,6 +155,10 @@ def _instability(line: Line, summary: Summary) -> dict[str, Any]:
 def _solution(it: dict[str, Any]) -> list[Markup | str]:
     numbers = (number(it[key]) for key in ("w_over_h", "w_pole_over_h", "volume_change", "energy"))
     return [f"{it['point']}", f"{it['solution']}", stability(it), *numbers, number(it["residual"], 2)]
+
+
+def _frequency(it: Frequency) -> list[Markup | str]:
+    return [f"{it.point}", it.wave or "–", number(it.omega2), "–" if isnan(it.hertz) else number(it.hertz)]
 
 
 def _how_to_estimate(case: dict[str, Any]) -> str:

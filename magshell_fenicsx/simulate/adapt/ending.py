@@ -74,9 +74,16 @@ class History:
         """
         steps = scene.case.programme
         until = steps[-1].until if steps else "target"
-        if until in ("target", "points", "zero") and not stopped and self.last and self.last.amplitude:
+        if (
+            until in ("target", "points", "zero")
+            and not stopped
+            and self.last
+            and self.last.amplitude not in ("", "time")
+        ):
             found = _target(scene, self.last)
             return replace(found, kind="held") if any(how != "load" for how in steps[-1].load.hold.values()) else found
+        if self.last and self.last.amplitude == "time":
+            raise NoResult("a motion ends at no single load")
         if not self.located:
             raise NoResult(stopped or "the case has neither a load nor a field")
         in_last = [record for record in self.located if record.step == self.located[-1].step]

@@ -11,6 +11,7 @@ from mpi4py import MPI
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.loads.field import FieldBefore, RotationSection
+from magshell_fenicsx.case.loads.time import TimeSection
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.output.store.durable import write_whole
 from magshell_fenicsx.output.store.folder import by_first, held_folder
@@ -67,7 +68,7 @@ def compare(
     file, folder = Path(file), Path(out)
     for model in MODELS:
         case = Case.load(file, [*settings, f"model={model}", *(["solid=null"] if model == "shell" else [])])
-    if not case.programme or isinstance(case.programme[-1].load, FieldBefore | RotationSection):
+    if not case.programme or isinstance(case.programme[-1].load, FieldBefore | RotationSection | TimeSection):
         raise CaseError("compare: needs a load whose curve can be compared: pressure, indentation or field")
     with held_folder(folder, MPI.COMM_SELF, make=True):
         runs: dict[ModelName, list[ModelRun]] = {}

@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from along import csr
+from along import difference as tangent_difference
 from conftest import disc, hemisphere, random_displacement
 from test_derivatives import alone, check
 from test_fast_residual import difference as residual_difference
-from test_fast_tangent import csr
-from test_fast_tangent import difference as tangent_difference
 
 from magshell_fenicsx.case.expressions import with_derivatives
 from magshell_fenicsx.mesh.frame import rotation

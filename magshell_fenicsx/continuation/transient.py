@@ -1,0 +1,295 @@
+"""One step in time of M a + c M v + D + dPi/du(u; mu(t)) = 0, by the generalised alpha method with the exact tangent.
+
+J. Chung and G. M. Hulbert, Journal of Applied Mechanics 60 (1993): second order; high frequencies fade by the factor
+rho at each step. With rho = 1 the force is averaged along the step at Gauss points, which conserves the energy
+(G. R. W. Quispel and D. I. McLaren, Journal of Physics A 41, 2008). PETSc's TSALPHA2 has the same formulas for
+rho < 1, but shows neither its acceleration, without which a resumed run is another one, nor a place for that average.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Protocol
+
+import numpy as np
+from petsc4py import PETSc
+
+from magshell_fenicsx.continuation.factor import Factorisation
+from magshell_fenicsx.continuation.newton import MOTION
+from magshell_fenicsx.continuation.system import Edged, Skewed, System, Vector, dot, max_abs
+
+TOLERANCE = 1e-10  # of u in a step, over the system's length or, where that is longer, a tenth of the displacement
+STALLED = 1e-7  # steps below this that shrink no more are rounding
+MOST = 20  # iterations
+SLOW = 0.2  # new factors if a step is longer than this part of the one before
+SMOOTH = 1e-2  # error of the last step up to which the acceleration predicts the next: in stiff motions it alternates
+OTHER = 0.05  # relative change of the time step after which factors are renewed
+GAUSS = ((0.5 - np.sqrt(1 / 12), 0.5), (0.5 + np.sqrt(1 / 12), 0.5))  # exact for the membrane's energy, of degree 4
+Loads = Callable[[float, bool], dict[str, float]]  # mu(t), at a jump before or after it
+
+
+class Viscous(Protocol):
+    """A force on a step from u0 to u1 that depends on the strains between them."""
+
+    def force(self, u0: Vector, u1: Vector, dt: float) -> Vector:
+        """The force, zero at supports."""
+
+    def add_tangent(self, K: PETSc.Mat, dt: float) -> None:
+        """Add the derivative of the force by u1, at the displacements of the last `force`."""
+
+    def accept(self, u0: Vector, u1: Vector, dt: float) -> float:
+        """Go on from u1; what the step has dissipated."""
+
+
+@dataclass(frozen=True)
+class Rule:
+    """The parameters of generalised alpha; forces are weighted sums at parts of the step."""
+
+    alpha_m: float
+    alpha_f: float
+    beta: float
+    gamma: float
+    forces: tuple[tuple[float, float], ...]
+
+    @classmethod
+    def of(cls, rho: float) -> "Rule":
+        """Of a spectral radius at infinite frequency, 0 to 1."""
+        m, f = (2 * rho - 1) / (rho + 1), rho / (rho + 1)
+        at = GAUSS if rho == 1 else ((1 - f, 1.0),)
+        return cls(m, f, (1 - m + f) ** 2 / 4, 0.5 - m + f, at)
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A moving state.
+
+    Attributes
+    ----------
+    t
+        Time.
+    u, v, a
+        Displacement, velocity and acceleration.
+    mu
+        Amplitudes.
+    work, dissipated
+        By the loads, and by drag and viscosity, since the begin.
+    potentials
+        dPi/dmu of the loads.
+    error
+        Estimated error of the last step, over the system's length.
+    """
+
+    t: float
+    u: Vector
+    v: Vector
+    a: Vector
+    mu: dict[str, float]
+    work: float = 0.0
+    dissipated: float = 0.0
+    potentials: dict[str, float] = field(default_factory=dict)
+    error: float = np.inf
+
+
+class Integrator:
+    """Makes steps in time; factors are kept while they serve.
+
+    Parameters
+    ----------
+    mass
+        Its pattern is part of that of the tangent; zero rows and columns at supports.
+    loads
+        All amplitudes; at a jump the step before it ends with the value before.
+    drag
+        c, force per mass and velocity.
+    viscous
+        Further forces.
+
+    Attributes
+    ----------
+    steps, iterations
+        Work so far.
+    """
+
+    def __init__(
+        self,
+        system: System,
+        mass: PETSc.Mat,
+        loads: Loads,
+        rho: float,
+        drag: float = 0.0,
+        viscous: Viscous | None = None,
+    ) -> None:
+        self.system, self.mass, self.loads, self.drag, self.viscous = system, mass, loads, drag, viscous
+        self.rule = Rule.of(rho)
+        self.factorisation = Factorisation(system.comm)
+        self.steps = self.iterations = 0
+        self._K: PETSc.Mat | None = None
+        self._factored = 0.0  # the time step of the latest factors
+        self._x, self._y = mass.createVecs()
+
+    def begin(self, t: float, u: Vector, v: Vector, before: Motion | None = None) -> Motion:
+        """A motion with the acceleration that the loads after t give it; sums go on from those of `before`."""
+        mu = self.loads(t, False)
+        r = self.system.residual(u, mu) + self.drag * self._times(v)
+        if self.viscous:
+            r = r + self.viscous.force(u, u, 1.0)
+        M = self.mass.copy()
+        here = M.getDiagonal()
+        here.setArray((here.array_r == 0).astype(float))
+        M.setOption(PETSc.Mat.Option.NEW_NONZERO_ALLOCATION_ERR, False)
+        M.setOption(PETSc.Mat.Option.IGNORE_ZERO_ENTRIES, False)
+        M.setDiagonal(here, PETSc.InsertMode.ADD_VALUES)
+        M.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+        factors = Factorisation(self.system.comm)
+        factors.factor(M)
+        work, dissipated = (before.work, before.dissipated) if before else (0.0, 0.0)
+        return Motion(t, u, v, -factors.solve(r), mu, work, dissipated, self._potentials(u, mu))
+
+    def kinetic(self, now: Motion) -> float:
+        """v . M v/2 on all ranks."""
+        return dot(self.system.comm, now.v, self._times(now.v)) / 2
+
+    def step(self, now: Motion, dt: float) -> Motion | str:
+        """The motion after a step; else the reason why there is none."""
+        comm = self.system.comm
+        u = now.u + dt * now.v
+        if now.error < SMOOTH:
+            u = u + dt**2 / 2 * now.a
+        last, fresh = np.inf, False
+        if abs(dt - self._factored) > OTHER * dt:
+            self._factor(now, u, dt)
+            fresh = True
+        for _ in range(MOST):
+            a, v = self._rates(now, u, dt)
+            d = self.factorisation.solve(self._unbalanced(now, u, v, a, dt))
+            u = u - d
+            self.iterations += 1
+            size = max_abs(comm, d) / self.system.length
+            if not np.isfinite(size):
+                return "the step is not a number"
+            tolerance = TOLERANCE * max(1.0, MOTION * max_abs(comm, u) / self.system.length)
+            if size <= tolerance or (size <= STALLED and size > last / 2):
+                self.steps += 1
+                return self._accepted(now, u, dt)
+            if size > SLOW * last:
+                if fresh and size > last:
+                    break
+                self._factor(now, u, dt)
+                fresh = True
+            last = size
+        self._factored = 0.0
+        return "Newton's method does not converge"
+
+    def _rates(self, now: Motion, u: Vector, dt: float) -> tuple[Vector, Vector]:
+        """Acceleration and velocity at the end of a step to u (Newmark)."""
+        beta, gamma = self.rule.beta, self.rule.gamma
+        a = (u - now.u - dt * now.v) / (beta * dt**2) - (0.5 / beta - 1) * now.a
+        return a, now.v + dt * ((1 - gamma) * now.a + gamma * a)
+
+    def _unbalanced(self, now: Motion, u: Vector, v: Vector, a: Vector, dt: float) -> Vector:
+        rule = self.rule
+        m, f = rule.alpha_m, rule.alpha_f
+        r = self._times((1 - m) * a + m * now.a + self.drag * ((1 - f) * v + f * now.v))
+        for part, weight in rule.forces:
+            at = now.u + part * (u - now.u)
+            r = r + weight * self.system.residual(at, self.loads(now.t + part * dt, True))
+        return r + self.viscous.force(now.u, u, dt) if self.viscous else r
+
+    def _factor(self, now: Motion, u: Vector, dt: float) -> None:
+        """Factor the derivative of `_unbalanced` by u, with one tangent for all parts of the step."""
+        rule, part = self.rule, 1 - self.rule.alpha_f
+        tangent = self.system.tangent(now.u + part * (u - now.u), self.loads(now.t + part * dt, True))
+        assert not isinstance(tangent, Edged)
+        K = tangent.K if isinstance(tangent, Skewed) else tangent
+        if self._K is None:
+            self._K = K.duplicate()
+            self._K.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+        K.copy(self._K, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
+        self._K.scale(part)
+        inertia = (1 - rule.alpha_m) / (rule.beta * dt**2) + self.drag * part * rule.gamma / (rule.beta * dt)
+        self._K.axpy(inertia, self.mass, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
+        if self.viscous:
+            self.viscous.add_tangent(self._K, dt)
+        self.factorisation.factor(Skewed(self._K, part * tangent.N) if isinstance(tangent, Skewed) else self._K)
+        self._factored = dt
+
+    def _accepted(self, now: Motion, u: Vector, dt: float) -> Motion:
+        comm, rule, t = self.system.comm, self.rule, now.t + dt
+        a, v = self._rates(now, u, dt)
+        mu = self.loads(t, True)
+        potentials, moved = self._potentials(u, mu), u - now.u
+        work = sum(-0.5 * (now.mu[name] + mu[name]) * (potentials[name] - now.potentials[name]) for name in potentials)
+        lost = self.drag * dot(comm, moved, self._times((1 - rule.alpha_f) * v + rule.alpha_f * now.v))
+        if self.viscous:
+            lost += self.viscous.accept(now.u, u, dt)
+        error = abs(rule.beta - 1 / 6) * dt**2 * max_abs(comm, a - now.a) / self.system.length
+        return Motion(t, u, v, a, mu, now.work + work, now.dissipated + lost, potentials, error)
+
+    def _potentials(self, u: Vector, mu: dict[str, float]) -> dict[str, float]:
+        return {name: self.system.potential(u, mu, name) for name in mu if name not in self.system.coordinates}
+
+    def _times(self, x: Vector) -> Vector:
+        self._x.setArray(x)
+        self.mass.mult(self._x, self._y)
+        return np.array(self._y.array_r)
+
+
+@dataclass(frozen=True)
+class TimeSteps:
+    """How long steps are.
+
+    Attributes
+    ----------
+    fixed
+        The longest step, which is halved only where Newton's method fails; None: steps for the tolerance.
+    tolerance
+        Largest estimated error of a step, over the system's length (O. C. Zienkiewicz and Y. M. Xie, Earthquake
+        Engineering and Structural Dynamics 20, 1991).
+    first
+        First step without `fixed`.
+    """
+
+    fixed: float | None
+    tolerance: float
+    first: float
+
+
+class TimeStopped(RuntimeError):
+    """The motion could not be followed; `motion` is its last state."""
+
+    def __init__(self, reason: str, motion: Motion) -> None:
+        super().__init__(reason)
+        self.motion = motion
+
+
+def advance(integrator: Integrator, now: Motion, end: float, steps: TimeSteps, dt: float) -> tuple[Motion, float]:
+    """The motion at a later time, and the step to go on with.
+
+    Parameters
+    ----------
+    dt
+        The step to begin with.
+
+    Raises
+    ------
+    TimeStopped
+        If even a tiny step fails.
+    """
+    begin = now.t
+    while end - now.t > 1e-9 * (end - begin):
+        way = end - now.t
+        dt = min(dt, steps.fixed or dt)
+        length = way / np.ceil(way / dt * (1 - 1e-9))
+        found = integrator.step(now, length)
+        if isinstance(found, str):
+            dt = length / 2
+            if dt < 1e-6 * steps.first:
+                raise TimeStopped(f"the time step has become too small: {found}", now)
+            continue
+        if steps.fixed is None:
+            change = 0.9 * (steps.tolerance / max(found.error, 1e-300)) ** (1 / 3)
+            if found.error > steps.tolerance and length > 1e-6 * steps.first:
+                dt = max(0.3, change) * length
+                continue
+            dt = length * min(change, 2.0) if change > 1.3 else max(length, dt if change > 1 else 0.0)
+        now = found
+    return replace(now, t=end), dt

@@ -1,0 +1,69 @@
+"""Inner products of displacements, and the consistent mass of a model.
+
+Over rho h R^4 with times over R sqrt(rho/E), so that energies are over E h R^2 as all others.
+"""
+
+import numpy as np
+import ufl
+from dolfinx import fem
+from dolfinx.fem import petsc as fem_petsc
+from petsc4py import PETSc
+from ufl.core.expr import Expr
+
+from magshell_fenicsx.models.axisymmetric import jets
+from magshell_fenicsx.models.axisymmetric.model import MeridianModel
+from magshell_fenicsx.models.shell import kinematics as kin
+from magshell_fenicsx.models.shell.model import ShellModel
+from magshell_fenicsx.models.solid.model import SolidModel
+from magshell_fenicsx.platform import compat
+
+Model = ShellModel | MeridianModel | SolidModel
+
+
+def mass(model: Model) -> PETSc.Mat:
+    """The consistent mass of what is modelled, without rotary inertia; zero rows and columns at supports."""
+    factor = thickness(model)
+    name = "mass" if factor is None else "weighted mass"
+    form = model.kernels.compile(name, of_displacements(model, 1.0 if factor is None else factor))
+    M, projection = mass_matrix(form, model.system.clamped), model.system.projection
+    return projection.mass(M) if projection else M
+
+
+def thickness(model: Model) -> Expr | None:
+    """What multiplies the thickness of a shell; a solid has it in its shape."""
+    return None if isinstance(model, SolidModel) or model.thickness is None else model.thickness[0]
+
+
+def of_displacements(model: Model, weight: Expr | float) -> ufl.Form:
+    """The weighted integral of u . v over the undeformed mid-surface of what is modelled."""
+    product = weight * ufl.dot(ufl.TrialFunction(model.V), ufl.TestFunction(model.V))
+    return _integral(model, 2 * np.pi * product if isinstance(model, MeridianModel) else product)
+
+
+def of_waves(model: MeridianModel, weight: Expr | float) -> ufl.Form:
+    """The same of two waves with the coefficients (U + V, V, W); it does not depend on m."""
+    V = model.excluded_modes.waves.V
+    cosine, sine = zip(*(jets.wave(f, 1) for f in (ufl.TrialFunction(V), ufl.TestFunction(V))), strict=True)
+    return _integral(model, weight * np.pi * sum(ufl.dot(a.r, b.r) for a, b in (cosine, sine)))
+
+
+def _integral(model: Model, f: Expr) -> ufl.Form:
+    """Over the undeformed area, of a solid averaged over the thickness; on a meridian per radian."""
+    domain, degree = model.V.mesh, model.degree
+    dx = ufl.Measure("dx", domain=domain, metadata={"quadrature_degree": 2 * degree + 2})
+    if isinstance(model, SolidModel):
+        return f / model.material.h * dx
+    j0 = jets.revolved(model.r0) if isinstance(model, MeridianModel) else kin.jet(model.r0, domain)
+    return f * kin.area_ratio(j0) * dx
+
+
+def mass_matrix(product: fem.Form, held: list[fem.DirichletBC]) -> PETSc.Mat:
+    """The matrix of an inner product, with zero rows and columns at held degrees of freedom.
+
+    So held degrees of freedom have no finite eigenvalue, whatever the tangent's diagonal is there.
+    """
+    M = fem_petsc.create_matrix(product)
+    M.setOption(PETSc.Mat.Option.IGNORE_ZERO_ENTRIES, True)  # the tangent has no entries of held ones
+    compat.add_matrix(M, product, held)
+    M.assemble()
+    return M

@@ -1,0 +1,87 @@
+"""After a run: natural frequencies at points of its path."""
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.continuation.modes import ModesNotFound
+from magshell_fenicsx.continuation.system import Vector
+from magshell_fenicsx.models.axisymmetric.model import MeridianModel
+from magshell_fenicsx.models.modes import ShellMode, ShellModes
+from magshell_fenicsx.output.fields.frequencies import NAME, frequency_table, hertz, wave_of
+from magshell_fenicsx.output.fields.gathering import gatherer
+from magshell_fenicsx.output.fields.modes import mode_file, mode_surface, write_mode
+from magshell_fenicsx.output.fields.surface import Surface
+from magshell_fenicsx.output.fields.vtu import About
+from magshell_fenicsx.output.store.durable import write_whole
+from magshell_fenicsx.output.store.folder import by_first
+from magshell_fenicsx.run.summary import Result
+from magshell_fenicsx.simulate.scene import Scene
+
+Say = Callable[[str], None]
+
+
+def wanted(case: Case, point: int) -> bool:
+    """Whether the state of a point must be kept for its frequencies; the start and the end are known anyway."""
+    at = case.frequencies.at if case.frequencies else ()
+    return at == "all" or (isinstance(at, list) and point in at)
+
+
+def own_wave(scene: Scene) -> str:
+    """The wave of the model's own modes."""
+    if isinstance(scene.model, MeridianModel):
+        return "0"
+    return "symmetric" if scene.model.multiplicity == 2 else ""
+
+
+def frequencies_after(result: Result, folder: Path, say: Say) -> None:
+    """Write frequencies.csv, and fields/mode_*_f*.vtu of the first and the last of the points; keep the modes.
+
+    Collective; rank 0 writes. Call it after the run, because it overwrites the model's tangent.
+
+    Raises
+    ------
+    DiskError
+        On every rank, if something cannot be written.
+    """
+    scene, section = result.scene, result.scene.case.frequencies
+    if section is None:
+        return
+    if scene.model.without_potential and scene.plan.loads.pressure:
+        say("warning: a pressure at a free edge has no potential: frequencies are those of the symmetric tangent")
+    states = dict(sorted(result.kept.items()))
+    if section.at in ("ends", "end"):
+        start = {0: scene.unloaded()} if section.at == "ends" else {}
+        states = {**start, result.end: result.last}
+    elif isinstance(section.at, list) and (strange := sorted(set(section.at) - set(states))):
+        say(f"warning: frequencies.at: the path has no point {', '.join(map(str, strange))}")
+    shell, own, unit = ShellModes(scene.model), own_wave(scene), scene.case.time_unit
+    for number, state in states.items():
+        try:
+            result.frequencies[number] = modes = shell.vibrations(state, section.count)
+        except ModesNotFound as e:
+            say(f"warning: no frequencies of point {number}: {e}")
+            continue
+        first = modes[0]
+        f, wave = hertz(first.eigenvalue, unit), wave_of(first.label, own)
+        in_hertz = "" if f is None else f", {f:.6g} Hz"
+        say(f"lowest frequency at point {number}: omega2 {first.eigenvalue:.6g}{in_hertz}  {wave}".rstrip())
+    content = frequency_table(result.frequencies, own, unit)
+    by_first(scene.comm, partial(write_whole, folder / NAME, content))
+    for number in {*list(states)[:1], *list(states)[-1:]} & set(result.frequencies):
+        _write_modes(result, folder, number, states[number].u, result.frequencies[number][: section.count])
+
+
+def _write_modes(result: Result, folder: Path, number: int, u: Vector, modes: list[ShellMode]) -> None:
+    scene, material = result.scene, result.scene.plan.material
+    gathering = gatherer(scene.model, scene.comm)
+    for n, mode in enumerate(modes, 1):
+        surface = mode_surface(scene.model, gathering, u, mode.label, mode.vector, scene.plan.azimuth)
+        file = mode_file(folder, number, f"f{n}", mode.label)
+
+        def write(file: Path = file, surface: Surface | None = surface) -> None:
+            assert surface is not None
+            write_mode(file, surface, About(material.h, material.nu))
+
+        by_first(scene.comm, write)

@@ -1,0 +1,143 @@
+"""Shells in time: vibrations of known frequency, energy, jumps, rest, resumed runs, ranks."""
+
+import csv
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from command import started
+
+from magshell_fenicsx import Case, Scene
+from magshell_fenicsx.case.source import CaseError, Source
+from magshell_fenicsx.run.rows import columns
+from magshell_fenicsx.run.run import run
+from magshell_fenicsx.simulate.follow import follow
+
+STRIP = {
+    "shell": {"geometry": "strip", "radius_to_thickness": 50, "poisson_ratio": 0.0, "width": 0.2},
+    "boundary": {"root": "clamped"},
+    "mesh": {"degree": 3, "size": 0.5},
+}
+PLATE = {
+    "shell": {"geometry": "disc", "radius_to_thickness": 50, "poisson_ratio": 0.3},
+    "boundary": {"rim": "clamped"},
+    "mesh": {"degree": 3, "refinement": 0.5},
+}
+BEAM = 3.5160 * np.sqrt(1 / 12) / 50  # omega of a cantilever, R/h = 50, nu = 0
+
+
+def case_of(base: dict[str, Any], *steps: dict[str, Any], **sections: Any) -> Case:
+    return Case.from_source(Source("test", {**base, **sections, "loading": list(steps)}))
+
+
+def columns_of(case: Case) -> dict[str, Any]:
+    scene = Scene(case)
+    return columns(scene, follow(scene))
+
+
+def test_a_cantilever_swings() -> None:
+    """A small push along the first mode: cos omega t with the frequency of beam theory; energy conserved."""
+    period = 2 * np.pi / BEAM
+    push = {"mode": 1, "displacement": 0.01}
+    swing = {"kind": "time", "duration": 2 * period, "points": 8, "step": period / 40, "rho_inf": 1.0, "push": push}
+    found = columns_of(case_of(STRIP, swing, symmetry="half"))
+    w = found["w_over_h"][1:]
+    assert w[[1, 3, 5, 7]] == pytest.approx([-0.01, 0.01, -0.01, 0.01], rel=5e-3)
+    assert w[[0, 2, 4]] == pytest.approx(np.zeros(3), abs=1e-3)
+    energy = (found["kinetic"] + found["stored"])[1:]
+    assert np.ptp(energy) < 1e-8 * energy[0]
+
+
+@pytest.mark.parametrize("symmetry", ["axisymmetric", "half", "none"])
+def test_a_sudden_pressure_doubles_the_deflection(symmetry: str) -> None:
+    """1.9 to 2.1 of the static w; work = kinetic + stored + dissipated; with drag it comes to rest in equilibrium."""
+    static = {"kind": "pressure", "control": "load", "until": "target", "pressure": 1e-4, "points": 1}
+    w = columns_of(case_of(PLATE, static, symmetry=symmetry))["w_pole_over_h"][-1]
+    sudden = {"pressure": {"kind": "step", "to": 1e-4}}
+    first = {"kind": "time", "duration": 120.0, "points": 24, "history": sudden, "rho_inf": 0.9}
+    still = {"kind": "time", "duration": 2000.0, "points": 20, "drag": 0.06, "until": "rest", "tolerance": 1e-2}
+    found = columns_of(case_of(PLATE, first, still, symmetry=symmetry))
+    moving = found["step"] == 1
+    assert 1.9 < found["w_pole_over_h"][moving].max() / w < 2.1
+    balance = found["kinetic"] + found["stored"] + found["dissipated"] - found["work"]
+    assert np.abs(balance[moving]).max() < 1e-3 * found["work"].max()
+    assert found["w_pole_over_h"][-1] == pytest.approx(w, rel=1e-8)
+    assert found["label"][-1] == "target"
+    assert found["kinetic"][-1] == 0
+
+
+HISTORIES = {
+    "ramp": ({"kind": "ramp", "to": 1e-5, "over": 4.0}, [0.25, 0.5, 0.75, 1, 1, 1, 1, 1]),
+    "step": ({"kind": "step", "to": 1e-5, "at": 2.5}, [0, 0, 1, 1, 1, 1, 1, 1]),
+    "triangle": ({"kind": "triangle", "size": 1e-5, "period": 8.0}, [0.5, 1, 0.5, 0, -0.5, -1, -0.5, 0]),
+    "sine": ({"kind": "sine", "size": 1e-5, "period": 4.0, "mean": 1e-5}, [2, 1, 0, 1, 2, 1, 0, 1]),
+    "table": ([[0, 0], [2, 1e-5], [2, -1e-5], [4, 0]], [0.5, 1, -0.5, 0, 0, 0, 0, 0]),
+    "formula": ("1e-5*t**2/16", [1 / 16, 4 / 16, 9 / 16, 1, 25 / 16, 36 / 16, 49 / 16, 4]),
+}
+
+
+@pytest.mark.parametrize("kind", HISTORIES)
+def test_histories(kind: str) -> None:
+    """The pressure at eight times, just before a jump."""
+    history, expected = HISTORIES[kind]
+    step = {"kind": "time", "duration": 8.0, "points": 8, "history": {"pressure": history}, "step": 1.0}
+    found = columns_of(case_of(PLATE, step, symmetry="axisymmetric", mesh={"degree": 2, "refinement": 0.2}))
+    after = [-1 if kind == "table" and i == 1 else value for i, value in enumerate(expected)]
+    assert found["p_over_pc"][1:] / 1e-5 == pytest.approx(after, abs=1e-9)
+    assert found["time"][1:] == pytest.approx(np.arange(1, 9))
+
+
+MISTAKES = [
+    ({"duration": "2 s"}, "a time with a unit needs shell.density, youngs_modulus and lengths"),
+    ({"duration": -1.0}, "duration: -1.0: must be positive"),
+    ({"history": {"force": "t"}}, "history.force: no such load; allowed: field, pressure"),
+    ({"history": {"pressure": [[0, 0], [1, "5 mT"]]}}, "5 mT: is a flux density: give a number"),
+    ({"history": {"field": "t"}}, "history.field: needs magnetic.lambda_m, not zero"),
+    ({"history": {"pressure": [[1, 0], [0, 1]]}}, "the times of a table must not fall, nor be negative"),
+    ({"history": {"pressure": "x + t"}}, "is not a formula of the time t"),
+    ({"hold": {"pressure": "conjugate"}}, "in kind: time all loads are functions of time: only load is allowed"),
+]
+
+
+@pytest.mark.parametrize(("given", "message"), MISTAKES)
+def test_mistakes(given: dict[str, Any], message: str) -> None:
+    with pytest.raises(CaseError) as error:
+        case_of(PLATE, {"kind": "time", "duration": 1.0, **given})
+    assert message in str(error.value)
+
+
+def test_a_static_step_needs_rest() -> None:
+    with pytest.raises(CaseError, match="begins in equilibrium: the step of kind: time before it needs until: rest"):
+        case_of(PLATE, {"kind": "time", "duration": 1.0}, {"kind": "pressure"})
+
+
+def test_resumed(tmp_path: Path) -> None:
+    """Stopped after each point by its time limit, and resumed: the same rows."""
+    sudden = {"pressure": {"kind": "step", "to": 1e-4}}
+    case = case_of(PLATE, {"kind": "time", "duration": 40.0, "points": 3, "history": sudden}, symmetry="axisymmetric")
+    whole = run(case, tmp_path / "whole")
+    first = run(case, tmp_path / "parts", time_limit=1e-9)
+    assert first.stopped
+    assert len(first.rows) < len(whole.rows)
+    second = run(case, tmp_path / "parts", resume=True)
+    assert second.stopped is None
+    for key in ("time", "w_pole_over_h", "kinetic", "stored", "work"):
+        assert [row[key] for row in second.rows] == pytest.approx([row[key] for row in whole.rows], rel=1e-9)
+
+
+@pytest.mark.slow
+def test_one_rank_and_two(tmp_path: Path) -> None:
+    file = tmp_path / "case.yaml"
+    file.write_text(
+        "shell: {geometry: disc, radius_to_thickness: 50, poisson_ratio: 0.3}\nboundary: {rim: clamped}\n"
+        "symmetry: half\nmesh: {degree: 2, refinement: 0.5}\n"
+        "loading: [{kind: time, duration: 40, points: 2, history: {pressure: {kind: step, to: 1e-4}}}]\n"
+    )
+    found = []
+    for ranks in (1, 2):
+        out = tmp_path / str(ranks)
+        done = started("run", file, "--out", out, ranks=ranks, pictures=False)
+        assert done.returncode == 0, done.stderr
+        found.append([float(row["kinetic"]) for row in csv.DictReader((out / "path.csv").open(encoding="utf-8"))])
+    assert found[1] == pytest.approx(found[0], rel=1e-7)
