@@ -250,6 +250,7 @@ def test_shell_leaves_the_grid(tmp_path: Path) -> None:
     assert 9e-3 < rows[-1]["tip_uz"] < 11.2e-3  # the outermost quadrature point is not the tip
 
 
+@pytest.mark.slow
 def test_magnet_in_the_way() -> None:
     """It is driven into the strip."""
     steps = [{"kind": "field", "points": 1}, {"kind": "source", "move": [0, 0, "30 mm"], "points": 2}]
