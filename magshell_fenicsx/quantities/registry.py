@@ -117,9 +117,7 @@ OF_SOME_RUNS = (
         "of force (N with units), of rotations alone in that of a moment.",
         "reaction",
     ),
-    Quantity(
-        "source", "source", "Factor of a source's motion or strength; the step may give it another name.", "load"
-    ),
+    Quantity("source", "source", "Factor of a source's motion or strength; the step may give it another name.", "load"),
     Quantity(
         "source_force",
         "force on the source",
