@@ -37,7 +37,9 @@ def rod(position: tuple[float, float, float]) -> tuple[float, float]:
         x, z, a, nx, nz, M = y
         t, normal = np.array([np.cos(a), np.sin(a)]), np.array([-np.sin(a), np.cos(a)])
         B = load * c * field(x, z)
-        slopes = [load * c * (field(x + d * i, z + d * j) - field(x - d * i, z - d * j)) / (2 * d) for i, j in np.eye(2)]
+        slopes = [
+            load * c * (field(x + d * i, z + d * j) - field(x - d * i, z - d * j)) / (2 * d) for i, j in np.eye(2)
+        ]
         N, e = nx * t[0] + nz * t[1] + (B * t).sum(0), np.ones_like(x)
         for _ in range(10):
             e = e - (EA / 2 * (e**2 - 1) * e + M**2 / (EI * e**3) - N) / EA

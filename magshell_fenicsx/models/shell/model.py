@@ -13,7 +13,7 @@ from dolfinx import fem
 from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.kernels import KernelLog
-from magshell_fenicsx.assembly.parameter import make_parameters
+from magshell_fenicsx.assembly.parameter import FreeParameter, make_parameters
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.assembly.sliding import Constraint, held_along
 from magshell_fenicsx.assembly.terms import LinearTerm, Term
@@ -202,7 +202,7 @@ class ShellModel(Observed):
             self._near = self.moving.cells, near
         fast = FastTangent(self.u, self._sites, held + mirrored, self._near)
         gradients = FastResidual(self.r0, self.u, degree, terms, self.kernels)
-        parameters = make_parameters(factory.free, terms, self.u, self.kernels)
+        parameters: dict[str, FreeParameter] = {**make_parameters(factory.free, terms, self.u, self.kernels)}
         parameters |= field_parameters(factory.fields, terms, self.u, self.kernels)
         self.fields = factory.fields
         self.system = FiniteElementSystem(
