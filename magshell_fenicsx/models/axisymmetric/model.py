@@ -119,6 +119,11 @@ class MeridianModel(Observed):
         self.energies += [factory.own(term) for term in loads.own]
         u = jets.revolved(self.u)
         self.observed = self.kernels.compile_all(factory.observed(term, u) for term in loads.own)
+        self.contacts = {}
+        for contact in loads.contacts:
+            pressed, known, integrals = factory.contact(contact, self.u)
+            self.energies.append(pressed)
+            self.contacts[contact.amplitude] = known, self.kernels.compile_all([integrals])
         for name, force in loads.forces.items():
             self.energies.append(pole_force(name, force.patch, self.force_unit, factory, self.kernels))
         self.load_size = {}

@@ -177,6 +177,11 @@ class ShellModel(Observed):
             terms.append(factory.pressure(closing))
         terms += [factory.own(term) for term in loads.own]
         self.observed = self.kernels.compile_all(factory.observed(term) for term in loads.own)
+        self.contacts = {}
+        for contact in loads.contacts:
+            pressed, known, integrals = factory.contact(contact)
+            terms.append(pressed)
+            self.contacts[contact.amplitude] = known, self.kernels.compile_all([integrals])
         self.normals = {name: vertex_normal(self.r0, x) for name, x in midsurface.points.items()}
         terms += [self._force(name, force) for name, force in loads.forces.items()]
         on = SurfaceMeasures(self.r0, midsurface, degree) if loads.dead else None

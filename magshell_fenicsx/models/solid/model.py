@@ -113,7 +113,7 @@ class SolidModel(Observed):
             self._terms += factory.pressure(material.classical_pressure, origin, potential=potential)
         self._terms += [factory.own(term) for term in loads.own]
         self.observed = self.kernels.compile_all(factory.observed(term) for term in loads.own)
-        self.load_size = {}
+        self.load_size, self.contacts = {}, {}
         for name, force in loads.forces.items():
             patch = outer_patch(body, V, force.point, force.patch, self.kernels)
             self._terms.append(LinearTerm(name, patch[0], self.force_unit * patch[1], self.u, name))
