@@ -41,7 +41,7 @@ def _compiled(term: FormTerm | HessianTerm) -> Direction:
 
 def along(system: FiniteElementSystem, u: np.ndarray, mu: Mapping[str, float], v: np.ndarray) -> np.ndarray:
     """d2Pi/du2 . v without supports."""
-    system._at(u, dict(mu))
+    system.at(u, dict(mu))
     total = np.zeros_like(system.u.x.array)
     for term in system.terms:
         if isinstance(term, FormTerm | HessianTerm) and not term.linear:

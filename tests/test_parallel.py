@@ -95,6 +95,17 @@ SCENES |= {
         ],
     ),
 }
+SCENES |= {
+    "a ball": (
+        "ball_contact.yaml",
+        [
+            "--set=symmetry=half",
+            "--set=mesh.degree=2",
+            "--set=bodies.ball={kind: sphere, radius: 0.2, stiffness: 1e4, penetration: 0.1}",
+            "--set=loading={kind: contact, control: approach, approach: 0.3, points: 1}",
+        ],
+    ),
+}
 MOVES = "[{supports: [right], translation: [0, 0, 0.02], rotation: {axis: [0.1, -1, 0], angle: 10, point: [1, 0, 0]}}]"
 SCENES |= {
     "a natural shape": (
