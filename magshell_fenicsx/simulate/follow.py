@@ -3,11 +3,13 @@
 from collections.abc import Iterator
 from dataclasses import replace
 
+from magshell_fenicsx.case.loads.step import PathStep
 from magshell_fenicsx.continuation.point import Point
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.search import searched
 from magshell_fenicsx.simulate.steps import LOCATED, records_of
+from magshell_fenicsx.simulate.transient import released
 from magshell_fenicsx.simulate.walked import Walked
 
 
@@ -34,11 +36,16 @@ def follow(scene: Scene, *, search: bool = True) -> Iterator[Record]:
     for step in steps:
         where = f"step {step.number} of {len(steps)} ({step.kind}): " if isinstance(scene.case.loading, list) else ""
         scene.progress.beginning(step.number)
-        walked, last = Walked(records_of(scene, step, state)), ""
+        walked, last, record = Walked(records_of(scene, step, state)), "", None
         try:
             for record in walked:
                 last = record.label
                 yield replace(record, step=step.number)
+            if isinstance(step.load, PathStep) and step.load.then == "snap" and record:
+                walked = Walked(released(scene, record))
+                for record in walked:
+                    last = record.label
+                    yield replace(record, step=step.number)
         except Stopped as e:
             raise Stopped(f"{where}{e}") from None
         begin, state = state, walked.end

@@ -184,7 +184,8 @@ class Scene:
         own = (*self._own_amplitudes, *(column for term in self.plan.loads.own for column in term.observed))
         factors = (self._column(name) for name in (*self.plan.loads.forces, *self.plan.loads.dead) if name != "force")
         displaced = (f"w_{name}_over_h" for name in self._also_displaced)
-        clock = tuple(q.name for q in IN_TIME) if self.case.loads_of(TimeSection) else ()
+        moves = any(isinstance(s.load, TimeSection) or getattr(s.load, "then", None) for s in self.case.programme)
+        clock = tuple(q.name for q in IN_TIME) if moves else ()
         return (*factors, *displaced, *named, *own, *self._support_columns, *clock)
 
     def stored(self, state: State, energy: float) -> float:

@@ -19,6 +19,9 @@ from magshell_fenicsx.simulate.record import Label, Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.walked import Records
 
+AWAY = 0.05  # displacement from a fold, in lengths
+DAMPED = 0.1  # part of the critical drag of a mode
+LONGEST, MOST = 2000.0, 500  # of a snap, in radians of that mode, and its rows
 QUIET = 1e-6  # kinetic energy over its largest value below which a shell may be at rest
 SMALL = 1e-6  # deflection of a mode of size one that does not give its sign
 NEAR = 1e-2  # distance to the equilibrium, in lengths, below which it is
@@ -117,6 +120,34 @@ def motion(scene: Scene, load: TimeSection, state: State) -> Records:
             f"the shell still moves at the end of its duration, kinetic energy {kinetic / most:.2g} of its largest"
         )
     return Moving(point.state.u, point.state.mu, now.v)
+
+
+def released(scene: Scene, fold: Record) -> Records:
+    """The records of a snap from a fold to rest, all loads being constant; its return value is the state at its end.
+
+    The shell leaves the fold along the path's direction there, and is damped as its second mode of vibration, in part
+    of the critical drag: the first one has no frequency at a fold.
+
+    Raises
+    ------
+    Stopped
+        If the point is no fold of the model itself, or the shell does not come to rest.
+    """
+    if fold.label != "fold" or fold.mode:
+        raise Stopped(f"then: snap: the step ends at a {fold.mode or fold.label}, not at a fold of the model itself")
+    state, system, unit = fold.point.state, scene.model.system, scene.case.time_unit or 1.0
+    own = [mode.eigenvalue for mode in ShellModes(scene.model).lowest(state, 3) if not mode.label]
+    omega = float(np.sqrt(max(own[1:])))
+    load = TimeSection(
+        kind="time",
+        duration=LONGEST * unit / omega,
+        points=MOST,
+        drag=2 * DAMPED * omega / unit,
+        until="rest",
+    )
+    away = scene.model.system.held(fold.point.du)
+    size = AWAY * system.length / max_abs(system.comm, away)
+    return (yield from motion(scene, load, State(state.u + size * away, state.mu)))
 
 
 def _journalled(
