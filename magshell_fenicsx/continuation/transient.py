@@ -28,16 +28,16 @@ Loads = Callable[[float, bool], dict[str, float]]  # mu(t), at a jump before or 
 
 
 class Viscous(Protocol):
-    """A force on a step from u0 to u1 that depends on the strains between them."""
+    """Forces that depend on the strains along a step."""
 
-    def force(self, u0: Vector, u1: Vector, dt: float) -> Vector:
-        """The force, zero at supports."""
+    def force(self, u0: Vector, u1: Vector, v: Vector, part: float, dt: float) -> Vector:
+        """The force at a part of the step from u0 to u1, with the velocity v there; zero at supports."""
 
-    def add_tangent(self, K: PETSc.Mat, dt: float) -> None:
-        """Add the derivative of the force by u1, at the displacements of the last `force`."""
+    def stiffness(self, dt: float, rate: float) -> float:
+        """Its derivative by u1, in parts of the tangent; dv/du at the end is `rate`."""
 
-    def accept(self, u0: Vector, u1: Vector, dt: float) -> float:
-        """Go on from u1; what the step has dissipated."""
+    def accept(self, u0: Vector, u1: Vector, dt: float) -> Vector:
+        """Go on from u1; the latest force."""
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ class Integrator:
         mu = self.loads(t, False)
         r = self.system.residual(u, mu) + self.drag * self._times(v)
         if self.viscous:
-            r = r + self.viscous.force(u, u, 1.0)
+            r = r + self.viscous.force(u, u, v, 1.0, 0.0)
         M = self.mass.copy()
         here = M.getDiagonal()
         here.setArray((here.array_r == 0).astype(float))
@@ -192,7 +192,7 @@ class Integrator:
         for part, weight in rule.forces:
             at = now.u + part * (u - now.u)
             r = r + weight * self.system.residual(at, self.loads(now.t + part * dt, True))
-        return r + self.viscous.force(now.u, u, dt) if self.viscous else r
+        return r + self.viscous.force(now.u, u, (1 - f) * v + f * now.v, 1 - f, dt) if self.viscous else r
 
     def _factor(self, now: Motion, u: Vector, dt: float) -> None:
         """Factor the derivative of `_unbalanced` by u, with one tangent for all parts of the step."""
@@ -204,11 +204,9 @@ class Integrator:
             self._K = K.duplicate()
             self._K.setOption(PETSc.Mat.Option.SYMMETRIC, True)
         K.copy(self._K, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
-        self._K.scale(part)
+        self._K.scale(part * (1 + (self.viscous.stiffness(dt, rule.gamma / (rule.beta * dt)) if self.viscous else 0)))
         inertia = (1 - rule.alpha_m) / (rule.beta * dt**2) + self.drag * part * rule.gamma / (rule.beta * dt)
         self._K.axpy(inertia, self.mass, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
-        if self.viscous:
-            self.viscous.add_tangent(self._K, dt)
         self.factorisation.factor(Skewed(self._K, part * tangent.N) if isinstance(tangent, Skewed) else self._K)
         self._factored = dt
 
@@ -220,7 +218,7 @@ class Integrator:
         work = sum(-0.5 * (now.mu[name] + mu[name]) * (potentials[name] - now.potentials[name]) for name in potentials)
         lost = self.drag * dot(comm, moved, self._times((1 - rule.alpha_f) * v + rule.alpha_f * now.v))
         if self.viscous:
-            lost += self.viscous.accept(now.u, u, dt)
+            lost += dot(comm, moved, self.viscous.accept(now.u, u, dt))
         error = abs(rule.beta - 1 / 6) * dt**2 * max_abs(comm, a - now.a) / self.system.length
         return Motion(t, u, v, a, mu, now.work + work, now.dissipated + lost, potentials, error)
 

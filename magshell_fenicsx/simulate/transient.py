@@ -14,6 +14,8 @@ from magshell_fenicsx.continuation.system import State, Vector, dot, max_abs
 from magshell_fenicsx.continuation.transient import Integrator, Motion, TimeSteps, TimeStopped, advance
 from magshell_fenicsx.models.mass import mass
 from magshell_fenicsx.models.modes import ShellModes
+from magshell_fenicsx.models.shell.model import ShellModel
+from magshell_fenicsx.models.shell.viscous import Branch, Viscosity
 from magshell_fenicsx.parts.section import in_units
 from magshell_fenicsx.simulate.record import Label, Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
@@ -86,7 +88,7 @@ def motion(scene: Scene, load: TimeSection, state: State) -> Records:
     case, system = scene.case, scene.model.system
     loads = LoadsInTime(case, load, state)
     drag = float(in_units("1/second")(load.drag)) * (case.time_unit or 1.0)
-    integrator = Integrator(system, mass(scene.model), loads, load.rho_inf, drag)
+    integrator = Integrator(system, mass(scene.model), loads, load.rho_inf, drag, viscosity(scene, state))
     u, v = state.u, state.v if isinstance(state, Moving) else 0.0 * state.u
     if load.push:
         u, v = _pushed(scene, load.push, state, v)
@@ -122,6 +124,20 @@ def motion(scene: Scene, load: TimeSection, state: State) -> Records:
     return Moving(point.state.u, point.state.mu, now.v)
 
 
+def viscosity(scene: Scene, state: State) -> Viscosity | None:
+    """Of the shell at rest in a state; None without."""
+    case, shell = scene.case, scene.case.shell
+    if shell.viscosity is None and not shell.relaxation:
+        return None
+    assert isinstance(scene.model, ShellModel)
+    found = []
+    for branch in shell.relaxation:
+        size = float(in_units("pascal")(branch.modulus))
+        ratio = size / (shell.youngs_modulus or 1.0) if isinstance(branch.modulus, str) else size
+        found.append(Branch(ratio, time_of(case, branch.time)))
+    return Viscosity(scene.model, state.mu, time_of(case, shell.viscosity or 0.0), found)
+
+
 def released(scene: Scene, fold: Record) -> Records:
     """The records of a snap from a fold to rest, all loads being constant; its return value is the state at its end.
 
@@ -154,7 +170,8 @@ def _journalled(
     scene: Scene, integrator: Integrator, now: Motion, dt: float, ends: list[float], steps: TimeSteps, jumps: set[float]
 ) -> tuple[Motion, float, Point]:
     """The motion at the last of some times, from the journal if it is there, as two of its points."""
-    first, second = scene.journal.replay(), None
+    memory = integrator.viscous is not None  # of a branch's strains, which the journal has no place for: computed again
+    first, second = (None if memory else scene.journal.replay()), None
     if isinstance(first, Point):
         second = scene.journal.replay()
     if isinstance(first, Point) and isinstance(second, Point):
@@ -175,7 +192,7 @@ def _journalled(
     pivots = scene.newton.factor_at(state).negative_pivots
     point = Point(state, now.t, now.v, dt, pivots, pivots, *spent)
     rest = Point(State(now.a, now.potentials), now.work, 0.0 * now.a, now.dissipated, 0, 0, error=now.error)
-    for part in (rest,) if isinstance(first, Point) else (point, rest):
+    for part in () if memory else (rest,) if isinstance(first, Point) else (point, rest):
         scene.journal.record(part)
     return now, dt, point
 
