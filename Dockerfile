@@ -1,11 +1,12 @@
 # Debian 13 packages dolfinx 0.9. The first stage alone is the environment that .ci/in-env uses.
 FROM debian:trixie-slim AS env
-COPY .ci/packages.txt .ci/check-blas /usr/local/share/magshell/
+COPY .ci/packages.txt .ci/pypi.txt .ci/check-blas /usr/local/share/magshell/
 RUN apt-get update \
  && DEBIAN_FRONTEND=noninteractive apt-get install -y --no-install-recommends \
         $(sed 's/#.*//' /usr/local/share/magshell/packages.txt) \
  && rm -rf /var/lib/apt/lists/* \
  && /usr/local/share/magshell/check-blas
+RUN python3 -m pip install --no-deps --no-cache-dir --break-system-packages -r /usr/local/share/magshell/pypi.txt
 ENV OMPI_ALLOW_RUN_AS_ROOT=1 OMPI_ALLOW_RUN_AS_ROOT_CONFIRM=1 OMPI_MCA_btl=self,sm OMP_NUM_THREADS=1
 
 FROM env

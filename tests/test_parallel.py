@@ -36,6 +36,16 @@ SCENES = {
         ],
     ),
 }
+SCENES |= {
+    "half shell, a magnet that moves": (
+        "magnet_past_strip.yaml",
+        [
+            *COARSER,
+            "--set=mesh.degree=2",
+            "--set=loading=[{kind: field, points: 1}, {kind: source, move: [0, 0, 20 mm], points: 1}]",
+        ],
+    ),
+}
 ROOF = ["--set=loading.control=load", "--set=loading.factor=0.3", "--set=loading.points=2"]
 SCENES |= {
     "symmetry planes, a force at a point": ("benchmarks/hinged_roof_12.7.yaml", ROOF),

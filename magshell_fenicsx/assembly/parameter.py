@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any, Protocol
 
 import ufl
 from dolfinx import fem
@@ -10,6 +11,24 @@ from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.terms import FormTerm, Term
 
 Weighted = tuple[str | None, fem.Form]  # an amplitude, None for 1, and a form that it multiplies
+
+
+class Settable(Protocol):
+    """A number that terms depend on."""
+
+    value: Any
+
+
+class FreeParameter(Protocol):
+    """What a system needs of a parameter, see `Parameter`."""
+
+    @property
+    def constant(self) -> Settable: ...
+
+    @property
+    def slopes(self) -> Sequence[FormTerm]: ...
+
+    def bends(self, q: Any) -> list[Weighted]: ...
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from magshell_fenicsx.assembly.moving import Moving
-from magshell_fenicsx.assembly.parameter import Parameter
+from magshell_fenicsx.assembly.parameter import FreeParameter
 from magshell_fenicsx.assembly.sliding import Constraint, Projection, Sliding
 from magshell_fenicsx.assembly.terms import FormTerm, Term
 from magshell_fenicsx.continuation.noise import Noise
@@ -83,7 +83,7 @@ class FiniteElementSystem:
         length: float,
         assembler: TangentAssembler | None = None,
         gradients: ResidualAssembler | None = None,
-        parameters: Mapping[str, Parameter] | None = None,
+        parameters: Mapping[str, FreeParameter] | None = None,
         moving: Moving | None = None,
     ) -> None:
         V = u.function_space

@@ -14,8 +14,8 @@ from magshell_fenicsx.case.boundary import EDGES, BoundarySection
 from magshell_fenicsx.case.ensemble import EnsembleSection
 from magshell_fenicsx.case.expressions import is_formula
 from magshell_fenicsx.case.fields import MagneticSection, layer_average
+from magshell_fenicsx.case.file import FileKeys
 from magshell_fenicsx.case.frequencies import FrequenciesSection
-from magshell_fenicsx.case.imperfections.data import FileSection
 from magshell_fenicsx.case.imperfections.dimple import DimpleSection
 from magshell_fenicsx.case.imperfections.place import ImperfectionSection, places_with_units
 from magshell_fenicsx.case.imperfections.random import RandomSection
@@ -32,6 +32,7 @@ from magshell_fenicsx.case.programme import refuse_unfit_steps
 from magshell_fenicsx.case.shell import ShellSection
 from magshell_fenicsx.case.solid import SolidSection
 from magshell_fenicsx.case.source import CaseError, Source, override, read_source
+from magshell_fenicsx.case.sources.source import SourceSection
 from magshell_fenicsx.case.stability import StabilitySection
 from magshell_fenicsx.case.surfaces import CapSurface, MeshSurface, RevolutionSurface, Surface, SurfaceSection
 from magshell_fenicsx.case.viscosity import refuse_unfit_viscosity
@@ -121,6 +122,10 @@ class Case(WithParts):
     def _sections_fit(self) -> Self:
         if self.magnetic and self.magnetic.lambda_m is None and self.shell.youngs_modulus is None:
             raise ValueError("shell.youngs_modulus is needed to turn flux densities into lambda_m")
+        if self.magnetic and self.magnetic.applied.sources and not self.shell.with_units:
+            raise ValueError(
+                "magnetic.applied.sources: are in metres and tesla: give youngs_modulus and the shell's lengths units"
+            )
         layers = self.magnetic.remanent.layers if self.magnetic else None
         if layers and self.model == "shell" and np.linalg.norm(layer_average(layers)) < 1e-9:
             raise ValueError(
@@ -314,6 +319,11 @@ class Case(WithParts):
         return self.magnetic.amplitude(self.shell.youngs_modulus) if self.magnetic else 0.0
 
     @property
+    def sources(self) -> Sequence[SourceSection]:
+        """Of the applied field."""
+        return (self.magnetic.applied.sources if self.magnetic else None) or []
+
+    @property
     def time_unit(self) -> float | None:
         """R √(ρ/E), that times are over: in seconds where the case has units; None without a density."""
         density, modulus = self.shell.density, self.shell.youngs_modulus
@@ -323,7 +333,9 @@ class Case(WithParts):
     def outside(self) -> dict[str, str | None]:
         """What is solved besides the case's own keys: the hashes of its mesh file and of its other files."""
         mesh = {"mesh_file": self.shell.digest} if isinstance(self.shell, MeshSurface) else {}
-        files = {key: s.digest for key, s in self.imperfections.items() if isinstance(s, FileSection) and s.file}
+        sections = dict[str, object](self.imperfections)
+        sections |= {f"magnetic.applied.sources.{i}": source for i, source in enumerate(self.sources)}
+        files = {key: s.digest for key, s in sections.items() if isinstance(s, FileKeys) and s.file}
         return mesh | {f"{key}.file": digest for key, digest in files.items()}
 
     @classmethod

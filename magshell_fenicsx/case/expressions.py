@@ -4,10 +4,11 @@ import ast
 import operator
 import sys
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import AfterValidator, Field
 
 from magshell_fenicsx.case.taylor import Taylor
 
@@ -37,6 +38,14 @@ def formula(text: str) -> Callable[[Array, Array, Array], Array]:
     """
     steps = _read(text)
     return lambda x, y, z: np.broadcast_to(np.asarray(_evaluate(steps, x, y, z), dtype=np.float64), x.shape)
+
+
+def _checked(text: str) -> str:
+    formula(text)
+    return text
+
+
+Formula = Annotated[str, AfterValidator(_checked), Field(examples=["z*sqrt(x**2 + y**2)"])]
 
 
 def with_derivatives(text: str) -> Callable[[Array], Taylor]:

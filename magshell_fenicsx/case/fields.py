@@ -5,34 +5,14 @@ from typing import Annotated, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import Field, model_validator
 
-from magshell_fenicsx.case.expressions import formula
+from magshell_fenicsx.case.direction import Direction
+from magshell_fenicsx.case.expressions import Formula
+from magshell_fenicsx.case.sources.registered import Sources
 from magshell_fenicsx.parts.section import FluxDensity, Section
 
 MU_0 = 4e-7 * pi  # T m/A
-
-
-def _checked(text: str) -> str:
-    formula(text)
-    return text
-
-
-Formula = Annotated[str, AfterValidator(_checked), Field(examples=["z*sqrt(x**2 + y**2)"])]
-
-
-class Direction(Section):
-    """Angles in degrees: polar from e3, azimuth from e1 about e3."""
-
-    polar: float = 0.0
-    """Angle from e3 [degree]"""
-    azimuth: float = 0.0
-    """Angle from e1 about e3 [degree]"""
-
-    def vector(self, turn: float = 0.0) -> NDArray[np.float64]:
-        """The unit vector (3,) in a frame that is turned by `turn` (rad) about e3."""
-        polar, azimuth = np.radians(self.polar), np.radians(self.azimuth) - turn
-        return np.array([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)])
 
 
 class Layer(Direction):
@@ -89,7 +69,7 @@ def layer_average(layers: list[Layer], turn: float = 0.0) -> NDArray[np.float64]
 class AppliedSection(Direction):
     """The applied flux density, uniform or linear in space: |B^a| (uniform b + gradient · r/R); or by formula.
 
-    The unit vector b has the direction of polar and azimuth, r is the deformed place.
+    The unit vector b has the direction of polar and azimuth, r is the deformed place. The fields of sources are added.
     """
 
     flux_density: FluxDensity | None = Field(default=None, ge=-1e3, le=1e3)
@@ -104,6 +84,19 @@ class AppliedSection(Direction):
     """Formulas of the deformed position x, y, z over R, in place of the other keys. On a shell the position is that of
     the mid-surface. They are written as those of `remanent`, must be twice differentiable, and need energy: full
     [|B^a|]"""
+    sources: Sources | None = None
+    """Magnets, coils, and fields on grids or by formulas, in tesla; without `flux_density` they are the whole field,
+    |B^a| is 1 T, and λ_m is in proportion. They need lengths with units and energy: full"""
+
+    @model_validator(mode="after")
+    def _beside_sources(self) -> Self:
+        others = {"polar", "azimuth", "uniform", "gradient", "components"} & self.model_fields_set
+        if self.sources and self.flux_density is None and others:
+            raise ValueError(f"{', '.join(sorted(others))}: of a field beside the sources: give its flux_density too")
+        names = [source.name for source in self.sources or [] if source.name is not None]
+        if twice := next((name for name in names if names.count(name) > 1), None):
+            raise ValueError(f"sources: {twice}: two of them have this name")
+        return self
 
     @model_validator(mode="after")
     def _square(self) -> Self:
@@ -118,7 +111,17 @@ class AppliedSection(Direction):
     @property
     def is_uniform(self) -> bool:
         """Whether it is the same everywhere."""
-        return not (self.gradient or self.components)
+        return not (self.gradient or self.components or self.sources)
+
+    @property
+    def reference(self) -> float | None:
+        """|B^a| in T, with its sign; 1 T where sources are the whole field."""
+        return (self.flux_density or 1.0) if self.sources else self.flux_density
+
+    @property
+    def beside(self) -> bool:
+        """Whether there is a field beside that of the sources."""
+        return bool(self.flux_density) if self.sources else True
 
 
 class MagneticSection(Section):
@@ -141,7 +144,9 @@ class MagneticSection(Section):
 
     @model_validator(mode="after")
     def _one_amplitude(self) -> Self:
-        densities = [self.remanent.flux_density, self.applied.flux_density]
+        densities = [self.remanent.flux_density, self.applied.reference]
+        if self.lambda_m is not None and self.applied.sources:
+            raise ValueError("sources are in tesla: give remanent.flux_density in place of lambda_m")
         if self.lambda_m is not None and densities != [None, None]:
             raise ValueError("give lambda_m, or the flux densities of remanent and applied, not both")
         if self.model_fields_set == {"remanence"}:
@@ -152,7 +157,7 @@ class MagneticSection(Section):
             raise ValueError("a remanence of length zero is no magnetisation: leave the section out")
         if not self.applied.is_uniform and self.energy != "full":
             raise ValueError(
-                "the approximate energies are of uniform fields; gradient and components need energy: full"
+                "the approximate energies are of uniform fields; gradient, components and sources need energy: full"
             )
         return self
 
@@ -160,7 +165,7 @@ class MagneticSection(Section):
         """lambda_m = |Br||Ba|/(mu_0 E)."""
         if self.lambda_m is not None:
             return self.lambda_m
-        Br, Ba = self.remanent.flux_density, self.applied.flux_density
+        Br, Ba = self.remanent.flux_density, self.applied.reference
         assert Br is not None
         assert Ba is not None
         assert youngs_modulus

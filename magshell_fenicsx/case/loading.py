@@ -12,6 +12,7 @@ from magshell_fenicsx.case.loads.field import FieldBefore, FieldSection, Rotatio
 from magshell_fenicsx.case.loads.growth import GrowthSection
 from magshell_fenicsx.case.loads.indentation import IndentationSection
 from magshell_fenicsx.case.loads.pressure import PressureSection
+from magshell_fenicsx.case.loads.source import SourceStep
 from magshell_fenicsx.case.loads.step import PathStep, Step, Until
 from magshell_fenicsx.case.loads.time import TimeSection
 
@@ -23,6 +24,7 @@ OneStep: TypeAlias = Annotated[
     | GrowthSection
     | DeadSection
     | EdgeSection
+    | SourceStep
     | TimeSection,
     Field(discriminator="kind"),
 ]

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import BeforeValidator, Field, model_validator
 
 from magshell_fenicsx.case.expressions import formula
-from magshell_fenicsx.case.fields import Formula
+from magshell_fenicsx.case.expressions import Formula
 from magshell_fenicsx.parts.section import _NUMBER, Section, in_units
 
 _PER_LENGTH = re.compile(

@@ -7,6 +7,7 @@ from magshell_fenicsx.case.loading import ProgrammeStep
 from magshell_fenicsx.case.loads.dead import DeadSection
 from magshell_fenicsx.case.loads.edge import EdgeSection
 from magshell_fenicsx.case.loads.field import FieldBefore, FieldSection, RotationSection
+from magshell_fenicsx.case.loads.source import SourceStep, refuse_unknown_source
 from magshell_fenicsx.case.loads.step import LEAST_TARGET, Gas, Step
 from magshell_fenicsx.case.loads.time import TimeSection, refuse_unfit_time
 
@@ -42,14 +43,25 @@ def refuse_unfit_steps(
         load, key = step.load, step.key
         if isinstance(load, FieldSection) and not isinstance(load, FieldBefore) and not lambda_m:
             raise ValueError(f"{key}.kind: field needs magnetic.lambda_m, not zero, for its target or direction")
+        if isinstance(load, SourceStep):
+            sources = magnetic.applied.sources if magnetic else None
+            refuse_unknown_source(key, load, sources or [])
+            if whole and "lambda_m" not in driven:
+                raise ValueError(f"{key}.kind: source needs the field of its source: a step of kind: field before it")
+            others = [other.load for other in steps if isinstance(other.load, SourceStep) and other.name != step.name]
+            same = (other for other in others if other.number(sources or []) == load.number(sources or []))
+            if load.to and any(other.move or other.to for other in same):
+                raise ValueError(f"{key}.to: another step moves the same source: give move")
         if isinstance(load, RotationSection):
             if magnetic is None or field is None or not lambda_m:
                 raise ValueError(f"{key}.kind: rotation needs a field: magnetic.lambda_m, not zero")
             if whole and "lambda_m" not in driven:
                 raise ValueError(f"{key}.kind: rotation needs a field: a step of kind: field before it")
-            if magnetic.applied.components:
+            if magnetic.applied.components or magnetic.applied.sources:
+                what = "components, formulas" if magnetic.applied.components else "sources, magnets and fields"
                 raise ValueError(
-                    f"{key}.kind: rotation: not with magnetic.applied.components, formulas that do not turn"
+                    f"{key}.kind: rotation: not with magnetic.applied.{what} that do not turn"
+                    + ("; kind: source turns a source" if magnetic.applied.sources else "")
                 )
             if abs(field @ load.to.vector()) > 1 - SAME:
                 where = "magnetic.applied" if "angle" not in driven else "the field at its beginning"

@@ -12,8 +12,7 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import BeforeValidator, Field, ModelWrapValidatorHandler, PrivateAttr, model_validator
 
-from magshell_fenicsx.case.expressions import formula
-from magshell_fenicsx.case.fields import Formula
+from magshell_fenicsx.case.expressions import Formula, formula
 from magshell_fenicsx.case.history import Time
 from magshell_fenicsx.case.imperfections.dimple import DimpleSection
 from magshell_fenicsx.case.imperfections.registered import Imperfections

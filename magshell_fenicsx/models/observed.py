@@ -1,6 +1,6 @@
 """What is read off the displacement of a model with named points, shell or solid."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from dolfinx import fem
@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.assembly.terms import LinearTerm
 from magshell_fenicsx.continuation.system import Vector
+from magshell_fenicsx.models.shell.applied import AppliedField
 from magshell_fenicsx.models.shell.dead_load import DeadLoads
 from magshell_fenicsx.models.shell.moved import Support
 from magshell_fenicsx.models.shell.parameters import Loads, Material
@@ -36,6 +37,8 @@ class Observed:
         Name of an edge, point or patch -> what it holds.
     without_potential
         Names of the edges at which a live pressure has none; see `openings`.
+    fields
+        The applied field, where it is known by its values.
     observed
         Column -> the form that a term observes, see `OwnTerm.observed`; of the modelled part.
     """
@@ -51,6 +54,7 @@ class Observed:
     supports: Mapping[str, Support]
     without_potential: tuple[str, ...] = ()
     observed: Mapping[str, fem.Form]
+    fields: Sequence[AppliedField] = ()
 
     def observe(self, volume: fem.Form, points: Mapping[str, Array]) -> None:
         """Take the volume change's form (of the modelled part), and the named vertices' places (3,)."""

@@ -32,6 +32,28 @@ def motion_size(loads: Loads, name: str) -> float:
     return shifts or float(sum(np.linalg.norm(motion.turn) for motion in motions))
 
 
+def source_columns(loads: Loads) -> dict[str, str]:
+    """Amplitude of a source -> the column of the force, the torque or the work on it."""
+    found: dict[str, str] = {}
+    for each in loads.magnetic.driven if loads.magnetic else ():
+        found |= {motion.name: "source_torque" if motion.turns else "source_force" for motion in each.motions}
+        found |= dict.fromkeys(each.factors, "source_work")
+    kinds = list(found.values())
+    return {name: kind if kinds.count(kind) == 1 else f"{kind}_{name}" for name, kind in found.items()}
+
+
+def source_size(loads: Loads, name: str) -> float:
+    """The length over R, the angle (rad) or the change of the factor for an amplitude of one."""
+    assert loads.magnetic
+    for each in loads.magnetic.driven:
+        if name in each.factors:
+            return each.factors[name]
+        for motion in each.motions:
+            if motion.name == name:
+                return float(np.linalg.norm(motion.turn if motion.turns else motion.shift))
+    raise KeyError(name)
+
+
 def observed_reactions(
     model: Observed, state: State, mirror: Mirror | None, frame: Array, force: float, length: float
 ) -> dict[str, float]:

@@ -21,6 +21,7 @@ def account(case: Case, loads: Loads, model: str, mirror: Mirror | None) -> tupl
     if loads.magnetic:
         law = "" if loads.magnetic.law == "deformation" else ", remanence that turns and does not stretch"
         included.append(f"magnetic energy ({loads.magnetic.energy}){law}, lambda_m = {case.lambda_m:g}")
+        included += [f"source {source.name or i}: {source.words()}" for i, source in enumerate(case.sources)]
     else:
         left_out.append("magnetic energy: " + ("lambda_m is zero" if case.magnetic else "no magnetic section"))
     if loads.natural:

@@ -8,6 +8,7 @@ from magshell_fenicsx.case.expressions import formula, with_derivatives
 from magshell_fenicsx.case.messages import shown
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.plan.body import layers
+from magshell_fenicsx.plan.sources.registered import placed
 
 Array = NDArray[np.float64]
 MOST_UNKNOWNS = 2_000_000  # whose factors fill the memory of a large workstation
@@ -45,13 +46,22 @@ def refuse_unbounded_fields(case: Case, r0: Array) -> None:
     CaseError
         If one is not finite, or beyond all sense.
     """
-    if case.lambda_m and not SMALLEST_FIELD <= abs(case.lambda_m) <= LARGEST_FIELD:
+    largest = LARGEST_FIELD * (100.0 if case.sources else 1.0)  # of 1 T, which no source makes on a shell
+    if case.lambda_m and not SMALLEST_FIELD <= abs(case.lambda_m) <= largest:
         raise CaseError(
             f"magnetic: lambda_m is {case.lambda_m:.4g}; allowed are 0 and, of either sign, "
-            f"{SMALLEST_FIELD:g} to {LARGEST_FIELD:g}"
+            f"{SMALLEST_FIELD:g} to {largest:g}"
         )
     if not case.magnetic:
         return
+    for source in placed(case):
+        bad = r0[~np.isfinite(source(r0)[0]).all(axis=1)]
+        if len(bad):
+            x, y, z = bad[0]
+            raise CaseError(
+                f"{source.key}: the shell's point (x, y, z)/R = ({x:.3g}, {y:.3g}, {z:.3g}) {source.nowhere}; "
+                "see its position"
+            )
     found = {"remanent": case.magnetic.remanent.components, "applied": case.magnetic.applied.components}
     for key, text in ((key, text) for key, texts in found.items() for text in texts or []):
         bad = r0[~(np.abs(formula(text)(*r0.T)) <= 1e6)]

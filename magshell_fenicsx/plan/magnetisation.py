@@ -1,40 +1,23 @@
 """The field section in the model's frame."""
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.expressions import formula, with_derivatives
-from magshell_fenicsx.case.fields import Direction, MagneticSection, layer_average
+from magshell_fenicsx.case.direction import Direction
+from magshell_fenicsx.case.expressions import formula
+from magshell_fenicsx.case.fields import MagneticSection, layer_average
 from magshell_fenicsx.case.surfaces import MeshSurface
-from magshell_fenicsx.case.taylor import Taylor
 from magshell_fenicsx.mesh.frame import rotation
 from magshell_fenicsx.models.shell.parameters import Magnetisation
 from magshell_fenicsx.models.shell.patterns import Components, Inside, Pattern, WithinRims, radial, tangential
+from magshell_fenicsx.plan.sources.field import in_space
 from magshell_fenicsx.plan.turned import basis as turned_basis
 
 Array = NDArray[np.float64]
 SAME = 1e-9  # part of a direction outside a plane: rounding
-
-
-@dataclass(frozen=True)
-class FormulasInSpace:
-    """Three formulas of the deformed place as a `FieldInSpace`, in a frame whose axes are the rows of `axes`."""
-
-    components: list[Callable[[Array], Taylor]]
-    axes: Array
-
-    def __call__(self, x: Array) -> tuple[Array, Array, Array]:
-        found, Q = [component(x @ self.axes) for component in self.components], self.axes
-        B, G, H = (np.stack([getattr(f, d) for f in found]) for d in ("value", "gradient", "hessian"))
-        return (
-            np.einsum("ai,in->na", Q, B),
-            np.einsum("ai,bj,ijn->nab", Q, Q, G, optimize=True),
-            np.einsum("ai,bj,ck,ijkn->nabc", Q, Q, Q, H, optimize=True),
-        )
 
 
 def magnetisation(
@@ -79,8 +62,9 @@ def magnetisation(
     Q = rotation(turn)
     G = Q @ np.array(gradient) @ Q.T if gradient else None
     layers = tuple((layer.fraction, layer.vector(turn)) for layer in section.layers or [])
-    texts = magnetic.applied.components
-    known = FormulasInSpace([with_derivatives(text) for text in texts], Q) if texts else None
+    known, driven = in_space(case, turn)
+    if case.sources:
+        G = None  # it is a part of the field in space
     turned = turned_basis(G, [along, *(direction.vector(turn) for direction in to)]) if G is not None else ()
     return Magnetisation(
         remanent,
@@ -94,4 +78,5 @@ def magnetisation(
         known,
         tuple(basis),
         turned,
+        driven,
     )

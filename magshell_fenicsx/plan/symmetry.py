@@ -23,7 +23,8 @@ from magshell_fenicsx.plan.by_formula import function
 from magshell_fenicsx.plan.moves import held_vectors, mirrored, sideways
 from magshell_fenicsx.plan.outline import Outline
 from magshell_fenicsx.plan.plan import Span
-from magshell_fenicsx.plan.turning import beside, scalar_turns, vector_turns, vectors_of
+from magshell_fenicsx.plan.sources.field import values
+from magshell_fenicsx.plan.turning import beside, field_turns, scalar_turns, vector_turns, vectors_of
 
 Array = NDArray[np.float64]
 Vectors = Sequence[Array]
@@ -197,8 +198,9 @@ def _field(case: Case, outline: Outline) -> list[Leaves]:
     """Remanence and applied field must both be symmetric to a plane, or both antisymmetric."""
     magnetic = case.magnetic
     assert magnetic
-    known = magnetic.applied.components
-    vectors = [d.vector() for d in (*magnetic.remanent.directions(), *([] if known else [magnetic.applied]))]
+    known = magnetic.applied.components if magnetic.applied.beside else None
+    alone = known or not magnetic.applied.beside
+    vectors = [d.vector() for d in (*magnetic.remanent.directions(), *([] if alone else [magnetic.applied]))]
     turning = [load.to.vector() for load in case.loads_of(RotationSection)]
     remanent, G = magnetic.remanent, np.array(magnetic.applied.gradient or np.zeros((3, 3)))
     fields: list[Callable[[Array], Array]] = [lambda x: np.asarray(x @ G.T)] if G.any() else []
@@ -208,24 +210,35 @@ def _field(case: Case, outline: Outline) -> list[Leaves]:
         askew.append("the formula of the remanence differs around e3")
     if known and not (outline.span and vector_turns(known, outline.span, in_space=True)):
         askew.append("the formula of the applied field differs around e3")
+    sources = values(case) if case.sources else []
+    if sources and not (outline.span and all(field_turns(field, outline.span) for field in sources)):
+        askew.append("the field of a source differs around e3")
     if np.abs(G - np.diag([G[0, 0], G[0, 0], G[2, 2]])).max() > PARALLEL:
         askew.append("the gradient of the applied field is not diag(a, a, b)")
 
     def mirrors(mirror: Mirror) -> bool:
-        S, x = mirror.reflection, outline.sample() if fields else np.zeros((0, 3))
+        S, x = mirror.reflection, outline.sample() if fields or sources else np.zeros((0, 3))
         x = beside(x) if known else x
 
         def images(sign: float) -> bool:
             uniform = all(np.abs(S @ v - sign * v).max() <= 1e-10 for v in (*vectors, *turning))
             varying = all(
-                _alike(sign * np.einsum("ni,ij->nj", field(x), S), field(mirror.image(x))) for field in fields
+                _alike(sign * np.einsum("ni,ij->nj", field(x), S), field(mirror.image(x)))
+                for field in (*fields, *sources)
             )
             kinds = {"radial": 1.0, "tangential": float(S[2, 2])}
             return uniform and varying and kinds.get(remanent.kind, sign) == sign
 
         return images(1.0) or images(-1.0)
 
-    return [Leaves(next(iter(askew), None), vectors, mirrors)]
+    return [Leaves(next(iter(askew), None), [*vectors, *_of_sources(case)], mirrors)]
+
+
+def _of_sources(case: Case) -> list[Array]:
+    """What a mirror plane through e3 may hold: the places of sources, or the axes of those on e3."""
+    places = [np.array(source.position) / case.shell.reference for source in case.sources]
+    axes = [source.axes[:, 2] for source in case.sources]
+    return [place if _tilted(place) else axis for place, axis in zip(places, axes, strict=True)]
 
 
 def _natural(case: Case, outline: Outline) -> list[Leaves]:

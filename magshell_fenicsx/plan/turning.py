@@ -34,7 +34,16 @@ def vector_turns(components: Sequence[str], span: Span, length: float = 1.0, *, 
     vectors, places = vectors_of(components), _places(span)
     if in_space:
         places = beside(places) * [1.0, 0.0, 1.0]
-    found = [vectors(length * places @ Q) @ Q.T for Q in map(rotation, ANGLES)]
+    return _turns(lambda x: vectors(length * x), places)
+
+
+def field_turns(field: Callable[[Array], Array], span: Span) -> bool:
+    """Whether a field on the surface turns with the meridian and has no component across it."""
+    return _turns(field, _places(span))
+
+
+def _turns(field: Callable[[Array], Array], places: Array) -> bool:
+    found = [field(places @ Q) @ Q.T for Q in map(rotation, ANGLES)]
     return _same([*found, found[0] * [1.0, 0.0, 1.0]])
 
 

@@ -117,6 +117,18 @@ OF_SOME_RUNS = (
         "of force (N with units), of rotations alone in that of a moment.",
         "reaction",
     ),
+    Quantity("source", "source", "Factor of a source's motion or strength; the step may give it another name.", "load"),
+    Quantity(
+        "source_force",
+        "force on the source",
+        "Force of the shell on a source that is driven, along its motion; of several source_force_NAME.",
+        "reaction",
+        si="N",
+    ),
+    Quantity("source_torque", "torque on the source", "The same about the axis of its turn.", "reaction", si="N m"),
+    Quantity(
+        "source_work", "work of the source", "The same of its strength: -dΠ/d(factor of the field).", "reaction", si="J"
+    ),
 )
 IN_TIME = (  # of runs with a step of kind: time
     Quantity(
@@ -144,6 +156,7 @@ AMPLITUDES = {
 # names of terms, and of amplitudes that only the solvers use
 GRADIENTS = tuple(f"lambda_gradient_{i}" for i in range(1, 10))
 INTERNAL = ("push", "lambda_across", "lambda_third", *GRADIENTS, "membrane", "couple")
+OF_SOURCES = ("source_force", "source_torque", "source_work")
 TAKEN = frozenset((*QUANTITIES, *AMPLITUDES, *INTERNAL))
 
 
@@ -161,8 +174,9 @@ def quantity(name: str) -> Quantity:
         return replace(of, name=name, words=f"{of.words} {again[2]}", symbol=of.symbol and f"F_{again[2]} R/(2πD)")
     if again := re.fullmatch(r"w_((force|load)(_\d+)?)_over_h", name):
         return _w(name, f"at {again[1].replace('_', ' ')}", f"Displacement conjugate to {again[1]}, as w_over_h.")
-    if name.startswith("reaction_"):
-        return replace(QUANTITIES["reaction"], name=name, words=name.replace("_", " "))
+    for column in ("reaction", *OF_SOURCES):
+        if name.startswith(f"{column}_"):
+            return replace(QUANTITIES[column], name=name, words=name.replace("_", " "))
     kinds: dict[str, Kind] = {"u": "place", "f": "reaction", "m": "moment"}
     ending = re.search(r"_([ufm])[xyz]$", name)
     return Quantity(name, name.replace("_", " "), "", kinds[ending[1]] if ending else "load")
@@ -188,8 +202,9 @@ def axes_of(name: str, row: Collection[str] = ()) -> tuple[Quantity, Quantity]:
     row
         The columns that there are: where w_over_h belongs to another load, this one has a column of its own.
     """
-    for reaction in (f"reaction_{name}", "reaction"):
-        if name not in AMPLITUDES and reaction in row:
+    own_name = tuple(f"{column}_{name}" for column in ("reaction", *OF_SOURCES))
+    for reaction in (*own_name, "reaction", *OF_SOURCES) if name not in AMPLITUDES else ():
+        if reaction in row:
             return quantity(name), quantity(reaction)
     varied, own = amplitude(name), f"w_{name}_over_h"
     over, drawn = quantity(own if own in row else varied.conjugate), quantity(varied.column)

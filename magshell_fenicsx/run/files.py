@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 from shutil import rmtree
 from typing import Any
@@ -12,6 +13,7 @@ from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.output.fields.gathering import gatherer
+from magshell_fenicsx.output.fields.outlines import DRIVEN, STILL, outlines
 from magshell_fenicsx.output.fields.surface import turned
 from magshell_fenicsx.output.fields.vtu import About, FieldSeries
 from magshell_fenicsx.output.pictures.picture import PICTURES
@@ -111,7 +113,10 @@ class RunFiles:
         plan = self._scene.plan
         mirror = plan.mirror.turned(plan.azimuth).plane if plan.mirror else None
         about = About(plan.material.h, plan.material.nu, mirror)
-        self._fields = FieldSeries(self._folder / "fields", about)
+        field = plan.loads.magnetic
+        drawn = outlines(field, self._scene.unloaded().mu)
+        name = "" if not drawn else DRIVEN if self._scene.sources else STILL
+        self._fields = FieldSeries(self._folder / "fields", about, name)
         sync_folder(self._folder)
         return min(len(self._table.kept), self._fields.kept), self._table.kept
 
@@ -132,8 +137,10 @@ class RunFiles:
 
         def write() -> None:
             assert surface is not None
+            plan = self._scene.plan
+            whole = replace(surface, outlines=outlines(plan.loads.magnetic, state.mu))
             self._table.write(row)
-            self._fields.write(number, turned(surface, self._scene.plan.azimuth))
+            self._fields.write(number, turned(whole, plan.azimuth))
 
         by_first(self._comm, write)
 

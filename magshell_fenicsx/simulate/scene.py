@@ -25,7 +25,14 @@ from magshell_fenicsx.mesh.midsurface import Midsurface, distribute
 from magshell_fenicsx.mesh.mirror import Y0
 from magshell_fenicsx.models.axisymmetric.meridian import make_meridian
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
-from magshell_fenicsx.models.reacting import columns, motion_columns, motion_size, observed_reactions
+from magshell_fenicsx.models.reacting import (
+    columns,
+    motion_columns,
+    motion_size,
+    observed_reactions,
+    source_columns,
+    source_size,
+)
 from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.shell.openings import no_potential
 from magshell_fenicsx.models.shell.own_term import OwnTerm
@@ -101,6 +108,12 @@ class Scene:
         """The watch over the modes that the model excludes. Its first use compiles their kernels."""
         return Watch(self.model.excluded_modes)
 
+    def nowhere(self) -> str:
+        """Where a step since the beginning of a walk has found no field, in words after a message; collective."""
+        found = [known.lost for known in self.model.fields if known.lost]
+        said = [each for part in self.model.system.comm.allgather(found) for each in part]
+        return f"; on this way a step has found no field: {said[0]}" if said else ""
+
     @property
     def left_out(self) -> list[str]:
         """What the model lacks, for people."""
@@ -109,7 +122,7 @@ class Scene:
 
     def unloaded(self) -> State:
         """The undeformed shell; amplitudes are zero, except user-defined ones with a value."""
-        amplitudes = {t.amplitude for t in self.model.system.terms if t.amplitude} | self.motions
+        amplitudes = {t.amplitude for t in self.model.system.terms if t.amplitude} | self.motions | set(self.sources)
         given = self._own_amplitudes
         return State(self.model.zero(), {name: given.get(name, 0.0) for name in sorted({*amplitudes, *given})})
 
@@ -141,6 +154,7 @@ class Scene:
             **self._observe_points(state),
             **{name: state.mu[name] for name in self._own_amplitudes},
             **self._observe_supports(state),
+            **self._observe_sources(state),
             **{
                 column: state.mu[term.name]
                 * model.multiplicity
@@ -178,6 +192,11 @@ class Scene:
         return frozenset(move.motion.name for move in self.plan.loads.moves)
 
     @property
+    def sources(self) -> dict[str, str]:
+        """See `source_columns`."""
+        return source_columns(self.plan.loads)
+
+    @property
     def extra_columns(self) -> tuple[str, ...]:
         """The columns of `observe` besides those of every run."""
         named = tuple(f"{point}_u{axis}" for point in self.case.points for axis in "xyz")
@@ -186,7 +205,8 @@ class Scene:
         displaced = (f"w_{name}_over_h" for name in self._also_displaced)
         moves = any(isinstance(s.load, TimeSection) or getattr(s.load, "then", None) for s in self.case.programme)
         clock = tuple(q.name for q in IN_TIME) if moves else ()
-        return (*factors, *displaced, *named, *own, *self._support_columns, *clock)
+        sources = (*self.sources, *self.sources.values())
+        return (*factors, *displaced, *named, *own, *self._support_columns, *sources, *clock)
 
     def stored(self, state: State, energy: float) -> float:
         """The energy of the shell itself: without the potentials of the loads."""
@@ -211,6 +231,14 @@ class Scene:
         if plan.reactions:
             frame = rotation(plan.azimuth)
             found |= observed_reactions(model, state, plan.mirror, frame, force, R)
+        return found
+
+    def _observe_sources(self, state: State) -> dict[str, float]:
+        """The amplitudes of sources, and their conjugates in SI."""
+        found: dict[str, float] = {}
+        for name, column in self.sources.items():
+            potential = self.model.system.potential(state.u, state.mu, name)
+            found |= {name: state.mu[name], column: -potential / self.conjugate_unit(name)}
         return found
 
     @property
@@ -246,6 +274,10 @@ class Scene:
                 else self.plan.length
             )
             return -motion_size(self.plan.loads, name) / (force * arm * model.multiplicity)
+        if name in self.sources:
+            force = (self.case.shell.modulus or 1.0) * material.h * self.plan.length**2
+            arm = 1.0 if self.sources[name].startswith("source_force") else self.plan.length
+            return source_size(self.plan.loads, name) / (force * arm * model.multiplicity)
         if name in model.loads.forces:
             return model.force_unit * material.h
         return model.load_size.get(name, 0.0) / self.plan.length

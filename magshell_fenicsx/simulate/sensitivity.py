@@ -15,6 +15,7 @@ from magshell_fenicsx.continuation.fold import Fold, Guess, find_fold, sensitivi
 from magshell_fenicsx.continuation.system import Vector
 from magshell_fenicsx.models.axisymmetric import jets
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
+from magshell_fenicsx.models.shell.applied import AppliedField
 from magshell_fenicsx.models.shell.parameters import Magnetisation
 from magshell_fenicsx.models.shell.patterns import Array, Pattern, WithinRims
 from magshell_fenicsx.models.shell.terms import TermFactory
@@ -108,8 +109,10 @@ def _remanence_columns(scene: Scene, fold: Fold) -> dict[str, Vector]:
 
 def _magnetic_column(scene: Scene, fold: Fold, field: Magnetisation) -> Vector:
     model, system = scene.model, scene.model.system
-    terms = _magnetic_terms(scene, field)
+    terms, fields = _magnetic_terms(scene, field)
     system.set(fold.state.u)
+    for known in fields:
+        known.mu.update({name: fold.state.mu[name] for name in known.names})
     column = system.u.copy()
     column.x.array[:] = 0
     for term in terms:
@@ -122,17 +125,16 @@ def _magnetic_column(scene: Scene, fold: Fold, field: Magnetisation) -> Vector:
     return np.array(column.x.array[: model.system.size])
 
 
-def _magnetic_terms(scene: Scene, field: Magnetisation) -> Sequence[FormTerm]:
-    """The model's magnetic terms with another remanence."""
-    model, log = scene.model, KernelLog()
+def _magnetic_terms(scene: Scene, field: Magnetisation) -> tuple[Sequence[FormTerm], Sequence[AppliedField]]:
+    """The model's magnetic terms with another remanence, and the field that they follow."""
+    model, log, fields = scene.model, KernelLog(), list[AppliedField]()
     if isinstance(model, MeridianModel):
         u = jets.revolved(model.u)
         return [
             FormTerm(e.name, 2 * np.pi * e.of(u), model.u, log, e.amplitude, linear=e.linear, follow=e.follow)
-            for e in model.factory.magnetic(field, model.u)
-        ]
+            for e in replace(model.factory, fields=fields).magnetic(field, model.u)
+        ], fields
     if isinstance(model, SolidModel):
-        return replace(model.factory, log=log).magnetic(field)
-    return TermFactory(model.r0, model.u, model.material, model.sigma, model.degree, log, model.thickness).magnetic(
-        field
-    )
+        return replace(model.factory, log=log, fields=fields).magnetic(field), fields
+    made = TermFactory(model.r0, model.u, model.material, model.sigma, model.degree, log, model.thickness)
+    return made.magnetic(field), made.fields

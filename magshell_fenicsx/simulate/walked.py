@@ -53,6 +53,8 @@ def _followed(stage: Stage, walk: Walk, branches: PathStep | None) -> Iterator[R
     path, start, goal = walk.path, walk.points[0], walk.goal
     crossing, lost, watch = None, "", stage.scene.watch
     furthest = np.inf  # amplitude, once an excluded mode is unstable
+    for known in stage.scene.model.fields:
+        known.lost = ""
     watch.begin(path, start, stage.leave)
     try:
         for label, point in walk:
@@ -72,7 +74,7 @@ def _followed(stage: Stage, walk: Walk, branches: PathStep | None) -> Iterator[R
             if abs(point.state.mu[path.name]) > furthest:
                 break
     except PathStopped as e:
-        lost = _why(path, e, walk.points)
+        lost = _why(path, e, walk.points) + stage.scene.nowhere()
     yield from _excluded(path, watch.end())
     if lost and path.control == "load":
         for found in _fold_ahead(stage, path, walk.points):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.fields import Direction
+from magshell_fenicsx.case.direction import Direction
 from magshell_fenicsx.case.source import CaseError, Source
 from magshell_fenicsx.plan.planner import make_plan
 from magshell_fenicsx.plan.symmetry import common_azimuth

@@ -79,7 +79,7 @@ def test_ci_runs_both(tmp_path: Path, fails: str) -> None:
     calls = [line.split() for line in (tmp_path / "calls").read_text(encoding="utf-8").splitlines()]
     assert (done.returncode != 0) == bool(fails)
     assert calls[0] == ["test", "ROOT="]
-    solving = [f"tests/{each}" for each in ("continuation", "assembly", "models", "simulate", "cases")]
+    solving = [f"tests/{each}" for each in ("continuation", "models/axisymmetric", "simulate", "cases")]
     again = ["fast", "OPENBLAS_CORETYPE=Nehalem", f"TESTS={solving[0]}", *solving[1:], "ROOT="]
     assert calls[1:2] == ([] if fails == "test" else [again])
     assert len(calls) == {"": 3, "test": 1, "fast": 2}[fails]

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from command import magshell
 from conftest import CASES
+from interrupted import kill, start, wait_until
 
 from magshell_fenicsx import CaseError
 from magshell_fenicsx.case.source import override, read_source
@@ -185,8 +186,12 @@ def test_failed_samples_are_counted_and_listed(tmp_path: Path, monkeypatch: pyte
 
 @pytest.mark.slow
 def test_ranks_give_the_table_of_one(tmp_path: Path, alone: list[dict[str, str]]) -> None:
-    """In any order, with other folds to begin with."""
-    done = magshell("ensemble", DIMPLE, *THREE, "--out", tmp_path, ranks=3)
+    """In any order, with other folds to begin with; on three ranks killed after a sample, resumed on two."""
+    run, points = start("ensemble", DIMPLE, *THREE, "--out", tmp_path, ranks=3), tmp_path / "points"
+    wait_until(lambda: points.is_dir() and any(points.iterdir()))
+    kill(run, 3)
+    assert not (tmp_path / "samples.csv").exists()
+    done = magshell("ensemble", DIMPLE, *THREE, "--out", tmp_path, "--resume", ranks=2)
     assert done.returncode == 0, done.stderr
     same(alone, read(tmp_path / "samples.csv"))
     assert (tmp_path / "ensemble.png").stat().st_size > 10_000

@@ -1,41 +1,14 @@
 """A measured imperfection."""
 
-import hashlib
-from functools import cached_property
-from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
-from pydantic import Field, PrivateAttr
+from pydantic import Field
 
+from magshell_fenicsx.case.file import FileKeys
 from magshell_fenicsx.case.imperfections.place import ImperfectionSection
 
 
-class FileSection(ImperfectionSection):
-    """May read a file; its path is from the folder of the case."""
-
-    file: str | None = None
-    """From the folder of the case"""
-
-    _folder: Path = PrivateAttr(default_factory=Path)
-
-    def model_post_init(self, context: Any, /) -> None:
-        self._folder = Path((context or {}).get("folder", "")).absolute()
-
-    @property
-    def path(self) -> Path:
-        """Where the file is."""
-        return self._folder / (self.file or "")
-
-    @cached_property
-    def digest(self) -> str | None:
-        """Hash of the file's content; None if it cannot be read."""
-        try:
-            return hashlib.sha256(self.path.read_bytes()).hexdigest()
-        except OSError:
-            return None
-
-
-class DataSection(FileSection):
+class DataSection(FileKeys, ImperfectionSection):
     """w0 measured at places of the surface, scattered or on a grid, with noise and holes; a smooth function fits it.
 
     Columns of the file: x, y, z, w0; or polar, azimuth, w0 (spheres); or azimuth, z, w0 (cylinders), angles in

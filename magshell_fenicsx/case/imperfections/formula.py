@@ -4,7 +4,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from magshell_fenicsx.case.fields import Formula
+from magshell_fenicsx.case.expressions import Formula
 from magshell_fenicsx.case.imperfections.place import ImperfectionSection
 
 

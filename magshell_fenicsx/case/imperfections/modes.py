@@ -7,12 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, PrivateAttr, model_validator
 
-from magshell_fenicsx.case.imperfections.data import FileSection
+from magshell_fenicsx.case.file import FileKeys
+from magshell_fenicsx.case.imperfections.place import ImperfectionSection
 
 Shape = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 
-class ModesSection(FileSection):
+class ModesSection(FileKeys, ImperfectionSection):
     """The lowest modes of the perfect shell where it first becomes unstable under the case's loads.
 
     A pressure goes on to there, whatever its target; under other loads without an instability they are those at the

@@ -5,7 +5,7 @@ from typing import Annotated, Any, Self
 
 from pydantic import Field, model_validator
 
-from magshell_fenicsx.case.fields import Direction
+from magshell_fenicsx.case.direction import Direction
 from magshell_fenicsx.parts.section import Section, or_number, texts
 
 Coordinates = Annotated[list[Annotated[float, or_number("metre")]], Field(min_length=3, max_length=3)]

@@ -4,7 +4,7 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
-from magshell_fenicsx.case.fields import Direction
+from magshell_fenicsx.case.direction import Direction
 from magshell_fenicsx.case.loads.step import Drive, Now, PathStep, Step, Target, Until
 
 

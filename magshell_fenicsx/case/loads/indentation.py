@@ -5,7 +5,7 @@ from typing import Any, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
-from magshell_fenicsx.case.fields import Direction
+from magshell_fenicsx.case.direction import Direction
 from magshell_fenicsx.case.loads.step import Count, Now, PathStep, Target, Until
 
 LEAST_HUMP = 0.01  # F of the first step towards the top of an energy barrier

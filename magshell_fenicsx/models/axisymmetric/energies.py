@@ -74,6 +74,7 @@ class EnergyFactory:
     thickness: fem.Function | None = None
     natural: Shape | None = None
     free: Constants = field(default_factory=dict)  # of parameters that enter freely
+    fields: list[AppliedField] = field(default_factory=list)  # those made
 
     def membrane(self) -> Energy:
         j0, t, nu = self.j0, self._t, self.constant(self.material.nu)
@@ -125,7 +126,8 @@ class EnergyFactory:
             return self._cells(name, lambda u: t * density(j0, u, Br, Ba), "lambda_m", linear=name in LINEAR)
 
         if field.in_space:
-            known = AppliedField(field.in_space, self.r0, u, self._quadrature)
+            known = AppliedField(field.in_space, self.r0, u, self._quadrature, field.driven)
+            self.fields.append(known)
             return [
                 replace(term("magnetic", densities.in_space(FULL[field.law]), known.polynomial), follow=known.follow)
             ]

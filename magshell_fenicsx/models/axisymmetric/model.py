@@ -27,6 +27,7 @@ from magshell_fenicsx.models.axisymmetric.supports import openings, supports
 from magshell_fenicsx.models.axisymmetric.waves import Waves
 from magshell_fenicsx.models.observed import Observed
 from magshell_fenicsx.models.shell import edges
+from magshell_fenicsx.models.shell.driving import field_parameters
 from magshell_fenicsx.models.shell.energy import Density
 from magshell_fenicsx.models.shell.moment import Counted
 from magshell_fenicsx.models.shell.moved import Support, moving, rotation_of
@@ -132,6 +133,8 @@ class MeridianModel(Observed):
             terms += [self._moment(f"{name} moment {load.edge} {i}", load, name) for i, load in enumerate(moments)]
         pattern, held = next(term for term in terms if term.name == INTERIOR), self.held.held(V)
         parameters = make_parameters(factory.free, terms, self.u, self.kernels)
+        parameters |= field_parameters(factory.fields, terms, self.u, self.kernels)
+        self.fields = factory.fields
         self.system = FiniteElementSystem(
             self.u,
             terms,

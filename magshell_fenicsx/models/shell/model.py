@@ -22,6 +22,7 @@ from magshell_fenicsx.mesh.mirror import Y0, Mirror
 from magshell_fenicsx.models.observed import Observed
 from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes
 from magshell_fenicsx.models.shell.dead_load import SurfaceMeasures, assemble_dead_loads
+from magshell_fenicsx.models.shell.driving import field_parameters
 from magshell_fenicsx.models.shell.fast_tangent import FastTangent, make_sites
 from magshell_fenicsx.models.shell.folds import FOLD, largest_fold
 from magshell_fenicsx.models.shell.moved import Support, moving, rotation_of
@@ -199,6 +200,8 @@ class ShellModel(Observed):
         fast = FastTangent(self.u, self._sites, held + mirrored, self._near)
         gradients = FastResidual(self.r0, self.u, degree, terms, self.kernels)
         parameters = make_parameters(factory.free, terms, self.u, self.kernels)
+        parameters |= field_parameters(factory.fields, terms, self.u, self.kernels)
+        self.fields = factory.fields
         self.system = FiniteElementSystem(
             self.u, terms, held + mirrored, interior, material.h, fast, gradients, parameters, self.moving
         )

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.motion import Motion
-from magshell_fenicsx.models.shell.applied import FieldInSpace
+from magshell_fenicsx.models.shell.driven import Driven, FieldInSpace
 from magshell_fenicsx.models.shell.natural import Natural
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.patterns import Pattern
@@ -74,6 +74,8 @@ class Magnetisation:
         (3, 3) of the applied flux density, which is applied + gradient . r; None if uniform.
     in_space
         The applied flux density as a function of the deformed place, in place of `applied` and `gradient`.
+    driven
+        Fields that amplitudes drive, added to `in_space`.
     across
         Vectors (3,), normal to `applied` and to each other, that the field turns towards, with the amplitudes of
         `ACROSS`.
@@ -102,6 +104,7 @@ class Magnetisation:
     in_space: FieldInSpace | None = None
     axes: tuple[NDArray[np.float64], ...] = ()
     turned: tuple[NDArray[np.float64], ...] = ()
+    driven: tuple[Driven, ...] = ()
 
     @property
     def gradients(self) -> dict[str, NDArray[np.float64]]:

@@ -48,6 +48,7 @@ class TermFactory:
     natural: Shape | None = None
     free: Constants = field(default_factory=dict)  # of parameters that enter freely
     folded: bool = False  # whether cells meet at angles that are not small
+    fields: list[AppliedField] = field(default_factory=list)  # those made
 
     def membrane(self) -> ShellTerm:
         density = Density(per_area(densities.membrane), (self._constant(self.material.nu),))
@@ -113,7 +114,8 @@ class TermFactory:
         pattern = field.remanent
         Br = pattern_field(pattern, self.r0) if callable(pattern) else self._constant(pattern)
         if field.in_space:
-            known = AppliedField(field.in_space, self.r0, self.u, cell_quadrature(self.degree))
+            known = AppliedField(field.in_space, self.r0, self.u, cell_quadrature(self.degree), field.driven)
+            self.fields.append(known)
             of = densities.in_space(FULL[field.law])
             density = self._thick(Density(per_area(of), (Br, known.polynomial), parts=MOVED), None)
             return [self._cells("magnetic", density, "lambda_m", follow=known.follow)]

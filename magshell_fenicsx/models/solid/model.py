@@ -22,6 +22,7 @@ from magshell_fenicsx.mesh.mirror import Y0, Mirror
 from magshell_fenicsx.models.observed import Observed
 from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes
 from magshell_fenicsx.models.shell.dead_load import assemble_dead_loads
+from magshell_fenicsx.models.shell.driving import field_parameters
 from magshell_fenicsx.models.shell.fast_tangent import FastTangent
 from magshell_fenicsx.models.shell.moved import moving
 from magshell_fenicsx.models.shell.openings import openings
@@ -148,6 +149,8 @@ class SolidModel(Observed):
             near = moving.cells, make_sites(self.body, self.r0, self._terms, self.kernels, moving.cells)
         fast = FastTangent(self.u, self._sites, held, near)
         parameters = make_parameters(factory.free, self._terms, self.u, self.kernels)
+        parameters |= field_parameters(factory.fields, self._terms, self.u, self.kernels)
+        self.fields = factory.fields
         return FiniteElementSystem(
             self.u, self._terms, held, self._pattern, self.material.h, fast, parameters=parameters, moving=moving
         )

@@ -92,6 +92,7 @@ class TermFactory:
     hinged: tuple[str, ...] = ()
     grown: Callable[[Density], Density] = lambda density: density  # takes the body's natural shape
     free: Constants = field(default_factory=dict)  # of parameters that enter freely
+    fields: list[AppliedField] = field(default_factory=list)  # those made
 
     def distortion(self) -> SolidTerm:
         density = Density(densities.distortion, self._constants(self.material.shear, self.h))
@@ -113,7 +114,8 @@ class TermFactory:
         if of.in_space:
             X = fem.Function(self.u.function_space)
             X.interpolate(lambda x: x)
-            known = AppliedField(of.in_space, X, self.u, WHOLE)
+            known = AppliedField(of.in_space, X, self.u, WHOLE, of.driven)
+            self.fields.append(known)
             density = Density(law.magnetic_in_space, (Br, known.polynomial, *self._constants(self.h)), VALUE + GRADIENT)
             return [self._bulk("magnetic", density, "lambda_m", follow=known.follow)]
         directions = [("lambda_m", "", of.applied)]

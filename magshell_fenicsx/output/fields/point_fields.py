@@ -101,8 +101,12 @@ class PointFields:
 def _applied(field: Magnetisation, mu: Mapping[str, float], r: Array) -> Array:
     """The applied flux density (..., 3) at points r (..., 3)."""
     along = mu.get("lambda_m", 0.0)
+    if field.in_space and not along:
+        return np.zeros_like(r)
     if field.in_space:
-        return np.asarray(along * field.in_space(r.reshape(-1, 3))[0].reshape(r.shape))
+        x = r.reshape(-1, 3)
+        B = field.in_space(x)[0] + sum((each.at(x, mu).value[0] for each in field.driven), np.zeros(3))
+        return np.asarray(along * B.reshape(r.shape))
     uniform = along * field.applied
     for name, across in zip(ACROSS, field.across, strict=False):
         uniform = uniform + mu.get(name, 0.0) * across

@@ -39,6 +39,8 @@ class Surface:
     fields
         Name -> (n,), (n, 3) or (n, 3, 3), see `point_fields.PointFields`, and w0_over_h where there are
         imperfections; of a solid that alone.
+    outlines
+        Places (n, 3) along lines: the sources of the applied field.
     """
 
     r0: Array
@@ -46,6 +48,7 @@ class Surface:
     n0: Array
     cells: NDArray[np.int64]
     fields: dict[str, Array]
+    outlines: tuple[Array, ...] = ()
 
     @property
     def is_body(self) -> bool:
@@ -180,6 +183,7 @@ def completed(surface: Surface, mirror: Array) -> Surface:
         both(surface.n0, image.n0),
         np.concatenate([surface.cells, surface.cells + len(surface.r0)]),
         {name: both(f, image.fields[name]) for name, f in surface.fields.items()},
+        surface.outlines,
     )
 
 
@@ -190,4 +194,6 @@ def _moved(surface: Surface, Q: Array) -> Surface:
         return f if f.ndim == 1 else f @ Q if f.ndim == 2 else Q.T @ f @ Q
 
     fields = {name: moved(f) for name, f in surface.fields.items()}
-    return replace(surface, r0=moved(surface.r0), u=moved(surface.u), n0=moved(surface.n0), fields=fields)
+    lines = tuple(line @ Q for line in surface.outlines)
+    r0, u, n0 = (moved(f) for f in (surface.r0, surface.u, surface.n0))
+    return replace(surface, r0=r0, u=u, n0=n0, fields=fields, outlines=lines)

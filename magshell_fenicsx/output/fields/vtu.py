@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.case.source import CaseError
+from magshell_fenicsx.output.fields.outlines import vtp_content
 from magshell_fenicsx.output.fields.surface import LAGRANGE_HEXAHEDRON, LAGRANGE_TRIANGLE, TRIANGLE, Surface
 from magshell_fenicsx.output.store.durable import write_whole
 
@@ -82,14 +83,19 @@ def read_vtu(file: Path) -> tuple[Surface, About]:
 class FieldSeries:
     """Writes `point_NNNN.vtu` files and updates `path.pvd` after each; continues after an interrupted run.
 
+    Parameters
+    ----------
+    outlines
+        Name of a point's file with the outlines of sources, of its number; empty without.
+
     Attributes
     ----------
     kept
         Number of leading points whose files exist.
     """
 
-    def __init__(self, folder: Path, about: About) -> None:
-        self._folder, self._about = folder, about
+    def __init__(self, folder: Path, about: About, outlines: str = "") -> None:
+        self._folder, self._about, self._outlines = folder, about, outlines
         folder.mkdir(exist_ok=True)
         self.kept = 0
         while (folder / point_file(self.kept)).exists():
@@ -106,12 +112,16 @@ class FieldSeries:
         OSError
             If the disk is full; the file is not written then.
         """
+        if self._outlines:
+            write_whole(self._folder / self._outlines.format(number), vtp_content(surface.outlines))
         write_whole(self._folder / point_file(number), vtu_content(surface, self._about))
         self._numbers.append(number)
         self._write_list()
 
     def _write_list(self) -> None:
-        rows = "\n".join(f'    <DataSet timestep="{n}" part="0" file="{point_file(n)}"/>' for n in self._numbers)
+        files = [(n, 0, point_file(n)) for n in self._numbers]
+        files += [(n, 1, self._outlines.format(n)) for n in self._numbers if self._outlines]
+        rows = "\n".join(f'    <DataSet timestep="{n}" part="{part}" file="{file}"/>' for n, part, file in files)
         content = (
             '<?xml version="1.0"?>\n<VTKFile type="Collection" version="0.1">\n  <Collection>\n'
             f"{rows}\n  </Collection>\n</VTKFile>\n"

@@ -88,14 +88,15 @@ def _views(surfaces: Sequence[Surface], h: float, factor: float) -> list[View]:
     limit = max(float(np.abs(s.w).max()) / h for s in surfaces) or 1.0
     last = max(surfaces, key=lambda s: float(np.abs(s.w).max()))
     camera = towards(deflected_place(last))
-    places = [s.r0 + factor * s.u for s in surfaces]
+    places = [np.concatenate([s.r0 + factor * s.u, *s.outlines]) for s in surfaces]
     low, high = np.min([r.min(axis=0) for r in places], axis=0), np.max([r.max(axis=0) for r in places], axis=0)
     bounds = tuple(float(x) for x in np.column_stack([low, high]).ravel())
     views = []
     for s in surfaces:
         smooth = smooth_surface(replace(s, u=factor * s.u, fields={}), factor * h)
         colours = smooth.point_data["w_over_h"]
-        views.append(View(smooth, colours, (-limit, limit), "RdBu_r", camera, WINDOW, "$w/h$", bounds=bounds))
+        view = View(smooth, colours, (-limit, limit), "RdBu_r", camera, WINDOW, "$w/h$", bounds=bounds)
+        views.append(replace(view, outlines=s.outlines))
     return views
 
 

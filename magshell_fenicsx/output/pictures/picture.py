@@ -29,6 +29,7 @@ ROUNDING = {"E_1": 1e-13, "M_1": 1e-8}  # smaller values are drawn as zero
 EVERYWHERE, PEAK = 0.997, 1.5  # colour limit: PEAK times this quantile of the area
 FROM_THE_SIDE = np.array([2.2, -3.6, 2.85])
 PANEL, WHOLE = 480, 1000  # pixels
+FAR = 4.0  # of the shell's extent, from its middle: sources farther away are not drawn
 SEEDS, APART = 70, 0.13  # largest number of arrows; their least distance over the shell's extent
 FIELDS = {  # colour, caption, length of the longest arrow, thickness; both over the shell's extent
     "Br": ("C3", r"remanence $F\,\hat B^\mathrm{r}$", 0.105, 0.008),
@@ -73,7 +74,15 @@ def deflected_place(surface: Surface) -> Array:
 def _shell(surface: Surface, smooth: "pyvista.PolyData", h: float) -> list[View]:
     limit = float(np.abs(surface.w).max() / h) or 1.0
     camera = towards(deflected_place(surface))
-    return [View(smooth, smooth.point_data["w_over_h"], (-limit, limit), "RdBu_r", camera, WHOLE, "$w/h$")]
+    colours = smooth.point_data["w_over_h"]
+    return [View(smooth, colours, (-limit, limit), "RdBu_r", camera, WHOLE, "$w/h$", outlines=_near(surface))]
+
+
+def _near(surface: Surface) -> tuple[Array, ...]:
+    """The outlines of sources that leave the shell large enough to be seen."""
+    r = surface.r0 + surface.u
+    middle, reach = r.mean(axis=0), FAR * float(np.ptp(r, axis=0).max())
+    return tuple(line for line in surface.outlines if np.linalg.norm(line - middle, axis=1).max() < reach)
 
 
 def _loads(surface: Surface, smooth: "pyvista.PolyData", h: float) -> list[View]:
@@ -139,7 +148,7 @@ def _fields(surface: Surface, smooth: "pyvista.PolyData", h: float) -> list[View
         places = r[seeds] + 0.01 * extent * side - np.where(inward[:, None], vectors, 0.0)
         arrows.append(Arrows(places[shown], vectors[shown], colour, thickness * extent))
     grey = np.full(smooth.n_points, 0.25)
-    return [View(smooth, grey, (0.0, 1.0), "Greys", camera, 700, arrows=tuple(arrows))]
+    return [View(smooth, grey, (0.0, 1.0), "Greys", camera, 700, arrows=tuple(arrows), outlines=_near(surface))]
 
 
 def _spread(r: Array, apart: float) -> NDArray[np.int64]:

@@ -2,12 +2,13 @@
 
 import csv
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.output.fields.frequencies import read_frequencies
 from magshell_fenicsx.output.fields.modes import mode_caption, mode_file, wave_number
+from magshell_fenicsx.output.fields.outlines import read_outlines
 from magshell_fenicsx.output.fields.surface import Surface, completed
 from magshell_fenicsx.output.fields.vtu import About, point_file, read_vtu
 from magshell_fenicsx.output.pictures.animation import animated
@@ -143,6 +144,7 @@ def _file(folder: Path, row: Row) -> Path:
 def _point(folder: Path, row: Row) -> tuple[Surface, About]:
     """The whole deformed shell at a point."""
     surface, about = read_vtu(_file(folder, row))
+    surface = replace(surface, outlines=read_outlines(folder / "fields", int(row["point"])))
     return surface if about.mirror is None else completed(surface, about.mirror), about
 
 

@@ -59,6 +59,8 @@ class View:
         Arrows in the view.
     bounds
         (xmin, xmax, ymin, ...) of the window's content; None fits it to the view.
+    outlines
+        Places (n, 3) along lines, of the sources of the field.
     """
 
     smooth: "pyvista.PolyData"
@@ -70,6 +72,7 @@ class View:
     caption: str = ""
     arrows: tuple[Arrows, ...] = ()
     bounds: tuple[float, ...] | None = None
+    outlines: tuple[Array, ...] = ()
 
 
 def smooth_surface(surface: Surface, h: float) -> "pyvista.PolyData":
@@ -134,6 +137,7 @@ def _image(plotter: "pyvista.Plotter", view: View) -> Image:
         render=False,
     )
     drawn = [surface, *(_arrows(plotter, arrows) for arrows in view.arrows)]
+    drawn += [plotter.add_lines(line, color="dimgray", width=2, connected=True) for line in view.outlines]
     plotter.render_window.SetSize(view.size, view.size)
     plotter.camera.focal_point, plotter.camera.up = (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)
     plotter.camera.position = view.camera

@@ -76,6 +76,29 @@ def read_scan(file: Path, lengths: Lengths) -> Scan:
     ScanError
         If it cannot be read, or has not the columns.
     """
+    known, units = table(file)
+    wanted = next(
+        (names for names in PLACES if set(names) <= known.keys() and ("w0" in known or len(names) == 3)), None
+    )
+    if wanted is None:
+        raise ScanError(
+            f"has the columns {', '.join(map(repr, known))}; needed are x, y, z, w0, or x, y, z of the real "
+            "surface, or polar, azimuth, w0 of a sphere, or azimuth, z, w0 of a cylinder"
+        )
+    names = [*wanted, *(["w0"] if "w0" in known else [])]
+    if "w0" in units and units["w0"] is None and any(units[name] for name in wanted if name not in ANGLES):
+        raise ScanError("column w0: has no unit, but the places have one: write w0 [h] or a length, such as w0 [um]")
+    return _finite(names, [known[name] * _factor(units[name], name, lengths) for name in names])
+
+
+def table(file: Path) -> tuple[dict[str, Array], dict[str, str | None]]:
+    """The columns of a CSV file or the arrays of an .npz file, and their units, by name.
+
+    Raises
+    ------
+    ScanError
+        If it cannot be read, or has a column twice.
+    """
     try:
         if file.stat().st_size > LARGEST:
             raise ScanError(f"is larger than {LARGEST // 1_000_000} MB; leave out rows")
@@ -85,19 +108,7 @@ def read_scan(file: Path, lengths: Lengths) -> Scan:
     units = dict(_named(header) for header in columns)
     if len(units) < len(columns):
         raise ScanError(f"has a column twice: {', '.join(columns)}")
-    known = {name: np.asarray(v, dtype=float) for name, v in zip(units, columns.values(), strict=True)}
-    wanted = next(
-        (names for names in PLACES if set(names) <= known.keys() and ("w0" in known or len(names) == 3)), None
-    )
-    if wanted is None:
-        raise ScanError(
-            f"has the columns {', '.join(map(repr, columns))}; needed are x, y, z, w0, or x, y, z of the real "
-            "surface, or polar, azimuth, w0 of a sphere, or azimuth, z, w0 of a cylinder"
-        )
-    names = [*wanted, *(["w0"] if "w0" in known else [])]
-    if "w0" in units and units["w0"] is None and any(units[name] for name in wanted if name not in ANGLES):
-        raise ScanError("column w0: has no unit, but the places have one: write w0 [h] or a length, such as w0 [um]")
-    return _finite(names, [known[name] * _factor(units[name], name, lengths) for name in names])
+    return {name: np.asarray(v, dtype=float) for name, v in zip(units, columns.values(), strict=True)}, units
 
 
 def _factor(unit: str | None, name: str, lengths: Lengths) -> float:

@@ -12,7 +12,7 @@ from magshell_fenicsx.case.expressions import with_derivatives
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.models.shell.parameters import Loads, Magnetisation, RemanenceLaw
 from magshell_fenicsx.models.shell.patterns import tangential
-from magshell_fenicsx.plan.magnetisation import FormulasInSpace
+from magshell_fenicsx.plan.formulas_in_space import FormulasInSpace
 
 
 def dense(K: PETSc.Mat) -> np.ndarray:

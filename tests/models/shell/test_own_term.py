@@ -5,9 +5,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import ufl
+from along import difference as tangent_difference
 from conftest import CASES, TILTED, hemisphere, random_displacement
 from test_fast_residual import difference as residual_difference
-from test_fast_tangent import difference as tangent_difference
 from ufl.core.expr import Expr
 
 from magshell_fenicsx import Case, CaseError, Jet, OwnTerm, Scene

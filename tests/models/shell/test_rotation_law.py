@@ -7,10 +7,10 @@ from typing import get_args
 import numpy as np
 import pytest
 import scipy.linalg
+from along import difference as tangent_difference
 from conftest import TILTED, disc, hemisphere, random_displacement
 from test_derivatives import alone, check
 from test_fast_residual import difference as residual_difference
-from test_fast_tangent import difference as tangent_difference
 from test_magnetic_energies import order, smooth
 
 from magshell_fenicsx.mesh.mirror import Y0

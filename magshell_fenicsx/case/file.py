@@ -1,0 +1,35 @@
+"""Files that a section of a case reads."""
+
+import hashlib
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from pydantic import PrivateAttr
+
+from magshell_fenicsx.parts.section import Section
+
+
+class FileKeys(Section):
+    """Of sections that may read a file; its path is from the folder of the case."""
+
+    file: str | None = None
+    """From the folder of the case"""
+
+    _folder: Path = PrivateAttr(default_factory=Path)
+
+    def model_post_init(self, context: Any, /) -> None:
+        self._folder = Path((context or {}).get("folder", "")).absolute()
+
+    @property
+    def path(self) -> Path:
+        """Where the file is."""
+        return self._folder / (self.file or "")
+
+    @cached_property
+    def digest(self) -> str | None:
+        """Hash of the file's content; None if it cannot be read."""
+        try:
+            return hashlib.sha256(self.path.read_bytes()).hexdigest()
+        except OSError:
+            return None

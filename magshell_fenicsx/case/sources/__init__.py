@@ -1,0 +1,1 @@
+"""The sources of the applied field: one section for each kind."""

@@ -1,0 +1,15 @@
+"""A cylinder magnet."""
+
+from typing import Literal
+
+from magshell_fenicsx.case.sources.source import MagnetSection, Size
+
+
+class CylinderSection(MagnetSection):
+    """A cylinder around its own z axis, uniformly magnetised."""
+
+    kind: Literal["cylinder"]
+    diameter: Size
+    """Diameter [m]"""
+    height: Size
+    """Along its own z axis [m]"""

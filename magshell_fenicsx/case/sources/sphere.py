@@ -1,0 +1,13 @@
+"""A sphere magnet."""
+
+from typing import Literal
+
+from magshell_fenicsx.case.sources.source import MagnetSection, Size
+
+
+class SphereSection(MagnetSection):
+    """A sphere, uniformly magnetised: outside it the field of a dipole."""
+
+    kind: Literal["sphere"]
+    diameter: Size
+    """Diameter [m]"""

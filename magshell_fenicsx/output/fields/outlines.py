@@ -1,0 +1,56 @@
+"""The outlines of the applied field's sources, for pictures and for ParaView."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magshell_fenicsx.models.shell.driven import carried
+from magshell_fenicsx.models.shell.parameters import Magnetisation
+
+Array = NDArray[np.float64]
+STILL, DRIVEN = "sources.vtp", "sources_{:04d}.vtp"  # of all points, or of each
+
+
+def outlines(field: Magnetisation | None, mu: Mapping[str, float]) -> tuple[Array, ...]:
+    """Places (n, 3) over R along lines in the model's frame, where the amplitudes have driven the sources."""
+    if field is None:
+        return ()
+    found = [line for part in getattr(field.in_space, "parts", ()) for line in getattr(part, "lines", ())]
+    for each in field.driven:
+        Q, t = carried(each.motions, mu)
+        found += [line @ Q.T + t for line in getattr(each.of, "lines", ())]
+    return tuple(found)
+
+
+def vtp_content(lines: tuple[Array, ...]) -> bytes:
+    """The content of a .vtp file."""
+    import pyvista
+    from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter  # type: ignore[import-untyped]
+
+    cells = [np.concatenate([[len(line)], start + np.arange(len(line))]) for start, line in _numbered(lines)]
+    writer = vtkXMLPolyDataWriter()
+    writer.SetInputData(pyvista.PolyData(np.concatenate(lines), lines=np.concatenate(cells)))
+    writer.SetDataModeToAscii()
+    writer.WriteToOutputStringOn()
+    writer.Write()
+    content: bytes | str = writer.GetOutputString()
+    return content if isinstance(content, bytes) else content.encode()
+
+
+def _numbered(lines: tuple[Array, ...]) -> list[tuple[int, Array]]:
+    starts = np.cumsum([0, *(len(line) for line in lines)])
+    return list(zip(starts.tolist(), lines, strict=False))
+
+
+def read_outlines(folder: Path, number: int) -> tuple[Array, ...]:
+    """Those beside the fields of a point; none without sources."""
+    file = folder / DRIVEN.format(number)
+    file = file if file.exists() else folder / STILL
+    if not file.exists():
+        return ()
+    import pyvista
+
+    data = pyvista.read(file)
+    return tuple(np.asarray(cell.points, dtype=float) for cell in data.cell)

@@ -1,0 +1,1 @@
+"""Sources as fields in space: from each kind's section to a function of places."""

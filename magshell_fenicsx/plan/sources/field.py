@@ -1,0 +1,108 @@
+"""The whole applied field where it is known by its values: formulas, sources, and what is uniform beside these."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from math import radians
+
+import numpy as np
+
+from magshell_fenicsx.assembly.motion import Motion
+from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.expressions import with_derivatives
+from magshell_fenicsx.case.loads.source import SourceStep
+from magshell_fenicsx.mesh.frame import rotation
+from magshell_fenicsx.models.shell.driven import Driven, FieldInSpace
+from magshell_fenicsx.plan.formulas_in_space import FormulasInSpace
+from magshell_fenicsx.plan.sources.known import Array, Placed
+from magshell_fenicsx.plan.sources.registered import placed
+
+HALFWAY = 0.371  # of a motion: no symmetric place
+
+
+@dataclass(frozen=True)
+class Linear:
+    """A field b + G x."""
+
+    b: Array
+    G: Array
+
+    def __call__(self, x: Array) -> tuple[Array, Array, Array]:
+        n = len(x)
+        return self.b + x @ self.G.T, np.broadcast_to(self.G, (n, 3, 3)), np.zeros((n, 3, 3, 3))
+
+
+@dataclass(frozen=True)
+class Sum:
+    """The sum of some fields, perhaps of none."""
+
+    parts: Sequence[FieldInSpace]
+
+    def __call__(self, x: Array) -> tuple[Array, Array, Array]:
+        n = len(x)
+        B, G, H = np.zeros((n, 3)), np.zeros((n, 3, 3)), np.zeros((n, 3, 3, 3))
+        for part in self.parts:
+            for whole, own in zip((B, G, H), part(x), strict=True):
+                whole += own
+        return B, G, H
+
+
+def in_space(case: Case, turn: float = 0.0) -> tuple[FieldInSpace | None, tuple[Driven, ...]]:
+    """The field that stays, None if it is built in, and the fields that steps drive, in a frame turned about e3 (rad).
+
+    Raises
+    ------
+    CaseError
+        If a source cannot be built.
+    """
+    if case.magnetic is None:
+        return None, ()
+    applied, Q = case.magnetic.applied, rotation(turn)
+    formulas = [with_derivatives(text) for text in applied.components or []]
+    by_formula = FormulasInSpace(formulas, Q) if formulas else None
+    if not case.sources:
+        return by_formula, ()
+    parts = list[FieldInSpace]()
+    if applied.beside:
+        G = Q @ np.array(applied.gradient or np.zeros((3, 3))) @ Q.T
+        parts.append(by_formula or Linear(applied.uniform * applied.vector(turn), G))
+    driven = list[Driven]()
+    for number, source in enumerate(placed(case, turn)):
+        one = _driven(case, number, source, Q)
+        if one.names:
+            driven.append(one)
+        else:
+            parts.append(source)
+    return Sum(parts), tuple(driven)
+
+
+def _driven(case: Case, number: int, source: Placed, Q: Array) -> Driven:
+    """A source with the amplitudes of its steps; turns about its own position come before translations."""
+    turns, moves, factors, zero = list[Motion](), list[Motion](), dict[str, float](), np.zeros(3)
+    steps = {step.name: step.load for step in case.programme if isinstance(step.load, SourceStep)}
+    for name, load in steps.items():
+        if load.number(case.sources) != number:
+            continue
+        if load.turn:
+            axis = np.array(load.turn.axis) / np.linalg.norm(load.turn.axis)
+            turns.append(Motion(name, zero, radians(load.turn.angle) * (Q @ axis), source.position))
+        elif load.strength is not None:
+            factors[name] = load.strength - 1
+        else:
+            end = np.array(load.move or load.to) / source.length
+            moves.append(Motion(name, Q @ end - (source.position if load.to else zero), zero, zero))
+    return Driven(source, [*turns, *moves], factors)
+
+
+def values(case: Case) -> list[Callable[[Array], Array]]:
+    """B over |B^a| at places (n, 3) as the sources are at first, and where each amplitude of them has changed."""
+    still, driven = in_space(case)
+    if still is None:
+        return []
+    names = [name for each in driven for name in each.names]
+    mus = [dict.fromkeys(names, 0.0)]
+    mus += [{**mus[0], name: mu} for name in names for mu in (HALFWAY, 1.0)]
+
+    def at(mu: dict[str, float]) -> Callable[[Array], Array]:
+        return lambda x: np.asarray(still(x)[0] + sum((each.at(x, mu).value[0] for each in driven), np.zeros(3)))
+
+    return [at(mu) for mu in mus]

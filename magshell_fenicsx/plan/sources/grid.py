@@ -1,0 +1,129 @@
+"""A field that is known on a rectilinear grid, as a C2 cubic spline."""
+
+from functools import lru_cache
+from itertools import combinations_with_replacement
+from pathlib import Path
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.source import CaseError
+from magshell_fenicsx.case.sources.grid import GridSection
+from magshell_fenicsx.parts.section import in_units
+from magshell_fenicsx.plan.imperfections.scan import ScanError, table
+from magshell_fenicsx.plan.sources.cuboid import edges
+from magshell_fenicsx.plan.sources.known import Array, Known
+
+PLACES, FIELD = ("x", "y", "z"), ("Bx", "By", "Bz")
+VTK, DEGREE = (".vtk", ".vti", ".vtr", ".vts"), 3
+SAME = 1e-6  # of the distance between places: rounding of a table
+
+
+def grid(section: GridSection, case: Case, key: str) -> Known:
+    """See `Known`.
+
+    Raises
+    ------
+    CaseError
+        If the file is no such grid.
+    """
+    try:
+        axes, values = read(section.path, section.digest)
+    except ScanError as e:
+        raise CaseError(f"{key}.file: {section.file}: {e}") from None
+    spline = _spline(axes, values)
+
+    def field(x: Array) -> tuple[Array, Array, Array]:
+        def of(*by: int) -> Array:
+            return np.asarray(spline(x, nu=np.bincount(by, minlength=3)) if by else spline(x))
+
+        B, G = of(), np.stack([of(j) for j in range(3)], axis=-1)
+        H = np.empty((len(x), 3, 3, 3))
+        for j, k in combinations_with_replacement(range(3), 2):
+            H[:, :, j, k] = H[:, :, k, j] = of(j, k)
+        return B, G, H
+
+    low, high = (np.array([axis[end] for axis in axes]) for end in (0, -1))
+    return Known(field, edges(low, high), "beyond the grid of")
+
+
+def _spline(axes: list[Array], values: Array) -> "scipy.interpolate.NdBSpline":
+    """The tensor product of the cubic splines along each axis, of values (nx, ny, nz, 3)."""
+    knots = []
+    for i, axis in enumerate(axes):
+        along = scipy.interpolate.make_interp_spline(axis, values, DEGREE, axis=i)
+        knots.append(along.t)
+        values = np.moveaxis(along.c, 0, i)
+    return scipy.interpolate.NdBSpline(tuple(knots), values, DEGREE, extrapolate=False)
+
+
+@lru_cache(maxsize=8)
+def read(file: Path, digest: str | None) -> tuple[list[Array], Array]:
+    """The places along each axis in m, and B (nx, ny, nz, 3) in T; `digest` tells one content from another.
+
+    Raises
+    ------
+    ScanError
+        If it cannot be read, or is no rectilinear grid.
+    """
+    x, B = _vtk(file) if file.suffix in VTK else _table(file)
+    axes = [_places(along) for along in x.T]
+    shape = tuple(len(axis) for axis in axes)
+    if min(shape) <= DEGREE:
+        raise ScanError(f"has {' x '.join(map(str, shape))} places: a cubic spline needs four along each axis")
+    where = tuple(_nearest(axis, along) for axis, along in zip(axes, x.T, strict=True))
+    values = np.full((*shape, 3), np.nan)
+    values[where] = B
+    if len(x) != np.prod(shape) or not np.isfinite(values).all():
+        raise ScanError(
+            f"is no rectilinear grid of finite numbers: {len(x)} rows with {' x '.join(map(str, shape))} "
+            "different places along the axes"
+        )
+    return axes, values
+
+
+def _table(file: Path) -> tuple[Array, Array]:
+    known, units = table(file)
+    if missing := [name for name in (*PLACES, *FIELD) if name not in known]:
+        raise ScanError(f"has no column {', '.join(missing)}; needed are {', '.join((*PLACES, *FIELD))}")
+    if file.suffix == ".npz" and known["Bx"].ndim == 3 and known["x"].ndim == 1:  # the places along each axis
+        known |= dict(zip(PLACES, np.meshgrid(*(known[name] for name in PLACES), indexing="ij"), strict=True))
+    columns = [known[name].ravel() * _size(units[name], name) for name in (*PLACES, *FIELD)]
+    if len({len(column) for column in columns}) > 1:
+        raise ScanError("its arrays have different lengths")
+    return np.column_stack(columns[:3]), np.column_stack(columns[3:])
+
+
+def _size(unit: str | None, name: str) -> float:
+    known = "metre" if name in PLACES else "tesla"
+    try:
+        return float(in_units(known, bare=True)(unit or known))
+    except ValueError as e:
+        raise ScanError(f"column {name}: its unit {unit} {e}") from None
+
+
+def _vtk(file: Path) -> tuple[Array, Array]:
+    import pyvista
+
+    try:
+        data = pyvista.read(file)
+    except OSError as e:
+        raise ScanError(f"cannot be read: {e.strerror or e}") from None
+    if "B" not in data.point_data or np.shape(data.point_data["B"]) != (data.n_points, 3):
+        raise ScanError("has no vector B at its points")
+    return np.array(data.points, dtype=float), np.array(data.point_data["B"], dtype=float)
+
+
+def _places(along: Array) -> Array:
+    """Different places, sorted; those that differ by rounding are one."""
+    found = np.unique(along)
+    apart = np.ptp(found) / len(found) if len(found) > 1 else 1.0
+    first = np.concatenate([[True], np.diff(found) > SAME * apart])
+    return np.asarray(found[first])
+
+
+def _nearest(axis: Array, along: Array) -> NDArray[np.int64]:
+    middle = (axis[1:] + axis[:-1]) / 2
+    return np.asarray(np.searchsorted(middle, along))

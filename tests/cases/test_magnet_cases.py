@@ -1,0 +1,96 @@
+"""Strips and magnets: against a rod in the same field by SciPy, and a magnet that is driven past and back."""
+
+from functools import cache
+
+import magpylib
+import numpy as np
+import pytest
+from conftest import CASES
+from scipy.integrate import solve_bvp
+
+from magshell_fenicsx import Case, Result
+from magshell_fenicsx.run.run import run
+
+LENGTH, WIDTH, H, E, BR = 30e-3, 5e-3, 0.5e-3, 1e6, 0.1  # of cases/magnet_strip.yaml
+
+
+@cache
+def result(file: str, *settings: str) -> Result:
+    return run(Case.load(CASES / file, settings))
+
+
+def rod(position: tuple[float, float, float]) -> tuple[float, float]:
+    """Displacement of the tip along x and z of a rod with stretch e and curvature k, by SciPy.
+
+    Energy per length EA (e² - 1)²/8 + EI (e k)²/2 - c e B.t at each place, the field averaged over the width. Force n
+    and moment M: n' = -c e grad(B.t), M' = -e n.d - c e B.d with the normal d, n.t = dW/de, M = dW/dk.
+    """
+    magnet = magpylib.magnet.Cylinder(dimension=(20e-3, 10e-3), polarization=(0, 0, 1.3), position=position)
+    EA, EI, c = E * WIDTH * H, E * WIDTH * H**3 / 12, WIDTH * H * BR / magpylib.mu_0
+    across, weights = np.polynomial.legendre.leggauss(3)
+
+    def field(x: np.ndarray, z: np.ndarray) -> np.ndarray:
+        places = [np.column_stack([x, np.full_like(x, WIDTH / 2 * a), z]) for a in across]
+        return np.tensordot(weights / 2, [magnet.getB(p)[:, [0, 2]].T for p in places], 1)
+
+    def rates(s: np.ndarray, y: np.ndarray, load: float, d: float = 1e-5) -> np.ndarray:
+        x, z, a, nx, nz, M = y
+        t, normal = np.array([np.cos(a), np.sin(a)]), np.array([-np.sin(a), np.cos(a)])
+        B = load * c * field(x, z)
+        slopes = [
+            load * c * (field(x + d * i, z + d * j) - field(x - d * i, z - d * j)) / (2 * d) for i, j in np.eye(2)
+        ]
+        N, e = nx * t[0] + nz * t[1] + (B * t).sum(0), np.ones_like(x)
+        for _ in range(10):
+            e = e - (EA / 2 * (e**2 - 1) * e + M**2 / (EI * e**3) - N) / EA
+        pull = [-e * (slope * t).sum(0) for slope in slopes]
+        turn = -e * (nx * normal[0] + nz * normal[1] + (B * normal).sum(0))
+        return np.stack([e * t[0], e * t[1], M / (EI * e**2), *pull, turn])
+
+    s = np.linspace(0, LENGTH, 41)
+    y = np.vstack([s, np.zeros((5, 41))])
+    for load in (0.1, 0.4, 1.0):
+        found = solve_bvp(
+            lambda s, y, load=load: rates(s, y, load), lambda a, b: np.array([*a[:3], *b[3:]]), s, y, tol=1e-6
+        )
+        assert found.success
+        s, y = found.x, found.y
+    return float(y[0, -1] - LENGTH), float(y[1, -1])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("place", [None, (50e-3, 0.0, -35e-3)])
+def test_magnet_strip(place: tuple[float, float, float] | None) -> None:
+    """Its tip, at the case's own place of the magnet and at another one."""
+    key = "magnetic.applied.sources.0.position"
+    settings = [f"{key}=[{', '.join(f'{1e3 * x:g} mm' for x in place)}]"] if place else []
+    row = result("magnet_strip.yaml", *settings).rows[-1]
+    tip = np.array([row["tip_ux"], row["tip_uz"]], dtype=float)
+    assert np.linalg.norm(tip) > LENGTH / 2
+    np.testing.assert_allclose(tip, rod(place or (40e-3, 0.0, -60e-3)), rtol=1e-5)
+
+
+PAST = ("mesh={degree: 3, refinement: 0.3}",)
+
+
+@pytest.mark.slow
+def test_magnet_past_strip() -> None:
+    """A closed curve; the snaps are folds at places that are mirror images; the force is the slope of the energy."""
+    found = result("magnet_past_strip.yaml", *PAST)
+    assert found.stopped is None
+    rows = found.rows
+    way = {step: [row for row in rows if row["step"] == step] for step in (2, 3)}
+    folds = {step: [row for row in way[step] if row["label"] == "fold"] for step in way}
+    for there, back in zip(folds[2], reversed(folds[3]), strict=True):
+        assert there["source"] == pytest.approx(back["source"], rel=1e-7)  # the place at a fold is less exact
+        assert there["tip_uz"] == pytest.approx(back["tip_uz"], rel=1e-3)
+    first, second = folds[2]
+    assert first["source"] + second["source"] == pytest.approx(1, abs=1e-6)
+    assert first["tip_uz"] + second["tip_uz"] == pytest.approx(0, abs=1e-3 * first["tip_uz"])
+    assert first["source"] > 0.6
+    begin, end = (next(row for row in reversed(rows) if row["step"] == step) for step in (1, 3))
+    assert end["tip_uz"] == pytest.approx(begin["tip_uz"], rel=1e-8)
+    f, pi, force = (np.array([row[key] for row in way[2]], dtype=float) for key in ("source", "energy", "source_force"))
+    work = np.diff(f) * (force[1:] + force[:-1]) / 2 * 60e-3
+    unit = E * H * LENGTH**2  # E h R²
+    assert np.abs(work + unit * np.diff(pi)).max() < 0.03 * np.abs(unit * np.diff(pi)).max()
