@@ -21,15 +21,16 @@ class Contraction:
     def __init__(self, rule: Rule, pairs: Pairs) -> None:
         w, tables = rule.weights, rule.tables
         self._symmetric = [table.symmetric(w, pairs.same) for table in tables]
-        self._skew = [table.skew(w, pairs.skew) for table in tables]
+        self._skew = [table.skew(w, pairs.skew) for table in tables] if pairs.skew else []
         self._cross = tables[0].cross(w, tables[1], pairs.cross) if pairs.cross else None
 
     def same(self, blocks: "Blocks", side: int) -> Array:
         """(entities, 9, pairs a <= b) of one side: the symmetric parts, then the skew parts."""
-        symmetric, skew = self._symmetric[side], self._skew[side]
-        K = np.empty((len(blocks.skew[side]), 9, symmetric.shape[1]))
+        symmetric = self._symmetric[side]
+        K = np.zeros((len(blocks.skew[side]), 9, symmetric.shape[1]))
         K[:, :6] = _product(blocks.symmetric[side], symmetric)
-        K[:, 6:] = _product(blocks.skew[side], skew)
+        if self._skew:
+            K[:, 6:] = _product(blocks.skew[side], self._skew[side])
         return K
 
     def cross(self, blocks: "Blocks") -> Array:

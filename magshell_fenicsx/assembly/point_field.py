@@ -36,3 +36,11 @@ class PointField(fem.Function):  # type: ignore[misc]  # dolfinx has no types
         """The values (cells * q, size) at some consecutive cells: a view, which changes with them."""
         first = cells[0] if len(cells) else 0
         return self.values[first : first + len(cells)].reshape(-1, self.values.shape[-1])
+
+
+def at_quadrature(field: fem.Function, points: Array) -> Array:
+    """(cells, points, components) of a field at points of the reference cell; (.., 3) of a meridian's plane vectors."""
+    size, V = field.function_space.dofmap.bs, field.function_space
+    shape = V.element.basix_element.tabulate(0, points)[0, :, :, 0]
+    found = np.asarray(shape @ field.x.array.reshape(-1, size)[V.dofmap.list])
+    return np.insert(found, 1, 0.0, axis=-1) if size == 2 else found

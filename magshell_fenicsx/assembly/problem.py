@@ -128,10 +128,10 @@ class FiniteElementSystem:
         """The state with the displacement of the nodes that move."""
         if self.moving is None:
             return state
-        self._at(state.u, state.mu)
+        self.at(state.u, state.mu)
         return State(np.array(self.u.x.array[: self.size]), state.mu)
 
-    def _at(self, u: Vector, mu: Amplitudes) -> None:
+    def at(self, u: Vector, mu: Amplitudes) -> None:
         """Set the displacement and the free parameters of the terms."""
         self._copy(u)
         self.place(mu)
@@ -140,7 +140,7 @@ class FiniteElementSystem:
 
     def gradient_of(self, u: Vector, mu: Amplitudes, forms: Sequence[fem.Form]) -> Vector:
         """The sum of compiled linear forms at a displacement over all ranks, zero at supports."""
-        self._at(u, mu)
+        self.at(u, mu)
         part: NDArray[np.float64] = np.zeros_like(self.u.x.array)
         for form in forms:
             fem.assemble_vector(part, form)
@@ -171,7 +171,7 @@ class FiniteElementSystem:
             self.moving.put(self.u.x.array, mu)
 
     def residual(self, u: Vector, mu: Amplitudes) -> Vector:
-        self._at(u, mu)
+        self.at(u, mu)
         factors = self._factors(mu)
         if self.noise is None:
             return self._summed(self._gradient(factors))
@@ -181,15 +181,15 @@ class FiniteElementSystem:
 
     def forces(self, u: Vector, mu: Amplitudes, name: str = "") -> Vector:
         """dPi/du at all nodes, of all terms or of one: of all at supports the forces of these on the shell."""
-        self._at(u, mu)
+        self.at(u, mu)
         return self._summed(self._gradient({name: 1.0} if name else self._factors(mu)), held=False)
 
     def load(self, u: Vector, mu: Amplitudes, name: str) -> Vector:
-        self._at(u, mu)
+        self.at(u, mu)
         return self._summed(self._column(mu, name))
 
     def potential(self, u: Vector, mu: Amplitudes, name: str) -> float:
-        self._at(u, mu)
+        self.at(u, mu)
         if self.moving and name in self.moving.names:
             here = float(self._gradient(self._factors(mu)) @ self.moving.rate(mu, name))
             for edge, A in self.moving.turning(mu, name):
@@ -204,7 +204,7 @@ class FiniteElementSystem:
     def curvature(self, u: Vector, mu: Amplitudes, name: str, other: str) -> float:
         if not {name, other} & self.coordinates:
             return 0.0  # amplitudes that multiply their terms
-        self._at(u, mu)
+        self.at(u, mu)
         if self.moving and {name, other} & self.moving.names:
             here = self._motion_curvature(self.moving, mu, *sorted((name, other), key=self.moving.names.__contains__))
             return float(self.comm.allreduce(here))
@@ -284,7 +284,7 @@ class FiniteElementSystem:
     def tangent(self, u: Vector, mu: Amplitudes, stress: Sequence[Weighted] = ()) -> PETSc.Mat | Skewed:
         with self.assembly:
             whole = [(weight, self.with_ghosts(v, mu)) for weight, v in stress]
-            self._at(u, mu)
+            self.at(u, mu)
             factors = self._factors(mu)
             K = (
                 self._assembler.tangent(factors, whole)

@@ -10,6 +10,8 @@ from typing import Annotated, Any, Literal, Self, TypeVar
 import numpy as np
 from pydantic import Field, ModelWrapValidatorHandler, ValidationError, model_validator
 
+from magshell_fenicsx.case.bodies.body import with_units
+from magshell_fenicsx.case.bodies.registered import Bodies
 from magshell_fenicsx.case.boundary import EDGES, BoundarySection
 from magshell_fenicsx.case.ensemble import EnsembleSection
 from magshell_fenicsx.case.expressions import is_formula
@@ -20,6 +22,7 @@ from magshell_fenicsx.case.imperfections.dimple import DimpleSection
 from magshell_fenicsx.case.imperfections.place import ImperfectionSection, places_with_units
 from magshell_fenicsx.case.imperfections.random import RandomSection
 from magshell_fenicsx.case.loading import Loading, ProgrammeStep, programme
+from magshell_fenicsx.case.loads.contact import ContactSection
 from magshell_fenicsx.case.loads.dead import DeadSection
 from magshell_fenicsx.case.loads.edge import EdgeSection, refuse_unheld
 from magshell_fenicsx.case.loads.growth import GrowthSection
@@ -85,6 +88,8 @@ class Case(WithParts):
     """Remanence and applied field, which is applied before the load"""
     natural: NaturalSection | None = None
     """The curvature and the size that the shell would have without stress"""
+    bodies: Bodies = Field(default_factory=dict)
+    """Name -> rigid body that presses on the shell, or stands in its way"""
     loading: Loading | None = None
     """The load after the field, without which the path ends with the field; or a list of steps, one after the other,
     in which the field is a step too"""
@@ -114,7 +119,12 @@ class Case(WithParts):
             for step, source in zip(programme(section.loading, field=False), sources, strict=False):
                 if isinstance(step.load, DeadSection | EdgeSection) and isinstance(source, dict):
                     parts[step.key] = {key: value for key, value in source.items() if key != "hold"}
-            for key in (*texts(parts, is_formula), *measured(data.get("natural")), *places_with_units(data["shell"])):
+            for key in (
+                *texts(parts, is_formula),
+                *measured(data.get("natural")),
+                *places_with_units(data["shell"]),
+                *with_units(data.get("bodies")),
+            ):
                 raise ValueError(f"{key}: has a unit, but the shell's lengths have none: give all of them one, or none")
         return section
 
@@ -241,6 +251,22 @@ class Case(WithParts):
         return self
 
     @model_validator(mode="after")
+    def _bodies_fit(self) -> Self:
+        for name, body in self.bodies.items():
+            if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,39}", name):
+                raise ValueError(f"bodies.{name}: a name is a letter, then letters, digits and _; at most 40")
+            if body.at.point is None:
+                self._on_shell(body.at.polar)
+        if self.bodies and self.model == "solid":
+            raise ValueError("bodies: press on a shell; of a solid give a force on a patch (kind: indentation, patch)")
+        for step in self.programme:
+            if isinstance(step.load, ContactSection):
+                moved, known = step.load.body, ", ".join(self.bodies) or "none: give it in bodies"
+                if (moved is None and len(self.bodies) != 1) or (moved is not None and moved not in self.bodies):
+                    raise ValueError(f"{step.key}.body: {moved or 'is missing'}; allowed: {known}")
+        return self
+
+    @model_validator(mode="after")
     def _programme_fits(self) -> Self:
         for step in self.programme:
             if isinstance(step.load, EdgeSection):
@@ -255,7 +281,14 @@ class Case(WithParts):
     def programme(self) -> tuple[ProgrammeStep, ...]:
         """Its steps; before a single load the natural shape grows, then the field."""
         grows = [key for key in ("stretch", "curvature") if getattr(self.natural, key, None) is not None]
-        return programme(self.loading, field=bool(self.lambda_m), natural=grows)
+        return programme(self.loading, field=bool(self.lambda_m), natural=grows, approaches=self.approaches)
+
+    @cached_property
+    def approaches(self) -> dict[str, str]:
+        """Body -> name of its approach, the amplitude; a single one needs no name beside it."""
+        steps: list[Step | None] = [*self.loading] if isinstance(self.loading, list) else [self.loading]
+        alone = len(self.bodies) == 1 and not any(isinstance(step, IndentationSection) for step in steps)
+        return {name: "approach" if alone else f"approach_{name}" for name in self.bodies}
 
     def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
         """A copy with some sections changed, which makes its programme anew."""

@@ -1,11 +1,12 @@
 """The kinds of steps, and the programme of a case: its steps with their numbers and amplitudes."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, TypeAlias
 
 from pydantic import Discriminator, Field, Tag
 
+from magshell_fenicsx.case.loads.contact import ContactSection
 from magshell_fenicsx.case.loads.dead import DeadSection
 from magshell_fenicsx.case.loads.edge import EdgeSection
 from magshell_fenicsx.case.loads.field import FieldBefore, FieldSection, RotationSection
@@ -24,6 +25,7 @@ OneStep: TypeAlias = Annotated[
     | GrowthSection
     | DeadSection
     | EdgeSection
+    | ContactSection
     | SourceStep
     | TimeSection,
     Field(discriminator="kind"),
@@ -64,7 +66,11 @@ class ProgrammeStep:
 
 
 def programme(
-    loading: Step | Sequence[Step] | None, *, field: bool, natural: Sequence[str] = ()
+    loading: Step | Sequence[Step] | None,
+    *,
+    field: bool,
+    natural: Sequence[str] = (),
+    approaches: Mapping[str, str] | None = None,
 ) -> tuple[ProgrammeStep, ...]:
     """The steps of a case: those of a list, or the natural shape, the field and then one load.
 
@@ -74,22 +80,28 @@ def programme(
         Whether the case has a field.
     natural
         What of its natural shape grows, stretch before curvature.
+    approaches
+        Body -> name of its approach.
     """
     if isinstance(loading, Sequence):
-        return _numbered(loading, [f"loading.{i}" for i in range(len(loading))])
+        return _numbered(loading, [f"loading.{i}" for i in range(len(loading))], approaches or {})
     grown = [] if isinstance(loading, GrowthSection) else [{"kind": "natural", key: 1.0} for key in natural]
     growth = [GrowthSection.model_validate(each) for each in grown]
     drives = isinstance(loading, FieldSection) or (isinstance(loading, TimeSection) and "field" in loading.history)
     first = [FieldBefore(kind="field")] if field and not drives else []
     given = [loading] if loading else []
     keys = [*("natural" for _ in growth), *("magnetic" for _ in first), *("loading" for _ in given)]
-    return _numbered([*growth, *first, *given], keys)
+    return _numbered([*growth, *first, *given], keys, approaches or {})
 
 
-def _numbered(loads: Sequence[Step], keys: Sequence[str]) -> tuple[ProgrammeStep, ...]:
+def _numbered(loads: Sequence[Step], keys: Sequence[str], approaches: Mapping[str, str]) -> tuple[ProgrammeStep, ...]:
     known: dict[str, list[Any]] = {}
     steps = []
     for number, (load, key) in enumerate(zip(loads, keys, strict=True), 1):
+        if isinstance(load, ContactSection):
+            body = str(load.body or next(iter(approaches), ""))
+            steps.append(ProgrammeStep(number, approaches.get(body, load.amplitude), key, load))
+            continue
         places = known.setdefault(load.amplitude, [])
         if load.place not in places:
             places.append(load.place)

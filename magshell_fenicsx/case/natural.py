@@ -5,8 +5,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from magshell_fenicsx.case.expressions import formula
-from magshell_fenicsx.case.expressions import Formula
+from magshell_fenicsx.case.expressions import Formula, formula
 from magshell_fenicsx.parts.section import _NUMBER, Section, in_units
 
 _PER_LENGTH = re.compile(

@@ -6,7 +6,7 @@ rho at each step. With rho = 1 the force is averaged along the step at Gauss poi
 rho < 1, but shows neither its acceleration, without which a resumed run is another one, nor a place for that average.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Protocol
 
@@ -102,6 +102,8 @@ class Integrator:
         c, force per mass and velocity.
     viscous
         Further forces.
+    driven
+        Amplitudes that are positions and move.
 
     Attributes
     ----------
@@ -117,9 +119,11 @@ class Integrator:
         rho: float,
         drag: float = 0.0,
         viscous: Viscous | None = None,
+        driven: Collection[str] = (),
     ) -> None:
         self.system, self.mass, self.loads, self.drag, self.viscous = system, mass, loads, drag, viscous
         self.rule = Rule.of(rho)
+        self._driven = frozenset(driven)
         self.factorisation = Factorisation(system.comm)
         self.steps = self.iterations = 0
         self._K: PETSc.Mat | None = None
@@ -215,7 +219,7 @@ class Integrator:
         a, v = self._rates(now, u, dt)
         mu = self.loads(t, True)
         potentials, moved = self._potentials(u, mu), u - now.u
-        work = sum(-0.5 * (now.mu[name] + mu[name]) * (potentials[name] - now.potentials[name]) for name in potentials)
+        work = sum(self._work(name, now, mu, potentials) for name in potentials)
         lost = self.drag * dot(comm, moved, self._times((1 - rule.alpha_f) * v + rule.alpha_f * now.v))
         if self.viscous:
             lost += dot(comm, moved, self.viscous.accept(now.u, u, dt))
@@ -223,7 +227,15 @@ class Integrator:
         return Motion(t, u, v, a, mu, now.work + work, now.dissipated + lost, potentials, error)
 
     def _potentials(self, u: Vector, mu: dict[str, float]) -> dict[str, float]:
-        return {name: self.system.potential(u, mu, name) for name in mu if name not in self.system.coordinates}
+        still = self.system.coordinates - self._driven
+        return {name: self.system.potential(u, mu, name) for name in mu if name not in still}
+
+    def _work(self, name: str, now: Motion, mu: Mapping[str, float], potentials: Mapping[str, float]) -> float:
+        """In a step: of a load on its displacement, of a position that moves on what it meets."""
+        a, b = now.potentials[name], potentials[name]
+        if name in self.system.coordinates:
+            return (a + b) / 2 * (mu[name] - now.mu[name])
+        return -(now.mu[name] + mu[name]) / 2 * (b - a)
 
     def _times(self, x: Vector) -> Vector:
         self._x.setArray(x)

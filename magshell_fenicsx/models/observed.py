@@ -8,8 +8,9 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.assembly.terms import LinearTerm
-from magshell_fenicsx.continuation.system import Vector
+from magshell_fenicsx.continuation.system import State, Vector
 from magshell_fenicsx.models.shell.applied import AppliedField
+from magshell_fenicsx.models.shell.contact import Pressing, Region
 from magshell_fenicsx.models.shell.dead_load import DeadLoads
 from magshell_fenicsx.models.shell.moved import Support
 from magshell_fenicsx.models.shell.parameters import Loads, Material
@@ -41,6 +42,8 @@ class Observed:
         The applied field, where it is known by its values.
     observed
         Column -> the form that a term observes, see `OwnTerm.observed`; of the modelled part.
+    contacts
+        Approach of a body -> what is known of its contact, and the integrals of its pressure.
     """
 
     system: FiniteElementSystem
@@ -54,6 +57,7 @@ class Observed:
     supports: Mapping[str, Support]
     without_potential: tuple[str, ...] = ()
     observed: Mapping[str, fem.Form]
+    contacts: dict[str, tuple[Pressing, Mapping[str, fem.Form]]]
     fields: Sequence[AppliedField] = ()
 
     def observe(self, volume: fem.Form, points: Mapping[str, Array]) -> None:
@@ -84,6 +88,21 @@ class Observed:
         """u/R (3,) at a named vertex."""
         here = u[self._probes[point]].reshape(-1, 3).sum(axis=0)
         return np.asarray(self.system.comm.allreduce(here))
+
+    def touching(self, state: State, approach: str) -> Region:
+        """Where a body touches."""
+        known, forms = self.contacts[approach]
+        self.system.place(state.mu)
+        pressure, moment = (self.system.integral(state.u, forms[name]) for name in ("pressure", "radius"))
+        return known.region(self.system.comm, moment / pressure if pressure else 0.0)
+
+    def cell_pressures(self, state: State) -> Array | None:
+        """The pressure of all bodies in each local cell, see `Pressing`; None without bodies."""
+        if not self.contacts:
+            return None
+        self.system.place(state.mu)
+        self.system.set(state.u)
+        return np.asarray(sum(known.cell_pressures() for known, _ in self.contacts.values()))
 
     def loaded_deflection(self, u: Vector, name: str) -> float:
         """w/R conjugate to a force: at its point, or averaged over its patch; of dead loads along themselves.

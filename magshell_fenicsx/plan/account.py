@@ -43,6 +43,9 @@ def account(case: Case, loads: Loads, model: str, mirror: Mirror | None) -> tupl
     if loads.moves:
         moved = dict.fromkeys(name for move in loads.moves for name in move.names)
         included.append(f"supports that move: {', '.join(moved)}")
+    for contact in loads.contacts:
+        k, kind = f"{contact.stiffness:.4g}", case.bodies[contact.body].kind
+        included.append(f"body {contact.body}: {kind} without friction, stiffness k R²/(E h) = {k}")
     if case.imperfections:
         included.append(_imperfections(case))
     for key, part in PARTS.items():

@@ -96,9 +96,16 @@ class Outline:
 
     def sample(self) -> Array:
         """Places (n, 3) all over the surface, with its centre, edges and axes among them."""
+        chart = self.charts()
+        if chart is None:
+            return in_space(read_msh(self.chart(None, ANY), {}).nodes)  # type: ignore[arg-type]
+        return self.embedding(chart)
+
+    def charts(self) -> Array | None:
+        """Their charts (n, 2); None for a mesh file."""
         shape = self.chart(None, ANY)
         if isinstance(shape, MeshFile):
-            return in_space(read_msh(shape, {}).nodes)
+            return None
         t = np.linspace(0, 1, 41)
         if isinstance(shape, DiscShape):
             rho, theta = np.meshgrid(shape.reach * t, 2 * np.pi * t)
@@ -108,7 +115,17 @@ class Outline:
         else:
             assert isinstance(shape, Grid)
             x, y = np.meshgrid(*(a + t * (b - a) for a, b in zip(shape.low, shape.high, strict=True)))
-        return self.embedding(np.column_stack([x.ravel(), y.ravel()]))
+        return np.column_stack([x.ravel(), y.ravel()])
+
+    def within(self, chart: Array) -> Array:
+        """The nearest place of the chart (2,) to one that may be beside it."""
+        shape = self.chart(None, ANY)
+        if isinstance(shape, DiscShape):
+            return np.asarray(chart / max(float(np.hypot(*chart)) / self.edge, 1.0))
+        if isinstance(shape, StripShape):
+            return np.clip(chart, [0, -shape.width / 2], [1, shape.width / 2])
+        assert isinstance(shape, Grid)
+        return np.clip(chart, shape.low, shape.high)
 
     @property
     def perfect(self) -> Embedding:

@@ -82,6 +82,8 @@ class Plan:
         R in the unit that results are told in.
     own
         One's own energies; `loads` has them too, after those of the case's parts.
+    pressed
+        Size of each body, and how far from its first contact it presses; over R.
     warning
         What is unphysical, if anything.
     within
@@ -103,6 +105,7 @@ class Plan:
     thickness: Thickness | None = None
     length: float = 1.0
     own: tuple[OwnTerm, ...] = ()
+    pressed: tuple[tuple[float, float], ...] = ()
     supports: tuple[str, ...] = ()
     reactions: bool = False
     warning: str | None = None

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from math import inf, radians
+from math import inf, radians, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,7 @@ from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.parameters import Condition, Held, Material
 from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.plan.account import account
+from magshell_fenicsx.plan.bodies.registered import body_leaves, contacts, pressed
 from magshell_fenicsx.plan.imperfections.flaw import Flaw, in_frame
 from magshell_fenicsx.plan.imperfections.registered import flaws
 from magshell_fenicsx.plan.imperfections.rims import MOST_RIMS, Spot, spots
@@ -36,11 +37,12 @@ from magshell_fenicsx.plan.names import refuse_unfit_ends
 from magshell_fenicsx.plan.outline import Chart, Outline, outline, refuse_beside
 from magshell_fenicsx.plan.own_terms import surface_terms
 from magshell_fenicsx.plan.plan import Plan
-from magshell_fenicsx.plan.sizes import Loaded, grading
+from magshell_fenicsx.plan.sizes import Loaded, grading, travel
 from magshell_fenicsx.plan.symmetry import Leaves, askew, left, mirror, unmirrored
 
 Array = NDArray[np.float64]
 Points = dict[str, Array]
+PRESSED = 0.08  # of sqrt(Rh): cells of a meridian that show the ring of a contact
 SAME_RIM = 0.02  # of the element size
 
 
@@ -64,6 +66,7 @@ def make_plan(case: Case, terms: Sequence[OwnTerm] = ()) -> Plan:
     energies = surface_terms(case, terms)
     parts = left(case, drawn, places, (*energies, *potentials(case)))
     parts += leaves(found, perfect, each=bool(case.patches))
+    parts += [body_leaves(contact) for contact in contacts(case, perfect, drawn, 0.0)]
     axisymmetric, plane = _symmetry(case, drawn, parts)
     half = plane is not None
     turn, beyond = 0.0, plane
@@ -86,7 +89,9 @@ def make_plan(case: Case, terms: Sequence[OwnTerm] = ()) -> Plan:
         loaded.append((points[point], [load for load in there if isinstance(load, IndentationSection)]))
     local = [] if isinstance(case.shell, MeshSurface) else spots(found.items(), perfect, turn)
     everywhere = min((flaw.size for flaw in found.values() if flaw.centre is None), default=inf)
-    size = grading(case, drawn, material.h, local, everywhere, loaded)
+    bodies = contacts(case, perfect, drawn, turn)
+    touched = [(drawn.inverse(c.front), travel(material.h, pressed(case, c.body), c.size), c.size) for c in bodies]
+    size = grading(case, drawn, material.h, local, everywhere, loaded, touched)
     drawn = imperfect(perfect, found, turn)
     shape = drawn.chart(beyond, size)
     if isinstance(shape, Grid) and beyond:  # what a point needs, its image needs too
@@ -102,7 +107,7 @@ def make_plan(case: Case, terms: Sequence[OwnTerm] = ()) -> Plan:
     if beyond:
         conditions = {name: c for name, c in conditions.items() if name not in beyond.lost} | {CUT: "symmetry"}
     within = {name: in_frame(found[key].inside, turn) for name, key in case.dimples.items()}
-    all_loads = loads(case, under, turn, beyond, energies, within)
+    all_loads = replace(loads(case, under, turn, beyond, energies, within), contacts=bodies)
     if span:
         refuse_unfit_ends([name for name in span.names if name], points, conditions, all_loads)
     model = "meridian" if axisymmetric else f"{'half' if half else 'full'} {case.model}"
@@ -127,6 +132,7 @@ def make_plan(case: Case, terms: Sequence[OwnTerm] = ()) -> Plan:
         within=within,
         supports=supports,
         reactions=bool(all_loads.moves) if case.reactions is None else case.reactions,
+        pressed=tuple((size, reach) for _, reach, size in touched),
         warning=sources_beside(case, sample if len(sample) else drawn.sample()),
     )
 
@@ -152,7 +158,16 @@ def meridian_vertices(plan: Plan, refinement: float) -> Array:
     assert span
     pole = span.names[0] is None
     h = plan.material.h / span.curvature
-    return graded_vertices(span.length, span.circles, h, refinement=refinement, axis=pole, largest=span.largest)
+    reach = max((one[1] for one in plan.pressed), default=0.0)
+    return graded_vertices(
+        span.length,
+        span.circles,
+        min([h, *(size / 3 for size, _ in plan.pressed)]),
+        refinement=refinement,
+        axis=pole,
+        largest=min(0.2 * sqrt(h), span.largest),
+        pressed=((reach if pole else span.length), PRESSED * sqrt(h)) if reach else None,
+    )
 
 
 def imperfect(perfect: Outline, found: Mapping[str, Flaw], turn: float) -> Outline:

@@ -16,11 +16,19 @@ from magshell_fenicsx.plan.imperfections.rims import Spot, images
 from magshell_fenicsx.plan.outline import Outline
 
 Array = NDArray[np.float64]
+RING = 0.35  # of sqrt(Rh): elements that show the ring of a contact
+Pressed = tuple[Array, float, float]  # place in the chart, how far from there the body presses, its size; over R
 Loaded = tuple[Array, Sequence[IndentationSection]]  # place in the chart, and the indentations there
 
 
 def grading(
-    case: Case, outline: Outline, h: float, spots: Sequence[Spot], everywhere: float, loaded: Sequence[Loaded]
+    case: Case,
+    outline: Outline,
+    h: float,
+    spots: Sequence[Spot],
+    everywhere: float,
+    loaded: Sequence[Loaded],
+    pressed: Sequence[Pressed] = (),
 ) -> Grading:
     """Sizes for 1e-4 in k_d and 1e-3 in F at degree 4; the case's own size is everywhere the same.
 
@@ -30,12 +38,15 @@ def grading(
         The local imperfections, and the largest size that shows the others.
     loaded
         The concentrated loads.
+    pressed
+        Where bodies press.
     """
     if case.mesh.size is not None or isinstance(case.shell, MeshSurface):
         return Grading([], _uniform(case, h))
     features = [*_rim(case, outline, h), *_imperfections(case, outline, h, spots)]
     for place, indentations in loaded:
         features += _load(case, h, place, indentations)
+    features += [feature for one in pressed for feature in _contact(case, h, *one)]
     return Grading(features, min(_largest(case, outline, h, local=bool(spots)), everywhere) / case.mesh.refinement)
 
 
@@ -96,3 +107,15 @@ def _load(case: Case, h: float, place: Array, indentations: Sequence[Indentation
         dent = (1.0 if case.model == "solid" else 0.85) * sqrt(2 * depth * h) + 0.5 * sqrt(h)
         features.insert(0, Disc((x, y), dent, sqrt(h) / case.mesh.refinement, _growth(case)))
     return features
+
+
+def travel(h: float, approach: float, size: float) -> float:
+    """How far from the first contact a body presses: a plane in a ring up to sqrt(2 R a), others on their front."""
+    return min(1.1 * sqrt(2 * (approach or 10.0) * h) + 0.5 * sqrt(h), size + sqrt(h))
+
+
+def _contact(case: Case, h: float, place: Array, reach: float, size: float) -> list[Feature]:
+    x, y = map(float, place)
+    centre, finer = (x, y), sqrt(h) / case.mesh.refinement
+    small = [Disc(centre, 1.5 * size, max(size / 3, 0.1 * h), 0.4)] if size < sqrt(h) else []
+    return [Disc(centre, reach, RING * finer, _growth(case)), *small]

@@ -130,6 +130,36 @@ OF_SOME_RUNS = (
         "source_work", "work of the source", "The same of its strength: -dΠ/d(factor of the field).", "reaction", si="J"
     ),
 )
+OF_CONTACTS = (
+    Quantity(
+        "approach_over_h",
+        "approach",
+        "Approach of a body along its direction; of several bodies, or beside an indentation, approach_over_h_NAME. "
+        "`force` is then the force on the body.",
+        "load",
+        "a/h",
+        "h",
+        "m",
+    ),
+    Quantity(
+        "penetration_over_h",
+        "penetration",
+        "Largest penetration of a body into the shell's face, an error of the penalty; negative: minus the least gap.",
+        "error",
+        "",
+        "h",
+        "m",
+    ),
+    Quantity(
+        "contact_radius",
+        "contact radius",
+        "Mean distance of the pressure from the body's axis, in the shell's length; over R if that has no unit.",
+        "place",
+    ),
+    Quantity("contact_inner", "contact from", "Least distance of the pressure from the body's axis.", "place"),
+    Quantity("contact_outer", "contact to", "Largest distance of the pressure from the body's axis.", "place"),
+)
+CONTACT = ("approach_over_h", "force", "penetration_over_h", "contact_radius", "contact_inner", "contact_outer")
 IN_TIME = (  # of runs with a step of kind: time
     Quantity(
         "time", "time", "Time of the motion; in seconds, or the case's own unit, with shell.density.", "time", "t"
@@ -141,7 +171,7 @@ IN_TIME = (  # of runs with a step of kind: time
         "work", "work", "Work of the loads in steps of kind: time, kinetic + stored + dissipated less what was stored."
     ),
 )
-QUANTITIES = {q.name: q for q in (*OF_EVERY_RUN, *OF_SOME_RUNS, *IN_TIME)}
+QUANTITIES = {q.name: q for q in (*OF_EVERY_RUN, *OF_SOME_RUNS, *OF_CONTACTS, *IN_TIME)}
 AMPLITUDES = {
     a.name: a
     for a in (
@@ -150,6 +180,7 @@ AMPLITUDES = {
         Amplitude("load", "load_factor", "w_over_h", "along the loads"),
         Amplitude("lambda_m", "lambda_m"),
         Amplitude("angle", "field_angle"),
+        Amplitude("approach", "approach_over_h", "force", ""),
         Amplitude("time", "time"),
     )
 }
@@ -174,6 +205,9 @@ def quantity(name: str) -> Quantity:
         return replace(of, name=name, words=f"{of.words} {again[2]}", symbol=of.symbol and f"F_{again[2]} R/(2πD)")
     if again := re.fullmatch(r"w_((force|load)(_\d+)?)_over_h", name):
         return _w(name, f"at {again[1].replace('_', ' ')}", f"Displacement conjugate to {again[1]}, as w_over_h.")
+    if again := re.fullmatch(rf"({'|'.join(CONTACT)})_([A-Za-z]\w*)", name):
+        of = QUANTITIES[again[1]]
+        return replace(of, name=name, words=f"{of.words} {again[2]}", note="")
     for column in ("reaction", *OF_SOURCES):
         if name.startswith(f"{column}_"):
             return replace(QUANTITIES[column], name=name, words=name.replace("_", " "))
@@ -189,7 +223,14 @@ def amplitude(name: str) -> Amplitude:
     """
     if again := re.fullmatch(r"(force|load)_\d+", name):
         return Amplitude(name, name, f"w_{name}_over_h", AMPLITUDES[again[1]].place)
+    if again := re.fullmatch(r"approach_(\w+)", name):
+        return Amplitude(name, f"approach_over_h_{again[1]}", f"force_{again[1]}", "")
     return AMPLITUDES.get(name) or Amplitude(name, name)
+
+
+def contact_columns(approach: str) -> tuple[str, ...]:
+    """The columns of a body, in the order of `CONTACT`."""
+    return tuple(column + approach.removeprefix("approach") for column in CONTACT)
 
 
 def axes_of(name: str, row: Collection[str] = ()) -> tuple[Quantity, Quantity]:
@@ -210,4 +251,5 @@ def axes_of(name: str, row: Collection[str] = ()) -> tuple[Quantity, Quantity]:
     over, drawn = quantity(own if own in row else varied.conjugate), quantity(varied.column)
     if varied.conjugate == "w_over_h":
         over = replace(over, note=varied.place)
-    return (drawn, over) if name in ("angle", "time") else (over, drawn)
+    sideways = name in ("angle", "time") or varied.column.startswith("approach_over_h")
+    return (drawn, over) if sideways else (over, drawn)

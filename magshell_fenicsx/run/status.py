@@ -86,6 +86,8 @@ def aim(scene: Scene, step: ProgrammeStep) -> Aim:
     target, value = load.target
     if target.quantity == "load":
         return Aim(varied.column, value * (scene.case.lambda_m if step.name == "lambda_m" else 1.0))
+    if step.name in scene.model.contacts:
+        return Aim(varied.conjugate, value)
     if step.name in scene.motions:
         return Aim(motion_columns(scene.plan.loads)[step.name], value)
     own = f"w_{step.name}_over_h"

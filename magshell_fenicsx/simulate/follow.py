@@ -9,6 +9,7 @@ from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.search import searched
 from magshell_fenicsx.simulate.steps import LOCATED, records_of
+from magshell_fenicsx.simulate.touch import refuse_penetration
 from magshell_fenicsx.simulate.transient import released
 from magshell_fenicsx.simulate.walked import Walked
 
@@ -41,11 +42,13 @@ def follow(scene: Scene, *, search: bool = True) -> Iterator[Record]:
             for record in walked:
                 last = record.label
                 yield replace(record, step=step.number)
+                refuse_penetration(scene, record.point.state)
             if isinstance(step.load, PathStep) and step.load.then == "snap" and record:
                 walked = Walked(released(scene, record))
                 for record in walked:
                     last = record.label
                     yield replace(record, step=step.number)
+                    refuse_penetration(scene, record.point.state)
         except Stopped as e:
             raise Stopped(f"{where}{e}") from None
         begin, state = state, walked.end

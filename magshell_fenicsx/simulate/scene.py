@@ -16,7 +16,7 @@ from magshell_fenicsx.case.loads.time import TimeSection
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.continuation.journal import Journal, NoJournal
 from magshell_fenicsx.continuation.listener import NoProgress, Progress
-from magshell_fenicsx.continuation.newton import BorderedNewton
+from magshell_fenicsx.continuation.newton import BorderedNewton, NewtonOptions
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.continuation.watch import Watch
 from magshell_fenicsx.mesh.frame import rotation
@@ -43,7 +43,7 @@ from magshell_fenicsx.plan.body import layers, neo_hookean
 from magshell_fenicsx.plan.plan import Plan
 from magshell_fenicsx.plan.planner import make_plan, meridian_vertices
 from magshell_fenicsx.platform.first import from_first
-from magshell_fenicsx.quantities.registry import IN_TIME, amplitude
+from magshell_fenicsx.quantities.registry import IN_TIME, amplitude, contact_columns
 from magshell_fenicsx.simulate.direction import directions, field_angle, field_size, turned
 
 Array = NDArray[np.float64]
@@ -93,7 +93,9 @@ class Scene:
             self.model = build_model(case, self.plan, comm)
         if not (self.plan.fixed or isinstance(self.model, MeridianModel)):
             refuse_loose(self.model.system, self.model.r0, self.unloaded().mu)
-        self.newton = BorderedNewton(self.model.system)
+        # a body's penetration changes over far less than h: factors of a state near by are no tangent's
+        options = NewtonOptions(fresh=0.0) if self.model.contacts else None
+        self.newton = BorderedNewton(self.model.system, options)
         self.journal: Journal = NoJournal()
         self.progress: Progress = NoProgress()
         self.setup_s = time.perf_counter() - start - self.model.kernels.seconds
@@ -122,7 +124,8 @@ class Scene:
 
     def unloaded(self) -> State:
         """The undeformed shell; amplitudes are zero, except user-defined ones with a value."""
-        amplitudes = {t.amplitude for t in self.model.system.terms if t.amplitude} | self.motions | set(self.sources)
+        own = {*self.motions, *self.sources, *self.model.contacts}
+        amplitudes = {t.amplitude for t in self.model.system.terms if t.amplitude} | own
         given = self._own_amplitudes
         return State(self.model.zero(), {name: given.get(name, 0.0) for name in sorted({*amplitudes, *given})})
 
@@ -154,6 +157,7 @@ class Scene:
             **self._observe_points(state),
             **{name: state.mu[name] for name in self._own_amplitudes},
             **self._observe_supports(state),
+            **self._observe_contacts(state),
             **self._observe_sources(state),
             **{
                 column: state.mu[term.name]
@@ -206,7 +210,8 @@ class Scene:
         moves = any(isinstance(s.load, TimeSection) or getattr(s.load, "then", None) for s in self.case.programme)
         clock = tuple(q.name for q in IN_TIME) if moves else ()
         sources = (*self.sources, *self.sources.values())
-        return (*factors, *displaced, *named, *own, *self._support_columns, *sources, *clock)
+        contacts = (column for name in self.model.contacts for column in contact_columns(name) if column != "force")
+        return (*factors, *displaced, *named, *own, *self._support_columns, *sources, *contacts, *clock)
 
     def stored(self, state: State, energy: float) -> float:
         """The energy of the shell itself: without the potentials of the loads."""
@@ -231,6 +236,16 @@ class Scene:
         if plan.reactions:
             frame = rotation(plan.azimuth)
             found |= observed_reactions(model, state, plan.mirror, frame, force, R)
+        return found
+
+    def _observe_contacts(self, state: State) -> dict[str, float]:
+        """Approach, force, penetration and radii of each body."""
+        model, h, found = self.model, self.plan.material.h, dict[str, float]()
+        for name in model.contacts:
+            at, force = model.touching(state, name), model.system.potential(state.u, state.mu, name)
+            values = (state.mu[name], -force / self.conjugate_unit(name), at.penetration / h)
+            radii = (self.plan.length * radius for radius in (at.radius, at.inner, at.outer))
+            found |= dict(zip(contact_columns(name), (*values, *radii), strict=True))
         return found
 
     def _observe_sources(self, state: State) -> dict[str, float]:
@@ -274,6 +289,8 @@ class Scene:
                 else self.plan.length
             )
             return -motion_size(self.plan.loads, name) / (force * arm * model.multiplicity)
+        if name in model.contacts:
+            return -model.force_unit * material.h
         if name in self.sources:
             force = (self.case.shell.modulus or 1.0) * material.h * self.plan.length**2
             arm = 1.0 if self.sources[name].startswith("source_force") else self.plan.length

@@ -6,6 +6,7 @@ from math import acos
 import numpy as np
 
 from magshell_fenicsx.case.loading import ProgrammeStep
+from magshell_fenicsx.case.loads.contact import ContactSection
 from magshell_fenicsx.case.loads.field import FieldBefore, FieldSection, RotationSection
 from magshell_fenicsx.case.loads.step import Gas, Now, PathStep
 from magshell_fenicsx.case.loads.time import TimeSection
@@ -18,10 +19,12 @@ from magshell_fenicsx.simulate.gas import gas
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.stage import Stage, staged
+from magshell_fenicsx.simulate.touch import touched
 from magshell_fenicsx.simulate.transient import motion
 from magshell_fenicsx.simulate.walked import Records, Walked, followed
 
 LOCATED = ("fold", "bifurcation")
+EASY, HARD = 4, 8  # matrices of a step along a contact, whose rim moves from point to point before it settles
 
 
 def records_of(scene: Scene, step: ProgrammeStep, state: State) -> Records:
@@ -38,6 +41,8 @@ def records_of(scene: Scene, step: ProgrammeStep, state: State) -> Records:
     if isinstance(load, RotationSection):
         return (yield from _rotation(scene, step, load, state))
     assert isinstance(load, PathStep)
+    if isinstance(load, ContactSection):
+        state = touched(scene, step, state)
     stage = stage_of(scene, step, state)
     drive = load.drive(_now(scene, step, state))
     if step.name == "pressure" and scene.model.without_potential and "control" not in load.model_fields_set:
@@ -45,6 +50,8 @@ def records_of(scene: Scene, step: ProgrammeStep, state: State) -> Records:
     path, start = stage.begin(step.name, drive.control, state, drive.first, drive.scale)
     if drive.step is not None:
         path = path.in_steps(StepOptions(drive.step, 2 * drive.step, 1e-4 * drive.step))
+    if isinstance(load, ContactSection):
+        path = path.in_steps(replace(path.options, easy=EASY, few=EASY, hard=HARD))
     if drive.end is not None and not drive.targets and load.until == "target":  # it is there
         yield Record("target", step.name, stage.point(start))
         return state

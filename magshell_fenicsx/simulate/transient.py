@@ -88,7 +88,7 @@ def motion(scene: Scene, load: TimeSection, state: State) -> Records:
     case, system = scene.case, scene.model.system
     loads = LoadsInTime(case, load, state)
     drag = float(in_units("1/second")(load.drag)) * (case.time_unit or 1.0)
-    integrator = Integrator(system, mass(scene.model), loads, load.rho_inf, drag, viscosity(scene, state))
+    integrator = Integrator(system, mass(scene.model), loads, load.rho_inf, drag, viscosity(scene, state), load.drives)
     u, v = state.u, state.v if isinstance(state, Moving) else 0.0 * state.u
     if load.push:
         u, v = _pushed(scene, load.push, state, v)

@@ -5,8 +5,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from magshell_fenicsx.case.expressions import is_formula
-from magshell_fenicsx.case.expressions import Formula
+from magshell_fenicsx.case.expressions import Formula, is_formula
 from magshell_fenicsx.case.loads.step import Count, Now, PathStep, Target, Until
 from magshell_fenicsx.parts.section import Section, in_units, or_number
 

@@ -26,7 +26,7 @@ class SourceSection(Section):
     kind: str
     name: SourceName | None = None
     """For steps and pictures; by default its number in the list, from 0"""
-    position: Position = [0.0, 0.0, 0.0]
+    position: Position = Field(default=[0.0, 0.0, 0.0])
     """Of its middle, or of the origin of its own axes [m]"""
     axis: Direction = Direction()
     """Direction of its own z axis, e3 by default"""

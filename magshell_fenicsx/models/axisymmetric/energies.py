@@ -19,6 +19,7 @@ from magshell_fenicsx.models.axisymmetric.pattern import pattern_field
 from magshell_fenicsx.models.shell import densities, edges
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.applied import AppliedField
+from magshell_fenicsx.models.shell.contact import Contact, Pressing, contact_energy, contact_pressure, pressed_radius
 from magshell_fenicsx.models.shell.densities import MagneticDensity
 from magshell_fenicsx.models.shell.energy import Density
 from magshell_fenicsx.models.shell.free import Constants, constants_of
@@ -29,6 +30,7 @@ from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.parameters import Magnetisation, Material
 
 INTERIOR = "interior edges"
+CONTACT = 6  # degree of the rule of a contact over that of the displacement: points are cheap on a meridian
 Facets = NDArray[np.int32]
 Integral = Callable[[Expr], ufl.Form]
 
@@ -166,6 +168,21 @@ class EnergyFactory:
             column: 2 * np.pi * self._cells(column, self._surface(term, of)).of(u)
             for column, of in term.observed.items()
         }
+
+    def contact(self, contact: Contact, u: fem.Function) -> tuple[Energy, Pressing, dict[str, ufl.Form]]:
+        """As that of `shell.terms`; the integrals are of the whole shell."""
+        rule, approach = CONTACT * self.degree, self.free.setdefault(contact.amplitude, self.constant(0.0))
+        known = Pressing(contact, self.material.h, self.r0, u, approach, rule, self.thickness)
+        j0, parameters = self.j0, (known.polynomial, self.constant(known.motion), approach)
+        dx = ufl.Measure("dx", domain=self.meridian.mesh, metadata={"quadrature_degree": rule})
+
+        def over(of: Callable[..., Expr]) -> Callable[[Jet], ufl.Form]:
+            return lambda v: of(j0, v, *parameters) * kin.area_ratio(j0) * dx
+
+        of_radius = pressed_radius(self.constant(contact.front), self.constant(contact.direction))
+        seen: dict[str, Callable[..., Expr]] = {"pressure": contact_pressure, "radius": of_radius}
+        integrals = {name: 2 * np.pi * over(of)(jets.revolved(u)) for name, of in seen.items()}
+        return Energy(f"contact {contact.body}", over(contact_energy), follow=known.follow), known, integrals
 
     def _surface(self, term: OwnTerm, of: Callable[..., Expr]) -> Callable[[Jet], Expr]:
         j0, parameters = self.j0, constants_of(term, self.meridian.mesh, self.free)

@@ -102,7 +102,14 @@ def make_meridian(
 
 
 def graded_vertices(
-    end: float, circles: Sequence[float], h: float, *, refinement: float = 1.0, axis: bool = True, largest: float = inf
+    end: float,
+    circles: Sequence[float],
+    h: float,
+    *,
+    refinement: float = 1.0,
+    axis: bool = True,
+    largest: float = inf,
+    pressed: tuple[float, float] | None = None,
 ) -> Array:
     """Vertices for 1e-7 in k_d at degree 4: cells of a fraction of sqrt(h), finer on the axis, if 0 is there.
 
@@ -113,9 +120,11 @@ def graded_vertices(
     circles
         Where the curvature jumps, rims of dimples: a vertex is put there.
     h
-        Thickness over R.
+        Thickness over R, or the smaller size of the cells on the axis.
     largest
         Of the cells, whatever the thickness.
+    pressed
+        Cells of a size up to a distance from the start, where bodies press.
 
     Notes
     -----
@@ -126,7 +135,10 @@ def graded_vertices(
     largest = min(0.2 * sqrt(h), largest) / refinement
 
     def size(s: Array) -> Array:
-        return np.minimum(smallest + growth * s, largest) if axis else np.full_like(s, largest)
+        found = np.minimum(smallest + growth * s, largest) if axis else np.full_like(s, largest)
+        if pressed:
+            found = np.minimum(found, pressed[1] / refinement + growth * np.maximum(0.0, s - pressed[0]))
+        return found
 
     corners = [0.0, *sorted({circle for circle in circles if circle < end}), end]
     return _equidistributed(corners, size)

@@ -12,7 +12,7 @@ import ufl
 from dolfinx import fem
 
 from magshell_fenicsx.assembly.kernels import KernelLog
-from magshell_fenicsx.assembly.parameter import make_parameters
+from magshell_fenicsx.assembly.parameter import FreeParameter, make_parameters
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.assembly.terms import FormTerm
 from magshell_fenicsx.continuation.system import Vector
@@ -119,6 +119,11 @@ class MeridianModel(Observed):
         self.energies += [factory.own(term) for term in loads.own]
         u = jets.revolved(self.u)
         self.observed = self.kernels.compile_all(factory.observed(term, u) for term in loads.own)
+        self.contacts = {}
+        for contact in loads.contacts:
+            pressed, known, integrals = factory.contact(contact, self.u)
+            self.energies.append(pressed)
+            self.contacts[contact.amplitude] = known, self.kernels.compile_all([integrals])
         for name, force in loads.forces.items():
             self.energies.append(pole_force(name, force.patch, self.force_unit, factory, self.kernels))
         self.load_size = {}
@@ -132,7 +137,7 @@ class MeridianModel(Observed):
             moments = [load for load in dead if isinstance(load, EdgeMoment)]
             terms += [self._moment(f"{name} moment {load.edge} {i}", load, name) for i, load in enumerate(moments)]
         pattern, held = next(term for term in terms if term.name == INTERIOR), self.held.held(V)
-        parameters = make_parameters(factory.free, terms, self.u, self.kernels)
+        parameters: dict[str, FreeParameter] = {**make_parameters(factory.free, terms, self.u, self.kernels)}
         parameters |= field_parameters(factory.fields, terms, self.u, self.kernels)
         self.fields = factory.fields
         self.system = FiniteElementSystem(

@@ -56,6 +56,12 @@ class Revolution:
         """The values of a field (1,) at the ends of all cells: (cells, 2)."""
         return self._at_ends(f)[0, :, :2, 0]
 
+    @property
+    def order(self) -> NDArray[np.int64]:
+        """The cells along the meridian."""
+        V = self._model.V
+        return np.argsort(V.tabulate_dof_coordinates()[V.dofmap.list].mean(axis=1)[:, 0])
+
     def _at_ends(self, f: fem.Function) -> Array:
         """(3, cells, 3, components) values, first and second derivatives, the last ones a little off the first end."""
         V = f.function_space

@@ -79,8 +79,7 @@ class Waves:
 
     def tangent(self, state: State, m: int) -> PETSc.Mat:
         """The matrix of Q_m at an axisymmetric state; it is reused by the next call."""
-        self._system.set(state.u)
-        self._system.place(state.mu)
+        self._system.at(state.u, state.mu)
         self._assemble(self._K, state, m, self.held(m))
         return self._K
 
@@ -99,8 +98,7 @@ class Waves:
         A jet of a wave is quadratic in m, and so Q_m is a polynomial of degree 4: its matrices are interpolated
         between five. Only those that are not positive definite are factored for their inertia.
         """
-        self._system.set(state.u)
-        self._system.place(state.mu)
+        self._system.at(state.u, state.mu)
         for part, node in zip(self._parts, self._nodes, strict=True):
             self._assemble(part, state, node, [])
         if not self._bands:

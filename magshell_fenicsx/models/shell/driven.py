@@ -88,7 +88,8 @@ class Here:
             return self._factor(*scaled) * self._along(moving[0])[0]
         C, slope = self._along(moving[0])  # the motion that is carried out first, or the only one
         A, v = self._velocity(moving[-1])
-        return self._factor() * (C @ A.T - np.einsum("nij,nj->ni", slope, self.x @ A.T + v))
+        rate: Array = C @ A.T - np.einsum("nij,nj->ni", slope, self.x @ A.T + v)
+        return self._factor() * rate
 
     def _factor(self, *by: str) -> float:
         """The product of all factors, differentiated by some amplitudes."""
@@ -109,11 +110,11 @@ class Here:
         motions = self.driven.motions
         number = next(i for i, motion in enumerate(motions) if motion.name == name)
         own = motions[number]
-        A = np.cross(np.eye(3), own.turn)
+        A = np.asarray(np.cross(np.eye(3), own.turn), dtype=np.float64)
         v = own.shift - A @ own.centre
         Q, t = carried(motions[number + 1 :], self.mu)
         A = Q @ A @ Q.T
-        return A, Q @ v - A @ t
+        return A, np.asarray(Q @ v - A @ t)
 
 
 def carried(motions: Sequence[Motion], mu: Mapping[str, float]) -> tuple[Array, Array]:

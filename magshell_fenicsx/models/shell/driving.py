@@ -33,8 +33,8 @@ class Amplitude:
 class FieldParameter:
     """An amplitude of a driven field, as `assembly.parameter.Parameter`.
 
-    The energy is linear in the field: of dB/dmu it is dPi/dmu. So the forms are those of the terms, with the polynomials
-    of the derivatives.
+    The energy is linear in the field: of dB/dmu it is dPi/dmu. So the forms are those of the terms, with the
+    polynomials of the derivatives.
     """
 
     constant: Amplitude

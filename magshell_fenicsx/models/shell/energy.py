@@ -43,6 +43,8 @@ class Density:
         2 on interior edges.
     work
         Of (r0, u, v, *parameters), linear in v: the virtual work of a load without potential, on cells.
+    quadrature
+        Degree of its rule on cells; None for `cell_quadrature`.
     """
 
     of: Callable[..., Expr]
@@ -52,6 +54,7 @@ class Density:
     facets: NDArray[np.int32] | None = None
     sides: int = 1
     work: Callable[..., Expr] | None = None
+    quadrature: int | None = None
 
     @property
     def on_edges(self) -> bool:

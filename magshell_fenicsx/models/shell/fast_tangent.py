@@ -125,8 +125,10 @@ def make_sites(
     cells = [t for t in found if t.density.facets is None and t.density.sides == 1]
     interior = [t for t in found if t.density.sides == 2]
     sites = []
-    if cells:
-        sites.append(Site(r0, cell_batches(V, cell_quadrature(degree), chosen), 1, cells, log, prestress))
+    for rule in dict.fromkeys(t.density.quadrature for t in cells):
+        here = [t for t in cells if t.density.quadrature == rule]
+        batches = cell_batches(V, rule or cell_quadrature(degree), chosen)
+        sites.append(Site(r0, batches, 1, here, log, None if rule else prestress))
     if interior:
         sites.append(Site(r0, interior_batches(V, edge_quadrature(degree), chosen), 2, interior, log))
     for term in found:

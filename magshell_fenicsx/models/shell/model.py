@@ -13,7 +13,7 @@ from dolfinx import fem
 from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.kernels import KernelLog
-from magshell_fenicsx.assembly.parameter import make_parameters
+from magshell_fenicsx.assembly.parameter import FreeParameter, make_parameters
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.assembly.sliding import Constraint, held_along
 from magshell_fenicsx.assembly.terms import LinearTerm, Term
@@ -179,6 +179,11 @@ class ShellModel(Observed):
             terms.append(factory.pressure(closing))
         terms += [factory.own(term) for term in loads.own]
         self.observed = self.kernels.compile_all(factory.observed(term) for term in loads.own)
+        self.contacts = {}
+        for contact in loads.contacts:
+            pressed, known, integrals = factory.contact(contact)
+            terms.append(pressed)
+            self.contacts[contact.amplitude] = known, self.kernels.compile_all([integrals])
         self.normals = {name: vertex_normal(self.r0, x) for name, x in midsurface.points.items()}
         terms += [self._force(name, force) for name, force in loads.forces.items()]
         on = SurfaceMeasures(self.r0, midsurface, degree) if loads.dead else None
@@ -199,7 +204,7 @@ class ShellModel(Observed):
             self._near = self.moving.cells, near
         fast = FastTangent(self.u, self._sites, held + mirrored, self._near)
         gradients = FastResidual(self.r0, self.u, degree, terms, self.kernels)
-        parameters = make_parameters(factory.free, terms, self.u, self.kernels)
+        parameters: dict[str, FreeParameter] = {**make_parameters(factory.free, terms, self.u, self.kernels)}
         parameters |= field_parameters(factory.fields, terms, self.u, self.kernels)
         self.fields = factory.fields
         self.system = FiniteElementSystem(

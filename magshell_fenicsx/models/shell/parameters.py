@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.motion import Motion
+from magshell_fenicsx.models.shell.contact import Contact
 from magshell_fenicsx.models.shell.driven import Driven, FieldInSpace
 from magshell_fenicsx.models.shell.natural import Natural
 from magshell_fenicsx.models.shell.own_term import OwnTerm
@@ -189,6 +190,7 @@ class Loads:
     own: tuple[OwnTerm, ...] = ()
     natural: Natural | None = None
     moves: tuple[Move, ...] = ()
+    contacts: tuple[Contact, ...] = ()
 
     @property
     def all_dead(self) -> tuple[DeadLoad, ...]:

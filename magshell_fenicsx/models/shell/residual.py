@@ -15,7 +15,7 @@ from magshell_fenicsx.assembly.sheets import Sheet
 from magshell_fenicsx.assembly.terms import Term
 from magshell_fenicsx.models.shell.energy import Density, ShellTerm, cell_quadrature, edge_quadrature
 from magshell_fenicsx.models.shell.gradients import FRAME, PointGradient, in_own_coordinates
-from magshell_fenicsx.models.shell.kinematics import CURVED, Jet
+from magshell_fenicsx.models.shell.kinematics import CURVED, FIRST, Jet
 from magshell_fenicsx.models.shell.sites import NAMES, at_points
 
 Array = NDArray[np.float64]
@@ -53,9 +53,9 @@ class FastResidual:
         on_cells = [term for term in found if not term.density.on_edges]
         on_edges = [term for term in found if term.density.on_edges]
         self._sites: list[_Site] = []
-        for amplitude in dict.fromkeys(term.amplitude for term in on_cells):
-            together = [term for term in on_cells if term.amplitude == amplitude]
-            self._sites.append(_Cells(r0, cell_quadrature(degree), together, log))
+        for kind in dict.fromkeys((term.amplitude, term.density.quadrature) for term in on_cells):
+            together = [term for term in on_cells if (term.amplitude, term.density.quadrature) == kind]
+            self._sites.append(_Cells(r0, kind[1] or cell_quadrature(degree), together, log))
         if on_edges:
             self._sites.append(_Edges(r0, edge_quadrature(degree), on_edges, log))
         self.names = frozenset(term.name for term in found)
@@ -79,7 +79,7 @@ class _Cells:
         self.names = [term.name for term in terms]
         X, w = cell_rule(degree)
         table = Table.tabulate(V.element.basix_element, X)
-        parts = [name for name in NAMES if any(name in term.density.parts for term in terms)]
+        parts = [name for name in NAMES if name in FIRST or any(name in term.density.parts for term in terms)]
         self._sheet, self._each = Sheet(table, w, [NAMES.index(part) for part in parts]), len(w)
         cells = np.arange(V.mesh.topology.index_map(2).size_local, dtype=np.int32)
         frames = cell_frames(V.mesh)

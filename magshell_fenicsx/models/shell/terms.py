@@ -14,6 +14,14 @@ from magshell_fenicsx.models.shell import densities, edges
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.antisymmetric import antisymmetric_edge
 from magshell_fenicsx.models.shell.applied import AppliedField
+from magshell_fenicsx.models.shell.contact import (
+    Contact,
+    Pressing,
+    contact_energy,
+    contact_pressure,
+    contact_quadrature,
+    pressed_radius,
+)
 from magshell_fenicsx.models.shell.energy import (
     Density,
     HessianTerm,
@@ -166,6 +174,18 @@ class TermFactory:
         arguments = (*self.jets(), *self._parameters(term))
         return {column: per_area(of)(*arguments) * self.dx() for column, of in term.observed.items()}
 
+    def contact(self, contact: Contact) -> tuple[ShellTerm, Pressing, dict[str, fem.Form]]:
+        """The energy of a body, what it knows of it, and the integrals of its pressure and of that times its radius."""
+        rule, approach = contact_quadrature(self.degree), self.free.setdefault(contact.amplitude, self._constant(0.0))
+        known = Pressing(contact, self.material.h, self.r0, self.u, approach, rule, self.thickness)
+        parameters = (known.polynomial, self._constant(known.motion), approach)
+        density = Density(per_area(contact_energy), parameters, ("r",), quadrature=rule)
+        term = self._cells(f"contact {contact.body}", density, follow=known.follow)
+        arguments, dx = (*self.jets(), *parameters), self.dx(rule)
+        of_radius = pressed_radius(self._constant(contact.front), self._constant(contact.direction))
+        seen: dict[str, Callable[..., Expr]] = {"pressure": contact_pressure, "radius": of_radius}
+        return term, known, {name: per_area(of)(*arguments) * dx for name, of in seen.items()}
+
     def _parameters(self, term: OwnTerm) -> tuple[fem.Constant, ...]:
         return constants_of(term, self._domain, self.free)
 
@@ -197,8 +217,8 @@ class TermFactory:
     def _penalised(self) -> tuple[Parameter, ...]:
         return *self._nu_h(), self._constant(self.sigma)
 
-    def dx(self) -> ufl.Measure:
-        metadata = {"quadrature_degree": cell_quadrature(self.degree)}
+    def dx(self, rule: int | None = None) -> ufl.Measure:
+        metadata = {"quadrature_degree": rule or cell_quadrature(self.degree)}
         return ufl.Measure("dx", domain=self._domain, metadata=metadata)
 
     def _edge_rule(self) -> dict[str, int]:
@@ -224,7 +244,7 @@ class TermFactory:
         linear: bool = False,
         follow: Callable[[], None] | None = None,
     ) -> ShellTerm:
-        energy, work = density.of(*self.jets(), *density.parameters) * self.dx(), None
+        energy, work = density.of(*self.jets(), *density.parameters) * self.dx(density.quadrature), None
         if density.work:
             v = kin.jet(ufl.TestFunction(self.u.function_space), self._domain)
             work = density.work(*self.jets(), v, *density.parameters) * self.dx()

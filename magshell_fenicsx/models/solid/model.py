@@ -13,7 +13,7 @@ from dolfinx import fem
 from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.kernels import KernelLog
-from magshell_fenicsx.assembly.parameter import make_parameters
+from magshell_fenicsx.assembly.parameter import FreeParameter, make_parameters
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.assembly.sliding import Constraint, held_along
 from magshell_fenicsx.assembly.terms import LinearTerm, Term
@@ -94,7 +94,7 @@ class SolidModel(Observed):
             shape = body_shape(loads.natural, body, V, free)
             growing["grown"] = lambda density: grown(density, shape)
         self.factory = factory = TermFactory(
-            body, self.u, neo_hookean, material.h, self.kernels, hinged, free=free, **growing
+            body, self.u, neo_hookean, material.h, self.kernels, hinged, free=free, fields=[], **growing
         )
         self._pattern = factory.distortion()
         self._held, planes, self.supports = supports(body, self.r0, conditions)
@@ -113,7 +113,7 @@ class SolidModel(Observed):
             self._terms += factory.pressure(material.classical_pressure, origin, potential=potential)
         self._terms += [factory.own(term) for term in loads.own]
         self.observed = self.kernels.compile_all(factory.observed(term) for term in loads.own)
-        self.load_size = {}
+        self.load_size, self.contacts = {}, {}
         for name, force in loads.forces.items():
             patch = outer_patch(body, V, force.point, force.patch, self.kernels)
             self._terms.append(LinearTerm(name, patch[0], self.force_unit * patch[1], self.u, name))
@@ -148,7 +148,7 @@ class SolidModel(Observed):
         if moving:
             near = moving.cells, make_sites(self.body, self.r0, self._terms, self.kernels, moving.cells)
         fast = FastTangent(self.u, self._sites, held, near)
-        parameters = make_parameters(factory.free, self._terms, self.u, self.kernels)
+        parameters: dict[str, FreeParameter] = {**make_parameters(factory.free, self._terms, self.u, self.kernels)}
         parameters |= field_parameters(factory.fields, self._terms, self.u, self.kernels)
         self.fields = factory.fields
         return FiniteElementSystem(

@@ -29,7 +29,8 @@ def vtp_content(lines: tuple[Array, ...]) -> bytes:
     import pyvista
     from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter  # type: ignore[import-untyped]
 
-    cells = [np.concatenate([[len(line)], start + np.arange(len(line))]) for start, line in _numbered(lines)]
+    starts = np.cumsum([0, *(len(line) for line in lines)])
+    cells = [np.r_[len(line), start + np.arange(len(line))] for start, line in zip(starts[:-1], lines, strict=True)]
     writer = vtkXMLPolyDataWriter()
     writer.SetInputData(pyvista.PolyData(np.concatenate(lines), lines=np.concatenate(cells)))
     writer.SetDataModeToAscii()
@@ -37,11 +38,6 @@ def vtp_content(lines: tuple[Array, ...]) -> bytes:
     writer.Write()
     content: bytes | str = writer.GetOutputString()
     return content if isinstance(content, bytes) else content.encode()
-
-
-def _numbered(lines: tuple[Array, ...]) -> list[tuple[int, Array]]:
-    starts = np.cumsum([0, *(len(line) for line in lines)])
-    return list(zip(starts.tolist(), lines, strict=False))
 
 
 def read_outlines(folder: Path, number: int) -> tuple[Array, ...]:

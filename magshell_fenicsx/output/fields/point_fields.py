@@ -1,10 +1,11 @@
 """Fields at a shell's points besides the displacement: strains, moments, magnetic fields and loads."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
+from magshell_fenicsx.models.shell.contact import Contact
 from magshell_fenicsx.models.shell.natural import CURVATURE, STRETCH, Natural
 from magshell_fenicsx.models.shell.parameters import ACROSS, Magnetisation, Material
 from magshell_fenicsx.models.shell.strains import NaturalFrame, TangentFrame, bending_moment, principal
@@ -24,6 +25,8 @@ class PointFields:
         The magnetisation, or None.
     thickness
         (cells, points) factor of h; None for 1.
+    contacts
+        Bodies that press.
 
     Attributes
     ----------
@@ -41,7 +44,9 @@ class PointFields:
         field: Magnetisation | None,
         thickness: Array | None,
         natural: Natural | None = None,
+        contacts: Sequence[Contact] = (),
     ) -> None:
+        self._contacts, self._h = contacts, material.h
         self._frame, self._nu, self._field, self._thickness = TangentFrame.of(r0), material.nu, field, thickness
         self._natural = natural and natural.at(r0[0], self._frame.n0)
         self.constant: dict[str, Array] = {}
@@ -71,6 +76,8 @@ class PointFields:
             deformed point, over mu_0 E / |Br|, so that its magnitude is lambda_m.
         tau
             (..., 3) torque, for a uniform field.
+        gap_over_h
+            (...) the least gap to a body.
         """
         frame, total = self._frame, {}
         E, K = frame.membrane_strain(u), frame.curvature_change(u)
@@ -89,7 +96,14 @@ class PointFields:
             found |= {"Br": carried(self._Br, u), "Ba": _applied(self._field, mu, frame.jet[0] + u[0])}
         if self._torque:
             found["tau"] = self._torque(np.moveaxis(u[1:3], 0, -2))
+        if self._contacts:
+            found["gap_over_h"] = self._gap(frame.jet[0] + u[0], mu)
         return found
+
+    def _gap(self, r: Array, mu: Mapping[str, float]) -> Array:
+        h, factor = self._h, 1.0 if self._thickness is None else self._thickness.ravel()
+        gaps = [c.gap(r.reshape(-1, 3), h * mu.get(c.amplitude, 0.0), h / 2 * factor)[0] for c in self._contacts]
+        return np.asarray(np.min(gaps, axis=0) / h).reshape(r.shape[:-1])
 
     def _geometry(self) -> SurfaceGeometry:
         r0 = self._frame.jet

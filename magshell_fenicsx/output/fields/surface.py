@@ -12,7 +12,7 @@ from dolfinx.cpp.io import perm_vtk
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from magshell_fenicsx.continuation.system import Vector
+from magshell_fenicsx.continuation.system import State, Vector
 from magshell_fenicsx.mesh.deviation import Deviated
 from magshell_fenicsx.mesh.frame import rotation
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
@@ -22,6 +22,7 @@ from magshell_fenicsx.output.fields.point_fields import PointFields
 
 TRIANGLE, LAGRANGE_TRIANGLE, LAGRANGE_HEXAHEDRON = 5, 69, 72  # VTK's numbers of cell types
 HEXAHEDRON_NODES = 27
+PRESSURE = "contact_pressure"  # of bodies, over E h/R: the mean over a cell
 W0 = "w0_over_h"  # the imperfections: the deviation of the drawn surface from the perfect one
 Array = NDArray[np.float64]
 
@@ -82,7 +83,8 @@ class SurfaceGatherer:
         self._cells = np.concatenate(cells) if self.comm.rank == 0 else numbers
         r = self._at_nodes(model.r0)
         factor = None if model.thickness is None else self._thickness(model.thickness)
-        self._fields = PointFields(r, model.material, model.loads.magnetic, factor, model.loads.natural)
+        loads = model.loads
+        self._fields = PointFields(r, model.material, loads.magnetic, factor, loads.natural, loads.contacts)
         self._mean = self._weighted_mean(numbers, map_.size_global)
         deviation = model.midsurface.deviation(self._places)
         if deviation is not None:
@@ -95,7 +97,11 @@ class SurfaceGatherer:
         """The displaced surface with its fields at the amplitudes mu, on rank 0; None on other ranks."""
         self._model.system.set(u)
         jet = self._at_nodes(self._model.u)
-        found = {name: self._averaged(values) for name, values in self._fields.of(jet, mu or {}).items()}
+        values = self._fields.of(jet, mu or {})
+        pressure = self._model.cell_pressures(State(u, dict(mu))) if mu else None
+        if pressure is not None:
+            values[PRESSURE] = np.repeat(pressure[: self._owned, None], len(self._places), axis=1)
+        found = {name: self._averaged(each) for name, each in values.items()}
         nodes = self._averaged(jet[0])
         return Surface(self._r0, nodes, self._n0, self._cells, self._constant | found) if self.comm.rank == 0 else None
 
@@ -138,9 +144,8 @@ class RevolvedGatherer:
     def __init__(self, model: MeridianModel, comm: MPI.Comm) -> None:
         self.comm, self._model, self._swept = comm, model, Revolution(model)
         factor = None if model.thickness is None else self._swept.scalars(model.thickness)
-        self._fields = PointFields(
-            self._swept.jets(model.r0), model.material, model.loads.magnetic, factor, model.loads.natural
-        )
+        r, loads = self._swept.jets(model.r0), model.loads
+        self._fields = PointFields(r, model.material, loads.magnetic, factor, loads.natural, loads.contacts)
         if isinstance(model.meridian.embedding, Deviated):
             s = np.sort(model.meridian.mesh.geometry.x[:, 0])
             w0 = model.meridian.embedding.w0(np.column_stack([s, 0 * s])) / model.material.h
@@ -152,7 +157,11 @@ class RevolvedGatherer:
         if self.comm.rank:
             return None
         self._model.system.set(u)
-        swept, found = self._swept, self._around(self._fields.of(self._swept.jets(self._model.u), mu or {}))
+        swept, values = self._swept, self._fields.of(self._swept.jets(self._model.u), mu or {})
+        pressure = self._model.cell_pressures(State(u, dict(mu))) if mu else None
+        if pressure is not None:
+            values[PRESSURE] = np.repeat(pressure[swept.order, None], 2, axis=1)
+        found = self._around(values)
         return Surface(swept.r0, swept.displacement(u), swept.n0, swept.cells, self._constant | found)
 
     def _around(self, fields: Mapping[str, Array]) -> dict[str, Array]:

@@ -24,6 +24,7 @@ LOADS = {
 }
 STRAINS = {"E_1": "larger principal membrane strain $E_1$", "E_2": "smaller principal membrane strain $E_2$"}
 MOMENTS = {"M_1": "larger principal bending moment $M_1R/D$", "M_2": "smaller principal bending moment $M_2R/D$"}
+CONTACT = {"gap_over_h": "gap, up to $h$", "contact_pressure": r"contact pressure $pR/(Eh)$"}
 CONSTANT = 1e-9  # a load that varies by less is drawn as constant
 ROUNDING = {"E_1": 1e-13, "M_1": 1e-8}  # smaller values are drawn as zero
 EVERYWHERE, PEAK = 0.997, 1.5  # colour limit: PEAK times this quantile of the area
@@ -114,6 +115,27 @@ def _principal(captions: dict[str, str]) -> Callable[[Surface, "pyvista.PolyData
     return views
 
 
+def _contact(surface: Surface, smooth: "pyvista.PolyData", h: float) -> list[View]:
+    """The gap and the pressure of bodies, from above them."""
+    if not CONTACT.keys() <= surface.fields.keys():
+        return []
+    camera = towards(surface.r0[np.argmin(surface.fields["gap_over_h"])])
+    most = float(surface.fields["contact_pressure"].max()) or 1.0
+    limits, colours = {"gap_over_h": (0.0, 1.0), "contact_pressure": (0.0, most)}, {"gap_over_h": "viridis_r"}
+    return [
+        View(
+            smooth,
+            np.asarray(smooth.point_data[name]),
+            limits[name],
+            colours.get(name, "magma_r"),
+            camera,
+            PANEL,
+            words,
+        )
+        for name, words in CONTACT.items()
+    ]
+
+
 def _limit(surface: Surface, first: str, second: str) -> float:
     """The colour limit of two fields: their largest magnitude, without peaks of small area such as at a point load."""
     size = np.maximum(np.abs(surface.fields[first]), np.abs(surface.fields[second]))
@@ -192,4 +214,5 @@ PICTURES = {
     "strains": Picture(_principal(STRAINS), panels),
     "moments": Picture(_principal(MOMENTS), panels),
     "fields": Picture(_fields, _with_legend),
+    "contact": Picture(_contact, panels),
 }

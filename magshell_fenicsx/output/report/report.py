@@ -29,6 +29,7 @@ PICTURES = {  # in the order of the report
     "magnetic_loads.png": "The magnetic energy read as loads on the deformed shell, at the last point.",
     "strains.png": "Strains of the mid-surface at the last point.",
     "moments.png": "Bending moments at the last point.",
+    "contact.png": "Gap and contact pressure of the bodies at the last point.",
     "fields.png": "Fields on the deformed shell at the last point.",
     "instabilities.png": "Null vectors at the instabilities, on the deformed shell: how it buckles.",
     "frequencies.png": "Natural frequencies squared along the path; below zero the shell is unstable.",

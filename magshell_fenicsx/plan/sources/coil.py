@@ -31,7 +31,7 @@ def coil(section: CoilSection, case: Case, key: str) -> Known:
 def to_polygon(x: Array, corners: Array) -> Array:
     """The distance (n,) of places (n, 3) from the nearest of the lines between corners (m, 3)."""
     found = np.full(len(x), np.inf)
-    for a, b in zip(corners, corners[1:], strict=False):
-        along = np.clip((x - a) @ (b - a) / ((b - a) @ (b - a)), 0.0, 1.0)
-        found = np.minimum(found, np.linalg.norm(x - a - along[:, None] * (b - a), axis=1))
+    for a, way in zip(corners, np.diff(corners, axis=0), strict=False):
+        along = np.clip((x - a) @ way / np.sum(way**2), 0.0, 1.0)
+        found = np.minimum(found, np.linalg.norm(x - a - along[:, None] * way, axis=1))
     return found

@@ -14,7 +14,7 @@ def by_formula(section: FormulaSource, case: Case, key: str) -> Known:
     R, formulas = case.shell.reference, FormulasInSpace([with_derivatives(t) for t in section.components], np.eye(3))
 
     def field(x: Array) -> tuple[Array, Array, Array]:
-        B, G, H = formulas(x / R)
+        B, G, H = formulas(np.asarray(x / R))
         return section.flux_density * B, section.flux_density / R * G, section.flux_density / R**2 * H
 
     return Known(field, [], "where there is no finite value or derivative of")

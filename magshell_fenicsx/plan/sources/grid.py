@@ -69,11 +69,11 @@ def read(file: Path, digest: str | None) -> tuple[list[Array], Array]:
         If it cannot be read, or is no rectilinear grid.
     """
     x, B = _vtk(file) if file.suffix in VTK else _table(file)
-    axes = [_places(along) for along in x.T]
+    axes = [_places(x[:, i]) for i in range(3)]
     shape = tuple(len(axis) for axis in axes)
     if min(shape) <= DEGREE:
         raise ScanError(f"has {' x '.join(map(str, shape))} places: a cubic spline needs four along each axis")
-    where = tuple(_nearest(axis, along) for axis, along in zip(axes, x.T, strict=True))
+    where = tuple(_nearest(axis, x[:, i]) for i, axis in enumerate(axes))
     values = np.full((*shape, 3), np.nan)
     values[where] = B
     if len(x) != np.prod(shape) or not np.isfinite(values).all():

@@ -70,4 +70,5 @@ def stencil() -> tuple[Array, Array, Array]:
                 for known, row in zip((values, first, second), (degree * rows[0], rows[1], third), strict=True):
                     known.append(part(row))
     inverse = np.linalg.pinv(np.array(values), rcond=1e-10)
-    return points, inverse @ np.array(first), inverse @ np.array(second)
+    first_weights, second_weights = (np.asarray(inverse @ np.array(rows), dtype=float) for rows in (first, second))
+    return points, first_weights, second_weights

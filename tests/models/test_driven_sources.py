@@ -15,7 +15,13 @@ from magshell_fenicsx.continuation.system import State
 
 MM = 1e-3
 PLATE = {"geometry": "plate", "length": "30 mm", "width": "12 mm", "thickness": "1 mm", "youngs_modulus": "1 MPa"}
-RING = {"geometry": "annulus", "radius": "30 mm", "inner_radius": "12 mm", "thickness": "1 mm", "youngs_modulus": "1 MPa"}
+RING = {
+    "geometry": "annulus",
+    "radius": "30 mm",
+    "inner_radius": "12 mm",
+    "thickness": "1 mm",
+    "youngs_modulus": "1 MPa",
+}
 MAGNET = {"kind": "cylinder", "diameter": "20 mm", "height": "10 mm", "polarization": "1.3 T"}
 ASIDE = {**MAGNET, "position": [0.035, 0.006, -0.02], "axis": {"polar": 25.0}, "name": "magnet"}
 COIL = {"kind": "coil", "diameter": "30 mm", "current": "500 A", "position": [0.01, 0.0, 0.03], "axis": {"polar": 60.0}}
@@ -72,32 +78,25 @@ def test_derivatives_by_the_amplitudes(kind: str) -> None:
     u = system.held(2e-4 * np.random.default_rng(1).standard_normal(system.size))
     start = scene(kind).unloaded().mu
     driven, found = list(scene(kind).sources), []
+    others = ("lambda_m", *driven)
     for size in (0.05, 0.4):
         mu = {**dict.fromkeys(start, 0.0), "lambda_m": 0.05}
         mu |= {name: size * (1 + i / 2) * (-1) ** i for i, name in enumerate(driven)}
 
-        def energy(mu: dict[str, float]) -> float:
-            return mu["lambda_m"] * system.potential(u, mu, "lambda_m")
+        def known(mu: dict[str, float]) -> tuple[np.ndarray, np.ndarray]:
+            """The residual, and all potentials: that of lambda_m times it is the energy that the amplitudes change."""
+            return system.residual(u, mu), np.array([system.potential(u, mu, name) for name in others])
 
         for name in driven:
-            near = [{**mu, name: mu[name] + side * step} for side in (-2, -1, 1, 2)]
-
-            def rate(of: Any, near: Any = near) -> Any:
-                a, b, c, d = (of(each) for each in near)
-                return (a - 8 * b + 8 * c - d) / (12 * step)
-
-            slope = system.potential(u, mu, name)
-            assert slope == pytest.approx(rate(energy), rel=1e-6)
-            column = system.load(u, mu, name)
-            difference = rate(lambda mu: system.residual(u, mu))
-            np.testing.assert_allclose(column, difference, atol=1e-6 * np.abs(column).max())
+            a, b, c, d = (known({**mu, name: mu[name] + side * step}) for side in (-2, -1, 1, 2))
+            rates = [(p - 8 * q + 8 * r - s) / (12 * step) for p, q, r, s in zip(a, b, c, d, strict=True)]
+            slope, column = system.potential(u, mu, name), system.load(u, mu, name)
+            assert slope == pytest.approx(mu["lambda_m"] * rates[1][0], rel=1e-6)
+            np.testing.assert_allclose(column, rates[0], atol=1e-6 * np.abs(column).max())
             if name in ("turn", "shift"):  # in a factor alone the energy is linear
                 found.append((slope, np.abs(column).max()))
-            for other in ("lambda_m", *driven):
-                bend = system.curvature(u, mu, name, other)
-                mixed = rate(lambda mu, other=other: system.potential(u, mu, other))
-                assert bend == pytest.approx(mixed, rel=1e-6, abs=1e-8 * abs(slope))
-                assert bend == pytest.approx(system.curvature(u, mu, other, name), rel=1e-9, abs=1e-12 * abs(slope))
+            bends = [system.curvature(u, mu, name, other) for other in others]
+            np.testing.assert_allclose(bends, rates[1], rtol=1e-6, atol=1e-8 * abs(slope))
     first, second = np.array(found).reshape(2, -1)
     assert (np.abs(second / first - 1) > 1e-2).all()
 
@@ -109,7 +108,7 @@ def test_tangent(kind: str) -> None:
     u, v = (system.held(size * rng.standard_normal(system.size)) for size in (1e-4, 1.0))
     moved = []
     for size in (0.1, 0.7):
-        mu = {name: size for name in scene(kind).unloaded().mu} | {"lambda_m": 2.0}
+        mu = dict.fromkeys(scene(kind).unloaded().mu, size) | {"lambda_m": 2.0}
         none = {**mu, "lambda_m": 0.0}
 
         def rate(of: Any) -> Any:
@@ -189,3 +188,28 @@ def test_newton_is_quadratic(kind: str) -> None:
     assert len(near) >= 4
     assert all(after <= 1e4 * before**2 + 1e-14 for before, after in pairwise(near))
     assert near[-1] < 1e-12
+
+
+def test_models_agree() -> None:
+    """A magnet below a rigid disc, moved: meridian, half and full shell have the same force on it; a solid is thick."""
+    disc = {"geometry": "disc", "radius": "25 mm", "thickness": "0.5 mm", "youngs_modulus": "1 MPa"}
+    coarse = {"mesh": {"degree": 3, "refinement": 0.5}}
+    found = []
+    for symmetry, sections in (
+        ("axisymmetric", {}),
+        ("half", coarse),
+        ("none", coarse),
+        ("half", {"model": "solid", "mesh": {"refinement": 0.5}}),
+    ):
+        one = made(
+            disc,
+            {"rim": "clamped"},
+            symmetry=symmetry,
+            magnetic={"remanent": {"flux_density": "60 mT"}, "applied": {"sources": [BELOW]}},
+            loading=[{"kind": "field", "points": 1}, {"kind": "source", "move": [0, 0, -0.01], "points": 1}],
+            **sections,
+        )
+        mu = dict.fromkeys(one.unloaded().mu, 0.5) | {"lambda_m": one.case.lambda_m}
+        found.append(one.observe(State(one.model.zero(), mu))["source_force"])
+    assert found[1:3] == pytest.approx([found[0]] * 2, rel=1e-5)
+    assert found[3] == pytest.approx(found[0], rel=2e-3)

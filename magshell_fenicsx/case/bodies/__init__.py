@@ -1,0 +1,1 @@
+"""The sections of rigid bodies that press on the shell, one file a kind."""

@@ -1,0 +1,17 @@
+"""A sphere."""
+
+from typing import Literal
+
+from magshell_fenicsx.case.bodies.body import BodySection, Size
+
+
+class SphereSection(BodySection):
+    """A ball."""
+
+    kind: Literal["sphere"]
+    radius: Size
+    """[the shell's length; over R if that has no unit]"""
+
+    @property
+    def ahead(self) -> float:
+        return self.radius

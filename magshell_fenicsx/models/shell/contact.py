@@ -1,0 +1,218 @@
+"""Rigid bodies that press on the shell: the penalty of the gap by its Taylor polynomial at each quadrature point.
+
+The gap between a body and the shell's face is g(x - a d) - h/2, with the body's signed distance g at approach zero, its
+approach a along d and the place x of the mid-surface. The penalty psi(-gap) is zero where the gap is open. As of an
+applied field (`applied`), the polynomial of second order in y = u - a d at the present y has the derivatives of the
+penalty itself, by the displacement and by the approach, for every shape of a body.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import basix
+import numpy as np
+import ufl
+from dolfinx import fem
+from mpi4py import MPI
+from numpy.typing import NDArray
+from ufl.core.expr import Expr
+
+from magshell_fenicsx.assembly.point_field import PointField, at_quadrature
+from magshell_fenicsx.models.shell.kinematics import Jet
+
+Array = NDArray[np.float64]
+Distance = Callable[[Array], tuple[Array, Array, Array]]  # places (n, 3) over R -> g (n,), dg (n, 3), d2g (n, 3, 3)
+SOFT = 1e-3  # of h: the penalty's stiffness grows from zero over this penetration
+PAIRS = np.triu_indices(3)
+SIZE = 3 + 1 + 3 + 6  # y*, psi*, its gradient, its Hessian by pairs i <= j
+PRESSED = 1e-3  # of the largest pressure: less does not count as contact
+
+
+@dataclass(frozen=True)
+class Contact:
+    """A rigid body, dimensionless and in the model's frame.
+
+    Attributes
+    ----------
+    body
+        Its name.
+    amplitude
+        Name of its approach, over h.
+    distance
+        Signed distance at approach zero, positive outside.
+    direction
+        Unit vector (3,) of the approach.
+    front
+        Place (3,) of its surface that goes ahead: radii of contact are distances from the axis through it.
+    stiffness
+        k of the penalty, over E h/R^2.
+    bound
+        Largest penetration that is allowed, over h.
+    size
+        Radius over R of what touches, such as a ball's; infinite for a plane.
+    """
+
+    body: str
+    amplitude: str
+    distance: Distance
+    direction: Array
+    front: Array
+    stiffness: float
+    bound: float
+    size: float
+
+    def gap(self, x: Array, approach: float, half: float | Array) -> tuple[Array, Array, Array]:
+        """The gap at places (n, 3) with its gradient and Hessian; `approach` and half the thickness over R."""
+        g, n, N = self.distance(x - approach * self.direction)
+        return g - half, n, N
+
+    def pressure(self, gap: Array, h: float) -> Array:
+        """Over E h/R."""
+        return penalty(-gap, self.stiffness, SOFT * h)[1]
+
+
+def contact_quadrature(degree: int) -> int:
+    """Degree of the rule: the pressure at the rim of a contact is narrower than an element."""
+    return 3 * degree
+
+
+def penalty(s: Array, k: float, soft: float) -> tuple[Array, Array, Array]:
+    """psi of a penetration s with two derivatives: psi'' grows from 0 to k over `soft`, and is continuous."""
+    t = np.maximum(s, 0.0)
+    full = t > soft
+    second = np.where(full, k, k * t / soft)
+    first = np.where(full, k * (t - soft / 2), k * t**2 / (2 * soft))
+    value = np.where(full, k * (t**2 / 2 - t * soft / 2 + soft**2 / 6), k * t**3 / (6 * soft))
+    return value, first, second
+
+
+def contact_energy(r0: Jet, u: Jet, P: Expr, motion: Expr, approach: Expr) -> Expr:
+    """psi per undeformed area from its polynomial P (`SIZE`,); `motion` is d for an approach of one."""
+    s = _moved(u, P, motion, approach)
+    pairs = enumerate(zip(*PAIRS, strict=True))
+    second = sum(P[7 + n] * s[int(i)] * s[int(j)] for n, (i, j) in pairs)
+    return P[3] + ufl.dot(_gradient(P), s) + second
+
+
+def contact_pressure(r0: Jet, u: Jet, P: Expr, motion: Expr, approach: Expr) -> Expr:
+    """The pressure on the shell per undeformed area, at the state of P."""
+    return ufl.sqrt(ufl.dot(_gradient(P), _gradient(P)))
+
+
+def pressed_radius(front: Expr, along: Expr) -> Callable[..., Expr]:
+    """The pressure times the distance from the axis of the approach."""
+
+    def density(r0: Jet, u: Jet, P: Expr, motion: Expr, approach: Expr) -> Expr:
+        x = r0.r + u.r - front
+        off = x - ufl.dot(x, along) * along
+        return contact_pressure(r0, u, P, motion, approach) * ufl.sqrt(ufl.dot(off, off))
+
+    return density
+
+
+def _moved(u: Jet, P: Expr, motion: Expr, approach: Expr) -> Expr:
+    return u.r - approach * motion - ufl.as_vector([P[i] for i in range(3)])
+
+
+def _gradient(P: Expr) -> Expr:
+    return ufl.as_vector([P[4 + i] for i in range(3)])
+
+
+@dataclass(frozen=True)
+class Region:
+    """Where a body touches, over R.
+
+    Attributes
+    ----------
+    penetration
+        The largest; while nothing touches it is negative, minus the least gap.
+    radius, inner, outer
+        Mean distance of the pressure from the axis of the approach, and its least and largest one; 0 without.
+    """
+
+    penetration: float
+    radius: float
+    inner: float
+    outer: float
+
+
+class Pressing:
+    """The polynomials of a contact at the quadrature points of a shell or a meridian.
+
+    Parameters
+    ----------
+    h
+        Thickness over R.
+    r0, u
+        Placement and displacement in one space; on a meridian along e_rho and e_z.
+    approach
+        The constant in the forms, over h.
+    degree
+        Of the quadrature.
+    thickness
+        What multiplies h; None for 1.
+
+    Attributes
+    ----------
+    polynomial
+        The parameter of the densities.
+    """
+
+    def __init__(
+        self,
+        contact: Contact,
+        h: float,
+        r0: fem.Function,
+        u: fem.Function,
+        approach: fem.Constant,
+        degree: int,
+        thickness: fem.Function | None = None,
+    ) -> None:
+        V = u.function_space
+        self.contact, self._h, self._u, self._approach = contact, h, u, approach
+        self.polynomial = PointField(V.mesh, degree, SIZE)
+        self._points, self._degree = self.polynomial.points, degree
+        self._r0 = at_quadrature(r0, self._points)
+        factor = 1.0 if thickness is None else at_quadrature(thickness, self._points)[..., 0].ravel()
+        self._half = h / 2 * factor
+        self._owned = V.mesh.topology.index_map(V.mesh.topology.dim).size_local
+        self._known: Array = np.empty(0)
+        self.gap: Array = np.empty(0)
+        self.follow()
+
+    @property
+    def motion(self) -> Array:
+        """The displacement (3,) of the body for an approach of one."""
+        return self._h * self.contact.direction
+
+    def follow(self) -> None:
+        """Renew the polynomials where displacement or approach have changed."""
+        y = at_quadrature(self._u, self._points) - float(self._approach.value) * self.motion
+        if np.array_equal(y, self._known):
+            return
+        self._known = y
+        self.gap, n, N = self.contact.gap((self._r0 + y).reshape(-1, 3), 0.0, self._half)
+        value, first, second = penalty(-self.gap, self.contact.stiffness, SOFT * self._h)
+        H = second[:, None, None] * n[:, :, None] * n[:, None, :] - first[:, None, None] * N
+        pairs = H[:, *PAIRS] * np.where(PAIRS[0] == PAIRS[1], 0.5, 1.0)
+        flat = [a.reshape(*y.shape[:2], -1) for a in (y, value, -first[:, None] * n, pairs)]
+        self.polynomial.renew(np.concatenate(flat, axis=-1))
+
+    def cell_pressures(self) -> Array:
+        """The mean pressure in each local cell, over E h/R: the ring of a contact is narrower than that of nodes."""
+        V = self._u.function_space
+        weights = basix.make_quadrature(V.mesh.basix_cell(), self._degree)[1]
+        size = np.linalg.norm(self.polynomial.values[..., 4:7], axis=-1)
+        return np.asarray(size @ weights / weights.sum())
+
+    def region(self, comm: MPI.Comm, radius: float) -> Region:
+        """Where the body touches; `radius` is the mean one."""
+        owned = slice(0, self._owned * len(self._points))
+        gap, x = self.gap[owned], (self._r0 + self._known).reshape(-1, 3)[owned] - self.contact.front
+        pressure, d = self.contact.pressure(gap, self._h), self.contact.direction
+        most = comm.allreduce(float(pressure.max(initial=0.0)), MPI.MAX)
+        from_axis = np.linalg.norm(x - (x @ d)[:, None] * d, axis=1)[pressure > PRESSED * most]
+        penetration = comm.allreduce(float(-gap.min(initial=np.inf)), MPI.MAX)
+        inner = comm.allreduce(float(from_axis.min(initial=np.inf)), MPI.MIN)
+        outer = comm.allreduce(float(from_axis.max(initial=0.0)), MPI.MAX)
+        return Region(penetration, radius, inner if most else 0.0, outer)

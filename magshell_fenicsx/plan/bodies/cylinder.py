@@ -1,0 +1,31 @@
+"""The distance from the round side of a cylinder."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magshell_fenicsx.case.bodies.cylinder import CylinderSection
+from magshell_fenicsx.plan.bodies.placed import Placed
+from magshell_fenicsx.plan.bodies.sphere import Sphere
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Cylinder:
+    """A `Distance`: that of a sphere, of places without their part along the unit vector `axis`."""
+
+    centre: Array
+    axis: Array
+    radius: float
+
+    def __call__(self, x: Array) -> tuple[Array, Array, Array]:
+        across = np.eye(3) - np.outer(self.axis, self.axis)
+        g, n, N = Sphere(np.zeros(3), self.radius)((x - self.centre) @ across)
+        return g, n, across @ N @ across
+
+
+def cylinder(section: CylinderSection, placed: Placed) -> Cylinder:
+    """See `Placed`."""
+    return Cylinder(placed.centre, placed.across(section.axis), section.radius / placed.R)

@@ -1,0 +1,62 @@
+"""The first contact of a body: free flight, which is no equilibrium path that arc length could measure."""
+
+from magshell_fenicsx.case.loading import ProgrammeStep
+from magshell_fenicsx.case.loads.contact import ContactSection
+from magshell_fenicsx.continuation.control import GivenLoad
+from magshell_fenicsx.continuation.system import State
+from magshell_fenicsx.simulate.record import Stopped
+from magshell_fenicsx.simulate.scene import Scene
+
+DEEP = tuple(2e-3 / 4**i for i in range(7))  # of h: how far past the first contact the path begins, at the first try
+NEAR = 1e-7  # of h: a smaller gap is none
+MOST = 1000  # approaches by the least gap
+
+
+def touched(scene: Scene, step: ProgrammeStep, state: State) -> State:
+    """The state just after the body of a step first touches; the given one if it touches, or its target is nearer.
+
+    Raises
+    ------
+    Stopped
+        If the body never meets the shell, or the first contact has no equilibrium.
+    """
+    load, name, h = step.load, step.name, scene.plan.material.h
+    assert isinstance(load, ContactSection)
+    region = scene.model.touching(state, name)
+    if region.penetration > NEAR * h or (load.approach is not None and load.approach <= state.mu[name]):
+        return state
+    for _ in range(MOST):
+        gap = -scene.model.touching(state, name).penetration / h
+        if gap <= NEAR:
+            break
+        state = state.with_(state.u, name, state.mu[name] + gap)
+        if load.approach is not None and state.mu[name] + DEEP[0] >= load.approach:
+            return state.with_(state.u, name, load.approach)
+    else:
+        raise Stopped("the body does not meet the shell")
+    reason = ""
+    for deep in DEEP:
+        a = state.mu[name] + deep
+        outcome = scene.newton.solve(state.with_(state.u, name, a), name, GivenLoad(name, a))
+        if outcome.converged:
+            return outcome.state
+        reason = outcome.reason
+    raise Stopped(f"no equilibrium found at the first contact: {reason}")
+
+
+def refuse_penetration(scene: Scene, state: State) -> None:
+    """See that no body penetrates more than its bound.
+
+    Raises
+    ------
+    Stopped
+        With the penetration and the stiffness that would halve it.
+    """
+    h = scene.plan.material.h
+    for contact in scene.plan.loads.contacts:
+        deep = scene.model.touching(state, contact.amplitude).penetration / h
+        if deep > contact.bound:
+            raise Stopped(
+                f"the penetration of the body {contact.body} is {deep:.3g} h, more than bodies.{contact.body}."
+                f"penetration: {contact.bound:g}; its stiffness is {contact.stiffness:.4g}: give four times as much"
+            )

@@ -1,0 +1,98 @@
+"""Cases with bodies: paths, folds and rings of contact against other models, stiffnesses and the point force."""
+
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command import magshell, read_path
+from conftest import CASES
+
+from magshell_fenicsx import Case, Result
+from magshell_fenicsx.run.run import run
+
+Row = dict[str, float]
+LENGTH = 90**-0.5  # sqrt(Rh) over R
+
+
+@cache
+def rows(file: str, *settings: str) -> list[Row]:
+    found: Result = run(Case.load(CASES / file, settings))
+    assert found.stopped is None
+    return [{**row} for row in found.rows]  # type: ignore[dict-item]
+
+
+def last(file: str, *settings: str) -> Row:
+    return rows(file, *settings)[-1]
+
+
+ONE = ("loading.approach=0.8", "loading.points=1")
+
+
+@pytest.mark.slow
+def test_plate() -> None:
+    """Flat up to a fold near 2.55 h, back to one at 2.50 h, then a dimple in a ring with the radius of a mirrored cap.
+
+    The plane of the plate cuts the sphere at sqrt(2 R a); a mirrored cap of the depth w has the radius sqrt(R w).
+    """
+    path = rows("plate_contact.yaml", "loading.points=4")
+    first, second = (row["approach_over_h"] for row in path if row["label"] == "fold")
+    assert 2.5 < second < first < 2.6
+    assert second == pytest.approx(2.5, abs=0.01)
+    assert max(row["penetration_over_h"] for row in path) < 1e-3
+    for row in path:
+        flat = abs(row["w_pole_over_h"] - row["approach_over_h"]) < 0.02
+        if row["label"] == "target":
+            assert flat == (row["approach_over_h"] < 2.5)
+            assert row["contact_inner"] <= row["contact_radius"] <= row["contact_outer"]
+    end = path[-1]
+    assert end["force"] == pytest.approx(13.97, rel=2e-3)
+    assert end["contact_radius"] == pytest.approx(np.sqrt(end["w_pole_over_h"]) * LENGTH, rel=0.1)
+
+
+@pytest.mark.slow
+def test_stiffness() -> None:
+    """Over four decades of it the force changes by less than 1e-3, with penetrations below 1e-3 h."""
+    found = [last("plate_contact.yaml", *ONE, f"bodies.plate.stiffness={k}") for k in ("2e4", "2e8")]
+    assert all(row["penetration_over_h"] < 1e-3 for row in found)
+    assert np.ptp([row["force"] for row in found]) < 1e-3 * found[0]["force"]
+    assert found[1]["penetration_over_h"] < 0.05 * found[0]["penetration_over_h"]
+
+
+@pytest.mark.slow
+def test_half_against_meridian() -> None:
+    """Triangles with quadrature of their own, 1e-3."""
+    at = ("loading.approach=0.3", "loading.points=1")
+    force = last("plate_contact.yaml", *at)["force"]
+    assert last("plate_contact.yaml", *at, "symmetry=half")["force"] == pytest.approx(force, rel=1e-3)
+
+
+def test_ball_and_rod_against_a_point_force() -> None:
+    """At the same displacement of the pole the real indenters need a little more force; both press by their units."""
+    ball, rod = (last(f"{kind}_contact.yaml", "loading.points=2") for kind in ("ball", "rod"))
+    case = "{kind: indentation, at: {polar: 0}, depth: 4, points: 2}"
+    point = last("pole_indentation.yaml", f"loading={case}")
+    stiffness = 0.563  # dF/d(w/h) there
+    for row, more in ((ball, 1.0036), (rod, 1.0017)):
+        force = row["force"] - stiffness * (row["w_pole_over_h"] - 4)
+        assert force == pytest.approx(more * point["force"], rel=5e-4)
+    assert rod["contact_radius"] == pytest.approx(0.2e-3, rel=0.1)  # in metres, at the rounded edge
+    assert ball["contact_outer"] < 0.02
+
+
+def test_force_control_and_a_held_force(tmp_path: Path) -> None:
+    """A ball with a weight: the approach follows; the weight stays while a pressure acts; then it is taken away."""
+    steps = (
+        "[{kind: contact, control: force, force: 1, points: 1},"
+        " {kind: pressure, control: load, until: target, pressure: 0.1, points: 1, hold: {approach: conjugate}},"
+        " {kind: contact, approach: -0.1, points: 1}]"
+    )
+    out = tmp_path / "out"
+    done = magshell("run", CASES / "ball_contact.yaml", f"--set=loading={steps}", "--out", out)
+    assert done.returncode == 0, done.stderr
+    ends = [row for row in read_path(out) if row["label"] == "target"]
+    force, approach = ([float(row[key]) for row in ends] for key in ("force", "approach_over_h"))
+    assert force == pytest.approx([1, 1, 0], abs=1e-9)
+    assert approach[0] == pytest.approx(0.3054, rel=1e-3)
+    assert approach[1] > approach[0]
+    assert (out / "contact.png").exists()
