@@ -138,7 +138,16 @@ class FiniteElementSystem:
         for term in self.terms:
             term.follow()
 
-    def _with_ghosts(self, u: Vector, mu: Amplitudes) -> NDArray[np.float64]:
+    def gradient_of(self, u: Vector, mu: Amplitudes, forms: Sequence[fem.Form]) -> Vector:
+        """The sum of compiled linear forms at a displacement over all ranks, zero at supports."""
+        self.at(u, mu)
+        part: NDArray[np.float64] = np.zeros_like(self.u.x.array)
+        for form in forms:
+            fem.assemble_vector(part, form)
+        return self._summed(part)
+
+    def with_ghosts(self, u: Vector, mu: Amplitudes) -> NDArray[np.float64]:
+        """All nodes' displacement on this rank, of those that move too."""
         self._copy(u)
         self.place(mu)
         return np.array(self.u.x.array)
@@ -274,7 +283,7 @@ class FiniteElementSystem:
 
     def tangent(self, u: Vector, mu: Amplitudes, stress: Sequence[Weighted] = ()) -> PETSc.Mat | Skewed:
         with self.assembly:
-            whole = [(weight, self._with_ghosts(v, mu)) for weight, v in stress]
+            whole = [(weight, self.with_ghosts(v, mu)) for weight, v in stress]
             self.at(u, mu)
             factors = self._factors(mu)
             K = (

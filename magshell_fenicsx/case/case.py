@@ -38,6 +38,7 @@ from magshell_fenicsx.case.source import CaseError, Source, override, read_sourc
 from magshell_fenicsx.case.sources.source import SourceSection
 from magshell_fenicsx.case.stability import StabilitySection
 from magshell_fenicsx.case.surfaces import CapSurface, MeshSurface, RevolutionSurface, Surface, SurfaceSection
+from magshell_fenicsx.case.viscosity import refuse_unfit_viscosity
 from magshell_fenicsx.parts.part import Part, Scales
 from magshell_fenicsx.parts.registered import PARTS, WithParts
 from magshell_fenicsx.parts.section import Section, or_number, texts
@@ -271,6 +272,7 @@ class Case(WithParts):
             if isinstance(step.load, EdgeSection):
                 refuse_unheld(step.key, step.load, self.boundary.conditions())
         density = self.time_unit is not None and self.shell.with_units
+        refuse_unfit_viscosity(self.shell, density=density, plain=self.model == "shell" and not self.natural)
         whole = isinstance(self.loading, list)
         refuse_unfit_steps(self.programme, self.magnetic, self.lambda_m, whole=whole, density=density)
         return self
@@ -357,10 +359,8 @@ class Case(WithParts):
     @property
     def time_unit(self) -> float | None:
         """R √(ρ/E), that times are over: in seconds where the case has units; None without a density."""
-        shell = self.shell
-        if shell.density is None or shell.youngs_modulus is None:
-            return None
-        return float(shell.reference * np.sqrt(shell.density / shell.youngs_modulus))
+        density, modulus = self.shell.density, self.shell.youngs_modulus
+        return float(self.shell.reference * np.sqrt(density / modulus)) if density and modulus else None
 
     @property
     def outside(self) -> dict[str, str | None]:

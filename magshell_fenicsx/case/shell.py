@@ -4,8 +4,10 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
+from magshell_fenicsx.case.history import Time
 from magshell_fenicsx.case.imperfections.dimple import DimpleSection
 from magshell_fenicsx.case.imperfections.registered import Imperfections
+from magshell_fenicsx.case.viscosity import Branches
 from magshell_fenicsx.parts.section import Density, Length, Pressure, Section
 
 
@@ -31,6 +33,10 @@ class ShellSection(Section):
     """Poisson's ratio ν"""
     density: Density | None = Field(default=None, gt=0)
     """Density ρ; with it frequencies are in hertz"""
+    viscosity: Time | None = None
+    """Of Kelvin and Voigt in steps of kind: time: viscosity over Young's modulus"""
+    relaxation: Branches = Field(default=[])
+    """Branches of Maxwell in steps of kind: time, relaxed before each of these"""
     defect: DimpleSection | None = None
     """One dimple of a hemisphere; for more, or elsewhere, see imperfections"""
     imperfections: Imperfections = Field(default=[])

@@ -13,8 +13,10 @@ import numpy as np
 from pydantic import BeforeValidator, Field, ModelWrapValidatorHandler, PrivateAttr, model_validator
 
 from magshell_fenicsx.case.expressions import Formula, formula
+from magshell_fenicsx.case.history import Time
 from magshell_fenicsx.case.imperfections.dimple import DimpleSection
 from magshell_fenicsx.case.imperfections.registered import Imperfections
+from magshell_fenicsx.case.viscosity import Branches
 from magshell_fenicsx.parts.section import Section, in_units, or_number, texts
 
 Positive = Annotated[float, Field(gt=0)]
@@ -37,6 +39,10 @@ class SurfaceSection(Section):
     """Poisson's ratio ν"""
     density: Annotated[float, or_number("kilogram/metre**3", Positive), Field(gt=0)] | None = None
     """Density ρ; with it frequencies are in hertz [mass/length³]"""
+    viscosity: Time | None = None
+    """Of Kelvin and Voigt in steps of kind: time: viscosity over Young's modulus"""
+    relaxation: Branches = Field(default=[])
+    """Branches of Maxwell in steps of kind: time, relaxed before each of these"""
     thickness_factor: Formula | dict[str, Annotated[float, Field(gt=0, le=100)]] | None = None
     """Multiplies h: a formula of x, y, z over R, or of a mesh patch -> number"""
     imperfections: Imperfections = Field(default=[])

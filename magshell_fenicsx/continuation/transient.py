@@ -6,7 +6,7 @@ rho at each step. With rho = 1 the force is averaged along the step at Gauss poi
 rho < 1, but shows neither its acceleration, without which a resumed run is another one, nor a place for that average.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Protocol
 
@@ -28,16 +28,16 @@ Loads = Callable[[float, bool], dict[str, float]]  # mu(t), at a jump before or 
 
 
 class Viscous(Protocol):
-    """A force on a step from u0 to u1 that depends on the strains between them."""
+    """Forces that depend on the strains along a step."""
 
-    def force(self, u0: Vector, u1: Vector, dt: float) -> Vector:
-        """The force, zero at supports."""
+    def force(self, u0: Vector, u1: Vector, v: Vector, part: float, dt: float) -> Vector:
+        """The force at a part of the step from u0 to u1, with the velocity v there; zero at supports."""
 
-    def add_tangent(self, K: PETSc.Mat, dt: float) -> None:
-        """Add the derivative of the force by u1, at the displacements of the last `force`."""
+    def stiffness(self, dt: float, rate: float) -> float:
+        """Its derivative by u1, in parts of the tangent; dv/du at the end is `rate`."""
 
-    def accept(self, u0: Vector, u1: Vector, dt: float) -> float:
-        """Go on from u1; what the step has dissipated."""
+    def accept(self, u0: Vector, u1: Vector, dt: float) -> Vector:
+        """Go on from u1; the latest force."""
 
 
 @dataclass(frozen=True)
@@ -102,6 +102,8 @@ class Integrator:
         c, force per mass and velocity.
     viscous
         Further forces.
+    driven
+        Amplitudes that are positions and move.
 
     Attributes
     ----------
@@ -117,9 +119,11 @@ class Integrator:
         rho: float,
         drag: float = 0.0,
         viscous: Viscous | None = None,
+        driven: Collection[str] = (),
     ) -> None:
         self.system, self.mass, self.loads, self.drag, self.viscous = system, mass, loads, drag, viscous
         self.rule = Rule.of(rho)
+        self._driven = frozenset(driven)
         self.factorisation = Factorisation(system.comm)
         self.steps = self.iterations = 0
         self._K: PETSc.Mat | None = None
@@ -131,7 +135,7 @@ class Integrator:
         mu = self.loads(t, False)
         r = self.system.residual(u, mu) + self.drag * self._times(v)
         if self.viscous:
-            r = r + self.viscous.force(u, u, 1.0)
+            r = r + self.viscous.force(u, u, v, 1.0, 0.0)
         M = self.mass.copy()
         here = M.getDiagonal()
         here.setArray((here.array_r == 0).astype(float))
@@ -192,7 +196,7 @@ class Integrator:
         for part, weight in rule.forces:
             at = now.u + part * (u - now.u)
             r = r + weight * self.system.residual(at, self.loads(now.t + part * dt, True))
-        return r + self.viscous.force(now.u, u, dt) if self.viscous else r
+        return r + self.viscous.force(now.u, u, (1 - f) * v + f * now.v, 1 - f, dt) if self.viscous else r
 
     def _factor(self, now: Motion, u: Vector, dt: float) -> None:
         """Factor the derivative of `_unbalanced` by u, with one tangent for all parts of the step."""
@@ -204,11 +208,9 @@ class Integrator:
             self._K = K.duplicate()
             self._K.setOption(PETSc.Mat.Option.SYMMETRIC, True)
         K.copy(self._K, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
-        self._K.scale(part)
+        self._K.scale(part * (1 + (self.viscous.stiffness(dt, rule.gamma / (rule.beta * dt)) if self.viscous else 0)))
         inertia = (1 - rule.alpha_m) / (rule.beta * dt**2) + self.drag * part * rule.gamma / (rule.beta * dt)
         self._K.axpy(inertia, self.mass, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
-        if self.viscous:
-            self.viscous.add_tangent(self._K, dt)
         self.factorisation.factor(Skewed(self._K, part * tangent.N) if isinstance(tangent, Skewed) else self._K)
         self._factored = dt
 
@@ -217,15 +219,23 @@ class Integrator:
         a, v = self._rates(now, u, dt)
         mu = self.loads(t, True)
         potentials, moved = self._potentials(u, mu), u - now.u
-        work = sum(-0.5 * (now.mu[name] + mu[name]) * (potentials[name] - now.potentials[name]) for name in potentials)
+        work = sum(self._work(name, now, mu, potentials) for name in potentials)
         lost = self.drag * dot(comm, moved, self._times((1 - rule.alpha_f) * v + rule.alpha_f * now.v))
         if self.viscous:
-            lost += self.viscous.accept(now.u, u, dt)
+            lost += dot(comm, moved, self.viscous.accept(now.u, u, dt))
         error = abs(rule.beta - 1 / 6) * dt**2 * max_abs(comm, a - now.a) / self.system.length
         return Motion(t, u, v, a, mu, now.work + work, now.dissipated + lost, potentials, error)
 
     def _potentials(self, u: Vector, mu: dict[str, float]) -> dict[str, float]:
-        return {name: self.system.potential(u, mu, name) for name in mu if name not in self.system.coordinates}
+        still = self.system.coordinates - self._driven
+        return {name: self.system.potential(u, mu, name) for name in mu if name not in still}
+
+    def _work(self, name: str, now: Motion, mu: Mapping[str, float], potentials: Mapping[str, float]) -> float:
+        """In a step: of a load on its displacement, of a position that moves on what it meets."""
+        a, b = now.potentials[name], potentials[name]
+        if name in self.system.coordinates:
+            return (a + b) / 2 * (mu[name] - now.mu[name])
+        return -(now.mu[name] + mu[name]) / 2 * (b - a)
 
     def _times(self, x: Vector) -> Vector:
         self._x.setArray(x)

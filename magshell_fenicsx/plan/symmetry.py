@@ -15,6 +15,7 @@ from magshell_fenicsx.case.loads.dead import DeadLoadSection, DeadSection
 from magshell_fenicsx.case.loads.edge import EdgeSection
 from magshell_fenicsx.case.loads.field import RotationSection
 from magshell_fenicsx.case.loads.step import Step
+from magshell_fenicsx.case.loads.time import TimeSection
 from magshell_fenicsx.mesh.mirror import ROUNDING, Y0, Mirror
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.plan import natural
@@ -68,9 +69,17 @@ def left(case: Case, outline: Outline, indented: Mapping[str, Array], terms: Seq
         *(_field(case, outline) if case.magnetic and case.lambda_m else []),
         *_natural(case, outline),
         *_loads(case, outline, indented),
+        *_viscous(case),
         *_named(case, outline),
         *(_energy(term, outline) for term in terms),
     ]
+
+
+def _viscous(case: Case) -> list[Leaves]:
+    """A shell in motion is viscous in its surface, not on a meridian."""
+    moves = any(isinstance(s.load, TimeSection) or getattr(s.load, "then", None) for s in case.programme)
+    viscous = case.shell.viscosity is not None or case.shell.relaxation
+    return [Leaves("its viscosity is that of a surface", [], lambda mirror: True)] if moves and viscous else []
 
 
 def common_azimuth(vectors: Vectors) -> float | None:

@@ -14,6 +14,7 @@ from magshell_fenicsx.output.store.table import LOCATED, Row
 from magshell_fenicsx.platform import sources
 from magshell_fenicsx.platform.environment import fast_blas, versions
 from magshell_fenicsx.quantities.registry import amplitude
+from magshell_fenicsx.run.snaps import snaps
 from magshell_fenicsx.simulate.adapt.choice import Adapted
 from magshell_fenicsx.simulate.adapt.ending import History, NoResult
 from magshell_fenicsx.simulate.scene import Scene
@@ -132,6 +133,7 @@ def summary(result: Result, total_s: float) -> dict[str, Any]:
         "sensitivities": result.sensitivities,
         "knockdown": result.knockdown,
         "barrier": result.barrier,
+        "snaps": snaps(result.rows),
         "frequencies": [
             {"point": number, "omega2": [mode.eigenvalue for mode in modes]}
             for number, modes in result.frequencies.items()

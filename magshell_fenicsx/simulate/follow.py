@@ -3,12 +3,14 @@
 from collections.abc import Iterator
 from dataclasses import replace
 
+from magshell_fenicsx.case.loads.step import PathStep
 from magshell_fenicsx.continuation.point import Point
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.search import searched
 from magshell_fenicsx.simulate.steps import LOCATED, records_of
 from magshell_fenicsx.simulate.touch import refuse_penetration
+from magshell_fenicsx.simulate.transient import released
 from magshell_fenicsx.simulate.walked import Walked
 
 
@@ -35,12 +37,18 @@ def follow(scene: Scene, *, search: bool = True) -> Iterator[Record]:
     for step in steps:
         where = f"step {step.number} of {len(steps)} ({step.kind}): " if isinstance(scene.case.loading, list) else ""
         scene.progress.beginning(step.number)
-        walked, last = Walked(records_of(scene, step, state)), ""
+        walked, last, record = Walked(records_of(scene, step, state)), "", None
         try:
             for record in walked:
                 last = record.label
                 yield replace(record, step=step.number)
                 refuse_penetration(scene, record.point.state)
+            if isinstance(step.load, PathStep) and step.load.then == "snap" and record:
+                walked = Walked(released(scene, record))
+                for record in walked:
+                    last = record.label
+                    yield replace(record, step=step.number)
+                    refuse_penetration(scene, record.point.state)
         except Stopped as e:
             raise Stopped(f"{where}{e}") from None
         begin, state = state, walked.end

@@ -14,11 +14,16 @@ from magshell_fenicsx.continuation.system import State, Vector, dot, max_abs
 from magshell_fenicsx.continuation.transient import Integrator, Motion, TimeSteps, TimeStopped, advance
 from magshell_fenicsx.models.mass import mass
 from magshell_fenicsx.models.modes import ShellModes
+from magshell_fenicsx.models.shell.model import ShellModel
+from magshell_fenicsx.models.shell.viscous import Branch, Viscosity
 from magshell_fenicsx.parts.section import in_units
 from magshell_fenicsx.simulate.record import Label, Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.walked import Records
 
+AWAY = 0.05  # displacement from a fold, in lengths
+DAMPED = 0.1  # part of the critical drag of a mode
+LONGEST, MOST = 2000.0, 500  # of a snap, in radians of that mode, and its rows
 QUIET = 1e-6  # kinetic energy over its largest value below which a shell may be at rest
 SMALL = 1e-6  # deflection of a mode of size one that does not give its sign
 NEAR = 1e-2  # distance to the equilibrium, in lengths, below which it is
@@ -83,7 +88,7 @@ def motion(scene: Scene, load: TimeSection, state: State) -> Records:
     case, system = scene.case, scene.model.system
     loads = LoadsInTime(case, load, state)
     drag = float(in_units("1/second")(load.drag)) * (case.time_unit or 1.0)
-    integrator = Integrator(system, mass(scene.model), loads, load.rho_inf, drag)
+    integrator = Integrator(system, mass(scene.model), loads, load.rho_inf, drag, viscosity(scene, state), load.drives)
     u, v = state.u, state.v if isinstance(state, Moving) else 0.0 * state.u
     if load.push:
         u, v = _pushed(scene, load.push, state, v)
@@ -119,11 +124,54 @@ def motion(scene: Scene, load: TimeSection, state: State) -> Records:
     return Moving(point.state.u, point.state.mu, now.v)
 
 
+def viscosity(scene: Scene, state: State) -> Viscosity | None:
+    """Of the shell at rest in a state; None without."""
+    case, shell = scene.case, scene.case.shell
+    if shell.viscosity is None and not shell.relaxation:
+        return None
+    assert isinstance(scene.model, ShellModel)
+    found = []
+    for branch in shell.relaxation:
+        size = float(in_units("pascal")(branch.modulus))
+        ratio = size / (shell.youngs_modulus or 1.0) if isinstance(branch.modulus, str) else size
+        found.append(Branch(ratio, time_of(case, branch.time)))
+    return Viscosity(scene.model, state.mu, time_of(case, shell.viscosity or 0.0), found)
+
+
+def released(scene: Scene, fold: Record) -> Records:
+    """The records of a snap from a fold to rest, all loads being constant; its return value is the state at its end.
+
+    The shell leaves the fold along the path's direction there, and is damped as its second mode of vibration, in part
+    of the critical drag: the first one has no frequency at a fold.
+
+    Raises
+    ------
+    Stopped
+        If the point is no fold of the model itself, or the shell does not come to rest.
+    """
+    if fold.label != "fold" or fold.mode:
+        raise Stopped(f"then: snap: the step ends at a {fold.mode or fold.label}, not at a fold of the model itself")
+    state, system, unit = fold.point.state, scene.model.system, scene.case.time_unit or 1.0
+    own = [mode.eigenvalue for mode in ShellModes(scene.model).lowest(state, 3) if not mode.label]
+    omega = float(np.sqrt(max(own[1:])))
+    load = TimeSection(
+        kind="time",
+        duration=LONGEST * unit / omega,
+        points=MOST,
+        drag=2 * DAMPED * omega / unit,
+        until="rest",
+    )
+    away = scene.model.system.held(fold.point.du)
+    size = AWAY * system.length / max_abs(system.comm, away)
+    return (yield from motion(scene, load, State(state.u + size * away, state.mu)))
+
+
 def _journalled(
     scene: Scene, integrator: Integrator, now: Motion, dt: float, ends: list[float], steps: TimeSteps, jumps: set[float]
 ) -> tuple[Motion, float, Point]:
     """The motion at the last of some times, from the journal if it is there, as two of its points."""
-    first, second = scene.journal.replay(), None
+    memory = integrator.viscous is not None  # of a branch's strains, which the journal has no place for: computed again
+    first, second = (None if memory else scene.journal.replay()), None
     if isinstance(first, Point):
         second = scene.journal.replay()
     if isinstance(first, Point) and isinstance(second, Point):
@@ -144,7 +192,7 @@ def _journalled(
     pivots = scene.newton.factor_at(state).negative_pivots
     point = Point(state, now.t, now.v, dt, pivots, pivots, *spent)
     rest = Point(State(now.a, now.potentials), now.work, 0.0 * now.a, now.dissipated, 0, 0, error=now.error)
-    for part in (rest,) if isinstance(first, Point) else (point, rest):
+    for part in () if memory else (rest,) if isinstance(first, Point) else (point, rest):
         scene.journal.record(part)
     return now, dt, point
 

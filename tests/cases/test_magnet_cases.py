@@ -51,7 +51,7 @@ def rod(position: tuple[float, float, float]) -> tuple[float, float]:
     y = np.vstack([s, np.zeros((5, 41))])
     for load in (0.1, 0.4, 1.0):
         found = solve_bvp(
-            lambda s, y, load=load: rates(s, y, load), lambda a, b: np.array([*a[:3], *b[3:]]), s, y, tol=1e-6
+            lambda s, y, load=load: rates(s, y, load), lambda a, b: np.array([*a[:3], *b[3:]]), s, y, tol=1e-5
         )
         assert found.success
         s, y = found.x, found.y
@@ -70,7 +70,7 @@ def test_magnet_strip(place: tuple[float, float, float] | None) -> None:
     np.testing.assert_allclose(tip, rod(place or (40e-3, 0.0, -60e-3)), rtol=1e-5)
 
 
-PAST = ("mesh={degree: 3, refinement: 0.3}",)
+PAST = ("mesh={degree: 2, refinement: 0.3}",)
 
 
 @pytest.mark.slow
@@ -91,6 +91,8 @@ def test_magnet_past_strip() -> None:
     begin, end = (next(row for row in reversed(rows) if row["step"] == step) for step in (1, 3))
     assert end["tip_uz"] == pytest.approx(begin["tip_uz"], rel=1e-8)
     f, pi, force = (np.array([row[key] for row in way[2]], dtype=float) for key in ("source", "energy", "source_force"))
-    work = np.diff(f) * (force[1:] + force[:-1]) / 2 * 60e-3
-    unit = E * H * LENGTH**2  # E h R²
-    assert np.abs(work + unit * np.diff(pi)).max() < 0.03 * np.abs(unit * np.diff(pi)).max()
+    near = (np.abs(np.diff(f)) < 0.05) & (np.abs(np.diff(force)) < 0.15 * np.abs(force).max())  # trapezoidal rule
+    assert near.sum() > 10
+    work = (np.diff(f) * (force[1:] + force[:-1]) / 2 * 60e-3)[near]
+    energy = (E * H * LENGTH**2 * np.diff(pi))[near]  # over E h R²
+    assert np.abs(work + energy).max() < 0.02 * np.abs(energy).max()

@@ -10,9 +10,11 @@ from command import started
 
 from magshell_fenicsx import Case, Scene
 from magshell_fenicsx.case.source import CaseError, Source
-from magshell_fenicsx.run.rows import columns
+from magshell_fenicsx.run.rows import columns, rows
 from magshell_fenicsx.run.run import run
+from magshell_fenicsx.run.snaps import snaps
 from magshell_fenicsx.simulate.follow import follow
+from magshell_fenicsx.simulate.trace import trace
 
 STRIP = {
     "shell": {"geometry": "strip", "radius_to_thickness": 50, "poisson_ratio": 0.0, "width": 0.2},
@@ -65,6 +67,29 @@ def test_a_sudden_pressure_doubles_the_deflection(symmetry: str) -> None:
     assert found["w_pole_over_h"][-1] == pytest.approx(w, rel=1e-8)
     assert found["label"][-1] == "target"
     assert found["kinetic"][-1] == 0
+
+
+def test_a_cap_snaps_and_goes_on() -> None:
+    """Released at its fold it comes to rest where a static path by arc length comes to at the same pressure."""
+    shell = {"geometry": "cap", "polar": 20, "radius": 1.0, "thickness": 0.02, "poisson_ratio": 0.3}
+    base = {"shell": shell, "boundary": {"rim": "clamped"}, "symmetry": "axisymmetric", "mesh": {"refinement": 0.5}}
+    snap = {"kind": "pressure", "until": "limit", "then": "snap"}
+    scene = Scene(case_of(base, snap))
+    records = list(follow(scene))
+    (fold,) = [record for record in records if record.label == "fold" and not record.mode]
+    rest, p = records[-1], fold.point.state.mu["pressure"]
+    assert rest.label == "target"
+    path = trace(scene, "pressure", until="target", targets=[1.01 * p], first=0.1)  # first reached beyond both folds
+    far = [record.point.state for record in path if record.label == "target"][-1]
+    *_, back = trace(scene, "pressure", far, control="load", until="target", targets=[p])
+    assert rest.point.state.u == pytest.approx(back.point.state.u, abs=1e-6 * 0.02)
+    found = rows(scene, records)
+    (made,) = snaps(found)
+    assert made["time"] > 0
+    assert 0 < made["overshoot"] < 1
+    first, last = found[made["point"]], found[made["rest"]]
+    push = 0.05  # of h: its energy is of third order
+    assert made["dissipated"] == pytest.approx(first["energy"] - last["energy"], rel=push)
 
 
 HISTORIES = {

@@ -158,6 +158,9 @@ class PathStep(Step):
     control: str
     until: Until
     points: Count = 10
+    then: Literal["snap"] | None = None
+    """What follows the fold that ends the step with `until: limit`: `snap` releases the shell, which moves under its
+    loads, lightly damped, until it rests on the branch that it snaps to; the next step goes on from there"""
     branches: bool = False
     """Follow both directions of the branch at the first bifurcation too, to the target or for `points` steps"""
     sensitivities: bool = False
@@ -179,6 +182,8 @@ class PathStep(Step):
         if self.until in ("points", "zero") and by != "arc":
             why = "counts steps by arc length" if self.until == "points" else "passes the largest load"
             raise ValueError(f"until: {self.until} {why}: it goes with control: arc")
+        if self.then and (self.until != "limit" or any(how != "load" for how in self.hold.values())):
+            raise ValueError("then: snap: goes with until: limit, and with loads that are held")
         return self
 
     @property

@@ -54,16 +54,20 @@ def bending(r0: Jet, u: Jet, nu: Expr, h: Expr, natural: Forms | None = None) ->
     return stiffness / 2 * koiter(K - natural.bend, natural.up, nu)
 
 
+def moment_of(K: Expr, r0: Jet, nu1: Expr, nu2: Expr, nu: Expr) -> Expr:
+    """(1 - nu) K_nunu + nu tr K."""
+    K_nunu = K[0, 0] * nu1**2 + 2 * K[0, 1] * nu1 * nu2 + K[1, 1] * nu2**2
+    return (1 - nu) * K_nunu + nu * ufl.tr(kin.mixed(K, kin.inverse_metric(r0)))
+
+
 def normal_moment(
     r0: Jet, u: Jet, nu1: Expr, nu2: Expr, nu: Expr, h: Expr, natural: Forms | None = None
 ) -> tuple[Expr, Expr]:
     """M_nunu = D [(1 - nu) K_nunu + nu tr K] for the unit conormal nu^1, nu^2, and D; M_nunu works on b_nunu."""
     K = kin.curvature_change(r0, u)
     if natural is None:
-        K_nunu = K[0, 0] * nu1**2 + 2 * K[0, 1] * nu1 * nu2 + K[1, 1] * nu2**2
-        trace = ufl.tr(kin.mixed(K, kin.inverse_metric(r0)))
         D = bending_stiffness(h, nu)
-        return D * ((1 - nu) * K_nunu + nu * trace), D
+        return D * moment_of(K, r0, nu1, nu2, nu), D
     K = K - natural.bend
     covector = ufl.dot(kin.metric(r0), ufl.as_vector([nu1, nu2]))
     raised = ufl.dot(natural.up, covector)

@@ -119,8 +119,10 @@ class ShellModel(Observed):
             grown = loads.natural.on(midsurface.patches, cells.size_local + cells.num_ghosts)
             loads = self.loads = replace(loads, natural=grown)
             shape = Shape.of(natural_field(grown, *places(self.r0), self.V), grown, free)
-        factory = TermFactory(self.r0, self.u, material, self.sigma, degree, self.kernels, factor, shape, free)
-        interior = factory.interior_edges(folded=midsurface.read and largest_fold(self.r0, degree) > FOLD)
+        folded = midsurface.read and largest_fold(self.r0, degree) > FOLD
+        of_shell = material, self.sigma, degree, self.kernels, factor, shape, free, folded
+        self.factory = factory = TermFactory(self.r0, self.u, *of_shell)
+        interior = factory.interior_edges()
         terms: list[Term] = [factory.membrane(), factory.bending(), interior]
         held: list[Constraint] = []
         mirrored: list[Constraint] = []
@@ -208,7 +210,7 @@ class ShellModel(Observed):
         self.system = FiniteElementSystem(
             self.u, terms, held + mirrored, interior, material.h, fast, gradients, parameters, self.moving
         )
-        self._factory, self._interior, self._held, self.mirror = factory, interior, held, mirror
+        self._interior, self._held, self.mirror = interior, held, mirror
         self._on_mirror = facets("symmetry")
         self.observe(self.kernels.compile("volume energy", volume), midsurface.points)
 
@@ -217,7 +219,7 @@ class ShellModel(Observed):
         """The modes that a half model does not see; None for a whole one. Compiles a kernel."""
         if self.multiplicity == 1:
             return None
-        edges = self._factory.antisymmetric_edges(self._on_mirror, self.mirror.normal)
+        edges = self.factory.antisymmetric_edges(self._on_mirror, self.mirror.normal)
         held = self._held + [held_along(self.V, 1, self._on_mirror, along) for along in self.mirror.in_plane]
         sites = self._sites + make_sites(self.r0, self.degree, [edges], self.kernels)
         fast = FastTangent(self.u, sites, held)

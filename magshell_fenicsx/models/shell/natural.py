@@ -204,13 +204,13 @@ class Shape:
 
 def _forms(r0: Jet, field: Expr, bent: Expr | None, stretched: Expr | None) -> Forms:
     a0, up, n0 = kin.metric(r0), kin.inverse_metric(r0), kin.normal(r0)
-    kappa = ufl.zero((2, 2)) if bent is None else bent * _covariant(r0, field, 0)
+    kappa = ufl.zero((2, 2)) if bent is None else bent * covariant(r0, field, 0)
     if stretched is None:
         return Forms(ufl.zero((2, 2)), kappa, a0, up, ufl.as_ufl(1), ufl.as_ufl(1))
     b12 = ufl.dot(n0, r0.r12)
     b0 = ufl.as_matrix([[ufl.dot(n0, r0.r11), b12], [b12, ufl.dot(n0, r0.r22)]])
     t = stretched * field[12]
-    mixed = stretched * ufl.dot(up, _covariant(r0, field, 6))
+    mixed = stretched * ufl.dot(up, covariant(r0, field, 6))
     U = ufl.Identity(2) + mixed
     twice = 2 * mixed + ufl.dot(mixed, mixed)  # U^2 - 1
     metric = a0 + ufl.dot(a0, twice)
@@ -240,7 +240,7 @@ def grown(density: Density, shape: Shape) -> Density:
     return replace(density, of=of, parameters=(*density.parameters, *shape.parameters))
 
 
-def _covariant(r0: Jet, field: Expr, first: int) -> Expr:
+def covariant(r0: Jet, field: Expr, first: int) -> Expr:
     """The components in the surface's coordinates of a symmetric tensor in space."""
     xx, yy, zz, xy, xz, yz = (field[first + i] for i in range(6))
     S = ufl.as_matrix([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])

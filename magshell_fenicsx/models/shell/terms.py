@@ -55,6 +55,7 @@ class TermFactory:
     thickness: fem.Function | None = None
     natural: Shape | None = None
     free: Constants = field(default_factory=dict)  # of parameters that enter freely
+    folded: bool = False  # whether cells meet at angles that are not small
     fields: list[AppliedField] = field(default_factory=list)  # those made
 
     def membrane(self) -> ShellTerm:
@@ -71,18 +72,16 @@ class TermFactory:
         density = Density(per_area(densities.bending), self._nu_h(), parts=CURVED)
         return self._cells("bending", self._thick(self._grown(density), 1))
 
-    def interior_edges(self, *, folded: bool = False) -> ShellTerm:
-        """With `folded`, for a surface whose cells meet at angles that are not small."""
+    def interior_edges(self) -> ShellTerm:
         parameters = self._penalised() if self.thickness is None else (*self._penalised(), self.thickness)
-        of = edges.folded if folded else edges.interior
+        of = edges.folded if self.folded else edges.interior
         density = self._grown(Density(of, parameters, CURVED, SECOND, sides=2))
-        r0, u = ((j.side("+"), j.side("-")) for j in self._jets())
+        r0, u = ((j.side("+"), j.side("-")) for j in self.jets())
         m = kin.facet_covector(self._domain)
         width = ufl.avg(ufl.CellVolume(self._domain)) / ufl.avg(ufl.FacetArea(self._domain))
         sided = [(p("+"), p("-")) if isinstance(p, fem.Function) else p for p in density.parameters]
         energy = density.of(r0, u, (m("+"), m("-")), width, *sided)
-        measure = ufl.dS(domain=self._domain, metadata=self._edge_rule())
-        return ShellTerm("interior edges", density, energy * measure, self.u, self.log)
+        return ShellTerm("interior edges", density, energy * self.interior_measure(), self.u, self.log)
 
     def clamped_edges(self, name: str, facets: NDArray[np.int32], turn: fem.Constant | None = None) -> ShellTerm:
         """`turn` is the rotation of an edge that moves."""
@@ -101,9 +100,9 @@ class TermFactory:
         """A moment per length about the edge's first tangent; in E h R."""
         past = self._constant(np.array([1.0, 0.0]))
         density = Density(edges.turning, (self._constant(intensity), past), facets=facets)
-        energy = density.of(*self._jets(), *self._edge_geometry(), *density.parameters) * self._ds(facets)
-        along = kin.conormal(self._jets()[0], self._edge_geometry()[0])[2]
-        length = self.log.compile(f"{name} length", along * self._ds(facets))
+        energy = density.of(*self.jets(), *self.edge_geometry(), *density.parameters) * self.ds(facets)
+        along = kin.conormal(self.jets()[0], self.edge_geometry()[0])[2]
+        length = self.log.compile(f"{name} length", along * self.ds(facets))
         total = self._domain.comm.allreduce(fem.assemble_scalar(length))
         term = MomentTerm(name, density, energy, self.u, self.log, amplitude)
         term.count_from(past, intensity * total)
@@ -114,8 +113,8 @@ class TermFactory:
         parameters = (*self._penalised(), self._constant(normal))
         density = self._grown(Density(antisymmetric_edge, parameters, CURVED, facets=facets))
         v = fem.Function(self.u.function_space)
-        jets = (*self._jets(), kin.jet(v, self._domain))
-        energy = density.of(*jets, *self._edge_geometry(), *density.parameters) * self._ds(facets)
+        jets = (*self.jets(), kin.jet(v, self._domain))
+        energy = density.of(*jets, *self.edge_geometry(), *density.parameters) * self.ds(facets)
         return HessianTerm("antisymmetric edges", density, energy, v, self.log)
 
     def magnetic(self, field: Magnetisation) -> list[ShellTerm]:
@@ -161,7 +160,7 @@ class TermFactory:
 
     def swept_volume(self) -> ufl.Form:
         """Delta V/R^3 of the modelled part where edges move."""
-        return densities.swept(*self._jets()) * self._dx()
+        return densities.swept(*self.jets()) * self.dx()
 
     def own(self, term: OwnTerm, amplitude: str | None = None) -> ShellTerm:
         """The energy of a part or one's own, with the amplitude of its name or another."""
@@ -172,8 +171,8 @@ class TermFactory:
 
     def observed(self, term: OwnTerm) -> dict[str, ufl.Form]:
         """What it observes."""
-        arguments = (*self._jets(), *self._parameters(term))
-        return {column: per_area(of)(*arguments) * self._dx() for column, of in term.observed.items()}
+        arguments = (*self.jets(), *self._parameters(term))
+        return {column: per_area(of)(*arguments) * self.dx() for column, of in term.observed.items()}
 
     def contact(self, contact: Contact) -> tuple[ShellTerm, Pressing, dict[str, fem.Form]]:
         """The energy of a body, what it knows of it, and the integrals of its pressure and of that times its radius."""
@@ -182,7 +181,7 @@ class TermFactory:
         parameters = (known.polynomial, self._constant(known.motion), approach)
         density = Density(per_area(contact_energy), parameters, ("r",), quadrature=rule)
         term = self._cells(f"contact {contact.body}", density, follow=known.follow)
-        arguments, dx = (*self._jets(), *parameters), self._dx(rule)
+        arguments, dx = (*self.jets(), *parameters), self.dx(rule)
         of_radius = pressed_radius(self._constant(contact.front), self._constant(contact.direction))
         seen: dict[str, Callable[..., Expr]] = {"pressure": contact_pressure, "radius": of_radius}
         return term, known, {name: per_area(of)(*arguments) * dx for name, of in seen.items()}
@@ -192,13 +191,13 @@ class TermFactory:
 
     def volume_change(self, origin: NDArray[np.float64]) -> ufl.Form:
         """Delta V/R^3 of the modelled part, between it and a point of all its symmetry planes."""
-        return densities.volume(*self._jets(), *([self._constant(origin)] if origin.any() else [])) * self._dx()
+        return densities.volume(*self.jets(), *([self._constant(origin)] if origin.any() else [])) * self.dx()
 
     @property
     def _domain(self) -> mesh.Mesh:
         return self.u.function_space.mesh
 
-    def _jets(self) -> tuple[Jet, Jet]:
+    def jets(self) -> tuple[Jet, Jet]:
         return kin.jet(self.r0, self._domain), kin.jet(self.u, self._domain)
 
     def _constant(self, value: float | NDArray[np.float64]) -> fem.Constant:
@@ -218,18 +217,21 @@ class TermFactory:
     def _penalised(self) -> tuple[Parameter, ...]:
         return *self._nu_h(), self._constant(self.sigma)
 
-    def _dx(self, rule: int | None = None) -> ufl.Measure:
+    def dx(self, rule: int | None = None) -> ufl.Measure:
         metadata = {"quadrature_degree": rule or cell_quadrature(self.degree)}
         return ufl.Measure("dx", domain=self._domain, metadata=metadata)
 
     def _edge_rule(self) -> dict[str, int]:
         return {"quadrature_degree": edge_quadrature(self.degree)}
 
-    def _ds(self, facets: NDArray[np.int32]) -> ufl.Measure:
+    def interior_measure(self) -> ufl.Measure:
+        return ufl.dS(domain=self._domain, metadata=self._edge_rule())
+
+    def ds(self, facets: NDArray[np.int32]) -> ufl.Measure:
         tags = mesh.meshtags(self._domain, 1, facets, np.ones_like(facets))
         return ufl.Measure("ds", domain=self._domain, subdomain_data=tags, metadata=self._edge_rule())(1)
 
-    def _edge_geometry(self) -> tuple[Expr, Expr]:
+    def edge_geometry(self) -> tuple[Expr, Expr]:
         """Covector and width of a boundary edge."""
         return kin.facet_covector(self._domain), ufl.CellVolume(self._domain) / ufl.FacetArea(self._domain)
 
@@ -242,13 +244,13 @@ class TermFactory:
         linear: bool = False,
         follow: Callable[[], None] | None = None,
     ) -> ShellTerm:
-        energy, work = density.of(*self._jets(), *density.parameters) * self._dx(density.quadrature), None
+        energy, work = density.of(*self.jets(), *density.parameters) * self.dx(density.quadrature), None
         if density.work:
             v = kin.jet(ufl.TestFunction(self.u.function_space), self._domain)
-            work = density.work(*self._jets(), v, *density.parameters) * self._dx()
+            work = density.work(*self.jets(), v, *density.parameters) * self.dx()
         return ShellTerm(name, density, energy, self.u, self.log, amplitude, linear=linear, work=work, follow=follow)
 
     def _edges(self, name: str, density: Density) -> ShellTerm:
         assert density.facets is not None
-        energy = density.of(*self._jets(), *self._edge_geometry(), *density.parameters) * self._ds(density.facets)
+        energy = density.of(*self.jets(), *self.edge_geometry(), *density.parameters) * self.ds(density.facets)
         return ShellTerm(name, density, energy, self.u, self.log)

@@ -1,0 +1,85 @@
+"""Viscous shells in motion: exact damped vibrations and creep, and rigid motions, which are not damped."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from magshell_fenicsx import Case, Scene, follow
+from magshell_fenicsx.case.source import CaseError, Source
+from magshell_fenicsx.models.shell.viscous import Viscosity
+from magshell_fenicsx.run.rows import columns
+
+OMEGA = 3.5160 * np.sqrt(1 / 12) / 50  # of a cantilever, R/h = 50, nu = 0
+
+
+def case_of(shell: dict[str, Any], step: dict[str, Any], symmetry: str = "half", degree: int = 3) -> Case:
+    strip = {"geometry": "strip", "radius_to_thickness": 50, "poisson_ratio": 0.0, "width": 0.2}
+    data = {"shell": strip | shell, "boundary": {"root": "clamped"}, "mesh": {"degree": degree, "size": 0.5}}
+    return Case.from_source(Source("test", data | {"symmetry": symmetry, "loading": [{"kind": "time", **step}]}))
+
+
+def exact(polynomial: list[float], t: Any) -> Any:
+    """The solution from x = 1 at rest with these coefficients, of the second or third order."""
+    roots = np.roots(polynomial)
+    weights = np.linalg.solve(np.vander(roots, len(roots), increasing=True).T, [1, 0, -1][: len(roots)])
+    return np.real(np.exp(np.outer(t, roots)) @ weights)
+
+
+@pytest.mark.parametrize(
+    ("shell", "polynomial"),
+    [
+        ({"viscosity": 0.1 / OMEGA}, [1, 0.1, 1]),
+        ({"relaxation": [{"modulus": 0.3, "time": 1 / OMEGA}]}, [1, 1, 1.3, 1]),  # (s^2 + 1)(s + 1) + 0.3 s
+    ],
+)
+def test_damped_vibration(shell: dict[str, Any], polynomial: list[float]) -> None:
+    """A mode of a cantilever is an oscillator of one freedom; the energies add up."""
+    period, push = 2 * np.pi / OMEGA, {"mode": 1, "displacement": 0.01}
+    step = {"duration": period, "points": 8, "step": period / 80, "rho_inf": 1.0, "push": push}
+    scene = Scene(case_of(shell, step))
+    found = columns(scene, follow(scene))
+    assert found["w_over_h"][1:] / 0.01 == pytest.approx(exact(polynomial, OMEGA * found["time"][1:]), abs=2e-3)
+    energy = (found["kinetic"] + found["stored"] + found["dissipated"])[1:]
+    assert np.ptp(energy) < 1e-7 * energy[0]
+    assert found["dissipated"][-1] > 0.1 * energy[0]
+
+
+def test_creep() -> None:
+    """Under a load c t, slow against all vibrations, w is c (t - g tau (1 - exp(-t/((1 + g) tau))))."""
+    g, tau = 0.5, 1e4 / OMEGA
+    load = {"pressure": {"kind": "ramp", "to": 1e-9, "over": 4 * tau}}
+    step = {"duration": 4 * tau, "points": 4, "step": tau / 50, "rho_inf": 0.0, "history": load}
+    scene = Scene(case_of({"relaxation": [{"modulus": g, "time": tau}]}, step, degree=4))
+    found = columns(scene, follow(scene))
+    t = found["time"][1:] / tau
+    creep = t - g * (1 - np.exp(-t / (1 + g)))
+    assert found["w_over_h"][2:] / found["w_over_h"][1] == pytest.approx(creep[1:] / creep[0], rel=1e-5)
+
+
+def test_rigid_motion_is_not_damped() -> None:
+    """The velocity of a rotation about a tilted axis, of a strip that is turned already and was bent before."""
+    scene = Scene(case_of({"viscosity": 1.0}, {"duration": 1.0}, symmetry="none"))
+    model = scene.model
+    viscous = Viscosity(model, {}, 1.0, [])  # type: ignore[arg-type]
+    r0 = model.r0.x.array.reshape(-1, 3)
+    bent = r0 + np.outer(0.1 * r0[:, 0] ** 2, [0, 0, 1])
+    place = bent @ Rotation.from_rotvec([0.3, -0.8, 0.5]).as_matrix().T
+    turning, stretching = np.cross([0.2, 0.5, -0.4], place), place
+    forces = [viscous.force(u, u, v.ravel(), 1.0, 0.0) for u in [(place - r0).ravel()] for v in (turning, stretching)]
+    assert np.abs(forces[0]).max() < 1e-6 * np.abs(forces[1]).max()
+
+
+@pytest.mark.parametrize(
+    ("shell", "message"),
+    [
+        ({"viscosity": "1 ms"}, "shell.viscosity: 1 ms: its unit needs shell.density, youngs_modulus and lengths"),
+        ({"viscosity": -1.0}, "shell.viscosity: -1.0: must be positive"),
+        ({"relaxation": [{"modulus": 0.5, "time": 0.0}]}, "shell.relaxation.0.time: 0.0: must be positive"),
+    ],
+)
+def test_mistakes(shell: dict[str, Any], message: str) -> None:
+    with pytest.raises(CaseError) as error:
+        case_of(shell, {"duration": 1.0})
+    assert message in str(error.value)

@@ -1,0 +1,32 @@
+"""Outlines of sources: where the amplitudes have driven them, written and read again."""
+
+from pathlib import Path
+
+import numpy as np
+from conftest import CASES
+
+from magshell_fenicsx import Case
+from magshell_fenicsx.output.fields.outlines import DRIVEN, STILL, outlines, read_outlines, vtp_content
+from magshell_fenicsx.plan.planner import make_plan
+
+TURN = "{kind: source, name: roll, turn: {axis: [0, 1, 0], angle: 90}}"
+STEPS = f"loading=[{{kind: field}}, {{kind: source, move: [0, 0, 6 mm]}}, {TURN}]"
+POSITION = np.array([40.0, 0, -60]) / 30
+
+
+def test_outlines(tmp_path: Path) -> None:
+    """A cylinder of 20 x 10 mm: still, then half way up and lying on its side; the files hold the same lines."""
+    still = outlines(make_plan(Case.load(CASES / "magnet_strip.yaml")).loads.magnetic, {})
+    size = np.ptp(np.concatenate(still) - POSITION, axis=0) * 30
+    np.testing.assert_allclose(size, [20, 20, 10], atol=1e-12)
+    driven = make_plan(Case.load(CASES / "magnet_strip.yaml", [STEPS])).loads.magnetic
+    lying = outlines(driven, {"source": 0.5, "roll": 1.0})
+    middle = (np.concatenate(lying).max(axis=0) + np.concatenate(lying).min(axis=0)) / 2
+    np.testing.assert_allclose(middle - POSITION, [0, 0, 0.1], atol=1e-12)
+    np.testing.assert_allclose(np.ptp(np.concatenate(lying), axis=0) * 30, [10, 20, 20], atol=1e-12)
+    (tmp_path / STILL).write_bytes(vtp_content(still))
+    (tmp_path / DRIVEN.format(3)).write_bytes(vtp_content(lying))
+    for number, lines in ((2, still), (3, lying)):
+        for found, line in zip(read_outlines(tmp_path, number), lines, strict=True):
+            np.testing.assert_allclose(found, line, atol=1e-6)
+    assert read_outlines(tmp_path / "none", 0) == ()
