@@ -26,7 +26,7 @@ from magshell_fenicsx.mesh.shapes import StripShape
 from magshell_fenicsx.plan.planner import make_plan
 from magshell_fenicsx.run.run import run
 from magshell_fenicsx.run.summary import Result
-from magshell_fenicsx.simulate.scene import build_model
+from magshell_fenicsx.simulate.build import build_model
 
 CASES = Path(__file__).parent
 OUT = CASES.parents[1] / "docs" / "extremes"

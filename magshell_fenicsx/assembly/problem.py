@@ -98,9 +98,8 @@ class FiniteElementSystem:
         self.size = V.dofmap.index_map.size_local * V.dofmap.index_map_bs
         self.dofs = V.dofmap.index_map.size_global * V.dofmap.index_map_bs
         self.assembly, self.noise = Stopwatch(), Noise.from_environment()
-        fixed = [bc.dof_indices()[0] for bc in clamped]
-        fixed_dofs = np.unique(np.concatenate(fixed)) if fixed else np.empty(0, dtype=np.int32)
-        self._fixed = fixed_dofs[fixed_dofs < self.size]
+        fixed = np.unique(np.concatenate([np.empty(0, dtype=np.int32), *(bc.dof_indices()[0] for bc in clamped)]))
+        self._fixed = fixed[fixed < self.size]
         self._b = fem.Function(V)
         self._assembler, self.gradients = assembler, gradients
         self._N: PETSc.Mat | None = None

@@ -1,5 +1,7 @@
 """Conditions on the named edges and points of a geometry."""
 
+import re
+from collections.abc import Iterable
 from typing import Annotated, Any, Literal, get_args
 
 from pydantic import BeforeValidator, Field, ValidationError
@@ -51,3 +53,12 @@ class BoundarySection(Section):
     def conditions(self) -> dict[str, EdgeCondition | HeldSection]:
         """Name -> condition."""
         return dict(self.__pydantic_extra__ or {})
+
+
+def refuse_taken(points: Iterable[str]) -> None:
+    """Refuse names of points that the program gives itself."""
+    for point in points:
+        if point == "pole":
+            raise ValueError("points.pole: is taken, by the point that w_pole_over_h is of; choose another name")
+        if re.fullmatch(r"load(_\d+)?", point):
+            raise ValueError(f"points.{point}: is taken, by the point that is indented; choose another name")

@@ -1,6 +1,5 @@
 """The whole case: its sections and what they must have in common."""
 
-import re
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
 from math import pi, radians
@@ -10,9 +9,9 @@ from typing import Annotated, Any, Literal, Self, TypeVar
 import numpy as np
 from pydantic import Field, ModelWrapValidatorHandler, ValidationError, model_validator
 
-from magshell_fenicsx.case.bodies.body import with_units
+from magshell_fenicsx.case.bodies.body import refuse_unfit_bodies, with_units
 from magshell_fenicsx.case.bodies.registered import Bodies
-from magshell_fenicsx.case.boundary import EDGES, BoundarySection
+from magshell_fenicsx.case.boundary import EDGES, BoundarySection, refuse_taken
 from magshell_fenicsx.case.ensemble import EnsembleSection
 from magshell_fenicsx.case.expressions import is_formula
 from magshell_fenicsx.case.fields import MagneticSection, layer_average
@@ -28,6 +27,7 @@ from magshell_fenicsx.case.loads.edge import EdgeSection, refuse_unheld
 from magshell_fenicsx.case.loads.growth import GrowthSection
 from magshell_fenicsx.case.loads.indentation import IndentationSection
 from magshell_fenicsx.case.loads.step import Step
+from magshell_fenicsx.case.mesh import SOLID_DEGREE, MeshSection
 from magshell_fenicsx.case.messages import explain
 from magshell_fenicsx.case.natural import NaturalSection, measured
 from magshell_fenicsx.case.patches import refuse_strange
@@ -41,31 +41,9 @@ from magshell_fenicsx.case.surfaces import CapSurface, MeshSurface, RevolutionSu
 from magshell_fenicsx.case.viscosity import refuse_unfit_viscosity
 from magshell_fenicsx.parts.part import Part, Scales
 from magshell_fenicsx.parts.registered import PARTS, WithParts
-from magshell_fenicsx.parts.section import Section, or_number, texts
+from magshell_fenicsx.parts.section import or_number, texts
 
-SOLID_DEGREE = 2
 AnyStep = TypeVar("AnyStep", bound=Step)
-
-
-class MeshSection(Section):
-    """The elements: C0 interior penalty on triangles, graded towards dimple, load and held edges."""
-
-    degree: int = Field(default=4, ge=2, le=5)
-    """Degree k of the displacement. Degree 2 locks; a solid has degree 2 and no other"""
-    refinement: float = Field(default=1.0, ge=0.1, le=20)
-    """Divides every element size; not of a mesh file"""
-    size: Annotated[float, or_number("metre"), Field(gt=0, le=1e12)] | None = None
-    """Element size everywhere; by default graded, away from loads and held edges at most 0.35 R [the shell's length]"""
-    penalty: float | None = Field(default=None, ge=1e-3, le=1e9)
-    """σ of the interior penalty; by default 5 k²"""
-    tolerance: float | None = Field(default=None, ge=1e-6, le=0.1)
-    """Relative error of the run's result; chooses degree and refinement, of a solid refinement and layers"""
-
-    @model_validator(mode="after")
-    def _tolerance_chooses_the_mesh(self) -> Self:
-        if self.tolerance is not None and self.model_fields_set & {"degree", "refinement"}:
-            raise ValueError("tolerance chooses degree and refinement: give it or them")
-        return self
 
 
 Place = Annotated[list[Annotated[float, or_number("metre")]], Field(min_length=3, max_length=3)]
@@ -166,11 +144,7 @@ class Case(WithParts):
     def _named_parts_are_there(self) -> Self:
         """Points, and the edges and patches of geometries whose names are known."""
         shell = self.shell
-        if "pole" in self.points:
-            raise ValueError("points.pole: is taken, by the point that w_pole_over_h is of; choose another name")
-        for point in self.points:
-            if re.fullmatch(r"load(_\d+)?", point):
-                raise ValueError(f"points.{point}: is taken, by the point that is indented; choose another name")
+        refuse_taken(self.points)
         dead = self.loads_of(DeadSection)
         for key in (*(["loads of kind: dead"] if dead else []), *self.parts):
             if shell.modulus is None:
@@ -224,46 +198,28 @@ class Case(WithParts):
             if self.solid:
                 raise ValueError("solid belongs to model: solid")
             return self
-        magnetic = self.magnetic
         if isinstance(self.thickness_factor, dict):
             raise ValueError("shell.thickness_factor: of a solid a formula: a step in the thickness is no swept body")
-        if magnetic and magnetic.energy != "full":
+        if self.magnetic and self.magnetic.energy != "full":
             raise ValueError(
-                f"magnetic.energy: {magnetic.energy}: the expansions are of a shell; a solid has the full energy"
+                f"magnetic.energy: {self.magnetic.energy}: the expansions are of a shell; a solid has the full energy"
             )
-        for key in self.mesh.model_fields_set & {"degree", "penalty"}:
-            if key != "degree" or self.mesh.degree != SOLID_DEGREE:
-                read = isinstance(self.shell, MeshSurface)
-                finer = "a file with smaller elements" if read else "mesh.refinement"
-                raise ValueError(f"mesh.{key}: not of a solid, which has degree {SOLID_DEGREE}; {finer} makes it finer")
+        self.mesh.refuse_unfit_solid(read=isinstance(self.shell, MeshSurface))
         if self.symmetry == "axisymmetric":
             raise ValueError("symmetry: axisymmetric: a solid is whole or half")
-        if any(not load.patch for load in self.loads_of(IndentationSection)):
-            raise ValueError(
-                "loading.patch: 0: a point force sinks into a solid without limit; give the patch its radius over h "
-                "(of the paper's indenter, 0.2 mm at R = 25.2 mm, with R/h = 90: 0.714)"
-            )
-        if self.solid and "bulk_to_shear" in self.solid.model_fields_set and self.shell.poisson_ratio != 0.5:
-            raise ValueError(
-                "solid.bulk_to_shear: takes the place of shell.poisson_ratio: 0.5; here that is "
-                f"{self.shell.poisson_ratio:g}, which says all"
-            )
+        for load in self.loads_of(IndentationSection):
+            load.refuse_point_of_solid()
+        if self.solid:
+            self.solid.refuse_unfit(self.shell.poisson_ratio)
         return self
 
     @model_validator(mode="after")
     def _bodies_fit(self) -> Self:
-        for name, body in self.bodies.items():
-            if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,39}", name):
-                raise ValueError(f"bodies.{name}: a name is a letter, then letters, digits and _; at most 40")
+        for body in self.bodies.values():
             if body.at.point is None:
                 self._on_shell(body.at.polar)
-        if self.bodies and self.model == "solid":
-            raise ValueError("bodies: press on a shell; of a solid give a force on a patch (kind: indentation, patch)")
-        for step in self.programme:
-            if isinstance(step.load, ContactSection):
-                moved, known = step.load.body, ", ".join(self.bodies) or "none: give it in bodies"
-                if (moved is None and len(self.bodies) != 1) or (moved is not None and moved not in self.bodies):
-                    raise ValueError(f"{step.key}.body: {moved or 'is missing'}; allowed: {known}")
+        moved = {step.key: step.load.body for step in self.programme if isinstance(step.load, ContactSection)}
+        refuse_unfit_bodies(self.bodies, moved, solid=self.model == "solid")
         return self
 
     @model_validator(mode="after")
@@ -283,7 +239,7 @@ class Case(WithParts):
         grows = [key for key in ("stretch", "curvature") if getattr(self.natural, key, None) is not None]
         return programme(self.loading, field=bool(self.lambda_m), natural=grows, approaches=self.approaches)
 
-    @cached_property
+    @property
     def approaches(self) -> dict[str, str]:
         """Body -> name of its approach, the amplitude; a single one needs no name beside it."""
         steps: list[Step | None] = [*self.loading] if isinstance(self.loading, list) else [self.loading]

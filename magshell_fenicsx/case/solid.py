@@ -12,3 +12,11 @@ class SolidSection(Section):
     """Elements through the thickness"""
     bulk_to_shear: float = Field(default=100.0, ge=10, le=1e5)
     """κ/μ, in place of ν = 0.5 and only there"""
+
+    def refuse_unfit(self, poisson_ratio: float) -> None:
+        """Refuse a compressibility beside a ratio that says all."""
+        if "bulk_to_shear" in self.model_fields_set and poisson_ratio != 0.5:
+            raise ValueError(
+                "solid.bulk_to_shear: takes the place of shell.poisson_ratio: 0.5; here that is "
+                f"{poisson_ratio:g}, which says all"
+            )

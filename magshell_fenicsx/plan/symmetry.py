@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.case.boundary import HeldSection
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.expressions import formula
-from magshell_fenicsx.case.loads.dead import DeadLoadSection, DeadSection
+from magshell_fenicsx.case.loads.dead import DeadSection
 from magshell_fenicsx.case.loads.edge import EdgeSection
 from magshell_fenicsx.case.loads.field import RotationSection
 from magshell_fenicsx.case.loads.step import Step
@@ -19,10 +19,9 @@ from magshell_fenicsx.case.loads.time import TimeSection
 from magshell_fenicsx.mesh.mirror import ROUNDING, Y0, Mirror
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.plan import natural
-from magshell_fenicsx.plan.by_formula import function
+from magshell_fenicsx.plan.loads_left import alike, is_image, load_turns
 from magshell_fenicsx.plan.moves import held_vectors, mirrored, sideways
 from magshell_fenicsx.plan.outline import Outline
-from magshell_fenicsx.plan.plan import Span
 from magshell_fenicsx.plan.sources.field import values
 from magshell_fenicsx.plan.turning import beside, field_turns, scalar_turns, vector_turns, vectors_of
 
@@ -150,7 +149,7 @@ def _shape(case: Case, outline: Outline) -> Leaves:
         if not isinstance(factor, str):
             return True  # patches are mapped onto themselves
         x = outline.sample()
-        return _alike(formula(factor)(*x.T), formula(factor)(*mirror.image(x).T))
+        return alike(formula(factor)(*x.T), formula(factor)(*mirror.image(x).T))
 
     reason = None
     if not outline.round:
@@ -224,7 +223,7 @@ def _field(case: Case, outline: Outline) -> list[Leaves]:
             uniform = all(np.abs(S @ v - sign * v).max() <= 1e-10 for v in (*vectors, *turning))
             few = x[:: len(x) // 50 + 1]  # the field of a source is smooth
             varying = all(
-                _alike(sign * np.einsum("ni,ij->nj", field(places), S), field(mirror.image(places)))
+                alike(sign * np.einsum("ni,ij->nj", field(places), S), field(mirror.image(places)))
                 for field, places in (*((field, x) for field in fields), *((field, few) for field in sources))
             )
             kinds = {"radial": 1.0, "tangential": float(S[2, 2])}
@@ -276,54 +275,15 @@ def _load(case: Case, outline: Outline, loading: Step, place: Array | None) -> l
 
         def mirrors(mirror: Mirror) -> bool:
             on_plane = all(abs(float(mirror.beyond(x))) < ROUNDING for x in places)
-            return on_plane and all(any(_is_image(a, b, mirror, x, R) for b in loading.loads) for a in loading.loads)
+            return on_plane and all(any(is_image(a, b, mirror, x, R) for b in loading.loads) for a in loading.loads)
 
         tilted = any(_tilted(v) for v in vectors)
         why = "a load is not along e3, or off the axis" if tilted else "a patch is loaded" if patches else None
         span = outline.span
-        if span and not all(_turns(load, span, R) for load in loading.loads if load.varies):
+        if span and not all(load_turns(load, span, R) for load in loading.loads if load.varies):
             why = why or "a load differs around e3"
         return [Leaves(why, vectors, mirrors)]
     return []
-
-
-def _turns(load: DeadLoadSection, span: Span, R: float) -> bool:
-    if load.vector is None:
-        return scalar_turns(str(load.pressure), span, R)
-    return vector_turns([str(v) for v in load.vector], span, R)
-
-
-def _is_image(load: DeadLoadSection, other: DeadLoadSection, mirror: Mirror, x: Array, R: float) -> bool:
-    """Whether the plane mirrors one load to the other; x are places (n, 3) for formulas."""
-    if load.varies or other.varies:
-        return _mirrored_formula(load, other, mirror, R * x, R * mirror.image(x))
-    edge = load.edge and mirror.other(load.edge)
-    if (edge, load.at, load.over, load.moment, load.pressure, load.potential is None) != (
-        other.edge,
-        other.at,
-        other.over,
-        other.moment,
-        other.pressure,
-        other.potential is None,
-    ):
-        return False
-    for here, there in ((getattr(x, key) for x in (load, other)) for key in ("force", "per_length", "per_area")):
-        if (here is None) != (there is None):
-            return False
-        if here and np.abs(mirror.reflection @ here - there).max() > 1e-10 * np.linalg.norm(here):
-            return False
-    return True
-
-
-def _mirrored_formula(load: DeadLoadSection, other: DeadLoadSection, mirror: Mirror, x: Array, image: Array) -> bool:
-    edge = load.edge and mirror.other(load.edge)
-    if (edge, load.over, load.vector is None) != (other.edge, other.over, other.vector is None):
-        return False
-    values, images = (
-        np.stack([function(v)(*places.T) for v in (each.vector or [each.pressure or 0.0])], axis=-1)
-        for each, places in ((load, x), (other, image))
-    )
-    return _alike(values if load.vector is None else values @ mirror.reflection, images)
 
 
 def _named(case: Case, outline: Outline) -> list[Leaves]:
@@ -337,13 +297,6 @@ def _named(case: Case, outline: Outline) -> list[Leaves]:
         return chosen or all(float(mirror.beyond(x)) > -ROUNDING for x in places)
 
     return [Leaves(mirrors=within)]
-
-
-def _alike(here: Array, there: Array) -> bool:
-    """Equal to rounding, and finite."""
-    if not (np.isfinite(here).all() and np.isfinite(there).all()):
-        return False
-    return bool((np.abs(here - there) <= ROUNDING * np.abs(here).max(initial=0.0)).all())
 
 
 def _tilted(v: Array) -> bool:

@@ -6,9 +6,10 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from magshell_fenicsx.case.case import Case, MeshSection
+from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.imperfections.modes import ModesSection, Shape
 from magshell_fenicsx.case.loads.pressure import PressureSection
+from magshell_fenicsx.case.mesh import MeshSection
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.continuation.modes import ModesNotFound
 from magshell_fenicsx.continuation.system import State

@@ -20,10 +20,6 @@ from magshell_fenicsx.continuation.newton import BorderedNewton, NewtonOptions
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.continuation.watch import Watch
 from magshell_fenicsx.mesh.frame import rotation
-from magshell_fenicsx.mesh.hexahedra import sweep
-from magshell_fenicsx.mesh.midsurface import Midsurface, distribute
-from magshell_fenicsx.mesh.mirror import Y0
-from magshell_fenicsx.models.axisymmetric.meridian import make_meridian
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.reacting import (
     columns,
@@ -37,13 +33,11 @@ from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.shell.openings import no_potential
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.supports import refuse_loose
-from magshell_fenicsx.models.shell.thickness import Thickness, refuse_unfit
 from magshell_fenicsx.models.solid.model import SolidModel
-from magshell_fenicsx.plan.body import layers, neo_hookean
 from magshell_fenicsx.plan.plan import Plan
-from magshell_fenicsx.plan.planner import make_plan, meridian_vertices
-from magshell_fenicsx.platform.first import from_first
+from magshell_fenicsx.plan.planner import make_plan
 from magshell_fenicsx.quantities.registry import IN_TIME, amplitude, contact_columns
+from magshell_fenicsx.simulate.build import build_meridian_model, build_model, build_solid_model
 from magshell_fenicsx.simulate.direction import directions, field_angle, field_size, turned
 
 Array = NDArray[np.float64]
@@ -306,49 +300,3 @@ class Scene:
             u = self.plan.length * self.model.displacement(state.u, point) @ rotation(self.plan.azimuth)
             found |= {f"{point}_u{axis}": float(c) for axis, c in zip("xyz", u, strict=True)}
         return found
-
-
-def build_model(case: Case, plan: Plan, comm: MPI.Comm) -> ShellModel:
-    """The whole shell or half of it, on all ranks together."""
-    surface = build_midsurface(plan, comm)
-    return ShellModel(
-        surface,
-        plan.material,
-        case.mesh.degree,
-        plan.conditions,
-        plan.loads,
-        case.mesh.penalty,
-        plan.thickness,
-        plan.mirror or Y0,
-    )
-
-
-def build_meridian_model(case: Case, plan: Plan) -> MeridianModel:
-    """The meridian, whole on every rank."""
-    span = plan.meridian
-    assert span
-    points = {name: span.place(x) for name, x in plan.points.items()}
-    vertices = meridian_vertices(plan, case.mesh.refinement)
-    meridian = make_meridian(span.embedding, vertices, span.names, points, span.curvature)
-    model = MeridianModel(
-        meridian, plan.material, case.mesh.degree, plan.conditions, plan.loads, case.mesh.penalty, plan.thickness
-    )
-    model.held.refuse_loose(model.r0)
-    return model
-
-
-def build_solid_model(case: Case, plan: Plan, comm: MPI.Comm) -> SolidModel:
-    """The whole body or half of it, on all ranks together."""
-
-    def factor(x: Array) -> Array:
-        found = (plan.thickness or Thickness()).at(x)
-        refuse_unfit(found, x, comm)
-        return found
-
-    body = sweep(from_first(comm, plan.triangulated), plan.material.h, layers(case), comm, factor)
-    return SolidModel(body, plan.material, neo_hookean(case), plan.conditions, plan.loads, plan.mirror or Y0)
-
-
-def build_midsurface(plan: Plan, comm: MPI.Comm) -> Midsurface:
-    """Triangulate on rank 0, distribute to all."""
-    return distribute(from_first(comm, plan.triangulated), comm)

@@ -16,7 +16,7 @@ from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.openings import moving
 from magshell_fenicsx.plan.check import describe
 from magshell_fenicsx.plan.planner import make_plan
-from magshell_fenicsx.simulate.scene import build_midsurface
+from magshell_fenicsx.simulate.build import build_midsurface
 
 COMMON = {"thickness": 0.01, "poisson_ratio": 0.3}
 THIRD = {"azimuth": [0, 120]}

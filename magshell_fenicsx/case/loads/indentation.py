@@ -54,6 +54,14 @@ class IndentationSection(PathStep):
     def place(self) -> Any:
         return self.at, self.patch
 
+    def refuse_point_of_solid(self) -> None:
+        """Refuse a point force, which a solid cannot have."""
+        if not self.patch:
+            raise ValueError(
+                "loading.patch: 0: a point force sinks into a solid without limit; give the patch its radius over h "
+                "(of the paper's indenter, 0.2 mm at R = 25.2 mm, with R/h = 90: 0.714)"
+            )
+
     def first(self, change: float, now: Now, *, by_load: bool) -> float:
         if self.until == "zero":
             return LEAST_HUMP

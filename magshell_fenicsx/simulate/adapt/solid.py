@@ -9,7 +9,8 @@ from collections.abc import Callable
 import numpy as np
 from mpi4py import MPI
 
-from magshell_fenicsx.case.case import SOLID_DEGREE, Case
+from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.mesh import SOLID_DEGREE
 from magshell_fenicsx.case.solid import SolidSection
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.simulate.adapt.choice import Adapted, Choice, Round
