@@ -86,8 +86,8 @@ def check_fields(out: Path) -> None:
     rows = len(read_path(out))
     names = {f"point_{i:04d}.vtu" for i in range(rows)}
     found = {file.name for file in (out / "fields").iterdir() if not file.name.startswith("mode_")}
-    if drawn := {name for name in found if name.startswith("sources_")}:  # a source that moves
-        assert drawn == {f"sources_{i:04d}.vtp" for i in range(rows)}
+    if drawn := {name for name in found if name.startswith("outlines_")}:  # a source or a body moves
+        assert drawn == {f"outlines_{i:04d}.vtp" for i in range(rows)}
         names |= drawn
     assert found == names | {"path.pvd"}
     assert set(re.findall(r'file="(.*?)"', (out / "fields" / "path.pvd").read_text(encoding="utf-8"))) == names

@@ -2,7 +2,7 @@
 
 import difflib
 import re
-from typing import Any, get_args
+from typing import Any, get_args, get_origin
 
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
@@ -55,9 +55,13 @@ def shown(value: Any) -> str:
 
 def _without_tag(loc: Location, case: type[BaseModel]) -> Location:
     """Pydantic puts what distinguishes the members of a union after their key: take it out."""
-    models, kept = [case], list[str | int]()
+    models, kept, named = [case], list[str | int](), False
     for key in loc:
         if key in NO_KEYS:
+            continue
+        if named:
+            kept.append(key)
+            named = False
             continue
         if len(models) > 1 and not isinstance(key, int):
             models = [m for m in models if _tag_key([m]) and key in _tags(m)][:1] or models
@@ -66,6 +70,7 @@ def _without_tag(loc: Location, case: type[BaseModel]) -> Location:
         if isinstance(key, str) and models:
             field = models[0].model_fields.get(key)
             models = _models(field.annotation) if field else []
+            named = _has_names(field)
     return tuple(kept)
 
 
@@ -83,19 +88,26 @@ def _meaning(location: Location, data: Any, case: type[BaseModel]) -> str:
 
 def _found(location: Location, data: Any, case: type[BaseModel]) -> tuple[type[BaseModel], FieldInfo | None]:
     """The innermost section at a location; and the last key, if it is one of a section."""
-    model, field, models = case, None, list[type[BaseModel]]()
+    model, field, models, named = case, None, list[type[BaseModel]](), False
     for key in location:
         if isinstance(data, dict):
             data = data.get(key)
         else:
             data = data[key] if isinstance(data, list) and isinstance(key, int) else None
-        field = model.model_fields.get(str(key))  # None: of a list or mapping of sections, or a part of a union
-        if field or not isinstance(key, int):
+        # None: of a list or mapping of sections, or a part of a union
+        field = None if named else model.model_fields.get(str(key))
+        if field or not (named or isinstance(key, int)):
             models = _models(field.annotation) if field else []
-        if models:
+        named = _has_names(field)
+        if models and not named:
             tag = data.get(_tag_key(models)) if len(models) > 1 and isinstance(data, dict) else None
             model = next((m for m in models if tag is not None and tag in _tags(m)), models[0])
     return model, field
+
+
+def _has_names(field: FieldInfo | None) -> bool:
+    """Whether the keys below a key are names that the user gives to sections."""
+    return field is not None and get_origin(field.annotation) is dict and bool(_models(field.annotation))
 
 
 def _models(annotation: Any) -> list[type[BaseModel]]:

@@ -113,9 +113,8 @@ class RunFiles:
         plan = self._scene.plan
         mirror = plan.mirror.turned(plan.azimuth).plane if plan.mirror else None
         about = About(plan.material.h, plan.material.nu, mirror)
-        field = plan.loads.magnetic
-        drawn = outlines(field, self._scene.unloaded().mu)
-        name = "" if not drawn else DRIVEN if self._scene.sources else STILL
+        drawn = outlines(plan.loads, self._scene.unloaded().mu, about.h)
+        name = "" if not drawn else DRIVEN if self._scene.sources or self._scene.model.contacts else STILL
         self._fields = FieldSeries(self._folder / "fields", about, name)
         sync_folder(self._folder)
         return min(len(self._table.kept), self._fields.kept), self._table.kept
@@ -138,7 +137,7 @@ class RunFiles:
         def write() -> None:
             assert surface is not None
             plan = self._scene.plan
-            whole = replace(surface, outlines=outlines(plan.loads.magnetic, state.mu))
+            whole = replace(surface, outlines=outlines(plan.loads, state.mu, plan.material.h))
             self._table.write(row)
             self._fields.write(number, turned(whole, plan.azimuth))
 

@@ -69,7 +69,7 @@ def test_half_against_meridian() -> None:
 
 def test_ball_and_rod_against_a_point_force() -> None:
     """At the same displacement of the pole the real indenters need a little more force; both press by their units."""
-    ball, rod = (last(f"{kind}_contact.yaml", "loading.points=2") for kind in ("ball", "rod"))
+    ball, rod = (last(name, "loading.points=2") for name in ("ball_contact.yaml", "rod_contact.yaml"))
     case = "{kind: indentation, at: {polar: 0}, depth: 4, points: 2}"
     point = last("pole_indentation.yaml", f"loading={case}")
     stiffness = 0.563  # dF/d(w/h) there

@@ -155,7 +155,8 @@ def test_time_left_of_a_resumed_run(monkeypatch: pytest.MonkeyPatch) -> None:
     told: list[str] = []
     clock = iter(range(0, 1000, 10))
     monkeypatch.setattr(time, "perf_counter", lambda: next(clock))
-    scene = SimpleNamespace(case=case, plan=plan, extra_columns=(), motions=())
+    model = SimpleNamespace(contacts={})
+    scene = SimpleNamespace(case=case, plan=plan, model=model, extra_columns=(), motions=())
     progress = RunProgress(scene, told.append, -30.0)  # type: ignore[arg-type]
     here = SimpleNamespace(du=np.array([0.0, -0.5]))
     row = {"lambda_m": 0.0, "w_over_h": 0.0}

@@ -10,7 +10,7 @@ class CylinderSection(BodySection):
 
     kind: Literal["cylinder"]
     radius: Size
-    """[the shell's length; over R if that has no unit]"""
+    """Its radius [the shell's length; over R if that has no unit]"""
     axis: Axis
     """Along the cylinder, of any length, not along the approach"""
 

@@ -12,7 +12,7 @@ class RodSection(BodySection):
 
     kind: Literal["rod"]
     radius: Size
-    """[the shell's length; over R if that has no unit]"""
+    """Its radius [the shell's length; over R if that has no unit]"""
     edge: Size
     """Radius of the edge's rounding, at most `radius` [the shell's length; over R if that has no unit]"""
 

@@ -10,7 +10,7 @@ class SphereSection(BodySection):
 
     kind: Literal["sphere"]
     radius: Size
-    """[the shell's length; over R if that has no unit]"""
+    """Its radius [the shell's length; over R if that has no unit]"""
 
     @property
     def ahead(self) -> float:

@@ -1,4 +1,4 @@
-"""The outlines of the applied field's sources, for pictures and for ParaView."""
+"""The outlines of sources of the applied field and of bodies, for pictures and for ParaView."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -7,21 +7,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.models.shell.driven import carried
-from magshell_fenicsx.models.shell.parameters import Magnetisation
+from magshell_fenicsx.models.shell.parameters import Loads
 
 Array = NDArray[np.float64]
-STILL, DRIVEN = "sources.vtp", "sources_{:04d}.vtp"  # of all points, or of each
+STILL, DRIVEN = "outlines.vtp", "outlines_{:04d}.vtp"  # of all points, or of each
 
 
-def outlines(field: Magnetisation | None, mu: Mapping[str, float]) -> tuple[Array, ...]:
-    """Places (n, 3) over R along lines in the model's frame, where the amplitudes have driven the sources."""
+def outlines(loads: Loads, mu: Mapping[str, float], h: float) -> tuple[Array, ...]:
+    """Places (n, 3) over R along lines in the model's frame, where the amplitudes have driven sources and bodies."""
+    bodies = [
+        line + mu.get(c.amplitude, 0.0) * h * c.direction
+        for c in loads.contacts
+        for line in getattr(c.distance, "lines", ())
+    ]
+    field = loads.magnetic
     if field is None:
-        return ()
+        return tuple(bodies)
     found = [line for part in getattr(field.in_space, "parts", ()) for line in getattr(part, "lines", ())]
     for each in field.driven:
         Q, t = carried(each.motions, mu)
         found += [line @ Q.T + t for line in getattr(each.of, "lines", ())]
-    return tuple(found)
+    return (*bodies, *found)
 
 
 def vtp_content(lines: tuple[Array, ...]) -> bytes:
@@ -41,7 +47,7 @@ def vtp_content(lines: tuple[Array, ...]) -> bytes:
 
 
 def read_outlines(folder: Path, number: int) -> tuple[Array, ...]:
-    """Those beside the fields of a point; none without sources."""
+    """Those beside the fields of a point; none without any."""
     file = folder / DRIVEN.format(number)
     file = file if file.exists() else folder / STILL
     if not file.exists():

@@ -86,7 +86,7 @@ class FieldSeries:
     Parameters
     ----------
     outlines
-        Name of a point's file with the outlines of sources, of its number; empty without.
+        Name of a point's file with the outlines of sources and bodies, of its number; empty without.
 
     Attributes
     ----------

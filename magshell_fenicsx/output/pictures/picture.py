@@ -80,7 +80,7 @@ def _shell(surface: Surface, smooth: "pyvista.PolyData", h: float) -> list[View]
 
 
 def _near(surface: Surface) -> tuple[Array, ...]:
-    """The outlines of sources that leave the shell large enough to be seen."""
+    """The outlines of sources and bodies that leave the shell large enough to be seen."""
     r = surface.r0 + surface.u
     middle, reach = r.mean(axis=0), FAR * float(np.ptp(r, axis=0).max())
     return tuple(line for line in surface.outlines if np.linalg.norm(line - middle, axis=1).max() < reach)

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.case.bodies.box import BoxSection
 from magshell_fenicsx.plan.bodies.placed import Placed
 from magshell_fenicsx.plan.bodies.rounded import rounded
+from magshell_fenicsx.plan.lines import edges
 
 Array = NDArray[np.float64]
 
@@ -26,6 +27,11 @@ class Box:
         g, n, N = rounded(np.abs(y) - self.half + self.edge, self.edge)
         basis = np.where(y < 0, -1.0, 1.0)[:, :, None] * self.axes
         return g, np.einsum("na,nai->ni", n, basis), np.einsum("nai,nab,nbj->nij", basis, N, basis)
+
+    @property
+    def lines(self) -> list[Array]:
+        """Its outline: places (n, 3) along lines, over R."""
+        return [self.centre + line @ self.axes for line in edges(-self.half, self.half)]
 
 
 def box(section: BoxSection, placed: Placed) -> Box:

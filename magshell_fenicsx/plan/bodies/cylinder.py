@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.case.bodies.cylinder import CylinderSection
 from magshell_fenicsx.plan.bodies.placed import Placed
 from magshell_fenicsx.plan.bodies.sphere import Sphere
+from magshell_fenicsx.plan.lines import SEEN, frame, upright
 
 Array = NDArray[np.float64]
 
@@ -24,6 +25,11 @@ class Cylinder:
         across = np.eye(3) - np.outer(self.axis, self.axis)
         g, n, N = Sphere(np.zeros(3), self.radius)((x - self.centre) @ across)
         return g, n, across @ N @ across
+
+    @property
+    def lines(self) -> list[Array]:
+        """Its outline: places (n, 3) along lines, over R."""
+        return [self.centre + line @ frame(self.axis).T for line in upright(self.radius, 2 * SEEN)]
 
 
 def cylinder(section: CylinderSection, placed: Placed) -> Cylinder:

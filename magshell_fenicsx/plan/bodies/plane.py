@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.case.bodies.plane import PlaneSection
 from magshell_fenicsx.plan.bodies.placed import Placed
+from magshell_fenicsx.plan.lines import SEEN, frame
 
 Array = NDArray[np.float64]
 
@@ -21,6 +22,12 @@ class Plane:
     def __call__(self, x: Array) -> tuple[Array, Array, Array]:
         n = np.broadcast_to(self.along, x.shape)
         return (x - self.front) @ self.along, n, np.zeros((len(x), 3, 3))
+
+    @property
+    def lines(self) -> list[Array]:
+        """Its outline: places (n, 3) along lines, over R."""
+        square = np.array([[1, 1, 0], [-1, 1, 0], [-1, -1, 0], [1, -1, 0], [1, 1, 0]])
+        return [self.front + SEEN * square @ frame(self.along).T]
 
 
 def plane(section: PlaneSection, placed: Placed) -> Plane:

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.case.bodies.rod import RodSection
 from magshell_fenicsx.plan.bodies.placed import Placed
 from magshell_fenicsx.plan.bodies.rounded import rounded
+from magshell_fenicsx.plan.lines import SEEN, frame, upright
 
 Array = NDArray[np.float64]
 
@@ -33,6 +34,12 @@ class Rod:
         turned = (n[:, 0] / np.maximum(far, 1e-300))[:, None, None] * around
         H = np.einsum("nai,nab,nbj->nij", basis, N, basis) + np.where(far[:, None, None] > 0, turned, 0.0)
         return g, np.einsum("na,nai->ni", n, basis), H
+
+    @property
+    def lines(self) -> list[Array]:
+        """Its outline: places (n, 3) along lines, over R."""
+        middle = self.end - SEEN * self.along
+        return [middle + line @ frame(self.along).T for line in upright(self.radius, 2 * SEEN)]
 
 
 def rod(section: RodSection, placed: Placed) -> Rod:

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.case.bodies.sphere import SphereSection
 from magshell_fenicsx.plan.bodies.placed import Placed
+from magshell_fenicsx.plan.lines import ball
 
 Array = NDArray[np.float64]
 
@@ -23,6 +24,11 @@ class Sphere:
         far = np.maximum(np.linalg.norm(r, axis=1), 1e-300)
         n = r / far[:, None]
         return far - self.radius, n, (np.eye(3) - n[:, :, None] * n[:, None, :]) / far[:, None, None]
+
+    @property
+    def lines(self) -> list[Array]:
+        """Its outline: places (n, 3) along lines, over R."""
+        return [self.centre + line for line in ball(self.radius)]
 
 
 def sphere(section: SphereSection, placed: Placed) -> Sphere:

@@ -5,8 +5,9 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.sources.coil import CoilSection
+from magshell_fenicsx.plan.lines import circle
 from magshell_fenicsx.plan.sources.harmonic import Harmonic
-from magshell_fenicsx.plan.sources.known import Known, circle, magpylib
+from magshell_fenicsx.plan.sources.known import Known, magpylib
 
 Array = NDArray[np.float64]
 

@@ -5,8 +5,9 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.sources.cylinder import CylinderSection
+from magshell_fenicsx.plan.lines import upright
 from magshell_fenicsx.plan.sources.harmonic import Harmonic
-from magshell_fenicsx.plan.sources.known import Known, magpylib, upright
+from magshell_fenicsx.plan.sources.known import Known, magpylib
 
 Array = NDArray[np.float64]
 

@@ -13,7 +13,7 @@ from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.case.sources.grid import GridSection
 from magshell_fenicsx.parts.section import in_units
 from magshell_fenicsx.plan.imperfections.scan import ScanError, table
-from magshell_fenicsx.plan.sources.cuboid import edges
+from magshell_fenicsx.plan.lines import edges
 from magshell_fenicsx.plan.sources.known import Array, Known
 
 PLACES, FIELD = ("x", "y", "z"), ("Bx", "By", "Bz")

@@ -92,17 +92,4 @@ def magpylib(key: str) -> ModuleType:
     return found  # type: ignore[no-any-return]
 
 
-def circle(radius: float, z: float = 0.0, *, axes: tuple[int, int, int] = (0, 1, 2)) -> Array:
-    """Places (n, 3) along a circle around the last of some axes."""
-    t = np.linspace(0.0, 2 * np.pi, 49)
-    return np.column_stack([radius * np.cos(t), radius * np.sin(t), np.full_like(t, z)])[:, np.argsort(axes)]
-
-
-def upright(radius: float, height: float) -> list[Array]:
-    """The outline of a cylinder: both circles, and four lines between them."""
-    ends = np.array([-height / 2, height / 2])
-    sides = [np.array([[x, y, z] for z in ends]) for x, y in radius * np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])]
-    return [*(circle(radius, z) for z in ends), *sides]
-
-
 Values = Callable[[Array], Array]

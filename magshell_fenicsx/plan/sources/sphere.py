@@ -5,8 +5,9 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.sources.sphere import SphereSection
+from magshell_fenicsx.plan.lines import ball
 from magshell_fenicsx.plan.sources.harmonic import Harmonic
-from magshell_fenicsx.plan.sources.known import Known, circle, magpylib
+from magshell_fenicsx.plan.sources.known import Known, magpylib
 
 Array = NDArray[np.float64]
 
@@ -15,9 +16,8 @@ def sphere(section: SphereSection, case: Case, key: str) -> Known:
     """See `Known`."""
     r = section.diameter / 2
     magnet = magpylib(key).magnet.Sphere(diameter=2 * r, polarization=section.vector)
-    around = [circle(r, axes=axes) for axes in ((0, 1, 2), (1, 2, 0), (2, 0, 1))]
 
     def distance(x: Array) -> Array:
         return np.asarray(np.linalg.norm(x, axis=1) - r)
 
-    return Known(Harmonic(magnet.getB, distance), around, "inside")
+    return Known(Harmonic(magnet.getB, distance), ball(r), "inside")
