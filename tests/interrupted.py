@@ -11,7 +11,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
-from command import read_path
+from command import mpirun, read_path
 
 SAME = ("label", "amplitude", "negative_pivots", "iterations", "factorisations", "mode", "branch")
 NUMBERS = ("p_over_pc", "lambda_m", "force", "w_over_h", "w_pole_over_h", "volume_change", "energy")
@@ -19,7 +19,7 @@ NUMBERS = ("p_over_pc", "lambda_m", "force", "w_over_h", "w_pole_over_h", "volum
 
 def start(*arguments: str | Path, ranks: int = 0, size_limit: int = 0) -> subprocess.Popen[str]:
     """Start `magshell ...`; `size_limit` is the largest file that it can write, in bytes."""
-    launcher = ["mpirun", "--map-by", ":OVERSUBSCRIBE", "-n", str(ranks)] if ranks else []
+    launcher = mpirun(ranks) if ranks else []
     program = ["-m", "magshell_fenicsx"]
     if size_limit:  # MPI itself needs larger files as it begins
         limit = f"resource.setrlimit(resource.RLIMIT_FSIZE, ({size_limit}, {size_limit}))"

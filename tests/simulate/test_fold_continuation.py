@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command import magshell
+from command import magshell, mpirun
 from conftest import CASES
 
 from magshell_fenicsx.case.case import Case
@@ -185,7 +185,7 @@ def test_ranks_do_not_matter() -> None:
     """A half shell without field on one rank and on three: fold, sensitivities, transfer to another mesh."""
     found = []
     for ranks in (1, 3):
-        command = ["mpirun", "--map-by", ":OVERSUBSCRIBE", "-n", str(ranks), sys.executable, "-c", SHARED]
+        command = [*mpirun(ranks), sys.executable, "-c", SHARED]
         settings = [*COARSE, "mesh.refinement=0.25", "magnetic.lambda_m=0"]
         done = subprocess.run([*command, COPLANAR, *settings], capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stderr

@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from command import mpirun
 
 CASES = Path(__file__).parents[2] / "cases"
 SEALED = """
@@ -41,7 +42,7 @@ assert abs(volumes[0]) < 1e-7 * abs(volumes[1]), volumes
 
 
 def sealed(ranks: int) -> dict[str, float]:
-    command = ["mpirun", "--map-by", ":OVERSUBSCRIBE", "-n", str(ranks), sys.executable, "-c", SEALED]
+    command = [*mpirun(ranks), sys.executable, "-c", SEALED]
     done = subprocess.run([*command, str(CASES / "dimple_buckling.yaml")], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return dict(json.loads(done.stdout.splitlines()[-1]))

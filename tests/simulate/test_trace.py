@@ -9,7 +9,7 @@ import numpy as np
 import pandas
 import pytest
 import ufl
-from command import read_path
+from command import mpirun, read_path
 from conftest import CASES
 from scipy.special import bei, beip, ber, berp
 
@@ -189,7 +189,7 @@ def test_same_on_ranks() -> None:
     found = []
     for ranks in (1, 3):
         script = RANKS.format(file=CASES / "dimple_buckling.yaml")
-        command = ["mpirun", "--map-by", ":OVERSUBSCRIBE", "-n", str(ranks), sys.executable, "-c", script]
+        command = [*mpirun(ranks), sys.executable, "-c", script]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stderr
         found.append(json.loads(done.stdout.splitlines()[-1]))

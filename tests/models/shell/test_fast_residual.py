@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 import pytest
+from command import mpirun
 from conftest import TILTED, hemisphere, random_displacement
 from test_fast_tangent import HALF_SHELL, pattern
 
@@ -160,7 +161,7 @@ def test_ranks() -> None:
     """On 1, 2 and 3 ranks residual and load columns are those of the forms, and equal."""
     found = []
     for ranks in (1, 2, 3):
-        command = ["mpirun", "--map-by", ":OVERSUBSCRIBE", "-n", str(ranks), sys.executable, "-c", RANKS]
+        command = [*mpirun(ranks), sys.executable, "-c", RANKS]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stderr
         lines = [line.split()[1:] for line in done.stdout.splitlines() if line.startswith("result")]

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import ufl
 from along import csr, difference
+from command import mpirun
 from conftest import hemisphere, random_displacement
 from dolfinx import fem
 
@@ -188,7 +189,7 @@ def test_ranks() -> None:
     """On 1, 2 and 3 ranks the tangents are those of the forms, and equal."""
     found = []
     for ranks in (1, 2, 3):
-        command = ["mpirun", "--map-by", ":OVERSUBSCRIBE", "-n", str(ranks), sys.executable, "-c", RANKS]
+        command = [*mpirun(ranks), sys.executable, "-c", RANKS]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stderr
         found.append([float(line.split()[1]) for line in done.stdout.splitlines() if line.startswith("result")])
