@@ -6,16 +6,14 @@ from pathlib import Path
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.continuation.modes import ModesNotFound
-from magshell_fenicsx.continuation.system import Vector
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
-from magshell_fenicsx.models.modes import ShellMode, ShellModes
+from magshell_fenicsx.models.modes import ShellModes
 from magshell_fenicsx.output.fields.frequencies import NAME, frequency_table, hertz, wave_of
 from magshell_fenicsx.output.fields.gathering import gatherer
-from magshell_fenicsx.output.fields.modes import mode_file, mode_surface, write_mode
-from magshell_fenicsx.output.fields.surface import Surface
-from magshell_fenicsx.output.fields.vtu import About
+from magshell_fenicsx.output.fields.modes import mode_file
 from magshell_fenicsx.output.store.durable import write_whole
 from magshell_fenicsx.output.store.folder import by_first
+from magshell_fenicsx.run.modes import write_mode_of
 from magshell_fenicsx.run.summary import Result
 from magshell_fenicsx.simulate.scene import Scene
 
@@ -69,19 +67,8 @@ def frequencies_after(result: Result, folder: Path, say: Say) -> None:
         say(f"lowest frequency at point {number}: omega2 {first.eigenvalue:.6g}{in_hertz}  {wave}".rstrip())
     content = frequency_table(result.frequencies, own, unit)
     by_first(scene.comm, partial(write_whole, folder / NAME, content))
-    for number in {*list(states)[:1], *list(states)[-1:]} & set(result.frequencies):
-        _write_modes(result, folder, number, states[number].u, result.frequencies[number][: section.count])
-
-
-def _write_modes(result: Result, folder: Path, number: int, u: Vector, modes: list[ShellMode]) -> None:
-    scene, material = result.scene, result.scene.plan.material
     gathering = gatherer(scene.model, scene.comm)
-    for n, mode in enumerate(modes, 1):
-        surface = mode_surface(scene.model, gathering, u, mode.label, mode.vector, scene.plan.azimuth)
-        file = mode_file(folder, number, f"f{n}", mode.label)
-
-        def write(file: Path = file, surface: Surface | None = surface) -> None:
-            assert surface is not None
-            write_mode(file, surface, About(material.h, material.nu))
-
-        by_first(scene.comm, write)
+    for number in {*list(states)[:1], *list(states)[-1:]} & set(result.frequencies):
+        for n, mode in enumerate(result.frequencies[number][: section.count], 1):
+            file = mode_file(folder, number, f"f{n}", mode.label)
+            write_mode_of(scene, gathering, file, states[number].u, mode.label, mode.vector)

@@ -17,6 +17,7 @@ from magshell_fenicsx.output.store.durable import write_whole
 from magshell_fenicsx.output.store.folder import by_first
 from magshell_fenicsx.output.store.table import OWN_MODES
 from magshell_fenicsx.run.summary import Result
+from magshell_fenicsx.simulate.scene import Scene
 
 Say = Callable[[str], None]
 
@@ -80,13 +81,19 @@ class _Writer:
             self.say(f"lowest stiffness at point {number}: {first.eigenvalue:.6g} E h/R^2  {first.label}".rstrip())
 
     def _write(self, number: int, name: str, state: State, label: str, vector: Vector) -> Surface | None:
-        scene = self.result.scene
-        surface = mode_surface(scene.model, self.gatherer, state.u, label, vector, scene.plan.azimuth)
+        file = mode_file(self.folder, number, name, label)
+        return write_mode_of(self.result.scene, self.gatherer, file, state.u, label, vector)
 
-        def write() -> None:
-            assert surface is not None
-            material = scene.plan.material
-            write_mode(mode_file(self.folder, number, name, label), surface, About(material.h, material.nu))
 
-        by_first(scene.comm, write)
-        return surface
+def write_mode_of(
+    scene: Scene, gatherer: Gatherer, file: Path, u: Vector, label: str, vector: Vector
+) -> Surface | None:
+    """Write a mode at a displacement, and return it on rank 0; collective."""
+    surface = mode_surface(scene.model, gatherer, u, label, vector, scene.plan.azimuth)
+
+    def write() -> None:
+        assert surface is not None
+        write_mode(file, surface, About(scene.plan.material.h, scene.plan.material.nu))
+
+    by_first(scene.comm, write)
+    return surface

@@ -12,7 +12,7 @@ from dolfinx import fem
 from numpy.typing import NDArray
 from ufl.core.expr import Expr
 
-from magshell_fenicsx.assembly.point_field import PointField
+from magshell_fenicsx.assembly.point_field import PointField, at_quadrature
 from magshell_fenicsx.models.shell.driven import Driven, FieldInSpace, Here
 from magshell_fenicsx.models.shell.patterns import refuse_unbounded
 
@@ -75,9 +75,7 @@ class AppliedField:
         self._here: list[Here] = []
         self._known: tuple[Array, dict[str, float]] = np.empty(0), {}
         self._still: tuple[Array, Array, Array] | None = None
-        self._shape = V.element.basix_element.tabulate(0, self.polynomial.points)[0, :, :, 0]
-        self._nodes = V.dofmap.list
-        self._r0 = self._at_points(r0)
+        self._r0 = at_quadrature(r0, self.polynomial.points)
         B, G, H = self._values(self._r0.reshape(-1, 3))
         known = np.isfinite(G).all(axis=(1, 2)) & np.isfinite(H).all(axis=(1, 2, 3))
         self._B0 = np.where(np.reshape(known, (-1, 1)), B, np.nan).reshape(self._r0.shape)
@@ -97,7 +95,7 @@ class AppliedField:
         else:
             self._still = None
         self._known = np.array(self._u.x.array), dict(self.mu)
-        u = self._at_points(self._u)
+        u = at_quadrature(self._u, self.polynomial.points)
         x = self._r0 + u
         B, G, H = self._values(x.reshape(-1, 3))
         bad = ~np.isfinite(B).all(axis=1)
@@ -140,9 +138,3 @@ class AppliedField:
                 said = getattr(of, "nowhere", "is where magnetic.applied has no finite value")
                 return f"the shell's point (x, y, z)/R = ({x[0]:.3g}, {x[1]:.3g}, {x[2]:.3g}) {said}"
         return ""
-
-    def _at_points(self, field: fem.Function) -> Array:
-        """(cells, points, 3)."""
-        size = field.function_space.dofmap.bs
-        found = np.asarray(self._shape @ field.x.array.reshape(-1, size)[self._nodes])
-        return np.insert(found, 1, 0.0, axis=-1) if size == 2 else found

@@ -61,7 +61,7 @@ def _spline(axes: list[Array], values: Array) -> "scipy.interpolate.NdBSpline":
 
 @lru_cache(maxsize=8)
 def read(file: Path, digest: str | None) -> tuple[list[Array], Array]:
-    """The places along each axis in m, and B (nx, ny, nz, 3) in T; `digest` tells one content from another.
+    """The places along each axis in m, and B (nx, ny, nz, 3) in T. A file is read again if its `digest` has changed.
 
     Raises
     ------
