@@ -7,13 +7,17 @@ rho < 1, but shows neither its acceleration, without which a resumed run is anot
 """
 
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 from petsc4py import PETSc
 
+from magshell_fenicsx.continuation.device import Device
+from magshell_fenicsx.continuation.edge import join, split
 from magshell_fenicsx.continuation.factor import Factorisation
+from magshell_fenicsx.continuation.motion import Motion, constrained, held_back
 from magshell_fenicsx.continuation.newton import MOTION
 from magshell_fenicsx.continuation.system import Edged, Skewed, System, Vector, dot, max_abs
 
@@ -24,6 +28,7 @@ SLOW = 0.2  # new factors if a step is longer than this part of the one before
 SMOOTH = 1e-2  # error of the last step up to which the acceleration predicts the next: in stiff motions it alternates
 OTHER = 0.05  # relative change of the time step after which factors are renewed
 GAUSS = ((0.5 - np.sqrt(1 / 12), 0.5), (0.5 + np.sqrt(1 / 12), 0.5))  # exact for the membrane's energy, of degree 4
+Array = NDArray[np.float64]
 Loads = Callable[[float, bool], dict[str, float]]  # mu(t), at a jump before or after it
 
 
@@ -58,37 +63,6 @@ class Rule:
         return cls(m, f, (1 - m + f) ** 2 / 4, 0.5 - m + f, at)
 
 
-@dataclass(frozen=True)
-class Motion:
-    """A moving state.
-
-    Attributes
-    ----------
-    t
-        Time.
-    u, v, a
-        Displacement, velocity and acceleration.
-    mu
-        Amplitudes.
-    work, dissipated
-        By the loads, and by drag and viscosity, since the begin.
-    potentials
-        dPi/dmu of the loads.
-    error
-        Estimated error of the last step, over the system's length.
-    """
-
-    t: float
-    u: Vector
-    v: Vector
-    a: Vector
-    mu: dict[str, float]
-    work: float = 0.0
-    dissipated: float = 0.0
-    potentials: dict[str, float] = field(default_factory=dict)
-    error: float = np.inf
-
-
 class Integrator:
     """Makes steps in time; factors are kept while they serve.
 
@@ -104,6 +78,8 @@ class Integrator:
         Further forces.
     driven
         Amplitudes that are positions and move.
+    device
+        Amplitudes that are unknown, since their conjugates are held at the end of each step; None: all are loads.
 
     Attributes
     ----------
@@ -120,10 +96,12 @@ class Integrator:
         drag: float = 0.0,
         viscous: Viscous | None = None,
         driven: Collection[str] = (),
+        device: Device | None = None,
     ) -> None:
         self.system, self.mass, self.loads, self.drag, self.viscous = system, mass, loads, drag, viscous
         self.rule = Rule.of(rho)
-        self._driven = frozenset(driven)
+        self.device, self._free = device, tuple(device.names) if device else ()
+        self._driven = frozenset({*driven, *self._free})
         self.factorisation = Factorisation(system.comm)
         self.steps = self.iterations = 0
         self._K: PETSc.Mat | None = None
@@ -131,11 +109,26 @@ class Integrator:
         self._x, self._y = mass.createVecs()
 
     def begin(self, t: float, u: Vector, v: Vector, before: Motion | None = None) -> Motion:
-        """A motion with the acceleration that the loads after t give it; sums go on from those of `before`."""
+        """A motion with the acceleration that the loads after t give it; sums go on from those of `before`.
+
+        What a device constrains is put where it must be, along the forces of the constraint, and so is its velocity.
+        """
         mu = self.loads(t, False)
+        if before:
+            mu |= {name: before.mu[name] for name in self._free}
+        inverse = self._inverse_mass()
+        if self.device:
+            u, v, mu = constrained(self.system, self.device, inverse, u, v, mu)
         r = self.system.residual(u, mu) + self.drag * self._times(v)
         if self.viscous:
             r = r + self.viscous.force(u, u, v, 1.0, 0.0)
+        a = -inverse(r)
+        if self.device:
+            a, mu = held_back(self.system, self.device, inverse, Motion(t, u, v, a, mu))
+        work, dissipated = (before.work, before.dissipated) if before else (0.0, 0.0)
+        return Motion(t, u, v, a, mu, work, dissipated, self._potentials(u, mu))
+
+    def _inverse_mass(self) -> Callable[[Vector], Vector]:
         M = self.mass.copy()
         here = M.getDiagonal()
         here.setArray((here.array_r == 0).astype(float))
@@ -145,8 +138,7 @@ class Integrator:
         M.setOption(PETSc.Mat.Option.SYMMETRIC, True)
         factors = Factorisation(self.system.comm)
         factors.factor(M)
-        work, dissipated = (before.work, before.dissipated) if before else (0.0, 0.0)
-        return Motion(t, u, v, -factors.solve(r), mu, work, dissipated, self._potentials(u, mu))
+        return factors.solve
 
     def kinetic(self, now: Motion) -> float:
         """v . M v/2 on all ranks."""
@@ -158,14 +150,16 @@ class Integrator:
         u = now.u + dt * now.v
         if now.error < SMOOTH:
             u = u + dt**2 / 2 * now.a
+        y = self.device.unknowns(now.mu) if self.device else np.empty(0)
         last, fresh = np.inf, False
         if abs(dt - self._factored) > OTHER * dt:
-            self._factor(now, u, dt)
+            self._factor(now, u, y, dt)
             fresh = True
         for _ in range(MOST):
             a, v = self._rates(now, u, dt)
-            d = self.factorisation.solve(self._unbalanced(now, u, v, a, dt))
-            u = u - d
+            d = self.factorisation.solve(self._unbalanced(now, u, y, v, a, dt))
+            d, dy = split(d, y.size, comm)
+            u, y = u - d, y - dy
             self.iterations += 1
             size = max_abs(comm, d) / self.system.length
             if not np.isfinite(size):
@@ -173,11 +167,11 @@ class Integrator:
             tolerance = TOLERANCE * max(1.0, MOTION * max_abs(comm, u) / self.system.length)
             if size <= tolerance or (size <= STALLED and size > last / 2):
                 self.steps += 1
-                return self._accepted(now, u, dt)
+                return self._accepted(now, u, y, dt)
             if size > SLOW * last:
                 if fresh and size > last:
                     break
-                self._factor(now, u, dt)
+                self._factor(now, u, y, dt)
                 fresh = True
             last = size
         self._factored = 0.0
@@ -189,19 +183,29 @@ class Integrator:
         a = (u - now.u - dt * now.v) / (beta * dt**2) - (0.5 / beta - 1) * now.a
         return a, now.v + dt * ((1 - gamma) * now.a + gamma * a)
 
-    def _unbalanced(self, now: Motion, u: Vector, v: Vector, a: Vector, dt: float) -> Vector:
+    def _at(self, now: Motion, y: Array, part: float, dt: float) -> dict[str, float]:
+        """Amplitudes at a part of a step; unknown ones grow evenly."""
+        mu = self.loads(now.t + part * dt, True)
+        ends = self.device.values(y) if self.device else {}
+        return mu | {name: now.mu[name] + part * (end - now.mu[name]) for name, end in ends.items()}
+
+    def _unbalanced(self, now: Motion, u: Vector, y: Array, v: Vector, a: Vector, dt: float) -> Vector:
         rule = self.rule
         m, f = rule.alpha_m, rule.alpha_f
         r = self._times((1 - m) * a + m * now.a + self.drag * ((1 - f) * v + f * now.v))
         for part, weight in rule.forces:
-            at = now.u + part * (u - now.u)
-            r = r + weight * self.system.residual(at, self.loads(now.t + part * dt, True))
-        return r + self.viscous.force(now.u, u, (1 - f) * v + f * now.v, 1 - f, dt) if self.viscous else r
+            r = r + weight * self.system.residual(now.u + part * (u - now.u), self._at(now, y, part, dt))
+        if self.viscous:
+            r = r + self.viscous.force(now.u, u, (1 - f) * v + f * now.v, 1 - f, dt)
+        if self.device is None:
+            return r
+        return join(r, (1 - f) * self.device.rows(u, self._at(now, y, 1.0, dt)), self.system.comm)
 
-    def _factor(self, now: Motion, u: Vector, dt: float) -> None:
-        """Factor the derivative of `_unbalanced` by u, with one tangent for all parts of the step."""
+    def _factor(self, now: Motion, u: Vector, y: Array, dt: float) -> None:
+        """Factor the derivative of `_unbalanced` by u and y, with one tangent for all parts of the step."""
         rule, part = self.rule, 1 - self.rule.alpha_f
-        tangent = self.system.tangent(now.u + part * (u - now.u), self.loads(now.t + part * dt, True))
+        here, mu = now.u + part * (u - now.u), self._at(now, y, part, dt)
+        tangent = self.system.tangent(here, mu)
         assert not isinstance(tangent, Edged)
         K = tangent.K if isinstance(tangent, Skewed) else tangent
         if self._K is None:
@@ -211,13 +215,18 @@ class Integrator:
         self._K.scale(part * (1 + (self.viscous.stiffness(dt, rule.gamma / (rule.beta * dt)) if self.viscous else 0)))
         inertia = (1 - rule.alpha_m) / (rule.beta * dt**2) + self.drag * part * rule.gamma / (rule.beta * dt)
         self._K.axpy(inertia, self.mass, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
-        self.factorisation.factor(Skewed(self._K, part * tangent.N) if isinstance(tangent, Skewed) else self._K)
+        whole = Skewed(self._K, part * tangent.N) if isinstance(tangent, Skewed) else self._K
+        if self.device:
+            C, D = self.device.edge(here, mu)
+            self.factorisation.factor(Edged(whole, [part * c for c in C], part * D, self.device.multipliers))
+        else:
+            self.factorisation.factor(whole)
         self._factored = dt
 
-    def _accepted(self, now: Motion, u: Vector, dt: float) -> Motion:
+    def _accepted(self, now: Motion, u: Vector, y: Array, dt: float) -> Motion:
         comm, rule, t = self.system.comm, self.rule, now.t + dt
         a, v = self._rates(now, u, dt)
-        mu = self.loads(t, True)
+        mu = self._at(now, y, 1.0, dt)
         potentials, moved = self._potentials(u, mu), u - now.u
         work = sum(self._work(name, now, mu, potentials) for name in potentials)
         lost = self.drag * dot(comm, moved, self._times((1 - rule.alpha_f) * v + rule.alpha_f * now.v))
@@ -241,65 +250,3 @@ class Integrator:
         self._x.setArray(x)
         self.mass.mult(self._x, self._y)
         return np.array(self._y.array_r)
-
-
-@dataclass(frozen=True)
-class TimeSteps:
-    """How long steps are.
-
-    Attributes
-    ----------
-    fixed
-        The longest step, which is halved only where Newton's method fails; None: steps for the tolerance.
-    tolerance
-        Largest estimated error of a step, over the system's length (O. C. Zienkiewicz and Y. M. Xie, Earthquake
-        Engineering and Structural Dynamics 20, 1991).
-    first
-        First step without `fixed`.
-    """
-
-    fixed: float | None
-    tolerance: float
-    first: float
-
-
-class TimeStopped(RuntimeError):
-    """The motion could not be followed; `motion` is its last state."""
-
-    def __init__(self, reason: str, motion: Motion) -> None:
-        super().__init__(reason)
-        self.motion = motion
-
-
-def advance(integrator: Integrator, now: Motion, end: float, steps: TimeSteps, dt: float) -> tuple[Motion, float]:
-    """The motion at a later time, and the step to go on with.
-
-    Parameters
-    ----------
-    dt
-        The step to begin with.
-
-    Raises
-    ------
-    TimeStopped
-        If even a tiny step fails.
-    """
-    begin = now.t
-    while end - now.t > 1e-9 * (end - begin):
-        way = end - now.t
-        dt = min(dt, steps.fixed or dt)
-        length = way / np.ceil(way / dt * (1 - 1e-9))
-        found = integrator.step(now, length)
-        if isinstance(found, str):
-            dt = length / 2
-            if dt < 1e-6 * steps.first:
-                raise TimeStopped(f"the time step has become too small: {found}", now)
-            continue
-        if steps.fixed is None:
-            change = 0.9 * (steps.tolerance / max(found.error, 1e-300)) ** (1 / 3)
-            if found.error > steps.tolerance and length > 1e-6 * steps.first:
-                dt = max(0.3, change) * length
-                continue
-            dt = length * min(change, 2.0) if change > 1.3 else max(length, dt if change > 1 else 0.0)
-        now = found
-    return replace(now, t=end), dt

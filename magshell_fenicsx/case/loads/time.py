@@ -56,8 +56,8 @@ class TimeSection(Step):
     @model_validator(mode="after")
     def _loads_are_held(self) -> Self:
         for name, how in self.hold.items():
-            if how != "load":
-                raise ValueError(f"hold.{name}: in kind: time all loads are functions of time: only load is allowed")
+            if how != "load" and name in self.drives:
+                raise ValueError(f"hold.{name}: it follows its history: only load is allowed")
         if self.search:
             raise ValueError("search: is for steps that end in equilibrium")
         for key, value in (("duration", self.duration), ("step", self.step), ("drag", self.drag)):
