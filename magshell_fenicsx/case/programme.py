@@ -73,7 +73,7 @@ def refuse_unfit_steps(
                 "begins there"
             )
         after = steps[step.number - 2].load if step.number > 1 else None
-        if isinstance(after, TimeSection) and after.until == "duration" and not isinstance(load, TimeSection):
+        if isinstance(after, TimeSection) and after.until != "rest" and not isinstance(load, TimeSection):
             raise ValueError(f"{key}: begins in equilibrium: the step of kind: time before it needs until: rest")
         if isinstance(load, TimeSection):
             if "field" in load.history and (not lambda_m or "angle" in driven):

@@ -8,7 +8,7 @@ rho < 1, but shows neither its acceleration, without which a resumed run is anot
 
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +33,15 @@ Loads = Callable[[float, bool], dict[str, float]]  # mu(t), at a jump before or 
 
 
 class Viscous(Protocol):
-    """Forces that depend on the strains along a step."""
+    """Forces that depend on the strains along a step.
+
+    Attributes
+    ----------
+    memory
+        What they remember of earlier steps; `accept` replaces it.
+    """
+
+    memory: Any
 
     def force(self, u0: Vector, u1: Vector, v: Vector, part: float, dt: float) -> Vector:
         """The force at a part of the step from u0 to u1, with the velocity v there; zero at supports."""

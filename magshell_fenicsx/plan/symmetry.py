@@ -260,6 +260,15 @@ def _load(case: Case, outline: Outline, loading: Step, place: Array | None) -> l
     if place is not None:
         reason = "the force is not at the pole" if _tilted(place) else None
         return [Leaves(reason, [place], lambda mirror: bool(abs(mirror.beyond(place)) < ROUNDING))]
+    if isinstance(loading, TimeSection) and loading.velocity:
+        given = vectors_of(loading.velocity)
+
+        def keeps(mirror: Mirror) -> bool:
+            S, x = mirror.reflection, outline.sample()
+            return alike(given(R * x) @ S, given(R * mirror.image(x)))
+
+        turns = outline.span and vector_turns(loading.velocity, outline.span, R)
+        return [Leaves(None if turns else "the initial velocity differs around e3", (), keeps)]
     if isinstance(loading, RotationSection):
         return [Leaves("the field turns", [loading.to.vector()])]
     if isinstance(loading, EdgeSection):

@@ -44,7 +44,7 @@ def follow(scene: Scene, *, search: bool = True) -> Iterator[Record]:
                 yield replace(record, step=step.number)
                 refuse_penetration(scene, record.point.state)
             if isinstance(step.load, PathStep) and step.load.then == "snap" and record:
-                walked = Walked(released(scene, record, held_by(scene, step, record.point.state)))
+                walked = Walked(released(scene, step.load.snap, record, held_by(scene, step, record.point.state)))
                 for record in walked:
                     last = record.label
                     yield replace(record, step=step.number)

@@ -10,8 +10,6 @@ from scipy.integrate import solve_ivp
 from magshell_fenicsx import Case, Scene
 from magshell_fenicsx.case.source import Source
 from magshell_fenicsx.continuation.advance import TimeSteps, advance
-from magshell_fenicsx.continuation.control import GivenLoad
-from magshell_fenicsx.continuation.motion import Motion
 from magshell_fenicsx.continuation.transient import Integrator
 from magshell_fenicsx.models.mass import mass
 

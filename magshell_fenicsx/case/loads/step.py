@@ -7,6 +7,7 @@ import numpy as np
 from pydantic import Discriminator, Field, Tag, model_validator
 
 from magshell_fenicsx.case.loads.search import SearchSection
+from magshell_fenicsx.case.loads.snap import SnapSection
 from magshell_fenicsx.parts.section import Pressure, Section
 
 Until = Annotated[
@@ -163,6 +164,8 @@ class PathStep(Step):
     """What follows the fold that ends the step with `until: limit`: `snap` releases the shell, which moves under its
     loads and what else is held, lightly damped, until it rests on the branch that it snaps to; the next step goes on
     from there"""
+    snap: SnapSection = SnapSection()
+    """How it is released"""
     branches: bool = False
     """Follow both directions of the branch at the first bifurcation too, to the target or for `points` steps"""
     sensitivities: bool = False
@@ -186,6 +189,8 @@ class PathStep(Step):
             raise ValueError(f"until: {self.until} {why}: it goes with control: arc")
         if self.then and self.until != "limit":
             raise ValueError("then: snap: goes with until: limit")
+        if "snap" in self.model_fields_set and not self.then:
+            raise ValueError("snap: goes with then: snap")
         return self
 
     @property
