@@ -80,7 +80,7 @@ def refuse_unfit_steps(
                 why = "not after kind: rotation" if lambda_m else "needs magnetic.lambda_m, not zero"
                 raise ValueError(f"{key}.history.field: {why}")
             flux = magnetic is not None and magnetic.applied.flux_density not in (None, 0.0)
-            refuse_unfit_time(key, load, amplitudes - moved, density=density, measured=flux)
+            refuse_unfit_time(key, load, amplitudes, moved, density=density, measured=flux)
             driven.update(load.drives)
         driven.add(step.name)
         _refuse_unfit_hold(step, steps)

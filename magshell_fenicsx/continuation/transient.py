@@ -7,7 +7,7 @@ rho < 1, but shows neither its acceleration, without which a resumed run is anot
 """
 
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -19,7 +19,7 @@ from magshell_fenicsx.continuation.edge import join, split
 from magshell_fenicsx.continuation.factor import Factorisation
 from magshell_fenicsx.continuation.motion import Motion, constrained, held_back
 from magshell_fenicsx.continuation.newton import MOTION
-from magshell_fenicsx.continuation.system import Edged, Skewed, System, Vector, dot, max_abs
+from magshell_fenicsx.continuation.system import Amplitudes, Edged, Skewed, System, Vector, dot, max_abs
 
 TOLERANCE = 1e-10  # of u in a step, over the system's length or, where that is longer, a tenth of the displacement
 STALLED = 1e-7  # steps below this that shrink no more are rounding
@@ -51,6 +51,33 @@ class Viscous(Protocol):
 
     def accept(self, u0: Vector, u1: Vector, dt: float) -> Vector:
         """Go on from u1; the latest force."""
+
+
+class Ground(Protocol):
+    """Supports that move; see `assembly.ground`.
+
+    Attributes
+    ----------
+    names
+        Their amplitudes.
+    """
+
+    names: frozenset[str]
+
+    def velocity(self, t: float, before: bool) -> Vector:
+        """Of supports."""
+
+    def acceleration(self, t: float, before: bool) -> Vector:
+        """Of supports."""
+
+    def along(self, mu: Amplitudes, name: str) -> Vector:
+        """Their displacement by an amplitude."""
+
+    def times(self, x: Vector) -> Vector:
+        """The mass of all nodes times a vector."""
+
+    def held(self, x: Vector) -> Vector:
+        """With zeros at supports."""
 
 
 @dataclass(frozen=True)
@@ -86,6 +113,8 @@ class Integrator:
         Further forces.
     driven
         Amplitudes that are positions and move.
+    ground
+        Supports that move.
     device
         Amplitudes that are unknown, since their conjugates are held at the end of each step; None: all are loads.
 
@@ -105,9 +134,11 @@ class Integrator:
         viscous: Viscous | None = None,
         driven: Collection[str] = (),
         device: Device | None = None,
+        ground: Ground | None = None,
     ) -> None:
         self.system, self.mass, self.loads, self.drag, self.viscous = system, mass, loads, drag, viscous
         self.rule = Rule.of(rho)
+        self.ground = ground
         self.device, self._free = device, tuple(device.names) if device else ()
         self._driven = frozenset({*driven, *self._free})
         self.factorisation = Factorisation(system.comm)
@@ -122,19 +153,26 @@ class Integrator:
         What a device constrains is put where it must be, along the forces of the constraint, and so is its velocity.
         """
         mu = self.loads(t, False)
+        work, dissipated = (before.work, before.dissipated) if before else (0.0, 0.0)
         if before:
             mu |= {name: before.mu[name] for name in self._free}
         inverse = self._inverse_mass()
+        if self.ground:  # a jump of its velocity is an impulse, whose work is the change of the kinetic energy
+            work -= self._kinetic(v, t, True)
+            v = v - inverse(self._pulled(self.ground.velocity(t, False) - self.ground.velocity(t, True)))
+            work += self._kinetic(v, t, False)
         if self.device:
             u, v, mu = constrained(self.system, self.device, inverse, u, v, mu)
         r = self.system.residual(u, mu) + self.drag * self._times(v)
+        if self.ground:
+            r = r + self._pulled(self.ground.acceleration(t, False) + self.drag * self.ground.velocity(t, False))
         if self.viscous:
             r = r + self.viscous.force(u, u, v, 1.0, 0.0)
         a = -inverse(r)
         if self.device:
             a, mu = held_back(self.system, self.device, inverse, Motion(t, u, v, a, mu))
-        work, dissipated = (before.work, before.dissipated) if before else (0.0, 0.0)
-        return Motion(t, u, v, a, mu, work, dissipated, self._potentials(u, mu))
+        now = Motion(t, u, v, a, mu, work, dissipated)
+        return replace(now, potentials=self._potentials(now, False))
 
     def _inverse_mass(self) -> Callable[[Vector], Vector]:
         M = self.mass.copy()
@@ -149,8 +187,19 @@ class Integrator:
         return factors.solve
 
     def kinetic(self, now: Motion) -> float:
-        """v . M v/2 on all ranks."""
-        return dot(self.system.comm, now.v, self._times(now.v)) / 2
+        """v . M v/2 on all ranks, with the velocity of supports."""
+        return self._kinetic(now.v, now.t, True)
+
+    def _kinetic(self, v: Vector, t: float, before: bool) -> float:
+        if self.ground is None:
+            return dot(self.system.comm, v, self._times(v)) / 2
+        v = v + self.ground.velocity(t, before)
+        return dot(self.system.comm, v, self.ground.times(v)) / 2
+
+    def _pulled(self, x: Vector) -> Vector:
+        """The mass times a vector of supports, at all other nodes."""
+        assert self.ground
+        return self.ground.held(self.ground.times(x))
 
     def step(self, now: Motion, dt: float) -> Motion | str:
         """The motion after a step; else the reason why there is none."""
@@ -159,13 +208,14 @@ class Integrator:
         if now.error < SMOOTH:
             u = u + dt**2 / 2 * now.a
         y = self.device.unknowns(now.mu) if self.device else np.empty(0)
+        pull = self._pull(now, dt)
         last, fresh = np.inf, False
         if abs(dt - self._factored) > OTHER * dt:
             self._factor(now, u, y, dt)
             fresh = True
         for _ in range(MOST):
             a, v = self._rates(now, u, dt)
-            d = self.factorisation.solve(self._unbalanced(now, u, y, v, a, dt))
+            d = self.factorisation.solve(pull + self._unbalanced(now, u, y, v, a, dt))
             d, dy = split(d, y.size, comm)
             u, y = u - d, y - dy
             self.iterations += 1
@@ -185,6 +235,16 @@ class Integrator:
         self._factored = 0.0
         return "Newton's method does not converge"
 
+    def _pull(self, now: Motion, dt: float) -> Vector:
+        """The forces of inertia and drag by moving supports in a step, with zeros for unknown amplitudes."""
+        pull, ground, end = 0.0 * now.u, self.ground, now.t + dt
+        if ground:
+            m, f = self.rule.alpha_m, self.rule.alpha_f
+            a = (1 - m) * ground.acceleration(end, True) + m * ground.acceleration(now.t, False)
+            v = (1 - f) * ground.velocity(end, True) + f * ground.velocity(now.t, False)
+            pull = self._pulled(a + self.drag * v)
+        return self.device.padded(pull) if self.device else pull
+
     def _rates(self, now: Motion, u: Vector, dt: float) -> tuple[Vector, Vector]:
         """Acceleration and velocity at the end of a step to u (Newmark)."""
         beta, gamma = self.rule.beta, self.rule.gamma
@@ -192,9 +252,12 @@ class Integrator:
         return a, now.v + dt * ((1 - gamma) * now.a + gamma * a)
 
     def _at(self, now: Motion, y: Array, part: float, dt: float) -> dict[str, float]:
-        """Amplitudes at a part of a step; unknown ones grow evenly."""
+        """Amplitudes at a part of a step; unknown ones and places of supports grow evenly, as displacements do."""
         mu = self.loads(now.t + part * dt, True)
         ends = self.device.values(y) if self.device else {}
+        if self.ground:
+            last = self.loads(now.t + dt, True)
+            ends |= {name: last[name] for name in self.ground.names & set(mu)}
         return mu | {name: now.mu[name] + part * (end - now.mu[name]) for name, end in ends.items()}
 
     def _unbalanced(self, now: Motion, u: Vector, y: Array, v: Vector, a: Vector, dt: float) -> Vector:
@@ -235,17 +298,32 @@ class Integrator:
         comm, rule, t = self.system.comm, self.rule, now.t + dt
         a, v = self._rates(now, u, dt)
         mu = self._at(now, y, 1.0, dt)
-        potentials, moved = self._potentials(u, mu), u - now.u
+        after = Motion(t, u, v, a, mu)
+        potentials, moved, w = self._potentials(after, True), u - now.u, (1 - rule.alpha_f) * v + rule.alpha_f * now.v
         work = sum(self._work(name, now, mu, potentials) for name in potentials)
-        lost = self.drag * dot(comm, moved, self._times((1 - rule.alpha_f) * v + rule.alpha_f * now.v))
+        if self.ground and self.drag:
+            ends = self.ground.velocity(now.t, False), self.ground.velocity(t, True)
+            along, w = moved + dt / 2 * (ends[0] + ends[1]), w + (1 - rule.alpha_f) * ends[1] + rule.alpha_f * ends[0]
+            lost = self.drag * dot(comm, along, self.ground.times(w))
+        else:
+            lost = self.drag * dot(comm, moved, self._times(w)) if self.drag else 0.0
         if self.viscous:
             lost += dot(comm, moved, self.viscous.accept(now.u, u, dt))
         error = abs(rule.beta - 1 / 6) * dt**2 * max_abs(comm, a - now.a) / self.system.length
-        return Motion(t, u, v, a, mu, now.work + work, now.dissipated + lost, potentials, error)
+        return replace(
+            after, work=now.work + work, dissipated=now.dissipated + lost, potentials=potentials, error=error
+        )
 
-    def _potentials(self, u: Vector, mu: dict[str, float]) -> dict[str, float]:
-        still = self.system.coordinates - self._driven
-        return {name: self.system.potential(u, mu, name) for name in mu if name not in still}
+    def _potentials(self, now: Motion, before: bool) -> dict[str, float]:
+        """dPi/dmu of the loads; of supports that move with the forces of inertia and drag."""
+        mu, still = now.mu, self.system.coordinates - self._driven
+        found = {name: self.system.potential(now.u, mu, name) for name in mu if name not in still}
+        if self.ground:
+            a = now.a + self.ground.acceleration(now.t, before)
+            forces = self.ground.times(a + self.drag * (now.v + self.ground.velocity(now.t, before)))
+            for name in self._driven & self.ground.names:
+                found[name] += dot(self.system.comm, forces, self.ground.along(mu, name))
+        return found
 
     def _work(self, name: str, now: Motion, mu: Mapping[str, float], potentials: Mapping[str, float]) -> float:
         """In a step: of a load on its displacement, of a position that moves on what it meets."""

@@ -50,9 +50,9 @@ class Intervals:
     def moved(self, now: Motion, dt: float, end: float) -> tuple[Motion, float]:
         """The motion at a later time, and the step to go on with."""
         for t in [*sorted(t for t in self.marks if now.t < t < end), end]:
+            if now.t in self.marks:  # a jump: the acceleration after it
+                now = self.integrator.begin(now.t, now.u, now.v, now)
             now, dt = advance(self.integrator, now, t, self.steps, dt)
-            if t in self.marks:  # a jump: the acceleration after it
-                now = self.integrator.begin(t, now.u, now.v, now)
         return now, dt
 
     def crossing(self, now: Motion, dt: float, end: float, beyond: Callable[[Motion], float]) -> float:

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from magshell_fenicsx.assembly.ground import Ground
 from magshell_fenicsx.case.loads.snap import SnapSection
 from magshell_fenicsx.case.loads.time import EventSection, TimeSection
 from magshell_fenicsx.case.source import CaseError
@@ -14,7 +15,7 @@ from magshell_fenicsx.continuation.device import Held
 from magshell_fenicsx.continuation.motion import Motion
 from magshell_fenicsx.continuation.system import State, Vector, max_abs
 from magshell_fenicsx.continuation.transient import Integrator
-from magshell_fenicsx.models.mass import mass
+from magshell_fenicsx.models.mass import mass, whole_mass
 from magshell_fenicsx.models.modes import ShellModes
 from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.shell.viscous import Branch, Viscosity
@@ -35,9 +36,10 @@ NEAR = 1e-2  # distance to the equilibrium, in lengths, below which it is
 
 @dataclass(frozen=True)
 class Moving(State):
-    """A state with a velocity."""
+    """A state with a velocity, and perhaps one of its supports."""
 
     v: Vector
+    ground: Vector | None = None
 
 
 def motion(scene: Scene, load: TimeSection, state: State, held: Mapping[str, Held]) -> Records:
@@ -54,10 +56,15 @@ def motion(scene: Scene, load: TimeSection, state: State, held: Mapping[str, Hel
         If steps in time become too small, or the shell does not come to rest.
     """
     case, system = scene.case, scene.model.system
-    loads = LoadsInTime(case, load, state)
+    loads = LoadsInTime(case, load, state, scene.motions)
     drag = float(in_units("1/second")(load.drag)) * (case.time_unit or 1.0)
-    viscous, device = viscosity(scene, state), staged(scene, state, held).device
-    integrator = Integrator(system, mass(scene.model), loads, load.rho_inf, drag, viscous, load.drives, device)
+    viscous, device, ground = viscosity(scene, state), staged(scene, state, held).device, None
+    if moving := scene.motions & set(load.drives):
+        if viscous:
+            raise CaseError(f"history.{next(iter(moving))}: a viscous shell needs supports that are at rest")
+        carried = state.ground if isinstance(state, Moving) else None
+        ground = Ground(system, whole_mass(scene.model), lambda t, b: (loads(t, b), loads.rates(t, b, moving)), carried)
+    integrator = Integrator(system, mass(scene.model), loads, load.rho_inf, drag, viscous, load.drives, device, ground)
     u, v = state.u, state.v if isinstance(state, Moving) else 0.0 * state.u
     if load.push:
         u, v = pushed(scene, load.push, state, v)
@@ -98,7 +105,7 @@ def motion(scene: Scene, load: TimeSection, state: State, held: Mapping[str, Hel
             yield Record("target", "time", replace(point, state=rest), excluded_pivots=unseen, clock=still)
             return rest
         if ended:
-            return Moving(point.state.u, point.state.mu, now.v)
+            return Moving(point.state.u, point.state.mu, now.v, ground.velocity(now.t, True) if ground else None)
     if load.until == "rest":
         raise Stopped(
             f"the shell still moves at the end of its duration, kinetic energy {kinetic / most:.2g} of its largest"

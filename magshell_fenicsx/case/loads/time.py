@@ -110,13 +110,17 @@ def history_may_begin(history: History) -> bool:
     return getattr(history, "kind", "") == "step"
 
 
-def refuse_unfit_time(key: str, load: TimeSection, amplitudes: set[str], *, density: bool, measured: bool) -> None:
+def refuse_unfit_time(
+    key: str, load: TimeSection, amplitudes: set[str], motions: set[str], *, density: bool, measured: bool
+) -> None:
     """See that its loads are there, and that its units have a meaning.
 
     Parameters
     ----------
     amplitudes
         Of other steps.
+    motions
+        Those of supports.
     density, measured
         Whether the shell has a density, and the field a flux density.
 
@@ -134,6 +138,9 @@ def refuse_unfit_time(key: str, load: TimeSection, amplitudes: set[str], *, dens
     for name, history in load.history.items():
         if name not in allowed:
             raise ValueError(f"{key}.history.{name}: no such load; allowed: {', '.join(sorted(allowed))}")
+        times = [t for t, _ in history] if isinstance(history, list) else []
+        if name in motions and (getattr(history, "kind", "") == "step" or len(set(times)) < len(times)):
+            raise ValueError(f"{key}.history.{name}: a support cannot jump")
         for level in levels_of(history):
             if isinstance(level, str) and not (name == "field" and measured):
                 why = "needs magnetic.applied.flux_density" if name == "field" else "is a flux density: give a number"
