@@ -55,15 +55,15 @@ class Intervals:
             now, dt = advance(self.integrator, now, t, self.steps, dt)
         return now, dt
 
-    def crossing(self, now: Motion, dt: float, end: float, beyond: Callable[[Motion], float]) -> float:
-        """The time before `end` at which a function of the motion changes its sign; the memory stays."""
-        memory, close = self.memory, CLOSE * (end - now.t)
+    def crossing(self, now: Motion, dt: float, end: Motion, beyond: Callable[[Motion], float]) -> float:
+        """The time between two motions at which a function of them changes its sign; the memory stays."""
+        memory, close, ends = self.memory, CLOSE * (end.t - now.t), {now.t: now, end.t: end}
 
         def at(t: float) -> float:
             self.memory = memory
-            return beyond(self.moved(now, dt, t)[0] if t > now.t else now)
+            return beyond(ends.get(t) or self.moved(now, dt, t)[0])
 
-        found = float(brentq(at, now.t, end, xtol=close))
+        found = float(brentq(at, now.t, end.t, xtol=close))
         self.memory = memory
         return max(found, now.t + close)
 
