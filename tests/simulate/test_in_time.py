@@ -196,17 +196,25 @@ def test_resumed(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_one_rank_and_two(tmp_path: Path) -> None:
+def test_ranks(tmp_path: Path) -> None:
+    """The same columns on 1, 2 and 3 ranks, with a volume that is held and a support that moves."""
     file = tmp_path / "case.yaml"
     file.write_text(
         "shell: {geometry: disc, radius_to_thickness: 50, poisson_ratio: 0.3}\nboundary: {rim: clamped}\n"
-        "symmetry: half\nmesh: {degree: 2, refinement: 0.5}\n"
-        "loading: [{kind: time, duration: 40, points: 2, history: {pressure: {kind: step, to: 1e-4}}}]\n"
+        "symmetry: half\nmesh: {degree: 2, refinement: 0.5}\nloading:\n"
+        "- {kind: edge, name: lift, moves: [{supports: [rim], translation: [0, 0, 1]}], factor: 1e-9, control: load}\n"
+        "- {kind: indentation, at: {polar: 0}, control: load, force: 0.01, points: 1}\n"
+        "- {kind: time, duration: 20, step: 4, points: 1, hold: {pressure: conjugate}, history: {force: {kind: step, to: 0.1}}}\n"
+        "- {kind: time, duration: 20, step: 4, points: 1, history: {lift: 1e-9 + t**2*1e-5}}\n"
     )
     found = []
-    for ranks in (1, 2):
+    for ranks in (1, 2, 3):
         out = tmp_path / str(ranks)
         done = started("run", file, "--out", out, ranks=ranks, pictures=False)
         assert done.returncode == 0, done.stderr
-        found.append([float(row["kinetic"]) for row in csv.DictReader((out / "path.csv").open(encoding="utf-8"))])
-    assert found[1] == pytest.approx(found[0], rel=1e-7)
+        *_, a, b = csv.DictReader((out / "path.csv").open(encoding="utf-8"))
+        found.append(
+            [float(row[key]) for row in (a, b) for key in ("kinetic", "stored", "work", "p_over_pc", "w_over_h")]
+        )
+    assert found[1] == pytest.approx(found[0], rel=1e-9)
+    assert found[2] == pytest.approx(found[0], rel=1e-9)

@@ -52,6 +52,24 @@ def test_instability() -> None:
     assert found["label"][-1] == "target"
 
 
+@pytest.mark.slow
+def test_delay_of_a_cap() -> None:
+    """Under a heavy drag the fold is passed late by the rate to the power of 2/3."""
+    shell = {"geometry": "cap", "polar": 20, "radius": 1.0, "thickness": 0.02, "poisson_ratio": 0.3}
+    base = {"shell": shell, "boundary": {"rim": "clamped"}, "mesh": {"degree": 3, "refinement": 0.3}}
+    late, times = [], (3000.0, 12000.0)
+    for over in times:
+        event = {"column": "w_pole_over_h", "value": 2.0}
+        ramp = {"pressure": {"kind": "ramp", "to": 0.86, "over": over}}
+        ending = {"until": "event", "event": event}
+        step = {"kind": "time", "duration": over, "points": 20, "history": ramp, "drag": 2.0, **ending}
+        static = {"kind": "pressure", "control": "load", "until": "target", "pressure": 0.52, "points": 2}
+        late.append(columns_of(case_of(base, static, step, symmetry="axisymmetric"))["p_over_pc"][-1])
+    fold = columns_of(case_of(base, {"kind": "pressure"}, symmetry="axisymmetric"))["p_over_pc"][-1]
+    exponent = np.log((late[0] - fold) / (late[1] - fold)) / np.log(times[1] / times[0])
+    assert exponent == pytest.approx(2 / 3, abs=0.01)
+
+
 MISTAKES: list[tuple[dict[str, Any], str]] = [
     ({"until": "event"}, "event: goes with until: event, which needs one"),
     ({"until": "event", "event": {"column": "weight", "value": 1.0}}, "event.column: weight: no such column"),
