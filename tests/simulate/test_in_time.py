@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from command import started
+from command import magshell
 
 from magshell_fenicsx import Case, Scene
 from magshell_fenicsx.case.source import CaseError, Source
@@ -210,7 +210,7 @@ def test_ranks(tmp_path: Path) -> None:
     found = []
     for ranks in (1, 2, 3):
         out = tmp_path / str(ranks)
-        done = started("run", file, "--out", out, ranks=ranks, pictures=False)
+        done = magshell("run", file, "--out", out, ranks=ranks)
         assert done.returncode == 0, done.stderr
         *_, a, b = csv.DictReader((out / "path.csv").open(encoding="utf-8"))
         found.append(
