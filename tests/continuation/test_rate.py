@@ -33,7 +33,7 @@ def delay(rate: float, mass: float, drag: float) -> float:
 
 @pytest.mark.parametrize(("mass", "drag", "exponent"), [(1.0, 0.0, 4 / 5), (1e-4, 1.0, 2 / 3)])
 def test_exponent(mass: float, drag: float, exponent: float) -> None:
-    """M x'' + c x' = a + x^2 with a = rate t: all times are like rate^(-1/5) with inertia, like rate^(-1/3) with drag."""
+    """M x'' + c x' = a + x^2 with a = rate t: times are like rate^(-1/5) with inertia, rate^(-1/3) with drag."""
     rates = np.array([2e-5, 5e-6])
     late = [delay(rate, mass, drag) for rate in rates]
     found = np.log(late[0] / late[1]) / np.log(rates[0] / rates[1])

@@ -204,7 +204,7 @@ def test_ranks(tmp_path: Path) -> None:
         "symmetry: half\nmesh: {degree: 2, refinement: 0.5}\nloading:\n"
         "- {kind: edge, name: lift, moves: [{supports: [rim], translation: [0, 0, 1]}], factor: 1e-9, control: load}\n"
         "- {kind: indentation, at: {polar: 0}, control: load, force: 0.01, points: 1}\n"
-        "- {kind: time, duration: 20, step: 4, points: 1, hold: {pressure: conjugate}, history: {force: {kind: step, to: 0.1}}}\n"
+        "- {kind: time, duration: 20, step: 4, points: 1, hold: {pressure: conjugate}, history: {force: '0.1'}}\n"
         "- {kind: time, duration: 20, step: 4, points: 1, history: {lift: 1e-9 + t**2*1e-5}}\n"
     )
     found = []
