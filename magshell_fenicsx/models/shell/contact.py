@@ -177,6 +177,7 @@ class Pressing:
         self._half = h / 2 * factor
         self._owned = V.mesh.topology.index_map(V.mesh.topology.dim).size_local
         self._known: Array = np.empty(0)
+        self._seen: tuple[Array, float] = np.empty(0), 0.0  # the displacement's and the approach's latest values
         self.gap: Array = np.empty(0)
         self.follow()
 
@@ -187,10 +188,11 @@ class Pressing:
 
     def follow(self) -> None:
         """Renew the polynomials where displacement or approach have changed."""
-        y = at_quadrature(self._u, self._points) - float(self._approach.value) * self.motion
-        if np.array_equal(y, self._known):
+        u, approach = self._u.x.array, float(self._approach.value)
+        if approach == self._seen[1] and np.array_equal(u, self._seen[0]):
             return
-        self._known = y
+        self._seen = u.copy(), approach
+        self._known = y = at_quadrature(self._u, self._points) - approach * self.motion
         self.gap, n, N = self.contact.gap((self._r0 + y).reshape(-1, 3), 0.0, self._half)
         value, first, second = penalty(-self.gap, self.contact.stiffness, SOFT * self._h)
         H = second[:, None, None] * n[:, :, None] * n[:, None, :] - first[:, None, None] * N
