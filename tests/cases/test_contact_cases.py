@@ -8,8 +8,9 @@ import pytest
 from command import magshell, read_path
 from conftest import CASES
 
-from magshell_fenicsx import Case, Result
+from magshell_fenicsx import Case, Result, Scene
 from magshell_fenicsx.run.run import run
+from magshell_fenicsx.simulate.follow import follow
 
 Row = dict[str, float]
 LENGTH = 90**-0.5  # sqrt(Rh) over R
@@ -46,8 +47,30 @@ def test_plate() -> None:
             assert flat == (row["approach_over_h"] < 2.5)
             assert row["contact_inner"] <= row["contact_radius"] <= row["contact_outer"]
     end = path[-1]
+    assert len(path) < 62  # at most 2.5 times the time of a point force
     assert end["force"] == pytest.approx(13.97, rel=2e-3)
     assert end["contact_radius"] == pytest.approx(np.sqrt(end["w_pole_over_h"]) * LENGTH, rel=0.1)
+
+
+@pytest.mark.slow
+def test_hard_plate() -> None:
+    """Without folds, the flat branch goes on, as the shell presses on the plate at its centre too.
+
+    Where it is flat, b = 0 and K = A/R: M = D (1 + nu) A/R is constant, but not the map from the sphere's metric A to
+    the plane. With its radius r = theta - (3 nu - 1) theta^3/48 (plane stress), the pressure is (1 + nu)^2 D/R^3. A
+    dimple at the same approach needs less force.
+    """
+    scene = Scene(Case.load(CASES / "plate_contact.yaml", ["bodies.plate.stiffness=2e6", "loading.points=1"]))
+    records = list(follow(scene))
+    assert [r.label for r in records if r.label != "step"] == ["start", "target"]
+    end = records[-1]
+    assert (end.point.negative_pivots, end.excluded_pivots) == (0, 0)
+    row, h, nu = scene.observe(end.point.state), scene.plan.material.h, 0.5
+    pressure = scene.model.cell_pressures(end.point.state)
+    assert pressure is not None
+    assert pressure[0] == pytest.approx((1 + nu) ** 2 * h**2 / (12 * (1 - nu**2)), rel=0.02)
+    assert row["force"] == pytest.approx(23.626, rel=1e-3)
+    assert row["w_pole_over_h"] == pytest.approx(4, abs=1e-3)
 
 
 @pytest.mark.slow
