@@ -72,6 +72,11 @@ class FiniteElementSystem:
     moving
         Nodes among the held ones whose displacement E(mu) is prescribed. Increments of u are zero there, and
         whatever u holds there is replaced by E(mu).
+
+    Attributes
+    ----------
+    settings
+        Constants that the amplitudes of a state may have besides their own: name -> constant, and its value without.
     """
 
     def __init__(
@@ -93,6 +98,7 @@ class FiniteElementSystem:
         self.projection = Projection(V, sliding, clamped) if sliding else None
         self.parameters = parameters or {}
         self.moving = moving
+        self.settings: dict[str, tuple[fem.Constant, float]] = {}
         self.coordinates = frozenset(self.parameters) | (moving.names if moving else frozenset())
         self.comm = V.mesh.comm
         self.size = V.dofmap.index_map.size_local * V.dofmap.index_map_bs
@@ -166,6 +172,8 @@ class FiniteElementSystem:
         """Set the free parameters of the terms, and move the nodes that move."""
         for name, parameter in self.parameters.items():
             parameter.constant.value = mu[name]
+        for name, (constant, value) in self.settings.items():
+            constant.value = mu.get(name, value)
         if self.moving:
             self.moving.put(self.u.x.array, mu)
 

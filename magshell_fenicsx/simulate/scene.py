@@ -241,7 +241,8 @@ class Scene:
             at, force = model.touching(state, name), model.system.potential(state.u, state.mu, name)
             values = (state.mu[name], -force / self.conjugate_unit(name), at.penetration / h)
             radii = (self.plan.length * radius for radius in (at.radius, at.inner, at.outer))
-            found |= dict(zip(contact_columns(name), (*values, *radii), strict=True))
+            k = float(model.contacts[name][0].stiffness.value)
+            found |= dict(zip(contact_columns(name), (*values, *radii, k), strict=True))
         return found
 
     def _observe_sources(self, state: State) -> dict[str, float]:
