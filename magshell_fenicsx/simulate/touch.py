@@ -1,9 +1,14 @@
 """The first contact of a body: free flight, which is no equilibrium path that arc length could measure."""
 
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
 from magshell_fenicsx.case.loading import ProgrammeStep
 from magshell_fenicsx.case.loads.contact import ContactSection
 from magshell_fenicsx.continuation.control import GivenLoad
-from magshell_fenicsx.continuation.point import Point
+from magshell_fenicsx.continuation.point import PathStopped, Point
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.simulate.record import Stopped
 from magshell_fenicsx.simulate.scene import Scene
@@ -59,6 +64,24 @@ def stiffer(stage: Stage, low: Point, high: Point) -> State | None:
         if deep > contact.bound * h and not contact.given and k < MOST_STIFF * contact.stiffness:
             raised[contact.setting] = STIFFER * k
     return State(low.state.u, {**low.state.mu, **raised}) if raised else None
+
+
+def refuse_crossing(stage: Stage, low: Point, high: Point) -> None:
+    """See that the shell passes through no magnet between two points.
+
+    Raises
+    ------
+    PathStopped
+        With the magnet.
+    """
+    model, states = stage.scene.model, [stage.leave(point.state) for point in (low, high)]
+    for known in model.fields:
+        ends = list[tuple[NDArray[np.float64], Mapping[str, float]]]()
+        for state in states:
+            model.system.with_ghosts(state.u, state.mu)
+            ends.append((known.places, state.mu))
+        if said := [each for each in model.system.comm.allgather(known.passed(*ends)) if each]:
+            raise PathStopped(said[0], low)
 
 
 def refuse_penetration(scene: Scene, state: State) -> None:
