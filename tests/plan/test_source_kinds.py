@@ -254,14 +254,14 @@ def test_shell_leaves_the_grid(tmp_path: Path) -> None:
 
 def test_thin_magnet_in_the_way() -> None:
     """It is passed through in one step: the distance of the ends of a way says nothing about its middle."""
-    (plate,) = placed(case([{"kind": "cylinder", **{**ALONG, "height": "0.02 mm"}, "position": [0, 0, 0]}]))
+    (plate,) = placed(case([{"kind": "cylinder", **ALONG, "height": "0.02 mm", "position": [0, 0, 0]}]))
     x = np.array([[0.01, 0.02, 0.3], [5.0, 0, 0.3]])
     found = crossing(plate.distance, x, x - [0, 0, 0.7])
     assert found is not None
     assert plate.distance(found[None])[0] < 0
     assert crossing(plate.distance, x, x - [0, 0, 0.29]) is None
     steps = [{"kind": "field", "points": 1}, {"kind": "source", "move": [0, 0, "60 mm"], "points": 1}]
-    thin = {"kind": "cylinder", **{**ALONG, "height": "0.02 mm"}, "strength": 1e-9, "position": [0.02, 0, -0.03]}
+    thin = {"kind": "cylinder", **ALONG, "height": "0.02 mm", "strength": 1e-9, "position": [0.02, 0, -0.03]}
     rows, said = stopped(Scene(case([thin], loading=steps)))
     assert "is inside magnetic.applied.sources.0 between two points" in said
     assert rows[-1]["source"] == 0

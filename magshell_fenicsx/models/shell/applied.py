@@ -135,7 +135,8 @@ class AppliedField:
             if distance := getattr(of, "distance", None):
                 ways = [(x - t) @ Q for x, (Q, t) in ((x, carried(driven.motions, mu)) for x, mu in (before, after))]
                 if crossing(distance, *ways) is not None:
-                    return f"a point of the shell {getattr(of, 'nowhere', '')} between two points of the path"
+                    said = getattr(of, "nowhere", "is inside a source")
+                    return f"a point of the shell {said} between two points of the path"
         return ""
 
     def _values(self, x: Array) -> tuple[Array, Array, Array]:
