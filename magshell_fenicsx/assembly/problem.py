@@ -73,11 +73,6 @@ class FiniteElementSystem:
     moving
         Nodes among the held ones whose displacement E(mu) is prescribed. Increments of u are zero there, and
         whatever u holds there is replaced by E(mu).
-
-    Attributes
-    ----------
-    settings
-        Constants that the amplitudes of a state may have besides their own: name -> constant, and its value without.
     """
 
     def __init__(
@@ -99,6 +94,7 @@ class FiniteElementSystem:
         self.projection = Projection(V, sliding, clamped) if sliding else None
         self.parameters = parameters or {}
         self.moving = moving
+        # constants that a state's amplitudes may have besides their own, and their values without
         self.settings: dict[str, tuple[fem.Constant, float]] = {}
         self.coordinates = frozenset(self.parameters) | (moving.names if moving else frozenset())
         self.comm = V.mesh.comm
