@@ -60,7 +60,7 @@ def ensemble(
     Parameters
     ----------
     result
-        As of `magshell study`: knockdown, barrier, critical_field, snap_time, COLUMN@COLUMN=VALUE or COLUMN@end.
+        As of `magshell study`: knockdown, barrier, critical_field, COLUMN@COLUMN=VALUE or COLUMN@end.
     out
         Folder of samples.csv, summary.json, ensemble.png, report.md and points/; samples that are there are kept
         if these sources computed them.

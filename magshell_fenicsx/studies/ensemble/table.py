@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from magshell_fenicsx.run.snaps import snaps
 from magshell_fenicsx.studies.ensemble.samples import Sample
 from magshell_fenicsx.studies.ensemble.solve import FAILED
 from magshell_fenicsx.studies.study.scalar import Scalar
@@ -61,7 +60,6 @@ def value(outcome: Outcome | None, scalar: Scalar) -> float | None:
         "knockdown": outcome.knockdown,
         "barrier": outcome.barrier,
         "limit_points": [outcome.limit] if outcome.limit else [],
-        "snaps": snaps(outcome.curve),
     }
     return scalar.of(summary, [{key: str(v) for key, v in row.items()} for row in outcome.curve])
 

@@ -49,7 +49,7 @@ class Scalar:
             points = (point["value"] for point in summary["limit_points"] if point["amplitude"] == "lambda_m")
             return _number(next(points, None))
         if self.name == "snap_time":
-            return _number(next((snap["time"] for snap in summary["snaps"]), None))
+            return _number(next((snap["time"] for snap in summary.get("snaps", ())), None))
         path = [row for row in rows if row["branch"] == "0" and row["mode"] in OWN_MODES]
         if not path or not {self.column, self.at} - {"end"} <= set(path[0]):
             return None
