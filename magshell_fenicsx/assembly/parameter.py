@@ -4,19 +4,34 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
+import numpy as np
 import ufl
 from dolfinx import fem
+from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.terms import FormTerm, Term
 
-Weighted = tuple[str | None, fem.Form]  # an amplitude, None for 1, and a form that it multiplies
+Weighted = tuple[str | None, float]  # an amplitude, None for 1, and this rank's part of what it multiplies
 
 
 class Settable(Protocol):
     """A number that terms depend on."""
 
     value: Any
+
+
+class Slope(Protocol):
+    """The derivative of terms with one amplitude."""
+
+    @property
+    def amplitude(self) -> str | None: ...
+
+    def energy(self) -> float:
+        """On this rank's part."""
+
+    def add_residual(self, b: NDArray[np.float64], factor: float) -> None:
+        """Add its gradient, see `Term`."""
 
 
 class FreeParameter(Protocol):
@@ -26,7 +41,7 @@ class FreeParameter(Protocol):
     def constant(self) -> Settable: ...
 
     @property
-    def slopes(self) -> Sequence[FormTerm]: ...
+    def slopes(self) -> Sequence[Slope]: ...
 
     def bends(self, q: Any) -> list[Weighted]: ...
 
@@ -48,16 +63,23 @@ class Parameter:
     constant: fem.Constant
     slopes: Sequence[FormTerm]
     log: KernelLog
-    _bends: dict[fem.Constant, list[Weighted]] = field(default_factory=dict)
+    _bends: dict[fem.Constant, list[tuple[str | None, fem.Form]]] = field(default_factory=dict)
 
-    def bends(self, q: fem.Constant) -> list[Weighted]:
+    def bends(self, q: Any) -> list[Weighted]:
         """d2Pi_i/dp dq with the amplitudes mu_i; q may be p. Its first call compiles: collective."""
+        if not isinstance(q, fem.Constant):
+            return bends_of(q, self.constant)
         if q not in self._bends:
             entered = [slope for slope in self.slopes if q in slope.form.constants()]
             self._bends[q] = [
                 (slope.amplitude, self.log.compile(f"{slope.name} twice", derived(slope.form, q))) for slope in entered
             ]
-        return self._bends[q]
+        return [(amplitude, fem.assemble_scalar(form)) for amplitude, form in self._bends[q]]
+
+
+def bends_of(q: Any, p: Any) -> list[Weighted]:
+    """The mixed derivatives by what is no constant in a form, as that has them; else none."""
+    return list(q.bends(p)) if hasattr(q, "bends") else []
 
 
 def make_parameters(

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from magshell_fenicsx.assembly.moving import Moving
-from magshell_fenicsx.assembly.parameter import FreeParameter
+from magshell_fenicsx.assembly.parameter import FreeParameter, Slope
 from magshell_fenicsx.assembly.sliding import Constraint, Projection, Sliding
 from magshell_fenicsx.assembly.terms import FormTerm, Term
 from magshell_fenicsx.continuation.noise import Noise
@@ -212,7 +212,7 @@ class FiniteElementSystem:
         parameter = self.parameters[name]
         if other in self.parameters:
             bends = parameter.bends(self.parameters[other].constant)
-            here = sum(_value(amplitude, mu) * fem.assemble_scalar(form) for amplitude, form in bends)
+            here = sum(_value(amplitude, mu) * value for amplitude, value in bends)
         else:
             here = sum(slope.energy() for slope in parameter.slopes if slope.amplitude == other)
         return float(self.comm.allreduce(here))
@@ -323,7 +323,7 @@ class FiniteElementSystem:
         return {t.name: _value(t.amplitude, mu) for t in self.terms}
 
     def _gradient(
-        self, factors: Mapping[str, float], besides: Sequence[tuple[float, Term]] = ()
+        self, factors: Mapping[str, float], besides: Sequence[tuple[float, Slope]] = ()
     ) -> NDArray[np.float64]:
         """This rank's part of the gradient of the terms with these factors, by name, plus further terms."""
         with self.assembly:

@@ -4,6 +4,7 @@ from collections import Counter
 from math import degrees
 
 from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.loads.imperfection import grown_by
 from magshell_fenicsx.case.surfaces import MeshSurface
 from magshell_fenicsx.mesh.mirror import Mirror, plane_text
 from magshell_fenicsx.models.shell.parameters import Loads
@@ -48,6 +49,8 @@ def account(case: Case, loads: Loads, model: str, mirror: Mirror | None) -> tupl
         included.append(f"body {contact.body}: {kind} without friction, stiffness k R²/(E h) = {k}")
     if case.imperfections:
         included.append(_imperfections(case))
+    for name, keys in grown_by(case.programme, case.imperfections).items():
+        included.append(f"{name} grows: {', '.join(keys)}")
     for key, part in PARTS.items():
         if key in case.parts:
             included.append(case.parts[key].account(case.scales))

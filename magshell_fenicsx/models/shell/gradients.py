@@ -86,6 +86,11 @@ class PointGradient:
         self._gradient = log.compile_expression(name, sum(gradients[1:], gradients[0]), comm)
         self._loaded: slice | None = None
 
+    def place(self, r0: Array) -> None:
+        """Take another placement."""
+        self._known[0] = self._known[0][0], r0
+        self._loaded = None
+
     def room(self, chunk: slice) -> Array:
         """For the derivatives of u in reference coordinates, to be filled: (points, sides * parts * 3)."""
         count = chunk.stop - chunk.start

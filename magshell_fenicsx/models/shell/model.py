@@ -12,6 +12,7 @@ import numpy as np
 from dolfinx import fem
 from numpy.typing import NDArray
 
+from magshell_fenicsx.assembly.growing import Growing
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.parameter import FreeParameter, make_parameters
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
@@ -112,6 +113,8 @@ class ShellModel(Observed):
         self.V = V = fem.functionspace(midsurface.mesh, ("Lagrange", degree, (3,)))
         self.r0, self.u = midsurface.placement(V), fem.Function(V, name="u")
         self.sigma = default_penalty(degree) if sigma is None else sigma
+        shapes = {name: midsurface.growth(V, deviations) for name, deviations in loads.growing.items()}
+        self.growing = Growing(self.r0, shapes, material.h) if shapes else None
         self.thickness = factor = thickness_field(thickness, self.r0, midsurface) if thickness else None
         free, shape = dict[str, fem.Constant](), None
         if loads.natural:
@@ -121,7 +124,7 @@ class ShellModel(Observed):
             shape = Shape.of(natural_field(grown, *places(self.r0), self.V), grown, free)
         folded = midsurface.read and largest_fold(self.r0, degree) > FOLD
         of_shell = material, self.sigma, degree, self.kernels, factor, shape, free, folded
-        self.factory = factory = TermFactory(self.r0, self.u, *of_shell)
+        self.factory = factory = TermFactory(self.r0, self.u, *of_shell, drawn=self.growing and self.growing.drawn)
         interior = factory.interior_edges()
         terms: list[Term] = [factory.membrane(), factory.bending(), interior]
         held: list[Constraint] = []
@@ -207,6 +210,10 @@ class ShellModel(Observed):
         parameters: dict[str, FreeParameter] = {**make_parameters(factory.free, terms, self.u, self.kernels)}
         parameters |= field_parameters(factory.fields, terms, self.u, self.kernels)
         self.fields = factory.fields
+        if self.growing:
+            parameters |= self.growing.parameters(terms, parameters, gradients)
+            sites = [*self._sites, *(self._near[1] if self._near else [])]
+            self.growing.renewed += [gradients.renew, *(site.renew for site in sites), *self._renewals]
         self.system = FiniteElementSystem(
             self.u, terms, held + mirrored, interior, material.h, fast, gradients, parameters, self.moving
         )
@@ -222,6 +229,8 @@ class ShellModel(Observed):
         edges = self.factory.antisymmetric_edges(self._on_mirror, self.mirror.normal)
         held = self._held + [held_along(self.V, 1, self._on_mirror, along) for along in self.mirror.in_plane]
         sites = self._sites + make_sites(self.r0, self.degree, [edges], self.kernels)
+        if self.growing:
+            self.growing.renewed += [site.renew for site in sites[len(self._sites) :]]
         fast = FastTangent(self.u, sites, held)
         terms = [edges if t.name == "mirror edges" else t for t in self.system.terms]
         system = self.system

@@ -24,6 +24,9 @@ Array = NDArray[np.float64]
 class _Site(Protocol):
     names: list[str]
 
+    def place(self, r0: fem.Function) -> None:
+        """Take another placement."""
+
     def add(self, nodal: Array, factors: Mapping[str, float], elements: Array) -> None:
         """Add the element vectors (cells, functions * 3) of the terms with these factors."""
 
@@ -59,8 +62,14 @@ class FastResidual:
         if on_edges:
             self._sites.append(_Edges(r0, edge_quadrature(degree), on_edges, log))
         self.names = frozenset(term.name for term in found)
+        self._r0 = r0
         self._u, self._nodes = u, u.function_space.dofmap.list
         self._dofs = (3 * self._nodes[:, :, None] + np.arange(3)).ravel()
+
+    def renew(self) -> None:
+        """Take the placement anew."""
+        for site in self._sites:
+            site.place(self._r0)
 
     def add(self, b: Array, factors: Mapping[str, float]) -> None:
         """Add it to the local vector (ghosts included), at the present u."""
@@ -81,13 +90,21 @@ class _Cells:
         table = Table.tabulate(V.element.basix_element, X)
         parts = [name for name in NAMES if name in FIRST or any(name in term.density.parts for term in terms)]
         self._sheet, self._each = Sheet(table, w, [NAMES.index(part) for part in parts]), len(w)
-        cells = np.arange(V.mesh.topology.index_map(2).size_local, dtype=np.int32)
-        frames = cell_frames(V.mesh)
-        known = _placement(r0, table, frames, parts)[cells].reshape(len(cells) * len(w), 3 * len(parts))
+        cells = self._owned = np.arange(V.mesh.topology.index_map(2).size_local, dtype=np.int32)
+        frames = self._frames = cell_frames(V.mesh)
+        self._table, self._parts = table, parts
+        known = self._known(r0)
         geometry = np.repeat(frames[cells], len(w), axis=0)
         self._gradient = PointGradient(
             terms, parts, len(w), known, geometry, lambda field: at_points(field, X, cells), log, V.mesh.comm
         )
+
+    def _known(self, r0: fem.Function) -> Array:
+        known = _placement(r0, self._table, self._frames, self._parts)[self._owned]
+        return known.reshape(len(known) * self._each, 3 * len(self._parts))
+
+    def place(self, r0: fem.Function) -> None:
+        self._gradient.place(self._known(r0))
 
     def add(self, nodal: Array, factors: Mapping[str, float], elements: Array) -> None:
         factor = factors.get(self.names[0], 0.0)
@@ -109,18 +126,27 @@ class _Edges:
         table = Table.tabulate(V.element.basix_element, X)
         self._sheet = Sheet(table, w, [NAMES.index(part) for part in CURVED])
         frames, cells = cell_frames(V.mesh), np.arange(len(V.dofmap.list), dtype=np.int32)
-        placement = _placement(r0, table, frames, CURVED).reshape(-1, 3 * len(CURVED))
+        self._table, self._frames = table, frames
+        placement = self._placed(r0)
         self._there, self._back = np.empty_like(placement), np.empty_like(placement)
         self._rows, self._gradients = [], []
         for term in terms:
             rows, geometry = _where(V, term.density, frames, each)
-            known = placement[rows].reshape(len(rows), 3 * len(CURVED) * term.density.sides)
+            known = placement[rows].reshape(len(rows), rows.shape[1] * placement.shape[1])
 
             def values(field: fem.Function, rows: NDArray[np.intp] = rows) -> Array:
                 return at_points(field, X, cells)[rows].reshape(len(rows), rows.shape[1] * field.ufl_shape[0])
 
             self._rows.append(rows)
             self._gradients.append(PointGradient([term], CURVED, each, known, geometry, values, log, V.mesh.comm))
+
+    def _placed(self, r0: fem.Function) -> Array:
+        return _placement(r0, self._table, self._frames, CURVED).reshape(-1, 3 * len(CURVED))
+
+    def place(self, r0: fem.Function) -> None:
+        placement = self._placed(r0)
+        for gradient, rows in zip(self._gradients, self._rows, strict=True):
+            gradient.place(placement[rows].reshape(len(rows), rows.shape[1] * placement.shape[1]))
 
     def add(self, nodal: Array, factors: Mapping[str, float], elements: Array) -> None:
         active = [
