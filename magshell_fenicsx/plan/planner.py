@@ -30,7 +30,7 @@ from magshell_fenicsx.plan.account import account
 from magshell_fenicsx.plan.bodies.registered import body_leaves, contacts, pressed
 from magshell_fenicsx.plan.imperfections.flaw import Flaw, in_frame
 from magshell_fenicsx.plan.imperfections.registered import flaws
-from magshell_fenicsx.plan.imperfections.rims import MOST_RIMS, Spot, spots
+from magshell_fenicsx.plan.imperfections.rims import MOST_RIMS, Spot, different, spots
 from magshell_fenicsx.plan.imperfections.symmetry import leaves
 from magshell_fenicsx.plan.limits import refuse_too_many, refuse_unbounded_fields, sources_beside
 from magshell_fenicsx.plan.loads import indented, loads, potentials, refuse_wide_patch
@@ -44,7 +44,6 @@ from magshell_fenicsx.plan.symmetry import Leaves, askew, left, mirror, unmirror
 Array = NDArray[np.float64]
 Points = dict[str, Array]
 PRESSED = 0.08  # of sqrt(Rh): cells of a meridian that show the ring of a contact
-SAME_RIM = 0.02  # of the element size
 
 
 def make_plan(case: Case, terms: Sequence[OwnTerm] = ()) -> Plan:
@@ -103,7 +102,8 @@ def make_plan(case: Case, terms: Sequence[OwnTerm] = ()) -> Plan:
         images = [drawn.inverse(beyond.image(drawn.embedding(x[None])[0])) for x in points.values()]
         x, y = ((*shape.through[i], *(float(image[i]) for image in images)) for i in range(2))
         shape = replace(shape, through=(x, y))
-    shape = _matched(shape, local)
+    rims = different(local)
+    shape = _matched(shape, local, rims if len(rims) <= MOST_RIMS else ())
     span = drawn.span if axisymmetric else None
     if not span:
         _refuse_too_large(case, shape, size, half=half)
@@ -117,7 +117,7 @@ def make_plan(case: Case, terms: Sequence[OwnTerm] = ()) -> Plan:
     if span:
         refuse_unfit_ends([name for name in span.names if name], points, conditions, all_loads)
     model = "meridian" if axisymmetric else f"{'half' if half else 'full'} {case.model}"
-    included, left_out = account(case, all_loads, model, plane)
+    included, left_out = account(case, all_loads, model, plane, len(rims))
     included += [f"{key}: {flaw.account}" for key, flaw in found.items() if flaw.account]
     return Plan(
         material=material,
@@ -187,25 +187,14 @@ def imperfect(perfect: Outline, found: Mapping[str, Flaw], turn: float, still: C
     )
 
 
-def _matched(shape: Chart, local: Sequence[Spot]) -> Chart | RimmedGrid:
+def _matched(shape: Chart, local: Sequence[Spot], rims: tuple[Array, ...]) -> Chart | RimmedGrid:
     """The shape with element edges along the rims."""
     circles = tuple(dict.fromkeys(spot.radius for spot in local if spot.circle and spot.jumps))
-    rims = _different([(spot.rim, spot.size) for spot in local if spot.rim is not None])
-    rims = rims if len(rims) <= MOST_RIMS else ()
     if isinstance(shape, Grid):
         return RimmedGrid(shape, rims) if rims else shape
     if isinstance(shape, DiscShape):
         return replace(shape, circles=tuple(r for r in circles if r < shape.radius), rims=rims)
     return replace(shape, rims=rims) if isinstance(shape, StripShape) else shape
-
-
-def _different(rims: Sequence[tuple[Array, float]]) -> tuple[Array, ...]:
-    """Curves with the element size there; of several that are nearly the same, the first."""
-    kept: list[Array] = []
-    for rim, size in rims:
-        if all(np.abs(rim - other).max() > SAME_RIM * size for other in kept):
-            kept.append(rim)
-    return tuple(kept)
 
 
 def _symmetry(case: Case, drawn: Outline, parts: list[Leaves]) -> tuple[bool, Mirror | None]:

@@ -47,6 +47,7 @@ from magshell_fenicsx.models.shell.supports import (
     held_at_vertex,
     held_on,
     plane_of,
+    put_in_plane,
     refuse_unknown,
 )
 from magshell_fenicsx.models.shell.terms import TermFactory
@@ -113,6 +114,8 @@ class ShellModel(Observed):
         self.V = V = fem.functionspace(midsurface.mesh, ("Lagrange", degree, (3,)))
         self.r0, self.u = midsurface.placement(V), fem.Function(V, name="u")
         self.sigma = default_penalty(degree) if sigma is None else sigma
+        for name in [name for name, c in conditions.items() if c == "plane" and not midsurface.read]:
+            put_in_plane(self.r0, midsurface.edges[name])
         shapes = {name: midsurface.growth(V, deviations) for name, deviations in loads.growing.items()}
         self.growing = Growing(self.r0, shapes, material.h) if shapes else None
         self.thickness = factor = thickness_field(thickness, self.r0, midsurface) if thickness else None
