@@ -44,14 +44,15 @@ difference from half as many. **error** is the relative error of U on triangles 
 **order** that of the last two meshes in the size of the elements, where it is above the reference's error.
 
 - Both energies tend to a number as h falls, as the theory has it.
-- Clamped edges have layers of the width √h. On meshes with cells of 4 √h times the size there, which grow away from the
-  edge, the error is the same for thick and thin shells, with the order 6 to 7: no locking. Uniform meshes do not
+- Clamped edges have layers of the width √h. On meshes with cells of 4 √h times the size there, which grow away from
+  the edge, the error is the same for thick and thin shells, with the order 6 to 7: no locking. Uniform meshes do not
   resolve the layer at R/h = 10 000, 0.01 wide; the error is below 2 %, but the order is lost.
 - Free edges: the shell bends without stretching, and the element, which has displacements alone, locks on coarse
-  meshes: on one mesh the error grows with R/h. It is no layer that is missed, as the last table shows: with equally many
-  unknowns the error falls with the degree, for thin shells most. Degree 2 is useless for thin shells, 3 has 4 % on the finer
-  mesh at R/h = 10 000, 4 has 6e-4 and 5 has 5e-6. Locking becomes weak with the degree, and disappears at none: **ratio**,
-  the error at R/h = 10 000 over that at 100, is still 270 at degree 5 (27 on the finer mesh, where the reference's error counts).
+  meshes: on one mesh the error grows with R/h. It is no layer that is missed, as the last table shows: with equally
+  many unknowns the error falls with the degree, for thin shells most. Degree 2 is useless for thin shells, 3 has 4 %
+  on the finer mesh at R/h = 10 000, 4 has 6e-4 and 5 has 5e-6. Locking becomes weak with the degree, and disappears
+  at none: **ratio**, the error at R/h = 10 000 over that at 100, is still 270 at degree 5 (27 on the finer mesh, where
+  the reference's error counts).
 
 """
 

@@ -1,4 +1,4 @@
-"""Edges of elements along the rim of a dimple beside the pole: what they are worth on a coarse mesh (docs/study/rims.md)."""
+"""Edges of elements along the rim of a dimple beside the pole, on a coarse mesh (docs/study/rims.md)."""
 
 import pytest
 from benchmarks.rims import knockdown
