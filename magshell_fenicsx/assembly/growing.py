@@ -15,7 +15,7 @@ from dolfinx import fem
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from magshell_fenicsx.assembly.parameter import FreeParameter, Slope
+from magshell_fenicsx.assembly.parameter import Derivative, FreeParameter
 from magshell_fenicsx.assembly.terms import Term
 
 Array = NDArray[np.float64]
@@ -108,13 +108,13 @@ class GrowingValue:
     def value(self, value: float) -> None:
         self.growing.put(self.name, float(value))
 
-    def bends(self, q: object) -> list[tuple[str | None, float]]:
+    def bends(self, q: object) -> list[Derivative]:
         """d2Pi_i/dmu dq with the amplitudes mu_i; q is the value of another parameter, or this one."""
         if isinstance(q, GrowingValue):
-            slopes: Sequence[Slope] = GrowingParameter(q, None).slopes
+            slopes: Sequence[Derivative] = GrowingParameter(q, None).slopes
         else:
             slopes = next(other.slopes for other in self.others.values() if other.constant is q)
-        return [(slope.amplitude, self.slope_of(slope.energy)) for slope in slopes]
+        return [_Slope(slope.amplitude, self, [slope], None) for slope in slopes]
 
     def slope_of(self, energy: Callable[[], float]) -> float:
         """The derivative of an energy."""
@@ -134,44 +134,43 @@ class GrowingParameter:
     gradients: Gradients | None
 
     @property
-    def slopes(self) -> list[Slope]:
+    def slopes(self) -> list[Derivative]:
         """dPi_i/dmu as terms."""
-        amplitudes = dict.fromkeys(term.amplitude for term in self.constant.terms)
-        return [_Slope(amplitude, self.constant, self.gradients) for amplitude in amplitudes]
+        terms = self.constant.terms
+        each = {amplitude: [t for t in terms if t.amplitude == amplitude] for amplitude in (t.amplitude for t in terms)}
+        return [_Slope(amplitude, self.constant, of, self.gradients) for amplitude, of in each.items()]
 
-    def bends(self, q: object) -> list[tuple[str | None, float]]:
+    def bends(self, q: object) -> list[Derivative]:
         """See `GrowingValue.bends`."""
         return self.constant.bends(q)
 
 
 @dataclass(frozen=True)
 class _Slope:
-    """The derivative of the terms with one amplitude."""
+    """The derivative of some energies with one amplitude."""
 
     amplitude: str | None
     by: GrowingValue
+    of: Sequence[Term | Derivative]
     gradients: Gradients | None
-
-    @property
-    def terms(self) -> list[Term]:
-        return [term for term in self.by.terms if term.amplitude == self.amplitude]
 
     def energy(self) -> float:
         """On this rank's part."""
-        return self.by.slope_of(lambda: sum(term.energy() for term in self.terms))
+        return self.by.slope_of(lambda: sum(one.energy() for one in self.of))
 
     def add_residual(self, b: Array, factor: float) -> None:
         """Add factor times its gradient to the local vector."""
-        names = self.gradients.names if self.gradients else frozenset[str]()
+        served = self.gradients.names if self.gradients else frozenset[str]()
+        names = [name for one in self.of if (name := getattr(one, "name", "")) in served]
 
         def add(weight: float) -> float:
+            for term in self.by.terms:
+                term.follow()
             if self.gradients:
-                together = {term.name: weight * factor for term in self.terms if term.name in names}
-                self.gradients.add(b, together)
-            for term in self.terms:
-                if term.name not in names:
-                    term.follow()
-                    term.add_residual(b, weight * factor)
+                self.gradients.add(b, dict.fromkeys(names, weight * factor))
+            for one in self.of:
+                if getattr(one, "name", "") not in served:
+                    one.add_residual(b, weight * factor)
             return 0.0
 
         self.by.growing.by(self.by.name, add)

@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.terms import FormTerm, Term
 
-Weighted = tuple[str | None, float]  # an amplitude, None for 1, and this rank's part of what it multiplies
-
 
 class Settable(Protocol):
     """A number that terms depend on."""
@@ -21,17 +19,15 @@ class Settable(Protocol):
     value: Any
 
 
-class Slope(Protocol):
-    """The derivative of terms with one amplitude."""
+class Derivative(Protocol):
+    """An energy's derivative by parameters, with the amplitude of its term."""
 
     @property
     def amplitude(self) -> str | None: ...
 
-    def energy(self) -> float:
-        """On this rank's part."""
+    def energy(self) -> float: ...
 
-    def add_residual(self, b: NDArray[np.float64], factor: float) -> None:
-        """Add its gradient, see `Term`."""
+    def add_residual(self, b: NDArray[np.float64], factor: float) -> None: ...
 
 
 class FreeParameter(Protocol):
@@ -41,9 +37,9 @@ class FreeParameter(Protocol):
     def constant(self) -> Settable: ...
 
     @property
-    def slopes(self) -> Sequence[Slope]: ...
+    def slopes(self) -> Sequence[Derivative]: ...
 
-    def bends(self, q: Any) -> list[Weighted]: ...
+    def bends(self, q: Any) -> Sequence[Derivative]: ...
 
 
 @dataclass(frozen=True)
@@ -63,22 +59,23 @@ class Parameter:
     constant: fem.Constant
     slopes: Sequence[FormTerm]
     log: KernelLog
-    _bends: dict[fem.Constant, list[tuple[str | None, fem.Form]]] = field(default_factory=dict)
+    _bends: dict[fem.Constant, list[FormTerm]] = field(default_factory=dict)
 
-    def bends(self, q: Any) -> list[Weighted]:
-        """d2Pi_i/dp dq with the amplitudes mu_i; q may be p. Its first call compiles: collective."""
+    def bends(self, q: Any) -> Sequence[Derivative]:
+        """d2Pi_i/dp dq with the amplitudes mu_i; q may be p."""
         if not isinstance(q, fem.Constant):
             return bends_of(q, self.constant)
         if q not in self._bends:
-            entered = [slope for slope in self.slopes if q in slope.form.constants()]
             self._bends[q] = [
-                (slope.amplitude, self.log.compile(f"{slope.name} twice", derived(slope.form, q))) for slope in entered
+                FormTerm(f"{t.name} twice", derived(t.form, q), t._u, self.log, t.amplitude)
+                for t in self.slopes
+                if q in t.form.constants()
             ]
-        return [(amplitude, fem.assemble_scalar(form)) for amplitude, form in self._bends[q]]
+        return self._bends[q]
 
 
-def bends_of(q: Any, p: Any) -> list[Weighted]:
-    """The mixed derivatives by what is no constant in a form, as that has them; else none."""
+def bends_of(q: Any, p: Any) -> Sequence[Derivative]:
+    """The mixed derivatives by q, which is no constant in a form, as q has them; else none."""
     return list(q.bends(p)) if hasattr(q, "bends") else []
 
 

@@ -4,7 +4,7 @@ Lengths in R, energies in E h R^2. Amplitudes: "pressure" is p/p_c, "force" is
 F R/(2 pi D), "lambda_m" is lambda_m.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.growing import Growing
 from magshell_fenicsx.assembly.kernels import KernelLog
-from magshell_fenicsx.assembly.parameter import FreeParameter, make_parameters
+from magshell_fenicsx.assembly.parameter import FreeParameter
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.assembly.sliding import Constraint, held_along
 from magshell_fenicsx.assembly.terms import LinearTerm, Term
@@ -24,8 +24,10 @@ from magshell_fenicsx.models.observed import Observed
 from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes
 from magshell_fenicsx.models.shell.dead_load import SurfaceMeasures, assemble_dead_loads
 from magshell_fenicsx.models.shell.driving import field_parameters
+from magshell_fenicsx.models.shell.energy import ShellTerm
 from magshell_fenicsx.models.shell.fast_tangent import FastTangent, make_sites
 from magshell_fenicsx.models.shell.folds import FOLD, largest_fold
+from magshell_fenicsx.models.shell.gradients import PointTerm
 from magshell_fenicsx.models.shell.moved import Support, moving, rotation_of
 from magshell_fenicsx.models.shell.natural import Shape, natural_field
 from magshell_fenicsx.models.shell.openings import openings
@@ -41,7 +43,8 @@ from magshell_fenicsx.models.shell.parameters import (
 )
 from magshell_fenicsx.models.shell.patterns import by_patch, places
 from magshell_fenicsx.models.shell.point_load import patch_entries, point_entries, vertex_normal
-from magshell_fenicsx.models.shell.residual import FastResidual
+from magshell_fenicsx.models.shell.residual import FastResidual, renew
+from magshell_fenicsx.models.shell.slopes import point_parameters
 from magshell_fenicsx.models.shell.supports import (
     closing_point,
     held_at_vertex,
@@ -209,14 +212,28 @@ class ShellModel(Observed):
             near = make_sites(self.r0, degree, terms, self.kernels, chosen=self.moving.cells)
             self._near = self.moving.cells, near
         fast = FastTangent(self.u, self._sites, held + mirrored, self._near)
-        gradients = FastResidual(self.r0, self.u, degree, terms, self.kernels)
-        parameters: dict[str, FreeParameter] = {**make_parameters(factory.free, terms, self.u, self.kernels)}
+        dense = [term for term in terms if isinstance(term, ShellTerm)]
+        served = list[FastResidual]()
+
+        def serve(terms: Sequence[PointTerm], *, apart: bool = False) -> FastResidual:
+            served.append(FastResidual(self.r0, self.u, degree, terms, self.kernels, apart=apart))
+            return served[-1]
+
+        gradients = serve(dense)
+        gradients.compile()
+        for term in dense:
+            if not (self.growing and term.amplitude == "pressure"):  # whose form measures from the drawn placement
+                term.points = gradients
+        parameters: dict[str, FreeParameter] = {
+            **point_parameters(factory.free, dense, lambda slopes: serve(slopes, apart=True))
+        }
         parameters |= field_parameters(factory.fields, terms, self.u, self.kernels)
         self.fields = factory.fields
         if self.growing:
             parameters |= self.growing.parameters(terms, parameters, gradients)
             sites = [*self._sites, *(self._near[1] if self._near else [])]
-            self.growing.renewed += [gradients.renew, *(site.renew for site in sites), *self._renewals]
+            self.growing.renewed += [each.renew for each in sites] + self._renewals
+            self.growing.renewed.append(lambda: renew(served))  # some come later
         self.system = FiniteElementSystem(
             self.u, terms, held + mirrored, interior, material.h, fast, gradients, parameters, self.moving
         )
