@@ -2,6 +2,10 @@
 
 They come from central differences of the residual, R_p = (R(r0 + s dr0/dp) - R(r0 - s dr0/dp))/(2 s): where the chart's
 nodes stay, r0 alone depends on an imperfection. A rim makes r0 rough in p beside it, but R is smooth in r0.
+
+Differences of folds converge to these derivatives on the same mesh: for depths with the square of their step, for what
+moves a rim with the step itself. Between new meshes, whose edges follow the rim, they have the meshes' noise over the
+step.
 """
 
 from dataclasses import dataclass, replace

@@ -281,9 +281,7 @@ def test_strip_against_its_field_buckles() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("lambda_m", "k_d", "refinement"), [(0.00184, 0.552053778, 0.5), (-0.00184, 0.120723848, 1.0)]
-)
+@pytest.mark.parametrize(("lambda_m", "k_d", "refinement"), [(0.00184, 0.552053778, 0.5), (-0.00184, 0.120723848, 1.0)])
 def test_solid_buckling(lambda_m: float, k_d: float, refinement: float) -> None:
     """The axisymmetric shell's k_d; the solid's is above it, 0.8 % and 1.3 % (docs/solid) and 0.4 % of mesh."""
     found = result("solid_buckling.yaml", f"magnetic.lambda_m={lambda_m}", f"mesh.refinement={refinement}")
