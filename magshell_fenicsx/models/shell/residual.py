@@ -37,7 +37,7 @@ class _Site(Protocol):
 
 
 class FastResidual:
-    """The residual of a sum of terms; a `solve.problem.ResidualAssembler`.
+    """The residual of a sum of terms; an `assemblers.ResidualAssembler`.
 
     Terms on cells that share an amplitude also share a kernel: their geometry is found once.
 
