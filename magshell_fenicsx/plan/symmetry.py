@@ -52,12 +52,15 @@ class Leaves:
         Whether a plane is left.
     energy
         The name of the energy that it is of, if any.
+    azimuths
+        Of further planes through e3 (rad) that may be left.
     """
 
     askew: str | None = None
     vectors: Vectors = ()
     mirrors: Callable[[Mirror], bool] = _every
     energy: str = ""
+    azimuths: tuple[float, ...] = ()
 
 
 def left(case: Case, outline: Outline, indented: Mapping[str, Array], terms: Sequence[OwnTerm]) -> list[Leaves]:
@@ -109,6 +112,10 @@ def mirror(parts: Sequence[Leaves], outline: Outline, *, loosely: bool = False) 
     if azimuth is not None:
         turns = (0.0, pi) if any(_tilted(v) for v in vectors) else (0.0, pi, pi / 2, -pi / 2)
         upright = [Mirror.upright(azimuth + turn) for turn in turns]
+
+    if outline.round:
+        between = [Mirror.upright(a + turn) for part in parts for a in part.azimuths for turn in (0.0, pi)]
+        upright += [plane for plane in between if all(abs(plane.normal @ _unit(v)) <= PARALLEL for v in vectors)]
 
     def first(planes: Sequence[Mirror]) -> Mirror | None:
         return next((plane for plane in planes if all(part.mirrors(plane) for part in parts)), None)
