@@ -230,6 +230,25 @@ def ensemble(
 
 
 @app.command()
+def design(
+    case: CaseFile,
+    set_: Settings = None,
+    out: Annotated[Path | None, _folder("results/<case name>_design/")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="continue the interrupted design in that folder")] = False,
+) -> None:
+    """Vary a case for a result (its section `design`); write the best case, its table and picture, and verify it."""
+    from magshell_fenicsx.mesh.patch import MeshError
+    from magshell_fenicsx.output.store.folder import DiskError
+    from magshell_fenicsx.studies.design.design import Missed
+    from magshell_fenicsx.studies.design.design import design as run_design
+
+    folder = out or Path("results") / f"{case.stem}_design"
+    with _exit_codes(MeshError, stopped=(DiskError, Missed)):
+        run_design(case, set_ or [], folder, resume=resume, say=_print_line)
+    _print_line(f"results in {folder}/")
+
+
+@app.command()
 def compare(
     case: CaseFile,
     set_: Settings = None,

@@ -12,6 +12,7 @@ from pydantic import Field, ModelWrapValidatorHandler, ValidationError, model_va
 from magshell_fenicsx.case.bodies.body import refuse_unfit_bodies, with_units
 from magshell_fenicsx.case.bodies.registered import Bodies
 from magshell_fenicsx.case.boundary import EDGES, BoundarySection, refuse_taken
+from magshell_fenicsx.case.design import DesignSection
 from magshell_fenicsx.case.ensemble import EnsembleSection
 from magshell_fenicsx.case.expressions import is_formula
 from magshell_fenicsx.case.fields import MagneticSection, layer_average
@@ -79,6 +80,8 @@ class Case(WithParts):
     """Natural frequencies at points of the path"""
     ensemble: EnsembleSection | None = None
     """What is random, for `magshell ensemble`"""
+    design: DesignSection | None = None
+    """What varies and what is wanted, for `magshell design`"""
     reactions: bool | None = None
     """Forces and moments of every support as columns of path.csv; by default where a support moves"""
     symmetry: Literal["auto", "none", "half", "axisymmetric"] = "auto"
