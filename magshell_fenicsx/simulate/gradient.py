@@ -5,6 +5,9 @@ With R(x; p) = 0 for the state x under the loading device in use, and K = R_x,
     dJ/dp = J_p + w . R_p,    K^T w = -J_x
 
 takes one solve for all parameters. For the amplitude at a fold w = -phi/(phi . R_mu) with the left null vector phi.
+Where a wave phi is neutral that a meridian does not see, Q(phi; u, mu, p) = 0 for its second variation, and
+
+    dmu/dp = -(Q_p + w . R_p)/(Q_mu + w . R_mu),    K w = -Q_u.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,6 +24,7 @@ from magshell_fenicsx.case.loads.step import PathStep
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.continuation.device import Device
 from magshell_fenicsx.continuation.fold import Fold
+from magshell_fenicsx.continuation.inverse import nearest_to_zero
 from magshell_fenicsx.continuation.system import State, System, Vector, dot
 from magshell_fenicsx.models.axisymmetric import pattern as of_meridian
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
@@ -29,6 +33,7 @@ from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.shell.patterns import Uniform
 from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.models.solid import remanence as of_body
+from magshell_fenicsx.models.solid.model import SolidModel
 from magshell_fenicsx.simulate.numbers import carried, number_of, scene_with
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.results import Functional, Target, functional
@@ -40,6 +45,7 @@ from magshell_fenicsx.simulate.transfer import transfer
 Array = NDArray[np.float64]
 Gradient: TypeAlias = float | FieldGradient
 FIELDS = {"remanence": "Br", "thickness": "thickness"}  # name -> that of the field in the terms
+WAVE = "m = "  # what the mode of a wave begins with
 STEP = 1e-4  # of a number, or of one where it is smaller
 
 
@@ -54,7 +60,11 @@ class Adjoint:
     rows
         c_i: of the rows of the device, which hold the conjugates of the amplitudes i.
     of, explicit
-        J itself; None for the amplitude at a fold, which no formula gives.
+        J itself; None for the amplitude at an instability, which no formula gives.
+    wave
+        phi, m and the factor of Q_p.
+    value
+        J.
     """
 
     scene: Scene
@@ -63,6 +73,8 @@ class Adjoint:
     rows: Mapping[str, float]
     of: str | Target = ""
     explicit: Functional | None = None
+    wave: tuple[Vector, int, float] | None = None
+    value: float = 0.0
 
     @property
     def potentials(self) -> dict[str, float]:
@@ -87,7 +99,7 @@ def gradient(
     Parameters
     ----------
     of
-        "fold": the amplitude of a record with that label; a column of path.csv (named points, w_over_h, reactions,
+        "instability": the amplitude of a record that is a fold or, on a meridian, a neutral wave; a column of path.csv (named points, w_over_h, reactions,
         volume_change, the load where it is not held, energy); or a function from undeformed places (n, 3) over R to
         wanted ones: the mean square distance to them.
     by
@@ -110,12 +122,26 @@ def gradient(
     FoldLost
         If Newton's method for the fold fails.
     """
-    found = adjoint_of_fold(scene, record, fold) if of == "fold" else adjoint(scene, record, of, hold)
+    found = adjoint_of_instability(scene, record, fold) if of == "instability" else adjoint(scene, record, of, hold)
     return {name: derivative(found, name) for name in by}
 
 
-def adjoint_of_fold(scene: Scene, record: Record, fold: Fold | None = None) -> Adjoint:
-    """The adjoint of the amplitude at a fold, from its null vector: no factorisation but those of the fold."""
+def adjoint_of_instability(scene: Scene, record: Record, fold: Fold | None = None) -> Adjoint:
+    """The adjoint of the amplitude where a fold or a neutral wave is.
+
+    A fold takes no factorisation but its own, a wave one of the tangent and one of its second variation.
+
+    Raises
+    ------
+    CaseError
+        If the record is another instability.
+    """
+    if record.mode.startswith(WAVE):
+        return _of_wave(scene, record)
+    if record.label != "fold":
+        raise CaseError(
+            f"instability: this is a {record.label} {record.mode}".rstrip() + ": only of folds, and of waves"
+        )
     fold = fold or fold_at(scene, record)
     stage = stage_at(scene, record)
     system = stage.newton.system
@@ -123,7 +149,30 @@ def adjoint_of_fold(scene: Scene, record: Record, fold: Fold | None = None) -> A
     left = -fold.left / pull
     rows = stage.device.rates(left) if stage.device else {}
     w = stage.device.displacement(left) if stage.device else left
-    return Adjoint(scene, stage.leave(fold.state), np.array(w), rows)
+    return Adjoint(scene, stage.leave(fold.state), np.array(w), rows, value=fold.value)
+
+
+def _of_wave(scene: Scene, record: Record) -> Adjoint:
+    model, m = scene.model, int(record.mode.removeprefix(WAVE))
+    if record.step and scene.case.programme[record.step - 1].load.hold:
+        raise CaseError(f"instability: {record.mode}: not while a conjugate is held")
+    assert isinstance(model, MeridianModel)
+    system, waves, state = model.system, model.excluded_modes.waves, model.system.placed(record.point.state)
+    phi = nearest_to_zero(waves.factor_at(state, m))[1]
+    terms = waves.along(phi, m)
+    system.at(state.u, state.mu)
+    mu = {term.name: state.mu[term.amplitude] if term.amplitude else 1.0 for term in terms}
+    Q = sum(mu[term.name] * term.energy() for term in terms)
+    Q_mu = sum(term.energy() for term in terms if term.amplitude == record.amplitude)
+    Q_u = np.zeros(system.size)
+    for term in terms:
+        term.add_residual(Q_u, mu[term.name])
+    factors = scene.newton.factor_at(state)
+    slope = system.held(-Q_u)
+    w = factors.solve_transposed(slope) if factors.skewed else factors.solve(slope)
+    rate = Q_mu + w @ system.load(state.u, state.mu, record.amplitude)
+    value = state.mu[record.amplitude] - Q / rate  # what locating it has left, to second order
+    return Adjoint(scene, state, -w / rate, {}, wave=(phi, m, -1 / rate), value=float(value))
 
 
 def adjoint(scene: Scene, record: Record, of: str | Target, hold: Mapping[str, str] | None = None) -> Adjoint:
@@ -150,7 +199,8 @@ def adjoint(scene: Scene, record: Record, of: str | Target, hold: Mapping[str, s
         )
     w = factors.solve_transposed(-slope) if factors.skewed else factors.solve(-slope)
     rows = device.rates(w) if device else {}
-    return Adjoint(scene, state, np.array(device.displacement(w) if device else w), rows, of, found)
+    w = np.array(device.displacement(w) if device else w)
+    return Adjoint(scene, state, w, rows, of, found, value=found.value)
 
 
 def _mixed(scene: Scene, state: State, of: Functional, name: str) -> float:
@@ -193,6 +243,9 @@ def _by_amplitude(adjoint: Adjoint, name: str) -> float:
     system, of = scene.model.system, adjoint.explicit
     found = dot(system.comm, adjoint.w, system.load(state.u, state.mu, name))
     found += sum(c * system.curvature(state.u, state.mu, i, name) for i, c in adjoint.rows.items())
+    if adjoint.wave:
+        system.at(state.u, state.mu)
+        found += adjoint.wave[2] * sum(t.energy() for t in _along(scene, adjoint) if t.amplitude == name)
     return float(found + (_mixed(scene, state, of, name) + of.by_mu.get(name, 0.0) if of else 0.0))
 
 
@@ -209,17 +262,30 @@ def _by_number(adjoint: Adjoint, key: str) -> float:
         moved = system.placed(moved)
         explicit = functional(other, moved, adjoint.of).value if adjoint.explicit else 0.0
         rows = sum(c * system.potential(moved.u, moved.mu, name) for name, c in adjoint.rows.items())
-        return float(explicit + dot(system.comm, w, system.residual(moved.u, moved.mu)) + rows)
+        total = explicit + dot(system.comm, w, system.residual(moved.u, moved.mu)) + rows
+        for term in _along(other, adjoint):
+            assert adjoint.wave
+            mu = moved.mu[term.amplitude] if term.amplitude else 1.0
+            total += adjoint.wave[2] * mu * term.energy()
+        return float(total)
 
     return (contracted(value + step) - contracted(value - step)) / (2 * step)
 
 
+def _along(scene: Scene, adjoint: Adjoint) -> list[FormTerm]:
+    """The second variation along the wave, at the displacement that is set; none without a wave."""
+    if adjoint.wave is None:
+        return []
+    assert isinstance(scene.model, MeridianModel)
+    return scene.model.excluded_modes.waves.along(*adjoint.wave[:2])
+
+
 def _by_field(adjoint: Adjoint, name: str) -> FieldGradient:
     scene, state = adjoint.scene, adjoint.state
-    if name == "thickness" and not scene.model.thickness:
-        even = Scene(scene.case, scene.comm, replace(scene.plan, thickness=Thickness()))
-        u, w = (transfer(scene, even, v) for v in (state.u, adjoint.w))
-        return _by_field(replace(adjoint, scene=even, state=State(u, state.mu), w=w), name)
+    other = _with_field(adjoint, name)
+    if other is not scene:
+        u, w = (transfer(scene, other, v) for v in (state.u, adjoint.w))
+        return _by_field(replace(adjoint, scene=other, state=State(u, state.mu), w=w), name)
     model, system = scene.model, scene.model.system
     system.at(state.u, state.mu)
     terms = _terms(scene, state, name)
@@ -237,12 +303,28 @@ def _by_field(adjoint: Adjoint, name: str) -> FieldGradient:
     for term in terms:
         mu = state.mu[term.amplitude] if term.amplitude else 1.0
         shares.append(Share(term, energy * mu + c.get(term.amplitude or "", 0.0), mu))
+    if adjoint.wave:
+        for term in _along(scene, adjoint):
+            mu = state.mu[term.amplitude] if term.amplitude else 1.0
+            shares.append(Share(term, adjoint.wave[2] * mu, 0.0))
     for each in c.keys() & system.parameters.keys():
         for slope in system.parameters[each].slopes:
             shares.append(Share(slope, c[each] * (state.mu[slope.amplitude] if slope.amplitude else 1.0), 0.0))
     forces = by_field(shares, f, model.u, w, model.kernels)
     places, normals = _places(scene, f)
     return FieldGradient(f, forces, places[: len(forces)], normals[: len(forces)])
+
+
+def _with_field(adjoint: Adjoint, name: str) -> Scene:
+    """The scene, or one in whose terms a number that is the same everywhere is a field."""
+    scene, plan = adjoint.scene, adjoint.scene.plan
+    if name == "thickness" and not (isinstance(scene.model, SolidModel) or scene.model.thickness):
+        return Scene(scene.case, scene.comm, replace(plan, thickness=Thickness()))
+    magnetic = plan.loads.magnetic
+    if adjoint.wave and name == "remanence" and magnetic and not callable(magnetic.remanent):
+        even = replace(magnetic, remanent=Uniform(np.asarray(magnetic.remanent)))
+        return Scene(scene.case, scene.comm, replace(plan, loads=replace(plan.loads, magnetic=even)))
+    return scene
 
 
 def _terms(scene: Scene, state: State, name: str) -> list[FormTerm]:

@@ -17,7 +17,7 @@ from magshell_fenicsx.continuation.fold import Guess, find_fold
 from magshell_fenicsx.models.shell.controls import ByControls
 from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.simulate.follow import follow
-from magshell_fenicsx.simulate.gradient import gradient
+from magshell_fenicsx.simulate.gradient import adjoint_of_instability, gradient
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.results import functional
 from magshell_fenicsx.simulate.scene import Scene
@@ -85,7 +85,9 @@ def test_state_by_remanence_amplitude_and_number(strip: Path, symmetry: str) -> 
     scene = Scene(case)
     last, before = solved(scene), scene.newton.factorisation.count
     one = with_values(scene, 0 * CHANGE)
-    others = {c: (moved, solved(moved)) for c in (-2e-3, -1e-3, 1e-3, 2e-3) for moved in [with_values(scene, c * CHANGE)]}
+    others = {
+        c: (moved, solved(moved)) for c in (-2e-3, -1e-3, 1e-3, 2e-3) for moved in [with_values(scene, c * CHANGE)]
+    }
     assert one.plan.half == scene.plan.half == (symmetry == "auto")
     for of in ("tip_uz", circle, "energy"):
         found = gradient(scene, last, of=of, by=["remanence"])["remanence"]
@@ -108,11 +110,15 @@ def test_state_by_remanence_amplitude_and_number(strip: Path, symmetry: str) -> 
         assert found_numbers[name] == pytest.approx(by_difference(other, 1e-2) / at, rel=1e-5), name
 
 
-def folded(tmp_path: Path, *settings: str) -> Scene:
+def turning(a: Array) -> tuple[Array, Array]:
+    return np.sin(3 * a), np.cos(2 * a)
+
+
+def folded(tmp_path: Path, *settings: str, polar: Callable[[Array], tuple[Array, Array]] = turning) -> Scene:
     """The dimpled hemisphere with a remanence that varies along its meridians."""
-    polar = np.radians(np.linspace(0, 90, 7))
-    places = np.column_stack([np.sin(polar), np.cos(polar)])
-    write_vectors(tmp_path / "B.csv", places, np.column_stack([np.sin(3 * polar), np.cos(2 * polar)]))
+    angles = np.radians(np.linspace(0, 90, 7))
+    places = np.column_stack([np.sin(angles), np.cos(angles)])
+    write_vectors(tmp_path / "B.csv", places, np.column_stack(polar(angles)))
     remanent = f"{{kind: points, file: {tmp_path / 'B.csv'}, filter: 0.3}}"
     return Scene(
         Case.load(
@@ -125,14 +131,16 @@ def folded(tmp_path: Path, *settings: str) -> Scene:
 HALF = ["symmetry=half", "mesh.degree=3", "mesh.refinement=0.3"]
 
 
-@pytest.mark.parametrize("settings", [pytest.param([], id="meridian"), pytest.param(HALF, id="half", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "settings", [pytest.param([], id="meridian"), pytest.param(HALF, id="half", marks=pytest.mark.slow)]
+)
 def test_fold_by_remanence_and_thickness(tmp_path: Path, settings: list[str]) -> None:
     """The knockdown factor; no factorisation but those of the fold."""
     scene = folded(tmp_path, *settings)
     last = solved(scene)
     fold = fold_at(scene, last)
     before = scene.newton.factorisation.count
-    found = gradient(scene, last, of="fold", by=["remanence", "thickness"], fold=fold)
+    found = gradient(scene, last, of="instability", by=["remanence", "thickness"], fold=fold)
     assert scene.newton.factorisation.count == before
     change = np.random.default_rng(1).standard_normal((7, 2))
 
@@ -149,6 +157,23 @@ def test_fold_by_remanence_and_thickness(tmp_path: Path, settings: list[str]) ->
     assert isinstance(thickness, FieldGradient)
     expected = by_difference(lambda c: again(thicker(c)), 0.01)
     assert thickness.along(thickness.places[..., 2:] ** 2) == pytest.approx(expected, rel=1e-5)
+
+
+def test_neutral_wave(tmp_path: Path) -> None:
+    """A wave around the axis that is neutral before the fold; its pressure found again by a path."""
+    settings = ["loading={kind: pressure, until: bifurcation, control: arc}", "shell.defect.amplitude=0.05"]
+    scene = folded(tmp_path, *settings, polar=lambda a: (0.2 * np.sin(3 * a), 1 + 0 * a))
+    change = np.random.default_rng(3).standard_normal((7, 2))
+    wave = solved(scene)
+    assert wave.mode.startswith("m = ")
+    found = gradient(scene, wave, of="instability", by=["remanence", "lambda_m", "magnetic.lambda_m"])
+    near = {c: with_values(scene, c * change) for c in (-2e-3, -1e-3, 1e-3, 2e-3)}
+    values = {c: adjoint_of_instability(other, solved(other)).value for c, other in near.items()}
+    expected = by_difference(values.__getitem__, 1e-3)
+    assert np.sum(of_points(scene, found["remanence"]) * change) == pytest.approx(expected, rel=1e-4)
+    whole = np.sum(of_points(scene, found["remanence"]) * scene.plan.loads.magnetic.remanent.values)  # type: ignore[union-attr]
+    assert found["lambda_m"] == pytest.approx(whole / 0.001, rel=1e-9)  # the energy is linear in both
+    assert found["magnetic.lambda_m"] == pytest.approx(found["lambda_m"], rel=1e-6)
 
 
 def test_force_at_a_depth(tmp_path: Path) -> None:
