@@ -48,14 +48,16 @@ def by_difference(f: Callable[[float], float], step: float) -> float:
 def with_values(scene: Scene, change: Array) -> Scene:
     """The scene with other vectors at the points of its remanence."""
     loads = scene.plan.loads
-    assert loads.magnetic and isinstance(loads.magnetic.remanent, ByControls)
+    assert loads.magnetic
+    assert isinstance(loads.magnetic.remanent, ByControls)
     other = replace(loads.magnetic.remanent, values=loads.magnetic.remanent.values + change)
     plan = replace(scene.plan, loads=replace(loads, magnetic=replace(loads.magnetic, remanent=other)))
     return Scene(scene.case, scene.comm, plan)
 
 
 def of_points(scene: Scene, found: object) -> Array:
-    assert isinstance(found, FieldGradient) and scene.plan.loads.magnetic
+    assert isinstance(found, FieldGradient)
+    assert scene.plan.loads.magnetic
     remanent = scene.plan.loads.magnetic.remanent
     assert isinstance(remanent, ByControls)
     return remanent.pulled(found.places, found.forces)

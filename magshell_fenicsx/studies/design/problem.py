@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.design import DesignSection
 from magshell_fenicsx.simulate.results import Target
-from magshell_fenicsx.studies.design.evaluate import DISTANCE, Evaluation
+from magshell_fenicsx.studies.design.evaluate import BESIDE, DISTANCE, FOLDS, MOST, Evaluation
 from magshell_fenicsx.studies.design.target import target_of
 
 Array = NDArray[np.float64]
@@ -58,6 +58,23 @@ class Problem:
             return ((value - wanted.value) / scale) ** 2, 2 * (value - wanted.value) / scale**2
         sign = -1.0 if wanted.maximise else 1.0
         return sign * value / scale, sign / scale
+
+    @property
+    def lowest(self) -> bool:
+        """Whether the lowest of several instabilities is to be raised."""
+        return self.section.objective.maximise in FOLDS
+
+    def lowest_values(self, found: Evaluation) -> Array:
+        """(MOST,): the lowest instabilities over their first value; where fewer are near, what is surely above."""
+        result = self.section.objective.result
+        values = [found.values[result], *(value for value, _ in found.beside[result])]
+        return np.array([*values, *[BESIDE * values[0]] * MOST])[:MOST] / self.scale[result]
+
+    def lowest_slopes(self, found: Evaluation) -> Array:
+        """(MOST, variables)."""
+        result = self.section.objective.result
+        slopes = [found.gradients[result], *(slope for _, slope in found.beside[result])]
+        return np.array([*slopes, *[[BESIDE * v for v in slopes[0]]] * MOST])[:MOST] / self.scale[result]
 
     def constraints(self, found: Evaluation) -> Array:
         """Not negative where all are kept."""
