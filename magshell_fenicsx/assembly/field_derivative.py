@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import ufl
@@ -43,7 +44,7 @@ class FieldGradient:
 
     def along(self, change: Array) -> float:
         """The derivative along a change (cells, nodes, components) of the field; collective."""
-        return self._sum(np.sum(self.forces * change))
+        return float(self._sum(np.sum(self.forces * change)))
 
     def cells(self) -> Array:
         """(cells, components): of a field that is the same within each cell, of this rank's own cells."""
@@ -53,8 +54,8 @@ class FieldGradient:
         """(components,): of a field that is the same within a patch of own cells; collective."""
         return np.asarray(self._sum(self.forces[cells].sum(axis=(0, 1))))
 
-    def _sum(self, own: float | Array) -> float | Array:
-        return self.field.function_space.mesh.comm.allreduce(own)  # type: ignore[no-any-return]
+    def _sum(self, own: Any) -> Any:
+        return self.field.function_space.mesh.comm.allreduce(own)
 
 
 def by_field(shares: Iterable[Share], f: fem.Function, u: fem.Function, w: fem.Function, log: KernelLog) -> Array:

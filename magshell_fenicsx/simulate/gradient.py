@@ -22,7 +22,7 @@ from magshell_fenicsx.assembly.field_derivative import FieldGradient, Share, by_
 from magshell_fenicsx.assembly.terms import FormTerm, Term
 from magshell_fenicsx.case.loads.step import PathStep
 from magshell_fenicsx.case.source import CaseError
-from magshell_fenicsx.continuation.device import Device
+from magshell_fenicsx.continuation.device import Conjugate, Device
 from magshell_fenicsx.continuation.fold import Fold
 from magshell_fenicsx.continuation.inverse import nearest_to_zero
 from magshell_fenicsx.continuation.system import State, System, Vector, dot
@@ -146,7 +146,7 @@ def adjoint_of_instability(scene: Scene, record: Record, fold: Fold | None = Non
     stage = stage_at(scene, record)
     system = stage.newton.system
     pull = dot(system.comm, fold.left, system.load(fold.state.u, fold.state.mu, fold.name))
-    left = -fold.left / pull
+    left = np.asarray(-fold.left / pull)
     rows = stage.device.rates(left) if stage.device else {}
     w = stage.device.displacement(left) if stage.device else left
     return Adjoint(scene, stage.leave(fold.state), np.array(w), rows, value=fold.value)
@@ -172,7 +172,7 @@ def _of_wave(scene: Scene, record: Record) -> Adjoint:
     w = factors.solve_transposed(slope) if factors.skewed else factors.solve(slope)
     rate = Q_mu + w @ system.load(state.u, state.mu, record.amplitude)
     value = state.mu[record.amplitude] - Q / rate  # what locating it has left, to second order
-    return Adjoint(scene, state, -w / rate, {}, wave=(phi, m, -1 / rate), value=float(value))
+    return Adjoint(scene, state, -w / rate, {}, wave=(phi, m, float(-1 / rate)), value=float(value))
 
 
 def adjoint(scene: Scene, record: Record, of: str | Target, hold: Mapping[str, str] | None = None) -> Adjoint:
@@ -210,9 +210,9 @@ def _mixed(scene: Scene, state: State, of: Functional, name: str) -> float:
     return float(changes + (of.energy and of.energy * system.potential(state.u, state.mu, name)))
 
 
-def _held(scene: Scene, record: Record, state: State, hold: Mapping[str, str] | None) -> dict[str, float]:
+def _held(scene: Scene, record: Record, state: State, hold: Mapping[str, str] | None) -> dict[str, float | Conjugate]:
     """Amplitude -> its conjugate, of those that are unknown."""
-    held = dict[str, float]()
+    held = dict[str, float | Conjugate]()
     step = scene.case.programme[record.step - 1] if record.step else None
     if hold is None and step:
         held |= held_by(scene, step, state)
@@ -292,12 +292,12 @@ def _by_field(adjoint: Adjoint, name: str) -> FieldGradient:
     f = next((c for t in terms for c in t.form.coefficients() if c.name == FIELDS[name]), None)
     if f is None:
         raise CaseError(f"{name}: the case has no such field: no result depends on it")
-    w, c = fem.Function(model.V), adjoint.potentials
-    w.x.array[: system.size] = adjoint.w
-    w.x.scatter_forward()
+    along, c = fem.Function(model.V), adjoint.potentials
+    along.x.array[: system.size] = adjoint.w
+    along.x.scatter_forward()
     if system.moving:
         for motion in c.keys() & system.moving.names:
-            w.x.array[:] += c[motion] * system.moving.rate(state.mu, motion)
+            along.x.array[:] += c[motion] * system.moving.rate(state.mu, motion)
     energy = adjoint.explicit.energy if adjoint.explicit else 0.0
     shares = []
     for term in terms:
@@ -310,7 +310,7 @@ def _by_field(adjoint: Adjoint, name: str) -> FieldGradient:
     for each in c.keys() & system.parameters.keys():
         for slope in system.parameters[each].slopes:
             shares.append(Share(slope, c[each] * (state.mu[slope.amplitude] if slope.amplitude else 1.0), 0.0))
-    forces = by_field(shares, f, model.u, w, model.kernels)
+    forces = by_field(shares, f, model.u, along, model.kernels)
     places, normals = _places(scene, f)
     return FieldGradient(f, forces, places[: len(forces)], normals[: len(forces)])
 

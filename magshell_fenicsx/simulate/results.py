@@ -68,11 +68,11 @@ def functional(scene: Scene, state: State, of: str | Target) -> Functional:
         return Functional(scene.observe(state)[of], system.held(by_u))
     if of in (conjugates := _conjugates(scene)):
         name, unit = conjugates[of]
-        by_u = -system.load(state.u, state.mu, name) / unit
+        by_u = np.asarray(-system.load(state.u, state.mu, name) / unit)
         value = -system.potential(state.u, state.mu, name) / unit
         return Functional(value, by_u, potentials={name: -1 / unit})
     if of in ("w_pole_over_h", "w_over_h") and "pole" in model.normals:
-        by_u = -(model.normals["pole"] @ model.probe("pole")) / scene.plan.material.h
+        by_u = np.asarray(-(model.normals["pole"] @ model.probe("pole")) / scene.plan.material.h)
         return Functional(scene.observe(state)["w_pole_over_h"], system.held(by_u))
     name = "pressure" if of == "p_over_pc" else of
     if name in state.mu:
@@ -147,4 +147,4 @@ def _misfit(scene: Scene, state: State, target: Target) -> Functional:
     fem.assemble_vector(vector.x.array, slope)
     vector.x.scatter_reverse(InsertMode.add)
     by_u = system.held(np.array(vector.x.array[: system.size]))
-    return Functional(system.integral(state.u, square) / area, by_u / area)
+    return Functional(system.integral(state.u, square) / area, np.asarray(by_u / area))

@@ -67,7 +67,7 @@ class ByControls:
     def __call__(self, r0: Array, n0: Array) -> Array:
         x = r0.reshape(-1, 3)
         x = x if self.frame is None else x @ self.frame
-        found = np.asarray(self.controls.weights(x) @ self.values)
+        found: Array = np.asarray(self.controls.weights(x) @ self.values)
         if self.controls.around:
             rho = np.maximum(np.hypot(x[:, 0], x[:, 1]), 1e-300)[:, None]
             found = np.column_stack([found[:, :1] * x[:, :2] / rho, found[:, 1]])
@@ -75,7 +75,7 @@ class ByControls:
 
     def pulled(self, r0: Array, forces: Array) -> Array:
         """The transposed map: what multiplies each of the values in sum(forces . B) over places (cells, nodes, 3)."""
-        x, f = r0.reshape(-1, 3), forces.reshape(-1, 3)
+        x, f = np.asarray(r0.reshape(-1, 3)), np.asarray(forces.reshape(-1, 3))
         if self.frame is not None:
             x, f = x @ self.frame, f @ self.frame
         if self.controls.around:

@@ -70,16 +70,18 @@ class Design:
                 return found
         name = hashlib.sha256(x.tobytes()).hexdigest()[:16]
         file, vectors = (self.folder / "points" / f"{name}.{ending}" for ending in ("json", "csv"))
-        found = by_first(self.comm, lambda: self._known(file), "cannot be read")
-        if found is None:
-            by_first(self.comm, lambda: self.variables.write(x, vectors))
-            case = self.variables.case_of(x, vectors)
-            found = self.comm.bcast(
-                evaluate(case, x, self.variables, self.problem.results, self.problem.targets, self.comm)
-            )
-            content = {"design": self._mine, "sources": sources.ours(), "evaluation": asdict(found)}
-            by_first(self.comm, lambda: write_whole(file, (json.dumps(content) + "\n").encode()))
+        kept = by_first(self.comm, lambda: self._known(file), "cannot be read")
+        found = kept or self._new(x, file, vectors)
         self._add(x, found, name)
+        return found
+
+    def _new(self, x: Array, file: Path, vectors: Path) -> Evaluation:
+        by_first(self.comm, lambda: self.variables.write(x, vectors))
+        case, problem = self.variables.case_of(x, vectors), self.problem
+        found = evaluate(case, x, self.variables, problem.results, problem.targets, self.comm)
+        found = Evaluation(**self.comm.bcast(asdict(found)))
+        content = {"design": self._mine, "sources": sources.ours(), "evaluation": asdict(found)}
+        by_first(self.comm, lambda: write_whole(file, (json.dumps(content) + "\n").encode()))
         return found
 
     @property
@@ -109,7 +111,7 @@ class Design:
             **found.seen,
             "objective": self.problem.objective(found) if found.values else None,
             "violation": self.problem.violation(found) if found.values else None,
-            "best": best is not None and best[0] is x,
+            "best": bool(best and best[0] is x),
             **self.variables.numbers(x),
             "note": found.note,
             "point": name,
@@ -185,7 +187,9 @@ def _designed(made: Design, case: Case, file: Path, comm: MPI.Intracomm) -> dict
     if len(idle) == len(vary.keys) + (vary.controls is not None):
         raise Missed(f"no variable has an influence on {', '.join(problem.results)} where the design starts")
     ended = searched(made, problem, vary, section.iterations)
-    x, best = _best(made)
+    found = made.best
+    assert found
+    x, best = found
     steps = section.remanence.steps if section.remanence else None
     if steps:
         x = vary.rounded(x, steps)
@@ -214,12 +218,6 @@ def _designed(made: Design, case: Case, file: Path, comm: MPI.Intracomm) -> dict
     if said := problem.missed(best):
         raise Missed(f"{said}; the best case is {folder / 'best.yaml'}")
     return content
-
-
-def _best(made: Design) -> tuple[Array, Evaluation]:
-    best = made.best
-    assert best
-    return best
 
 
 def _without_influence(vary: Variables, first: Evaluation) -> list[str]:

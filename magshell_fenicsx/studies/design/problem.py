@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.design import DesignSection
 from magshell_fenicsx.simulate.results import Target
-from magshell_fenicsx.studies.design.evaluate import BESIDE, DISTANCE, FOLDS, MOST, Evaluation
+from magshell_fenicsx.studies.design.evaluate import BESIDE, FOLDS, MOST, Evaluation
 from magshell_fenicsx.studies.design.target import target_of
 
 Array = NDArray[np.float64]
@@ -114,15 +114,12 @@ class Problem:
         if wanted.value is not None and wanted.reach:
             value = found.values[wanted.reach]
             if abs(value - wanted.value) > REACHED * (abs(wanted.value) or 1.0):
-                said.append(
-                    f"{wanted.reach} = {wanted.value:g} cannot be reached within the bounds: the nearest found is {value:.6g}"
-                )
+                asked = f"{wanted.reach} = {wanted.value:g} is not reached within the bounds"
+                said.append(f"{asked}: the nearest found is {value:.6g}")
         for of, bound, sign, _ in self._bounds:
-            away = sign * (found.values[of] - bound)
-            if away < -KEPT * (abs(bound) or 1.0):
-                said.append(
-                    f"{of} {'at least' if sign > 0 else 'at most'} {bound:g} cannot be kept: the nearest found is {found.values[of]:.6g}"
-                )
+            if sign * (found.values[of] - bound) < -KEPT * (abs(bound) or 1.0):
+                asked = f"{of} {'at least' if sign > 0 else 'at most'} {bound:g} is not kept"
+                said.append(f"{asked}: the nearest found is {found.values[of]:.6g}")
         return "; ".join(said)
 
 
@@ -130,6 +127,3 @@ def problem_of(case: Case, section: DesignSection) -> Problem:
     """What the section of a case wants."""
     shape = section.objective.shape
     return Problem(section, {"shape": target_of(shape, case)} if shape else {})
-
-
-__all__ = ["DISTANCE", "Problem", "problem_of"]

@@ -25,7 +25,8 @@ def searched(evaluated: Callable[[Array], Evaluation], problem: Problem, vary: V
         found = evaluated(x)
         if not found.values:
             away = x - min(known, key=lambda each: each[1])[0]
-            return max(value for _, value in known) + WORSE, away / max(float(np.linalg.norm(away)), 1e-300)
+            uphill = np.asarray(away / max(float(np.linalg.norm(away)), 1e-300))
+            return max(value for _, value in known) + WORSE, uphill
         value = problem.objective(found)
         known.append((np.array(x), value))
         return value, problem.slope(found)

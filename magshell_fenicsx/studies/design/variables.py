@@ -76,9 +76,11 @@ class Variables:
     @property
     def limits(self) -> list[tuple[float | None, float | None]]:
         """Bounds of the vector."""
-        free = [(None, None)] * (0 if self.controls is None else len(self.start) * (1 if self.planar else 2))
-        sizes = [(0.0, 1.0)] * (len(self.start) if self.lengths else 0)
-        return [(0.0, 1.0)] * len(self.keys) + free + sizes
+        free: list[tuple[float | None, float | None]] = [(None, None)] * (
+            0 if self.controls is None else len(self.start) * (1 if self.planar else 2)
+        )
+        sizes = len(self.start) if self.lengths else 0
+        return [*[(0.0, 1.0)] * len(self.keys), *free, *[(0.0, 1.0)] * sizes]
 
     def numbers(self, x: Array) -> dict[str, float]:
         """Key -> value."""
@@ -95,7 +97,7 @@ class Variables:
         numbers = np.array([found[key] for key in self.keys]) * np.ptp(self.bounds, axis=1)
         field = found.get("remanence")
         if not isinstance(field, FieldGradient) or self.controls is None:
-            return numbers
+            return np.asarray(numbers)
         magnetic = scene.plan.loads.magnetic
         assert magnetic
         assert isinstance(magnetic.remanent, ByControls)
@@ -167,7 +169,7 @@ def variables(source: Source, case: Case, design: DesignSection) -> Variables:
     for key, (low, high) in design.numbers.items():
         if not low <= (value := number_of(case, key)) <= high:
             raise CaseError(f"design.numbers: {key}: the case starts at {value:g}, beyond {low:g} to {high:g}")
-    controls, start = None, np.zeros((0, 3))
+    controls, start = None, np.asarray(np.zeros((0, 3)))
     if design.remanence:
         controls, start = _controls(case, design)
         if not (case.shell.geometry == "strip" or controls.around):
