@@ -105,6 +105,7 @@ def run(
     time_limit: Annotated[
         float | None, typer.Option(min=0, metavar="SECONDS", help="stop after this time; --resume continues")
     ] = None,
+    pictures: Annotated[bool, typer.Option(" /--no-pictures", help="draw none; magshell plot draws them later")] = True,
 ) -> None:
     """Solve a case and write path.csv, summary.json, fields and pictures."""
     from magshell_fenicsx.case.case import Case
@@ -119,7 +120,9 @@ def run(
         with _exit_codes(MeshError, stopped=(DiskError,)):
             read = Case.load(case, set_ or [])
             with live_line(_world().size, _print_line) as (say, tell):
-                result = run_case(read, folder, say=say, tell=tell, resume=resume, time_limit=time_limit)
+                result = run_case(
+                    read, folder, say=say, tell=tell, resume=resume, time_limit=time_limit, pictures=pictures
+                )
     except AlreadyComplete as e:
         _print_line(f"complete already: {e.summary['points']} points; results in {folder}/")
         return

@@ -2,6 +2,7 @@
 
 import csv
 import gc
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -12,20 +13,14 @@ from magshell_fenicsx.cli import app
 
 NICE = ["nice", "-n", "-10"]
 FIRST = [] if subprocess.run([*NICE, "true"], capture_output=True, check=False).stderr else NICE  # root may
-UNDRAWN = """
-import sys
-import magshell_fenicsx.run.run
-from magshell_fenicsx.cli import main
-sys.modules["magshell_fenicsx.run.run"].draw = lambda folder: []
-main()
-"""
 
 
 def magshell(*arguments: str | Path | float, ranks: int = 0) -> subprocess.CompletedProcess[str]:
-    """Run `magshell ...`: in this process, which saves two seconds, or undrawn under mpirun if `ranks` is given."""
+    """Run `magshell ...`: in this process, which saves two seconds, or undrawn under mpirun if it has more ranks."""
     words = [str(word) for word in arguments]
-    if ranks:
+    if ranks > 1:
         return started(*words, ranks=ranks, pictures=False)
+    words += ["--no-pictures"] if words[:1] == ["run"] and ranks else []
     done = CliRunner(mix_stderr=False).invoke(app, words, prog_name="magshell")
     gc.unfreeze()  # a run freezes what it leaves, as its process ends soon
     if done.exception and not isinstance(done.exception, SystemExit):
@@ -43,9 +38,9 @@ def mpirun(ranks: int) -> list[str]:
 
 def started(*arguments: str | Path | float, ranks: int = 0, pictures: bool = True) -> subprocess.CompletedProcess[str]:
     """Run `magshell ...` in processes of its own, under mpirun if `ranks` is given."""
-    program = ["-m", "magshell_fenicsx"] if pictures else ["-c", UNDRAWN]
-    launcher = mpirun(ranks) if ranks else []
-    command = [*launcher, sys.executable, *program, *map(str, arguments)]
+    launcher, words = mpirun(ranks) if ranks else [], [str(word) for word in arguments]
+    undrawn = ["--no-pictures"] if words[:1] == ["run"] and not pictures else []
+    command = [*launcher, sys.executable, "-m", "magshell_fenicsx", *words, *undrawn]
     return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
@@ -53,3 +48,23 @@ def read_path(folder: Path) -> list[dict[str, str]]:
     """Rows of path.csv."""
     with (folder / "path.csv").open(encoding="utf-8") as stream:
         return list(csv.DictReader(stream))
+
+
+SEVERAL = """
+import gc, json, sys
+from magshell_fenicsx.cli import main
+for words in json.loads(sys.argv[1]):
+    sys.argv = ["magshell", *words]
+    try:
+        main()
+    except SystemExit as e:
+        if e.code:
+            raise
+    gc.unfreeze()
+"""
+
+
+def all_started(commands: list[list[str]], ranks: int) -> subprocess.CompletedProcess[str]:
+    """Run `magshell ...` several times in the same processes under mpirun, which start once; all must succeed."""
+    command = [*mpirun(ranks), sys.executable, "-c", SEVERAL, json.dumps(commands)]
+    return subprocess.run(command, capture_output=True, text=True, check=False)

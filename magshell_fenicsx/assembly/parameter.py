@@ -4,19 +4,30 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
+import numpy as np
 import ufl
 from dolfinx import fem
+from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.terms import FormTerm, Term
-
-Weighted = tuple[str | None, fem.Form]  # an amplitude, None for 1, and a form that it multiplies
 
 
 class Settable(Protocol):
     """A number that terms depend on."""
 
     value: Any
+
+
+class Derivative(Protocol):
+    """An energy's derivative by parameters, with the amplitude of its term."""
+
+    @property
+    def amplitude(self) -> str | None: ...
+
+    def energy(self) -> float: ...
+
+    def add_residual(self, b: NDArray[np.float64], factor: float) -> None: ...
 
 
 class FreeParameter(Protocol):
@@ -26,9 +37,9 @@ class FreeParameter(Protocol):
     def constant(self) -> Settable: ...
 
     @property
-    def slopes(self) -> Sequence[FormTerm]: ...
+    def slopes(self) -> Sequence[Derivative]: ...
 
-    def bends(self, q: Any) -> list[Weighted]: ...
+    def bends(self, q: Any) -> Sequence[Derivative]: ...
 
 
 @dataclass(frozen=True)
@@ -48,14 +59,15 @@ class Parameter:
     constant: fem.Constant
     slopes: Sequence[FormTerm]
     log: KernelLog
-    _bends: dict[fem.Constant, list[Weighted]] = field(default_factory=dict)
+    _bends: dict[fem.Constant, list[FormTerm]] = field(default_factory=dict)
 
-    def bends(self, q: fem.Constant) -> list[Weighted]:
-        """d2Pi_i/dp dq with the amplitudes mu_i; q may be p. Its first call compiles: collective."""
+    def bends(self, q: fem.Constant) -> list[FormTerm]:
+        """d2Pi_i/dp dq with the amplitudes mu_i; q may be p."""
         if q not in self._bends:
-            entered = [slope for slope in self.slopes if q in slope.form.constants()]
             self._bends[q] = [
-                (slope.amplitude, self.log.compile(f"{slope.name} twice", derived(slope.form, q))) for slope in entered
+                FormTerm(f"{t.name} twice", derived(t.form, q), t._u, self.log, t.amplitude)
+                for t in self.slopes
+                if q in t.form.constants()
             ]
         return self._bends[q]
 

@@ -1,5 +1,6 @@
 """The sum of terms on a finite-element space, as a system for the solvers."""
 
+import itertools
 from collections.abc import Mapping, Sequence
 from typing import Protocol
 
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from magshell_fenicsx.assembly.moving import Moving
-from magshell_fenicsx.assembly.parameter import FreeParameter
+from magshell_fenicsx.assembly.parameter import Derivative, FreeParameter
 from magshell_fenicsx.assembly.sliding import Constraint, Projection, Sliding
 from magshell_fenicsx.assembly.terms import FormTerm, Term
 from magshell_fenicsx.continuation.noise import Noise
@@ -212,7 +213,7 @@ class FiniteElementSystem:
         parameter = self.parameters[name]
         if other in self.parameters:
             bends = parameter.bends(self.parameters[other].constant)
-            here = sum(_value(amplitude, mu) * fem.assemble_scalar(form) for amplitude, form in bends)
+            here = sum(_value(bend.amplitude, mu) * bend.energy() for bend in bends)
         else:
             here = sum(slope.energy() for slope in parameter.slopes if slope.amplitude == other)
         return float(self.comm.allreduce(here))
@@ -323,14 +324,15 @@ class FiniteElementSystem:
         return {t.name: _value(t.amplitude, mu) for t in self.terms}
 
     def _gradient(
-        self, factors: Mapping[str, float], besides: Sequence[tuple[float, Term]] = ()
+        self, factors: Mapping[str, float], besides: Sequence[tuple[float, Derivative]] = ()
     ) -> NDArray[np.float64]:
         """This rank's part of the gradient of the terms with these factors, by name, plus further terms."""
         with self.assembly:
             b: NDArray[np.float64] = np.zeros_like(self.u.x.array)
             if self.gradients and factors:
                 self.gradients.add(b, factors)
-            for factor, term in [*((factors.get(t.name, 0.0), t) for t in self._own_residual), *besides]:
+            own = [(factors.get(t.name, 0.0), t) for t in self._own_residual]
+            for factor, term in itertools.chain(own, besides):
                 if factor:
                     term.add_residual(b, factor)
             return b

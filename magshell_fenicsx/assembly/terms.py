@@ -35,7 +35,7 @@ class Term(Protocol):
         """Accept the present u as a point of the path; turns are counted from here."""
 
     def compile_residual(self) -> None:
-        """Compile the form of `add_residual`."""
+        """Compile the forms of `energy` and `add_residual`."""
 
     def add_residual(self, b: NDArray[np.float64], factor: float) -> None:
         """Add factor dPi/du to the local vector (ghosts included)."""
@@ -59,8 +59,8 @@ class FormTerm:
     ----------
     form
         The energy.
-    residual_form, tangent_form
-        Compiled on first use; None for the tangent of a linear energy.
+    energy_form, residual_form, tangent_form
+        Compiled on first use, on all ranks; None for the tangent of a linear energy.
     skew_form
         What the symmetric tangent lacks; None for a potential.
     """
@@ -81,9 +81,17 @@ class FormTerm:
         self.has_potential = work is None
         self._factor = fem.Constant(u.function_space.mesh, 1.0)
         self._u, self._log = u, log
-        self.form = energy
-        self._gradient = work if work is not None else ufl.derivative(energy, u, ufl.TestFunction(u.function_space))
-        self._energy = log.compile(f"{name} energy", energy)
+        self.form, self._work = energy, work
+
+    @cached_property
+    def _gradient(self) -> ufl.Form:
+        if self._work is not None:
+            return self._work
+        return ufl.derivative(self.form, self._u, ufl.TestFunction(self._u.function_space))
+
+    @cached_property
+    def energy_form(self) -> fem.Form:
+        return self._log.compile(f"{self.name} energy", self.form)
 
     @cached_property
     def residual_form(self) -> fem.Form:
@@ -110,7 +118,7 @@ class FormTerm:
         return ufl.derivative(self._gradient, self._u, ufl.TrialFunction(self._u.function_space))
 
     def energy(self) -> float:
-        return float(fem.assemble_scalar(self._energy))
+        return float(fem.assemble_scalar(self.energy_form))
 
     def follow(self) -> None:
         """Renew coefficients that depend on u."""
@@ -121,7 +129,7 @@ class FormTerm:
         """Its energy has no history."""
 
     def compile_residual(self) -> None:
-        _ = self.residual_form
+        _ = self.energy_form, self.residual_form
 
     def add_residual(self, b: NDArray[np.float64], factor: float) -> None:
         self._factor.value = factor

@@ -13,7 +13,6 @@ from magshell_fenicsx.continuation.factor import has_cholmod
 from magshell_fenicsx.continuation.fold import FoldLost
 from magshell_fenicsx.continuation.inverse import NoEigenpair
 from magshell_fenicsx.continuation.journal import NoJournal
-from magshell_fenicsx.output.pictures.plot import draw
 from magshell_fenicsx.output.pictures.render import NoScreen
 from magshell_fenicsx.output.report.report import write_report
 from magshell_fenicsx.output.store.durable import write_whole
@@ -52,6 +51,7 @@ def run(
     tell: Say | None = None,
     resume: bool = False,
     time_limit: float | None = None,
+    pictures: bool = True,
 ) -> Result:
     """Run a case.
 
@@ -69,6 +69,8 @@ def run(
         Continue the interrupted run in `out`.
     time_limit
         Seconds after which the run stops in the same way.
+    pictures
+        Whether they are drawn; `magshell plot` draws them later.
 
     Raises
     ------
@@ -83,17 +85,19 @@ def run(
     watch = Watch(comm, start, time_limit, signals=out is not None)
     say, tell = (say, tell or _ignored) if comm.rank == 0 else (_ignored, _ignored)
     if out is None:
-        return _run(case, None, comm, say, tell, watch, start)
+        return _run(case, None, comm, say, tell, watch, start, pictures)
     with held_folder(Path(out), comm, make=not resume):
         open_folder(Path(out), case, comm, resume)
-        return _run(case, Path(out), comm, say, tell, watch, start)
+        return _run(case, Path(out), comm, say, tell, watch, start, pictures)
 
 
 def _ignored(line: str) -> None:
     """Print nothing."""
 
 
-def _run(case: Case, folder: Path | None, comm: MPI.Comm, say: Say, tell: Say, watch: Watch, start: float) -> Result:
+def _run(
+    case: Case, folder: Path | None, comm: MPI.Comm, say: Say, tell: Say, watch: Watch, start: float, pictures: bool
+) -> Result:
     """Run a case in a prepared folder; `start` is in seconds of `time.perf_counter`."""
 
     def doing(what: str) -> None:
@@ -139,7 +143,8 @@ def _run(case: Case, folder: Path | None, comm: MPI.Comm, say: Say, tell: Say, w
                     with result.output:
                         modes_after(result, folder, say)
                         frequencies_after(result, folder, say)
-                        by_first(comm, partial(_draw, folder, say))
+                        if pictures:
+                            by_first(comm, partial(_draw, folder, say))
                     files.summarise(summary(result, time.perf_counter() - start))  # with the time of the pictures
                 by_first(comm, partial(write_report, folder))
             except DiskError as e:
@@ -153,6 +158,8 @@ def _run(case: Case, folder: Path | None, comm: MPI.Comm, say: Say, tell: Say, w
 
 def _draw(folder: Path, say: Say) -> None:
     """Draw the pictures of the folder; warn if there is no display."""
+    from magshell_fenicsx.output.pictures.plot import draw
+
     try:
         draw(folder)
     except NoScreen as e:

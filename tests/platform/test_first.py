@@ -89,7 +89,10 @@ def meshes() -> None:
 
 
 def a_folder(out: Path) -> None:
-    with patch("magshell_fenicsx.run.run.draw", failing(RuntimeError("a bug"))), raised(RuntimeError, "a bug"):
+    with (
+        patch("magshell_fenicsx.output.pictures.plot.draw", failing(RuntimeError("a bug"))),
+        raised(RuntimeError, "a bug"),
+    ):
         ms.run(ms.Case.load(PLATE), out / "run", COMM)
     from_first(COMM, (out / "run" / "mesh.json").mkdir)
     case = ms.Case.load(PLATE, ["mesh={tolerance: 0.01}"])
@@ -122,11 +125,11 @@ def test_every_rank_gets_what_the_first_does(tmp_path: Path, ranks: int) -> None
 def test_only_a_missing_screen_is_a_warning(tmp_path: Path) -> None:
     """Anything else in the pictures is a bug, told when all numbers are on disk."""
     case, said = ms.Case.load(PLATE), list[str]()
-    with patch("magshell_fenicsx.run.run.draw", failing(NoScreen("no display"))):
+    with patch("magshell_fenicsx.output.pictures.plot.draw", failing(NoScreen("no display"))):
         ms.run(case, tmp_path, say=said.append)
     assert "warning: no pictures: no display" in said
     with (
-        patch("magshell_fenicsx.run.run.draw", failing(RuntimeError("a bug"))),
+        patch("magshell_fenicsx.output.pictures.plot.draw", failing(RuntimeError("a bug"))),
         pytest.raises(RuntimeError, match="bug"),
     ):
         ms.run(case, tmp_path)

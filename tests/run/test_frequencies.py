@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from command import magshell, started
+from command import magshell
 from conftest import CASES
 from scipy.linalg import eigh
 from scipy.optimize import brentq
@@ -188,7 +188,7 @@ def test_one_rank_and_three(tmp_path: Path) -> None:
     tables = []
     for ranks in (1, 3):
         out = tmp_path / str(ranks)
-        done = started("run", CASES / "clamped_plate.yaml", *settings, "--out", out, ranks=ranks, pictures=False)
+        done = magshell("run", CASES / "clamped_plate.yaml", *settings, "--out", out, ranks=ranks)
         assert done.returncode == 0, done.stderr
         tables.append(table(out))
     values = [[float(row["omega2"]) for row in rows] for rows in tables]

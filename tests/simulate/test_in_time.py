@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from command import started
+from command import magshell
 
 from magshell_fenicsx import Case, Scene
 from magshell_fenicsx.case.source import CaseError, Source
@@ -162,7 +162,7 @@ def test_one_rank_and_two(tmp_path: Path) -> None:
     found = []
     for ranks in (1, 2):
         out = tmp_path / str(ranks)
-        done = started("run", file, "--out", out, ranks=ranks, pictures=False)
+        done = magshell("run", file, "--out", out, ranks=ranks)
         assert done.returncode == 0, done.stderr
         found.append([float(row["kinetic"]) for row in csv.DictReader((out / "path.csv").open(encoding="utf-8"))])
     assert found[1] == pytest.approx(found[0], rel=1e-7)

@@ -7,7 +7,6 @@ import ufl
 from dolfinx import fem
 
 from magshell_fenicsx.assembly.kernels import KernelLog
-from magshell_fenicsx.assembly.parameter import Weighted
 from magshell_fenicsx.assembly.point_field import PointField
 from magshell_fenicsx.assembly.terms import FormTerm, Term
 from magshell_fenicsx.models.shell.applied import AppliedField
@@ -42,7 +41,7 @@ class FieldParameter:
     log: KernelLog
     _slope: PointField
     _slopes: Sequence[FormTerm]
-    _bends: dict[str, tuple[PointField, list[Weighted]]] = field(default_factory=dict)
+    _bends: dict[str, tuple[PointField, list[FormTerm]]] = field(default_factory=dict)
 
     @property
     def slopes(self) -> Sequence[FormTerm]:
@@ -50,18 +49,18 @@ class FieldParameter:
         self.constant.known.renew(self._slope, self.constant.name)
         return self._slopes
 
-    def bends(self, q: object) -> list[Weighted]:
-        """d2Pi_i/dmu dq with the amplitudes that multiply them; its first call compiles: collective."""
+    def bends(self, q: object) -> list[FormTerm]:
+        """d2Pi_i/dmu dq with the amplitudes that multiply them."""
         known = self.constant.known
         if not isinstance(q, Amplitude) or q.known is not known:
             return []
         if q.name not in self._bends:
             bend = known.slope(q.name)
-            forms = [(t.amplitude, self.log.compile(t.name, _with(t.form, known, bend))) for t in self.terms]
-            self._bends[q.name] = bend, forms
-        bend, forms = self._bends[q.name]
+            terms = [FormTerm(t.name, _with(t.form, known, bend), t._u, self.log, t.amplitude) for t in self.terms]
+            self._bends[q.name] = bend, terms
+        bend, terms = self._bends[q.name]
         known.renew(bend, self.constant.name, q.name)
-        return forms
+        return terms
 
 
 def field_parameters(

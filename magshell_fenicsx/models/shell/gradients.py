@@ -1,4 +1,4 @@
-"""First derivatives of densities at points.
+"""Densities and their first derivatives at points.
 
 The derivatives of u are those by the coordinates of the reference cell, so that one table of shape
 functions serves all cells. The kernels take them to the flat cell's own orthonormal coordinates
@@ -6,19 +6,22 @@ first: the metric of a sliver is then as well conditioned as in a form.
 """
 
 from collections.abc import Callable, Sequence
+from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 import ufl
 from dolfinx import fem
 from mpi4py import MPI
 from numpy.typing import NDArray
+from ufl.algorithms import extract_coefficients
 from ufl.constantvalue import Zero
 from ufl.core.expr import Expr
 
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.point_field import PointField
 from magshell_fenicsx.assembly.point_kernels import Points
-from magshell_fenicsx.models.shell.energy import Density, ShellTerm
+from magshell_fenicsx.models.shell.energy import Density
 from magshell_fenicsx.models.shell.kinematics import Jet
 from magshell_fenicsx.models.shell.sites import NAMES, fill, parameters_at
 
@@ -27,8 +30,23 @@ CHUNK = 16384  # points at a time: their vectors stay within some ten megabytes
 FRAME = 4  # numbers of a cell's frame, see `cell_frames`
 
 
+class PointTerm(Protocol):
+    """What has a density."""
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def amplitude(self) -> str | None: ...
+
+    @property
+    def density(self) -> Density: ...
+
+
 class PointGradient:
-    """dW/du of the sum of some terms' densities at points, or the virtual work's derivative in v.
+    """Some terms' densities at points, and dW/du of their sum, or the virtual work's derivative in v.
+
+    Kernels are compiled when they are first asked for, on all ranks.
 
     Parameters
     ----------
@@ -56,7 +74,7 @@ class PointGradient:
 
     def __init__(
         self,
-        terms: Sequence[ShellTerm],
+        terms: Sequence[PointTerm],
         parts: Sequence[str],
         each: int,
         r0: Array,
@@ -72,31 +90,49 @@ class PointGradient:
         self._u, placement, place = (points.field(size) for size in (self._size, self._size, geometry.shape[1]))
         self._known = [(placement, r0), (place, geometry)]
         self._following: list[tuple[fem.Function, Array]] = []
-        W, work, v = ufl.zero(), ufl.zero(), points.field(self._size)
+        self._names, self._log, self._comm = [term.name for term in terms], log, comm
+        self._W, self._work, self._v = list[Expr](), list[Expr](), points.field(self._size)
         for term in terms:
             parameters, varying = parameters_at(points, term.density.parameters, term.density.sides)
             self._known += [(here, values(field)) for here, field in varying]
             self._following += [(here, values(field)) for here, field in varying if isinstance(field, PointField)]
+            self._W.append(_energy(term.density, [placement, self._u], place, parts, parameters))
             if term.density.work:
-                work += _energy(term.density, [placement, self._u, v], place, parts, parameters)
-            else:
-                W += _energy(term.density, [placement, self._u], place, parts, parameters)
-        name = f"{', '.join(term.name for term in terms)} gradient"
-        gradients = [ufl.diff(w, z) for w, z in ((W, self._u), (work, v)) if not isinstance(w, Zero)]
-        self._gradient = log.compile_expression(name, sum(gradients[1:], gradients[0]), comm)
+                self._work.append(_energy(term.density, [placement, self._u, self._v], place, parts, parameters))
+        self._conservative = [W for W, term in zip(self._W, terms, strict=True) if not term.density.work]
         self._loaded: slice | None = None
+        self._energies: dict[str, fem.Expression | None] = {}
+
+    @cached_property
+    def gradient(self) -> fem.Expression | None:
+        """The kernel of `evaluate`; None if nothing depends on u."""
+        sums = [(sum(self._conservative, ufl.zero()), self._u), (sum(self._work, ufl.zero()), self._v)]
+        gradients = [ufl.diff(W, z) for W, z in sums if z in extract_coefficients(W)]
+        if not gradients:
+            return None
+        return self._log.compile_expression(
+            f"{', '.join(self._names)} gradient", sum(gradients[1:], gradients[0]), self._comm
+        )
+
+    def energy(self, name: str) -> fem.Expression | None:
+        """The kernel of a term's energy; None if that is zero."""
+        if name not in self._energies:
+            W = self._W[self._names.index(name)]
+            none = isinstance(W, Zero)
+            self._energies[name] = None if none else self._log.compile_expression(f"{name} energy", W, self._comm)
+        return self._energies[name]
 
     def room(self, chunk: slice) -> Array:
         """For the derivatives of u in reference coordinates, to be filled: (points, sides * parts * 3)."""
         count = chunk.stop - chunk.start
         return np.asarray(self._u.x.array[: count * self._size].reshape(count, self._size))
 
-    def evaluate(self, chunk: slice) -> Array:
-        """The derivatives by what was filled in, in the same order; the array is reused by the next call."""
+    def evaluate(self, chunk: slice, kernel: fem.Expression) -> Array:
+        """`gradient` by what was filled in, in the same order, or `energy`; the array is reused by the next call."""
         for field, values in self._known if self._loaded != chunk else self._following:
             fill(field, values[chunk])
         self._loaded = chunk
-        return self._points.evaluate(self._gradient, chunk.stop - chunk.start)
+        return self._points.evaluate(kernel, chunk.stop - chunk.start)
 
 
 def in_own_coordinates(jet: Jet, frame: Sequence[Expr | Array]) -> Jet:

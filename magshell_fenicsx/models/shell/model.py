@@ -6,14 +6,14 @@ F R/(2 pi D), "lambda_m" is lambda_m.
 
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from dolfinx import fem
 from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.kernels import KernelLog
-from magshell_fenicsx.assembly.parameter import FreeParameter, make_parameters
+from magshell_fenicsx.assembly.parameter import FreeParameter
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.assembly.sliding import Constraint, held_along
 from magshell_fenicsx.assembly.terms import LinearTerm, Term
@@ -23,6 +23,7 @@ from magshell_fenicsx.models.observed import Observed
 from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes
 from magshell_fenicsx.models.shell.dead_load import SurfaceMeasures, assemble_dead_loads
 from magshell_fenicsx.models.shell.driving import field_parameters
+from magshell_fenicsx.models.shell.energy import ShellTerm
 from magshell_fenicsx.models.shell.fast_tangent import FastTangent, make_sites
 from magshell_fenicsx.models.shell.folds import FOLD, largest_fold
 from magshell_fenicsx.models.shell.moved import Support, moving, rotation_of
@@ -41,6 +42,7 @@ from magshell_fenicsx.models.shell.parameters import (
 from magshell_fenicsx.models.shell.patterns import by_patch, places
 from magshell_fenicsx.models.shell.point_load import patch_entries, point_entries, vertex_normal
 from magshell_fenicsx.models.shell.residual import FastResidual
+from magshell_fenicsx.models.shell.slopes import point_parameters
 from magshell_fenicsx.models.shell.supports import (
     closing_point,
     held_at_vertex,
@@ -203,8 +205,15 @@ class ShellModel(Observed):
             near = make_sites(self.r0, degree, terms, self.kernels, chosen=self.moving.cells)
             self._near = self.moving.cells, near
         fast = FastTangent(self.u, self._sites, held + mirrored, self._near)
-        gradients = FastResidual(self.r0, self.u, degree, terms, self.kernels)
-        parameters: dict[str, FreeParameter] = {**make_parameters(factory.free, terms, self.u, self.kernels)}
+        dense = [term for term in terms if isinstance(term, ShellTerm)]
+        serve = partial(FastResidual, self.r0, self.u, degree, log=self.kernels)
+        gradients = serve(terms=dense)
+        gradients.compile()
+        for term in dense:
+            term.points = gradients
+        parameters: dict[str, FreeParameter] = {
+            **point_parameters(factory.free, dense, lambda slopes: serve(terms=slopes, apart=True))
+        }
         parameters |= field_parameters(factory.fields, terms, self.u, self.kernels)
         self.fields = factory.fields
         self.system = FiniteElementSystem(

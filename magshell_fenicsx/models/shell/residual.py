@@ -1,6 +1,6 @@
-"""The residual without compiled residual forms, from the point gradients of the terms' own densities."""
+"""Energies and residuals without compiled forms, from the terms' own densities and their gradients at points."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Protocol
 
 import numpy as np
@@ -12,9 +12,8 @@ from magshell_fenicsx.assembly.cell_frames import cell_frames
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.shape_tables import Table, cell_rule, edge_covector, edge_rule
 from magshell_fenicsx.assembly.sheets import Sheet
-from magshell_fenicsx.assembly.terms import Term
-from magshell_fenicsx.models.shell.energy import Density, ShellTerm, cell_quadrature, edge_quadrature
-from magshell_fenicsx.models.shell.gradients import FRAME, PointGradient, in_own_coordinates
+from magshell_fenicsx.models.shell.energy import Density, cell_quadrature, edge_quadrature
+from magshell_fenicsx.models.shell.gradients import FRAME, PointGradient, PointTerm, in_own_coordinates
 from magshell_fenicsx.models.shell.kinematics import CURVED, FIRST, Jet
 from magshell_fenicsx.models.shell.sites import NAMES, at_points
 
@@ -23,6 +22,12 @@ Array = NDArray[np.float64]
 
 class _Site(Protocol):
     names: list[str]
+
+    def energy(self, nodal: Array, name: str) -> float:
+        """That of a term on this rank's part."""
+
+    def compile(self) -> None:
+        """Compile the kernels of `add`; collective."""
 
     def add(self, nodal: Array, factors: Mapping[str, float], elements: Array) -> None:
         """Add the element vectors (cells, functions * 3) of the terms with these factors."""
@@ -40,7 +45,9 @@ class FastResidual:
     degree
         Of the elements.
     terms
-        Those without a density are left out. Collective.
+        What has a density.
+    apart
+        Whether each term has a kernel of its own, so that it can be added alone.
 
     Attributes
     ----------
@@ -48,70 +55,114 @@ class FastResidual:
         Of the terms that it serves.
     """
 
-    def __init__(self, r0: fem.Function, u: fem.Function, degree: int, terms: Sequence[Term], log: KernelLog) -> None:
-        found = [term for term in terms if isinstance(term, ShellTerm)]
-        on_cells = [term for term in found if not term.density.on_edges]
-        on_edges = [term for term in found if term.density.on_edges]
-        self._sites: list[_Site] = []
-        for kind in dict.fromkeys((term.amplitude, term.density.quadrature) for term in on_cells):
-            together = [term for term in on_cells if (term.amplitude, term.density.quadrature) == kind]
-            self._sites.append(_Cells(r0, kind[1] or cell_quadrature(degree), together, log))
+    def __init__(
+        self,
+        r0: fem.Function,
+        u: fem.Function,
+        degree: int,
+        terms: Sequence[PointTerm],
+        log: KernelLog,
+        *,
+        apart: bool = False,
+    ) -> None:
+        on_cells = [term for term in terms if not term.density.on_edges]
+        on_edges = [term for term in terms if term.density.on_edges]
+
+        def kind(term: PointTerm) -> tuple[int | None, str | None, str]:
+            return term.density.quadrature, term.amplitude, term.name if apart else ""
+
+        sites: list[_Site] = []
+        for this in dict.fromkeys(map(kind, on_cells)):
+            together = [term for term in on_cells if kind(term) == this]
+            sites.append(_Cells(r0, this[0] or cell_quadrature(degree), together, log))
         if on_edges:
-            self._sites.append(_Edges(r0, edge_quadrature(degree), on_edges, log))
-        self.names = frozenset(term.name for term in found)
+            sites.append(_Edges(r0, edge_quadrature(degree), on_edges, log))
+        self._sites = sites
+        self.names = frozenset(term.name for term in terms)
         self._u, self._nodes = u, u.function_space.dofmap.list
         self._dofs = (3 * self._nodes[:, :, None] + np.arange(3)).ravel()
 
+    def compile(self) -> None:
+        """Compile the kernels of the residual; collective."""
+        for site in self._sites:
+            site.compile()
+
+    def energy(self, name: str) -> float:
+        """That of a term on this rank's part, at the present u; collective at first."""
+        return next(site for site in self._sites if name in site.names).energy(self._nodal(), name)
+
     def add(self, b: Array, factors: Mapping[str, float]) -> None:
-        """Add it to the local vector (ghosts included), at the present u."""
-        nodal = np.take(self._u.x.array.reshape(-1, 3), self._nodes, axis=0).reshape(-1, 3 * self._nodes.shape[1])
+        """Add it to the local vector (ghosts included), at the present u; collective at first."""
+        nodal = self._nodal()
         elements = np.zeros_like(nodal)
         for site in self._sites:
             site.add(nodal, factors, elements)
         b += np.bincount(self._dofs, elements.ravel(), len(b))
 
+    def _nodal(self) -> Array:
+        """u as (cells, functions * 3)."""
+        nodal = np.take(self._u.x.array.reshape(-1, 3), self._nodes, axis=0)
+        return np.asarray(nodal.reshape(-1, 3 * self._nodes.shape[1]))
+
 
 class _Cells:
     """Terms with one amplitude on the owned cells."""
 
-    def __init__(self, r0: fem.Function, degree: int, terms: Sequence[ShellTerm], log: KernelLog) -> None:
+    def __init__(self, r0: fem.Function, degree: int, terms: Sequence[PointTerm], log: KernelLog) -> None:
         V = r0.function_space
         self.names = [term.name for term in terms]
-        X, w = cell_rule(degree)
-        table = Table.tabulate(V.element.basix_element, X)
+        X, self._weights = cell_rule(degree)
+        table, each = Table.tabulate(V.element.basix_element, X), len(X)
         parts = [name for name in NAMES if name in FIRST or any(name in term.density.parts for term in terms)]
-        self._sheet, self._each = Sheet(table, w, [NAMES.index(part) for part in parts]), len(w)
+        self._sheet = Sheet(table, self._weights, [NAMES.index(part) for part in parts])
         cells = np.arange(V.mesh.topology.index_map(2).size_local, dtype=np.int32)
         frames = cell_frames(V.mesh)
-        known = _placement(r0, table, frames, parts)[cells].reshape(len(cells) * len(w), 3 * len(parts))
-        geometry = np.repeat(frames[cells], len(w), axis=0)
-        self._gradient = PointGradient(
-            terms, parts, len(w), known, geometry, lambda field: at_points(field, X, cells), log, V.mesh.comm
+        known = _placement(r0, table, frames, parts)[cells].reshape(len(cells) * each, 3 * len(parts))
+        geometry = np.repeat(frames[cells], each, axis=0)
+        self._points = PointGradient(
+            terms, parts, each, known, geometry, lambda field: at_points(field, X, cells), log, V.mesh.comm
         )
+
+    def compile(self) -> None:
+        _ = self._points.gradient
+
+    def energy(self, nodal: Array, name: str) -> float:
+        kernel, found = self._points.energy(name), 0.0
+        for chunk, _ in self._filled(nodal) if kernel else []:
+            found += float(np.sum(self._points.evaluate(chunk, kernel).reshape(-1, len(self._weights)) @ self._weights))
+        return found
 
     def add(self, nodal: Array, factors: Mapping[str, float], elements: Array) -> None:
         factor = factors.get(self.names[0], 0.0)
-        for chunk in self._gradient.chunks if factor else []:
-            cells = slice(chunk.start // self._each, chunk.stop // self._each)
-            self._sheet.at_points(nodal[cells], self._gradient.room(chunk))
-            elements[cells] += factor * self._sheet.at_nodes(self._gradient.evaluate(chunk))
+        kernel = self._points.gradient if factor else None
+        for chunk, cells in self._filled(nodal) if kernel else []:
+            elements[cells] += factor * self._sheet.at_nodes(self._points.evaluate(chunk, kernel))
+
+    def _filled(self, nodal: Array) -> Iterator[tuple[slice, slice]]:
+        """Each chunk, with the derivatives of u filled in, and its cells."""
+        each = len(self._weights)
+        for chunk in self._points.chunks:
+            cells = slice(chunk.start // each, chunk.stop // each)
+            self._sheet.at_points(nodal[cells], self._points.room(chunk))
+            yield chunk, cells
 
 
 class _Edges:
     """Terms on edges, interior and boundary: the jets on the edges of all cells are found together."""
 
-    def __init__(self, r0: fem.Function, degree: int, terms: Sequence[ShellTerm], log: KernelLog) -> None:
+    def __init__(self, r0: fem.Function, degree: int, terms: Sequence[PointTerm], log: KernelLog) -> None:
         V = r0.function_space
         self.names = [term.name for term in terms]
         rules = [edge_rule(degree, edge, backwards=False) for edge in range(3)]
-        each = len(rules[0][1])
-        X, w = np.concatenate([points for points, _ in rules]), np.tile(rules[0][1], 3)
+        self._weights = rules[0][1]
+        each = len(self._weights)
+        X, w = np.concatenate([points for points, _ in rules]), np.tile(self._weights, 3)
         table = Table.tabulate(V.element.basix_element, X)
         self._sheet = Sheet(table, w, [NAMES.index(part) for part in CURVED])
         frames, cells = cell_frames(V.mesh), np.arange(len(V.dofmap.list), dtype=np.int32)
         placement = _placement(r0, table, frames, CURVED).reshape(-1, 3 * len(CURVED))
         self._there, self._back = np.empty_like(placement), np.empty_like(placement)
-        self._rows, self._gradients = [], []
+        self._on = dict[str, tuple[NDArray[np.intp], PointGradient]]()
         for term in terms:
             rows, geometry = _where(V, term.density, frames, each)
             known = placement[rows].reshape(len(rows), 3 * len(CURVED) * term.density.sides)
@@ -119,26 +170,37 @@ class _Edges:
             def values(field: fem.Function, rows: NDArray[np.intp] = rows) -> Array:
                 return at_points(field, X, cells)[rows].reshape(len(rows), rows.shape[1] * field.ufl_shape[0])
 
-            self._rows.append(rows)
-            self._gradients.append(PointGradient([term], CURVED, each, known, geometry, values, log, V.mesh.comm))
+            self._on[term.name] = rows, PointGradient([term], CURVED, each, known, geometry, values, log, V.mesh.comm)
+
+    def compile(self) -> None:
+        for _, points in self._on.values():
+            _ = points.gradient
+
+    def energy(self, nodal: Array, name: str) -> float:
+        self._sheet.at_points(nodal, self._there)
+        kernel, found = self._on[name][1].energy(name), 0.0
+        for _, values in self._evaluated(name, kernel):
+            found += float(np.sum(values.reshape(-1, len(self._weights)) @ self._weights))
+        return found
 
     def add(self, nodal: Array, factors: Mapping[str, float], elements: Array) -> None:
-        active = [
-            (g, rows, factors[name])
-            for name, rows, g in zip(self.names, self._rows, self._gradients, strict=True)
-            if factors.get(name)
-        ]
+        active = [name for name in self.names if factors.get(name)]
         if not active:
             return
         self._sheet.at_points(nodal, self._there)
         self._back[:] = 0
-        for gradient, rows, factor in active:
-            for chunk in gradient.chunks:
-                here, size = rows[chunk].ravel(), 3 * len(CURVED)
-                room = gradient.room(chunk).reshape(-1, size)
-                np.take(self._there, here, axis=0, out=room, mode="clip")
-                self._back[here] += factor * gradient.evaluate(chunk).reshape(-1, size)
+        for name in active:
+            for here, values in self._evaluated(name, self._on[name][1].gradient):
+                self._back[here] += factors[name] * values.reshape(-1, 3 * len(CURVED))
         elements += self._sheet.at_nodes(self._back)
+
+    def _evaluated(self, name: str, kernel: fem.Expression | None) -> Iterator[tuple[NDArray[np.intp], Array]]:
+        """A kernel's values in each chunk, at the points of these numbers among those of all cells' edges."""
+        rows, points = self._on[name]
+        for chunk in points.chunks if kernel else []:
+            here = rows[chunk].ravel()
+            np.take(self._there, here, axis=0, out=points.room(chunk).reshape(len(here), -1), mode="clip")
+            yield here, points.evaluate(chunk, kernel)
 
 
 def _placement(r0: fem.Function, table: Table, frames: Array, parts: Sequence[str]) -> Array:

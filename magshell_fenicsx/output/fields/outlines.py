@@ -33,7 +33,7 @@ def outlines(loads: Loads, mu: Mapping[str, float], h: float) -> tuple[Array, ..
 def vtp_content(lines: tuple[Array, ...]) -> bytes:
     """The content of a .vtp file."""
     import pyvista
-    from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter  # type: ignore[import-untyped]
+    from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
 
     starts = np.cumsum([0, *(len(line) for line in lines)])
     cells = [np.r_[len(line), start + np.arange(len(line))] for start, line in zip(starts[:-1], lines, strict=True)]

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,7 @@ from magshell_fenicsx.output.fields.surface import LAGRANGE_HEXAHEDRON, LAGRANGE
 from magshell_fenicsx.output.store.durable import write_whole
 
 if TYPE_CHECKING:  # VTK takes long to import
-    import pyvista
+    from vtkmodules.vtkCommonDataModel import vtkUnstructuredGrid
 
 Array = NDArray[np.float64]
 SYMMETRIC = ([0, 1, 2, 0, 1, 0], [0, 1, 2, 1, 2, 2])  # VTK's order of a symmetric tensor: XX, YY, ZZ, XY, YZ, XZ
@@ -40,22 +40,36 @@ class About:
     mirror: Array | None = None
 
 
-def unstructured_grid(surface: Surface, h: float) -> "pyvista.UnstructuredGrid":
-    """The deformed surface or body with u/h, w/h, r0, n0 and its fields at the nodes; lengths are over R."""
-    import pyvista
+def unstructured_grid(surface: Surface, h: float) -> "vtkUnstructuredGrid":
+    """The deformed surface or body with u/h, w/h, r0, n0 and its fields at the nodes; lengths are over R.
 
-    count = surface.cells.shape[1]
-    cells = np.column_stack([np.full(len(surface.cells), count), surface.cells])
-    kind = TRIANGLE if count == 3 else LAGRANGE_HEXAHEDRON if surface.is_body else LAGRANGE_TRIANGLE
-    kinds = np.full(len(surface.cells), kind, dtype=np.uint8)
-    grid = pyvista.UnstructuredGrid(cells.ravel(), kinds, surface.r0 + surface.u)
-    grid.point_data["u_over_h"] = surface.u / h
-    grid.point_data["w_over_h"] = surface.w / h
-    grid.point_data["r0"] = surface.r0
-    grid.point_data["n0"] = surface.n0
-    for name, values in surface.fields.items():
-        grid.point_data[name] = values if values.ndim < 3 else values[:, *SYMMETRIC]
+    It is built without pyvista, which takes longer to import than all fields of a path to write.
+    """
+    from vtkmodules.util.numpy_support import numpy_to_vtk
+    from vtkmodules.vtkCommonCore import vtkPoints
+    from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkUnstructuredGrid
+
+    points, cells, grid = vtkPoints(), vtkCellArray(), vtkUnstructuredGrid()
+    points.SetData(numpy_to_vtk(surface.r0 + surface.u, deep=True))
+    number, count = surface.cells.shape
+    starts, nodes = np.arange(0, (number + 1) * count, count), surface.cells.ravel()
+    cells.SetData(*(numpy_to_vtk(array.astype(np.int64), deep=True) for array in (starts, nodes)))
+    grid.SetPoints(points)
+    grid.SetCells(TRIANGLE if count == 3 else LAGRANGE_HEXAHEDRON if surface.is_body else LAGRANGE_TRIANGLE, cells)
+    own = (surface.u / h, surface.w / h, surface.r0, surface.n0)
+    fields = {name: f if f.ndim < 3 else f[:, *SYMMETRIC] for name, f in surface.fields.items()}
+    for name, values in {**dict(zip(OWN_DATA, own, strict=True)), **fields}.items():
+        _give(grid.GetPointData(), name, values)
     return grid
+
+
+def _give(to: Any, name: str, values: NDArray[Any]) -> None:
+    """Add an array to VTK's data of points, or of a file."""
+    from vtkmodules.util.numpy_support import numpy_to_vtk
+
+    array = numpy_to_vtk(np.ascontiguousarray(values), deep=True)
+    array.SetName(name)
+    to.AddArray(array)
 
 
 def read_vtu(file: Path) -> tuple[Surface, About]:
@@ -139,12 +153,13 @@ def vtu_content(surface: Surface, about: About) -> bytes:
 
     LZ4 compression costs almost no time; zlib takes ten times as long and saves only a tenth more on curved surfaces.
     """
-    from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter  # type: ignore[import-untyped]
+    from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter
 
     grid = unstructured_grid(surface, about.h)
-    grid.field_data["h_over_R"], grid.field_data["poisson_ratio"] = [about.h], [about.nu]
-    if about.mirror is not None:
-        grid.field_data["mirror"] = about.mirror
+    numbers = {"h_over_R": np.array([about.h]), "poisson_ratio": np.array([about.nu]), "mirror": about.mirror}
+    for name, values in numbers.items():
+        if values is not None:
+            _give(grid.GetFieldData(), name, values)
     writer = vtkXMLUnstructuredGridWriter()
     writer.SetInputData(grid)
     writer.SetDataModeToAppended()

@@ -78,7 +78,7 @@ class View:
 def smooth_surface(surface: Surface, h: float) -> "pyvista.PolyData":
     """The deformed surface in flat triangles with normals; curved triangles are divided."""
     import pyvista
-    from vtkmodules.vtkFiltersGeometry import vtkDataSetSurfaceFilter  # type: ignore[import-untyped]
+    from vtkmodules.vtkFiltersGeometry import vtkDataSetSurfaceFilter
 
     divided = vtkDataSetSurfaceFilter()
     divided.SetInputData(unstructured_grid(surface, h))

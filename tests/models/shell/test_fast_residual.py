@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from command import mpirun
 from conftest import TILTED, hemisphere, random_displacement
+from dolfinx import fem
 from test_fast_tangent import HALF_SHELL, pattern
 
 from magshell_fenicsx.assembly.kernels import KernelLog
@@ -54,7 +55,7 @@ def difference(system: FiniteElementSystem, u: np.ndarray, mu: Mapping[str, floa
 @pytest.mark.parametrize("degree", DEGREES)
 @pytest.mark.parametrize("name", TERMS)
 def test_term_alone(shell: Shells, name: str, degree: int) -> None:
-    """To 1e-12 at random nodal values, nothing held; added to what is there."""
+    """To 1e-12 at random nodal values, nothing held; added to what is there. So is the energy."""
     model = shell(degree, half=name == "mirror edges", energy=TERMS[name])
     term = next(t for t in model.system.terms if t.name == name)
     model.system.set(random_displacement(model, 1e-3))
@@ -64,6 +65,7 @@ def test_term_alone(shell: Shells, name: str, degree: int) -> None:
     residual.add(found, {name: -0.7, "another": 1.0})
     assert residual.names == {name}
     assert np.abs(found - 1 - reference).max() <= 1e-12 * np.abs(reference).max()
+    assert residual.energy(name) == pytest.approx(fem.assemble_scalar(term.energy_form), rel=1e-12)
 
 
 @pytest.mark.parametrize("degree", HIGH)
