@@ -103,7 +103,7 @@ class DesignSection(Section):
     objective: ObjectiveSection
     """What is wanted"""
     numbers: dict[str, Bounds] = Field(default_factory=dict)
-    """Key of the case with a number (`magnetic.remanent.polar`, `shell.poisson_ratio`) -> its least and largest value"""
+    """Key of the case with a number (`magnetic.remanent.polar`, `shell.poisson_ratio`) -> least and largest value"""
     remanence: RemanenceVariables | None = None
     """Vectors of the remanence that vary"""
     constraints: list[LimitSection] = Field(default_factory=list)

@@ -99,9 +99,9 @@ def gradient(
     Parameters
     ----------
     of
-        "instability": the amplitude of a record that is a fold or, on a meridian, a neutral wave; a column of path.csv (named points, w_over_h, reactions,
-        volume_change, the load where it is not held, energy); or a function from undeformed places (n, 3) over R to
-        wanted ones: the mean square distance to them.
+        "instability": the amplitude of a record that is a fold or, on a meridian, a neutral wave; a column of path.csv
+        (named points, w_over_h, reactions, volume_change, the load where it is not held, energy); or a function from
+        undeformed places (n, 3) over R to wanted ones: the mean square distance to them.
     by
         Amplitudes ("lambda_m", ...), keys of the case with a number ("magnetic.remanent.polar"), and fields:
         "remanence" (vectors over |B^r|, of a meridian along e_rho, e_theta, e_z) and "thickness" (over h).

@@ -1,4 +1,4 @@
-"""Designs: what is reached, kept, said and resumed; SciPy's optimisers are trusted, the gradients are tested elsewhere."""
+"""Designs: what is reached, kept, said and resumed; SciPy's optimisers are trusted, gradients have tests of their own."""
 
 import csv
 import json
