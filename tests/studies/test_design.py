@@ -1,4 +1,4 @@
-"""Designs: what is reached, kept, said and resumed; SciPy's optimisers are trusted, gradients have tests of their own."""
+"""Designs: what is reached, kept, said and resumed; SciPy's optimisers are trusted, gradients tested elsewhere."""
 
 import csv
 import json
