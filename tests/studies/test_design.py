@@ -92,7 +92,7 @@ def test_numbers_between_bounds_and_a_constraint(strip: Callable[[str], Path], t
     """The deflection is largest at the bound of the field that a constraint on the shortening gives."""
     varied = "{magnetic.lambda_m: [5.0e-5, 2.0e-4], magnetic.applied.azimuth: [-10, 10]}"
     kept = "[{of: tip_ux, least: -0.2}]"
-    section = f"{{objective: {{maximise: tip_uz}}, numbers: {varied}, constraints: {kept}}}"
+    section = f"{{objective: {{maximise: tip_uz}}, numbers: {varied}, constraints: {kept}, iterations: 6}}"
     done = magshell("design", strip(f"design: {section}\n"), "--out", tmp_path / "out")
     assert done.returncode == 0
     content = json.loads((tmp_path / "out/summary.json").read_text())
@@ -104,7 +104,7 @@ def test_numbers_between_bounds_and_a_constraint(strip: Callable[[str], Path], t
 
 @pytest.mark.slow
 def test_a_target_out_of_reach(strip: Callable[[str], Path], tmp_path: Path) -> None:
-    section = "{objective: {reach: tip_uz, value: 0.99}, numbers: {magnetic.lambda_m: [5.0e-5, 2.0e-4]}}"
+    section = "{objective: {reach: tip_uz, value: 0.99}, numbers: {magnetic.lambda_m: [5.0e-5, 2.0e-4]}, iterations: 4}"
     done = magshell("design", strip(f"design: {section}\n"), "--out", tmp_path / "out")
     assert done.returncode == 3
     assert "tip_uz = 0.99 is not reached within the bounds: the nearest found is" in done.stderr
