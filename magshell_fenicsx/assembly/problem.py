@@ -94,6 +94,8 @@ class FiniteElementSystem:
         self.projection = Projection(V, sliding, clamped) if sliding else None
         self.parameters = parameters or {}
         self.moving = moving
+        # constants that a state's amplitudes may have besides their own, and their values without
+        self.settings: dict[str, tuple[fem.Constant, float]] = {}
         self.coordinates = frozenset(self.parameters) | (moving.names if moving else frozenset())
         self.comm = V.mesh.comm
         self.size = V.dofmap.index_map.size_local * V.dofmap.index_map_bs
@@ -167,6 +169,8 @@ class FiniteElementSystem:
         """Set the free parameters of the terms, and move the nodes that move."""
         for name, parameter in self.parameters.items():
             parameter.constant.value = mu[name]
+        for name, (constant, value) in self.settings.items():
+            constant.value = mu.get(name, value)
         if self.moving:
             self.moving.put(self.u.x.array, mu)
 

@@ -14,7 +14,7 @@ import numpy as np
 Verdict = Literal["go on", "converged", "diverged", "rounding", "too many"]
 FULL = 0.5  # a step longer than this part of the one before shows no quadratic convergence
 SMALL = 1e-3  # full Newton steps below this size shrink, unless they are rounding
-PATIENCE, GAIN = 4, 0.1  # after so many matrices the steps must have shrunk to this part of the first one
+GAIN = 0.1  # of the first step, to which steps must have shrunk after `patience` matrices
 ROUNDING = 10.0  # steps up to this many times the rounding error count as rounding
 
 
@@ -44,10 +44,13 @@ class Iterates:
         A longer step counts as divergence.
     most
         Iterations after which the solve is given up.
+    patience
+        Matrices after which steps must have shrunk.
     """
 
     largest: float = np.inf
     most: int = 0
+    patience: int = 4
     steps: list[Step] = field(default_factory=list)
 
     def judge(self, tolerance: float, rounding: Callable[[], float]) -> Verdict:
@@ -71,6 +74,6 @@ class Iterates:
             return "rounding"
         if step.own and len(before) > 2 and step.size > 2 * full[-1]:
             return "diverged"
-        if step.own and len(full) >= PATIENCE and step.size > GAIN * full[0]:
+        if step.own and len(full) >= self.patience and step.size > GAIN * full[0]:
             return "diverged"
         return "too many" if len(before) >= self.most else "go on"

@@ -52,6 +52,8 @@ class NewtonOptions:
         Distance, in lengths, up to which factors are used for the tangent and the inertia of a solution.
     largest_step
         An iteration that moves u by more than this many lengths counts as divergence.
+    patience
+        Matrices after which the steps of a solve must have shrunk.
     """
 
     tolerance: float = 1e-9
@@ -61,6 +63,7 @@ class NewtonOptions:
     cheap: int = 8
     fresh: float = 0.05
     largest_step: float = 1e4
+    patience: int = 4
 
 
 @dataclass(frozen=True)
@@ -164,7 +167,8 @@ class BorderedNewton:
         self._guess, self._name, self._row = guess, name, row
         self._stress: Sequence[Weighted] = stress
         self._followed = bool(stress)
-        self._progress = progress = _Progress(Iterates(self.options.largest_step, self.options.max_iterations))
+        o = self.options
+        self._progress = progress = _Progress(Iterates(o.largest_step, o.max_iterations, o.patience))
         self._join(guess.u, guess.mu[name], self._x)
         self._snes.solve(None, self._x)
         u, mu = self._split(self._x)

@@ -121,6 +121,19 @@ class Path:
         stress = [(1 - t, low.state.u), (t, high.state.u)]
         return self.solve(self._row(s, base), s, self.between(s, low, high), stress)
 
+    def renewed(self, point: Point, state: State) -> Point:
+        """The point at the same s with other amplitudes beside that of the path, from a state near it.
+
+        Raises
+        ------
+        PathStopped
+            If none is found.
+        """
+        found = self.at(point.s, state, point)
+        if isinstance(found, str):
+            raise PathStopped(found, point)
+        return self.as_base(found)
+
     def solve(self, row: Row, s: float, guess: State, stress: Sequence[Weighted] = ()) -> Point | str:
         """The point on which a row holds, or the reason why the solve failed; its tangent is per unit of the row."""
         found = self.recorded(lambda: self._solve(row, s, guess, stress))

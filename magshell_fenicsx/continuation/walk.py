@@ -1,6 +1,6 @@
 """A walk along a path to its goal, with every instability and every requested point on the way."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -9,6 +9,7 @@ import numpy as np
 from magshell_fenicsx.continuation.events import instabilities
 from magshell_fenicsx.continuation.path import Path, Quantity
 from magshell_fenicsx.continuation.point import PathStopped, Point
+from magshell_fenicsx.continuation.system import State
 
 Label = Literal["step", "target", "fold", "bifurcation"]
 Until = Literal["limit", "bifurcation", "target", "points"]
@@ -45,14 +46,22 @@ class Goal:
 class Walk:
     """A walk; iterate over it once.
 
+    Parameters
+    ----------
+    renew
+        The state of the first of two successive points with other amplitudes beside that of the path, from which the
+        walk goes on in place of the second; None if that is accepted.
+
     Attributes
     ----------
     points
         The start, the steps so far, and the instability or target that ended the walk.
     """
 
-    def __init__(self, path: Path, start: Point, goal: Goal) -> None:
-        self.path, self.goal, self.points = path, goal, [start]
+    def __init__(
+        self, path: Path, start: Point, goal: Goal, renew: Callable[[Point, Point], State | None] | None = None
+    ) -> None:
+        self.path, self.goal, self.points, self._renew = path, goal, [start], renew
         self._folds: list[Point] = []
 
     def __iter__(self) -> Iterator[tuple[Label, Point]]:
@@ -67,6 +76,9 @@ class Walk:
         while True:
             for point, reached in self.path.towards(self.points[-1], self._ahead()):
                 low, shorter = self.points[-1], None
+                if self._renew and (state := self._renew(low, point)):
+                    self.points[-1], shorter = self.path.renewed(low, state), abs(point.s - low.s)
+                    break
                 try:
                     between = self._between(low, point)
                 except PathStopped:  # the step had left the branch: approach in shorter steps

@@ -74,12 +74,19 @@ class _Look:
 class Watch:
     """Looks along a path for the unstable directions that a model excludes.
 
-    A look counts the unstable directions at a point. Several families get a look at every accepted point. The tangent
-    of a single family costs as much as the model's. So a point is skipped if the softest mode would not yet be neutral
-    there, even if it softened `FASTER` times as fast per length of the path as between the last two looks. At first no
-    point is skipped, then at most one in a row, two, and `MOST_PASSED`. If the next look shows that the mode softened
-    faster, and to less than a half, or that the number of unstable directions has changed, all skipped points
-    get a look.
+    A look counts the unstable directions at a point. Several families get a look at every accepted point that is
+    farther than `apart` from the last look. The tangent of a single family costs as much as the model's. So a point is
+    skipped if the softest mode would not yet be neutral there, even if it softened `FASTER` times as fast per length of
+    the path as between the last two looks. At first no point is skipped, then at most one in a row, two, and
+    `MOST_PASSED`. If the next look shows that the mode softened faster, and to less than a half, or that the number of
+    unstable directions has changed, all skipped points get a look.
+
+    Parameters
+    ----------
+    excluded
+        None if the model excludes no modes.
+    apart
+        Length of a path.
 
     Attributes
     ----------
@@ -87,8 +94,8 @@ class Watch:
         The reason why a change could not be located, for the first such change; "" if there is none.
     """
 
-    def __init__(self, excluded: Excluded | None) -> None:
-        self._excluded = excluded
+    def __init__(self, excluded: Excluded | None, apart: float = 0.0) -> None:
+        self._excluded, self._apart = excluded, apart
         self._families = excluded.families if excluded else []
         self._looked: _Look | None = None
         self._u: Vector | None = None
@@ -136,8 +143,7 @@ class Watch:
         name, last = self._path.name, self._last.state
         self._along += self._path.metric.norm(point.state.u - last.u, point.state.mu[name] - last.mu[name])
         self._last, self._u = point, point.state.u
-        may_pass = len(self._families) == 1 and len(self._passed) < self._may_pass and not look
-        if may_pass and self._at_least > 0:
+        if not look and (self._near if len(self._families) > 1 else self._still_stiff):
             self._passed.append((point, self._along))
             return []
         return self._changes()
@@ -148,6 +154,16 @@ class Watch:
             return []
         self._passed = [passed for passed in self._passed if passed[0] is not self._last]
         return self._changes()
+
+    @property
+    def _near(self) -> bool:
+        """Whether the last point is near the last look."""
+        return self._looked is not None and self._along - self._looked.along < self._apart
+
+    @property
+    def _still_stiff(self) -> bool:
+        """Whether the only family cannot be neutral at the last point."""
+        return len(self._passed) < self._may_pass and self._at_least > 0
 
     @property
     def _at_least(self) -> float:

@@ -158,8 +158,22 @@ OF_CONTACTS = (
     ),
     Quantity("contact_inner", "contact from", "Least distance of the pressure from the body's axis.", "place"),
     Quantity("contact_outer", "contact to", "Largest distance of the pressure from the body's axis.", "place"),
+    Quantity(
+        "contact_stiffness",
+        "stiffness of the contact",
+        "Of the penalty, in E h/R²; raised fourfold where a body without `stiffness` would penetrate too much.",
+        "error",
+    ),
 )
-CONTACT = ("approach_over_h", "force", "penetration_over_h", "contact_radius", "contact_inner", "contact_outer")
+CONTACT = (
+    "approach_over_h",
+    "force",
+    "penetration_over_h",
+    "contact_radius",
+    "contact_inner",
+    "contact_outer",
+    "contact_stiffness",
+)
 IN_TIME = (  # of runs with a step of kind: time
     Quantity(
         "time", "time", "Time of the motion; in seconds, or the case's own unit, with shell.density.", "time", "t"

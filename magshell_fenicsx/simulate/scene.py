@@ -41,6 +41,7 @@ from magshell_fenicsx.simulate.build import build_meridian_model, build_model, b
 from magshell_fenicsx.simulate.direction import directions, field_angle, field_size, turned
 
 Array = NDArray[np.float64]
+APART = 0.3  # of h, about: a path along a contact has shorter steps than waves around the axis need
 
 
 class Scene:
@@ -87,8 +88,9 @@ class Scene:
             self.model = build_model(case, self.plan, comm)
         if not (self.plan.fixed or isinstance(self.model, MeridianModel)):
             refuse_loose(self.model.system, self.model.r0, self.unloaded().mu)
-        # a body's penetration changes over far less than h: factors of a state near by are no tangent's
-        options = NewtonOptions(fresh=0.0) if self.model.contacts else None
+        # a body's penetration changes over far less than h: factors of a state near by are no tangent's, and the first
+        # matrices only find what touches
+        options = NewtonOptions(fresh=0.0, patience=7) if self.model.contacts else None
         self.newton = BorderedNewton(self.model.system, options)
         self.journal: Journal = NoJournal()
         self.progress: Progress = NoProgress()
@@ -102,7 +104,7 @@ class Scene:
     @cached_property
     def watch(self) -> Watch:
         """The watch over the modes that the model excludes. Its first use compiles their kernels."""
-        return Watch(self.model.excluded_modes)
+        return Watch(self.model.excluded_modes, APART if self.model.contacts else 0.0)
 
     def nowhere(self) -> str:
         """Where a step since the beginning of a walk has found no field, in words after a message; collective."""
@@ -239,7 +241,8 @@ class Scene:
             at, force = model.touching(state, name), model.system.potential(state.u, state.mu, name)
             values = (state.mu[name], -force / self.conjugate_unit(name), at.penetration / h)
             radii = (self.plan.length * radius for radius in (at.radius, at.inner, at.outer))
-            found |= dict(zip(contact_columns(name), (*values, *radii), strict=True))
+            k = float(model.contacts[name][0].stiffness.value)
+            found |= dict(zip(contact_columns(name), (*values, *radii, k), strict=True))
         return found
 
     def _observe_sources(self, state: State) -> dict[str, float]:

@@ -67,8 +67,8 @@ def sensitivities(scene: Scene, fold: Fold, record: Record | None = None) -> dic
       the derivative in lambda_m.
     """
     stage = stage_at(scene, record) if record else plain(scene)
-    system, state = stage.newton.system, fold.state
-    columns = {name: system.load(state.u, state.mu, name) for name in state.mu if name != fold.name}
+    system, state, settings = stage.newton.system, fold.state, scene.model.system.settings
+    columns = {name: system.load(state.u, state.mu, name) for name in state.mu if name not in (fold.name, *settings)}
     by_patch = _remanence_columns(scene, replace(fold, state=stage.leave(state)))
     columns |= {name: stage.padded(column) for name, column in by_patch.items()}
     found = {name: sensitivity(system, fold, column) for name, column in columns.items()}

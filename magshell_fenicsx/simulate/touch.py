@@ -1,15 +1,23 @@
 """The first contact of a body: free flight, which is no equilibrium path that arc length could measure."""
 
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
 from magshell_fenicsx.case.loading import ProgrammeStep
 from magshell_fenicsx.case.loads.contact import ContactSection
 from magshell_fenicsx.continuation.control import GivenLoad
+from magshell_fenicsx.continuation.point import PathStopped, Point
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.simulate.record import Stopped
 from magshell_fenicsx.simulate.scene import Scene
+from magshell_fenicsx.simulate.stage import Stage
 
 DEEP = tuple(2e-3 / 4**i for i in range(7))  # of h: how far past the first contact the path begins, at the first try
 NEAR = 1e-7  # of h: a smaller gap is none
 MOST = 1000  # approaches by the least gap
+STIFFER, MOST_STIFF = 4.0, 1e4  # how much stiffer a body becomes at once, and at most
 
 
 def touched(scene: Scene, step: ProgrammeStep, state: State) -> State:
@@ -44,6 +52,38 @@ def touched(scene: Scene, step: ProgrammeStep, state: State) -> State:
     raise Stopped(f"no equilibrium found at the first contact: {reason}")
 
 
+def stiffer(stage: Stage, low: Point, high: Point) -> State | None:
+    """The state of the first of two points with stiffer bodies where they penetrate too much at the second one.
+
+    None if none does, or if its stiffness is given.
+    """
+    state, h, raised = stage.leave(high.state), stage.scene.plan.material.h, dict[str, float]()
+    for contact in stage.scene.plan.loads.contacts:
+        k = state.mu.get(contact.setting, contact.stiffness)
+        deep = stage.scene.model.touching(state, contact.amplitude).penetration
+        if deep > contact.bound * h and not contact.given and k < MOST_STIFF * contact.stiffness:
+            raised[contact.setting] = STIFFER * k
+    return State(low.state.u, {**low.state.mu, **raised}) if raised else None
+
+
+def refuse_crossing(stage: Stage, low: Point, high: Point) -> None:
+    """See that the shell passes through no magnet between two points.
+
+    Raises
+    ------
+    PathStopped
+        With the magnet.
+    """
+    model, states = stage.scene.model, [stage.leave(point.state) for point in (low, high)]
+    for known in model.fields:
+        ends = list[tuple[NDArray[np.float64], Mapping[str, float]]]()
+        for state in states:
+            model.system.with_ghosts(state.u, state.mu)
+            ends.append((known.places, state.mu))
+        if said := [each for each in model.system.comm.allgather(known.passed(*ends)) if each]:
+            raise PathStopped(said[0], low)
+
+
 def refuse_penetration(scene: Scene, state: State) -> None:
     """See that no body penetrates more than its bound.
 
@@ -56,7 +96,8 @@ def refuse_penetration(scene: Scene, state: State) -> None:
     for contact in scene.plan.loads.contacts:
         deep = scene.model.touching(state, contact.amplitude).penetration / h
         if deep > contact.bound:
+            k = state.mu.get(contact.setting, contact.stiffness)
             raise Stopped(
                 f"the penetration of the body {contact.body} is {deep:.3g} h, more than bodies.{contact.body}."
-                f"penetration: {contact.bound:g}; its stiffness is {contact.stiffness:.4g}: give four times as much"
+                f"penetration: {contact.bound:g}; its stiffness is {k:.4g}: give four times as much"
             )

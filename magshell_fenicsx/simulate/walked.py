@@ -2,6 +2,7 @@
 
 from collections.abc import Generator, Iterable, Iterator
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from magshell_fenicsx.continuation.walk import Goal, Walk
 from magshell_fenicsx.continuation.watch import Crossing
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.stage import LONGEST, Stage
+from magshell_fenicsx.simulate.touch import refuse_crossing, stiffer
 
 BEYOND = 2.0  # a walk ends at this multiple of the load of the first excluded instability
 
@@ -42,10 +44,16 @@ def followed(stage: Stage, path: Path, start: Point, goal: Goal, branches: PathS
     Stopped
         If the path is lost.
     """
-    walk = Walk(path, start, goal)
+    walk = Walk(path, start, goal, partial(_checked, stage))
     for record in _followed(stage, walk, branches):
         yield replace(record, point=stage.point(record.point))
     return stage.leave(walk.points[-1].state)
+
+
+def _checked(stage: Stage, low: Point, high: Point) -> State | None:
+    """See `Walk`: bodies become stiffer; a magnet between the points ends the walk."""
+    refuse_crossing(stage, low, high)
+    return stiffer(stage, low, high)
 
 
 def _followed(stage: Stage, walk: Walk, branches: PathStep | None) -> Iterator[Record]:

@@ -1,5 +1,6 @@
 """Cases with bodies: paths, folds and rings of contact against other models, stiffnesses and the point force."""
 
+import csv
 from functools import cache
 from pathlib import Path
 
@@ -8,8 +9,9 @@ import pytest
 from command import magshell, read_path
 from conftest import CASES
 
-from magshell_fenicsx import Case, Result
+from magshell_fenicsx import Case, Result, Scene
 from magshell_fenicsx.run.run import run
+from magshell_fenicsx.simulate.follow import follow
 
 Row = dict[str, float]
 LENGTH = 90**-0.5  # sqrt(Rh) over R
@@ -46,8 +48,30 @@ def test_plate() -> None:
             assert flat == (row["approach_over_h"] < 2.5)
             assert row["contact_inner"] <= row["contact_radius"] <= row["contact_outer"]
     end = path[-1]
+    assert len(path) < 62  # at most 2.5 times the time of a point force
     assert end["force"] == pytest.approx(13.97, rel=2e-3)
     assert end["contact_radius"] == pytest.approx(np.sqrt(end["w_pole_over_h"]) * LENGTH, rel=0.1)
+
+
+@pytest.mark.slow
+def test_hard_plate() -> None:
+    """Without folds, the flat branch goes on, as the shell presses on the plate at its centre too.
+
+    Where it is flat, b = 0 and K = A/R: M = D (1 + nu) A/R is constant, but not the map from the sphere's metric A to
+    the plane. With its radius r = theta - (3 nu - 1) theta^3/48 (plane stress), the pressure is (1 + nu)^2 D/R^3. A
+    dimple at the same approach needs less force.
+    """
+    scene = Scene(Case.load(CASES / "plate_contact.yaml", ["bodies.plate.stiffness=2e6", "loading.points=1"]))
+    records = list(follow(scene))
+    assert [r.label for r in records if r.label != "step"] == ["start", "target"]
+    end = records[-1]
+    assert (end.point.negative_pivots, end.excluded_pivots) == (0, 0)
+    row, h, nu = scene.observe(end.point.state), scene.plan.material.h, 0.5
+    pressure = scene.model.cell_pressures(end.point.state)
+    assert pressure is not None
+    assert pressure[0] == pytest.approx((1 + nu) ** 2 * h**2 / (12 * (1 - nu**2)), rel=0.02)
+    assert row["force"] == pytest.approx(23.626, rel=1e-3)
+    assert row["w_pole_over_h"] == pytest.approx(4, abs=1e-3)
 
 
 @pytest.mark.slow
@@ -60,11 +84,24 @@ def test_stiffness() -> None:
 
 
 @pytest.mark.slow
-def test_half_against_meridian() -> None:
-    """Triangles with quadrature of their own, 1e-3."""
-    at = ("loading.approach=0.3", "loading.points=1")
-    force = last("plate_contact.yaml", *at)["force"]
-    assert last("plate_contact.yaml", *at, "symmetry=half")["force"] == pytest.approx(force, rel=1e-3)
+def test_half_and_full_against_meridian() -> None:
+    """Triangles with quadrature of their own, 2e-4."""
+    steps = "loading={kind: contact, control: approach, approach: 0.3, points: 1}"
+    plate = "bodies.plate={kind: plane, stiffness: 2e4, penetration: 0.01}"
+    forces = []
+    for symmetry in ("axisymmetric", "half", "none"):
+        scene = Scene(Case.load(CASES / "plate_contact.yaml", [steps, plate, f"symmetry={symmetry}"]))
+        forces.append(scene.observe(list(follow(scene))[-1].point.state)["force"])
+    assert forces == pytest.approx([forces[0]] * 3, rel=2e-4)
+
+
+def test_stiffer_by_itself() -> None:
+    """A plate without a given stiffness penetrates no more than it may, with the same force."""
+    few = ("loading.approach=0.4", "loading.points=1", "mesh.refinement=0.5")
+    soft, path = last("plate_contact.yaml", *few), rows("plate_contact.yaml", *few, "bodies.plate.penetration=2e-4")
+    assert max(row["penetration_over_h"] for row in path) < 2e-4 < soft["penetration_over_h"]
+    assert path[-1]["contact_stiffness"] > path[0]["contact_stiffness"]
+    assert path[-1]["force"] == pytest.approx(soft["force"], rel=1e-3)
 
 
 def test_ball_and_rod_against_a_point_force() -> None:
@@ -78,6 +115,43 @@ def test_ball_and_rod_against_a_point_force() -> None:
         assert force == pytest.approx(more * point["force"], rel=5e-4)
     assert rod["contact_radius"] == pytest.approx(0.2e-3, rel=0.1)  # in metres, at the rounded edge
     assert ball["contact_outer"] < 0.02
+
+
+def test_sweep_of_a_body(tmp_path: Path) -> None:
+    """The columns of a body are in the curves, and drawn: a blunter ball needs more force."""
+    few = ("loading.approach=0.2", "loading.points=1", "mesh.refinement=0.4")
+    over = ("--over", "bodies.ball.radius=0.1,0.3")
+    done = magshell("sweep", CASES / "ball_contact.yaml", *over, *(f"--set={s}" for s in few), "--out", tmp_path)
+    assert done.returncode == 0, done.stderr
+    with (tmp_path / "curves.csv").open(encoding="utf-8") as file:
+        ends = [row for row in csv.DictReader(file) if row["label"] == "target"]
+    assert [float(row["approach_over_h"]) for row in ends] == pytest.approx([0.2, 0.2])
+    assert float(ends[0]["force"]) < float(ends[1]["force"])
+    assert (tmp_path / "sweep.png").exists()
+
+
+def test_held_while_the_shell_moves() -> None:
+    """A ball that comes in a time, with drag, ends with the force of the static path, 1e-3."""
+    shell = {"geometry": "hemisphere", "radius": "30 mm", "thickness": "1.5 mm", "poisson_ratio": 0.3}
+    given = {
+        "shell": {**shell, "youngs_modulus": "1 MPa", "density": "1000 kg/m^3"},
+        "boundary": {"equator": "clamped"},
+        "bodies": {"ball": {"kind": "sphere", "radius": "9 mm"}},
+        "mesh": {"refinement": 0.3},
+    }
+    come = {"kind": "ramp", "to": 0.4, "over": "10 ms"}
+    move = {"kind": "time", "duration": "25 ms", "points": 1, "drag": "2000 Hz", "tolerance": 0.01}
+    forces = []
+    for steps in (
+        [{"kind": "contact", "control": "approach", "approach": 0.4, "points": 1}],
+        [
+            {"kind": "contact", "control": "approach", "approach": 0.3, "points": 1},
+            {**move, "history": {"approach": come}},
+        ],
+    ):
+        scene = Scene(Case.model_validate({**given, "loading": steps}))
+        forces.append(scene.observe(list(follow(scene))[-1].point.state)["force"])
+    assert forces[1] == pytest.approx(forces[0], rel=1e-3)
 
 
 def test_force_control_and_a_held_force(tmp_path: Path) -> None:

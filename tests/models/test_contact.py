@@ -1,10 +1,12 @@
 """Bodies that press: derivatives of every model by u and the approach, and plate theory."""
 
 from functools import cache
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import pytest
+import scipy.sparse.linalg
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
@@ -78,6 +80,26 @@ def test_derivatives(kind: str) -> None:
     for number, (first, second) in enumerate(zip(*changed, strict=True)):
         least = 1e-3 if number else 1e-7  # of the tangent the shell's own stiffness stays
         assert np.abs(first - second).max() > least * np.abs(first).max()
+
+
+@pytest.mark.parametrize("kind", ["meridian", "full"])
+def test_newton_is_quadratic(kind: str) -> None:
+    """Full steps with the tangent at each iterate: each error is at most a fixed multiple of the last one squared."""
+    system = scene(kind).model.system
+    mu = dict.fromkeys(scene(kind).unloaded().mu, 0.2)
+    u, sizes = np.zeros(system.size), list[float]()
+    for _ in range(25):
+        rows, columns, values = system.tangent(u, mu).getValuesCSR()
+        K = scipy.sparse.csc_array(scipy.sparse.csr_array((values, columns, rows), shape=(u.size, u.size)))
+        du = scipy.sparse.linalg.spsolve(K, system.residual(u, mu))
+        u = u - du
+        sizes.append(float(np.abs(du).max()) / system.length)
+        if sizes[-1] < 1e-10:
+            break
+    near = [size for size in sizes if size < 1e-2]
+    assert len(near) >= 3
+    assert all(after <= 200 * before**2 + 1e-11 for before, after in pairwise(near))
+    assert near[-1] < 1e-10
 
 
 def test_penalty() -> None:

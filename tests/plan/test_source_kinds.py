@@ -16,9 +16,11 @@ from scipy.spatial.transform import Rotation
 from magshell_fenicsx import Case, CaseError, Scene
 from magshell_fenicsx.case.expressions import with_derivatives
 from magshell_fenicsx.case.source import Source
+from magshell_fenicsx.models.shell.crossing import crossing
 from magshell_fenicsx.plan.formulas_in_space import FormulasInSpace
 from magshell_fenicsx.plan.planner import make_plan
 from magshell_fenicsx.plan.sources.field import in_space
+from magshell_fenicsx.plan.sources.registered import placed
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.record import Stopped
 
@@ -248,6 +250,21 @@ def test_shell_leaves_the_grid(tmp_path: Path) -> None:
     rows, said = stopped(scene)
     assert re.search(r"on this way a step has found no field: the shell's point .* is beyond the grid of", said)
     assert 9e-3 < rows[-1]["tip_uz"] < 11.2e-3  # the outermost quadrature point is not the tip
+
+
+def test_thin_magnet_in_the_way() -> None:
+    """It is passed through in one step: the distance of the ends of a way says nothing about its middle."""
+    (plate,) = placed(case([{"kind": "cylinder", **ALONG, "height": "0.02 mm", "position": [0, 0, 0]}]))
+    x = np.array([[0.01, 0.02, 0.3], [5.0, 0, 0.3]])
+    found = crossing(plate.distance, x, x - [0, 0, 0.7])
+    assert found is not None
+    assert plate.distance(found[None])[0] < 0
+    assert crossing(plate.distance, x, x - [0, 0, 0.29]) is None
+    steps = [{"kind": "field", "points": 1}, {"kind": "source", "move": [0, 0, "60 mm"], "points": 1}]
+    thin = {"kind": "cylinder", **ALONG, "height": "0.02 mm", "strength": 1e-9, "position": [0.02, 0, -0.03]}
+    rows, said = stopped(Scene(case([thin], loading=steps)))
+    assert "is inside magnetic.applied.sources.0 between two points" in said
+    assert rows[-1]["source"] == 0
 
 
 @pytest.mark.slow

@@ -34,9 +34,10 @@ class BodySection(Section):
     end [the shell's length; over R if that has no unit]"""
     stiffness: float | None = Field(default=None, gt=0, le=1e12)
     """k of the penalty k s²/2 per area of a penetration s; by default 1e6 D/(R² h²) of a plane, of another body of
-    radius r 15 (1 + R/r) times as much [E h/R²]"""
+    radius r 15 (1 + R/r) times as much, and four times as much each time that the penetration would exceed its bound
+    [E h/R²]"""
     penetration: float = Field(default=1e-3, ge=1e-6, le=0.1)
-    """Largest penetration that is allowed; where it is more the run stops [h]"""
+    """Largest penetration that is allowed; with a given `stiffness` the run stops where it is more [h]"""
 
     @property
     def ahead(self) -> float:

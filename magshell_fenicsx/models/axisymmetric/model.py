@@ -149,6 +149,7 @@ class MeridianModel(Observed):
             parameters=parameters,
             moving=moving(self.r0, self.supports, loads),
         )
+        self.system.settings = dict(known.setting for known, _ in self.contacts.values())
         self._volume = self.kernels.compile("volume energy", 2 * np.pi * volume(jets.revolved(self.u)))
         self._seen = {name: Probe.at(*place, self.r0) for name, place in meridian.points.items()}
         self.normals = {name: probe.normal for name, probe in self._seen.items()}

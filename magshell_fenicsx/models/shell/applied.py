@@ -4,7 +4,7 @@ The polynomial of second order has the first and second derivatives of the field
 take it: the forms and kernels are the same for every field.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import ufl
@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from ufl.core.expr import Expr
 
 from magshell_fenicsx.assembly.point_field import PointField, at_quadrature
-from magshell_fenicsx.models.shell.driven import Driven, FieldInSpace, Here
+from magshell_fenicsx.models.shell.crossing import crossing
+from magshell_fenicsx.models.shell.driven import Driven, FieldInSpace, Here, carried
 from magshell_fenicsx.models.shell.patterns import refuse_unbounded
 
 Array = NDArray[np.float64]
@@ -121,6 +122,22 @@ class AppliedField:
                 if G is not None:
                     values[..., 9:18] = G.reshape(*shape, 9)
         field.renew(values)
+
+    @property
+    def places(self) -> Array:
+        """The present places (n, 3) of the quadrature points."""
+        return (self._r0 + at_quadrature(self._u, self.polynomial.points)).reshape(-1, 3)
+
+    def passed(self, before: tuple[Array, Mapping[str, float]], after: tuple[Array, Mapping[str, float]]) -> str:
+        """Through what a point has moved between two states, from their places and amplitudes; "" if through none."""
+        still: list[tuple[FieldInSpace, Driven]] = [(part, Driven(part)) for part in getattr(self._of, "parts", [])]
+        for of, driven in [*still, *((each.of, each) for each in self._driven)]:
+            if distance := getattr(of, "distance", None):
+                ways = [(x - t) @ Q for x, (Q, t) in ((x, carried(driven.motions, mu)) for x, mu in (before, after))]
+                if crossing(distance, *ways) is not None:
+                    said = getattr(of, "nowhere", "is inside a source")
+                    return f"a point of the shell {said} between two points of the path"
+        return ""
 
     def _values(self, x: Array) -> tuple[Array, Array, Array]:
         if self._still is None:

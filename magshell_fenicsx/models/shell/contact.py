@@ -48,6 +48,8 @@ class Contact:
         k of the penalty, over E h/R^2.
     bound
         Largest penetration that is allowed, over h.
+    given
+        Whether the case gives its stiffness, which then stays.
     size
         Radius over R of what touches, such as a ball's; infinite for a plane.
     """
@@ -60,15 +62,17 @@ class Contact:
     stiffness: float
     bound: float
     size: float
+    given: bool = False
 
     def gap(self, x: Array, approach: float, half: float | Array) -> tuple[Array, Array, Array]:
         """The gap at places (n, 3) with its gradient and Hessian; `approach` and half the thickness over R."""
         g, n, N = self.distance(x - approach * self.direction)
         return g - half, n, N
 
-    def pressure(self, gap: Array, h: float) -> Array:
-        """Over E h/R."""
-        return penalty(-gap, self.stiffness, SOFT * h)[1]
+    @property
+    def setting(self) -> str:
+        """Name of its stiffness among the amplitudes of a state, where it was raised."""
+        return f"stiffness_{self.body}"
 
 
 def contact_quadrature(degree: int) -> int:
@@ -156,6 +160,8 @@ class Pressing:
     ----------
     polynomial
         The parameter of the densities.
+    stiffness
+        That of the present state.
     """
 
     def __init__(
@@ -177,8 +183,15 @@ class Pressing:
         self._half = h / 2 * factor
         self._owned = V.mesh.topology.index_map(V.mesh.topology.dim).size_local
         self._known: Array = np.empty(0)
+        self.stiffness = fem.Constant(V.mesh, contact.stiffness)
+        self._seen: tuple[Array, float, float] = np.empty(0), 0.0, 0.0  # displacement, approach and stiffness
         self.gap: Array = np.empty(0)
         self.follow()
+
+    @property
+    def setting(self) -> tuple[str, tuple[fem.Constant, float]]:
+        """Its stiffness, see `FiniteElementSystem.settings`."""
+        return self.contact.setting, (self.stiffness, self.contact.stiffness)
 
     @property
     def motion(self) -> Array:
@@ -187,12 +200,13 @@ class Pressing:
 
     def follow(self) -> None:
         """Renew the polynomials where displacement or approach have changed."""
-        y = at_quadrature(self._u, self._points) - float(self._approach.value) * self.motion
-        if np.array_equal(y, self._known):
+        u, approach, k = self._u.x.array, float(self._approach.value), float(self.stiffness.value)
+        if (approach, k) == self._seen[1:] and np.array_equal(u, self._seen[0]):
             return
-        self._known = y
+        self._seen = u.copy(), approach, k
+        self._known = y = at_quadrature(self._u, self._points) - approach * self.motion
         self.gap, n, N = self.contact.gap((self._r0 + y).reshape(-1, 3), 0.0, self._half)
-        value, first, second = penalty(-self.gap, self.contact.stiffness, SOFT * self._h)
+        value, first, second = penalty(-self.gap, k, SOFT * self._h)
         H = second[:, None, None] * n[:, :, None] * n[:, None, :] - first[:, None, None] * N
         pairs = H[:, *PAIRS] * np.where(PAIRS[0] == PAIRS[1], 0.5, 1.0)
         flat = [a.reshape(*y.shape[:2], -1) for a in (y, value, -first[:, None] * n, pairs)]
@@ -209,7 +223,7 @@ class Pressing:
         """Where the body touches; `radius` is the mean one."""
         owned = slice(0, self._owned * len(self._points))
         gap, x = self.gap[owned], (self._r0 + self._known).reshape(-1, 3)[owned] - self.contact.front
-        pressure, d = self.contact.pressure(gap, self._h), self.contact.direction
+        pressure, d = penalty(-gap, float(self.stiffness.value), SOFT * self._h)[1], self.contact.direction
         most = comm.allreduce(float(pressure.max(initial=0.0)), MPI.MAX)
         from_axis = np.linalg.norm(x - (x @ d)[:, None] * d, axis=1)[pressure > PRESSED * most]
         penetration = comm.allreduce(float(-gap.min(initial=np.inf)), MPI.MAX)

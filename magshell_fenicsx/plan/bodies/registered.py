@@ -80,7 +80,17 @@ def _contact(case: Case, perfect: Outline, drawn: Outline, turn: float, name: st
     distance = KINDS[section.kind](section, placed)
     D, size = h**2 / (12 * (1 - case.shell.poisson_ratio**2)), section.blunt / placed.R
     k = section.stiffness or NATURAL * D / h**2 * (1.0 if size == inf else POINTED * (1 + 1 / size))
-    found = Contact(name, case.approaches[name], distance, placed.direction, placed.front, k, section.penetration, size)
+    found = Contact(
+        name,
+        case.approaches[name],
+        distance,
+        placed.direction,
+        placed.front,
+        k,
+        section.penetration,
+        size,
+        section.stiffness is not None,
+    )
     depth = -least_gap(found, drawn, Q, half)
     if depth > WITHIN * h:
         raise CaseError(

@@ -64,6 +64,13 @@ class Placed:
             np.einsum("ai,bj,ck,nijk->nabc", Q, Q, Q, H, optimize=True) * (self.factor * R**2),
         )
 
+    def distance(self, x: Array) -> Array:
+        """From places (n, 3) to its body, over R, negative inside; infinite if it has none."""
+        of = getattr(self.known.field, "distance", None)
+        return (
+            np.full(len(x), np.inf) if of is None else of(self.length * (x - self.position) @ self.axes) / self.length
+        )
+
     @property
     def nowhere(self) -> str:
         """What a place without a field is, in words."""

@@ -43,7 +43,8 @@ class Outcome:
     stopped
         Why the run ended before its target; None if it reached it.
     curve
-        Every accepted point, with the columns of `CURVE` that the run has.
+        Every accepted point, with the columns of `CURVE` that the run has, and with those of its own bodies, supports,
+        sources and points.
     found
         "path": the full path was computed; "fold": the fold of the previous point was followed, and the curve has
         only this point.
@@ -68,13 +69,14 @@ class Outcome:
 def outcome_of(result: Result, found: Found, factorisations: int, wall_s: float) -> Outcome:
     """The outcome of a run, or of a fold in the form of a run."""
     limits = sorted(result.limit_points, key=lambda p: p["amplitude"] != "pressure" or p["value"] != result.knockdown)
+    columns = dict.fromkeys((*CURVE, *result.scene.extra_columns))
     return Outcome(
         knockdown=result.knockdown,
         limit=next(iter(limits), None),
         stopped=result.stopped,
         dofs=result.scene.model.system.dofs,
         wall_s=round(wall_s, 3),
-        curve=[{key: row[key] for key in CURVE if key in row} for row in result.rows],
+        curve=[{key: row[key] for key in columns if key in row} for row in result.rows],
         found=found,
         factorisations=factorisations,
         barrier=result.barrier,

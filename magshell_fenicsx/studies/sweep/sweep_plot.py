@@ -65,7 +65,7 @@ def _values(
 def _curves(plot: Any, points: Sequence[SweepPoint], outcomes: Sequence[Outcome]) -> None:
     """Draw the last varied load over its displacement, for every point."""
     amplitude = next((str(o.curve[-1]["amplitude"]) for o in outcomes if len(o.curve) > 1), "force")
-    x, y = axes_of(amplitude)
+    x, y = axes_of(amplitude, next((o.curve[-1] for o in outcomes if o.curve), ()))
     for point, outcome, style in zip(points, outcomes, cycle(STYLES), strict=False):
         part = loaded(outcome.curve, amplitude)
         places = ([each.on_axis(row) for row in part] for each in (x, y))

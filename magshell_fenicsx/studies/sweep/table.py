@@ -54,7 +54,8 @@ def write_curves(points: Sequence[SweepPoint], outcomes: Sequence[Outcome], file
     """Write curves.csv."""
     rows = [{**point.values, **row} for point, outcome in zip(points, outcomes, strict=True) for row in outcome.curve]
     there = [key for key in CURVE if any(key in row for row in rows)]
-    write_csv(rows, (*points[0].values, *there), file)
+    own = dict.fromkeys(key for row in rows for key in row if key not in points[0].values)
+    write_csv(rows, (*points[0].values, *dict.fromkeys((*there, *own))), file)
 
 
 def write_csv(rows: Iterable[Mapping[str, Any]], columns: Sequence[str], file: Path) -> None:
