@@ -309,6 +309,8 @@ def _by_field(adjoint: Adjoint, name: str) -> FieldGradient:
             shares.append(Share(term, adjoint.wave[2] * mu, 0.0))
     for each in c.keys() & system.parameters.keys():
         for slope in system.parameters[each].slopes:
+            if not isinstance(slope, FormTerm):
+                raise CaseError(f"{name}: the conjugate of {each} has no gradient by this field")
             shares.append(Share(slope, c[each] * (state.mu[slope.amplitude] if slope.amplitude else 1.0), 0.0))
     forces = by_field(shares, f, model.u, along, model.kernels)
     places, normals = _places(scene, f)

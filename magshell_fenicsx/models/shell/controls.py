@@ -65,7 +65,7 @@ class ByControls:
     frame: Array | None = None
 
     def __call__(self, r0: Array, n0: Array) -> Array:
-        x = r0.reshape(-1, 3)
+        x = np.asarray(r0.reshape(-1, 3))
         x = x if self.frame is None else x @ self.frame
         found: Array = np.asarray(self.controls.weights(x) @ self.values)
         if self.controls.around:

@@ -130,7 +130,7 @@ class Design:
     def best(self) -> tuple[Array, Evaluation] | None:
         """The evaluation with the least objective of those that keep the constraints best."""
         there = [each for each in self.tried if each[1].values]
-        return min(there, key=lambda each: self.problem.merit(each[1]), default=None)
+        return min(there, key=lambda each: self.problem.merit(each[1])) if there else None
 
 
 def design(
