@@ -8,19 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import scipy
 from command import magshell
 from conftest import CASES, draw_nothing
 from numpy.typing import NDArray
 
-from magshell_fenicsx.assembly.field_derivative import FieldGradient
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.controls import read_vectors, write_vectors
+from magshell_fenicsx.case.controls import read_vectors
 from magshell_fenicsx.run.run import run
-from magshell_fenicsx.simulate.follow import follow
-from magshell_fenicsx.simulate.gradient import gradient
-from magshell_fenicsx.simulate.results import functional
-from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.studies.design.design import design
 
 Array = NDArray[np.float64]
@@ -167,43 +161,3 @@ def test_hemisphere_that_buckles_late(tmp_path: Path) -> None:
     assert content["start"]["knockdown"] == pytest.approx(0.447276, rel=1e-5)
     assert content["best"]["knockdown"] > 1.3 * content["start"]["knockdown"]
     assert content["verified"]["knockdown"] == pytest.approx(content["best"]["knockdown"], rel=5e-4)
-
-
-@pytest.mark.slow
-def test_a_known_remanence_from_its_shape(tmp_path: Path) -> None:
-    """The misfit falls by 1e6, and the angles are found again where the strip feels them: not at its clamped root."""
-    along = np.linspace(0, 1, 5)
-    places, wanted = np.column_stack([along, 0 * along, 0 * along]), np.pi / 2 + 0.5 * np.sin(4 * along)
-    (tmp_path / "strip.yaml").write_text(
-        STRIP.replace("remanent: {polar: 90}", "remanent: {kind: points, file: B.csv, filter: 0.25}")
-    )
-
-    def end(angles: Array) -> tuple[Scene, list[object]]:
-        write_vectors(tmp_path / "B.csv", places, np.column_stack([np.sin(angles), 0 * angles, np.cos(angles)]))
-        scene = Scene(Case.load(tmp_path / "strip.yaml"))
-        return scene, list(follow(scene))
-
-    scene, records = end(wanted)
-    model = scene.model
-    model.system.set(records[-1].point.state.u)  # type: ignore[attr-defined]
-    nodes, moved = (np.array(f.x.array.reshape(-1, 3)) for f in (model.r0, model.u))
-    tree = scipy.spatial.cKDTree(nodes)
-
-    def shape(x: Array) -> Array:
-        return np.asarray(x + moved[tree.query(x)[1]])
-
-    seen = list[float]()
-
-    def misfit(angles: Array) -> tuple[float, Array]:
-        scene, records = end(angles)
-        last = records[-1]
-        found = gradient(scene, last, of=shape, by=["remanence"])["remanence"]  # type: ignore[arg-type]
-        assert isinstance(found, FieldGradient)
-        forces = scene.plan.loads.magnetic.remanent.pulled(found.places, found.forces)  # type: ignore[union-attr]
-        seen.append(functional(scene, last.point.state, shape).value)  # type: ignore[attr-defined]
-        slope = forces[:, 0] * np.cos(angles) - forces[:, 2] * np.sin(angles)
-        return 1e4 * seen[-1], 1e4 * slope
-
-    found = scipy.optimize.minimize(misfit, np.full(5, np.pi / 2), jac=True, method="BFGS", options={"gtol": 1e-6})
-    assert min(seen) < 1e-6 * seen[0]
-    assert found.x[1:] == pytest.approx(wanted[1:], abs=0.02)
