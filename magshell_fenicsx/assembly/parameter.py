@@ -61,8 +61,10 @@ class Parameter:
     log: KernelLog
     _bends: dict[fem.Constant, list[FormTerm]] = field(default_factory=dict)
 
-    def bends(self, q: fem.Constant) -> list[FormTerm]:
+    def bends(self, q: Any) -> Sequence[Derivative]:
         """d2Pi_i/dp dq with the amplitudes mu_i; q may be p."""
+        if not isinstance(q, fem.Constant):
+            return bends_of(q, self.constant)
         if q not in self._bends:
             self._bends[q] = [
                 FormTerm(f"{t.name} twice", derived(t.form, q), t._u, self.log, t.amplitude)
@@ -70,6 +72,11 @@ class Parameter:
                 if q in t.form.constants()
             ]
         return self._bends[q]
+
+
+def bends_of(q: Any, p: Any) -> Sequence[Derivative]:
+    """The mixed derivatives by q, which is no constant in a form, as q has them; else none."""
+    return list(q.bends(p)) if hasattr(q, "bends") else []
 
 
 def make_parameters(

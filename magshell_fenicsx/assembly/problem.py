@@ -2,7 +2,6 @@
 
 import itertools
 from collections.abc import Mapping, Sequence
-from typing import Protocol
 
 import numpy as np
 from dolfinx import fem
@@ -11,6 +10,7 @@ from dolfinx.la import InsertMode
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
+from magshell_fenicsx.assembly.assemblers import ResidualAssembler, TangentAssembler
 from magshell_fenicsx.assembly.moving import Moving
 from magshell_fenicsx.assembly.parameter import Derivative, FreeParameter
 from magshell_fenicsx.assembly.sliding import Constraint, Projection, Sliding
@@ -19,36 +19,6 @@ from magshell_fenicsx.continuation.noise import Noise
 from magshell_fenicsx.continuation.system import Amplitudes, Skewed, State, Vector, Weighted
 from magshell_fenicsx.continuation.timing import Stopwatch
 from magshell_fenicsx.platform import compat
-
-
-class TangentAssembler(Protocol):
-    """Computes the tangent without the terms' forms."""
-
-    def tangent(
-        self, factors: Mapping[str, float], stress: Sequence[tuple[float, NDArray[np.float64]]] = ()
-    ) -> PETSc.Mat:
-        """The matrix of the terms with these factors, by name, at the present u.
-
-        `stress` is that of `System.tangent`, of displacements with ghosts.
-        """
-
-    def times(self, v: NDArray[np.float64], factors: Mapping[str, float]) -> NDArray[np.float64]:
-        """This rank's part of the matrix without supports times a vector with ghosts, exact where nodes move."""
-
-
-class ResidualAssembler(Protocol):
-    """Computes the residual of some terms without their forms.
-
-    Attributes
-    ----------
-    names
-        Names of these terms.
-    """
-
-    names: frozenset[str]
-
-    def add(self, b: NDArray[np.float64], factors: Mapping[str, float]) -> None:
-        """Add the gradients of the terms with these factors, by name, at the present u."""
 
 
 class FiniteElementSystem:

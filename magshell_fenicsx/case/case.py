@@ -26,6 +26,7 @@ from magshell_fenicsx.case.loads.contact import ContactSection
 from magshell_fenicsx.case.loads.dead import DeadSection
 from magshell_fenicsx.case.loads.edge import EdgeSection, refuse_unheld
 from magshell_fenicsx.case.loads.growth import GrowthSection
+from magshell_fenicsx.case.loads.imperfection import refuse_unfit_growth
 from magshell_fenicsx.case.loads.indentation import IndentationSection
 from magshell_fenicsx.case.loads.step import Step
 from magshell_fenicsx.case.mesh import SOLID_DEGREE, MeshSection
@@ -142,7 +143,6 @@ class Case(WithParts):
 
     @model_validator(mode="after")
     def _named_parts_are_there(self) -> Self:
-        """Points, and the edges and patches of geometries whose names are known."""
         shell = self.shell
         refuse_taken(self.points)
         dead = self.loads_of(DeadSection)
@@ -227,9 +227,9 @@ class Case(WithParts):
         for step in self.programme:
             if isinstance(step.load, EdgeSection):
                 refuse_unheld(step.key, step.load, self.boundary.conditions())
-        density = self.time_unit is not None and self.shell.with_units
+        refuse_unfit_growth(self.programme, self.imperfections, solid=self.model == "solid")
+        density, whole = self.time_unit is not None and self.shell.with_units, isinstance(self.loading, list)
         refuse_unfit_viscosity(self.shell, density=density, plain=self.model == "shell" and not self.natural)
-        whole = isinstance(self.loading, list)
         refuse_unfit_steps(self.programme, self.magnetic, self.lambda_m, whole=whole, density=density)
         return self
 

@@ -11,6 +11,7 @@ from magshell_fenicsx.case.loads.dead import DeadSection
 from magshell_fenicsx.case.loads.edge import EdgeSection
 from magshell_fenicsx.case.loads.field import FieldBefore, FieldSection, RotationSection
 from magshell_fenicsx.case.loads.growth import GrowthSection
+from magshell_fenicsx.case.loads.imperfection import ImperfectionStep
 from magshell_fenicsx.case.loads.indentation import IndentationSection
 from magshell_fenicsx.case.loads.pressure import PressureSection
 from magshell_fenicsx.case.loads.source import SourceStep
@@ -23,6 +24,7 @@ OneStep: TypeAlias = Annotated[
     | FieldSection
     | RotationSection
     | GrowthSection
+    | ImperfectionStep
     | DeadSection
     | EdgeSection
     | ContactSection

@@ -8,7 +8,7 @@ from magshell_fenicsx.case.loads.dead import DeadSection
 from magshell_fenicsx.case.loads.edge import EdgeSection
 from magshell_fenicsx.case.loads.field import FieldBefore, FieldSection, RotationSection
 from magshell_fenicsx.case.loads.source import SourceStep, refuse_unknown_source
-from magshell_fenicsx.case.loads.step import LEAST_TARGET, Gas, Step
+from magshell_fenicsx.case.loads.step import LEAST_TARGET, Gas, PathStep, Step
 from magshell_fenicsx.case.loads.time import TimeSection, refuse_unfit_time
 
 SAME = 1e-9  # cosine of directions: rounding
@@ -73,14 +73,14 @@ def refuse_unfit_steps(
                 "begins there"
             )
         after = steps[step.number - 2].load if step.number > 1 else None
-        if isinstance(after, TimeSection) and after.until == "duration" and not isinstance(load, TimeSection):
+        if isinstance(after, TimeSection) and after.until != "rest" and not isinstance(load, TimeSection):
             raise ValueError(f"{key}: begins in equilibrium: the step of kind: time before it needs until: rest")
         if isinstance(load, TimeSection):
             if "field" in load.history and (not lambda_m or "angle" in driven):
                 why = "not after kind: rotation" if lambda_m else "needs magnetic.lambda_m, not zero"
                 raise ValueError(f"{key}.history.field: {why}")
             flux = magnetic is not None and magnetic.applied.flux_density not in (None, 0.0)
-            refuse_unfit_time(key, load, amplitudes - moved, density=density, measured=flux)
+            refuse_unfit_time(key, load, amplitudes, moved, density=density, measured=flux)
             driven.update(load.drives)
         driven.add(step.name)
         _refuse_unfit_hold(step, steps)
@@ -89,10 +89,13 @@ def refuse_unfit_steps(
 def _refuse_unfit_hold(step: ProgrammeStep, steps: Sequence[ProgrammeStep]) -> None:
     loads: dict[str, Step | None] = {"pressure": None, **{other.name: other.load for other in steps}}
     loads.pop("angle", None)
-    allowed = sorted(set(loads) - {step.name})
+    if isinstance(step.load, TimeSection):
+        loads.pop("time")
+    limit = isinstance(step.load, PathStep) and step.load.until == "limit"
+    allowed = sorted(set(loads) - (set() if limit else {step.name}))
     for name, how in step.load.hold.items():
         key = f"{step.key}.hold.{name}"
-        if name == step.name:
+        if name == step.name and not (limit and how == "conjugate"):
             raise ValueError(f"{key}: this step drives {name}; allowed: {', '.join(allowed) or 'none'}")
         if name not in loads:
             raise ValueError(f"{key}: the programme has no such amplitude; allowed: {', '.join(allowed) or 'none'}")
@@ -105,3 +108,6 @@ def _refuse_unfit_hold(step: ProgrammeStep, steps: Sequence[ProgrammeStep]) -> N
             and (not load.conjugate or (isinstance(load, DeadSection) and (load.turns or load.by_place)))
         ):
             raise ValueError(f"{key}: conjugate: nothing that can be held is conjugate to it; allowed: load")
+        moves = isinstance(step.load, TimeSection) or getattr(step.load, "then", None)
+        if how == "conjugate" and isinstance(load, EdgeSection) and moves:
+            raise ValueError(f"{key}: conjugate: a support that is free to move has a mass, which is not known")

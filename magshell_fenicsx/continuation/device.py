@@ -15,12 +15,15 @@ from copy import copy
 from math import log2
 
 import numpy as np
+from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.edge import join, split
 from magshell_fenicsx.continuation.factor import Factorisation
 from magshell_fenicsx.continuation.system import Amplitudes, Edged, State, System, Vector, Weighted, max_abs
 
 Conjugate = Callable[[float], tuple[float, float]]  # mu -> q and dq/dmu
+Held = float | Conjugate | str
+Array = NDArray[np.float64]
 
 
 class Device:
@@ -29,15 +32,21 @@ class Device:
     Parameters
     ----------
     held
-        Amplitude that becomes unknown -> its conjugate: a value of -dPi/dmu, or a function q(mu) that does not rise.
+        Amplitude that becomes unknown -> its conjugate: a value of -dPi/dmu, a function q(mu) that does not rise, or
+        the name of a further amplitude of the device, whose value it is.
     scale
         Amplitude -> a value that counts as of order one.
+
+    Attributes
+    ----------
+    names
+        The amplitudes that are unknown.
     """
 
-    def __init__(self, system: System, held: Mapping[str, float | Conjugate], scale: Mapping[str, float]) -> None:
+    def __init__(self, system: System, held: Mapping[str, Held], scale: Mapping[str, float]) -> None:
         self.comm, self.length, self.coordinates = system.comm, system.length, system.coordinates
-        self._system, self._names = system, list(held)
-        self._held: list[Conjugate] = [q if callable(q) else constant(q) for q in held.values()]
+        self._system, self.names = system, list(held)
+        self._held = [q if callable(q) or isinstance(q, str) else constant(q) for q in held.values()]
         self._unit = np.array([scale[name] / system.length for name in held])
         self.size = system.size + len(held) * (self.comm.rank == self.comm.size - 1)
 
@@ -50,21 +59,21 @@ class Device:
 
     def padded(self, u: Vector) -> Vector:
         """A vector of the inner system with zeros for the amplitudes."""
-        return join(u, np.zeros(len(self._names)), self.comm)
+        return join(u, np.zeros(len(self.names)), self.comm)
 
     def enter(self, state: State) -> State:
         """A state of the inner system as a state of the device."""
-        y = np.array([state.mu[name] for name in self._names]) / self._unit
-        fixed = {name: value for name, value in state.mu.items() if name not in self._names}
-        return State(join(state.u, y, self.comm), fixed)
+        fixed = {name: value for name, value in state.mu.items() if name not in self.names}
+        return State(join(state.u, self.unknowns(state.mu), self.comm), fixed)
 
     def leave(self, state: State) -> State:
         """A state of the device as a state of the inner system."""
-        return State(*self._split(state.u, state.mu))
+        u, mu = self._split(state.u, state.mu)
+        return State(u, {name: value for name, value in mu.items() if name not in self._held})
 
     def displacement(self, x: Vector) -> Vector:
         """u of a vector (u, y)."""
-        return split(x, len(self._names), self.comm)[0]
+        return split(x, len(self.names), self.comm)[0]
 
     def rates(self, x: Vector) -> dict[str, float]:
         """The changes of the amplitudes along a vector (u, y)."""
@@ -77,35 +86,66 @@ class Device:
 
     def residual(self, u: Vector, mu: Amplitudes) -> Vector:
         v, whole = self._split(u, mu)
-        held = [q(whole[name])[0] for name, q in zip(self._names, self._held, strict=True)]
-        rows = np.array([self._system.potential(v, whole, name) for name in self._names]) + held
-        return join(self._system.residual(v, whole), rows * self._unit, self.comm)
+        return join(self._system.residual(v, whole), self.rows(v, whole), self.comm)
+
+    def rows(self, u: Vector, mu: Amplitudes) -> Array:
+        """The further rows at a state of the inner system, zero where each conjugate is what it should be."""
+        each = zip(self.names, self._held, strict=True)
+        held = [mu[q] if isinstance(q, str) else q(mu[name])[0] for name, q in each]
+        rows = np.array([self._system.potential(u, mu, name) for name in self.names]) + held
+        return np.asarray(rows * self._unit)
 
     def load(self, u: Vector, mu: Amplitudes, name: str) -> Vector:
         v, whole = self._split(u, mu)
-        mixed = [self._system.curvature(v, whole, other, name) for other in self._names]
+        if name in self._held:
+            return join(0.0 * v, self._unit * (np.array(self._held, dtype=object) == name), self.comm)
+        mixed = [self._system.curvature(v, whole, other, name) for other in self.names]
         return join(self._system.load(v, whole, name), np.array(mixed) * self._unit, self.comm)
 
     def potential(self, u: Vector, mu: Amplitudes, name: str) -> float:
-        return self._system.potential(*self._split(u, mu), name)
+        v, whole = self._split(u, mu)
+        if name in self._held:
+            return whole[self.names[self._held.index(name)]]
+        return self._system.potential(v, whole, name)
 
     def curvature(self, u: Vector, mu: Amplitudes, name: str, other: str) -> float:
+        if {name, other} & set(self._held):
+            return 0.0
         return self._system.curvature(*self._split(u, mu), name, other)
 
     def tangent(self, u: Vector, mu: Amplitudes, stress: Sequence[Weighted] = ()) -> Edged:
         v, whole = self._split(u, mu)
-        columns = [unit * self._system.load(v, whole, name) for name, unit in zip(self._names, self._unit, strict=True)]
-        D = np.array([[self._system.curvature(v, whole, i, j) for j in self._names] for i in self._names])
-        D += np.diag([q(whole[name])[1] for name, q in zip(self._names, self._held, strict=True)])
+        columns, D = self.edge(v, whole)
         below = [(weight, self.displacement(w)) for weight, w in stress]
         K = self._system.tangent(v, whole, below)
         assert not isinstance(K, Edged)  # a device of a device is one device
-        multipliers = sum(name not in self.coordinates for name in self._names)
-        return Edged(K, columns, D * np.outer(self._unit, self._unit), multipliers)
+        return Edged(K, columns, D, self.multipliers)
+
+    def edge(self, u: Vector, mu: Amplitudes) -> tuple[list[Vector], Array]:
+        """The columns C, and D (k, k), at a state of the inner system."""
+        system, names = self._system, self.names
+        columns = [unit * system.load(u, mu, name) for name, unit in zip(names, self._unit, strict=True)]
+        D = np.array([[system.curvature(u, mu, i, j) for j in names] for i in names])
+        each = zip(names, self._held, strict=True)
+        D += np.diag([0.0 if isinstance(q, str) else q(mu[name])[1] for name, q in each])
+        return columns, np.asarray(D * np.outer(self._unit, self._unit))
+
+    @property
+    def multipliers(self) -> int:
+        """See `Edged`."""
+        return sum(name not in self.coordinates for name in self.names)
+
+    def values(self, y: Array) -> dict[str, float]:
+        """The amplitudes of the unknowns y."""
+        return dict(zip(self.names, (float(v) for v in y * self._unit), strict=True))
+
+    def unknowns(self, mu: Amplitudes) -> Array:
+        """The unknowns y of amplitudes."""
+        return np.asarray(np.array([mu[name] for name in self.names]) / self._unit)
 
     def _split(self, x: Vector, mu: Amplitudes) -> tuple[Vector, dict[str, float]]:
-        u, y = split(x, len(self._names), self.comm)
-        return u, {**mu, **dict(zip(self._names, (float(v) for v in y * self._unit), strict=True))}
+        u, y = split(x, len(self.names), self.comm)
+        return u, {**mu, **self.values(y)}
 
 
 def constant(q: float) -> Conjugate:

@@ -2,7 +2,7 @@
 
 A guess is tried in two ways: by Newton's method with all known solutions deflated, and by the path on which a force
 along its displacement that holds it is released. Each solution that is found gives two more guesses, along its softest
-mode.
+mode. A search for stable solutions first lets each guess go down in energy until it rests at one.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -21,7 +21,8 @@ from magshell_fenicsx.continuation.release import released
 from magshell_fenicsx.continuation.system import State, Vector, max_abs
 
 COPY = 1e-3  # solutions at a smaller distance, in lengths of the system, are one
-MODE = 1.0  # size of a mode in a guess, in lengths
+MODE, DOWN = 1.0, 0.3  # size of a mode in a guess, and where a descent leaves an unstable solution, in lengths
+DESCENTS = 20  # times that a guess goes on settling
 OVER = "the time of the search is over"
 
 
@@ -63,6 +64,7 @@ def further(
     guesses: Iterable[Callable[[], State]],
     limits: Limits,
     displacement: Callable[[Vector], Vector] = lambda u: u,
+    descend: Callable[[State], State] | None = None,
 ) -> Iterator[Point]:
     """Solutions at the amplitudes of a known one, each accepted as a point of the path is.
 
@@ -76,13 +78,15 @@ def further(
         Further guesses, which are tried first.
     displacement
         A vector of the system with zeros for unknowns that are no displacements.
+    descend
+        Lets a state go down in energy by some steps; then only stable solutions count. None: all count.
     """
-    search = _Search(path, [start])
+    search = _Search(path, [start], descend, limits.over)
     queue = [Guess(make, start, displacement) for make in guesses]
     queue += search.along_mode(start, displacement)
     found = 0
     for number, guess in enumerate(queue, 1):  # the queue grows
-        attempts = [search.by_newton, search.by_release]
+        attempts = [*([search.by_descent] if descend else []), search.by_newton, search.by_release]
         while attempts:
             attempt = attempts.pop(0)
             path.progress.doing(f"searching: guess {number} of at most {limits.guesses}, solutions found: {found}")
@@ -93,7 +97,7 @@ def further(
                 continue
             search.known.append(point.state)
             queue += search.along_mode(point.state, displacement)
-            found += 1
+            found += not (descend and point.negative_pivots)
             yield point
             if found == limits.solutions:
                 return
@@ -119,8 +123,10 @@ class _Search:
         The solutions so far.
     """
 
-    def __init__(self, path: Path, known: list[State]) -> None:
-        self._path, self.known = path, known
+    def __init__(
+        self, path: Path, known: list[State], descend: Callable[[State], State] | None, over: Callable[[], bool]
+    ) -> None:
+        self._path, self.known, self._descend, self._over = path, known, descend, over
         self._system, self._newton = path.system, path.newton
         self._solver = Path(path.newton, path.name, "load", path.options)  # without a journal
         self._value = known[0].mu[path.name]
@@ -129,6 +135,29 @@ class _Search:
     def by_newton(self, guess: Guess) -> Point | str:
         """The solution that deflated Newton's method finds from a guess."""
         return self._accepted(guess.state)
+
+    def by_descent(self, guess: Guess) -> Point | str:
+        """The stable solution below a guess; from an unstable one on the way it goes on along the softest mode."""
+        assert self._descend
+        state, tried = guess.state, "it does not come to rest"
+        for _ in range(DESCENTS):
+            if self._over():
+                return OVER
+            state = self._descend(state)
+            if self._newton.factor_at(state).negative_pivots:
+                continue
+            near = deflated(self._newton, state, self._path.name, self._row)
+            found = self._solver.solve(self._row, self._value, near) if near else "no solution is near"
+            if isinstance(found, str):
+                tried = found
+            elif self._is_known(found.state):
+                return "the solution is a known one"
+            else:
+                point = self._solver.exact(found, found)
+                if not point.negative_pivots:
+                    return point
+                state = _Mode(self._path, point.state).state(DOWN)
+        return tried
 
     def by_release(self, guess: Guess) -> Point | str:
         """The first solution on the path of a force that holds the guess."""
@@ -151,10 +180,13 @@ class _Search:
         found = self._solver.solve(self._row, self._value, near)
         if isinstance(found, str):
             return found
-        away = (max_abs(self._system.comm, found.state.u - state.u) for state in self.known)
-        if min(away) <= COPY * self._system.length:
+        if self._is_known(found.state):
             return "the solution is a known one"
         return self._solver.exact(found, found)
+
+    def _is_known(self, found: State) -> bool:
+        away = (max_abs(self._system.comm, found.u - state.u) for state in self.known)
+        return min(away) <= COPY * self._system.length
 
 
 @dataclass(frozen=True)

@@ -7,15 +7,19 @@ rho < 1, but shows neither its acceleration, without which a resumed run is anot
 """
 
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass, field, replace
-from typing import Protocol
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 from petsc4py import PETSc
 
+from magshell_fenicsx.continuation.device import Device
+from magshell_fenicsx.continuation.edge import join, split
 from magshell_fenicsx.continuation.factor import Factorisation
+from magshell_fenicsx.continuation.motion import Motion, constrained, held_back
 from magshell_fenicsx.continuation.newton import MOTION
-from magshell_fenicsx.continuation.system import Edged, Skewed, System, Vector, dot, max_abs
+from magshell_fenicsx.continuation.system import Amplitudes, Edged, Skewed, System, Vector, dot, max_abs
 
 TOLERANCE = 1e-10  # of u in a step, over the system's length or, where that is longer, a tenth of the displacement
 STALLED = 1e-7  # steps below this that shrink no more are rounding
@@ -24,11 +28,20 @@ SLOW = 0.2  # new factors if a step is longer than this part of the one before
 SMOOTH = 1e-2  # error of the last step up to which the acceleration predicts the next: in stiff motions it alternates
 OTHER = 0.05  # relative change of the time step after which factors are renewed
 GAUSS = ((0.5 - np.sqrt(1 / 12), 0.5), (0.5 + np.sqrt(1 / 12), 0.5))  # exact for the membrane's energy, of degree 4
+Array = NDArray[np.float64]
 Loads = Callable[[float, bool], dict[str, float]]  # mu(t), at a jump before or after it
 
 
 class Viscous(Protocol):
-    """Forces that depend on the strains along a step."""
+    """Forces that depend on the strains along a step.
+
+    Attributes
+    ----------
+    memory
+        What they remember of earlier steps; `accept` replaces it.
+    """
+
+    memory: Any
 
     def force(self, u0: Vector, u1: Vector, v: Vector, part: float, dt: float) -> Vector:
         """The force at a part of the step from u0 to u1, with the velocity v there; zero at supports."""
@@ -38,6 +51,33 @@ class Viscous(Protocol):
 
     def accept(self, u0: Vector, u1: Vector, dt: float) -> Vector:
         """Go on from u1; the latest force."""
+
+
+class Ground(Protocol):
+    """Supports that move; see `assembly.ground`.
+
+    Attributes
+    ----------
+    names
+        Their amplitudes.
+    """
+
+    names: frozenset[str]
+
+    def velocity(self, t: float, before: bool) -> Vector:
+        """Of supports."""
+
+    def acceleration(self, t: float, before: bool) -> Vector:
+        """Of supports."""
+
+    def along(self, mu: Amplitudes, name: str) -> Vector:
+        """Their displacement by an amplitude."""
+
+    def times(self, x: Vector) -> Vector:
+        """The mass of all nodes times a vector."""
+
+    def held(self, x: Vector) -> Vector:
+        """With zeros at supports."""
 
 
 @dataclass(frozen=True)
@@ -58,37 +98,6 @@ class Rule:
         return cls(m, f, (1 - m + f) ** 2 / 4, 0.5 - m + f, at)
 
 
-@dataclass(frozen=True)
-class Motion:
-    """A moving state.
-
-    Attributes
-    ----------
-    t
-        Time.
-    u, v, a
-        Displacement, velocity and acceleration.
-    mu
-        Amplitudes.
-    work, dissipated
-        By the loads, and by drag and viscosity, since the begin.
-    potentials
-        dPi/dmu of the loads.
-    error
-        Estimated error of the last step, over the system's length.
-    """
-
-    t: float
-    u: Vector
-    v: Vector
-    a: Vector
-    mu: dict[str, float]
-    work: float = 0.0
-    dissipated: float = 0.0
-    potentials: dict[str, float] = field(default_factory=dict)
-    error: float = np.inf
-
-
 class Integrator:
     """Makes steps in time; factors are kept while they serve.
 
@@ -104,6 +113,10 @@ class Integrator:
         Further forces.
     driven
         Amplitudes that are positions and move.
+    ground
+        Supports that move.
+    device
+        Amplitudes that are unknown, since their conjugates are held at the end of each step; None: all are loads.
 
     Attributes
     ----------
@@ -120,10 +133,14 @@ class Integrator:
         drag: float = 0.0,
         viscous: Viscous | None = None,
         driven: Collection[str] = (),
+        device: Device | None = None,
+        ground: Ground | None = None,
     ) -> None:
         self.system, self.mass, self.loads, self.drag, self.viscous = system, mass, loads, drag, viscous
         self.rule = Rule.of(rho)
-        self._driven = frozenset(driven)
+        self.ground = ground
+        self.device, self._free = device, tuple(device.names) if device else ()
+        self._driven = frozenset({*driven, *self._free})
         self.factorisation = Factorisation(system.comm)
         self.steps = self.iterations = 0
         self._K: PETSc.Mat | None = None
@@ -131,11 +148,33 @@ class Integrator:
         self._x, self._y = mass.createVecs()
 
     def begin(self, t: float, u: Vector, v: Vector, before: Motion | None = None) -> Motion:
-        """A motion with the acceleration that the loads after t give it; sums go on from those of `before`."""
+        """A motion with the acceleration that the loads after t give it; sums go on from those of `before`.
+
+        What a device constrains is put where it must be, along the forces of the constraint, and so is its velocity.
+        """
         mu = self.loads(t, False)
+        work, dissipated = (before.work, before.dissipated) if before else (0.0, 0.0)
+        if before:
+            mu |= {name: before.mu[name] for name in self._free}
+        inverse = self._inverse_mass()
+        if self.ground:  # a jump of its velocity is an impulse, whose work is the change of the kinetic energy
+            work -= self._kinetic(v, t, True)
+            v = v - inverse(self._pulled(self.ground.velocity(t, False) - self.ground.velocity(t, True)))
+            work += self._kinetic(v, t, False)
+        if self.device:
+            u, v, mu = constrained(self.system, self.device, inverse, u, v, mu)
         r = self.system.residual(u, mu) + self.drag * self._times(v)
+        if self.ground:
+            r = r + self._pulled(self.ground.acceleration(t, False) + self.drag * self.ground.velocity(t, False))
         if self.viscous:
             r = r + self.viscous.force(u, u, v, 1.0, 0.0)
+        a = -inverse(r)
+        if self.device:
+            a, mu = held_back(self.system, self.device, inverse, Motion(t, u, v, a, mu))
+        now = Motion(t, u, v, a, mu, work, dissipated)
+        return replace(now, potentials=self._potentials(now, False))
+
+    def _inverse_mass(self) -> Callable[[Vector], Vector]:
         M = self.mass.copy()
         here = M.getDiagonal()
         here.setArray((here.array_r == 0).astype(float))
@@ -145,12 +184,22 @@ class Integrator:
         M.setOption(PETSc.Mat.Option.SYMMETRIC, True)
         factors = Factorisation(self.system.comm)
         factors.factor(M)
-        work, dissipated = (before.work, before.dissipated) if before else (0.0, 0.0)
-        return Motion(t, u, v, -factors.solve(r), mu, work, dissipated, self._potentials(u, mu))
+        return factors.solve
 
     def kinetic(self, now: Motion) -> float:
-        """v . M v/2 on all ranks."""
-        return dot(self.system.comm, now.v, self._times(now.v)) / 2
+        """v . M v/2 on all ranks, with the velocity of supports."""
+        return self._kinetic(now.v, now.t, True)
+
+    def _kinetic(self, v: Vector, t: float, before: bool) -> float:
+        if self.ground is None:
+            return dot(self.system.comm, v, self._times(v)) / 2
+        v = v + self.ground.velocity(t, before)
+        return dot(self.system.comm, v, self.ground.times(v)) / 2
+
+    def _pulled(self, x: Vector) -> Vector:
+        """The mass times a vector of supports, at all other nodes."""
+        assert self.ground
+        return self.ground.held(self.ground.times(x))
 
     def step(self, now: Motion, dt: float) -> Motion | str:
         """The motion after a step; else the reason why there is none."""
@@ -158,14 +207,17 @@ class Integrator:
         u = now.u + dt * now.v
         if now.error < SMOOTH:
             u = u + dt**2 / 2 * now.a
+        y = self.device.unknowns(now.mu) if self.device else np.empty(0)
+        pull = self._pull(now, dt)
         last, fresh = np.inf, False
         if abs(dt - self._factored) > OTHER * dt:
-            self._factor(now, u, dt)
+            self._factor(now, u, y, dt)
             fresh = True
         for _ in range(MOST):
             a, v = self._rates(now, u, dt)
-            d = self.factorisation.solve(self._unbalanced(now, u, v, a, dt))
-            u = u - d
+            d = self.factorisation.solve(pull + self._unbalanced(now, u, y, v, a, dt))
+            d, dy = split(d, y.size, comm)
+            u, y = u - d, y - dy
             self.iterations += 1
             size = max_abs(comm, d) / self.system.length
             if not np.isfinite(size):
@@ -173,15 +225,25 @@ class Integrator:
             tolerance = TOLERANCE * max(1.0, MOTION * max_abs(comm, u) / self.system.length)
             if size <= tolerance or (size <= STALLED and size > last / 2):
                 self.steps += 1
-                return self._accepted(now, u, dt)
+                return self._accepted(now, u, y, dt)
             if size > SLOW * last:
                 if fresh and size > last:
                     break
-                self._factor(now, u, dt)
+                self._factor(now, u, y, dt)
                 fresh = True
             last = size
         self._factored = 0.0
         return "Newton's method does not converge"
+
+    def _pull(self, now: Motion, dt: float) -> Vector:
+        """The forces of inertia and drag by moving supports in a step, with zeros for unknown amplitudes."""
+        pull, ground, end = 0.0 * now.u, self.ground, now.t + dt
+        if ground:
+            m, f = self.rule.alpha_m, self.rule.alpha_f
+            a = (1 - m) * ground.acceleration(end, True) + m * ground.acceleration(now.t, False)
+            v = (1 - f) * ground.velocity(end, True) + f * ground.velocity(now.t, False)
+            pull = self._pulled(a + self.drag * v)
+        return self.device.padded(pull) if self.device else pull
 
     def _rates(self, now: Motion, u: Vector, dt: float) -> tuple[Vector, Vector]:
         """Acceleration and velocity at the end of a step to u (Newmark)."""
@@ -189,19 +251,32 @@ class Integrator:
         a = (u - now.u - dt * now.v) / (beta * dt**2) - (0.5 / beta - 1) * now.a
         return a, now.v + dt * ((1 - gamma) * now.a + gamma * a)
 
-    def _unbalanced(self, now: Motion, u: Vector, v: Vector, a: Vector, dt: float) -> Vector:
+    def _at(self, now: Motion, y: Array, part: float, dt: float) -> dict[str, float]:
+        """Amplitudes at a part of a step; unknown ones and places of supports grow evenly, as displacements do."""
+        mu = self.loads(now.t + part * dt, True)
+        ends = self.device.values(y) if self.device else {}
+        if self.ground:
+            last = self.loads(now.t + dt, True)
+            ends |= {name: last[name] for name in self.ground.names & set(mu)}
+        return mu | {name: now.mu[name] + part * (end - now.mu[name]) for name, end in ends.items()}
+
+    def _unbalanced(self, now: Motion, u: Vector, y: Array, v: Vector, a: Vector, dt: float) -> Vector:
         rule = self.rule
         m, f = rule.alpha_m, rule.alpha_f
         r = self._times((1 - m) * a + m * now.a + self.drag * ((1 - f) * v + f * now.v))
         for part, weight in rule.forces:
-            at = now.u + part * (u - now.u)
-            r = r + weight * self.system.residual(at, self.loads(now.t + part * dt, True))
-        return r + self.viscous.force(now.u, u, (1 - f) * v + f * now.v, 1 - f, dt) if self.viscous else r
+            r = r + weight * self.system.residual(now.u + part * (u - now.u), self._at(now, y, part, dt))
+        if self.viscous:
+            r = r + self.viscous.force(now.u, u, (1 - f) * v + f * now.v, 1 - f, dt)
+        if self.device is None:
+            return r
+        return join(r, (1 - f) * self.device.rows(u, self._at(now, y, 1.0, dt)), self.system.comm)
 
-    def _factor(self, now: Motion, u: Vector, dt: float) -> None:
-        """Factor the derivative of `_unbalanced` by u, with one tangent for all parts of the step."""
+    def _factor(self, now: Motion, u: Vector, y: Array, dt: float) -> None:
+        """Factor the derivative of `_unbalanced` by u and y, with one tangent for all parts of the step."""
         rule, part = self.rule, 1 - self.rule.alpha_f
-        tangent = self.system.tangent(now.u + part * (u - now.u), self.loads(now.t + part * dt, True))
+        here, mu = now.u + part * (u - now.u), self._at(now, y, part, dt)
+        tangent = self.system.tangent(here, mu)
         assert not isinstance(tangent, Edged)
         K = tangent.K if isinstance(tangent, Skewed) else tangent
         if self._K is None:
@@ -211,24 +286,44 @@ class Integrator:
         self._K.scale(part * (1 + (self.viscous.stiffness(dt, rule.gamma / (rule.beta * dt)) if self.viscous else 0)))
         inertia = (1 - rule.alpha_m) / (rule.beta * dt**2) + self.drag * part * rule.gamma / (rule.beta * dt)
         self._K.axpy(inertia, self.mass, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
-        self.factorisation.factor(Skewed(self._K, part * tangent.N) if isinstance(tangent, Skewed) else self._K)
+        whole = Skewed(self._K, part * tangent.N) if isinstance(tangent, Skewed) else self._K
+        if self.device:
+            C, D = self.device.edge(here, mu)
+            self.factorisation.factor(Edged(whole, [part * c for c in C], part * D, self.device.multipliers))
+        else:
+            self.factorisation.factor(whole)
         self._factored = dt
 
-    def _accepted(self, now: Motion, u: Vector, dt: float) -> Motion:
+    def _accepted(self, now: Motion, u: Vector, y: Array, dt: float) -> Motion:
         comm, rule, t = self.system.comm, self.rule, now.t + dt
         a, v = self._rates(now, u, dt)
-        mu = self.loads(t, True)
-        potentials, moved = self._potentials(u, mu), u - now.u
+        mu = self._at(now, y, 1.0, dt)
+        after = Motion(t, u, v, a, mu)
+        potentials, moved, w = self._potentials(after, True), u - now.u, (1 - rule.alpha_f) * v + rule.alpha_f * now.v
         work = sum(self._work(name, now, mu, potentials) for name in potentials)
-        lost = self.drag * dot(comm, moved, self._times((1 - rule.alpha_f) * v + rule.alpha_f * now.v))
+        if self.ground and self.drag:
+            ends = self.ground.velocity(now.t, False), self.ground.velocity(t, True)
+            along, w = moved + dt / 2 * (ends[0] + ends[1]), w + (1 - rule.alpha_f) * ends[1] + rule.alpha_f * ends[0]
+            lost = self.drag * dot(comm, along, self.ground.times(w))
+        else:
+            lost = self.drag * dot(comm, moved, self._times(w)) if self.drag else 0.0
         if self.viscous:
             lost += dot(comm, moved, self.viscous.accept(now.u, u, dt))
         error = abs(rule.beta - 1 / 6) * dt**2 * max_abs(comm, a - now.a) / self.system.length
-        return Motion(t, u, v, a, mu, now.work + work, now.dissipated + lost, potentials, error)
+        return replace(
+            after, work=now.work + work, dissipated=now.dissipated + lost, potentials=potentials, error=error
+        )
 
-    def _potentials(self, u: Vector, mu: dict[str, float]) -> dict[str, float]:
-        still = self.system.coordinates - self._driven
-        return {name: self.system.potential(u, mu, name) for name in mu if name not in still}
+    def _potentials(self, now: Motion, before: bool) -> dict[str, float]:
+        """dPi/dmu of the loads; of supports that move with the forces of inertia and drag."""
+        mu, still = now.mu, self.system.coordinates - self._driven
+        found = {name: self.system.potential(now.u, mu, name) for name in mu if name not in still}
+        if self.ground:
+            a = now.a + self.ground.acceleration(now.t, before)
+            forces = self.ground.times(a + self.drag * (now.v + self.ground.velocity(now.t, before)))
+            for name in self._driven & self.ground.names:
+                found[name] += dot(self.system.comm, forces, self.ground.along(mu, name))
+        return found
 
     def _work(self, name: str, now: Motion, mu: Mapping[str, float], potentials: Mapping[str, float]) -> float:
         """In a step: of a load on its displacement, of a position that moves on what it meets."""
@@ -241,65 +336,3 @@ class Integrator:
         self._x.setArray(x)
         self.mass.mult(self._x, self._y)
         return np.array(self._y.array_r)
-
-
-@dataclass(frozen=True)
-class TimeSteps:
-    """How long steps are.
-
-    Attributes
-    ----------
-    fixed
-        The longest step, which is halved only where Newton's method fails; None: steps for the tolerance.
-    tolerance
-        Largest estimated error of a step, over the system's length (O. C. Zienkiewicz and Y. M. Xie, Earthquake
-        Engineering and Structural Dynamics 20, 1991).
-    first
-        First step without `fixed`.
-    """
-
-    fixed: float | None
-    tolerance: float
-    first: float
-
-
-class TimeStopped(RuntimeError):
-    """The motion could not be followed; `motion` is its last state."""
-
-    def __init__(self, reason: str, motion: Motion) -> None:
-        super().__init__(reason)
-        self.motion = motion
-
-
-def advance(integrator: Integrator, now: Motion, end: float, steps: TimeSteps, dt: float) -> tuple[Motion, float]:
-    """The motion at a later time, and the step to go on with.
-
-    Parameters
-    ----------
-    dt
-        The step to begin with.
-
-    Raises
-    ------
-    TimeStopped
-        If even a tiny step fails.
-    """
-    begin = now.t
-    while end - now.t > 1e-9 * (end - begin):
-        way = end - now.t
-        dt = min(dt, steps.fixed or dt)
-        length = way / np.ceil(way / dt * (1 - 1e-9))
-        found = integrator.step(now, length)
-        if isinstance(found, str):
-            dt = length / 2
-            if dt < 1e-6 * steps.first:
-                raise TimeStopped(f"the time step has become too small: {found}", now)
-            continue
-        if steps.fixed is None:
-            change = 0.9 * (steps.tolerance / max(found.error, 1e-300)) ** (1 / 3)
-            if found.error > steps.tolerance and length > 1e-6 * steps.first:
-                dt = max(0.3, change) * length
-                continue
-            dt = length * min(change, 2.0) if change > 1.3 else max(length, dt if change > 1 else 0.0)
-        now = found
-    return replace(now, t=end), dt

@@ -1,7 +1,7 @@
 """An imperfect surface: a perfect one moved along its normal."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +28,10 @@ class Deviated:
 
     def __call__(self, chart: Array) -> Array:
         return np.asarray(self.perfect(chart) + self.w0(chart)[:, None] * self.normal(chart))
+
+    def along_normal(self, chart: Array, deviations: Sequence[Deviation]) -> Array:
+        """The displacement (n, 3) that other deviations add."""
+        return replace(self, deviations=tuple(deviations)).w0(chart)[:, None] * self.normal(chart)
 
     def w0(self, chart: Array) -> Array:
         """w0 over R at places of the chart, (n,)."""

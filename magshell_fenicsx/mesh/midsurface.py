@@ -5,6 +5,7 @@ The shape itself is the vector field r0. It is interpolated at the nodes of the 
 rigid motions are exact.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -17,7 +18,7 @@ from dolfinx.cpp.io import perm_gmsh
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from magshell_fenicsx.mesh.deviation import Deviated
+from magshell_fenicsx.mesh.deviation import Deviated, Deviation
 from magshell_fenicsx.mesh.nodal_normals import ORDERS
 from magshell_fenicsx.mesh.patch import Embedding, PatchMesh, as_set, check_orientation
 from magshell_fenicsx.platform import compat
@@ -50,11 +51,12 @@ class Midsurface:
         """The same at reference points (q, 2), with the normals of a mesh file that has imperfections."""
         return at_reference_points(self._patch.nodes, self._patch.cells[self._original_cells], points)
 
-    def deviation(self, points: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    def deviation(self, points: NDArray[np.float64], besides: Sequence[Deviation] = ()) -> NDArray[np.float64] | None:
         """w0 over R at reference points (q, 2) of each cell, (cells, q); None where there are no imperfections."""
         chart, embedding = self._charted(points), self._patch.embedding
         if not isinstance(embedding, Deviated):
             return None
+        embedding = replace(embedding, deviations=(*embedding.deviations, *besides))
         return embedding.w0(chart.reshape(-1, chart.shape[-1])).reshape(chart.shape[:2])
 
     def reshaped(self, embedding: Embedding) -> PatchMesh:
@@ -63,11 +65,20 @@ class Midsurface:
 
     def placement(self, V: fem.FunctionSpace) -> fem.Function:
         """The undeformed placement r0 in the Lagrange space `V` (vector valued)."""
-        chart, r0 = self._charted(compat.interpolation_points(V)), fem.Function(V, name="r0")
-        places = self._patch.embedding(chart.reshape(-1, chart.shape[-1]))
-        r0.x.array.reshape(-1, 3)[V.dofmap.list] = places.reshape(*chart.shape[:2], 3)
-        r0.x.scatter_forward()
-        return r0
+        return self._field(V, "r0", self._patch.embedding)
+
+    def growth(self, V: fem.FunctionSpace, deviations: Sequence[Deviation]) -> fem.Function:
+        """What further deviations add to the placement in the same space."""
+        drawn = self._patch.embedding
+        assert isinstance(drawn, Deviated)
+        return self._field(V, "growth", lambda chart: drawn.along_normal(chart, deviations))
+
+    def _field(self, V: fem.FunctionSpace, name: str, of: Embedding) -> fem.Function:
+        chart, found = self._charted(compat.interpolation_points(V)), fem.Function(V, name=name)
+        values = of(chart.reshape(-1, chart.shape[-1]))
+        found.x.array.reshape(-1, 3)[V.dofmap.list] = values.reshape(*chart.shape[:2], 3)
+        found.x.scatter_forward()
+        return found
 
     @property
     def read(self) -> bool:

@@ -22,11 +22,19 @@ Model = ShellModel | MeridianModel | SolidModel
 
 def mass(model: Model) -> PETSc.Mat:
     """The consistent mass of what is modelled, without rotary inertia; zero rows and columns at supports."""
+    M, projection = mass_matrix(_product(model), model.system.clamped), model.system.projection
+    return projection.mass(M) if projection else M
+
+
+def whole_mass(model: Model) -> PETSc.Mat:
+    """The same with supports."""
+    return mass_matrix(_product(model), [])
+
+
+def _product(model: Model) -> fem.Form:
     factor = thickness(model)
     name = "mass" if factor is None else "weighted mass"
-    form = model.kernels.compile(name, of_displacements(model, 1.0 if factor is None else factor))
-    M, projection = mass_matrix(form, model.system.clamped), model.system.projection
-    return projection.mass(M) if projection else M
+    return model.kernels.compile(name, of_displacements(model, 1.0 if factor is None else factor))
 
 
 def thickness(model: Model) -> Expr | None:

@@ -1,11 +1,12 @@
 """What is read off the displacement of a model with named points, shell or solid."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from dolfinx import fem
 from numpy.typing import NDArray
 
+from magshell_fenicsx.assembly.growing import Growing
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.assembly.terms import LinearTerm
 from magshell_fenicsx.continuation.system import State, Vector
@@ -44,6 +45,8 @@ class Observed:
         Column -> the form that a term observes, see `OwnTerm.observed`; of the modelled part.
     contacts
         Approach of a body -> what is known of its contact, and the integrals of its pressure.
+    growing
+        The placement, where imperfections grow.
     """
 
     system: FiniteElementSystem
@@ -59,6 +62,7 @@ class Observed:
     observed: Mapping[str, fem.Form]
     contacts: dict[str, tuple[Pressing, Mapping[str, fem.Form]]]
     fields: Sequence[AppliedField] = ()
+    growing: Growing | None = None
 
     def observe(self, volume: fem.Form, points: Mapping[str, Array]) -> None:
         """Take the volume change's form (of the modelled part), and the named vertices' places (3,)."""
@@ -102,6 +106,12 @@ class Observed:
         self.system.place(state.mu)
         pressure, moment = (self.system.integral(state.u, forms[name]) for name in ("pressure", "radius"))
         return known.region(self.system.comm, moment / pressure if pressure else 0.0)
+
+    @property
+    def _renewals(self) -> list[Callable[[], None]]:
+        """What the fields and the bodies take anew where the placement changes."""
+        bodies = [known.renew_place for known, _ in self.contacts.values()]
+        return [*(known.renew_place for known in self.fields), *bodies]
 
     def cell_pressures(self, state: State) -> Array | None:
         """The pressure of all bodies in each local cell, see `Pressing`; None without bodies."""

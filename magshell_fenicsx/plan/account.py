@@ -4,6 +4,7 @@ from collections import Counter
 from math import degrees
 
 from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.loads.imperfection import grown_by
 from magshell_fenicsx.case.surfaces import MeshSurface
 from magshell_fenicsx.mesh.mirror import Mirror, plane_text
 from magshell_fenicsx.models.shell.parameters import Loads
@@ -14,8 +15,18 @@ from magshell_fenicsx.plan.imperfections.rims import MOST_RIMS
 SHOWN = 6  # of many imperfections
 
 
-def account(case: Case, loads: Loads, model: str, mirror: Mirror | None) -> tuple[list[str], list[str]]:
-    """What is included and what is left out; `model` is "meridian", "half shell", ..., `mirror` its plane."""
+def account(case: Case, loads: Loads, model: str, mirror: Mirror | None, rims: int) -> tuple[list[str], list[str]]:
+    """What is included and what is left out.
+
+    Parameters
+    ----------
+    model
+        "meridian", "half shell", ...
+    mirror
+        Plane of a half.
+    rims
+        Number of different rims beside the pole.
+    """
     included = [model, "membrane and bending energy" if case.model == "shell" else _elastic(case)]
     left_out = []
     if loads.magnetic:
@@ -47,7 +58,9 @@ def account(case: Case, loads: Loads, model: str, mirror: Mirror | None) -> tupl
         k, kind = f"{contact.stiffness:.4g}", case.bodies[contact.body].kind
         included.append(f"body {contact.body}: {kind} without friction, stiffness k R²/(E h) = {k}")
     if case.imperfections:
-        included.append(_imperfections(case))
+        included.append(_imperfections(case, rims))
+    for name, keys in grown_by(case.programme, case.imperfections).items():
+        included.append(f"{name} grows: {', '.join(keys)}")
     for key, part in PARTS.items():
         if key in case.parts:
             included.append(case.parts[key].account(case.scales))
@@ -65,14 +78,14 @@ def account(case: Case, loads: Loads, model: str, mirror: Mirror | None) -> tupl
     return included, left_out
 
 
-def _imperfections(case: Case) -> str:
+def _imperfections(case: Case, rims: int) -> str:
     """All of a few; of many how many there are of each kind."""
     found = [section.account() for section in case.imperfections.values()]
     if len(found) > SHOWN:
         kinds = Counter(section.kind for section in case.imperfections.values())
         found = [f"{count} of kind {kind}" for kind, count in kinds.items()]
     beside = ""
-    if case.dimples and (isinstance(case.shell, MeshSurface) or len(case.dimples) > MOST_RIMS):
+    if case.dimples and (isinstance(case.shell, MeshSurface) or rims > MOST_RIMS):
         why = "of a mesh file" if isinstance(case.shell, MeshSurface) else f"of more than {MOST_RIMS}"
         beside = f"; elements lie across the rims of dimples, {why}: k_d is then less exact"
     return f"imperfections: {', '.join(found)}{beside}"

@@ -76,7 +76,7 @@ def loads(
     driven = {*steps, *(name for load in case.loads_of(TimeSection) for name in load.drives)}
     turned = [load.to for load in case.loads_of(RotationSection)]
     field = magnetisation(magnetic, case, turn, within, turned) if magnetic and "lambda_m" in driven else None
-    pressure = "pressure" in driven or any("pressure" in load.hold for load in steps.values())
+    pressure = "pressure" in driven or any("pressure" in step.load.hold for step in case.programme)
     return Loads(pressure, forces, field, dead, own, natural=natural(case, turn, within), moves=moves(case, turn))
 
 

@@ -134,8 +134,6 @@ class Outline:
 
     def deviated(self, deviations: tuple[Deviation, ...], circles: tuple[float, ...], largest: float) -> "Outline":
         """The outline with imperfections; the curvature jumps on circles around the pole, `largest` cells show them."""
-        if not deviations:
-            return self
         span = self.span and replace(
             self.span,
             embedding=Deviated(self.span.embedding, self.span.normal, deviations),

@@ -1,6 +1,6 @@
 """From a case to what must be built for it, without building anything: the parts added up."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from math import inf, radians, sqrt
 
@@ -11,6 +11,7 @@ from magshell_fenicsx.case.boundary import BoundarySection, EdgeCondition, HeldS
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.expressions import formula
 from magshell_fenicsx.case.loads.dead import DeadSection
+from magshell_fenicsx.case.loads.imperfection import grown_by
 from magshell_fenicsx.case.loads.indentation import IndentationSection
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.case.surfaces import MeshSurface
@@ -29,7 +30,7 @@ from magshell_fenicsx.plan.account import account
 from magshell_fenicsx.plan.bodies.registered import body_leaves, contacts, pressed
 from magshell_fenicsx.plan.imperfections.flaw import Flaw, in_frame
 from magshell_fenicsx.plan.imperfections.registered import flaws
-from magshell_fenicsx.plan.imperfections.rims import MOST_RIMS, Spot, spots
+from magshell_fenicsx.plan.imperfections.rims import MOST_RIMS, Spot, different, spots
 from magshell_fenicsx.plan.imperfections.symmetry import leaves
 from magshell_fenicsx.plan.limits import refuse_too_many, refuse_unbounded_fields, sources_beside
 from magshell_fenicsx.plan.loads import indented, loads, potentials, refuse_wide_patch
@@ -43,7 +44,6 @@ from magshell_fenicsx.plan.symmetry import Leaves, askew, left, mirror, unmirror
 Array = NDArray[np.float64]
 Points = dict[str, Array]
 PRESSED = 0.08  # of sqrt(Rh): cells of a meridian that show the ring of a contact
-SAME_RIM = 0.02  # of the element size
 
 
 def make_plan(case: Case, terms: Sequence[OwnTerm] = ()) -> Plan:
@@ -59,7 +59,11 @@ def make_plan(case: Case, terms: Sequence[OwnTerm] = ()) -> Plan:
     material = Material(case.shell.poisson_ratio, 1 / case.shell.R_over_h)
     perfect = outline(case)
     found = flaws(case, perfect)
-    drawn = imperfect(perfect, found, 0.0)
+    growing = {
+        name: {key: found[key] for key in keys} for name, keys in grown_by(case.programme, case.imperfections).items()
+    }
+    still = {*found} - {key for keys in growing.values() for key in keys}
+    drawn = imperfect(perfect, found, 0.0, still)
     places = indented(case, drawn)
     sample = np.zeros((0, 3)) if isinstance(case.shell, MeshSurface) else drawn.sample()
     refuse_unbounded_fields(case, sample)
@@ -92,13 +96,14 @@ def make_plan(case: Case, terms: Sequence[OwnTerm] = ()) -> Plan:
     bodies = contacts(case, perfect, drawn, turn)
     touched = [(drawn.inverse(c.front), travel(material.h, pressed(case, c.body), c.size), c.size) for c in bodies]
     size = grading(case, drawn, material.h, local, everywhere, loaded, touched)
-    drawn = imperfect(perfect, found, turn)
+    drawn = imperfect(perfect, found, turn, still)
     shape = drawn.chart(beyond, size)
     if isinstance(shape, Grid) and beyond:  # what a point needs, its image needs too
         images = [drawn.inverse(beyond.image(drawn.embedding(x[None])[0])) for x in points.values()]
         x, y = ((*shape.through[i], *(float(image[i]) for image in images)) for i in range(2))
         shape = replace(shape, through=(x, y))
-    shape = _matched(shape, local)
+    rims = different(local)
+    shape = _matched(shape, local, rims if len(rims) <= MOST_RIMS else ())
     span = drawn.span if axisymmetric else None
     if not span:
         _refuse_too_large(case, shape, size, half=half)
@@ -107,11 +112,12 @@ def make_plan(case: Case, terms: Sequence[OwnTerm] = ()) -> Plan:
     if beyond:
         conditions = {name: c for name, c in conditions.items() if name not in beyond.lost} | {CUT: "symmetry"}
     within = {name: in_frame(found[key].inside, turn) for name, key in case.dimples.items()}
-    all_loads = replace(loads(case, under, turn, beyond, energies, within), contacts=bodies)
+    grown = {name: tuple(in_frame(f.deviation, turn) for f in each.values()) for name, each in growing.items()}
+    all_loads = replace(loads(case, under, turn, beyond, energies, within), contacts=bodies, growing=grown)
     if span:
         refuse_unfit_ends([name for name in span.names if name], points, conditions, all_loads)
     model = "meridian" if axisymmetric else f"{'half' if half else 'full'} {case.model}"
-    included, left_out = account(case, all_loads, model, plane)
+    included, left_out = account(case, all_loads, model, plane, len(rims))
     included += [f"{key}: {flaw.account}" for key, flaw in found.items() if flaw.account]
     return Plan(
         material=material,
@@ -170,32 +176,25 @@ def meridian_vertices(plan: Plan, refinement: float) -> Array:
     )
 
 
-def imperfect(perfect: Outline, found: Mapping[str, Flaw], turn: float) -> Outline:
-    """The shell with its imperfections, in a frame turned about e3 (rad)."""
+def imperfect(perfect: Outline, found: Mapping[str, Flaw], turn: float, still: Collection[str]) -> Outline:
+    """The shell with the imperfections that do not grow, in a frame turned about e3 (rad); all have their cells."""
+    if not found:
+        return perfect
     circles = tuple(flaw.reach for flaw in found.values() if flaw.rim) if perfect.disc else ()
     shown = min((flaw.size for flaw in found.values()), default=inf)
-    return perfect.deviated(tuple(in_frame(flaw.deviation, turn) for flaw in found.values()), circles, shown)
+    return perfect.deviated(
+        tuple(in_frame(found[key].deviation, turn) for key in found if key in still), circles, shown
+    )
 
 
-def _matched(shape: Chart, local: Sequence[Spot]) -> Chart | RimmedGrid:
+def _matched(shape: Chart, local: Sequence[Spot], rims: tuple[Array, ...]) -> Chart | RimmedGrid:
     """The shape with element edges along the rims."""
     circles = tuple(dict.fromkeys(spot.radius for spot in local if spot.circle and spot.jumps))
-    rims = _different([(spot.rim, spot.size) for spot in local if spot.rim is not None])
-    rims = rims if len(rims) <= MOST_RIMS else ()
     if isinstance(shape, Grid):
         return RimmedGrid(shape, rims) if rims else shape
     if isinstance(shape, DiscShape):
         return replace(shape, circles=tuple(r for r in circles if r < shape.radius), rims=rims)
     return replace(shape, rims=rims) if isinstance(shape, StripShape) else shape
-
-
-def _different(rims: Sequence[tuple[Array, float]]) -> tuple[Array, ...]:
-    """Curves with the element size there; of several that are nearly the same, the first."""
-    kept: list[Array] = []
-    for rim, size in rims:
-        if all(np.abs(rim - other).max() > SAME_RIM * size for other in kept):
-            kept.append(rim)
-    return tuple(kept)
 
 
 def _symmetry(case: Case, drawn: Outline, parts: list[Leaves]) -> tuple[bool, Mirror | None]:

@@ -53,12 +53,15 @@ class Leaves:
         Whether a plane is left.
     energy
         The name of the energy that it is of, if any.
+    azimuths
+        Of further planes through e3 (rad) that may be left.
     """
 
     askew: str | None = None
     vectors: Vectors = ()
     mirrors: Callable[[Mirror], bool] = _every
     energy: str = ""
+    azimuths: tuple[float, ...] = ()
 
 
 def left(case: Case, outline: Outline, indented: Mapping[str, Array], terms: Sequence[OwnTerm]) -> list[Leaves]:
@@ -110,6 +113,10 @@ def mirror(parts: Sequence[Leaves], outline: Outline, *, loosely: bool = False) 
     if azimuth is not None:
         turns = (0.0, pi) if any(_tilted(v) for v in vectors) else (0.0, pi, pi / 2, -pi / 2)
         upright = [Mirror.upright(azimuth + turn) for turn in turns]
+
+    if outline.round:
+        between = [Mirror.upright(a + turn) for part in parts for a in part.azimuths for turn in (0.0, pi)]
+        upright += [plane for plane in between if all(abs(plane.normal @ _unit(v)) <= PARALLEL for v in vectors)]
 
     def first(planes: Sequence[Mirror]) -> Mirror | None:
         return next((plane for plane in planes if all(part.mirrors(plane) for part in parts)), None)
@@ -265,6 +272,15 @@ def _load(case: Case, outline: Outline, loading: Step, place: Array | None) -> l
     if place is not None:
         reason = "the force is not at the pole" if _tilted(place) else None
         return [Leaves(reason, [place], lambda mirror: bool(abs(mirror.beyond(place)) < ROUNDING))]
+    if isinstance(loading, TimeSection) and loading.velocity:
+        given = vectors_of(loading.velocity)
+
+        def keeps(mirror: Mirror) -> bool:
+            S, x = mirror.reflection, outline.sample()
+            return alike(given(R * x) @ S, given(R * mirror.image(x)))
+
+        turns = outline.span and vector_turns(loading.velocity, outline.span, R)
+        return [Leaves(None if turns else "the initial velocity differs around e3", (), keeps)]
     if isinstance(loading, RotationSection):
         return [Leaves("the field turns", [loading.to.vector()])]
     if isinstance(loading, EdgeSection):

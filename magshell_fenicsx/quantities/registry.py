@@ -109,6 +109,7 @@ OF_SOME_RUNS = (
     Quantity("load_factor", "load factor", "Common factor of all dead loads.", "load"),
     Quantity("natural_curvature", "natural curvature", "Factor of the natural curvature; 0: as drawn.", "load"),
     Quantity("natural_stretch", "natural stretch", "Factor of the natural stretch less one; 0: as drawn.", "load"),
+    Quantity("imperfection", "imperfection", "Factor of the imperfections that grow; 0: without them.", "load"),
     Quantity("motion", "motion", "Factor of the motion of supports; the step may give it another name.", "load"),
     Quantity(
         "reaction",

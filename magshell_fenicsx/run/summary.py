@@ -90,9 +90,10 @@ class Result:
 
     @property
     def knockdown(self) -> float | None:
-        """k_d: p/p_c at the first instability under pressure; None if there is none."""
-        points = (p for p in self.limit_points if p["amplitude"] == "pressure" and not p["branch"])
-        return next((float(p["value"]) for p in points), None)
+        """k_d: p/p_c at the first instability under pressure; None if there is none, or at held volume."""
+        at_volume = {step.number for step in self.scene.case.programme if step.name in step.load.hold}
+        points = (row for row in self.rows if row["label"] in LOCATED and row["amplitude"] == "pressure")
+        return next((float(p["p_over_pc"]) for p in points if not p["branch"] and p["step"] not in at_volume), None)
 
     @property
     def value(self) -> float | None:

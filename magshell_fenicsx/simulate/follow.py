@@ -8,7 +8,7 @@ from magshell_fenicsx.continuation.point import Point
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.search import searched
-from magshell_fenicsx.simulate.steps import LOCATED, records_of
+from magshell_fenicsx.simulate.steps import LOCATED, held_by, records_of
 from magshell_fenicsx.simulate.touch import refuse_penetration
 from magshell_fenicsx.simulate.transient import released
 from magshell_fenicsx.simulate.walked import Walked
@@ -44,7 +44,7 @@ def follow(scene: Scene, *, search: bool = True) -> Iterator[Record]:
                 yield replace(record, step=step.number)
                 refuse_penetration(scene, record.point.state)
             if isinstance(step.load, PathStep) and step.load.then == "snap" and record:
-                walked = Walked(released(scene, record))
+                walked = Walked(released(scene, step.load.snap, record, held_by(scene, step, record.point.state)))
                 for record in walked:
                     last = record.label
                     yield replace(record, step=step.number)

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.imperfections.modes import ModesSection, Shape
+from magshell_fenicsx.case.loads.imperfection import ImperfectionStep
 from magshell_fenicsx.case.loads.pressure import PressureSection
 from magshell_fenicsx.case.mesh import MeshSection
 from magshell_fenicsx.case.source import CaseError
@@ -89,7 +90,10 @@ def _to_the_limit(case: Case) -> Any:
             return load
         return PressureSection(kind="pressure", control=load.control, hold=load.hold)
 
-    return [*loading[:-1], freed(loading[-1])] if isinstance(loading, list) else freed(loading)
+    if not isinstance(loading, list):
+        return None if isinstance(loading, ImperfectionStep) else freed(loading)
+    loads = [load for load in loading if not isinstance(load, ImperfectionStep)]
+    return [*loads[:-1], *map(freed, loads[-1:])] or None
 
 
 def perfect_modes(case: Case, count: int, comm: MPI.Comm) -> tuple[Shape, ...]:

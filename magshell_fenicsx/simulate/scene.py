@@ -179,9 +179,10 @@ class Scene:
 
     @property
     def _own_amplitudes(self) -> dict[str, float]:
-        """The amplitudes of the natural shape and of user-defined energies and parameters, with initial values."""
+        """The amplitudes of natural shape, imperfections, user-defined energies and parameters, with initial values."""
         terms, natural = self.plan.loads.own, self.plan.loads.natural
         grown = dict.fromkeys(natural.amplitudes, 0.0) if natural else {}
+        grown |= dict.fromkeys(self.plan.loads.growing, 0.0)
         return (
             grown | {term.name: term.value for term in terms} | {p.name: p.value for term in terms for p in term.free}
         )

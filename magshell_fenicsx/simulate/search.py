@@ -35,7 +35,13 @@ def searched(scene: Scene, step: ProgrammeStep, begin: State, end: State) -> Ite
 
 
 def solutions(
-    scene: Scene, known: Record | State, *, most: int = 3, guesses: int = 12, seconds: float | None = None
+    scene: Scene,
+    known: Record | State,
+    *,
+    most: int = 3,
+    guesses: int = 12,
+    stable: bool = False,
+    seconds: float | None = None,
 ) -> Iterator[Record]:
     """Further equilibria at the amplitudes of a known one, such as snapped shapes; all amplitudes are loads.
 
@@ -45,8 +51,8 @@ def solutions(
     ----------
     most
         Largest number of solutions.
-    guesses, seconds
-        Limits of the search, see `SearchSection`.
+    guesses, stable, seconds
+        See `SearchSection`.
 
     Raises
     ------
@@ -58,7 +64,7 @@ def solutions(
     rest = scene.newton.solve(state, name, GivenLoad(name, state.mu[name]))
     if not rest.converged:
         raise Stopped(f"there is no equilibrium to start from near the given state: {rest.reason}")
-    search = SearchSection(solutions=most, guesses=guesses, seconds=seconds)
+    search = SearchSection(solutions=most, guesses=guesses, stable=stable, seconds=seconds)
     yield from _solutions(plain(scene), name, rest.state, search)
 
 
@@ -74,7 +80,8 @@ def _solutions(stage: Stage, name: str, state: State, search: SearchSection) -> 
     made = [partial(dents.settled, number) for number in range(dents.count)]
     limits = Limits(search.solutions, search.guesses, over)
     excluded = scene.model.excluded_modes
-    for number, found in enumerate(further(path, stage.enter(state), made, limits, stage.displaced), 1):
+    descend = dents.descended if search.stable else None
+    for number, found in enumerate(further(path, stage.enter(state), made, limits, stage.displaced, descend), 1):
         point = stage.point(found)
         unstable = sum(excluded.counts(point.state)) if excluded else 0
         yield Record("solution", name, point, branch=number, excluded_pivots=unstable)
@@ -94,3 +101,7 @@ class _Dents:
 
     def settled(self, number: int) -> State:
         return self._stage.enter(self._settling.settled(self._guesses[number]))
+
+    def descended(self, state: State) -> State:
+        """A state of the stage further down in energy; amplitudes whose conjugates are held stay."""
+        return self._stage.enter(self._settling.settled(self._stage.leave(state)))

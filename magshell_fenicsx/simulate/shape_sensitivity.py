@@ -2,6 +2,10 @@
 
 They come from central differences of the residual, R_p = (R(r0 + s dr0/dp) - R(r0 - s dr0/dp))/(2 s): where the chart's
 nodes stay, r0 alone depends on an imperfection. A rim makes r0 rough in p beside it, but R is smooth in r0.
+
+Differences of folds converge to these derivatives on the same mesh: for depths with the square of their step, for what
+moves a rim with the step itself. Between new meshes, whose edges follow the rim, they have the meshes' noise over the
+step.
 """
 
 from dataclasses import dataclass, replace
@@ -15,6 +19,7 @@ from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.imperfections.dimple import DimpleSection
 from magshell_fenicsx.case.imperfections.gaussian import GaussianSection
 from magshell_fenicsx.case.imperfections.place import ImperfectionSection
+from magshell_fenicsx.case.loads.imperfection import grown_by
 from magshell_fenicsx.continuation.fold import Fold, sensitivity
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.mesh.deviation import Deviated, Deviation
@@ -72,7 +77,12 @@ def _derivative(stage: Stage, fold: Fold, key: str, name: str) -> float:
         moved, system = replace(fold, state=State(u, fold.state.mu), left=left), stage.on(other).newton.system
         return sensitivity(system, moved, system.residual(u, fold.state.mu))
 
-    return (out_of_balance(step) - out_of_balance(-step)) / (2 * step)
+    grown = [
+        fold.state.mu[of]
+        for of, keys in grown_by(scene.case.programme, scene.case.imperfections).items()
+        if key in keys
+    ]
+    return (grown or [1.0])[0] * (out_of_balance(step) - out_of_balance(-step)) / (2 * step)
 
 
 def _unit(case: Case, key: str, name: str) -> float:

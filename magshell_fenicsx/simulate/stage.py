@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from magshell_fenicsx.continuation.along import Along, Curve
-from magshell_fenicsx.continuation.device import Conjugate, Device, natural_scale
+from magshell_fenicsx.continuation.device import Device, Held, natural_scale
 from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.path import Control, Path, StepOptions
 from magshell_fenicsx.continuation.point import Point
@@ -106,7 +106,7 @@ def plain(scene: Scene) -> Stage:
 def staged(
     scene: Scene,
     state: State,
-    held: Mapping[str, float | Conjugate] | None = None,
+    held: Mapping[str, Held] | None = None,
     curves: tuple[str, Mapping[str, Curve], float] | None = None,
 ) -> Stage:
     """The stage of a step.

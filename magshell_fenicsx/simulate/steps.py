@@ -8,7 +8,7 @@ import numpy as np
 from magshell_fenicsx.case.loading import ProgrammeStep
 from magshell_fenicsx.case.loads.contact import ContactSection
 from magshell_fenicsx.case.loads.field import FieldBefore, FieldSection, RotationSection
-from magshell_fenicsx.case.loads.step import Gas, Now, PathStep
+from magshell_fenicsx.case.loads.step import Drive, Gas, Now, PathStep
 from magshell_fenicsx.case.loads.time import TimeSection
 from magshell_fenicsx.continuation.device import Conjugate
 from magshell_fenicsx.continuation.path import StepOptions
@@ -37,7 +37,7 @@ def records_of(scene: Scene, step: ProgrammeStep, state: State) -> Records:
     """
     load = step.load
     if isinstance(load, TimeSection):
-        return (yield from motion(scene, load, state))
+        return (yield from motion(scene, load, state, held_by(scene, step, state)))
     if isinstance(load, RotationSection):
         return (yield from _rotation(scene, step, load, state))
     assert isinstance(load, PathStep)
@@ -45,6 +45,8 @@ def records_of(scene: Scene, step: ProgrammeStep, state: State) -> Records:
         state = touched(scene, step, state)
     stage = stage_of(scene, step, state)
     drive = load.drive(_now(scene, step, state))
+    if step.name in load.hold:
+        return (yield from _at_held_conjugate(scene, step, state, drive))
     if step.name == "pressure" and scene.model.without_potential and "control" not in load.model_fields_set:
         drive = replace(drive, control="arc")
     path, start = stage.begin(step.name, drive.control, state, drive.first, drive.scale)
@@ -61,6 +63,21 @@ def records_of(scene: Scene, step: ProgrammeStep, state: State) -> Records:
     if not isinstance(load, FieldBefore):
         return (yield from followed(stage, path, start, goal, branches=load))
     return (yield from _field_before(followed(stage, path, start, replace(goal, until="limit")), drive.end or 0.0))
+
+
+def _at_held_conjugate(scene: Scene, step: ProgrammeStep, state: State, drive: Drive) -> Records:
+    """The records to the first instability of a shell whose conjugate the step drives, and not the load itself."""
+    held, name = held_by(scene, step, state), step.name
+    q = -scene.model.system.potential(state.u, state.mu, name)
+    others = {key: how for key, how in held.items() if key != name}
+    steps = staged(scene, state, others).begin(name, "arc", state, drive.first, drive.scale)[0].options
+    driven = f"conjugate of {name}"
+    stage = staged(scene, state, {**others, name: driven})
+    path, start = stage.begin(driven, "arc", State(state.u, state.mu | {driven: q}), drive.first)
+    walked = Walked(followed(stage, path.in_steps(steps), start, Goal("limit", sense=drive.first)))
+    for record in walked:
+        yield replace(record, amplitude=name)
+    return walked.end
 
 
 def stage_of(scene: Scene, step: ProgrammeStep, state: State) -> Stage:

@@ -7,7 +7,9 @@ from petsc4py import PETSc
 from scipy.integrate import solve_ivp
 from toys import Toy, pitchfork
 
-from magshell_fenicsx.continuation.transient import Integrator, Motion, TimeSteps, advance
+from magshell_fenicsx.continuation.advance import TimeSteps, advance
+from magshell_fenicsx.continuation.motion import Motion
+from magshell_fenicsx.continuation.transient import Integrator
 
 Array = NDArray[np.float64]
 MASS = np.diag([1.0, 2.0])

@@ -11,7 +11,7 @@ from PIL import Image
 import magshell_fenicsx as ms
 from magshell_fenicsx.case.source import CaseError, Source
 from magshell_fenicsx.output.pictures.picture import PICTURES
-from magshell_fenicsx.output.pictures.plot import draw, draw_animation, plot
+from magshell_fenicsx.output.pictures.plot import draw, draw_animation, in_true_time, plot
 from magshell_fenicsx.output.store.table import read_rows
 
 pytestmark = pytest.mark.skipif(shutil.which("Xvfb") is None, reason="no screen to draw on")
@@ -91,6 +91,17 @@ def test_nothing_there(tmp_path: Path, name: str) -> None:
     (tmp_path / "case.yaml").touch()
     with pytest.raises(CaseError, match=rf"{tmp_path / name} holds no run: it has no path\.csv"):
         plot(tmp_path / name)
+
+
+def test_frames_at_equal_times() -> None:
+    """Two steps in time, the second with rows ten times as close: as many frames to each unit of time."""
+    times = [*range(1, 11), *(10 + 0.1 * i for i in range(1, 101))]
+    rows = [{"amplitude": "pressure", "time": 0.0}, *({"amplitude": "time", "time": t} for t in times)]
+    chosen = [row["time"] for row in in_true_time(rows)]
+    assert len(chosen) == 40
+    assert np.diff(chosen) == pytest.approx(np.full(39, 19 / 39), abs=1.0)
+    assert sum(t < 10.5 for t in chosen) == pytest.approx(20, abs=1)
+    assert len(in_true_time(rows[:11])) == 10
 
 
 def test_animation(run: Path, tmp_path: Path) -> None:

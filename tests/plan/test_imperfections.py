@@ -118,6 +118,8 @@ def test_rims_that_overlap_touch_or_nearly_do(polar: float, near: float) -> None
         ([{"kind": "formula", "w0": "x*y*(x+0.3)*(y+0.2)"}], "full"),
         ([towards(40.0, 30.0), towards(20.0, 210.0)], "half"),
         ([towards(40.0, 30.0), towards(20.0, 200.0)], "full"),
+        ([towards(40.0, 30.0), towards(40.0, 100.0)], "half"),  # the plane between them
+        ([towards(40.0, 30.0), towards(41.0, 100.0)], "full"),
         ([towards(40.0, 30.0), {"kind": "formula", "w0": "x"}], "full"),
     ],
 )

@@ -123,6 +123,30 @@ def test_clamped_hemisphere_by_half_and_meridian() -> None:
     assert [value for _, value in found["half"]] == pytest.approx(pairs[:10], rel=1e-4)
 
 
+def test_full_shell_has_both_symmetries() -> None:
+    """The lowest ten of a coarse full shell are the symmetric and the antisymmetric ones of its half."""
+    shell = {"geometry": "hemisphere", "radius_to_thickness": 30, "poisson_ratio": 0.3}
+    mesh = {"degree": 4, "refinement": 0.8}
+    half, full = (
+        lowest(scene_of(shell, {"equator": "clamped"}, symmetry=symmetry, mesh=mesh), 10)
+        for symmetry in ("half", "none")
+    )
+    labels = [label for label, _ in half]
+    assert {"", "antisymmetric"} == set(labels)
+    assert [value for _, value in full] == pytest.approx([value for _, value in half], rel=1e-3)
+
+
+def test_a_solid_disc_converges() -> None:
+    """The lowest frequency of a clamped solid disc, R/h = 20, comes from above and closer with each refinement."""
+    shell = {"geometry": "disc", "radius_to_thickness": 20, "poisson_ratio": 0.3}
+    found = []
+    for refinement in (0.5, 1.0, 1.5):
+        sections = {"model": "solid", "symmetry": "half", "mesh": {"refinement": refinement}}
+        found.append(lowest(scene_of(shell, {"rim": "clamped"}, **sections), 1)[0][1])
+    changes = -np.diff(found) / found[-1]
+    assert 0 < changes[1] < changes[0] / 2
+
+
 def near_instability(scene: Scene) -> tuple[float, float]:
     """The exponent with which omega^2 of the neutral mode grows with the distance below its load, and omega^2 there."""
     located = next(record for record in follow(scene) if record.label in ("fold", "bifurcation"))

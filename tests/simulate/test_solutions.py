@@ -64,6 +64,16 @@ def test_a_roof_has_snapped_through() -> None:
     assert min(apart(scene, back[0].point.state, other) for other in (result.last, found[0])) < 1e-8
 
 
+def test_a_search_for_stable_solutions() -> None:
+    """It ends at the snapped roof: the equilibrium between, which is unstable, does not count."""
+    result = ms.run(roof("mesh.size=127", "loading.search={solutions: 1, stable: true}"))
+    *_, state = result.found.values()
+    pivots = [row["negative_pivots"] for row in result.rows if row["label"] == "solution"]
+    assert pivots[-1] == 0 < min([*pivots[:-1], 1])
+    _, snapped = crossings(result.scene, "load", result.last, 0.05, 2)
+    assert apart(result.scene, state, snapped) < 1e-8
+
+
 def test_what_a_step_holds_stays_held() -> None:
     """Sze's thin roof snaps back: under one displacement of its middle it has three equilibria, the second unstable."""
     push, more = (f"{{kind: dead, loads: [{{at: C, force: [-{size}, 0, 0]}}], " for size in (750, 7.5))

@@ -17,5 +17,8 @@ class SearchSection(Section):
     """Ends after so many, each a point with the label solution"""
     guesses: Annotated[int, Field(ge=1, le=1000)] = 12
     """Guesses tried at most: the shell with dents, then both directions of the softest mode of each solution"""
+    stable: bool = False
+    """Whether each guess goes down in energy until it rests at a stable solution, which takes minutes on surfaces; only
+    stable ones count. A half or a meridian knows no motions beside its symmetry: take symmetry: none"""
     seconds: Annotated[float, Field(gt=0)] | None = None
     """No guess is tried after so long; by default there is no limit [s]"""

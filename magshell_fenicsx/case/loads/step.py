@@ -7,6 +7,7 @@ import numpy as np
 from pydantic import Discriminator, Field, Tag, model_validator
 
 from magshell_fenicsx.case.loads.search import SearchSection
+from magshell_fenicsx.case.loads.snap import SnapSection
 from magshell_fenicsx.parts.section import Pressure, Section
 
 Until = Annotated[
@@ -127,7 +128,8 @@ class Step(Section):
     points: int
     hold: dict[str, Hold] = Field(default_factory=dict)
     """Amplitude of another step, or pressure -> what is constant in this step: the load itself (default), its
-    conjugate displacement (of the pressure the volume, of a force the displacement), or a gas under the shell"""
+    conjugate displacement (of the pressure the volume, of a force the displacement), or a gas under the shell. With
+    `until: limit` also this step's own amplitude: `conjugate` finds the instability at held volume or displacement"""
     search: SearchSection | None = None
     """Search for further solutions at the end of the step"""
 
@@ -160,7 +162,10 @@ class PathStep(Step):
     points: Count = 10
     then: Literal["snap"] | None = None
     """What follows the fold that ends the step with `until: limit`: `snap` releases the shell, which moves under its
-    loads, lightly damped, until it rests on the branch that it snaps to; the next step goes on from there"""
+    loads and what else is held, lightly damped, until it rests on the branch that it snaps to; the next step goes on
+    from there"""
+    snap: SnapSection = SnapSection()
+    """How it is released"""
     branches: bool = False
     """Follow both directions of the branch at the first bifurcation too, to the target or for `points` steps"""
     sensitivities: bool = False
@@ -182,8 +187,10 @@ class PathStep(Step):
         if self.until in ("points", "zero") and by != "arc":
             why = "counts steps by arc length" if self.until == "points" else "passes the largest load"
             raise ValueError(f"until: {self.until} {why}: it goes with control: arc")
-        if self.then and (self.until != "limit" or any(how != "load" for how in self.hold.values())):
-            raise ValueError("then: snap: goes with until: limit, and with loads that are held")
+        if self.then and self.until != "limit":
+            raise ValueError("then: snap: goes with until: limit")
+        if "snap" in self.model_fields_set and not self.then:
+            raise ValueError("snap: goes with then: snap")
         return self
 
     @property

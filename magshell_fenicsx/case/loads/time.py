@@ -5,6 +5,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self, TypeAlias
 
 from pydantic import Field, model_validator
 
+from magshell_fenicsx.case.expressions import Formula
 from magshell_fenicsx.case.history import History, Time, levels_of, measured, times_of
 from magshell_fenicsx.case.loads.step import Step
 from magshell_fenicsx.parts.section import Section, in_units
@@ -21,6 +22,15 @@ class PushSection(Section):
     """Displacement, inward at the pole or the first named point [h]"""
     velocity: float = Field(default=0.0, ge=-1e9, le=1e9)
     """Velocity, likewise, per unit of time [h]"""
+
+
+class EventSection(Section):
+    """A column of path.csv that comes to a value."""
+
+    column: str
+    """Its name, such as w_over_h or middle_uz"""
+    value: float
+    """In the column's unit"""
 
 
 class TimeSection(Step):
@@ -50,14 +60,22 @@ class TimeSection(Step):
     """Force over mass and velocity; free vibrations fade at half of it [per unit of time; 20 Hz is 20 per second]"""
     push: PushSection | None = None
     """How it begins to move"""
-    until: Literal["duration", "rest"] = "duration"
-    """At the end of the duration, or as soon as the shell rests: then its equilibrium is the last row"""
+    velocity: Annotated[list[Formula], Field(min_length=3, max_length=3)] | None = None
+    """Initial velocity, added: formulas of the undeformed place x, y, z [length of the shell; over R if without unit]
+    along e1, e2, e3 [the same per unit of time]"""
+    until: Literal["duration", "rest", "event", "instability"] = "duration"
+    """At the end of the duration; as soon as the shell rests: then its equilibrium is the last row; at the `event`; or
+    at the first row at which the shell has an unstable direction"""
+    event: EventSection | None = None
+    """What ends the step with `until: event`"""
 
     @model_validator(mode="after")
     def _loads_are_held(self) -> Self:
         for name, how in self.hold.items():
-            if how != "load":
-                raise ValueError(f"hold.{name}: in kind: time all loads are functions of time: only load is allowed")
+            if how != "load" and name in self.drives:
+                raise ValueError(f"hold.{name}: it follows its history: only load is allowed")
+        if (self.event is None) == (self.until == "event"):
+            raise ValueError("event: goes with until: event, which needs one")
         if self.search:
             raise ValueError("search: is for steps that end in equilibrium")
         for key, value in (("duration", self.duration), ("step", self.step), ("drag", self.drag)):
@@ -92,13 +110,17 @@ def history_may_begin(history: History) -> bool:
     return getattr(history, "kind", "") == "step"
 
 
-def refuse_unfit_time(key: str, load: TimeSection, amplitudes: set[str], *, density: bool, measured: bool) -> None:
+def refuse_unfit_time(
+    key: str, load: TimeSection, amplitudes: set[str], motions: set[str], *, density: bool, measured: bool
+) -> None:
     """See that its loads are there, and that its units have a meaning.
 
     Parameters
     ----------
     amplitudes
         Of other steps.
+    motions
+        Those of supports.
     density, measured
         Whether the shell has a density, and the field a flux density.
 
@@ -116,6 +138,9 @@ def refuse_unfit_time(key: str, load: TimeSection, amplitudes: set[str], *, dens
     for name, history in load.history.items():
         if name not in allowed:
             raise ValueError(f"{key}.history.{name}: no such load; allowed: {', '.join(sorted(allowed))}")
+        times = [t for t, _ in history] if isinstance(history, list) else []
+        if name in motions and (getattr(history, "kind", "") == "step" or len(set(times)) < len(times)):
+            raise ValueError(f"{key}.history.{name}: a support cannot jump")
         for level in levels_of(history):
             if isinstance(level, str) and not (name == "field" and measured):
                 why = "needs magnetic.applied.flux_density" if name == "field" else "is a flux density: give a number"

@@ -77,6 +77,7 @@ class EnergyFactory:
     natural: Shape | None = None
     free: Constants = field(default_factory=dict)  # of parameters that enter freely
     fields: list[AppliedField] = field(default_factory=list)  # those made
+    drawn: fem.Function | None = None  # the placement that volumes count from; None for r0
 
     def membrane(self) -> Energy:
         j0, t, nu = self.j0, self._t, self.constant(self.material.nu)
@@ -156,7 +157,7 @@ class EnergyFactory:
 
     def swept_volume(self, u: Jet) -> ufl.Form:
         """Delta V/R^3 per radian where an end moves."""
-        return densities.swept(self.j0, u) * self._dx()
+        return densities.swept(*self._from_drawn(u)) * self._dx()
 
     def own(self, term: OwnTerm, amplitude: str | None = None) -> Energy:
         """The energy of a part or one's own, with the amplitude of its name or another; it shares the symmetry."""
@@ -190,7 +191,14 @@ class EnergyFactory:
 
     def volume_change(self, u: Jet) -> ufl.Form:
         """Delta V/R^3 per radian."""
-        return densities.volume(self.j0, u) * self._dx()
+        return densities.volume(*self._from_drawn(u)) * self._dx()
+
+    def _from_drawn(self, u: Jet) -> tuple[Jet, Jet]:
+        """The jets of the drawn placement and of the displacement from there."""
+        if self.drawn is None:
+            return self.j0, u
+        drawn = jets.revolved(self.drawn)
+        return drawn, self.j0 + u - drawn
 
     def area(self) -> Integral:
         """Over the undeformed area, per radian as all of these."""

@@ -11,6 +11,7 @@ from dolfinx import fem, mesh
 from mpi4py import MPI
 from numpy.typing import NDArray
 
+from magshell_fenicsx.mesh.deviation import Deviated, Deviation
 from magshell_fenicsx.mesh.patch import Embedding
 
 Array = NDArray[np.float64]
@@ -63,6 +64,13 @@ class Meridian:
         r0 = fem.Function(V, name="r0")
         r0.x.array[:] = self.section(s).ravel()
         return r0
+
+    def growth(self, V: fem.FunctionSpace, deviations: Sequence[Deviation]) -> fem.Function:
+        """What further deviations add to the placement in the same space."""
+        s, found = V.tabulate_dof_coordinates()[:, 0], fem.Function(V, name="growth")
+        assert isinstance(self.embedding, Deviated)
+        found.x.array[:] = self.embedding.along_normal(np.column_stack([s, 0 * s]), deviations)[:, [0, 2]].ravel()
+        return found
 
 
 def make_meridian(

@@ -5,12 +5,14 @@ Lengths in R, energies in E h R^2, of the whole shell. Amplitudes as in `ShellMo
 """
 
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
 import ufl
 from dolfinx import fem
 
+from magshell_fenicsx.assembly.growing import Growing
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.parameter import FreeParameter, make_parameters
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
@@ -89,12 +91,14 @@ class MeridianModel(Observed):
         self.V = V = fem.functionspace(meridian.mesh, ("Lagrange", degree, (2,)))
         self.r0, self.u = meridian.placement(V), fem.Function(V, name="u")
         self.sigma = default_penalty(degree) if sigma is None else sigma
+        shapes = {name: meridian.growth(V, deviations) for name, deviations in loads.growing.items()}
+        self.growing = Growing(self.r0, shapes, material.h) if shapes else None
         self.thickness = thickness_field(thickness, self.r0) if thickness else None
         free, shape = dict[str, fem.Constant](), None
         if loads.natural:
             shape = Shape.of(natural_field(loads.natural, *places(self.r0), V), loads.natural, free)
         factory = EnergyFactory(meridian, self.r0, material, self.sigma, degree, self.thickness, shape, free)
-        self.factory = factory
+        self.factory = factory = replace(factory, drawn=self.growing and self.growing.drawn)
         self.held = supports(meridian, conditions)
         self.energies = [factory.membrane(), factory.bending(), factory.interior_edges()]
         self.supports = {}
@@ -140,6 +144,9 @@ class MeridianModel(Observed):
         parameters: dict[str, FreeParameter] = {**make_parameters(factory.free, terms, self.u, self.kernels)}
         parameters |= field_parameters(factory.fields, terms, self.u, self.kernels)
         self.fields = factory.fields
+        if self.growing:
+            parameters |= self.growing.parameters(terms, parameters)
+            self.growing.renewed += self._renewals
         self.system = FiniteElementSystem(
             self.u,
             terms,

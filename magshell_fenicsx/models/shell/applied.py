@@ -76,6 +76,7 @@ class AppliedField:
         self._here: list[Here] = []
         self._known: tuple[Array, dict[str, float]] = np.empty(0), {}
         self._still: tuple[Array, Array, Array] | None = None
+        self._placement = r0
         self._r0 = at_quadrature(r0, self.polynomial.points)
         B, G, H = self._values(self._r0.reshape(-1, 3))
         known = np.isfinite(G).all(axis=(1, 2)) & np.isfinite(H).all(axis=(1, 2, 3))
@@ -104,6 +105,11 @@ class AppliedField:
         second = H[:, :, *PAIRS] * np.where(PAIRS[0] == PAIRS[1], 0.5, 1.0)
         flat = [a.reshape(*u.shape[:2], -1) for a in (u, self._B0, B, G, second)]
         self.polynomial.renew(np.concatenate(flat, axis=-1))
+
+    def renew_place(self) -> None:
+        """Take the placement anew."""
+        self._r0 = at_quadrature(self._placement, self.polynomial.points)
+        self._known, self._still = (np.empty(0), {}), None
 
     def slope(self, name: str) -> PointField:
         """A field for the derivatives by a driven amplitude, to be filled by `renew`."""

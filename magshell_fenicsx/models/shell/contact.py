@@ -178,7 +178,7 @@ class Pressing:
         self.contact, self._h, self._u, self._approach = contact, h, u, approach
         self.polynomial = PointField(V.mesh, degree, SIZE)
         self._points, self._degree = self.polynomial.points, degree
-        self._r0 = at_quadrature(r0, self._points)
+        self._placement, self._r0 = r0, at_quadrature(r0, self._points)
         factor = 1.0 if thickness is None else at_quadrature(thickness, self._points)[..., 0].ravel()
         self._half = h / 2 * factor
         self._owned = V.mesh.topology.index_map(V.mesh.topology.dim).size_local
@@ -211,6 +211,10 @@ class Pressing:
         pairs = H[:, *PAIRS] * np.where(PAIRS[0] == PAIRS[1], 0.5, 1.0)
         flat = [a.reshape(*y.shape[:2], -1) for a in (y, value, -first[:, None] * n, pairs)]
         self.polynomial.renew(np.concatenate(flat, axis=-1))
+
+    def renew_place(self) -> None:
+        """Take the placement anew."""
+        self._r0, self._known = at_quadrature(self._placement, self._points), np.empty(0)
 
     def cell_pressures(self) -> Array:
         """The mean pressure in each local cell, over E h/R: the ring of a contact is narrower than that of nodes."""

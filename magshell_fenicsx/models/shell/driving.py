@@ -7,6 +7,7 @@ import ufl
 from dolfinx import fem
 
 from magshell_fenicsx.assembly.kernels import KernelLog
+from magshell_fenicsx.assembly.parameter import Derivative, bends_of
 from magshell_fenicsx.assembly.point_field import PointField
 from magshell_fenicsx.assembly.terms import FormTerm, Term
 from magshell_fenicsx.models.shell.applied import AppliedField
@@ -49,11 +50,11 @@ class FieldParameter:
         self.constant.known.renew(self._slope, self.constant.name)
         return self._slopes
 
-    def bends(self, q: object) -> list[FormTerm]:
+    def bends(self, q: object) -> Sequence[Derivative]:
         """d2Pi_i/dmu dq with the amplitudes that multiply them."""
         known = self.constant.known
         if not isinstance(q, Amplitude) or q.known is not known:
-            return []
+            return bends_of(q, self.constant)
         if q.name not in self._bends:
             bend = known.slope(q.name)
             terms = [FormTerm(t.name, _with(t.form, known, bend), t._u, self.log, t.amplitude) for t in self.terms]

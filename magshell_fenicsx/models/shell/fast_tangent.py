@@ -41,7 +41,7 @@ class TangentSite(Protocol):
 
 
 class FastTangent:
-    """The tangent of a sum of terms; a `solve.problem.TangentAssembler`.
+    """The tangent of a sum of terms; an `assemblers.TangentAssembler`.
 
     Parameters
     ----------

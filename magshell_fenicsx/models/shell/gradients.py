@@ -122,6 +122,11 @@ class PointGradient:
             self._energies[name] = None if none else self._log.compile_expression(f"{name} energy", W, self._comm)
         return self._energies[name]
 
+    def place(self, r0: Array) -> None:
+        """Take another placement."""
+        self._known[0] = self._known[0][0], r0
+        self._loaded = None
+
     def room(self, chunk: slice) -> Array:
         """For the derivatives of u in reference coordinates, to be filled: (points, sides * parts * 3)."""
         count = chunk.stop - chunk.start

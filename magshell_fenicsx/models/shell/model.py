@@ -4,14 +4,15 @@ Lengths in R, energies in E h R^2. Amplitudes: "pressure" is p/p_c, "force" is
 F R/(2 pi D), "lambda_m" is lambda_m.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property, partial
+from functools import cached_property
 
 import numpy as np
 from dolfinx import fem
 from numpy.typing import NDArray
 
+from magshell_fenicsx.assembly.growing import Growing
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.parameter import FreeParameter
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
@@ -26,6 +27,7 @@ from magshell_fenicsx.models.shell.driving import field_parameters
 from magshell_fenicsx.models.shell.energy import ShellTerm
 from magshell_fenicsx.models.shell.fast_tangent import FastTangent, make_sites
 from magshell_fenicsx.models.shell.folds import FOLD, largest_fold
+from magshell_fenicsx.models.shell.gradients import PointTerm
 from magshell_fenicsx.models.shell.moved import Support, moving, rotation_of
 from magshell_fenicsx.models.shell.natural import Shape, natural_field
 from magshell_fenicsx.models.shell.openings import openings
@@ -41,13 +43,14 @@ from magshell_fenicsx.models.shell.parameters import (
 )
 from magshell_fenicsx.models.shell.patterns import by_patch, places
 from magshell_fenicsx.models.shell.point_load import patch_entries, point_entries, vertex_normal
-from magshell_fenicsx.models.shell.residual import FastResidual
+from magshell_fenicsx.models.shell.residual import FastResidual, renew
 from magshell_fenicsx.models.shell.slopes import point_parameters
 from magshell_fenicsx.models.shell.supports import (
     closing_point,
     held_at_vertex,
     held_on,
     plane_of,
+    put_in_plane,
     refuse_unknown,
 )
 from magshell_fenicsx.models.shell.terms import TermFactory
@@ -114,6 +117,10 @@ class ShellModel(Observed):
         self.V = V = fem.functionspace(midsurface.mesh, ("Lagrange", degree, (3,)))
         self.r0, self.u = midsurface.placement(V), fem.Function(V, name="u")
         self.sigma = default_penalty(degree) if sigma is None else sigma
+        for name in [name for name, c in conditions.items() if c == "plane" and not midsurface.read]:
+            put_in_plane(self.r0, midsurface.edges[name])
+        shapes = {name: midsurface.growth(V, deviations) for name, deviations in loads.growing.items()}
+        self.growing = Growing(self.r0, shapes, material.h) if shapes else None
         self.thickness = factor = thickness_field(thickness, self.r0, midsurface) if thickness else None
         free, shape = dict[str, fem.Constant](), None
         if loads.natural:
@@ -123,7 +130,7 @@ class ShellModel(Observed):
             shape = Shape.of(natural_field(grown, *places(self.r0), self.V), grown, free)
         folded = midsurface.read and largest_fold(self.r0, degree) > FOLD
         of_shell = material, self.sigma, degree, self.kernels, factor, shape, free, folded
-        self.factory = factory = TermFactory(self.r0, self.u, *of_shell)
+        self.factory = factory = TermFactory(self.r0, self.u, *of_shell, drawn=self.growing and self.growing.drawn)
         interior = factory.interior_edges()
         terms: list[Term] = [factory.membrane(), factory.bending(), interior]
         held: list[Constraint] = []
@@ -206,16 +213,27 @@ class ShellModel(Observed):
             self._near = self.moving.cells, near
         fast = FastTangent(self.u, self._sites, held + mirrored, self._near)
         dense = [term for term in terms if isinstance(term, ShellTerm)]
-        serve = partial(FastResidual, self.r0, self.u, degree, log=self.kernels)
-        gradients = serve(terms=dense)
+        served = list[FastResidual]()
+
+        def serve(terms: Sequence[PointTerm], *, apart: bool = False) -> FastResidual:
+            served.append(FastResidual(self.r0, self.u, degree, terms, self.kernels, apart=apart))
+            return served[-1]
+
+        gradients = serve(dense)
         gradients.compile()
         for term in dense:
-            term.points = gradients
+            if not (self.growing and term.amplitude == "pressure"):  # whose form measures from the drawn placement
+                term.points = gradients
         parameters: dict[str, FreeParameter] = {
-            **point_parameters(factory.free, dense, lambda slopes: serve(terms=slopes, apart=True))
+            **point_parameters(factory.free, dense, lambda slopes: serve(slopes, apart=True))
         }
         parameters |= field_parameters(factory.fields, terms, self.u, self.kernels)
         self.fields = factory.fields
+        if self.growing:
+            parameters |= self.growing.parameters(terms, parameters, gradients)
+            sites = [*self._sites, *(self._near[1] if self._near else [])]
+            self.growing.renewed += [each.renew for each in sites] + self._renewals
+            self.growing.renewed.append(lambda: renew(served))  # some come later
         self.system = FiniteElementSystem(
             self.u, terms, held + mirrored, interior, material.h, fast, gradients, parameters, self.moving
         )
@@ -232,6 +250,8 @@ class ShellModel(Observed):
         edges = self.factory.antisymmetric_edges(self._on_mirror, self.mirror.normal)
         held = self._held + [held_along(self.V, 1, self._on_mirror, along) for along in self.mirror.in_plane]
         sites = self._sites + make_sites(self.r0, self.degree, [edges], self.kernels)
+        if self.growing:
+            self.growing.renewed += [site.renew for site in sites[len(self._sites) :]]
         fast = FastTangent(self.u, sites, held)
         terms = [edges if t.name == "mirror edges" else t for t in self.system.terms]
         system = self.system

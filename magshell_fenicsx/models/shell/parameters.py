@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.motion import Motion
+from magshell_fenicsx.mesh.deviation import Deviation
 from magshell_fenicsx.models.shell.contact import Contact
 from magshell_fenicsx.models.shell.driven import Driven, FieldInSpace
 from magshell_fenicsx.models.shell.natural import Natural
@@ -181,6 +182,8 @@ class Loads:
     ----------
     forces, dead
         Amplitude -> the force, or the dead loads that grow together.
+    growing
+        Amplitude -> imperfections that grow.
     """
 
     pressure: bool = False
@@ -191,6 +194,7 @@ class Loads:
     natural: Natural | None = None
     moves: tuple[Move, ...] = ()
     contacts: tuple[Contact, ...] = ()
+    growing: Mapping[str, tuple[Deviation, ...]] = field(default_factory=dict)
 
     @property
     def all_dead(self) -> tuple[DeadLoad, ...]:

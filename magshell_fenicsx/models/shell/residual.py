@@ -1,6 +1,6 @@
 """Energies and residuals without compiled forms, from the terms' own densities and their gradients at points."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Protocol
 
 import numpy as np
@@ -26,6 +26,9 @@ class _Site(Protocol):
     def energy(self, nodal: Array, name: str) -> float:
         """That of a term on this rank's part."""
 
+    def place(self, r0: fem.Function) -> None:
+        """Take another placement."""
+
     def compile(self) -> None:
         """Compile the kernels of `add`; collective."""
 
@@ -34,7 +37,7 @@ class _Site(Protocol):
 
 
 class FastResidual:
-    """The residual of a sum of terms; a `solve.problem.ResidualAssembler`.
+    """The residual of a sum of terms; an `assemblers.ResidualAssembler`.
 
     Terms on cells that share an amplitude also share a kernel: their geometry is found once.
 
@@ -77,10 +80,15 @@ class FastResidual:
             sites.append(_Cells(r0, this[0] or cell_quadrature(degree), together, log))
         if on_edges:
             sites.append(_Edges(r0, edge_quadrature(degree), on_edges, log))
-        self._sites = sites
+        self._sites, self._r0 = sites, r0
         self.names = frozenset(term.name for term in terms)
         self._u, self._nodes = u, u.function_space.dofmap.list
         self._dofs = (3 * self._nodes[:, :, None] + np.arange(3)).ravel()
+
+    def renew(self) -> None:
+        """Take the placement anew."""
+        for site in self._sites:
+            site.place(self._r0)
 
     def compile(self) -> None:
         """Compile the kernels of the residual; collective."""
@@ -105,6 +113,12 @@ class FastResidual:
         return np.asarray(nodal.reshape(-1, 3 * self._nodes.shape[1]))
 
 
+def renew(residuals: Iterable[FastResidual]) -> None:
+    """Let all take the placement anew."""
+    for each in residuals:
+        each.renew()
+
+
 class _Cells:
     """Terms with one amplitude on the owned cells."""
 
@@ -115,13 +129,21 @@ class _Cells:
         table, each = Table.tabulate(V.element.basix_element, X), len(X)
         parts = [name for name in NAMES if name in FIRST or any(name in term.density.parts for term in terms)]
         self._sheet = Sheet(table, self._weights, [NAMES.index(part) for part in parts])
-        cells = np.arange(V.mesh.topology.index_map(2).size_local, dtype=np.int32)
-        frames = cell_frames(V.mesh)
-        known = _placement(r0, table, frames, parts)[cells].reshape(len(cells) * each, 3 * len(parts))
+        cells = self._owned = np.arange(V.mesh.topology.index_map(2).size_local, dtype=np.int32)
+        frames = self._frames = cell_frames(V.mesh)
+        self._table, self._parts = table, parts
+        known = self._known(r0)
         geometry = np.repeat(frames[cells], each, axis=0)
         self._points = PointGradient(
             terms, parts, each, known, geometry, lambda field: at_points(field, X, cells), log, V.mesh.comm
         )
+
+    def _known(self, r0: fem.Function) -> Array:
+        known = _placement(r0, self._table, self._frames, self._parts)[self._owned]
+        return known.reshape(len(known) * len(self._weights), 3 * len(self._parts))
+
+    def place(self, r0: fem.Function) -> None:
+        self._points.place(self._known(r0))
 
     def compile(self) -> None:
         _ = self._points.gradient
@@ -160,17 +182,26 @@ class _Edges:
         table = Table.tabulate(V.element.basix_element, X)
         self._sheet = Sheet(table, w, [NAMES.index(part) for part in CURVED])
         frames, cells = cell_frames(V.mesh), np.arange(len(V.dofmap.list), dtype=np.int32)
-        placement = _placement(r0, table, frames, CURVED).reshape(-1, 3 * len(CURVED))
+        self._table, self._frames = table, frames
+        placement = self._placed(r0)
         self._there, self._back = np.empty_like(placement), np.empty_like(placement)
         self._on = dict[str, tuple[NDArray[np.intp], PointGradient]]()
         for term in terms:
             rows, geometry = _where(V, term.density, frames, each)
-            known = placement[rows].reshape(len(rows), 3 * len(CURVED) * term.density.sides)
+            known = placement[rows].reshape(len(rows), rows.shape[1] * placement.shape[1])
 
             def values(field: fem.Function, rows: NDArray[np.intp] = rows) -> Array:
                 return at_points(field, X, cells)[rows].reshape(len(rows), rows.shape[1] * field.ufl_shape[0])
 
             self._on[term.name] = rows, PointGradient([term], CURVED, each, known, geometry, values, log, V.mesh.comm)
+
+    def _placed(self, r0: fem.Function) -> Array:
+        return _placement(r0, self._table, self._frames, CURVED).reshape(-1, 3 * len(CURVED))
+
+    def place(self, r0: fem.Function) -> None:
+        placement = self._placed(r0)
+        for rows, points in self._on.values():
+            points.place(placement[rows].reshape(len(rows), rows.shape[1] * placement.shape[1]))
 
     def compile(self) -> None:
         for _, points in self._on.values():

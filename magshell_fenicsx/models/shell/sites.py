@@ -56,7 +56,8 @@ class Site:
         self._points = Points(max([1, *(batch.size for batch in batches)]))
         self._u, self._r0 = (self._points.field(3 * PARTS * sides) for _ in range(2))
         self._geometry = self._points.field(2 * sides + 1)
-        self._placements = [self._jets(batch, r0.x.array) for batch in batches]
+        self._placement = r0
+        self.renew()
         self._kernels = {
             t.name: Kernel(
                 t.name, t.density, self._points, batches, of_v=isinstance(t, HessianTerm) or bool(t.density.work)
@@ -102,6 +103,10 @@ class Site:
             if self._sides == 2:
                 couple(number, contraction.cross(blocks))
         self._replaced = False
+
+    def renew(self) -> None:
+        """Take the placement anew."""
+        self._placements = [self._jets(batch, self._placement.x.array) for batch in self.batches]
 
     def replace_strain(
         self, u: Array, by: Sequence[tuple[float, Array]], besides: NDArray[np.bool_] | None = None

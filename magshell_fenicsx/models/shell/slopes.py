@@ -10,6 +10,7 @@ from dolfinx import fem
 from numpy.typing import NDArray
 from ufl.core.expr import Expr
 
+from magshell_fenicsx.assembly.parameter import Derivative, bends_of
 from magshell_fenicsx.models.shell.energy import Density, ShellTerm
 from magshell_fenicsx.models.shell.gradients import PointTerm
 from magshell_fenicsx.models.shell.residual import FastResidual
@@ -44,8 +45,10 @@ class PointParameter:
     serve: Serve
     _bends: dict[fem.Constant, Sequence[Slope]] = field(default_factory=dict)
 
-    def bends(self, q: fem.Constant) -> Sequence[Slope]:
+    def bends(self, q: Any) -> Sequence[Derivative]:
         """d2Pi_i/dp dq with the amplitudes mu_i; q may be p."""
+        if not isinstance(q, fem.Constant):
+            return bends_of(q, self.constant)
         if q not in self._bends:
             self._bends[q] = slopes(self.slopes, q, "twice", self.serve)
         return self._bends[q]

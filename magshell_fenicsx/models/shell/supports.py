@@ -4,7 +4,8 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 
 import basix
 import numpy as np
-from dolfinx import fem
+from dolfinx import fem, mesh
+from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
@@ -16,6 +17,7 @@ from magshell_fenicsx.models.shell.parameters import Condition, Held, Loads
 
 Array = NDArray[np.float64]
 STRAIGHT = 1e-6  # deviation of an edge from a plane, in lengths of R
+BESIDE = 1e-3  # largest distance from its plane at which curved elements leave an edge
 RIGHT = 0.99  # mean cosine between the conormals of an edge and the normal of the plane that the surface crosses
 FREE = 1e-12  # of the squares that a rigid motion has where the shell is held, over the largest: rounding
 LOOSE = 1e-13  # of a rigid motion's energy, over the tangent's largest row
@@ -103,6 +105,25 @@ def plane_of(r0: fem.Function, facets: NDArray[np.int32], name: str) -> Mirror:
         if np.ptp(plane.beyond(places)) < STRAIGHT and crossing > RIGHT:
             return plane
     raise MeshError(no_mirror(name))
+
+
+def put_in_plane(r0: fem.Function, facets: NDArray[np.int32]) -> None:
+    """Move the nodes of an edge into the plane of its vertices, if curved elements leave them a little beside it.
+
+    The vertices of a chart are exact, the cubic edges between them are not. Collective.
+    """
+    V, domain = r0.function_space, r0.function_space.mesh
+    ends = mesh.entities_to_geometry(domain, 1, facets) if len(facets) else np.empty(0, dtype=np.int32)
+    vertices = np.concatenate(domain.comm.allgather(domain.geometry.x[ends.ravel()]))
+    centre = vertices.mean(axis=0)
+    _, spread, axes = np.linalg.svd(vertices - centre, full_matrices=False)
+    if spread[1] <= STRAIGHT * spread[0] or np.ptp(vertices @ axes[2]) > STRAIGHT:
+        return
+    dofs, x = fem.locate_dofs_topological(V, 1, facets), r0.x.array.reshape(-1, 3)
+    off = (x[dofs] - centre) @ axes[2]
+    if domain.comm.allreduce(np.abs(off).max(initial=0.0), MPI.MAX) < BESIDE:
+        x[dofs] -= np.outer(off, axes[2])
+    r0.x.scatter_forward()
 
 
 def closing_point(planes: Sequence[Mirror]) -> Array | None:

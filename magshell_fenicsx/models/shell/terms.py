@@ -57,6 +57,7 @@ class TermFactory:
     free: Constants = field(default_factory=dict)  # of parameters that enter freely
     folded: bool = False  # whether cells meet at angles that are not small
     fields: list[AppliedField] = field(default_factory=list)  # those made
+    drawn: fem.Function | None = None  # the placement that volumes count from; None for r0
 
     def membrane(self) -> ShellTerm:
         density = Density(per_area(densities.membrane), (self._constant(self.material.nu),))
@@ -150,17 +151,19 @@ class TermFactory:
         """Amplitude p/p_c; potential p Delta V, of a live pressure; `origin` as of `volume_change`."""
         unit = self._constant(self.material.classical_pressure / self.material.h)
         parameters = (unit, self._constant(origin)) if origin.any() else (unit,)
-        return self._cells("pressure", Density(densities.pressure, parameters, parts=MOVED), "pressure")
+        return self._cells("pressure", Density(densities.pressure, parameters, parts=MOVED), "pressure", drawn=True)
 
     def pressure_beside_edges(self, *, potential: bool) -> ShellTerm:
         """The same where edges move that lie in no planes with a common point, with a potential or without."""
         unit = self._constant(self.material.classical_pressure / self.material.h)
         work = None if potential else densities.following
-        return self._cells("pressure", Density(densities.swept, (unit,), parts=MOVED, work=work), "pressure")
+        return self._cells(
+            "pressure", Density(densities.swept, (unit,), parts=MOVED, work=work), "pressure", drawn=True
+        )
 
     def swept_volume(self) -> ufl.Form:
         """Delta V/R^3 of the modelled part where edges move."""
-        return densities.swept(*self.jets()) * self.dx()
+        return densities.swept(*self._jets_from_drawn()) * self.dx()
 
     def own(self, term: OwnTerm, amplitude: str | None = None) -> ShellTerm:
         """The energy of a part or one's own, with the amplitude of its name or another."""
@@ -191,7 +194,9 @@ class TermFactory:
 
     def volume_change(self, origin: NDArray[np.float64]) -> ufl.Form:
         """Delta V/R^3 of the modelled part, between it and a point of all its symmetry planes."""
-        return densities.volume(*self.jets(), *([self._constant(origin)] if origin.any() else [])) * self.dx()
+        return (
+            densities.volume(*self._jets_from_drawn(), *([self._constant(origin)] if origin.any() else [])) * self.dx()
+        )
 
     @property
     def _domain(self) -> mesh.Mesh:
@@ -199,6 +204,12 @@ class TermFactory:
 
     def jets(self) -> tuple[Jet, Jet]:
         return kin.jet(self.r0, self._domain), kin.jet(self.u, self._domain)
+
+    def _jets_from_drawn(self) -> tuple[Jet, Jet]:
+        """Those of the drawn placement and of the displacement from there."""
+        r0, u = self.jets()
+        drawn = kin.jet(self.drawn, self._domain) if self.drawn else r0
+        return (drawn, r0 + u - drawn) if self.drawn else (r0, u)
 
     def _constant(self, value: float | NDArray[np.float64]) -> fem.Constant:
         return fem.Constant(self._domain, value)
@@ -243,8 +254,10 @@ class TermFactory:
         *,
         linear: bool = False,
         follow: Callable[[], None] | None = None,
+        drawn: bool = False,
     ) -> ShellTerm:
-        energy, work = density.of(*self.jets(), *density.parameters) * self.dx(density.quadrature), None
+        jets, work = self._jets_from_drawn() if drawn else self.jets(), None
+        energy = density.of(*jets, *density.parameters) * self.dx(density.quadrature)
         if density.work:
             v = kin.jet(ufl.TestFunction(self.u.function_space), self._domain)
             work = density.work(*self.jets(), v, *density.parameters) * self.dx()

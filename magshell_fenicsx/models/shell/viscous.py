@@ -46,6 +46,11 @@ class Viscosity:
         Amplitudes with the places of supports, which do not move.
     kelvin
         Time tau of Kelvin and Voigt; zero without.
+
+    Attributes
+    ----------
+    memory
+        q of each branch, (cells, nodes, 12).
     """
 
     def __init__(self, model: ShellModel, mu: Amplitudes, kelvin: float, branches: Sequence[Branch]) -> None:
@@ -60,7 +65,7 @@ class Viscosity:
         gradients = [ufl.derivative(work, model.u, ufl.TestFunction(V)) for work in _works(model, self._given)]
         self._forms = [model.kernels.compile(f"viscous residual {i}", form) for i, form in enumerate(gradients)]
         shape = (*self._nodes.shape, SIZE)
-        self._q = [np.zeros(shape) for _ in branches]
+        self.memory = [np.zeros(shape) for _ in branches]
         self._known: tuple[Vector, Array] | None = None
         self._force = np.zeros(model.system.size)
 
@@ -68,7 +73,7 @@ class Viscosity:
         """The forces at a part of the step from u0 to u1, with the velocity v there."""
         at = u0 + part * (u1 - u0)
         stress = self._kelvin * self._rate(at, v) if self._kelvin else 0.0
-        for branch, q in zip(self._branches, self._q, strict=True):
+        for branch, q in zip(self._branches, self.memory, strict=True):
             stress = stress + branch.modulus * (part * self._evolved(branch, q, u0, u1, dt) + (1 - part) * q)
         self._field.x.array.reshape(-1, SIZE)[self._places] = stress
         given, system = self._given, self._model.system
@@ -84,7 +89,7 @@ class Viscosity:
 
     def accept(self, u0: Vector, u1: Vector, dt: float) -> Vector:
         """Go on from u1; the force that the step was solved with."""
-        self._q = [self._evolved(b, q, u0, u1, dt) for b, q in zip(self._branches, self._q, strict=True)]
+        self.memory = [self._evolved(b, q, u0, u1, dt) for b, q in zip(self._branches, self.memory, strict=True)]
         return self._force
 
     def _evolved(self, branch: Branch, q: Array, u0: Vector, u1: Vector, dt: float) -> Array:

@@ -13,7 +13,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.system import State, Vector
-from magshell_fenicsx.mesh.deviation import Deviated
+from magshell_fenicsx.mesh.deviation import Deviated, Deviation
 from magshell_fenicsx.mesh.frame import rotation
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.axisymmetric.revolution import Revolution
@@ -81,12 +81,17 @@ class SurfaceGatherer:
         numbers = V.dofmap.index_map.local_to_global(local.ravel().astype(np.int32)).reshape(local.shape)
         cells = self.comm.gather(numbers[:, np.argsort(perm_vtk(mesh.CellType.triangle, local.shape[1]))])
         self._cells = np.concatenate(cells) if self.comm.rank == 0 else numbers
+        self._numbers, self._size = numbers, map_.size_global
+        self._take_placement({})
+
+    def _take_placement(self, mu: Mapping[str, float]) -> None:
+        """What depends on the placement, at amplitudes of imperfections that grow."""
+        model, loads = self._model, self._model.loads
         r = self._at_nodes(model.r0)
         factor = None if model.thickness is None else self._thickness(model.thickness)
-        loads = model.loads
         self._fields = PointFields(r, model.material, loads.magnetic, factor, loads.natural, loads.contacts)
-        self._mean = self._weighted_mean(numbers, map_.size_global)
-        deviation = model.midsurface.deviation(self._places)
+        self._mean = self._weighted_mean(self._numbers, self._size)
+        deviation = model.midsurface.deviation(self._places, grown(loads.growing, mu))
         if deviation is not None:
             self._fields.constant[W0] = np.asarray(deviation[: self._owned] / model.material.h)
         n0 = self._averaged(self._fields.n0)
@@ -95,6 +100,9 @@ class SurfaceGatherer:
 
     def gather(self, u: Vector, mu: Mapping[str, float] | None = None) -> Surface | None:
         """The displaced surface with its fields at the amplitudes mu, on rank 0; None on other ranks."""
+        if self._model.growing and mu:
+            self._model.system.place(mu)
+            self._take_placement(mu)
         self._model.system.set(u)
         jet = self._at_nodes(self._model.u)
         values = self._fields.of(jet, mu or {})
@@ -142,13 +150,21 @@ class RevolvedGatherer:
     """The surface of revolution of a meridian, in flat triangles."""
 
     def __init__(self, model: MeridianModel, comm: MPI.Comm) -> None:
-        self.comm, self._model, self._swept = comm, model, Revolution(model)
+        self.comm, self._model = comm, model
+        self._take_placement({})
+
+    def _take_placement(self, mu: Mapping[str, float]) -> None:
+        """What depends on the placement, at amplitudes of imperfections that grow."""
+        model = self._model
+        self._swept = Revolution(model)
         factor = None if model.thickness is None else self._swept.scalars(model.thickness)
         r, loads = self._swept.jets(model.r0), model.loads
         self._fields = PointFields(r, model.material, loads.magnetic, factor, loads.natural, loads.contacts)
         if isinstance(model.meridian.embedding, Deviated):
             s = np.sort(model.meridian.mesh.geometry.x[:, 0])
-            w0 = model.meridian.embedding.w0(np.column_stack([s, 0 * s])) / model.material.h
+            embedding = model.meridian.embedding
+            deviations = (*embedding.deviations, *grown(loads.growing, mu))
+            w0 = replace(embedding, deviations=deviations).w0(np.column_stack([s, 0 * s])) / model.material.h
             self._fields.constant[W0] = np.column_stack([w0[:-1], w0[1:]])
         self._constant = self._around(self._fields.constant)
 
@@ -156,6 +172,9 @@ class RevolvedGatherer:
         """The displaced surface with its fields at the amplitudes mu, on rank 0; None on other ranks."""
         if self.comm.rank:
             return None
+        if self._model.growing and mu:
+            self._model.system.place(mu)
+            self._take_placement(mu)
         self._model.system.set(u)
         swept, values = self._swept, self._fields.of(self._swept.jets(self._model.u), mu or {})
         pressure = self._model.cell_pressures(State(u, dict(mu))) if mu else None
@@ -166,6 +185,15 @@ class RevolvedGatherer:
 
     def _around(self, fields: Mapping[str, Array]) -> dict[str, Array]:
         return {name: self._swept.around(values, self._fields.weight) for name, values in fields.items()}
+
+
+def grown(growing: Mapping[str, tuple[Deviation, ...]], mu: Mapping[str, float]) -> list[Deviation]:
+    """Imperfections that grow, at their amplitudes."""
+
+    def times(deviation: Deviation, factor: float) -> Deviation:
+        return lambda places: factor * deviation(places)
+
+    return [times(deviation, mu.get(name, 0.0)) for name, each in growing.items() for deviation in each]
 
 
 def turned(surface: Surface, azimuth: float) -> Surface:

@@ -35,6 +35,8 @@ def caption(h: float, nu: float, row: Row, own: Sequence[str] = ()) -> str:
         parts.append(f"{_value('force', row)}, {_value('w_over_h', row)} {amplitude('force').place}")
     if "load_factor" in row:
         parts.append(f"{_value('load_factor', row)}, {_value('w_over_h', row)}")
+    if row["amplitude"] == "time":
+        parts.append(_value("time", row))
     parts += [_value(name, row) for name in own if row[name]]
     return ", ".join(parts)
 

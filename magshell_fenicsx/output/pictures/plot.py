@@ -5,6 +5,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.output.fields.frequencies import read_frequencies
 from magshell_fenicsx.output.fields.modes import mode_caption, mode_file, wave_number
@@ -103,6 +105,8 @@ def draw(folder: Path, point: int | None = None) -> list[str]:
 def draw_animation(folder: Path) -> str:
     """Draw animation.gif: all steps of a programme, or the part in which the last amplitude varied; see `draw`.
 
+    After a motion only it, at equal times.
+
     Returns
     -------
     The name of the file.
@@ -111,13 +115,26 @@ def draw_animation(folder: Path) -> str:
     amplitude = str(rows[-1]["amplitude"])
     parts = drawn_parts(rows, amplitude) if amplitude else []
     part = rows if len(parts) != 1 else parts[0].rows
-    count = min(len(part), MOST_FRAMES)
-    chosen = [part[round(i * (len(part) - 1) / max(count - 1, 1))] for i in range(count)]
+    chosen = in_true_time(rows) if amplitude == "time" else _evenly(part)
     surfaces, abouts = zip(*(_point(folder, row) for row in chosen), strict=True)
     about: About = abouts[0]
     titles = [caption(about.h, about.nu, row) for row in chosen]
     write_whole(folder / "animation.gif", animated(surfaces, about.h, titles, rows, chosen))
     return "animation.gif"
+
+
+def in_true_time(rows: Sequence[Row]) -> list[Row]:
+    """The rows of a path's motions that are nearest to equal times."""
+    part = [row for row in rows if row["amplitude"] == "time"]
+    times = np.array([float(row["time"]) for row in part])
+    shortest = np.diff(np.unique(times)).min(initial=np.ptp(times) or 1.0)
+    count = int(min(MOST_FRAMES, np.ptp(times) / shortest + 1.5))
+    return [part[int(np.abs(times - t).argmin())] for t in np.linspace(times[0], times[-1], count)]
+
+
+def _evenly(part: Sequence[Row]) -> list[Row]:
+    count = min(len(part), MOST_FRAMES)
+    return [part[round(i * (len(part) - 1) / max(count - 1, 1))] for i in range(count)]
 
 
 def _rows(folder: Path) -> list[Row]:

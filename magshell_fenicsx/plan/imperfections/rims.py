@@ -15,6 +15,7 @@ from magshell_fenicsx.plan.outline import Outline
 Array = NDArray[np.float64]
 CORNERS = 128  # of a closed curve: a cubic spline through them is exact to 1e-6 of its size
 STEPS, ROUNDS = 40, 12
+SAME_RIM = 0.02  # of the element size
 MOST_RIMS = 60  # more would take gmsh minutes
 WIDEST = 4.0  # distance in the chart over the distance on the surface
 AXIS = 1e-9  # over R
@@ -69,6 +70,16 @@ def spots(found: Iterable[tuple[str, Flaw]], drawn: Outline, turn: float) -> lis
         radius = float(np.linalg.norm(curve - centre, axis=1).max())
         placed.append(Spot(centre, radius, flaw.size, False, flaw.rim, curve if flaw.rim else None))
     return placed
+
+
+def different(local: Iterable[Spot]) -> tuple[Array, ...]:
+    """The rims that need edges of elements; of several that are nearly the same, the first."""
+    kept: list[Array] = []
+    for spot in local:
+        rim = spot.rim
+        if rim is not None and all(np.abs(rim - other).max() > SAME_RIM * spot.size for other in kept):
+            kept.append(rim)
+    return tuple(kept)
 
 
 def contour(key: str, flaw: Flaw, drawn: Outline, turn: float, centre: Array, part: float) -> Array:

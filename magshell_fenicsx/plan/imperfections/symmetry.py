@@ -1,7 +1,8 @@
 """The symmetry that the imperfections of a case leave, by their values."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache
+from math import atan2
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,7 @@ from magshell_fenicsx.mesh.mirror import Mirror
 from magshell_fenicsx.plan.imperfections.flaw import Flaw
 from magshell_fenicsx.plan.imperfections.rims import AXIS, contour
 from magshell_fenicsx.plan.outline import Outline
-from magshell_fenicsx.plan.symmetry import Leaves
+from magshell_fenicsx.plan.symmetry import Leaves, common_azimuth
 from magshell_fenicsx.plan.turning import ANGLES
 
 Array = NDArray[np.float64]
@@ -51,7 +52,18 @@ def leaves(found: Mapping[str, Flaw], drawn: Outline, *, each: bool) -> list[Lea
         turned = [np.concatenate([_w0(group, places @ rotation(a)) for group in groups]) for a in ANGLES[:24]]
         if not all(_same(turned[0], w0) for w0 in turned):
             reason = "an imperfection differs around e3"
-    return [Leaves(reason, off if drawn.round else (), mirrors)]
+    if not drawn.round:
+        return [Leaves(reason, (), mirrors)]
+    if common_azimuth(off) is None:
+        return [Leaves(reason, (), mirrors, azimuths=_between(off))]
+    return [Leaves(reason, off, mirrors)]
+
+
+def _between(centres: Sequence[Array]) -> tuple[float, ...]:
+    """Azimuths (rad) of the planes through e3 that map the first place to itself or to one at the same distance."""
+    first, *others = centres
+    alike = [x for x in others if abs(np.hypot(*x[:2]) - np.hypot(*first[:2])) < AXIS and abs(x[2] - first[2]) < AXIS]
+    return tuple((atan2(x[1], x[0]) + atan2(first[1], first[0])) / 2 for x in (first, *alike))
 
 
 def _sample(found: Mapping[str, Flaw], drawn: Outline) -> Array:

@@ -1,6 +1,7 @@
 """The number of a run that `--result` names."""
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -10,9 +11,11 @@ from scipy.interpolate import barycentric_interpolate
 
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.output.store.table import COLUMNS, OWN_MODES, TEXTS
+from magshell_fenicsx.quantities.registry import IN_TIME
 
-NUMBERS = tuple(column for column in COLUMNS if column not in TEXTS)
-FORMS = "write knockdown, barrier, critical_field, COLUMN@COLUMN=VALUE or COLUMN@end, with columns of path.csv"
+NUMBERS = (*(column for column in COLUMNS if column not in TEXTS), *(q.name for q in IN_TIME))
+IN_SUMMARY = ("knockdown", "barrier", "critical_field", "snap_time")
+FORMS = f"write {', '.join(IN_SUMMARY)}, COLUMN@COLUMN=VALUE or COLUMN@end, with columns of path.csv"
 
 
 @dataclass(frozen=True)
@@ -45,9 +48,13 @@ class Scalar:
         if self.name == "critical_field":
             points = (point["value"] for point in summary["limit_points"] if point["amplitude"] == "lambda_m")
             return _number(next(points, None))
+        if self.name == "snap_time":
+            return _number(next((snap["time"] for snap in summary.get("snaps", ())), None))
         path = [row for row in rows if row["branch"] == "0" and row["mode"] in OWN_MODES]
+        if not path or not {self.column, self.at} - {"end"} <= set(path[0]):
+            return None
         if self.at == "end":
-            return float(path[-1][self.column]) if path else None
+            return float(path[-1][self.column])
         return _crossing(path, self.column, self.at, self.value)
 
 
@@ -64,12 +71,12 @@ def parse_scalar(text: str) -> Scalar:
     >>> parse_scalar("force@w_over_h=10")
     Scalar(name='force@w_over_h=10', column='force', at='w_over_h', value=10.0)
     """
-    if text in ("knockdown", "barrier", "critical_field"):
+    if text in IN_SUMMARY:
         return Scalar(text)
     column, _, place = text.partition("@")
     at, _, number = place.partition("=")
     for name in (column, at) if place != "end" else (column,):
-        if name not in NUMBERS:
+        if name not in NUMBERS and not re.fullmatch(r"\w+_u[xyz]", name):  # of a named point
             raise CaseError(f"--result {text}: {name or 'nothing'} is no column with numbers; {FORMS}")
     if place == "end":
         return Scalar(text, column, "end")

@@ -13,6 +13,7 @@ from mpi4py import MPI
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.run.rows import RowMaker
+from magshell_fenicsx.run.snaps import snaps
 from magshell_fenicsx.run.summary import Result
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.perfect import with_modes
@@ -37,7 +38,7 @@ def path(scene: Scene, results: list[str]) -> Report:
             result.stopped = str(e)
 
     wall, cpu = timed(comm, solve)
-    found = {"knockdown": result.knockdown, "limit_points": result.limit_points}
+    found = {"knockdown": result.knockdown, "limit_points": result.limit_points, "snaps": snaps(result.rows)}
     rows = [{key: str(value) for key, value in row.items()} for row in result.rows]
     newton = scene.newton
     return {

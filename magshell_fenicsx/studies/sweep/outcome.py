@@ -39,7 +39,7 @@ class Outcome:
     barrier
         The energy barrier over E h R²; None if the case does not ask for one.
     limit
-        The first limit point (the one of k_d) as in summary.json; None if there is none.
+        The first limit point (the one of k_d) as in summary.json, or the event that ends a motion; None without.
     stopped
         Why the run ended before its target; None if it reached it.
     curve
@@ -72,7 +72,7 @@ def outcome_of(result: Result, found: Found, factorisations: int, wall_s: float)
     columns = dict.fromkeys((*CURVE, *result.scene.extra_columns))
     return Outcome(
         knockdown=result.knockdown,
-        limit=next(iter(limits), None),
+        limit=next(iter(limits), None) or _event(result),
         stopped=result.stopped,
         dofs=result.scene.model.system.dofs,
         wall_s=round(wall_s, 3),
@@ -81,6 +81,16 @@ def outcome_of(result: Result, found: Found, factorisations: int, wall_s: float)
         factorisations=factorisations,
         barrier=result.barrier,
     )
+
+
+def _event(result: Result) -> dict[str, Any] | None:
+    """The point at which a motion has ended by an event or an instability, in the form of a limit point."""
+    last, steps = result.rows[-1], result.scene.case.programme
+    until = getattr(steps[-1].load, "until", "") if steps else ""
+    if result.stopped or last["amplitude"] != "time" or until not in ("event", "instability"):
+        return None
+    known = {key: last[key] for key in ("p_over_pc", "w_pole_over_h", "amplitude")}
+    return {**known, "kind": until, "mode": "", "value": last["time"]}
 
 
 def save(outcome: Outcome, case: Case, file: Path) -> None:

@@ -1,0 +1,70 @@
+"""Steps in time up to a given time, of a fixed length or for a tolerance."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from magshell_fenicsx.continuation.motion import Motion
+from magshell_fenicsx.continuation.transient import Integrator
+
+
+@dataclass(frozen=True)
+class TimeSteps:
+    """How long steps are.
+
+    Attributes
+    ----------
+    fixed
+        The longest step, which is halved only where Newton's method fails; None: steps for the tolerance.
+    tolerance
+        Largest estimated error of a step, over the system's length (O. C. Zienkiewicz and Y. M. Xie, Earthquake
+        Engineering and Structural Dynamics 20, 1991).
+    first
+        First step without `fixed`.
+    """
+
+    fixed: float | None
+    tolerance: float
+    first: float
+
+
+class TimeStopped(RuntimeError):
+    """The motion could not be followed; `motion` is its last state."""
+
+    def __init__(self, reason: str, motion: Motion) -> None:
+        super().__init__(reason)
+        self.motion = motion
+
+
+def advance(integrator: Integrator, now: Motion, end: float, steps: TimeSteps, dt: float) -> tuple[Motion, float]:
+    """The motion at a later time, and the step to go on with.
+
+    Parameters
+    ----------
+    dt
+        The step to begin with.
+
+    Raises
+    ------
+    TimeStopped
+        If even a tiny step fails.
+    """
+    begin = now.t
+    while end - now.t > 1e-9 * (end - begin):
+        way = end - now.t
+        dt = min(dt, steps.fixed or dt)
+        length = way / np.ceil(way / dt * (1 - 1e-9))
+        found = integrator.step(now, length)
+        if isinstance(found, str):
+            dt = length / 2
+            if dt < 1e-6 * steps.first:
+                raise TimeStopped(f"the time step has become too small: {found}", now)
+            continue
+        if steps.fixed is None:
+            change = 0.9 * (steps.tolerance / max(found.error, 1e-300)) ** (1 / 3)
+            if found.error > steps.tolerance and length > 1e-6 * steps.first:
+                dt = max(0.3, change) * length
+                continue
+            dt = length * min(change, 2.0) if change > 1.3 else max(length, dt if change > 1 else 0.0)
+        now = found
+    return replace(now, t=end), dt

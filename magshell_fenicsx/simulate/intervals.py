@@ -1,0 +1,96 @@
+"""The rows of a motion: its states at given times, from the journal where it has them."""
+
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from scipy.optimize import brentq
+
+from magshell_fenicsx.continuation.advance import TimeSteps, TimeStopped, advance
+from magshell_fenicsx.continuation.device import Held
+from magshell_fenicsx.continuation.motion import Motion
+from magshell_fenicsx.continuation.point import Point
+from magshell_fenicsx.continuation.system import State
+from magshell_fenicsx.continuation.transient import Integrator
+from magshell_fenicsx.simulate.record import Stopped
+from magshell_fenicsx.simulate.scene import Scene
+from magshell_fenicsx.simulate.stage import staged
+
+CLOSE = 1e-9  # of an interval: the error of an event's time
+
+
+@dataclass
+class Intervals:
+    """Moves a scene from row to row.
+
+    Parameters
+    ----------
+    held
+        See `staged`.
+    marks
+        Times at which loads have kinks or jumps.
+    """
+
+    scene: Scene
+    integrator: Integrator
+    held: Mapping[str, Held]
+    steps: TimeSteps
+    marks: Collection[float]
+
+    @property
+    def memory(self) -> Any:
+        """What the shell remembers besides its state: strains of branches."""
+        return self.integrator.viscous.memory if self.integrator.viscous else None
+
+    @memory.setter
+    def memory(self, known: Any) -> None:
+        if self.integrator.viscous:
+            self.integrator.viscous.memory = known
+
+    def moved(self, now: Motion, dt: float, end: float) -> tuple[Motion, float]:
+        """The motion at a later time, and the step to go on with."""
+        for t in [*sorted(t for t in self.marks if now.t < t < end), end]:
+            if now.t in self.marks:  # a jump: the acceleration after it
+                now = self.integrator.begin(now.t, now.u, now.v, now)
+            now, dt = advance(self.integrator, now, t, self.steps, dt)
+        return now, dt
+
+    def crossing(self, now: Motion, dt: float, end: Motion, beyond: Callable[[Motion], float]) -> float:
+        """The time between two motions at which a function of them changes its sign; the memory stays."""
+        memory, close, ends = self.memory, CLOSE * (end.t - now.t), {now.t: now, end.t: end}
+
+        def at(t: float) -> float:
+            self.memory = memory
+            return beyond(ends.get(t) or self.moved(now, dt, t)[0])
+
+        found = float(brentq(at, now.t, end.t, xtol=close))
+        self.memory = memory
+        return max(found, now.t + close)
+
+    def journalled(self, now: Motion, dt: float, end: float) -> tuple[Motion, float, Point]:
+        """The motion at a later time, the step to go on with, and the point there; in the journal as two points."""
+        scene, integrator = self.scene, self.integrator
+        first, second = scene.journal.replay(), None
+        if isinstance(first, Point):
+            second = scene.journal.replay()
+        again = integrator.viscous is not None  # the journal has no place for a branch's strains: computed again
+        if isinstance(first, Point) and isinstance(second, Point) and not again:
+            mu, potentials = dict(first.state.mu), dict(second.state.mu)
+            u, v, a = first.state.u, first.du, second.state.u
+            return Motion(first.s, u, v, a, mu, second.s, second.dmu, potentials, second.error), first.dmu, first
+        before = integrator.steps, integrator.iterations, integrator.factorisation.count
+        scene.progress.trying(Point(State(now.u, now.mu), now.t, now.v, 0.0, 0, 0), end - now.t)
+        try:
+            now, dt = self.moved(now, dt, end)
+        except TimeStopped as e:
+            raise Stopped(str(e)) from None
+        spent = integrator.iterations - before[1], integrator.factorisation.count - before[2]
+        state = scene.model.system.placed(State(now.u, now.mu))
+        stage = staged(scene, state, self.held)
+        pivots = stage.newton.factor_at(stage.enter(state)).negative_pivots
+        point = Point(state, now.t, now.v, dt, pivots, pivots, *spent)
+        rest = Point(State(now.a, now.potentials), now.work, 0.0 * now.a, now.dissipated, 0, 0, error=now.error)
+        for known, part in ((first, point), (second, rest)):
+            if known is None:
+                scene.journal.record(part)
+        return now, dt, point

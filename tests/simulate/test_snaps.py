@@ -1,0 +1,61 @@
+"""Snaps of a dimpled hemisphere, the pressure held or the volume: at rest it is on a branch of the static path."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from magshell_fenicsx import Case, Scene
+from magshell_fenicsx.case.source import CaseError, Source
+from magshell_fenicsx.run.rows import rows
+from magshell_fenicsx.run.snaps import snaps
+from magshell_fenicsx.simulate.follow import follow
+from magshell_fenicsx.simulate.trace import trace
+
+
+def case_of(radius: float, amplitude: float, **load: Any) -> Case:
+    dimple = {"kind": "dimple", "amplitude": amplitude, "width": 3.2}
+    shell = {"geometry": "hemisphere", "radius_to_thickness": radius, "poisson_ratio": 0.5, "imperfections": [dimple]}
+    pressed = {"kind": "pressure", "until": "limit"} | load
+    data = {"shell": shell, "boundary": {"equator": "clamped"}, "symmetry": "axisymmetric", "mesh": {"refinement": 0.4}}
+    return Case.from_source(Source("test", data | {"loading": pressed}))
+
+
+def test_volume_held() -> None:
+    """The volume turns just beyond the largest pressure; the shell snaps to the branch on which it grows again."""
+    scene = Scene(case_of(100, 0.5, then="snap", hold={"pressure": "conjugate"}))
+    records = list(follow(scene))
+    table = rows(scene, records)
+    (made,) = snaps(table)
+    fold, rest = records[made["point"]], records[made["rest"]]
+    volumes = [row["volume_change"] for row in table[made["point"] :]]
+    assert volumes == pytest.approx(np.full(len(volumes), volumes[0]), rel=1e-9)
+    assert table[made["rest"]]["p_over_pc"] < 0.9 * table[made["point"]]["p_over_pc"]
+    assert made["dissipated"] == pytest.approx(table[made["point"]]["stored"] - table[made["rest"]]["stored"], rel=0.05)
+    unit, there = scene.conjugate_unit("pressure"), []
+    path = trace(scene, "pressure", fold, first=-0.01, until="points", steps=30)
+    for record in path:  # by arc length past the fold, to a larger change of volume
+        there.append(record.point.state)
+        if record.point.negative_pivots == 1 and record.point.negative_pivots_held == 0 and len(there) > 5:
+            break
+    target = [volumes[0] * unit]
+    *_, static = trace(scene, "pressure", there[-1], control="conjugate", until="target", targets=target)
+    assert rest.point.state.u == pytest.approx(static.point.state.u, abs=1e-6 * 0.01)
+    assert rest.point.state.mu == pytest.approx(static.point.state.mu, rel=1e-6)
+
+
+def test_pressure_held() -> None:
+    """A thick shell everts and holds the pressure; the static path comes there through all folds, and from above."""
+    scene = Scene(case_of(20, 3.0, then="snap"))
+    *_, rest = follow(scene)
+    assert rest.label == "target"
+    p = rest.point.state.mu["pressure"]
+    path = trace(scene, "pressure", until="target", targets=[0.6], first=0.1)
+    away = [record for record in path if record.label == "target"][-1]
+    *_, static = trace(scene, "pressure", away, control="load", until="target", targets=[p])
+    assert rest.point.state.u == pytest.approx(static.point.state.u, abs=1e-6 / 20)
+
+
+def test_own_conjugate_goes_with_a_limit() -> None:
+    with pytest.raises(CaseError, match=r"hold.pressure: this step drives pressure"):
+        case_of(100, 0.5, hold={"pressure": "conjugate"}, until="target", volume_change=-0.01)
