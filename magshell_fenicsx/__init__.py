@@ -5,7 +5,8 @@
 >>> ms.run(case).knockdown  # doctest: +SKIP
 0.32624
 
-A scene is stepped through by `follow` (the history of its case) and `trace` (a path in any amplitude); `columns`,
+A scene is stepped through by `follow` (the history of its case) and `trace` (a path in any amplitude); `gradient`
+differentiates what was found by amplitudes, numbers of the case and fields; `columns`,
 `surface`, `polydata`, `curve` and `picture` show what was found; an `OwnTerm` is one's own energy,
 whose `Free` parameters are amplitudes too.
 """
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from magshell_fenicsx.run.rows import columns
     from magshell_fenicsx.run.run import Result, run
     from magshell_fenicsx.simulate.follow import follow
+    from magshell_fenicsx.simulate.gradient import gradient
     from magshell_fenicsx.simulate.record import Record, Stopped
     from magshell_fenicsx.simulate.scene import Scene
     from magshell_fenicsx.simulate.search import solutions
@@ -48,6 +50,7 @@ __all__ = [
     "curve",
     "fold_at",
     "follow",
+    "gradient",
     "kinematics",
     "picture",
     "polydata",
@@ -68,6 +71,7 @@ _ROOMS = {
     "run.rows": "columns",
     "run.run": "Result run",
     "simulate.follow": "follow",
+    "simulate.gradient": "gradient",
     "simulate.record": "Record Stopped",
     "simulate.scene": "Scene",
     "simulate.search": "solutions",

@@ -4,12 +4,10 @@ import gc
 import signal
 import sys
 import traceback
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
-from magshell_fenicsx.case.source import CaseError
+from magshell_fenicsx.ending import STOPPED, exit_codes, failure, print_line, world
 from magshell_fenicsx.platform.completion import case_files, left_to_the_shell
 from magshell_fenicsx.platform.plain import typer
 from magshell_fenicsx.platform.version import __version__
@@ -31,41 +29,9 @@ Result = Annotated[
     str, typer.Option(metavar="NAME", help="knockdown, critical_field, force@w_over_h=10, energy@end, ...")
 ]
 
-INVALID, STOPPED = 2, 3
-
 
 def _folder(default: str) -> Any:
     return typer.Option(help=f"output folder; default {default}", autocompletion=left_to_the_shell)
-
-
-def _world() -> Any:
-    """All ranks."""
-    from mpi4py import MPI
-
-    return MPI.COMM_WORLD
-
-
-def _print_line(line: str) -> None:
-    if _world().rank == 0:
-        print(line, flush=True)
-
-
-def _failure(message: str, code: int) -> typer.Exit:
-    if _world().rank:
-        return typer.Exit()  # mpirun ends the job at the first failing rank, and may lose the message of rank 0
-    print(message, file=sys.stderr, flush=True)
-    return typer.Exit(code)
-
-
-@contextmanager
-def _exit_codes(invalid: type[Exception] = CaseError, stopped: tuple[type[Exception], ...] = ()) -> Iterator[None]:
-    """Turn an invalid input (`CaseError` and `invalid`) or an early stop into a message and its exit code."""
-    try:
-        yield
-    except (CaseError, invalid) as e:
-        raise _failure(str(e), INVALID) from None
-    except stopped as e:
-        raise _failure(f"stopped early: {e}", STOPPED) from None
 
 
 def main() -> None:
@@ -74,16 +40,16 @@ def main() -> None:
     try:
         app(prog_name="magshell")  # the same name however it was started: completion depends on it
     except Exception:
-        if _world().size == 1:
+        if world().size == 1:
             raise
         traceback.print_exc()
         sys.stderr.flush()
-        _world().Abort(1)  # the other ranks would wait for this one for ever
+        world().Abort(1)  # the other ranks would wait for this one for ever
 
 
 def _print_version(requested: bool) -> None:
     if requested:
-        _print_line(f"magshell_fenicsx {__version__}")
+        print_line(f"magshell_fenicsx {__version__}")
         raise typer.Exit
 
 
@@ -117,23 +83,23 @@ def run(
 
     folder = out or Path("results") / case.stem
     try:
-        with _exit_codes(MeshError, stopped=(DiskError,)):
+        with exit_codes(MeshError, stopped=(DiskError,)):
             read = Case.load(case, set_ or [])
-            with live_line(_world().size, _print_line) as (say, tell):
+            with live_line(world().size, print_line) as (say, tell):
                 result = run_case(
                     read, folder, say=say, tell=tell, resume=resume, time_limit=time_limit, pictures=pictures
                 )
     except AlreadyComplete as e:
-        _print_line(f"complete already: {e.summary['points']} points; results in {folder}/")
+        print_line(f"complete already: {e.summary['points']} points; results in {folder}/")
         return
     gc.freeze()  # the process ends soon: another garbage collection takes longer than importing dolfinx
     if result.knockdown is not None:
-        _print_line(f"knockdown factor k_d = {result.knockdown:.9g}")
+        print_line(f"knockdown factor k_d = {result.knockdown:.9g}")
     if result.barrier is not None:
-        _print_line(f"energy barrier = {result.barrier:.9g} E h R^2")
-    _print_line(f"results in {folder}/")
+        print_line(f"energy barrier = {result.barrier:.9g} E h R^2")
+    print_line(f"results in {folder}/")
     if result.stopped:
-        raise _failure(f"stopped early: {result.stopped}", STOPPED)
+        raise failure(f"stopped early: {result.stopped}", STOPPED)
 
 
 @app.command()
@@ -151,11 +117,11 @@ def sweep(
     from magshell_fenicsx.studies.sweep.sweep import sweep as run_sweep
 
     folder = out or Path("results") / f"{case.stem}_sweep"
-    with _exit_codes(stopped=(DiskError,)):
+    with exit_codes(stopped=(DiskError,)):
         done = run_sweep(case, over, set_ or [], folder, full_paths=full_paths)
-    _print_line(f"results in {folder}/")
+    print_line(f"results in {folder}/")
     if done.stopped:
-        raise _failure(f"{done.stopped} of {len(done.points)} points stopped early; sweep.csv says why", STOPPED)
+        raise failure(f"{done.stopped} of {len(done.points)} points stopped early; sweep.csv says why", STOPPED)
 
 
 @app.command()
@@ -175,14 +141,14 @@ def study(
     from magshell_fenicsx.studies.study.study import study as run_study
 
     folder = out or Path("results") / f"{case.stem}_study"
-    with _exit_codes(stopped=(DiskError,)):
+    with exit_codes(stopped=(DiskError,)):
         numbers, settings = parse_ranks(ranks), set_ or []
         done = run_study(
             case, over, settings, result=result, reference=reference, ranks=numbers, repeat=repeat, out=folder
         )
-    _print_line(f"results in {folder}/")
+    print_line(f"results in {folder}/")
     if done.without_result:
-        raise _failure(f"{done.without_result} of {len(done.rows)} runs gave no {result}; study.csv says why", STOPPED)
+        raise failure(f"{done.without_result} of {len(done.rows)} runs gave no {result}; study.csv says why", STOPPED)
 
 
 @app.command()
@@ -210,7 +176,7 @@ def ensemble(
     from magshell_fenicsx.studies.ensemble.ensemble import ensemble as run_ensemble
 
     folder = out or Path("results") / f"{case.stem}_ensemble"
-    with _exit_codes(stopped=(DiskError,)):
+    with exit_codes(stopped=(DiskError,)):
         done = run_ensemble(
             case,
             set_ or [],
@@ -224,12 +190,31 @@ def ensemble(
             resume=resume,
         )
     if (mean := done.content["mean"]) is not None:
-        _print_line(f"mean {result} = {mean:.6g} of {len(done.rows) - done.without_result} samples")
-    _print_line(f"results in {folder}/")
+        print_line(f"mean {result} = {mean:.6g} of {len(done.rows) - done.without_result} samples")
+    print_line(f"results in {folder}/")
     if done.without_result:
-        raise _failure(
+        raise failure(
             f"{done.without_result} of {len(done.rows)} samples have no {result}; samples.csv says why", STOPPED
         )
+
+
+@app.command()
+def design(
+    case: CaseFile,
+    set_: Settings = None,
+    out: Annotated[Path | None, _folder("results/<case name>_design/")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="continue the interrupted design in that folder")] = False,
+) -> None:
+    """Vary a case for a result (its section `design`); write the best case, its table and picture, and verify it."""
+    from magshell_fenicsx.mesh.patch import MeshError
+    from magshell_fenicsx.output.store.folder import DiskError
+    from magshell_fenicsx.studies.design.design import Missed
+    from magshell_fenicsx.studies.design.design import design as run_design
+
+    folder = out or Path("results") / f"{case.stem}_design"
+    with exit_codes(MeshError, stopped=(DiskError, Missed)):
+        run_design(case, set_ or [], folder, resume=resume, say=print_line)
+    print_line(f"results in {folder}/")
 
 
 @app.command()
@@ -251,13 +236,13 @@ def compare(
     from magshell_fenicsx.studies.compare.runs import NothingLeft
 
     folder = out or Path("results") / f"{case.stem}_compare"
-    with _exit_codes(stopped=(DiskError, NothingLeft)):
+    with exit_codes(stopped=(DiskError, NothingLeft)):
         refinements = parse_refinements(shell, solid)
-        done = run_comparison(case, set_ or [], refinements=refinements, out=folder, say=_print_line)
+        done = run_comparison(case, set_ or [], refinements=refinements, out=folder, say=print_line)
     difference = done.content["difference"]
     if difference is not None:
-        _print_line(f"{done.content['result']}: the solid differs from the shell by {100 * difference:+.3f} %")
-    _print_line(f"results in {folder}/")
+        print_line(f"{done.content['result']}: the solid differs from the shell by {100 * difference:+.3f} %")
+    print_line(f"results in {folder}/")
 
 
 @app.command()
@@ -273,11 +258,11 @@ def plot(
     from magshell_fenicsx.output.pictures.plot import plot as plot_again
     from magshell_fenicsx.output.pictures.render import NoScreen
 
-    if _world().rank:
+    if world().rank:
         return
-    with _exit_codes(stopped=(NoScreen, OSError)):
+    with exit_codes(stopped=(NoScreen, OSError)):
         drawn = plot_again(folder, point, animation)
-    _print_line(f"{', '.join(drawn)} in {folder}/")
+    print_line(f"{', '.join(drawn)} in {folder}/")
 
 
 @app.command()
@@ -287,8 +272,8 @@ def check(case: CaseFile, set_: Settings = None) -> None:
     from magshell_fenicsx.plan.check import describe
     from magshell_fenicsx.simulate.perfect import with_modes
 
-    with _exit_codes():
-        _print_line(describe(with_modes(Case.load(case, set_ or []), _world())))
+    with exit_codes():
+        print_line(describe(with_modes(Case.load(case, set_ or []), world())))
 
 
 def _names() -> list[str]:
@@ -312,13 +297,13 @@ def example(
 
     if name is None:
         for known, where in examples().items():
-            _print_line(f"{known:24} {title(where)}")
+            print_line(f"{known:24} {title(where)}")
         return
-    if _world().rank:
+    if world().rank:
         return
-    with _exit_codes():
+    with exit_codes():
         written = write_example(name, file)
-    _print_line(f"wrote {', '.join(map(str, written))}")
+    print_line(f"wrote {', '.join(map(str, written))}")
 
 
 @app.command()
@@ -329,7 +314,7 @@ def schema(
     from magshell_fenicsx.case.reference import reference
     from magshell_fenicsx.case.schema import schema_text
 
-    _print_line((reference() if markdown else schema_text()).removesuffix("\n"))
+    print_line((reference() if markdown else schema_text()).removesuffix("\n"))
 
 
 @app.command()
@@ -341,10 +326,10 @@ def info(
     from magshell_fenicsx.simulate.precompile import precompile
 
     for name, number in versions().items():
-        _print_line(f"{name:18} {number}")
-    _print_line(f"{'blas':18} {fast_blas() or 'reference (slow: install OpenBLAS)'}")
-    _print_line(f"{'ranks':18} {_world().size}")
-    _print_line(f"{'kernel cache':18} {kernel_cache()}")
+        print_line(f"{name:18} {number}")
+    print_line(f"{'blas':18} {fast_blas() or 'reference (slow: install OpenBLAS)'}")
+    print_line(f"{'ranks':18} {world().size}")
+    print_line(f"{'kernel cache':18} {kernel_cache()}")
     if compile_:
         for degree in (3, 4):
-            _print_line(f"compiled degree {degree} in {precompile(degree):.1f} s")
+            print_line(f"compiled degree {degree} in {precompile(degree):.1f} s")

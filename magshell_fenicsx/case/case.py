@@ -12,13 +12,14 @@ from pydantic import Field, ModelWrapValidatorHandler, ValidationError, model_va
 from magshell_fenicsx.case.bodies.body import refuse_unfit_bodies, with_units
 from magshell_fenicsx.case.bodies.registered import Bodies
 from magshell_fenicsx.case.boundary import EDGES, BoundarySection, refuse_taken
+from magshell_fenicsx.case.design import DesignSection
 from magshell_fenicsx.case.ensemble import EnsembleSection
 from magshell_fenicsx.case.expressions import is_formula
 from magshell_fenicsx.case.fields import MagneticSection, layer_average
 from magshell_fenicsx.case.file import FileKeys
 from magshell_fenicsx.case.frequencies import FrequenciesSection
 from magshell_fenicsx.case.imperfections.dimple import DimpleSection
-from magshell_fenicsx.case.imperfections.place import ImperfectionSection, places_with_units
+from magshell_fenicsx.case.imperfections.place import Coordinates, ImperfectionSection, places_with_units
 from magshell_fenicsx.case.imperfections.random import RandomSection
 from magshell_fenicsx.case.loading import Loading, ProgrammeStep, programme
 from magshell_fenicsx.case.loads.contact import ContactSection
@@ -42,12 +43,9 @@ from magshell_fenicsx.case.surfaces import CapSurface, MeshSurface, RevolutionSu
 from magshell_fenicsx.case.viscosity import refuse_unfit_viscosity
 from magshell_fenicsx.parts.part import Part, Scales
 from magshell_fenicsx.parts.registered import PARTS, WithParts
-from magshell_fenicsx.parts.section import or_number, texts
+from magshell_fenicsx.parts.section import texts
 
 AnyStep = TypeVar("AnyStep", bound=Step)
-
-
-Place = Annotated[list[Annotated[float, or_number("metre")]], Field(min_length=3, max_length=3)]
 
 
 class Case(WithParts):
@@ -61,7 +59,7 @@ class Case(WithParts):
     """Of `model: solid`"""
     boundary: BoundarySection
     """What is held"""
-    points: dict[str, Place] = Field(default_factory=dict)
+    points: dict[str, Coordinates] = Field(default_factory=dict)
     """Name -> place of what is loaded, held or watched [the shell's length; over R if that has no unit]"""
     magnetic: MagneticSection | None = None
     """Remanence and applied field, which is applied before the load"""
@@ -80,6 +78,8 @@ class Case(WithParts):
     """Natural frequencies at points of the path"""
     ensemble: EnsembleSection | None = None
     """What is random, for `magshell ensemble`"""
+    design: DesignSection | None = None
+    """What varies and what is wanted, for `magshell design`"""
     reactions: bool | None = None
     """Forces and moments of every support as columns of path.csv; by default where a support moves"""
     symmetry: Literal["auto", "none", "half", "axisymmetric"] = "auto"
@@ -322,10 +322,10 @@ class Case(WithParts):
     def outside(self) -> dict[str, str | None]:
         """What is solved besides the case's own keys: the hashes of its mesh file and of its other files."""
         mesh = {"mesh_file": self.shell.digest} if isinstance(self.shell, MeshSurface) else {}
-        sections = dict[str, object](self.imperfections)
+        sections: dict[str, object] = {"magnetic.remanent": self.magnetic.remanent} if self.magnetic else {}
+        sections |= self.imperfections
         sections |= {f"magnetic.applied.sources.{i}": source for i, source in enumerate(self.sources)}
-        files = {key: s.digest for key, s in sections.items() if isinstance(s, FileKeys) and s.file}
-        return mesh | {f"{key}.file": digest for key, digest in files.items()}
+        return mesh | {f"{key}.file": s.digest for key, s in sections.items() if isinstance(s, FileKeys) and s.file}
 
     @classmethod
     def load(cls, file: str | Path, settings: Sequence[str] = ()) -> "Case":

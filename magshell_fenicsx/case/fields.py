@@ -9,6 +9,7 @@ from pydantic import Field, model_validator
 
 from magshell_fenicsx.case.direction import Direction
 from magshell_fenicsx.case.expressions import Formula
+from magshell_fenicsx.case.file import FileKeys
 from magshell_fenicsx.case.sources.registered import Sources
 from magshell_fenicsx.parts.section import FluxDensity, Section
 
@@ -22,16 +23,16 @@ class Layer(Direction):
     """Of the thickness; all add up to one [h]"""
 
 
-class RemanentSection(Direction):
+class RemanentSection(FileKeys, Direction):
     """The remanent flux density B^r; `polar` and `azimuth` belong to the uniform one.
 
     radial: along the normal. tangential: along the meridians, away from e3. expression: components as
     formulas of the undeformed position x, y, z over R. patches: a direction per named patch, "dimple"
     (within its rim) of a hemisphere, those of a mesh, and "rest". layers: from the inner face outwards; a shell takes
-    their average.
+    their average. points: vectors at points, of which each place has the mean, weighted by exp(-(distance/filter)²).
     """
 
-    kind: Literal["uniform", "radial", "tangential", "expression", "patches", "layers"] = "uniform"
+    kind: Literal["uniform", "radial", "tangential", "expression", "patches", "layers", "points"] = "uniform"
     """How it varies in space"""
     flux_density: FluxDensity | None = Field(default=None, ge=-1e3, le=1e3)
     """|B^r|, at most 1000 T; with that of `applied` in place of lambda_m"""
@@ -41,10 +42,16 @@ class RemanentSection(Direction):
     """Of kind: patches: name -> direction"""
     layers: list[Layer] | None = Field(default=None, min_length=1)
     """Of kind: layers: those through the thickness"""
+    file: str | None = None
+    """Of kind: points: CSV with the columns x, y, z, bx, by, bz, or rho, z, b_rho, b_z of a field that turns about e3;
+    undeformed places over R, vectors over |B^r|, the path from the folder of the case"""
+    filter: float | None = Field(default=None, gt=0, le=10)
+    """Of kind: points: distance over which the points are averaged [R]"""
 
     @model_validator(mode="after")
     def _keys_of_the_kind(self) -> Self:
         belongs = {"components": "expression", "patches": "patches", "layers": "layers"}
+        belongs |= {"file": "points", "filter": "points"}
         for key, kind in belongs.items():
             if (getattr(self, key) is not None) != (self.kind == kind):
                 raise ValueError(f"{key} belongs to kind: {kind}, and must be given there; the kind is {self.kind}")

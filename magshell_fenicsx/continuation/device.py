@@ -75,6 +75,15 @@ class Device:
         """u of a vector (u, y)."""
         return split(x, len(self.names), self.comm)[0]
 
+    def rates(self, x: Vector) -> dict[str, float]:
+        """The changes of the amplitudes along a vector (u, y)."""
+        y = split(x, len(self._names), self.comm)[1]
+        return dict(zip(self._names, (float(v) for v in y * self._unit), strict=True))
+
+    def joined(self, u: Vector, rows: Amplitudes) -> Vector:
+        """A gradient by (u, y), from those by u and by the amplitudes."""
+        return join(u, np.array([rows[name] for name in self._names]) * self._unit, self.comm)
+
     def residual(self, u: Vector, mu: Amplitudes) -> Vector:
         v, whole = self._split(u, mu)
         return join(self._system.residual(v, whole), self.rows(v, whole), self.comm)

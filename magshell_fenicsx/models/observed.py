@@ -93,6 +93,13 @@ class Observed:
         here = u[self._probes[point]].reshape(-1, 3).sum(axis=0)
         return np.asarray(self.system.comm.allreduce(here))
 
+    def probe(self, point: str) -> Array:
+        """Rows (3, size) that take the displacement at a named vertex from a vector, each rank its part."""
+        rows = np.zeros((3, self.system.size))
+        dofs = np.asarray(self._probes[point]).reshape(-1, 3)
+        rows[np.arange(3), dofs] = 1.0
+        return rows
+
     def touching(self, state: State, approach: str) -> Region:
         """Where a body touches."""
         known, forms = self.contacts[approach]

@@ -6,11 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.controls import read_vectors
 from magshell_fenicsx.case.direction import Direction
 from magshell_fenicsx.case.expressions import formula
-from magshell_fenicsx.case.fields import MagneticSection, layer_average
+from magshell_fenicsx.case.fields import MagneticSection, RemanentSection, layer_average
 from magshell_fenicsx.case.surfaces import MeshSurface
 from magshell_fenicsx.mesh.frame import rotation
+from magshell_fenicsx.models.shell.controls import ByControls, Controls
 from magshell_fenicsx.models.shell.parameters import Magnetisation
 from magshell_fenicsx.models.shell.patterns import Components, Inside, Pattern, WithinRims, radial, tangential
 from magshell_fenicsx.plan.sources.field import in_space
@@ -18,6 +20,19 @@ from magshell_fenicsx.plan.turned import basis as turned_basis
 
 Array = NDArray[np.float64]
 SAME = 1e-9  # part of a direction outside a plane: rounding
+
+
+def by_points(section: RemanentSection, turn: float = 0.0) -> ByControls:
+    """A remanence by vectors at points, in a frame turned about e3 (rad).
+
+    Raises
+    ------
+    CaseError
+        If its file cannot be read.
+    """
+    places, vectors = read_vectors(section.path, "magnetic.remanent.file")
+    assert section.filter
+    return ByControls(Controls(places, section.filter), vectors, rotation(turn) if turn else None)
 
 
 def magnetisation(
@@ -40,6 +55,8 @@ def magnetisation(
         remanent = tangential
     elif section.components:
         remanent = Components([formula(text) for text in section.components], rotation(turn) if turn else None)
+    elif section.file:
+        remanent = by_points(section, turn)
     elif section.layers:
         remanent = layer_average(section.layers, turn)
     elif section.patches and not isinstance(case.shell, MeshSurface):

@@ -20,6 +20,7 @@ from magshell_fenicsx.mesh.mirror import ROUNDING, Y0, Mirror
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.plan import natural
 from magshell_fenicsx.plan.loads_left import alike, is_image, load_turns
+from magshell_fenicsx.plan.magnetisation import by_points
 from magshell_fenicsx.plan.moves import held_vectors, mirrored, sideways
 from magshell_fenicsx.plan.outline import Outline
 from magshell_fenicsx.plan.sources.field import values
@@ -212,6 +213,10 @@ def _field(case: Case, outline: Outline) -> list[Leaves]:
     fields: list[Callable[[Array], Array]] = [lambda x: np.asarray(x @ G.T)] if G.any() else []
     fields += [vectors_of(texts) for texts in (remanent.components, known) if texts]
     askew = ["a field is not along e3"] if any(_tilted(v) for v in vectors) else []
+    if remanent.file:
+        by_place = by_points(remanent)
+        fields.append(lambda x: by_place(x, x))
+        askew += [] if by_place.controls.around else ["the remanence is given at points in space"]
     if remanent.components and not (outline.span and vector_turns(remanent.components, outline.span)):
         askew.append("the formula of the remanence differs around e3")
     if known and not (outline.span and vector_turns(known, outline.span, in_space=True)):

@@ -12,7 +12,7 @@ from dolfinx.la import InsertMode
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.terms import FormTerm
 from magshell_fenicsx.continuation.fold import Fold, Guess, find_fold, sensitivity
-from magshell_fenicsx.continuation.system import Vector
+from magshell_fenicsx.continuation.system import State, Vector
 from magshell_fenicsx.models.axisymmetric import jets
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.shell.applied import AppliedField
@@ -109,15 +109,11 @@ def _remanence_columns(scene: Scene, fold: Fold) -> dict[str, Vector]:
 
 def _magnetic_column(scene: Scene, fold: Fold, field: Magnetisation) -> Vector:
     model, system = scene.model, scene.model.system
-    terms, fields = _magnetic_terms(scene, field)
     system.set(fold.state.u)
-    for known in fields:
-        known.mu.update({name: fold.state.mu[name] for name in known.names})
     column = system.u.copy()
     column.x.array[:] = 0
-    for term in terms:
+    for term in magnetic_terms(scene, fold.state, field):
         assert term.amplitude
-        term.follow()
         term.add_residual(column.x.array, fold.state.mu[term.amplitude])
     column.x.scatter_reverse(InsertMode.add)
     for held in system.clamped:
@@ -125,8 +121,17 @@ def _magnetic_column(scene: Scene, fold: Fold, field: Magnetisation) -> Vector:
     return np.array(column.x.array[: model.system.size])
 
 
-def _magnetic_terms(scene: Scene, field: Magnetisation) -> tuple[Sequence[FormTerm], Sequence[AppliedField]]:
-    """The model's magnetic terms with another remanence, and the field that they follow."""
+def magnetic_terms(scene: Scene, state: State, field: Magnetisation) -> Sequence[FormTerm]:
+    """The model's magnetic terms with another remanence, at a state whose displacement is set."""
+    terms, fields = _made(scene, field)
+    for known in fields:
+        known.mu.update({name: state.mu[name] for name in known.names})
+    for term in terms:
+        term.follow()
+    return terms
+
+
+def _made(scene: Scene, field: Magnetisation) -> tuple[Sequence[FormTerm], Sequence[AppliedField]]:
     model, log, fields = scene.model, KernelLog(), list[AppliedField]()
     if isinstance(model, MeridianModel):
         u = jets.revolved(model.u)

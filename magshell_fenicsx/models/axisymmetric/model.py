@@ -170,6 +170,10 @@ class MeridianModel(Observed):
         """u/R (3,) at a named point."""
         return self._seen[point](u)
 
+    def probe(self, point: str) -> Array:
+        """See `Observed`."""
+        return self._seen[point].rows(self.system.size)
+
     def _term(self, e: Energy) -> FormTerm:
         u, v = jets.revolved(self.u), jets.revolved(ufl.TestFunction(self.V))
         work, energy = 2 * np.pi * e.work(u, v) if e.work else None, 2 * np.pi * e.of(u)

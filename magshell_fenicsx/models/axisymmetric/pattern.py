@@ -22,9 +22,8 @@ def pattern_field(pattern: Pattern, r0: fem.Function, finer: int = 0) -> fem.Fun
 
 def thickness_field(thickness: Thickness, r0: fem.Function) -> fem.Function:
     """h(x)/h at the nodes of every cell; see `models.shell.thickness`."""
-    assert thickness.of_position
     nodes, _ = places(r0)
-    return nodal_thickness(thickness.of_position(*np.moveaxis(nodes, -1, 0)), nodes, r0.function_space)
+    return nodal_thickness(thickness.at(nodes), nodes, r0.function_space)
 
 
 def places(r0: fem.Function, at: Array | None = None) -> tuple[Array, Array]:

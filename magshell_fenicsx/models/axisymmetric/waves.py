@@ -17,6 +17,7 @@ from petsc4py import PETSc
 
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
+from magshell_fenicsx.assembly.terms import FormTerm
 from magshell_fenicsx.continuation.banded import Banded
 from magshell_fenicsx.continuation.factor import Factorisation
 from magshell_fenicsx.continuation.inverse import nearest_to_zero
@@ -65,8 +66,9 @@ class Waves:
         self.largest = ceil(2.2 * meridian.reach * sqrt(meridian.curvature / system.length)) + 5
         self._m = fem.Constant(V.mesh, 1.0)
         self._factor = fem.Constant(V.mesh, 1.0)
-        kept = [e for e in energies if not e.linear]
+        self._kept = kept = [e for e in energies if not e.linear]
         self._forms = [(e.amplitude, log.compile(f"{e.name} waves", self._second(e))) for e in kept]
+        self._phi, self._energies, self._log = fem.Function(V, name="phi"), list[FormTerm](), log
         self._held_once, self._held = supports.held_waves(V, 1), supports.held_waves(V, 2)
         pattern = next(form for e, (_, form) in zip(kept, self._forms, strict=True) if e.name == INTERIOR)
         self._K = fem_petsc.create_matrix(pattern)
@@ -82,6 +84,17 @@ class Waves:
         self._system.at(state.u, state.mu)
         self._assemble(self._K, state, m, self.held(m))
         return self._K
+
+    def along(self, phi: NDArray[np.float64], m: int) -> list[FormTerm]:
+        """Q_m(phi), summand by summand as energies of the axisymmetric displacement, for one phi and m at a time."""
+        self._phi.x.array[:], self._m.value = phi, m
+        if not self._energies:
+            for e in self._kept:
+                energy, v = self._of_wave(e)
+                twice = ufl.derivative(ufl.derivative(energy, v, self._phi), v, self._phi)
+                form = ufl.replace(twice, {v: ufl.zero(3)})
+                self._energies.append(FormTerm(f"{e.name} along a wave", form, self._system.u, self._log, e.amplitude))
+        return self._energies
 
     def held(self, m: int) -> list[fem.DirichletBC]:
         """What is held at the axis and at the ends: a wave m = 1 may move the axis across itself."""
@@ -153,12 +166,15 @@ class Waves:
         compat.finish_matrix(K, self.V, held)
 
     def _second(self, e: Energy) -> ufl.Form:
-        v, u = fem.Function(self.V), jets.revolved(self._system.u)
-        cosine, sine = jets.wave(v, self._m)
-        energy = np.pi * (e.added(u, cosine) + e.added(u, sine))
+        energy, v = self._of_wave(e)
         gradient = ufl.derivative(energy, v, ufl.TestFunction(self.V))
         hessian = ufl.derivative(gradient, v, ufl.TrialFunction(self.V))
         return self._factor * ufl.replace(hessian, {v: ufl.zero(3)})  # at v = 0 most of it vanishes
+
+    def _of_wave(self, e: Energy) -> tuple[ufl.Form, fem.Function]:
+        v, u = fem.Function(self.V), jets.revolved(self._system.u)
+        cosine, sine = jets.wave(v, self._m)
+        return np.pi * (e.added(u, cosine) + e.added(u, sine)), v
 
 
 def _lagrange(nodes: NDArray[np.float64], at: float) -> list[float]:

@@ -32,6 +32,16 @@ def tangential(r0: Array, n0: Array) -> Array:
 
 
 @dataclass(frozen=True)
+class Uniform:
+    """The same vector (3,) everywhere, as a field."""
+
+    vector: Array
+
+    def __call__(self, r0: Array, n0: Array) -> Array:
+        return np.broadcast_to(self.vector, r0.shape)
+
+
+@dataclass(frozen=True)
 class Components:
     """Three functions of x, y, z, perhaps of a frame whose axes (3, 3), told in this one, are columns of `frame`."""
 

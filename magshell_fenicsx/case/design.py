@@ -1,0 +1,128 @@
+"""The section of a design: what may vary, what is wanted, and what must hold."""
+
+from typing import Annotated, Self
+
+from pydantic import Field, model_validator
+
+from magshell_fenicsx.case.expressions import Formula
+from magshell_fenicsx.parts.section import Section
+
+Point = Annotated[list[float], Field(min_length=3, max_length=3)]
+Bounds = Annotated[list[float], Field(min_length=2, max_length=2)]
+RESULTS = "knockdown, critical_field, or a column of path.csv where the path ends"
+
+
+class ShapeSection(Section):
+    """Where each place should be at the end of the path: the mean square distance over the area is least there."""
+
+    components: Annotated[list[Formula], Field(min_length=3, max_length=3)] | None = None
+    """The wanted place as formulas of the undeformed x, y, z over R [R]"""
+    curve: Annotated[list[Point], Field(min_length=3)] | None = None
+    """Of a strip: points of the curve of its middle line from the root on, which a spline joins; it is scaled to the
+    strip's length [any length]"""
+
+    @model_validator(mode="after")
+    def _one_of_them(self) -> Self:
+        if (self.components is None) == (self.curve is None):
+            raise ValueError("give components or curve")
+        return self
+
+
+class ObjectiveSection(Section):
+    """One of its keys; the results are knockdown, critical_field, or a column of path.csv where the path ends."""
+
+    maximise: str | None = None
+    """A result"""
+    minimise: str | None = None
+    """A result"""
+    reach: str | None = None
+    """A result that should have `value`"""
+    value: float | None = None
+    """Of `reach`"""
+    shape: ShapeSection | None = None
+    """A shape"""
+
+    @model_validator(mode="after")
+    def _one_of_them(self) -> Self:
+        given = [key for key in ("maximise", "minimise", "reach", "shape") if getattr(self, key) is not None]
+        if len(given) != 1:
+            raise ValueError(f"give one of maximise, minimise, reach and shape, here {', '.join(given) or 'none'}")
+        if (self.reach is None) != (self.value is None):
+            raise ValueError("reach and value belong together")
+        return self
+
+    @property
+    def result(self) -> str:
+        """Its name; "shape" of a shape."""
+        return self.maximise or self.minimise or self.reach or "shape"
+
+
+class LimitSection(Section):
+    """A result within bounds."""
+
+    of: str
+    """A result, as in the objective"""
+    least: float | None = None
+    """Its least value"""
+    most: float | None = None
+    """Its largest value"""
+
+    @model_validator(mode="after")
+    def _bounds(self) -> Self:
+        if self.least is None and self.most is None:
+            raise ValueError(f"of: {self.of}: give least, most, or both")
+        return self
+
+
+class RemanenceVariables(Section):
+    """The vectors of the remanence at points, of which each place has a mean; see `kind: points` of the remanence.
+
+    Their directions are free. On a meridian the points lie along it; on a strip along its middle, and vectors stay in
+    the plane of x and z; elsewhere they are spread over the surface, and all of it is modelled.
+    """
+
+    points: Annotated[int, Field(ge=2, le=20_000)] | None = None
+    """How many; without it those of `magnetic.remanent`, kind: points"""
+    filter: float | None = Field(default=None, gt=0, le=10)
+    """Nothing varies over less than this; by default the distance of the points [R]"""
+    magnitude: Bounds | None = None
+    """Least and largest length of a vector; by default lengths stay as they are [|B^r|]"""
+    steps: Annotated[int, Field(ge=2, le=360)] | None = None
+    """At the end polar angles (and azimuths) are rounded to the nearest of so many steps of a turn"""
+
+    @model_validator(mode="after")
+    def _magnitudes(self) -> Self:
+        if self.magnitude and not 0 < self.magnitude[0] < self.magnitude[1] <= 1:
+            raise ValueError(f"magnitude: needs 0 < least < largest <= 1, here {self.magnitude}")
+        return self
+
+
+class DesignSection(Section):
+    """What `magshell design` varies, and for what; every other command takes the case without it."""
+
+    objective: ObjectiveSection
+    """What is wanted"""
+    numbers: dict[str, Bounds] = Field(default_factory=dict)
+    """Key of the case with a number (`magnetic.remanent.polar`, `shell.poisson_ratio`) -> least and largest value"""
+    remanence: RemanenceVariables | None = None
+    """Vectors of the remanence that vary"""
+    constraints: list[LimitSection] = Field(default_factory=list)
+    """Results that must stay within bounds"""
+    iterations: int = Field(default=60, ge=1, le=10_000)
+    """At most so many steps of the optimiser"""
+    verify: float = Field(default=1.5, ge=1, le=10)
+    """The result is run again with `mesh.refinement` times this number"""
+
+    @model_validator(mode="after")
+    def _something_varies(self) -> Self:
+        if not self.numbers and self.remanence is None:
+            raise ValueError("needs numbers or remanence: otherwise nothing varies")
+        for key, (least, most) in self.numbers.items():
+            if not least < most:
+                raise ValueError(f"numbers: {key}: the first bound must be less than the second, here {least}, {most}")
+        return self
+
+    @property
+    def results(self) -> list[str]:
+        """All that are computed: that of the objective first."""
+        return list(dict.fromkeys([self.objective.result, *(limit.of for limit in self.constraints)]))

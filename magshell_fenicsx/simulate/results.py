@@ -1,0 +1,150 @@
+"""Numbers of a state that can be differentiated: their values and their derivatives by the state."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+import ufl
+from dolfinx import fem
+from dolfinx.la import InsertMode
+from mpi4py import MPI
+from numpy.typing import NDArray
+
+from magshell_fenicsx.case.source import CaseError
+from magshell_fenicsx.continuation.system import State, Vector
+from magshell_fenicsx.mesh.frame import rotation
+from magshell_fenicsx.models.axisymmetric.model import MeridianModel
+from magshell_fenicsx.models.reacting import motion_columns
+from magshell_fenicsx.models.shell import kinematics as kin
+from magshell_fenicsx.models.shell.model import ShellModel
+from magshell_fenicsx.quantities.registry import contact_columns
+from magshell_fenicsx.simulate.scene import Scene
+
+Array = NDArray[np.float64]
+Target = Callable[[Array], Array]  # undeformed places (n, 3) over R -> wanted places (n, 3) over R
+
+
+@dataclass(frozen=True)
+class Functional:
+    """A number J(u, mu; p) of a state.
+
+    Attributes
+    ----------
+    by_u, by_mu
+        dJ/du, zero at supports, and dJ/dmu_i where J contains the amplitude itself.
+    potentials
+        c_i: J contains the sum of c_i dPi/dmu_i.
+    energy
+        c: J contains c Pi.
+    """
+
+    value: float
+    by_u: Vector
+    by_mu: Mapping[str, float] = field(default_factory=dict)
+    potentials: Mapping[str, float] = field(default_factory=dict)
+    energy: float = 0.0
+
+
+def functional(scene: Scene, state: State, of: str | Target) -> Functional:
+    """A column of path.csv, or the mean square distance to a target over the area, in R^2; collective.
+
+    Raises
+    ------
+    CaseError
+        If the scene has no such column, or it has no derivative here; the message has those that have one.
+    """
+    model, system = scene.model, scene.model.system
+    if callable(of):
+        return _misfit(scene, state, of)
+    still: Vector = np.zeros(system.size)
+    if of == "energy":
+        by_u = model.multiplicity * system.residual(state.u, state.mu)
+        return Functional(scene.observe(state)["energy"], by_u, energy=model.multiplicity)
+    points = {f"{point}_u{axis}": (point, i) for point in scene.case.points for i, axis in enumerate("xyz")}
+    known = {**dict.fromkeys(_conjugates(scene)), **dict.fromkeys(points), **dict.fromkeys(state.mu)}
+    if of in points:
+        point, i = points[of]
+        by_u = scene.plan.length * (_turned(scene) @ model.probe(point))[i]
+        return Functional(scene.observe(state)[of], system.held(by_u))
+    if of in (conjugates := _conjugates(scene)):
+        name, unit = conjugates[of]
+        by_u = np.asarray(-system.load(state.u, state.mu, name) / unit)
+        value = -system.potential(state.u, state.mu, name) / unit
+        return Functional(value, by_u, potentials={name: -1 / unit})
+    if of in ("w_pole_over_h", "w_over_h") and "pole" in model.normals:
+        by_u = np.asarray(-(model.normals["pole"] @ model.probe("pole")) / scene.plan.material.h)
+        return Functional(scene.observe(state)["w_pole_over_h"], system.held(by_u))
+    name = "pressure" if of == "p_over_pc" else of
+    if name in state.mu:
+        return Functional(state.mu[name], still, {name: 1.0})
+    raise CaseError(f"{of}: has no gradient here; allowed are {', '.join(('energy', 'distance', *known))}")
+
+
+def _conjugates(scene: Scene) -> dict[str, tuple[str, float]]:
+    """Column -> the amplitude whose conjugate it is, and the conjugate's unit."""
+    model, loads = scene.model, scene.plan.loads
+    found = {"volume_change": "pressure"} if loads.pressure else {}
+    found |= {column: name for name, column in motion_columns(loads).items()}
+    found |= {column: name for name, column in scene.sources.items()}
+    for name in model.contacts:
+        found[contact_columns(name)[1]] = name
+    known = {column: (name, scene.conjugate_unit(name)) for column, name in found.items()}
+    for name in (*loads.forces, *loads.dead):
+        if size := model.force_unit if name in loads.forces else model.load_size.get(name, 0.0):
+            column = "w_over_h" if name == loads.displaced else f"w_{name}_over_h"
+            known[column] = name, size * scene.plan.material.h
+    return known
+
+
+def _turned(scene: Scene) -> Array:
+    """From the model's frame to the case's."""
+    return rotation(scene.plan.azimuth).T
+
+
+def offset(scene: Scene, target: Target) -> fem.Function:
+    """The displacement that reaches the target, at the nodes of the model."""
+    model, Q = scene.model, rotation(scene.plan.azimuth)
+    found = fem.Function(model.V)
+    axes = [0, 2] if isinstance(model, MeridianModel) else [0, 1, 2]
+    r0 = model.r0.x.array if isinstance(model, ShellModel | MeridianModel) else model.V.tabulate_dof_coordinates()
+    places = np.zeros((np.size(r0) // len(axes), 3))
+    places[:, axes] = np.reshape(r0, (-1, len(axes)))
+    wanted = target(places @ Q) @ Q.T
+    found.x.array[:] = (wanted - places)[:, axes].ravel()
+    return found
+
+
+def over_area(scene: Scene) -> Callable[[ufl.core.expr.Expr], ufl.Form]:
+    """The integral over the undeformed area of the modelled part; of a solid over its volume."""
+    model = scene.model
+    if isinstance(model, MeridianModel):
+        return lambda f: 2 * np.pi * model.factory.area()(f)
+    if isinstance(model, ShellModel):
+        ratio, dx = kin.area_ratio(model.factory.jets()[0]), model.factory.dx()
+        return lambda f: f * ratio * dx
+    return lambda f: f * ufl.dx(domain=model.V.mesh)
+
+
+def distances(scene: Scene, state: State, target: Target) -> tuple[float, float]:
+    """Root mean square and largest distance to a target at the nodes, over R; collective."""
+    system, away = scene.model.system, offset(scene, target)
+    system.set(state.u)
+    gaps = np.linalg.norm((system.u.x.array - away.x.array).reshape(-1, scene.model.V.dofmap.bs), axis=1)
+    largest = system.comm.allreduce(float(gaps.max(initial=0.0)), MPI.MAX)
+    return float(np.sqrt(_misfit(scene, state, target).value)), largest
+
+
+def _misfit(scene: Scene, state: State, target: Target) -> Functional:
+    model, system = scene.model, scene.model.system
+    over, away = over_area(scene), offset(scene, target)
+    gap, log = system.u - away, model.kernels
+    one = fem.Constant(model.V.mesh, 1.0)
+    square = log.compile("misfit", over(ufl.dot(gap, gap)))
+    area = system.integral(state.u, log.compile("area", over(one)))
+    slope = log.compile("misfit slope", over(2 * ufl.dot(gap, ufl.TestFunction(model.V))))
+    system.set(state.u)
+    vector = fem.Function(model.V)
+    fem.assemble_vector(vector.x.array, slope)
+    vector.x.scatter_reverse(InsertMode.add)
+    by_u = system.held(np.array(vector.x.array[: system.size]))
+    return Functional(system.integral(state.u, square) / area, np.asarray(by_u / area))

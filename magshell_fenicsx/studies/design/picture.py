@@ -1,0 +1,41 @@
+"""design.png: the results over the evaluations, and the remanence."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magshell_fenicsx.studies.design.variables import Variables
+
+Array = NDArray[np.float64]
+
+
+def draw_design(rows: Sequence[dict[str, Any]], results: Sequence[str], vary: Variables, x: Array, file: Path) -> None:
+    """Write the picture."""
+    from matplotlib.figure import Figure
+
+    panels = 1 + (vary.controls is not None)
+    figure = Figure(figsize=(4.6 * panels, 3.8), dpi=160, layout="constrained")
+    history, *others = figure.subplots(1, panels, squeeze=False)[0]
+    number = np.array([row["evaluation"] for row in rows])
+    for result in results:
+        values = np.array([np.nan if row[result] is None else row[result] for row in rows], dtype=float)
+        name = "mean square distance over R²" if result == "shape" else result
+        (line,) = history.plot(number, values, "-", linewidth=0.8, label=name)
+        best = np.array([row["best"] for row in rows], dtype=bool)
+        history.plot(number[best], values[best], "o", markersize=3, color=line.get_color())
+        if result == "shape":
+            history.set_yscale("log")
+    history.set(xlabel="evaluation (dots: the best so far)")
+    history.legend(frameon=False, fontsize=8)
+    if vary.controls is not None:
+        places, vectors = vary.controls.places, vary.vectors(x)
+        across = "rho" if vary.controls.around else "x"
+        others[0].plot(places[:, 0], places[:, -1], ".", color="0.6", markersize=3)
+        others[0].quiver(places[:, 0], places[:, -1], vectors[:, 0], vectors[:, -1], color="C3", width=0.006)
+        others[0].set(xlabel=f"{across}/R", ylabel="z/R", title=r"remanence over $|B^\mathrm{r}|$, undeformed")
+        others[0].set_aspect("equal", adjustable="datalim")
+        others[0].margins(0.2)
+    figure.savefig(file)

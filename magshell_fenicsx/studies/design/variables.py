@@ -1,0 +1,233 @@
+"""The variables of a design as one vector, and the case that a vector stands for.
+
+Numbers run from 0 to 1 between their bounds. Each vector of the remanence has a polar angle, an azimuth where it is not
+kept in a plane, and its length where that varies, from 0 to 1 between its bounds. So all bounds are bounds of single
+variables.
+"""
+
+import copy
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from magshell_fenicsx.assembly.field_derivative import FieldGradient
+from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.controls import read_vectors, write_vectors
+from magshell_fenicsx.case.design import DesignSection
+from magshell_fenicsx.case.source import CaseError, Source
+from magshell_fenicsx.models.shell.controls import ByControls, Controls
+from magshell_fenicsx.plan.magnetisation import magnetisation
+from magshell_fenicsx.plan.outline import outline
+from magshell_fenicsx.plan.planner import make_plan
+from magshell_fenicsx.simulate.numbers import number_of
+from magshell_fenicsx.simulate.scene import Scene
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Variables:
+    """What varies.
+
+    Attributes
+    ----------
+    case
+        At the start.
+    keys, bounds
+        Of the numbers; (numbers, 2).
+    controls, start
+        Of the remanence, None without; its vectors at the start.
+    lengths
+        Least and largest length of a vector; None: they stay as they are.
+    """
+
+    source: Source
+    case: Case
+    keys: tuple[str, ...]
+    bounds: Array
+    controls: Controls | None
+    start: Array
+    lengths: tuple[float, float] | None
+
+    @property
+    def planar(self) -> bool:
+        """Whether the vectors stay in a plane."""
+        return self.controls is not None and (self.controls.around or not self.controls.places[:, 1].any())
+
+    @property
+    def first(self) -> Array:
+        """The vector of the case itself."""
+        numbers = np.array([number_of(self.case, key) for key in self.keys])
+        parts = [(numbers - self.bounds[:, 0]) / np.ptp(self.bounds, axis=1)]
+        if self.controls is not None:
+            size = np.linalg.norm(self.start, axis=1)
+            across = self.start[:, 0] if self.planar else np.hypot(*self.start[:, :2].T)
+            parts.append(np.arctan2(across, self.start[:, -1]))
+            if not self.planar:
+                parts.append(np.arctan2(self.start[:, 1], self.start[:, 0]))
+            if self.lengths:
+                parts.append((size - self.lengths[0]) / (self.lengths[1] - self.lengths[0]))
+        return np.concatenate(parts)
+
+    @property
+    def limits(self) -> list[tuple[float | None, float | None]]:
+        """Bounds of the vector."""
+        free: list[tuple[float | None, float | None]] = [(None, None)] * (
+            0 if self.controls is None else len(self.start) * (1 if self.planar else 2)
+        )
+        sizes = len(self.start) if self.lengths else 0
+        return [*[(0.0, 1.0)] * len(self.keys), *free, *[(0.0, 1.0)] * sizes]
+
+    def numbers(self, x: Array) -> dict[str, float]:
+        """Key -> value."""
+        low, high = self.bounds.T
+        values = low + x[: len(self.keys)] * (high - low)
+        return dict(zip(self.keys, map(float, values), strict=True))
+
+    def vectors(self, x: Array) -> Array:
+        """The remanence at its points, (n, 3) or (n, 2)."""
+        return self._polar(x)[0]
+
+    def gradient(self, x: Array, scene: Scene, found: dict[str, float | FieldGradient]) -> Array:
+        """A gradient by the vector from those of `simulate.gradient`."""
+        numbers = np.array([found[key] for key in self.keys]) * np.ptp(self.bounds, axis=1)
+        field = found.get("remanence")
+        if not isinstance(field, FieldGradient) or self.controls is None:
+            return np.asarray(numbers)
+        magnetic = scene.plan.loads.magnetic
+        assert magnetic
+        assert isinstance(magnetic.remanent, ByControls)
+        comm = field.field.function_space.mesh.comm
+        forces = comm.allreduce(magnetic.remanent.pulled(field.places, field.forces))
+        return np.concatenate([numbers, *(np.sum(forces * way, axis=1) for way in self._polar(x)[1])])
+
+    def _polar(self, x: Array) -> tuple[Array, list[Array]]:
+        """Vectors, and their derivatives by each of their variables."""
+        n, rest = len(self.start), x[len(self.keys) :]
+        polar, *more = rest.reshape(-1, n)
+        s, c = np.sin(polar), np.cos(polar)
+        size, grows = np.linalg.norm(self.start, axis=1), 0.0
+        if self.lengths:
+            grows = self.lengths[1] - self.lengths[0]
+            size = self.lengths[0] + more[-1] * grows
+        one = size[:, None]
+        if self.planar:
+            still = [] if self.controls and self.controls.around else [0 * s]
+            unit, turned = (np.stack(v, axis=1) for v in ([s, *still, c], [c, *still, -s]))
+            ways = [one * turned]
+        else:
+            a, b = np.cos(more[0]), np.sin(more[0])
+            unit = np.stack([s * a, s * b, c], axis=1)
+            ways = [one * np.stack([c * a, c * b, -s], axis=1), one * np.stack([-s * b, s * a, 0 * s], axis=1)]
+        return one * unit, [*ways, *([grows * unit] if self.lengths else [])]
+
+    def rounded(self, x: Array, steps: int) -> Array:
+        """The vector with angles at the nearest of so many steps of a turn."""
+        x, n = np.array(x), len(self.start) * (1 if self.planar else 2)
+        angles = slice(len(self.keys), len(self.keys) + n)
+        x[angles] = np.round(x[angles] * steps / (2 * np.pi)) * 2 * np.pi / steps
+        return x
+
+    def write(self, x: Array, file: Path) -> None:
+        """Write the vectors."""
+        if self.controls is not None:
+            write_vectors(file, self.controls.places, self.vectors(x))
+
+    def data(self, x: Array, vectors: str) -> dict[str, Any]:
+        """The case of a vector as plain data; `vectors` is the file of the remanence."""
+        data = copy.deepcopy(self.source.data)
+        data.pop("design", None)
+        for key, value in self.numbers(x).items():
+            section, names = data, key.split(".")
+            for name in names[:-1]:
+                section = section[int(name)] if isinstance(section, list) else section.setdefault(name, {})
+            section[int(names[-1]) if isinstance(section, list) else names[-1]] = value
+        if self.controls is not None:
+            known = data["magnetic"].get("remanent", {})
+            kept = {"flux_density": known["flux_density"]} if "flux_density" in known else {}
+            data["magnetic"]["remanent"] = {"kind": "points", "file": vectors, "filter": self.controls.width, **kept}
+        return data
+
+    def case_of(self, x: Array, vectors: Path) -> Case:
+        """The case of a vector, whose remanence is in a file."""
+        data = self.data(x, str(vectors.absolute()))
+        return Case.from_source(Source(self.source.name, data, folder=self.source.folder))
+
+
+def variables(source: Source, case: Case, design: DesignSection) -> Variables:
+    """What a design varies.
+
+    Raises
+    ------
+    CaseError
+        If a key has no number or starts beyond its bounds, or there is no remanence to vary.
+    """
+    for key, (low, high) in design.numbers.items():
+        if not low <= (value := number_of(case, key)) <= high:
+            raise CaseError(f"design.numbers: {key}: the case starts at {value:g}, beyond {low:g} to {high:g}")
+    controls, start = None, np.asarray(np.zeros((0, 3)))
+    if design.remanence:
+        controls, start = _controls(case, design)
+        if not (case.shell.geometry == "strip" or controls.around):
+            source = copy.deepcopy(source)
+            source.data["symmetry"] = "none"
+            case = Case.from_source(source)
+    lengths = design.remanence and design.remanence.magnitude
+    sizes = np.linalg.norm(start, axis=1)
+    if lengths and not (lengths[0] - 1e-9 <= sizes.min() and sizes.max() <= lengths[1] + 1e-9):
+        raise CaseError(
+            f"design.remanence.magnitude: the vectors start with lengths {sizes.min():g} to {sizes.max():g}, beyond "
+            f"{lengths[0]:g} to {lengths[1]:g}"
+        )
+    bounds = np.array(list(design.numbers.values()), dtype=float).reshape(-1, 2)
+    return Variables(
+        source, case, tuple(design.numbers), bounds, controls, start, (lengths[0], lengths[1]) if lengths else None
+    )
+
+
+def _controls(case: Case, design: DesignSection) -> tuple[Controls, Array]:
+    """The points of the remanence, and its vectors there at the start."""
+    assert design.remanence
+    magnetic, count, width = case.magnetic, design.remanence.points, design.remanence.filter
+    if magnetic is None or not case.lambda_m:
+        raise CaseError("design.remanence: the case has no field, so no result depends on the remanence")
+    if count is None:
+        if not magnetic.remanent.file:
+            raise CaseError("design.remanence: give points, or magnetic.remanent of kind: points")
+        places, vectors = read_vectors(magnetic.remanent.path, "magnetic.remanent.file")
+        return Controls(places, width or magnetic.remanent.filter or 1.0), vectors
+    plan = make_plan(case)
+    places = _places(case, count)
+    field = magnetisation(magnetic, case, 0.0, plan.within)
+    if field.patches is not None:
+        raise CaseError("design.remanence.points: the remanence starts by patches of a mesh: start from another kind")
+    if callable(field.remanent):
+        normals = places / np.maximum(np.linalg.norm(places, axis=1, keepdims=True), 1e-300)
+        vectors = np.array(field.remanent(places[:, None], normals[:, None])[:, 0])
+    else:
+        vectors = np.tile(np.asarray(field.remanent, dtype=float), (count, 1))
+    gaps = scipy.spatial.cKDTree(places).query(places, [2])[0]
+    if plan.meridian:
+        places, vectors = places[:, [0, 2]], vectors[:, [0, 2]]
+    return Controls(places, width or float(np.median(gaps))), vectors
+
+
+def _places(case: Case, count: int) -> Array:
+    """Points (n, 3) along a meridian or a strip, or far from each other on the surface."""
+    plan = make_plan(case)
+    if plan.meridian:
+        sample = plan.meridian.sample()
+        return np.asarray(sample[np.linspace(0, len(sample) - 1, count).round().astype(int)] * [1.0, 0.0, 1.0])
+    if case.shell.geometry == "strip":
+        along = np.linspace(0.0, 1.0, count)
+        return np.column_stack([along, 0 * along, 0 * along])
+    sample = outline(case).sample()
+    chosen, away = [0], np.full(len(sample), np.inf)
+    while len(chosen) < min(count, len(sample)):
+        away = np.minimum(away, np.linalg.norm(sample - sample[chosen[-1]], axis=1))
+        chosen.append(int(np.argmax(away)))
+    return np.asarray(sample[chosen])

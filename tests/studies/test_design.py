@@ -1,0 +1,163 @@
+"""Designs: what is reached, kept, said and resumed; SciPy's optimisers are trusted, gradients tested elsewhere."""
+
+import csv
+import json
+from collections.abc import Callable
+from importlib import import_module
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command import magshell
+from conftest import CASES, draw_nothing
+from numpy.typing import NDArray
+
+from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.controls import read_vectors
+from magshell_fenicsx.run.run import run
+from magshell_fenicsx.studies.design.design import design
+
+Array = NDArray[np.float64]
+STRIP = """
+shell: {geometry: strip, radius_to_thickness: 100, width: 0.1, poisson_ratio: 0.2}
+boundary: {root: clamped}
+points: {tip: [1, 0, 0]}
+magnetic: {lambda_m: 1.0e-4, remanent: {polar: 90}, applied: {polar: 0}}
+mesh: {degree: 2}
+symmetry: none
+"""
+TURN = "design: {objective: {reach: tip_uz, value: 0.5}, remanence: {points: 5}, iterations: 6}\n"
+
+
+@pytest.fixture(autouse=True)
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    draw_nothing(monkeypatch)
+
+
+@pytest.fixture
+def strip(tmp_path: Path) -> Callable[[str], Path]:
+    def write(section: str) -> Path:
+        (tmp_path / "strip.yaml").write_text(STRIP + section)
+        return tmp_path / "strip.yaml"
+
+    return write
+
+
+def rows(folder: Path) -> list[dict[str, str]]:
+    with (folder / "design.csv").open(encoding="utf-8") as stream:
+        return list(csv.DictReader(stream))
+
+
+@pytest.mark.slow
+def test_reach_interrupt_and_resume(
+    strip: Callable[[str], Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An interrupted design ends as one that was not; its best case runs as it is, to the same number."""
+    case, room = strip(TURN), import_module("magshell_fenicsx.studies.design.design")
+    evaluate, count = room.evaluate, [0]
+
+    def stopping(*arguments: object) -> object:
+        count[0] += 1
+        if count[0] == 3:
+            raise KeyboardInterrupt
+        return evaluate(*arguments)
+
+    monkeypatch.setattr(room, "evaluate", stopping)
+    with pytest.raises(KeyboardInterrupt):
+        design(case, out=tmp_path / "out")
+    assert len(rows(tmp_path / "out")) == 2
+    design(case, out=tmp_path / "out", resume=True)
+    computed = count[0]
+    whole = rows(tmp_path / "out")
+    assert computed == len(whole) + 1  # the interrupted one twice, no other
+    content = design(case, out=tmp_path / "out")
+    assert count[0] == computed
+    assert rows(tmp_path / "out") == whole
+    assert content["best"]["tip_uz"] == pytest.approx(0.5, rel=1e-3)
+    best = run(Case.load(tmp_path / "out/best.yaml"))
+    assert best.rows[-1]["tip_uz"] == pytest.approx(content["best"]["tip_uz"], rel=1e-9)
+    vectors = read_vectors(tmp_path / "out/best.csv", "")[1]
+    assert np.linalg.norm(vectors, axis=1) == pytest.approx(1)
+    assert content["verified"]["tip_uz"] == pytest.approx(content["best"]["tip_uz"], rel=1e-2)
+
+
+@pytest.mark.slow
+def test_numbers_between_bounds_and_a_constraint(strip: Callable[[str], Path], tmp_path: Path) -> None:
+    """The deflection is largest at the bound of the field that a constraint on the shortening gives."""
+    kept = "[{of: tip_ux, least: -0.2}]"
+    varied = "{magnetic.lambda_m: [1.0e-5, 2.0e-4]}"
+    section = f"{{objective: {{maximise: tip_uz}}, numbers: {varied}, constraints: {kept}, iterations: 8}}"
+    content = design(strip(f"design: {section}\n"), out=tmp_path / "out")
+    assert content["best"]["tip_ux"] == pytest.approx(-0.2, rel=1e-3)
+    assert 1e-5 < content["numbers"]["magnetic.lambda_m"] < 2e-4
+
+
+def test_a_variable_without_influence(strip: Callable[[str], Path], tmp_path: Path) -> None:
+    """The azimuth of a field along e3."""
+    section = "{objective: {maximise: tip_uz}, numbers: {magnetic.applied.azimuth: [-10, 10]}}"
+    done = magshell("design", strip(f"design: {section}\n"), "--out", tmp_path / "out")
+    assert done.returncode == 3
+    assert "warning: magnetic.applied.azimuth has no influence on tip_uz" in done.stdout
+    assert "no variable has an influence on tip_uz" in done.stderr
+
+
+@pytest.mark.slow
+def test_a_target_out_of_reach(strip: Callable[[str], Path], tmp_path: Path) -> None:
+    section = "{objective: {reach: tip_uz, value: 0.99}, numbers: {magnetic.lambda_m: [5.0e-5, 2.0e-4]}, iterations: 4}"
+    done = magshell("design", strip(f"design: {section}\n"), "--out", tmp_path / "out")
+    assert done.returncode == 3
+    assert "tip_uz = 0.99 is not reached within the bounds: the nearest found is" in done.stderr
+    assert (tmp_path / "out/best.yaml").exists()
+    content = json.loads((tmp_path / "out/summary.json").read_text())
+    assert content["numbers"]["magnetic.lambda_m"] == pytest.approx(2e-4)
+
+
+@pytest.mark.parametrize(
+    ("section", "message"),
+    [
+        ("", "design: is missing: it says what varies and what is wanted"),
+        ("design: {objective: {minimise: tip_ux}}", "needs numbers or remanence: otherwise nothing varies"),
+        ("design: {objective: {}, remanence: {}}", "give one of maximise, minimise, reach and shape, here none"),
+        ("design: {objective: {reach: tip_ux}, remanence: {}}", "reach and value belong together"),
+        ("design: {objective: {shape: {}}, remanence: {}}", "give components or curve"),
+        ("design: {objective: {minimise: tip_ux}, remanence: {}}", "design.remanence: give points, or"),
+        (
+            "design: {objective: {minimise: tip_ux}, numbers: {magnetic.lambda_m: [1, 2]}}",
+            "design.numbers: magnetic.lambda_m: the case starts at 0.0001, beyond 1 to 2",
+        ),
+        (
+            "design: {objective: {minimise: tip_ux}, remanence: {points: 3, magnitude: [0.1, 0.5]}}",
+            "design.remanence.magnitude: the vectors start with lengths 1 to 1, beyond 0.1 to 0.5",
+        ),
+        (
+            "design: {objective: {shape: {curve: [[1, 0, 0], [2, 0, 0], [3, 0, 0]]}}, remanence: {points: 3}}",
+            "design.objective.shape.curve: begins at",
+        ),
+        (
+            "design: {objective: {minimise: sideways}, remanence: {points: 3}}",
+            "sideways: has no gradient here; allowed",
+        ),
+    ],
+)
+def test_mistakes(strip: Callable[[str], Path], tmp_path: Path, section: str, message: str) -> None:
+    done = magshell("design", strip(f"{section}\n"), "--out", tmp_path / "out")
+    assert done.returncode == 2
+    assert message in done.stderr
+
+
+@pytest.mark.slow
+def test_strip_that_becomes_half_a_circle(tmp_path: Path) -> None:
+    """Within 1 % of the strip's length everywhere, on a finer mesh too."""
+    coarse = ["mesh.degree=2", "symmetry=none", "design.iterations=13"]
+    content = design(CASES / "designed_strip.yaml", coarse, tmp_path)
+    assert content["best"]["largest_distance"] < 0.01
+    assert content["verified"]["largest_distance"] < 0.01
+
+
+@pytest.mark.slow
+def test_hemisphere_that_buckles_late(tmp_path: Path) -> None:
+    """1.3 times the knockdown factor of the uniform remanence of the same magnitude; waves are looked at too."""
+    content = design(CASES / "designed_hemisphere.yaml", ["design.iterations=3", "design.verify=2"], tmp_path)
+    assert content["start"]["knockdown"] == pytest.approx(0.447276, rel=1e-5)
+    assert content["best"]["knockdown"] > 1.3 * content["start"]["knockdown"]
+    assert content["verified"]["knockdown"] == pytest.approx(content["best"]["knockdown"], rel=5e-4)
