@@ -77,12 +77,12 @@ class Device:
 
     def rates(self, x: Vector) -> dict[str, float]:
         """The changes of the amplitudes along a vector (u, y)."""
-        y = split(x, len(self._names), self.comm)[1]
-        return dict(zip(self._names, (float(v) for v in y * self._unit), strict=True))
+        y = split(x, len(self.names), self.comm)[1]
+        return dict(zip(self.names, (float(v) for v in y * self._unit), strict=True))
 
     def joined(self, u: Vector, rows: Amplitudes) -> Vector:
         """A gradient by (u, y), from those by u and by the amplitudes."""
-        return join(u, np.array([rows[name] for name in self._names]) * self._unit, self.comm)
+        return join(u, np.array([rows[name] for name in self.names]) * self._unit, self.comm)
 
     def residual(self, u: Vector, mu: Amplitudes) -> Vector:
         v, whole = self._split(u, mu)
