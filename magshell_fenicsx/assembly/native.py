@@ -7,7 +7,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import cffi  # type: ignore[import-untyped]
+import cffi
 from dolfinx.jit import get_options
 from mpi4py import MPI
 
