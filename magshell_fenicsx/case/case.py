@@ -229,7 +229,7 @@ class Case(WithParts):
                 refuse_unheld(step.key, step.load, self.boundary.conditions())
         refuse_unfit_growth(self.programme, self.imperfections, solid=self.model == "solid")
         density, whole = self.time_unit is not None and self.shell.with_units, isinstance(self.loading, list)
-        refuse_unfit_viscosity(self.shell, density=density, plain=self.model == "shell" and not self.natural)
+        refuse_unfit_viscosity(self.shell, self.natural, density=density, solid=self.model == "solid")
         refuse_unfit_steps(self.programme, self.magnetic, self.lambda_m, whole=whole, density=density)
         return self
 

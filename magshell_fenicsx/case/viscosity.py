@@ -5,6 +5,7 @@ from typing import Annotated, Protocol, TypeAlias
 from pydantic import Field
 
 from magshell_fenicsx.case.history import Time, measured
+from magshell_fenicsx.case.natural import NaturalSection
 from magshell_fenicsx.parts.section import Section, in_units
 
 Ratio: TypeAlias = measured("pascal")  # type: ignore[valid-type]
@@ -30,15 +31,15 @@ class Viscous(Protocol):
     youngs_modulus: float | None
 
 
-def refuse_unfit_viscosity(shell: Viscous, *, density: bool, plain: bool) -> None:
+def refuse_unfit_viscosity(shell: Viscous, natural: NaturalSection | None, *, density: bool, solid: bool) -> None:
     """See that its numbers are positive and that their units have a meaning.
 
     Parameters
     ----------
     density
         Whether times and moduli may have units.
-    plain
-        Whether the model is a shell without a natural shape.
+    solid
+        Whether the model is a solid.
 
     Raises
     ------
@@ -51,8 +52,8 @@ def refuse_unfit_viscosity(shell: Viscous, *, density: bool, plain: bool) -> Non
         unit = "pascal" if key in moduli else "second"
         if value is None:
             continue
-        if not plain:
-            raise ValueError(f"shell.{key}: is of a shell, not of a solid, and not with a natural shape")
+        if solid or (natural and natural.stretch):
+            raise ValueError(f"shell.{key}: is of a shell, not of a solid, and not with natural.stretch")
         if in_units(unit)(value) <= 0:
             raise ValueError(f"shell.{key}: {value}: must be positive")
         if isinstance(value, str) and not density:

@@ -72,17 +72,9 @@ def left(case: Case, outline: Outline, indented: Mapping[str, Array], terms: Seq
         *(_field(case, outline) if case.magnetic and case.lambda_m else []),
         *_natural(case, outline),
         *_loads(case, outline, indented),
-        *_viscous(case),
         *_named(case, outline),
         *(_energy(term, outline) for term in terms),
     ]
-
-
-def _viscous(case: Case) -> list[Leaves]:
-    """A shell in motion is viscous in its surface, not on a meridian."""
-    moves = any(isinstance(s.load, TimeSection) or getattr(s.load, "then", None) for s in case.programme)
-    viscous = case.shell.viscosity is not None or case.shell.relaxation
-    return [Leaves("its viscosity is that of a surface", [], lambda mirror: True)] if moves and viscous else []
 
 
 def common_azimuth(vectors: Vectors) -> float | None:

@@ -15,10 +15,13 @@ from magshell_fenicsx.continuation.device import Held
 from magshell_fenicsx.continuation.motion import Motion
 from magshell_fenicsx.continuation.system import State, Vector, max_abs
 from magshell_fenicsx.continuation.transient import Integrator
+from magshell_fenicsx.models.axisymmetric.model import MeridianModel
+from magshell_fenicsx.models.axisymmetric.viscous import surface_of as of_meridian
 from magshell_fenicsx.models.mass import mass, whole_mass
 from magshell_fenicsx.models.modes import ShellModes
 from magshell_fenicsx.models.shell.model import ShellModel
-from magshell_fenicsx.models.shell.viscous import Branch, Viscosity
+from magshell_fenicsx.models.shell.viscous import surface_of as of_shell
+from magshell_fenicsx.models.viscous import Branch, Viscosity
 from magshell_fenicsx.parts.section import in_units
 from magshell_fenicsx.simulate.histories import LoadsInTime, time_of
 from magshell_fenicsx.simulate.intervals import Intervals
@@ -131,13 +134,14 @@ def viscosity(scene: Scene, state: State) -> Viscosity | None:
     case, shell = scene.case, scene.case.shell
     if shell.viscosity is None and not shell.relaxation:
         return None
-    assert isinstance(scene.model, ShellModel)
-    found = []
+    model, found = scene.model, list[Branch]()
     for branch in shell.relaxation:
         size = float(in_units("pascal")(branch.modulus))
         ratio = size / (shell.youngs_modulus or 1.0) if isinstance(branch.modulus, str) else size
         found.append(Branch(ratio, time_of(case, branch.time)))
-    return Viscosity(scene.model, state.mu, time_of(case, shell.viscosity or 0.0), found)
+    assert isinstance(model, ShellModel | MeridianModel)
+    surface = of_shell(model) if isinstance(model, ShellModel) else of_meridian(model)
+    return Viscosity(model, surface, state.mu, time_of(case, shell.viscosity or 0.0), found)
 
 
 def released(scene: Scene, snap: SnapSection, fold: Record, held: Mapping[str, Held]) -> Records:

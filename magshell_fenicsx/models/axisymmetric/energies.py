@@ -94,7 +94,7 @@ class EnergyFactory:
         j0, nu, h, sigma = self.j0, *self._nu_h(), self.constant(self.sigma)
         dS = ufl.Measure("dS", domain=self.meridian.mesh)
         t = self.thickness and (self.thickness("+"), self.thickness("-"))
-        m, width = self._covector(), ufl.avg(self._width())
+        m, width = self.covector(), ufl.avg(self.width())
         plus, minus = self._natural("+"), self._natural("-")
         natural = (plus, minus) if plus and minus else None
 
@@ -114,7 +114,7 @@ class EnergyFactory:
 
     def moment(self, name: str, facets: Facets, density: Density, amplitude: str) -> Energy:
         """A moment per length about an edge; `density` as of `TermFactory.edge_moment`."""
-        j0, ds, m, width = self.j0, self._ds(facets), self._covector(), self._width()
+        j0, ds, m, width = self.j0, self.ds(facets), self.covector(), self.width()
         return Energy(name, lambda u: density.of(j0, u, m, width, *density.parameters) * ds, amplitude)
 
     def magnetic(self, field: Magnetisation, u: fem.Function) -> list[Energy]:
@@ -151,13 +151,13 @@ class EnergyFactory:
         j0, unit = self.j0, self.constant(self.material.classical_pressure / self.material.h)
 
         def work(u: Jet, v: Jet) -> ufl.Form:
-            return densities.following(j0, u, v, unit) * self._dx()
+            return densities.following(j0, u, v, unit) * self.dx()
 
         return Energy("pressure", lambda u: unit * self.swept_volume(u), "pressure", work=None if potential else work)
 
     def swept_volume(self, u: Jet) -> ufl.Form:
         """Delta V/R^3 per radian where an end moves."""
-        return densities.swept(*self._from_drawn(u)) * self._dx()
+        return densities.swept(*self._from_drawn(u)) * self.dx()
 
     def own(self, term: OwnTerm, amplitude: str | None = None) -> Energy:
         """The energy of a part or one's own, with the amplitude of its name or another; it shares the symmetry."""
@@ -191,7 +191,7 @@ class EnergyFactory:
 
     def volume_change(self, u: Jet) -> ufl.Form:
         """Delta V/R^3 per radian."""
-        return densities.volume(*self._from_drawn(u)) * self._dx()
+        return densities.volume(*self._from_drawn(u)) * self.dx()
 
     def _from_drawn(self, u: Jet) -> tuple[Jet, Jet]:
         """The jets of the drawn placement and of the displacement from there."""
@@ -203,15 +203,15 @@ class EnergyFactory:
     def area(self) -> Integral:
         """Over the undeformed area, per radian as all of these."""
         ratio = kin.area_ratio(self.j0)
-        return lambda f: f * ratio * self._dx()
+        return lambda f: f * ratio * self.dx()
 
     def around(self, facets: Facets) -> Integral:
         """Along the undeformed circle of an end."""
-        return lambda f: f * self.r0[0] * self._ds(facets)
+        return lambda f: f * self.r0[0] * self.ds(facets)
 
     def at_pole(self) -> Integral:
         """The value on the axis, over 2 pi."""
-        return lambda f: f / (2 * np.pi) * self._ds(self.meridian.axis)
+        return lambda f: f / (2 * np.pi) * self.ds(self.meridian.axis)
 
     def patch(self, radius: float) -> Integral:
         """Of f (1 - d^2/radius^2)^2, d the distance in space from the pole."""
@@ -244,22 +244,24 @@ class EnergyFactory:
     def _nu_h(self) -> tuple[fem.Constant, fem.Constant]:
         return self.constant(self.material.nu), self.constant(self.material.h)
 
-    def _dx(self) -> ufl.Measure:
+    def dx(self) -> ufl.Measure:
+        """Of the cells, in the meridian's parameter."""
         return ufl.Measure("dx", domain=self.meridian.mesh, metadata={"quadrature_degree": self._quadrature})
 
     @property
     def _quadrature(self) -> int:
         return 2 * self.degree + 2  # one point more than the surface's 2k: on the axis the densities are rational
 
-    def _ds(self, facets: Facets) -> ufl.Measure:
+    def ds(self, facets: Facets) -> ufl.Measure:
+        """Of some ends."""
         tags = mesh.meshtags(self.meridian.mesh, 0, facets, np.ones_like(facets))
         return ufl.Measure("ds", domain=self.meridian.mesh, subdomain_data=tags)(1)
 
-    def _covector(self) -> Expr:
+    def covector(self) -> Expr:
         """Of an edge, see `kinematics.conormal`: its length is then that per radian."""
         return ufl.as_vector([ufl.FacetNormal(self.meridian.mesh)[0], 0])
 
-    def _width(self) -> Expr:
+    def width(self) -> Expr:
         """Half the length of a cell, as the triangles of the surface have half their height."""
         return ufl.CellVolume(self.meridian.mesh) / 2 * ufl.sqrt(ufl.dot(self.j0.r1, self.j0.r1))
 
@@ -272,5 +274,5 @@ class EnergyFactory:
     def _ends(self, name: str, density: Callable[..., Expr], facets: Facets, *rest: Expr) -> Energy:
         """The bending energy of ends whose normal does not turn freely."""
         j0, t, nu, h, sigma = self.j0, self._t, *self._nu_h(), self.constant(self.sigma)
-        ds, m, width, natural = self._ds(facets), self._covector(), self._width(), self._natural()
+        ds, m, width, natural = self.ds(facets), self.covector(), self.width(), self._natural()
         return Energy(name, lambda u: t * density(j0, u, m, width, nu, t * h, sigma, *rest, natural=natural) * ds)

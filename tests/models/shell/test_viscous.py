@@ -4,11 +4,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+import scipy.linalg
+from along import csr
 from scipy.spatial.transform import Rotation
 
 from magshell_fenicsx import Case, Scene, follow
 from magshell_fenicsx.case.source import CaseError, Source
-from magshell_fenicsx.models.shell.viscous import Viscosity
+from magshell_fenicsx.models.mass import mass
+from magshell_fenicsx.models.shell.viscous import surface_of
+from magshell_fenicsx.models.viscous import Viscosity
 from magshell_fenicsx.run.rows import columns
 
 OMEGA = 3.5160 * np.sqrt(1 / 12) / 50  # of a cantilever, R/h = 50, nu = 0
@@ -58,11 +62,32 @@ def test_creep() -> None:
     assert found["w_over_h"][2:] / found["w_over_h"][1] == pytest.approx(creep[1:] / creep[0], rel=1e-5)
 
 
+def test_damped_vibration_of_a_natural_shape() -> None:
+    """A strip that has rolled up by its natural curvature: a mode of its own, of one freedom too."""
+    strip = {"geometry": "strip", "radius_to_thickness": 50, "poisson_ratio": 0.0, "width": 0.2}
+    data = {"boundary": {"root": "clamped"}, "natural": {"curvature": [1.0, 0, 0]}, "mesh": {"degree": 3, "size": 0.5}}
+    grown: dict[str, Any] = {"kind": "natural", "curvature": 1.0, "control": "load", "points": 1}
+    still = Scene(Case.from_source(Source("test", data | {"shell": strip, "loading": [grown]})))
+    *_, last = follow(still)
+    system = still.model.system
+    K, M = (csr(A).toarray() for A in (system.tangent(last.point.state.u, last.point.state.mu), mass(still.model)))
+    free = np.flatnonzero(system.held(np.ones(system.size)))
+    omega = float(np.sqrt(scipy.linalg.eigh(K[np.ix_(free, free)], M[np.ix_(free, free)], eigvals_only=True)[0]))
+    period, push = 2 * np.pi / omega, {"mode": 1, "displacement": 0.01}
+    step = {"kind": "time", "duration": period, "points": 4, "step": period / 80, "rho_inf": 1.0, "push": push}
+    shell = strip | {"viscosity": 0.1 / omega}
+    scene = Scene(Case.from_source(Source("test", data | {"shell": shell, "loading": [grown, step]})))
+    found = columns(scene, follow(scene))
+    moved = (found["w_over_h"] - scene.observe(last.point.state)["w_over_h"])[-4:] / 0.01
+    damped = exact([1, 0.1, 1], np.arange(1, 5) * np.pi / 2)
+    assert moved / moved[-1] == pytest.approx(damped / damped[-1], abs=1e-2)
+
+
 def test_rigid_motion_is_not_damped() -> None:
     """The velocity of a rotation about a tilted axis, of a strip that is turned already and was bent before."""
     scene = Scene(case_of({"viscosity": 1.0}, {"duration": 1.0}, symmetry="none"))
     model = scene.model
-    viscous = Viscosity(model, {}, 1.0, [])  # type: ignore[arg-type]
+    viscous = Viscosity(model, surface_of(model), {}, 1.0, [])  # type: ignore[arg-type]
     r0 = model.r0.x.array.reshape(-1, 3)
     bent = r0 + np.outer(0.1 * r0[:, 0] ** 2, [0, 0, 1])
     place = bent @ Rotation.from_rotvec([0.3, -0.8, 0.5]).as_matrix().T

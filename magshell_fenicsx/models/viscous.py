@@ -1,0 +1,254 @@
+"""Viscosity of a shell: stresses that follow the rates of its strains, in the elastic law's form.
+
+Kelvin and Voigt: the stress of tau dE/dt and tau dK/dt. A branch of Maxwell, a spring g in series with a dashpot: the
+stress of g q with dq/dt = dE/dt - q/tau, q of the membrane strain and of the curvature. Rates are those of the exact
+strains, so that rigid motions are not damped. Strains are known at the nodes of each cell and interpolated.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import ufl
+from dolfinx import fem
+from numpy.typing import NDArray
+from ufl.core.expr import Expr
+
+from magshell_fenicsx.continuation.system import Amplitudes, Vector, max_abs
+from magshell_fenicsx.models.axisymmetric.model import MeridianModel
+from magshell_fenicsx.models.shell import densities, edges
+from magshell_fenicsx.models.shell import kinematics as kin
+from magshell_fenicsx.models.shell.kinematics import Jet
+from magshell_fenicsx.models.shell.model import ShellModel
+from magshell_fenicsx.models.shell.natural import covariant
+from magshell_fenicsx.models.shell.strains import TangentFrame
+
+Array = NDArray[np.float64]
+SIZE = 12  # numbers of a strain and a change of curvature, symmetric tensors in space
+STEP = 1e-3  # part of the thickness by which a velocity moves the shell for its rate of strain
+
+
+@dataclass(frozen=True)
+class Branch:
+    """A branch of Maxwell: its modulus over Young's, and its relaxation time."""
+
+    modulus: float
+    time: float
+
+
+@dataclass(frozen=True)
+class Edge:
+    """Edges that hold the normal, or lie on a mirror plane.
+
+    Attributes
+    ----------
+    jump
+        Of the deformed jet, by how much the edge is open; of a mirrored edge half of what is between both sides.
+    sides
+        2 for mirrored edges.
+    along
+        Measure of these edges.
+    """
+
+    jump: Callable[[Jet], Expr]
+    sides: int
+    along: ufl.Measure
+
+
+@dataclass(frozen=True)
+class Surface:
+    """What viscous forces need to know of a model, of a shell or of its meridian.
+
+    Attributes
+    ----------
+    stresses
+        Space of what is known of strains, whose nodes are the places.
+    tables
+        From nodal displacements, with ghosts, to jets (6, cells, places, 3).
+    jet, r0, thickness
+        The jet of a field; that of the placement; what multiplies h, None for 1.
+    over
+        Measures of the cells and of the edges between them; energies are multiplied by `whole`.
+    m, widths
+        Covector of an edge, see `kinematics.conormal`; h_e between cells and at ends, see `edges.two_sided`.
+    """
+
+    stresses: fem.FunctionSpace
+    tables: Callable[[Array], Array]
+    jet: Callable[[Expr], Jet]
+    r0: Jet
+    thickness: fem.Function | None
+    over: tuple[ufl.Measure, ufl.Measure]
+    m: Expr
+    widths: tuple[Expr, Expr]
+    ends: Sequence[Edge]
+    folded: bool = False
+    whole: float = 1.0
+
+
+class Viscosity:
+    """The viscous forces of a shell in motion; a `continuation.transient.Viscous`. Compiles kernels.
+
+    Parameters
+    ----------
+    model, surface
+        A shell or a meridian, and what `surface_of` finds of it.
+    mu
+        Amplitudes with the places of supports, which do not move.
+    kelvin
+        Time tau of Kelvin and Voigt; zero without.
+
+    Attributes
+    ----------
+    memory
+        q of each branch, (cells, places, 12).
+    """
+
+    def __init__(
+        self,
+        model: ShellModel | MeridianModel,
+        surface: Surface,
+        mu: Amplitudes,
+        kelvin: float,
+        branches: Sequence[Branch],
+    ) -> None:
+        self._model, self._mu, self._kelvin, self._branches = model, dict(mu), kelvin, branches
+        V, Q, self._jets = model.V, surface.stresses, surface.tables
+        self._frame = TangentFrame.of(self._jets(model.r0.x.array))
+        self._field, self._places = fem.Function(Q, name="viscous"), Q.dofmap.list
+        self._given = _Given(self._field, fem.Function(V), fem.Function(V), fem.Constant(V.mesh, 0.0))
+        works = _works(model, surface, self._given)
+        gradients = [ufl.derivative(surface.whole * work, model.u, ufl.TestFunction(V)) for work in works]
+        self._forms = [model.kernels.compile(f"viscous residual {i}", form) for i, form in enumerate(gradients)]
+        self.memory = [np.zeros((*self._places.shape, SIZE)) for _ in branches]
+        self._known: tuple[Vector, Array] | None = None
+        self._force = np.zeros(model.system.size)
+
+    def force(self, u0: Vector, u1: Vector, v: Vector, part: float, dt: float) -> Vector:
+        """The forces at a part of the step from u0 to u1, with the velocity v there."""
+        at = u0 + part * (u1 - u0)
+        stress = self._kelvin * self._rate(at, v) if self._kelvin else 0.0
+        for branch, q in zip(self._branches, self.memory, strict=True):
+            stress = stress + branch.modulus * (part * self._evolved(branch, q, u0, u1, dt) + (1 - part) * q)
+        self._field.x.array.reshape(-1, SIZE)[self._places] = stress
+        given, system = self._given, self._model.system
+        given.stiffness.value = self.stiffness(dt, 2 / dt) if dt else 0.0
+        for field, displacement in ((given.before, u0), (given.after, at)):
+            field.x.array[:] = system.with_ghosts(displacement, self._mu)
+        self._force = self._model.system.gradient_of(at, self._mu, self._forms)
+        return self._force
+
+    def stiffness(self, dt: float, rate: float) -> float:
+        """What a step adds to the elastic tangent, in parts of it; `rate` is dv/du at its end."""
+        return self._kelvin * rate + sum(b.modulus * _share(b, dt) for b in self._branches)
+
+    def accept(self, u0: Vector, u1: Vector, dt: float) -> Vector:
+        """Go on from u1; the force that the step was solved with."""
+        self.memory = [self._evolved(b, q, u0, u1, dt) for b, q in zip(self._branches, self.memory, strict=True)]
+        return self._force
+
+    def _evolved(self, branch: Branch, q: Array, u0: Vector, u1: Vector, dt: float) -> Array:
+        """q at the end of a step along which the strain grows evenly."""
+        if self._known is None or self._known[0] is not u0:
+            self._known = u0, self._strain(u0)
+        change = self._strain(u1) - self._known[1]
+        return np.asarray(np.exp(-dt / branch.time) * q + _share(branch, dt) * change)
+
+    def _rate(self, u: Vector, v: Vector) -> Array:
+        size = max_abs(self._model.system.comm, v)
+        if size == 0:
+            return np.zeros((*self._places.shape, SIZE))
+        step = STEP * self._model.material.h / size
+        return np.asarray((self._strain(u + step * v) - self._strain(u - step * v)) / (2 * step))
+
+    def _strain(self, u: Vector) -> Array:
+        """(cells, places, 12): E and K as tensors in space."""
+        jets = self._jets(self._model.system.with_ghosts(u, self._mu))
+        tensors = [
+            self._frame.tensor(S) for S in (self._frame.membrane_strain(jets), self._frame.curvature_change(jets))
+        ]
+        return np.concatenate([S[..., [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]] for S in tensors], axis=-1)
+
+
+def _share(branch: Branch, dt: float) -> float:
+    """The part of a strain that grows evenly in a step and that is left in the spring at its end."""
+    return float(-np.expm1(-dt / branch.time) * branch.time / dt) if dt else 1.0
+
+
+@dataclass(frozen=True)
+class _Given:
+    """What viscous forces depend on: stresses at nodes, and two displacements between which edges open, how stiffly."""
+
+    field: fem.Function
+    before: fem.Function
+    after: fem.Function
+    stiffness: fem.Constant
+
+    def opened(self, surface: Surface, jump: Callable[[Jet], Expr]) -> Expr:
+        """The stiffness times the change of an edge's jump, a given number."""
+        after, before = (jump(surface.r0 + surface.jet(field)) for field in (self.after, self.before))
+        return self.stiffness * (after - before)
+
+
+def mirrored_jump(r0: Jet, m: Expr, normal: Expr) -> Callable[[Jet], Expr]:
+    """Half of the jump across a plane with that normal."""
+    nu1, nu2, _ = kin.conormal(r0, m)
+    return lambda r: ufl.dot(kin.normal(r), normal) * ufl.dot(normal, r.r1 * nu1 + r.r2 * nu2)
+
+
+def held_jump(r0: Jet, m: Expr, n0: Expr) -> Callable[[Jet], Expr]:
+    """The jump to the normal that an edge holds."""
+    nu1, nu2, _ = kin.conormal(r0, m)
+    return lambda r: -ufl.dot(n0 - kin.normal(r), r.r1 * nu1 + r.r2 * nu2)
+
+
+def _works(model: ShellModel | MeridianModel, surface: Surface, given: _Given) -> list[ufl.Form]:
+    """The work of given stresses on the strains of u, and on edges as in C0 interior penalty; its gradient are forces.
+
+    Smooth surfaces have no jumps, so that these need no memory: each step closes the edges that it opens.
+    """
+    field, r0, u, t, m = given.field, surface.r0, surface.jet(model.u), surface.thickness, surface.m
+    nu, h, sigma = model.material.nu, model.material.h, model.sigma
+    D = densities.bending_stiffness(h, nu)
+    up = kin.inverse_metric(r0)
+
+    def thick(side: str = "") -> Expr | float:
+        return 1.0 if t is None else (t(side) if side else t)[0]
+
+    def product(S: Expr, T: Expr) -> Expr:
+        a, b = kin.mixed(S, up), kin.mixed(T, up)
+        return (1 - nu) * ufl.tr(ufl.dot(a, b)) + nu * ufl.tr(a) * ufl.tr(b)
+
+    membrane = thick() * product(covariant(r0, field, 0), kin.membrane_strain(r0, u)) / (1 - nu**2)
+    bending = thick() ** 3 * D * product(covariant(r0, field, 6), kin.curvature_change(r0, u))
+    work = (membrane + bending) * kin.area_ratio(r0) * surface.over[0]
+
+    sides = ("+", "-")
+    r0s, us = ([j.side(s) for s in sides] for j in (r0, u))
+    conormals = [kin.conormal(j, m(s)) for j, s in zip(r0s, sides, strict=True)]
+
+    def across(r: Jet) -> Expr:
+        plus, minus = (r.side(s) for s in sides)
+        if surface.folded:
+            return ufl.atan2(*edges.fold_angle(plus, minus, m("+")))
+        return edges.fold_jump(plus, minus, conormals[0][:2], conormals[1][:2])
+
+    def moments(of: Callable[[Jet, str], Expr]) -> Expr:
+        each = zip(r0s, sides, conormals, strict=True)
+        return sum(thick(s) ** 3 * D * densities.moment_of(of(j, s), j, a, b, nu) for j, s, (a, b, _) in each) / 2
+
+    between, at_ends = surface.widths
+    S_J, J = given.opened(surface, across), across(r0 + u)
+    bent = moments(lambda j, s: kin.curvature_change(j, us[sides.index(s)]))
+    stiff = (thick("+") ** 3 + thick("-") ** 3) / 2 * sigma * D / between
+    edge = moments(lambda j, s: covariant(j, field(s), 6)) * J + S_J * (bent + stiff * J)
+    works = [work + edge * (conormals[0][2] + conormals[1][2]) / 2 * surface.over[1]]
+    nu1, nu2, stretch = kin.conormal(r0, m)
+    for end in surface.ends:
+        S_J, J = given.opened(surface, end.jump), end.jump(r0 + u)
+        M, bent = (
+            densities.moment_of(K, r0, nu1, nu2, nu) for K in (covariant(r0, field, 6), kin.curvature_change(r0, u))
+        )
+        edge = M * J + S_J * (bent + end.sides * sigma / at_ends * J)
+        works.append(thick() ** 3 * D * edge * stretch * end.along)
+    return works
