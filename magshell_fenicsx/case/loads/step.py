@@ -189,7 +189,7 @@ class PathStep(Step):
             raise ValueError(f"until: {self.until} {why}: it goes with control: arc")
         if self.then and self.until != "limit":
             raise ValueError("then: snap: goes with until: limit")
-        if "snap" in self.model_fields_set and not self.then:
+        if self.snap != SnapSection() and not self.then:
             raise ValueError("snap: goes with then: snap")
         return self
 
