@@ -93,7 +93,7 @@ class Result:
         """k_d: p/p_c at the first instability under pressure; None if there is none, or at held volume."""
         at_volume = {step.number for step in self.scene.case.programme if step.name in step.load.hold}
         points = (row for row in self.rows if row["label"] in LOCATED and row["amplitude"] == "pressure")
-        return next((float(p["p_over_pc"]) for p in points if not p["branch"] and p["step"] not in at_volume), None)
+        return next((float(p["p_over_pc"]) for p in points if not p["branch"] and p.get("step") not in at_volume), None)
 
     @property
     def value(self) -> float | None:
