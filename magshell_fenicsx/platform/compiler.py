@@ -25,7 +25,7 @@ DECLARATIONS = (
 OTHERS = jit._compile_objects, jit._load_objects, jit.get_cached_module
 _ffi = cffi.FFI()
 _ffi.cdef(DECLARATIONS.replace("_Complex", ""))  # only pointers to them occur, which cffi would need a compiler for
-_known: set[str] = set()
+_loaded: dict[Path, tuple[list[Any], Any]] = {}
 
 
 def _compile_objects(
@@ -57,11 +57,12 @@ def _load_objects(folder: Path, module: str, names: list[str]) -> tuple[list[Any
     if not library.exists():
         found: tuple[list[Any], Any] = OTHERS[1](folder, module, names)
         return found
-    kind = "ufcx_form" if module.startswith("libffcx_forms") else "ufcx_expression"
-    _ffi.cdef("".join(f"extern {kind} {name};\n" for name in names if name not in _known))
-    _known.update(names)
-    lib = _ffi.dlopen(str(library))
-    return [getattr(lib, name) for name in names], SimpleNamespace(ffi=_ffi, lib=lib)
+    if library not in _loaded:
+        kind = "ufcx_form" if module.startswith("libffcx_forms") else "ufcx_expression"
+        _ffi.cdef("".join(f"extern {kind} {name};\n" for name in names), override=True)
+        lib = _ffi.dlopen(str(library))
+        _loaded[library] = [getattr(lib, name) for name in names], SimpleNamespace(ffi=_ffi, lib=lib)
+    return _loaded[library]
 
 
 def _get_cached_module(module: str, names: list[str], folder: Path, timeout: int) -> tuple[Any, Any]:
