@@ -8,28 +8,19 @@ differences of fourth order over steps of h/200, exact to about 1e-9.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from dolfinx import fem
 from mpi4py import MPI
 from numpy.typing import NDArray
 
+from magshell_fenicsx.assembly.assemblers import ResidualAssembler
 from magshell_fenicsx.assembly.parameter import Derivative, FreeParameter
 from magshell_fenicsx.assembly.terms import Term
 
 Array = NDArray[np.float64]
 STEP = 5e-3  # of the length, that the largest displacement of a difference has
 FOURTH = ((-2, 1 / 12), (-1, -2 / 3), (1, 2 / 3), (2, -1 / 12))  # steps and weights
-
-
-class Gradients(Protocol):
-    """See `problem.ResidualAssembler`."""
-
-    names: frozenset[str]
-
-    def add(self, b: Array, factors: Mapping[str, float]) -> None:
-        """Add gradients of terms by name."""
 
 
 class Growing:
@@ -85,7 +76,7 @@ class Growing:
         return found
 
     def parameters(
-        self, terms: Sequence[Term], others: Mapping[str, FreeParameter], gradients: Gradients | None = None
+        self, terms: Sequence[Term], others: Mapping[str, FreeParameter], gradients: ResidualAssembler | None = None
     ) -> dict[str, FreeParameter]:
         """The amplitudes as free parameters of the terms, beside the other ones."""
         return {name: GrowingParameter(GrowingValue(self, name, terms, others), gradients) for name in self._values}
@@ -131,7 +122,7 @@ class GrowingParameter:
     """An amplitude of the placement, as `assembly.parameter.Parameter`."""
 
     constant: GrowingValue
-    gradients: Gradients | None
+    gradients: ResidualAssembler | None
 
     @property
     def slopes(self) -> list[Derivative]:
@@ -152,7 +143,7 @@ class _Slope:
     amplitude: str | None
     by: GrowingValue
     of: Sequence[Term | Derivative]
-    gradients: Gradients | None
+    gradients: ResidualAssembler | None
 
     def energy(self) -> float:
         """On this rank's part."""
