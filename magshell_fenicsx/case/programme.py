@@ -57,12 +57,6 @@ def refuse_unfit_steps(
                 raise ValueError(f"{key}.kind: rotation needs a field: magnetic.lambda_m, not zero")
             if whole and "lambda_m" not in driven:
                 raise ValueError(f"{key}.kind: rotation needs a field: a step of kind: field before it")
-            if magnetic.applied.components or magnetic.applied.sources:
-                what = "components, formulas" if magnetic.applied.components else "sources, magnets and fields"
-                raise ValueError(
-                    f"{key}.kind: rotation: not with magnetic.applied.{what} that do not turn"
-                    + ("; kind: source turns a source" if magnetic.applied.sources else "")
-                )
             if abs(field @ load.to.vector()) > 1 - SAME:
                 where = "magnetic.applied" if "angle" not in driven else "the field at its beginning"
                 raise ValueError(f"{key}.to: must be neither parallel nor opposite to {where}")

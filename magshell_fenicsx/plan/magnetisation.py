@@ -15,8 +15,7 @@ from magshell_fenicsx.mesh.frame import rotation
 from magshell_fenicsx.models.shell.controls import ByControls, Controls
 from magshell_fenicsx.models.shell.parameters import Magnetisation
 from magshell_fenicsx.models.shell.patterns import Components, Inside, Pattern, WithinRims, radial, tangential
-from magshell_fenicsx.plan.sources.field import in_space
-from magshell_fenicsx.plan.turned import basis as turned_basis
+from magshell_fenicsx.plan.sources.field import in_space, turns
 
 Array = NDArray[np.float64]
 SAME = 1e-9  # part of a direction outside a plane: rounding
@@ -66,9 +65,9 @@ def magnetisation(
         remanent = WithinRims(rims, rest) if vectors else rest
     else:
         remanent = section.vector(turn)
-    along = magnetic.applied.vector(turn)
-    basis = [along]
-    for direction in to:
+    known, driven = in_space(case, turn)
+    basis = [magnetic.applied.vector(turn)]
+    for direction in () if known else to:
         away = direction.vector(turn) - np.sum([(direction.vector(turn) @ e) * e for e in basis], axis=0)
         if np.linalg.norm(away) > SAME:
             basis.append(away / np.linalg.norm(away))
@@ -77,12 +76,8 @@ def magnetisation(
     if section.patches and isinstance(case.shell, MeshSurface):
         patches = {name: direction.vector(turn) for name, direction in section.patches.items()}
     Q = rotation(turn)
-    G = Q @ np.array(gradient) @ Q.T if gradient else None
     layers = tuple((layer.fraction, layer.vector(turn)) for layer in section.layers or [])
-    known, driven = in_space(case, turn)
-    if case.sources:
-        G = None  # it is a part of the field in space
-    turned = turned_basis(G, [along, *(direction.vector(turn) for direction in to)]) if G is not None else ()
+    G = Q @ np.array(gradient) @ Q.T if gradient and not known else None
     return Magnetisation(
         remanent,
         applied,
@@ -94,6 +89,6 @@ def magnetisation(
         magnetic.remanence,
         known,
         tuple(basis),
-        turned,
         driven,
+        turns(case, turn),
     )

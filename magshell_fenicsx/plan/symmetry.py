@@ -23,7 +23,7 @@ from magshell_fenicsx.plan.loads_left import alike, is_image, load_turns
 from magshell_fenicsx.plan.magnetisation import by_points
 from magshell_fenicsx.plan.moves import held_vectors, mirrored, sideways
 from magshell_fenicsx.plan.outline import Outline
-from magshell_fenicsx.plan.sources.field import values
+from magshell_fenicsx.plan.sources.field import turns, values
 from magshell_fenicsx.plan.turning import beside, field_turns, scalar_turns, vector_turns, vectors_of
 
 Array = NDArray[np.float64]
@@ -200,7 +200,8 @@ def _field(case: Case, outline: Outline) -> list[Leaves]:
     known = magnetic.applied.components if magnetic.applied.beside else None
     alone = known or not magnetic.applied.beside
     vectors = [d.vector() for d in (*magnetic.remanent.directions(), *([] if alone else [magnetic.applied]))]
-    turning = [load.to.vector() for load in case.loads_of(RotationSection)]
+    whole = turns(case)  # then the rotation is a part of the field at each place
+    turning = [] if whole else [load.to.vector() for load in case.loads_of(RotationSection)]
     remanent, G = magnetic.remanent, np.array(magnetic.applied.gradient or np.zeros((3, 3)))
     fields: list[Callable[[Array], Array]] = [lambda x: np.asarray(x @ G.T)] if G.any() else []
     fields += [vectors_of(texts) for texts in (remanent.components, known) if texts]
@@ -213,7 +214,7 @@ def _field(case: Case, outline: Outline) -> list[Leaves]:
         askew.append("the formula of the remanence differs around e3")
     if known and not (outline.span and vector_turns(known, outline.span, in_space=True)):
         askew.append("the formula of the applied field differs around e3")
-    sources = values(case) if case.sources else []
+    sources = values(case) if case.sources or whole else []
     if sources and not (outline.span and all(field_turns(field, outline.span) for field in sources)):
         askew.append("the field of a source differs around e3")
     if np.abs(G - np.diag([G[0, 0], G[0, 0], G[2, 2]])).max() > PARALLEL:

@@ -200,8 +200,7 @@ AMPLITUDES = {
     )
 }
 # names of terms, and of amplitudes that only the solvers use
-GRADIENTS = tuple(f"lambda_gradient_{i}" for i in range(1, 10))
-INTERNAL = ("push", "lambda_across", "lambda_third", *GRADIENTS, "membrane", "couple")
+INTERNAL = ("push", "lambda_across", "lambda_third", "membrane", "couple")
 OF_SOURCES = ("source_force", "source_torque", "source_work")
 TAKEN = frozenset((*QUANTITIES, *AMPLITUDES, *INTERNAL))
 

@@ -114,7 +114,8 @@ class RunFiles:
         mirror = plan.mirror.turned(plan.azimuth).plane if plan.mirror else None
         about = About(plan.material.h, plan.material.nu, mirror)
         drawn = outlines(plan.loads, self._scene.unloaded().mu, about.h)
-        name = "" if not drawn else DRIVEN if self._scene.sources or self._scene.model.contacts else STILL
+        moves = plan.loads.contacts or (plan.loads.magnetic and plan.loads.magnetic.driven)
+        name = "" if not drawn else DRIVEN if moves else STILL
         self._fields = FieldSeries(self._folder / "fields", about, name)
         sync_folder(self._folder)
         return min(len(self._table.kept), self._fields.kept), self._table.kept

@@ -10,22 +10,24 @@ from magshell_fenicsx.case.loading import ProgrammeStep
 from magshell_fenicsx.case.loads.field import RotationSection
 from magshell_fenicsx.continuation.along import Curve
 from magshell_fenicsx.continuation.system import State
+from magshell_fenicsx.models.shell.driven import carried
 from magshell_fenicsx.models.shell.parameters import ACROSS, Magnetisation
-from magshell_fenicsx.plan.turned import along, at_angle
 
 Array = NDArray[np.float64]
 FIELD = ("lambda_m", *ACROSS)  # amplitudes of the field's components
 
 
 def directions(programme: Sequence[ProgrammeStep], field: Magnetisation | None, turn: float) -> Array:
-    """Unit vectors (steps + 1, components) of the field before each step and after the last, in a turned frame."""
-    if field is None:
-        return np.ones((len(programme) + 1, 1))
-    basis = np.array(field.axes)
-    found = [np.eye(len(basis))[0]]
+    """Unit vectors (steps + 1, 3) of the field before each step and after the last, in a turned frame."""
+    found = [field.axes[0] if field else np.eye(3)[2]]
     for step in programme:
-        found.append(basis @ step.load.to.vector(turn) if isinstance(step.load, RotationSection) else found[-1])
+        found.append(step.load.to.vector(turn) if isinstance(step.load, RotationSection) else found[-1])
     return np.array(found)
+
+
+def components(direction: Array, field: Magnetisation | None) -> Array:
+    """A direction by the amplitudes of `FIELD`; a field in space has one amplitude in each direction."""
+    return np.ones(1) if field is None or field.in_space else np.array(field.axes) @ direction
 
 
 def field_at(state: State) -> Array:
@@ -33,35 +35,19 @@ def field_at(state: State) -> Array:
     return np.array([state.mu[name] for name in FIELD if name in state.mu])
 
 
-def turned(directions: Array, field: Magnetisation | None) -> list[Array]:
-    """Harmonics (5, 3, 3) of the gradient of a field of size one, from each direction of `directions` to the next."""
-    if field is None or field.gradient is None or not field.turned:
-        return []
-    return [parts for _, parts in along(field.gradient, list(directions @ np.array(field.axes)))]
-
-
-def straight(direction: Array, field: Magnetisation, parts: Array | None) -> dict[str, Curve]:
-    """The components of a field t along a direction, and of its gradient; `parts` are its harmonics there."""
+def straight(direction: Array) -> dict[str, Curve]:
+    """The components of a field t along a direction."""
 
     def curve(c: float) -> Curve:
         return lambda t: (c * t, c, 0.0)
 
-    found = dict(zip(FIELD, direction, strict=False))
-    if parts is not None and field.gradient is not None:
-        rest = at_angle(parts, 0.0) - direction[0] * field.gradient
-        found |= {name: np.sum(rest * B) for name, B in field.gradients.items() if name != FIELD[0]}
-    return {name: curve(float(c)) for name, c in found.items()}
-
-
-def _away(before: Array, after: Array) -> Array:
-    """The unit vector in the plane of two directions that is normal to the first, on the side of the second."""
-    rest = after - (before @ after) * before
-    return np.asarray(rest / np.linalg.norm(rest))
+    return {name: curve(float(c)) for name, c in zip(FIELD, direction, strict=False)}
 
 
 def circle(size: float, before: Array, after: Array) -> dict[str, Curve]:
     """The components of a field that has turned by t (rad) from one direction towards another."""
-    away = _away(before, after)
+    rest = after - (before @ after) * before
+    away = rest / np.linalg.norm(rest)
 
     def curve(b: float, a: float) -> Curve:
         return lambda t: (b * cos(t) + a * sin(t), a * cos(t) - b * sin(t), -b * cos(t) - a * sin(t))
@@ -70,23 +56,9 @@ def circle(size: float, before: Array, after: Array) -> dict[str, Curve]:
     return {name: curve(float(b), float(a)) for name, b, a in parts}
 
 
-def turning(size: float, before: Array, after: Array, field: Magnetisation, parts: Array) -> dict[str, Curve]:
-    """The components of the gradient of the field of `circle`; lambda_m has `Magnetisation.gradient` in its own."""
-    away = _away(before, after)
-    assert field.gradient is not None
-    rest = parts - np.multiply.outer([0.0, before[0], away[0], 0.0, 0.0], field.gradient)
-
-    def curve(k: Array) -> Curve:
-        def of(t: float) -> tuple[float, float, float]:
-            c, s, c2, s2 = cos(t), sin(t), cos(2 * t), sin(2 * t)
-            slope = k @ [0.0, -s, c, -2 * s2, 2 * c2]
-            return float(k @ [1.0, c, s, c2, s2]), float(slope), float(k @ [0.0, -c, -s, -4 * c2, -4 * s2])
-
-        return of
-
-    return {
-        name: curve(size * np.sum(rest * B, axis=(1, 2))) for name, B in field.gradients.items() if name != FIELD[0]
-    }
+def as_a_whole(name: str, total: float) -> dict[str, Curve]:
+    """The amplitude of the rotation of a field in space, which is 1 at the angle `total` (rad)."""
+    return {name: lambda t: (t / total, 1 / total, 0.0)}
 
 
 def field_size(mu: Mapping[str, float], sense: float) -> float:
@@ -95,9 +67,16 @@ def field_size(mu: Mapping[str, float], sense: float) -> float:
     return copysign(hypot(first, across, third), sense) if across or third else first
 
 
-def field_angle(mu: Mapping[str, float], sense: float = 1.0) -> float:
+def field_angle(mu: Mapping[str, float], field: Magnetisation | None, sense: float = 1.0) -> float:
     """The angle between the field and its first direction (degrees); `sense` is the sign of the case's field."""
-    first, across, third = (mu.get(name, 0.0) for name in FIELD)
+    if field and field.turns:
+        first, axis = field.axes[0], field.turns[0].turn / np.linalg.norm(field.turns[0].turn)
+        now = carried(field.turns, mu)[0] @ first
+        normal = np.cross(first, now)
+        planar = all(np.abs(np.cross(axis, one.turn)).max() < 1e-9 for one in field.turns)
+        across = float(normal @ axis) if planar else float(np.linalg.norm(normal))
+        return degrees(atan2(across, float(first @ now)))
+    along, across, third = (mu.get(name, 0.0) for name in FIELD)
     if not (across or third):
         return 0.0
-    return degrees(atan2(hypot(across, third) if third else sense * across, sense * first))
+    return degrees(atan2(hypot(across, third) if third else sense * across, sense * along))

@@ -38,7 +38,7 @@ from magshell_fenicsx.plan.plan import Plan
 from magshell_fenicsx.plan.planner import make_plan
 from magshell_fenicsx.quantities.registry import IN_TIME, amplitude, contact_columns
 from magshell_fenicsx.simulate.build import build_meridian_model, build_model, build_solid_model
-from magshell_fenicsx.simulate.direction import directions, field_angle, field_size, turned
+from magshell_fenicsx.simulate.direction import directions, field_angle, field_size
 
 Array = NDArray[np.float64]
 APART = 0.3  # of h, about: a path along a contact has shorter steps than waves around the axis need
@@ -120,7 +120,9 @@ class Scene:
 
     def unloaded(self) -> State:
         """The undeformed shell; amplitudes are zero, except user-defined ones with a value."""
-        own = {*self.motions, *self.sources, *self.model.contacts}
+        field = self.plan.loads.magnetic
+        turns = (motion.name for motion in field.turns) if field else ()
+        own = {*self.motions, *self.sources, *turns, *self.model.contacts}
         amplitudes = {t.amplitude for t in self.model.system.terms if t.amplitude} | own
         given = self._own_amplitudes
         return State(self.model.zero(), {name: given.get(name, 0.0) for name in sorted({*amplitudes, *given})})
@@ -135,7 +137,7 @@ class Scene:
         return {
             "p_over_pc": state.mu.get("pressure", 0.0),
             "lambda_m": field_size(state.mu, sense),
-            "field_angle": field_angle(state.mu, sense),
+            "field_angle": field_angle(state.mu, loads.magnetic, sense),
             "force": 0.0,
             "w_over_h": model.loaded_deflection(state.u, loads.displaced) / h if loads.displaced else pole,
             "w_pole_over_h": pole,
@@ -268,11 +270,6 @@ class Scene:
     def directions(self) -> Array:
         """See `direction.directions`."""
         return directions(self.case.programme, self.plan.loads.magnetic, self.plan.azimuth)
-
-    @cached_property
-    def turned(self) -> list[Array]:
-        """See `direction.turned`."""
-        return turned(self.directions, self.plan.loads.magnetic)
 
     def conjugate_unit(self, name: str) -> float:
         """-dPi/dmu of one unit of a target: ΔV/R³ of a pressure, w/h of a force, the shell's length of dead loads."""

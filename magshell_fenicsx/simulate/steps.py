@@ -14,7 +14,8 @@ from magshell_fenicsx.continuation.device import Conjugate
 from magshell_fenicsx.continuation.path import StepOptions
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.continuation.walk import MOST_STEPS, Goal
-from magshell_fenicsx.simulate.direction import circle, field_angle, field_at, straight, turning
+from magshell_fenicsx.plan.sources.field import turn_name
+from magshell_fenicsx.simulate.direction import as_a_whole, circle, components, field_angle, field_at, straight
 from magshell_fenicsx.simulate.gas import gas
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
@@ -82,12 +83,10 @@ def _at_held_conjugate(scene: Scene, step: ProgrammeStep, state: State, drive: D
 
 def stage_of(scene: Scene, step: ProgrammeStep, state: State) -> Stage:
     """The solver of a step, from any state of it."""
-    direction = scene.directions[step.number - 1]
+    direction = components(scene.directions[step.number - 1], scene.plan.loads.magnetic)
     curves = None
-    if isinstance(step.load, FieldSection) and (direction[1:].any() or scene.turned):
-        parts, field = scene.turned[step.number - 1 : step.number], scene.plan.loads.magnetic
-        assert field
-        curves = (step.name, straight(direction, field, next(iter(parts), None)), float(direction @ field_at(state)))
+    if isinstance(step.load, FieldSection) and direction[1:].any():
+        curves = (step.name, straight(direction), float(direction @ field_at(state)))
     return staged(scene, state, held_by(scene, step, state), curves)
 
 
@@ -106,7 +105,7 @@ def _now(scene: Scene, step: ProgrammeStep, state: State) -> Now:
     """The amplitude of a step where it begins."""
     driven = any(step.name == other.name for other in scene.case.programme[: step.number - 1])
     if isinstance(step.load, FieldSection):
-        value = float(scene.directions[step.number - 1] @ field_at(state))
+        value = float(components(scene.directions[step.number - 1], scene.plan.loads.magnetic) @ field_at(state))
         return Now(value, 0.0, 0.0, driven, scene.case.lambda_m)
     conjugate = -scene.model.system.potential(state.u, state.mu, step.name)
     return Now(state.mu[step.name], conjugate, scene.conjugate_unit(step.name), driven, 1.0)
@@ -128,13 +127,13 @@ def _field_before(records: Records, target: float) -> Records:
 
 
 def _rotation(scene: Scene, step: ProgrammeStep, load: RotationSection, state: State) -> Records:
-    before, after = scene.directions[step.number - 1 : step.number + 1]
-    size, total = float(before @ field_at(state)), acos(float(before @ after))
+    ends, field = scene.directions[step.number - 1 : step.number + 1], scene.plan.loads.magnetic
+    before, after = (components(end, field) for end in ends)
+    size, total = float(before @ field_at(state)), acos(float(ends[0] @ ends[1]))
     if size == 0:
         raise Stopped("the field is zero and cannot turn")
-    curves, field = circle(size, before, after), scene.plan.loads.magnetic
-    if scene.turned and field:
-        curves |= turning(size, before, after, field, scene.turned[step.number - 1])
+    whole = field and field.turns
+    curves = as_a_whole(turn_name(step), total) if whole else circle(size, before, after)
     stage = staged(scene, state, held_by(scene, step, state), ("angle", curves, 0.0))
     path, start = stage.begin("angle", "arc", state, total / load.points, total / load.points)
     targets = [float(t) for t in np.linspace(0.0, total, load.points + 1)[1:]]
@@ -142,6 +141,6 @@ def _rotation(scene: Scene, step: ProgrammeStep, load: RotationSection, state: S
     for record in walked:
         yield record
         if record.label in LOCATED:
-            angle, kind = field_angle(record.point.state.mu) % 360, record.mode or record.label
+            angle, kind = field_angle(record.point.state.mu, field) % 360, record.mode or record.label
             raise Stopped(f"the turning field makes the shell unstable at {angle:.4g} degrees: {kind}")
     return walked.end

@@ -42,7 +42,8 @@ class FieldBefore(FieldSection):
 class RotationSection(Step):
     """The applied field, at its magnitude, turns on the shortest way to another direction.
 
-    The requested points are equal angles apart; the field keeps its magnitude.
+    The requested points are equal angles apart; the field keeps its magnitude. A gradient, formulas and sources turn
+    with it, about the origin; the direction of formulas, and of sources that are the whole field, is e3 at first.
     """
 
     amplitude: ClassVar[str] = "angle"

@@ -124,9 +124,9 @@ class AppliedField:
         for here in self._here:
             if name in here.driven.names and (not other or other in here.driven.names):
                 B, G = (here.twice(name, other), None) if other else here.by(name)
-                values[..., 6:9] = B.reshape(*shape, 3)
+                values[..., 6:9] += B.reshape(*shape, 3)
                 if G is not None:
-                    values[..., 9:18] = G.reshape(*shape, 9)
+                    values[..., 9:18] += G.reshape(*shape, 9)
         field.renew(values)
 
     @property

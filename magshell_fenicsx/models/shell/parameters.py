@@ -83,8 +83,8 @@ class Magnetisation:
         `ACROSS`.
     axes
         Unit vectors along `applied` and `across`.
-    turned
-        Orthonormal matrices (3, 3): the gradient of a turning field is a sum of them and of `gradient`.
+    turns
+        Rotations of all of a field in space, which are motions of `driven`, in their order.
     energy
         The full energy, or which of the paper's approximations takes its place.
     patches
@@ -105,14 +105,8 @@ class Magnetisation:
     law: RemanenceLaw = "deformation"
     in_space: FieldInSpace | None = None
     axes: tuple[NDArray[np.float64], ...] = ()
-    turned: tuple[NDArray[np.float64], ...] = ()
     driven: tuple[Driven, ...] = ()
-
-    @property
-    def gradients(self) -> dict[str, NDArray[np.float64]]:
-        """Amplitude -> the part of the field's gradient that it multiplies."""
-        parts = {f"lambda_gradient_{i}": B for i, B in enumerate(self.turned, 1)}
-        return {} if self.gradient is None else {"lambda_m": self.gradient, **parts}
+    turns: tuple[Motion, ...] = ()
 
     @property
     def uniform(self) -> bool:

@@ -140,11 +140,10 @@ class TermFactory:
             for amplitude, suffix, Ba in directions
             for name, of in magnetic_densities(field.law, field.energy).items()
         ]
-        for name, G in field.gradients.items():
-            parameters = (Br, self._constant(G))
+        if field.gradient is not None:
+            parameters = (Br, self._constant(field.gradient))
             density = Density(per_area(densities.in_gradient(FULL[field.law])), parameters, parts=MOVED)
-            suffix = name.removeprefix("lambda_m").replace("lambda_gradient_", " ")
-            terms.append(self._cells("magnetic gradient" + suffix, self._thick(density, None), name))
+            terms.append(self._cells("magnetic gradient", self._thick(density, None), "lambda_m"))
         return terms
 
     def pressure(self, origin: NDArray[np.float64]) -> ShellTerm:

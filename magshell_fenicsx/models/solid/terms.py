@@ -124,10 +124,9 @@ class TermFactory:
         for amplitude, suffix, Ba in directions:
             density = Density(law.magnetic, (Br, *self._constants(Ba, self.h)))
             terms.append(self._bulk("magnetic" + suffix, density, amplitude, linear=law is densities))
-        for name, G in of.gradients.items():
-            density = Density(law.magnetic_gradient, (Br, *self._constants(G, self.h)), VALUE + GRADIENT)
-            suffix = name.removeprefix("lambda_m").replace("lambda_gradient_", " ")
-            terms.append(self._bulk("magnetic gradient" + suffix, density, name))
+        if of.gradient is not None:
+            density = Density(law.magnetic_gradient, (Br, *self._constants(of.gradient, self.h)), VALUE + GRADIENT)
+            terms.append(self._bulk("magnetic gradient", density, "lambda_m"))
         return terms
 
     def pressure(self, classical: float, origin: Array | None, *, potential: bool = True) -> list[SolidTerm]:

@@ -124,5 +124,4 @@ def _applied(field: Magnetisation, mu: Mapping[str, float], r: Array) -> Array:
     uniform = along * field.applied
     for name, across in zip(ACROSS, field.across, strict=False):
         uniform = uniform + mu.get(name, 0.0) * across
-    parts = (mu.get(name, 0.0) * r @ G.T for name, G in field.gradients.items())
-    return np.broadcast_to(uniform, r.shape) if field.gradient is None else uniform + sum(parts, np.zeros(3))
+    return np.broadcast_to(uniform, r.shape) if field.gradient is None else uniform + along * r @ field.gradient.T

@@ -2,13 +2,15 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from math import radians
+from math import acos, radians
 
 import numpy as np
 
-from magshell_fenicsx.assembly.motion import Motion
+from magshell_fenicsx.assembly.motion import Motion, moved
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.expressions import with_derivatives
+from magshell_fenicsx.case.loading import ProgrammeStep
+from magshell_fenicsx.case.loads.field import RotationSection
 from magshell_fenicsx.case.loads.source import SourceStep
 from magshell_fenicsx.mesh.frame import rotation
 from magshell_fenicsx.models.shell.driven import Driven, FieldInSpace
@@ -46,6 +48,26 @@ class Sum:
         return B, G, H
 
 
+def turn_name(step: ProgrammeStep) -> str:
+    """The amplitude by which a step of kind: rotation turns a field in space; no user's name has a space."""
+    return f"{step.name} {step.number}"
+
+
+def turns(case: Case, turn: float = 0.0) -> tuple[Motion, ...]:
+    """The rotations of all of the field about the origin, of a field that is known by values, or has a gradient."""
+    applied = case.magnetic.applied if case.magnetic else None
+    if applied is None or not (applied.components or applied.sources or applied.gradient):
+        return ()
+    found, before, zero = list[Motion](), applied.vector(turn), np.zeros(3)
+    for step in case.programme:
+        if isinstance(step.load, RotationSection):
+            after = step.load.to.vector(turn)
+            axis = np.cross(before, after) / np.linalg.norm(np.cross(before, after))
+            found.append(Motion(turn_name(step), zero, acos(float(before @ after)) * axis, zero))
+            before = after
+    return tuple(found)
+
+
 def in_space(case: Case, turn: float = 0.0) -> tuple[FieldInSpace | None, tuple[Driven, ...]]:
     """The field that stays, None if it is built in, and the fields that steps drive, in a frame turned about e3 (rad).
 
@@ -59,7 +81,8 @@ def in_space(case: Case, turn: float = 0.0) -> tuple[FieldInSpace | None, tuple[
     applied, Q = case.magnetic.applied, rotation(turn)
     formulas = [with_derivatives(text) for text in applied.components or []]
     by_formula = FormulasInSpace(formulas, Q) if formulas else None
-    if not case.sources:
+    rotations = turns(case, turn)
+    if not case.sources and not rotations:
         return by_formula, ()
     parts = list[FieldInSpace]()
     if applied.beside:
@@ -67,30 +90,40 @@ def in_space(case: Case, turn: float = 0.0) -> tuple[FieldInSpace | None, tuple[
         parts.append(by_formula or Linear(applied.uniform * applied.vector(turn), G))
     driven = list[Driven]()
     for number, source in enumerate(placed(case, turn)):
-        one = _driven(case, number, source, Q)
+        one = _driven(case, number, source, rotations, Q)
         if one.names:
             driven.append(one)
         else:
             parts.append(source)
+    if rotations:
+        driven += [Driven(part, rotations) for part in parts]
+        parts = []
     return Sum(parts), tuple(driven)
 
 
-def _driven(case: Case, number: int, source: Placed, Q: Array) -> Driven:
-    """A source with the amplitudes of its steps; turns about its own position come before translations."""
-    turns, moves, factors, zero = list[Motion](), list[Motion](), dict[str, float](), np.zeros(3)
+def _driven(case: Case, number: int, source: Placed, rotations: Sequence[Motion], Q: Array) -> Driven:
+    """A source with the amplitudes of its steps; turns about its own position come before all other motions."""
+    spins, moves, factors, zero = list[Motion](), list[Motion](), dict[str, float](), np.zeros(3)
+    left = {motion.name: motion for motion in rotations}
     steps = {step.name: step.load for step in case.programme if isinstance(step.load, SourceStep)}
-    for name, load in steps.items():
-        if load.number(case.sources) != number:
+    own = {name for name, load in steps.items() if load.number(case.sources) == number}
+    for step in case.programme:
+        if isinstance(step.load, RotationSection):
+            moves.append(left.pop(turn_name(step)))
+        if step.name not in own:
             continue
+        own.remove(step.name)
+        load, name = steps[step.name], step.name
         if load.turn:
             axis = np.array(load.turn.axis) / np.linalg.norm(load.turn.axis)
-            turns.append(Motion(name, zero, radians(load.turn.angle) * (Q @ axis), source.position))
+            spins.append(Motion(name, zero, radians(load.turn.angle) * (Q @ axis), source.position))
         elif load.strength is not None:
             factors[name] = load.strength - 1
         else:
             end = np.array(load.move or load.to) / source.length
-            moves.append(Motion(name, Q @ end - (source.position if load.to else zero), zero, zero))
-    return Driven(source, [*turns, *moves], factors)
+            here = moved(moves, dict.fromkeys((m.name for m in moves), 1.0), source.position[None]).x[0]
+            moves.append(Motion(name, Q @ end - (here if load.to else zero), zero, zero))
+    return Driven(source, [*spins, *moves], factors)
 
 
 def values(case: Case) -> list[Callable[[Array], Array]]:
