@@ -70,7 +70,9 @@ def account(case: Case, loads: Loads, model: str, mirror: Mirror | None, rims: i
         left_out.append("waves around the axis (they are looked for at each point)")
     if mirror:
         plane = (
-            f"through e3 at azimuth {degrees(mirror.azimuth) + 0.0:g} degrees" if mirror.through_e3 else plane_text(mirror)
+            f"through e3 at azimuth {degrees(mirror.azimuth) + 0.0:g} degrees"
+            if mirror.through_e3
+            else plane_text(mirror)
         )
         left_out.append(
             f"the other half: mirror plane {plane} (modes antisymmetric to it are looked for along the path)"

@@ -96,6 +96,13 @@ class Scene:
         self.progress: Progress = NoProgress()
         self.setup_s = time.perf_counter() - start - self.model.kernels.seconds
 
+    def retuned(self, case: Case) -> "Scene":
+        """The same model and solver for a case that differs by the strength of the field alone."""
+        found = object.__new__(Scene)
+        known = {name: of for name, of in vars(self).items() if name not in vars(Scene)}  # what is cached is found anew
+        vars(found).update(known, case=case)
+        return found
+
     @property
     def cells(self) -> int:
         topology = self.model.V.mesh.topology

@@ -30,6 +30,16 @@ def outcomes(file: Path, over: str, settings: list[str], out: Path, *, full_path
     return sweep(file, [over], settings, out, say=lambda line: None, full_paths=full_paths).outcomes
 
 
+def test_a_grid_takes_one_path(tmp_path: Path) -> None:
+    """Each line begins at the fold of the line before it; nine digits of the axisymmetric reference in README."""
+    over = ["magnetic.lambda_m=-0.00184,0.0005,0.00184", "shell.defect.amplitude=1.64,2"]
+    found = sweep(DIMPLE, over, [], tmp_path / "grid", say=lambda line: None).outcomes
+    assert [outcome.found for outcome in found] == ["path"] + 5 * ["fold"]
+    assert [found[0].knockdown, found[4].knockdown] == pytest.approx([0.120723865, 0.552053784], abs=2e-8)
+    last = Case.load(DIMPLE, ["magnetic.lambda_m=0.00184", "shell.defect.amplitude=2"])
+    assert found[5].knockdown == pytest.approx(run(last).knockdown, rel=1e-7)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("over", "most"),

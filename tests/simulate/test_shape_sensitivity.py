@@ -9,7 +9,7 @@ from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.sensitivity import fold_at, sensitivities
-from magshell_fenicsx.simulate.shape_sensitivity import changed
+from magshell_fenicsx.simulate.shape_sensitivity import Along, _deviation, changed, reshaped
 from magshell_fenicsx.simulate.transfer import transfer
 
 
@@ -31,3 +31,25 @@ def test_of_the_meridian(kind: str) -> None:
 
         by_folds = (8 * (value(0.005) - value(-0.005)) - (value(0.01) - value(-0.01))) / 0.06
         assert derivative == pytest.approx(by_folds, rel=1e-4), name
+
+
+@pytest.mark.slow
+def test_beside_the_pole() -> None:
+    """Depth, width and both angles of the deeper of two dimples, on the same mesh with the dimple itself changed."""
+    flaws = ("amplitude: 1, width: 2.5, at: {polar: 20, azimuth: 70}", "amplitude: 0.7, width: 3, at: {polar: 45}")
+    several = ", ".join(f"{{kind: gaussian, {numbers}}}" for numbers in flaws)
+    sets = [f"shell.imperfections=[{several}]", "shell.radius_to_thickness=30", "mesh.degree=3", "mesh.refinement=0.4"]
+    scene = Scene(Case.load(CASES / "dimple_buckling.yaml", [*sets, "symmetry=none"]))
+    *_, last = follow(scene)
+    found = sensitivities(scene, fold := fold_at(scene, last))
+    key, old = "imperfections.0", _deviation(scene, scene.case, "imperfections.0")
+    for number, step in (("amplitude", 0.004), ("width", 0.01), ("at.polar", 0.1), ("at.azimuth", 0.1)):
+
+        def value(change: float, number: str = number) -> float:
+            other = reshaped(scene, Along(_deviation(scene, changed(scene.case, key, number, change), key), old, 1.0))
+            u, phi = (transfer(scene, other, v) for v in (fold.state.u, fold.phi))
+            return find_fold(other.newton, Guess(State(u, fold.state.mu), phi), "pressure").value
+
+        ends = [value(n * step) for n in (-2, -1, 1, 2)]
+        by_folds = (ends[0] - 8 * ends[1] + 8 * ends[2] - ends[3]) / (12 * step)
+        assert found[f"{key}.{number}"] == pytest.approx(by_folds, rel=2e-5), number

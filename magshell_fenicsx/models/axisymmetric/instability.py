@@ -42,4 +42,4 @@ class ExcludedWaves:
 
     def is_unstable(self, state: State) -> bool:
         """Whether some wave is unstable at an axisymmetric state."""
-        return bool(self.waves.unstable(state))
+        return any(self.waves.counts(state))

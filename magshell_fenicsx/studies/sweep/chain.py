@@ -6,7 +6,7 @@ this fails, computes the full path.
 
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from mpi4py import MPI
@@ -19,12 +19,12 @@ from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.output.store.table import Row
 from magshell_fenicsx.plan.planner import make_plan
 from magshell_fenicsx.run.run import Result, run
-from magshell_fenicsx.simulate.perfect import with_modes
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.studies.sweep.axes import Axis, along
 from magshell_fenicsx.studies.sweep.continuation import Continuation
 from magshell_fenicsx.studies.sweep.outcome import Outcome, outcome_of
 from magshell_fenicsx.studies.sweep.points import SweepPoint
+from magshell_fenicsx.studies.sweep.scenes import Scenes
 
 Symmetry = Literal["none", "half", "axisymmetric"]
 SYMMETRIES: tuple[Symmetry, ...] = (
@@ -79,31 +79,53 @@ def _chains_of(line: list[int], key: str, points: Sequence[SweepPoint], missing:
     return [sorted(chain, key=lambda link: link.at)]
 
 
-def run_chain(chain: Chain) -> Iterator[tuple[int, Outcome]]:
+@dataclass
+class Known:
+    """What the chains of one rank share.
+
+    Attributes
+    ----------
+    first
+        The first fold of the last chain, from which that of the next one is followed if it has the same mesh.
+    """
+
+    scenes: Scenes = field(default_factory=Scenes)
+    first: Continuation | None = None
+
+
+def run_chain(chain: Chain, known: Known) -> Iterator[tuple[int, Outcome]]:
     """Compute a chain on this rank; number and outcome of each point."""
-    continuation = None
+    continuation = known.first if len(chain) > 1 else None
     for link in chain:
+        begun = link is chain[0]
         start, spent, outcome = time.perf_counter(), 0, None
         if continuation:
-            outcome, spent = _by_fold(continuation, link, start)
+            outcome, spent = _by_fold(continuation, link, known.scenes, start, same_mesh=begun)
         if not outcome:
             outcome, continuation = _by_path(link, spent, start, go_on=link is not chain[-1])
+        if begun:
+            known.first = continuation = continuation and continuation.from_here()
         yield link.number, outcome
 
 
-def _by_fold(continuation: Continuation, link: Link, start: float) -> tuple[Outcome | None, int]:
+def _by_fold(
+    continuation: Continuation, link: Link, scenes: Scenes, start: float, *, same_mesh: bool
+) -> tuple[Outcome | None, int]:
     """The outcome, or None if the fold cannot be followed; and the number of factorisations."""
     try:
-        scene = Scene(with_modes(link.case, MPI.COMM_SELF), MPI.COMM_SELF)
+        scene = scenes.of(link.case)
     except MeshError:
         return None, 0
+    if same_mesh and not continuation.has_mesh_of(scene):
+        return None, 0
     factorisation = scene.newton.factorisation
+    before = factorisation.count
     try:
         fold = continuation.follow(link.at, scene)
     except FoldLost:
-        return None, factorisation.count
-    result = Result(scene, fold.state, [fold_row(scene, fold)])
-    return outcome_of(result, "fold", factorisation.count, time.perf_counter() - start), factorisation.count
+        return None, factorisation.count - before
+    result, work = Result(scene, fold.state, [fold_row(scene, fold)]), factorisation.count - before
+    return outcome_of(result, "fold", work, time.perf_counter() - start), work
 
 
 def _by_path(link: Link, spent: int, start: float, *, go_on: bool) -> tuple[Outcome, Continuation | None]:

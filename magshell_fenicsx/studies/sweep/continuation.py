@@ -1,5 +1,6 @@
 """Continuation of a fold under pressure from case to case, each with its own scene."""
 
+from copy import copy
 from dataclasses import replace
 
 import numpy as np
@@ -7,7 +8,7 @@ import numpy as np
 from magshell_fenicsx.continuation.fold import Fold, FoldLost, Guess, find_fold, predict_fold
 from magshell_fenicsx.continuation.system import State, Vector, dot
 from magshell_fenicsx.simulate.scene import Scene
-from magshell_fenicsx.simulate.transfer import transfer
+from magshell_fenicsx.simulate.transfer import same_mesh, transfer
 
 KEPT = 3  # folds, for a quadratic extrapolation
 LEAST_COSINE = 0.5  # between successive null vectors; a smaller value means a jump to another fold
@@ -50,6 +51,17 @@ class Continuation:
         refuse_later(scene, fold, known[-1][1].phi)
         self._known, self._scene = [*known, (p, fold)][-KEPT:], scene
         return fold
+
+    def from_here(self) -> "Continuation":
+        """A continuation that knows the last fold only, in which another parameter may vary."""
+        found = copy(self)
+        found._known = self._known[-1:]
+        return found
+
+    def has_mesh_of(self, scene: Scene) -> bool:
+        """Whether a scene has the mesh of the last one."""
+        alike = type(scene.model) is type(self._scene.model) and scene.plan.half == self._scene.plan.half
+        return alike and same_mesh(self._scene, scene)
 
     def _moved(self, fold: Fold, scene: Scene) -> Fold:
         u, phi = (transfer(self._scene, scene, v) for v in (fold.state.u, fold.phi))

@@ -10,7 +10,7 @@ from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.output.store.folder import by_first, prepare_folder
 from magshell_fenicsx.platform.terminal import print_line
 from magshell_fenicsx.studies.sweep.axes import Axis, parse_axes
-from magshell_fenicsx.studies.sweep.chain import make_chains, run_chain
+from magshell_fenicsx.studies.sweep.chain import Known, make_chains, run_chain
 from magshell_fenicsx.studies.sweep.deal import deal, together
 from magshell_fenicsx.studies.sweep.outcome import Outcome, load, save
 from magshell_fenicsx.studies.sweep.points import SweepPoint, identity, make_points
@@ -75,9 +75,10 @@ def sweep(
         if again := sum(files[number].exists() for number in missing):
             say(f"{again} of these computed again: their files are of other sources of magshell_fenicsx, or damaged")
     chains = make_chains(axes, points, missing, full_paths=full_paths)
+    known = Known()
     with together(comm):
         for chain in deal(len(chains), comm):
-            for number, outcome in run_chain(chains[chain]):
+            for number, outcome in run_chain(chains[chain], known):
                 if identity(points[number].case) != points[number].key:
                     raise CaseError(f"{file}: its mesh file was changed during the sweep; start it again")
                 save(outcome, points[number].case, files[number])
