@@ -19,6 +19,8 @@ Quantity = Literal["load", "conjugate"]
 Control = Quantity | Literal["arc"]
 MOST_LEAPS = 3  # longer steps that are tried if rounding hides a point
 MANY = 2  # after so many hard solves the tangent takes the stress extrapolated from the last point: a tenth more time
+BEHIND = 1.15  # of the length to a fold that is foreseen: a longer step may end on another branch
+LEAST_PART = 0.25  # of a step, to which it is shortened before a fold
 SHORTER = 1 - 1e-9  # rounding must not decide whether one step reaches a target
 SEEN = 1e-6  # in lengths of the system: smaller displacements count as zero
 
@@ -196,7 +198,8 @@ class Path:
                 way = target - here.s
                 pieces = max(1.0, np.ceil(SHORTER * abs(way) / step)) if np.isfinite(way) else np.inf
                 length = abs(way) / pieces if pieces < 3 else step  # no tiny step before a target
-                s = target if pieces == 1 else here.s + np.copysign(length, way)
+                length = min(length, self._past_fold(before, here, length))
+                s = target if length == abs(way) else here.s + np.copysign(length, way)
                 found = self._try(s, before, here)
                 if isinstance(found, str):
                     leaps += 1
@@ -214,6 +217,18 @@ class Path:
                     step = 0.6 * length
                 before, here = here, found
                 yield here, here.s == target
+
+    def _past_fold(self, before: Point | None, here: Point, length: float) -> float:
+        """The length to a little behind the next fold of mu, where the cubic through two points has its maximum."""
+        if before is None or self.control != "arc":
+            return np.inf
+        way, last = here.s - before.s, self.seen_from(before, here)
+        mean = (here.state.mu[self.name] - before.state.mu[self.name]) / way
+        # dmu/ds = first + b t + c t^2 has both slopes and their mean
+        first, c = before.dmu, 3 * (before.dmu + last.dmu - 2 * mean)
+        b = last.dmu - first - c
+        turns = [float(t.real) for t in np.roots([c, b, first]) if abs(t.imag) < SEEN and t.real > 1]
+        return max(BEHIND * (min(turns) - 1) * abs(way), LEAST_PART * length) if turns else np.inf
 
     def predict(self, s: float, before: Point | None, here: Point) -> State:
         """Cubic through the last two points with their tangents (linear at the start)."""
