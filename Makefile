@@ -21,12 +21,13 @@ make test             lint and all tests; with ROOT=sid the tests that are not m
 make fast             lint and the tests that are not marked slow (TESTS="tests/simulate ...": of these folders)
                       (both: OPENBLAS_CORETYPE=Haswell, Nehalem, ... rounds as on another processor)
 make lint             ruff and mypy
+make site             the documentation as a site in results/site (Sphinx, from PyPI)
 make image            the Docker image magshell_fenicsx
 make clean            remove caches and compiled kernels; keeps .env/root* and results
 endef
 export HELP
 
-.PHONY: help run check figures benchmarks extremes noise bench studies test fast lint image clean
+.PHONY: help run check figures benchmarks extremes noise bench studies site test fast lint image clean
 
 help:
 	@echo "$$HELP"
@@ -65,6 +66,9 @@ studies:
 		--set loading.depth=10 --set loading.points=10 $(MESHES))
 	$(call study,buckling,cases/dimple_buckling.yaml --result knockdown --reference 0.552053778 \
 		--set symmetry=half --set magnetic.lambda_m=0.00184 $(MESHES))
+
+site:
+	$(ENV) docs/site/build
 
 test: $(if $(ROOT),,lint)
 	$(CORE_TYPE)

@@ -15,10 +15,11 @@ from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.reference import anchor
 from magshell_fenicsx.cli import app
 from magshell_fenicsx.plan.check import describe
+from magshell_fenicsx.run.run import run
 
 TOP = CASES.parent
 PAGES = [TOP / "README.md", TOP / "CONTRIBUTING.md", *sorted((TOP / "docs").rglob("*.md")), TOP / "meshes/README.md"]
-GUIDES = [TOP / name for name in ("README.md", "docs/howto.md", "docs/troubleshooting.md")]
+GUIDES = [TOP / name for name in ("README.md", "docs/tutorial.md", "docs/howto.md", "docs/troubleshooting.md")]
 
 
 def text(page: Path) -> str:
@@ -92,6 +93,15 @@ def test_commands_are_understood(page: Path) -> None:
         settings = [after for word, after in pairwise(rest) if word == "--set"]
         for case in (word for word in rest if word.endswith(".yaml")):
             assert Case.load(TOP / case, settings)
+
+
+def test_numbers_of_the_tutorial(tmp_path: Path) -> None:
+    """Its case, and its case in the field."""
+    page = text(TOP / "docs/tutorial.md")
+    (tmp_path / "cap.yaml").write_text(*blocks(TOP / "docs/tutorial.md", "yaml"), encoding="utf-8")
+    (field,) = re.findall(r'--set "(magnetic=.*)" --out', page)
+    for settings, number in zip(([], [field]), re.findall(r"k_d = (0\.\d+)", page), strict=True):
+        assert run(Case.load(tmp_path / "cap.yaml", settings)).knockdown == pytest.approx(float(number), abs=1e-6)
 
 
 def test_the_editor_line_leads_to_the_schema() -> None:

@@ -98,7 +98,7 @@ def write(lines: Sequence[Line], file: Path) -> None:
     """Write the CSV and, beside it, the same for people."""
     found = rows(lines)
     write_csv(found, list(found[0]), file)
-    file.with_suffix(".md").write_text(markdown(lines), encoding="utf-8")
+    file.with_suffix(".md").write_text(f"# The obstacle course: all meshes\n\n{markdown(lines)}", encoding="utf-8")
 
 
 def draw(title: str, curves: Mapping[str, tuple[Array, Array]], second: Mapping[str, Array]) -> bytes:
