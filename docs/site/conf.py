@@ -3,7 +3,7 @@
 import re
 
 project = "magshell_fenicsx"
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx-mathjax-offline"]
 html_theme = "furo"
 html_title = "magshell_fenicsx"
 source_suffix = {".md": "markdown"}
