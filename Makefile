@@ -21,13 +21,14 @@ make test             lint and all tests; with ROOT=sid the tests that are not m
 make fast             lint and the tests that are not marked slow (TESTS="tests/simulate ...": of these folders)
                       (both: OPENBLAS_CORETYPE=Haswell, Nehalem, ... rounds as on another processor)
 make lint             ruff and mypy
+make gallery          every case with picture, command, result and time into docs/gallery/: 6 minutes on one core
 make site             the documentation as a site in results/site (Sphinx, from PyPI)
 make image            the Docker image magshell_fenicsx
 make clean            remove caches and compiled kernels; keeps .env/root* and results
 endef
 export HELP
 
-.PHONY: help run check figures benchmarks extremes noise bench studies site test fast lint image clean
+.PHONY: help run check figures benchmarks extremes noise bench studies gallery site test fast lint image clean
 
 help:
 	@echo "$$HELP"
@@ -66,6 +67,9 @@ studies:
 		--set loading.depth=10 --set loading.points=10 $(MESHES))
 	$(call study,buckling,cases/dimple_buckling.yaml --result knockdown --reference 0.552053778 \
 		--set symmetry=half --set magnetic.lambda_m=0.00184 $(MESHES))
+
+gallery:
+	$(ENV) $(CAMPAIGN) gallery $(ARGS)
 
 site:
 	$(ENV) docs/site/build

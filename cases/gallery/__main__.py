@@ -1,0 +1,70 @@
+"""Every case with a picture, its command, its result and its time, into docs/gallery.
+
+make gallery [ARGS="NAME..."]     # some cases alone: the page keeps the rows of the others
+"""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+from PIL import Image
+
+from magshell_fenicsx.case.examples import CASES, title
+from magshell_fenicsx.case.source import read_source
+
+OUT = CASES.parent / "docs" / "gallery"
+WIDTH, COLOURS = 420, 64  # of a picture: 10 to 30 kB
+FIRST = ("designed.png", "design.png", "ensemble.png", "solutions.png", "contact.png", "shell.png")  # that there is
+HEAD = """# Gallery
+
+Every case of `cases/`, which `magshell example NAME` writes too. CPU time is of the whole process with all its files, on
+one core of a shared machine, kernels compiled. Made by `make gallery`.
+"""
+
+
+def row(file: Path) -> str:
+    """Run a case; its part of the page."""
+    data = read_source(file).data
+    kind = next((kind for kind in ("ensemble", "design") if kind in data), "run")
+    more = ["--samples", "20"] if kind == "ensemble" else []
+    command, folder = ["magshell", kind, f"cases/{file.name}", *more], CASES.parent / "results" / "gallery" / file.stem
+    before = os.times()
+    said = subprocess.run(
+        [*command, "--out", str(folder)], cwd=CASES.parent, capture_output=True, text=True, check=False
+    )
+    after = os.times()
+    cpu = after.children_user + after.children_system - before.children_user - before.children_system
+    lines = [line.strip() for line in said.stdout.splitlines() if line.strip() and not line.startswith("results in")]
+    last = lines[-1] if lines else said.stderr.strip()
+    end = f" Ends with exit code {said.returncode}." if said.returncode else ""
+    shot = next(folder / name for name in FIRST if (folder / name).exists())
+    _shrink(shot, OUT / f"{file.stem}.png")
+    return (
+        f"## {file.stem}\n\n{title(file)}.\n\n![{title(file)}]({file.stem}.png)\n\n    {' '.join(command)}\n\n"
+        f"{last.removesuffix('.')}.{end} CPU time: {cpu:.0f} s.\n"
+    )
+
+
+def _shrink(source: Path, target: Path) -> None:
+    picture = Image.open(source).convert("RGB")
+    picture.thumbnail((WIDTH, 10 * WIDTH))
+    picture.quantize(COLOURS).save(target, optimize=True)
+
+
+def main(names: list[str]) -> None:
+    """Make the page."""
+    OUT.mkdir(parents=True, exist_ok=True)
+    page = OUT / "README.md"
+    known = {
+        text.partition("\n")[0]: f"## {text}" for text in (page.read_text() if page.exists() else "").split("\n## ")[1:]
+    }
+    for file in sorted(CASES.glob("*.yaml")):
+        if not names or file.stem in names:
+            known[file.stem] = row(file)
+            print(file.stem, flush=True)
+        page.write_text("\n".join([HEAD, *(known[name].strip() + "\n" for name in sorted(known))]), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
