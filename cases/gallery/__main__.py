@@ -18,7 +18,7 @@ WIDTH, COLOURS = 420, 64  # of a picture: 10 to 30 kB
 FIRST = ("designed.png", "design.png", "ensemble.png", "solutions.png", "contact.png", "shell.png")  # that there is
 HEAD = """# Gallery
 
-Every case of `cases/`, which `magshell example NAME` writes too. CPU time is of the whole process with all its files, on
+Every case of `cases/`, which `magshell example NAME` writes too. CPU time is of the whole process with all files, on
 one core of a shared machine, kernels compiled. Made by `make gallery`.
 """
 
