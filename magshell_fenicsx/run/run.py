@@ -19,7 +19,8 @@ from magshell_fenicsx.output.store.durable import write_whole
 from magshell_fenicsx.output.store.folder import DiskError, by_first, held_folder
 from magshell_fenicsx.output.store.table import LOCATED, SOLUTION, Row
 from magshell_fenicsx.platform.environment import fast_blas
-from magshell_fenicsx.quantities.registry import quantity
+from magshell_fenicsx.quantities.quantity import spelled
+from magshell_fenicsx.quantities.registry import amplitude, shown
 from magshell_fenicsx.run.files import MESH, RunFiles, open_folder
 from magshell_fenicsx.run.frequencies import frequencies_after, wanted
 from magshell_fenicsx.run.interrupt import Interrupted, Stoppable, Watch
@@ -233,9 +234,17 @@ def _follow(result: Result, files: RunFiles | None, say: Say, progress: RunProgr
 
 def _line(row: Row) -> str:
     load = "load_factor" if "load_factor" in row else "force"
-    formats = {"lambda_m": "+.4e", "p_over_pc": ".6f", load: "9.5f", "w_over_h": "8.4f"}
-    loads = "  ".join(f"{quantity(name).plain} {row[name]:{form}}" for name, form in formats.items())
-    return (
-        f"{row['point']:4d} {row['label']:>11}  {loads}  pole {row['w_pole_over_h']:8.4f}  "
-        f"unstable {row['negative_pivots']}  it {row['iterations']}"
-    )
+    formats = {"lambda_m": "+.4e", "p_over_pc": ".6f", load: "9.5f"}
+    if row["amplitude"] and (varied := amplitude(str(row["amplitude"])).column) not in formats:
+        formats[varied] = "9.5f"
+    values = [_value(name, row, form) for name, form in (formats | {"w_over_h": "8.4f"}).items()]
+    pole = _value("w_pole_over_h", row, "8.4f", "pole")
+    counts = f"unstable {row['negative_pivots']}  it {row['iterations']}"
+    return "  ".join([f"{row['point']:4d} {row['label']:>11}", *values, pole, counts])
+
+
+def _value(name: str, row: Row, form: str, words: str = "") -> str:
+    """A column, in the case's units with five digits if it has any, else in a format."""
+    q = shown(name, row)
+    measured = spelled(float(row[q.name]), "9.5g" if q.name != name else form)
+    return f"{words or q.plain} {measured}{f' {q.si}' if q.name != name else ''}"

@@ -129,7 +129,7 @@ def _begun(at: float, result: Result) -> Continuation | None:
 
 def fold_row(scene: Scene, fold: Fold) -> Row:
     """A fold as a row of path.csv."""
-    return {
+    row: Row = {
         "label": "fold",
         "amplitude": fold.name,
         **scene.observe(fold.state),
@@ -137,6 +137,7 @@ def fold_row(scene: Scene, fold: Fold) -> Row:
         "branch": 0,
         "load_error": 0.0,
     }
+    return {**row, **scene.sizes.values(row)}
 
 
 def has_knockdown(case: Case) -> bool:
