@@ -115,6 +115,9 @@ def sweep(
     full_paths: Annotated[
         bool, typer.Option("--full-paths", help="compute the full path at every point; follow no fold")
     ] = False,
+    part: Annotated[
+        str | None, typer.Option(metavar="I/N", help="compute only the I-th of N shares of the points: one of N jobs")
+    ] = None,
 ) -> None:
     """Run a case over ranges of its keys; keep the points that are already in the folder."""
     from magshell_fenicsx.output.store.folder import DiskError
@@ -122,7 +125,7 @@ def sweep(
 
     folder = out or Path("results") / f"{case.stem}_sweep"
     with exit_codes(stopped=(DiskError,)):
-        done = run_sweep(case, over, set_ or [], folder, full_paths=full_paths)
+        done = run_sweep(case, over, set_ or [], folder, full_paths=full_paths, part=part)
     print_line(f"results in {folder}/")
     if done.stopped:
         raise failure(f"{done.stopped} of {len(done.points)} points stopped early; sweep.csv says why", STOPPED)

@@ -129,7 +129,7 @@ def summary(result: Result, total_s: float) -> dict[str, Any]:
             "energy_unit": "E h R^2",
         },
         "dimensions": _dimensions(scene.case.shell),
-        "in_units": _in_units(result),
+        "in_units": in_units(result),
         "model": {
             "included": scene.plan.included,
             "left_out": scene.left_out,
@@ -202,7 +202,7 @@ def _told(row: Row) -> set[str]:
     return {amplitude(str(row["amplitude"])).column, "p_over_pc", "w_pole_over_h"}
 
 
-def _in_units(result: Result) -> dict[str, float]:
+def in_units(result: Result) -> dict[str, float]:
     """The numbers of a case with units, with these in their names; none of a case without."""
     of, case = result.scene.sizes.of, result.scene.case
     found = {}
