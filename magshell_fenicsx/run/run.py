@@ -1,7 +1,7 @@
 """Run a case: follow its history, write every accepted point, summarise."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -13,6 +13,7 @@ from magshell_fenicsx.continuation.factor import has_cholmod
 from magshell_fenicsx.continuation.fold import FoldLost
 from magshell_fenicsx.continuation.inverse import NoEigenpair
 from magshell_fenicsx.continuation.journal import NoJournal
+from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.output.pictures.render import NoScreen
 from magshell_fenicsx.output.report.report import write_report
 from magshell_fenicsx.output.store.durable import write_whole
@@ -53,6 +54,7 @@ def run(
     resume: bool = False,
     time_limit: float | None = None,
     pictures: bool = True,
+    terms: Sequence[OwnTerm] = (),
 ) -> Result:
     """Run a case.
 
@@ -72,6 +74,8 @@ def run(
         Seconds after which the run stops in the same way.
     pictures
         Whether they are drawn; `magshell plot` draws them later.
+    terms
+        User-defined energies, with their amplitudes at `OwnTerm.value`; to resume the run give the same.
 
     Raises
     ------
@@ -83,6 +87,7 @@ def run(
         If the disk is full before the first point.
     """
     start = time.perf_counter()
+    case = case.with_terms(terms) if terms else case
     watch = Watch(comm, start, time_limit, signals=out is not None)
     say, tell = (say, tell or _ignored) if comm.rank == 0 else (_ignored, _ignored)
     if out is None:

@@ -127,8 +127,25 @@ class Scene:
         given = self._own_amplitudes
         return State(self.model.zero(), {name: given.get(name, 0.0) for name in sorted({*amplitudes, *given})})
 
+    def refuse_foreign(self, state: State) -> None:
+        """Refuse a state of another scene, as far as it shows.
+
+        Raises
+        ------
+        ValueError
+            If it has another number of unknowns or other amplitudes.
+        """
+        own, words = self.unloaded(), "this state is of another scene"
+        if state.u.shape != own.u.shape:
+            numbers = f"it has {state.u.size} unknowns on this rank, this scene has {own.u.size}"
+            raise ValueError(f"{words}: {numbers}; take records of follow or trace of the same scene")
+        if state.mu.keys() != own.mu.keys():
+            there, here = (", ".join(sorted(mu)) or "none" for mu in (state.mu, own.mu))
+            raise ValueError(f"{words}: its amplitudes are {there}, those of this scene {here}")
+
     def observe(self, state: State) -> dict[str, float]:
         """The physical columns of a table row: loads, displacements over h, volume, energies over E h R^2."""
+        self.refuse_foreign(state)
         model, h, loads = self.model, self.plan.material.h, self.model.loads
         force, sense = loads.forces.get("force"), copysign(1.0, self.case.lambda_m)
         energies = self.energies(state)
