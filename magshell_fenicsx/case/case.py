@@ -345,6 +345,6 @@ class Case(WithParts):
     def from_source(cls, source: Source) -> "Case":
         """Validate plain data; see `load`."""
         try:
-            return cls.model_validate(source.data, context={"folder": source.folder})
+            return cls.model_validate(source.data, context={"folder": source.folder}).written_at(source.place)
         except ValidationError as e:
             raise CaseError("\n".join(explain(error, source, cls) for error in e.errors())) from None

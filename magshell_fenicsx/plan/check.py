@@ -22,7 +22,14 @@ def describe(case: Case) -> str:
     CaseError
         If the case cannot be built, or nothing is held.
     """
-    plan = _planned(case)
+    try:
+        return _described(case)
+    except (CaseError, MeshError) as e:
+        raise CaseError(case.placed(str(e))) from None
+
+
+def _described(case: Case) -> str:
+    plan = make_plan(case)
     if all(condition in ("free", "symmetry") for condition in plan.conditions.values()):
         raise CaseError("boundary: nothing is held: clamp an edge or a patch, or hold points, for instance")
     numbers = {
@@ -35,7 +42,7 @@ def describe(case: Case) -> str:
     lines = [f"{name} = {value:.6g}" for name, value in numbers.items()]
     patch = None
     if case.mesh.tolerance is None:
-        patch = None if plan.axisymmetric else _meshed(plan)
+        patch = None if plan.axisymmetric else plan.triangulated()
         cells, unknowns = _count(case, plan, patch)
         lines.append(f"mesh: {cells} cells of degree {case.degree}, {unknowns} unknowns")
         if patch and isinstance(plan.shape, MeshFile):
@@ -58,24 +65,10 @@ def _open(plan: Plan, patch: PatchMesh | None) -> tuple[str, ...]:
     """The edges at which a live pressure has no potential."""
     span = plan.meridian
     if span is None:
-        return open_edges(patch or _meshed(plan), plan.conditions)
+        return open_edges(patch or plan.triangulated(), plan.conditions)
     places = span.sample()[[0, -1]][:, [0, 2]]
     ends = {name: np.asarray(place) for name, place in zip(span.names, places, strict=True) if name}
     return ring_openings(ends, plan.conditions)[1]
-
-
-def _planned(case: Case) -> Plan:
-    try:
-        return make_plan(case)
-    except MeshError as e:
-        raise CaseError(str(e)) from None
-
-
-def _meshed(plan: Plan) -> PatchMesh:
-    try:
-        return plan.triangulated()
-    except MeshError as e:
-        raise CaseError(str(e)) from None
 
 
 def _surface(patch: PatchMesh) -> list[str]:

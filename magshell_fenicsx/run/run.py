@@ -9,10 +9,12 @@ from mpi4py import MPI
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.loads.step import PathStep
+from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.continuation.factor import has_cholmod
 from magshell_fenicsx.continuation.fold import FoldLost
 from magshell_fenicsx.continuation.inverse import NoEigenpair
 from magshell_fenicsx.continuation.journal import NoJournal
+from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.output.pictures.render import NoScreen
 from magshell_fenicsx.output.report.report import write_report
@@ -109,10 +111,13 @@ def _run(
     def doing(what: str) -> None:
         tell(waiting(what, time.perf_counter() - start))
 
-    with_modes(case, comm)
-    found = _mesh_for_tolerance(case, folder, comm, say, doing)
-    doing("mesh and kernels")
-    scene = found.choice.scene(case, comm) if found else Scene(case, comm)
+    try:
+        with_modes(case, comm)
+        found = _mesh_for_tolerance(case, folder, comm, say, doing)
+        doing("mesh and kernels")
+        scene = found.choice.scene(case, comm) if found else Scene(case, comm)
+    except (CaseError, MeshError) as e:
+        raise type(e)(case.placed(str(e))) from None
     result = Result(scene, scene.unloaded(), adapted=found)
     say(f"{', '.join(scene.plan.included)}: {scene.cells} cells, {scene.model.system.dofs} unknowns")
     if scene.plan.warning:

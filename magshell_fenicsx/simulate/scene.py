@@ -135,13 +135,15 @@ class Scene:
         ValueError
             If it has another number of unknowns or other amplitudes.
         """
-        own, words = self.unloaded(), "this state is of another scene"
+        own = self.unloaded()
         if state.u.shape != own.u.shape:
-            numbers = f"it has {state.u.size} unknowns on this rank, this scene has {own.u.size}"
-            raise ValueError(f"{words}: {numbers}; take records of follow or trace of the same scene")
+            raise ValueError(
+                f"this state is of another scene: it has {state.u.size} unknowns on this rank, this scene has "
+                f"{own.u.size}; take records of follow or trace of the same scene"
+            )
         if state.mu.keys() != own.mu.keys():
             there, here = (", ".join(sorted(mu)) or "none" for mu in (state.mu, own.mu))
-            raise ValueError(f"{words}: its amplitudes are {there}, those of this scene {here}")
+            raise ValueError(f"this state is of another scene: its amplitudes are {there}, those of this scene {here}")
 
     def observe(self, state: State) -> dict[str, float]:
         """The physical columns of a table row: loads, displacements over h, volume, energies over E h R^2."""
