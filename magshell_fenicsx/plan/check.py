@@ -5,6 +5,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.source import CaseError
+from magshell_fenicsx.case.units import sizes_of
 from magshell_fenicsx.mesh.msh import MeshFile
 from magshell_fenicsx.mesh.patch import MeshError, PatchMesh
 from magshell_fenicsx.models.shell.openings import no_potential, ring_openings
@@ -40,6 +41,7 @@ def _described(case: Case) -> str:
         "Lambda_m = lambda_m R/h": case.lambda_m / plan.material.h,
     }
     lines = [f"{name} = {value:.6g}" for name, value in numbers.items()]
+    lines += _in_units(case)
     patch = None
     if case.mesh.tolerance is None:
         patch = None if plan.axisymmetric else plan.triangulated()
@@ -59,6 +61,15 @@ def _described(case: Case) -> str:
     if plan.warning:
         lines.append(f"warning: {plan.warning}")
     return "\n".join(lines)
+
+
+def _in_units(case: Case) -> list[str]:
+    """The sizes of a case with units."""
+    known = sizes_of(case)
+    named = {"h": ("h", "mm"), "p_c": ("p_c", "Pa"), "2πD/R": ("2 pi D/R", "N"), "λ_m": ("applied field", known.field)}
+    factor = {"λ_m": case.lambda_m}
+    there = {scale: words for scale, words in named.items() if scale in known.of}
+    return [f"{name} = {known.of[scale] * factor.get(scale, 1.0):.6g} {unit}" for scale, (name, unit) in there.items()]
 
 
 def _open(plan: Plan, patch: PatchMesh | None) -> tuple[str, ...]:
