@@ -127,8 +127,13 @@ class Scene:
         given = self._own_amplitudes
         return State(self.model.zero(), {name: given.get(name, 0.0) for name in sorted({*amplitudes, *given})})
 
-    def refuse_foreign(self, state: State) -> None:
+    def refuse_foreign(self, state: State, *, more: bool = False) -> None:
         """Refuse a state of another scene, as far as it shows.
+
+        Parameters
+        ----------
+        more
+            Whether the state may have amplitudes that this scene has not.
 
         Raises
         ------
@@ -141,13 +146,14 @@ class Scene:
                 f"this state is of another scene: it has {state.u.size} unknowns on this rank, this scene has "
                 f"{own.u.size}; take records of follow or trace of the same scene"
             )
-        if state.mu.keys() != own.mu.keys():
+        others = state.mu.keys() - own.mu.keys() - {*self.model.system.settings}
+        if own.mu.keys() - state.mu.keys() or (others and not more):
             there, here = (", ".join(sorted(mu)) or "none" for mu in (state.mu, own.mu))
             raise ValueError(f"this state is of another scene: its amplitudes are {there}, those of this scene {here}")
 
     def observe(self, state: State) -> dict[str, float]:
         """The physical columns of a table row: loads, displacements over h, volume, energies over E h R^2."""
-        self.refuse_foreign(state)
+        self.refuse_foreign(state, more=True)
         model, h, loads = self.model, self.plan.material.h, self.model.loads
         force, sense = loads.forces.get("force"), copysign(1.0, self.case.lambda_m)
         energies = self.energies(state)

@@ -61,6 +61,9 @@ def test_state_of_another_scene_is_refused() -> None:
     scene, finer = ms.Scene(case_of()), ms.Scene(case_of("mesh.degree=4"))
     with_springs = ms.Scene(case_of(), terms=[ms.OwnTerm("k", springs, (1.0,))])
     *_, last = ms.trace(scene, "pressure", targets=[0.1])
+    *_, sprung = ms.trace(with_springs, "pressure", targets=[0.1])
+    with pytest.raises(ValueError, match="its amplitudes are k, pressure, those of this scene pressure"):
+        ms.surface(scene, sprung)
     for other, said in (
         (finer, r"it has \d+ unknowns on this rank, this scene has \d+"),
         (with_springs, "those of this"),
