@@ -76,6 +76,7 @@ def run(
     """Solve a case and write path.csv, summary.json, fields and pictures."""
     from magshell_fenicsx.case.case import Case
     from magshell_fenicsx.mesh.patch import MeshError
+    from magshell_fenicsx.output.report.verdict import sentence_of
     from magshell_fenicsx.output.store.folder import DiskError
     from magshell_fenicsx.platform.terminal import live_line
     from magshell_fenicsx.run.files import AlreadyComplete
@@ -91,6 +92,7 @@ def run(
                 )
     except AlreadyComplete as e:
         print_line(f"complete already: {e.summary['points']} points; results in {folder}/")
+        print_line(sentence_of(folder))
         return
     gc.freeze()  # the process ends soon: another garbage collection takes longer than importing dolfinx
     if result.knockdown is not None:
@@ -100,6 +102,8 @@ def run(
     print_line(f"results in {folder}/")
     if result.stopped:
         raise failure(f"stopped early: {result.stopped}", STOPPED)
+    if world().rank == 0:
+        print_line(sentence_of(folder))
 
 
 @app.command()
@@ -111,6 +115,9 @@ def sweep(
     full_paths: Annotated[
         bool, typer.Option("--full-paths", help="compute the full path at every point; follow no fold")
     ] = False,
+    part: Annotated[
+        str | None, typer.Option(metavar="I/N", help="compute only the I-th of N shares of the points: one of N jobs")
+    ] = None,
 ) -> None:
     """Run a case over ranges of its keys; keep the points that are already in the folder."""
     from magshell_fenicsx.output.store.folder import DiskError
@@ -118,7 +125,7 @@ def sweep(
 
     folder = out or Path("results") / f"{case.stem}_sweep"
     with exit_codes(stopped=(DiskError,)):
-        done = run_sweep(case, over, set_ or [], folder, full_paths=full_paths)
+        done = run_sweep(case, over, set_ or [], folder, full_paths=full_paths, part=part)
     print_line(f"results in {folder}/")
     if done.stopped:
         raise failure(f"{done.stopped} of {len(done.points)} points stopped early; sweep.csv says why", STOPPED)

@@ -1,8 +1,9 @@
 """How a command ends: messages of rank 0 and exit codes."""
 
+import signal
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 from magshell_fenicsx.case.source import CaseError
@@ -20,6 +21,8 @@ def world() -> Any:
 
 def print_line(line: str) -> None:
     if world().rank == 0:
+        with suppress(ValueError):  # elsewhere than in the main thread
+            signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # again: PETSc has taken it if it was imported since `main`
         print(line, flush=True)
 
 

@@ -320,12 +320,12 @@ class Case(WithParts):
 
     @property
     def outside(self) -> dict[str, str | None]:
-        """What is solved besides the case's own keys: the hashes of its mesh file and of its other files."""
+        """Hashes of what is solved besides its own keys: mesh file, other files, user-defined energies."""
         mesh = {"mesh_file": self.shell.digest} if isinstance(self.shell, MeshSurface) else {}
         sections: dict[str, object] = {"magnetic.remanent": self.magnetic.remanent} if self.magnetic else {}
-        sections |= self.imperfections
-        sections |= {f"magnetic.applied.sources.{i}": source for i, source in enumerate(self.sources)}
-        return mesh | {f"{key}.file": s.digest for key, s in sections.items() if isinstance(s, FileKeys) and s.file}
+        sections |= self.imperfections | {f"magnetic.applied.sources.{i}": s for i, s in enumerate(self.sources)}
+        files = {f"{key}.file": s.digest for key, s in sections.items() if isinstance(s, FileKeys) and s.file}
+        return mesh | files | self.term_digests
 
     @classmethod
     def load(cls, file: str | Path, settings: Sequence[str] = ()) -> "Case":
@@ -345,6 +345,6 @@ class Case(WithParts):
     def from_source(cls, source: Source) -> "Case":
         """Validate plain data; see `load`."""
         try:
-            return cls.model_validate(source.data, context={"folder": source.folder})
+            return cls.model_validate(source.data, context={"folder": source.folder}).written_at(source.place)
         except ValidationError as e:
             raise CaseError("\n".join(explain(error, source, cls) for error in e.errors())) from None

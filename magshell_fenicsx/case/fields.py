@@ -35,7 +35,7 @@ class RemanentSection(FileKeys, Direction):
     kind: Literal["uniform", "radial", "tangential", "expression", "patches", "layers", "points"] = "uniform"
     """How it varies in space"""
     flux_density: FluxDensity | None = Field(default=None, ge=-1e3, le=1e3)
-    """|B^r|, at most 1000 T; with that of `applied` in place of lambda_m"""
+    """|B^r|, at most 1000 T; with that of `applied` in place of lambda_m; negative: the remanence is reversed"""
     components: list[Formula] | None = Field(default=None, min_length=3, max_length=3)
     """Of kind: expression: arithmetic of x, y, z, pi and sin, cos, tan, exp, log, sqrt, abs, sign, arctan2 [|B^r|]"""
     patches: dict[str, Direction] | None = None
@@ -80,7 +80,7 @@ class AppliedSection(Direction):
     """
 
     flux_density: FluxDensity | None = Field(default=None, ge=-1e3, le=1e3)
-    """|B^a|, at most 1000 T; with that of `remanent` in place of lambda_m"""
+    """|B^a|, at most 1000 T; with that of `remanent` in place of lambda_m; negative: the field is reversed"""
     uniform: float = Field(default=1.0, ge=-1e3, le=1e3)
     """Factor of the uniform part [|B^a|]"""
     gradient: list[list[Annotated[float, Field(ge=-1e3, le=1e3)]]] | None = Field(

@@ -80,10 +80,11 @@ def _allowed_keys(location: Location, data: Any, case: type[BaseModel]) -> list[
 
 
 def _meaning(location: Location, data: Any, case: type[BaseModel]) -> str:
-    """The first words on a key, in brackets."""
+    """The first words on a key, in brackets, with its unit."""
     field = _found(location, data, case)[1]
-    words = re.split(r"[;:.,] | \[", field.description)[0] if field and field.description else ""
-    return f" ({' '.join(words.split())})" if words else ""
+    description = (field and field.description) or ""
+    words, unit = re.split(r"[;:.,] | \[", description)[0], re.search(r"\[([^\[\]]+)\]$", description)
+    return f" ({' '.join(words.split())}{f', in {unit[1]}' if unit else ''})" if words else ""
 
 
 def _found(location: Location, data: Any, case: type[BaseModel]) -> tuple[type[BaseModel], FieldInfo | None]:

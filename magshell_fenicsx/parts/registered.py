@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 from pydantic import Field, create_model
 
+from magshell_fenicsx.parts.own import WithOwnTerms
 from magshell_fenicsx.parts.part import Part
-from magshell_fenicsx.parts.section import Section
 
 REGISTERED: dict[str, str] = {
     # key of the case file, and name of the file here -> the class in it
@@ -24,10 +24,10 @@ def _meaning(part: type[Part]) -> str:
 
 
 if TYPE_CHECKING:
-    WithParts = Section
+    WithParts = WithOwnTerms
 else:  # an optional key for each part
     WithParts = create_model(
         "WithParts",
-        __base__=Section,
+        __base__=WithOwnTerms,
         **{key: (part | None, Field(default=None, description=_meaning(part))) for key, part in PARTS.items()},
     )

@@ -65,6 +65,36 @@ def _converted(value: str, unit: str) -> float:
         raise ValueError(f'is not a number with a unit such as "{_example(unit)}"') from None
 
 
+def number_and_unit(text: str) -> tuple[str, str]:
+    """The number and the unit of a text, which is empty for a bare number; both are empty for a word.
+
+    Examples
+    --------
+    >>> number_and_unit("-40mT"), number_and_unit("2.5e-3"), number_and_unit("full")
+    (('-40', 'mT'), ('2.5e-3', ''), ('', ''))
+    """
+    if re.fullmatch(_NUMBER, text.strip()):
+        return text.strip(), ""
+    found = re.match(rf"\s*({_NUMBER})", text) if _NUMBER_AND_UNITS.fullmatch(text) else None
+    return (found[1], text[found.end() :].strip(" *")) if found else ("", "")
+
+
+def in_unit(text: str, unit: str) -> float:
+    """A number with a unit in another unit; a bare zero has any.
+
+    Raises
+    ------
+    ValueError
+        If it is none, or of another dimension.
+    """
+    number, own = number_and_unit(text)
+    if not own and number and (not unit or float(number) == 0):
+        return float(number)
+    if not unit or not number:
+        raise ValueError(f"{text} is not convertible to {unit or 'a bare number'}")
+    return float(number) if own == unit else _converted(text, unit)
+
+
 def in_units(unit: str, *, bare: bool = False) -> Callable[[Any], float]:
     """A validator: text with a unit -> a float in `unit`; a number stays as it is.
 

@@ -5,6 +5,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.source import CaseError
+from magshell_fenicsx.case.units import sizes_of
 from magshell_fenicsx.mesh.msh import MeshFile
 from magshell_fenicsx.mesh.patch import MeshError, PatchMesh
 from magshell_fenicsx.models.shell.openings import no_potential, ring_openings
@@ -22,7 +23,14 @@ def describe(case: Case) -> str:
     CaseError
         If the case cannot be built, or nothing is held.
     """
-    plan = _planned(case)
+    try:
+        return _described(case)
+    except (CaseError, MeshError) as e:
+        raise CaseError(case.placed(str(e))) from None
+
+
+def _described(case: Case) -> str:
+    plan = make_plan(case)
     if all(condition in ("free", "symmetry") for condition in plan.conditions.values()):
         raise CaseError("boundary: nothing is held: clamp an edge or a patch, or hold points, for instance")
     numbers = {
@@ -33,9 +41,10 @@ def describe(case: Case) -> str:
         "Lambda_m = lambda_m R/h": case.lambda_m / plan.material.h,
     }
     lines = [f"{name} = {value:.6g}" for name, value in numbers.items()]
+    lines += _in_units(case)
     patch = None
     if case.mesh.tolerance is None:
-        patch = None if plan.axisymmetric else _meshed(plan)
+        patch = None if plan.axisymmetric else plan.triangulated()
         cells, unknowns = _count(case, plan, patch)
         lines.append(f"mesh: {cells} cells of degree {case.degree}, {unknowns} unknowns")
         if patch and isinstance(plan.shape, MeshFile):
@@ -54,28 +63,23 @@ def describe(case: Case) -> str:
     return "\n".join(lines)
 
 
+def _in_units(case: Case) -> list[str]:
+    """The sizes of a case with units."""
+    known = sizes_of(case)
+    named = {"h": ("h", "mm"), "p_c": ("p_c", "Pa"), "2πD/R": ("2 pi D/R", "N"), "λ_m": ("applied field", known.field)}
+    factor = {"λ_m": case.lambda_m}
+    there = {scale: words for scale, words in named.items() if scale in known.of}
+    return [f"{name} = {known.of[scale] * factor.get(scale, 1.0):.6g} {unit}" for scale, (name, unit) in there.items()]
+
+
 def _open(plan: Plan, patch: PatchMesh | None) -> tuple[str, ...]:
     """The edges at which a live pressure has no potential."""
     span = plan.meridian
     if span is None:
-        return open_edges(patch or _meshed(plan), plan.conditions)
+        return open_edges(patch or plan.triangulated(), plan.conditions)
     places = span.sample()[[0, -1]][:, [0, 2]]
     ends = {name: np.asarray(place) for name, place in zip(span.names, places, strict=True) if name}
     return ring_openings(ends, plan.conditions)[1]
-
-
-def _planned(case: Case) -> Plan:
-    try:
-        return make_plan(case)
-    except MeshError as e:
-        raise CaseError(str(e)) from None
-
-
-def _meshed(plan: Plan) -> PatchMesh:
-    try:
-        return plan.triangulated()
-    except MeshError as e:
-        raise CaseError(str(e)) from None
 
 
 def _surface(patch: PatchMesh) -> list[str]:

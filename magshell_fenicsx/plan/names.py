@@ -26,8 +26,11 @@ def refuse_unfit(
     _refuse_ambiguous(patch.edges, patch.points, conditions)
     if loads.magnetic and loads.magnetic.patches:
         by_patch(loads.magnetic.patches, patch.patches, len(patch.cells))
+    for key in ("curvature", "stretch"):
+        if isinstance(values := getattr(loads.natural, key, None), Mapping):
+            by_patch(values, patch.patches, len(patch.cells), f"natural.{key}")
     for name in (thickness and thickness.patches) or {}:
-        patch_of(patch.patches, name)
+        patch_of(patch.patches, name, "shell.thickness_factor")
     for load in loads.all_dead:
         if isinstance(load, AreaForce) and load.patch is not None:
             patch_of(patch.patches, load.patch)

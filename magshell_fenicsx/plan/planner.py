@@ -47,7 +47,7 @@ PRESSED = 0.08  # of sqrt(Rh): cells of a meridian that show the ring of a conta
 
 
 def make_plan(case: Case, terms: Sequence[OwnTerm] = ()) -> Plan:
-    """Plan a case, with one's own energies.
+    """Plan a case, with its user-defined energies and `terms`.
 
     Raises
     ------
@@ -67,6 +67,7 @@ def make_plan(case: Case, terms: Sequence[OwnTerm] = ()) -> Plan:
     places = indented(case, drawn)
     sample = np.zeros((0, 3)) if isinstance(case.shell, MeshSurface) else drawn.sample()
     refuse_unbounded_fields(case, sample)
+    terms = (*case.own_terms, *terms)
     energies = surface_terms(case, terms)
     parts = left(case, drawn, places, (*energies, *potentials(case)))
     parts += leaves(found, perfect, each=bool(case.patches))

@@ -202,7 +202,9 @@ AMPLITUDES = {
 # names of terms, and of amplitudes that only the solvers use
 INTERNAL = ("push", "lambda_across", "lambda_third", "membrane", "couple")
 OF_SOURCES = ("source_force", "source_torque", "source_work")
-TAKEN = frozenset((*QUANTITIES, *AMPLITUDES, *INTERNAL))
+TAKEN = frozenset(
+    (*QUANTITIES, *AMPLITUDES, *INTERNAL, *(each.name for q in QUANTITIES.values() for each in q.in_units))
+)
 
 
 def register(quantities: Iterable[Quantity]) -> None:
@@ -228,6 +230,12 @@ def quantity(name: str) -> Quantity:
     kinds: dict[str, Kind] = {"u": "place", "f": "reaction", "m": "moment"}
     ending = re.search(r"_([ufm])[xyz]$", name)
     return Quantity(name, name.replace("_", " "), "", kinds[ending[1]] if ending else "load")
+
+
+def shown(name: str, columns: Collection[str]) -> Quantity:
+    """The quantity of a column, in the case's units if one of the columns has it in these."""
+    known = quantity(name)
+    return next((each for each in known.in_units if each.name in columns), known)
 
 
 def amplitude(name: str) -> Amplitude:
@@ -260,9 +268,9 @@ def axes_of(name: str, row: Collection[str] = ()) -> tuple[Quantity, Quantity]:
     own_name = tuple(f"{column}_{name}" for column in ("reaction", *OF_SOURCES))
     for reaction in (*own_name, "reaction", *OF_SOURCES) if name not in AMPLITUDES else ():
         if reaction in row:
-            return quantity(name), quantity(reaction)
+            return quantity(name), shown(reaction, row)
     varied, own = amplitude(name), f"w_{name}_over_h"
-    over, drawn = quantity(own if own in row else varied.conjugate), quantity(varied.column)
+    over, drawn = shown(own if own in row else varied.conjugate, row), shown(varied.column, row)
     if varied.conjugate == "w_over_h":
         over = replace(over, note=varied.place)
     sideways = name in ("angle", "time") or varied.column.startswith("approach_over_h")

@@ -68,7 +68,7 @@ def _resumed(out: Path, case: Case) -> None:
     if not file.exists() and (out / "summary.json").exists():
         summary = json.loads((out / "summary.json").read_text(encoding="utf-8"))
         if summary["stopped"] is None:
-            kept = {key: summary[key] for key in ("case", "mesh_file", "sources") if key in summary}
+            kept = {key: summary[key] for key in ("case", "sources", *case.outside) if key in summary}
             checkpoint.refuse_other({"version": summary["versions"]["magshell_fenicsx"], **kept}, case, out)
             raise AlreadyComplete(summary)
     checkpoint.check_resumable(file, case)
@@ -108,7 +108,7 @@ class RunFiles:
 
     def _open(self) -> tuple[int, list[dict[str, str]]]:
         begun = checkpoint.begun_with(self._folder / checkpoint.NAME) or {}
-        self._begun_with = {key: begun[key] for key in ("mesh_file", "sources") if key in begun}
+        self._begun_with = {key: value for key, value in begun.items() if key not in ("case", "version")}
         self._table = PathTable(self._folder / "path.csv", self._scene.extra_columns)
         plan = self._scene.plan
         mirror = plan.mirror.turned(plan.azimuth).plane if plan.mirror else None

@@ -31,6 +31,7 @@ def surface(scene: Scene, record: Record) -> Surface | None:
     `M_2`, and those of the magnetic field: `Br`, `Ba`, `p_mag`, `f_mag`, `k`, `tau`; see `PointFields`.
     """
     plan, state = scene.plan, record.point.state
+    scene.refuse_foreign(state)
     found = gatherer(scene.model, scene.comm).gather(state.u, state.mu)
     return turned(completed(found, plan.mirror.plane) if plan.mirror else found, plan.azimuth) if found else None
 

@@ -26,7 +26,7 @@ class RowMaker:
         if record.label in ("start", "field") or (self._listed and record.amplitude in ("lambda_m", "angle")):
             self._field_end = values["w_over_h"]
         self._count += 1
-        return {
+        row: Row = {
             "point": self._count - 1,
             "label": record.label,
             "amplitude": record.amplitude,
@@ -45,6 +45,7 @@ class RowMaker:
             "step": record.step,
             **self._in_time(record, values),
         }
+        return {**row, **self._scene.sizes.values(row)}
 
     def _in_time(self, record: Record, values: Mapping[str, float]) -> dict[str, float]:
         """The columns of a motion: time and sums go on from earlier steps."""

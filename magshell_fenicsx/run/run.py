@@ -1,7 +1,7 @@
 """Run a case: follow its history, write every accepted point, summarise."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -9,17 +9,21 @@ from mpi4py import MPI
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.loads.step import PathStep
+from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.continuation.factor import has_cholmod
 from magshell_fenicsx.continuation.fold import FoldLost
 from magshell_fenicsx.continuation.inverse import NoEigenpair
 from magshell_fenicsx.continuation.journal import NoJournal
+from magshell_fenicsx.mesh.patch import MeshError
+from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.output.pictures.render import NoScreen
 from magshell_fenicsx.output.report.report import write_report
 from magshell_fenicsx.output.store.durable import write_whole
 from magshell_fenicsx.output.store.folder import DiskError, by_first, held_folder
 from magshell_fenicsx.output.store.table import LOCATED, SOLUTION, Row
 from magshell_fenicsx.platform.environment import fast_blas
-from magshell_fenicsx.quantities.registry import quantity
+from magshell_fenicsx.quantities.quantity import spelled
+from magshell_fenicsx.quantities.registry import amplitude, shown
 from magshell_fenicsx.run.files import MESH, RunFiles, open_folder
 from magshell_fenicsx.run.frequencies import frequencies_after, wanted
 from magshell_fenicsx.run.interrupt import Interrupted, Stoppable, Watch
@@ -52,6 +56,7 @@ def run(
     resume: bool = False,
     time_limit: float | None = None,
     pictures: bool = True,
+    terms: Sequence[OwnTerm] = (),
 ) -> Result:
     """Run a case.
 
@@ -71,6 +76,8 @@ def run(
         Seconds after which the run stops in the same way.
     pictures
         Whether they are drawn; `magshell plot` draws them later.
+    terms
+        User-defined energies, with their amplitudes at `OwnTerm.value`; to resume the run give the same.
 
     Raises
     ------
@@ -82,6 +89,7 @@ def run(
         If the disk is full before the first point.
     """
     start = time.perf_counter()
+    case = case.with_terms(terms) if terms else case
     watch = Watch(comm, start, time_limit, signals=out is not None)
     say, tell = (say, tell or _ignored) if comm.rank == 0 else (_ignored, _ignored)
     if out is None:
@@ -103,10 +111,13 @@ def _run(
     def doing(what: str) -> None:
         tell(waiting(what, time.perf_counter() - start))
 
-    with_modes(case, comm)
-    found = _mesh_for_tolerance(case, folder, comm, say, doing)
-    doing("mesh and kernels")
-    scene = found.choice.scene(case, comm) if found else Scene(case, comm)
+    try:
+        with_modes(case, comm)
+        found = _mesh_for_tolerance(case, folder, comm, say, doing)
+        doing("mesh and kernels")
+        scene = found.choice.scene(case, comm) if found else Scene(case, comm)
+    except (CaseError, MeshError) as e:
+        raise type(e)(case.placed(str(e))) from None
     result = Result(scene, scene.unloaded(), adapted=found)
     say(f"{', '.join(scene.plan.included)}: {scene.cells} cells, {scene.model.system.dofs} unknowns")
     if scene.plan.warning:
@@ -233,9 +244,17 @@ def _follow(result: Result, files: RunFiles | None, say: Say, progress: RunProgr
 
 def _line(row: Row) -> str:
     load = "load_factor" if "load_factor" in row else "force"
-    formats = {"lambda_m": "+.4e", "p_over_pc": ".6f", load: "9.5f", "w_over_h": "8.4f"}
-    loads = "  ".join(f"{quantity(name).plain} {row[name]:{form}}" for name, form in formats.items())
-    return (
-        f"{row['point']:4d} {row['label']:>11}  {loads}  pole {row['w_pole_over_h']:8.4f}  "
-        f"unstable {row['negative_pivots']}  it {row['iterations']}"
-    )
+    formats = {"lambda_m": "+.4e", "p_over_pc": ".6f", load: "9.5f"}
+    if row["amplitude"] and (varied := amplitude(str(row["amplitude"])).column) not in formats:
+        formats[varied] = "9.5f"
+    values = [_value(name, row, form) for name, form in (formats | {"w_over_h": "8.4f"}).items()]
+    pole = _value("w_pole_over_h", row, "8.4f", "pole")
+    counts = f"unstable {row['negative_pivots']}  it {row['iterations']}"
+    return "  ".join([f"{row['point']:4d} {row['label']:>11}", *values, pole, counts])
+
+
+def _value(name: str, row: Row, form: str, words: str = "") -> str:
+    """A column, in the case's units with five digits if it has any, else in a format."""
+    q = shown(name, row)
+    measured = spelled(float(row[q.name]), "9.5g" if q.name != name else form)
+    return f"{words or q.plain} {measured}{f' {q.si}' if q.name != name else ''}"

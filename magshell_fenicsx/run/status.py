@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from math import acos, degrees
 
 import numpy as np
@@ -15,7 +15,9 @@ from magshell_fenicsx.case.loads.time import TimeSection
 from magshell_fenicsx.continuation.point import Point
 from magshell_fenicsx.models.reacting import motion_columns
 from magshell_fenicsx.output.store.table import SOLUTION, Row
-from magshell_fenicsx.quantities.registry import amplitude, quantity
+from magshell_fenicsx.quantities.quantity import spelled
+from magshell_fenicsx.quantities.registry import amplitude, quantity, shown
+from magshell_fenicsx.quantities.units import Sizes
 from magshell_fenicsx.simulate.scene import Scene
 
 WORDS = {"limit": "the first instability", "bifurcation": "the first bifurcation"}
@@ -35,12 +37,15 @@ class Aim:
         That event.
     steps
         Number of steps after which the path ends; None if it ends otherwise.
+    sizes
+        Of the case's units.
     """
 
     column: str
     end: float | None = None
     words: str = ""
     steps: int | None = None
+    sizes: Sizes = field(default_factory=Sizes)
 
     def part(self, first: Row, row: Row, steps: int) -> float | None:
         """The completed part of the path at a point, after some steps; None if the end is unknown.
@@ -65,8 +70,10 @@ class Aim:
         >>> Aim("w_over_h", 20.0).text({"w_over_h": 5.0})
         'w/h 5 -> 20'
         """
-        end = self.words if self.end is None else f"{self.end:.4g}"
-        return f"{quantity(self.column).plain} {float(row[self.column]) + 0.0:.4g} -> {end}"  # no minus zero
+        q, of = shown(self.column, row), self.sizes.of.get(quantity(self.column).scale, 1.0)
+        size, unit = (of, f" {q.si}") if q.name != self.column else (1.0, "")
+        end = self.words if self.end is None else f"{self.end * size:.4g}{unit}"
+        return f"{q.plain} {spelled(float(row[q.name]), '.4g')}{unit * (self.end is None)} -> {end}"
 
 
 def aim(scene: Scene, step: ProgrammeStep) -> Aim:
@@ -142,7 +149,7 @@ class RunProgress:
 
     def __init__(self, scene: Scene, report: Callable[[str], None], start: float) -> None:
         self._scene, self._report, self._start = scene, report, start
-        self._aims = [aim(scene, step) for step in scene.case.programme]
+        self._aims = [replace(aim(scene, step), sizes=scene.sizes) for step in scene.case.programme]
         self._row: Row = {}
         self._first: Row = {}
         self._step = 1

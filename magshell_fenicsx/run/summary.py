@@ -75,6 +75,7 @@ class Result:
         """The located instabilities."""
         return [
             {
+                **self.scene.sizes.values({key: row[key] for key in _told(row)}),
                 "amplitude": row["amplitude"],
                 "value": row[amplitude(str(row["amplitude"])).column],
                 "p_over_pc": row["p_over_pc"],
@@ -94,6 +95,12 @@ class Result:
         at_volume = {step.number for step in self.scene.case.programme if step.name in step.load.hold}
         points = (row for row in self.rows if row["label"] in LOCATED and row["amplitude"] == "pressure")
         return next((float(p["p_over_pc"]) for p in points if not p["branch"] and p.get("step") not in at_volume), None)
+
+    @property
+    def critical_field(self) -> float | None:
+        """λ_m at the first instability under the field; None if there is none."""
+        points = (row for row in self.rows if row["label"] in LOCATED and row["amplitude"] == "lambda_m")
+        return next((float(row["lambda_m"]) for row in points if not row["branch"]), None)
 
     @property
     def value(self) -> float | None:
@@ -122,6 +129,7 @@ def summary(result: Result, total_s: float) -> dict[str, Any]:
             "energy_unit": "E h R^2",
         },
         "dimensions": _dimensions(scene.case.shell),
+        "in_units": in_units(result),
         "model": {
             "included": scene.plan.included,
             "left_out": scene.left_out,
@@ -133,6 +141,7 @@ def summary(result: Result, total_s: float) -> dict[str, Any]:
         "limit_points": result.limit_points,
         "sensitivities": result.sensitivities,
         "knockdown": result.knockdown,
+        "critical_field": result.critical_field,
         "barrier": result.barrier,
         "snaps": snaps(result.rows),
         "frequencies": [
@@ -181,9 +190,35 @@ def solutions(result: Result) -> list[dict[str, Any]]:
                 "solution": row["branch"],
                 "stable": not int(row["negative_pivots"]) + int(row["excluded_pivots"]),
                 **{key: row[key] for key in (*keys, "excluded_pivots", "error_over_h")},
+                **result.scene.sizes.values({key: row[key] for key in keys}),
                 "residual": sizes[0] / sum(sizes[1:]),
             }
         )
+    return found
+
+
+def _told(row: Row) -> set[str]:
+    """The columns of a limit point that may have units."""
+    return {amplitude(str(row["amplitude"])).column, "p_over_pc", "w_pole_over_h"}
+
+
+def in_units(result: Result) -> dict[str, float]:
+    """The numbers of a case with units, with these in their names; none of a case without."""
+    of, case = result.scene.sizes.of, result.scene.case
+    found = {}
+    if "p_c" in of:
+        found["classical_pressure_Pa"] = of["p_c"]
+        if result.knockdown is not None:
+            found["buckling_pressure_Pa"] = result.knockdown * of["p_c"]
+    if "λ_m" in of and result.critical_field is not None:
+        ending = "percent" if result.scene.sizes.field == "%" else "mT"
+        found[f"critical_field_{ending}"] = result.critical_field * of["λ_m"]
+    if "2πD/R" in of:
+        found["unit_force_N"] = of["2πD/R"]
+        found["bending_stiffness_N_m"] = of["2πD/R"] * case.shell.reference / (2 * np.pi)
+        found["unit_energy_mJ"] = of["E h R²"]
+        if result.barrier is not None:
+            found["barrier_mJ"] = result.barrier * of["E h R²"]
     return found
 
 

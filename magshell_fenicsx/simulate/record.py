@@ -35,6 +35,8 @@ class Record:
         Number of the programme's step, from 1; 0 at the start.
     clock
         Of a step in time: the columns time, kinetic, dissipated and work, since its begin.
+    reached
+        False at the end of a `trace` that has not come to its last target.
     """
 
     label: Label
@@ -45,6 +47,7 @@ class Record:
     excluded_pivots: int = 0
     step: int = 0
     clock: Mapping[str, float] = field(default_factory=dict)
+    reached: bool = True
 
 
 class Stopped(RuntimeError):

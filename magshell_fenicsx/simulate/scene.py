@@ -14,6 +14,7 @@ from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.imperfections.modes import ModesSection
 from magshell_fenicsx.case.loads.time import TimeSection
 from magshell_fenicsx.case.source import CaseError
+from magshell_fenicsx.case.units import sizes_of
 from magshell_fenicsx.continuation.journal import Journal, NoJournal
 from magshell_fenicsx.continuation.listener import NoProgress, Progress
 from magshell_fenicsx.continuation.newton import BorderedNewton, NewtonOptions
@@ -36,7 +37,8 @@ from magshell_fenicsx.models.shell.supports import refuse_loose
 from magshell_fenicsx.models.solid.model import SolidModel
 from magshell_fenicsx.plan.plan import Plan
 from magshell_fenicsx.plan.planner import make_plan
-from magshell_fenicsx.quantities.registry import IN_TIME, amplitude, contact_columns
+from magshell_fenicsx.quantities.registry import IN_TIME, OF_EVERY_RUN, amplitude, contact_columns
+from magshell_fenicsx.quantities.units import Sizes
 from magshell_fenicsx.simulate.build import build_meridian_model, build_model, build_solid_model
 from magshell_fenicsx.simulate.direction import directions, field_angle, field_size
 
@@ -134,8 +136,33 @@ class Scene:
         given = self._own_amplitudes
         return State(self.model.zero(), {name: given.get(name, 0.0) for name in sorted({*amplitudes, *given})})
 
+    def refuse_foreign(self, state: State, *, more: bool = False) -> None:
+        """Refuse a state of another scene, as far as it shows.
+
+        Parameters
+        ----------
+        more
+            Whether the state may have amplitudes that this scene has not.
+
+        Raises
+        ------
+        ValueError
+            If it has another number of unknowns or other amplitudes.
+        """
+        own = self.unloaded()
+        if state.u.shape != own.u.shape:
+            raise ValueError(
+                f"this state is of another scene: it has {state.u.size} unknowns on this rank, this scene has "
+                f"{own.u.size}; take records of follow or trace of the same scene"
+            )
+        others = state.mu.keys() - own.mu.keys() - {*self.model.system.settings}
+        if own.mu.keys() - state.mu.keys() or (others and not more):
+            there, here = (", ".join(sorted(mu)) or "none" for mu in (state.mu, own.mu))
+            raise ValueError(f"this state is of another scene: its amplitudes are {there}, those of this scene {here}")
+
     def observe(self, state: State) -> dict[str, float]:
         """The physical columns of a table row: loads, displacements over h, volume, energies over E h R^2."""
+        self.refuse_foreign(state, more=True)
         model, h, loads = self.model, self.plan.material.h, self.model.loads
         force, sense = loads.forces.get("force"), copysign(1.0, self.case.lambda_m)
         energies = self.energies(state)
@@ -206,9 +233,15 @@ class Scene:
         """See `source_columns`."""
         return source_columns(self.plan.loads)
 
-    @property
+    @cached_property
+    def sizes(self) -> Sizes:
+        """The sizes of the case's units."""
+        moments = {column for name, column in motion_columns(self.plan.loads).items() if self._only_turns(name)}
+        return sizes_of(self.case, moments)
+
+    @cached_property
     def extra_columns(self) -> tuple[str, ...]:
-        """The columns of `observe` besides those of every run."""
+        """The columns of a row besides those of every run; the last ones are those in the case's units."""
         named = tuple(f"{point}_u{axis}" for point in self.case.points for axis in "xyz")
         own = (*self._own_amplitudes, *(column for term in self.plan.loads.own for column in term.observed))
         factors = (self._column(name) for name in (*self.plan.loads.forces, *self.plan.loads.dead) if name != "force")
@@ -217,7 +250,8 @@ class Scene:
         clock = tuple(q.name for q in IN_TIME) if moves else ()
         sources = (*self.sources, *self.sources.values())
         contacts = (column for name in self.model.contacts for column in contact_columns(name) if column != "force")
-        return (*factors, *displaced, *named, *own, *self._support_columns, *sources, *contacts, *clock)
+        extra = (*factors, *displaced, *named, *own, *self._support_columns, *sources, *contacts, *clock)
+        return (*extra, *self.sizes.columns((*(q.name for q in OF_EVERY_RUN), *extra)))
 
     def stored(self, state: State, energy: float) -> float:
         """The energy of the shell itself: without the potentials of the loads."""
@@ -285,11 +319,7 @@ class Scene:
             return -material.classical_pressure / material.h / model.multiplicity
         if name in self.motions:
             force = (self.case.shell.modulus or 1.0) * material.h * self.plan.length**2
-            arm = (
-                1.0
-                if any(m.motion.shift.any() for m in self.plan.loads.moves if m.motion.name == name)
-                else self.plan.length
-            )
+            arm = self.plan.length if self._only_turns(name) else 1.0
             return -motion_size(self.plan.loads, name) / (force * arm * model.multiplicity)
         if name in model.contacts:
             return -model.force_unit * material.h
@@ -300,6 +330,10 @@ class Scene:
         if name in model.loads.forces:
             return model.force_unit * material.h
         return model.load_size.get(name, 0.0) / self.plan.length
+
+    def _only_turns(self, name: str) -> bool:
+        """Whether a motion has rotations alone, so that its reaction is a moment."""
+        return not any(m.motion.shift.any() for m in self.plan.loads.moves if m.motion.name == name)
 
     def _observe_points(self, state: State) -> dict[str, float]:
         """The displacements of named points in the unit of the shell's lengths."""

@@ -60,6 +60,7 @@ def solutions(
         If the known state is no equilibrium.
     """
     state = known.point.state if isinstance(known, Record) else known
+    scene.refuse_foreign(state)
     name = known.amplitude if isinstance(known, Record) and known.amplitude in state.mu else next(iter(state.mu))
     rest = scene.newton.solve(state, name, GivenLoad(name, state.mu[name]))
     if not rest.converged:

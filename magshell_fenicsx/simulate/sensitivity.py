@@ -26,6 +26,8 @@ from magshell_fenicsx.simulate.shape_sensitivity import to_imperfections
 from magshell_fenicsx.simulate.stage import Stage, plain
 from magshell_fenicsx.simulate.steps import stage_of
 
+SOME_FIELD = 1e-3  # a lambda_m that is not zero; nothing is solved in it
+
 
 def fold_at(scene: Scene, record: Record) -> Fold:
     """The fold of a record with the label "fold", with its null vector; collective.
@@ -39,6 +41,7 @@ def fold_at(scene: Scene, record: Record) -> Fold:
     """
     if record.label != "fold":
         raise ValueError(f"this record is no fold, but a {record.label}")
+    scene.refuse_foreign(record.point.state)
     stage = stage_at(scene, record)
     return find_fold(stage.newton, Guess(stage.enter(record.point.state)), record.amplitude)
 
@@ -70,9 +73,28 @@ def sensitivities(scene: Scene, fold: Fold, record: Record | None = None) -> dic
     system, state, settings = stage.newton.system, fold.state, scene.model.system.settings
     columns = {name: system.load(state.u, state.mu, name) for name in state.mu if name not in (fold.name, *settings)}
     by_patch = _remanence_columns(scene, replace(fold, state=stage.leave(state)))
-    columns |= {name: stage.padded(column) for name, column in by_patch.items()}
+    columns |= {name: stage.padded(column) for name, column in (by_patch | _field_column(scene, state)).items()}
     found = {name: sensitivity(system, fold, column) for name, column in columns.items()}
     return found | to_imperfections(stage, fold)
+
+
+def _field_column(scene: Scene, state: State) -> dict[str, Vector]:
+    """The load column of lambda_m for a case whose field is zero: of the same shell with a field.
+
+    Empty without a section magnetic, and where the field leaves less symmetry than the model has.
+    """
+    magnetic = scene.case.magnetic
+    if magnetic is None or "lambda_m" in state.mu:
+        return {}
+    remanent, applied = (
+        part.model_copy(update={"flux_density": None}) for part in (magnetic.remanent, magnetic.applied)
+    )
+    some = {"lambda_m": SOME_FIELD, "remanent": remanent, "applied": applied}
+    there = Scene(scene.case.model_copy(update={"magnetic": magnetic.model_copy(update=some)}), scene.comm)
+    if type(there.model) is not type(scene.model) or there.model.system.size != scene.model.system.size:
+        return {}
+    size = scene.model.system.size
+    return {"lambda_m": there.model.system.load(state.u[:size], {**there.unloaded().mu, **state.mu}, "lambda_m")}
 
 
 @dataclass(frozen=True)

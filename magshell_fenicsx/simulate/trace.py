@@ -1,6 +1,9 @@
 """A path in any amplitude of a scene from any state, for notebooks."""
 
+import warnings
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from itertools import chain
 
 import numpy as np
 
@@ -29,7 +32,8 @@ def trace(
     """Follow the equilibria of a scene while one amplitude varies and the others are constant.
 
     The first record is the start, after Newton's method at its amplitudes. As in `follow`, the last record may be an
-    earlier instability that a reduced model excludes (`Record.mode`).
+    earlier instability that a reduced model excludes (`Record.mode`). Where the path ends before its last target, the
+    last record has `reached=False`, and a warning names the place.
 
     Parameters
     ----------
@@ -61,6 +65,7 @@ def trace(
         If the path is lost, or there is no equilibrium to start from.
     """
     state = start.point.state if isinstance(start, Record) else start or scene.unloaded()
+    scene.refuse_foreign(state)
     if name not in state.mu:
         raise ValueError(f"trace: {name}: the scene has no such amplitude, only {', '.join(state.mu) or 'none'}")
     of_load = control == "load" or (control == "arc" and quantity == "load")
@@ -84,5 +89,17 @@ def trace(
         step = abs(targets[-1] - here.s) / 10
         path = path.in_steps(StepOptions(step, 2 * step, 1e-5 * step))
     sense = float(np.copysign(1.0, first * here.dmu))
-    yield Record("start", "", here)
-    yield from followed(plain(scene), path, here, Goal(until, targets, quantity, steps, sense))
+    found = followed(plain(scene), path, here, Goal(until, targets, quantity, steps, sense))
+    yield from _marked(chain([Record("start", "", here)], found), name, targets)
+
+
+def _marked(records: Iterator[Record], name: str, targets: Sequence[float]) -> Iterator[Record]:
+    """The records; the last one says if it is not at the last target."""
+    last, missed = next(records), len(targets)
+    for record in records:
+        yield last
+        last, missed = record, missed - (record.label == "target")
+    if missed > 0:
+        where = f"{last.label}{f' ({last.mode})' if last.mode else ''} at {name} = {last.point.state.mu[name]:.6g}"
+        warnings.warn(f"trace: {name}: ends at a {where}, before its target {targets[-1]:.6g}", stacklevel=2)
+    yield replace(last, reached=missed <= 0)

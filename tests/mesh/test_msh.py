@@ -269,7 +269,10 @@ def test_unknown_names_are_refused(model: Any, tmp_path: Path) -> None:
             {"boundary": {"rim": "clamped"}},
             "boundary.rim: the surface has no such edge, only bottom, left, lower, right, top, upper",
         ),
-        ({"boundary": {"top": "hinged"}, "shell": {**shell, "thickness_factor": {"front": 2}}}, "no patch front"),
+        (
+            {"boundary": {"top": "hinged"}, "shell": {**shell, "thickness_factor": {"front": 2}}},
+            "shell.thickness_factor: front: the surface has no such patch, only lower, upper",
+        ),
         ({"boundary": {"top": {"held": ["z"]}}}, "the shell is not held"),
     ):
         with pytest.raises(MeshError, match=said):

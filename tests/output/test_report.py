@@ -4,6 +4,7 @@ import base64
 import copy
 import json
 from html.parser import HTMLParser
+from math import pi
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,7 @@ SUMMARY: dict[str, Any] = {
         "pc_over_E": 4 / 3 / 90**2,  # 2/sqrt(3 (1 - nu^2)) (h/R)^2 with nu = 1/2
     },
     "dimensions": {"radius": 0.0252, "thickness": 0.00028, "youngs_modulus": 1.8e6, "units": "SI"},
+    "in_units": {"classical_pressure_Pa": 1.8e6 * 4 / 3 / 90**2},
     "model": {"included": ["meridian", "live pressure"], "left_out": ["force: none"]},
     "stopped": None,
     "sensitivities": {},
@@ -72,9 +74,10 @@ class Page(HTMLParser):
 
 def page(folder: Path, rows: list[dict[str, Any]], pictures: dict[str, bytes] | None = None, **changes: Any) -> Page:
     """The report of a folder with a start, so many more rows, and a summary with changes."""
-    lines = [",".join(COLUMNS)]
+    columns = dict.fromkeys((*COLUMNS, *(name for row in rows for name in row)))
+    lines = [",".join(columns)]
     for number, row in enumerate([{}, *rows]):
-        lines.append(",".join(str((START | {"point": number} | row)[name]) for name in COLUMNS))
+        lines.append(",".join(str((START | {"point": number} | row).get(name, 0.0)) for name in columns))
     (folder / "path.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
     (folder / "summary.json").write_text(json.dumps(copy.deepcopy(SUMMARY) | changes), encoding="utf-8")
     for name, content in (pictures or {}).items():
@@ -100,7 +103,7 @@ def test_one_file_with_every_picture_and_no_reference(tmp_path: Path) -> None:
 
 def test_buckling_in_one_sentence_and_in_pascals(tmp_path: Path) -> None:
     """p_c = 1.8e6 * 4/3/90^2 = 296.296 Pa, k_d p_c = 96.6617 Pa."""
-    text = page(tmp_path, [FOLD]).text
+    text = page(tmp_path, [FOLD | {"pressure_Pa": 0.326233305 * 1.8e6 * 4 / 3 / 90**2}]).text
     assert (
         "The shell buckles at the knockdown factor kd = p/pc = 0.326233 (96.6617 Pa): a fold, w/h = 3.4 at the" in text
     )
@@ -110,7 +113,8 @@ def test_buckling_in_one_sentence_and_in_pascals(tmp_path: Path) -> None:
 
 def test_force_at_the_target_in_newtons(tmp_path: Path) -> None:
     """2 pi D/R with D = 1.8e6 (2.8e-4)^3/9 = 4.3904e-6 N m is 1.094671e-3 N; times 27.532."""
-    rows = [{"label": "target", "amplitude": "force", "force": 27.532, "w_over_h": 20.0}]
+    newtons = 27.532 * 2 * pi * 1.8e6 * 2.8e-4**3 / 9 / 0.0252
+    rows = [{"label": "target", "amplitude": "force", "force": 27.532, "w_over_h": 20.0, "force_N": newtons}]
     case = SUMMARY["case"] | {"loading": {"kind": "indentation", "until": "target"}}
     text = page(tmp_path, rows, case=case, knockdown=None).text
     assert "The run reached its target: F R/(2πD) = 27.532 (0.0301385 N), w/h = 20 at the load." in text
@@ -179,7 +183,7 @@ def test_error_estimate_or_how_to_get_one(tmp_path: Path) -> None:
 
 def test_units_of_ones_own(tmp_path: Path) -> None:
     """Nobody knows what an amount of them is in pascals."""
-    found = page(tmp_path, [FOLD], dimensions=SUMMARY["dimensions"] | {"units": "the case's own"})
+    found = page(tmp_path, [FOLD], dimensions=SUMMARY["dimensions"] | {"units": "the case's own"}, in_units={})
     assert "in the case's own units" in found.text
     assert "Pa" not in found.text[: found.text.index("Path")]
 

@@ -21,6 +21,7 @@ from conftest import CASES
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.platform.terminal import LAUNCHERS, live_line
+from magshell_fenicsx.quantities.units import Sizes
 from magshell_fenicsx.run.status import Aim, RunProgress, time_left
 
 QUICK = (CASES / "pole_indentation.yaml", "--set=mesh.degree=3", "--set=mesh.refinement=0.5")
@@ -156,7 +157,7 @@ def test_time_left_of_a_resumed_run(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = iter(range(0, 1000, 10))
     monkeypatch.setattr(time, "perf_counter", lambda: next(clock))
     model = SimpleNamespace(contacts={})
-    scene = SimpleNamespace(case=case, plan=plan, model=model, extra_columns=(), motions=())
+    scene = SimpleNamespace(case=case, plan=plan, model=model, extra_columns=(), motions=(), sizes=Sizes())
     progress = RunProgress(scene, told.append, -30.0)  # type: ignore[arg-type]
     here = SimpleNamespace(du=np.array([0.0, -0.5]))
     row = {"lambda_m": 0.0, "w_over_h": 0.0}

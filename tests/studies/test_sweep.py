@@ -14,7 +14,7 @@ from figures.figures import FIGURES
 
 from magshell_fenicsx import CaseError
 from magshell_fenicsx.run.run import run
-from magshell_fenicsx.studies.sweep import chain
+from magshell_fenicsx.studies.sweep import chain, sweep_plot
 from magshell_fenicsx.studies.sweep import sweep as module
 from magshell_fenicsx.studies.sweep.axes import parse_axes
 from magshell_fenicsx.studies.sweep.points import SweepPoint, make_points
@@ -91,6 +91,7 @@ def test_units_and_exact_ends() -> None:
         ("mesh.degree=3:4", "3:4 is not start:stop:count"),
         ("mesh.degree=3:4:a", "is not start:stop:count"),
         ("mesh.refinement=nan:1:3", "start and stop must be finite"),
+        ("shell.radius=1 mm:2 mT:3", "is not start:stop:count (two numbers of one unit"),
         ("mesh.refinement=1:2:1", "count is 1; allowed 2 to 10000"),
         ("mesh.refinement=1:2:100000000", "count is 100000000"),
         ("magnetic.remanent=[1,2]", "only numbers and words"),
@@ -151,11 +152,68 @@ def test_second_call_computes_what_is_missing(tmp_path: Path, computed: list[flo
     assert computed == [1e-5, 3e-5, 2e-5, 1e-5]
 
 
-def test_changed_case_is_computed_again(tmp_path: Path, computed: list[float]) -> None:
-    thick = plate(tmp_path)
-    thin = plate(tmp_path, settings=("shell.radius_to_thickness=60",))
-    assert len(computed) == 4
-    assert thin.outcomes[0].curve[-1]["w_pole_over_h"] != thick.outcomes[0].curve[-1]["w_pole_over_h"]
+def test_another_sweep_into_a_folder_adds_or_is_refused(tmp_path: Path, computed: list[float]) -> None:
+    """sweep.csv never loses a row: more values are added to it; another case and other keys need another folder."""
+    plate(tmp_path)
+    before = {row["point"] for row in read(tmp_path / "sweep.csv")}
+    plate(tmp_path, "loading.pressure=3e-5,5e-5")
+    after = (tmp_path / "sweep.csv").read_text(encoding="utf-8")
+    assert computed == [1e-5, 3e-5, 5e-5]
+    assert before < {row["point"] for row in read(tmp_path / "sweep.csv")}
+    assert [float(row["loading.pressure"]) for row in read(tmp_path / "sweep.csv")] == [1e-5, 3e-5, 5e-5]
+    with pytest.raises(CaseError, match="has a sweep of another case or other --set, which is kept; give another"):
+        plate(tmp_path, settings=("shell.radius_to_thickness=60",))
+    with pytest.raises(CaseError, match=r"has a sweep over loading\.pressure, which is kept; give another folder for"):
+        plate(tmp_path, "shell.poisson_ratio=0.3,0.4")
+    (tmp_path / "sweep.json").unlink()
+    with pytest.raises(CaseError, match=r"has a sweep\.csv of an earlier version; give another folder"):
+        plate(tmp_path)
+    assert (tmp_path / "sweep.csv").read_text(encoding="utf-8") == after
+
+
+def test_parts_of_several_jobs_make_one_table(tmp_path: Path, computed: list[float]) -> None:
+    """Each computes its share into one folder; the whole sweep then computes nothing."""
+    over = "loading.pressure=1e-5:3e-5:3"
+    first = module.sweep(PLATE, [over], COARSE, tmp_path, part="1/2")
+    assert (computed, len(first.points)) == ([1e-5], 1)
+    assert len(read(tmp_path / "sweep.csv")) == 1
+    module.sweep(PLATE, [over], COARSE, tmp_path, part="2/2")
+    assert len(plate(tmp_path, over).points) == len(read(tmp_path / "sweep.csv")) == 3
+    assert computed == [1e-5, 2e-5, 3e-5]
+    with pytest.raises(CaseError, match="--part 3/2: write it as i/n with 1 <= i <= n"):
+        module.sweep(PLATE, [over], COARSE, tmp_path, part="3/2")
+
+
+def test_values_with_units_are_numbers(tmp_path: Path) -> None:
+    """A cap's fold is followed along a field in mT; the picture's line is straight to 1 %, as that over lambda_m is."""
+    sizes = "radius: 25.2 mm, thickness: 0.28 mm, youngs_modulus: 1.8 MPa"
+    shell = f"{{geometry: cap, polar: 60, {sizes}, poisson_ratio: 0.5, "
+    file = tmp_path / "cap.yaml"
+    file.write_text(
+        f"shell: {shell}defect: {{kind: dimple, amplitude: 1.64, width: 3.2}}}}\nboundary: {{rim: clamped}}\n"
+        "magnetic: {remanent: {flux_density: 63 mT}, applied: {flux_density: 1 mT}}\n"
+        "loading: {kind: pressure, until: limit}\nmesh: {degree: 3, refinement: 0.5}\n",
+        encoding="utf-8",
+    )
+    done = module.sweep(file, ["magnetic.applied.flux_density=-20mT:0.02T:3"], out=tmp_path / "out")
+    assert [outcome.found for outcome in done.outcomes] == ["path", "fold", "fold"]
+    rows = read(tmp_path / "out" / "sweep.csv")
+    assert [row["magnetic.applied.flux_density"] for row in rows] == ["-20 mT", "0 mT", "20 mT"]
+    assert [float(row["magnetic.applied.flux_density_mT"]) for row in rows] == [-20, 0, 20]
+    low, middle, high = (float(row["pressure_Pa"]) for row in rows)
+    p_c = 2 * 1.8e6 / 1.5 * (0.28 / 25.2) ** 2
+    assert middle == pytest.approx(0.326233289 * p_c, rel=3e-3)
+    assert middle == pytest.approx((low + high) / 2, rel=1e-2)
+    assert done.axes[0].numbers == [-20, 0, 20]
+
+
+def test_two_numbers_are_a_map() -> None:
+    """Only if both have several values; one of another unit is converted."""
+    three, two, words = (parse_axes([f"mesh.degree={each}"])[0] for each in ("1,2,3", "1,2", "a,b,c"))
+    lengths = parse_axes(["shell.radius=25 mm,3 cm,0.04 m"])[0]
+    assert lengths.numbers == [25, pytest.approx(30), pytest.approx(40)]
+    assert sweep_plot._is_map([three, lengths])
+    assert not any(sweep_plot._is_map([three, each]) for each in (two, words))
 
 
 def test_equal_problems_are_computed_once(tmp_path: Path, computed: list[float]) -> None:

@@ -1,5 +1,6 @@
 """An energy of the mid-surface, a part's or one's own, from nothing but its density."""
 
+import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -131,13 +132,29 @@ class OwnTerm:
 
         return all(self._same((r0, u), image(r0, u)) for r0, u in _random_jets())
 
+    @property
+    def digest(self) -> str:
+        """A hash of its name, its amplitude and its values at random jets."""
+        values = [self._value(r0, u) for r0, u in _random_jets()]
+        free = [(p.name, p.value) for p in self.free]
+        text = f"{self.name} {self.value!r} {free} {sorted(self.observed)} {[f'{v:.9e}' for v in values]}"
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
+
     @cached_property
     def _symbolic(self) -> tuple[Expr, Jet, Jet]:
         """The density, and the jets of r0 and u that it is written with."""
         domain = ufl.Mesh(basix.ufl.element("Lagrange", "triangle", 1, shape=(2,)))
         V = ufl.FunctionSpace(domain, basix.ufl.element("DG", "triangle", 0, shape=(3,)))
         r0, u = (Jet(*(ufl.variable(ufl.Coefficient(V)) for _ in range(1 + len(CURVED)))) for _ in range(2))
-        return self._at(r0, u), r0, u
+        try:
+            return self._at(r0, u), r0, u
+        except Exception as e:  # of any kind: the density is the user's own program
+            said = f"{type(e).__name__}: {e}"
+            raise ValueError(
+                f"{self.name}: the density cannot be computed ({said}). It is a function of r0, u and "
+                f"{len(self.parameters)} parameters, and returns a scalar made of r0.r, u.r, u.r1, ... by functions of "
+                "UFL (ufl.dot, ufl.sqrt, ...) and of kinematics, not of NumPy or math"
+            ) from e
 
     def _strangers(self) -> list[Expr]:
         """What else is in the density: fields, constants and coordinates of some mesh."""
@@ -158,11 +175,15 @@ class OwnTerm:
 
     def _same(self, *pairs: tuple[Array, Array]) -> bool:
         """Whether the density is the same at two pairs of jets (6, 3)."""
+        here, there = (self._value(*pair) for pair in pairs)
+        return abs(here - there) <= SAME * max(abs(here), abs(there))  # never of nan: no symmetry is known
+
+    def _value(self, r0: Array, u: Array) -> float:
+        """The density at jets (6, 3); nan where it has none, as a root of less than zero."""
         try:
-            here, there = (float(apply_algebra_lowering(self._at(*map(_as_jet, pair)))(())) for pair in pairs)
-        except (ArithmeticError, TypeError, ValueError):  # a root of less than zero, say: no symmetry is known
-            return False
-        return abs(here - there) <= SAME * max(abs(here), abs(there))
+            return float(apply_algebra_lowering(self._at(_as_jet(r0), _as_jet(u)))(()))
+        except (ArithmeticError, TypeError, ValueError):
+            return np.nan
 
 
 def _random_jets() -> list[tuple[Array, Array]]:

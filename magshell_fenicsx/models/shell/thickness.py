@@ -54,7 +54,7 @@ def thickness_field(thickness: Thickness, r0: fem.Function, midsurface: Midsurfa
     nodes = r0.x.array.reshape(-1, 3)[V.dofmap.list]
     values = thickness.at(nodes)
     for name, factor in (thickness.patches or {}).items():
-        values[patch_of(midsurface.patches, name)] = factor
+        values[patch_of(midsurface.patches, name, "shell.thickness_factor")] = factor
     return nodal_thickness(values, nodes, V)
 
 
@@ -73,8 +73,8 @@ def nodal_thickness(values: Array, nodes: Array, V: fem.FunctionSpace) -> fem.Fu
     return field
 
 
-def patch_of(patches: Mapping[str, NDArray[np.bool_]], name: str) -> NDArray[np.bool_]:
-    """Whether each cell belongs to a patch.
+def patch_of(patches: Mapping[str, NDArray[np.bool_]], name: str, key: str = "loading.loads") -> NDArray[np.bool_]:
+    """Whether each cell belongs to a patch; `key` is the one of the case that names it.
 
     Raises
     ------
@@ -83,7 +83,7 @@ def patch_of(patches: Mapping[str, NDArray[np.bool_]], name: str) -> NDArray[np.
     """
     if name not in patches:
         there = ", ".join(patches) or "none"
-        raise MeshError(f"the surface has no patch {name}; it has {there}")
+        raise MeshError(f"{key}: {name}: the surface has no such patch, only {there}")
     return patches[name]
 
 

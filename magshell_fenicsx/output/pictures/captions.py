@@ -3,13 +3,14 @@
 from collections.abc import Sequence
 
 from magshell_fenicsx.output.store.table import Row
-from magshell_fenicsx.quantities.registry import amplitude, quantity
+from magshell_fenicsx.quantities.quantity import spelled
+from magshell_fenicsx.quantities.registry import amplitude, shown
 
 
 def shell_caption(h: float, nu: float, row: Row) -> str:
     """R/h, Poisson's ratio and the field, from the thickness h over R and nu."""
     text = rf"$R/h$ = {1 / h:.6g}, $\nu$ = {nu:g}"
-    return text + (f", {_value('lambda_m', row)}" if row["lambda_m"] else "")
+    return text + (f", {named_value('lambda_m', row)}" if row["lambda_m"] else "")
 
 
 def caption(h: float, nu: float, row: Row, own: Sequence[str] = ()) -> str:
@@ -30,16 +31,19 @@ def caption(h: float, nu: float, row: Row, own: Sequence[str] = ()) -> str:
     if row["field_angle"]:
         parts.append(rf"turned by ${row['field_angle']:.4g}\degree$")
     if row["p_over_pc"]:
-        parts.append(_value("p_over_pc", row, 5))
+        parts.append(named_value("p_over_pc", row, 5))
     if row.get("force"):
-        parts.append(f"{_value('force', row)}, {_value('w_over_h', row)} {amplitude('force').place}")
+        parts.append(f"{named_value('force', row)}, {named_value('w_over_h', row)} {amplitude('force').place}")
     if "load_factor" in row:
-        parts.append(f"{_value('load_factor', row)}, {_value('w_over_h', row)}")
+        parts.append(f"{named_value('load_factor', row)}, {named_value('w_over_h', row)}")
     if row["amplitude"] == "time":
-        parts.append(_value("time", row))
-    parts += [_value(name, row) for name in own if row[name]]
+        parts.append(named_value("time", row))
+    parts += [named_value(name, row) for name in own if row[name]]
     return ", ".join(parts)
 
 
-def _value(name: str, row: Row, digits: int = 4) -> str:
-    return f"{quantity(name).latex} = {row[name]:.{digits}g}"
+def named_value(name: str, row: Row, digits: int = 4) -> str:
+    """A column of a row, in the case's units if it has any."""
+    q = shown(name, row)
+    unit = q.si.replace("%", r"\%") if q.name != name else ""
+    return f"{q.latex} = {spelled(float(row[q.name]), f'.{digits}g')}{f' {unit}' if unit else ''}"

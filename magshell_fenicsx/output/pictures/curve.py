@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.output.store.table import LOCATED, OWN_MODES, SOLUTION, Row, pole_name
 from magshell_fenicsx.quantities.registry import amplitude as registered
-from magshell_fenicsx.quantities.registry import axes_of, quantity
+from magshell_fenicsx.quantities.registry import axes_of, quantity, shown
 
 if TYPE_CHECKING:  # takes long to import
     from matplotlib.axes import Axes
@@ -101,7 +101,7 @@ def plot_curve(axes: "Axes", of: Part) -> None:
     part, amplitude = of.rows, of.amplitude
     x, y = axes_of(amplitude, part[0])
     if amplitude == "load" and all(row["w_over_h"] == row["w_pole_over_h"] for row in part):
-        x = quantity("w_pole_over_h")  # moments have no conjugate displacement
+        x = shown("w_pole_over_h", part[0])  # moments have no conjugate displacement
     pole = pole_name(part[0]).replace("$", r"\$")  # plain text, no mathematics
     x_label, y_label = (each.label.replace("the pole", pole) for each in (x, y))
     path = [row for row in part if row["label"] != SOLUTION]
@@ -118,7 +118,7 @@ def plot_curve(axes: "Axes", of: Part) -> None:
     marked = [row for row in part if row["label"] in LOCATED]
     for number, row in enumerate(marked, 1):
         mode = f" ({row['mode']})" if row["mode"] else ""
-        name = f"{row['label']}{mode} at {row[y.name]:.5g}"
+        name = f"{row['label']}{mode} at {row[y.name]:.5g}{f' {y.shown_unit}' if y.shown_unit else ''}"
         if number > NAMED:
             name = f"and {len(marked) - NAMED} more" if number == NAMED + 1 else "_"  # matplotlib omits "_"
         axes.plot(*place(row, amplitude), "o", color="C3", markersize=6, label=name)

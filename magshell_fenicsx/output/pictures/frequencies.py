@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from magshell_fenicsx.output.fields.frequencies import Frequency
 from magshell_fenicsx.output.store.table import Row
 from magshell_fenicsx.quantities.registry import amplitude as registered
-from magshell_fenicsx.quantities.registry import quantity
+from magshell_fenicsx.quantities.registry import shown
 
 if TYPE_CHECKING:  # takes long to import
     from matplotlib.figure import Figure
@@ -20,7 +20,7 @@ def frequencies_figure(found: Sequence[Frequency], rows: Sequence[Row], title: s
     from matplotlib.figure import Figure
 
     varied = next((str(row["amplitude"]) for row in reversed(rows) if row["amplitude"]), "")
-    column = quantity(registered(varied).column) if varied else None
+    column = shown(registered(varied).column, rows[0]) if varied else None
     places = {int(row["point"]): float(row[column.name]) if column else 0.0 for row in rows}
     lines = defaultdict[tuple[str, int], list[tuple[float, float]]](list)
     count = defaultdict[tuple[int, str], int](int)

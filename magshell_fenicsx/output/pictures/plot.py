@@ -14,7 +14,7 @@ from magshell_fenicsx.output.fields.outlines import read_outlines
 from magshell_fenicsx.output.fields.surface import Surface, completed
 from magshell_fenicsx.output.fields.vtu import About, point_file, read_vtu
 from magshell_fenicsx.output.pictures.animation import animated
-from magshell_fenicsx.output.pictures.captions import caption, shell_caption
+from magshell_fenicsx.output.pictures.captions import caption, named_value, shell_caption
 from magshell_fenicsx.output.pictures.curve import curve_figure, drawn_parts
 from magshell_fenicsx.output.pictures.frequencies import frequencies_figure
 from magshell_fenicsx.output.pictures.layout import png
@@ -25,7 +25,6 @@ from magshell_fenicsx.output.report.report import write_report
 from magshell_fenicsx.output.store.durable import write_whole
 from magshell_fenicsx.output.store.table import LOCATED, OWN_MODES, SOLUTION, Row, read_rows
 from magshell_fenicsx.quantities.registry import amplitude as registered
-from magshell_fenicsx.quantities.registry import quantity
 
 MOST_PANELS = 9
 MOST_FRAMES = 40
@@ -210,6 +209,6 @@ def _drawn(panels: Sequence[Panel], title: str) -> bytes:
 
 
 def _where(row: Row) -> str:
-    varied = quantity(registered(str(row["amplitude"])).column)
-    value = f": {varied.latex} = {row[varied.name]:.5g}" if row["amplitude"] else ""
+    name = registered(str(row["amplitude"])).column
+    value = f": {named_value(name, row, 5)}" if row["amplitude"] else ""
     return f"point {row['point']}{value}"

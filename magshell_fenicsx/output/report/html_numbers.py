@@ -24,15 +24,17 @@ def number(value: float, digits: int = DIGITS) -> Markup:
     return (Markup() if short == "1" else _signed(short) + Markup(" · ")) + power(int(exponent))
 
 
-def column(values: Sequence[float]) -> tuple[int, list[Markup]]:
+def column(values: Sequence[float], beside: Sequence[float] = ()) -> tuple[int, list[Markup]]:
     """A column of numbers with a common power of ten and equally many decimals; nan is left empty.
+
+    `beside` are numbers of other columns with the same power of ten and the same decimals.
 
     Examples
     --------
     >>> column([0.0, -1.5e-06, 2.25e-05])
     (-5, [Markup('0.00'), Markup('−0.15'), Markup('2.25')])
     """
-    largest = max((abs(v) for v in values if math.isfinite(v)), default=0.0)
+    largest = max((abs(v) for v in (*values, *beside) if math.isfinite(v)), default=0.0)
     order = math.floor(math.log10(largest)) if largest else 0
     exponent = 0 if LEAST <= largest < MOST or not largest else order
     texts = [f"{v / 10.0**exponent:.{max(0, DIGITS - 1 - order + exponent)}f}" for v in values]

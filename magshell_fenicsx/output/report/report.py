@@ -1,8 +1,6 @@
 """report.html: a run in one file, made from the files of its folder."""
 
 import base64
-import csv
-import json
 from collections.abc import Iterator
 from math import isnan
 from pathlib import Path
@@ -13,11 +11,11 @@ from markupsafe import Markup
 
 from magshell_fenicsx.output.fields.frequencies import Frequency, read_frequencies
 from magshell_fenicsx.output.report.html_numbers import number
-from magshell_fenicsx.output.report.report_path import Line, path_table, pole_head, symbol
-from magshell_fenicsx.output.report.verdict import Summary, bending_stiffness, located, physical_units, value, verdict
+from magshell_fenicsx.output.report.report_path import Line, head, path_table, pole_head, symbol
+from magshell_fenicsx.output.report.verdict import Summary, located, read_run, value, verdict
 from magshell_fenicsx.output.store.durable import write_whole
 from magshell_fenicsx.output.store.table import stability
-from magshell_fenicsx.quantities.registry import amplitude
+from magshell_fenicsx.quantities.registry import amplitude, shown
 
 NAME, TEMPLATE = "report.html", "report_template.html"
 FOLDED = 30  # a table with at least so many points is folded
@@ -36,6 +34,7 @@ PICTURES = {  # in the order of the report
     "modes_*.png": "The modes of least stiffness, on the deformed shell.",
 }
 SMALL = ("curve.png", "shell.png")  # beside each other
+SOLUTION_COLUMNS = ("w_over_h", "w_pole_over_h", "volume_change", "energy")
 ADAPTED = ("hemisphere", "disc", "strip")  # geometries with mesh.tolerance
 TIMES = {
     "jit_s": "compiling kernels",
@@ -70,9 +69,7 @@ def report(folder: Path) -> str:
 
 def _content(folder: Path) -> dict[str, Any]:
     """The values of the template."""
-    summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
-    with (folder / "path.csv").open(encoding="utf-8", newline="") as stream:
-        lines = list(csv.DictReader(stream))
+    summary, lines = read_run(folder)
     path = path_table(lines, "m" if summary["dimensions"]["units"] == "SI" else "")
     return {
         "name": folder.resolve().name,
@@ -82,6 +79,7 @@ def _content(folder: Path) -> dict[str, Any]:
         "dimensions": _dimensions(summary),
         "pictures": list(_pictures(folder)),
         "pole": pole_head(lines[0] if lines else {}),
+        "heads": {name: _head(name, lines[0] if lines else {}) for name in SOLUTION_COLUMNS},
         "instabilities": [_instability(line, summary) for line in located(lines)],
         "solutions": [_solution(it) for it in summary.get("solutions", [])],
         "frequencies": [_frequency(it) for it in read_frequencies(folder)],
@@ -99,6 +97,13 @@ def _content(folder: Path) -> dict[str, Any]:
     }
 
 
+def _head(name: str, line: Line) -> Markup:
+    """The heading of a column with its unit, and its size where the symbol does not have it."""
+    known = shown(name, line)
+    where = pole_head(line) if name == "w_pole_over_h" else head(known)
+    return Markup("{} ({})").format(where, known.shown_unit) if known.shown_unit else where
+
+
 def _groups(summary: Summary) -> list[tuple[Markup, Markup]]:
     of = summary["dimensionless"]
     named = {
@@ -113,15 +118,14 @@ def _groups(summary: Summary) -> list[tuple[Markup, Markup]]:
 
 def _dimensions(summary: Summary) -> list[tuple[Markup, Markup, str]]:
     """Name, value and unit of the quantities that the case gives with units."""
-    dims, magnetic, loads = summary["dimensions"], summary["case"].get("magnetic") or {}, physical_units(summary)
-    stiff = dims["youngs_modulus"] and dims["thickness"]
+    dims, magnetic, measured = summary["dimensions"], summary["case"].get("magnetic") or {}, summary.get("in_units", {})
     named = {
         "radius R": (dims["radius"], "m"),
         "thickness h": (dims["thickness"], "m"),
         "Young’s modulus E": (dims["youngs_modulus"], "Pa"),
-        "bending stiffness D": (bending_stiffness(summary) if stiff else None, "N m"),
-        "classical pressure p<sub>c</sub>": loads.get("pressure", (None, "")),
-        "unit of the force, 2πD/R": loads.get("force", (None, "")),
+        "bending stiffness D": (measured.get("bending_stiffness_N_m"), "N m"),
+        "classical pressure p<sub>c</sub>": (measured.get("classical_pressure_Pa"), "Pa"),
+        "unit of the force, 2πD/R": (measured.get("unit_force_N"), "N"),
         "remanence |B<sup>r</sup>|": (magnetic.get("remanent", {}).get("flux_density"), "T"),
         "applied |B<sup>a</sup>|": (magnetic.get("applied", {}).get("flux_density"), "T"),
     }
@@ -148,13 +152,14 @@ def _instability(line: Line, summary: Summary) -> dict[str, Any]:
         "mode": line["mode"] or "–",
         "branch": int(line["branch"]),
         "load": value(line, summary),
-        "w": number(float(line["w_over_h"])),
-        "pole": number(float(line["w_pole_over_h"])),
+        "w": number(float(line[shown("w_over_h", line).name])),
+        "pole": number(float(line[shown("w_pole_over_h", line).name])),
     }
 
 
 def _solution(it: dict[str, Any]) -> list[Markup | str]:
-    numbers = (number(it[key]) for key in ("w_over_h", "w_pole_over_h", "volume_change", "energy"))
+    names = (shown(name, it).name for name in SOLUTION_COLUMNS)
+    numbers = (number(it[name]) for name in names)
     return [f"{it['point']}", f"{it['solution']}", stability(it), *numbers, number(it["residual"], 2)]
 
 

@@ -8,7 +8,8 @@ from markupsafe import Markup
 
 from magshell_fenicsx.output.report.html_numbers import column, power
 from magshell_fenicsx.output.store.table import pole_name
-from magshell_fenicsx.quantities.registry import amplitude, quantity
+from magshell_fenicsx.quantities.quantity import Quantity
+from magshell_fenicsx.quantities.registry import amplitude, quantity, shown
 
 Line = Mapping[str, str]  # a row of path.csv
 ORDER = (
@@ -37,24 +38,32 @@ class Column:
 
 def symbol(name: str) -> Markup:
     """The heading of a column of numbers; a named point or a user-defined amplitude has its own name."""
-    known = quantity(name)
+    return head(quantity(name))
+
+
+def head(known: Quantity) -> Markup:
+    """The heading of a quantity."""
     return Markup(known.html) if known.symbol else Markup("{}").format(known.words)
 
 
 def pole_head(line: Line) -> Markup:
     """The heading of w_pole_over_h, with the point that it belongs to."""
-    return Markup("{}, {}").format(symbol("w_pole_over_h"), pole_name(line).removeprefix("the "))
+    return Markup("{}, {}").format(head(shown("w_pole_over_h", line)), pole_name(line).removeprefix("the "))
 
 
 def path_table(lines: Sequence[Line], length_unit: str) -> list[Column]:
     """The columns that vary, in the order of interest; a displacement equal to an earlier one is left out.
+
+    What is in the case's units is shown in these alone.
 
     Parameters
     ----------
     length_unit
         Unit of the displacements of named points.
     """
-    names = [name for name in (lines[0] if lines else ()) if name != "point"]
+    there = lines[0] if lines else {}
+    in_units = {known.name for name in there if (known := shown(name, there)).name != name}
+    names = [name for name in there if name != "point" and name not in in_units]
     order = ["point", *sorted(names, key=lambda name: ORDER.index(quantity(name).kind))]
     found: dict[str, list[str]] = {}
     for name in order:
@@ -62,25 +71,35 @@ def path_table(lines: Sequence[Line], length_unit: str) -> list[Column]:
         again = name.startswith("w_") and any(_same(values, other) for key, other in found.items() if key[:2] == "w_")
         if name in ("point", "label") or (len(set(values)) > 1 and not again):
             found[name] = values
-    table = {name: _column(name, values, length_unit) for name, values in found.items()}
+    energies = _energies(lines, [name for name in found if quantity(name).kind == "energy"])
+    table = {}
+    for name in found:
+        known = shown(name, there)
+        of_all = energies if known.kind == "energy" else ()
+        table[name] = _column(known, [line.get(known.name, "") for line in lines], length_unit, of_all)
     if pole := table.get("w_pole_over_h"):
         table["w_pole_over_h"] = replace(pole, head=pole_head(lines[0]))
     return list(table.values())
 
 
-def _column(name: str, values: Sequence[str], length_unit: str) -> Column:
-    known = quantity(name)
+def _energies(lines: Sequence[Line], names: Sequence[str]) -> list[float]:
+    """All energies of a path: their columns have one power of ten, so that they can be compared."""
+    return [float(line[shown(name, line).name]) for line in lines for name in names]
+
+
+def _column(known: Quantity, values: Sequence[str], length_unit: str, beside: Sequence[float] = ()) -> Column:
+    """A column; `beside` are the numbers of others with the same power of ten."""
     if known.kind == "text":
-        varied = [quantity(amplitude(value).column).words for value in values] if name == "amplitude" else values
-        return Column(symbol(name), Markup(), varied, numeric=False)
+        varied = [quantity(amplitude(value).column).words for value in values] if known.name == "amplitude" else values
+        return Column(head(known), Markup(), varied, numeric=False)
     if known.kind == "count":
-        return Column(symbol(name), Markup(), values)
-    exponent, cells = column([float(value) for value in values])
+        return Column(head(known), Markup(), values)
+    exponent, cells = column([float(value) for value in values], beside)
     size = power(exponent) if exponent else Markup()
-    head = Markup("{} {}").format(symbol(name), known.note) if known.note else symbol(name)
-    in_case = {"place": "m", "reaction": "N", "moment": "N m"}  # columns in the case's units
-    unit = (in_case[known.kind] if length_unit else "") if known.kind in in_case else known.shown_unit
-    return Column(head, Markup("{} {}").format(size, unit), cells)
+    title = Markup("{} {}").format(head(known), known.note) if known.note else head(known)
+    in_case = {"place": "m", "reaction": "N", "moment": "N m"}  # of a path.csv without columns in units
+    unit = known.shown_unit or (in_case.get(known.kind, "") if length_unit else "")
+    return Column(title, Markup("{} {}").format(size, unit), cells)
 
 
 def _same(values: Sequence[str], others: Sequence[str]) -> bool:

@@ -1,17 +1,23 @@
 """The result of a run in one sentence, for its report."""
 
+import csv
+import json
+import re
 from collections.abc import Mapping, Sequence
-from math import pi
+from html import unescape
+from pathlib import Path
 from typing import Any
 
 from markupsafe import Markup
 
 from magshell_fenicsx.output.report.html_numbers import number
-from magshell_fenicsx.output.report.report_path import Line, symbol
+from magshell_fenicsx.output.report.report_path import Line, head, symbol
 from magshell_fenicsx.output.store.table import LOCATED, OWN_MODES, pole_name
-from magshell_fenicsx.quantities.registry import amplitude, quantity
+from magshell_fenicsx.quantities.quantity import PLAIN, Quantity
+from magshell_fenicsx.quantities.registry import amplitude, axes_of, shown
 
 Summary = Mapping[str, Any]
+ROUNDING = 1e-15  # of displacements and forces, in any unit
 
 
 def located(lines: Sequence[Line]) -> list[Line]:
@@ -33,38 +39,51 @@ def verdict(summary: Summary, lines: Sequence[Line]) -> Markup:
         sentences.append(
             Markup("A search has found {} {}, {} of them stable.").format(len(found), more, stable or "none")
         )
+    if summary.get("barrier") is not None:
+        sentences.append(_barrier(summary))
     if summary["stopped"]:
         points = f"{len(lines)} point{'s' * (len(lines) != 1)}"
         sentences.insert(0, Markup("The run stopped early, after {}: {}.").format(points, summary["stopped"]))
     return Markup(" ").join(sentences)
 
 
+def _barrier(summary: Summary) -> Markup:
+    measured = summary.get("in_units", {}).get("barrier_mJ")
+    size = Markup(" ({} mJ)").format(number(measured)) if measured is not None else ""
+    return Markup("The energy barrier is {} E h R²{}.").format(number(summary["barrier"]), size)
+
+
 def value(line: Line, summary: Summary) -> Markup:
     """The amplitude that varied at a point, as "p/p_c = 0.326233 (53.7 Pa)"."""
     name = amplitude(line["amplitude"]).column
     amount, degrees = float(line[name]), "°" if line["amplitude"] == "angle" else ""
-    size, unit = physical_units(summary).get(line["amplitude"], (0.0, ""))
-    measured = Markup(" ({} {})").format(number(amount * size), unit) if size else ""
+    known = shown(name, line)
+    measured = Markup(" ({} {})").format(number(float(line[known.name])), known.si) if known.name != name else ""
     return Markup("{} = {}{}{}").format(symbol(name), number(amount), degrees, measured)
 
 
-def physical_units(summary: Summary) -> dict[str, tuple[float, str]]:
-    """Amplitude -> (size of one, unit) in SI, where the case gives units; the field by its flux density."""
-    dims, of, sizes = summary["dimensions"], summary["dimensionless"], {}
-    applied = ((summary["case"].get("magnetic") or {}).get("applied") or {}).get("flux_density")
-    if applied and of["lambda_m"]:
-        sizes["lambda_m"] = 1e3 * abs(applied / of["lambda_m"])
-    if dims["units"] == "SI" and dims["youngs_modulus"]:
-        sizes["pressure"] = of["pc_over_E"] * dims["youngs_modulus"]
-        if dims["thickness"]:
-            sizes["force"] = 2 * pi * bending_stiffness(summary) / dims["radius"]
-    return {name: (size, quantity(amplitude(name).column).si) for name, size in sizes.items()}
+def plain(sentence: Markup) -> str:
+    """A sentence for a terminal.
+
+    Examples
+    --------
+    >>> plain(Markup("λ<sub>m</sub> = −1.84 · 10<sup>−5</sup> (10<sup>2</sup> Pa) &lt; 1"))
+    'lambda_m = -1.84e-5 (1e2 Pa) < 1'
+    """
+    text = str(sentence).replace(" · 10<sup>", "e").replace("10<sup>", "1e").replace("−", "-")
+    return unescape(re.sub(r"</?su[bp]>", "", text.replace("<sub>", "_"))).translate(PLAIN)
 
 
-def bending_stiffness(summary: Summary) -> float:
-    """D = E h^3/(12 (1 - nu^2)) in the units of the case's dimensions."""
-    dims, nu = summary["dimensions"], summary["dimensionless"]["poisson_ratio"]
-    return float(dims["youngs_modulus"] * dims["thickness"] ** 3 / (12 * (1 - nu**2)))
+def sentence_of(folder: Path) -> str:
+    """The result of the run in a folder, for a terminal."""
+    return plain(verdict(*read_run(folder)))
+
+
+def read_run(folder: Path) -> tuple[Summary, list[Line]]:
+    """summary.json and the rows of path.csv, as text."""
+    with (folder / "path.csv").open(encoding="utf-8", newline="") as stream:
+        lines = list[Line](csv.DictReader(stream))
+    return json.loads((folder / "summary.json").read_text(encoding="utf-8")), lines
 
 
 def _instability(line: Line, summary: Summary) -> Markup:
@@ -86,12 +105,27 @@ def _end(summary: Summary, lines: Sequence[Line]) -> Markup:
     last = path[-1] if path else None
     if last is None or not last["amplitude"]:
         return Markup("Nothing loads the shell: this is its undeformed state." if not summary["stopped"] else "")
-    reached = "The run reached its target" if last["label"] == "target" and not summary["stopped"] else "The last point"
+    arrived = last["label"] in ("target", "field") and not summary["stopped"]
+    reached = "The run reached its target" if arrived else "The last point"
     return Markup("{}: {}, {}.").format(reached, value(last, summary), _displacement(last))
 
 
 def _displacement(line: Line) -> Markup:
-    varied, w = amplitude(line["amplitude"]), symbol("w_over_h")
+    """The displacement, and the force on what moves."""
+    varied = amplitude(line["amplitude"])
+    force = [q for q in axes_of(line["amplitude"], line) if q.kind == "reaction" or q.name.startswith("force")]
+    if force and varied.column != "force":
+        return Markup("{}, {}").format(_amount(force[0], line), _at_pole(line))
     if varied.conjugate == "w_over_h" and line["w_over_h"] != line["w_pole_over_h"]:
-        return Markup("{} = {} {}").format(w, number(float(line["w_over_h"])), varied.place)
-    return Markup("{} = {} at {}").format(w, number(float(line["w_pole_over_h"])), pole_name(line))
+        return Markup("{} {}").format(_amount(shown("w_over_h", line), line), varied.place)
+    return _at_pole(line)
+
+
+def _at_pole(line: Line) -> Markup:
+    return Markup("{} at {}").format(_amount(shown("w_pole_over_h", line), line), pole_name(line))
+
+
+def _amount(known: Quantity, line: Line) -> Markup:
+    exact = float(line[known.name])
+    amount = number(exact if abs(exact) > ROUNDING else 0.0)
+    return Markup("{} = {}{}").format(head(known), amount, f" {known.shown_unit}" if known.shown_unit else "")

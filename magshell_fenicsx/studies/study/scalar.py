@@ -11,9 +11,10 @@ from scipy.interpolate import barycentric_interpolate
 
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.output.store.table import COLUMNS, OWN_MODES, TEXTS
-from magshell_fenicsx.quantities.registry import IN_TIME
+from magshell_fenicsx.quantities.registry import IN_TIME, quantity
 
-NUMBERS = (*(column for column in COLUMNS if column not in TEXTS), *(q.name for q in IN_TIME))
+BARE = (*(column for column in COLUMNS if column not in TEXTS), *(q.name for q in IN_TIME))
+NUMBERS = (*BARE, *(each.name for name in BARE for each in quantity(name).in_units))
 IN_SUMMARY = ("knockdown", "barrier", "critical_field", "snap_time")
 FORMS = f"write {', '.join(IN_SUMMARY)}, COLUMN@COLUMN=VALUE or COLUMN@end, with columns of path.csv"
 
@@ -68,6 +69,8 @@ def parse_scalar(text: str) -> Scalar:
 
     Examples
     --------
+    >>> parse_scalar("force_N@w_mm=2.5").at
+    'w_mm'
     >>> parse_scalar("force@w_over_h=10")
     Scalar(name='force@w_over_h=10', column='force', at='w_over_h', value=10.0)
     """
@@ -76,7 +79,7 @@ def parse_scalar(text: str) -> Scalar:
     column, _, place = text.partition("@")
     at, _, number = place.partition("=")
     for name in (column, at) if place != "end" else (column,):
-        if name not in NUMBERS and not re.fullmatch(r"\w+_u[xyz]", name):  # of a named point
+        if name not in NUMBERS and not re.fullmatch(r"\w+_u[xyz](_mm)?", name):  # of a named point
             raise CaseError(f"--result {text}: {name or 'nothing'} is no column with numbers; {FORMS}")
     if place == "end":
         return Scalar(text, column, "end")

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from magshell_fenicsx.case.source import CaseError
+from magshell_fenicsx.parts.section import in_unit, number_and_unit
 
 MOST_POINTS = 10_000
 FORMS = "write it as key.path=start:stop:count or key.path=value,value,..."
@@ -34,12 +35,21 @@ class Axis:
         return "+".join(self.keys)
 
     @property
+    def unit(self) -> str:
+        """The unit of its values, that of the first which has one."""
+        return next(filter(None, (number_and_unit(value)[1] for value in self.values)), "")
+
+    @property
     def numbers(self) -> list[float] | None:
-        """The values as numbers; None if one of them is a word."""
+        """The values as numbers, in its unit; None if one of them is a word."""
         try:
-            return [float(value) for value in self.values]
+            return [self.number(value) for value in self.values]
         except ValueError:
             return None
+
+    def number(self, value: str) -> float:
+        """A value in its unit."""
+        return in_unit(value, self.unit)
 
 
 def along(axes: Sequence[Axis]) -> Axis | None:
@@ -72,6 +82,8 @@ def parse_axis(text: str) -> Axis:
     Axis(keys=('a.x', 'a.y'), values=('0', '45', '90'))
     >>> parse_axis("magnetic.energy=full,first").values
     ('full', 'first')
+    >>> parse_axis("magnetic.applied.flux_density=-40mT:0.04T:3").values
+    ('-40 mT', '0 mT', '40 mT')
     """
     path, equals, values = text.partition("=")
     keys = tuple(key.strip() for key in path.split("+"))
@@ -81,17 +93,21 @@ def parse_axis(text: str) -> Axis:
 
 
 def _range(text: str, values: str) -> tuple[str, ...]:
-    """start:stop:count, equidistant with both ends."""
+    """start:stop:count, equidistant with both ends; the values are in the unit of the first end that has one."""
     try:
         first, last, number = values.split(":")
-        start, stop, count = float(first), float(last), int(number)
+        unit = number_and_unit(first)[1] or number_and_unit(last)[1]
+        ends = [in_unit(end, unit) if unit else float(end) for end in (first, last)]
+        start, stop, count = *ends, int(number)
     except ValueError:
-        raise CaseError(f"--over {text}: {values} is not start:stop:count (two numbers and a whole number)") from None
+        raise CaseError(
+            f"--over {text}: {values} is not start:stop:count (two numbers of one unit and a whole number)"
+        ) from None
     if not (math.isfinite(start) and math.isfinite(stop)):
         raise CaseError(f"--over {text}: start and stop must be finite")
     if not 2 <= count <= MOST_POINTS:
         raise CaseError(f"--over {text}: count is {count}; allowed 2 to {MOST_POINTS}")
-    return tuple(f"{value:.12g}" for value in np.linspace(start, stop, count))
+    return tuple(f"{value + 0.0:.12g} {unit}".rstrip() for value in np.linspace(start, stop, count))
 
 
 def _list(text: str, values: str) -> tuple[str, ...]:

@@ -64,12 +64,13 @@ def make_chains(
     lines: dict[tuple[str, ...], list[int]] = {}
     for number, point in enumerate(points):
         lines.setdefault(tuple(v for key, v in point.values.items() if key not in axis.keys), []).append(number)
-    return [chain for line in lines.values() for chain in _chains_of(line, axis.keys[0], points, set(missing))]
+    return [chain for line in lines.values() for chain in _chains_of(line, axis, points, set(missing))]
 
 
-def _chains_of(line: list[int], key: str, points: Sequence[SweepPoint], missing: set[int]) -> list[Chain]:
+def _chains_of(line: list[int], axis: Axis, points: Sequence[SweepPoint], missing: set[int]) -> list[Chain]:
     """The missing points along the axis, as one chain if their folds can be followed."""
-    wanted = [Link(n, float(points[n].values[key]), points[n].case) for n in line if n in missing]
+    key = axis.keys[0]
+    wanted = [Link(n, axis.number(points[n].values[key]), points[n].case) for n in line if n in missing]
     one_mesh = key.startswith("magnetic.")  # a solid's state cannot be transferred to another mesh
     followed = all(has_knockdown(link.case) and (one_mesh or link.case.model == "shell") for link in wanted)
     if len(wanted) < 2 or not followed:
@@ -151,7 +152,7 @@ def _begun(at: float, result: Result) -> Continuation | None:
 
 def fold_row(scene: Scene, fold: Fold) -> Row:
     """A fold as a row of path.csv."""
-    return {
+    row: Row = {
         "label": "fold",
         "amplitude": fold.name,
         **scene.observe(fold.state),
@@ -159,6 +160,7 @@ def fold_row(scene: Scene, fold: Fold) -> Row:
         "branch": 0,
         "load_error": 0.0,
     }
+    return {**row, **scene.sizes.values(row)}
 
 
 def has_knockdown(case: Case) -> bool:

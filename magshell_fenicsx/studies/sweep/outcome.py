@@ -1,7 +1,7 @@
 """The outcome of a point of a sweep, and its file."""
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 from uuid import uuid4
@@ -10,6 +10,7 @@ from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.output.store.table import Row
 from magshell_fenicsx.platform import sources
 from magshell_fenicsx.run.run import Result
+from magshell_fenicsx.run.summary import in_units
 
 CURVE = (
     "label",
@@ -52,6 +53,8 @@ class Outcome:
         Factorisations of the model's tangent, including failed attempts; without those for excluded modes.
     cpu_s
         CPU time of a sample of an ensemble.
+    in_units
+        Numbers of a case with units, as in summary.json.
     """
 
     knockdown: float | None
@@ -64,6 +67,7 @@ class Outcome:
     factorisations: int
     barrier: float | None = None
     cpu_s: float = 0.0
+    in_units: dict[str, float] = field(default_factory=dict)
 
 
 def outcome_of(result: Result, found: Found, factorisations: int, wall_s: float) -> Outcome:
@@ -80,6 +84,7 @@ def outcome_of(result: Result, found: Found, factorisations: int, wall_s: float)
         found=found,
         factorisations=factorisations,
         barrier=result.barrier,
+        in_units=in_units(result),
     )
 
 

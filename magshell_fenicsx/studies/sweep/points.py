@@ -45,18 +45,31 @@ def make_points(file: Path, axes: Sequence[Axis], settings: Sequence[str] = ()) 
     CaseError
         If any point is not a valid case; nothing has been computed then.
     """
+    source = swept_source(file, axes, settings)
+    count = prod(len(axis.values) for axis in axes)
+    if count > MOST_POINTS:
+        raise CaseError(f"--over: {count} points; allowed at most {MOST_POINTS}")
+    return [make_point(source, axes, values) for values in product(*(axis.values for axis in axes))]
+
+
+def swept_source(file: Path, axes: Sequence[Axis], settings: Sequence[str]) -> Source:
+    """The case that is swept, with the settings.
+
+    Raises
+    ------
+    CaseError
+        If it cannot be read, or a setting is of a swept key.
+    """
     source = read_source(file)
     for setting in settings:
         if setting.partition("=")[0].strip() in {key for axis in axes for key in axis.keys}:
             raise CaseError(f"--set {setting}: this key is swept by --over")
         override(source, setting)
-    count = prod(len(axis.values) for axis in axes)
-    if count > MOST_POINTS:
-        raise CaseError(f"--over: {count} points; allowed at most {MOST_POINTS}")
-    return [_point(source, axes, values) for values in product(*(axis.values for axis in axes))]
+    return source
 
 
-def _point(source: Source, axes: Sequence[Axis], values: Sequence[str]) -> SweepPoint:
+def make_point(source: Source, axes: Sequence[Axis], values: Sequence[str]) -> SweepPoint:
+    """The point with one value for each axis."""
     here = copy.deepcopy(source)
     chosen = {key: value for axis, value in zip(axes, values, strict=True) for key in axis.keys}
     assignments = [f"{key}={value}" for key, value in chosen.items()]

@@ -12,8 +12,9 @@ from magshell_fenicsx.platform.terminal import print_line
 from magshell_fenicsx.studies.sweep.axes import Axis, parse_axes
 from magshell_fenicsx.studies.sweep.chain import Known, make_chains, run_chain
 from magshell_fenicsx.studies.sweep.deal import deal, together
+from magshell_fenicsx.studies.sweep.earlier import TABLE, with_earlier
 from magshell_fenicsx.studies.sweep.outcome import Outcome, load, save
-from magshell_fenicsx.studies.sweep.points import SweepPoint, identity, make_points
+from magshell_fenicsx.studies.sweep.points import SweepPoint, identity, make_points, swept_source
 from magshell_fenicsx.studies.sweep.sweep_plot import draw_sweep
 from magshell_fenicsx.studies.sweep.table import write_curves, write_sweep
 
@@ -41,6 +42,7 @@ def sweep(
     say: Callable[[str], None] = print_line,
     *,
     full_paths: bool = False,
+    part: str | None = None,
 ) -> Sweep:
     """Run a case at all points of a product; collective, and every rank works.
 
@@ -52,26 +54,37 @@ def sweep(
     over
         `key.path=start:stop:count` or `key.path=value,value`; keys tied with `+`.
     out
-        Folder of sweep.csv, sweep.png and points/; existing points are kept if these sources computed them.
+        Folder of sweep.csv, sweep.png and points/; existing points are kept if these sources computed them. Tables and
+        picture have the points of earlier sweeps over the same keys too.
     say
         Called with one line per finished point, on the rank that finished it.
     full_paths
         Compute the full path at every point.
+    part
+        "i/n": compute only the i-th of n equal shares of the points; several jobs may share one folder.
 
     Raises
     ------
     CaseError
-        Before the first point, if a point is not a valid case or `out` cannot be written; or if the mesh file changes.
+        Before the first point, if a point is not a valid case, `out` cannot be written or has another sweep; or if the
+        mesh file changes.
     DiskError
         If the tables cannot be written.
     """
     axes = parse_axes(over)
-    points = make_points(Path(file), axes, settings)
-    folder = prepare_folder(Path(out), comm, _ready)
+    asked = make_points(Path(file), axes, settings)
+    share = share_of(part, len(asked))
+    source, folder = swept_source(Path(file), axes, settings), prepare_folder(Path(out), comm, _ready)
+    points = by_first(comm, lambda: with_earlier(folder, source, axes, asked))
+    before = len(points) - len(asked)
     files = [folder / "points" / f"{point.key}.json" for point in points]
     missing = by_first(comm, lambda: _missing(points, files), "cannot be read")
+    if part:
+        missing = [number for number in missing if number - before in share]
     if comm.rank == 0:
-        say(f"{len(points)} points, {len(missing)} to compute on {comm.size} rank{'s' if comm.size > 1 else ''}")
+        also = f" and {before} there" if before else ""
+        ranks = f"{comm.size} rank{'s' if comm.size > 1 else ''}"
+        say(f"{len(asked)} points{also}, {len(missing)} to compute on {ranks}")
         if again := sum(files[number].exists() for number in missing):
             say(f"{again} of these computed again: their files are of other sources of magshell_fenicsx, or damaged")
     chains = make_chains(axes, points, missing, full_paths=full_paths)
@@ -84,16 +97,37 @@ def sweep(
                 save(outcome, points[number].case, files[number])
                 place = f"{missing.index(number) + 1:4d}/{len(missing)}"
                 say(f"{place}  {points[number].label}: {_result(outcome)}, {outcome.wall_s:.1f} s")
-    outcomes = [found for result in files if (found := load(result))]
-    assert len(outcomes) == len(points)
+    found = [(point, known) for point, file in zip(points, files, strict=True) if (known := load(file))]
+    assert part or len(found) == len(points)
+    if comm.rank == 0 and len(found) < len(points):
+        say(f"{len(points) - len(found)} of {len(points)} points are left to other parts")
 
     def write() -> None:
-        write_sweep(points, outcomes, folder / "sweep.csv")
-        write_curves(points, outcomes, folder / "curves.csv")
-        draw_sweep(axes, points, outcomes, folder / "sweep.png")
+        done, outcomes = [point for point, _ in found], [outcome for _, outcome in found]
+        write_sweep(axes, done, outcomes, folder / "sweep.csv")
+        write_curves(done, outcomes, folder / "curves.csv")
+        draw_sweep(axes, done, outcomes, folder / "sweep.png")
 
-    by_first(comm, write)
-    return Sweep(axes, points, outcomes)
+    if found:
+        by_first(comm, write)
+    mine = {id(point) for i, point in enumerate(asked) if not part or i in share}
+    kept = [(point, outcome) for point, outcome in found if id(point) in mine]
+    return Sweep(axes, [point for point, _ in kept], [outcome for _, outcome in kept])
+
+
+def share_of(part: str | None, count: int) -> range:
+    """The numbers of the points of a part "i/n": neighbours, whose folds can be followed.
+
+    Examples
+    --------
+    >>> share_of("1/2", 5), share_of("2/2", 5)
+    (range(0, 2), range(2, 5))
+    """
+    first, slash, number = (part or "1/1").partition("/")
+    if not (slash and first.isdigit() and number.isdigit() and 1 <= int(first) <= int(number) <= count):
+        raise CaseError(f"--part {part}: write it as i/n with 1 <= i <= n, and n at most the number of points")
+    i, n = int(first), int(number)
+    return range((i - 1) * count // n, i * count // n)
 
 
 def _missing(points: Sequence[SweepPoint], files: Sequence[Path]) -> list[int]:
@@ -104,13 +138,14 @@ def _missing(points: Sequence[SweepPoint], files: Sequence[Path]) -> list[int]:
 
 def _ready(out: Path) -> None:
     (out / "points").mkdir(parents=True, exist_ok=True)
-    (out / "sweep.csv").touch()
+    (out / TABLE).touch()
 
 
 def _result(outcome: Outcome) -> str:
     found = "no limit point"
     if outcome.knockdown is not None:
-        found = f"k_d = {outcome.knockdown:.6f} ({outcome.found})"
+        pascals = outcome.in_units.get("buckling_pressure_Pa")
+        found = f"k_d = {outcome.knockdown:.6f}{f', {pascals:.6g} Pa' if pascals else ''} ({outcome.found})"
     elif outcome.barrier is not None:
         found = f"barrier = {outcome.barrier:.6g} E h R^2"
     elif outcome.limit:

@@ -5,6 +5,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from magshell_fenicsx.quantities.quantity import ENDINGS
+from magshell_fenicsx.studies.sweep.axes import Axis
 from magshell_fenicsx.studies.sweep.outcome import CURVE, Outcome
 from magshell_fenicsx.studies.sweep.points import SweepPoint
 
@@ -26,13 +28,28 @@ COLUMNS = (
 )
 
 
-def write_sweep(points: Sequence[SweepPoint], outcomes: Sequence[Outcome], file: Path) -> None:
-    """Write sweep.csv."""
+def write_sweep(axes: Sequence[Axis], points: Sequence[SweepPoint], outcomes: Sequence[Outcome], file: Path) -> None:
+    """Write sweep.csv; values with units are columns of numbers too, and so are the results of a case with units."""
     rows = [
-        {**point.values, **sweep_row(outcome), "point": point.key}
+        {**point.values, **sweep_row(outcome), "point": point.key, **_numbers(axes, point), **_in_units(outcome)}
         for point, outcome in zip(points, outcomes, strict=True)
     ]
-    write_csv(rows, (*points[0].values, *COLUMNS), file)
+    more = dict.fromkeys(key for row in rows for key in row)
+    write_csv(rows, tuple(dict.fromkeys((*points[0].values, *COLUMNS, *more))), file)
+
+
+def _numbers(axes: Sequence[Axis], point: SweepPoint) -> dict[str, float]:
+    """Key_unit -> number, of the values with units."""
+    swept = [(axis, key) for axis in axes if axis.unit and axis.numbers for key in axis.keys]
+    return {f"{key}_{axis.unit}": axis.number(point.values[key]) for axis, key in swept}
+
+
+def _in_units(outcome: Outcome) -> dict[str, Any]:
+    """The columns in units of its limit point, and the numbers of the case."""
+    limit = outcome.limit or {}
+    return {
+        key: v for key, v in limit.items() if key.endswith(tuple(f"_{each}" for each in ENDINGS))
+    } | outcome.in_units
 
 
 def sweep_row(outcome: Outcome) -> dict[str, Any]:

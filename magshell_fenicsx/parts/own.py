@@ -1,0 +1,57 @@
+"""What a case has besides its keys: where these were written, and energies that a program adds to it."""
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Self
+
+from pydantic import PrivateAttr
+
+from magshell_fenicsx.models.shell.own_term import OwnTerm
+from magshell_fenicsx.parts.section import Section
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Where the keys of a case were written; equal cases may come from different files."""
+
+    place: Callable[[tuple[str | int, ...]], str] | None = field(default=None, compare=False)
+
+
+class WithOwnTerms(Section):
+    """The base of a case."""
+
+    _own_terms: tuple[OwnTerm, ...] = PrivateAttr(default=())
+    _origin: Origin = PrivateAttr(default=Origin())
+
+    def written_at(self, place: Callable[[tuple[str | int, ...]], str]) -> Self:
+        """The case, with the places of its keys for messages that it does not make itself."""
+        self._origin = Origin(place)
+        return self
+
+    def placed(self, message: str) -> str:
+        """A message that begins with a key of the case, with the place of this key before it.
+
+        A name after the key, as that of a patch, is looked for below it.
+        """
+        about = re.match(r"([a-z]\w*(?:\.\w+)*): (?:(\w+): )?", message)
+        if not (about and self._origin.place) or about[1].split(".")[0] not in type(self).model_fields:
+            return message
+        keys = [*about[1].split("."), *([about[2]] if about[2] else [])]
+        return f"{self._origin.place(tuple(int(key) if key.isdigit() else key for key in keys))}: {message}"
+
+    @property
+    def own_terms(self) -> tuple[OwnTerm, ...]:
+        """The user-defined energies; what is made of the case has them."""
+        return self._own_terms
+
+    def with_terms(self, terms: Sequence[OwnTerm]) -> Self:
+        """A copy of the case with these energies, for `run`, `Scene` and whatever else takes a case."""
+        copied = self.model_copy()
+        copied._own_terms = tuple(terms)
+        return copied
+
+    @property
+    def term_digests(self) -> dict[str, str | None]:
+        """Hashes of the energies, by which a run is recognised that is resumed."""
+        return {f"terms.{term.name}": term.digest for term in self._own_terms}
