@@ -88,10 +88,10 @@ def sweep(
         if again := sum(files[number].exists() for number in missing):
             say(f"{again} of these computed again: their files are of other sources of magshell_fenicsx, or damaged")
     chains = make_chains(axes, points, missing, full_paths=full_paths)
-    known = Known()
+    shared = Known()
     with together(comm):
         for chain in deal(len(chains), comm):
-            for number, outcome in run_chain(chains[chain], known):
+            for number, outcome in run_chain(chains[chain], shared):
                 if identity(points[number].case) != points[number].key:
                     raise CaseError(f"{file}: its mesh file was changed during the sweep; start it again")
                 save(outcome, points[number].case, files[number])
