@@ -22,6 +22,7 @@ from magshell_fenicsx.platform.environment import fast_blas
 from magshell_fenicsx.quantities.registry import quantity
 from magshell_fenicsx.run.files import MESH, RunFiles, open_folder
 from magshell_fenicsx.run.frequencies import frequencies_after, wanted
+from magshell_fenicsx.run.gradients import gradients_after, refuse_unknown
 from magshell_fenicsx.run.interrupt import Interrupted, Stoppable, Watch
 from magshell_fenicsx.run.modes import modes_after
 from magshell_fenicsx.run.rows import RowMaker
@@ -107,6 +108,7 @@ def _run(
     found = _mesh_for_tolerance(case, folder, comm, say, doing)
     doing("mesh and kernels")
     scene = found.choice.scene(case, comm) if found else Scene(case, comm)
+    refuse_unknown(scene)
     result = Result(scene, scene.unloaded(), adapted=found)
     say(f"{', '.join(scene.plan.included)}: {scene.cells} cells, {scene.model.system.dofs} unknowns")
     if scene.plan.warning:
@@ -143,6 +145,7 @@ def _run(
                     with result.output:
                         modes_after(result, folder, say)
                         frequencies_after(result, folder, say)
+                        gradients_after(result, folder, say)
                         if pictures:
                             by_first(comm, partial(_draw, folder, say))
                     files.summarise(summary(result, time.perf_counter() - start))  # with the time of the pictures

@@ -19,7 +19,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.source import CaseError, override, read_source
+from magshell_fenicsx.case.source import CaseError, read_source
 from magshell_fenicsx.output.store.durable import write_whole
 from magshell_fenicsx.output.store.folder import by_first, held_folder
 from magshell_fenicsx.platform import sources
@@ -159,9 +159,7 @@ def design(
     Missed
         After everything is written: if a target is not reached, a constraint not kept, or no optimum found.
     """
-    source = read_source(Path(file))
-    for setting in settings:
-        override(source, setting)
+    source = read_source(Path(file), settings)
     case, folder = Case.from_source(source), Path(out)
     if case.design is None:
         raise CaseError(f"{file}: design: is missing: it says what varies and what is wanted")
@@ -184,7 +182,7 @@ def _designed(made: Design, case: Case, file: Path, comm: MPI.Intracomm) -> dict
     idle = _without_influence(vary, first)
     for name in idle:
         made.say(f"warning: {name} has no influence on {', '.join(problem.results)} where the design starts")
-    if len(idle) == len(vary.keys) + (vary.controls is not None):
+    if len(idle) == len(vary.blocks):
         raise Missed(f"no variable has an influence on {', '.join(problem.results)} where the design starts")
     ended = searched(made, problem, vary, section.iterations)
     found = made.best
@@ -225,9 +223,7 @@ def _without_influence(vary: Variables, first: Evaluation) -> list[str]:
     slopes = np.array([first.gradients[result] for result in first.values])
     size = np.array([abs(value) or 1.0 for value in first.values.values()])
     strongest = (np.abs(slopes) / size[:, None]).max(axis=0)
-    n = len(vary.keys)
-    idle = [key for key, slope in zip(vary.keys, strongest[:n], strict=True) if slope < NOTHING]
-    return idle + (["remanence"] if vary.controls is not None and strongest[n:].max() < NOTHING else [])
+    return [name for name, part in vary.blocks.items() if strongest[part].max() < NOTHING]
 
 
 def _write_best(made: Design, x: Array, file: Path) -> None:

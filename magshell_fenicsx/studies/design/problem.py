@@ -8,8 +8,9 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.design import DesignSection
+from magshell_fenicsx.simulate.gradients.instabilities import BESIDE, FOLDS, MOST
 from magshell_fenicsx.simulate.results import Target
-from magshell_fenicsx.studies.design.evaluate import BESIDE, FOLDS, MOST, Evaluation
+from magshell_fenicsx.studies.design.evaluate import Evaluation
 from magshell_fenicsx.studies.design.target import target_of
 
 Array = NDArray[np.float64]
