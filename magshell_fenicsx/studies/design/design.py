@@ -24,6 +24,7 @@ from magshell_fenicsx.output.store.durable import write_whole
 from magshell_fenicsx.output.store.folder import by_first, held_folder
 from magshell_fenicsx.platform import sources
 from magshell_fenicsx.platform.terminal import print_line
+from magshell_fenicsx.simulate.standing import Standing
 from magshell_fenicsx.studies.design.evaluate import Evaluation, evaluate
 from magshell_fenicsx.studies.design.picture import draw_design
 from magshell_fenicsx.studies.design.problem import Problem, problem_of
@@ -61,6 +62,7 @@ class Design:
     rows: list[dict[str, Any]] = field(default_factory=list)
     tried: list[tuple[Array, Evaluation]] = field(default_factory=list)
     _here: str = ""
+    _scene: Standing = field(default_factory=Standing)
 
     def __call__(self, x: Array) -> Evaluation:
         """The evaluation of a vector, known or new; collective."""
@@ -78,7 +80,7 @@ class Design:
     def _new(self, x: Array, file: Path, vectors: Path) -> Evaluation:
         by_first(self.comm, lambda: self.variables.write(x, vectors))
         case, problem = self.variables.case_of(x, vectors), self.problem
-        found = evaluate(case, x, self.variables, problem.results, problem.targets, self.comm)
+        found = evaluate(case, x, self.variables, problem.results, problem.targets, self.comm, self._scene)
         found = Evaluation(**self.comm.bcast(asdict(found)))
         content = {"design": self._mine, "sources": sources.ours(), "evaluation": asdict(found)}
         by_first(self.comm, lambda: write_whole(file, (json.dumps(content) + "\n").encode()))

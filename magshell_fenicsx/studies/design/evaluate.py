@@ -17,7 +17,7 @@ from magshell_fenicsx.simulate.gradients.instabilities import BESIDE, FOLDS, Los
 from magshell_fenicsx.simulate.gradients.mass import MASS, mass
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.results import Target, distances
-from magshell_fenicsx.simulate.scene import Scene
+from magshell_fenicsx.simulate.standing import Standing
 from magshell_fenicsx.studies.design.variables import Variables
 
 Array = NDArray[np.float64]
@@ -48,13 +48,19 @@ class Evaluation:
 
 
 def evaluate(
-    case: Case, x: Array, variables: Variables, results: Sequence[str], targets: Mapping[str, Target], comm: MPI.Comm
+    case: Case,
+    x: Array,
+    variables: Variables,
+    results: Sequence[str],
+    targets: Mapping[str, Target],
+    comm: MPI.Comm,
+    known: Standing,
 ) -> Evaluation:
-    """Follow the path of a case, and differentiate its results; collective."""
+    """Follow the path of a case, and differentiate its results; collective. `known` is of the case before."""
     lost = ""
     records = list[Record]()
     try:
-        scene = Scene(case, comm)
+        scene = known.of(case, comm)
         for record in follow(scene, search=False):
             records.append(record)
             if _enough(records, results):

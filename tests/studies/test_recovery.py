@@ -1,0 +1,1 @@
+"""A remanence is found again from the shape that it gives."""
