@@ -105,16 +105,28 @@ def test_state(tmp_path: Path, symmetry: str) -> None:
     scene = Scene(Case.load(tmp_path / "strip.yaml", [f"symmetry={symmetry}"]))
     last = solved(scene)
     assert scene.plan.half == (symmetry == "auto")
+    found = {of: gradient(scene, last, of=of, by=FIELDS) for of in ("tip_uz", "energy")}
     for seed, name in enumerate(FIELDS):
         along = Direction(seed)
         step = {"thickness": 2e-3, "curvature": 1e-2, "deviation": 1e-2}[name]
         near = {c: changed(scene, name, along, c * step) for c in (-2, -1, 1, 2)}
         states = {c: (other, solved(other).point.state) for c, other in near.items()}
-        for of in ("tip_uz", "energy"):
-            found = gradient(scene, last, of=of, by=[name])[name]
+        for of, by in found.items():
             values = {c: functional(*each, of).value for c, each in states.items()}
             expected = by_difference(values.__getitem__, 1) / step
-            assert directional(scene, found, name, along) == pytest.approx(expected, rel=1e-5), (name, of)
+            assert directional(scene, by[name], name, along) == pytest.approx(expected, rel=1e-5), (name, of)
+
+
+def test_cost(tmp_path: Path) -> None:
+    """At most one factorisation more than the state's own, for all of 10 000 parameters."""
+    (tmp_path / "strip.yaml").write_text(STRIP)
+    scene = Scene(Case.load(tmp_path / "strip.yaml", ["mesh.refinement=3.6"]))
+    last = solved(scene)
+    before = scene.newton.factorisation.count
+    found = gradient(scene, last, of="tip_uz", by=["remanence"])["remanence"]
+    assert isinstance(found, FieldGradient)
+    assert found.forces.size > 10_000
+    assert scene.newton.factorisation.count <= before + 1
 
 
 FIELD = "magnetic.lambda_m=0.001"
