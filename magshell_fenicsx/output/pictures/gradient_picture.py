@@ -12,8 +12,8 @@ from magshell_fenicsx.output.pictures.render import Arrows, View, rendered, smoo
 
 Array = NDArray[np.float64]
 PANEL, QUANTILE, PEAK = 480, 0.995, 1.3  # pixels; colours end at most PEAK times above this quantile of the nodes
-THICK, LONGEST = 0.006, 1.1  # of arrows: radius over the shell's extent, largest length over their distance
-SMALL, APART = 0.15, 0.12  # vectors below this part of the largest have none; their distance over the extent of those
+THICK, LONGEST = 0.045, 1.3  # of arrows over their distance: radius, largest length
+SMALL, APART = 0.15, 0.16  # vectors below this part of the largest have none; their distance over the extent of those
 ASIDE = np.array([0.4, -0.7, 0.4])  # added to the normal that the camera looks along
 WORDS = {
     "remanence": "more remanence, along arrows",
@@ -69,8 +69,8 @@ def _limit(sizes: Array) -> float:
 
 def _arrows(surface: Surface, vectors: Array) -> Arrows:
     r, length = surface.r0 + surface.u, np.linalg.norm(vectors, axis=1)
-    extent, most = float(np.ptp(r, axis=0).max()), length.max() or 1.0
+    most = length.max() or 1.0
     large = np.flatnonzero(length >= SMALL * most)
     apart = APART * float(np.ptp(r[large], axis=0).max())
     seeds = large[spread(r[large], apart)]
-    return Arrows(r[seeds], LONGEST * apart / most * vectors[seeds], "0.15", THICK * extent)
+    return Arrows(r[seeds], LONGEST * apart / most * vectors[seeds], "0.15", THICK * apart)
