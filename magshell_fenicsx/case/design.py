@@ -20,8 +20,8 @@ class ShapeSection(Section):
     """Of a strip: points of the curve of its middle line from the root on, which a spline joins; it is scaled to the
     strip's length [any length]"""
     stages: Annotated[int, Field(ge=1, le=50)] = 1
-    """Of a curve: it is first wanted with 1/stages of its curvature, then with 2/stages, and so on: a straight strip
-    finds no way to a curve that turns far. All but the last have a quarter of the iterations"""
+    """Of a curve: it is first wanted with 1/stages of its curvature, then with 2/stages, and so on. All but the last
+    have a quarter of the iterations"""
 
     @model_validator(mode="after")
     def _one_of_them(self) -> Self:
