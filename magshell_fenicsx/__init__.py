@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from magshell_fenicsx.run.rows import columns
     from magshell_fenicsx.run.run import Result, run
     from magshell_fenicsx.simulate.follow import follow
-    from magshell_fenicsx.simulate.gradient import gradient
+    from magshell_fenicsx.simulate.gradients.gradient import gradient
     from magshell_fenicsx.simulate.record import Record, Stopped
     from magshell_fenicsx.simulate.scene import Scene
     from magshell_fenicsx.simulate.search import solutions
@@ -71,7 +71,7 @@ _ROOMS = {
     "run.rows": "columns",
     "run.run": "Result run",
     "simulate.follow": "follow",
-    "simulate.gradient": "gradient",
+    "simulate.gradients.gradient": "gradient",
     "simulate.record": "Record Stopped",
     "simulate.scene": "Scene",
     "simulate.search": "solutions",

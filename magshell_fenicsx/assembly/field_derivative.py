@@ -34,7 +34,7 @@ class FieldGradient:
     forces
         (cells, nodes, components) of this rank's own cells; the components are the field's.
     places, normals
-        (cells, nodes, 3) of these nodes, undeformed, over R.
+        (cells, nodes, 3) of these nodes, undeformed, over R; of a deviation those of the perfect shell.
     """
 
     field: fem.Function
@@ -61,13 +61,17 @@ class FieldGradient:
 def by_field(shares: Iterable[Share], f: fem.Function, u: fem.Function, w: fem.Function, log: KernelLog) -> Array:
     """The sum of the shares' derivatives by f, (cells, nodes, components) on this rank's own cells; collective.
 
+    A field that is the same in neighbouring cells, such as a placement, changes in each cell alone: the sum over cells
+    that share a node is what the node's own change gives.
+
     Parameters
     ----------
     u, w
         The displacement of the terms, and the vector along which their residual is taken.
     """
-    Q, domain = f.function_space, f.function_space.mesh
-    v, vector = ufl.TestFunction(Q), np.zeros_like(f.x.array)
+    domain = f.function_space.mesh
+    Q = _broken(f.function_space)
+    v, found = ufl.TestFunction(Q), fem.Function(Q)
     for share in shares:
         energy = share.term.form
         if f not in energy.coefficients():
@@ -78,9 +82,15 @@ def by_field(shares: Iterable[Share], f: fem.Function, u: fem.Function, w: fem.F
             taken = ufl.derivative(energy, u, w) if order else energy
             weight = fem.Constant(domain, float(factor))
             form = log.compile(f"{share.term.name} by {f.name} {order}", weight * ufl.derivative(taken, f, v))
-            fem.assemble_vector(vector, form)
-    found = fem.Function(Q)
-    found.x.array[:] = vector
+            fem.assemble_vector(found.x.array, form)
     found.x.scatter_reverse(InsertMode.add)
     cells = domain.topology.index_map(domain.topology.dim).size_local
     return np.asarray(found.x.array.reshape(-1, Q.dofmap.bs)[Q.dofmap.list[:cells]])
+
+
+def _broken(V: fem.FunctionSpace) -> fem.FunctionSpace:
+    """The space, free to jump from cell to cell."""
+    element = V.element.basix_element
+    if element.discontinuous:
+        return V
+    return fem.functionspace(V.mesh, ("DG", element.degree, (V.dofmap.bs,)))

@@ -14,7 +14,7 @@ from magshell_fenicsx.assembly.assemblers import ResidualAssembler, TangentAssem
 from magshell_fenicsx.assembly.moving import Moving
 from magshell_fenicsx.assembly.parameter import Derivative, FreeParameter
 from magshell_fenicsx.assembly.sliding import Constraint, Projection, Sliding
-from magshell_fenicsx.assembly.terms import FormTerm, Term
+from magshell_fenicsx.assembly.terms import FormTerm, Term, factor_of
 from magshell_fenicsx.continuation.noise import Noise
 from magshell_fenicsx.continuation.system import Amplitudes, Skewed, State, Vector, Weighted
 from magshell_fenicsx.continuation.timing import Stopwatch
@@ -170,7 +170,7 @@ class FiniteElementSystem:
                 here += float(self._gradient({edge: 1.0}) @ self.moving.along(A, self.u.x.array))
         elif name in self.parameters:
             slopes = self.parameters[name].slopes
-            here = sum(_value(slope.amplitude, mu) * slope.energy() for slope in slopes)
+            here = sum(factor_of(slope.amplitude, mu) * slope.energy() for slope in slopes)
         else:
             here = sum(t.energy() for t in self.terms if t.amplitude == name)
         return float(self.comm.allreduce(here))
@@ -187,7 +187,7 @@ class FiniteElementSystem:
         parameter = self.parameters[name]
         if other in self.parameters:
             bends = parameter.bends(self.parameters[other].constant)
-            here = sum(_value(bend.amplitude, mu) * bend.energy() for bend in bends)
+            here = sum(factor_of(bend.amplitude, mu) * bend.energy() for bend in bends)
         else:
             here = sum(slope.energy() for slope in parameter.slopes if slope.amplitude == other)
         return float(self.comm.allreduce(here))
@@ -213,7 +213,7 @@ class FiniteElementSystem:
             return self._times(self.moving.rate(mu, name), self._factors(mu)) + self._turning_column(mu, name)
         if name in self.parameters:
             slopes = self.parameters[name].slopes
-            return self._gradient({}, [(_value(slope.amplitude, mu), slope) for slope in slopes])
+            return self._gradient({}, [(factor_of(slope.amplitude, mu), slope) for slope in slopes])
         return self._gradient({t.name: 1.0 for t in self.terms if t.amplitude == name})
 
     def _turning_column(self, mu: Amplitudes, name: str) -> NDArray[np.float64]:
@@ -295,7 +295,7 @@ class FiniteElementSystem:
         return K
 
     def _factors(self, mu: Amplitudes) -> dict[str, float]:
-        return {t.name: _value(t.amplitude, mu) for t in self.terms}
+        return {t.name: factor_of(t.amplitude, mu) for t in self.terms}
 
     def _gradient(
         self, factors: Mapping[str, float], besides: Sequence[tuple[float, Derivative]] = ()
@@ -320,7 +320,3 @@ class FiniteElementSystem:
             if held:
                 self._hold(b)
             return np.array(b[: self.size])
-
-
-def _value(amplitude: str | None, mu: Amplitudes) -> float:
-    return 1.0 if amplitude is None else mu[amplitude]

@@ -1,6 +1,6 @@
 """A potential Pi(u) with its amplitude: energy, residual and tangent."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import cached_property
 from typing import Generic, Protocol, TypeVar
 
@@ -45,6 +45,11 @@ class Term(Protocol):
 
     def add_tangent(self, K: PETSc.Mat, factor: float, clamped: list[fem.DirichletBC]) -> None:
         """Add factor d2Pi/du2."""
+
+
+def factor_of(amplitude: str | None, mu: Mapping[str, float]) -> float:
+    """What multiplies the energy of a term or slope with this amplitude."""
+    return 1.0 if amplitude is None else mu[amplitude]
 
 
 class FormTerm:

@@ -18,6 +18,7 @@ from magshell_fenicsx.case.expressions import is_formula
 from magshell_fenicsx.case.fields import MagneticSection, layer_average
 from magshell_fenicsx.case.file import FileKeys
 from magshell_fenicsx.case.frequencies import FrequenciesSection
+from magshell_fenicsx.case.gradients import GradientsSection
 from magshell_fenicsx.case.imperfections.dimple import DimpleSection
 from magshell_fenicsx.case.imperfections.place import Coordinates, ImperfectionSection, places_with_units
 from magshell_fenicsx.case.imperfections.random import RandomSection
@@ -36,7 +37,7 @@ from magshell_fenicsx.case.patches import refuse_strange
 from magshell_fenicsx.case.programme import refuse_unfit_steps
 from magshell_fenicsx.case.shell import ShellSection
 from magshell_fenicsx.case.solid import SolidSection
-from magshell_fenicsx.case.source import CaseError, Source, override, read_source
+from magshell_fenicsx.case.source import CaseError, Source, read_source
 from magshell_fenicsx.case.sources.source import SourceSection
 from magshell_fenicsx.case.stability import StabilitySection
 from magshell_fenicsx.case.surfaces import CapSurface, MeshSurface, RevolutionSurface, Surface, SurfaceSection
@@ -76,6 +77,8 @@ class Case(WithParts):
     """Lowest modes after the run"""
     frequencies: FrequenciesSection | None = None
     """Natural frequencies at points of the path"""
+    gradients: GradientsSection | None = None
+    """Derivatives of results after the run"""
     ensemble: EnsembleSection | None = None
     """What is random, for `magshell ensemble`"""
     design: DesignSection | None = None
@@ -295,7 +298,7 @@ class Case(WithParts):
     @property
     def thickness_factor(self) -> str | dict[str, float] | None:
         """What multiplies h: a formula, or numbers of patches."""
-        return self.shell.thickness_factor if isinstance(self.shell, SurfaceSection) else None
+        return self.shell.thickness_factor
 
     @property
     def width(self) -> float | None:
@@ -336,10 +339,7 @@ class Case(WithParts):
         CaseError
             One message with every mistake: file, line, key, value, what is allowed.
         """
-        source = read_source(Path(file))
-        for setting in settings:
-            override(source, setting)
-        return cls.from_source(source)
+        return cls.from_source(read_source(Path(file), settings))
 
     @classmethod
     def from_source(cls, source: Source) -> "Case":

@@ -9,7 +9,6 @@ from magshell_fenicsx.parts.section import Section
 
 Point = Annotated[list[float], Field(min_length=3, max_length=3)]
 Bounds = Annotated[list[float], Field(min_length=2, max_length=2)]
-RESULTS = "knockdown, critical_field, or a column of path.csv where the path ends"
 
 
 class ShapeSection(Section):
@@ -20,16 +19,22 @@ class ShapeSection(Section):
     curve: Annotated[list[Point], Field(min_length=3)] | None = None
     """Of a strip: points of the curve of its middle line from the root on, which a spline joins; it is scaled to the
     strip's length [any length]"""
+    stages: Annotated[int, Field(ge=1, le=50)] = 1
+    """Of a curve: it is first wanted with 1/stages of its curvature, then with 2/stages, and so on. All but the last
+    have a quarter of the iterations"""
 
     @model_validator(mode="after")
     def _one_of_them(self) -> Self:
         if (self.components is None) == (self.curve is None):
             raise ValueError("give components or curve")
+        if self.stages > 1 and self.curve is None:
+            raise ValueError("stages: belong to a curve")
         return self
 
 
 class ObjectiveSection(Section):
-    """One of its keys; the results are knockdown, critical_field, or a column of path.csv where the path ends."""
+    """One of its keys; the results are knockdown, critical_field, mass (over that of the thickness h everywhere), or a
+    column of path.csv where the path ends."""
 
     maximise: str | None = None
     """A result"""
@@ -97,6 +102,26 @@ class RemanenceVariables(Section):
         return self
 
 
+class FieldVariables(Section):
+    """The values of a field at points, of which each place has the mean, weighted by exp(-(distance/filter)²).
+
+    In the best case the field is a formula of x, y, z.
+    """
+
+    points: Annotated[int, Field(ge=2, le=300)]
+    """How many, spread as those of the remanence"""
+    values: Bounds
+    """Least and largest value"""
+    filter: float | None = Field(default=None, gt=0, le=10)
+    """Nothing varies over less than this; by default the distance of the points [R]"""
+
+    @model_validator(mode="after")
+    def _bounds(self) -> Self:
+        if not self.values[0] < self.values[1]:
+            raise ValueError(f"values: the first must be less than the second, here {self.values}")
+        return self
+
+
 class DesignSection(Section):
     """What `magshell design` varies, and for what; every other command takes the case without it."""
 
@@ -106,6 +131,10 @@ class DesignSection(Section):
     """Key of the case with a number (`magnetic.remanent.polar`, `shell.poisson_ratio`) -> least and largest value"""
     remanence: RemanenceVariables | None = None
     """Vectors of the remanence that vary"""
+    thickness: FieldVariables | None = None
+    """Factor of the thickness, which varies: `shell.thickness_factor` [h]"""
+    curvature: FieldVariables | None = None
+    """Natural curvatures 11 and 22, which vary: `natural.curvature` [1/R]"""
     constraints: list[LimitSection] = Field(default_factory=list)
     """Results that must stay within bounds"""
     iterations: int = Field(default=60, ge=1, le=10_000)
@@ -115,12 +144,20 @@ class DesignSection(Section):
 
     @model_validator(mode="after")
     def _something_varies(self) -> Self:
-        if not self.numbers and self.remanence is None:
-            raise ValueError("needs numbers or remanence: otherwise nothing varies")
+        if not self.numbers and self.remanence is None and not self.fields:
+            raise ValueError("needs numbers, remanence, thickness or curvature: otherwise nothing varies")
+        if self.thickness and self.thickness.values[0] <= 0:
+            raise ValueError("thickness: values: must be positive")
         for key, (least, most) in self.numbers.items():
             if not least < most:
                 raise ValueError(f"numbers: {key}: the first bound must be less than the second, here {least}, {most}")
         return self
+
+    @property
+    def fields(self) -> dict[str, FieldVariables]:
+        """The scalar fields that vary."""
+        found = {"thickness": self.thickness, "curvature": self.curvature}
+        return {name: section for name, section in found.items() if section}
 
     @property
     def results(self) -> list[str]:

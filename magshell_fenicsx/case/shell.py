@@ -4,6 +4,7 @@ from typing import Literal, Self
 
 from pydantic import Field, model_validator
 
+from magshell_fenicsx.case.expressions import Formula
 from magshell_fenicsx.case.history import Time
 from magshell_fenicsx.case.imperfections.dimple import DimpleSection
 from magshell_fenicsx.case.imperfections.registered import Imperfections
@@ -37,6 +38,8 @@ class ShellSection(Section):
     """Of Kelvin and Voigt in steps of kind: time: viscosity over Young's modulus"""
     relaxation: Branches = Field(default=[])
     """Branches of Maxwell in steps of kind: time, relaxed before each of these"""
+    thickness_factor: Formula | None = None
+    """Multiplies h: a formula of x, y, z over R"""
     defect: DimpleSection | None = None
     """One dimple of a hemisphere; for more, or elsewhere, see imperfections"""
     imperfections: Imperfections = Field(default=[])

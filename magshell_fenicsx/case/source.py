@@ -1,7 +1,7 @@
 """Reading a case file: YAML to plain data, with the line of every key kept for messages."""
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -55,13 +55,13 @@ class Source:
         return self.name
 
 
-def read_source(file: Path) -> Source:
-    """Read a case file.
+def read_source(file: Path, settings: Sequence[str] = ()) -> Source:
+    """Read a case file, with `key.path=value` settings in place of its own.
 
     Raises
     ------
     CaseError
-        If the file cannot be read, is no YAML mapping, or has a key twice.
+        If the file cannot be read, is no YAML mapping, or has a key twice, or a setting is none.
     """
     try:
         with file.open("rb") as stream:
@@ -82,6 +82,8 @@ def read_source(file: Path) -> Source:
     if not isinstance(data, dict):  # an explicit tag can make anything of a mapping
         raise CaseError(f"{file}: a case file is a mapping of sections (shell, boundary, loading, ...)")
     source.data = data
+    for setting in settings:
+        override(source, setting)
     return source
 
 

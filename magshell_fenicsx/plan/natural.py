@@ -12,7 +12,7 @@ from magshell_fenicsx.case.surfaces import MeshSurface, PlateSurface
 from magshell_fenicsx.mesh.frame import rotation
 from magshell_fenicsx.mesh.mirror import Mirror
 from magshell_fenicsx.models.shell.natural import Natural, Varying, meridians
-from magshell_fenicsx.models.shell.patterns import Inside, WithinRims
+from magshell_fenicsx.models.shell.patterns import Inside, Pattern, WithinRims
 from magshell_fenicsx.plan.by_formula import ByFormula, function
 from magshell_fenicsx.plan.outline import Outline
 from magshell_fenicsx.plan.turning import scalar_turns
@@ -43,17 +43,23 @@ def natural(case: Case, turn: float, within: Mapping[str, Inside]) -> Natural | 
         outside = vectors.get("rest", np.zeros(3))
         return WithinRims(tuple((inside, vectors.get(name, outside)) for name, inside in within.items()), outside)
 
+    curvature, stretch = varying(section.curvature, _curvatures, R), varying(section.stretch, _stretches, 1.0)
+    return Natural(curvature, stretch, frame(case, turn))
+
+
+def frame(case: Case, turn: float) -> Pattern:
+    """A pattern whose part in the surface is the first direction of the frame, in a frame turned about e3 (rad)."""
     direction = along(case)
-    pattern = meridians if direction == MERIDIAN else ByFormula([function(v) for v in direction], Q, R, vectors=True)
-    return Natural(varying(section.curvature, _curvatures, R), varying(section.stretch, _stretches, 1.0), pattern)
+    if direction == MERIDIAN:
+        return meridians
+    return ByFormula([function(v) for v in direction], rotation(turn), case.shell.reference, vectors=True)
 
 
 def along(case: Case) -> list[float | str] | str:
-    """The first direction of the frame."""
-    assert case.natural
+    """The first direction of the frame, by default where the case has no natural shape."""
     flat = isinstance(case.shell, MeshSurface | PlateSurface)
     flat = flat or (isinstance(case.shell, ShellSection) and case.shell.geometry == "strip")
-    return case.natural.along or ([1.0, 0.0, 0.0] if flat else MERIDIAN)
+    return (case.natural and case.natural.along) or ([1.0, 0.0, 0.0] if flat else MERIDIAN)
 
 
 def uneven(case: Case) -> bool:

@@ -23,7 +23,7 @@ from magshell_fenicsx.output.store.folder import by_first, prepare_folder
 from magshell_fenicsx.output.store.table import PathTable, Row
 from magshell_fenicsx.simulate.scene import Scene
 
-DRAWN = (*PICTURES, "curve", "instabilities", "modes", "frequencies", "solutions")
+DRAWN = (*PICTURES, "curve", "instabilities", "modes", "frequencies", "solutions", "gradients")
 LAST_FILES = (
     *("summary.json", "report.html", "stability.csv", "frequencies.csv", "animation.gif"),
     *(f"{name}{end}.png" for name in DRAWN for end in ("", "_[0-9]*")),

@@ -26,6 +26,7 @@ from magshell_fenicsx.quantities.quantity import spelled
 from magshell_fenicsx.quantities.registry import amplitude, shown
 from magshell_fenicsx.run.files import MESH, RunFiles, open_folder
 from magshell_fenicsx.run.frequencies import frequencies_after, wanted
+from magshell_fenicsx.run.gradients import gradients_after, refuse_unknown
 from magshell_fenicsx.run.interrupt import Interrupted, Stoppable, Watch
 from magshell_fenicsx.run.modes import modes_after
 from magshell_fenicsx.run.rows import RowMaker
@@ -116,6 +117,7 @@ def _run(
         found = _mesh_for_tolerance(case, folder, comm, say, doing)
         doing("mesh and kernels")
         scene = found.choice.scene(case, comm) if found else Scene(case, comm)
+        refuse_unknown(scene)
     except (CaseError, MeshError) as e:
         raise type(e)(case.placed(str(e))) from None
     result = Result(scene, scene.unloaded(), adapted=found)
@@ -154,6 +156,7 @@ def _run(
                     with result.output:
                         modes_after(result, folder, say)
                         frequencies_after(result, folder, say)
+                        gradients_after(result, folder, say)
                         if pictures:
                             by_first(comm, partial(_draw, folder, say))
                     files.summarise(summary(result, time.perf_counter() - start))  # with the time of the pictures

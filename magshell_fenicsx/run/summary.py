@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from magshell_fenicsx.assembly.terms import factor_of
 from magshell_fenicsx.case.shell import ShellSection
 from magshell_fenicsx.case.surfaces import Surface
 from magshell_fenicsx.continuation.system import State, dot
@@ -52,6 +53,8 @@ class Result:
         The states of the solutions that searches have found, by row number.
     barrier
         The energy barrier over E h R^2 of a last step with `until: zero`; None without.
+    gradients
+        By result, as in summary.json.
     """
 
     scene: Scene
@@ -69,6 +72,7 @@ class Result:
     found: dict[int, State] = field(default_factory=dict)
     kept: dict[int, State] = field(default_factory=dict)
     frequencies: dict[int, list[ShellMode]] = field(default_factory=dict)
+    gradients: dict[str, dict[str, Any]] = field(default_factory=dict)
 
     @property
     def limit_points(self) -> list[dict[str, Any]]:
@@ -140,6 +144,7 @@ def summary(result: Result, total_s: float) -> dict[str, Any]:
         "stopped": result.stopped,
         "limit_points": result.limit_points,
         "sensitivities": result.sensitivities,
+        "gradients": result.gradients,
         "knockdown": result.knockdown,
         "critical_field": result.critical_field,
         "barrier": result.barrier,
@@ -177,10 +182,7 @@ def solutions(result: Result) -> list[dict[str, Any]]:
     for number, state in result.found.items():
         row = result.rows[number]
         residual = system.residual(state.u, state.mu)
-        forces = (
-            (state.mu[t.amplitude] if t.amplitude else 1.0) * system.forces(state.u, state.mu, t.name)
-            for t in system.terms
-        )
+        forces = (factor_of(t.amplitude, state.mu) * system.forces(state.u, state.mu, t.name) for t in system.terms)
         sizes = [np.sqrt(dot(system.comm, v, v)) for v in (residual, *forces)]
         keys = ("p_over_pc", "w_over_h", "w_pole_over_h", "volume_change", "energy", "negative_pivots")
         found.append(

@@ -10,6 +10,7 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
+from magshell_fenicsx.assembly.terms import factor_of
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.imperfections.modes import ModesSection
 from magshell_fenicsx.case.loads.time import TimeSection
@@ -207,10 +208,9 @@ class Scene:
         model.system.accept(state.u)
         potentials = model.system.energies(state.u)
         for t in model.system.terms:
-            amplitude = state.mu[t.amplitude] if t.amplitude else 1.0
             name = t.name.removesuffix(" across").removesuffix(" third")
             name = "magnetic gradient" if name.startswith("magnetic gradient") else name
-            found[name] += model.multiplicity * amplitude * potentials[t.name]
+            found[name] += model.multiplicity * factor_of(t.amplitude, state.mu) * potentials[t.name]
         return found
 
     @property

@@ -17,7 +17,8 @@ from magshell_fenicsx.continuation.fold import Guess, find_fold
 from magshell_fenicsx.models.shell.controls import ByControls
 from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.simulate.follow import follow
-from magshell_fenicsx.simulate.gradient import adjoint_of_instability, gradient
+from magshell_fenicsx.simulate.gradients.adjoint import adjoint_of_instability
+from magshell_fenicsx.simulate.gradients.gradient import gradient
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.results import functional
 from magshell_fenicsx.simulate.scene import Scene

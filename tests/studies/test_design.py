@@ -8,14 +8,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy
 from command import magshell
 from conftest import CASES, draw_nothing
+from interrupted import kill, start, wait_until
+from mpi4py import MPI
 from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.controls import read_vectors
+from magshell_fenicsx.case.source import read_source
+from magshell_fenicsx.models.shell.controls import Controls
 from magshell_fenicsx.run.run import run
+from magshell_fenicsx.simulate.standing import Standing
 from magshell_fenicsx.studies.design.design import design
+from magshell_fenicsx.studies.design.evaluate import Evaluation, evaluate
+from magshell_fenicsx.studies.design.variables import variables
 
 Array = NDArray[np.float64]
 STRIP = """
@@ -92,6 +100,26 @@ def test_numbers_between_bounds_and_a_constraint(strip: Callable[[str], Path], t
     assert 1e-5 < content["numbers"]["magnetic.lambda_m"] < 2e-4
 
 
+def test_fields_between_bounds(strip: Callable[[str], Path], tmp_path: Path) -> None:
+    """The deflection and the mass by a random change of thickness and curvature, against differences."""
+    varied = "thickness: {points: 4, values: [0.5, 2]}, curvature: {points: 3, values: [-1, 1]}"
+    source = read_source(strip(f"design: {{objective: {{maximise: tip_uz}}, {varied}}}\n"))
+    case = Case.from_source(source)
+    assert case.design
+    vary, standing = variables(source, case, case.design), Standing()
+    x, way = vary.first, np.random.default_rng(0).standard_normal(len(vary.first))
+
+    def at(c: float) -> Evaluation:
+        there = vary.case_of(x + c * way, tmp_path / "B.csv")
+        return evaluate(there, x, vary, ["tip_uz", "mass"], {}, MPI.COMM_WORLD, standing)
+
+    here, (further, back) = at(0.0), (at(1e-3), at(-1e-3))
+    assert here.values["mass"] == pytest.approx(1, rel=1e-12)
+    for result in ("tip_uz", "mass"):
+        expected = (further.values[result] - back.values[result]) / 2e-3
+        assert np.array(here.gradients[result]) @ way == pytest.approx(expected, rel=1e-5)
+
+
 def test_a_variable_without_influence(strip: Callable[[str], Path], tmp_path: Path) -> None:
     """The azimuth of a field along e3."""
     section = "{objective: {maximise: tip_uz}, numbers: {magnetic.applied.azimuth: [-10, 10]}}"
@@ -116,7 +144,10 @@ def test_a_target_out_of_reach(strip: Callable[[str], Path], tmp_path: Path) -> 
     ("section", "message"),
     [
         ("", "design: is missing: it says what varies and what is wanted"),
-        ("design: {objective: {minimise: tip_ux}}", "needs numbers or remanence: otherwise nothing varies"),
+        (
+            "design: {objective: {minimise: tip_ux}}",
+            "needs numbers, remanence, thickness or curvature: otherwise nothing varies",
+        ),
         ("design: {objective: {}, remanence: {}}", "give one of maximise, minimise, reach and shape, here none"),
         ("design: {objective: {reach: tip_ux}, remanence: {}}", "reach and value belong together"),
         ("design: {objective: {shape: {}}, remanence: {}}", "give components or curve"),
@@ -161,3 +192,60 @@ def test_hemisphere_that_buckles_late(tmp_path: Path) -> None:
     assert content["start"]["knockdown"] == pytest.approx(0.447276, rel=1e-5)
     assert content["best"]["knockdown"] > 1.3 * content["start"]["knockdown"]
     assert content["verified"]["knockdown"] == pytest.approx(content["best"]["knockdown"], rel=5e-4)
+
+
+@pytest.mark.slow
+def test_thickness_for_the_highest_load_at_equal_mass(tmp_path: Path) -> None:
+    """Twice the knockdown factor of the even shell, at its mass; the finer mesh has the same."""
+    content = design(CASES / "designed_thickness.yaml", ["design.iterations=3"], tmp_path)
+    assert content["start"]["knockdown"] == pytest.approx(0.326233305, rel=1e-6)
+    assert content["best"]["knockdown"] > 2 * content["start"]["knockdown"]
+    assert content["best"]["mass"] == pytest.approx(1, rel=1e-6)
+    assert content["verified"]["knockdown"] == pytest.approx(content["best"]["knockdown"], rel=5e-4)
+
+
+@pytest.mark.slow
+def test_a_given_load_of_a_design_that_is_killed(tmp_path: Path) -> None:
+    """The field with which a shell buckles at a given pressure; killed and resumed, a design walks the same way."""
+    file, out = CASES / "designed_field.yaml", tmp_path / "out"
+    content = design(file, ["design.verify=1"], tmp_path / "whole")
+    assert content["best"]["knockdown"] == pytest.approx(0.4, rel=1e-4)
+    strength = content["numbers"]["magnetic.lambda_m"]
+    other = run(Case.load(CASES / "dimple_buckling.yaml", [f"magnetic.lambda_m={strength}", "mesh.degree=3"]))
+    assert other.knockdown == pytest.approx(0.4, rel=1e-3)
+    killed = start("design", file, "--out", out, "--set=design.verify=1")
+    wait_until(lambda: len([*out.glob("points/*.json")]) > 1 or killed.poll() is not None)
+    kill(killed, 0)
+    known = len([*out.glob("points/*.json")])
+    assert 1 < known < len(rows(tmp_path / "whole"))
+    assert magshell("design", file, "--out", out, "--set=design.verify=1", "--resume").returncode == 0
+    for row, whole in zip(rows(out), rows(tmp_path / "whole"), strict=True):
+        assert float(row["knockdown"]) == pytest.approx(float(whole["knockdown"]), rel=1e-12)
+
+
+@pytest.mark.slow
+def test_letter_and_its_elastica(tmp_path: Path) -> None:
+    """The letter U to 1 % of the length; the elastica with the remanence that was found has the same tip."""
+    coarse = ["mesh.degree=2", "symmetry=none", "design.iterations=16", "design.remanence={points: 16}"]
+    content = design(CASES / "designed_letter.yaml", coarse, tmp_path)
+    assert content["best"]["largest_distance"] < 0.01
+    assert content["verified"]["largest_distance"] < 0.01
+    places, vectors = read_vectors(tmp_path / "best.csv", "")
+    found = Controls(places, 1 / 15)
+    q, s = 12 * 1e-3 * 100**2, np.linspace(0, 1, 201)
+
+    def slopes(s: Array, y: Array) -> Array:
+        theta = y[0]
+        bx, _, bz = (found.weights(np.column_stack([s, 0 * s, 0 * s])) @ vectors).T
+        return np.stack([y[1], -q * (bx * np.cos(theta) - bz * np.sin(theta)), np.cos(theta), np.sin(theta)])
+
+    def ends(root: Array, tip: Array) -> Array:
+        return np.array([root[0], tip[1], root[2], root[3]])
+
+    letter = np.clip((s - 0.3) / 0.4, 0, 1) * np.pi
+    guess = np.stack([letter, np.gradient(letter, s), s * 0.5, s * 0.25])
+    solved = scipy.integrate.solve_bvp(slopes, ends, s, guess, tol=1e-6, max_nodes=20_000)
+    assert solved.success
+    finer = run(Case.load(tmp_path / "best.yaml", ["mesh.degree=3", "points={tip: [1, 0, 0]}"]))
+    tip = np.array([1 + finer.rows[-1]["tip_ux"], finer.rows[-1]["tip_uz"]])
+    np.testing.assert_allclose(solved.y[2:, -1], tip, rtol=0, atol=1e-4)

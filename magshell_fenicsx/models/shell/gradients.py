@@ -90,11 +90,14 @@ class PointGradient:
         self._u, placement, place = (points.field(size) for size in (self._size, self._size, geometry.shape[1]))
         self._known = [(placement, r0), (place, geometry)]
         self._following: list[tuple[fem.Function, Array]] = []
+        self._taken, self._values = dict[int, fem.Function](), values
         self._names, self._log, self._comm = [term.name for term in terms], log, comm
         self._W, self._work, self._v = list[Expr](), list[Expr](), points.field(self._size)
         for term in terms:
             parameters, varying = parameters_at(points, term.density.parameters, term.density.sides)
-            self._known += [(here, values(field)) for here, field in varying]
+            for here, field in varying:
+                self._taken[len(self._known)] = field
+                self._known.append((here, values(field)))
             self._following += [(here, values(field)) for here, field in varying if isinstance(field, PointField)]
             self._W.append(_energy(term.density, [placement, self._u], place, parts, parameters))
             if term.density.work:
@@ -125,6 +128,13 @@ class PointGradient:
     def place(self, r0: Array) -> None:
         """Take another placement."""
         self._known[0] = self._known[0][0], r0
+        self._loaded = None
+
+    def retake(self) -> None:
+        """Take the fields of the densities anew, but for those that are followed."""
+        for number, field in self._taken.items():
+            if not isinstance(field, PointField):
+                self._known[number] = self._known[number][0], self._values(field)
         self._loaded = None
 
     def room(self, chunk: slice) -> Array:

@@ -44,6 +44,7 @@ from magshell_fenicsx.models.shell.parameters import (
 from magshell_fenicsx.models.shell.patterns import by_patch, places
 from magshell_fenicsx.models.shell.point_load import patch_entries, point_entries, vertex_normal
 from magshell_fenicsx.models.shell.residual import FastResidual, renew
+from magshell_fenicsx.models.shell.sites import Site
 from magshell_fenicsx.models.shell.slopes import point_parameters
 from magshell_fenicsx.models.shell.supports import (
     closing_point,
@@ -207,7 +208,7 @@ class ShellModel(Observed):
             terms += [factory.own(load.term, name) for load in dead if isinstance(load, Potential)]
         self._sites = make_sites(self.r0, degree, terms, self.kernels, factory.prestress())
         self.moving = moving(self.r0, self.supports, loads)
-        self._near = None
+        self._near, self._beside = None, list[Site]()
         if self.moving:
             near = make_sites(self.r0, degree, terms, self.kernels, chosen=self.moving.cells)
             self._near = self.moving.cells, near
@@ -238,6 +239,7 @@ class ShellModel(Observed):
             self.u, terms, held + mirrored, interior, material.h, fast, gradients, parameters, self.moving
         )
         self.system.settings = dict(known.setting for known, _ in self.contacts.values())
+        self._served = served
         self._interior, self._held, self.mirror = interior, held, mirror
         self._on_mirror = facets("symmetry")
         self.observe(self.kernels.compile("volume energy", volume), midsurface.points)
@@ -249,9 +251,10 @@ class ShellModel(Observed):
             return None
         edges = self.factory.antisymmetric_edges(self._on_mirror, self.mirror.normal)
         held = self._held + [held_along(self.V, 1, self._on_mirror, along) for along in self.mirror.in_plane]
-        sites = self._sites + make_sites(self.r0, self.degree, [edges], self.kernels)
+        self._beside = make_sites(self.r0, self.degree, [edges], self.kernels)
+        sites = self._sites + self._beside
         if self.growing:
-            self.growing.renewed += [site.renew for site in sites[len(self._sites) :]]
+            self.growing.renewed += [site.renew for site in self._beside]
         fast = FastTangent(self.u, sites, held)
         terms = [edges if t.name == "mirror edges" else t for t in self.system.terms]
         system = self.system
@@ -268,6 +271,14 @@ class ShellModel(Observed):
                 self.moving,
             )
         )
+
+    def retake(self) -> None:
+        """Take the values of remanence, thickness and natural shape anew, after they have changed."""
+        near = self._near[1] if self._near else []
+        for site in (*self._sites, *near, *self._beside):
+            site.retake()
+        for residual in self._served:
+            residual.retake()
 
     def _force(self, name: str, force: Force) -> LinearTerm:
         x, inward = self.midsurface.points[force.point], -self.normals[force.point]

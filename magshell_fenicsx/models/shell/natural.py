@@ -30,6 +30,7 @@ Array = NDArray[np.float64]
 Varying: TypeAlias = Array | Pattern | Mapping[str, Array]
 STRETCH, CURVATURE = "natural_stretch", "natural_curvature"
 SIZE = 13  # numbers of a field: kappa and T as symmetric tensors in space, and t
+FIELD = ([0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2])  # the components of a tensor in space, in the field's order
 SMALLEST, LARGEST = 0.05, 20.0  # of a natural stretch
 NORMAL = 1e-6  # length in the surface of a unit vector that is normal to it
 
@@ -83,6 +84,12 @@ class Natural:
         t1, t2 = self._frame(r0, n0, (stretch[..., 0] != stretch[..., 1]) | _uneven(curvature))
         return _tensor(stretch[..., :2], t1, t2), _tensor(curvature, t1, t2), stretch[..., 2]
 
+    def in_frame(self, forces: Array, r0: Array, n0: Array) -> Array:
+        """Derivatives (..., 3) by kappa_11, kappa_22 and kappa_12 from those (..., 6) by kappa's field."""
+        t1, t2 = self._frame(r0, n0, np.zeros(r0.shape[:-1], dtype=bool))
+        ones = (_tensor(np.broadcast_to(e, r0.shape), t1, t2)[..., *FIELD] for e in np.eye(3))
+        return np.stack([np.sum(forces * one, axis=-1) for one in ones], axis=-1)
+
     def _frame(self, r0: Array, n0: Array, needed: NDArray[np.bool_]) -> tuple[Array, Array]:
         """t1 and t2 (cells, nodes, 3); zero where nobody needs them and they are not there."""
         d = self.along(r0, n0)
@@ -122,8 +129,7 @@ def natural_field(natural: Natural, r0: Array, n0: Array, V: fem.FunctionSpace) 
         raise MeshError(problems[0])
     Q = fem.functionspace(V.mesh, ("DG", V.element.basix_element.degree, (SIZE,)))
     field = fem.Function(Q, name="natural")
-    rows, columns = [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]
-    values = np.concatenate([kappa[..., rows, columns], T[..., rows, columns], t[..., None]], axis=-1)
+    values = np.concatenate([kappa[..., *FIELD], T[..., *FIELD], t[..., None]], axis=-1)
     field.x.array.reshape(-1, SIZE)[Q.dofmap.list] = values
     return field
 

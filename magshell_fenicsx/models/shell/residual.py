@@ -29,6 +29,9 @@ class _Site(Protocol):
     def place(self, r0: fem.Function) -> None:
         """Take another placement."""
 
+    def retake(self) -> None:
+        """Take the fields anew."""
+
     def compile(self) -> None:
         """Compile the kernels of `add`; collective."""
 
@@ -90,6 +93,11 @@ class FastResidual:
         for site in self._sites:
             site.place(self._r0)
 
+    def retake(self) -> None:
+        """Take the fields of the densities anew."""
+        for site in self._sites:
+            site.retake()
+
     def compile(self) -> None:
         """Compile the kernels of the residual; collective."""
         for site in self._sites:
@@ -144,6 +152,9 @@ class _Cells:
 
     def place(self, r0: fem.Function) -> None:
         self._points.place(self._known(r0))
+
+    def retake(self) -> None:
+        self._points.retake()
 
     def compile(self) -> None:
         _ = self._points.gradient
@@ -202,6 +213,10 @@ class _Edges:
         placement = self._placed(r0)
         for rows, points in self._on.values():
             points.place(placement[rows].reshape(len(rows), rows.shape[1] * placement.shape[1]))
+
+    def retake(self) -> None:
+        for _, points in self._on.values():
+            points.retake()
 
     def compile(self) -> None:
         for _, points in self._on.values():

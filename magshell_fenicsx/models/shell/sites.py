@@ -104,6 +104,11 @@ class Site:
                 couple(number, contraction.cross(blocks))
         self._replaced = False
 
+    def retake(self) -> None:
+        """Take the fields of the densities anew."""
+        for kernel in [*self._kernels.values(), *([self._prestress] if self._prestress else [])]:
+            kernel.retake()
+
     def renew(self) -> None:
         """Take the placement anew."""
         self._placements = [self._jets(batch, self._placement.x.array) for batch in self.batches]
@@ -139,8 +144,16 @@ class Kernel:
         self._name, self._density, self._of_v = name, density, of_v
         self._points, self._batches = points, batches
         self._parameters, varying = parameters_at(points, density.parameters, density.sides)
-        sides = range(density.sides)
-        self._varying = [(here, [_on_sides(field, batch, sides) for batch in batches]) for here, field in varying]
+        self._fields = [field for _, field in varying]
+        self._varying = [(here, self._taken(field)) for here, field in varying]
+
+    def _taken(self, field: fem.Function) -> list[Array]:
+        return [_on_sides(field, batch, range(self._density.sides)) for batch in self._batches]
+
+    def retake(self) -> None:
+        """Take the fields of the density anew."""
+        for field, (_, values) in zip(self._fields, self._varying, strict=True):
+            values[:] = self._taken(field)
 
     def compile(
         self, u: fem.Function, r0: fem.Function, geometry: fem.Function, sides: int, log: KernelLog, comm: MPI.Comm

@@ -156,7 +156,7 @@ def _fields(surface: Surface, smooth: "pyvista.PolyData", h: float) -> list[View
     camera = towards(deflected_place(surface))
     r = surface.r0 + surface.u
     extent = float(np.ptp(r, axis=0).max())
-    seeds = _spread(r, APART * extent)
+    seeds = spread(r, APART * extent)
     normals = np.asarray(smooth.point_data["Normals"])[_nearest(np.asarray(smooth.points), r[seeds])]
     side = normals * np.copysign(1.0, normals @ camera)[:, None]
     arrows = []
@@ -173,7 +173,7 @@ def _fields(surface: Surface, smooth: "pyvista.PolyData", h: float) -> list[View
     return [View(smooth, grey, (0.0, 1.0), "Greys", camera, 700, arrows=tuple(arrows), outlines=_near(surface))]
 
 
-def _spread(r: Array, apart: float) -> NDArray[np.int64]:
+def spread(r: Array, apart: float) -> NDArray[np.int64]:
     """Indices of well separated points of (n, 3): each is the farthest from those before, at least `apart` away."""
     chosen = [int(np.argmax(r[:, 2]))]
     distance = np.full(len(r), np.inf)

@@ -9,6 +9,7 @@ import numpy as np
 
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.output.fields.frequencies import read_frequencies
+from magshell_fenicsx.output.fields.gradients import gradient_files
 from magshell_fenicsx.output.fields.modes import mode_caption, mode_file, wave_number
 from magshell_fenicsx.output.fields.outlines import read_outlines
 from magshell_fenicsx.output.fields.surface import Surface, completed
@@ -17,6 +18,7 @@ from magshell_fenicsx.output.pictures.animation import animated
 from magshell_fenicsx.output.pictures.captions import caption, named_value, shell_caption
 from magshell_fenicsx.output.pictures.curve import curve_figure, drawn_parts
 from magshell_fenicsx.output.pictures.frequencies import frequencies_figure
+from magshell_fenicsx.output.pictures.gradient_picture import draw_gradients
 from magshell_fenicsx.output.pictures.layout import png
 from magshell_fenicsx.output.pictures.mode_picture import draw_modes
 from magshell_fenicsx.output.pictures.picture import figures
@@ -94,6 +96,9 @@ def draw(folder: Path, point: int | None = None) -> list[str]:
             write(name, content)
         if frequencies := read_frequencies(folder):
             write("frequencies.png", png(frequencies_figure(frequencies, rows, title)))
+        if files := gradient_files(folder):
+            title = "Change of a result per area by the change of a field there\n" + title
+            write("gradients.png", draw_gradients({of: read_vtu(f)[0] for of, f in files.items()}, about.h, title))
         if found := searched(rows):
             surfaces = [_point(folder, each)[0] for each in found[:MOST_PANELS]]
             title = caption(about.h, about.nu, found[0])

@@ -30,6 +30,7 @@ PICTURES = {  # in the order of the report
     "contact.png": "Gap and contact pressure of the bodies at the last point.",
     "fields.png": "Fields on the deformed shell at the last point.",
     "instabilities.png": "Null vectors at the instabilities, on the deformed shell: how it buckles.",
+    "gradients.png": "Where a result would change most: red where more of a field raises it, blue where it lowers it.",
     "frequencies.png": "Natural frequencies squared along the path; below zero the shell is unstable.",
     "modes_*.png": "The modes of least stiffness, on the deformed shell.",
 }
@@ -85,6 +86,7 @@ def _content(folder: Path) -> dict[str, Any]:
         "frequencies": [_frequency(it) for it in read_frequencies(folder)],
         "sensitivities": [(name, number(v)) for name, v in summary["sensitivities"].items()],
         "sensitive": symbol(amplitude(lines[-1]["amplitude"]).column) if summary["sensitivities"] else "",
+        "gradients": [row for of, it in summary.get("gradients", {}).items() for row in _gradients(of, it)],
         "how_to_estimate": _how_to_estimate(summary["case"]),
         "path": path,
         "rows": list(zip(*(column.cells for column in path), strict=True)),
@@ -165,6 +167,17 @@ def _solution(it: dict[str, Any]) -> list[Markup | str]:
 
 def _frequency(it: Frequency) -> list[Markup | str]:
     return [f"{it.point}", it.wave or "–", number(it.omega2), "–" if isnan(it.hertz) else number(it.hertz)]
+
+
+def _gradients(of: str, it: dict[str, Any]) -> Iterator[list[Markup | str]]:
+    """Result, its value, parameter, derivative, and where that by a field is largest."""
+    first: list[Markup | str] = [of, number(it["value"])]
+    for by, slope in it["numbers"].items():
+        yield [*first, by, number(slope), "–", "–"]
+    for by, field in it["fields"].items():
+        alike = Markup(", ").join(number(v) for v in field["alike"])
+        at = ", ".join(f"{x:.3g}" for x in field["at"])
+        yield [*first, by, alike, number(field["most_per_area"]), f"({at})"]
 
 
 def _how_to_estimate(case: dict[str, Any]) -> str:

@@ -7,7 +7,7 @@ and goes on where it was interrupted.
 import hashlib
 import json
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
@@ -19,11 +19,13 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.source import CaseError, override, read_source
+from magshell_fenicsx.case.source import CaseError, read_source
 from magshell_fenicsx.output.store.durable import write_whole
 from magshell_fenicsx.output.store.folder import by_first, held_folder
 from magshell_fenicsx.platform import sources
 from magshell_fenicsx.platform.terminal import print_line
+from magshell_fenicsx.simulate.results import Target
+from magshell_fenicsx.simulate.standing import Standing
 from magshell_fenicsx.studies.design.evaluate import Evaluation, evaluate
 from magshell_fenicsx.studies.design.picture import draw_design
 from magshell_fenicsx.studies.design.problem import Problem, problem_of
@@ -34,6 +36,7 @@ from magshell_fenicsx.studies.sweep.points import identity
 from magshell_fenicsx.studies.sweep.table import write_csv
 
 Array = NDArray[np.float64]
+WAY = 4  # stages before the last have this part of the iterations
 NOTHING = 1e-10  # change of a result, relative, over the whole range of a variable
 
 
@@ -50,7 +53,9 @@ class Design:
     rows
         Of design.csv: one per evaluation.
     tried
-        The variables and the evaluations, in the same order.
+        The variables and the evaluations, in the same order; those of the present stage.
+    stage
+        Number of the wanted shape; 0 of the last.
     """
 
     variables: Variables
@@ -60,7 +65,9 @@ class Design:
     say: Callable[[str], None]
     rows: list[dict[str, Any]] = field(default_factory=list)
     tried: list[tuple[Array, Evaluation]] = field(default_factory=list)
+    stage: int = 0
     _here: str = ""
+    _scene: Standing = field(default_factory=Standing)
 
     def __call__(self, x: Array) -> Evaluation:
         """The evaluation of a vector, known or new; collective."""
@@ -68,17 +75,24 @@ class Design:
         for known, found in reversed(self.tried):
             if np.array_equal(known, x):
                 return found
-        name = hashlib.sha256(x.tobytes()).hexdigest()[:16]
+        stage = f"{self.stage}".encode() if self.stage else b""
+        name = hashlib.sha256(x.tobytes() + stage).hexdigest()[:16]
         file, vectors = (self.folder / "points" / f"{name}.{ending}" for ending in ("json", "csv"))
         kept = by_first(self.comm, lambda: self._known(file), "cannot be read")
         found = kept or self._new(x, file, vectors)
         self._add(x, found, name)
         return found
 
+    def begin(self, stage: int, targets: Sequence[Mapping[str, Target]]) -> None:
+        """Want the next of several shapes."""
+        self.stage = (stage + 1) % len(targets)
+        self.problem.targets = targets[stage]
+        self.tried.clear()
+
     def _new(self, x: Array, file: Path, vectors: Path) -> Evaluation:
         by_first(self.comm, lambda: self.variables.write(x, vectors))
         case, problem = self.variables.case_of(x, vectors), self.problem
-        found = evaluate(case, x, self.variables, problem.results, problem.targets, self.comm)
+        found = evaluate(case, x, self.variables, problem.results, problem.targets, self.comm, self._scene)
         found = Evaluation(**self.comm.bcast(asdict(found)))
         content = {"design": self._mine, "sources": sources.ours(), "evaluation": asdict(found)}
         by_first(self.comm, lambda: write_whole(file, (json.dumps(content) + "\n").encode()))
@@ -113,6 +127,7 @@ class Design:
             "violation": self.problem.violation(found) if found.values else None,
             "best": bool(best and best[0] is x),
             **self.variables.numbers(x),
+            **({"stage": self.stage or "last"} if self.problem.stages else {}),
             "note": found.note,
             "point": name,
         }
@@ -159,9 +174,7 @@ def design(
     Missed
         After everything is written: if a target is not reached, a constraint not kept, or no optimum found.
     """
-    source = read_source(Path(file))
-    for setting in settings:
-        override(source, setting)
+    source = read_source(Path(file), settings)
     case, folder = Case.from_source(source), Path(out)
     if case.design is None:
         raise CaseError(f"{file}: design: is missing: it says what varies and what is wanted")
@@ -177,6 +190,8 @@ def design(
 def _designed(made: Design, case: Case, file: Path, comm: MPI.Intracomm) -> dict[str, Any]:
     vary, problem, section, folder = made.variables, made.problem, case.design, made.folder
     assert section
+    targets = [*problem.stages, problem.targets]
+    made.begin(0, targets)
     first = made(vary.first)
     if not first.values:
         raise Missed(f"the case itself has no result to start from: {first.note}")
@@ -184,12 +199,18 @@ def _designed(made: Design, case: Case, file: Path, comm: MPI.Intracomm) -> dict
     idle = _without_influence(vary, first)
     for name in idle:
         made.say(f"warning: {name} has no influence on {', '.join(problem.results)} where the design starts")
-    if len(idle) == len(vary.keys) + (vary.controls is not None):
+    if len(idle) == len(vary.blocks):
         raise Missed(f"no variable has an influence on {', '.join(problem.results)} where the design starts")
-    ended = searched(made, problem, vary, section.iterations)
-    found = made.best
-    assert found
-    x, best = found
+    x = vary.first
+    for stage in range(len(targets)):
+        if stage:
+            made.begin(stage, targets)
+            problem.begin(made(x))
+        last = stage == len(targets) - 1
+        ended = searched(made, problem, vary, x, section.iterations if last else -(-section.iterations // WAY))
+        found = made.best
+        assert found
+        x, best = found
     steps = section.remanence.steps if section.remanence else None
     if steps:
         x = vary.rounded(x, steps)
@@ -225,9 +246,7 @@ def _without_influence(vary: Variables, first: Evaluation) -> list[str]:
     slopes = np.array([first.gradients[result] for result in first.values])
     size = np.array([abs(value) or 1.0 for value in first.values.values()])
     strongest = (np.abs(slopes) / size[:, None]).max(axis=0)
-    n = len(vary.keys)
-    idle = [key for key, slope in zip(vary.keys, strongest[:n], strict=True) if slope < NOTHING]
-    return idle + (["remanence"] if vary.controls is not None and strongest[n:].max() < NOTHING else [])
+    return [name for name, part in vary.blocks.items() if strongest[part].max() < NOTHING]
 
 
 def _write_best(made: Design, x: Array, file: Path) -> None:

@@ -1,4 +1,4 @@
-"""design.png: the results over the evaluations, and the remanence."""
+"""design.png: the results over the evaluations, the remanence, and the fields that vary."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -7,16 +7,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from magshell_fenicsx.studies.design.between import Between
 from magshell_fenicsx.studies.design.variables import Variables
 
 Array = NDArray[np.float64]
+TITLES = {"thickness": "thickness over h", "curvature": "natural curvature R"}
+MARGINS = (-0.03, 0.03)  # beyond the bounds
 
 
 def draw_design(rows: Sequence[dict[str, Any]], results: Sequence[str], vary: Variables, x: Array, file: Path) -> None:
     """Write the picture."""
     from matplotlib.figure import Figure
 
-    panels = 1 + (vary.controls is not None)
+    panels = 1 + (vary.controls is not None) + len(vary.fields)
     figure = Figure(figsize=(4.6 * panels, 3.8), dpi=160, layout="constrained")
     history, *others = figure.subplots(1, panels, squeeze=False)[0]
     number = np.array([row["evaluation"] for row in rows])
@@ -38,4 +41,22 @@ def draw_design(rows: Sequence[dict[str, Any]], results: Sequence[str], vary: Va
         others[0].set(xlabel=f"{across}/R", ylabel="z/R", title=r"remanence over $|B^\mathrm{r}|$, undeformed")
         others[0].set_aspect("equal", adjustable="datalim")
         others[0].margins(0.2)
+    for axes, field in zip(others[len(others) - len(vary.fields) :], vary.fields, strict=True):
+        _draw_field(axes, field, field.values(x[vary.blocks[field.name]]))
     figure.savefig(file)
+
+
+def _draw_field(axes: Any, field: Between, values: Array) -> None:
+    """The values at the points: along a meridian or a strip as lines, else as colours from above."""
+    places, title = field.controls.places, TITLES[field.name]
+    if field.controls.around or not places[:, 1:].any():
+        along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(places, axis=0), axis=1))])
+        for number, (line, marker) in enumerate(zip(values.T, ("o-", "s--"), strict=False), 1):
+            axes.plot(along, line, marker, markersize=3, linewidth=1, label=f"{number}{number}")
+        axes.set(xlabel="arc length/R", ylabel=title, ylim=[v + w for v, w in zip(field.bounds, MARGINS, strict=True)])
+        if values.shape[1] > 1:
+            axes.legend(frameon=False, fontsize=8)
+    else:
+        shown = axes.scatter(*places[:, :2].T, c=values[:, 0], vmin=field.bounds[0], vmax=field.bounds[1], s=14)
+        axes.figure.colorbar(shown, ax=axes, label=title)
+        axes.set(xlabel="x/R", ylabel="y/R", aspect="equal")

@@ -1,6 +1,6 @@
 """What a design wants, as an objective that is least and constraints that are not negative."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -8,8 +8,9 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.design import DesignSection
+from magshell_fenicsx.simulate.gradients.instabilities import BESIDE, FOLDS, MOST
 from magshell_fenicsx.simulate.results import Target
-from magshell_fenicsx.studies.design.evaluate import BESIDE, FOLDS, MOST, Evaluation
+from magshell_fenicsx.studies.design.evaluate import Evaluation
 from magshell_fenicsx.studies.design.target import target_of
 
 Array = NDArray[np.float64]
@@ -27,10 +28,13 @@ class Problem:
         That of the objective first.
     targets
         Of the wanted shape.
+    stages
+        Those that come before it.
     """
 
     section: DesignSection
     targets: Mapping[str, Target]
+    stages: Sequence[Mapping[str, Target]] = ()
     scale: dict[str, float] = field(default_factory=dict)
 
     @property
@@ -126,4 +130,8 @@ class Problem:
 def problem_of(case: Case, section: DesignSection) -> Problem:
     """What the section of a case wants."""
     shape = section.objective.shape
-    return Problem(section, {"shape": target_of(shape, case)} if shape else {})
+    if shape is None:
+        return Problem(section, {})
+    parts = [(i + 1) / shape.stages for i in range(shape.stages)]
+    *stages, last = [{"shape": target_of(shape, case, part)} for part in parts]
+    return Problem(section, last, stages)

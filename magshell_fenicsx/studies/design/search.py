@@ -15,10 +15,12 @@ Array = NDArray[np.float64]
 WORSE = 1.0  # a lost path counts as this much worse than the worst found
 
 
-def searched(evaluated: Callable[[Array], Evaluation], problem: Problem, vary: Variables, iterations: int) -> str:
-    """Look for the best variables from those of the case on; why the optimiser ended."""
+def searched(
+    evaluated: Callable[[Array], Evaluation], problem: Problem, vary: Variables, first: Array, iterations: int
+) -> str:
+    """Look for the best variables from the first on; why the optimiser ended."""
     if problem.lowest:
-        return _raised(evaluated, problem, vary, iterations)
+        return _raised(evaluated, problem, vary, first, iterations)
     known: list[tuple[Array, float]] = []
 
     def objective(x: Array) -> tuple[float, Array]:
@@ -38,7 +40,7 @@ def searched(evaluated: Callable[[Array], Evaluation], problem: Problem, vary: V
         constraints = _kept(evaluated, problem.constraints, problem.constraint_slopes)
     found = scipy.optimize.minimize(
         objective,
-        vary.first,
+        first,
         jac=True,
         method=method,
         bounds=vary.limits,
@@ -48,7 +50,9 @@ def searched(evaluated: Callable[[Array], Evaluation], problem: Problem, vary: V
     return str(found.message)
 
 
-def _raised(evaluated: Callable[[Array], Evaluation], problem: Problem, vary: Variables, iterations: int) -> str:
+def _raised(
+    evaluated: Callable[[Array], Evaluation], problem: Problem, vary: Variables, first: Array, iterations: int
+) -> str:
     """Raise the lowest of several instabilities: the largest t with all of them above t, for (x, t).
 
     Where two of them cross, their minimum has a corner, and this problem has none.
@@ -71,7 +75,6 @@ def _raised(evaluated: Callable[[Array], Evaluation], problem: Problem, vary: Va
         values = above(last[0], z[-1])
         return (values if found.values else values * 0 - WORSE), slopes(last[0])
 
-    first = vary.first
     start = np.append(first, problem.lowest_values(evaluated(first)).min())
     down = np.append(0 * first, -1.0)
     found = scipy.optimize.minimize(

@@ -1,11 +1,12 @@
 """The variables of a design as one vector, and the case that a vector stands for.
 
 Numbers run from 0 to 1 between their bounds. Each vector of the remanence has a polar angle, an azimuth where it is not
-kept in a plane, and its length where that varies, from 0 to 1 between its bounds. So all bounds are bounds of single
-variables.
+kept in a plane, and its length where that varies, from 0 to 1 between its bounds; then come the values of scalar fields
+(`between`). So all bounds are bounds of single variables.
 """
 
 import copy
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,11 +21,14 @@ from magshell_fenicsx.case.controls import read_vectors, write_vectors
 from magshell_fenicsx.case.design import DesignSection
 from magshell_fenicsx.case.source import CaseError, Source
 from magshell_fenicsx.models.shell.controls import ByControls, Controls
+from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.plan.magnetisation import magnetisation
 from magshell_fenicsx.plan.outline import outline
+from magshell_fenicsx.plan.plan import Plan
 from magshell_fenicsx.plan.planner import make_plan
 from magshell_fenicsx.simulate.numbers import number_of
 from magshell_fenicsx.simulate.scene import Scene
+from magshell_fenicsx.studies.design.between import Between
 
 Array = NDArray[np.float64]
 
@@ -43,6 +47,8 @@ class Variables:
         Of the remanence, None without; its vectors at the start.
     lengths
         Least and largest length of a vector; None: they stay as they are.
+    fields
+        Scalar fields, in this order after all else.
     """
 
     source: Source
@@ -52,6 +58,27 @@ class Variables:
     controls: Controls | None
     start: Array
     lengths: tuple[float, float] | None
+    fields: tuple[Between, ...] = ()
+
+    @property
+    def blocks(self) -> dict[str, slice]:
+        """What varies -> its variables."""
+        found, at = {key: slice(i, i + 1) for i, key in enumerate(self.keys)}, len(self.keys)
+        sizes = {"remanence": len(self._angles) + (len(self.start) if self.lengths else 0)} if self.controls else {}
+        for name, size in (sizes | {field.name: field.start.size for field in self.fields}).items():
+            found[name] = slice(at, at + size)
+            at += size
+        return found
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What results are differentiated by."""
+        return tuple(self.blocks)
+
+    @property
+    def _angles(self) -> range:
+        """Of the vectors, after the numbers."""
+        return range(0 if self.controls is None else len(self.start) * (1 if self.planar else 2))
 
     @property
     def planar(self) -> bool:
@@ -71,16 +98,14 @@ class Variables:
                 parts.append(np.arctan2(self.start[:, 1], self.start[:, 0]))
             if self.lengths:
                 parts.append((size - self.lengths[0]) / (self.lengths[1] - self.lengths[0]))
-        return np.concatenate(parts)
+        return np.concatenate([*parts, *(field.first for field in self.fields)])
 
     @property
     def limits(self) -> list[tuple[float | None, float | None]]:
         """Bounds of the vector."""
-        free: list[tuple[float | None, float | None]] = [(None, None)] * (
-            0 if self.controls is None else len(self.start) * (1 if self.planar else 2)
-        )
-        sizes = len(self.start) if self.lengths else 0
-        return [*[(0.0, 1.0)] * len(self.keys), *free, *[(0.0, 1.0)] * sizes]
+        free: list[tuple[float | None, float | None]] = [(None, None)] * len(self._angles)
+        between = (len(self.start) if self.lengths else 0) + sum(field.start.size for field in self.fields)
+        return [*[(0.0, 1.0)] * len(self.keys), *free, *[(0.0, 1.0)] * between]
 
     def numbers(self, x: Array) -> dict[str, float]:
         """Key -> value."""
@@ -92,22 +117,26 @@ class Variables:
         """The remanence at its points, (n, 3) or (n, 2)."""
         return self._polar(x)[0]
 
-    def gradient(self, x: Array, scene: Scene, found: dict[str, float | FieldGradient]) -> Array:
-        """A gradient by the vector from those of `simulate.gradient`."""
-        numbers = np.array([found[key] for key in self.keys]) * np.ptp(self.bounds, axis=1)
-        field = found.get("remanence")
-        if not isinstance(field, FieldGradient) or self.controls is None:
-            return np.asarray(numbers)
-        magnetic = scene.plan.loads.magnetic
-        assert magnetic
-        assert isinstance(magnetic.remanent, ByControls)
-        comm = field.field.function_space.mesh.comm
-        forces = comm.allreduce(magnetic.remanent.pulled(field.places, field.forces))
-        return np.concatenate([numbers, *(np.sum(forces * way, axis=1) for way in self._polar(x)[1])])
+    def gradient(self, x: Array, scene: Scene, found: Mapping[str, float | FieldGradient]) -> Array:
+        """A gradient by the vector from those of `simulate.gradients`; by what is not among them it is zero."""
+        total = np.zeros(len(x))
+        total[: len(self.keys)] = [found.get(key, 0.0) for key in self.keys] * np.ptp(self.bounds, axis=1)
+        for field in self.fields:
+            if isinstance(by := found.get(field.name), FieldGradient):
+                total[self.blocks[field.name]] = field.gradient(scene, by)
+        if self.controls is not None and isinstance(by := found.get("remanence"), FieldGradient):
+            magnetic = scene.plan.loads.magnetic
+            assert magnetic
+            assert isinstance(magnetic.remanent, ByControls)
+            comm = by.field.function_space.mesh.comm
+            forces = comm.allreduce(magnetic.remanent.pulled(by.places, by.forces))
+            ways = [np.sum(forces * way, axis=1) for way in self._polar(x)[1]]
+            total[self.blocks["remanence"]] = np.concatenate(ways)
+        return total
 
     def _polar(self, x: Array) -> tuple[Array, list[Array]]:
         """Vectors, and their derivatives by each of their variables."""
-        n, rest = len(self.start), x[len(self.keys) :]
+        n, rest = len(self.start), x[self.blocks["remanence"]]
         polar, *more = rest.reshape(-1, n)
         s, c = np.sin(polar), np.cos(polar)
         size, grows = np.linalg.norm(self.start, axis=1), 0.0
@@ -127,8 +156,8 @@ class Variables:
 
     def rounded(self, x: Array, steps: int) -> Array:
         """The vector with angles at the nearest of so many steps of a turn."""
-        x, n = np.array(x), len(self.start) * (1 if self.planar else 2)
-        angles = slice(len(self.keys), len(self.keys) + n)
+        x = np.array(x)
+        angles = slice(len(self.keys), len(self.keys) + len(self._angles))
         x[angles] = np.round(x[angles] * steps / (2 * np.pi)) * 2 * np.pi / steps
         return x
 
@@ -150,6 +179,8 @@ class Variables:
             known = data["magnetic"].get("remanent", {})
             kept = {"flux_density": known["flux_density"]} if "flux_density" in known else {}
             data["magnetic"]["remanent"] = {"kind": "points", "file": vectors, "filter": self.controls.width, **kept}
+        for field in self.fields:
+            field.put(data, x[self.blocks[field.name]])
         return data
 
     def case_of(self, x: Array, vectors: Path) -> Case:
@@ -184,9 +215,44 @@ def variables(source: Source, case: Case, design: DesignSection) -> Variables:
             f"{lengths[0]:g} to {lengths[1]:g}"
         )
     bounds = np.array(list(design.numbers.values()), dtype=float).reshape(-1, 2)
-    return Variables(
-        source, case, tuple(design.numbers), bounds, controls, start, (lengths[0], lengths[1]) if lengths else None
-    )
+    between = (lengths[0], lengths[1]) if lengths else None
+    return Variables(source, case, tuple(design.numbers), bounds, controls, start, between, _fields(case, design))
+
+
+def _fields(case: Case, design: DesignSection) -> tuple[Between, ...]:
+    """The scalar fields with their points and values at the start."""
+    found, plan = [], make_plan(case)
+    for name, section in design.fields.items():
+        places, width = _spread(case, plan, section.points, section.filter)
+        if name == "thickness":
+            start = (plan.thickness or Thickness()).at(places)[:, None]
+        else:
+            start = _curvatures(plan, places)
+        low, high = section.values
+        if not (low <= start.min() and start.max() <= high):
+            raise CaseError(
+                f"design.{name}.values: the case starts with {start.min():g} to {start.max():g}, beyond {low:g} to "
+                f"{high:g}"
+            )
+        at = places[:, [0, 2]] if plan.meridian else places
+        found.append(Between(name, Controls(at, width), np.asarray(start), (low, high), case.shell.reference))
+    return tuple(found)
+
+
+def _curvatures(plan: Plan, places: Array) -> Array:
+    """The natural curvatures 11 and 22 of the case at places of its surface, (n, 2) over 1/R."""
+    drawn = plan.loads.natural.curvature if plan.loads.natural else None
+    if isinstance(drawn, Mapping):
+        raise CaseError("design.curvature: natural.curvature starts by patches: start from numbers or formulas")
+    if callable(drawn):
+        return np.asarray(drawn(places[:, None], places[:, None])[:, 0, :2])
+    return np.tile(np.zeros(2) if drawn is None else drawn[:2], (len(places), 1))
+
+
+def _spread(case: Case, plan: Plan, count: int, width: float | None) -> tuple[Array, float]:
+    """Points of the case's surface, and the filter or their distance."""
+    places = _places(case, plan, count)
+    return places, width or float(np.median(scipy.spatial.cKDTree(places).query(places, [2])[0]))
 
 
 def _controls(case: Case, design: DesignSection) -> tuple[Controls, Array]:
@@ -201,7 +267,7 @@ def _controls(case: Case, design: DesignSection) -> tuple[Controls, Array]:
         places, vectors = read_vectors(magnetic.remanent.path, "magnetic.remanent.file")
         return Controls(places, width or magnetic.remanent.filter or 1.0), vectors
     plan = make_plan(case)
-    places = _places(case, count)
+    places, width = _spread(case, plan, count, width)
     field = magnetisation(magnetic, case, 0.0, plan.within)
     if field.patches is not None:
         raise CaseError("design.remanence.points: the remanence starts by patches of a mesh: start from another kind")
@@ -210,15 +276,13 @@ def _controls(case: Case, design: DesignSection) -> tuple[Controls, Array]:
         vectors = np.array(field.remanent(places[:, None], normals[:, None])[:, 0])
     else:
         vectors = np.tile(np.asarray(field.remanent, dtype=float), (count, 1))
-    gaps = scipy.spatial.cKDTree(places).query(places, [2])[0]
     if plan.meridian:
         places, vectors = places[:, [0, 2]], vectors[:, [0, 2]]
-    return Controls(places, width or float(np.median(gaps))), vectors
+    return Controls(places, width), vectors
 
 
-def _places(case: Case, count: int) -> Array:
+def _places(case: Case, plan: Plan, count: int) -> Array:
     """Points (n, 3) along a meridian or a strip, or far from each other on the surface."""
-    plan = make_plan(case)
     if plan.meridian:
         sample = plan.meridian.sample()
         return np.asarray(sample[np.linspace(0, len(sample) - 1, count).round().astype(int)] * [1.0, 0.0, 1.0])

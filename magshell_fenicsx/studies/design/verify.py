@@ -11,8 +11,10 @@ from magshell_fenicsx.case.design import DesignSection
 from magshell_fenicsx.case.surfaces import MeshSurface
 from magshell_fenicsx.run.run import run
 from magshell_fenicsx.run.summary import Result
+from magshell_fenicsx.simulate.gradients.instabilities import FOLDS
+from magshell_fenicsx.simulate.gradients.mass import MASS, mass
 from magshell_fenicsx.simulate.results import distances
-from magshell_fenicsx.studies.design.evaluate import DISTANCE, FOLDS, Evaluation
+from magshell_fenicsx.studies.design.evaluate import DISTANCE, Evaluation
 from magshell_fenicsx.studies.design.problem import Problem
 
 FAR = 0.3  # relative difference of a result that is another result
@@ -55,6 +57,8 @@ def verified(
 
 def _value(result: Result, name: str) -> float | None:
     """A result of a run: the first instability of a fold's amplitude, excluded modes too."""
+    if name == MASS:
+        return mass(result.scene)[0]
     if name in FOLDS:
         found = (p for p in result.limit_points if p["amplitude"] == FOLDS[name] and not p["branch"])
         return next((float(p["value"]) for p in found), None)

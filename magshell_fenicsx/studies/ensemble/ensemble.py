@@ -8,7 +8,7 @@ from typing import Any
 
 from mpi4py import MPI
 
-from magshell_fenicsx.case.source import CaseError, override, read_source
+from magshell_fenicsx.case.source import CaseError, read_source
 from magshell_fenicsx.output.store.durable import write_whole
 from magshell_fenicsx.output.store.folder import by_first, prepare_folder
 from magshell_fenicsx.platform import sources
@@ -83,9 +83,7 @@ def ensemble(
         If the tables cannot be written.
     """
     scalar, numbers, ending = parse_scalar(result), _numbers(samples, seed, part), _ending(part)
-    source = read_source(Path(file))
-    for setting in settings:
-        override(source, setting)
+    source = read_source(Path(file), settings)
     variants = [
         make_samples(source, seed, numbers, deleted) for deleted in ([0, delete_weakest] if delete_weakest else [0])
     ]

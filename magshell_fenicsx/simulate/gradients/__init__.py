@@ -1,0 +1,1 @@
+"""Gradients of results: an adjoint, and what it contracts."""

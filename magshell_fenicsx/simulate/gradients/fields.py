@@ -1,0 +1,206 @@
+"""Derivatives by a field, at the nodes of all cells at once.
+
+Each field is a coefficient of the terms' forms, or a part of one: the remanence, a factor of its magnitude, the factor
+of the thickness, the natural curvature in the case's frame, and a deviation w0 of the drawn shape along the normal of
+the perfect one. By a deviation what is attached to the material (remanence, thickness, natural shape, dead loads) stays
+with it, and the triangulation stays.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from dolfinx import fem
+from numpy.typing import NDArray
+
+from magshell_fenicsx.assembly.field_derivative import FieldGradient, Share
+from magshell_fenicsx.assembly.field_derivative import by_field as summed
+from magshell_fenicsx.assembly.terms import FormTerm, Term, factor_of
+from magshell_fenicsx.case.source import CaseError
+from magshell_fenicsx.continuation.system import State
+from magshell_fenicsx.mesh.deviation import Deviated
+from magshell_fenicsx.models.axisymmetric import pattern as of_meridian
+from magshell_fenicsx.models.axisymmetric.model import MeridianModel
+from magshell_fenicsx.models.shell import patterns
+from magshell_fenicsx.models.shell.model import ShellModel
+from magshell_fenicsx.models.shell.natural import Natural
+from magshell_fenicsx.models.shell.patterns import Uniform
+from magshell_fenicsx.models.shell.thickness import Thickness
+from magshell_fenicsx.models.solid import remanence as of_body
+from magshell_fenicsx.models.solid.model import SolidModel
+from magshell_fenicsx.plan.natural import frame
+from magshell_fenicsx.simulate.gradients.adjoint import Adjoint, along
+from magshell_fenicsx.simulate.scene import Scene
+from magshell_fenicsx.simulate.sensitivity import magnetic_terms
+from magshell_fenicsx.simulate.transfer import transfer
+
+Array = NDArray[np.float64]
+Projection = Callable[[Scene, fem.Function, Array, Array, Array], Array]  # of field, forces, places, normals -> forces
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A field that results are differentiated by.
+
+    Attributes
+    ----------
+    coefficient
+        Its name in the terms.
+    project
+        From the coefficient's components to the field's own; None: they are the same.
+    """
+
+    coefficient: str
+    project: Projection | None = None
+
+
+def by_field(adjoint: Adjoint, name: str) -> FieldGradient:
+    """The derivatives by a field of `FIELDS`; collective.
+
+    Raises
+    ------
+    CaseError
+        If no result of the scene depends on it.
+    """
+    scene, state = adjoint.scene, adjoint.state
+    other = _with_field(adjoint, name)
+    if other is not scene:
+        u, w = (transfer(scene, other, v) for v in (state.u, adjoint.w))
+        mu = dict.fromkeys(other.unloaded().mu, 1.0) | dict(state.mu)  # of a natural curvature of zero
+        return by_field(replace(adjoint, scene=other, state=State(u, mu), w=w), name)
+    model, system, kind = scene.model, scene.model.system, FIELDS[name]
+    system.at(state.u, state.mu)
+    terms = _terms(scene, state, name)
+    f = next((c for t in terms for c in t.form.coefficients() if c.name == kind.coefficient), None)
+    if f is None or (isinstance(model, SolidModel) and kind.coefficient != "Br"):
+        raise CaseError(f"{name}: the case has no such field: no result depends on it")
+    if name == "deviation" and (model.contacts or getattr(scene.plan.loads.magnetic, "in_space", None)):
+        raise CaseError("deviation: no gradient beside bodies, or in a field that is known at points of space")
+    energy = adjoint.explicit.energy if adjoint.explicit else 0.0
+    c, shares = adjoint.potentials, []
+    for term in terms:
+        mu_i = factor_of(term.amplitude, state.mu)
+        shares.append(Share(term, energy * mu_i + c.get(term.amplitude or "", 0.0), mu_i))
+    if adjoint.wave:
+        for term in along(scene, adjoint):
+            shares.append(Share(term, adjoint.wave[2] * factor_of(term.amplitude, state.mu), 0.0))
+    for each in c.keys() & system.parameters.keys():
+        for slope in system.parameters[each].slopes:
+            if not isinstance(slope, FormTerm):
+                raise CaseError(f"{name}: the conjugate of {each} has no gradient by this field")
+            shares.append(Share(slope, c[each] * factor_of(slope.amplitude, state.mu), 0.0))
+    forces = summed(shares, f, model.u, _contracted(adjoint), model.kernels)
+    places, normals = (v[: len(forces)] for v in places_of(scene, f))
+    if name == "deviation":
+        places = _perfect(scene, places, normals)
+    if kind.project:
+        forces = kind.project(scene, f, forces, places, normals)
+    return FieldGradient(f, forces, places, normals)
+
+
+def _contracted(adjoint: Adjoint) -> fem.Function:
+    """The vector along which residuals are taken, with what the supports that move add."""
+    model, system, c = adjoint.scene.model, adjoint.scene.model.system, adjoint.potentials
+    found = fem.Function(model.V)
+    found.x.array[: system.size] = adjoint.w
+    found.x.scatter_forward()
+    if system.moving:
+        for motion in c.keys() & system.moving.names:
+            found.x.array[:] += c[motion] * system.moving.rate(adjoint.state.mu, motion)
+    return found
+
+
+def _with_field(adjoint: Adjoint, name: str) -> Scene:
+    """The scene, or one in whose terms a number that is the same everywhere is a field."""
+    scene, plan = adjoint.scene, adjoint.scene.plan
+    if isinstance(scene.model, SolidModel):
+        return scene
+    if name == "thickness" and not scene.model.thickness:
+        return Scene(scene.case, scene.comm, replace(plan, thickness=Thickness()))
+    loads, natural = plan.loads, plan.loads.natural
+    if name == "curvature" and (natural is None or natural.curvature is None):
+        bent = Natural(np.zeros(3), natural.stretch if natural else None, frame(scene.case, plan.azimuth))
+        return Scene(scene.case, scene.comm, replace(plan, loads=replace(loads, natural=bent)))
+    magnetic = loads.magnetic
+    if adjoint.wave and FIELDS[name].coefficient == "Br" and magnetic and not callable(magnetic.remanent):
+        even = replace(magnetic, remanent=Uniform(np.asarray(magnetic.remanent)))
+        return Scene(scene.case, scene.comm, replace(plan, loads=replace(loads, magnetic=even)))
+    return scene
+
+
+def _terms(scene: Scene, state: State, name: str) -> list[FormTerm]:
+    """The terms with the field as a coefficient; a remanence that is the same everywhere is no field in the model's."""
+    terms: list[Term] = list(scene.model.system.terms)
+    magnetic = scene.model.loads.magnetic
+    if FIELDS[name].coefficient == "Br" and magnetic and not callable(magnetic.remanent):
+        terms = list(magnetic_terms(scene, state, replace(magnetic, remanent=Uniform(np.asarray(magnetic.remanent)))))
+    return [term for term in terms if isinstance(term, FormTerm)]
+
+
+def places_of(scene: Scene, f: fem.Function) -> tuple[Array, Array]:
+    """Nodes of every cell of a field and normals there, as the field's pattern is given them."""
+    model, nodes = scene.model, f.function_space.element.basix_element.points
+    if isinstance(model, MeridianModel):
+        places, normals = of_meridian.places(model.r0, nodes)
+    elif isinstance(model, ShellModel):
+        places, normals = patterns.places(model.r0, nodes)
+    else:
+        places, normals = of_body.places(model.V)
+    return patterns.inside(places), normals
+
+
+def _lengths(scene: Scene, f: fem.Function, forces: Array, places: Array, normals: Array) -> Array:
+    """By a factor of the vector at each place."""
+    Q = f.function_space
+    vectors = f.x.array.reshape(-1, Q.dofmap.bs)[Q.dofmap.list[: len(forces)]]
+    return np.asarray(np.sum(forces * vectors, axis=-1, keepdims=True))
+
+
+def _curvatures(scene: Scene, f: fem.Function, forces: Array, places: Array, normals: Array) -> Array:
+    """By kappa_11, kappa_22 and kappa_12 in the frame of the natural shape, from those by the tensor in space."""
+    natural = scene.plan.loads.natural
+    assert natural
+    return natural.in_frame(forces[..., :6], places, normals)
+
+
+def _outwards(scene: Scene, f: fem.Function, forces: Array, places: Array, normals: Array) -> Array:
+    """By w0, from those by the place."""
+    axes = [0, 2] if isinstance(scene.model, MeridianModel) else [0, 1, 2]
+    return np.asarray(np.sum(forces * _normals(scene, normals)[..., axes], axis=-1, keepdims=True))
+
+
+def _normals(scene: Scene, drawn: Array) -> Array:
+    """The normals of the perfect shell at the nodes of this rank's cells, from those of the drawn one."""
+    model = scene.model
+    if isinstance(model, SolidModel) or not isinstance(scene.plan.embedding, Deviated):
+        return drawn
+    shape = model.midsurface if isinstance(model, ShellModel) else model.meridian
+    unit = shape.growth(model.V, (lambda x: np.ones(len(x)),))
+    width = model.V.dofmap.bs
+    found = np.zeros_like(drawn)
+    found[..., [0, 2] if width == 2 else [0, 1, 2]] = unit.x.array.reshape(-1, width)[model.V.dofmap.list[: len(drawn)]]
+    return found
+
+
+def _perfect(scene: Scene, places: Array, normals: Array) -> Array:
+    """The places of the perfect shell that deviations are functions of."""
+    model = scene.model
+    if isinstance(model, MeridianModel):
+        embedding = model.meridian.embedding
+        if not isinstance(embedding, Deviated):
+            return places
+        s = model.V.tabulate_dof_coordinates()[:, 0]
+        w0: Array | None = embedding.w0(np.column_stack([s, 0 * s]))[model.V.dofmap.list]
+    else:
+        assert isinstance(model, ShellModel)
+        w0 = model.midsurface.deviation(model.V.element.basix_element.points)
+    return places if w0 is None else places - w0[: len(places), :, None] * _normals(scene, normals)
+
+
+FIELDS = {
+    "remanence": Kind("Br"),
+    "magnitude": Kind("Br", _lengths),
+    "thickness": Kind("thickness"),
+    "curvature": Kind("natural", _curvatures),
+    "deviation": Kind("r0", _outwards),
+}

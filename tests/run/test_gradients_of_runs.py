@@ -1,0 +1,86 @@
+"""The section `gradients` of a case: numbers, fields and messages."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from command import magshell
+from conftest import CASES
+from scipy.spatial import cKDTree
+
+from magshell_fenicsx.output.fields.vtu import read_vtu
+
+WHERE = CASES / "where_to_magnetise.yaml"
+STRIP = """
+shell: {geometry: strip, radius_to_thickness: 100, width: 0.1, poisson_ratio: 0.2}
+boundary: {root: clamped}
+points: {tip: [1, 0, 0]}
+magnetic: {lambda_m: 3.3e-5, remanent: {polar: 60}, applied: {polar: 0}}
+mesh: {degree: 2}
+gradients: {of: [tip_uz], by: [remanence, thickness, curvature, deviation, lambda_m]}
+"""
+
+
+def summary(folder: Path) -> dict[str, Any]:
+    content: dict[str, Any] = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+    return content
+
+
+def test_fold_of_a_meridian(tmp_path: Path) -> None:
+    """A stronger magnet everywhere is a larger lambda_m; interrupted and resumed, the run has the same gradients."""
+    out = tmp_path / "out"
+    assert magshell("run", WHERE, "--out", out, ranks=1).returncode == 0
+    found = summary(out)["gradients"]["knockdown"]
+    assert found["value"] == pytest.approx(0.44727601, rel=1e-7)
+    assert found["fields"]["magnitude"]["alike"][0] == pytest.approx(0.001 * found["numbers"]["lambda_m"], rel=1e-8)
+    surface, _ = read_vtu(out / "fields/gradients_knockdown.vtu")
+    assert surface.fields["remanence"].shape == surface.r0.shape
+    assert np.abs(surface.fields["thickness"]).max() == pytest.approx(found["fields"]["thickness"]["most_per_area"])
+    assert "most per area" in (out / "report.html").read_text(encoding="utf-8")
+    again = tmp_path / "again"
+    assert magshell("run", WHERE, "--out", again, "--time-limit", "0.01", ranks=1).returncode != 0
+    assert not summary(again)["gradients"]
+    assert magshell("run", WHERE, "--out", again, "--resume", ranks=1).returncode == 0
+    assert summary(again)["gradients"]["knockdown"] == found
+
+
+@pytest.mark.slow
+def test_same_on_ranks(tmp_path: Path) -> None:
+    """A half shell on 1, 2 and 3 ranks."""
+    (tmp_path / "strip.yaml").write_text(STRIP)
+    found = {}
+    for ranks in (1, 2, 3):
+        done = magshell("run", tmp_path / "strip.yaml", "--out", tmp_path / f"{ranks}", ranks=ranks)
+        assert done.returncode == 0, done.stderr
+        surface, _ = read_vtu(tmp_path / f"{ranks}/fields/gradients_tip_uz.vtu")
+        found[ranks] = summary(tmp_path / f"{ranks}")["gradients"]["tip_uz"], surface
+    numbers, surface = found[1]
+    for ranks in (2, 3):
+        other, there = found[ranks]
+        assert other["numbers"]["lambda_m"] == pytest.approx(numbers["numbers"]["lambda_m"], rel=1e-7)
+        order = cKDTree(there.r0).query(surface.r0)[1]
+        for name, field in numbers["fields"].items():
+            size = field["most_per_area"]
+            assert other["fields"][name]["alike"] == pytest.approx(field["alike"], rel=1e-6, abs=1e-6 * size), name
+        for name, values in surface.fields.items():
+            size = np.abs(values).max()
+            here, other_half = np.abs(values), np.abs(there.fields[name][order])  # on the mirror plane both images lie
+            np.testing.assert_allclose(other_half, here, rtol=0, atol=1e-5 * size, err_msg=name)
+
+
+@pytest.mark.parametrize(
+    ("section", "message"),
+    [
+        ("{of: [sideways]}", "sideways: has no gradient here; allowed are energy"),
+        ("{of: [tip_uz], by: [magnets]}", "magnets: the case has no such key"),
+    ],
+)
+def test_mistakes(tmp_path: Path, section: str, message: str) -> None:
+    """Said before the run."""
+    (tmp_path / "strip.yaml").write_text(STRIP)
+    done = magshell("run", tmp_path / "strip.yaml", "--out", tmp_path / "out", f"--set=gradients={section}", ranks=1)
+    assert done.returncode == 2
+    assert message in done.stderr
+    assert not (tmp_path / "out/path.csv").exists()

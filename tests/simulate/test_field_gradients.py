@@ -1,0 +1,182 @@
+"""Thickness, natural curvature and deviation as fields: against differences of states and folds solved again."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import CASES
+from numpy.typing import NDArray
+
+from magshell_fenicsx.assembly.field_derivative import FieldGradient
+from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.continuation.fold import Guess, find_fold
+from magshell_fenicsx.continuation.system import State
+from magshell_fenicsx.models.shell.natural import Natural
+from magshell_fenicsx.models.shell.thickness import Thickness
+from magshell_fenicsx.plan.natural import frame
+from magshell_fenicsx.simulate.follow import follow
+from magshell_fenicsx.simulate.gradients.adjoint import adjoint_of_instability
+from magshell_fenicsx.simulate.gradients.gradient import gradient
+from magshell_fenicsx.simulate.record import Record
+from magshell_fenicsx.simulate.results import functional
+from magshell_fenicsx.simulate.scene import Scene
+from magshell_fenicsx.simulate.sensitivity import fold_at
+from magshell_fenicsx.simulate.shape_sensitivity import reshaped
+
+Array = NDArray[np.float64]
+FIELDS = ("thickness", "curvature", "deviation")
+STRIP = """
+shell:
+  geometry: strip
+  radius_to_thickness: 100
+  width: 0.1
+  poisson_ratio: 0.2
+  imperfections: [{kind: formula, w0: x**2*(1 - x)}]
+boundary: {root: clamped}
+points: {tip: [1, 0, 0]}
+magnetic: {lambda_m: 3.3e-5, remanent: {polar: 60}, applied: {polar: 0}}
+natural: {curvature: [0.2*x, 0.1, 0]}
+mesh: {degree: 2}
+"""
+
+
+def by_difference(f: Callable[[float], float], step: float) -> float:
+    """Of fourth order."""
+    return (8 * (f(step) - f(-step)) - (f(2 * step) - f(-2 * step))) / (12 * step)
+
+
+class Direction:
+    """A random smooth change of a field; even in y, as halves are, and the same along every meridian."""
+
+    def __init__(self, seed: int, *, around: bool = False) -> None:
+        self._a, self._around = np.random.default_rng(seed).standard_normal((3, 4)), around
+
+    def __call__(self, x: Array, component: int = 0) -> Array:
+        a, b, c, d = self._a[component]
+        s = np.hypot(x[..., 0], x[..., 1]) ** 2 if self._around else x[..., 0]
+        return np.asarray(a + b * s + c * np.sin(4 * s) + d * x[..., 2] ** 2)
+
+
+def changed(scene: Scene, name: str, along: Direction, c: float) -> Scene:
+    """The scene with another field, on the same mesh."""
+    plan = scene.plan
+    if name == "deviation":  # the triangulation moves too, on which the penalty's width depends
+        return reshaped(scene, lambda x: c * along(x) * plan.material.h)
+    if name == "thickness":
+        one = Thickness(lambda x, y, z: 1 + c * along(np.stack([x, y, z], axis=-1)))
+        return Scene(scene.case, scene.comm, replace(plan, thickness=one))
+    natural = plan.loads.natural or Natural(np.zeros(3), None, frame(scene.case, plan.azimuth))
+    drawn = natural.curvature
+
+    def curvature(r0: Array, n0: Array) -> Array:
+        known = drawn(r0, n0) if callable(drawn) else np.asarray(drawn)
+        return np.asarray(known + c * np.stack([along(r0, i) for i in range(3)], axis=-1) * [1, 1, 0])
+
+    other = Natural(curvature, natural.stretch, natural.along)
+    return Scene(scene.case, scene.comm, replace(plan, loads=replace(plan.loads, natural=other)))
+
+
+def growing(scene: Scene, along: Direction) -> Scene:
+    """The scene with a deviation that grows with the amplitude "shape", on the same triangulation."""
+    plan = scene.plan
+    shape = {"shape": (lambda x: along(x) * plan.material.h,)}
+    return Scene(scene.case, scene.comm, replace(plan, loads=replace(plan.loads, growing=shape)))
+
+
+def directional(scene: Scene, found: object, name: str, along: Direction) -> float:
+    assert isinstance(found, FieldGradient)
+    if name == "curvature":
+        return found.along(np.stack([along(found.places, i) for i in range(3)], axis=-1) * [1, 1, 0])
+    unit = scene.plan.material.h if name == "deviation" else 1.0
+    return found.along(unit * along(found.places)[..., None])
+
+
+def solved(scene: Scene) -> Record:
+    *_, last = follow(scene)
+    return last
+
+
+@pytest.mark.parametrize("symmetry", ["auto", pytest.param("none", marks=pytest.mark.slow)])
+def test_state(tmp_path: Path, symmetry: str) -> None:
+    """The displacement and the energy of a strip in a field, of half and whole shells."""
+    (tmp_path / "strip.yaml").write_text(STRIP)
+    scene = Scene(Case.load(tmp_path / "strip.yaml", [f"symmetry={symmetry}"]))
+    last = solved(scene)
+    assert scene.plan.half == (symmetry == "auto")
+    found = {of: gradient(scene, last, of=of, by=FIELDS) for of in ("tip_uz", "energy")}
+    for seed, name in enumerate(FIELDS):
+        along = Direction(seed)
+        step = {"thickness": 2e-3, "curvature": 1e-2, "deviation": 1e-2}[name]
+        near = {c: changed(scene, name, along, c * step) for c in (-2, -1, 1, 2)}
+        states = {c: (other, solved(other).point.state) for c, other in near.items()}
+        for of, by in found.items():
+            values = {c: functional(*each, of).value for c, each in states.items()}
+            expected = by_difference(values.__getitem__, 1) / step
+            assert directional(scene, by[name], name, along) == pytest.approx(expected, rel=1e-5), (name, of)
+
+
+def test_cost(tmp_path: Path) -> None:
+    """At most one factorisation more than the state's own, for all of 10 000 parameters."""
+    (tmp_path / "strip.yaml").write_text(STRIP)
+    scene = Scene(Case.load(tmp_path / "strip.yaml", ["mesh.refinement=3.6"]))
+    last = solved(scene)
+    before = scene.newton.factorisation.count
+    found = gradient(scene, last, of="tip_uz", by=["remanence"])["remanence"]
+    assert isinstance(found, FieldGradient)
+    assert found.forces.size > 10_000
+    assert scene.newton.factorisation.count <= before + 1
+
+
+FIELD = "magnetic.lambda_m=0.001"
+HALF = [FIELD, "symmetry=half", "mesh.degree=3", "mesh.refinement=0.3"]
+
+
+@pytest.mark.parametrize(
+    "settings", [pytest.param([FIELD], id="meridian"), pytest.param(HALF, id="half", marks=pytest.mark.slow)]
+)
+def test_fold(settings: list[str]) -> None:
+    """The knockdown factor of the dimpled hemisphere; no factorisation but those of the fold."""
+    scene = Scene(Case.load(CASES / "dimple_buckling.yaml", settings))
+    last = solved(scene)
+    fold = fold_at(scene, last)
+    before = scene.newton.factorisation.count
+    found = gradient(scene, last, of="instability", by=(*FIELDS, "remanence", "magnitude", "lambda_m"), fold=fold)
+    assert scene.newton.factorisation.count == before
+    mu = {"natural_curvature": 1.0, **fold.state.mu}
+    for seed, name in enumerate(FIELDS):
+        along = Direction(seed, around=True)
+        step = {"thickness": 5e-3, "curvature": 2e-2, "deviation": 5e-3}[name]
+
+        def again(c: float, name: str = name, along: Direction = along) -> float:
+            other = growing(scene, along) if name == "deviation" else changed(scene, name, along, c)
+            return find_fold(other.newton, Guess(State(fold.state.u, {**mu, "shape": c}), fold.phi), "pressure").value
+
+        expected = by_difference(again, step)
+        assert directional(scene, found[name], name, along) == pytest.approx(expected, rel=1e-4), name
+    factor = found["magnitude"]
+    assert isinstance(factor, FieldGradient)
+    assert factor.along(np.ones_like(factor.forces)) == pytest.approx(0.001 * found["lambda_m"], rel=1e-8)
+
+
+@pytest.mark.slow
+def test_neutral_wave() -> None:
+    """A wave around the axis, found again by paths along which all fields change together."""
+    path = "loading={kind: pressure, until: bifurcation, control: arc}"
+    settings = [FIELD, path, "shell.defect.amplitude=0.05", "natural={curvature: 0.02}"]
+    scene = Scene(Case.load(CASES / "dimple_buckling.yaml", settings))
+    wave = solved(scene)
+    assert wave.mode.startswith("m = ")
+    found = gradient(scene, wave, of="instability", by=FIELDS)
+    along = {name: Direction(seed, around=True) for seed, name in enumerate(FIELDS)}
+
+    def again(c: float) -> float:
+        other = scene
+        for name in FIELDS:
+            other = changed(other, name, along[name], c)
+        return adjoint_of_instability(other, solved(other)).value
+
+    expected = by_difference(again, 1e-3)
+    total = sum(directional(scene, found[name], name, along[name]) for name in FIELDS)
+    assert total == pytest.approx(expected, rel=1e-4)

@@ -1,0 +1,62 @@
+"""A scene with the fields of another case has the path of a scene that is made for it."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import CASES
+
+from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.controls import write_vectors
+from magshell_fenicsx.simulate.follow import follow
+from magshell_fenicsx.simulate.scene import Scene
+from magshell_fenicsx.simulate.standing import Standing, refilled
+
+STRIP = """
+shell: {geometry: strip, radius_to_thickness: 100, width: 0.1, poisson_ratio: 0.2, thickness_factor: "1"}
+boundary: {root: clamped}
+magnetic: {lambda_m: 3.3e-5, remanent: {kind: points, file: one.csv, filter: 0.3}, applied: {polar: 0}}
+natural: {curvature: [0, 0, 0]}
+mesh: {degree: 2}
+"""
+OTHER = ["magnetic.remanent.file=two.csv", "shell.thickness_factor=1 + x/5", "natural.curvature=[0.3*x, 0.1, 0]"]
+BUCKLING = ["shell.thickness_factor=1 + 0*z", "natural={curvature: [0, 0, 0]}", "magnetic.lambda_m=0.001"]
+THICKER = ["shell.thickness_factor=1 + z/10", "natural={curvature: [0.1, 0.2*z, 0]}", "magnetic.lambda_m=0.001"]
+
+
+def test_half_strip(tmp_path: Path) -> None:
+    s = np.linspace(0, 1, 5)
+    for name, angle in (("one", 1.5 + 0 * s), ("two", 2 * s)):
+        vectors = np.column_stack([np.sin(angle), 0 * s, np.cos(angle)])
+        write_vectors(tmp_path / f"{name}.csv", np.column_stack([s, 0 * s, 0 * s]), vectors)
+    (tmp_path / "strip.yaml").write_text(STRIP)
+    agree(Case.load(tmp_path / "strip.yaml"), Case.load(tmp_path / "strip.yaml", OTHER))
+
+
+def test_meridian() -> None:
+    agree(*(Case.load(CASES / "dimple_buckling.yaml", settings) for settings in (BUCKLING, THICKER)))
+
+
+def agree(first: Case, second: Case) -> None:
+    """Forwards and back."""
+    scene = Scene(first)
+    there = [record.point.state for record in follow(scene)][-1]
+    for case in (second, first):
+        assert refilled(scene, case)
+        *_, last = follow(scene)
+        *_, expected = follow(Scene(case))
+        assert last.label == expected.label
+        assert last.point.state.mu == pytest.approx(expected.point.state.mu, rel=1e-10)
+        size = np.abs(expected.point.state.u).max()
+        np.testing.assert_allclose(last.point.state.u, expected.point.state.u, rtol=0, atol=1e-9 * size)
+    np.testing.assert_allclose(last.point.state.u, there.u, rtol=0, atol=1e-9 * size)
+
+
+def test_another_case_is_another_scene() -> None:
+    """What is not a field in the terms, or changes more, makes a new scene."""
+    case = Case.load(CASES / "dimple_buckling.yaml", BUCKLING)
+    known = Standing()
+    scene = known.of(case, Scene(case).comm)
+    assert known.of(case, scene.comm) is scene
+    for setting in ("shell.poisson_ratio=0.3", "symmetry=half", "mesh.degree=3"):
+        assert not refilled(scene, Case.load(CASES / "dimple_buckling.yaml", [*BUCKLING, setting]))
