@@ -32,6 +32,7 @@ from magshell_fenicsx.case.loads.step import Step
 from magshell_fenicsx.case.mesh import SOLID_DEGREE, MeshSection
 from magshell_fenicsx.case.messages import explain
 from magshell_fenicsx.case.natural import NaturalSection, measured
+from magshell_fenicsx.case.output import OutputSection
 from magshell_fenicsx.case.patches import refuse_strange
 from magshell_fenicsx.case.programme import refuse_unfit_steps
 from magshell_fenicsx.case.shell import ShellSection
@@ -80,6 +81,8 @@ class Case(WithParts):
     """What is random, for `magshell ensemble`"""
     design: DesignSection | None = None
     """What varies and what is wanted, for `magshell design`"""
+    output: OutputSection = OutputSection()
+    """How pictures look"""
     reactions: bool | None = None
     """Forces and moments of every support as columns of path.csv; by default where a support moves"""
     symmetry: Literal["auto", "none", "half", "axisymmetric"] = "auto"

@@ -13,9 +13,11 @@ from markupsafe import Markup
 
 from magshell_fenicsx.output.fields.frequencies import Frequency, read_frequencies
 from magshell_fenicsx.output.report.html_numbers import number
+from magshell_fenicsx.output.report.interactive import interactive
 from magshell_fenicsx.output.report.report_path import Line, path_table, pole_head, symbol
 from magshell_fenicsx.output.report.verdict import Summary, bending_stiffness, located, physical_units, value, verdict
 from magshell_fenicsx.output.store.durable import write_whole
+from magshell_fenicsx.output.store.known import pole_of
 from magshell_fenicsx.output.store.table import stability
 from magshell_fenicsx.quantities.registry import amplitude
 
@@ -48,32 +50,37 @@ TIMES = {
 }
 
 
-def write_report(folder: Path) -> None:
-    """Write report.html from summary.json, path.csv and the pictures in a run's folder.
+def write_report(folder: Path, *, playable: bool = True) -> None:
+    """Write report.html from summary.json, path.csv, the pictures and the fields in a run's folder.
+
+    Parameters
+    ----------
+    playable
+        Whether it has the shell to turn and the path to walk along.
 
     Raises
     ------
     OSError
         If summary.json or path.csv is missing, or the report cannot be written; an older report stays unchanged.
     """
-    write_whole(folder / NAME, report(folder).encode())
+    write_whole(folder / NAME, report(folder, playable=playable).encode())
 
 
-def report(folder: Path) -> str:
+def report(folder: Path, *, playable: bool = True) -> str:
     """The content of report.html."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined  # takes long to import
 
     loader = FileSystemLoader(Path(__file__).parent)
     made = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    return made.get_template(TEMPLATE).render(_content(folder))
+    return made.get_template(TEMPLATE).render(_content(folder, playable))
 
 
-def _content(folder: Path) -> dict[str, Any]:
+def _content(folder: Path, playable: bool) -> dict[str, Any]:
     """The values of the template."""
     summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
     with (folder / "path.csv").open(encoding="utf-8", newline="") as stream:
         lines = list(csv.DictReader(stream))
-    path = path_table(lines, "m" if summary["dimensions"]["units"] == "SI" else "")
+    path = path_table(lines, "m" if summary["dimensions"]["units"] == "SI" else "", pole_of(summary["case"]))
     return {
         "name": folder.resolve().name,
         "summary": summary,
@@ -81,7 +88,8 @@ def _content(folder: Path) -> dict[str, Any]:
         "groups": _groups(summary),
         "dimensions": _dimensions(summary),
         "pictures": list(_pictures(folder)),
-        "pole": pole_head(lines[0] if lines else {}),
+        "interactive": interactive(folder, summary["case"]) if playable else None,
+        "pole": pole_head(lines[0] if lines else {}, pole_of(summary["case"])),
         "instabilities": [_instability(line, summary) for line in located(lines)],
         "solutions": [_solution(it) for it in summary.get("solutions", [])],
         "frequencies": [_frequency(it) for it in read_frequencies(folder)],

@@ -7,7 +7,7 @@ from math import isclose
 from markupsafe import Markup
 
 from magshell_fenicsx.output.report.html_numbers import column, power
-from magshell_fenicsx.output.store.table import pole_name
+from magshell_fenicsx.output.store.table import POLE, pole_name
 from magshell_fenicsx.quantities.registry import amplitude, quantity
 
 Line = Mapping[str, str]  # a row of path.csv
@@ -41,18 +41,20 @@ def symbol(name: str) -> Markup:
     return Markup(known.html) if known.symbol else Markup("{}").format(known.words)
 
 
-def pole_head(line: Line) -> Markup:
+def pole_head(line: Line, pole: str = POLE) -> Markup:
     """The heading of w_pole_over_h, with the point that it belongs to."""
-    return Markup("{}, {}").format(symbol("w_pole_over_h"), pole_name(line).removeprefix("the "))
+    return Markup("{}, {}").format(symbol("w_pole_over_h"), pole_name(line, pole).removeprefix("the "))
 
 
-def path_table(lines: Sequence[Line], length_unit: str) -> list[Column]:
+def path_table(lines: Sequence[Line], length_unit: str, pole: str = POLE) -> list[Column]:
     """The columns that vary, in the order of interest; a displacement equal to an earlier one is left out.
 
     Parameters
     ----------
     length_unit
         Unit of the displacements of named points.
+    pole
+        Name of the point of w_pole_over_h.
     """
     names = [name for name in (lines[0] if lines else ()) if name != "point"]
     order = ["point", *sorted(names, key=lambda name: ORDER.index(quantity(name).kind))]
@@ -63,8 +65,8 @@ def path_table(lines: Sequence[Line], length_unit: str) -> list[Column]:
         if name in ("point", "label") or (len(set(values)) > 1 and not again):
             found[name] = values
     table = {name: _column(name, values, length_unit) for name, values in found.items()}
-    if pole := table.get("w_pole_over_h"):
-        table["w_pole_over_h"] = replace(pole, head=pole_head(lines[0]))
+    if there := table.get("w_pole_over_h"):
+        table["w_pole_over_h"] = replace(there, head=pole_head(lines[0], pole))
     return list(table.values())
 
 

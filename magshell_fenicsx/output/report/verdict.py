@@ -8,6 +8,7 @@ from markupsafe import Markup
 
 from magshell_fenicsx.output.report.html_numbers import number
 from magshell_fenicsx.output.report.report_path import Line, symbol
+from magshell_fenicsx.output.store.known import pole_of
 from magshell_fenicsx.output.store.table import LOCATED, OWN_MODES, pole_name
 from magshell_fenicsx.quantities.registry import amplitude, quantity
 
@@ -71,7 +72,7 @@ def _instability(line: Line, summary: Summary) -> Markup:
     kind = line["label"]
     if line["mode"]:
         kind += f" ({line['mode']}{' waves' if line['mode'] not in (*OWN_MODES, 'antisymmetric') else ''})"
-    at, place = value(line, summary), _displacement(line)
+    at, place = value(line, summary), _displacement(line, summary)
     if line["amplitude"] == "pressure" and summary["knockdown"] is not None:
         sentence = "The shell buckles at the knockdown factor k<sub>d</sub> = {}: a {}, {}."
     elif line["amplitude"] == "lambda_m":
@@ -87,11 +88,13 @@ def _end(summary: Summary, lines: Sequence[Line]) -> Markup:
     if last is None or not last["amplitude"]:
         return Markup("Nothing loads the shell: this is its undeformed state." if not summary["stopped"] else "")
     reached = "The run reached its target" if last["label"] == "target" and not summary["stopped"] else "The last point"
-    return Markup("{}: {}, {}.").format(reached, value(last, summary), _displacement(last))
+    return Markup("{}: {}, {}.").format(reached, value(last, summary), _displacement(last, summary))
 
 
-def _displacement(line: Line) -> Markup:
+def _displacement(line: Line, summary: Summary) -> Markup:
     varied, w = amplitude(line["amplitude"]), symbol("w_over_h")
     if varied.conjugate == "w_over_h" and line["w_over_h"] != line["w_pole_over_h"]:
         return Markup("{} = {} {}").format(w, number(float(line["w_over_h"])), varied.place)
-    return Markup("{} = {} at {}").format(w, number(float(line["w_pole_over_h"])), pole_name(line))
+    return Markup("{} = {} at {}").format(
+        w, number(float(line["w_pole_over_h"])), pole_name(line, pole_of(summary["case"]))
+    )
