@@ -98,7 +98,8 @@ def read_vtu(file: Path) -> tuple[Surface, About]:
         raise CaseError(f"{file} is of an earlier version: run the case again")
     about = About(float(numbers["h_over_R"][0]), float(numbers["poisson_ratio"][0]), numbers.get("mirror"))
     r0 = data["r0"]
-    return Surface(r0, data["u_over_h"] * about.h, data["n0"], cells, fields), about
+    jump = float(numbers["moment_jump"][0]) if "moment_jump" in numbers else None
+    return Surface(r0, data["u_over_h"] * about.h, data["n0"], cells, fields, jump=jump), about
 
 
 class FieldSeries:
@@ -164,6 +165,7 @@ def vtu_content(surface: Surface, about: About) -> bytes:
 
     grid = unstructured_grid(surface, about.h)
     numbers = {"h_over_R": np.array([about.h]), "poisson_ratio": np.array([about.nu]), "mirror": about.mirror}
+    numbers["moment_jump"] = None if surface.jump is None else np.array([surface.jump])
     for name, values in numbers.items():
         if values is not None:
             _give(grid.GetFieldData(), name, values)

@@ -42,16 +42,18 @@ def colour_map(name: str) -> "Colormap":
 
 def colour_bar(figure: "Figure", axes: "Axes", of: Scale, orientation: str = "horizontal") -> None:
     """Draw a colour bar; its ends are pointed if values lie beyond them."""
+    from matplotlib import rcParams
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
     from matplotlib.ticker import MaxNLocator
 
     extend = {(True, True): "both", (True, False): "min", (False, True): "max", (False, False): "neither"}
+    few = 3 if axes.get_position().width * figure.get_figwidth() < 16 * rcParams["font.size"] / 72 else 5
     bar: Any = figure.colorbar(
         ScalarMappable(Normalize(*of.limits), colour_map(of.colours)),
         cax=axes,
         orientation=orientation,
-        ticks=MaxNLocator(5, steps=[1, 2, 5, 10]),
+        ticks=MaxNLocator(few, steps=[1, 2, 5, 10]),
         extend=extend[of.beyond],
         extendfrac=0.04,
     )
@@ -73,9 +75,11 @@ def number_format(limits: tuple[int, int] = (-3, 4)) -> "ScalarFormatter":
 
     class Numbers(ScalarFormatter):
         def get_offset(self) -> str:
-            power = self.orderOfMagnitude
-            return rf"$\times 10^{{{power}}}$" if power and len(self.locs) else ""
+            power, offset = self.orderOfMagnitude, self.offset
+            if not len(self.locs):
+                return ""
+            return (rf"$\times 10^{{{power}}}$" if power else "") + (f"{offset:+.10g}" if offset else "")
 
-    numbers = Numbers(useOffset=False, useMathText=False)
+    numbers = Numbers(useMathText=False)
     numbers.set_powerlimits(limits)
     return numbers

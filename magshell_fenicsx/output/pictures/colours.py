@@ -68,6 +68,13 @@ def moments(surface: Surface) -> list[Coloured]:
     return _principal(surface, MOMENTS)
 
 
+def jump_said(surface: Surface) -> str:
+    """How smooth the moments are before their mean at the nodes is drawn."""
+    if surface.jump is None:
+        return ""
+    return f"Means of the cells at their nodes; between cells the moments jump by {100 * surface.jump:.2g} % (rms)."
+
+
 def _principal(surface: Surface, captions: dict[str, str]) -> list[Coloured]:
     """Two fields with the same colours, white at zero, so that rounding of a constant field is invisible."""
     if not captions.keys() <= surface.fields.keys():

@@ -89,8 +89,10 @@ def panels_figure(panels: Sequence[Panel], style: OutputSection, note: str = "")
     below = (4.2 if barred else 0.4) * line
     legend = max((len(panel.arrows) for panel in panels), default=0)
     above = gap / 2 + (legend * line + 0.1 * wide if legend else 0.0)  # arrows may leave the panel
-    notes = _wrapped(note, wide * across - gap, style.font_size)
-    foot = len(notes) * line + (0.0 if barred else 2.2 * line)
+    beside = barred and across < 3  # the directions stand beside the first bar, else at the foot
+    indent = gap / 2 + (0.0 if beside else 4.0 * line)
+    notes = _wrapped(note, wide * across - indent - gap / 2, style.font_size)
+    foot = max(len(notes) * line, 0.0 if beside else 3.2 * line)
     height = rows * (tall + below + above) + foot
     figure = Figure(figsize=(wide * across, height), dpi=dpi)
     boxes = Boxes(figure)
@@ -103,17 +105,13 @@ def panels_figure(panels: Sequence[Panel], style: OutputSection, note: str = "")
             y = low + below + tall + above - gap / 2 - (k + 0.5) * line
             figure.text(*boxes.place(left + gap / 2, y), arrows.name, color=arrows.colour, va="center")
         if panel.scale.colours:
-            reach = max(wide - gap - 7.6 * line, 4 * line)  # beside it the directions and a power of ten
-            box = boxes.axes(left + gap / 2 + 4.4 * line, low + 1.7 * line, reach, 0.65 * line)
-            colour_bar(figure, box, panel.scale)
-    first = height - (tall + below + above) if barred else len(notes) * line - 0.3 * line
-    directions(
-        boxes.axes(gap / 2, first + (0.4 if barred else 0.2) * line, 3.4 * line, 3.4 * line), panels[0].camera, style
-    )
-    for k, text in enumerate(notes):
-        figure.text(
-            *boxes.place(gap / 2, (len(notes) - k - 0.5) * line), text, va="center", fontsize=0.9 * style.font_size
-        )
+            spare = (4.4 if beside else 2.2) * line  # a power of ten needs the other side
+            reach = max(wide - gap - spare - 3.2 * line, 3 * line)
+            colour_bar(figure, boxes.axes(left + gap / 2 + spare, low + 1.7 * line, reach, 0.65 * line), panel.scale)
+    size, low = 3.4 * line, height - (tall + below + above) + 0.4 * line if beside else foot - 3.3 * line
+    directions(boxes.axes(gap / 2, low, size, size), panels[0].camera, style)
+    for k, text in enumerate(reversed(notes)):
+        figure.text(*boxes.place(indent, (k + 0.5) * line), text, va="center", fontsize=0.9 * style.font_size)
     return figure
 
 

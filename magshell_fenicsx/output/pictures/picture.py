@@ -11,7 +11,7 @@ from magshell_fenicsx.case.output import OutputSection
 from magshell_fenicsx.output.fields.surface import Surface
 from magshell_fenicsx.output.pictures.arrows import drawn_arrows
 from magshell_fenicsx.output.pictures.bars import Scale, colour_map
-from magshell_fenicsx.output.pictures.colours import Coloured, contact, loads, moments, shell, strains
+from magshell_fenicsx.output.pictures.colours import Coloured, contact, jump_said, loads, moments, shell, strains
 from magshell_fenicsx.output.pictures.layout import (
     Arrow,
     Panel,
@@ -43,14 +43,20 @@ class Content:
 
 def _with_arrows(surface: Surface, h: float) -> Content:
     found = drawn_arrows(surface)
-    return Content([Coloured("", np.zeros(len(surface.r0)), (0, 1), "", "")] if found else [])
+    return Content([Coloured("", np.zeros(len(surface.r0)), (0, 1), "", "")] if found else [], far_said(surface))
+
+
+def far_said(surface: Surface) -> str:
+    """Whether there are sources of the field, or bodies, that are not drawn."""
+    left_out = len(surface.outlines) - len(near_outlines(surface))
+    return "Sources of the field, or bodies, are outside the picture." if left_out else ""
 
 
 PICTURES: dict[str, Callable[[Surface, float], Content]] = {
-    "shell": lambda surface, h: Content(shell(surface, h)),
+    "shell": lambda surface, h: Content(shell(surface, h), far_said(surface)),
     "magnetic_loads": lambda surface, h: Content(*loads(surface, h)),
     "strains": lambda surface, h: Content(strains(surface)),
-    "moments": lambda surface, h: Content(moments(surface)),
+    "moments": lambda surface, h: Content(moments(surface), jump_said(surface)),
     "fields": _with_arrows,
     "contact": lambda surface, h: Content(contact(surface)),
 }

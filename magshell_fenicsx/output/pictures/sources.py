@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.output.fields.surface import Surface
 
 Array = NDArray[np.float64]
-FAR = 4.0  # of the shell's extent, from its middle: sources farther away are not drawn
+FAR = 2.0  # of the shell's extent, from its middle: sources farther away are not drawn
 
 
 def near_outlines(surface: Surface) -> tuple[Array, ...]:

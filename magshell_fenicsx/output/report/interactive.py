@@ -143,6 +143,8 @@ def _values(surface: Surface, name: str, h: float) -> Array | None:
     if name == "w_over_h":
         return np.asarray(surface.w / h)
     values = couple(surface) if name == "couple" else surface.fields.get(name)
+    if values is None and name == "couple" and "Ba" in surface.fields:
+        return np.zeros(len(surface.r0))  # before the field is applied
     if values is None:
         return None
     return np.nan_to_num(values if values.ndim == 1 else np.linalg.norm(values, axis=1))

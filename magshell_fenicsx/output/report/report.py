@@ -14,6 +14,7 @@ from markupsafe import Markup
 from magshell_fenicsx.output.fields.frequencies import Frequency, read_frequencies
 from magshell_fenicsx.output.report.html_numbers import number
 from magshell_fenicsx.output.report.interactive import interactive
+from magshell_fenicsx.output.report.light import light
 from magshell_fenicsx.output.report.report_path import Line, path_table, pole_head, symbol
 from magshell_fenicsx.output.report.verdict import Summary, bending_stiffness, located, physical_units, value, verdict
 from magshell_fenicsx.output.store.durable import write_whole
@@ -80,6 +81,7 @@ def _content(folder: Path, playable: bool) -> dict[str, Any]:
     summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
     with (folder / "path.csv").open(encoding="utf-8", newline="") as stream:
         lines = list(csv.DictReader(stream))
+    played = interactive(folder, summary["case"]) if playable else None  # it moves in place of the animation
     path = path_table(lines, "m" if summary["dimensions"]["units"] == "SI" else "", pole_of(summary["case"]))
     return {
         "name": folder.resolve().name,
@@ -87,8 +89,8 @@ def _content(folder: Path, playable: bool) -> dict[str, Any]:
         "verdict": verdict(summary, lines),
         "groups": _groups(summary),
         "dimensions": _dimensions(summary),
-        "pictures": list(_pictures(folder)),
-        "interactive": interactive(folder, summary["case"]) if playable else None,
+        "pictures": list(_pictures(folder, moving=played is None)),
+        "interactive": played,
         "pole": pole_head(lines[0] if lines else {}, pole_of(summary["case"])),
         "instabilities": [_instability(line, summary) for line in located(lines)],
         "solutions": [_solution(it) for it in summary.get("solutions", [])],
@@ -141,11 +143,11 @@ def _dimensions(summary: Summary) -> list[tuple[Markup, Markup, str]]:
     ]
 
 
-def _pictures(folder: Path) -> Iterator[tuple[str, str, bool]]:
+def _pictures(folder: Path, *, moving: bool) -> Iterator[tuple[str, str, bool]]:
     """Source and caption of each picture in the folder, and whether it is shown small."""
     for pattern, caption in PICTURES.items():
-        for file in sorted(folder.glob(pattern)):
-            content = base64.b64encode(file.read_bytes()).decode()
+        for file in sorted(folder.glob(pattern)) if moving or pattern != "animation.gif" else []:
+            content = base64.b64encode(light(file.read_bytes())).decode()
             yield f"data:image/{file.suffix[1:]};base64,{content}", caption, pattern in SMALL
 
 
