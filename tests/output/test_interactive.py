@@ -83,7 +83,10 @@ def test_shells_are_those_of_the_fields(folder: Path) -> None:
     mesh = thinned(surface, 20_000)
     r = array(data, about["r0"]) + array(data, about["u"][-1])
     assert r == pytest.approx(mesh.at(surface.r0 + surface.u), abs=1e-4)
-    assert array(data, about["triangles"]).max() == mesh.count - 1
+    triangles = array(data, about["triangles"]).reshape(-1, 3)
+    assert triangles.max() == mesh.count - 1
+    a, b, c = (mesh.at(surface.r0)[triangles[:, k]] for k in range(3))
+    assert (np.einsum("ij,ij->i", np.cross(b - a, c - a), a) >= 0).all()  # all outwards
     fields = {field["name"]: field for field in about["fields"]}
     assert {"w_over_h", "E_1", "E_2", "M_1", "M_2", "couple", "p_mag"} <= fields.keys()
     expected = {"M_1": surface.fields["M_1"], "couple": np.linalg.norm(couple(surface), axis=1)}  # type: ignore[arg-type]

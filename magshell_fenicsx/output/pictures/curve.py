@@ -49,7 +49,7 @@ def curve_figure(rows: Sequence[Row], amplitude: str, style: OutputSection, plac
     from matplotlib.figure import Figure
 
     parts = drawn_parts(rows, amplitude)
-    wide = min(len(parts), 3)
+    wide = min(len(parts), 2)
     high = -(-len(parts) // wide)
     width = (style.width or (ONE if len(parts) == 1 else SEVERAL)) / INCH
     with drawing(style):

@@ -40,6 +40,9 @@ def thinned(surface: Surface, most: int) -> Thinned:
     while len(kept) > most:
         kept, triangles = _joined(r, pieces.triangles, size)
         size *= 1.3
+    outwards, corners = pieces.at(surface.n0)[kept][triangles].sum(axis=1), r[kept][triangles]
+    turned = np.einsum("ij,ij->i", np.cross(*np.moveaxis(corners[:, 1:] - corners[:, :1], 1, 0)), outwards) < 0
+    triangles[turned] = triangles[turned][:, ::-1]  # the image of a half has the other orientation
     return Thinned(pieces, kept, triangles)
 
 

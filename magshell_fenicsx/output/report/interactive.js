@@ -50,6 +50,7 @@
     return {type: "mesh3d", x: each(r, 0), y: each(r, 1), z: each(r, 2), i: corner(0), j: corner(1), k: corner(2),
       intensity: values(), cmin: f.low, cmax: f.high, colorscale: f.low < 0 ? signed : "Viridis",
       colorbar: {title: {text: f.label, side: "right"}, thickness: 12, len: 0.7, exponentformat: "power"}, flatshading: false,
+      lightposition: {x: 1e4 * about.camera[0], y: 1e4 * about.camera[1], z: 1e4 * about.camera[2]},
       lighting: {ambient: 0.85, diffuse: 0.2, specular: 0.03, roughness: 0.9, facenormalsepsilon: 0, vertexnormalsepsilon: 0},
       hovertemplate: "%{intensity:.4g}<extra></extra>"};
   };
@@ -71,7 +72,7 @@
   const scene = box => {
     const most = Math.max(...box.map(b => b[1] - b[0])), d = about.camera, n = Math.hypot(...d);
     const axis = b => ({visible: false, range: b, autorange: false});
-    const ratio = box.map(b => 1.6 * (b[1] - b[0]) / most);
+    const ratio = box.map(b => 1.3 * (b[1] - b[0]) / most);
     return {xaxis: axis(box[0]), yaxis: axis(box[1]), zaxis: axis(box[2]), aspectmode: "manual",
       aspectratio: {x: ratio[0], y: ratio[1], z: ratio[2]}, uirevision: "kept",
       camera: {eye: {x: 1.6 * d[0] / n, y: 1.6 * d[1] / n, z: 1.6 * d[2] / n}, up: {x: 0, y: 0, z: 1}, projection: {type: "orthographic"}}};
