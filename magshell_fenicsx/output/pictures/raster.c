@@ -19,17 +19,19 @@ void rasterise(const double *places, const int32_t *triangles, int64_t count, in
         if (top < 0) top = 0;
         if (right >= width) right = width - 1;
         if (bottom >= height) bottom = height - 1;
-        for (int32_t y = top; y <= bottom; y++)
-            for (int32_t x = left; x <= right; x++) {
-                const double v = ((x - a[0]) * (c[1] - a[1]) - (y - a[1]) * (c[0] - a[0])) / area;
-                const double w = ((b[0] - a[0]) * (y - a[1]) - (b[1] - a[1]) * (x - a[0])) / area;
+        const double over = 1 / area, vx = (c[1] - a[1]) * over, vy = -(c[0] - a[0]) * over;
+        const double wx = -(b[1] - a[1]) * over, wy = (b[0] - a[0]) * over;
+        for (int32_t y = top; y <= bottom; y++) {
+            double v = (left - a[0]) * vx + (y - a[1]) * vy, w = (left - a[0]) * wx + (y - a[1]) * wy;
+            int64_t at = (int64_t)y * width + left;
+            for (int32_t x = left; x <= right; x++, at++, v += vx, w += wx) {
                 if (v < -1e-9 || w < -1e-9 || v + w > 1 + 1e-9) continue;
                 const float z = (float)(a[2] + v * (b[2] - a[2]) + w * (c[2] - a[2]));
-                const int64_t at = (int64_t)y * width + x;
                 if (z > depth[at]) {
                     depth[at] = z, index[at] = (int32_t)t, second[at] = (float)v, third[at] = (float)w;
                 }
             }
+        }
     }
 }
 

@@ -50,8 +50,8 @@
     return {type: "mesh3d", x: each(r, 0), y: each(r, 1), z: each(r, 2), i: corner(0), j: corner(1), k: corner(2),
       intensity: values(), cmin: f.low, cmax: f.high, colorscale: f.low < 0 ? signed : "Viridis",
       colorbar: {title: {text: f.label, side: "right"}, thickness: 12, len: 0.7, exponentformat: "power"}, flatshading: false,
-      lightposition: {x: 1e4 * about.camera[0], y: 1e4 * about.camera[1], z: 1e4 * about.camera[2]},
-      lighting: {ambient: 0.85, diffuse: 0.2, specular: 0.03, roughness: 0.9, facenormalsepsilon: 0, vertexnormalsepsilon: 0},
+      lightposition: {x: -1e4 * about.camera[0], y: -1e4 * about.camera[1], z: -1e4 * about.camera[2]},
+      lighting: {ambient: 0.72, diffuse: 0.28, specular: 0.03, roughness: 0.9, facenormalsepsilon: 0, vertexnormalsepsilon: 0},
       hovertemplate: "%{intensity:.4g}<extra></extra>"};
   };
   const lines = () => {
