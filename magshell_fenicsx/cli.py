@@ -359,5 +359,9 @@ def info(
     print_line(f"{'ranks':18} {world().size}")
     print_line(f"{'kernel cache':18} {kernel_cache()}")
     if compile_:
+        from magshell_fenicsx.output.pictures.view import library
+
+        if not world().rank:
+            library()
         for degree in (3, 4):
             print_line(f"compiled degree {degree} in {precompile(degree):.1f} s")

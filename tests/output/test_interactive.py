@@ -23,6 +23,7 @@ from magshell_fenicsx.output.pictures.thinned import thinned
 from magshell_fenicsx.output.report.browser import opened, report_of
 from magshell_fenicsx.output.report.interactive import chosen_frames, plotly
 from magshell_fenicsx.output.report.report import write_report
+from magshell_fenicsx.output.store.checkpoint import identity, refuse_other
 
 needs_plotly = pytest.mark.skipif(plotly() is None, reason="Plotly is not installed")
 
@@ -165,3 +166,16 @@ def test_options_are_keys_of_the_case(folder: Path) -> None:
         plot(folder, 1, options={"dpi": 5})
     with pytest.raises(CaseError, match=r"E_3: no field with colours; there are w_over_h"):
         plot(folder, 1, options={"ranges": {"E_3": [0.0, 1.0]}})
+
+
+def test_pictures_are_no_part_of_what_is_resumed(tmp_path: Path) -> None:
+    """A run goes on with other pictures; with another mesh it is another run."""
+    shell = {"geometry": "strip", "radius_to_thickness": 50, "width": 0.2, "poisson_ratio": 0}
+    plain: dict[str, Any] = {"shell": shell, "boundary": {"root": "clamped"}}
+    first, other, finer = (
+        ms.Case.from_source(Source("test", plain | more))
+        for more in ({}, {"output": {"dpi": 90}}, {"mesh": {"degree": 3}})
+    )
+    refuse_other(identity(first), other, tmp_path)
+    with pytest.raises(CaseError, match="another run"):
+        refuse_other(identity(first), finer, tmp_path)

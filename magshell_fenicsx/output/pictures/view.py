@@ -93,7 +93,7 @@ class Seen:
         triangles = pieces.triangles
         arrays = np.ascontiguousarray(places), triangles, self._index, self._second, self._third, self._depth
         points, cells, *pixels = (_pointer(array) for array in arrays)
-        _library()[1].rasterise(points, cells, len(triangles), width, height, *pixels)
+        library()[1].rasterise(points, cells, len(triangles), width, height, *pixels)
         self._facing = np.abs(pieces.normals(r) @ camera.axes[2]).astype(np.float32)
 
     @staticmethod
@@ -118,7 +118,7 @@ class Seen:
         image = np.empty((height, width, 4), np.uint8)
         numbers, colours = values.astype(np.float32), table.astype(np.float32)
         before = self._pieces.triangles, self._index, self._second, self._third
-        _library()[1].paint(
+        library()[1].paint(
             *map(_pointer, before),
             *(width, height, FINER, _pointer(numbers), _pointer(self._facing), DARKEST, *limits),
             *(_pointer(colours), len(colours), _pointer(image)),
@@ -139,13 +139,14 @@ class Seen:
 
 
 @cache
-def _library() -> tuple[Any, Any]:
+def library() -> tuple[Any, Any]:
+    """The cffi objects of raster.c, compiled on first use."""
     return native(Path(__file__).with_name("raster.c"), FUNCTIONS, MPI.COMM_SELF)
 
 
 def _pointer(array: NDArray[Any]) -> Any:
     kinds = {"float64": "double[]", "float32": "float[]", "int32": "int32_t[]", "uint8": "uint8_t[]"}
-    return _library()[0].from_buffer(kinds[array.dtype.name], array)
+    return library()[0].from_buffer(kinds[array.dtype.name], array)
 
 
 def axes_on_screen(direction: Array) -> Array:
