@@ -218,9 +218,8 @@ class Case(WithParts):
 
     @model_validator(mode="after")
     def _bodies_fit(self) -> Self:
-        for body in self.bodies.values():
-            if body.at.point is None:
-                self._on_shell(body.at.polar)
+        for body in (body for body in self.bodies.values() if body.at.point is None):
+            self._on_shell(body.at.polar)
         moved = {step.key: step.load.body for step in self.programme if isinstance(step.load, ContactSection)}
         refuse_unfit_bodies(self.bodies, moved, solid=self.model == "solid")
         return self
