@@ -96,8 +96,7 @@ class Case(WithParts):
         section = handler(data)
         if isinstance(data, dict) and not section.shell.with_units:
             parts = {key: data.get(key) for key in ("points", "mesh", *PARTS)}
-            written = data.get("loading")
-            sources = written if isinstance(written, list) else [written]
+            sources = written if isinstance(written := data.get("loading"), list) else [written]
             for step, source in zip(programme(section.loading, field=False), sources, strict=False):
                 if isinstance(step.load, DeadSection | EdgeSection) and isinstance(source, dict):
                     parts[step.key] = {key: value for key, value in source.items() if key != "hold"}
@@ -325,8 +324,9 @@ class Case(WithParts):
         """What is solved besides the case's own keys: the hashes of its mesh file and of its other files."""
         mesh = {"mesh_file": self.shell.digest} if isinstance(self.shell, MeshSurface) else {}
         sections: dict[str, object] = {"magnetic.remanent": self.magnetic.remanent} if self.magnetic else {}
-        sections |= self.imperfections
-        sections |= {f"magnetic.applied.sources.{i}": source for i, source in enumerate(self.sources)}
+        sections |= {
+            f"magnetic.applied.sources.{i}": source for i, source in enumerate(self.sources)
+        } | self.imperfections
         return mesh | {f"{key}.file": s.digest for key, s in sections.items() if isinstance(s, FileKeys) and s.file}
 
     @classmethod
