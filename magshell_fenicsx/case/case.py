@@ -324,7 +324,7 @@ class Case(WithParts):
         """What is solved besides the case's own keys: the hashes of its mesh file and of its other files."""
         mesh = {"mesh_file": self.shell.digest} if isinstance(self.shell, MeshSurface) else {}
         sections: dict[str, object] = {"magnetic.remanent": self.magnetic.remanent} if self.magnetic else {}
-        sections |= {f"magnetic.applied.sources.{i}": s for i, s in enumerate(self.sources)} | self.imperfections
+        sections |= {**self.imperfections, **{f"magnetic.applied.sources.{i}": s for i, s in enumerate(self.sources)}}
         return mesh | {f"{key}.file": s.digest for key, s in sections.items() if isinstance(s, FileKeys) and s.file}
 
     @classmethod
