@@ -7,6 +7,7 @@ import traceback
 from pathlib import Path
 from typing import Annotated, Any
 
+from magshell_fenicsx.cli_pictures import plot, view
 from magshell_fenicsx.ending import STOPPED, exit_codes, failure, print_line, world
 from magshell_fenicsx.platform.completion import case_files, left_to_the_shell
 from magshell_fenicsx.platform.plain import typer
@@ -252,24 +253,8 @@ def compare(
     print_line(f"results in {folder}/")
 
 
-@app.command()
-def plot(
-    folder: Annotated[
-        Path,
-        typer.Argument(metavar="DIR", help="folder of a finished or interrupted run", autocompletion=left_to_the_shell),
-    ],
-    point: Annotated[int | None, typer.Option(metavar="N", help="draw only this point: shell_000N.png, ...")] = None,
-    animation: Annotated[bool, typer.Option("--animation", help="also draw the path: animation.gif")] = False,
-) -> None:
-    """Draw the pictures and write the report of a run again, from its folder."""
-    from magshell_fenicsx.output.pictures.plot import plot as plot_again
-    from magshell_fenicsx.output.pictures.render import NoScreen
-
-    if world().rank:
-        return
-    with exit_codes(stopped=(NoScreen, OSError)):
-        drawn = plot_again(folder, point, animation)
-    print_line(f"{', '.join(drawn)} in {folder}/")
+app.command()(plot)
+app.command()(view)
 
 
 @app.command()
@@ -338,5 +323,9 @@ def info(
     print_line(f"{'ranks':18} {world().size}")
     print_line(f"{'kernel cache':18} {kernel_cache()}")
     if compile_:
+        from magshell_fenicsx.output.pictures.view import library
+
+        if not world().rank:
+            library()
         for degree in (3, 4):
             print_line(f"compiled degree {degree} in {precompile(degree):.1f} s")

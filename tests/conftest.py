@@ -67,7 +67,7 @@ def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def draw_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(import_module("magshell_fenicsx.run.run"), "_draw", lambda folder, say: None)
+    monkeypatch.setattr(import_module("magshell_fenicsx.run.run"), "_draw", lambda folder: None)
 
 
 def random_displacement(model: ShellModel, size: float, seed: int = 0) -> Any:

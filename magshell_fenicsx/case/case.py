@@ -33,6 +33,7 @@ from magshell_fenicsx.case.loads.step import Step
 from magshell_fenicsx.case.mesh import SOLID_DEGREE, MeshSection
 from magshell_fenicsx.case.messages import explain
 from magshell_fenicsx.case.natural import NaturalSection, measured
+from magshell_fenicsx.case.output import OutputSection
 from magshell_fenicsx.case.patches import refuse_strange
 from magshell_fenicsx.case.programme import refuse_unfit_steps
 from magshell_fenicsx.case.shell import ShellSection
@@ -83,6 +84,8 @@ class Case(WithParts):
     """What is random, for `magshell ensemble`"""
     design: DesignSection | None = None
     """What varies and what is wanted, for `magshell design`"""
+    output: OutputSection = OutputSection()
+    """How pictures look"""
     reactions: bool | None = None
     """Forces and moments of every support as columns of path.csv; by default where a support moves"""
     symmetry: Literal["auto", "none", "half", "axisymmetric"] = "auto"
@@ -96,8 +99,7 @@ class Case(WithParts):
         section = handler(data)
         if isinstance(data, dict) and not section.shell.with_units:
             parts = {key: data.get(key) for key in ("points", "mesh", *PARTS)}
-            written = data.get("loading")
-            sources = written if isinstance(written, list) else [written]
+            sources = written if isinstance(written := data.get("loading"), list) else [written]
             for step, source in zip(programme(section.loading, field=False), sources, strict=False):
                 if isinstance(step.load, DeadSection | EdgeSection) and isinstance(source, dict):
                     parts[step.key] = {key: value for key, value in source.items() if key != "hold"}
@@ -218,9 +220,8 @@ class Case(WithParts):
 
     @model_validator(mode="after")
     def _bodies_fit(self) -> Self:
-        for body in self.bodies.values():
-            if body.at.point is None:
-                self._on_shell(body.at.polar)
+        for body in (body for body in self.bodies.values() if body.at.point is None):
+            self._on_shell(body.at.polar)
         moved = {step.key: step.load.body for step in self.programme if isinstance(step.load, ContactSection)}
         refuse_unfit_bodies(self.bodies, moved, solid=self.model == "solid")
         return self

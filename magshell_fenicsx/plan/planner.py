@@ -34,12 +34,13 @@ from magshell_fenicsx.plan.imperfections.rims import MOST_RIMS, Spot, different,
 from magshell_fenicsx.plan.imperfections.symmetry import leaves
 from magshell_fenicsx.plan.limits import refuse_too_many, refuse_unbounded_fields, sources_beside
 from magshell_fenicsx.plan.loads import indented, loads, potentials, refuse_wide_patch
+from magshell_fenicsx.plan.magnetisation import magnetisation
 from magshell_fenicsx.plan.names import refuse_unfit_ends
 from magshell_fenicsx.plan.outline import Chart, Outline, outline, refuse_beside
 from magshell_fenicsx.plan.own_terms import surface_terms
 from magshell_fenicsx.plan.plan import Plan
 from magshell_fenicsx.plan.sizes import Loaded, grading, travel
-from magshell_fenicsx.plan.symmetry import Leaves, askew, left, mirror, unmirrored
+from magshell_fenicsx.plan.symmetry import Leaves, askew, field_fits, left, mirror, unmirrored
 
 Array = NDArray[np.float64]
 Points = dict[str, Array]
@@ -115,6 +116,9 @@ def make_plan(case: Case, terms: Sequence[OwnTerm] = ()) -> Plan:
     within = {name: in_frame(found[key].inside, turn) for name, key in case.dimples.items()}
     grown = {name: tuple(in_frame(f.deviation, turn) for f in each.values()) for name, each in growing.items()}
     all_loads = replace(loads(case, under, turn, beyond, energies, within), contacts=bodies, growing=grown)
+    magnetic = case.magnetic
+    if magnetic and not all_loads.magnetic and field_fits(case, drawn, plane, axisymmetric=axisymmetric):
+        all_loads = replace(all_loads, remanence=magnetisation(magnetic, case, turn, within))
     if span:
         refuse_unfit_ends([name for name in span.names if name], points, conditions, all_loads)
     model = "meridian" if axisymmetric else f"{'half' if half else 'full'} {case.model}"

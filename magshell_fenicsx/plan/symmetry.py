@@ -77,6 +77,12 @@ def left(case: Case, outline: Outline, indented: Mapping[str, Array], terms: Seq
     ]
 
 
+def field_fits(case: Case, outline: Outline, plane: Mirror | None, *, axisymmetric: bool) -> bool:
+    """Whether a reduced model shows the remanence as it is, where without a field it does not reduce the model."""
+    (part,) = _field(case, outline)
+    return (part.askew is None or not axisymmetric) and (plane is None or part.mirrors(plane))
+
+
 def common_azimuth(vectors: Vectors) -> float | None:
     """Azimuth (rad) of the plane through e3 that holds all vectors; None if there is none.
 

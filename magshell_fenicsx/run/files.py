@@ -26,7 +26,7 @@ from magshell_fenicsx.simulate.scene import Scene
 DRAWN = (*PICTURES, "curve", "instabilities", "modes", "frequencies", "solutions", "gradients")
 LAST_FILES = (
     *("summary.json", "report.html", "stability.csv", "frequencies.csv", "animation.gif"),
-    *(f"{name}{end}.png" for name in DRAWN for end in ("", "_[0-9]*")),
+    *(f"{name}{end}.{kind}" for name in DRAWN for end in ("", "_[0-9]*") for kind in ("png", "svg", "pdf")),
 )
 MESH = "mesh.json"  # the mesh chosen for a tolerance
 COMPARED = ("p_over_pc", "lambda_m", "force", "w_over_h", "w_pole_over_h")

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Literal
 
 from magshell_fenicsx.output.fields.gathering import gatherer
 from magshell_fenicsx.output.fields.surface import Surface, completed, turned
-from magshell_fenicsx.output.pictures.captions import caption
+from magshell_fenicsx.output.fields.vtu import unstructured_grid
+from magshell_fenicsx.output.pictures.camera import run_camera
 from magshell_fenicsx.output.pictures.curve import curve_figure
 from magshell_fenicsx.output.pictures.layout import png
 from magshell_fenicsx.output.pictures.picture import figures
-from magshell_fenicsx.output.pictures.render import smooth_surface
-from magshell_fenicsx.output.store.table import Row
+from magshell_fenicsx.output.store.known import pole_of
 from magshell_fenicsx.run.rows import rows
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.scene import Scene
@@ -43,7 +43,7 @@ def polydata(scene: Scene, record: Record) -> "pyvista.PolyData | None":
     `plot(scalars="w_over_h")` shows it.
     """
     found = surface(scene, record)
-    return smooth_surface(found, scene.plan.material.h) if found else None
+    return _smooth(found, scene.plan.material.h) if found else None
 
 
 def picture(
@@ -51,29 +51,33 @@ def picture(
     record: Record,
     of: Literal["shell", "strains", "moments", "fields", "magnetic_loads"] = "shell",
 ) -> "Figure | None":
-    """One picture of a run, as in shell.png, strains.png, ...; None also if the scene has no such fields.
-
-    Raises
-    ------
-    NoScreen
-        If there is no display.
-    """
-    found, (row,) = surface(scene, record), rows(scene, [record])
+    """One picture of a run, as in shell.png, strains.png, ...; None also if the scene has no such fields."""
+    found = surface(scene, record)
     if found is None:
         return None
-    drawn = figures(found, scene.plan.material.h, _caption(scene, row), [of])
+    style = scene.case.output
+    drawn = figures(found, scene.plan.material.h, style, run_camera(found, style), [of])
     return _in_line(drawn[of]) if drawn else None
 
 
 def curve(scene: Scene, records: Sequence[Record], amplitude: str | None = None) -> "Figure":
     """The curve of the path, as in curve.png; by default for the amplitude that varied last."""
-    found = rows(scene, records)
-    return _in_line(curve_figure(found, amplitude or records[-1].amplitude, _caption(scene, found[-1])))
+    found, place = rows(scene, records), pole_of({"shell": scene.case.shell.model_dump(mode="json")})
+    return _in_line(curve_figure(found, amplitude or records[-1].amplitude, scene.case.output, place))
 
 
-def _caption(scene: Scene, row: Row) -> str:
-    material = scene.plan.material
-    return caption(material.h, material.nu, row, [term.name for term in scene.plan.own])
+def _smooth(surface: Surface, h: float) -> "pyvista.PolyData":
+    """Flat triangles with normals; curved triangles are divided."""
+    import pyvista
+    from vtkmodules.vtkFiltersGeometry import vtkDataSetSurfaceFilter
+
+    divided = vtkDataSetSurfaceFilter()
+    divided.SetInputData(unstructured_grid(surface, h))
+    divided.SetNonlinearSubdivisionLevel(2)
+    divided.Update()
+    smooth = pyvista.PolyData(divided.GetOutput())
+    body = surface.is_body  # its edges stay sharp
+    return smooth.compute_normals(cell_normals=False, split_vertices=body, feature_angle=60.0, consistent_normals=False)
 
 
 def _in_line(figure: "Figure") -> "Figure":

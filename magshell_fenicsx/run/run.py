@@ -16,7 +16,6 @@ from magshell_fenicsx.continuation.inverse import NoEigenpair
 from magshell_fenicsx.continuation.journal import NoJournal
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.shell.own_term import OwnTerm
-from magshell_fenicsx.output.pictures.render import NoScreen
 from magshell_fenicsx.output.report.report import write_report
 from magshell_fenicsx.output.store.durable import write_whole
 from magshell_fenicsx.output.store.folder import DiskError, by_first, held_folder
@@ -158,9 +157,9 @@ def _run(
                         frequencies_after(result, folder, say)
                         gradients_after(result, folder, say)
                         if pictures:
-                            by_first(comm, partial(_draw, folder, say))
+                            by_first(comm, partial(_draw, folder))
                     files.summarise(summary(result, time.perf_counter() - start))  # with the time of the pictures
-                by_first(comm, partial(write_report, folder))
+                by_first(comm, partial(write_report, folder, playable=pictures and not interrupted))
             except DiskError as e:
                 interrupted = interrupted or e
             files.close(complete=not interrupted and not result.stopped)
@@ -170,14 +169,11 @@ def _run(
     return result
 
 
-def _draw(folder: Path, say: Say) -> None:
-    """Draw the pictures of the folder; warn if there is no display."""
+def _draw(folder: Path) -> None:
+    """Draw the pictures of the folder."""
     from magshell_fenicsx.output.pictures.plot import draw
 
-    try:
-        draw(folder)
-    except NoScreen as e:
-        say(f"warning: no pictures: {e}")
+    draw(folder)
 
 
 def _mesh_for_tolerance(case: Case, folder: Path | None, comm: MPI.Comm, say: Say, doing: Say) -> Adapted | None:

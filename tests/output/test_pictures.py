@@ -1,28 +1,41 @@
 """Views of a shell: where its axes and its colours are."""
 
 import io
-import os
-import shutil
+import re
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
 
+import basix
 import matplotlib.image
 import numpy as np
 import pytest
+from dolfinx.cpp.io import perm_vtk
+from dolfinx.mesh import CellType
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from magshell_fenicsx.case.output import OutputSection
 from magshell_fenicsx.output.fields.surface import Surface, completed
 from magshell_fenicsx.output.fields.vtu import About, FieldSeries, point_file, read_vtu
+from magshell_fenicsx.output.pictures.arrows import _spread, drawn_arrows
+from magshell_fenicsx.output.pictures.bars import SIGNED, colour_map
+from magshell_fenicsx.output.pictures.camera import towards
 from magshell_fenicsx.output.pictures.captions import caption
+from magshell_fenicsx.output.pictures.colours import loads, strains
 from magshell_fenicsx.output.pictures.curve import curve_figure
-from magshell_fenicsx.output.pictures.layout import png
-from magshell_fenicsx.output.pictures.picture import PICTURES, _spread, figures, towards
-from magshell_fenicsx.output.pictures.render import MARGIN, View, axes_on_screen, rendered, screen, smooth_surface
+from magshell_fenicsx.output.pictures.layout import png, written
+from magshell_fenicsx.output.pictures.picture import PICTURES, figures
+from magshell_fenicsx.output.pictures.tessellation import tessellated
+from magshell_fenicsx.output.pictures.view import Camera, Seen, Window, axes_on_screen
+from magshell_fenicsx.output.store.known import pole_of
 from magshell_fenicsx.output.store.table import Row
 
 Array = NDArray[np.float64]
-on_a_screen = pytest.mark.skipif(shutil.which("Xvfb") is None, reason="no screen to draw on")
+STYLE = OutputSection()
 SQUARE = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
-ABOVE = np.array([0.0, -1e-3, 1.0])
+ABOVE = np.array([0.0, -1e-6, 1.0])
 
 
 def plate(w: float) -> Surface:
@@ -43,55 +56,159 @@ def test_a_place_is_seen_from_its_side() -> None:
         assert towards(place) @ place > 3 * np.linalg.norm(place)
 
 
-@on_a_screen
-def test_views_have_their_colours_and_no_white_around() -> None:
-    """The last colour of the map is a red, the first a blue; sizes are those of each view."""
-    smooth = smooth_surface(plate(0.0), 1.0)
-    views = [
-        View(smooth, np.full(4, value), (-1.0, 1.0), "RdBu_r", ABOVE, size) for value, size in ((1, 300), (-1, 500))
-    ]
-    red, blue = rendered(views)
-    for image in (red, blue):
-        assert (image[0] == 255).all()
-        assert (image[:, 0] == 255).all()
-        assert (image[MARGIN + 5, MARGIN + 5] < 200).any()
-    centre = [image[image.shape[0] // 2, image.shape[1] // 2].astype(int) for image in (red, blue)]
-    assert centre[0][0] > centre[0][2] + 50
-    assert centre[1][2] > centre[1][0] + 50
-    assert len(blue) / len(red) == pytest.approx(500 / 300, rel=0.1)
+def seen(surface: Surface, width: int = 300) -> Seen:
+    camera = Camera(ABOVE)
+    return Seen.of(surface, camera, Window.around(camera(surface.r0), width))
 
 
-@on_a_screen
-def test_a_display_that_is_gone_is_not_drawn_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As one that a closed ssh -X has left; VTK would end the process."""
-    monkeypatch.setenv("DISPLAY", ":7654")
-    with screen():
-        assert os.environ["DISPLAY"] != ":7654"
-    assert os.environ["DISPLAY"] == ":7654"
+def test_colours_are_those_of_the_bar_and_zero_is_white() -> None:
+    """Of a plate that faces the eye, pixel by pixel; what is not the plate is transparent."""
+    colours = colour_map(SIGNED)
+    for value, expected in ((0.0, (255, 255, 255)), (1.0, np.rint(255 * np.array(colours(256)[:3])))):
+        image = seen(plate(0.0)).coloured(np.full(4, value), (-1.0, 1.0), colours)
+        assert image[150, 150, :3] == pytest.approx(expected, abs=1)
+        assert image[150, 150, 3] == 255
+        assert (image[0, :, 3] == 0).all()
+    assert colours(128)[:3] == (1.0, 1.0, 1.0)
 
 
-@on_a_screen
+def test_shade_has_no_hue() -> None:
+    """A plate seen at 60 degrees is grey where its value is zero: light does not change ratios of colours."""
+    camera = Camera(np.array([0.0, -np.sin(np.pi / 3), np.cos(np.pi / 3)]))
+    image = Seen.of(plate(0.0), camera, Window.around(camera(SQUARE), 300)).coloured(
+        np.zeros(4), (-1.0, 1.0), colour_map(SIGNED)
+    )
+    red, green, blue, opaque = image[image.shape[0] // 2, 150]
+    assert red == green == blue == round(255 * (1 - 0.45 * 0.25))
+    assert opaque == 255
+
+
+def test_what_is_in_front_hides_what_is_behind() -> None:
+    """Two squares, one above the other, and linear values between nodes, as an independent formula has them."""
+    low, high = plate(0.0), plate(-0.5)  # -w is up
+    half = replace(high, r0=high.r0 * [0.5, 0.5, 1.0])
+    both = Surface(
+        *(np.concatenate([getattr(low, name), getattr(half, name)]) for name in ("r0", "u", "n0")),
+        np.concatenate([low.cells, low.cells + 4]),
+        {},
+    )
+    view = seen(both)
+    image = view.coloured(np.array([0.0, 1, 1, 0, 1, 1, 1, 1]), (0.0, 1.0), colour_map("gray"))
+    assert (image[150, 150, :3] == 255).all()  # the upper one
+    left = view.window.box[0]
+    for x in (20, 60, 250):
+        place = left + (x + 0.5) / view.window.scale
+        assert image[150, x, 0] == pytest.approx(255 * (place + 1) / 2, abs=2)
+    assert view.shows(np.array([[0, 0, 0.5], [0, 0, 0.0], [0.9, 0, 0]]), 0.01).tolist() == [True, False, True]
+
+
+def test_curved_cells_are_smooth() -> None:
+    """A quarter of a circular arc in one cubic hexahedral face, and a quadratic triangle: normals of the true shape."""
+    nodes = np.array([[0, 0, 0], [2, 0, 0], [0, 2, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], float)  # VTK: corners, edges
+    bent = nodes + np.column_stack([0 * nodes[:, 0], 0 * nodes[:, 0], nodes[:, 0] ** 2 / 4])
+    surface = Surface(bent, 0 * bent, np.tile([0.0, 0, 1], (6, 1)), np.arange(6)[None], {})
+    pieces = tessellated(surface)
+    r, n = pieces.at(bent), pieces.normals(bent)
+    assert r[:, 2] == pytest.approx(r[:, 0] ** 2 / 4)
+    slope = np.column_stack([-r[:, 0] / 2, 0 * r[:, 0], 1 + 0 * r[:, 0]])
+    assert np.abs(np.einsum("ij,ij->i", n, slope)) == pytest.approx(np.linalg.norm(slope, axis=1))
+
+
+def test_a_body_has_its_outer_faces_only() -> None:
+    """Two cubes beside each other: ten faces."""
+    at = np.array(np.meshgrid([0, 0.5, 1], [0, 0.5, 1], [0, 0.5, 1], indexing="ij")).reshape(3, -1).T
+    element = basix.create_element(
+        basix.ElementFamily.P, basix.CellType.hexahedron, 2, basix.LagrangeVariant.equispaced
+    )
+    first = element.points[np.argsort(perm_vtk(CellType.hexahedron, 27))]
+    r = np.unique(np.concatenate([at, at + np.array([1, 0, 0])]), axis=0)
+    ours = [first + np.array([k, 0, 0]) for k in (0, 1)]
+    cells = [[int(np.flatnonzero((r == p).all(axis=1))[0]) for p in cube] for cube in ours]
+    body = Surface(r, 0 * r, np.tile([0.0, 0, 1], (len(r), 1)), np.array(cells), {})
+    pieces = tessellated(body, 20)
+    a, b, c = np.moveaxis(pieces.at(r)[pieces.triangles], 1, 0)
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    assert len(pieces.nodes) == 10
+    assert area.sum() / 2 == pytest.approx(10)
+
+
+def drawn(surface: Surface, *names: str, **style: Any) -> dict[str, Figure]:
+    return figures(surface, 0.01, OutputSection(**style), Camera(ABOVE), names)
+
+
 def test_what_there_is_is_drawn() -> None:
     surface = plate(0.1)
-    assert list(figures(surface, 0.01, "title")) == ["shell"]
+    assert list(drawn(surface)) == ["shell"]
     surface.fields["p_mag"] = np.arange(4.0)
     surface.fields.update(dict.fromkeys(("E_1", "E_2", "M_1", "M_2"), np.arange(4.0)))
     surface.fields.update({"Br": np.eye(4)[:, :3], "Ba": np.zeros((4, 3))})
-    drawn = figures(surface, 0.01, "title")
-    assert list(drawn) == [name for name in PICTURES if name != "contact"]
-    height, width = matplotlib.image.imread(io.BytesIO(png(drawn["moments"]))).shape[:2]
-    assert width > 600
-    assert height > 300
-    assert list(figures(surface, 0.01, "title", ["strains"])) == ["strains"]
-    said = [text.get_text() for text in drawn["fields"].texts]
+    found = drawn(surface)
+    assert list(found) == [name for name in PICTURES if name not in ("contact", "magnetic_loads")]
+    assert list(drawn(surface, "strains")) == ["strains"]
+    said = [text.get_text() for text in found["fields"].texts]
     assert any("remanence" in text for text in said)
     assert not any("applied" in text for text in said)  # a field of length zero
+
+
+def test_sizes_and_formats() -> None:
+    """Millimetres at so many pixels per inch; svg and pdf are valid, with text as text."""
+    style = OutputSection(width=60, dpi=150, font_size=7, formats=["svg", "pdf"])
+    figure = figures(plate(0.1), 0.01, style, Camera(ABOVE), ["shell"])["shell"]
+    files = dict(written(figure, style, "shell"))
+    assert list(files) == ["shell.png", "shell.svg", "shell.pdf"]
+    assert matplotlib.image.imread(io.BytesIO(files["shell.png"])).shape[1] == pytest.approx(60 / 25.4 * 150, abs=2)
+    svg = ElementTree.fromstring(files["shell.svg"])
+    texts = ["".join(each.itertext()).strip() for each in svg.iter("{http://www.w3.org/2000/svg}text")]
+    assert "−10" in texts
+    letters = {"".join(sorted(re.sub(r"\s", "", text))) for text in texts}  # mathematics has its own order
+    assert "".join(sorted("inwardnormaldisplacementw/h")) in letters
+    assert len(list(svg.iter("{http://www.w3.org/2000/svg}image"))) >= 1
+    assert files["shell.pdf"].startswith(b"%PDF-")
+    assert files["shell.pdf"].rstrip().endswith(b"%%EOF")
+    assert b"/Type42" in files["shell.pdf"] or b"/CIDFontType2" in files["shell.pdf"]  # fonts, no outlines
+
+
+def test_ranges_of_colours() -> None:
+    """Those asked for; the bar's ends are pointed where values lie beyond them."""
+    bars = [drawn(plate(0.1), "shell", ranges=ranges)["shell"].axes[1] for ranges in ({}, {"w_over_h": [0.0, 2.0]})]
+    assert [tuple(bar.get_xlim()) for bar in bars] == [(-10.0, 10.0), (0.0, 2.0)]
+
+
+def test_opposite_fields_are_opposite_arrows() -> None:
+    """Side by side: their feet are beside the same place, their vectors opposite."""
+    surface = plate(0.0)
+    surface.fields.update({"Br": np.tile([1.0, 0, 0], (4, 1)), "Ba": np.tile([-2.0, 0, 0], (4, 1))})
+    first, second = drawn_arrows(surface, Camera(ABOVE), lambda r: np.ones(len(r), bool))
+    assert first.vectors == pytest.approx(-second.vectors)
+    middle = (first.feet + second.feet) / 2
+    places = Camera(ABOVE)(SQUARE)
+    assert sorted(map(tuple, np.round(middle[:, :2], 6))) == sorted(map(tuple, np.round(places[:, :2], 6)))
+    across = first.feet - second.feet
+    assert np.abs(across[:, 0]).max() < 1e-9
+    assert (np.abs(across[:, 1]) > 0.01).all()
+
+
+def test_magnetic_loads_tell_what_is_zero() -> None:
+    """In-plane remanence in a normal field: a couple of size one, all else is rounding and is said to be zero."""
+    surface = plate(0.0)
+    surface.fields.update({"Br": np.tile([1.0, 0, 0], (4, 1)), "Ba": np.tile([0, 0, -3e-4], (4, 1))})
+    surface.fields.update({"p_mag": 1e-17 * np.arange(4), "k": 1e-16 * np.arange(4), "tau": 1e-18 * np.ones((4, 3))})
+    (layer,), note = loads(surface, 0.01)
+    assert layer.name == "couple"
+    assert layer.values == pytest.approx(np.ones(4))
+    assert layer.limits == pytest.approx((0, 1))
+    assert note == (
+        "Zero everywhere: magnetic pressure, rotational springs, torque of gradients. "
+        "Not defined for this remanence or field: in-plane force."
+    )
+    surface.fields["k"] = np.array([0.0, -0.5, 0.2, 0])
+    assert loads(surface, 0.01)[0][1].limits == (-0.5, 0.5)
 
 
 def limits(E_1: Array, E_2: Array) -> tuple[float, float]:
     surface = plate(0.0)
     surface.fields.update({"E_1": E_1, "E_2": E_2})
-    first, second = PICTURES["strains"].views(surface, smooth_surface(surface, 1.0), 1.0)
+    first, second = strains(surface)
     assert first.limits == second.limits
     return first.limits
 
@@ -124,6 +241,7 @@ def test_captions_tell_the_load() -> None:
 def test_names_are_no_mathematics() -> None:
     """A point's name is drawn as it is written; as mathematics this one would end a run with a traceback."""
     row: Row = {
+        "point": 0,
         "label": "field",
         "amplitude": "lambda_m",
         "mode": "",
@@ -131,17 +249,54 @@ def test_names_are_no_mathematics() -> None:
         "negative_pivots": 0,
         "A$x_y^$_ux": 0.0,
     }
-    figure = curve_figure([row | {"lambda_m": x, "w_pole_over_h": x} for x in (0.0, 1.0)], "lambda_m", "")
+    figure = curve_figure([row | {"lambda_m": x, "w_pole_over_h": x} for x in (0.0, 1.0)], "lambda_m", STYLE)
     png(figure)
     assert figure.axes[0].get_xlabel() == r"displacement of A\$x_y^\$  $w/h$"
 
 
 def test_moments_have_no_displacement_of_their_own() -> None:
     """Their w_over_h is that of the first named point, and so says the curve."""
-    row: Row = {"label": "step", "amplitude": "load", "mode": "", "branch": 0, "negative_pivots": 0, "A_ux": 0.0}
+    row: Row = {
+        "point": 0,
+        "label": "step",
+        "amplitude": "load",
+        "mode": "",
+        "branch": 0,
+        "negative_pivots": 0,
+        "A_ux": 0.0,
+    }
     for pole, said in ((1.0, "displacement of A  $w/h$"), (0.5, "displacement along the loads  $w/h$")):
         path = [row | {"load_factor": x, "w_over_h": x, "w_pole_over_h": pole * x} for x in (0.0, 1.0)]
-        assert curve_figure(path, "load", "").axes[0].get_xlabel() == said
+        assert curve_figure(path, "load", STYLE).axes[0].get_xlabel() == said
+
+
+def test_instabilities_are_numbered_along_the_whole_path() -> None:
+    """On the curve of the last step too; the legend is above the axes, and nothing is cut off."""
+    row: Row = {"amplitude": "pressure", "mode": "", "branch": 0, "negative_pivots": 0, "p_over_pc": 0.0}
+    labels = ["start", "fold", "field", "step", "bifurcation", "target"]
+    path = [row | {"point": i, "label": label, "volume_change": -0.1 * i} for i, label in enumerate(labels)]
+    figure = curve_figure([each | {"amplitude": "lambda_m"} for each in path[:3]] + path[3:], "pressure", STYLE)
+    axes = figure.axes[0]
+    assert [text.get_text() for text in axes.texts] == ["2"]
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["bifurcation"]
+    figure.draw_without_rendering()
+    assert figure.legends[0].get_window_extent().y0 >= axes.get_window_extent().y1
+    whole = figure.get_tightbbox()
+    assert whole.x0 >= 0
+    assert whole.y0 >= 0
+    assert whole.x1 <= figure.get_figwidth()
+    assert whole.y1 <= figure.get_figheight()
+
+
+HOLE = {"geometry": "cap", "hole": 5}
+
+
+@pytest.mark.parametrize(("shape", "said"), [({"geometry": "strip"}, "the tip"), (HOLE, "the watched point")])
+def test_there_is_a_pole_only_where_there_is_one(shape: dict[str, Any], said: str) -> None:
+    row: Row = {"point": 0, "label": "field", "amplitude": "lambda_m", "mode": "", "branch": 0, "negative_pivots": 0}
+    path = [row | {"lambda_m": x, "w_pole_over_h": x} for x in (0.0, 1.0)]
+    label = curve_figure(path, "lambda_m", STYLE, pole_of({"shell": shape})).axes[0].get_xlabel()
+    assert label == f"displacement of {said}  $w/h$"
 
 
 def test_fields_are_read_as_they_were_written(tmp_path: Path) -> None:

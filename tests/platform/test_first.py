@@ -15,7 +15,6 @@ from mpi4py import MPI
 
 import magshell_fenicsx as ms
 from magshell_fenicsx.mesh.patch import MeshError
-from magshell_fenicsx.output.pictures.render import NoScreen
 from magshell_fenicsx.output.store.checkpoint import Checkpoint
 from magshell_fenicsx.output.store.folder import DiskError, by_first, prepare_folder
 from magshell_fenicsx.plan.plan import Plan
@@ -122,12 +121,9 @@ def test_every_rank_gets_what_the_first_does(tmp_path: Path, ranks: int) -> None
     assert done.stdout.count("done") == ranks
 
 
-def test_only_a_missing_screen_is_a_warning(tmp_path: Path) -> None:
-    """Anything else in the pictures is a bug, told when all numbers are on disk."""
-    case, said = ms.Case.load(PLATE), list[str]()
-    with patch("magshell_fenicsx.output.pictures.plot.draw", failing(NoScreen("no display"))):
-        ms.run(case, tmp_path, say=said.append)
-    assert "warning: no pictures: no display" in said
+def test_a_bug_in_pictures_is_told_at_the_end(tmp_path: Path) -> None:
+    """When all numbers are on disk."""
+    case = ms.Case.load(PLATE)
     with (
         patch("magshell_fenicsx.output.pictures.plot.draw", failing(RuntimeError("a bug"))),
         pytest.raises(RuntimeError, match="bug"),

@@ -80,14 +80,7 @@ class Revolution:
         weight
             (cells, 2) of a cell's value in the mean over the two that meet.
         """
-        weight = weight.reshape(*weight.shape, *(1,) * (ends.ndim - 2))
-
-        def sums(values: Array) -> Array:
-            total: Array = np.concatenate([values[:, 0], values[-1:, 1]])
-            total[1:-1] += values[:-1, 1]
-            return total
-
-        at = sums(weight * ends) / sums(weight)
+        at = _means(ends, weight)
         circles = at[self._first :, None]
         if at.ndim == 1:
             circles = np.repeat(circles, len(self._basis), axis=1)
@@ -96,6 +89,11 @@ class Revolution:
         else:
             circles = np.swapaxes(self._basis, 1, 2) @ circles @ self._basis
         return np.concatenate([at[: self._first], circles.reshape(-1, *at.shape[1:])])
+
+    def continuous(self, ends: Array, weight: Array) -> Array:
+        """The same means at the ends of all cells, (cells, 2, ...)."""
+        at = _means(ends, weight)
+        return np.stack([at[:-1], at[1:]], axis=1)
 
     def _turned(self, nodal: Array) -> Array:
         """(rho, z) components at the meridian's nodes -> vectors at the pole and on the circles."""
@@ -113,3 +111,15 @@ class Revolution:
         a, b, c, d = inner + here, inner + there, inner + sectors + here, inner + sectors + there
         bands = [np.stack(corners, axis=-1).reshape(-1, 3) for corners in ((a, c, d), (a, d, b))]
         return np.concatenate([cap, *bands])
+
+
+def _means(ends: Array, weight: Array) -> Array:
+    """The weighted mean of the two cells that meet at each vertex, of values (cells, 2, ...) at their ends."""
+    weight = weight.reshape(*weight.shape, *(1,) * (ends.ndim - 2))
+
+    def sums(values: Array) -> Array:
+        total: Array = np.concatenate([values[:, 0], values[-1:, 1]])
+        total[1:-1] += values[:-1, 1]
+        return total
+
+    return np.asarray(sums(weight * ends) / sums(weight))

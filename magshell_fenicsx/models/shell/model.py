@@ -106,11 +106,12 @@ class ShellModel(Observed):
         mirror: Mirror = Y0,
     ) -> None:
         refuse_unknown(midsurface.edges, midsurface.points, midsurface.patches, conditions, loads)
-        if loads.magnetic and loads.magnetic.patches:
-            topology = midsurface.mesh.topology.index_map(2)
-            cells = topology.size_local + topology.num_ghosts
-            remanent = by_patch(loads.magnetic.patches, midsurface.patches, cells)
-            loads = replace(loads, magnetic=replace(loads.magnetic, remanent=remanent))
+        for name in ("magnetic", "remanence"):
+            if (field := getattr(loads, name)) and field.patches:
+                topology = midsurface.mesh.topology.index_map(2)
+                cells = topology.size_local + topology.num_ghosts
+                remanent = by_patch(field.patches, midsurface.patches, cells)
+                loads = replace(loads, **{name: replace(field, remanent=remanent)})
         self.midsurface, self.material, self.degree, self.loads = midsurface, material, degree, loads
         self.load_size = {}
         self.multiplicity = 2 if "symmetry" in conditions.values() else 1

@@ -178,6 +178,8 @@ class Loads:
         Amplitude -> the force, or the dead loads that grow together.
     growing
         Amplitude -> imperfections that grow.
+    remanence
+        What is magnetised where no field is applied: it loads nothing, and is drawn.
     """
 
     pressure: bool = False
@@ -189,6 +191,7 @@ class Loads:
     moves: tuple[Move, ...] = ()
     contacts: tuple[Contact, ...] = ()
     growing: Mapping[str, tuple[Deviation, ...]] = field(default_factory=dict)
+    remanence: Magnetisation | None = None
 
     @property
     def all_dead(self) -> tuple[DeadLoad, ...]:

@@ -1,5 +1,6 @@
 """The outlines of sources of the applied field and of bodies, for pictures and for ParaView."""
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -10,6 +11,7 @@ from magshell_fenicsx.models.shell.driven import carried
 from magshell_fenicsx.models.shell.parameters import Loads
 
 Array = NDArray[np.float64]
+ARRAY = re.compile(r'Name="(\w+)" [^>]*>([^<]*)</DataArray>')  # in the files of `vtp_content`
 STILL, DRIVEN = "outlines.vtp", "outlines_{:04d}.vtp"  # of all points, or of each
 
 
@@ -56,7 +58,6 @@ def read_outlines(folder: Path, number: int) -> tuple[Array, ...]:
     file = file if file.exists() else folder / STILL
     if not file.exists():
         return ()
-    import pyvista
-
-    data = pyvista.read(file)
-    return tuple(np.asarray(cell.points, dtype=float) for cell in data.cell)
+    parts = {name: text.split() for name, text in ARRAY.findall(file.read_text(encoding="utf-8"))}
+    ends = np.array(parts["offsets"], dtype=int)
+    return tuple(np.split(np.array(parts["Points"], dtype=float).reshape(-1, 3), ends[:-1]))

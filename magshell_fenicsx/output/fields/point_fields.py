@@ -27,6 +27,8 @@ class PointFields:
         (cells, points) factor of h; None for 1.
     contacts
         Bodies that press.
+    remanence
+        What is magnetised if there is no field.
 
     Attributes
     ----------
@@ -45,6 +47,7 @@ class PointFields:
         thickness: Array | None,
         natural: Natural | None = None,
         contacts: Sequence[Contact] = (),
+        remanence: Magnetisation | None = None,
     ) -> None:
         self._contacts, self._h = contacts, material.h
         self._frame, self._nu, self._field, self._thickness = TangentFrame.of(r0), material.nu, field, thickness
@@ -52,8 +55,9 @@ class PointFields:
         self.constant: dict[str, Array] = {}
         self._torque: Torque | None = None
         self.n0, self.weight = self._frame.n0, self._frame.area
-        if field:
-            pattern = field.remanent
+        self._carried = field or remanence
+        if self._carried:
+            pattern = self._carried.remanent
             self._Br = pattern(r0[0], self.n0) if callable(pattern) else np.broadcast_to(pattern, r0[0].shape)
         if field and field.uniform:
             h = material.h if thickness is None else material.h * thickness
@@ -91,9 +95,11 @@ class PointFields:
         found = {"E": frame.tensor(E), "M": frame.tensor(M), **total}
         found["E_1"], found["E_2"] = principal(E)
         found["M_1"], found["M_2"] = principal(M)
+        if self._carried:
+            carried = frame.convected if self._carried.law == "deformation" else frame.rotated
+            found["Br"] = carried(self._Br, u)
         if self._field:
-            carried = frame.convected if self._field.law == "deformation" else frame.rotated
-            found |= {"Br": carried(self._Br, u), "Ba": _applied(self._field, mu, frame.jet[0] + u[0])}
+            found["Ba"] = _applied(self._field, mu, frame.jet[0] + u[0])
         if self._torque:
             found["tau"] = self._torque(np.moveaxis(u[1:3], 0, -2))
         if self._contacts:

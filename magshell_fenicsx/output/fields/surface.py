@@ -18,12 +18,15 @@ from magshell_fenicsx.mesh.frame import rotation
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.axisymmetric.revolution import Revolution
 from magshell_fenicsx.models.shell.model import ShellModel
+from magshell_fenicsx.output.fields.jump import relative_jump
 from magshell_fenicsx.output.fields.point_fields import PointFields
 
 TRIANGLE, LAGRANGE_TRIANGLE, LAGRANGE_HEXAHEDRON = 5, 69, 72  # VTK's numbers of cell types
 HEXAHEDRON_NODES = 27
 PRESSURE = "contact_pressure"  # of bodies, over E h/R: the mean over a cell
 W0 = "w0_over_h"  # the imperfections: the deviation of the drawn surface from the perfect one
+BOTH_WAYS = {"Br", "Ba"}  # a half shell's fields may be symmetric or antisymmetric to its plane
+ON_PLANE = 1e-9  # over R
 Array = NDArray[np.float64]
 
 
@@ -42,6 +45,8 @@ class Surface:
         imperfections; of a solid that alone.
     outlines
         Places (n, 3) along lines: the sources of the applied field.
+    jump
+        By how much the bending moments jump between cells, over their size; see `jump`. None of a solid.
     """
 
     r0: Array
@@ -50,6 +55,7 @@ class Surface:
     cells: NDArray[np.int64]
     fields: dict[str, Array]
     outlines: tuple[Array, ...] = ()
+    jump: float | None = None
 
     @property
     def is_body(self) -> bool:
@@ -89,7 +95,8 @@ class SurfaceGatherer:
         model, loads = self._model, self._model.loads
         r = self._at_nodes(model.r0)
         factor = None if model.thickness is None else self._thickness(model.thickness)
-        self._fields = PointFields(r, model.material, loads.magnetic, factor, loads.natural, loads.contacts)
+        others = loads.natural, loads.contacts, loads.remanence
+        self._fields = PointFields(r, model.material, loads.magnetic, factor, *others)
         self._mean = self._weighted_mean(self._numbers, self._size)
         deviation = model.midsurface.deviation(self._places, grown(loads.growing, mu))
         if deviation is not None:
@@ -110,8 +117,18 @@ class SurfaceGatherer:
         if pressure is not None:
             values[PRESSURE] = np.repeat(pressure[: self._owned, None], len(self._places), axis=1)
         found = {name: self._averaged(each) for name, each in values.items()}
-        nodes = self._averaged(jet[0])
-        return Surface(self._r0, nodes, self._n0, self._cells, self._constant | found) if self.comm.rank == 0 else None
+        nodes, jump = self._averaged(jet[0]), self._jump(values["M"], found["M"])
+        if self.comm.rank:
+            return None
+        return Surface(self._r0, nodes, self._n0, self._cells, self._constant | found, jump=jump)
+
+    def _jump(self, values: Array, averaged: Array) -> float:
+        """How much a field jumps between the cells of all ranks, on rank 0."""
+        parts = self.comm.gather((values, self._fields.weight, self._numbers))
+        if self.comm.rank:
+            return 0.0
+        whole, weight, numbers = (np.concatenate(part) for part in zip(*parts, strict=True))
+        return relative_jump(whole, averaged[numbers], weight)
 
     def _at_nodes(self, f: fem.Function) -> Array:
         """f, f,_1, f,_2, f,_11, f,_12, f,_22 in reference coordinates at each owned cell's nodes."""
@@ -159,7 +176,8 @@ class RevolvedGatherer:
         self._swept = Revolution(model)
         factor = None if model.thickness is None else self._swept.scalars(model.thickness)
         r, loads = self._swept.jets(model.r0), model.loads
-        self._fields = PointFields(r, model.material, loads.magnetic, factor, loads.natural, loads.contacts)
+        others = loads.natural, loads.contacts, loads.remanence
+        self._fields = PointFields(r, model.material, loads.magnetic, factor, *others)
         if isinstance(model.meridian.embedding, Deviated):
             s = np.sort(model.meridian.mesh.geometry.x[:, 0])
             embedding = model.meridian.embedding
@@ -181,7 +199,9 @@ class RevolvedGatherer:
         if pressure is not None:
             values[PRESSURE] = np.repeat(pressure[swept.order, None], 2, axis=1)
         found = self._around(values)
-        return Surface(swept.r0, swept.displacement(u), swept.n0, swept.cells, self._constant | found)
+        M, weight = values["M"], self._fields.weight
+        jump = relative_jump(M, swept.continuous(M, weight), weight)
+        return Surface(swept.r0, swept.displacement(u), swept.n0, swept.cells, self._constant | found, jump=jump)
 
     def _around(self, fields: Mapping[str, Array]) -> dict[str, Array]:
         return {name: self._swept.around(values, self._fields.weight) for name, values in fields.items()}
@@ -211,6 +231,10 @@ def completed(surface: Surface, mirror: Array) -> Surface:
     image = _moved(surface, np.eye(3) - 2 * np.outer(normal, normal))
     image = replace(image, r0=image.r0 + 2 * offset * normal)
 
+    sign = _parity(surface, normal, offset)
+    for name in BOTH_WAYS & surface.fields.keys():
+        image.fields[name] *= sign
+
     def both(f: Array, other: Array) -> Array:
         return np.concatenate([f, other])
 
@@ -221,7 +245,24 @@ def completed(surface: Surface, mirror: Array) -> Surface:
         np.concatenate([surface.cells, surface.cells + len(surface.r0)]),
         {name: both(f, image.fields[name]) for name, f in surface.fields.items()},
         surface.outlines,
+        surface.jump,
     )
+
+
+def _parity(surface: Surface, normal: Array, offset: float) -> float:
+    """1 if the mirror images of remanence and applied field continue them, -1 if their opposites do.
+
+    Both are alike. The applied field, which is continuous, tells; without one the remanence, if it does not jump at the
+    plane.
+    """
+    on = np.abs(surface.r0 @ normal - offset) < ON_PLANE
+    for name in ("Ba", "Br"):
+        there = surface.fields.get(name, np.zeros((len(on), 3)))[on]
+        size = np.nan_to_num(np.linalg.norm(there, axis=1))
+        if size.max(initial=0.0) > 0:
+            jumps = size.min() < size.max() / 2
+            return 1.0 if jumps or 2 * np.nansum((there @ normal) ** 2) <= np.sum(size**2) else -1.0
+    return 1.0
 
 
 def _moved(surface: Surface, Q: Array) -> Surface:

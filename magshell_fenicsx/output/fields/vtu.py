@@ -80,18 +80,26 @@ def read_vtu(file: Path) -> tuple[Surface, About]:
     CaseError
         If an earlier version wrote it, without the data of `About`.
     """
-    import pyvista
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+    from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridReader
 
-    grid = pyvista.read(file)
-    cells = grid.cells.reshape(-1, grid.cells[0] + 1)[:, 1:]
-    data = {name: np.asarray(grid.point_data[name]) for name in grid.point_data}
+    reader = vtkXMLUnstructuredGridReader()
+    reader.SetFileName(str(file))
+    reader.Update()
+    grid = reader.GetOutput()
+
+    def arrays(of: Any) -> dict[str, Array]:
+        return {of.GetArrayName(i): vtk_to_numpy(of.GetArray(i)) for i in range(of.GetNumberOfArrays())}
+
+    cells = vtk_to_numpy(grid.GetCells().GetConnectivityArray()).reshape(grid.GetNumberOfCells(), -1)
+    data, numbers = arrays(grid.GetPointData()), arrays(grid.GetFieldData())
     fields = {name: f[:, FULL] if f.shape[1:] == (6,) else f for name, f in data.items() if name not in OWN_DATA}
-    numbers = {name: np.asarray(grid.field_data[name]) for name in grid.field_data}
     if "h_over_R" not in numbers:
         raise CaseError(f"{file} is of an earlier version: run the case again")
     about = About(float(numbers["h_over_R"][0]), float(numbers["poisson_ratio"][0]), numbers.get("mirror"))
     r0 = data["r0"]
-    return Surface(r0, data["u_over_h"] * about.h, data["n0"], cells, fields), about
+    jump = float(numbers["moment_jump"][0]) if "moment_jump" in numbers else None
+    return Surface(r0, data["u_over_h"] * about.h, data["n0"], cells, fields, jump=jump), about
 
 
 class FieldSeries:
@@ -157,6 +165,7 @@ def vtu_content(surface: Surface, about: About) -> bytes:
 
     grid = unstructured_grid(surface, about.h)
     numbers = {"h_over_R": np.array([about.h]), "poisson_ratio": np.array([about.nu]), "mirror": about.mirror}
+    numbers["moment_jump"] = None if surface.jump is None else np.array([surface.jump])
     for name, values in numbers.items():
         if values is not None:
             _give(grid.GetFieldData(), name, values)

@@ -8,12 +8,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from magshell_fenicsx.case.output import OutputSection
 from magshell_fenicsx.output.fields.surface import Surface
+from magshell_fenicsx.output.pictures.bars import SIGNED, colour_bar
+from magshell_fenicsx.output.pictures.colours import Coloured
 from magshell_fenicsx.output.pictures.curve import Part, drawn_parts, place, plot_curve
-from magshell_fenicsx.output.pictures.layout import axes_in, colour_bar, empty_figure
-from magshell_fenicsx.output.pictures.picture import deflected_place, towards
-from magshell_fenicsx.output.pictures.render import Image, View, rendered, smooth_surface
-from magshell_fenicsx.output.store.table import Row
+from magshell_fenicsx.output.pictures.layout import Boxes, Panel, directions, drawing
+from magshell_fenicsx.output.pictures.picture import Background
+from magshell_fenicsx.output.pictures.sources import near_outlines
+from magshell_fenicsx.output.pictures.view import Camera, Image, Window
+from magshell_fenicsx.output.store.table import POLE, Row
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -26,6 +30,7 @@ SECONDS = 6.0  # duration of all frames
 HELD = 1500  # milliseconds of the last frame
 MOST_CURVES = 4  # beside each other
 COLOURS = 128
+STYLE = OutputSection(dpi=120, font_size=9)
 FOOT = 34  # pixels below the shell
 
 
@@ -47,7 +52,13 @@ def magnification(surfaces: Sequence[Surface]) -> float:
 
 
 def animated(
-    surfaces: Sequence[Surface], h: float, titles: Sequence[str], rows: Sequence[Row], shown: Sequence[Row]
+    surfaces: Sequence[Surface],
+    h: float,
+    titles: Sequence[str],
+    rows: Sequence[Row],
+    shown: Sequence[Row],
+    camera: Camera,
+    pole: str = POLE,
 ) -> bytes:
     """A GIF file.
 
@@ -57,12 +68,15 @@ def animated(
         For each frame: the whole deformed shell, the title and the row of path.csv.
     rows
         All rows of the path.
+    pole
+        Name of the point of w_pole_over_h.
     """
     from PIL import Image as Pillow
 
     factor = magnification(surfaces)
-    views = _views(surfaces, h, factor)
-    frames = _composed(rendered(views), views[0], factor, titles, rows, shown)
+    with drawing(STYLE):
+        views = _views(surfaces, h, factor, camera)
+        frames = _composed(views, factor, titles, rows, shown, pole)
     palette = _palette([frames[i] for i in sorted({0, len(frames) // 2, len(frames) - 1})])  # the same for all
     first, *others = (Pillow.fromarray(f).quantize(palette=palette, dither=Pillow.Dither.NONE) for f in frames)
     each = round(max(1000 * SECONDS / len(frames), 80), -1)
@@ -83,54 +97,57 @@ def _palette(frames: Sequence[Image]) -> "Pillow.Image":
     return palette
 
 
-def _views(surfaces: Sequence[Surface], h: float, factor: float) -> list[View]:
-    """The same camera, window and colours for all frames."""
+def _views(surfaces: Sequence[Surface], h: float, factor: float, camera: Camera) -> list[Panel]:
+    """The same window and colours for all frames."""
     limit = max(float(np.abs(s.w).max()) / h for s in surfaces) or 1.0
-    last = max(surfaces, key=lambda s: float(np.abs(s.w).max()))
-    camera = towards(deflected_place(last))
-    places = [np.concatenate([s.r0 + factor * s.u, *s.outlines]) for s in surfaces]
-    low, high = np.min([r.min(axis=0) for r in places], axis=0), np.max([r.max(axis=0) for r in places], axis=0)
-    bounds = tuple(float(x) for x in np.column_stack([low, high]).ravel())
-    views = []
-    for s in surfaces:
-        smooth = smooth_surface(replace(s, u=factor * s.u, fields={}), factor * h)
-        colours = smooth.point_data["w_over_h"]
-        view = View(smooth, colours, (-limit, limit), "RdBu_r", camera, WINDOW, "$w/h$", bounds=bounds)
-        views.append(replace(view, outlines=s.outlines))
-    return views
+    moved = [replace(s, u=factor * s.u) for s in surfaces]
+    places = [r for s in moved for r in (s.r0 + s.u, *near_outlines(s))]
+    window = Window.around(camera(np.concatenate([surfaces[0].r0, *places])), WINDOW)
+    panels = []
+    for surface, drawn in zip(surfaces, moved, strict=True):
+        layer = Coloured("w_over_h", np.asarray(surface.w / h), (-limit, limit), SIGNED, "$w/h$")
+        panels.append(Background(drawn, camera, WINDOW, window).panel(layer, STYLE))
+    return panels
 
 
 def _composed(
-    images: Sequence[Image],
-    view: View,
+    views: Sequence[Panel],
     factor: float,
     titles: Sequence[str],
     rows: Sequence[Row],
     shown: Sequence[Row],
+    pole: str,
 ) -> list[NDArray[np.uint8]]:
-    """Frames (height, width, 3); the fixed parts are drawn once, then the title and the marker on copies."""
+    """Frames (height, width, 3); the fixed parts are drawn once, then the title, the shell and the marker on copies."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
 
-    high, across = images[0].shape[:2]
-    height = max(high + 40 + FOOT, 400)
+    high, across = views[0].image.shape[:2]
+    width, height = across + 600, max(high + 40 + FOOT, 400)
     low = FOOT + (height - 40 - FOOT - high) // 2
-    figure = empty_figure(across + 600, height, "")
+    figure = Figure(figsize=(width / STYLE.dpi, height / STYLE.dpi), dpi=STYLE.dpi)
+    boxes = Boxes(figure)
+
+    def box(left: float, low: float, wide: float, tall: float) -> "Axes":
+        return boxes.axes(*(n / STYLE.dpi for n in (left, low, wide, tall)))
+
     canvas = FigureCanvasAgg(figure)
-    colour_bar(figure, view, (across + 30, 90, 16, height - 180), "vertical")
-    figure.text(15 / (across + 600), 12 / height, _scale(factor), fontsize=9)
+    colour_bar(figure, box(across + 30, 90, 16, height - 180), views[0].scale, "vertical")
+    figure.text(15 / width, 12 / height, _scale(factor))
+    directions(box(across - 60, 4, 70, 70), views[0].camera, STYLE)
     parts = drawn_parts(rows, str(rows[-1]["amplitude"]))[-MOST_CURVES:] if rows[-1]["amplitude"] else []
     room = (height - 70) // max(len(parts), 1)
     markers: dict[int, tuple[Axes, Part, Line2D]] = {}
     for i, part in enumerate(reversed(parts)):  # from below
-        axes = axes_in(figure, across + 230, 70 + i * room, 350, room - 70)
-        plot_curve(axes, part)
+        axes = box(across + 230, 70 + i * room, 350, room - 70)
+        plot_curve(axes, part, pole)
         marker = axes.plot([], [], "o", color="k", markersize=8, animated=True)[0]
         markers |= {int(row["point"]): (axes, part, marker) for row in part.rows}
-    title = figure.text(15 / (across + 600), 1 - 12 / height, "", fontsize=10, va="top", animated=True)
+    title = figure.text(15 / width, 1 - 12 / height, "", va="top", animated=True)
     canvas.draw()
     still = canvas.copy_from_bbox(figure.bbox)
     frames = []
-    for image, text, row in zip(images, titles, shown, strict=True):
+    for view, text, row in zip(views, titles, shown, strict=True):
         canvas.restore_region(still)
         title.set_text(text)
         figure.draw_artist(title)
@@ -139,9 +156,15 @@ def _composed(
             marker.set_data(*([x] for x in place(row, part.amplitude)))
             axes.draw_artist(marker)
         frame = np.array(canvas.buffer_rgba())[:, :, :3]
-        frame[height - low - high : height - low, 10 : 10 + across] = image
+        _lay(view.image, frame[height - low - high : height - low, 10 : 10 + across])
         frames.append(frame)
     return frames
+
+
+def _lay(image: Image, under: NDArray[np.uint8]) -> None:
+    """Put an image with transparency on a part of a frame."""
+    part = image[..., 3:] / 255
+    under[:] = np.rint(part * image[..., :3] + (1 - part) * under)
 
 
 def _scale(factor: float) -> str:

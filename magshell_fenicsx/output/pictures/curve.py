@@ -1,7 +1,7 @@
 """The load-displacement or pressure-volume curve as a picture."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from itertools import groupby, zip_longest
 from typing import TYPE_CHECKING
 
@@ -9,7 +9,10 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from magshell_fenicsx.output.store.table import LOCATED, OWN_MODES, SOLUTION, Row, pole_name
+from magshell_fenicsx.case.output import OutputSection
+from magshell_fenicsx.output.pictures.bars import number_format
+from magshell_fenicsx.output.pictures.layout import INCH, ONE, SEVERAL, drawing
+from magshell_fenicsx.output.store.table import LOCATED, OWN_MODES, POLE, SOLUTION, Row, pole_name
 from magshell_fenicsx.quantities.registry import amplitude as registered
 from magshell_fenicsx.quantities.registry import axes_of, quantity, shown
 
@@ -17,8 +20,9 @@ if TYPE_CHECKING:  # takes long to import
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-NAMED = 5  # most instabilities in the legend
 FINE = 16  # drawn segments between two points
+DASHED = (0, (2, 1.2))
+NARROW = 0.3  # of the figure: few numbers fit below
 
 
 def smooth(x: Sequence[float], y: Sequence[float]) -> NDArray[np.float64]:
@@ -31,43 +35,68 @@ def smooth(x: Sequence[float], y: Sequence[float]) -> NDArray[np.float64]:
     return np.asarray(scipy.interpolate.PchipInterpolator(chord, xy, axis=1)(fine))
 
 
-def curve_figure(rows: Sequence[Row], amplitude: str, title: str) -> "Figure":
-    """Draw the part of the path in which `amplitude` varied, and its branches; instabilities are marked.
+def curve_figure(rows: Sequence[Row], amplitude: str, style: OutputSection, place: str = POLE) -> "Figure":
+    """Draw the part of the path in which `amplitude` varied, and its branches; instabilities are marked and numbered.
 
     Of a programme each step is drawn. Stable parts are solid, unstable parts dashed. A user-defined amplitude is drawn
-    over the pole's displacement.
+    over the displacement of the pole, or what is called so.
+
+    Parameters
+    ----------
+    place
+        Name of the point of w_pole_over_h without named points.
     """
     from matplotlib.figure import Figure
 
     parts = drawn_parts(rows, amplitude)
-    wide = min(len(parts), 3)
+    wide = min(len(parts), 2)
     high = -(-len(parts) // wide)
-    figure = Figure(figsize=(4.6 * wide, 3.4 * high), dpi=200, layout="constrained")
-    for axes, part in zip_longest(figure.subplots(high, wide, squeeze=False).flat, parts):
-        if part is None:
-            axes.set_axis_off()
-            continue
-        plot_curve(axes, part)
-        axes.set_title(part.title or title, fontsize=9)
-    if len(parts) > 1:
-        figure.suptitle(title, fontsize=10)
+    width = (style.width or (ONE if len(parts) == 1 else SEVERAL)) / INCH
+    with drawing(style):
+        figure = Figure(figsize=(width, 0.75 * width / wide * high), dpi=style.dpi, layout="constrained")
+        for axes, part in zip_longest(figure.subplots(high, wide, squeeze=False).flat, parts):
+            if part is None:
+                axes.set_axis_off()
+                continue
+            plot_curve(axes, part, place)
+            axes.set_title(part.title)
+        named = {
+            name: line for axes in figure.axes for line, name in zip(*axes.get_legend_handles_labels(), strict=True)
+        }
+        if named:  # above the axes, where it covers no curve
+            number = min(len(named), 4 * wide)
+            figure.legend(
+                named.values(),
+                named.keys(),
+                loc="outside upper center",
+                ncols=number,
+                frameon=False,
+                handlelength=1.5,
+                columnspacing=1,
+            )
     return figure
 
 
 @dataclass(frozen=True)
 class Part:
-    """The rows in which an amplitude varied, with the one before them."""
+    """The rows in which an amplitude varied, with the one before them, and the numbers of its instabilities."""
 
     amplitude: str
     rows: Sequence[Row]
     title: str = ""
+    numbers: Mapping[int, int] = field(default_factory=dict)
+
+
+def numbered(rows: Sequence[Row]) -> dict[int, int]:
+    """Point -> number of its instability, from 1 along path.csv; so they are numbered in all pictures and tables."""
+    return {int(row["point"]): n for n, row in enumerate((row for row in rows if row["label"] in LOCATED), 1)}
 
 
 def drawn_parts(rows: Sequence[Row], amplitude: str) -> list[Part]:
     """The steps of a programme, or the last part in which the amplitude varied."""
     steps = sorted({int(row.get("step", 0)) for row in rows if row["label"] != "field"} - {0})
     if len(steps) < 2:
-        return [Part(amplitude, varied(rows, amplitude))]
+        return [Part(amplitude, varied(rows, amplitude), "", numbered(rows))]
     parts = []
     for step in steps:
         first = next(i for i, row in enumerate(rows) if row["step"] == step)
@@ -75,7 +104,7 @@ def drawn_parts(rows: Sequence[Row], amplitude: str) -> list[Part]:
         within = [row for row in rows[first:] if row["step"] == step]
         name = str(within[0]["amplitude"])
         varying = quantity(registered(name).column).words
-        parts.append(Part(name, [rows[before], *within], f"step {step}: {varying}"))
+        parts.append(Part(name, [rows[before], *within], f"step {step}: {varying}", numbered(rows)))
     return parts
 
 
@@ -96,14 +125,14 @@ def _unstable(row: Row) -> bool:
     return int(row["negative_pivots"]) + int(row.get("excluded_pivots", 0)) > 0
 
 
-def plot_curve(axes: "Axes", of: Part) -> None:
+def plot_curve(axes: "Axes", of: Part, pole: str = POLE) -> None:
     """Draw a part of a path in given axes."""
     part, amplitude = of.rows, of.amplitude
     x, y = axes_of(amplitude, part[0])
     if amplitude == "load" and all(row["w_over_h"] == row["w_pole_over_h"] for row in part):
         x = shown("w_pole_over_h", part[0])  # moments have no conjugate displacement
-    pole = pole_name(part[0]).replace("$", r"\$")  # plain text, no mathematics
-    x_label, y_label = (each.label.replace("the pole", pole) for each in (x, y))
+    name = pole_name(part[0], pole).replace("$", r"\$")  # plain text, no mathematics
+    x_label, y_label = (each.label.replace(POLE, name) for each in (x, y))
     path = [row for row in part if row["label"] != SOLUTION]
     for branch in sorted({int(row["branch"]) for row in path}):
         line = [row for row in path if row["branch"] == branch and row["mode"] in OWN_MODES]
@@ -112,24 +141,30 @@ def plot_curve(axes: "Axes", of: Part) -> None:
         for dashed, pieces in groupby(range(1, len(line)), key=unstable.__getitem__):
             i, *others = pieces
             piece = slice((i - 1) * FINE, (i + len(others)) * FINE + 1)
-            axes.plot(smooth_x[piece], smooth_y[piece], color="C0", linestyle=(0, (2, 1.2)) if dashed else "-")
+            axes.plot(smooth_x[piece], smooth_y[piece], color="C0", lw=1.2, linestyle=DASHED if dashed else "-")
         dots = [place(row, amplitude) for row in line if row["label"] in ("target", "step", "field")]
-        axes.plot([x for x, _ in dots], [y for _, y in dots], ".", color="C0", markersize=4)
+        axes.plot([x for x, _ in dots], [y for _, y in dots], ".", color="C0", markersize=3)
     marked = [row for row in part if row["label"] in LOCATED]
-    for number, row in enumerate(marked, 1):
-        mode = f" ({row['mode']})" if row["mode"] else ""
-        name = f"{row['label']}{mode} at {row[y.name]:.5g}{f' {y.shown_unit}' if y.shown_unit else ''}"
-        if number > NAMED:
-            name = f"and {len(marked) - NAMED} more" if number == NAMED + 1 else "_"  # matplotlib omits "_"
-        axes.plot(*place(row, amplitude), "o", color="C3", markersize=6, label=name)
+    for row in marked:
+        at, kind = place(row, amplitude), str(row["label"])
+        inside = "white" if kind == "bifurcation" else "C3"
+        axes.plot(*at, "o", color="C3", markersize=4.5, label=_once(axes, kind), zorder=4, markerfacecolor=inside)
+        axes.annotate(str(of.numbers[int(row["point"])]), at, (-4, 0), textcoords="offset points", ha="right")
     for row in (row for row in part if row["label"] == SOLUTION):
         name, inside = ("unstable", "none") if _unstable(row) else ("stable", "C2")
-        known = axes.get_legend_handles_labels()[1]
-        label = f"{name} solution" if f"{name} solution" not in known else "_"
-        axes.plot(*place(row, amplitude), "s", color="C2", markerfacecolor=inside, markersize=6, label=label)
-        axes.annotate(str(row["branch"]), place(row, amplitude), (0, 6), textcoords="offset points", fontsize=8)
+        label = _once(axes, f"{name} solution")
+        axes.plot(*place(row, amplitude), "s", color="C2", markerfacecolor=inside, markersize=4.5, label=label)
+        axes.annotate(str(row["branch"]), place(row, amplitude), (0, 6), textcoords="offset points")
     axes.set(xlabel=x_label, ylabel=y_label)
-    axes.locator_params(axis="x", nbins=6)
+    axes.locator_params(axis="x", nbins=6 if axes.get_position().width > NARROW else 3)
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_formatter(number_format())
     axes.axhline(0, color="0.8", linewidth=0.8, zorder=0)
-    if axes.get_legend_handles_labels()[1]:
-        axes.legend(frameon=False)
+    if any(_unstable(row) for row in path) and marked:
+        axes.plot([], [], color="C0", lw=1.2, label=_once(axes, "stable"))
+        axes.plot([], [], color="C0", lw=1.2, linestyle=DASHED, label=_once(axes, "unstable"))
+
+
+def _once(axes: "Axes", name: str) -> str:
+    """A label of the legend; matplotlib leaves out "_"."""
+    return "_" if name in axes.get_legend_handles_labels()[1] else name

@@ -1,20 +1,28 @@
 """gradients.png: where a result would change most with more of a field."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from magshell_fenicsx.case.output import OutputSection
 from magshell_fenicsx.output.fields.surface import Surface
-from magshell_fenicsx.output.pictures.layout import panels, png
-from magshell_fenicsx.output.pictures.picture import spread
-from magshell_fenicsx.output.pictures.render import Arrows, View, rendered, smooth_surface
+from magshell_fenicsx.output.pictures.arrows import spread
+from magshell_fenicsx.output.pictures.bars import SIGNED
+from magshell_fenicsx.output.pictures.colours import Coloured
+from magshell_fenicsx.output.pictures.layout import Arrow, Panel, columns, drawing, panel_width, panels_figure
+from magshell_fenicsx.output.pictures.picture import Background
+from magshell_fenicsx.output.pictures.view import Camera
+
+if TYPE_CHECKING:  # takes long to import
+    from matplotlib.figure import Figure
 
 Array = NDArray[np.float64]
-PANEL, QUANTILE, PEAK = 480, 0.995, 1.3  # pixels; colours end at most PEAK times above this quantile of the nodes
-THICK, LONGEST = 0.045, 1.3  # of arrows over their distance: radius, largest length
+QUANTILE, PEAK = 0.995, 1.3  # colours end at most PEAK times above this quantile of the nodes
 SMALL, APART = 0.15, 0.16  # vectors below this part of the largest have none; their distance over the extent of those
-ASIDE = np.array([0.4, -0.7, 0.4])  # added to the normal that the camera looks along
+NOTE = "Change of a result per area by the change of a field there."
 WORDS = {
     "remanence": "more remanence, along arrows",
     "magnitude": "stronger magnet",
@@ -26,40 +34,26 @@ WORDS = {
 }
 
 
-def draw_gradients(found: Mapping[str, Surface], h: float, title: str) -> bytes:
-    """A PNG with one panel for each result and field: red raises the result, blue lowers it; of vectors their length.
-
-    Raises
-    ------
-    NoScreen
-        If there is no display.
-    """
-    views = [view for of, surface in found.items() for view in _views(of, surface, h)]
-    return png(panels(rendered(views), views, title))
+def gradients_figure(found: Mapping[str, Surface], style: OutputSection, camera: Camera) -> "Figure":
+    """One panel for each result and field: red raises the result, blue lowers it; of vectors their length."""
+    count = sum(name in surface.fields for surface in found.values() for name in WORDS)
+    width = panel_width(style, columns(count))
+    with drawing(style):
+        panels = [panel for of, surface in found.items() for panel in _panels(of, surface, style, camera, width)]
+        return panels_figure(panels, style, NOTE)
 
 
-def _views(of: str, surface: Surface, h: float) -> list[View]:
-    smooth = smooth_surface(surface, h)
-    camera = _outwards(surface) + ASIDE
-    views = []
+def _panels(of: str, surface: Surface, style: OutputSection, camera: Camera, width: int) -> Iterator[Panel]:
+    view = Background(surface, camera, width)
     for name in (name for name in WORDS if name in surface.fields):
-        caption = f"{of.replace('_', ' ')}: {WORDS[name]}"
-        nodes, values = surface.fields[name], np.asarray(smooth.point_data[name])
-        if nodes.ndim == 2:
-            limits, colours = (0.0, _limit(np.linalg.norm(nodes, axis=1))), "Reds"
-            arrows: tuple[Arrows, ...] = (_arrows(surface, nodes),)
-            values = np.linalg.norm(values, axis=1)
-        else:
-            limit = _limit(np.abs(nodes))
-            limits, colours, arrows = (-limit, limit), "RdBu_r", ()
-        views.append(View(smooth, values, limits, colours, camera, PANEL, caption, arrows))
-    return views
-
-
-def _outwards(surface: Surface) -> Array:
-    """The normal where the first field is largest."""
-    first = next(iter(surface.fields.values()))
-    return np.asarray(surface.n0[np.argmax(np.linalg.norm(np.reshape(first, (len(first), -1)), axis=1))])
+        caption, values = f"{of.replace('_', ' ')}: {WORDS[name]}", surface.fields[name]
+        if values.ndim == 1:
+            limit = _limit(np.abs(values))
+            yield view.panel(Coloured(name, values, (-limit, limit), SIGNED, caption), style)
+            continue
+        size = np.asarray(np.linalg.norm(values, axis=1))
+        panel = view.panel(Coloured(name, size, (0.0, _limit(size)), "Reds", caption), style)
+        yield replace(panel, arrows=(_arrows(surface, values, view, camera),))
 
 
 def _limit(sizes: Array) -> float:
@@ -67,10 +61,10 @@ def _limit(sizes: Array) -> float:
     return float(min(sizes.max(), PEAK * np.quantile(sizes, QUANTILE))) or 1.0
 
 
-def _arrows(surface: Surface, vectors: Array) -> Arrows:
+def _arrows(surface: Surface, vectors: Array, view: Background, camera: Camera) -> Arrow:
     r, length = surface.r0 + surface.u, np.linalg.norm(vectors, axis=1)
-    most = length.max() or 1.0
-    large = np.flatnonzero(length >= SMALL * most)
+    most, extent = length.max() or 1.0, float(np.ptp(r, axis=0).max())
+    large = np.flatnonzero((length >= SMALL * most) & view.seen.shows(r, 0.03 * extent))
     apart = APART * float(np.ptp(r[large], axis=0).max())
     seeds = large[spread(r[large], apart)]
-    return Arrows(r[seeds], LONGEST * apart / most * vectors[seeds], "0.15", THICK * apart)
+    return Arrow(camera(r[seeds]), camera(apart / most * vectors[seeds]), "0.15", "")

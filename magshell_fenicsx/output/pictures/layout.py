@@ -1,97 +1,210 @@
-"""Figures around bare views: titles, colour bars, axes, panels."""
+"""Figures of panels: images of shells with outlines, arrows, colour bars and the directions of e1, e2, e3."""
 
 import io
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
 
-from magshell_fenicsx.output.pictures.render import Image, View, axes_on_screen
+import numpy as np
+from numpy.typing import NDArray
+
+from magshell_fenicsx.case.output import OutputSection
+from magshell_fenicsx.output.pictures.bars import Scale, colour_bar
+from magshell_fenicsx.output.pictures.view import Camera, Image, Window, axes_on_screen
 
 if TYPE_CHECKING:  # takes long to import
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-DPI = 120
-CAPTION, TITLE = 360, 560  # least width of a panel's caption and of a title, pixels
+Array = NDArray[np.float64]
+Pen = tuple[str, str]
+INCH = 25.4  # mm
+ONE, SEVERAL = 90.0, 180.0  # default widths in mm: one and two columns of a journal
+GAP = 4.0  # mm between panels
+LINE = 1.45 / 72  # height of a line of text in inches, for each point of the font
 QUICKLY = {"compress_level": 3}  # files are a quarter larger than by default and take a third of the time
 
 
-def empty_figure(width: int, height: int, title: str) -> "Figure":
-    """An empty picture of a size in pixels, with a title."""
+@dataclass(frozen=True)
+class Arrow:
+    """Arrows in a panel: feet and vectors (n, 3) as the camera projects them, colour, name."""
+
+    feet: Array
+    vectors: Array
+    colour: str
+    name: str
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One view of a shell.
+
+    Attributes
+    ----------
+    lines
+        Lines (n, 2) in the projection, with their pens: a grey, and matplotlib's name of dashes.
+    """
+
+    image: Image
+    window: Window
+    camera: Camera
+    scale: Scale = field(default_factory=Scale)
+    lines: tuple[tuple[Array, Pen], ...] = ()
+    arrows: tuple[Arrow, ...] = ()
+
+
+def drawing(style: OutputSection) -> AbstractContextManager[None]:
+    """Matplotlib's settings while a figure is made and written: text stays text in svg and pdf."""
+    import matplotlib
+
+    size = style.font_size
+    own: dict[str, Any] = {"font.size": size, "axes.labelsize": size, "axes.titlesize": size, "legend.fontsize": size}
+    own |= {"xtick.labelsize": 0.9 * size, "ytick.labelsize": 0.9 * size, "axes.linewidth": 0.6}
+    own |= {"svg.fonttype": "none", "pdf.fonttype": 42, "svg.hashsalt": "magshell"}
+    return matplotlib.rc_context(own)
+
+
+def columns(panels: int) -> int:
+    """The number of panels beside each other, of so many."""
+    return panels if panels < 4 else 2 if panels == 4 else 3
+
+
+def panel_width(style: OutputSection, beside: int) -> int:
+    """The width of a panel's image in pixels, of so many panels beside each other."""
+    width = style.width or (ONE if beside == 1 else SEVERAL)
+    return max(int((width / beside - GAP) / INCH * style.dpi), 50)
+
+
+def panels_figure(panels: Sequence[Panel], style: OutputSection, note: str = "") -> "Figure":
+    """Panels in rows, each above its colour bar; the directions once; a note at the foot."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(width / DPI, height / DPI), dpi=DPI)
-    text = figure.text(15 / width, 1 - 12 / height, title, fontsize=10, va="top")
-    if title and (wide := text.get_window_extent().width) > width - 30:
-        text.set_fontsize(10 * (width - 30) / wide)
+    across, line = columns(len(panels)), LINE * style.font_size
+    rows = -(-len(panels) // across)
+    gap, dpi = GAP / INCH, style.dpi
+    wide = max(panel.image.shape[1] for panel in panels) / dpi + gap
+    tall = max(panel.image.shape[0] for panel in panels) / dpi
+    barred = any(panel.scale.colours for panel in panels)
+    below = (4.2 if barred else 0.4) * line
+    legend = max((len(panel.arrows) for panel in panels), default=0)
+    above = gap / 2 + (legend * line + 0.1 * wide if legend else 0.0)  # arrows may leave the panel
+    beside = barred and across < 3  # the directions stand beside the first bar, else at the foot
+    indent = gap / 2 + (0.0 if beside else 4.0 * line)
+    notes = _wrapped(note, wide * across - indent - gap / 2, style.font_size)
+    foot = max(len(notes) * line, 0.0 if beside else 3.2 * line)
+    height = rows * (tall + below + above) + foot
+    figure = Figure(figsize=(wide * across, height), dpi=dpi)
+    boxes = Boxes(figure)
+    for i, panel in enumerate(panels):
+        left, low = i % across * wide, height - (i // across + 1) * (tall + below + above)
+        h, w = (n / dpi for n in panel.image.shape[:2])
+        start = left + (wide - w) / 2
+        draw_panel(boxes.axes(start, low + below + (tall - h) / 2, w, h), panel, style)
+        for k, arrows in enumerate(panel.arrows):
+            y = low + below + tall + above - gap / 2 - (k + 0.5) * line
+            figure.text(*boxes.place(left + gap / 2, y), arrows.name, color=arrows.colour, va="center")
+        if panel.scale.colours:
+            spare = (4.4 if beside else 2.2) * line  # a power of ten needs the other side
+            reach = max(wide - gap - spare - 3.2 * line, 3 * line)
+            colour_bar(figure, boxes.axes(left + gap / 2 + spare, low + 1.7 * line, reach, 0.65 * line), panel.scale)
+    size, low = 3.4 * line, height - (tall + below + above) + 0.4 * line if beside else foot - 3.3 * line
+    directions(boxes.axes(gap / 2, low, size, size), panels[0].camera, style)
+    for k, text in enumerate(reversed(notes)):
+        figure.text(*boxes.place(indent, (k + 0.5) * line), text, va="center", fontsize=0.9 * style.font_size)
     return figure
 
 
-def axes_in(figure: "Figure", left: float, low: float, width: float, height: float) -> "Axes":
-    """Axes in a box of pixels."""
-    across, up = figure.get_size_inches() * DPI
-    return figure.add_axes((left / across, low / up, width / across, height / up))
+@dataclass(frozen=True)
+class Boxes:
+    """Places in inches from the lower left of a figure."""
+
+    figure: "Figure"
+
+    def place(self, x: float, y: float) -> tuple[float, float]:
+        """In the figure's own coordinates."""
+        wide, tall = self.figure.get_size_inches()
+        return x / wide, y / tall
+
+    def axes(self, left: float, low: float, width: float, height: float) -> "Axes":
+        """Axes in a box."""
+        return self.figure.add_axes((*self.place(left, low), *self.place(width, height)))
 
 
-def beside(image: Image, view: View, title: str) -> "Figure":
-    """One view with its colour bar and the directions of e1, e2, e3 on the right."""
-    figure = with_margin(image, 170, title)
-    width, height = (figure.get_size_inches() * DPI).round()
-    colour_bar(figure, view, (width - 110, 140, 22, height - 210), "vertical")
-    directions(figure, view, width - 130, 10)
-    return figure
+def draw_panel(axes: "Axes", panel: Panel, style: OutputSection) -> None:
+    """Draw a panel's image, lines and arrows in axes of its proportions."""
+    left, right, low, high = panel.window.box
+    axes.imshow(panel.image, extent=(left, right, low, high), interpolation="none", aspect="auto")
+    for line, (grey, dashes) in panel.lines:
+        axes.plot(*line.T, dashes, color=grey, lw=0.06 * style.font_size)
+    for arrows in panel.arrows:
+        _draw_arrows(axes, arrows, right - left, style)
+    axes.set(xlim=(left, right), ylim=(low, high))
+    axes.set_axis_off()
 
 
-def with_margin(image: Image, margin: int, title: str) -> "Figure":
-    """A figure with an image on the left and a margin in pixels on the right."""
-    width, height = max(image.shape[1] + margin, TITLE), max(image.shape[0] + 60, 400)
-    figure = empty_figure(width, height, title)
-    figure.figimage(image, (width - margin - image.shape[1]) // 2 + 20, (height - 40 - image.shape[0]) // 2)
-    return figure
+def _draw_arrows(axes: "Axes", arrows: Arrow, extent: float, style: OutputSection) -> None:
+    """In the plane of the picture; what points to the eye is a dot in a circle, what points away a cross in it."""
+    flat, length = arrows.vectors[:, :2], np.linalg.norm(arrows.vectors, axis=1)
+    along = np.linalg.norm(flat, axis=1) < 0.3 * length
+    x, y = arrows.feet[:, :2].T
+    axes.quiver(
+        *(x[~along], y[~along], *flat[~along].T),
+        angles="xy",
+        scale_units="xy",
+        scale=1,
+        width=0.006,
+        minlength=0,
+        zorder=4,
+        clip_on=False,
+        color=arrows.colour,
+        headwidth=4,
+        headlength=5,
+        headaxislength=4.5,
+    )
+    size = (0.9 * style.font_size) ** 2
+    axes.scatter(x[~along], y[~along], s=size / 9, color=arrows.colour, zorder=4, linewidths=0)
+    for inside, marker in ((arrows.vectors[:, 2] > 0, "."), (arrows.vectors[:, 2] <= 0, "x")):
+        at = along & inside
+        if at.any():
+            axes.scatter(x[at], y[at], s=size, facecolors="white", edgecolors=arrows.colour, linewidths=0.8, zorder=5)
+            axes.scatter(x[at], y[at], s=size / 3, color=arrows.colour, marker=marker, linewidths=0.8, zorder=6)
 
 
-def panels(images: Sequence[Image], views: Sequence[View], title: str) -> "Figure":
-    """Two images per row, each with a colour bar below."""
-    down, across = (max(least, *(image.shape[axis] for image in images)) for axis, least in ((0, 0), (1, CAPTION)))
-    rows = -(-len(images) // 2)
-    width, height = 2 * across + 120, rows * (down + 110) + 50
-    figure = empty_figure(width, height, title)
-    for i, (image, view) in enumerate(zip(images, views, strict=True)):
-        left, low = 40 + (i % 2) * (across + 40), (rows - 1 - i // 2) * (down + 110)
-        figure.figimage(image, left + (across - image.shape[1]) // 2, low + 100)
-        colour_bar(figure, view, (left + 0.15 * across, low + 46, 0.7 * across, 18), "horizontal")
-    return figure
-
-
-def directions(figure: "Figure", view: View, left: float, low: float) -> None:
-    """Draw the directions of e1, e2, e3 in a view, in a square of 100 pixels."""
-    axes = axes_in(figure, left, low, 100, 100)
+def directions(axes: "Axes", camera: Camera, style: OutputSection) -> None:
+    """Draw the directions of e1, e2, e3."""
     axes.set(xlim=(-1.5, 1.5), ylim=(-1.5, 1.5))
     axes.set_axis_off()
-    for number, x, y in zip((1, 2, 3), *axes_on_screen(view.camera).T, strict=True):
-        axes.annotate("", (x, y), (0, 0), arrowprops={"arrowstyle": "->", "shrinkA": 0, "shrinkB": 0})
-        axes.text(1.3 * x, 1.3 * y, f"$e_{number}$", ha="center", va="center", fontsize=10)
+    on_screen = axes_on_screen(camera.direction)
+    arrow = {"arrowstyle": "->", "shrinkA": 0, "shrinkB": 0, "lw": 0.7, "mutation_scale": style.font_size * 0.8}
+    for number, (x, y) in enumerate(zip(*(0.9 * on_screen).T, strict=True), 1):
+        size = float(np.hypot(x, y))
+        if size < 0.05:  # it points to the eye, or away
+            axes.plot(0, 0, "k.", ms=0.4 * style.font_size)
+            x, y, size = -0.35, -0.35, 0.5
+        else:
+            axes.annotate("", (x, y), (0, 0), arrowprops=arrow)
+        further = 1 + 0.4 / size
+        axes.text(further * x, further * y, f"$e_{number}$", ha="center", va="center")
 
 
-def colour_bar(figure: "Figure", view: View, box: tuple[float, float, float, float], orientation: str) -> None:
-    """Draw a colour bar in a box (left, low, width, height) of pixels; its ends are pointed if values exceed them."""
-    from matplotlib.cm import ScalarMappable
-    from matplotlib.colors import Normalize
-    from matplotlib.ticker import MaxNLocator
+def _wrapped(text: str, inches: float, size: float) -> list[str]:
+    import textwrap
 
-    colours = ScalarMappable(Normalize(*view.limits), view.colours)
-    below, above = view.values.min() < view.limits[0], view.values.max() > view.limits[1]
-    bar = figure.colorbar(
-        colours,
-        cax=axes_in(figure, *box),
-        orientation=orientation,
-        ticks=MaxNLocator(5, steps=[1, 2, 5, 10]),
-        extend="both" if below and above else "min" if below else "max" if above else "neither",
-    )
-    if orientation == "vertical":
-        bar.set_label(view.caption, fontsize=10)
-    else:  # above the bar, because the ticks' common factor is below it
-        bar.ax.set_title(view.caption, fontsize=10, pad=5)
-    bar.ax.tick_params(labelsize=9)
+    return textwrap.wrap(text, max(int(inches * 72 / (0.47 * size)), 20)) if text else []
+
+
+def written(figure: "Figure", style: OutputSection, name: str) -> Iterator[tuple[str, bytes]]:
+    """Names and contents of a figure's files: PNG and the further formats."""
+    for kind in dict.fromkeys(["png", *style.formats]):
+        content = io.BytesIO()
+        options: dict[str, Any] = {"pil_kwargs": QUICKLY} if kind == "png" else {"metadata": {_DATE[kind]: None}}
+        with drawing(style):
+            figure.savefig(content, format=kind, dpi=style.dpi, **options)
+        yield f"{name}.{kind}", content.getvalue()
+
+
+_DATE = {"svg": "Date", "pdf": "CreationDate"}
 
 
 def png(figure: "Figure") -> bytes:

@@ -5,10 +5,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from magshell_fenicsx.case.output import OutputSection
 from magshell_fenicsx.output.fields.surface import Surface
-from magshell_fenicsx.output.pictures.layout import panels
-from magshell_fenicsx.output.pictures.picture import PANEL, deflected_place, towards
-from magshell_fenicsx.output.pictures.render import View, rendered, smooth_surface
+from magshell_fenicsx.output.pictures.bars import SIGNED
+from magshell_fenicsx.output.pictures.colours import Coloured
+from magshell_fenicsx.output.pictures.layout import drawing
+from magshell_fenicsx.output.pictures.small import small_panels
+from magshell_fenicsx.output.pictures.view import Camera
 from magshell_fenicsx.output.store.table import SOLUTION, Row, stability
 
 if TYPE_CHECKING:  # takes long to import
@@ -26,14 +29,19 @@ def searched(rows: Sequence[Row]) -> list[Row]:
     return found
 
 
-def solutions_figure(surfaces: Sequence[Surface], rows: Sequence[Row], h: float, title: str) -> "Figure":
-    """Draw the deformed shells of some rows, all from one side, each coloured by its own displacement."""
-    camera = towards(deflected_place(surfaces[-1]))
-    views = []
-    for surface, row in zip(surfaces, rows, strict=True):
-        smooth = smooth_surface(surface, h)
-        limit = float(np.abs(surface.w).max() / h) or 1.0
-        name = f"solution {row['branch']}" if row["label"] == SOLUTION else "end of the path"
-        caption = f"$w/h$, {name}: {stability(row).split()[0]}"
-        views.append(View(smooth, smooth.point_data["w_over_h"], (-limit, limit), "RdBu_r", camera, PANEL, caption))
-    return panels(rendered(views), views, title)
+def solutions_figure(
+    surfaces: Sequence[Surface], rows: Sequence[Row], h: float, style: OutputSection, camera: Camera
+) -> "Figure":
+    """Draw the deformed shells of some rows with the same colours."""
+    largest = max(float(np.abs(surface.w).max()) for surface in surfaces) / h or 1.0
+    limits = (-largest, largest)
+    layers = [
+        Coloured("w_over_h", np.asarray(s.w / h), limits, SIGNED, "inward normal displacement $w/h$") for s in surfaces
+    ]
+    captions = [f"{_name(row)}: {stability(row).split()[0]}" for row in rows]
+    with drawing(style):
+        return small_panels(surfaces, layers, captions, style, camera)
+
+
+def _name(row: Row) -> str:
+    return f"solution {row['branch']}" if row["label"] == SOLUTION else "end of the path"

@@ -11,9 +11,12 @@ from markupsafe import Markup
 
 from magshell_fenicsx.output.fields.frequencies import Frequency, read_frequencies
 from magshell_fenicsx.output.report.html_numbers import number
+from magshell_fenicsx.output.report.interactive import interactive
+from magshell_fenicsx.output.report.light import light
 from magshell_fenicsx.output.report.report_path import Line, head, path_table, pole_head, symbol
 from magshell_fenicsx.output.report.verdict import Summary, located, read_run, value, verdict
 from magshell_fenicsx.output.store.durable import write_whole
+from magshell_fenicsx.output.store.known import pole_of
 from magshell_fenicsx.output.store.table import stability
 from magshell_fenicsx.quantities.registry import amplitude, shown
 
@@ -48,38 +51,45 @@ TIMES = {
 }
 
 
-def write_report(folder: Path) -> None:
-    """Write report.html from summary.json, path.csv and the pictures in a run's folder.
+def write_report(folder: Path, *, playable: bool = True) -> None:
+    """Write report.html from summary.json, path.csv, the pictures and the fields in a run's folder.
+
+    Parameters
+    ----------
+    playable
+        Whether it has the shell to turn and the path to walk along.
 
     Raises
     ------
     OSError
         If summary.json or path.csv is missing, or the report cannot be written; an older report stays unchanged.
     """
-    write_whole(folder / NAME, report(folder).encode())
+    write_whole(folder / NAME, report(folder, playable=playable).encode())
 
 
-def report(folder: Path) -> str:
+def report(folder: Path, *, playable: bool = True) -> str:
     """The content of report.html."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined  # takes long to import
 
     loader = FileSystemLoader(Path(__file__).parent)
     made = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    return made.get_template(TEMPLATE).render(_content(folder))
+    return made.get_template(TEMPLATE).render(_content(folder, playable))
 
 
-def _content(folder: Path) -> dict[str, Any]:
+def _content(folder: Path, playable: bool) -> dict[str, Any]:
     """The values of the template."""
     summary, lines = read_run(folder)
-    path = path_table(lines, "m" if summary["dimensions"]["units"] == "SI" else "")
+    played = interactive(folder, summary["case"]) if playable else None  # it moves in place of the animation
+    path = path_table(lines, "m" if summary["dimensions"]["units"] == "SI" else "", pole_of(summary["case"]))
     return {
         "name": folder.resolve().name,
         "summary": summary,
         "verdict": verdict(summary, lines),
         "groups": _groups(summary),
         "dimensions": _dimensions(summary),
-        "pictures": list(_pictures(folder)),
-        "pole": pole_head(lines[0] if lines else {}),
+        "pictures": list(_pictures(folder, moving=played is None)),
+        "interactive": played,
+        "pole": pole_head(lines[0] if lines else {}, pole_of(summary["case"])),
         "heads": {name: _head(name, lines[0] if lines else {}) for name in SOLUTION_COLUMNS},
         "instabilities": [_instability(line, summary) for line in located(lines)],
         "solutions": [_solution(it) for it in summary.get("solutions", [])],
@@ -139,11 +149,11 @@ def _dimensions(summary: Summary) -> list[tuple[Markup, Markup, str]]:
     ]
 
 
-def _pictures(folder: Path) -> Iterator[tuple[str, str, bool]]:
+def _pictures(folder: Path, *, moving: bool) -> Iterator[tuple[str, str, bool]]:
     """Source and caption of each picture in the folder, and whether it is shown small."""
     for pattern, caption in PICTURES.items():
-        for file in sorted(folder.glob(pattern)):
-            content = base64.b64encode(file.read_bytes()).decode()
+        for file in sorted(folder.glob(pattern)) if moving or pattern != "animation.gif" else []:
+            content = base64.b64encode(light(file.read_bytes())).decode()
             yield f"data:image/{file.suffix[1:]};base64,{content}", caption, pattern in SMALL
 
 

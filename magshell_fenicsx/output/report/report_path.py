@@ -7,7 +7,7 @@ from math import isclose
 from markupsafe import Markup
 
 from magshell_fenicsx.output.report.html_numbers import column, power
-from magshell_fenicsx.output.store.table import pole_name
+from magshell_fenicsx.output.store.table import POLE, pole_name
 from magshell_fenicsx.quantities.quantity import Quantity
 from magshell_fenicsx.quantities.registry import amplitude, quantity, shown
 
@@ -46,12 +46,12 @@ def head(known: Quantity) -> Markup:
     return Markup(known.html) if known.symbol else Markup("{}").format(known.words)
 
 
-def pole_head(line: Line) -> Markup:
+def pole_head(line: Line, pole: str = POLE) -> Markup:
     """The heading of w_pole_over_h, with the point that it belongs to."""
-    return Markup("{}, {}").format(head(shown("w_pole_over_h", line)), pole_name(line).removeprefix("the "))
+    return Markup("{}, {}").format(head(shown("w_pole_over_h", line)), pole_name(line, pole).removeprefix("the "))
 
 
-def path_table(lines: Sequence[Line], length_unit: str) -> list[Column]:
+def path_table(lines: Sequence[Line], length_unit: str, pole: str = POLE) -> list[Column]:
     """The columns that vary, in the order of interest; a displacement equal to an earlier one is left out.
 
     What is in the case's units is shown in these alone.
@@ -60,6 +60,8 @@ def path_table(lines: Sequence[Line], length_unit: str) -> list[Column]:
     ----------
     length_unit
         Unit of the displacements of named points.
+    pole
+        Name of the point of w_pole_over_h.
     """
     there = lines[0] if lines else {}
     in_units = {known.name for name in there if (known := shown(name, there)).name != name}
@@ -77,8 +79,8 @@ def path_table(lines: Sequence[Line], length_unit: str) -> list[Column]:
         known = shown(name, there)
         of_all = energies if known.kind == "energy" else ()
         table[name] = _column(known, [line.get(known.name, "") for line in lines], length_unit, of_all)
-    if pole := table.get("w_pole_over_h"):
-        table["w_pole_over_h"] = replace(pole, head=pole_head(lines[0]))
+    if at_pole := table.get("w_pole_over_h"):
+        table["w_pole_over_h"] = replace(at_pole, head=pole_head(lines[0], pole))
     return list(table.values())
 
 

@@ -12,6 +12,7 @@ from markupsafe import Markup
 
 from magshell_fenicsx.output.report.html_numbers import number
 from magshell_fenicsx.output.report.report_path import Line, head, symbol
+from magshell_fenicsx.output.store.known import pole_of
 from magshell_fenicsx.output.store.table import LOCATED, OWN_MODES, pole_name
 from magshell_fenicsx.quantities.quantity import PLAIN, Quantity
 from magshell_fenicsx.quantities.registry import amplitude, axes_of, shown
@@ -90,7 +91,7 @@ def _instability(line: Line, summary: Summary) -> Markup:
     kind = line["label"]
     if line["mode"]:
         kind += f" ({line['mode']}{' waves' if line['mode'] not in (*OWN_MODES, 'antisymmetric') else ''})"
-    at, place = value(line, summary), _displacement(line)
+    at, place = value(line, summary), _displacement(line, summary)
     if line["amplitude"] == "pressure" and summary["knockdown"] is not None:
         sentence = "The shell buckles at the knockdown factor k<sub>d</sub> = {}: a {}, {}."
     elif line["amplitude"] == "lambda_m":
@@ -107,22 +108,20 @@ def _end(summary: Summary, lines: Sequence[Line]) -> Markup:
         return Markup("Nothing loads the shell: this is its undeformed state." if not summary["stopped"] else "")
     arrived = last["label"] in ("target", "field") and not summary["stopped"]
     reached = "The run reached its target" if arrived else "The last point"
-    return Markup("{}: {}, {}.").format(reached, value(last, summary), _displacement(last))
+    place = pole_name(last, pole_of(summary["case"]))
+    return Markup("{}: {}, {}.").format(reached, value(last, summary), _displacement(last, place))
 
 
-def _displacement(line: Line) -> Markup:
+def _displacement(line: Line, pole: str) -> Markup:
     """The displacement, and the force on what moves."""
     varied = amplitude(line["amplitude"])
+    at_pole = Markup("{} at {}").format(_amount(shown("w_pole_over_h", line), line), pole)
     force = [q for q in axes_of(line["amplitude"], line) if q.kind == "reaction" or q.name.startswith("force")]
     if force and varied.column != "force":
-        return Markup("{}, {}").format(_amount(force[0], line), _at_pole(line))
+        return Markup("{}, {}").format(_amount(force[0], line), at_pole)
     if varied.conjugate == "w_over_h" and line["w_over_h"] != line["w_pole_over_h"]:
         return Markup("{} {}").format(_amount(shown("w_over_h", line), line), varied.place)
-    return _at_pole(line)
-
-
-def _at_pole(line: Line) -> Markup:
-    return Markup("{} at {}").format(_amount(shown("w_pole_over_h", line), line), pole_name(line))
+    return at_pole
 
 
 def _amount(known: Quantity, line: Line) -> Markup:

@@ -12,14 +12,15 @@ from magshell_fenicsx.quantities.registry import OF_EVERY_RUN
 COLUMNS = tuple(q.name for q in OF_EVERY_RUN)
 TEXTS = tuple(q.name for q in OF_EVERY_RUN if q.kind == "text")
 Row = dict[str, float | int | str]
+POLE = "the pole"
 LOCATED = ("fold", "bifurcation")
 SOLUTION = "solution"  # label of what a search found
 OWN_MODES = ("", "symmetric", "asymmetric")  # modes of the model itself; it excludes all other modes
 
 
-def pole_name(row: Mapping[str, object]) -> str:
-    """The point of `w_pole_over_h`: the first named point, or the pole."""
-    return next((key.removesuffix("_ux") for key in row if key.endswith("_ux")), "the pole")
+def pole_name(row: Mapping[str, object], pole: str = POLE) -> str:
+    """The point of `w_pole_over_h`: the first named point, or what is there in place of a pole, see `pole_of`."""
+    return next((key.removesuffix("_ux") for key in row if key.endswith("_ux")), pole)
 
 
 def stability(row: Mapping[str, object]) -> str:

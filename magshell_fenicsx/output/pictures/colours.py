@@ -1,0 +1,145 @@
+"""Fields as colours: values, limits, captions with units; what is zero or cannot be said is named, not drawn."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magshell_fenicsx.output.fields.surface import Surface
+from magshell_fenicsx.output.pictures.bars import SIGNED
+
+Array = NDArray[np.float64]
+MAGNITUDE = "viridis"
+STRAINS = {"E_1": "larger principal membrane strain $E_1$", "E_2": "smaller principal membrane strain $E_2$"}
+MOMENTS = {"M_1": "larger principal bending moment $M_1R/D$", "M_2": "smaller principal bending moment $M_2R/D$"}
+LOADS = {  # caption with its unit, name in words
+    "couple": (
+        r"couple $|F\hat B^\mathrm{r} \times \hat B^\mathrm{a}|$ over $hE\lambda_\mathrm{m}$",
+        "couple of the remanence in the field",
+    ),
+    "p_mag": (r"magnetic pressure $p_\mathrm{mag}/(E\lambda_\mathrm{m})$", "magnetic pressure"),
+    "f_mag": (r"in-plane force $|f_\mathrm{mag}|/(E\lambda_\mathrm{m})$", "in-plane force"),
+    "k": (r"rotational springs $k/(hE\lambda_\mathrm{m})$", "rotational springs"),
+    "tau": (r"torque of gradients $|\tau(u)|/(hE\lambda_\mathrm{m})$", "torque of gradients"),
+}
+SCALARS = {  # of the interactive report, in HTML; of vectors the length
+    "w_over_h": "inward displacement w/h",
+    "E_1": "larger membrane strain E<sub>1</sub>",
+    "E_2": "smaller membrane strain E<sub>2</sub>",
+    "M_1": "larger bending moment M<sub>1</sub>R/D",
+    "M_2": "smaller bending moment M<sub>2</sub>R/D",
+    "couple": "couple |B<sup>r</sup>×B<sup>a</sup>|/(hEλ<sub>m</sub>)",
+    "p_mag": "magnetic pressure/(Eλ<sub>m</sub>)",
+    "f_mag": "magnetic in-plane force/(Eλ<sub>m</sub>)",
+    "k": "rotational springs/(hEλ<sub>m</sub>)",
+    "tau": "torque of gradients/(hEλ<sub>m</sub>)",
+    "gap_over_h": "gap/h",
+    "contact_pressure": "contact pressure pR/(Eh)",
+    "w0_over_h": "imperfections w<sub>0</sub>/h",
+}
+ZERO = 1e-9  # loads are of the order of one or of h: what is smaller comes from rounding
+ROUNDING = {"E_1": 1e-13, "M_1": 1e-8}  # smaller values are drawn as zero
+EVERYWHERE, PEAK = 0.997, 1.5  # colour limit: PEAK times this quantile of the area
+
+
+@dataclass(frozen=True)
+class Coloured:
+    """Values (n,) at the nodes with their limits, a colour map and the caption of its bar."""
+
+    name: str
+    values: Array
+    limits: tuple[float, float]
+    colours: str
+    caption: str
+
+
+def shell(surface: Surface, h: float) -> list[Coloured]:
+    """w/h, white at zero."""
+    w = np.asarray(surface.w / h, np.float64)
+    limit = float(np.abs(w).max()) or 1.0
+    return [Coloured("w_over_h", w, (-limit, limit), SIGNED, "inward normal displacement $w/h$")]
+
+
+def strains(surface: Surface) -> list[Coloured]:
+    return _principal(surface, STRAINS)
+
+
+def moments(surface: Surface) -> list[Coloured]:
+    return _principal(surface, MOMENTS)
+
+
+def jump_said(surface: Surface) -> str:
+    """How smooth the moments are before their mean at the nodes is drawn."""
+    if surface.jump is None:
+        return ""
+    return f"Means of the cells at their nodes; between cells the moments jump by {100 * surface.jump:.2g} % (rms)."
+
+
+def _principal(surface: Surface, captions: dict[str, str]) -> list[Coloured]:
+    """Two fields with the same colours, white at zero, so that rounding of a constant field is invisible."""
+    if not captions.keys() <= surface.fields.keys():
+        return []
+    limit = _limit(surface, *captions)
+    return [Coloured(name, surface.fields[name], (-limit, limit), SIGNED, said) for name, said in captions.items()]
+
+
+def _limit(surface: Surface, first: str, second: str) -> float:
+    """The colour limit of two fields: their largest magnitude, without peaks of small area such as at a point load."""
+    size = np.maximum(np.abs(surface.fields[first]), np.abs(surface.fields[second]))
+    if (largest := float(size.max())) < ROUNDING[first]:
+        return 1.0
+    in_cells = size[surface.cells].mean(axis=1)
+    a, b, c = np.moveaxis(surface.r0[surface.cells[:, :3]], 1, 0)
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    order = np.argsort(in_cells)
+    most = in_cells[order][np.searchsorted(np.cumsum(area[order]), EVERYWHERE * area.sum())]
+    return float(min(largest, max(PEAK * most, ROUNDING[first])))
+
+
+def couple(surface: Surface) -> Array | None:
+    """The moment (n, 3) of the field on the carried remanence per area, over h E λ_m; None without a field.
+
+    λ_m is the largest length of the applied field, so that of a uniform field it is the product of unit vectors.
+    """
+    fields = surface.fields
+    if not {"Br", "Ba"} <= fields.keys():
+        return None
+    largest = float(np.nan_to_num(np.linalg.norm(fields["Ba"], axis=1)).max())
+    return np.asarray(np.cross(fields["Br"], fields["Ba"]) / largest, np.float64) if largest else None
+
+
+def loads(surface: Surface, h: float) -> tuple[list[Coloured], str]:
+    """The magnetic loads that are not zero everywhere, and a sentence on those left out."""
+    fields = surface.fields
+    c = couple(surface)
+    if c is None:
+        return [], ""
+    shown, zero, unknown = [], [], []
+    for name, (caption, words) in LOADS.items():
+        values = c if name == "couple" else fields.get(name)
+        if values is None:
+            unknown.append(words)
+            continue
+        signed = values.ndim == 1
+        values = np.nan_to_num(values if signed else np.linalg.norm(values, axis=1))
+        largest = float(np.abs(values).max())
+        if largest < ZERO:
+            zero.append(words)
+            continue
+        limits = (-largest, largest) if signed else (0.0, largest)
+        shown.append(Coloured(name, values, limits, SIGNED if signed else MAGNITUDE, caption))
+    said = [f"Zero everywhere: {', '.join(zero)}."] if zero else []
+    said += [f"Not defined for this remanence or field: {', '.join(unknown)}."] if unknown else []
+    return shown, " ".join(said)
+
+
+def contact(surface: Surface) -> list[Coloured]:
+    """The gap and the pressure of bodies."""
+    if not {"gap_over_h", "contact_pressure"} <= surface.fields.keys():
+        return []
+    gap, pressure = surface.fields["gap_over_h"], surface.fields["contact_pressure"]
+    most = float(pressure.max()) or 1.0
+    return [
+        Coloured("gap_over_h", gap, (0.0, 1.0), "viridis_r", "gap over $h$"),
+        Coloured("contact_pressure", pressure, (0.0, most), "Reds", r"contact pressure $pR/(Eh)$"),
+    ]

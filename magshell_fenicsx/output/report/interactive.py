@@ -1,0 +1,194 @@
+"""The part of a report to play with: the deformed shell to turn, a slider along the path, the curve linked to it.
+
+All data stand in the page: the rows of path.csv as JSON, the shells as small integers, compressed.
+"""
+
+import base64
+import importlib.util
+import json
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from markupsafe import Markup
+from numpy.typing import NDArray
+
+from magshell_fenicsx.output.fields.point_file import read_point
+from magshell_fenicsx.output.fields.surface import Surface
+from magshell_fenicsx.output.fields.vtu import point_file
+from magshell_fenicsx.output.pictures.camera import run_camera
+from magshell_fenicsx.output.pictures.colours import SCALARS, couple
+from magshell_fenicsx.output.pictures.sources import near_outlines
+from magshell_fenicsx.output.pictures.thinned import Thinned, thinned
+from magshell_fenicsx.output.store.known import pole_of, style_of
+from magshell_fenicsx.output.store.table import LOCATED, POLE, SOLUTION, Row, pole_name, read_rows
+from magshell_fenicsx.quantities.registry import amplitude, axes_of, quantity
+
+Array = NDArray[np.float64]
+MOST_FRAMES, FEWEST_FRAMES = 24, 6
+MOST_VALUES = 110_000  # vertices times frames
+LEVEL = 3  # of zlib: a tenth larger than by default, in half of the time
+SCRIPT = "interactive.js"
+
+
+@dataclass(frozen=True)
+class Interactive:
+    """What the page's script needs.
+
+    Attributes
+    ----------
+    about
+        JSON: rows, columns, frames, fields, limits, and where each array begins.
+    data
+        Base64 of the compressed arrays, see `_Packed`.
+    library, script
+        Plotly in base64, compressed; the script of this package.
+    """
+
+    about: Markup
+    data: str
+    library: str
+    script: Markup
+
+
+def interactive(folder: Path, case: Mapping[str, Any]) -> Interactive | None:
+    """The data of a run's folder; None without fields of two points, or without Plotly."""
+    fields = folder / "fields"
+    rows = [row for row in read_rows(folder / "path.csv") if (fields / point_file(int(row["point"]))).exists()]
+    if len(rows) < 2 or (library := plotly()) is None:
+        return None
+    last = next(row for row in reversed(rows) if row["label"] != SOLUTION)
+    surface, about = read_point(fields, int(last["point"]))
+    mesh = thinned(surface, MOST_VALUES // FEWEST_FRAMES)
+    frames = chosen_frames(rows, min(MOST_FRAMES, MOST_VALUES // mesh.count))
+    shells = [read_point(fields, int(row["point"]))[0] for row in frames]
+    packed = _Packed()
+    content: dict[str, Any] = {
+        **_path(rows, last, pole_of(case)),
+        "frames": [rows.index(row) for row in frames],
+        "h": about.h,
+        "camera": run_camera(surface, style_of(case)).direction.tolist(),
+        "r0": packed.add(mesh.at(surface.r0), np.uint16),
+        "triangles": packed.raw(mesh.triangles.astype(np.uint16 if mesh.count < 2**16 else np.uint32)),
+        "u": [packed.add(mesh.at(s.u), np.int16) for s in shells],
+        "lines": [[np.round(line, 4).tolist() for line in near_outlines(s)] for s in shells],
+        "fields": _fields(shells, mesh, about.h, packed),
+    }
+    text = json.dumps(content).replace("<", "\\u003c")  # nothing in it can end the script
+    script = Path(__file__).with_name(SCRIPT).read_text(encoding="utf-8")
+    return Interactive(Markup(text), packed.content, library, Markup(script))
+
+
+def chosen_frames(rows: Sequence[Row], most: int) -> list[Row]:
+    """At most about so many rows of a path, evenly, besides the first, the last, and instabilities and solutions."""
+    special = [row for row in rows if row["label"] in (*LOCATED, SOLUTION)][: most // 2]
+    others = [row for row in rows if row not in special]
+    count = min(len(others), max(most - len(special), 2))
+    even = [others[round(i * (len(others) - 1) / max(count - 1, 1))] for i in range(count)]
+    return sorted([*special, *even], key=lambda row: int(row["point"]))
+
+
+def _path(rows: Sequence[Row], last: Row, pole: str) -> dict[str, Any]:
+    """The numbers of path.csv that vary, names of columns, and the axes that the curve begins with."""
+    numeric = [name for name in rows[0] if not isinstance(rows[0][name], str)]
+    varying = [name for name in numeric if len({row[name] for row in rows}) > 1]
+    varied = next((str(row["amplitude"]) for row in [last, *reversed(rows)] if row["amplitude"]), "")
+    axes = [q.name for q in axes_of(varied, rows[0])] if varied else varying[:2]
+    names = list(dict.fromkeys([*axes, *varying]))
+    labels = {name: _label(name, rows[0], pole) for name in names}
+    return {
+        "columns": {name: {"label": labels[name], "values": [row[name] for row in rows]} for name in names},
+        "signs": {q.name: q.sign for q in axes_of(varied, rows[0])} if varied else {},
+        "axes": axes,
+        "points": [row["point"] for row in rows],
+        "labels": [row["label"] for row in rows],
+        "branches": [row["branch"] for row in rows],
+        "unstable": [int(row["negative_pivots"]) + int(row.get("excluded_pivots", 0)) > 0 for row in rows],
+        "varied": quantity(amplitude(varied).column).name if varied else "",
+    }
+
+
+def _label(name: str, row: Row, pole: str) -> str:
+    known = quantity(name)
+    words = f"{known.words} {known.note}".strip().replace(POLE, pole_name(row, pole))
+    unit = f" ({known.shown_unit})" if known.shown_unit else ""
+    return str(Markup("{}{}{}").format(words, Markup(f" {known.html}") if known.symbol else "", unit))
+
+
+def _fields(shells: Sequence[Surface], mesh: Thinned, h: float, packed: "_Packed") -> list[dict[str, Any]]:
+    """Every scalar and every length of a vector, with the colour limits of the whole path."""
+    found = []
+    for name, caption in SCALARS.items():
+        values = [_values(shell, name, h) for shell in shells]
+        there = [v for v in values if v is not None]
+        if len(there) < len(shells):
+            continue
+        low, high = min(float(v.min()) for v in there), max(float(v.max()) for v in there)
+        if low < 0:
+            low, high = -max(-low, high), max(-low, high)
+        if high - low < 1e-12:
+            low, high = low - 1.0, low + 1.0
+        steps = [np.rint(255 * (mesh.at(v) - low) / (high - low)).astype(np.uint8) for v in there]
+        still = all((step == steps[0]).all() for step in steps)
+        places = [packed.raw(step) for step in (steps[:1] if still else steps)]
+        found.append({"name": name, "label": caption, "low": low, "high": high, "at": places})
+    return found
+
+
+def _values(surface: Surface, name: str, h: float) -> Array | None:
+    if name == "w_over_h":
+        return np.asarray(surface.w / h)
+    values = couple(surface) if name == "couple" else surface.fields.get(name)
+    if values is None and name == "couple" and "Ba" in surface.fields:
+        return np.zeros(len(surface.r0))  # before the field is applied
+    if values is None:
+        return None
+    return np.nan_to_num(values if values.ndim == 1 else np.linalg.norm(values, axis=1))
+
+
+class _Packed:
+    """Arrays one after the other, each at a multiple of four bytes."""
+
+    def __init__(self) -> None:
+        self._parts: list[bytes] = []
+        self._length = 0
+
+    def add(self, values: Array, kind: type[np.integer[Any]]) -> dict[str, Any]:
+        """Values (n, 3) as integers: low + step i."""
+        least, most = np.iinfo(kind).min, np.iinfo(kind).max
+        low, high = float(values.min()), float(values.max())
+        if least < 0:
+            low, high = 0.0, max(abs(low), abs(high))
+        step = (high - low) / most or 1.0
+        return {**self.raw(np.rint((values - low) / step).astype(kind)), "low": low, "step": step}
+
+    def raw(self, values: NDArray[Any]) -> dict[str, Any]:
+        content = np.ascontiguousarray(values).tobytes()
+        at = {"at": self._length, "size": int(values.size), "kind": values.dtype.name}
+        self._parts.append(content + bytes(-len(content) % 4))
+        self._length += len(self._parts[-1])
+        return at
+
+    @property
+    def content(self) -> str:
+        return packed(b"".join(self._parts))
+
+
+def packed(content: bytes) -> str:
+    """Compressed, in base64."""
+    return base64.b64encode(zlib.compress(content, LEVEL)).decode()
+
+
+@cache
+def plotly() -> str | None:
+    """Plotly's script, packed; None if it is not installed. Its Python is not imported."""
+    found = importlib.util.find_spec("plotly")
+    for place in (found.submodule_search_locations or []) if found else []:
+        file = Path(place) / "package_data" / "plotly.min.js"
+        if file.exists():
+            return packed(file.read_bytes())
+    return None
