@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.case.output import OutputSection
 from magshell_fenicsx.output.fields.surface import Surface, completed
 from magshell_fenicsx.output.fields.vtu import About, FieldSeries, point_file, read_vtu
-from magshell_fenicsx.output.pictures.arrows import _spread, drawn_arrows
+from magshell_fenicsx.output.pictures.arrows import drawn_arrows, spread
 from magshell_fenicsx.output.pictures.bars import SIGNED, colour_map
 from magshell_fenicsx.output.pictures.camera import towards
 from magshell_fenicsx.output.pictures.captions import caption
@@ -224,7 +224,7 @@ def test_rounding_is_no_pattern() -> None:
 
 def test_arrows_are_apart() -> None:
     r = np.random.default_rng(0).random((500, 3))
-    chosen = r[_spread(r, 0.3)]
+    chosen = r[spread(r, 0.3)]
     distance = np.linalg.norm(chosen[:, None] - chosen, axis=2)
     assert distance[~np.eye(len(chosen), dtype=bool)].min() >= 0.3
     assert np.linalg.norm(r[:, None] - chosen, axis=2).min(axis=1).max() < 0.3

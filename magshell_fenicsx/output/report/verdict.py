@@ -91,7 +91,7 @@ def _instability(line: Line, summary: Summary) -> Markup:
     kind = line["label"]
     if line["mode"]:
         kind += f" ({line['mode']}{' waves' if line['mode'] not in (*OWN_MODES, 'antisymmetric') else ''})"
-    at, place = value(line, summary), _displacement(line, summary)
+    at, place = value(line, summary), _displacement(line, pole_name(line, pole_of(summary["case"])))
     if line["amplitude"] == "pressure" and summary["knockdown"] is not None:
         sentence = "The shell buckles at the knockdown factor k<sub>d</sub> = {}: a {}, {}."
     elif line["amplitude"] == "lambda_m":
