@@ -16,7 +16,7 @@ from magshell_fenicsx.case.design import DesignSection
 from magshell_fenicsx.case.ensemble import EnsembleSection
 from magshell_fenicsx.case.expressions import is_formula
 from magshell_fenicsx.case.fields import MagneticSection, layer_average
-from magshell_fenicsx.case.file import FileKeys
+from magshell_fenicsx.case.file import digests
 from magshell_fenicsx.case.frequencies import FrequenciesSection
 from magshell_fenicsx.case.gradients import GradientsSection
 from magshell_fenicsx.case.imperfections.dimple import DimpleSection
@@ -328,8 +328,7 @@ class Case(WithParts):
         mesh = {"mesh_file": self.shell.digest} if isinstance(self.shell, MeshSurface) else {}
         sections: dict[str, object] = {"magnetic.remanent": self.magnetic.remanent} if self.magnetic else {}
         sections |= self.imperfections | {f"magnetic.applied.sources.{i}": s for i, s in enumerate(self.sources)}
-        files = {f"{key}.file": s.digest for key, s in sections.items() if isinstance(s, FileKeys) and s.file}
-        return mesh | files | self.term_digests
+        return mesh | digests(sections) | self.term_digests
 
     @classmethod
     def load(cls, file: str | Path, settings: Sequence[str] = ()) -> "Case":

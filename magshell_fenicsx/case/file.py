@@ -1,6 +1,7 @@
 """Files that a section of a case reads."""
 
 import hashlib
+from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -33,3 +34,8 @@ class FileKeys(Section):
             return hashlib.sha256(self.path.read_bytes()).hexdigest()
         except OSError:
             return None
+
+
+def digests(sections: Mapping[str, object]) -> dict[str, str | None]:
+    """Hashes of the files that some sections read, by the keys of the files."""
+    return {f"{key}.file": s.digest for key, s in sections.items() if isinstance(s, FileKeys) and s.file}
