@@ -149,13 +149,14 @@ def plot_curve(axes: "Axes", of: Part, pole: str = POLE) -> None:
         at, kind = place(row, amplitude), str(row["label"])
         inside = "white" if kind == "bifurcation" else "C3"
         axes.plot(*at, "o", color="C3", markersize=4.5, label=_once(axes, kind), zorder=4, markerfacecolor=inside)
-        axes.annotate(str(of.numbers[int(row["point"])]), at, (-4, 0), textcoords="offset points", ha="right")
+        axes.annotate(str(of.numbers[int(row["point"])]), at, (-3, 3), textcoords="offset points", ha="right")
     for row in (row for row in part if row["label"] == SOLUTION):
         name, inside = ("unstable", "none") if _unstable(row) else ("stable", "C2")
         label = _once(axes, f"{name} solution")
         axes.plot(*place(row, amplitude), "s", color="C2", markerfacecolor=inside, markersize=4.5, label=label)
         axes.annotate(str(row["branch"]), place(row, amplitude), (0, 6), textcoords="offset points")
     axes.set(xlabel=x_label, ylabel=y_label)
+    axes.margins(0.06, 0.09)  # room for the numbers
     axes.locator_params(axis="x", nbins=6 if axes.get_position().width > NARROW else 3)
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_formatter(number_format())
