@@ -42,6 +42,7 @@ from magshell_fenicsx.case.source import CaseError, Source, read_source
 from magshell_fenicsx.case.sources.source import SourceSection
 from magshell_fenicsx.case.stability import StabilitySection
 from magshell_fenicsx.case.surfaces import CapSurface, MeshSurface, RevolutionSurface, Surface, SurfaceSection
+from magshell_fenicsx.case.targets import NOTED
 from magshell_fenicsx.case.viscosity import refuse_unfit_viscosity
 from magshell_fenicsx.parts.part import Part, Scales
 from magshell_fenicsx.parts.registered import PARTS, WithParts
@@ -55,7 +56,7 @@ class Case(WithParts):
 
     model: Literal["shell", "solid"] = "shell"
     """A thin shell, or its body in three dimensions"""
-    shell: Annotated[ShellSection | Surface, Field(discriminator="geometry")]
+    shell: Annotated[ShellSection | Surface, Field(discriminator="geometry"), NOTED]
     """Mid-surface, thickness and material"""
     solid: SolidSection | None = None
     """Of `model: solid`"""
@@ -326,9 +327,8 @@ class Case(WithParts):
     def outside(self) -> dict[str, str | None]:
         """Hashes of what is solved besides its own keys: mesh file, other files, user-defined energies."""
         mesh = {"mesh_file": self.shell.digest} if isinstance(self.shell, MeshSurface) else {}
-        sections: dict[str, object] = {"magnetic.remanent": self.magnetic.remanent} if self.magnetic else {}
-        sections |= self.imperfections | {f"magnetic.applied.sources.{i}": s for i, s in enumerate(self.sources)}
-        return mesh | digests(sections) | self.term_digests
+        sections = self.imperfections | {f"magnetic.applied.sources.{i}": s for i, s in enumerate(self.sources)}
+        return mesh | digests(sections, self.magnetic and self.magnetic.remanent) | self.term_digests
 
     @classmethod
     def load(cls, file: str | Path, settings: Sequence[str] = ()) -> "Case":

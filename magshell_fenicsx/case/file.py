@@ -36,6 +36,7 @@ class FileKeys(Section):
             return None
 
 
-def digests(sections: Mapping[str, object]) -> dict[str, str | None]:
-    """Hashes of the files that some sections read, by the keys of the files."""
+def digests(sections: Mapping[str, object], remanent: object) -> dict[str, str | None]:
+    """Hashes of the files that the remanence and other sections read, by the keys of the files."""
+    sections = {"magnetic.remanent": remanent, **sections}
     return {f"{key}.file": s.digest for key, s in sections.items() if isinstance(s, FileKeys) and s.file}

@@ -4,15 +4,14 @@ from collections.abc import Collection
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.fields import MU_0
+from magshell_fenicsx.case.targets import given
 from magshell_fenicsx.quantities.units import Sizes, sizes
 
 
 def sizes_of(case: Case, moments: Collection[str] = ()) -> Sizes:
     """The sizes of what a case gives with units; `moments` are columns of reactions that are moments."""
     shell, magnetic = case.shell, case.magnetic
-    measured = shell.with_units
-    in_pascals = measured or shell.geometry in ("hemisphere", "disc", "strip")  # whose modulus always has a unit
-    E = shell.youngs_modulus if in_pascals else None
+    R, E = given(shell)
     by_sources = magnetic is not None and not magnetic.applied.beside
     per_lambda = None
     if magnetic and magnetic.remanent.flux_density and E:
@@ -20,9 +19,9 @@ def sizes_of(case: Case, moments: Collection[str] = ()) -> Sizes:
     of = sizes(
         shell.poisson_ratio,
         shell.R_over_h,
-        R=shell.reference if measured else None,
+        R=R,
         E=E,
         per_lambda=per_lambda,
-        in_seconds=measured and case.time_unit is not None,
+        in_seconds=shell.with_units and case.time_unit is not None,
     )
     return Sizes(of, "%" if by_sources else "mT", moments)

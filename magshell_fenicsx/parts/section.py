@@ -139,6 +139,8 @@ def texts(part: Any, known: Callable[[str], bool] = lambda text: False, path: st
 
 _EXAMPLES = {
     "metre": "25.2 mm",
+    "millimetre": "0.5 mm",
+    "millimetre**3": "80 mm^3",
     "pascal": "1.8 MPa",
     "tesla": "60 mT",
     "newton": "20 mN",

@@ -1,12 +1,13 @@
 """A rigid body that presses on the shell."""
 
 from math import copysign
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field
 
 from magshell_fenicsx.case.loads.edge import Name
 from magshell_fenicsx.case.loads.step import Control, Count, Now, PathStep, Target, Until
+from magshell_fenicsx.case.targets import over
 
 FIRST = 0.1  # of h: the first step of the approach towards a force
 
@@ -29,9 +30,9 @@ class ContactSection(PathStep):
     control: Literal["approach", "force", "arc"] = "arc"
     """What is prescribed step by step: the approach, the force, or arc length, which passes every fold"""
     until: Until = "target"
-    approach: float | None = Field(default=None, ge=-1e6, le=1e6)
+    approach: Annotated[float, over("h")] | None = Field(default=None, ge=-1e6, le=1e6)
     """Target of the approach, from where the body is at first; with control: approach or arc [h]"""
-    force: float | None = Field(default=None, ge=-1e6, le=1e6)
+    force: Annotated[float, over("2πD/R")] | None = Field(default=None, ge=-1e6, le=1e6)
     """Target of the force on the body; with control: force or arc [2πD/R]"""
     points: Count = 20
 

@@ -1,12 +1,13 @@
 """A force that pushes on one place."""
 
 from math import copysign
-from typing import Any, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
 from magshell_fenicsx.case.direction import Direction
 from magshell_fenicsx.case.loads.step import Count, Now, PathStep, Target, Until
+from magshell_fenicsx.case.targets import over
 
 LEAST_HUMP = 0.01  # F of the first step towards the top of an energy barrier
 
@@ -42,12 +43,12 @@ class IndentationSection(PathStep):
     control: Literal["displacement", "load", "arc"] = "displacement"
     """What is prescribed step by step: w, F, or arc length, which passes every fold"""
     until: Until = "target"
-    depth: float | None = Field(default=None, ge=-1e4, le=1e4)
+    depth: Annotated[float, over("h")] | None = Field(default=None, ge=-1e4, le=1e4)
     """Target w under the load; with control: displacement or arc [h]"""
-    force: float | None = Field(default=None, ge=-1e6, le=1e6)
+    force: Annotated[float, over("2πD/R")] | None = Field(default=None, ge=-1e6, le=1e6)
     """Target F; with control: load or arc [2πD/R]"""
     points: Count = 20
-    patch: float = Field(default=0.0, ge=0, le=1000)
+    patch: Annotated[float, over("h")] = Field(default=0.0, ge=0, le=1000)
     """Radius of the patch that the force is spread over, from 0.3; 0 is a point [h]"""
 
     @property

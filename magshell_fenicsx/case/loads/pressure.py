@@ -1,11 +1,12 @@
 """A live pressure."""
 
 from math import copysign
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
 from magshell_fenicsx.case.loads.step import Now, PathStep, Target, Until
+from magshell_fenicsx.case.targets import over
 
 
 class PressureSection(PathStep):
@@ -23,9 +24,9 @@ class PressureSection(PathStep):
     """What is prescribed step by step: ΔV, p, or arc length, which passes every fold. Beside a free edge no ΔV is
     conjugate to p: arc is then the default"""
     until: Until = "limit"
-    pressure: float | None = Field(default=None, ge=-1e3, le=1e3)
+    pressure: Annotated[float, over("p_c")] | None = Field(default=None, ge=-1e3, le=1e3)
     """Target p; with control: load or arc [p_c]"""
-    volume_change: float | None = Field(default=None, ge=-5, le=5)
+    volume_change: Annotated[float, over("R³")] | None = Field(default=None, ge=-5, le=5)
     """Target ΔV; with control: volume or arc [R³]"""
 
     def begin(self, here: float) -> float:
