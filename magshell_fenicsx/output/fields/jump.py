@@ -19,8 +19,8 @@ def relative_jump(values: Array, continuous: Array, weight: Array) -> float:
 
     Examples
     --------
-    >>> relative_jump(np.array([[3.0, 5.0], [3.0, 5.0]]), np.full((2, 2), 4.0), np.ones((2, 2)))
-    0.242...
+    >>> round(relative_jump(np.array([[3.0, 5.0], [3.0, 5.0]]), np.full((2, 2), 4.0), np.ones((2, 2))), 3)
+    0.243
     """
 
     def mean_square(f: Array) -> float:
