@@ -39,7 +39,7 @@ boundary: {root: clamped}
 points: {tip: [1, 0, 0]}
 magnetic: {lambda_m: 3.3e-5, remanent: {polar: 60}, applied: {polar: 0}}
 natural: {curvature: [0.2*x, 0.1, 0]}
-mesh: {degree: 2}
+mesh: {degree: 2, refinement: 0.4}
 """
 
 

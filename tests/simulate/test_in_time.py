@@ -197,7 +197,7 @@ def test_resumed(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_ranks(tmp_path: Path) -> None:
-    """The same columns on one rank and on three, with a volume that is held and a support that moves."""
+    """The same columns on one rank and on two, with a volume that is held and a support that moves."""
     file = tmp_path / "case.yaml"
     file.write_text(
         "shell: {geometry: disc, radius_to_thickness: 50, poisson_ratio: 0.3}\nboundary: {rim: clamped}\n"
@@ -208,7 +208,7 @@ def test_ranks(tmp_path: Path) -> None:
         "- {kind: time, duration: 20, step: 4, points: 1, history: {lift: 1e-9 + t**2*1e-5}}\n"
     )
     found = []
-    for ranks in (1, 3):
+    for ranks in (1, 2):
         out = tmp_path / str(ranks)
         done = magshell("run", file, "--out", out, ranks=ranks)
         assert done.returncode == 0, done.stderr
