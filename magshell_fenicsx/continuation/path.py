@@ -220,7 +220,7 @@ class Path:
 
     def _past_fold(self, before: Point | None, here: Point, length: float) -> float:
         """The length to a little behind the next fold of mu, where the cubic through two points has its maximum."""
-        if before is None or self.control != "arc":
+        if before is None or self.control == "load":
             return np.inf
         way, last = here.s - before.s, self.seen_from(before, here)
         mean = (here.state.mu[self.name] - before.state.mu[self.name]) / way
