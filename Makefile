@@ -4,7 +4,7 @@ PYTEST := python3 -m pytest -n auto --maxprocesses 4 --dist worksteal  # a worke
 # OPENBLAS_CORETYPE, on the command line or in the environment, must reach OpenBLAS in there
 CORE_TYPE = $(if $(OPENBLAS_CORETYPE),$(ENV) .ci/core-type $(OPENBLAS_CORETYPE))
 
-CAMPAIGN := env PYTHONPATH=cases python3 -m
+CAMPAIGN := sh -c 'PYTHONPATH=cases:$$PYTHONPATH exec python3 -m "$$@"' campaign
 
 define HELP
 make run CASE=cases/dimple_buckling.yaml [OUT=dir] [N=ranks] [ARGS="--set a=b"]

@@ -38,8 +38,10 @@ def row(file: Path) -> str:
     lines = [line.strip() for line in said.stdout.splitlines() if line.strip() and not line.startswith("results in")]
     last = lines[-1] if lines else said.stderr.strip()
     end = f" Ends with exit code {said.returncode}." if said.returncode else ""
-    shot = next(folder / name for name in FIRST if (folder / name).exists())
-    _shrink(shot, OUT / f"{file.stem}.png")
+    shots = [folder / name for name in FIRST if (folder / name).exists()]
+    if not shots:
+        raise SystemExit(f"{file.name}: no picture: {said.stderr.strip() or last}")
+    _shrink(shots[0], OUT / f"{file.stem}.png")
     return (
         f"## {file.stem}\n\n{title(file)}.\n\n![{title(file)}]({file.stem}.png)\n\n    {' '.join(command)}\n\n"
         f"{last.removesuffix('.')}.{end} CPU time: {cpu:.0f} s.\n"
