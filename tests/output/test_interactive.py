@@ -157,7 +157,7 @@ def test_view(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_options_are_keys_of_the_case(folder: Path) -> None:
-    """Wrong ones are told by name, as those of a case are."""
+    """Wrong options are reported with their names, as wrong keys of a case are."""
     drawn = plot(folder, 1, options={"formats": ["pdf"], "width": 50.0, "dpi": 60})
     assert {"shell_0001.png", "shell_0001.pdf", "fields_0001.pdf"} <= set(drawn)
     with Image.open(folder / "shell_0001.png") as image:

@@ -252,8 +252,8 @@ def completed(surface: Surface, mirror: Array) -> Surface:
 def _parity(surface: Surface, normal: Array, offset: float) -> float:
     """1 if the mirror images of remanence and applied field continue them, -1 if their opposites do.
 
-    Both are alike. The applied field, which is continuous, tells; without one the remanence, if it does not jump at the
-    plane.
+    Both have the same sign. It is that of the applied field at the plane, which is continuous there; without one, that
+    of the remanence, if it does not jump at the plane.
     """
     on = np.abs(surface.r0 @ normal - offset) < ON_PLANE
     for name in ("Ba", "Br"):

@@ -62,8 +62,9 @@ def turns(case: Case, turn: float = 0.0) -> tuple[Motion, ...]:
     for step in case.programme:
         if isinstance(step.load, RotationSection):
             after = step.load.to.vector(turn)
-            axis = np.cross(before, after) / np.linalg.norm(np.cross(before, after))
-            found.append(Motion(turn_name(step), zero, acos(float(before @ after)) * axis, zero))
+            axis = np.cross(before, after)
+            angle = acos(float(before @ after))
+            found.append(Motion(turn_name(step), zero, angle * axis / np.linalg.norm(axis), zero))
             before = after
     return tuple(found)
 
@@ -104,12 +105,12 @@ def in_space(case: Case, turn: float = 0.0) -> tuple[FieldInSpace | None, tuple[
 def _driven(case: Case, number: int, source: Placed, rotations: Sequence[Motion], Q: Array) -> Driven:
     """A source with the amplitudes of its steps; turns about its own position come before all other motions."""
     spins, moves, factors, zero = list[Motion](), list[Motion](), dict[str, float](), np.zeros(3)
-    left = {motion.name: motion for motion in rotations}
+    of_all = {motion.name: motion for motion in rotations}
     steps = {step.name: step.load for step in case.programme if isinstance(step.load, SourceStep)}
     own = {name for name, load in steps.items() if load.number(case.sources) == number}
     for step in case.programme:
         if isinstance(step.load, RotationSection):
-            moves.append(left.pop(turn_name(step)))
+            moves.append(of_all[turn_name(step)])
         if step.name not in own:
             continue
         own.remove(step.name)
