@@ -21,7 +21,7 @@ make test             lint and all tests; with ROOT=sid the tests that are not m
 make fast             lint and the tests that are not marked slow (TESTS="tests/simulate ...": of these folders)
                       (both: OPENBLAS_CORETYPE=Haswell, Nehalem, ... rounds as on another processor)
 make lint             ruff and mypy
-make gallery          every case with picture, command, result and time into docs/gallery/: 6 minutes on one core
+make gallery          every case with picture, command, result and time into docs/gallery/: 25 minutes on one core
 make site             the documentation as a site in results/site (Sphinx, from PyPI)
 make image            the Docker image magshell_fenicsx
 make clean            remove caches and compiled kernels; keeps .env/root* and results

@@ -37,6 +37,7 @@ def _folder(default: str) -> Any:
 
 def main() -> None:
     """Run the program."""
+    gc.set_threshold(100_000, 5, 5)  # Python's own would look for garbage two hundred times in a small run
     signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # sent by `magshell ... | head`; PETSc would report a crash
     try:
         app(prog_name="magshell")  # the same name however it was started: completion depends on it
@@ -261,11 +262,21 @@ app.command()(view)
 def check(case: CaseFile, set_: Settings = None) -> None:
     """Validate a case; print what would be built and what is left out."""
     from magshell_fenicsx.case.case import Case
+    from magshell_fenicsx.case.source import CaseError, read_source
     from magshell_fenicsx.plan.check import describe
     from magshell_fenicsx.simulate.perfect import with_modes
 
     with exit_codes():
-        print_line(describe(with_modes(Case.load(case, set_ or []), world())))
+        source = read_source(case, set_ or [])
+        read = Case.from_source(source)
+        print_line(describe(with_modes(read, world())))
+        if read.design:
+            from magshell_fenicsx.studies.design.numbers import refuse_unfit_numbers
+
+            try:
+                refuse_unfit_numbers(source, read, read.design)
+            except CaseError as e:
+                raise CaseError(read.placed(str(e))) from None
 
 
 def _names() -> list[str]:
@@ -314,7 +325,8 @@ def info(
     compile_: Annotated[bool, typer.Option("--compile", help="compile the kernels of degrees 3 and 4 now")] = False,
 ) -> None:
     """Print versions, the BLAS in use and the folder of the kernel cache."""
-    from magshell_fenicsx.platform.environment import fast_blas, kernel_cache, versions
+    from magshell_fenicsx.platform.environment import fast_blas, versions
+    from magshell_fenicsx.platform.kept import kernel_cache
     from magshell_fenicsx.simulate.precompile import precompile
 
     for name, number in versions().items():

@@ -22,6 +22,20 @@ from magshell_fenicsx.models.shell.parameters import Condition, Loads, MagneticE
 from magshell_fenicsx.plan.imperfections.dimple import Dimple
 
 CASES = Path(__file__).parents[1] / "cases"
+CAP = """
+shell:
+  geometry: cap
+  radius: 40 mm
+  thickness: 0.8 mm
+  polar: 45
+  youngs_modulus: 1.3 MPa
+  poisson_ratio: 0.49
+  imperfections: [{kind: dimple, amplitude: 0.8, width: 3}]
+boundary: {rim: clamped}
+magnetic: {remanent: {flux_density: 60 mT}, applied: {flux_density: 10 mT}}
+mesh: {degree: 3, refinement: 0.5}
+loading: {kind: pressure, until: limit}
+"""  # in units, with a dimple, in a field
 TILTED = Magnetisation(np.array([0.6, 0.0, 0.8]), np.array([0.0, 0.28, 0.96]))
 
 

@@ -19,7 +19,10 @@ from magshell_fenicsx.run.run import run
 
 TOP = CASES.parent
 PAGES = [TOP / "README.md", TOP / "CONTRIBUTING.md", *sorted((TOP / "docs").rglob("*.md")), TOP / "meshes/README.md"]
-GUIDES = [TOP / name for name in ("README.md", "docs/tutorial.md", "docs/howto.md", "docs/troubleshooting.md")]
+GUIDES = [
+    TOP / name
+    for name in ("README.md", "docs/install.md", "docs/tutorial.md", "docs/howto.md", "docs/troubleshooting.md")
+]
 
 
 def text(page: Path) -> str:

@@ -136,7 +136,10 @@ PARTS = [[QUICKEST], *([pytest.param(REST[i::4], marks=pytest.mark.slow, id=f"pa
 
 @pytest.mark.parametrize("scenes", PARTS)
 def test_same_path(tmp_path: Path, scenes: list[str]) -> None:
-    """Every column to 1e-8 of its largest value, second derivatives to 1e-5; the same steps, pivots and iterations."""
+    """Every column to 1e-8 of its largest value, second derivatives to 1e-5; the same steps, pivots and iterations.
+
+    Between targets to 1e-7: where a step ends follows from how the one before went.
+    """
     for ranks in (1, 2, 3):
         chosen = [scene for scene in scenes if ranks != 2 or scene == ON_TWO]
         commands = [_command(scene, tmp_path / scene / str(ranks)) for scene in chosen]
@@ -167,11 +170,14 @@ def _compare(folders: list[Path]) -> None:
         for group in [*([key] for key in COMPARED), *vectors]:  # a component that is zero counts beside the others
             scale = max((abs(float(row[key])) for row in paths[0] for key in group), default=0.0)
             for key in group:
-                a, b = ([float(row[key]) for row in path] for path in (paths[0], other))
-                assert b == pytest.approx(a, rel=0, abs=max(1e-8 * scale, 1e-18)), key
+                for row, there in zip(paths[0], other, strict=True):
+                    near = 1e-7 if row["label"] == "step" else 1e-8
+                    wanted = pytest.approx(float(row[key]), rel=0, abs=max(near * scale, 1e-18))
+                    assert float(there[key]) == wanted, (key, row["point"])
     one = fields[0]
     for other_surface in fields[1:]:
-        same = cKDTree(other_surface.r0).query(one.r0)[1]
+        places = [np.hstack([found.r0, found.n0]) for found in (one, other_surface)]  # two nodes at a fold
+        same = cKDTree(places[1]).query(places[0])[1]
         assert other_surface.fields.keys() == one.fields.keys()
         for key, values in one.fields.items():
             assert np.abs(other_surface.fields[key][same] - values).max() <= max(1e-5 * np.abs(values).max(), 1e-10), (

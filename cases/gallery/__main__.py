@@ -14,8 +14,16 @@ from magshell_fenicsx.case.examples import CASES, title
 from magshell_fenicsx.case.source import read_source
 
 OUT = CASES.parent / "docs" / "gallery"
-WIDTH, COLOURS = 420, 64  # of a picture: 10 to 30 kB
-FIRST = ("designed.png", "design.png", "ensemble.png", "solutions.png", "contact.png", "shell.png")  # that there is
+WIDTH, STEP = 420, 3  # of a picture: 10 to 50 kB; colours are rounded to such steps, so that files are small
+FIRST = (
+    "designed.png",
+    "design.png",
+    "ensemble.png",
+    "solutions.png",
+    "contact.png",
+    "gradients.png",
+    "shell.png",
+)  # that there is
 HEAD = """# Gallery
 
 Every case of `cases/`, which `magshell example NAME` writes too. CPU time is of the whole process with all files, on
@@ -27,7 +35,7 @@ def row(file: Path) -> str:
     """Run a case; its part of the page."""
     data = read_source(file).data
     kind = next((kind for kind in ("ensemble", "design") if kind in data), "run")
-    more = ["--samples", "20"] if kind == "ensemble" else []
+    more = ["--samples", "20", "--seed", "1"] if kind == "ensemble" else []
     command, folder = ["magshell", kind, f"cases/{file.name}", *more], CASES.parent / "results" / "gallery" / file.stem
     before = os.times()
     said = subprocess.run(
@@ -50,8 +58,9 @@ def row(file: Path) -> str:
 
 def _shrink(source: Path, target: Path) -> None:
     picture = Image.open(source).convert("RGB")
-    picture.thumbnail((WIDTH, 10 * WIDTH))
-    picture.quantize(COLOURS).save(target, optimize=True)
+    wide = WIDTH * (2 if picture.width > 2 * picture.height else 1)
+    picture.thumbnail((wide, 10 * WIDTH))
+    picture.point(lambda value: STEP * round(value / STEP)).save(target, optimize=True)
 
 
 def main(names: list[str]) -> None:

@@ -12,11 +12,13 @@ from mpi4py import MPI
 from ufl.core.expr import Expr
 
 from magshell_fenicsx.platform.compiler import SHARED, install_compiler
+from magshell_fenicsx.platform.index_maps import install_index_maps
 
 # -O1 compiles the tangents five times faster than -O2 and runs 15 % slower; -ffast-math halves the run time.
 # No -march: the cache may be shared by unlike machines, and it gains nothing here.
 JIT_OPTIONS = {"cffi_extra_compile_args": ["-O1", "-g0", "-ffast-math", SHARED], "timeout": 600}
 install_compiler()
+install_index_maps()
 
 
 def _node_symbols(numberer: ValueNumberer, node: Expr) -> list[int]:

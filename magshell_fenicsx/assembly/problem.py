@@ -7,6 +7,7 @@ import numpy as np
 from dolfinx import fem
 from dolfinx.fem import petsc as fem_petsc
 from dolfinx.la import InsertMode
+from mpi4py import MPI
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
@@ -19,6 +20,9 @@ from magshell_fenicsx.continuation.noise import Noise
 from magshell_fenicsx.continuation.system import Amplitudes, Skewed, State, Vector, Weighted
 from magshell_fenicsx.continuation.timing import Stopwatch
 from magshell_fenicsx.platform import compat
+
+ASIDE = 1e-3  # the largest displacement of a difference, over h
+CENTRAL = {1.0: 2 / 3, -1.0: -2 / 3, 2.0: -1 / 12, -2.0: 1 / 12}  # multiple of a step -> weight over it of a slope
 
 
 class FiniteElementSystem:
@@ -158,9 +162,27 @@ class FiniteElementSystem:
         self.at(u, mu)
         return self._summed(self._gradient({name: 1.0} if name else self._factors(mu)), held=False)
 
-    def load(self, u: Vector, mu: Amplitudes, name: str) -> Vector:
+    def step_along(self, v: Vector, part: float) -> float:
+        """What v is multiplied by so that its largest entry is a part of the system's length; collective."""
+        largest = self.comm.allreduce(float(np.abs(v).max(initial=0.0)), MPI.MAX)
+        return float(part * self.length / (largest or 1.0))
+
+    def stiffness_along(self, u: Vector, mu: Amplitudes, v: Vector) -> Vector:
+        """K v of all terms with the rows and columns of supports, by differences of fourth order."""
+        step, found = self.step_along(v, ASIDE), np.zeros(self.size)
+        for way, weight in CENTRAL.items():
+            self.at(u, mu)
+            self.u.x.array[: self.size] += way * step * v
+            self.u.x.scatter_forward()
+            for term in self.terms:
+                term.follow()
+            found += weight / step * self._summed(self._gradient(self._factors(mu)), held=False)
+        return found
+
+    def load(self, u: Vector, mu: Amplitudes, name: str, *, held: bool = True) -> Vector:
+        """d2Pi/du dmu, zero at supports if `held`."""
         self.at(u, mu)
-        return self._summed(self._column(mu, name))
+        return self._summed(self._column(mu, name), held=held)
 
     def potential(self, u: Vector, mu: Amplitudes, name: str) -> float:
         self.at(u, mu)

@@ -8,8 +8,8 @@ from dolfinx import fem
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
-from magshell_fenicsx.assembly.native import native
 from magshell_fenicsx.assembly.sparsity import Ints, Longs, Pattern
+from magshell_fenicsx.platform.native import native
 
 Array = NDArray[np.float64]
 FUNCTIONS = """

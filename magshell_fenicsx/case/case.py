@@ -31,11 +31,11 @@ from magshell_fenicsx.case.loads.imperfection import refuse_unfit_growth
 from magshell_fenicsx.case.loads.indentation import IndentationSection
 from magshell_fenicsx.case.loads.step import Step
 from magshell_fenicsx.case.mesh import SOLID_DEGREE, MeshSection
-from magshell_fenicsx.case.messages import explain
+from magshell_fenicsx.case.messages import explained
 from magshell_fenicsx.case.natural import NaturalSection, measured
 from magshell_fenicsx.case.output import OutputSection
 from magshell_fenicsx.case.patches import refuse_strange
-from magshell_fenicsx.case.programme import refuse_unfit_steps
+from magshell_fenicsx.case.programme import refuse_unfit_steps, refuse_unnamed
 from magshell_fenicsx.case.shell import ShellSection
 from magshell_fenicsx.case.solid import SolidSection
 from magshell_fenicsx.case.source import CaseError, Source, read_source
@@ -44,6 +44,7 @@ from magshell_fenicsx.case.stability import StabilitySection
 from magshell_fenicsx.case.surfaces import CapSurface, MeshSurface, RevolutionSurface, Surface, SurfaceSection
 from magshell_fenicsx.case.targets import NOTED
 from magshell_fenicsx.case.viscosity import refuse_unfit_viscosity
+from magshell_fenicsx.parts.chosen import Chosen
 from magshell_fenicsx.parts.part import Part, Scales
 from magshell_fenicsx.parts.registered import PARTS, WithParts
 from magshell_fenicsx.parts.section import texts
@@ -56,7 +57,7 @@ class Case(WithParts):
 
     model: Literal["shell", "solid"] = "shell"
     """A thin shell, or its body in three dimensions"""
-    shell: Annotated[ShellSection | Surface, Field(discriminator="geometry"), NOTED]
+    shell: Annotated[ShellSection | Surface, Chosen("geometry"), NOTED]
     """Mid-surface, thickness and material"""
     solid: SolidSection | None = None
     """Of `model: solid`"""
@@ -73,7 +74,7 @@ class Case(WithParts):
     loading: Loading | None = None
     """The load after the field, without which the path ends with the field; or a list of steps, one after the other,
     in which the field is a step too"""
-    mesh: MeshSection = MeshSection()
+    mesh: MeshSection = MeshSection.model_construct()
     """Elements"""
     stability: StabilitySection | None = None
     """Lowest modes after the run"""
@@ -85,7 +86,7 @@ class Case(WithParts):
     """What is random, for `magshell ensemble`"""
     design: DesignSection | None = None
     """What varies and what is wanted, for `magshell design`"""
-    output: OutputSection = OutputSection()
+    output: OutputSection = OutputSection.model_construct()
     """How pictures look"""
     reactions: bool | None = None
     """Forces and moments of every support as columns of path.csv; by default where a support moves"""
@@ -155,12 +156,10 @@ class Case(WithParts):
         for key in (*(["loads of kind: dead"] if dead else []), *self.parts):
             if shell.modulus is None:
                 raise ValueError(f"shell.youngs_modulus is needed for {key}")
-        indented = self.loads_of(IndentationSection)
-        for load in indented:
-            self._on_shell(load.at.polar)
-        for name in (*(load.at for step in dead for load in step.loads), *(load.at.point for load in indented)):
-            if name is not None and name not in self.points:
-                raise ValueError(f"loading: at: {name}: name it in points, with its place")
+        for step in self.programme:
+            if isinstance(step.load, IndentationSection):
+                self._on_shell(step.key, step.load.at.polar)
+        refuse_unnamed(self.programme, self.points)
         if isinstance(shell, ShellSection):
             edges = EDGES[shell.geometry]
             for name in self.boundary.conditions():
@@ -170,12 +169,12 @@ class Case(WithParts):
             refuse_strange(key, patches, shell, self.dimples)
         return self
 
-    def _on_shell(self, polar: float) -> None:
+    def _on_shell(self, key: str, polar: float) -> None:
         """A degree from the edge of a sphere at least."""
         shell = self.shell
         edge = shell.polar if isinstance(shell, CapSurface) else 90.0
         if shell.geometry in ("hemisphere", "cap") and not 0 <= polar < edge - 1:
-            raise ValueError(f"loading.at.polar: {polar:g} is not on the shell: allowed 0 to {edge - 1:g}")
+            raise ValueError(f"{key}.at.polar: {polar:g} is not on the shell: allowed 0 to {edge - 1:g}")
 
     @property
     def patches(self) -> dict[str, Iterable[str]]:
@@ -221,8 +220,8 @@ class Case(WithParts):
 
     @model_validator(mode="after")
     def _bodies_fit(self) -> Self:
-        for body in (body for body in self.bodies.values() if body.at.point is None):
-            self._on_shell(body.at.polar)
+        for name, body in self.bodies.items():
+            self._on_shell(f"bodies.{name}", 0.0 if body.at.point else body.at.polar)
         moved = {step.key: step.load.body for step in self.programme if isinstance(step.load, ContactSection)}
         refuse_unfit_bodies(self.bodies, moved, solid=self.model == "solid")
         return self
@@ -347,4 +346,4 @@ class Case(WithParts):
         try:
             return cls.model_validate(source.data, context={"folder": source.folder}).written_at(source.place)
         except ValidationError as e:
-            raise CaseError("\n".join(explain(error, source, cls) for error in e.errors())) from None
+            raise CaseError(explained(e.errors(), source, cls)) from None

@@ -2,13 +2,15 @@
 
 from typing import Annotated, Self
 
-from pydantic import Field, model_validator
+from pydantic import Discriminator, Field, Tag, model_validator
 
 from magshell_fenicsx.case.expressions import Formula
-from magshell_fenicsx.parts.section import Section
+from magshell_fenicsx.parts.section import Section, in_unit, number_and_unit
 
 Point = Annotated[list[float], Field(min_length=3, max_length=3)]
 Bounds = Annotated[list[float], Field(min_length=2, max_length=2)]
+Measured = Annotated[str, Field(pattern=r"^\s*[-+]?\.?[0-9]", examples=["20 mT"])]
+Amounts = Annotated[list[float | Measured], Field(min_length=2, max_length=2)]
 
 
 class ShapeSection(Section):
@@ -32,12 +34,20 @@ class ShapeSection(Section):
         return self
 
 
-class ObjectiveSection(Section):
-    """One of its keys; the results are knockdown, critical_field, mass (over that of the thickness h everywhere), or a
-    column of path.csv where the path ends."""
+Results = Annotated[
+    Annotated[str, Tag("one")] | Annotated[list[str], Tag("several"), Field(min_length=1)],
+    Discriminator(lambda data: "several" if isinstance(data, list) else "one"),
+]
 
-    maximise: str | None = None
-    """A result"""
+
+class ObjectiveSection(Section):
+    """One of its keys; the results are knockdown, critical_field (in units buckling_pressure_Pa, critical_field_mT),
+    mass (over that of the thickness h everywhere), barrier, natural frequencies (omega2_1, omega2_2, ... as in
+    frequencies.csv, or hertz_1, ...), or a column of path.csv where the path ends, such as force_N or a force of a
+    support."""
+
+    maximise: Results | None = None
+    """A result; of several the least, so that they end equal where nothing else stops them"""
     minimise: str | None = None
     """A result"""
     reach: str | None = None
@@ -59,7 +69,14 @@ class ObjectiveSection(Section):
     @property
     def result(self) -> str:
         """Its name; "shape" of a shape."""
-        return self.maximise or self.minimise or self.reach or "shape"
+        return self.results[0]
+
+    @property
+    def results(self) -> list[str]:
+        """All names of `maximise`, or the one."""
+        if isinstance(self.maximise, list):
+            return self.maximise
+        return [self.maximise or self.minimise or self.reach or "shape"]
 
 
 class LimitSection(Section):
@@ -71,11 +88,13 @@ class LimitSection(Section):
     """Its least value"""
     most: float | None = None
     """Its largest value"""
+    same_as: str | None = None
+    """Another result that it is equal to, to 1e-3"""
 
     @model_validator(mode="after")
     def _bounds(self) -> Self:
-        if self.least is None and self.most is None:
-            raise ValueError(f"of: {self.of}: give least, most, or both")
+        if self.least is None and self.most is None and self.same_as is None:
+            raise ValueError(f"of: {self.of}: give least, most, both, or same_as")
         return self
 
 
@@ -127,14 +146,17 @@ class DesignSection(Section):
 
     objective: ObjectiveSection
     """What is wanted"""
-    numbers: dict[str, Bounds] = Field(default_factory=dict)
-    """Key of the case with a number (`magnetic.remanent.polar`, `shell.poisson_ratio`) -> least and largest value"""
+    numbers: dict[str, Amounts] = Field(default_factory=dict)
+    """Key of the case with a number (`magnetic.remanent.polar`, `shell.poisson_ratio`) -> least and largest value, with
+    units where the key has one: `magnetic.applied.flux_density: [-20 mT, 20 mT]`"""
     remanence: RemanenceVariables | None = None
     """Vectors of the remanence that vary"""
     thickness: FieldVariables | None = None
     """Factor of the thickness, which varies: `shell.thickness_factor` [h]"""
     curvature: FieldVariables | None = None
     """Natural curvatures 11 and 22, which vary: `natural.curvature` [1/R]"""
+    deviation: FieldVariables | None = None
+    """Deviation w0 of the shape outwards, which varies from zero on: one more of `shell.imperfections` [h]"""
     constraints: list[LimitSection] = Field(default_factory=list)
     """Results that must stay within bounds"""
     iterations: int = Field(default=60, ge=1, le=10_000)
@@ -145,21 +167,42 @@ class DesignSection(Section):
     @model_validator(mode="after")
     def _something_varies(self) -> Self:
         if not self.numbers and self.remanence is None and not self.fields:
-            raise ValueError("needs numbers, remanence, thickness or curvature: otherwise nothing varies")
+            raise ValueError("needs numbers, remanence, thickness, curvature or deviation: otherwise nothing varies")
         if self.thickness and self.thickness.values[0] <= 0:
             raise ValueError("thickness: values: must be positive")
-        for key, (least, most) in self.numbers.items():
+        for key, written in self.numbers.items():
+            try:
+                least, most, _ = self.bounds(key)
+            except ValueError as e:
+                raise ValueError(f"numbers: {key}: {e}") from None
             if not least < most:
-                raise ValueError(f"numbers: {key}: the first bound must be less than the second, here {least}, {most}")
+                here = ", ".join(map(str, written))
+                raise ValueError(f"numbers: {key}: the first bound must be less than the second, here {here}")
         return self
+
+    def bounds(self, key: str) -> tuple[float, float, str]:
+        """The bounds of a number and their unit, that of the first one with a unit.
+
+        Raises
+        ------
+        ValueError
+            If one bound is not in that unit.
+        """
+        least, most = map(str, self.numbers[key])
+        unit = number_and_unit(least)[1] or number_and_unit(most)[1]
+        for bound in (least, most) if unit else ():
+            if not number_and_unit(bound)[1] and bound not in ("0", "0.0"):
+                raise ValueError(f"{bound.removesuffix('.0')} has no unit: give both bounds one")
+        return in_unit(least, unit), in_unit(most, unit), unit
 
     @property
     def fields(self) -> dict[str, FieldVariables]:
         """The scalar fields that vary."""
-        found = {"thickness": self.thickness, "curvature": self.curvature}
+        found = {"thickness": self.thickness, "curvature": self.curvature, "deviation": self.deviation}
         return {name: section for name, section in found.items() if section}
 
     @property
     def results(self) -> list[str]:
         """All that are computed: that of the objective first."""
-        return list(dict.fromkeys([self.objective.result, *(limit.of for limit in self.constraints)]))
+        limited = (name for limit in self.constraints for name in (limit.of, limit.same_as) if name)
+        return list(dict.fromkeys([*self.objective.results, *limited]))

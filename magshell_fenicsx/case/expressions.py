@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, BeforeValidator, Field
 
 from magshell_fenicsx.case.taylor import Taylor
 
@@ -45,7 +45,17 @@ def _checked(text: str) -> str:
     return text
 
 
-Formula = Annotated[str, AfterValidator(_checked), Field(examples=["z*sqrt(x**2 + y**2)"])]
+def _of_number(given: Any) -> Any:
+    """A number is a formula."""
+    return repr(given) if isinstance(given, int | float) and not isinstance(given, bool) else given
+
+
+Formula = Annotated[
+    str,
+    BeforeValidator(_of_number, json_schema_input_type=str | float),
+    AfterValidator(_checked),
+    Field(examples=["z*sqrt(x**2 + y**2)"]),
+]
 
 
 def with_derivatives(text: str) -> Callable[[Array], Taylor]:

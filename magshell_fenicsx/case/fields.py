@@ -144,9 +144,9 @@ class MagneticSection(Section):
     """How B^r moves with the material: by F, which stretches it too (the paper's law), or by the rotation of F alone"""
     lambda_m: float | None = Field(default=None, ge=-10, le=10)
     """λ_m = |B^r||B^a|/(μ0 E); negative: the field is reversed; 0: no magnetic term"""
-    remanent: RemanentSection = RemanentSection()
+    remanent: RemanentSection = RemanentSection.model_construct()
     """What is magnetised"""
-    applied: AppliedSection = AppliedSection()
+    applied: AppliedSection = AppliedSection.model_construct()
     """The field"""
 
     @model_validator(mode="after")

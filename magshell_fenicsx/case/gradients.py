@@ -18,6 +18,9 @@ class GradientsSection(Section):
     """
 
     of: Annotated[list[str], Field(min_length=1)] = Field(default=["knockdown"])
-    """Results: knockdown, critical_field, or columns of path.csv where the path ends"""
+    """Results: knockdown, critical_field (in units buckling_pressure_Pa, critical_field_mT), barrier, natural
+    frequencies (omega2_1, ..., hertz_1, ...), or columns of path.csv where the path ends, such as force_N or forces of
+    supports; where it ends at an instability, its load alone"""
     by: Annotated[list[str], Field(min_length=1)] = Field(default=["magnitude", "thickness"])
-    """remanence, magnitude, thickness, curvature, deviation; amplitudes (lambda_m); keys of the case with a number"""
+    """remanence, magnitude, thickness, curvature, deviation; amplitudes (lambda_m); keys of the case with a number,
+    in SI if it has a unit"""

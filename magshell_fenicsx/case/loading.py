@@ -17,6 +17,7 @@ from magshell_fenicsx.case.loads.pressure import PressureSection
 from magshell_fenicsx.case.loads.source import SourceStep
 from magshell_fenicsx.case.loads.step import PathStep, Step, Until
 from magshell_fenicsx.case.loads.time import TimeSection
+from magshell_fenicsx.parts.chosen import Chosen
 
 OneStep: TypeAlias = Annotated[
     PressureSection
@@ -30,7 +31,7 @@ OneStep: TypeAlias = Annotated[
     | ContactSection
     | SourceStep
     | TimeSection,
-    Field(discriminator="kind"),
+    Chosen("kind"),
 ]
 PROGRAMME = "programme"  # tag of a list of steps
 Loading: TypeAlias = Annotated[

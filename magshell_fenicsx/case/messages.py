@@ -2,21 +2,41 @@
 
 import difflib
 import re
+from collections.abc import Sequence
 from typing import Any, get_args, get_origin
 
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from magshell_fenicsx.case.source import Location, Source, dotted
+from magshell_fenicsx.parts.meanings import meaning
 
 NO_KEYS = ("a word", "a gas")  # tags of a union that has no sections to choose from
+NO_CONTAINER = ("list_type", "dict_type")
 
 
-def explain(error: Any, source: Source, case: type[BaseModel]) -> str:
-    """One line for one of pydantic's errors."""
-    location = _without_tag(error["loc"], case)
+def explained(errors: Sequence[Any], source: Source, case: type[BaseModel]) -> str:
+    """One line for each mistake.
+
+    Pydantic tries all members of a union, and each has an error: what is a list or a mapping counts as one, and what is
+    neither as a value.
+    """
+    found = [(_without_tag(error["loc"], source.data, case), error) for error in errors]
+    places = [location for location, _ in found]
+
+    def beside(location: Location, kind: str) -> bool:
+        within = any(len(other) > len(location) and other[: len(location)] == location for other in places)
+        return within or (kind in NO_CONTAINER and places.count(location) > 1)
+
+    told = [explain(error, location, source, case) for location, error in found if not beside(location, error["type"])]
+    return "\n".join(dict.fromkeys(told))
+
+
+def explain(error: Any, location: Location, source: Source, case: type[BaseModel]) -> str:
+    """One line for one of pydantic's errors, at the location of its key."""
     value, kind = error["input"], error["type"]
     said = error["msg"].removeprefix("Value error, ").replace("Input should be", "must be")
+    said = re.sub(r"^\w+ should have (at \w+ \d+) items? after validation, not", r"must have \1 items, not", said)
     if about := re.match(r"(\w+(\.[^.:]+)+): ", said):  # a rule between sections names its own key
         keys = about[1].split(".")
         location, said = tuple(int(key) if key.isdigit() else key for key in keys), said[about.end() :]
@@ -39,6 +59,8 @@ def explain(error: Any, source: Source, case: type[BaseModel]) -> str:
         return f"{place}: {key}: {shown(value)}: must be a section, with keys below it"
     if isinstance(value, dict | BaseModel):
         return f"{place}: {key}: {said}"
+    if said.startswith(shown(value)):
+        return f"{place}: {key}: {said}"
     says_all = kind in ("value_error", "literal_error")
     meaning = "" if says_all else _meaning(location, source.data, case)
     return f"{place}: {key}: {shown(value)}: {said}{meaning}"
@@ -53,12 +75,14 @@ def shown(value: Any) -> str:
     return text if len(text) <= 80 else f"{text[:77]}..."
 
 
-def _without_tag(loc: Location, case: type[BaseModel]) -> Location:
+def _without_tag(loc: Location, data: Any, case: type[BaseModel]) -> Location:
     """Pydantic puts what distinguishes the members of a union after their key: take it out."""
     models, kept, named = [case], list[str | int](), False
     for key in loc:
         if key in NO_KEYS:
             continue
+        if not models and not named and isinstance(key, str) and key not in _at(data, kept, dict):
+            continue  # of a union of values
         if named:
             kept.append(key)
             named = False
@@ -74,6 +98,14 @@ def _without_tag(loc: Location, case: type[BaseModel]) -> Location:
     return tuple(kept)
 
 
+def _at(data: Any, location: Sequence[str | int], kind: type) -> Any:
+    """The part of plain data at a location; an empty one if it is of another kind."""
+    for key in location:
+        there = isinstance(data, dict) or (isinstance(data, list) and isinstance(key, int) and key < len(data))
+        data = data.get(key) if isinstance(data, dict) else data[key] if there else None
+    return data if isinstance(data, kind) else kind()
+
+
 def _allowed_keys(location: Location, data: Any, case: type[BaseModel]) -> list[str]:
     """Keys of the section at a location."""
     return list(_found(location, data, case)[0].model_fields)
@@ -81,8 +113,8 @@ def _allowed_keys(location: Location, data: Any, case: type[BaseModel]) -> list[
 
 def _meaning(location: Location, data: Any, case: type[BaseModel]) -> str:
     """The first words on a key, in brackets, with its unit."""
-    field = _found(location, data, case)[1]
-    description = (field and field.description) or ""
+    section, field = _found(location, data, case)
+    description = meaning(section, str(location[-1])) if field else ""
     words, unit = re.split(r"[;:.,] | \[", description)[0], re.search(r"\[([^\[\]]+)\]$", description)
     return f" ({' '.join(words.split())}{f', in {unit[1]}' if unit else ''})" if words else ""
 

@@ -54,6 +54,7 @@ def _components(numbers: int, least: float, most: float, *, lengths: bool = Fals
 
 
 Number = float | str
+Component = Annotated[float | Formula, Field(union_mode="left_to_right")]  # a number stays one
 Values = Number | list[Number] | dict[str, Number | list[Number]] | None
 
 
@@ -72,7 +73,7 @@ class NaturalSection(Section):
     stretch: Annotated[Values, _components(2, 0.05, 20)] = None
     """Natural over drawn length: one number for all directions, the thickness too, or two along t1 and t2 of `along`,
     with the thickness as drawn"""
-    along: Literal["meridian"] | Annotated[list[float | Formula], Field(min_length=3, max_length=3)] | None = None
+    along: Literal["meridian"] | Annotated[list[Component], Field(min_length=3, max_length=3)] | None = None
     """t1 of the frame t1, t2 = n x t1: away from the pole on the meridians of e3, or the part in the surface of a
     vector; by default [1, 0, 0] of a strip, a plate and a mesh, meridian of all else"""
 

@@ -5,7 +5,7 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-from magshell_fenicsx.case.messages import explain
+from magshell_fenicsx.case.messages import explained
 from magshell_fenicsx.case.output import OutputSection
 from magshell_fenicsx.case.source import CaseError, Source
 
@@ -28,7 +28,7 @@ def output_section(case: Mapping[str, Any], options: Mapping[str, Any]) -> Outpu
     try:
         return _Options.model_validate(source.data).output
     except ValidationError as e:
-        raise CaseError("\n".join(explain(error, source, _Options) for error in e.errors())) from None
+        raise CaseError(explained(e.errors(), source, _Options)) from None
 
 
 def plot_options(

@@ -24,7 +24,7 @@ def refuse_strange(key: str, patches: Iterable[str], shell: ShellSection | Surfa
     if isinstance(shell, MeshSurface):
         return
     if not dimples and ("dimple" in patches or not isinstance(shell, ShellSection)):
-        raise ValueError(f"{key}: the shell has no dimple")
+        raise ValueError(f"{key}: the shell has no dimple: patches are those within dimples, or of a mesh file")
     known = [*(dimples or ["dimple"]), "rest"]
     if unknown := set(patches) - set(known):
         raise ValueError(f"{key}: {min(unknown)}: a {shell.geometry} has only {', '.join(known[:-1])} and rest")

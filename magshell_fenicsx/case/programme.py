@@ -1,12 +1,13 @@
 """What the steps of a programme must have in common."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 from magshell_fenicsx.case.fields import MagneticSection
 from magshell_fenicsx.case.loading import ProgrammeStep
 from magshell_fenicsx.case.loads.dead import DeadSection
 from magshell_fenicsx.case.loads.edge import EdgeSection
 from magshell_fenicsx.case.loads.field import FieldBefore, FieldSection, RotationSection
+from magshell_fenicsx.case.loads.indentation import IndentationSection
 from magshell_fenicsx.case.loads.source import SourceStep, refuse_unknown_source
 from magshell_fenicsx.case.loads.step import LEAST_TARGET, Gas, PathStep, Step
 from magshell_fenicsx.case.loads.time import TimeSection, refuse_unfit_time
@@ -78,6 +79,26 @@ def refuse_unfit_steps(
             driven.update(load.drives)
         driven.add(step.name)
         _refuse_unfit_hold(step, steps)
+
+
+def refuse_unnamed(steps: Sequence[ProgrammeStep], points: Collection[str]) -> None:
+    """See that each point at which something is loaded has a place.
+
+    Raises
+    ------
+    ValueError
+        With the key and the points that there are.
+    """
+    for step in steps:
+        load, at = step.load, dict[str, str | None]()
+        if isinstance(load, DeadSection):
+            at = {f"loads.{i}.at": each.at for i, each in enumerate(load.loads)}
+        elif isinstance(load, IndentationSection):
+            at = {"at.point": load.at.point}
+        for key, name in at.items():
+            if name is not None and name not in points:
+                known = ", ".join(points) or "none"
+                raise ValueError(f"{step.key}.{key}: {name}: name it in points, with its place; there are {known}")
 
 
 def _refuse_unfit_hold(step: ProgrammeStep, steps: Sequence[ProgrammeStep]) -> None:

@@ -27,6 +27,7 @@ Any key can be given on the command line, `--set loading.points=40`, sections to
 and a flux density are text with a unit: `25.2 mm`, `1.8 MPa`, `60 mT`. On all other geometries either all lengths and
 Young's modulus have units, and points, a profile, loads and mesh.size may have (without they are in m, N, N/m, Pa; a
 moment is per length, in N); or nothing has, and everything is in one's own units. A flux density has a unit everywhere.
+In a case with units, whatever its geometry, a point, a body or a magnet whose numbers have no unit is in metres.
 """
 
 

@@ -53,12 +53,22 @@ class SurfaceSection(Section):
     @model_validator(mode="wrap")
     @classmethod
     def _all_with_units_or_none(cls, data: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
-        measured = [data[key] for key in MEASURES if key in data] if isinstance(data, dict) else []
-        kinds = {isinstance(value, str) for value in measured if isinstance(value, str | int | float)}
+        written = {key: data[key] for key in MEASURES if key in data} if isinstance(data, dict) else {}
+        measured = {key: value for key, value in written.items() if isinstance(value, str | int | float)}
+        kinds = {isinstance(value, str) for value in measured.values()}
         profile = data.get("profile") if isinstance(data, dict) else None
         if len(kinds) > 1 or (kinds == {False} and [*texts(profile)]):
-            raise ValueError("give every length and youngs_modulus a unit, or none of them")
+            bare = [key for key, value in measured.items() if not isinstance(value, str)] or ["a length of profile"]
+            raise ValueError(
+                f"give every length and youngs_modulus a unit, or none of them: {', '.join(bare)} has none"
+            )
         section = handler(data)
+        modulus = section.youngs_modulus
+        if kinds == {True} and modulus is not None and not 1 <= modulus <= 1e13:
+            raise ValueError(
+                f"shell.youngs_modulus: {written['youngs_modulus']!r}: allowed are 1 Pa to 1e13 Pa (MPa: megapascal, "
+                "mPa: millipascal)"
+            )
         if isinstance(data, dict):
             section._with_units = kinds == {True}
         return section

@@ -20,6 +20,7 @@ Control = Quantity | Literal["arc"]
 MOST_LEAPS = 3  # longer steps that are tried if rounding hides a point
 MANY = 2  # after so many hard solves the tangent takes the stress extrapolated from the last point: a tenth more time
 BEHIND = 1.15  # of the length to a fold that is foreseen: a longer step may end on another branch
+LOOKS = 2  # at a point that was found too far away; a third point before it means that it is on another branch
 LEAST_PART = 0.25  # of a step, to which it is shortened before a fold
 SHORTER = 1 - 1e-9  # rounding must not decide whether one step reaches a target
 SEEN = 1e-6  # in lengths of the system: smaller displacements count as zero
@@ -55,6 +56,16 @@ class StepOptions:
     straight: float = 0.9
     turn: float = 0.5
     gap: float = 0.1
+
+
+@dataclass
+class _Far:
+    """A point that was found too far away, why it is no step, whether it has its own inertia, and the looks at it."""
+
+    point: Point
+    reason: str
+    exact: bool
+    looks: int = 0
 
 
 class Path:
@@ -187,12 +198,14 @@ class Path:
     def towards(self, start: Point, targets: Sequence[float]) -> Iterator[tuple[Point, bool]]:
         """Accepted points through every target in turn; the flag marks the targets.
 
+        A point that was found too far away is looked at again from the next points: it is a step of theirs for nothing.
+
         Raises
         ------
         PathStopped
             If a step of the smallest length fails.
         """
-        before, here, step, leaps = None, start, self.options.first, 0
+        before, here, step, leaps, far = None, start, self.options.first, 0, None
         for target in targets:
             while here.s != target:
                 way = target - here.s
@@ -201,6 +214,8 @@ class Path:
                 length = min(length, self._past_fold(before, here, length))
                 s = target if length == abs(way) else here.s + np.copysign(length, way)
                 found = self._try(s, before, here)
+                if isinstance(found, _Far):
+                    far, found = found, found.reason
                 if isinstance(found, str):
                     leaps += 1
                     over = found == HIDDEN and leaps <= MOST_LEAPS  # step over the singular tangent
@@ -217,6 +232,17 @@ class Path:
                     step = 0.6 * length
                 before, here = here, found
                 yield here, here.s == target
+                if not far:
+                    continue
+                again = self.measured_from(here, far.point)
+                length, far.looks = (again.s - here.s) * np.sign(way), far.looks + 1
+                known = length > 0 and (far.exact or not again.turned_from(here))
+                if known and not self._jumped(here, again := self.seen_from(here, again)):
+                    before, here, step, far = here, self.as_base(again), length, None
+                    yield here, here.s == target
+                else:
+                    step = min(step, max(length / 2, LEAST_PART * step)) if length > 0 else step
+                    far = far if far.looks < LOOKS else None
 
     def _past_fold(self, before: Point | None, here: Point, length: float) -> float:
         """The length to a little behind the next fold of mu, where the cubic through two points has its maximum."""
@@ -252,16 +278,16 @@ class Path:
             return point
         return point.per(self.metric.inner((base.du, base.dmu), (point.du, point.dmu)))
 
-    def _try(self, s: float, before: Point | None, here: Point) -> Point | str:
+    def _try(self, s: float, before: Point | None, here: Point) -> Point | _Far | str:
+        """The next point, or one that is too far away, or the reason why there is none."""
         self.progress.trying(here, s - here.s)
         found = self.at(s, self.predict(s, before, here), here)
         if isinstance(found, str):
             return found
-        if found.negative_pivots != here.negative_pivots or found.dmu * here.dmu < 0:
+        if turned := found.turned_from(here):
             found = self.exact(found, here)
-        if trouble := self._jumped(here, found):
-            return trouble
-        return self.as_base(found)
+        reason = self._jumped(here, found)
+        return _Far(found, reason, turned) if reason else self.as_base(found)
 
     def _jumped(self, here: Point, found: Point) -> str | None:
         """The reason to reject a step whose ends do not lie on one smooth arc; None if there is none."""

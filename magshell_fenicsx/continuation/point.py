@@ -1,6 +1,6 @@
 """An accepted point of an equilibrium path."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -31,7 +31,7 @@ class Point:
 
     state: State
     s: float
-    du: Vector
+    du: Vector = field(repr=False)
     dmu: float
     negative_pivots: int
     negative_pivots_held: int
@@ -43,6 +43,10 @@ class Point:
     def per(self, rate: float) -> "Point":
         """The point with its tangent divided by `rate`."""
         return replace(self, du=np.asarray(self.du / rate), dmu=self.dmu / rate)
+
+    def turned_from(self, other: "Point") -> bool:
+        """Whether an instability lies between two points of a path, as far as they show."""
+        return self.negative_pivots != other.negative_pivots or self.dmu * other.dmu < 0
 
 
 class PathStopped(RuntimeError):

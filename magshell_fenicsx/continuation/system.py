@@ -1,7 +1,7 @@
 """The interface of a system to the solvers: vectors, a matrix and named amplitudes, no shells."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol, TypeAlias
 
 import numpy as np
@@ -105,7 +105,7 @@ def followed(u: Vector, step: Vector) -> list[Weighted]:
 class State:
     """A displacement and the amplitudes."""
 
-    u: Vector
+    u: Vector = field(repr=False)
     mu: dict[str, float]
 
     def with_(self, u: Vector, name: str, value: float) -> "State":

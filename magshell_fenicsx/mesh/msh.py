@@ -61,11 +61,15 @@ def read_msh(file: MeshFile, points: Mapping[str, Array], mirror: Mirror | None 
     Raises
     ------
     MeshError
-        If the file cannot be read, or its surface cannot carry a shell; see `soundness`.
+        If the file cannot be read, or its surface cannot carry a shell; see `soundness`. Places in messages are
+        those of the file.
     """
-    patch = _whole(file)
+    try:
+        patch = _whole(file)
+    except MeshError as e:
+        raise MeshError(f"shell.file: {e}") from None
     patch = cut(patch, mirror) if mirror else patch
-    return replace(patch, points=_vertices(patch.nodes, patch.cells, points))
+    return replace(patch, points=_vertices(patch.nodes, patch.cells, points, file.scale))
 
 
 def _whole(file: MeshFile) -> PatchMesh:
@@ -74,19 +78,20 @@ def _whole(file: MeshFile) -> PatchMesh:
     cells = again.reshape(cells.shape)
     number = np.full(len(nodes), -1, dtype=np.int64)
     number[used] = np.arange(len(used))
-    nodes = nodes[used] * file.scale
+    nodes = nodes[used]
     for name, pairs in edges.items():
         edges[name] = number[pairs]
         if (edges[name] < 0).any():
             raise MeshError(f"{file.path}: the physical curve {name} is not part of the surface")
     cells = oriented(nodes, cells)
     edges = border_edges(nodes, cells, edges)
+    nodes = nodes * file.scale
     if file.normals:
         nodes = np.column_stack([nodes, nodal_normals(nodes, cells)])
     return PatchMesh(nodes, cells, in_space, edges, patches=patches)
 
 
-def _vertices(nodes: Array, cells: NDArray[np.int64], points: Mapping[str, Array]) -> dict[str, Array]:
+def _vertices(nodes: Array, cells: NDArray[np.int64], points: Mapping[str, Array], scale: float) -> dict[str, Array]:
     corners = nodes[np.unique(cells[:, :3])]
     highest = corners[np.lexsort(np.round(corners[:, :3], 9).T)[-1]]
     found = {"pole": highest}
@@ -94,7 +99,10 @@ def _vertices(nodes: Array, cells: NDArray[np.int64], points: Mapping[str, Array
         distance = np.linalg.norm(corners[:, :3] - x[:3], axis=1)
         nearest = corners[np.argmin(distance)]
         if distance.min() > NEAR * np.ptp(corners[:, :3], axis=0).max():
-            raise MeshError(f"the point {name} is no vertex of the mesh; the nearest, over R, is {place_text(nearest)}")
+            wanted, near = (place_text(np.divide(place, scale)) for place in (x, nearest))
+            raise MeshError(
+                f"points.{name}: {wanted} in the file's coordinates is no vertex of the mesh; the nearest is {near}"
+            )
         found[name] = nearest
     return found
 

@@ -19,7 +19,7 @@ SAME_PLACE = 1e-9  # of the extent
 
 
 def oriented(nodes: Array, cells: Cells) -> Cells:
-    """The triangles (m, 3 | 6 | 10) in one orientation, that of the larger area; places in messages are over R.
+    """The triangles (m, 3 | 6 | 10) in one orientation, that of the larger area.
 
     Raises
     ------

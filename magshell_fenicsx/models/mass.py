@@ -10,6 +10,8 @@ from dolfinx.fem import petsc as fem_petsc
 from petsc4py import PETSc
 from ufl.core.expr import Expr
 
+from magshell_fenicsx.assembly.terms import FormTerm
+from magshell_fenicsx.continuation.system import Vector
 from magshell_fenicsx.models.axisymmetric import jets
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.shell import kinematics as kin
@@ -53,6 +55,22 @@ def of_waves(model: MeridianModel, weight: Expr | float) -> ufl.Form:
     V = model.excluded_modes.waves.V
     cosine, sine = zip(*(jets.wave(f, 1) for f in (ufl.TrialFunction(V), ufl.TestFunction(V))), strict=True)
     return _integral(model, weight * np.pi * sum(ufl.dot(a.r, b.r) for a, b in (cosine, sine)))
+
+
+def mass_along(model: Model, phi: Vector, wave: int | None = None) -> FormTerm:
+    """phi . M phi as an energy; of a wave phi has the coefficients (U + V, V, W)."""
+    weight = thickness(model)
+    if wave is None:
+        V, product = model.V, of_displacements(model, 1.0 if weight is None else weight)
+    else:
+        assert isinstance(model, MeridianModel)
+        V, product = model.excluded_modes.waves.V, of_waves(model, 1.0 if weight is None else weight)
+    f = fem.Function(V, name="phi")
+    f.x.array[: len(phi)] = phi
+    f.x.scatter_forward()
+    energy = ufl.replace(product, dict.fromkeys(product.arguments(), f))
+    name = "mass along a displacement" if wave is None else "mass along a wave"
+    return FormTerm(name, energy, model.system.u, model.kernels, linear=True)
 
 
 def _integral(model: Model, f: Expr) -> ufl.Form:

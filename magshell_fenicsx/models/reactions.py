@@ -69,6 +69,28 @@ def reactions(model: Observed, state: State, mirror: Mirror | None = None) -> di
     return _of_whole(found, mirror) if mirror else found
 
 
+def weights(model: Observed, name: str, way: Array, mirror: Mirror | None = None) -> Array:
+    """e over owned unknowns: e . R of the residual R of all nodes is the force of a support along a way (3,).
+
+    As in `reactions`, of the whole shell, and a node of two supports belongs to the first.
+    """
+    system, found = model.system, np.zeros(model.system.size)
+    if mirror and name in mirror.lost:
+        name, way = mirror.lost[name], mirror.reflection @ way
+    elif mirror and mirror.other(name) == name:
+        way = way + mirror.reflection @ way
+    taken = np.zeros(system.size, dtype=bool)
+    for other, support in model.supports.items():
+        dofs = support.dofs[support.dofs < system.size]
+        if other == name:
+            axes = system.u.function_space.dofmap.index_map_bs
+            along = way if axes == 3 else np.array([0.0, way[2]])  # around the axis only that along it is left
+            found[dofs] = np.where(taken[dofs], 0.0, along[dofs % axes])
+            return found
+        taken[dofs] = True
+    raise KeyError(name)
+
+
 def _of_whole(half: Mapping[str, Reaction], mirror: Mirror) -> dict[str, Reaction]:
     """The reactions of the whole shell from those of a half."""
     found, S = dict(half), mirror.reflection

@@ -34,7 +34,7 @@ class WithOwnTerms(Section):
 
         A name after the key, as that of a patch, is looked for below it.
         """
-        about = re.match(r"([a-z]\w*(?:\.\w+)*): (?:(\w+): )?", message)
+        about = re.match(r"([a-z]\w*(?:\.\w+)*): (?:([\w.]+): )?", message)
         if not (about and self._origin.place) or about[1].split(".")[0] not in type(self).model_fields:
             return message
         keys = [*about[1].split("."), *([about[2]] if about[2] else [])]

@@ -27,12 +27,11 @@ def _units() -> "pint.UnitRegistry":
 class Section(BaseModel):
     """A section of the case file.
 
-    The docstring of a key appears in docs/case.md and in the schema; its unit is in brackets at the end.
+    The docstring of a key appears in docs/case.md and in the schema; its unit is in brackets at the end. See `meaning`.
+    A section that is a default is made by `model_construct`: a validator built at import would serve no case.
     """
 
-    model_config = ConfigDict(
-        extra="forbid", strict=True, frozen=True, allow_inf_nan=False, use_attribute_docstrings=True, defer_build=True
-    )
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False, defer_build=True)
 
 
 def with_unit(unit: str) -> Any:
@@ -93,6 +92,17 @@ def in_unit(text: str, unit: str) -> float:
     if not unit or not number:
         raise ValueError(f"{text} is not convertible to {unit or 'a bare number'}")
     return float(number) if own == unit else _converted(text, unit)
+
+
+def si_size(unit: str) -> float:
+    """What one of a unit is in SI; of no unit 1.
+
+    Examples
+    --------
+    >>> si_size("mT"), si_size("")
+    (0.001, 1.0)
+    """
+    return float(_units().Quantity(1.0, unit).to_base_units().magnitude) if unit else 1.0
 
 
 def in_units(unit: str, *, bare: bool = False) -> Callable[[Any], float]:

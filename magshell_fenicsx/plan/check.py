@@ -11,8 +11,10 @@ from magshell_fenicsx.mesh.patch import MeshError, PatchMesh
 from magshell_fenicsx.models.shell.openings import no_potential, ring_openings
 from magshell_fenicsx.plan.body import layers
 from magshell_fenicsx.plan.names import open_edges
+from magshell_fenicsx.plan.outline import outline
 from magshell_fenicsx.plan.plan import Plan
 from magshell_fenicsx.plan.planner import make_plan, meridian_vertices
+from magshell_fenicsx.plan.sources.registered import placed
 
 
 def describe(case: Case) -> str:
@@ -41,7 +43,7 @@ def _described(case: Case) -> str:
         "Lambda_m = lambda_m R/h": case.lambda_m / plan.material.h,
     }
     lines = [f"{name} = {value:.6g}" for name, value in numbers.items()]
-    lines += _in_units(case)
+    lines += [*_in_units(case), *_of_sources(case)]
     patch = None
     if case.mesh.tolerance is None:
         patch = None if plan.axisymmetric else plan.triangulated()
@@ -70,6 +72,17 @@ def _in_units(case: Case) -> list[str]:
     factor = {"λ_m": case.lambda_m}
     there = {scale: words for scale, words in named.items() if scale in known.of}
     return [f"{name} = {known.of[scale] * factor.get(scale, 1.0):.6g} {unit}" for scale, (name, unit) in there.items()]
+
+
+def _of_sources(case: Case) -> list[str]:
+    """How strong magnets and coils are on the shell: too weak, and a place was meant in another unit."""
+    sources = placed(case)
+    if not sources:
+        return []
+    assert case.magnetic
+    places, unit = outline(case).sample(), case.magnetic.applied.reference or 1.0
+    sizes = 1e3 * abs(unit) * np.linalg.norm(np.sum([source(places)[0] for source in sources], axis=0), axis=1)
+    return [f"field of the sources on the undeformed shell: {sizes.min():.4g} to {sizes.max():.4g} mT"]
 
 
 def _open(plan: Plan, patch: PatchMesh | None) -> tuple[str, ...]:

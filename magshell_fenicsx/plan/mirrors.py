@@ -3,8 +3,8 @@
 from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from magshell_fenicsx.mesh.grid import Grid
 from magshell_fenicsx.mesh.mirror import CUT, ROUNDING, Mirror, cut
@@ -85,7 +85,7 @@ def mesh_mirrors(patch: PatchMesh, vectors: Sequence[Array], *, loosely: bool) -
     found: list[Mirror] = []
     corners = patch.nodes[np.unique(patch.cells[:, :3])]
     centre, (middle, _) = corners.mean(axis=0), _centre(patch)
-    tree = cKDTree(patch.nodes)
+    tree = scipy.spatial.cKDTree(patch.nodes)
     for normal in _normals(patch, vectors):
         mirror = Mirror.of(normal)
         exact = _with_edges(Mirror(mirror.normal, _rounded(float(mirror.normal @ centre))), patch, tree)
@@ -122,7 +122,7 @@ def _normals(patch: PatchMesh, vectors: Sequence[Array]) -> Iterator[Array]:
             yield seen[-1]
 
 
-def _with_edges(mirror: Mirror, patch: PatchMesh, tree: "cKDTree") -> Mirror | None:
+def _with_edges(mirror: Mirror, patch: PatchMesh, tree: "scipy.spatial.cKDTree") -> Mirror | None:
     """The mirror with its pairs of edges; None if it does not map the triangulation onto itself."""
     nodes = patch.nodes
     near = ROUNDING * np.ptp(nodes, axis=0).max()

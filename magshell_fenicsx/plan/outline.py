@@ -164,9 +164,13 @@ def outline(case: Case) -> Outline:
         return Outline(lambda mirror, size: file, in_space, normals, lambda x: x, None, mirrors=planes)
     if isinstance(shell, ShellSection) and shell.width is not None:
         width = shell.width
-        tip = np.array([1.0, 0.0])
+        tip, corner = np.array([1.0, 0.0]), np.array([0.0, -width / 2])
+
+        def within(x: Array) -> Array:
+            return np.clip(_plane(x), corner, -corner + tip)
+
         return Outline(
-            lambda m, size: StripShape(width, m is not None), flat, upwards, _plane, tip, mirrors=lambda *_: [Y0]
+            lambda m, size: StripShape(width, m is not None), flat, upwards, within, tip, mirrors=lambda *_: [Y0]
         )
     if isinstance(shell, ShellSection) and shell.geometry == "disc":
         return _disc(1.0, "rim", flat, upwards, _plane)
@@ -186,8 +190,8 @@ def outline(case: Case) -> Outline:
     return _ring(shell, profile, (names[0], names[1]))
 
 
-def refuse_beside(name: str, x: Array, outline: Outline, R: float) -> None:
-    """See that a named point (3,) is on the surface.
+def refuse_beside(key: str, x: Array, outline: Outline, shell: Surface | ShellSection) -> None:
+    """See that the place (3,) at a key, over R, is on the surface.
 
     Raises
     ------
@@ -198,8 +202,10 @@ def refuse_beside(name: str, x: Array, outline: Outline, R: float) -> None:
     there = x if len(found) == 3 else outline.embedding(found[None])[0]
     perfect = outline.perfect(found[None])[0] if len(found) == 2 else x
     if min(float(np.linalg.norm(place - x)) for place in (there, perfect)) > ON_SURFACE:
-        near = ", ".join(f"{c * R:.8g}" for c in there)
-        raise CaseError(f"points.{name}: is not on the surface; a place near it that is: [{near}]")
+        size, unit = (1e3 * shell.reference, " mm") if shell.with_units else (shell.reference, "")
+        near = ", ".join(f"{c * size + 0.0:.8g}{unit}" for c in np.round(there, 12))
+        bare = "; a number without a unit is in metres here" if shell.with_units else ""
+        raise CaseError(f"{key}: is not on the surface; a place near it that is: [{near}]{bare}")
 
 
 def _disc(

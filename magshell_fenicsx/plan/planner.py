@@ -45,6 +45,7 @@ from magshell_fenicsx.plan.symmetry import Leaves, askew, field_fits, left, mirr
 Array = NDArray[np.float64]
 Points = dict[str, Array]
 PRESSED = 0.08  # of sqrt(Rh): cells of a meridian that show the ring of a contact
+FAR_FROM_ONE = 50.0  # times the radius, or a part of it: a surface as long as that hints at another unit
 
 
 def make_plan(case: Case, terms: Sequence[OwnTerm] = ()) -> Plan:
@@ -124,6 +125,7 @@ def make_plan(case: Case, terms: Sequence[OwnTerm] = ()) -> Plan:
     model = "meridian" if axisymmetric else f"{'half' if half else 'full'} {case.model}"
     included, left_out = account(case, all_loads, model, plane, len(rims))
     included += [f"{key}: {flaw.account}" for key, flaw in found.items() if flaw.account]
+    sample = sample if len(sample) else drawn.sample()
     return Plan(
         material=material,
         loads=all_loads,
@@ -144,8 +146,17 @@ def make_plan(case: Case, terms: Sequence[OwnTerm] = ()) -> Plan:
         supports=supports,
         reactions=bool(all_loads.moves) if case.reactions is None else case.reactions,
         pressed=tuple((size, reach) for _, reach, size in touched),
-        warning=sources_beside(case, sample if len(sample) else drawn.sample()),
+        warning=sources_beside(case, sample) or _wrong_unit(case, sample),
     )
+
+
+def _wrong_unit(case: Case, places: Array) -> str | None:
+    """What hints at another unit of a mesh file's coordinates, in words; None without."""
+    extent = float(np.ptp(places, axis=0).max())
+    if not isinstance(case.shell, MeshSurface) or 1 / FAR_FROM_ONE <= extent <= FAR_FROM_ONE:
+        return None
+    key = "unit" if case.shell.with_units else "radius"
+    return f"the surface of the mesh file is {extent:.4g} times as long as shell.radius: is shell.{key} right?"
 
 
 def edge_conditions(boundary: BoundarySection, turn: float) -> dict[str, Condition]:
@@ -226,7 +237,7 @@ def _named_points(case: Case, drawn: Outline, turn: float, half: bool) -> Points
     Q, R = rotation(turn), case.shell.reference
 
     def chart(name: str, x: Array) -> Array:
-        refuse_beside(name, x, drawn, R)
+        refuse_beside(f"points.{name}", x, drawn, case.shell)
         found = drawn.inverse(Q @ x)
         return drawn.on_half(found) if half else found
 

@@ -3,18 +3,18 @@
 Only kernels with `SHARED` among the compiler's arguments are concerned: other programs may share the cache.
 """
 
+import ctypes
 import os
 import shlex
 import subprocess
 import sysconfig
 import time
+from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import cffi
-import ffcx.codegeneration
-import ffcx.compiler
 from ffcx.codegeneration import jit
 
 SHARED = "-shared"
@@ -23,8 +23,6 @@ DECLARATIONS = (
     jit.UFC_HEADER_DECL.format("float64") + jit.UFC_INTEGRAL_DECL + jit.UFC_FORM_DECL + jit.UFC_EXPRESSION_DECL
 )
 OTHERS = jit._compile_objects, jit._load_objects, jit.get_cached_module
-_ffi = cffi.FFI()
-_ffi.cdef(DECLARATIONS.replace("_Complex", ""))  # only pointers to them occur, which cffi would need a compiler for
 _loaded: dict[Path, tuple[list[Any], Any]] = {}
 
 
@@ -41,6 +39,8 @@ def _compile_objects(
 ) -> Any:
     if SHARED not in arguments:
         return OTHERS[0](decl, objects, names, module, options, folder, arguments, *rest, **others)
+    import ffcx.compiler  # takes long, and only here it is needed
+
     _, code = ffcx.compiler.compile_ufl_objects(objects, prefix=module, options=options)
     source = folder / f"{module}.c"
     source.write_text(code)
@@ -58,22 +58,36 @@ def _load_objects(folder: Path, module: str, names: list[str]) -> tuple[list[Any
         found: tuple[list[Any], Any] = OTHERS[1](folder, module, names)
         return found
     if library not in _loaded:
-        kind = "ufcx_form" if module.startswith("libffcx_forms") else "ufcx_expression"
-        _ffi.cdef("".join(f"extern {kind} {name};\n" for name in names), override=True)
-        lib = _ffi.dlopen(str(library))
-        _loaded[library] = [getattr(lib, name) for name in names], SimpleNamespace(ffi=_ffi, lib=lib)
+        kind = "ufcx_form *" if module.startswith("libffcx_forms") else "ufcx_expression *"
+        lib, ffi = ctypes.CDLL(str(library)), _ffi()
+        places = [ctypes.addressof(ctypes.c_char.in_dll(lib, name)) for name in names]  # cffi would parse declarations
+        _loaded[library] = [ffi.cast(kind, place)[0] for place in places], SimpleNamespace(ffi=ffi, lib=lib)
     return _loaded[library]
 
 
+@cache
+def _ffi() -> cffi.FFI:
+    found = cffi.FFI()
+    # of complex numbers only pointers occur; for them themselves cffi would need a compiler
+    found.cdef(DECLARATIONS.replace("_Complex", ""))
+    return found
+
+
 def _get_cached_module(module: str, names: list[str], folder: Path, timeout: int) -> tuple[Any, Any]:
-    source = Path(folder) / f"{module}.c"
-    if source.exists():
-        end = time.monotonic() + timeout
+    source, end = Path(folder) / f"{module}.c", time.monotonic() + timeout
+    source.parent.mkdir(exist_ok=True, parents=True)
+    while True:
+        try:
+            with source.open("x"):  # who makes the file compiles it; FFCx would load as its own what appears meanwhile
+                return None, None
+        except FileExistsError:
+            pass
         while not source.with_suffix(".c.cached").exists() and source.exists() and time.monotonic() < end:
             time.sleep(WAIT)
         if source.with_suffix(".so").exists() and source.with_suffix(".c.cached").exists():
             return _load_objects(folder, module, names)
-    return OTHERS[2](module, names, folder, timeout)  # type: ignore[no-any-return]
+        if source.exists() or time.monotonic() >= end:
+            return OTHERS[2](module, names, folder, timeout)  # type: ignore[no-any-return]
 
 
 def install_compiler() -> None:

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import dolfinx
 import ufl
-from dolfinx.jit import get_options
 from petsc4py import PETSc
 
 from magshell_fenicsx.platform.version import __version__
@@ -36,8 +35,3 @@ def fast_blas() -> str | None:
         return "unknown"
     found = FAST_BLAS.search(loaded)
     return found[1] if found else None
-
-
-def kernel_cache() -> str:
-    """The folder of the compiled kernels."""
-    return str(get_options()["cache_dir"])

@@ -1,6 +1,6 @@
 """After a run: derivatives of its results by numbers and fields."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -21,16 +21,17 @@ from magshell_fenicsx.output.fields.vtu import About, vtu_content
 from magshell_fenicsx.output.store.durable import write_whole
 from magshell_fenicsx.output.store.folder import by_first
 from magshell_fenicsx.run.summary import Result
-from magshell_fenicsx.simulate.gradients.adjoint import Adjoint, adjoint
+from magshell_fenicsx.simulate.gradients.adjoint import Adjoint
 from magshell_fenicsx.simulate.gradients.density import density
 from magshell_fenicsx.simulate.gradients.fields import FIELDS
 from magshell_fenicsx.simulate.gradients.gradient import derivative
-from magshell_fenicsx.simulate.gradients.instabilities import FOLDS, Lost, instabilities
+from magshell_fenicsx.simulate.gradients.instabilities import FOLDS, Lost, instabilities, refuse_moving
+from magshell_fenicsx.simulate.gradients.results import adjoint_at_end, refuse_no_result
 from magshell_fenicsx.simulate.numbers import number_of
-from magshell_fenicsx.simulate.results import functional
 from magshell_fenicsx.simulate.scene import Scene
 
 Say = Callable[[str], None]
+ROUNDING = 1e-10
 Array = NDArray[np.float64]
 
 
@@ -43,12 +44,15 @@ def refuse_unknown(scene: Scene) -> None:
         If a result or a parameter is none of this case.
     """
     section, start = scene.case.gradients, scene.unloaded()
-    for of in section.of if section else []:
-        if of not in FOLDS:
-            functional(scene, start, of)
-    for by in section.by if section else []:
-        if by not in FIELDS and by not in start.mu:
-            number_of(scene.case, by)
+    if section is None:
+        return
+    refuse_no_result(scene, section.of, "gradients.of")
+    try:
+        for by in section.by:
+            if by not in FIELDS and by not in start.mu:
+                number_of(scene.case, by)
+    except CaseError as e:
+        raise CaseError(f"gradients.by: {e}") from None
 
 
 def gradients_after(result: Result, folder: Path, say: Say) -> None:
@@ -76,12 +80,17 @@ def gradients_after(result: Result, folder: Path, say: Say) -> None:
             for by, most in scene.comm.bcast(drawn and {by: _most(drawn, by) for by in fields}).items():
                 told[by] |= most
             by_first(scene.comm, partial(_write, gradient_file(folder, of), drawn, scene))
-        result.gradients[of] = {"value": found.value, "kind": kind, "numbers": numbers, "fields": told}
+        result.gradients[of] = {"value": found.shown, "kind": kind, "numbers": numbers, "fields": told}
         for by, v in told.items():
-            alike, place = ", ".join(f"{x:.6g}" for x in v["alike"]), ", ".join(f"{x:.3g}" for x in v["at"])
+            alike, place = _words(v["alike"], v["most_per_area"], 6), _words(v["at"], 1.0, 3)
             say(f"d {of}/d {by}: {alike} for a change that is the same everywhere, most per area at ({place})")
         for by, slope in numbers.items():
             say(f"d {of}/d {by}: {slope:.6g}")
+
+
+def _words(values: Sequence[float], size: float, digits: int) -> str:
+    """Numbers beside a size: what is but rounding of it is 0."""
+    return ", ".join(f"{x if abs(x) > ROUNDING * size else 0.0:.{digits}g}" for x in values)
 
 
 def _write(file: Path, drawn: Surface | None, scene: Scene) -> None:
@@ -90,13 +99,14 @@ def _write(file: Path, drawn: Surface | None, scene: Scene) -> None:
 
 
 def _adjoint(result: Result, of: str) -> tuple[str, Adjoint]:
-    """What the derivatives of a result are contracted with, and the kind of the instability."""
+    """What the derivatives of a result are contracted with, and of which kind it is."""
     scene, history = result.scene, result.history
     if of in FOLDS:
-        return instabilities(scene, history.located, FOLDS[of], 1)[0]
-    if result.stopped or history.last is None:
+        return instabilities(scene, history.located, of, 1)[0]
+    if result.stopped or history.end is None:
         raise Lost(result.stopped or "the path has no end")
-    return "", adjoint(scene, history.last, of)
+    refuse_moving(scene, history.end, of)
+    return adjoint_at_end(scene, history, of)
 
 
 def _alike(scene: Scene, by: str, found: FieldGradient) -> list[float]:

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+
 from magshell_fenicsx.case.stability import StabilitySection
 from magshell_fenicsx.continuation.modes import ModesNotFound
 from magshell_fenicsx.continuation.system import State, Vector
@@ -58,6 +60,9 @@ class _Writer:
                 self.say(f"warning: no modes of point {number}: {e}")
                 continue
             surface = self._write(number, str(row["label"]), state, label, vector)
+            if surface is not None and self.result.scene.plan.meridian is None:
+                place = surface.r0[np.argmax(np.abs(surface.fields["mode_w"]))]
+                self.result.largest[number] = [float(x) for x in place * self.result.scene.plan.length]
             if surface is not None and not label and (m := wave_number(surface)):
                 self.say(f"the null vector at point {number} has {m} waves around e3")
 

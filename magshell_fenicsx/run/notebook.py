@@ -13,7 +13,7 @@ from magshell_fenicsx.output.fields.vtu import unstructured_grid
 from magshell_fenicsx.output.pictures.camera import run_camera
 from magshell_fenicsx.output.pictures.curve import curve_figure
 from magshell_fenicsx.output.pictures.layout import png
-from magshell_fenicsx.output.pictures.picture import figures
+from magshell_fenicsx.output.pictures.picture import PICTURES, figures
 from magshell_fenicsx.output.store.known import pole_of
 from magshell_fenicsx.run.rows import rows
 from magshell_fenicsx.simulate.record import Record
@@ -28,7 +28,7 @@ def surface(scene: Scene, record: Record) -> Surface | None:
     """The whole deformed mid-surface as NumPy arrays, lengths in R: `r0`, `u`, `n0`, `w`, `cells` and `fields`.
 
     The fields are membrane strains `E` and bending moments over D/R `M`, their principal values `E_1`, `E_2`, `M_1`,
-    `M_2`, and those of the magnetic field: `Br`, `Ba`, `p_mag`, `f_mag`, `k`, `tau`; see `PointFields`.
+    `M_2`, and those of the magnetic field: `Br`, `Ba`, `p_mag`, `f_mag`, `k`, `tau`; see `Surface`.
     """
     plan, state = scene.plan, record.point.state
     scene.refuse_foreign(state)
@@ -52,6 +52,8 @@ def picture(
     of: Literal["shell", "strains", "moments", "fields", "magnetic_loads"] = "shell",
 ) -> "Figure | None":
     """One picture of a run, as in shell.png, strains.png, ...; None also if the scene has no such fields."""
+    if of not in PICTURES:
+        raise ValueError(f"picture: {of}: allowed are {', '.join(PICTURES)}")
     found = surface(scene, record)
     if found is None:
         return None

@@ -44,6 +44,7 @@ from magshell_fenicsx.simulate.sensitivity import fold_at, sensitivities
 __all__ = ["Result", "run"]
 
 Say = Callable[[str], None]
+ROUNDING = 1e-9  # a displacement over h as small as this is printed as zero
 
 
 def run(
@@ -248,12 +249,14 @@ def _line(row: Row) -> str:
         formats[varied] = "9.5f"
     values = [_value(name, row, form) for name, form in (formats | {"w_over_h": "8.4f"}).items()]
     pole = _value("w_pole_over_h", row, "8.4f", "pole")
-    counts = f"unstable {row['negative_pivots']}  it {row['iterations']}"
+    beside = f" + {row['excluded_pivots']} excluded" if row["excluded_pivots"] else ""
+    counts = f"unstable {row['negative_pivots']}{beside}  it {row['iterations']}"
     return "  ".join([f"{row['point']:4d} {row['label']:>11}", *values, pole, counts])
 
 
 def _value(name: str, row: Row, form: str, words: str = "") -> str:
     """A column, in the case's units with five digits if it has any, else in a format."""
     q = shown(name, row)
-    measured = spelled(float(row[q.name]), "9.5g" if q.name != name else form)
+    rounding = q.kind == "displacement" and abs(float(row[name])) < ROUNDING
+    measured = spelled(0.0 if rounding else float(row[q.name]), "9.5g" if q.name != name else form)
     return f"{words or q.plain} {measured}{f' {q.si}' if q.name != name else ''}"

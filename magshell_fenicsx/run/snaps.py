@@ -4,8 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from scipy.interpolate import CubicSpline
-from scipy.optimize import brentq
+import scipy
 
 from magshell_fenicsx.output.store.table import Row
 
@@ -27,8 +26,8 @@ def snaps(rows: Sequence[Row]) -> list[dict[str, Any]]:
         t, w, lost = (np.array([float(row[key]) for row in moving]) for key in ("time", "w_over_h", "dissipated"))
         way = (w - w[0]) / (w[-1] - w[0])
         at = int(np.argmax(way >= 0.5))
-        past_half = CubicSpline(t[:-1], way[:-1] - 0.5)  # the last two rows are of one time
-        half = float(brentq(past_half, t[at - 1], t[at], xtol=1e-12 * t[at])) - t[0]
+        past_half = scipy.interpolate.CubicSpline(t[:-1], way[:-1] - 0.5)  # the last two rows are of one time
+        half = float(scipy.optimize.brentq(past_half, t[at - 1], t[at], xtol=1e-12 * t[at])) - t[0]
         ends = {"point": fold["point"], "rest": moving[-1]["point"]}
         found.append({**ends, "time": half, "overshoot": float(way.max() - 1), "dissipated": float(lost[-1] - lost[0])})
     return found

@@ -55,6 +55,9 @@ class Result:
         The energy barrier over E h R^2 of a last step with `until: zero`; None without.
     gradients
         By result, as in summary.json.
+    largest
+        By row number of an instability the undeformed place where its mode moves most along the normal, in the shell's
+        length; on rank 0, and not of a meridian, whose modes have rings.
     """
 
     scene: Scene
@@ -73,6 +76,7 @@ class Result:
     kept: dict[int, State] = field(default_factory=dict)
     frequencies: dict[int, list[ShellMode]] = field(default_factory=dict)
     gradients: dict[str, dict[str, Any]] = field(default_factory=dict)
+    largest: dict[int, list[float]] = field(default_factory=dict)
 
     @property
     def limit_points(self) -> list[dict[str, Any]]:
@@ -88,8 +92,9 @@ class Result:
                 "mode": row["mode"],
                 "branch": row["branch"],
                 "load_error": row["load_error"],
+                **({"mode_at": self.largest[number]} if number in self.largest else {}),
             }
-            for row in self.rows
+            for number, row in enumerate(self.rows)
             if row["label"] in LOCATED
         ]
 

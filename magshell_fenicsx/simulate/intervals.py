@@ -4,7 +4,7 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from scipy.optimize import brentq
+import scipy
 
 from magshell_fenicsx.continuation.advance import TimeSteps, TimeStopped, advance
 from magshell_fenicsx.continuation.device import Held
@@ -63,7 +63,7 @@ class Intervals:
             self.memory = memory
             return beyond(ends.get(t) or self.moved(now, dt, t)[0])
 
-        found = float(brentq(at, now.t, end.t, xtol=close))
+        found = float(scipy.optimize.brentq(at, now.t, end.t, xtol=close))
         self.memory = memory
         return max(found, now.t + close)
 

@@ -9,7 +9,7 @@ from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.plan.planner import make_plan
 from magshell_fenicsx.simulate.scene import Scene
 
-OF_MATERIAL = ("poisson_ratio", "radius_to_thickness", "thickness", "youngs_modulus", "thickness_factor")
+OF_MATERIAL = ("density", "poisson_ratio", "radius_to_thickness", "thickness", "youngs_modulus", "thickness_factor")
 ELSEWHERE = ("mesh", "loading", "points", "boundary", "stability", "frequencies", "gradients", "ensemble", "design")
 
 

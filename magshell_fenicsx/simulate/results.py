@@ -11,16 +11,18 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from magshell_fenicsx.case.source import CaseError
-from magshell_fenicsx.continuation.system import State, Vector
+from magshell_fenicsx.continuation.system import State, Vector, dot
 from magshell_fenicsx.mesh.frame import rotation
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.reacting import motion_columns
+from magshell_fenicsx.models.reactions import weights
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.model import ShellModel
-from magshell_fenicsx.quantities.registry import contact_columns
+from magshell_fenicsx.quantities.registry import amplitude, contact_columns, quantity
 from magshell_fenicsx.simulate.scene import Scene
 
 Array = NDArray[np.float64]
+AT_POLE = ("w_pole_over_h", "w_over_h")
 Target = Callable[[Array], Array]  # undeformed places (n, 3) over R -> wanted places (n, 3) over R
 
 
@@ -36,6 +38,8 @@ class Functional:
         c_i: J contains the sum of c_i dPi/dmu_i.
     energy
         c: J contains c Pi.
+    reaction
+        e at supports: J is e . R of the residual of all nodes.
     """
 
     value: float
@@ -43,6 +47,7 @@ class Functional:
     by_mu: Mapping[str, float] = field(default_factory=dict)
     potentials: Mapping[str, float] = field(default_factory=dict)
     energy: float = 0.0
+    reaction: Vector | None = None
 
 
 def functional(scene: Scene, state: State, of: str | Target) -> Functional:
@@ -60,8 +65,7 @@ def functional(scene: Scene, state: State, of: str | Target) -> Functional:
     if of == "energy":
         by_u = model.multiplicity * system.residual(state.u, state.mu)
         return Functional(scene.observe(state)["energy"], by_u, energy=model.multiplicity)
-    points = {f"{point}_u{axis}": (point, i) for point in scene.case.points for i, axis in enumerate("xyz")}
-    known = {**dict.fromkeys(_conjugates(scene)), **dict.fromkeys(points), **dict.fromkeys(state.mu)}
+    points = _displacements(scene)
     if of in points:
         point, i = points[of]
         by_u = scene.plan.length * (_turned(scene) @ model.probe(point))[i]
@@ -71,13 +75,60 @@ def functional(scene: Scene, state: State, of: str | Target) -> Functional:
         by_u = np.asarray(-system.load(state.u, state.mu, name) / unit)
         value = -system.potential(state.u, state.mu, name) / unit
         return Functional(value, by_u, potentials={name: -1 / unit})
-    if of in ("w_pole_over_h", "w_over_h") and "pole" in model.normals:
+    if of in AT_POLE and "pole" in model.normals:
         by_u = np.asarray(-(model.normals["pole"] @ model.probe("pole")) / scene.plan.material.h)
         return Functional(scene.observe(state)["w_pole_over_h"], system.held(by_u))
-    name = "pressure" if of == "p_over_pc" else of
-    if name in state.mu:
+    if of in (forces := _forces(scene)):
+        return _reaction(scene, state, *forces[of], of)
+    name = next((name for name in state.mu if of in (name, amplitude(name).column)), "")
+    if name:
         return Functional(state.mu[name], still, {name: 1.0})
-    raise CaseError(f"{of}: has no gradient here; allowed are {', '.join(('energy', 'distance', *known))}")
+    raise CaseError(f"{of}: has no gradient here; allowed are {', '.join(differentiable(scene, state))}")
+
+
+def differentiable(scene: Scene, state: State) -> list[str]:
+    """The columns of path.csv that `functional` takes, and those of them in units."""
+    at_pole = AT_POLE if "pole" in scene.model.normals else ()
+    amplitudes = (amplitude(name).column for name in state.mu)
+    found = dict.fromkeys(
+        ("energy", *_conjugates(scene), *_displacements(scene), *_forces(scene), *at_pole, *amplitudes)
+    )
+    return [*found, *scene.sizes.columns(found)]
+
+
+def in_units(scene: Scene, state: State, of: str) -> tuple[str, str]:
+    """The dimensionless column of a column in units, and the scale of its unit; else the column itself, and ""."""
+    for name in differentiable(scene, state):
+        if (known := scene.sizes.column(name)) and known.name == of:
+            return name, quantity(name).scale
+    return of, ""
+
+
+def _displacements(scene: Scene) -> dict[str, tuple[str, int]]:
+    """Columns of named points -> the point and the axis."""
+    return {f"{point}_u{axis}": (point, i) for point in scene.case.points for i, axis in enumerate("xyz")}
+
+
+def force_unit(scene: Scene) -> float:
+    """E h R^2 over R in the case's unit of force."""
+    return (scene.case.shell.modulus or 1.0) * scene.plan.material.h * scene.plan.length**2
+
+
+def _forces(scene: Scene) -> dict[str, tuple[str, int]]:
+    """Column of a force of a support -> the support and the axis."""
+    columns = {f"{name}_f{axis}": (name, i) for name in scene.plan.supports for i, axis in enumerate("xyz")}
+    return {column: of for column, of in columns.items() if column in scene.support_columns}
+
+
+def _reaction(scene: Scene, state: State, name: str, axis: int, of: str) -> Functional:
+    """A force of a support."""
+    system, plan = scene.model.system, scene.plan
+    if scene.model.without_potential and plan.loads.pressure:
+        raise CaseError(f"{of}: has no gradient under a pressure at a free edge, which has no potential")
+    way = rotation(plan.azimuth)[:, axis]
+    e = force_unit(scene) * weights(scene.model, name, way, plan.mirror)
+    value = dot(system.comm, e, system.forces(state.u, state.mu))
+    return Functional(value, system.held(system.stiffness_along(state.u, state.mu, e)), reaction=e)
 
 
 def _conjugates(scene: Scene) -> dict[str, tuple[str, float]]:

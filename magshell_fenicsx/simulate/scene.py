@@ -250,7 +250,7 @@ class Scene:
         clock = tuple(q.name for q in IN_TIME) if moves else ()
         sources = (*self.sources, *self.sources.values())
         contacts = (column for name in self.model.contacts for column in contact_columns(name) if column != "force")
-        extra = (*factors, *displaced, *named, *own, *self._support_columns, *sources, *contacts, *clock)
+        extra = (*factors, *displaced, *named, *own, *self.support_columns, *sources, *contacts, *clock)
         return (*extra, *self.sizes.columns((*(q.name for q in OF_EVERY_RUN), *extra)))
 
     def stored(self, state: State, energy: float) -> float:
@@ -260,7 +260,7 @@ class Scene:
         return energy - of * sum(state.mu[name] * system.potential(state.u, state.mu, name) for name in loads)
 
     @property
-    def _support_columns(self) -> tuple[str, ...]:
+    def support_columns(self) -> tuple[str, ...]:
         """The factors of motions, their reactions, and those of all supports."""
         motions = motion_columns(self.plan.loads)
         return (*motions, *motions.values(), *(columns(self.plan.supports) if self.plan.reactions else ()))

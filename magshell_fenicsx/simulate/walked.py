@@ -13,7 +13,9 @@ from magshell_fenicsx.continuation.point import PathStopped, Point
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.continuation.walk import Goal, Walk
 from magshell_fenicsx.continuation.watch import Crossing
+from magshell_fenicsx.quantities.registry import amplitude, quantity
 from magshell_fenicsx.simulate.record import Record, Stopped
+from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.stage import LONGEST, Stage
 from magshell_fenicsx.simulate.touch import refuse_crossing, stiffer
 
@@ -82,14 +84,17 @@ def _followed(stage: Stage, walk: Walk, branches: PathStep | None) -> Iterator[R
             if abs(point.state.mu[path.name]) > furthest:
                 break
     except PathStopped as e:
-        lost = _why(path, e, walk.points) + stage.scene.nowhere()
+        lost = _why(stage.scene, path, e, walk.points) + stage.scene.nowhere()
     yield from _excluded(path, watch.end())
     if lost and path.control == "load":
         for found in _fold_ahead(stage, path, walk.points):
             yield found
             if found.label == "fold":
-                at = f"{path.name} = {found.point.state.mu[path.name]:.9g}"
-                lost = f"load control cannot pass the fold at {at}; {lost}"
+                at = _amount(stage.scene, path.name, found.point.state.mu[path.name])
+                before = (
+                    f", before its target, {_amount(stage.scene, path.name, goal.targets[-1])}" if goal.targets else ""
+                )
+                lost = f"load control cannot pass the fold at {at}{before}; {lost}"
     if watch.unlocated:
         why = f"a mode that the reduced model excludes is unstable from an unknown point on: {watch.unlocated}"
         lost = f"{lost}; {why}" if lost else why
@@ -115,7 +120,7 @@ def _branches(stage: Stage, path: Path, crossing: Branching, goal: Goal, steps: 
                     yield replace(found, branch=number)
                 yield Record(label, path.name, point, branch=number, excluded_pivots=watch.unstable)
         except PathStopped as e:
-            lost.append(f"branch {number}: {_why(by_arc, e, walk.points)}")
+            lost.append(f"branch {number}: {_why(stage.scene, by_arc, e, walk.points)}")
         for found in _excluded(by_arc, watch.end()):
             yield replace(found, branch=number)
     if lost:
@@ -150,12 +155,20 @@ def _excluded(path: Path, crossings: Iterable[Crossing]) -> Iterator[Record]:
         yield Record("bifurcation", path.name, found.point, found.label, excluded_pivots=found.unstable)
 
 
-def _why(path: Path, stop: PathStopped, points: list[Point]) -> str:
+def _amount(scene: Scene, name: str, value: float) -> str:
+    """The value of an amplitude, as "pressure = 0.326233 (53.7 Pa)"."""
+    column = amplitude(name).column
+    known = scene.sizes.column(column)
+    measured = known and f" ({value * scene.sizes.of[quantity(column).scale]:.6g} {known.si})"
+    return f"{name} = {value:.6g}{measured or ''}"
+
+
+def _why(scene: Scene, path: Path, stop: PathStopped, points: list[Point]) -> str:
     """The message for a lost path; it names a fold in the controlled quantity."""
     here = stop.point
-    where = f"the last point has {path.name} = {here.state.mu[path.name]:.6g}: {stop}"
+    where = f"the last point has {_amount(scene, path.name, here.state.mu[path.name])}: {stop}"
     if path.control == "load":
-        return f"load control stopped; {where}. To pass a limit point, use control: arc or control: displacement"
+        return f"load control stopped; {where}. To pass a limit point, use control: arc"
     before = points[-2] if len(points) > 1 else here
     if path.control == "arc" or before.dmu == here.dmu:
         return f"the controlled path stopped; {where}"

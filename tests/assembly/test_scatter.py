@@ -8,9 +8,9 @@ import scipy.sparse
 from dolfinx import fem, mesh
 from mpi4py import MPI
 
-from magshell_fenicsx.assembly.native import native
 from magshell_fenicsx.assembly.point_kernels import COMPONENTS, SKEW
 from magshell_fenicsx.assembly.scatter import BlockMatrix
+from magshell_fenicsx.platform.native import native
 
 
 def space(degree: int) -> fem.FunctionSpace:

@@ -2,6 +2,7 @@
 
 import gc
 import weakref
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from continuation.toys import Toy, pitchfork, snap_through
 
 from magshell_fenicsx.continuation.control import GivenConjugate, GivenLoad
 from magshell_fenicsx.continuation.events import instabilities
+from magshell_fenicsx.continuation.listener import NoProgress
 from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.path import Control, Path, StepOptions
 from magshell_fenicsx.continuation.point import PathStopped, Point
@@ -87,6 +89,27 @@ def test_imperfection_turns_the_pitchfork_into_a_stable_path() -> None:
         assert point.negative_pivots == 0
     u, v = point.state.u
     assert (1 - u) * v + v**3 == pytest.approx(0.01, abs=1e-10)
+
+
+def test_a_point_that_was_too_far_away_is_a_step_later() -> None:
+    """Where the path bends steps are too long, but none is in vain; every point is on the branch v > 0."""
+
+    class Tried(NoProgress):
+        places: ClassVar[list[float]] = []
+
+        def trying(self, here: Point, length: float) -> None:
+            self.places.append(here.s + length)
+
+    toy, options = pitchfork(imperfection=0.01), StepOptions(0.5, 0.5, 1e-6)
+    path = Path(BorderedNewton(toy), "load", "conjugate", options, progress=Tried())
+    bent = path.newton.solve(State(np.zeros(2), {"load": 0.0}), "load", GivenLoad("load", 0.0))
+    points = [point for point, _ in path.towards(path.start(bent.state), [5.0])]
+    assert Tried.places != sorted(Tried.places)
+    assert sorted(Tried.places) == [point.s for point in points]
+    for point in points:
+        u, v = point.state.u
+        assert v > 0
+        assert (1 - u) * v + v**3 == pytest.approx(0.01, abs=1e-10)
 
 
 def test_targets_are_met_exactly() -> None:

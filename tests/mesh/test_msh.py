@@ -194,7 +194,12 @@ MOEBIUS = [
 ]
 WRONG = [
     ([*TWO, [0, 4, 2]], CORNERS, FRAME, r"more than two triangles meet at the edge around \(0.5, 0.5, 0\)"),
-    (TWO, CORNERS, FRAME[:3], r"ends at the edge around \(0, 0.5, 0\), which belongs to no physical curve"),
+    (
+        TWO,
+        CORNERS,
+        FRAME[:3],
+        r"shell.file: the surface ends at the edge around \(0, 0.5, 0\), which belongs to no physical curve",
+    ),
     (
         [[0, 1, 2], [4, 5, 3]],
         [*CORNERS[:4], [0, 0, 0], [1, 1, 0]],
@@ -213,7 +218,7 @@ def test_unsound_meshes_are_refused(
 ) -> None:
     written(cells, nodes, lines, tmp_path / "wrong.msh")
     with pytest.raises(MeshError, match=said):
-        read_msh(MeshFile(tmp_path / "wrong.msh", 1.0), {})
+        read_msh(MeshFile(tmp_path / "wrong.msh", 0.02), {})  # places are those of the file
 
 
 def test_triangles_the_other_way_round_are_turned(model: Any, tmp_path: Path) -> None:
@@ -255,8 +260,20 @@ def test_what_is_no_mesh_is_refused(model: Any, tmp_path: Path) -> None:
 def test_named_point_must_be_a_vertex(model: Any, tmp_path: Path) -> None:
     panel(model, 1)
     gmsh.write(str(tmp_path / "part.msh"))
-    with pytest.raises(MeshError, match=r"the point A is no vertex of the mesh; the nearest, over R, is \(1, 0, 1\)"):
-        read_msh(MeshFile(tmp_path / "part.msh", 1.0), {"A": np.array([1.0, 0.0, 1.01])})
+    with pytest.raises(MeshError, match=r"points.A: \(1, 0, 1.01\) in the file's .* nearest is \(1, 0, 1\)"):
+        read_msh(MeshFile(tmp_path / "part.msh", 0.02), {"A": np.array([0.02, 0.0, 0.0202])})
+
+
+@pytest.mark.parametrize(("unit", "times"), [("mm", None), ("m", "1000 times"), ("um", "0.001 times")])
+def test_wrong_unit_is_told(model: Any, tmp_path: Path, unit: str, times: str | None) -> None:
+    """A file in mm that is read as metres is a thousand times as long as its radius; nothing else would say so."""
+    panel(model, 1)
+    gmsh.write(str(tmp_path / "part.msh"))
+    shell = {"geometry": "mesh", "file": str(tmp_path / "part.msh"), "unit": unit, "radius": "1 mm"}
+    shell |= {"thickness": "10 um", "youngs_modulus": "1 MPa", "poisson_ratio": 0.3}
+    told = make_plan(Case.model_validate({"shell": shell, "boundary": {"bottom": "clamped"}})).warning
+    assert (told is None) == (times is None)
+    assert (times or "") in (told or "")
 
 
 def test_unknown_names_are_refused(model: Any, tmp_path: Path) -> None:

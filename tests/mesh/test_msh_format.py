@@ -159,7 +159,7 @@ def test_options_beside_a_mesh_are_not_run(tmp_path: Path, monkeypatch: pytest.M
 
 @pytest.mark.parametrize("command", ["check", "run"])
 def test_what_the_user_sees(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: str) -> None:
-    """One line with the file and what is allowed, exit code 2."""
+    """One line with the files, the key and what is allowed, exit code 2."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "parts").mkdir()
     (tmp_path / "parts" / "part.msh").write_text(RUN, encoding="utf-8")
@@ -167,7 +167,8 @@ def test_what_the_user_sees(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, com
     done = magshell(command, tmp_path / "case.yaml")
     assert done.returncode == 2
     assert done.stderr.count("\n") == 1
-    assert done.stderr.startswith(f"{tmp_path}/parts/part.msh: is no mesh of gmsh's, which begins with $MeshFormat; ")
+    said = f"{tmp_path}/case.yaml:2: shell.file: {tmp_path}/parts/part.msh: is no mesh of gmsh's"
+    assert done.stderr.startswith(f"{said}, which begins with $MeshFormat; ")
     assert not (tmp_path / "ran").exists()
 
 

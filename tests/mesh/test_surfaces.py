@@ -1,5 +1,6 @@
 """Built-in geometries: their areas, edges, normals and named points; cases that cannot be are refused."""
 
+import re
 from typing import Any
 
 import numpy as np
@@ -108,6 +109,23 @@ POINTS = [
     ({"geometry": "revolution", "profile": {"points": [[2, 0], [1, 1]]}}, [0, 1.25, 0.75]),
     ({"geometry": "revolution", "profile": ROUND}, [2, 0, 0]),
 ]
+
+
+STRIP = {"geometry": "strip", "radius": "30 mm", "thickness": "0.5 mm", "width": 0.2, "youngs_modulus": "1 MPa"}
+OFF = [
+    (STRIP, [1, 0, 0], "points.A: is not on the surface; a place near it that is: [30 mm, 0 mm, 0 mm]; a number"),
+    (STRIP, ["30 mm", "6 mm", 0], "near it that is: [30 mm, 3 mm, 0 mm]"),
+    ({"geometry": "plate", "length": 2, "width": 0.5}, [1, 0.6, 0], "near it that is: [1, 0.5, 0]"),
+]
+
+
+@pytest.mark.parametrize(("shell", "place", "said"), OFF)
+def test_named_points_beside_the_surface(shell: dict[str, Any], place: list[float], said: str) -> None:
+    """A strip once took any point as one of its own, even 1 m away, where every displacement is nan."""
+    edge = "root" if shell["geometry"] == "strip" else "left"
+    data = {"shell": COMMON | shell, "boundary": {edge: "clamped"}, "points": {"A": place}}
+    with pytest.raises(CaseError, match=re.escape(said)):
+        make_plan(Case.model_validate(data))
 
 
 @pytest.mark.parametrize(("shell", "place"), POINTS)

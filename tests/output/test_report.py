@@ -4,7 +4,7 @@ import base64
 import copy
 import json
 from html.parser import HTMLParser
-from math import pi
+from math import cos, pi, radians, sin
 from pathlib import Path
 from typing import Any
 
@@ -109,6 +109,26 @@ def test_buckling_in_one_sentence_and_in_pascals(tmp_path: Path) -> None:
     )
     assert "296.296Pa" in text.replace("\n", "")
     assert "326233305" not in text
+
+
+def test_where_it_buckles(tmp_path: Path) -> None:
+    """On a sphere in degrees, as imperfections are placed, elsewhere as a place; of a meridian not at all."""
+    place = [0.0252 * sin(radians(50)) * f(radians(120)) for f in (cos, sin)] + [0.0252 * cos(radians(50))]
+    text = page(tmp_path, [FOLD], limit_points=[{"mode_at": place}]).text
+    assert "w/h = 3.4 at the pole; its mode is largest at polar 50°, azimuth 120°." in text
+    case = SUMMARY["case"] | {"shell": {"geometry": "cylinder"}}
+    text = page(tmp_path, [FOLD], limit_points=[{"mode_at": [0.0252, 0, -0.001]}], case=case).text
+    assert "its mode is largest at (25.2, 0, -1) mm." in text
+    assert "its mode" not in page(tmp_path, [FOLD], limit_points=[{}]).text
+
+
+def test_body_that_does_not_touch(tmp_path: Path) -> None:
+    """Else a force of zero at the target is a riddle."""
+    row = {"label": "target", "amplitude": "approach", "approach_over_h": 2.0, "penetration_over_h": -3.5}
+    case = SUMMARY["case"] | {"loading": {"kind": "contact", "until": "target"}}
+    text = page(tmp_path, [row], case=case, knockdown=None).text
+    assert "The body has not touched the shell: there is a gap of 3.5 h." in text
+    assert "not touched" not in page(tmp_path, [row | {"penetration_over_h": 1e-4}], case=case, knockdown=None).text
 
 
 def test_force_at_the_target_in_newtons(tmp_path: Path) -> None:

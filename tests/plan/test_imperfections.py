@@ -156,7 +156,7 @@ def test_defect_is_one_of_them() -> None:
     [
         ("cylinder", [dimple()], "on a cylinder give its place"),
         ("cylinder", [dimple(0.5, 0, 1)], r"at\.point: is not on the surface; a place near it that is: \[1, 0, 1\]"),
-        ("hemisphere", [towards(95.0)], r"imperfections\.0\.at\.polar: 95: is not on the shell"),
+        ("hemisphere", [towards(95.0)], r"imperfections\.0\.at\.polar: 95: is not on the shell: allowed 0 to 90"),
         ("hemisphere", [dimple(amplitude=30.0, width=0.5)], "steepest slope"),
         ("hemisphere", [{"kind": "formula", "w0": "1/z"}], "has no finite value"),
         ("holed cap", [towards(12.0)], "it would reach around the shell or its axis"),

@@ -17,6 +17,7 @@ from magshell_fenicsx import Case, CaseError, Scene
 from magshell_fenicsx.case.expressions import with_derivatives
 from magshell_fenicsx.case.source import Source
 from magshell_fenicsx.models.shell.crossing import crossing
+from magshell_fenicsx.plan.check import describe
 from magshell_fenicsx.plan.formulas_in_space import FormulasInSpace
 from magshell_fenicsx.plan.planner import make_plan
 from magshell_fenicsx.plan.sources.field import in_space
@@ -276,3 +277,27 @@ def test_magnet_in_the_way() -> None:
     rows, said = stopped(scene)
     assert "is inside magnetic.applied.sources.0" in said
     assert 0.7 < rows[-1]["source"] < 25 / 30
+
+
+def test_check_tells_how_strong_they_are() -> None:
+    """A ball is a dipole, on its axis 2 J/3 (a/d)^3; numbers that were meant in mm are metres, and nothing is felt."""
+    shell = {
+        "geometry": "disc",
+        "radius": "25 mm",
+        "thickness": "1 mm",
+        "youngs_modulus": "1 MPa",
+        "poisson_ratio": 0.5,
+    }
+    ball = {"kind": "sphere", "diameter": "10 mm", "polarization": "1.2 T", "position": [0, 0, "-30 mm"]}
+
+    def told(**changes: Any) -> float:
+        magnetic = {"remanent": {"flux_density": "60 mT"}, "applied": {"sources": [ball | changes]}}
+        data = {"shell": shell, "boundary": {"rim": "clamped"}, "magnetic": magnetic}
+        found = re.search(
+            r"field of the sources on the undeformed shell: .* to (.*) mT", describe(Case.model_validate(data))
+        )
+        assert found
+        return float(found[1])
+
+    assert told() == pytest.approx(1e3 * 2 / 3 * 1.2 * (5 / 30) ** 3, rel=1e-3)
+    assert told(position=[0, 0, -30]) < 1e-7

@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 from command import magshell
-from conftest import CASES
+from conftest import CAP, CASES
 from scipy.spatial import cKDTree
 
+import magshell_fenicsx as ms
 from magshell_fenicsx.output.fields.vtu import read_vtu
 
 WHERE = CASES / "where_to_magnetise.yaml"
@@ -73,8 +74,13 @@ def test_same_on_ranks(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("section", "message"),
     [
-        ("{of: [sideways]}", "sideways: has no gradient here; allowed are energy"),
-        ("{of: [tip_uz], by: [magnets]}", "magnets: the case has no such key"),
+        (
+            "{of: [sideways]}",
+            "gradients.of: sideways: has no gradient here; allowed are knockdown, buckling_pressure_Pa",
+        ),
+        ("{of: [force_N]}", "gradients.of: force_N: has no gradient here; allowed are"),
+        ("{of: [buckling_pressure_Pa]}", "buckling_pressure_Pa: the case has no such unit; knockdown has none"),
+        ("{of: [tip_uz], by: [magnets]}", "gradients.by: magnets: the case has no such key"),
     ],
 )
 def test_mistakes(tmp_path: Path, section: str, message: str) -> None:
@@ -84,3 +90,34 @@ def test_mistakes(tmp_path: Path, section: str, message: str) -> None:
     assert done.returncode == 2
     assert message in done.stderr
     assert not (tmp_path / "out/path.csv").exists()
+
+
+IN_UNITS = (
+    CAP
+    + """
+gradients: {of: [buckling_pressure_Pa, pressure_Pa, w_pole_mm], by: [shell.youngs_modulus]}
+"""
+)
+
+
+def test_results_in_units(tmp_path: Path) -> None:
+    """Against the difference of two runs; E changes k_d, by the field, and the classical pressure.
+
+    The pressure where the path ends is that of the fold; the displacement there moves along the path, and it once had
+    the derivative at the point before the fold.
+    """
+    (tmp_path / "cap.yaml").write_text(IN_UNITS, encoding="utf-8")
+    done = magshell("run", tmp_path / "cap.yaml", "--out", tmp_path / "out", "--no-pictures", ranks=1)
+    assert "no gradient of w_pole_mm: the path ends at a fold, which moves" in done.stdout
+    found = summary(tmp_path / "out")["gradients"]
+
+    def buckling(modulus: float) -> float:
+        result = ms.run(ms.Case.load(tmp_path / "cap.yaml", [f"shell.youngs_modulus={modulus} Pa", "gradients=null"]))
+        assert result.knockdown
+        return result.knockdown * result.scene.sizes.of["p_c"]
+
+    slope = (buckling(1.301e6) - buckling(1.299e6)) / 2e3
+    for name in ("buckling_pressure_Pa", "pressure_Pa"):
+        assert found[name]["numbers"]["shell.youngs_modulus"] == pytest.approx(slope, rel=1e-4)
+        assert found[name]["value"] == pytest.approx(buckling(1.3e6), rel=1e-6)
+    assert "w_pole_mm" not in found

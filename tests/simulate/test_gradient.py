@@ -195,7 +195,7 @@ def test_force_at_a_depth(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("of", "by", "message"),
     [
-        ("sideways", "remanence", "sideways: has no gradient here; allowed are energy, distance, tip_ux"),
+        ("sideways", "remanence", "sideways: has no gradient here; allowed are energy, tip_ux"),
         ("lambda_m", "remanence", "lambda_m: is a load here"),
         ("tip_ux", "shell.width", "shell.width: a number of the mesh, of the shape or of a target"),
         ("tip_ux", "magnetic.remanence", "magnetic.remanence: is no number"),
@@ -207,3 +207,17 @@ def test_mistakes(strip: Path, of: str, by: str, message: str) -> None:
     start = next(iter(follow(scene)))
     with pytest.raises(CaseError, match=message):
         gradient(scene, start, of=of, by=[by])
+
+
+def test_a_gas_has_numbers_of_its_own() -> None:
+    """Its law has the classical pressure, which depends on Poisson's ratio; by other amplitudes there is a slope."""
+    steps = [
+        "{kind: pressure, control: load, until: target, pressure: 0.1, points: 1}",
+        "{kind: indentation, at: {polar: 0}, depth: 0.5, points: 1, hold: {pressure: {gas: {ambient_over_pc: 2}}}}",
+    ]
+    settings = ["shell.defect=null", f"loading=[{', '.join(steps)}]", "magnetic=null", "natural={curvature: 0.01}"]
+    scene = Scene(Case.load(CASES / "dimple_buckling.yaml", settings))
+    last = solved(scene)
+    assert gradient(scene, last, of="force", by=["natural_curvature"])["natural_curvature"] != 0
+    with pytest.raises(CaseError, match=r"shell\.poisson_ratio: has no derivative while a gas is held"):
+        gradient(scene, last, of="force", by=["shell.poisson_ratio"])

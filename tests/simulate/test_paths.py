@@ -81,7 +81,21 @@ def test_coarse_field_steps_do_not_jump_over_a_fold(points: int) -> None:
     found = result("dimple_buckling.yaml", "magnetic.lambda_m=-0.005", loading)
     assert found.stopped
     assert "load control cannot pass the fold at lambda_m = -0.00335" in found.stopped
+    assert ", before its target, lambda_m = -0.005; " in found.stopped
     assert found.limit_points[-1]["value"] == pytest.approx(-0.0033554, rel=2e-5)
+
+
+def test_target_beyond_the_fold_in_units() -> None:
+    """p_c of R/h = 40, in pascals; a target without a control is reached by load control."""
+    shell = "shell={geometry: hemisphere, radius: 40 mm, thickness: 1 mm, youngs_modulus: 1.3 MPa, poisson_ratio: 0.5, "
+    shell += "defect: {kind: dimple, amplitude: 1, width: 3}}"
+    found = result(
+        "dimple_buckling.yaml", shell, "loading={kind: pressure, until: target, pressure: 900 Pa, points: 2}"
+    )
+    pascals = (found.knockdown or 0) * 1.3e6 * 4 / 3 / 40**2
+    assert found.stopped
+    assert f"cannot pass the fold at pressure = {found.knockdown:.6g} ({pascals:.6g} Pa), before" in found.stopped
+    assert "(900 Pa); load control stopped" in found.stopped
 
 
 @pytest.mark.slow

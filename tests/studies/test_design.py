@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import scipy
 from command import magshell
-from conftest import CASES, draw_nothing
+from conftest import CAP, CASES, draw_nothing
 from interrupted import kill, start, wait_until
 from mpi4py import MPI
 from numpy.typing import NDArray
@@ -129,6 +129,33 @@ def test_a_variable_without_influence(strip: Callable[[str], Path], tmp_path: Pa
     assert "no variable has an influence on tip_uz" in done.stderr
 
 
+IN_UNITS = (
+    CAP
+    + """
+design:
+  objective: {reach: buckling_pressure_Pa, value: 250}
+  numbers: {magnetic.applied.flux_density: [-20 mT, 0.02 T]}
+  iterations: 5
+  verify: 1
+"""
+)
+
+
+def test_bounds_and_results_in_units(tmp_path: Path) -> None:
+    """A field in tesla for a load in pascals: the best case, run as it is written, buckles there."""
+    (tmp_path / "cap.yaml").write_text(IN_UNITS, encoding="utf-8")
+    content = design(tmp_path / "cap.yaml", out=tmp_path / "out")
+    assert content["verified"]["buckling_pressure_Pa"] == pytest.approx(250, rel=1e-3)
+    (found,) = content["numbers"].items()
+    assert found[0] == "magnetic.applied.flux_density [mT]"
+    best = Case.load(tmp_path / "out/best.yaml")
+    assert best.magnetic
+    assert best.magnetic.applied.flux_density == pytest.approx(1e-3 * found[1], rel=1e-12)
+    bare = "--set=design.numbers={magnetic.applied.flux_density: [-20, 20]}"
+    checked = magshell("check", tmp_path / "cap.yaml", bare)
+    assert "design.numbers: magnetic.applied.flux_density: the case gives 10 mT: its bounds need" in checked.stderr
+
+
 @pytest.mark.slow
 def test_a_target_out_of_reach(strip: Callable[[str], Path], tmp_path: Path) -> None:
     section = "{objective: {reach: tip_uz, value: 0.99}, numbers: {magnetic.lambda_m: [5.0e-5, 2.0e-4]}, iterations: 4}"
@@ -146,15 +173,36 @@ def test_a_target_out_of_reach(strip: Callable[[str], Path], tmp_path: Path) -> 
         ("", "design: is missing: it says what varies and what is wanted"),
         (
             "design: {objective: {minimise: tip_ux}}",
-            "needs numbers, remanence, thickness or curvature: otherwise nothing varies",
+            "needs numbers, remanence, thickness, curvature or deviation: otherwise nothing varies",
         ),
         ("design: {objective: {}, remanence: {}}", "give one of maximise, minimise, reach and shape, here none"),
         ("design: {objective: {reach: tip_ux}, remanence: {}}", "reach and value belong together"),
         ("design: {objective: {shape: {}}, remanence: {}}", "give components or curve"),
+        (
+            "design: {objective: {maximise: tip_ux}, constraints: [{of: tip_uz}], remanence: {}}",
+            "of: tip_uz: give least",
+        ),
+        ("design: {objective: {maximise: hertz_1}, remanence: {points: 3}}", "hertz_1: needs shell.density"),
+        (
+            "design: {objective: {minimise: barrier}, remanence: {points: 3}}",
+            "barrier: needs a last step with until: zero",
+        ),
         ("design: {objective: {minimise: tip_ux}, remanence: {}}", "design.remanence: give points, or"),
         (
             "design: {objective: {minimise: tip_ux}, numbers: {magnetic.lambda_m: [1, 2]}}",
             "design.numbers: magnetic.lambda_m: the case starts at 0.0001, beyond 1 to 2",
+        ),
+        (
+            "design: {objective: {minimise: tip_ux}, numbers: {magnetic.lambda_m: [1 mT, 2 mT]}}",
+            "design.numbers: magnetic.lambda_m: is a number without a unit in the case: so are its bounds",
+        ),
+        (
+            "design: {objective: {minimise: tip_ux}, numbers: {magnetic.lambda_m: [1 mT, 2]}}",
+            "design: numbers: magnetic.lambda_m: 2 has no unit: give both bounds one",
+        ),
+        (
+            "design: {objective: {minimise: tip_ux}, numbers: {magnetic.lambd: [1, 2]}}",
+            "design.numbers: magnetic.lambd: the case has no such key (lambd)",
         ),
         (
             "design: {objective: {minimise: tip_ux}, remanence: {points: 3, magnitude: [0.1, 0.5]}}",
@@ -166,7 +214,7 @@ def test_a_target_out_of_reach(strip: Callable[[str], Path], tmp_path: Path) -> 
         ),
         (
             "design: {objective: {minimise: sideways}, remanence: {points: 3}}",
-            "sideways: has no gradient here; allowed",
+            "design.objective: sideways: has no gradient here; allowed",
         ),
     ],
 )
@@ -202,6 +250,38 @@ def test_thickness_for_the_highest_load_at_equal_mass(tmp_path: Path) -> None:
     assert content["best"]["knockdown"] > 2 * content["start"]["knockdown"]
     assert content["best"]["mass"] == pytest.approx(1, rel=1e-6)
     assert content["verified"]["knockdown"] == pytest.approx(content["best"]["knockdown"], rel=5e-4)
+
+
+@pytest.mark.slow
+def test_equal_forces_of_four_tips(tmp_path: Path) -> None:
+    """Arms that are magnetised inwards, by symmetry, press with 5.1 uN each in the part of the field along e3."""
+    content = design(CASES / "designed_gripper.yaml", ["design.iterations=40"], tmp_path)
+    tips = np.array([content["best"][f"{arm}_tip_fz"] for arm in ("east", "north", "west", "south")])
+    assert content["start"]["east_tip_fz"] == pytest.approx(-content["start"]["west_tip_fz"], rel=1e-5)
+    assert np.ptp(tips) < 2.1e-3 * tips.max()  # each within 1e-3 of the west one's
+    assert tips.min() > 4.9e-6
+    radial = "{kind: expression, components: [-x/sqrt(x**2 + y**2), -y/sqrt(x**2 + y**2), 0]}"
+    inwards = run(Case.load(CASES / "designed_gripper.yaml", [f"magnetic.remanent={radial}"])).rows[-1]
+    assert tips.mean() == pytest.approx(float(inwards["north_tip_fz"]), rel=0.03)
+
+
+@pytest.mark.slow
+def test_shape_for_the_highest_frequency(tmp_path: Path) -> None:
+    """A clamped disc, omega = 10.2158 sqrt(D/(rho h))/R^2 (Leissa, 1969) where it is flat, as a designed dome."""
+    file = CASES / "designed_shape.yaml"
+    vary = variables(source := read_source(file), case := Case.from_source(source), case.design)  # type: ignore[arg-type]
+    way, B = np.random.default_rng(0).random(len(vary.first)), tmp_path / "B.csv"
+    back, here, further = (
+        evaluate(vary.case_of(x, B), x, vary, ["omega2_1"], {}, MPI.COMM_WORLD, Standing())
+        for x in (vary.first + c * way for c in (0.01, 0.02, 0.03))
+    )
+    slope = (further.values["omega2_1"] - back.values["omega2_1"]) / 0.02
+    assert np.array(here.gradients["omega2_1"]) @ way == pytest.approx(slope, rel=3e-4)  # 1e-4 of the difference
+    content = design(file, ["design.iterations=4"], tmp_path / "out")
+    flat = 10.2158**2 * 1e-4 / (12 * (1 - 0.3**2))
+    assert content["start"]["omega2_1"] == pytest.approx(flat, rel=0.05)  # the dome of 0.2 h
+    assert content["best"]["omega2_1"] > 5 * flat
+    assert content["verified"]["omega2_1"] == pytest.approx(content["best"]["omega2_1"], rel=1e-5)
 
 
 @pytest.mark.slow

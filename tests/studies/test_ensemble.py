@@ -90,7 +90,7 @@ def test_a_known_fold_leads_to_the_knockdown_of_the_path() -> None:
     assert near.knockdown == pytest.approx(alone.knockdown, rel=1e-9)
     path = run(second.case)
     assert near.knockdown == pytest.approx(path.knockdown, rel=2e-8)  # located to 1e-8
-    assert near.factorisations < path.scene.newton.factorisation.count / 4
+    assert near.factorisations < path.scene.newton.factorisation.count / 3
     other = solving.solve(second, parse_scalar("w_pole_over_h@end"), known)  # every other result takes the path
     assert other.found == "path"
 

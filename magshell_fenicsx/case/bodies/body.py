@@ -23,7 +23,7 @@ class BodySection(Section):
     """
 
     kind: str
-    at: At = At()
+    at: At = At.model_construct()
     """Where it first touches; it gives `direction`, and without `position` the place: the front of the body touches
     the undeformed shell there"""
     side: Literal["outside", "inside"] = "outside"

@@ -55,7 +55,7 @@ class LocalSection(ImperfectionSection):
     """Depth δ, inwards; a bump is negative [h]"""
     width: float = Field(ge=0.05, le=50)
     """Half-width φo of a dimple, φg of a Gaussian one, times (√(12(1 - ν²)) R/h)^(1/2)"""
-    at: At = At()
+    at: At = At.model_construct()
     """Its centre"""
 
     @property

@@ -10,9 +10,10 @@ from magshell_fenicsx.case.imperfections.formula import FormulaSection
 from magshell_fenicsx.case.imperfections.gaussian import GaussianSection
 from magshell_fenicsx.case.imperfections.modes import ModesSection
 from magshell_fenicsx.case.imperfections.random import RandomSection
+from magshell_fenicsx.parts.chosen import Chosen
 
 Imperfection = Annotated[
     DimpleSection | GaussianSection | FormulaSection | DataSection | ModesSection | RandomSection,
-    Field(discriminator="kind"),
+    Chosen("kind"),
 ]
 Imperfections = Annotated[list[Imperfection], Field(max_length=1000)]

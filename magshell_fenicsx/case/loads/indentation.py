@@ -38,10 +38,11 @@ class IndentationSection(PathStep):
         "force": Target("load", "force"),
     }
     kind: Literal["indentation"]
-    at: Place
-    """Where the force is; on a hemisphere polar is below 89"""
+    at: Place = Place()
+    """Where the force is, by default the pole or the centre; on a hemisphere polar is below 89"""
     control: Literal["displacement", "load", "arc"] = "displacement"
-    """What is prescribed step by step: w, F, or arc length, which passes every fold"""
+    """What is prescribed step by step: w, F, or arc length, which passes every fold; the default is load with a target
+    `force`"""
     until: Until = "target"
     depth: Annotated[float, over("h")] | None = Field(default=None, ge=-1e4, le=1e4)
     """Target w under the load; with control: displacement or arc [h]"""

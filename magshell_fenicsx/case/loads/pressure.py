@@ -21,8 +21,8 @@ class PressureSection(PathStep):
     }
     kind: Literal["pressure"]
     control: Literal["volume", "load", "arc"] = "volume"
-    """What is prescribed step by step: ΔV, p, or arc length, which passes every fold. Beside a free edge no ΔV is
-    conjugate to p: arc is then the default"""
+    """What is prescribed step by step: ΔV, p, or arc length, which passes every fold. The default is load with a target
+    `pressure`; and arc beside a free edge, where no ΔV is conjugate to p"""
     until: Until = "limit"
     pressure: Annotated[float, over("p_c")] | None = Field(default=None, ge=-1e3, le=1e3)
     """Target p; with control: load or arc [p_c]"""

@@ -164,12 +164,22 @@ class PathStep(Step):
     """What follows the fold that ends the step with `until: limit`: `snap` releases the shell, which moves under its
     loads and what else is held, lightly damped, until it rests on the branch that it snaps to; the next step goes on
     from there"""
-    snap: SnapSection = SnapSection()
+    snap: SnapSection = SnapSection.model_construct()
     """How it is released"""
     branches: bool = False
     """Follow both directions of the branch at the first bifurcation too, to the target or for `points` steps"""
     sensitivities: bool = False
     """Derive the load at the fold that ends the path by all other amplitudes, the defect and each patch's remanence"""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _control_of_the_target(cls, data: Any) -> Any:
+        """A target that is a load is reached by load control, where the default prescribes its conjugate."""
+        default = cls.model_fields["control"].default
+        if not isinstance(data, dict) or "control" in data or default != cls.conjugate_control:
+            return data
+        quantities = {each.quantity for key, each in cls.targets.items() if data.get(key) is not None}
+        return {**data, "control": "load"} if quantities == {"load"} else data
 
     @model_validator(mode="after")
     def _target_fits_control(self) -> Self:
@@ -181,7 +191,10 @@ class PathStep(Step):
                 raise ValueError(f"{key} is a target and must be zero, or at least {LEAST_TARGET:g} in size")
         if self.until == "target" and (len(given) > 1 or not set(given) <= set(fitting) or not (given or self._end)):
             names = " or ".join(fitting) or "another control"
-            raise ValueError(f"until: target with control: {self.control} needs {names} (and nothing else) as target")
+            raise ValueError(
+                f"until: target with control: {self.control} needs {names} (and nothing else) as target; control: arc "
+                f"takes {' or '.join(self.targets)}"
+            )
         if self.until in ("limit", "bifurcation", "zero") and given:
             raise ValueError(f"{next(iter(given))} is a target: it goes with until: target")
         if self.until in ("points", "zero") and by != "arc":

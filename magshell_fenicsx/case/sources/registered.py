@@ -11,9 +11,10 @@ from magshell_fenicsx.case.sources.formula import FormulaSource
 from magshell_fenicsx.case.sources.grid import GridSection
 from magshell_fenicsx.case.sources.ring import RingSection
 from magshell_fenicsx.case.sources.sphere import SphereSection
+from magshell_fenicsx.parts.chosen import Chosen
 
 Source = Annotated[
     CylinderSection | CuboidSection | SphereSection | RingSection | CoilSection | GridSection | FormulaSource,
-    Field(discriminator="kind"),
+    Chosen("kind"),
 ]
 Sources = Annotated[list[Source], Field(min_length=1, max_length=1000)]

@@ -28,7 +28,7 @@ class SourceSection(Section):
     """For steps and pictures; by default its number in the list, from 0"""
     position: Position = Field(default=[0.0, 0.0, 0.0])
     """Of its middle, or of the origin of its own axes [m]"""
-    axis: Direction = Direction()
+    axis: Direction = Direction.model_construct()
     """Direction of its own z axis, e3 by default"""
     spin: float = 0.0
     """Angle by which its own x and y axes are turned about that [degree]"""

@@ -37,7 +37,7 @@ class Controls:
         """Whether the field turns about e3."""
         return self.places.shape[1] == 2
 
-    def weights(self, x: Array) -> scipy.sparse.csr_matrix:
+    def weights(self, x: Array) -> "scipy.sparse.csr_matrix":
         """w (m, n) at places (m, 3). Far from all points the nearest one counts alone."""
         at = np.column_stack([np.hypot(x[:, 0], x[:, 1]), x[:, 2]]) if self.around else x
         tree, count = scipy.spatial.cKDTree(self.places), len(self.places)

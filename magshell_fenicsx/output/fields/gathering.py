@@ -10,7 +10,8 @@ from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.solid.model import SolidModel
 from magshell_fenicsx.output.fields.body import BodyGatherer
-from magshell_fenicsx.output.fields.surface import RevolvedGatherer, Surface, SurfaceGatherer
+from magshell_fenicsx.output.fields.revolved import RevolvedGatherer
+from magshell_fenicsx.output.fields.surface import Surface, SurfaceGatherer
 
 
 class Gatherer(Protocol):

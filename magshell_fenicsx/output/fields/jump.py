@@ -1,21 +1,23 @@
-"""By how much a field jumps between cells, where a mean at shared nodes makes it continuous."""
+"""By how much a field that jumps between cells differs from the continuous one that is made of it."""
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-ROUNDING = 1e-8  # a smaller field is zero, up to rounding
+ROUNDING = {"E": 1e-13, "M": 1e-8}  # smaller strains and moments are zero, up to rounding
 
 
-def relative_jump(values: Array, continuous: Array, weight: Array) -> float:
-    """The weighted rms of the difference between the cells' values and their mean, over the rms of the values.
+def relative_jump(values: Array, continuous: Array, weight: Array, zero: float = 0.0) -> float:
+    """The weighted rms of the difference between the cells' values and continuous ones, over the rms of the values.
 
     Parameters
     ----------
     values, continuous
-        (cells, points, ...) at the cells' nodes.
+        (cells, points, ...)
     weight
         (cells, points)
+    zero
+        Of values no larger than this there is none.
 
     Examples
     --------
@@ -28,4 +30,4 @@ def relative_jump(values: Array, continuous: Array, weight: Array) -> float:
         return float((weight * squared).sum() / weight.sum())
 
     size = np.sqrt(mean_square(values))
-    return float(np.sqrt(mean_square(values - continuous)) / size) if size > ROUNDING else 0.0
+    return float(np.sqrt(mean_square(values - continuous)) / size) if size > zero else 0.0

@@ -1,4 +1,4 @@
-"""Fields at a shell's points besides the displacement: strains, moments, magnetic fields and loads."""
+"""Fields at a shell's points besides displacement, strains and moments: magnetic fields and loads, gaps."""
 
 from collections.abc import Mapping, Sequence
 
@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.models.shell.contact import Contact
-from magshell_fenicsx.models.shell.natural import CURVATURE, STRETCH, Natural
 from magshell_fenicsx.models.shell.parameters import ACROSS, Magnetisation, Material
-from magshell_fenicsx.models.shell.strains import NaturalFrame, TangentFrame, bending_moment, principal
+from magshell_fenicsx.models.shell.patterns import inside
+from magshell_fenicsx.models.shell.strains import TangentFrame
 from magshell_fenicsx.output.fields.interpretation import SurfaceGeometry, Torque, magnetic_loads
 
 Array = NDArray[np.float64]
@@ -35,8 +35,12 @@ class PointFields:
     constant
         Name -> values (cells, points, ...) of the fields that do not depend on the displacement: p_mag, k and f_mag
         of a uniform applied field.
+    n0
+        (cells, points, 3) undeformed normals.
     weight
         (cells, points) area; the weight of a cell in the mean over the cells that share a point.
+    Br
+        (cells, points, 3) the undeformed remanence; (cells, points, 0) without.
     """
 
     def __init__(
@@ -45,36 +49,32 @@ class PointFields:
         material: Material,
         field: Magnetisation | None,
         thickness: Array | None,
-        natural: Natural | None = None,
         contacts: Sequence[Contact] = (),
         remanence: Magnetisation | None = None,
     ) -> None:
         self._contacts, self._h = contacts, material.h
-        self._frame, self._nu, self._field, self._thickness = TangentFrame.of(r0), material.nu, field, thickness
-        self._natural = natural and natural.at(r0[0], self._frame.n0)
+        self._frame, self._field, self._thickness = TangentFrame.of(r0), field, thickness
         self.constant: dict[str, Array] = {}
         self._torque: Torque | None = None
         self.n0, self.weight = self._frame.n0, self._frame.area
-        self._carried = field or remanence
+        self._carried, self.Br = field or remanence, np.zeros((*r0.shape[1:-1], 0))
         if self._carried:
             pattern = self._carried.remanent
-            self._Br = pattern(r0[0], self.n0) if callable(pattern) else np.broadcast_to(pattern, r0[0].shape)
+            self.Br = pattern(inside(r0[0]), self.n0) if callable(pattern) else np.broadcast_to(pattern, r0[0].shape)
         if field and field.uniform:
             h = material.h if thickness is None else material.h * thickness
-            self.constant, self._torque = magnetic_loads(self._geometry(), field, r0[0], h)
+            self.constant, self._torque = magnetic_loads(self._geometry(), field, inside(r0[0]), h)
+
+    @property
+    def jet(self) -> Array:
+        """(6, cells, points, 3) of the placement."""
+        return self._frame.jet
 
     def of(self, u: Array, mu: Mapping[str, float]) -> dict[str, Array]:
-        """The fields of a displacement with the jet u (6, cells, points, 3) over R, at the amplitudes mu.
+        """The fields of a displacement with the jet u (3 or 6, cells, points, 3) over R, at the amplitudes mu.
 
         Returns
         -------
-        E, M
-            (..., 3, 3) membrane strain and bending moment over D/R, with D of the thickness h, as tensors in space
-            that are tangent to the undeformed surface; the strain from the natural shape, if there is one.
-        E_total
-            (..., 3, 3) the strain from the drawn shape, if there is a natural one.
-        E_1, E_2, M_1, M_2
-            (...) their principal values, the larger first.
         Br, Ba
             (..., 3) the remanence as the shell carries it, over its magnitude; the applied flux density at the
             deformed point, over mu_0 E / |Br|, so that its magnitude is lambda_m.
@@ -83,21 +83,10 @@ class PointFields:
         gap_over_h
             (...) the least gap to a body.
         """
-        frame, total = self._frame, {}
-        E, K = frame.membrane_strain(u), frame.curvature_change(u)
-        M = bending_moment(K, self._nu)
-        if self._natural:
-            total["E_total"] = frame.tensor(E)
-            shape = NaturalFrame.of(frame, *self._natural, mu.get(CURVATURE, 0.0), mu.get(STRETCH, 0.0))
-            E, M = shape.elastic(E), shape.moment(K, self._nu)
-        if self._thickness is not None:
-            M *= self._thickness[..., None] ** 3
-        found = {"E": frame.tensor(E), "M": frame.tensor(M), **total}
-        found["E_1"], found["E_2"] = principal(E)
-        found["M_1"], found["M_2"] = principal(M)
+        frame, found = self._frame, dict[str, Array]()
         if self._carried:
             carried = frame.convected if self._carried.law == "deformation" else frame.rotated
-            found["Br"] = carried(self._Br, u)
+            found["Br"] = carried(self.Br, u)
         if self._field:
             found["Ba"] = _applied(self._field, mu, frame.jet[0] + u[0])
         if self._torque:

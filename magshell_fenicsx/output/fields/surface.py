@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import basix
 import basix.ufl
@@ -9,20 +10,22 @@ import numpy as np
 import scipy
 from dolfinx import fem, mesh
 from dolfinx.cpp.io import perm_vtk
-from mpi4py import MPI
 from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.system import State, Vector
-from magshell_fenicsx.mesh.deviation import Deviated, Deviation
+from magshell_fenicsx.mesh.deviation import Deviation
 from magshell_fenicsx.mesh.frame import rotation
-from magshell_fenicsx.models.axisymmetric.model import MeridianModel
-from magshell_fenicsx.models.axisymmetric.revolution import Revolution
 from magshell_fenicsx.models.shell.model import ShellModel
-from magshell_fenicsx.output.fields.jump import relative_jump
+from magshell_fenicsx.models.shell.patterns import inside
 from magshell_fenicsx.output.fields.point_fields import PointFields
+from magshell_fenicsx.output.fields.recovered_shell import RecoveredShell, six
+from magshell_fenicsx.output.fields.smooth_parts import smooth_parts, split
+from magshell_fenicsx.output.fields.stresses import Stresses
 
 TRIANGLE, LAGRANGE_TRIANGLE, LAGRANGE_HEXAHEDRON = 5, 69, 72  # VTK's numbers of cell types
 HEXAHEDRON_NODES = 27
+SAMPLED, OF_MANY = 6, 4  # degree of the rule whose points are samples of strains and moments, at least; of many
+MANY = 20_000  # cells, whose recovery would take a quarter of a gigabyte
 PRESSURE = "contact_pressure"  # of bodies, over E h/R: the mean over a cell
 W0 = "w0_over_h"  # the imperfections: the deviation of the drawn surface from the perfect one
 BOTH_WAYS = {"Br", "Ba"}  # a half shell's fields may be symmetric or antisymmetric to its plane
@@ -41,12 +44,17 @@ class Surface:
     cells
         (m, k) node numbers of triangles of the displacement's degree or of hexahedra, in VTK's order.
     fields
-        Name -> (n,), (n, 3) or (n, 3, 3), see `point_fields.PointFields`, and w0_over_h where there are
-        imperfections; of a solid that alone.
+        Name -> (n,), (n, 3) or (n, 3, 3): E, M as tensors in space, tangent to the undeformed surface, and E_total
+        where there is a natural shape (see `stresses.Stresses`); E_1, E_2, M_1, M_2, their principal values, the
+        larger first; those of `point_fields.PointFields`; w0_over_h where there are imperfections, of a solid that
+        alone.
     outlines
         Places (n, 3) along lines: the sources of the applied field.
     jump
-        By how much the bending moments jump between cells, over their size; see `jump`. None of a solid.
+        By how much the cells' own bending moments differ from the smooth field M, over their size (see `jump`).
+        None of a solid.
+    strain_jump
+        The same of the strains E.
     """
 
     r0: Array
@@ -56,6 +64,7 @@ class Surface:
     fields: dict[str, Array]
     outlines: tuple[Array, ...] = ()
     jump: float | None = None
+    strain_jump: float | None = None
 
     @property
     def is_body(self) -> bool:
@@ -69,41 +78,67 @@ class Surface:
 
 
 class SurfaceGatherer:
-    """Gathers displacements and fields of one shell; constant fields are computed and gathered once."""
+    """Gathers displacements and fields of one shell; constant fields are computed and gathered once.
+
+    Strains and moments are recovered from samples inside the cells, in each smooth part of the surface; all else is
+    the mean of the cells that share a node.
+    """
 
     def __init__(self, model: ShellModel) -> None:
         self._model = model
-        domain, degree, map_ = model.V.mesh, model.degree, model.V.dofmap.index_map
+        domain, degree = model.V.mesh, model.degree
         self.comm = domain.comm
         # VTK's nodes are equidistant, the displacement's are not; their numbers on edges and in cells are equal
-        element = basix.create_element(
+        self._element = basix.create_element(
             basix.ElementFamily.P, basix.CellType.triangle, degree, basix.LagrangeVariant.equispaced
         )
-        self._places = element.points
-        self._table = model.V.element.basix_element.tabulate(2, self._places)[:, :, :, 0]
-        self._owned = domain.topology.index_map(2).size_local
-        V = fem.functionspace(domain, basix.ufl.wrap_element(element))  # numbers each shared node once
+        self._places = self._element.points
+        cells = domain.topology.index_map(2)
+        sampled = SAMPLED if cells.size_global < MANY else OF_MANY
+        self._inner, self._rule = basix.make_quadrature(basix.CellType.triangle, max(sampled, degree))
+        self._owned = cells.size_local
+        V = fem.functionspace(domain, basix.ufl.wrap_element(self._element))  # numbers each shared node once
         local = V.dofmap.list[: self._owned]
         numbers = V.dofmap.index_map.local_to_global(local.ravel().astype(np.int32)).reshape(local.shape)
-        cells = self.comm.gather(numbers[:, np.argsort(perm_vtk(mesh.CellType.triangle, local.shape[1]))])
-        self._cells = np.concatenate(cells) if self.comm.rank == 0 else numbers
-        self._numbers, self._size = numbers, map_.size_global
-        self._take_placement({})
+        self._recovered: RecoveredShell | None = None
+        self._take_placement({}, self._gathered(numbers))
 
-    def _take_placement(self, mu: Mapping[str, float]) -> None:
-        """What depends on the placement, at amplitudes of imperfections that grow."""
+    def _take_placement(self, mu: Mapping[str, float], numbers: NDArray[np.int64] | None = None) -> None:
+        """What depends on the placement, at amplitudes of imperfections that grow; at first given the nodes."""
         model, loads = self._model, self._model.loads
-        r = self._at_nodes(model.r0)
-        factor = None if model.thickness is None else self._thickness(model.thickness)
-        others = loads.natural, loads.contacts, loads.remanence
-        self._fields = PointFields(r, model.material, loads.magnetic, factor, *others)
-        self._mean = self._weighted_mean(self._numbers, self._size)
+        r, inner = self._jet(model.r0, self._places), self._jet(model.r0, self._inner)
+        thick, thick_inside = (self._thickness(at) for at in (self._places, self._inner))
+        others = loads.contacts, loads.remanence
+        self._fields = PointFields(r, model.material, loads.magnetic, thick, *others)
+        self._stresses = Stresses(inner, model.material, thick_inside, loads.natural)
+        self._six = six(self._stresses.frame)
+        if numbers is not None:
+            self._number(numbers, r[0], inner[0])
+        self._mean = self._weighted_mean()
         deviation = model.midsurface.deviation(self._places, grown(loads.growing, mu))
         if deviation is not None:
             self._fields.constant[W0] = np.asarray(deviation[: self._owned] / model.material.h)
         n0 = self._averaged(self._fields.n0)
-        self._r0, self._n0 = self._averaged(r[0]), n0 / np.linalg.norm(n0, axis=1)[:, None]
+        self._r0, self._n0 = self._averaged(r[0]), n0 / np.linalg.norm(n0, axis=-1)[..., None]
         self._constant = {name: self._averaged(values) for name, values in self._fields.constant.items()}
+
+    def _number(self, numbers: NDArray[np.int64], r: Array, inner: Array) -> None:
+        """Take the nodes of all cells, split between smooth parts, and the recovery on them."""
+        loads, fields = self._model.loads, self._fields
+        given = [fields.Br, *(loads.natural.at(inside(r), fields.n0) if loads.natural else ())]
+        thickness = self._thickness(self._places)
+        given = [self._gathered(f) for f in (*given, *(() if thickness is None else (thickness,))) if f.size]
+        r, n0, inner, weight = (
+            self._gathered(f) for f in (r, fields.n0, inner, self._stresses.frame.area * self._rule)
+        )
+        self._numbers = numbers
+        if self.comm.rank:
+            return
+        sides = np.array(self._element.entity_closure_dofs[1])
+        self._numbers = split(numbers, smooth_parts(numbers, sides, given, n0))
+        self._cells = self._numbers[:, np.argsort(perm_vtk(mesh.CellType.triangle, numbers.shape[1]))]
+        table = self._element.tabulate(0, self._inner)[0, :, :, 0]
+        self._recovered = RecoveredShell(self._numbers, self._places, r, n0, inner, weight, table, self._model.degree)
 
     def gather(self, u: Vector, mu: Mapping[str, float] | None = None) -> Surface | None:
         """The displaced surface with its fields at the amplitudes mu, on rank 0; None on other ranks."""
@@ -111,100 +146,56 @@ class SurfaceGatherer:
             self._model.system.place(mu)
             self._take_placement(mu)
         self._model.system.set(u)
-        jet = self._at_nodes(self._model.u)
+        jet = self._jet(self._model.u, self._places, 1)
         values = self._fields.of(jet, mu or {})
         pressure = self._model.cell_pressures(State(u, dict(mu))) if mu else None
         if pressure is not None:
             values[PRESSURE] = np.repeat(pressure[: self._owned, None], len(self._places), axis=1)
         found = {name: self._averaged(each) for name, each in values.items()}
-        nodes, jump = self._averaged(jet[0]), self._jump(values["M"], found["M"])
-        if self.comm.rank:
+        nodes = self._averaged(jet[0])
+        stresses = self._stresses.of(self._jet(self._model.u, self._inner), mu or {})
+        tensors = {name: self._gathered(np.einsum("...ia,...a->...i", self._six, S)) for name, S in stresses.items()}
+        if not self._recovered:
             return None
-        return Surface(self._r0, nodes, self._n0, self._cells, self._constant | found, jump=jump)
+        smooth, jumps = self._recovered.fields(tensors, self._n0)
+        fields = self._constant | smooth | found
+        return Surface(self._r0, nodes, self._n0, self._cells, fields, (), jumps["M"], jumps["E"])
 
-    def _jump(self, values: Array, averaged: Array) -> float:
-        """How much a field jumps between the cells of all ranks, on rank 0."""
-        parts = self.comm.gather((values, self._fields.weight, self._numbers))
-        if self.comm.rank:
-            return 0.0
-        whole, weight, numbers = (np.concatenate(part) for part in zip(*parts, strict=True))
-        return relative_jump(whole, averaged[numbers], weight)
+    def _gathered(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Values of all ranks' cells on rank 0, elsewhere those of its own."""
+        parts = self.comm.gather(values)
+        return values if self.comm.rank else np.concatenate(parts)
 
-    def _at_nodes(self, f: fem.Function) -> Array:
-        """f, f,_1, f,_2, f,_11, f,_12, f,_22 in reference coordinates at each owned cell's nodes."""
+    def _jet(self, f: fem.Function, at: Array, order: int = 2) -> Array:
+        """f, f,_1, f,_2, f,_11, f,_12, f,_22 in reference coordinates at points of each owned cell, up to an order."""
+        table = self._model.V.element.basix_element.tabulate(order, at)[:, :, :, 0]
         coefficients = f.x.array.reshape(-1, 3)[self._model.V.dofmap.list[: self._owned]]
-        return np.asarray(np.matmul(self._table[:, None], coefficients))
+        return np.asarray(np.matmul(table[:, None], coefficients))
 
-    def _thickness(self, factor: fem.Function) -> Array:
-        """h(x)/h at each owned cell's nodes."""
+    def _thickness(self, at: Array) -> Array | None:
+        """h(x)/h at points of each owned cell, if it varies."""
+        factor = self._model.thickness
+        if factor is None:
+            return None
         V = factor.function_space
-        element = V.element.basix_element
-        values = element.tabulate(0, self._places)[0, :, :, 0]
+        values = V.element.basix_element.tabulate(0, at)[0, :, :, 0]
         return np.asarray(factor.x.array[V.dofmap.list[: self._owned]] @ values.T)
 
-    def _weighted_mean(self, numbers: NDArray[np.int64], size: int) -> "scipy.sparse.csr_matrix | None":
-        """The matrix of the weighted mean, from the nodes of all cells to global nodes, on rank 0.
-
-        Second derivatives jump between cells, so values at a shared node are averaged with the cells' areas as weights.
-        """
-        parts = self.comm.gather((numbers.ravel(), self._fields.weight.ravel()))
+    def _weighted_mean(self) -> "scipy.sparse.csr_matrix | None":
+        """The matrix of the mean of the cells that share a node, weighted by area, from the nodes of all cells."""
+        weights = self._gathered(self._fields.weight).ravel()
         if self.comm.rank:
             return None
-        where, weights = (np.concatenate(part) for part in zip(*parts, strict=True))
-        weights = weights / np.bincount(where, weights)[where]
-        return scipy.sparse.csr_matrix((weights, (where, np.arange(len(where)))), (size, len(where)))
+        where = self._numbers.ravel()
+        share = weights / np.bincount(where, weights)[where]
+        return scipy.sparse.csr_matrix((share, (where, np.arange(len(where)))))
 
     def _averaged(self, values: Array) -> Array:
-        """Weighted mean over the cells that share a node, in global order, on rank 0."""
-        parts = self.comm.gather(values)
+        """Weighted mean over the cells that share a node, on rank 0."""
+        whole = self._gathered(values)
         if self._mean is None:
             return values
-        whole = np.concatenate(parts)
         return np.asarray(self._mean @ whole.reshape(self._mean.shape[1], -1)).reshape(-1, *values.shape[2:])
-
-
-class RevolvedGatherer:
-    """The surface of revolution of a meridian, in flat triangles."""
-
-    def __init__(self, model: MeridianModel, comm: MPI.Comm) -> None:
-        self.comm, self._model = comm, model
-        self._take_placement({})
-
-    def _take_placement(self, mu: Mapping[str, float]) -> None:
-        """What depends on the placement, at amplitudes of imperfections that grow."""
-        model = self._model
-        self._swept = Revolution(model)
-        factor = None if model.thickness is None else self._swept.scalars(model.thickness)
-        r, loads = self._swept.jets(model.r0), model.loads
-        others = loads.natural, loads.contacts, loads.remanence
-        self._fields = PointFields(r, model.material, loads.magnetic, factor, *others)
-        if isinstance(model.meridian.embedding, Deviated):
-            s = np.sort(model.meridian.mesh.geometry.x[:, 0])
-            embedding = model.meridian.embedding
-            deviations = (*embedding.deviations, *grown(loads.growing, mu))
-            w0 = replace(embedding, deviations=deviations).w0(np.column_stack([s, 0 * s])) / model.material.h
-            self._fields.constant[W0] = np.column_stack([w0[:-1], w0[1:]])
-        self._constant = self._around(self._fields.constant)
-
-    def gather(self, u: Vector, mu: Mapping[str, float] | None = None) -> Surface | None:
-        """The displaced surface with its fields at the amplitudes mu, on rank 0; None on other ranks."""
-        if self.comm.rank:
-            return None
-        if self._model.growing and mu:
-            self._model.system.place(mu)
-            self._take_placement(mu)
-        self._model.system.set(u)
-        swept, values = self._swept, self._fields.of(self._swept.jets(self._model.u), mu or {})
-        pressure = self._model.cell_pressures(State(u, dict(mu))) if mu else None
-        if pressure is not None:
-            values[PRESSURE] = np.repeat(pressure[swept.order, None], 2, axis=1)
-        found = self._around(values)
-        M, weight = values["M"], self._fields.weight
-        jump = relative_jump(M, swept.continuous(M, weight), weight)
-        return Surface(swept.r0, swept.displacement(u), swept.n0, swept.cells, self._constant | found, jump=jump)
-
-    def _around(self, fields: Mapping[str, Array]) -> dict[str, Array]:
-        return {name: self._swept.around(values, self._fields.weight) for name, values in fields.items()}
 
 
 def grown(growing: Mapping[str, tuple[Deviation, ...]], mu: Mapping[str, float]) -> list[Deviation]:
@@ -246,6 +237,7 @@ def completed(surface: Surface, mirror: Array) -> Surface:
         {name: both(f, image.fields[name]) for name, f in surface.fields.items()},
         surface.outlines,
         surface.jump,
+        surface.strain_jump,
     )
 
 

@@ -18,6 +18,7 @@ if TYPE_CHECKING:  # VTK takes long to import
 Array = NDArray[np.float64]
 SYMMETRIC = ([0, 1, 2, 0, 1, 0], [0, 1, 2, 1, 2, 2])  # VTK's order of a symmetric tensor: XX, YY, ZZ, XY, YZ, XZ
 FULL = [[0, 3, 5], [3, 1, 4], [5, 4, 2]]  # from VTK's order to (3, 3)
+JUMPS = ("moment_jump", "strain_jump")
 OWN_DATA = ("u_over_h", "w_over_h", "r0", "n0")
 
 
@@ -98,8 +99,8 @@ def read_vtu(file: Path) -> tuple[Surface, About]:
         raise CaseError(f"{file} is of an earlier version: run the case again")
     about = About(float(numbers["h_over_R"][0]), float(numbers["poisson_ratio"][0]), numbers.get("mirror"))
     r0 = data["r0"]
-    jump = float(numbers["moment_jump"][0]) if "moment_jump" in numbers else None
-    return Surface(r0, data["u_over_h"] * about.h, data["n0"], cells, fields, jump=jump), about
+    jumps = (float(numbers[name][0]) if name in numbers else None for name in JUMPS)
+    return Surface(r0, data["u_over_h"] * about.h, data["n0"], cells, fields, (), *jumps), about
 
 
 class FieldSeries:
@@ -165,7 +166,8 @@ def vtu_content(surface: Surface, about: About) -> bytes:
 
     grid = unstructured_grid(surface, about.h)
     numbers = {"h_over_R": np.array([about.h]), "poisson_ratio": np.array([about.nu]), "mirror": about.mirror}
-    numbers["moment_jump"] = None if surface.jump is None else np.array([surface.jump])
+    jumps = zip(JUMPS, (surface.jump, surface.strain_jump), strict=True)
+    numbers |= {name: None if jump is None else np.array([jump]) for name, jump in jumps}
     for name, values in numbers.items():
         if values is not None:
             _give(grid.GetFieldData(), name, values)

@@ -40,9 +40,18 @@ def colour_map(name: str) -> "Colormap":
     return ListedColormap(np.minimum(colours + near * (1 - colours[128]), 1), name)
 
 
-def colour_bar(figure: "Figure", axes: "Axes", of: Scale, orientation: str = "horizontal") -> None:
-    """Draw a colour bar; its ends are pointed if values lie beyond them."""
+def colour_bar(
+    figure: "Figure", axes: "Axes", of: Scale, orientation: str = "horizontal", room: float = np.inf
+) -> None:
+    """Draw a colour bar; its ends are pointed if values lie beyond them.
+
+    Parameters
+    ----------
+    room
+        Inches that the caption above a horizontal bar may be wide; a longer one is written smaller.
+    """
     from matplotlib import rcParams
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
     from matplotlib.ticker import MaxNLocator
@@ -66,7 +75,10 @@ def colour_bar(figure: "Figure", axes: "Axes", of: Scale, orientation: str = "ho
     if power := numbers.get_offset():  # beside the bar, where it meets no number
         bar.ax.xaxis.get_offset_text().set_visible(False)
         bar.ax.text(1.07, 0.5, power, transform=bar.ax.transAxes, va="center", fontsize="small")
-    bar.ax.set_title(of.caption, pad=3)
+    title = bar.ax.set_title(of.caption, pad=3)
+    if np.isfinite(room):
+        wide = title.get_window_extent(FigureCanvasAgg(figure).get_renderer()).width / figure.dpi
+        title.set_fontsize(title.get_fontsize() * min(1.0, room / wide))
 
 
 def number_format(limits: tuple[int, int] = (-3, 4)) -> "ScalarFormatter":

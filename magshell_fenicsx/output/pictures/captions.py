@@ -46,4 +46,16 @@ def named_value(name: str, row: Row, digits: int = 4) -> str:
     """A column of a row, in the case's units if it has any."""
     q = shown(name, row)
     unit = q.si.replace("%", r"\%") if q.name != name else ""
-    return f"{q.latex} = {spelled(float(row[q.name]), f'.{digits}g')}{f' {unit}' if unit else ''}"
+    return f"{q.latex} = {in_mathematics(float(row[q.name]), digits)}{f' {unit}' if unit else ''}"
+
+
+def in_mathematics(value: float, digits: int) -> str:
+    """A number with so many digits, with a power of ten where Python has an exponent.
+
+    Examples
+    --------
+    >>> in_mathematics(0.32623, 4), in_mathematics(-5.5, 4), in_mathematics(-1.5e-06, 4)
+    ('0.3262', '−5.5', '$-1.5 \\\\times 10^{-6}$')
+    """
+    mantissa, _, exponent = spelled(value, f".{digits}g").partition("e")
+    return rf"${mantissa} \times 10^{{{int(exponent)}}}$" if exponent else mantissa.replace("-", "−")

@@ -10,11 +10,11 @@ from magshell_fenicsx.output.pictures.bars import SIGNED
 
 Array = NDArray[np.float64]
 MAGNITUDE = "viridis"
-STRAINS = {"E_1": "larger principal membrane strain $E_1$", "E_2": "smaller principal membrane strain $E_2$"}
-MOMENTS = {"M_1": "larger principal bending moment $M_1R/D$", "M_2": "smaller principal bending moment $M_2R/D$"}
+STRAINS = {"E_1": "larger principal strain $E_1$", "E_2": "smaller principal strain $E_2$"}
+MOMENTS = {"M_1": "larger principal moment $M_1R/D$", "M_2": "smaller principal moment $M_2R/D$"}
 LOADS = {  # caption with its unit, name in words
     "couple": (
-        r"couple $|F\hat B^\mathrm{r} \times \hat B^\mathrm{a}|$ over $hE\lambda_\mathrm{m}$",
+        r"couple $|F\hat B^\mathrm{r} \times \hat B^\mathrm{a}|/(hE\lambda_\mathrm{m})$",
         "couple of the remanence in the field",
     ),
     "p_mag": (r"magnetic pressure $p_\mathrm{mag}/(E\lambda_\mathrm{m})$", "magnetic pressure"),
@@ -39,6 +39,9 @@ SCALARS = {  # of the interactive report, in HTML; of vectors the length
 }
 ZERO = 1e-9  # loads are of the order of one or of h: what is smaller comes from rounding
 ROUNDING = {"E_1": 1e-13, "M_1": 1e-8}  # smaller values are drawn as zero
+LEAST_JUMP = 0.01  # per cent
+NOISE = 20.0  # colour limit over the difference between fields of cells and the smooth ones
+DETAIL, AROUND = 0.15, 2.0  # of a contact: its largest size over the shell's to be drawn alone; its surroundings
 EVERYWHERE, PEAK = 0.997, 1.5  # colour limit: PEAK times this quantile of the area
 
 
@@ -61,26 +64,35 @@ def shell(surface: Surface, h: float) -> list[Coloured]:
 
 
 def strains(surface: Surface) -> list[Coloured]:
-    return _principal(surface, STRAINS)
+    return _principal(surface, STRAINS, surface.strain_jump)
 
 
 def moments(surface: Surface) -> list[Coloured]:
-    return _principal(surface, MOMENTS)
+    return _principal(surface, MOMENTS, surface.jump)
 
 
-def jump_said(surface: Surface) -> str:
-    """How smooth the moments are before their mean at the nodes is drawn."""
-    if surface.jump is None:
+def jump_said(jump: float | None, what: str) -> str:
+    """How far the strains or moments of the cells are from the smooth field that is drawn."""
+    if jump is None:
         return ""
-    return f"Means of the cells at their nodes; between cells the moments jump by {100 * surface.jump:.2g} % (rms)."
+    rms = 100 * jump
+    far = f"by {rms:.2g} %" if rms >= LEAST_JUMP else f"by less than {LEAST_JUMP:g} %"
+    return f"Smoothed across cells, whose own {what} differ from what is drawn {far} (rms)."
 
 
-def _principal(surface: Surface, captions: dict[str, str]) -> list[Coloured]:
+def _principal(surface: Surface, captions: dict[str, str], jump: float | None) -> list[Coloured]:
     """Two fields with the same colours, white at zero, so that rounding of a constant field is invisible."""
     if not captions.keys() <= surface.fields.keys():
         return []
-    limit = _limit(surface, *captions)
+    first, second = captions
+    limit = max(_limit(surface, first, second), _noise(surface, first, second, jump or 0.0))
     return [Coloured(name, surface.fields[name], (-limit, limit), SIGNED, said) for name, said in captions.items()]
+
+
+def _noise(surface: Surface, first: str, second: str, jump: float) -> float:
+    """The colour limit far above that by which the fields of cells differ: what is zero but for the mesh is pale."""
+    sizes = surface.fields[first] ** 2 + surface.fields[second] ** 2
+    return NOISE * jump * float(np.sqrt(sizes.mean()))
 
 
 def _limit(surface: Surface, first: str, second: str) -> float:
@@ -140,6 +152,20 @@ def contact(surface: Surface) -> list[Coloured]:
     gap, pressure = surface.fields["gap_over_h"], surface.fields["contact_pressure"]
     most = float(pressure.max()) or 1.0
     return [
-        Coloured("gap_over_h", gap, (0.0, 1.0), "viridis_r", "gap over $h$"),
+        Coloured("gap_over_h", gap, (0.0, 1.0), "viridis_r", "gap$/h$"),
         Coloured("contact_pressure", pressure, (0.0, most), "Reds", r"contact pressure $pR/(Eh)$"),
     ]
+
+
+def contact_region(surface: Surface) -> Array | None:
+    """Places (8, 3) around the contact, if it is so small that a picture of the whole shell would not show it."""
+    r = surface.r0 + surface.u
+    touching = r[(surface.fields["contact_pressure"] > 0) | (surface.fields["gap_over_h"] < 1)]
+    if not len(touching):
+        return None
+    low, high = touching.min(axis=0), touching.max(axis=0)
+    size = float((high - low).max())
+    if size > DETAIL * float(np.ptp(r, axis=0).max()):
+        return None
+    corners = np.array(np.meshgrid(*[[-0.5, 0.5]] * 3)).reshape(3, -1).T
+    return np.asarray((low + high) / 2 + AROUND * size * corners)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.case.output import OutputSection
 from magshell_fenicsx.output.pictures.bars import number_format
 from magshell_fenicsx.output.pictures.layout import INCH, ONE, SEVERAL, drawing
+from magshell_fenicsx.output.pictures.numbers import write_numbers
 from magshell_fenicsx.output.store.table import LOCATED, OWN_MODES, POLE, SOLUTION, Row, pole_name
 from magshell_fenicsx.quantities.registry import amplitude as registered
 from magshell_fenicsx.quantities.registry import axes_of, quantity, shown
@@ -133,10 +134,11 @@ def plot_curve(axes: "Axes", of: Part, pole: str = POLE) -> None:
         x = shown("w_pole_over_h", part[0])  # moments have no conjugate displacement
     name = pole_name(part[0], pole).replace("$", r"\$")  # plain text, no mathematics
     x_label, y_label = (each.label.replace(POLE, name) for each in (x, y))
-    path = [row for row in part if row["label"] != SOLUTION]
+    path, drawn = [row for row in part if row["label"] != SOLUTION], list[NDArray[np.float64]]()
     for branch in sorted({int(row["branch"]) for row in path}):
-        line = [row for row in path if row["branch"] == branch and row["mode"] in OWN_MODES]
+        line = _line([row for row in path if row["branch"] == branch], amplitude)
         smooth_x, smooth_y = smooth(*zip(*(place(row, amplitude) for row in line), strict=True))
+        drawn.append(np.array([smooth_x, smooth_y]))
         unstable = [_unstable(row) and row["label"] not in LOCATED for row in line]
         for dashed, pieces in groupby(range(1, len(line)), key=unstable.__getitem__):
             i, *others = pieces
@@ -149,14 +151,16 @@ def plot_curve(axes: "Axes", of: Part, pole: str = POLE) -> None:
         at, kind = place(row, amplitude), str(row["label"])
         inside = "white" if kind == "bifurcation" else "C3"
         axes.plot(*at, "o", color="C3", markersize=4.5, label=_once(axes, kind), zorder=4, markerfacecolor=inside)
-        axes.annotate(str(of.numbers[int(row["point"])]), at, (-3, 3), textcoords="offset points", ha="right")
-    for row in (row for row in part if row["label"] == SOLUTION):
+    solutions = [row for row in part if row["label"] == SOLUTION]
+    for row in solutions:
         name, inside = ("unstable", "none") if _unstable(row) else ("stable", "C2")
         label = _once(axes, f"{name} solution")
         axes.plot(*place(row, amplitude), "s", color="C2", markerfacecolor=inside, markersize=4.5, label=label)
-        axes.annotate(str(row["branch"]), place(row, amplitude), (0, 6), textcoords="offset points")
     axes.set(xlabel=x_label, ylabel=y_label)
     axes.margins(0.06, 0.09)  # room for the numbers
+    texts = [str(of.numbers[int(row["point"])]) for row in marked] + [str(row["branch"]) for row in solutions]
+    places = [place(row, amplitude) for row in (*marked, *solutions)]
+    write_numbers(axes, list(zip(places, texts, strict=True)), drawn)
     axes.locator_params(axis="x", nbins=6 if axes.get_position().width > NARROW else 3)
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_formatter(number_format())
@@ -164,6 +168,15 @@ def plot_curve(axes: "Axes", of: Part, pole: str = POLE) -> None:
     if any(_unstable(row) for row in path) and marked:
         axes.plot([], [], color="C0", lw=1.2, label=_once(axes, "stable"))
         axes.plot([], [], color="C0", lw=1.2, linestyle=DASHED, label=_once(axes, "unstable"))
+
+
+def _line(rows: Sequence[Row], amplitude: str) -> list[Row]:
+    """The rows of a branch along its curve: those of the model, and what the model excludes at its end."""
+    own = [row for row in rows if row["mode"] in OWN_MODES]
+    last, before = (place(row, amplitude) for row in (own[-1], own[max(len(own) - 2, 0)]))
+    beyond = [row for row in rows[-1:] if row not in own and row["label"] in LOCATED]
+    ahead = np.subtract(last, before)
+    return own + [row for row in beyond if np.dot(np.subtract(place(row, amplitude), last), ahead) > 0]
 
 
 def _once(axes: "Axes", name: str) -> str:

@@ -22,6 +22,8 @@ Pen = tuple[str, str]
 INCH = 25.4  # mm
 ONE, SEVERAL = 90.0, 180.0  # default widths in mm: one and two columns of a journal
 GAP = 4.0  # mm between panels
+HEAD = 0.012  # around the ends of arrows, over a panel's width
+LONG = 0.08  # an arrow of this length over a panel's width has the full thickness
 LINE = 1.45 / 72  # height of a line of text in inches, for each point of the font
 QUICKLY = {"compress_level": 3}  # files are a quarter larger than by default and take a third of the time
 
@@ -53,6 +55,28 @@ class Panel:
     lines: tuple[tuple[Array, Pen], ...] = ()
     arrows: tuple[Arrow, ...] = ()
 
+    @property
+    def frame(self) -> tuple[float, float, float, float]:
+        """(left, right, low, high) of what is drawn: the window, and arrows that leave it."""
+        left, right, low, high = self.window.box
+        if not any(len(arrows.feet) for arrows in self.arrows):
+            return self.window.box
+        x, y = np.concatenate([p[:, :2] for a in self.arrows for p in (a.feet, a.feet + a.vectors)]).T
+        spare = HEAD * (right - left)
+        return (
+            min(left, x.min() - spare),
+            max(right, x.max() + spare),
+            min(low, y.min() - spare),
+            max(high, y.max() + spare),
+        )
+
+    @property
+    def size(self) -> tuple[float, float]:
+        """Height and width in pixels, the width that of the image."""
+        left, right, low, high = self.frame
+        width = self.image.shape[1]
+        return width * (high - low) / (right - left), width
+
 
 def drawing(style: OutputSection) -> AbstractContextManager[None]:
     """Matplotlib's settings while a figure is made and written: text stays text in svg and pdf."""
@@ -83,22 +107,23 @@ def panels_figure(panels: Sequence[Panel], style: OutputSection, note: str = "")
     across, line = columns(len(panels)), LINE * style.font_size
     rows = -(-len(panels) // across)
     gap, dpi = GAP / INCH, style.dpi
-    wide = max(panel.image.shape[1] for panel in panels) / dpi + gap
-    tall = max(panel.image.shape[0] for panel in panels) / dpi
+    tall, wide = (max(size) / dpi for size in zip(*(panel.size for panel in panels), strict=True))
+    wide += gap
     barred = any(panel.scale.colours for panel in panels)
     below = (4.2 if barred else 0.4) * line
-    legend = max((len(panel.arrows) for panel in panels), default=0)
-    above = gap / 2 + (legend * line + 0.1 * wide if legend else 0.0)  # arrows may leave the panel
-    beside = barred and across < 3  # the directions stand beside the first bar, else at the foot
-    indent = gap / 2 + (0.0 if beside else 4.0 * line)
+    legend = max((sum(bool(arrows.name) for arrows in panel.arrows) for panel in panels), default=0)
+    above = gap / 2 + legend * line
+    beside = barred and across < 3  # the directions stand beside the first bar, else in a free panel or at the foot
+    free = 0 if beside else len(panels) % across
+    indent = gap / 2 + (0.0 if beside or free else 4.0 * line)
     notes = _wrapped(note, wide * across - indent - gap / 2, style.font_size)
-    foot = max(len(notes) * line, 0.0 if beside else 3.2 * line)
+    foot = max(len(notes) * line, 0.0 if beside or free else 3.2 * line)
     height = rows * (tall + below + above) + foot
     figure = Figure(figsize=(wide * across, height), dpi=dpi)
     boxes = Boxes(figure)
     for i, panel in enumerate(panels):
         left, low = i % across * wide, height - (i // across + 1) * (tall + below + above)
-        h, w = (n / dpi for n in panel.image.shape[:2])
+        h, w = (n / dpi for n in panel.size)
         start = left + (wide - w) / 2
         draw_panel(boxes.axes(start, low + below + (tall - h) / 2, w, h), panel, style)
         for k, arrows in enumerate(panel.arrows):
@@ -107,9 +132,11 @@ def panels_figure(panels: Sequence[Panel], style: OutputSection, note: str = "")
         if panel.scale.colours:
             spare = (4.4 if beside else 2.2) * line  # a power of ten needs the other side
             reach = max(wide - gap - spare - 3.2 * line, 3 * line)
-            colour_bar(figure, boxes.axes(left + gap / 2 + spare, low + 1.7 * line, reach, 0.65 * line), panel.scale)
-    size, low = 3.4 * line, height - (tall + below + above) + 0.4 * line if beside else foot - 3.3 * line
-    directions(boxes.axes(gap / 2, low, size, size), panels[0].camera, style)
+            bar = boxes.axes(left + gap / 2 + spare, low + 1.7 * line, reach, 0.65 * line)
+            colour_bar(figure, bar, panel.scale, room=reach + (0.8 if beside else 2 * 2.2) * line)
+    size, low = 3.4 * line, height - (tall + below + above) if beside else foot
+    low += -3.3 * line if not beside and not free else 0.4 * line
+    directions(boxes.axes(free * wide + gap / 2, low, size, size), panels[0].camera, style)
     for k, text in enumerate(reversed(notes)):
         figure.text(*boxes.place(indent, (k + 0.5) * line), text, va="center", fontsize=0.9 * style.font_size)
     return figure
@@ -133,8 +160,9 @@ class Boxes:
 
 def draw_panel(axes: "Axes", panel: Panel, style: OutputSection) -> None:
     """Draw a panel's image, lines and arrows in axes of its proportions."""
-    left, right, low, high = panel.window.box
-    axes.imshow(panel.image, extent=(left, right, low, high), interpolation="none", aspect="auto")
+    left, right, low, high = panel.frame
+    same = panel.frame == panel.window.box  # pixel by pixel
+    axes.imshow(panel.image, extent=panel.window.box, interpolation="none" if same else "antialiased", aspect="auto")
     for line, (grey, dashes) in panel.lines:
         axes.plot(*line.T, dashes, color=grey, lw=0.06 * style.font_size)
     for arrows in panel.arrows:
@@ -148,12 +176,13 @@ def _draw_arrows(axes: "Axes", arrows: Arrow, extent: float, style: OutputSectio
     flat, length = arrows.vectors[:, :2], np.linalg.norm(arrows.vectors, axis=1)
     along = np.linalg.norm(flat, axis=1) < 0.3 * length
     x, y = arrows.feet[:, :2].T
+    thin = min(1.0, float(np.linalg.norm(flat, axis=1).max(initial=0.0)) / (LONG * extent))
     axes.quiver(
         *(x[~along], y[~along], *flat[~along].T),
         angles="xy",
         scale_units="xy",
         scale=1,
-        width=0.006,
+        width=0.006 * thin,
         minlength=0,
         zorder=4,
         clip_on=False,
@@ -163,7 +192,7 @@ def _draw_arrows(axes: "Axes", arrows: Arrow, extent: float, style: OutputSectio
         headaxislength=4.5,
     )
     size = (0.9 * style.font_size) ** 2
-    axes.scatter(x[~along], y[~along], s=size / 9, color=arrows.colour, zorder=4, linewidths=0)
+    axes.scatter(x[~along], y[~along], s=size / 9 * thin**2, color=arrows.colour, zorder=4, linewidths=0)
     for inside, marker in ((arrows.vectors[:, 2] > 0, "."), (arrows.vectors[:, 2] <= 0, "x")):
         at = along & inside
         if at.any():

@@ -11,7 +11,16 @@ from magshell_fenicsx.case.output import OutputSection
 from magshell_fenicsx.output.fields.surface import Surface
 from magshell_fenicsx.output.pictures.arrows import drawn_arrows
 from magshell_fenicsx.output.pictures.bars import Scale, colour_map
-from magshell_fenicsx.output.pictures.colours import Coloured, contact, jump_said, loads, moments, shell, strains
+from magshell_fenicsx.output.pictures.colours import (
+    Coloured,
+    contact,
+    contact_region,
+    jump_said,
+    loads,
+    moments,
+    shell,
+    strains,
+)
 from magshell_fenicsx.output.pictures.layout import (
     Arrow,
     Panel,
@@ -23,7 +32,7 @@ from magshell_fenicsx.output.pictures.layout import (
 )
 from magshell_fenicsx.output.pictures.sources import near_outlines
 from magshell_fenicsx.output.pictures.tessellation import tessellated
-from magshell_fenicsx.output.pictures.view import FINER, Camera, Seen, Window
+from magshell_fenicsx.output.pictures.view import Camera, Seen, Window
 
 if TYPE_CHECKING:  # takes long to import
     from matplotlib.figure import Figure
@@ -35,10 +44,11 @@ UNDEFORMED, EDGE, OTHERS = ("0.5", "--"), ("0.35", "-"), ("0.2", "-")  # pens
 
 @dataclass(frozen=True)
 class Content:
-    """What a picture shows, and what it says at its foot."""
+    """What a picture shows, what it says at its foot, and the places (n, 3) around which it is; None: all."""
 
     layers: Sequence[Coloured]
     note: str = ""
+    detail: Array | None = None
 
 
 def _with_arrows(surface: Surface, h: float) -> Content:
@@ -52,13 +62,19 @@ def far_said(surface: Surface) -> str:
     return "Sources of the field, or bodies, are outside the picture." if left_out else ""
 
 
+def _of_contact(surface: Surface) -> Content:
+    layers = contact(surface)
+    detail = contact_region(surface) if layers else None
+    return Content(layers, "" if detail is None else "The part of the shell around the contact.", detail)
+
+
 PICTURES: dict[str, Callable[[Surface, float], Content]] = {
     "shell": lambda surface, h: Content(shell(surface, h), far_said(surface)),
     "magnetic_loads": lambda surface, h: Content(*loads(surface, h)),
-    "strains": lambda surface, h: Content(strains(surface)),
-    "moments": lambda surface, h: Content(moments(surface), jump_said(surface)),
+    "strains": lambda surface, h: Content(strains(surface), jump_said(surface.strain_jump, "strains")),
+    "moments": lambda surface, h: Content(moments(surface), jump_said(surface.jump, "moments")),
     "fields": _with_arrows,
-    "contact": lambda surface, h: Content(contact(surface)),
+    "contact": lambda surface, h: _of_contact(surface),
 }
 
 
@@ -72,10 +88,13 @@ def figures(
         if not content.layers:
             continue
         width = panel_width(style, columns(len(content.layers)))
-        if width not in views:  # panels of one width are all painted on one view
-            views[width] = Background(surface, camera, width)
+        if content.detail is not None:
+            window = Window.around(camera(content.detail), width)
+            view = Background(surface, camera, width, window)
+        else:  # panels of one width are all painted on one view
+            view = views[width] = views.get(width) or Background(surface, camera, width)
         with drawing(style):
-            panels = [views[width].panel(layer, style) for layer in content.layers]
+            panels = [view.panel(layer, style) for layer in content.layers]
             drawn[name] = panels_figure(panels, style, content.note)
     return drawn
 
@@ -125,11 +144,10 @@ class Background:
 
 
 def silhouette(seen: Seen) -> list[Array]:
-    """Lines (n, 2) around the drawn part of a surface, in the projection."""
+    """Lines (n, 2) around the drawn part of a surface, in the projection; none where it goes on beyond the window."""
     import contourpy
 
-    height, width = seen.window.shape
-    part = seen.covered.reshape(height, FINER, width, FINER).mean(axis=(1, 3))
+    part = seen.share
     left, _, _, high = seen.window.box
-    lines: Any = contourpy.contour_generator(z=np.pad(part, 1)).lines(0.5)
+    lines: Any = contourpy.contour_generator(z=np.pad(part, 1, mode="edge")).lines(0.5)
     return [np.array([left, high]) + (line - 0.5) * np.array([1, -1]) / seen.window.scale for line in lines]

@@ -1,13 +1,30 @@
 /* Which of the triangles is in front at each pixel, and where in it; pixel centres are at integers. */
 
+#include <math.h>
+
 static int32_t below(double x) { int32_t i = (int32_t)x; return x < i ? i - 1 : i; }
 
 static double least(double a, double b, double c) { double m = a < b ? a : b; return m < c ? m : c; }
 
-/* places: x to the right, y down, depth towards the eye. index and depth are given as -1 and -infinity. */
+/* Narrows the pixels from left to right to those where start + x * rise is not negative. */
+static void narrow(double start, double rise, int32_t *left, int32_t *right)
+{
+    if (rise == 0) {
+        if (start < 0) *right = *left - 1;
+        return;
+    }
+    const double end = -start / rise;
+    if (rise > 0 && end > *left) *left = end > *right ? *right + 1 : -below(-end);
+    if (rise < 0 && end < *right) *right = end < *left ? *left - 1 : below(end);
+}
+
+/* places: x to the right, y down, depth towards the eye. The results: the triangle in front, -1 without one; the
+   weights of its second and third corner; the depth. */
 void rasterise(const double *places, const int32_t *triangles, int64_t count, int32_t width, int32_t height,
                int32_t *index, float *second, float *third, float *depth)
 {
+    const double near = 1e-9;
+    for (int64_t at = 0; at < (int64_t)width * height; at++) index[at] = -1, depth[at] = -INFINITY;
     for (int64_t t = 0; t < count; t++) {
         const double *a = places + 3 * triangles[3 * t], *b = places + 3 * triangles[3 * t + 1];
         const double *c = places + 3 * triangles[3 * t + 2];
@@ -21,14 +38,19 @@ void rasterise(const double *places, const int32_t *triangles, int64_t count, in
         if (bottom >= height) bottom = height - 1;
         const double over = 1 / area, vx = (c[1] - a[1]) * over, vy = -(c[0] - a[0]) * over;
         const double wx = -(b[1] - a[1]) * over, wy = (b[0] - a[0]) * over;
+        const double db = b[2] - a[2], dc = c[2] - a[2];
         for (int32_t y = top; y <= bottom; y++) {
-            double v = (left - a[0]) * vx + (y - a[1]) * vy, w = (left - a[0]) * wx + (y - a[1]) * wy;
-            int64_t at = (int64_t)y * width + left;
-            for (int32_t x = left; x <= right; x++, at++, v += vx, w += wx) {
-                if (v < -1e-9 || w < -1e-9 || v + w > 1 + 1e-9) continue;
-                const float z = (float)(a[2] + v * (b[2] - a[2]) + w * (c[2] - a[2]));
+            const double v = (y - a[1]) * vy - a[0] * vx, w = (y - a[1]) * wy - a[0] * wx;
+            int32_t first = left, last = right;
+            narrow(v + near, vx, &first, &last);
+            narrow(w + near, wx, &first, &last);
+            narrow(1 + near - v - w, -vx - wx, &first, &last);
+            const double z0 = a[2] + v * db + w * dc, rise = vx * db + wx * dc;
+            for (int64_t x = first, at = (int64_t)y * width + first; x <= last; x++, at++) {
+                const float z = (float)(z0 + x * rise);
                 if (z > depth[at]) {
-                    depth[at] = z, index[at] = (int32_t)t, second[at] = (float)v, third[at] = (float)w;
+                    depth[at] = z, index[at] = (int32_t)t;
+                    second[at] = (float)(v + x * vx), third[at] = (float)(w + x * wx);
                 }
             }
         }

@@ -67,6 +67,7 @@ def _null_vector(folder: Path, row: Row, numbers: dict[int, int]) -> tuple[Surfa
     details = [str(row["mode"])] if row["mode"] else []
     if not label and (m := wave_number(surface)):
         details.append(f"m = {m}")
+    details = [detail.replace("m = ", "$m$ = ") for detail in details]
     kind = f" ({', '.join(details)})" if details else ""
     column = amplitude(str(row["amplitude"])).column
     where = f"\n{named_value(column, row, 5)}" if row["amplitude"] else ""

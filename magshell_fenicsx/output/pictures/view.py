@@ -9,9 +9,9 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from magshell_fenicsx.assembly.native import native
 from magshell_fenicsx.output.fields.surface import Surface
 from magshell_fenicsx.output.pictures.tessellation import Tessellation, tessellated
+from magshell_fenicsx.platform.native import native
 
 if TYPE_CHECKING:  # takes long to import
     from matplotlib.colors import Colormap
@@ -87,9 +87,8 @@ class Seen:
         scale = FINER * window.scale
         places = camera(pieces.at(r))
         places[:, 0], places[:, 1] = (places[:, 0] - left) * scale - 0.5, (high - places[:, 1]) * scale - 0.5
-        self._index = np.full((height, width), -1, np.int32)
-        self._second, self._third = np.zeros((2, height, width), np.float32)
-        self._depth = np.full((height, width), -np.inf, np.float32)
+        self._index = np.empty((height, width), np.int32)
+        self._second, self._third, self._depth = np.empty((3, height, width), np.float32)
         triangles = pieces.triangles
         arrays = np.ascontiguousarray(places), triangles, self._index, self._second, self._third, self._depth
         points, cells, *pixels = (_pointer(array) for array in arrays)
@@ -101,9 +100,11 @@ class Seen:
         return Seen(tessellated(surface), surface.r0 + surface.u, camera, window)
 
     @property
-    def covered(self) -> NDArray[np.bool_]:
-        """Where the surface is, on the fine pixels."""
-        return np.asarray(self._index >= 0)
+    def share(self) -> Array:
+        """How much of each pixel of the picture the surface covers."""
+        covered = (self._index >= 0).view(np.uint8)
+        found = sum(covered[i::FINER, j::FINER] for i in range(FINER) for j in range(FINER))
+        return np.asarray(found / FINER**2)
 
     def coloured(self, values: Array, limits: tuple[float, float], colours: "Colormap") -> Image:
         """The image (height, width, 4) of values (n,) at nodes; transparent around the surface."""

@@ -1,10 +1,11 @@
 """Numbers for people, in HTML."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 from markupsafe import Markup
 
+ROUNDING = 1e-15, 1e-9  # displacements and forces as small as this, in any unit or over their largest, are zero
 LEAST, MOST = 1e-3, 1e6  # magnitudes between them are written without a power of ten
 DIGITS = 6
 
@@ -22,6 +23,18 @@ def number(value: float, digits: int = DIGITS) -> Markup:
     mantissa, _, exponent = f"{value:.{digits - 1}e}".partition("e")
     short = mantissa.rstrip("0").rstrip(".")
     return (Markup() if short == "1" else _signed(short) + Markup(" · ")) + power(int(exponent))
+
+
+def above_rounding(value: float, along: Iterable[float] = ()) -> float:
+    """The value, or zero if it is as small as rounding, also beside the values along a path.
+
+    Examples
+    --------
+    >>> above_rounding(3.5e-14, [76.4]), above_rounding(3.5e-14, [1e-13])
+    (0.0, 3.5e-14)
+    """
+    largest = max((abs(v) for v in along if math.isfinite(v)), default=0.0)
+    return value if abs(value) > max(ROUNDING[0], ROUNDING[1] * largest) else 0.0
 
 
 def column(values: Sequence[float], beside: Sequence[float] = ()) -> tuple[int, list[Markup]]:

@@ -26,6 +26,7 @@ from magshell_fenicsx.output.pictures.sources import near_outlines
 from magshell_fenicsx.output.pictures.thinned import Thinned, thinned
 from magshell_fenicsx.output.store.known import pole_of, style_of
 from magshell_fenicsx.output.store.table import LOCATED, POLE, SOLUTION, Row, pole_name, read_rows
+from magshell_fenicsx.platform.kept import keep, recall
 from magshell_fenicsx.quantities.registry import amplitude, axes_of, quantity
 
 Array = NDArray[np.float64]
@@ -190,5 +191,16 @@ def plotly() -> str | None:
     for place in (found.submodule_search_locations or []) if found else []:
         file = Path(place) / "package_data" / "plotly.min.js"
         if file.exists():
-            return packed(file.read_bytes())
+            return _kept(file)
     return None
+
+
+def _kept(file: Path) -> str:
+    """A file, packed once for all runs."""
+    about = file.stat()
+    name = f"packed_{file.name}_{about.st_size}_{about.st_mtime_ns}_{LEVEL}"
+    if known := recall(name):
+        return known.decode()
+    found = packed(file.read_bytes())
+    keep(name, found.encode())
+    return found

@@ -1,7 +1,7 @@
 """report.html: a run in one file, made from the files of its folder."""
 
 import base64
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from math import isnan
 from pathlib import Path
 from typing import Any
@@ -14,10 +14,11 @@ from magshell_fenicsx.output.report.html_numbers import number
 from magshell_fenicsx.output.report.interactive import interactive
 from magshell_fenicsx.output.report.light import light
 from magshell_fenicsx.output.report.report_path import Line, head, path_table, pole_head, symbol
-from magshell_fenicsx.output.report.verdict import Summary, located, read_run, value, verdict
+from magshell_fenicsx.output.report.verdict import Summary, amount, located, read_run, value, verdict
 from magshell_fenicsx.output.store.durable import write_whole
 from magshell_fenicsx.output.store.known import pole_of
 from magshell_fenicsx.output.store.table import stability
+from magshell_fenicsx.platform.kept import keep, recall
 from magshell_fenicsx.quantities.registry import amplitude, shown
 
 NAME, TEMPLATE = "report.html", "report_template.html"
@@ -69,10 +70,28 @@ def write_report(folder: Path, *, playable: bool = True) -> None:
 
 def report(folder: Path, *, playable: bool = True) -> str:
     """The content of report.html."""
-    from jinja2 import Environment, FileSystemLoader, StrictUndefined  # takes long to import
+    from jinja2 import BytecodeCache, Environment, FileSystemLoader, StrictUndefined  # takes long to import
+    from jinja2.bccache import Bucket
+
+    class Compiled(BytecodeCache):
+        """Python's code of the template; Jinja checks that it is that of the file and of this Python."""
+
+        def load_bytecode(self, bucket: Bucket) -> None:
+            if code := recall(f"template_{bucket.key}"):
+                bucket.bytecode_from_string(code)
+
+        def dump_bytecode(self, bucket: Bucket) -> None:
+            keep(f"template_{bucket.key}", bucket.bytecode_to_string())
 
     loader = FileSystemLoader(Path(__file__).parent)
-    made = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    made = Environment(
+        loader=loader,
+        bytecode_cache=Compiled(),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
     return made.get_template(TEMPLATE).render(_content(folder, playable))
 
 
@@ -91,7 +110,7 @@ def _content(folder: Path, playable: bool) -> dict[str, Any]:
         "interactive": played,
         "pole": pole_head(lines[0] if lines else {}, pole_of(summary["case"])),
         "heads": {name: _head(name, lines[0] if lines else {}) for name in SOLUTION_COLUMNS},
-        "instabilities": [_instability(line, summary) for line in located(lines)],
+        "instabilities": [_instability(line, summary, lines) for line in located(lines)],
         "solutions": [_solution(it) for it in summary.get("solutions", [])],
         "frequencies": [_frequency(it) for it in read_frequencies(folder)],
         "sensitivities": [(name, number(v)) for name, v in summary["sensitivities"].items()],
@@ -157,15 +176,15 @@ def _pictures(folder: Path, *, moving: bool) -> Iterator[tuple[str, str, bool]]:
             yield f"data:image/{file.suffix[1:]};base64,{content}", caption, pattern in SMALL
 
 
-def _instability(line: Line, summary: Summary) -> dict[str, Any]:
+def _instability(line: Line, summary: Summary, lines: Sequence[Line]) -> dict[str, Any]:
     return {
         "point": line["point"],
         "kind": line["label"],
         "mode": line["mode"] or "–",
         "branch": int(line["branch"]),
         "load": value(line, summary),
-        "w": number(float(line[shown("w_over_h", line).name])),
-        "pole": number(float(line[shown("w_pole_over_h", line).name])),
+        "w": amount(shown("w_over_h", line).name, line, lines),
+        "pole": amount(shown("w_pole_over_h", line).name, line, lines),
     }
 
 

@@ -5,12 +5,13 @@ import json
 import re
 from collections.abc import Mapping, Sequence
 from html import unescape
+from math import atan2, degrees, hypot
 from pathlib import Path
 from typing import Any
 
 from markupsafe import Markup
 
-from magshell_fenicsx.output.report.html_numbers import number
+from magshell_fenicsx.output.report.html_numbers import above_rounding, number
 from magshell_fenicsx.output.report.report_path import Line, head, symbol
 from magshell_fenicsx.output.store.known import pole_of
 from magshell_fenicsx.output.store.table import LOCATED, OWN_MODES, pole_name
@@ -18,7 +19,7 @@ from magshell_fenicsx.quantities.quantity import PLAIN, Quantity
 from magshell_fenicsx.quantities.registry import amplitude, axes_of, shown
 
 Summary = Mapping[str, Any]
-ROUNDING = 1e-15  # of displacements and forces, in any unit
+ON_AXIS = 0.5  # degrees: an azimuth there is that of a node beside the pole
 
 
 def located(lines: Sequence[Line]) -> list[Line]:
@@ -33,7 +34,9 @@ def verdict(summary: Summary, lines: Sequence[Line]) -> Markup:
     first = next((line for line in located(lines) if line["branch"] == "0"), None)
     sentences = [_end(summary, lines)] if not first or until in ("target", "points") else []
     if first:
-        sentences.append(_instability(first, summary))
+        points = summary.get("limit_points") or [{}]
+        point = points[min(located(lines).index(first), len(points) - 1)]
+        sentences.append(_instability(first, summary, lines, point.get("mode_at")))
     if found := summary.get("solutions"):
         stable = sum(it["stable"] for it in found)
         more = "further solution" + "s" * (len(found) != 1)
@@ -57,10 +60,10 @@ def _barrier(summary: Summary) -> Markup:
 def value(line: Line, summary: Summary) -> Markup:
     """The amplitude that varied at a point, as "p/p_c = 0.326233 (53.7 Pa)"."""
     name = amplitude(line["amplitude"]).column
-    amount, degrees = float(line[name]), "°" if line["amplitude"] == "angle" else ""
+    degrees = "°" if line["amplitude"] == "angle" else ""
     known = shown(name, line)
     measured = Markup(" ({} {})").format(number(float(line[known.name])), known.si) if known.name != name else ""
-    return Markup("{} = {}{}{}").format(symbol(name), number(amount), degrees, measured)
+    return Markup("{} = {}{}{}").format(symbol(name), number(float(line[name])), degrees, measured)
 
 
 def plain(sentence: Markup) -> str:
@@ -87,18 +90,34 @@ def read_run(folder: Path) -> tuple[Summary, list[Line]]:
     return json.loads((folder / "summary.json").read_text(encoding="utf-8")), lines
 
 
-def _instability(line: Line, summary: Summary) -> Markup:
+def _instability(line: Line, summary: Summary, lines: Sequence[Line], mode_at: Sequence[float] | None) -> Markup:
     kind = line["label"]
     if line["mode"]:
         kind += f" ({line['mode']}{' waves' if line['mode'] not in (*OWN_MODES, 'antisymmetric') else ''})"
-    at, place = value(line, summary), _displacement(line, pole_name(line, pole_of(summary["case"])))
+    at, place = value(line, summary), _displacement(line, pole_name(line, pole_of(summary["case"])), lines)
     if line["amplitude"] == "pressure" and summary["knockdown"] is not None:
         sentence = "The shell buckles at the knockdown factor k<sub>d</sub> = {}: a {}, {}."
     elif line["amplitude"] == "lambda_m":
         sentence = "The field makes the shell unstable at the critical {}: a {}, {}."
     else:
         sentence = "The first instability on the path is at {}: a {}, {}."
-    return Markup(sentence).format(at, kind, place)
+    return Markup(sentence).format(at, kind, place + _where(mode_at, summary))
+
+
+def _where(place: Sequence[float] | None, summary: Summary) -> Markup:
+    """Where a mode is largest, in words; as a direction on a sphere, as imperfections give their places."""
+    if place is None:
+        return Markup("")
+    shell = summary["case"]["shell"]
+    if shell["geometry"] in ("hemisphere", "cap"):
+        polar = degrees(atan2(hypot(*place[:2]), place[2]))
+        azimuth = degrees(atan2(place[1], place[0])) if polar > ON_AXIS else 0.0
+        found = f"polar {polar:.0f}°, azimuth {round(azimuth)}°"
+    else:
+        known = summary["dimensions"]
+        size, unit = (1e3, " mm") if known["radius"] and known["units"] == "SI" else (1.0, "")
+        found = f"({', '.join(f'{size * x + 0.0:.3g}' for x in place)}){unit}"
+    return Markup("; its mode is largest at {}").format(found)
 
 
 def _end(summary: Summary, lines: Sequence[Line]) -> Markup:
@@ -109,22 +128,42 @@ def _end(summary: Summary, lines: Sequence[Line]) -> Markup:
     arrived = last["label"] in ("target", "field") and not summary["stopped"]
     reached = "The run reached its target" if arrived else "The last point"
     place = pole_name(last, pole_of(summary["case"]))
-    return Markup("{}: {}, {}.").format(reached, value(last, summary), _displacement(last, place))
+    found = Markup("{}: {}, {}.").format(reached, value(last, summary), _displacement(last, place, lines))
+    return found + _untouched(last)
 
 
-def _displacement(line: Line, pole: str) -> Markup:
+def _untouched(line: Line) -> Markup:
+    """That a body which moved has not met the shell."""
+    if not line["amplitude"].startswith("approach"):
+        return Markup("")
+    name = f"penetration_over_h{line['amplitude'].removeprefix('approach')}"
+    gap = -float(line[name])
+    if above_rounding(gap, ()) <= 0:
+        return Markup("")
+    known = shown(name, line)
+    unit = f" {known.shown_unit}" if known.shown_unit else " h"
+    return Markup(" The body has not touched the shell: there is a gap of {}{}.").format(
+        number(-float(line[known.name])), unit
+    )
+
+
+def _displacement(line: Line, pole: str, lines: Sequence[Line]) -> Markup:
     """The displacement, and the force on what moves."""
     varied = amplitude(line["amplitude"])
-    at_pole = Markup("{} at {}").format(_amount(shown("w_pole_over_h", line), line), pole)
+    at_pole = Markup("{} at {}").format(_amount(shown("w_pole_over_h", line), line, lines), pole)
     force = [q for q in axes_of(line["amplitude"], line) if q.kind == "reaction" or q.name.startswith("force")]
     if force and varied.column != "force":
-        return Markup("{}, {}").format(_amount(force[0], line), at_pole)
+        return Markup("{}, {}").format(_amount(force[0], line, lines), at_pole)
     if varied.conjugate == "w_over_h" and line["w_over_h"] != line["w_pole_over_h"]:
-        return Markup("{} {}").format(_amount(shown("w_over_h", line), line), varied.place)
+        return Markup("{} {}").format(_amount(shown("w_over_h", line), line, lines), varied.place)
     return at_pole
 
 
-def _amount(known: Quantity, line: Line) -> Markup:
-    exact = float(line[known.name])
-    amount = number(exact if abs(exact) > ROUNDING else 0.0)
-    return Markup("{} = {}{}").format(head(known), amount, f" {known.shown_unit}" if known.shown_unit else "")
+def amount(name: str, line: Line, lines: Sequence[Line]) -> Markup:
+    """A column at a point, without rounding."""
+    return number(above_rounding(float(line[name]), (float(each[name]) for each in lines)))
+
+
+def _amount(known: Quantity, line: Line, lines: Sequence[Line]) -> Markup:
+    told = amount(known.name, line, lines)
+    return Markup("{} = {}{}").format(head(known), told, f" {known.shown_unit}" if known.shown_unit else "")

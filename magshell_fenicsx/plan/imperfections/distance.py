@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.imperfections.place import At
 from magshell_fenicsx.case.source import CaseError
-from magshell_fenicsx.case.surfaces import MeshSurface
+from magshell_fenicsx.case.surfaces import CapSurface, MeshSurface
 from magshell_fenicsx.plan.imperfections.flaw import Distance
 from magshell_fenicsx.plan.outline import Outline, refuse_beside
 
@@ -48,11 +48,12 @@ def located(case: Case, drawn: Outline, at: At, key: str) -> tuple[Array, Distan
     if at.point is not None:
         place = np.array(at.point) / case.shell.reference
         if not isinstance(case.shell, MeshSurface):
-            refuse_beside(f"shell.{key}.at.point", place, drawn, case.shell.reference)
+            refuse_beside(f"shell.{key}.at.point", place, drawn, case.shell)
     elif spherical:
         place = at.vector()
+        edge = case.shell.polar if isinstance(case.shell, CapSurface) else 90.0
         if not 0 <= at.polar <= 180 or np.linalg.norm(drawn.perfect(drawn.inverse(place)[None])[0] - place) > 1e-6:
-            raise CaseError(f"shell.{key}.at.polar: {at.polar:g}: is not on the shell")
+            raise CaseError(f"shell.{key}.at.polar: {at.polar:g}: is not on the shell: allowed 0 to {edge:g}")
     elif at.polar or drawn.highest is None or not (drawn.disc or case.shell.geometry == "strip"):
         raise CaseError(f"shell.{key}.at: on a {case.shell.geometry} give its place, at: {{point: [x, y, z]}}")
     else:

@@ -48,15 +48,20 @@ class Ending:
 
 @dataclass
 class History:
-    """The records of a run that its end depends on; `begin` is the last one before the last step."""
+    """The records of a run that its end depends on.
+
+    `begin` is the last one before the last step, `last` the last one that is no instability, `end` the last one of all.
+    """
 
     last: Record | None = None
+    end: Record | None = None
     begin: Record | None = None
     located: list[Record] = field(default_factory=list)
 
     def add(self, record: Record) -> None:
         if record.branch:
             return
+        self.end = record
         if record.label in ("fold", "bifurcation"):
             self.located.append(record)
         else:

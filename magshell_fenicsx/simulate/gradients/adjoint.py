@@ -8,10 +8,13 @@ takes one solve for all parameters. For the amplitude at a fold w = -phi/(phi . 
 Where a wave phi is neutral that a meridian does not see, Q(phi; u, mu, p) = 0 for its second variation, and
 
     dmu/dp = -(Q_p + w . R_p)/(Q_mu + w . R_mu),    K w = -Q_u.
+
+The equations of vibrations and of energy barriers are contracted at several displacements: `Place`.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TypeAlias
 
 import numpy as np
 
@@ -23,49 +26,108 @@ from magshell_fenicsx.continuation.fold import Fold
 from magshell_fenicsx.continuation.inverse import nearest_to_zero
 from magshell_fenicsx.continuation.system import State, System, Vector, dot
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
+from magshell_fenicsx.models.mass import mass_along
 from magshell_fenicsx.simulate.record import Record
-from magshell_fenicsx.simulate.results import Functional, Target, functional
+from magshell_fenicsx.simulate.results import Functional, Target, force_unit, functional, in_units
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.sensitivity import fold_at, stage_at
 from magshell_fenicsx.simulate.steps import held_by
+from magshell_fenicsx.simulate.transfer import transfer
 
 WAVE = "m = "  # what the mode of a wave begins with
 
 
 @dataclass(frozen=True)
-class Adjoint:
-    """What contracts the derivatives of a state's equations: dJ/dp = J_p + w . R_p + sum_i c_i dPi_i/dp.
+class Place:
+    """A state at which w . R + c Pi + sum_i c_i dPi/dmu_i, functions of (u, mu; p), are differentiated by p.
 
     Attributes
     ----------
     w
-        Of the model's residual, zero at supports.
+        At supports that of a reaction, otherwise zero there.
     rows
-        c_i: of the rows of the device, which hold the conjugates of the amplitudes i.
-    of, explicit
-        J itself; None for the amplitude at an instability, which no formula gives.
+        c_i of the rows of the device: of amplitudes that are unknown there, as their conjugates are held.
+    energy, potentials
+        c, and c_i of what J itself contains.
+    """
+
+    state: State
+    w: Vector
+    rows: Mapping[str, float] = field(default_factory=dict)
+    energy: float = 0.0
+    potentials: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def conjugates(self) -> dict[str, float]:
+        """All c_i."""
+        names = {**self.rows, **self.potentials}
+        return {name: self.rows.get(name, 0.0) + self.potentials.get(name, 0.0) for name in names}
+
+
+@dataclass(frozen=True)
+class Direction:
+    """A vector phi whose energies at the first place are differentiated by p, times factors.
+
+    Attributes
+    ----------
     wave
-        phi, m and the factor of Q_p.
+        m of phi, which is in the space of waves; None of a displacement.
+    stiffness
+        Of the second variation Q_m(phi) of a wave.
+    inertia
+        Of phi . M phi.
+    """
+
+    phi: Vector
+    wave: int | None
+    stiffness: float = 0.0
+    inertia: float = 0.0
+
+
+@dataclass(frozen=True)
+class Adjoint:
+    """What contracts the derivatives of a result: dJ/dp is J_p and the sum over the places.
+
+    Attributes
+    ----------
+    places
+        The first is the state itself.
+    by_mu
+        dJ/dmu_i where J contains the amplitude itself.
+    by_itself
+        What J of a scene and a state is by p alone; None if energies and potentials of the places say it.
+    directions
+        Vectors whose energies J contains.
     value
         J.
+    gas
+        Whether a conjugate is that of a gas, whose law has numbers of the case.
+    scale
+        Of the unit (`Quantity.scale`) that J is asked for in, as which `derivative` gives dJ/dp; "": it has none.
     """
 
     scene: Scene
-    state: State
-    w: Vector
-    rows: Mapping[str, float]
-    of: str | Target = ""
-    explicit: Functional | None = None
-    wave: tuple[Vector, int, float] | None = None
+    places: Sequence[Place]
+    by_mu: Mapping[str, float] = field(default_factory=dict)
+    by_itself: Callable[[Scene, State], float] | None = None
+    directions: Sequence[Direction] = ()
     value: float = 0.0
+    gas: bool = False
+    scale: str = ""
 
     @property
-    def potentials(self) -> dict[str, float]:
-        """c_i of all potentials, those of J too."""
-        found = dict(self.rows)
-        for name, c in (self.explicit.potentials if self.explicit else {}).items():
-            found[name] = found.get(name, 0.0) + c
-        return found
+    def size(self) -> float:
+        """What one of J is in its unit."""
+        return self.scene.sizes.of[self.scale] if self.scale else 1.0
+
+    @property
+    def shown(self) -> float:
+        """J in its unit."""
+        return self.value * self.size
+
+    @property
+    def state(self) -> State:
+        return self.places[0].state
 
 
 def adjoint_of_instability(scene: Scene, record: Record, fold: Fold | None = None) -> Adjoint:
@@ -91,7 +153,8 @@ def adjoint_of_instability(scene: Scene, record: Record, fold: Fold | None = Non
     left = np.asarray(-fold.left / pull)
     rows = stage.device.rates(left) if stage.device else {}
     w = stage.device.displacement(left) if stage.device else left
-    return Adjoint(scene, stage.leave(fold.state), np.array(w), rows, value=fold.value)
+    here = Place(stage.leave(fold.state), np.array(w), rows)
+    return Adjoint(scene, [here], value=fold.value, gas=with_gas(held_at(scene, record, record.point.state)))
 
 
 def _of_wave(scene: Scene, record: Record) -> Adjoint:
@@ -101,20 +164,24 @@ def _of_wave(scene: Scene, record: Record) -> Adjoint:
     assert isinstance(model, MeridianModel)
     system, waves, state = model.system, model.excluded_modes.waves, model.system.placed(record.point.state)
     phi = nearest_to_zero(waves.factor_at(state, m))[1]
-    terms = waves.along(phi, m)
-    system.at(state.u, state.mu)
-    mu = {term.name: factor_of(term.amplitude, state.mu) for term in terms}
-    Q = sum(mu[term.name] * term.energy() for term in terms)
-    Q_mu = sum(term.energy() for term in terms if term.amplitude == record.amplitude)
-    Q_u = np.zeros(system.size)
+    Q = variation(model, state, phi, m, [record.amplitude])
+    w, _ = solved(scene, state, Q, {})
+    rate = Q.by_mu[record.amplitude] + w @ system.load(state.u, state.mu, record.amplitude)
+    value = state.mu[record.amplitude] - Q.value / rate  # what locating it has left, to second order
+    along = Direction(phi, m, stiffness=float(-1 / rate))
+    return Adjoint(scene, [Place(state, -w / rate)], directions=[along], value=float(value))
+
+
+def variation(model: MeridianModel, state: State, phi: Vector, m: int, names: Iterable[str]) -> Functional:
+    """Q_m(phi) of a wave, with its derivatives by u and by some amplitudes."""
+    terms, system, mu = model.excluded_modes.waves.along(phi, m), model.system, state.mu
+    system.at(state.u, mu)
+    by_u = np.zeros(system.size)
     for term in terms:
-        term.add_residual(Q_u, mu[term.name])
-    factors = scene.newton.factor_at(state)
-    slope = system.held(-Q_u)
-    w = factors.solve_transposed(slope) if factors.skewed else factors.solve(slope)
-    rate = Q_mu + w @ system.load(state.u, state.mu, record.amplitude)
-    value = state.mu[record.amplitude] - Q / rate  # what locating it has left, to second order
-    return Adjoint(scene, state, -w / rate, {}, wave=(phi, m, float(-1 / rate)), value=float(value))
+        term.add_residual(by_u, factor_of(term.amplitude, mu))
+    value = sum((factor_of(term.amplitude, mu) * term.energy() for term in terms), 0.0)
+    by_mu = {name: sum((term.energy() for term in terms if term.amplitude == name), 0.0) for name in names}
+    return Functional(value, system.held(by_u), by_mu)
 
 
 def adjoint(scene: Scene, record: Record, of: str | Target, hold: Mapping[str, str] | None = None) -> Adjoint:
@@ -126,23 +193,41 @@ def adjoint(scene: Scene, record: Record, of: str | Target, hold: Mapping[str, s
         If the scene has no such result.
     """
     state = scene.model.system.placed(record.point.state)
-    found = functional(scene, state, of)
-    held = _held(scene, record, state, hold)
+    column, scale = in_units(scene, state, of) if isinstance(of, str) else (of, "")
+    found = functional(scene, state, column)
+    held = held_at(scene, record, state, hold)
     if free := [name for name in found.by_mu if name not in held]:
         raise CaseError(f"{free[0]}: is a load here, which no parameter changes: hold its conjugate")
+    w, rows = solved(scene, state, found, held)
+    by_itself = None if found.energy else lambda there, at: functional(there, at, column).value
+    if found.reaction is not None:
+        unit = force_unit(scene)
+        by_itself = lambda there, _: found.value * force_unit(there) / unit  # noqa: E731
+        w = w + found.reaction
+    here = Place(state, w, rows, found.energy, found.potentials)
+    gas = with_gas(held)
+    return Adjoint(scene, [here], found.by_mu, by_itself, value=found.value, gas=gas, scale=scale)
+
+
+Held: TypeAlias = Mapping[str, float | Conjugate]  # amplitude -> its conjugate
+
+
+def with_gas(held: Held) -> bool:
+    """Whether a conjugate is that of a gas."""
+    return any(callable(q) for q in held.values())
+
+
+def solved(scene: Scene, state: State, of: Functional, held: Held) -> tuple[Vector, dict[str, float]]:
+    """w of a number, and of the rows of the device; one factorisation and one solve."""
     system: System = scene.model.system
     device = Device(system, held, dict.fromkeys(held, system.length)) if held else None
     whole = device.enter(state) if device else state
     factors = (scene.newton.on(device) if device else scene.newton).factor_at(whole)
-    slope = found.by_u
+    slope = of.by_u
     if device:
-        slope = device.joined(
-            found.by_u, {name: found.by_mu.get(name, 0.0) + mixed(scene, state, found, name) for name in held}
-        )
+        slope = device.joined(of.by_u, {name: of.by_mu.get(name, 0.0) + mixed(scene, state, of, name) for name in held})
     w = factors.solve_transposed(-slope) if factors.skewed else factors.solve(-slope)
-    rows = device.rates(w) if device else {}
-    w = np.array(device.displacement(w) if device else w)
-    return Adjoint(scene, state, w, rows, of, found, value=found.value)
+    return np.array(device.displacement(w) if device else w), device.rates(w) if device else {}
 
 
 def mixed(scene: Scene, state: State, of: Functional, name: str) -> float:
@@ -152,7 +237,9 @@ def mixed(scene: Scene, state: State, of: Functional, name: str) -> float:
     return float(changes + (of.energy and of.energy * system.potential(state.u, state.mu, name)))
 
 
-def _held(scene: Scene, record: Record, state: State, hold: Mapping[str, str] | None) -> dict[str, float | Conjugate]:
+def held_at(
+    scene: Scene, record: Record, state: State, hold: Mapping[str, str] | None = None
+) -> dict[str, float | Conjugate]:
     """Amplitude -> its conjugate, of those that are unknown."""
     held = dict[str, float | Conjugate]()
     step = scene.case.programme[record.step - 1] if record.step else None
@@ -169,9 +256,14 @@ def _held(scene: Scene, record: Record, state: State, hold: Mapping[str, str] | 
     return held
 
 
-def along(scene: Scene, adjoint: Adjoint) -> list[FormTerm]:
-    """The second variation along the wave, at the displacement that is set; none without a wave."""
-    if adjoint.wave is None:
-        return []
-    assert isinstance(scene.model, MeridianModel)
-    return scene.model.excluded_modes.waves.along(*adjoint.wave[:2])
+def along(scene: Scene, adjoint: Adjoint) -> list[tuple[FormTerm, float]]:
+    """The energies of the directions, at the displacement that is set, and their factors."""
+    model, found = scene.model, list[tuple[FormTerm, float]]()
+    for d in adjoint.directions:
+        phi = d.phi if d.wave is not None else transfer(adjoint.scene, scene, d.phi)
+        if d.stiffness:
+            assert isinstance(model, MeridianModel)
+            found += [(term, d.stiffness) for term in model.excluded_modes.waves.along(phi, d.wave or 0)]
+        if d.inertia:
+            found.append((mass_along(model, phi, d.wave), d.inertia))
+    return found

@@ -29,7 +29,7 @@ from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.models.solid import remanence as of_body
 from magshell_fenicsx.models.solid.model import SolidModel
 from magshell_fenicsx.plan.natural import frame
-from magshell_fenicsx.simulate.gradients.adjoint import Adjoint, along
+from magshell_fenicsx.simulate.gradients.adjoint import Adjoint, Place, along
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.sensitivity import magnetic_terms
 from magshell_fenicsx.simulate.transfer import transfer
@@ -62,34 +62,29 @@ def by_field(adjoint: Adjoint, name: str) -> FieldGradient:
     CaseError
         If no result of the scene depends on it.
     """
-    scene, state = adjoint.scene, adjoint.state
+    scene = adjoint.scene
     other = _with_field(adjoint, name)
     if other is not scene:
-        u, w = (transfer(scene, other, v) for v in (state.u, adjoint.w))
-        mu = dict.fromkeys(other.unloaded().mu, 1.0) | dict(state.mu)  # of a natural curvature of zero
-        return by_field(replace(adjoint, scene=other, state=State(u, mu), w=w), name)
-    model, system, kind = scene.model, scene.model.system, FIELDS[name]
-    system.at(state.u, state.mu)
-    terms = _terms(scene, state, name)
-    f = next((c for t in terms for c in t.form.coefficients() if c.name == kind.coefficient), None)
-    if f is None or (isinstance(model, SolidModel) and kind.coefficient != "Br"):
-        raise CaseError(f"{name}: the case has no such field: no result depends on it")
+        return by_field(_carried(adjoint, other), name)
+    model, kind = scene.model, FIELDS[name]
     if name == "deviation" and (model.contacts or getattr(scene.plan.loads.magnetic, "in_space", None)):
         raise CaseError("deviation: no gradient beside bodies, or in a field that is known at points of space")
-    energy = adjoint.explicit.energy if adjoint.explicit else 0.0
-    c, shares = adjoint.potentials, []
-    for term in terms:
-        mu_i = factor_of(term.amplitude, state.mu)
-        shares.append(Share(term, energy * mu_i + c.get(term.amplitude or "", 0.0), mu_i))
-    if adjoint.wave:
-        for term in along(scene, adjoint):
-            shares.append(Share(term, adjoint.wave[2] * factor_of(term.amplitude, state.mu), 0.0))
-    for each in c.keys() & system.parameters.keys():
-        for slope in system.parameters[each].slopes:
-            if not isinstance(slope, FormTerm):
-                raise CaseError(f"{name}: the conjugate of {each} has no gradient by this field")
-            shares.append(Share(slope, c[each] * factor_of(slope.amplitude, state.mu), 0.0))
-    forces = summed(shares, f, model.u, _contracted(adjoint), model.kernels)
+    parts = list[Array]()
+    for number, place in enumerate(adjoint.places):
+        model.system.at(place.state.u, place.state.mu)
+        terms = _terms(scene, place.state, name)
+        f = next((c for t in terms for c in t.form.coefficients() if c.name == kind.coefficient), None)
+        if f is None or (isinstance(model, SolidModel) and kind.coefficient != "Br"):
+            raise CaseError(f"{name}: the case has no such field: no result depends on it")
+        c = place.conjugates
+        mu = [(term, factor_of(term.amplitude, place.state.mu)) for term in terms]
+        shares = [Share(t, place.energy * mu_i + c.get(t.amplitude or "", 0.0), mu_i) for t, mu_i in mu]
+        shares += _of_parameters(scene, place, name)
+        if not number:
+            shares += [Share(t, c * factor_of(t.amplitude, place.state.mu), 0.0) for t, c in along(scene, adjoint)]
+        parts.append(summed(shares, f, model.u, _contracted(scene, place), model.kernels))
+    assert f
+    forces = np.sum(parts, axis=0)
     places, normals = (v[: len(forces)] for v in places_of(scene, f))
     if name == "deviation":
         places = _perfect(scene, places, normals)
@@ -98,15 +93,40 @@ def by_field(adjoint: Adjoint, name: str) -> FieldGradient:
     return FieldGradient(f, forces, places, normals)
 
 
-def _contracted(adjoint: Adjoint) -> fem.Function:
+def _carried(adjoint: Adjoint, other: Scene) -> Adjoint:
+    """The same in another scene on the same mesh."""
+    known = dict.fromkeys(other.unloaded().mu, 1.0)  # of a natural curvature of zero
+    places = []
+    for place in adjoint.places:
+        u, w = (transfer(adjoint.scene, other, v) for v in (place.state.u, place.w))
+        places.append(replace(place, state=State(u, known | dict(place.state.mu)), w=w))
+    directions = [
+        d if d.wave is not None else replace(d, phi=transfer(adjoint.scene, other, d.phi)) for d in adjoint.directions
+    ]
+    return replace(adjoint, scene=other, places=places, directions=directions)
+
+
+def _of_parameters(scene: Scene, place: Place, name: str) -> list[Share]:
+    """The shares of the conjugates of free parameters of terms."""
+    system, c, found = scene.model.system, place.conjugates, list[Share]()
+    for each in c.keys() & system.parameters.keys():
+        for slope in system.parameters[each].slopes:
+            if not isinstance(slope, FormTerm):
+                raise CaseError(f"{name}: the conjugate of {each} has no gradient by this field")
+            found.append(Share(slope, c[each] * factor_of(slope.amplitude, place.state.mu), 0.0))
+    return found
+
+
+def _contracted(scene: Scene, place: Place) -> fem.Function:
     """The vector along which residuals are taken, with what the supports that move add."""
-    model, system, c = adjoint.scene.model, adjoint.scene.model.system, adjoint.potentials
+    model, system = scene.model, scene.model.system
     found = fem.Function(model.V)
-    found.x.array[: system.size] = adjoint.w
+    found.x.array[: system.size] = place.w
     found.x.scatter_forward()
     if system.moving:
+        c = place.conjugates
         for motion in c.keys() & system.moving.names:
-            found.x.array[:] += c[motion] * system.moving.rate(adjoint.state.mu, motion)
+            found.x.array[:] += c[motion] * system.moving.rate(place.state.mu, motion)
     return found
 
 
@@ -122,7 +142,7 @@ def _with_field(adjoint: Adjoint, name: str) -> Scene:
         bent = Natural(np.zeros(3), natural.stretch if natural else None, frame(scene.case, plan.azimuth))
         return Scene(scene.case, scene.comm, replace(plan, loads=replace(loads, natural=bent)))
     magnetic = loads.magnetic
-    if adjoint.wave and FIELDS[name].coefficient == "Br" and magnetic and not callable(magnetic.remanent):
+    if adjoint.directions and FIELDS[name].coefficient == "Br" and magnetic and not callable(magnetic.remanent):
         even = replace(magnetic, remanent=Uniform(np.asarray(magnetic.remanent)))
         return Scene(scene.case, scene.comm, replace(plan, loads=replace(loads, magnetic=even)))
     return scene

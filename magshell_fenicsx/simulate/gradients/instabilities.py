@@ -1,13 +1,22 @@
 """The lowest instabilities of a path as results that have gradients."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from magshell_fenicsx.case.source import CaseError
+from magshell_fenicsx.quantities import registry as quantities
 from magshell_fenicsx.simulate.gradients.adjoint import Adjoint, adjoint_of_instability
 from magshell_fenicsx.simulate.record import Record
+from magshell_fenicsx.simulate.results import Target, in_units
 from magshell_fenicsx.simulate.scene import Scene
 
-FOLDS = {"knockdown": "pressure", "critical_field": "lambda_m"}  # result -> the amplitude of its fold
+FOLDS = {
+    "knockdown": "pressure",
+    "buckling_pressure_Pa": "pressure",
+    "critical_field": "lambda_m",
+    "critical_field_mT": "lambda_m",
+}  # result -> the amplitude of its fold
+SCALES = {"buckling_pressure_Pa": "p_c", "critical_field_mT": "λ_m"}  # of those in units
 BESIDE = 1.15  # instabilities up to this multiple of the lowest are looked at
 MOST = 5  # and at most so many
 
@@ -27,22 +36,65 @@ def load(record: Record, amplitude: str) -> float:
     return abs(record.point.state.mu[amplitude])
 
 
-def instabilities(
-    scene: Scene, records: Sequence[Record], amplitude: str, most: int = MOST
-) -> list[tuple[str, Adjoint]]:
+def refuse_unitless(scene: Scene, of: str) -> None:
+    """See that a case has the units of one of `FOLDS`.
+
+    Raises
+    ------
+    CaseError
+        If it has none.
+    """
+    sizes = scene.sizes
+    if of in SCALES and (SCALES[of] not in sizes.of or (of.endswith("_mT") and sizes.field != "mT")):
+        bare = next(name for name, amplitude in FOLDS.items() if amplitude == FOLDS[of])
+        raise CaseError(f"{of}: the case has no such unit; {bare} has none")
+
+
+def refuse_moving(scene: Scene, end: Record, of: str | Target) -> None:
+    """See that a result is not of a point which moves along the path with what varies.
+
+    Raises
+    ------
+    Lost
+        If the path ends at an instability: there the amplitude alone has a gradient.
+    """
+    column = in_units(scene, end.point.state, of)[0] if isinstance(of, str) else ""
+    load = end.amplitude in FOLDS.values() and column in (end.amplitude, quantities.amplitude(end.amplitude).column)
+    if end.label in ("fold", "bifurcation") and not load:
+        known = ", ".join(name for name, amplitude in FOLDS.items() if amplitude == end.amplitude) or "none"
+        raise Lost(
+            f"the path ends at a {end.label}, which moves with what varies: only its load has a gradient ({known})"
+        )
+
+
+def as_asked(found: Adjoint, of: object) -> Adjoint:
+    """With the unit of the result."""
+    if of not in SCALES:
+        return found
+    refuse_unitless(found.scene, str(of))
+    return replace(found, scale=SCALES[str(of)])
+
+
+def instabilities(scene: Scene, records: Sequence[Record], of: str, most: int = MOST) -> list[tuple[str, Adjoint]]:
     """The instabilities of a path by name, the lowest first, and what their derivatives are contracted with.
+
+    Parameters
+    ----------
+    of
+        One of `FOLDS`.
 
     Raises
     ------
     Lost, FoldLost
         If there is none, or the lowest one has no gradient.
     """
+    amplitude = FOLDS[of]
     there = sorted(located(records, amplitude), key=lambda r: load(r, amplitude))
     found = list[tuple[str, Adjoint]]()
     for record in [r for r in there if load(r, amplitude) <= BESIDE * load(there[0], amplitude)][:most]:
         name = record.mode or record.label
         try:
-            found.append((name, adjoint_of_instability(scene, record)))
+            found.append((name, as_asked(adjoint_of_instability(scene, record), of)))
         except CaseError as e:
             if not found:
                 raise Lost(str(e)) from None

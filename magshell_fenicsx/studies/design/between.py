@@ -25,7 +25,7 @@ class Between:
     Attributes
     ----------
     start
-        (n, components): factors of h, or curvatures 11 and 22 over 1/R.
+        (n, components): factors of h, curvatures 11 and 22 over 1/R, or deviations over h.
     length
         R in the unit of the case's formulas, of a curvature.
     """
@@ -52,19 +52,24 @@ class Between:
         forces = found.forces.reshape(len(places), -1)[:, : self.start.shape[1]]
         comm = found.field.function_space.mesh.comm
         pulled = comm.allreduce(np.asarray(self.controls.weights(places).T @ forces))
-        return np.asarray(pulled * (self.bounds[1] - self.bounds[0])).ravel()
+        unit = scene.plan.material.h if self.name == "deviation" else 1.0
+        return np.asarray(pulled * unit * (self.bounds[1] - self.bounds[0])).ravel()
 
     def put(self, data: dict[str, Any], x: Array) -> None:
         """Give plain data of the case the field of variables."""
         texts = [self._formula(values) for values in self.values(x).T]
         if self.name == "thickness":
             data["shell"]["thickness_factor"] = texts[0]
+        elif self.name == "deviation":
+            shell = data["shell"]
+            defect = [shell.pop("defect")] if shell.get("defect") else []
+            shell["imperfections"] = [*defect, *(shell.get("imperfections") or ()), {"kind": "formula", "w0": texts[0]}]
         else:
             known = data.get("natural") or {}
             data["natural"] = {**known, "curvature": [*texts, 0]}
 
     def _formula(self, values: Array) -> str:
-        R = self.length if self.name == "curvature" else 1.0  # formulas of a thickness are of places over R
+        R = self.length if self.name == "curvature" else 1.0  # other formulas are of places over R
         if np.ptp(values) == 0:
             return repr(float(values[0] / R))
         below = repr(float(self.controls.width * R) ** 2)

@@ -178,13 +178,19 @@ def design(
     case, folder = Case.from_source(source), Path(out)
     if case.design is None:
         raise CaseError(f"{file}: design: is missing: it says what varies and what is wanted")
-    vary, problem = variables(source, case, case.design), problem_of(case, case.design)
+    try:
+        vary, problem = variables(source, case, case.design), problem_of(case, case.design)
+    except CaseError as e:
+        raise CaseError(case.placed(str(e))) from None
     with held_folder(folder, comm, make=True):
         by_first(comm, lambda: (folder / "points").mkdir(exist_ok=True))
         if resume and not by_first(comm, lambda: any((folder / "points").glob("*.json"))):
             raise CaseError(f"{folder}: has no evaluation to resume")
         made = Design(vary, problem, folder, comm, say)
-        return _designed(made, case, Path(file), comm)
+        try:
+            return _designed(made, case, Path(file), comm)
+        except CaseError as e:
+            raise CaseError(case.placed(str(e))) from None
 
 
 def _designed(made: Design, case: Case, file: Path, comm: MPI.Intracomm) -> dict[str, Any]:

@@ -10,18 +10,32 @@ from numpy.typing import NDArray
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.continuation.fold import FoldLost
 from magshell_fenicsx.mesh.patch import MeshError
+from magshell_fenicsx.simulate.adapt.ending import History
 from magshell_fenicsx.simulate.follow import follow
-from magshell_fenicsx.simulate.gradients.adjoint import adjoint
+from magshell_fenicsx.simulate.gradients.adjoint import Adjoint
 from magshell_fenicsx.simulate.gradients.gradient import derivative
-from magshell_fenicsx.simulate.gradients.instabilities import BESIDE, FOLDS, Lost, instabilities, load, located
+from magshell_fenicsx.simulate.gradients.instabilities import (
+    BESIDE,
+    FOLDS,
+    MOST,
+    Lost,
+    instabilities,
+    load,
+    located,
+    refuse_moving,
+)
 from magshell_fenicsx.simulate.gradients.mass import MASS, mass
+from magshell_fenicsx.simulate.gradients.results import adjoint_at_end, refuse_no_result
+from magshell_fenicsx.simulate.gradients.vibration import FIRST, adjoints_of_vibrations
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.results import Target, distances
+from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.standing import Standing
 from magshell_fenicsx.studies.design.variables import Variables
 
 Array = NDArray[np.float64]
 DISTANCE = "largest_distance"
+LOWEST = (*FOLDS, *FIRST)  # results that others of their kind may cross
 
 
 @dataclass(frozen=True)
@@ -58,11 +72,15 @@ def evaluate(
 ) -> Evaluation:
     """Follow the path of a case, and differentiate its results; collective. `known` is of the case before."""
     lost = ""
-    records = list[Record]()
+    records, history = list[Record](), History()
     try:
         scene = known.of(case, comm)
+        for i, result in enumerate(results):
+            if result != MASS and result not in targets:
+                refuse_no_result(scene, [result], f"design.{'constraints' if i else 'objective'}")
         for record in follow(scene, search=False):
             records.append(record)
+            history.add(record)
             if _enough(records, results):
                 break
     except MeshError as e:
@@ -77,27 +95,36 @@ def evaluate(
                 slope = variables.gradient(x, scene, {"thickness": by_thickness} if by_thickness else {})
                 made.gradients[result] = [float(v) for v in slope]
                 continue
-            if result in FOLDS:
-                found = instabilities(scene, records, FOLDS[result])
-                notes.append("lowest: " + ", ".join(f"{name} at {each.value:.6g}" for name, each in found))
-            elif lost:
+            if lost and result not in FOLDS:
                 return Evaluation(note=notes[0])
+            if result in LOWEST:
+                found = _lowest(scene, records, result)
+                notes.append("lowest: " + ", ".join(f"{name or 'mode'} at {each.shown:.6g}" for name, each in found))
             else:
-                found = [("", adjoint(scene, records[-1], targets.get(result, result)))]
+                refuse_moving(scene, records[-1], targets.get(result, result))
+                found = [adjoint_at_end(scene, history, targets.get(result, result))]
+                notes += [f"{result}: {kind}" for kind, _ in found if kind]
             slopes = [
                 variables.gradient(x, scene, {name: derivative(each, name) for name in variables.names})
                 for _, each in found
             ]
             (made.values[result], made.gradients[result]), *others = [
-                (each.value, [float(v) for v in slope]) for (_, each), slope in zip(found, slopes, strict=True)
+                (each.shown, [float(v) for v in slope]) for (_, each), slope in zip(found, slopes, strict=True)
             ]
-            if result in FOLDS:
+            if result in LOWEST:
                 made.beside[result] = others
     except (Lost, FoldLost) as e:
         return Evaluation(note="; ".join([f"no {result}: {e}", *notes]))
     for target in targets.values():
         made.seen[DISTANCE] = distances(scene, records[-1].point.state, target)[1]
     return replace(made, note="; ".join(notes))
+
+
+def _lowest(scene: Scene, records: Sequence[Record], result: str) -> list[tuple[str, Adjoint]]:
+    """The lowest instabilities or vibrations, and what their derivatives are contracted with."""
+    if result in FOLDS:
+        return instabilities(scene, records, result)
+    return adjoints_of_vibrations(scene, records[-1], result, beside=BESIDE, most=MOST)
 
 
 def _enough(records: Sequence[Record], results: Sequence[str]) -> bool:

@@ -8,9 +8,10 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.design import DesignSection
-from magshell_fenicsx.simulate.gradients.instabilities import BESIDE, FOLDS, MOST
+from magshell_fenicsx.simulate.gradients.instabilities import BESIDE, MOST
 from magshell_fenicsx.simulate.results import Target
-from magshell_fenicsx.studies.design.evaluate import Evaluation
+from magshell_fenicsx.studies.design.evaluate import LOWEST, Evaluation
+from magshell_fenicsx.studies.design.limits import Limit, limits_of
 from magshell_fenicsx.studies.design.target import target_of
 
 Array = NDArray[np.float64]
@@ -55,8 +56,8 @@ class Problem:
 
     def _objective(self, found: Evaluation) -> tuple[float, float]:
         wanted = self.section.objective
-        value = found.values[wanted.result]
-        scale = self.scale.get(wanted.result, abs(value) or 1.0)
+        value = min(found.values[result] for result in wanted.results)
+        scale = self._scale or abs(value) or 1.0
         if wanted.value is not None:
             scale = abs(wanted.value) or scale
             return ((value - wanted.value) / scale) ** 2, 2 * (value - wanted.value) / scale**2
@@ -64,40 +65,42 @@ class Problem:
         return sign * value / scale, sign / scale
 
     @property
+    def _scale(self) -> float:
+        """The largest of the objective's results at the start."""
+        return max((self.scale.get(result, 0.0) for result in self.section.objective.results), default=0.0)
+
+    @property
     def lowest(self) -> bool:
-        """Whether the lowest of several instabilities is to be raised."""
-        return self.section.objective.maximise in FOLDS
+        """Whether the lowest of several values is to be raised: of results, instabilities or frequencies."""
+        wanted = self.section.objective
+        return wanted.maximise is not None and (len(wanted.results) > 1 or wanted.result in LOWEST)
 
     def lowest_values(self, found: Evaluation) -> Array:
-        """(MOST,): the lowest instabilities over their first value; where fewer are near, what is surely above."""
-        result = self.section.objective.result
-        values = [found.values[result], *(value for value, _ in found.beside[result])]
-        return np.array([*values, *[BESIDE * values[0]] * MOST])[:MOST] / self.scale[result]
+        """All of them over the scale, always as many: where fewer are near, what is surely above."""
+        every = [_several(found.values[of], found.beside.get(of)) for of in self.section.objective.results]
+        return np.asarray(np.concatenate([[value for value, _ in several] for several in every]) / self._scale)
 
     def lowest_slopes(self, found: Evaluation) -> Array:
-        """(MOST, variables)."""
-        result = self.section.objective.result
-        slopes = [found.gradients[result], *(slope for _, slope in found.beside[result])]
-        return np.array([*slopes, *[[BESIDE * v for v in slopes[0]]] * MOST])[:MOST] / self.scale[result]
+        """(values, variables)."""
+        results = self.section.objective.results
+        every = [_several(found.values[of], found.beside.get(of), found.gradients[of]) for of in results]
+        return np.asarray(np.concatenate([[slope for _, slope in several] for several in every]) / self._scale)
 
     def constraints(self, found: Evaluation) -> Array:
         """Not negative where all are kept."""
-        return np.array([sign * (found.values[of] - bound) / scale for of, bound, sign, scale in self._bounds])
+        return np.array([limit.left(found.values) / self._size(limit) for limit in self._limits])
 
     def constraint_slopes(self, found: Evaluation) -> Array:
         """(constraints, variables)."""
-        return np.array([sign / scale * np.array(found.gradients[of]) for of, _, sign, scale in self._bounds])
+        return np.array([limit.slope(found.gradients) / self._size(limit) for limit in self._limits])
 
     @property
-    def _bounds(self) -> list[tuple[str, float, float, float]]:
-        """Result, bound, sense and scale of each."""
-        sides = [
-            (limit.of, bound, sign)
-            for limit in self.section.constraints
-            for bound, sign in ((limit.least, 1.0), (limit.most, -1.0))
-            if bound is not None
-        ]
-        return [(of, bound, sign, abs(bound) or self.scale.get(of, 1.0)) for of, bound, sign in sides]
+    def _limits(self) -> list[Limit]:
+        """Of all constraints."""
+        return [each for section in self.section.constraints for each in limits_of(section, self.scale)]
+
+    def _size(self, limit: Limit) -> float:
+        return abs(limit.bound) or max(self.scale.get(of, 0.0) for of in (limit.of, limit.other)) or 1.0
 
     def violation(self, found: Evaluation) -> float:
         """By how much the constraints are not kept, relative."""
@@ -120,11 +123,20 @@ class Problem:
             if abs(value - wanted.value) > REACHED * (abs(wanted.value) or 1.0):
                 asked = f"{wanted.reach} = {wanted.value:g} is not reached within the bounds"
                 said.append(f"{asked}: the nearest found is {value:.6g}")
-        for of, bound, sign, _ in self._bounds:
-            if sign * (found.values[of] - bound) < -KEPT * (abs(bound) or 1.0):
-                asked = f"{of} {'at least' if sign > 0 else 'at most'} {bound:g} is not kept"
-                said.append(f"{asked}: the nearest found is {found.values[of]:.6g}")
+        for limit in self._limits:
+            if limit.left(found.values) < -KEPT * self._size(limit):
+                said.append(f"{limit.words} is not kept: the nearest found is {found.values[limit.of]:.6g}")
         return "; ".join(said)
+
+
+def _several(
+    value: float, beside: Sequence[tuple[float, list[float]]] | None, slope: Sequence[float] = ()
+) -> list[tuple[float, Sequence[float]]]:
+    """A result and those beside it with their slopes: MOST of what may cross others, else one."""
+    if beside is None:
+        return [(value, slope)]
+    above = (BESIDE * value, [BESIDE * v for v in slope])
+    return [(value, slope), *beside, *[above] * MOST][:MOST]
 
 
 def problem_of(case: Case, section: DesignSection) -> Problem:

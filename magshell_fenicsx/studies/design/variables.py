@@ -22,6 +22,7 @@ from magshell_fenicsx.case.design import DesignSection
 from magshell_fenicsx.case.source import CaseError, Source
 from magshell_fenicsx.models.shell.controls import ByControls, Controls
 from magshell_fenicsx.models.shell.thickness import Thickness
+from magshell_fenicsx.parts.section import si_size
 from magshell_fenicsx.plan.magnetisation import magnetisation
 from magshell_fenicsx.plan.outline import outline
 from magshell_fenicsx.plan.plan import Plan
@@ -29,6 +30,7 @@ from magshell_fenicsx.plan.planner import make_plan
 from magshell_fenicsx.simulate.numbers import number_of
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.studies.design.between import Between
+from magshell_fenicsx.studies.design.numbers import refuse_unfit_numbers
 
 Array = NDArray[np.float64]
 
@@ -41,8 +43,8 @@ class Variables:
     ----------
     case
         At the start.
-    keys, bounds
-        Of the numbers; (numbers, 2).
+    keys, bounds, units
+        Of the numbers; (numbers, 2), in these units.
     controls, start
         Of the remanence, None without; its vectors at the start.
     lengths
@@ -55,6 +57,7 @@ class Variables:
     case: Case
     keys: tuple[str, ...]
     bounds: Array
+    units: tuple[str, ...]
     controls: Controls | None
     start: Array
     lengths: tuple[float, float] | None
@@ -88,7 +91,7 @@ class Variables:
     @property
     def first(self) -> Array:
         """The vector of the case itself."""
-        numbers = np.array([number_of(self.case, key) for key in self.keys])
+        numbers = np.array([number_of(self.case, key) for key in self.keys]) / self._sizes
         parts = [(numbers - self.bounds[:, 0]) / np.ptp(self.bounds, axis=1)]
         if self.controls is not None:
             size = np.linalg.norm(self.start, axis=1)
@@ -107,8 +110,18 @@ class Variables:
         between = (len(self.start) if self.lengths else 0) + sum(field.start.size for field in self.fields)
         return [*[(0.0, 1.0)] * len(self.keys), *free, *[(0.0, 1.0)] * between]
 
+    @property
+    def _sizes(self) -> Array:
+        """Of the numbers' units in SI."""
+        return np.array([si_size(unit) for unit in self.units])
+
     def numbers(self, x: Array) -> dict[str, float]:
-        """Key -> value."""
+        """Key, with its unit if it has one -> value."""
+        named = (f"{key} [{unit}]" if unit else key for key, unit in zip(self.keys, self.units, strict=True))
+        return dict(zip(named, self._numbers(x).values(), strict=True))
+
+    def _numbers(self, x: Array) -> dict[str, float]:
+        """Key -> value in its unit."""
         low, high = self.bounds.T
         values = low + x[: len(self.keys)] * (high - low)
         return dict(zip(self.keys, map(float, values), strict=True))
@@ -120,7 +133,8 @@ class Variables:
     def gradient(self, x: Array, scene: Scene, found: Mapping[str, float | FieldGradient]) -> Array:
         """A gradient by the vector from those of `simulate.gradients`; by what is not among them it is zero."""
         total = np.zeros(len(x))
-        total[: len(self.keys)] = [found.get(key, 0.0) for key in self.keys] * np.ptp(self.bounds, axis=1)
+        slopes = np.array([found.get(key, 0.0) for key in self.keys])
+        total[: len(self.keys)] = slopes * self._sizes * np.ptp(self.bounds, axis=1)
         for field in self.fields:
             if isinstance(by := found.get(field.name), FieldGradient):
                 total[self.blocks[field.name]] = field.gradient(scene, by)
@@ -170,11 +184,13 @@ class Variables:
         """The case of a vector as plain data; `vectors` is the file of the remanence."""
         data = copy.deepcopy(self.source.data)
         data.pop("design", None)
-        for key, value in self.numbers(x).items():
+        for (key, value), unit in zip(self._numbers(x).items(), self.units, strict=True):
             section, names = data, key.split(".")
             for name in names[:-1]:
                 section = section[int(name)] if isinstance(section, list) else section.setdefault(name, {})
-            section[int(names[-1]) if isinstance(section, list) else names[-1]] = value
+            section[int(names[-1]) if isinstance(section, list) else names[-1]] = (
+                f"{value:.15g} {unit}" if unit else value
+            )
         if self.controls is not None:
             known = data["magnetic"].get("remanent", {})
             kept = {"flux_density": known["flux_density"]} if "flux_density" in known else {}
@@ -197,9 +213,7 @@ def variables(source: Source, case: Case, design: DesignSection) -> Variables:
     CaseError
         If a key has no number or starts beyond its bounds, or there is no remanence to vary.
     """
-    for key, (low, high) in design.numbers.items():
-        if not low <= (value := number_of(case, key)) <= high:
-            raise CaseError(f"design.numbers: {key}: the case starts at {value:g}, beyond {low:g} to {high:g}")
+    bounds, units = refuse_unfit_numbers(source, case, design)
     controls, start = None, np.asarray(np.zeros((0, 3)))
     if design.remanence:
         controls, start = _controls(case, design)
@@ -214,9 +228,9 @@ def variables(source: Source, case: Case, design: DesignSection) -> Variables:
             f"design.remanence.magnitude: the vectors start with lengths {sizes.min():g} to {sizes.max():g}, beyond "
             f"{lengths[0]:g} to {lengths[1]:g}"
         )
-    bounds = np.array(list(design.numbers.values()), dtype=float).reshape(-1, 2)
     between = (lengths[0], lengths[1]) if lengths else None
-    return Variables(source, case, tuple(design.numbers), bounds, controls, start, between, _fields(case, design))
+    fields = _fields(case, design)
+    return Variables(source, case, tuple(design.numbers), bounds, units, controls, start, between, fields)
 
 
 def _fields(case: Case, design: DesignSection) -> tuple[Between, ...]:
@@ -226,8 +240,10 @@ def _fields(case: Case, design: DesignSection) -> tuple[Between, ...]:
         places, width = _spread(case, plan, section.points, section.filter)
         if name == "thickness":
             start = (plan.thickness or Thickness()).at(places)[:, None]
-        else:
+        elif name == "curvature":
             start = _curvatures(plan, places)
+        else:
+            start = np.zeros((len(places), 1))
         low, high = section.values
         if not (low <= start.min() and start.max() <= high):
             raise CaseError(

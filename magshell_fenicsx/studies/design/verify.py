@@ -11,13 +11,16 @@ from magshell_fenicsx.case.design import DesignSection
 from magshell_fenicsx.case.surfaces import MeshSurface
 from magshell_fenicsx.run.run import run
 from magshell_fenicsx.run.summary import Result
-from magshell_fenicsx.simulate.gradients.instabilities import FOLDS
+from magshell_fenicsx.simulate.gradients.barriers import BARRIER
+from magshell_fenicsx.simulate.gradients.instabilities import FOLDS, SCALES, Lost
 from magshell_fenicsx.simulate.gradients.mass import MASS, mass
+from magshell_fenicsx.simulate.gradients.results import vibration_at_end
 from magshell_fenicsx.simulate.results import distances
 from magshell_fenicsx.studies.design.evaluate import DISTANCE, Evaluation
 from magshell_fenicsx.studies.design.problem import Problem
 
 FAR = 0.3  # relative difference of a result that is another result
+ROUNDING = 1e-12  # a smaller one is none
 
 
 def verified(
@@ -45,7 +48,7 @@ def verified(
             say(f"verified ({', '.join(settings)}): no {name}{f': {result.stopped}' if result.stopped else ''}")
         elif here is not None:
             away = value / here - 1
-            say(f"verified ({', '.join(settings)}): {name} = {value:.9g}, {away:+.2e} of {here:.9g}")
+            say(f"verified ({', '.join(settings)}): {name} = {value:.9g}, {_beside(away)} the design's {here:.9g}")
             if abs(away) > FAR:
                 say(f"warning: {name} is another one there: the mesh is too coarse, or there are several equilibria")
     modes = [f"{p['kind']} {p['mode']}".strip() for p in result.limit_points if p["mode"]]
@@ -61,5 +64,28 @@ def _value(result: Result, name: str) -> float | None:
         return mass(result.scene)[0]
     if name in FOLDS:
         found = (p for p in result.limit_points if p["amplitude"] == FOLDS[name] and not p["branch"])
-        return next((float(p["value"]) for p in found), None)
-    return float(result.rows[-1][name]) if result.rows else None
+        size = result.scene.sizes.of[SCALES[name]] if name in SCALES else 1.0
+        return next((size * float(p["value"]) for p in found), None)
+    if name == BARRIER:
+        return result.barrier
+    if not result.rows:
+        return None
+    row = result.rows[-1]
+    try:
+        omega2 = vibration_at_end(result.scene, result.history, name)
+    except Lost:
+        return None
+    return float((row | result.scene.sizes.values(row))[name]) if omega2 is None else omega2
+
+
+def _beside(away: float) -> str:
+    """A relative difference in words.
+
+    Examples
+    --------
+    >>> _beside(-3.19e-8), _beside(1.62e-2), _beside(-8.9e-15)
+    ('3.2e-06 % below', '1.6 % above', 'equal to')
+    """
+    if abs(away) < ROUNDING:
+        return "equal to"
+    return f"{100 * abs(away):.2g} % {'above' if away > 0 else 'below'}"

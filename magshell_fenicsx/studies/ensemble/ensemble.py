@@ -19,7 +19,7 @@ from magshell_fenicsx.studies.ensemble.report import report
 from magshell_fenicsx.studies.ensemble.samples import Sample, make_samples
 from magshell_fenicsx.studies.ensemble.solve import FAILED, serves, solve
 from magshell_fenicsx.studies.ensemble.statistics import statistics
-from magshell_fenicsx.studies.ensemble.table import STATUS, WITHOUT, Row, make_row, value, write_samples
+from magshell_fenicsx.studies.ensemble.table import WITHOUT, Row, make_row, value, write_samples
 from magshell_fenicsx.studies.study.scalar import Scalar, parse_scalar
 from magshell_fenicsx.studies.sweep.deal import deal, together
 from magshell_fenicsx.studies.sweep.outcome import Outcome, load, save
@@ -194,11 +194,7 @@ def _row(variants: Sequence[Sample], folder: Path, scalar: Scalar) -> Row:
 def _write(rows: Sequence[Row], content: dict[str, Any], folder: Path, ending: str) -> None:
     write_samples(rows, folder / f"samples{ending}.csv")
     write_whole(folder / f"summary{ending}.json", (json.dumps(content, indent=1) + "\n").encode())
-    counts = content["counts"]
-    told = ", ".join(f"{number} {STATUS[status]}" for status, number in counts.items() if status != "samples")
-    draw_ensemble(
-        rows, content["result"], f"{content['case']}, seed {content['seed']}: {told}", folder / f"ensemble{ending}.png"
-    )
+    draw_ensemble(rows, content["result"], folder / f"ensemble{ending}.png")
     text = report(content, rows)
     if ending:
         text = text.replace("(ensemble.png)", f"(ensemble{ending}.png)").replace("samples.csv", f"samples{ending}.csv")

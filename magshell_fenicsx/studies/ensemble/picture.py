@@ -12,7 +12,7 @@ from magshell_fenicsx.studies.ensemble.weibull import fit
 KNOCKDOWN = r"knockdown factor  $k_\mathrm{d}$"
 
 
-def draw_ensemble(rows: Sequence[Row], name: str, title: str, file: Path) -> None:
+def draw_ensemble(rows: Sequence[Row], name: str, file: Path) -> None:
     """Write the picture.
 
     Parameters
@@ -31,7 +31,8 @@ def draw_ensemble(rows: Sequence[Row], name: str, title: str, file: Path) -> Non
         x, found = np.linspace(values.min(), values.max(), 300), fit(values)
         histogram.hist(values, bins="auto" if np.ptp(values) > 0 else 1, density=True, color="C0", alpha=0.4)
         ordered = np.sort(values)
-        function.step(ordered, np.arange(1, len(values) + 1) / len(values), where="post", color="C0", label="samples")
+        part = np.arange(len(values) + 1) / len(values)
+        function.step(np.append(ordered[:1], ordered), part, where="post", color="C0", label="samples")
         if len(less := np.sort(results(rows, WITHOUT))):
             part = np.arange(1, len(less) + 1) / len(less)
             function.step(less, part, where="post", color="C2", linewidth=1, label="without the weakest defects")
@@ -45,7 +46,20 @@ def draw_ensemble(rows: Sequence[Row], name: str, title: str, file: Path) -> Non
         key, numbers = strongest
         pairs = [(row[key], row[RESULT]) for row in rows if row[RESULT] is not None and row.get(key) is not None]
         others[0].plot(*zip(*pairs, strict=True), ".", color="C0", markersize=4)
-        others[0].set(xlabel=key, ylabel=label, title=f"Spearman's correlation {numbers['spearman']:.2f}")
+        others[0].set(xlabel=_words(key), ylabel=label, title=f"Spearman's correlation {numbers['spearman']:.2f}")
         others[0].title.set_fontsize(9)
-    figure.suptitle(title, fontsize=9)
+    for axes in figure.axes:
+        axes.locator_params(axis="x", nbins=5)  # long numbers would touch
     figure.savefig(file)
+
+
+def _words(key: str) -> str:
+    """The label of a column of samples.csv.
+
+    Examples
+    --------
+    >>> _words("severest.amplitude"), _words("severest.at.polar")
+    ('amplitude of the most severe defect', 'polar of the most severe defect')
+    """
+    of, _, last = key.rpartition(".")
+    return last.replace("_", " ") + (" of the most severe defect" if of.startswith("severest") else "")

@@ -22,6 +22,12 @@ if TYPE_CHECKING:
 LEGEND_ROWS = 16
 STYLES = ("-", "--", ":", "-.")
 UNITS = {"polar": "degrees", "azimuth": "degrees"}
+NAMES = {  # words and symbol of keys
+    "lambda_m": ("field", r"$\lambda_\mathrm{m}$"),
+    "poisson_ratio": ("Poisson's ratio", r"$\nu$"),
+    "radius_to_thickness": ("radius over thickness", "$R/h$"),
+    "amplitude": ("amplitude over $h$", ""),
+}
 MAPPED = 3  # least different values of both axes of a map
 KNOCKDOWN, BARRIER = r"knockdown factor  $k_\mathrm{d}$", r"energy barrier  ($E h R^2$)"
 
@@ -154,8 +160,10 @@ def _words(key: str) -> str:
     Examples
     --------
     >>> _words("magnetic.applied.flux_density"), _words("shell.radius_to_thickness")
-    ('applied flux density', 'radius to thickness')
+    ('applied flux density', 'radius over thickness  $R/h$')
     """
+    if short(key) in NAMES:
+        return "  ".join(part for part in NAMES[short(key)] if part)
     words = " ".join(key.split(".")[-2:]) if key.endswith(".flux_density") else short(key)
     return words.replace("_", " ")
 
@@ -184,4 +192,10 @@ def loaded(curve: Sequence["Row"], amplitude: str) -> list["Row"]:
 
 def _label(point: SweepPoint, without: Axis | None) -> str:
     hidden = without.keys if without else ()
-    return ", ".join(f"{short(key)} {value}" for key, value in point.values.items() if key not in hidden)
+    return ", ".join(f"{_symbol(key)}{value}" for key, value in point.values.items() if key not in hidden)
+
+
+def _symbol(key: str) -> str:
+    """A key before its value: its symbol with a sign of equality, or its words."""
+    words, symbol = NAMES.get(short(key), (short(key).replace("_", " "), ""))
+    return f"{symbol} = " if symbol else f"{words} "

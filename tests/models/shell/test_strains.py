@@ -11,7 +11,7 @@ from magshell_fenicsx.case.source import Source
 from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.shell.parameters import Loads, Magnetisation, Material
 from magshell_fenicsx.models.shell.strains import TangentFrame, bending_moment, principal
-from magshell_fenicsx.output.fields.point_fields import PointFields
+from magshell_fenicsx.output.fields.stresses import Stresses, principal_fields
 from magshell_fenicsx.output.fields.surface import Surface, SurfaceGatherer
 from magshell_fenicsx.simulate.follow import follow
 
@@ -101,7 +101,8 @@ def test_sphere_under_pressure() -> None:
     for name in ("E_1", "E_2"):
         expected = -1e-3 * material.classical_pressure * (1 - NU) / (2 * material.h)
         assert found.fields[name][inner] == pytest.approx(expected, rel=2e-3)
-    assert found.fields["E_1"][edge] == pytest.approx(0, abs=1e-12)
+    size = np.abs(found.fields["E_2"]).max()
+    assert found.fields["E_1"][edge] == pytest.approx(0, abs=1e-5 * size)  # recovered from inside the cells
     assert found.fields["M_1"][edge] == pytest.approx(NU * found.fields["M_2"][edge], rel=1e-6)
     assert found.fields["M_2"].min() == pytest.approx(found.fields["M_2"][edge].mean())
 
@@ -128,7 +129,7 @@ def test_meridian_and_half_shell_agree() -> None:
 def test_moments_take_the_thickness_that_is_there() -> None:
     """D grows with its third power."""
     jet, u = RNG.standard_normal((2, 6, 4, 3, 3))
-    fields = [PointFields(jet, Material(NU, H), None, t).of(u, {}) for t in (None, np.full((4, 3), 2.0))]
+    fields = [principal_fields(Stresses(jet, Material(NU, H), t).of(u, {})) for t in (None, np.full((4, 3), 2.0))]
     assert fields[1]["M_1"] == pytest.approx(8 * fields[0]["M_1"])
     assert fields[1]["E_1"] == pytest.approx(fields[0]["E_1"])
 

@@ -8,10 +8,10 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import cffi
-from dolfinx.jit import get_options
 from mpi4py import MPI
 
 from magshell_fenicsx.platform.first import from_first
+from magshell_fenicsx.platform.kept import kernel_cache
 
 OPTIONS = ["-O3", "-g0"]
 
@@ -26,7 +26,7 @@ def native(source: Path, declarations: str, comm: MPI.Comm) -> tuple[Any, Any]:
     """
     text = "#include <stdint.h>\n" + source.read_text(encoding="utf-8")
     key = hashlib.sha256(repr((text, declarations, OPTIONS, sys.version, cffi.__version__)).encode()).hexdigest()[:16]
-    name, folder = f"magshell_{source.stem}_{key}", Path(get_options()["cache_dir"])
+    name, folder = f"magshell_{source.stem}_{key}", kernel_cache()
 
     def compiled() -> None:
         if not (folder / f"{name}.so").is_file():

@@ -1,0 +1,59 @@
+"""The energy barrier that a probing force passes, as a result with gradients.
+
+Both its ends are in equilibrium without the force, so that the energy changes by p alone,
+
+    dJ/dp = Pi_p(end) - Pi_p(begin) + sum_i (mu_i(end) - mu_i(begin)) dq_i/dp,
+
+with the conjugates q_i that the probing holds: they are those of its begin, where one solve is for them.
+"""
+
+import numpy as np
+
+from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.source import CaseError
+from magshell_fenicsx.simulate.barrier import barrier
+from magshell_fenicsx.simulate.gradients.adjoint import Adjoint, Place, held_at, solved
+from magshell_fenicsx.simulate.record import Record
+from magshell_fenicsx.simulate.results import Functional
+from magshell_fenicsx.simulate.scene import Scene
+
+BARRIER = "barrier"
+
+
+def refuse_no_barrier(case: Case) -> None:
+    """See that a case ends where a probing force is zero again.
+
+    Raises
+    ------
+    CaseError
+        If it does not.
+    """
+    if not case.programme or case.programme[-1].until != "zero":
+        raise CaseError("barrier: needs a last step with until: zero")
+
+
+def adjoint_of_barrier(scene: Scene, begin: Record | None, end: Record) -> Adjoint:
+    """The adjoint of the barrier between the begin and the end of the last step.
+
+    Raises
+    ------
+    CaseError
+        If the last step passes none, or holds a gas.
+    """
+    refuse_no_barrier(scene.case)
+    if begin is None:
+        raise CaseError("barrier: give the record before the last step")
+    system, step, whole = scene.model.system, scene.case.programme[-1], scene.model.multiplicity
+    before, after = (system.placed(record.point.state) for record in (begin, end))
+    held, change = held_at(scene, end, after), dict[str, float]()
+    for name, conjugate in held.items():
+        if callable(conjugate):
+            raise CaseError(f"barrier: {name}: no gradient while a gas is held")
+        change[name] = whole * (after.mu[name] - before.mu[name])
+    slope = -np.sum([c * system.load(before.u, before.mu, name) for name, c in change.items()], axis=0)
+    q = {name: -c for name, c in change.items()}
+    w, rows = 0.0 * before.u, dict[str, float]()
+    if change:
+        w, rows = solved(scene, before, Functional(0.0, slope, potentials=q), held_at(scene, begin, before))
+    places = [Place(after, 0.0 * after.u, dict.fromkeys(held, 0.0), whole), Place(before, w, rows, -whole, q)]
+    return Adjoint(scene, places, value=barrier(scene, step, before, after))

@@ -1,0 +1,76 @@
+"""What can be differentiated, by name: columns, shapes, vibrations and barriers at the end of a history."""
+
+from collections.abc import Iterable, Mapping
+
+from magshell_fenicsx.case.source import CaseError
+from magshell_fenicsx.simulate.adapt.ending import History
+from magshell_fenicsx.simulate.gradients.adjoint import Adjoint, adjoint
+from magshell_fenicsx.simulate.gradients.barriers import BARRIER, adjoint_of_barrier, refuse_no_barrier
+from magshell_fenicsx.simulate.gradients.instabilities import FOLDS, refuse_unitless
+from magshell_fenicsx.simulate.gradients.vibration import (
+    FIRST,
+    NAMES,
+    adjoints_of_vibrations,
+    frequency,
+    refuse_no_vibration,
+    vibration,
+)
+from magshell_fenicsx.simulate.results import Target, differentiable
+from magshell_fenicsx.simulate.scene import Scene
+
+
+def refuse_no_result(scene: Scene, results: Iterable[str], key: str) -> None:
+    """See before a history that the results at a key have gradients.
+
+    Raises
+    ------
+    CaseError
+        With those that have.
+    """
+    start, case = scene.unloaded(), scene.case
+    columns = differentiable(scene, start)
+    for of in results:
+        try:
+            refuse_unitless(scene, of)
+            if of == BARRIER:
+                refuse_no_barrier(case)
+            elif NAMES.fullmatch(of):
+                refuse_no_vibration(case, of)
+            elif of not in FOLDS and of not in columns and of not in start.mu:
+                known = ", ".join((*FOLDS, *columns, BARRIER, *FIRST))
+                raise CaseError(f"{of}: has no gradient here; allowed are {known}")
+        except CaseError as e:
+            raise CaseError(f"{key}: {e}") from None
+
+
+def adjoint_at_end(
+    scene: Scene, history: History, of: str | Target, hold: Mapping[str, str] | None = None
+) -> tuple[str, Adjoint]:
+    """The kind of a result ("" of most) at the last point of a history, and its adjoint; collective.
+
+    Raises
+    ------
+    CaseError
+        If there is no such result.
+    """
+    assert history.end
+    if of == BARRIER:
+        return "", adjoint_of_barrier(scene, history.begin, history.end)
+    if isinstance(of, str) and NAMES.fullmatch(of):
+        return adjoints_of_vibrations(scene, history.end, of, hold)[0]
+    return "", adjoint(scene, history.end, of, hold)
+
+
+def vibration_at_end(scene: Scene, history: History, of: str) -> float | None:
+    """The frequency of a name; None of another result; collective.
+
+    Raises
+    ------
+    Lost
+        If it cannot be computed.
+    """
+    if not NAMES.fullmatch(of):
+        return None
+    assert history.end
+    state = scene.model.system.placed(history.end.point.state)
+    return frequency(scene.case, of, vibration(scene, state, of).value)

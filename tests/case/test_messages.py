@@ -1,0 +1,87 @@
+"""What a user reads who makes the mistakes of the first day: one message with place, key, value and what is allowed."""
+
+from pathlib import Path
+
+import pytest
+
+from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.source import CaseError
+
+CAP = """\
+shell:
+  geometry: cap
+  radius: 40 mm
+  thickness: 0.5 mm
+  polar: 45
+  youngs_modulus: 1.3 MPa
+  poisson_ratio: 0.49
+boundary: {rim: clamped}
+magnetic:
+  remanent: {flux_density: 60 mT}
+  applied:
+    sources:
+      - {kind: cylinder, diameter: 10 mm, height: 10 mm, polarization: 1.2 T, position: [0, 0, -60 mm]}
+loading: {kind: pressure, control: arc, until: target, pressure: 100 Pa}
+"""
+MAGNET = "magnetic.applied.sources.0"
+MISTAKES = [
+    # a wrong shell is no reason to complain of a target with a unit
+    ("shell.polar=200", "shell.polar: 200: must be less than or equal to 179"),
+    (
+        "loading={kind: dead, loads: [{at: A, force: [0, 0, 1 mN]}], factor: 1}",
+        "loading.loads.0.at: A: name it in points",
+    ),
+    (
+        "loading={kind: indentation, at: {point: A}, depth: 1}",
+        "loading.at.point: A: name it in points, with its place; ",
+    ),
+    ("bodies={ball: {kind: sphere, radius: 6 mm, at: {polar: 50}}}", "bodies.ball.at.polar: 50 is not on the shell"),
+    ("shell.thickness=0.5", "cap.yaml:1: shell: give every length and youngs_modulus a unit, or none of them: thick"),
+    ("shell.youngs_modulus=1.3 mPa", "shell.youngs_modulus: '1.3 mPa': allowed are 1 Pa to 1e13 Pa (MPa: megapascal"),
+    (f"{MAGNET}.polarization=1.2", f'{MAGNET}.polarization: 1.2: needs a unit, for example "60 mT"'),
+    (f"{MAGNET}.polarization=[1 T, 2, 3 T]", f'{MAGNET}.polarization.1: 2: needs a unit, for example "60 mT"'),
+    (f"{MAGNET}.position=[60 mm, 0]", f"{MAGNET}.position: ['60 mm', 0]: must have at least 3 items, not 2"),
+    ("magnetic.applied.sources.1.height=1", "magnetic.applied.sources.1: the list has items 0 to 0"),
+    ("shell.thickness_factor=[2]", "shell.thickness_factor: [2]: must be a valid string (Multiplies h)"),
+    (
+        'magnetic.remanent={kind: expression, flux_density: 60 mT, components: ["x", "y", "q"]}',
+        "magnetic.remanent.components.2: 'q': allowed are numbers, x, y, z",
+    ),
+    (
+        "loading={kind: pressure, control: volume, until: target, pressure: 100 Pa}",
+        "loading: until: target with control: volume needs volume_change (and nothing else) as target; control: arc",
+    ),
+]
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    path = tmp_path / "cap.yaml"
+    path.write_text(CAP, encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize(("setting", "said"), MISTAKES)
+def test_one_clear_message(file: Path, setting: str, said: str) -> None:
+    with pytest.raises(CaseError) as error:
+        Case.load(file, [setting])
+    (line,) = str(error.value).splitlines()
+    assert said in line
+    assert "function-" not in line  # pydantic's own names
+
+
+@pytest.mark.parametrize(
+    ("loading", "control"),
+    [
+        ("{kind: pressure, until: target, pressure: 100 Pa}", "load"),
+        ("{kind: pressure, until: target, volume_change: -80 mm^3}", "volume"),
+        ("{kind: pressure, until: limit}", "volume"),
+        ("{kind: indentation, force: 1 mN}", "load"),
+        ("{kind: indentation, depth: 1 mm}", "displacement"),
+        ("{kind: indentation, control: arc, force: 1 mN}", "arc"),
+    ],
+)
+def test_a_target_chooses_its_control(file: Path, loading: str, control: str) -> None:
+    """A force at the pole needs no place either."""
+    case = Case.load(file, [f"loading={loading}"])
+    assert getattr(case.loading, "control") == control  # noqa: B009

@@ -1,0 +1,96 @@
+"""What is drawn keeps clear of what is drawn beside it, and is large enough to be seen."""
+
+import numpy as np
+import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from magshell_fenicsx.case.output import OutputSection
+from magshell_fenicsx.output.fields.surface import Surface
+from magshell_fenicsx.output.pictures.colours import contact_region, moments
+from magshell_fenicsx.output.pictures.layout import Arrow, Panel
+from magshell_fenicsx.output.pictures.numbers import write_numbers
+from magshell_fenicsx.output.pictures.picture import figures
+from magshell_fenicsx.output.pictures.sources import near_outlines
+from magshell_fenicsx.output.pictures.view import Camera, Window
+
+Array = NDArray[np.float64]
+ABOVE = Camera(np.array([0.0, -1e-6, 1.0]))
+
+
+def grid(n: int = 41) -> Surface:
+    """A flat square of side 2 in triangles, not displaced."""
+    x, y = np.meshgrid(np.linspace(-1, 1, n), np.linspace(-1, 1, n))
+    r = np.column_stack([x.ravel(), y.ravel(), 0 * x.ravel()])
+    a = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).ravel()
+    cells = np.concatenate([np.column_stack([a, a + 1, a + n + 1]), np.column_stack([a, a + n + 1, a + n])])
+    return Surface(r, 0 * r, np.tile([0.0, 0, 1], (len(r), 1)), cells, {})
+
+
+def test_numbers_cover_no_other_numbers_and_no_marks() -> None:
+    """Of forty marks, half of them crowded; those without room are left out, all others are inside the axes."""
+    figure = Figure(figsize=(3.5, 2.6), dpi=100)
+    axes = figure.subplots()
+    x = np.concatenate([np.linspace(0, 0.1, 20), np.linspace(0.15, 1, 20)])
+    axes.plot(x, 1 / (1 + 20 * x), "o", markersize=4.5)
+    marks = [((float(v), float(1 / (1 + 20 * v))), str(i)) for i, v in enumerate(x, 1)]
+    write_numbers(axes, marks, [np.array([x, 1 / (1 + 20 * x)])])
+    renderer = FigureCanvasAgg(figure).get_renderer()
+    boxes = [text.get_window_extent(renderer).expanded(1.0, 0.7) for text in axes.texts]  # digits have no tails
+    assert 20 < len(boxes) < 40
+    assert not any(a.overlaps(b) for i, a in enumerate(boxes) for b in boxes[:i])
+    at = axes.transData.transform(np.array([place for place, _ in marks]))
+    assert not any(box.contains(*place) for box in boxes for place in at)
+    frame = axes.get_window_extent(renderer)
+    assert all(frame.contains(*corner) for box in boxes for corner in box.corners())
+
+
+def test_a_source_is_drawn_whole_or_not_at_all() -> None:
+    """A cylinder of two circles, one beyond the picture, and a line that joins them; a ring that is near."""
+    t = np.linspace(0, 2 * np.pi, 49)
+    circle = np.column_stack([np.cos(t), np.sin(t), 0 * t])
+    up = np.array([0.0, 0, 1])
+    near, far, ring = circle + 3 * up, circle + 5 * up, 0.5 * circle + 0.5 * up
+    joining = np.linspace(near[12], far[12], 2)
+    surface = grid(3)
+    drawn = near_outlines(
+        Surface(*(vars(surface)[k] for k in ("r0", "u", "n0", "cells", "fields")), (near, far, joining, ring))
+    )
+    assert [line is ring for line in drawn] == [True]
+
+
+@pytest.mark.parametrize(("radius", "alone"), [(0.1, True), (0.6, False)])
+def test_a_small_contact_is_drawn_large(radius: float, alone: bool) -> None:
+    surface = grid()
+    distance = np.linalg.norm(surface.r0, axis=1)
+    surface.fields.update(gap_over_h=np.where(distance < radius, 0.5, 9.0), contact_pressure=1.0 * (distance < radius))
+    assert (contact_region(surface) is not None) == alone
+    figure = figures(surface, 0.01, OutputSection(), ABOVE, ["contact"])["contact"]
+    assert any("around the contact" in text.get_text() for text in figure.texts) == alone
+    left, right = figure.axes[0].get_xlim()
+    assert (right - left < 8 * radius) == alone or not alone
+
+
+def test_arrows_stay_in_their_panel() -> None:
+    """One that leaves the image at the top: the panel is higher, and as wide in pixels."""
+    window = Window((-1.0, 1.0, -1.0, 1.0), 50)
+    arrow = Arrow(np.array([[0.0, 0.9, 0]]), np.array([[0.0, 0.6, 0]]), "C0", "up")
+    panel = Panel(np.zeros((100, 100, 4), np.uint8), window, ABOVE, arrows=(arrow,))
+    left, right, low, high = panel.frame
+    assert (left, right, low) == (-1, 1, -1)
+    assert 1.5 < high < 1.6
+    assert panel.size == pytest.approx((100 * (high + 1) / 2, 100))
+
+
+def test_moments_that_are_noise_are_pale() -> None:
+    """Smooth ones have colours up to their largest value; those that differ by 90 % from the cells' do not."""
+    surface = grid()
+    wave = 1e-5 * np.sin(3 * surface.r0[:, 0])
+    surface.fields.update(M_1=wave, M_2=0 * wave)
+    smooth, noise = (
+        moments(Surface(*(vars(surface)[k] for k in ("r0", "u", "n0", "cells", "fields")), jump=jump))[0].limits[1]
+        for jump in (1e-3, 0.9)
+    )
+    assert smooth == pytest.approx(np.abs(wave).max())
+    assert noise > 10 * np.sqrt(np.mean(wave**2))
