@@ -25,7 +25,7 @@ GAP = 4.0  # mm between panels
 HEAD = 0.012  # around the ends of arrows, over a panel's width
 LONG = 0.08  # an arrow of this length over a panel's width has the full thickness
 LINE = 1.45 / 72  # height of a line of text in inches, for each point of the font
-QUICKLY = {"compress_level": 3}  # files are a quarter larger than by default and take a third of the time
+LEVEL = 3  # files are a quarter larger than by default and take a third of the time
 
 
 @dataclass(frozen=True)
@@ -225,11 +225,12 @@ def _wrapped(text: str, inches: float, size: float) -> list[str]:
 
 def written(figure: "Figure", style: OutputSection, name: str) -> Iterator[tuple[str, bytes]]:
     """Names and contents of a figure's files: PNG and the further formats."""
-    for kind in dict.fromkeys(["png", *style.formats]):
+    with drawing(style):
+        yield f"{name}.png", png(figure)
+    for kind in dict.fromkeys(kind for kind in style.formats if kind != "png"):
         content = io.BytesIO()
-        options: dict[str, Any] = {"pil_kwargs": QUICKLY} if kind == "png" else {"metadata": {_DATE[kind]: None}}
         with drawing(style):
-            figure.savefig(content, format=kind, dpi=style.dpi, **options)
+            figure.savefig(content, format=kind, dpi=style.dpi, metadata={_DATE[kind]: None})
         yield f"{name}.{kind}", content.getvalue()
 
 
@@ -237,7 +238,12 @@ _DATE = {"svg": "Date", "pdf": "CreationDate"}
 
 
 def png(figure: "Figure") -> bytes:
-    """A PNG file."""
-    content = io.BytesIO()
-    figure.savefig(content, format="png", dpi=figure.dpi, pil_kwargs=QUICKLY)
+    """A PNG file, without the fourth channel that Matplotlib writes."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from PIL import Image as Pillow
+
+    canvas, content = FigureCanvasAgg(figure), io.BytesIO()
+    canvas.draw()
+    colours = Pillow.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
+    colours.save(content, "PNG", dpi=(figure.dpi, figure.dpi), compress_level=LEVEL)
     return content.getvalue()

@@ -1,7 +1,7 @@
 """Pictures of the deformed shell: displacement, strains, bending moments, magnetic fields and loads."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -108,7 +108,8 @@ class Background:
         pieces, r = tessellated(surface), surface.r0 + surface.u
         self.window = window or Window.around(camera(np.concatenate([surface.r0, r, *near])), width)
         self.seen = Seen(pieces, r, camera, self.window)
-        undeformed = silhouette(Seen(pieces, surface.r0, camera, self.window))
+        coarse = replace(self.window, scale=self.window.scale / 2)  # enough for a line that is wider than a pixel
+        undeformed = silhouette(Seen(pieces, surface.r0, camera, coarse))
         self._lines = (
             *((line, UNDEFORMED) for line in undeformed),
             *((line, EDGE) for line in silhouette(self.seen)),

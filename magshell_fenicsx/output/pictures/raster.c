@@ -18,40 +18,56 @@ static void narrow(double start, double rise, int32_t *left, int32_t *right)
     if (rise < 0 && end < *right) *right = end < *left ? *left - 1 : below(end);
 }
 
-/* places: x to the right, y down, depth towards the eye. The results: the triangle in front, -1 without one; the
-   weights of its second and third corner; the depth. */
+/* Where a triangle is in front: at (x, y) its second and third corner have the weights v0 + x vx + y vy and w0 + ... */
+struct weights { double v0, vx, vy, w0, wx, wy; };
+
+/* The weights in a triangle of projected places; 0 where it is seen edgewise. */
+static int weights_of(const double *places, const int32_t *corners, struct weights *found)
+{
+    const double *a = places + 3 * corners[0], *b = places + 3 * corners[1], *c = places + 3 * corners[2];
+    const double area = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]);
+    if (!(area > 1e-12 || area < -1e-12)) return 0;
+    const double over = 1 / area;
+    found->vx = (c[1] - a[1]) * over, found->vy = -(c[0] - a[0]) * over;
+    found->wx = -(b[1] - a[1]) * over, found->wy = (b[0] - a[0]) * over;
+    found->v0 = -a[0] * found->vx - a[1] * found->vy, found->w0 = -a[0] * found->wx - a[1] * found->wy;
+    return 1;
+}
+
+/* places: x to the right, y down, depth towards the eye. The results: the triangle in front, -1 without one, and its
+   depth. */
 void rasterise(const double *places, const int32_t *triangles, int64_t count, int32_t width, int32_t height,
-               int32_t *index, float *second, float *third, float *depth)
+               int32_t *restrict index, float *restrict depth)
 {
     const double near = 1e-9;
     for (int64_t at = 0; at < (int64_t)width * height; at++) index[at] = -1, depth[at] = -INFINITY;
     for (int64_t t = 0; t < count; t++) {
         const double *a = places + 3 * triangles[3 * t], *b = places + 3 * triangles[3 * t + 1];
         const double *c = places + 3 * triangles[3 * t + 2];
-        const double area = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]);
-        if (!(area > 1e-12 || area < -1e-12)) continue;
+        struct weights it;
+        if (!weights_of(places, triangles + 3 * t, &it)) continue;
         int32_t left = -below(-least(a[0], b[0], c[0])), right = below(-least(-a[0], -b[0], -c[0]));
         int32_t top = -below(-least(a[1], b[1], c[1])), bottom = below(-least(-a[1], -b[1], -c[1]));
         if (left < 0) left = 0;
         if (top < 0) top = 0;
         if (right >= width) right = width - 1;
         if (bottom >= height) bottom = height - 1;
-        const double over = 1 / area, vx = (c[1] - a[1]) * over, vy = -(c[0] - a[0]) * over;
-        const double wx = -(b[1] - a[1]) * over, wy = (b[0] - a[0]) * over;
         const double db = b[2] - a[2], dc = c[2] - a[2];
         for (int32_t y = top; y <= bottom; y++) {
-            const double v = (y - a[1]) * vy - a[0] * vx, w = (y - a[1]) * wy - a[0] * wx;
+            const double v = it.v0 + y * it.vy, w = it.w0 + y * it.wy;
             int32_t first = left, last = right;
-            narrow(v + near, vx, &first, &last);
-            narrow(w + near, wx, &first, &last);
-            narrow(1 + near - v - w, -vx - wx, &first, &last);
-            const double z0 = a[2] + v * db + w * dc, rise = vx * db + wx * dc;
-            for (int64_t x = first, at = (int64_t)y * width + first; x <= last; x++, at++) {
-                const float z = (float)(z0 + x * rise);
-                if (z > depth[at]) {
-                    depth[at] = z, index[at] = (int32_t)t;
-                    second[at] = (float)(v + x * vx), third[at] = (float)(w + x * wx);
-                }
+            narrow(v + near, it.vx, &first, &last);
+            narrow(w + near, it.wx, &first, &last);
+            narrow(1 + near - v - w, -it.vx - it.wx, &first, &last);
+            const double rise = it.vx * db + it.wx * dc;
+            const float start = (float)(a[2] + v * db + w * dc + first * rise), step = (float)rise;
+            int32_t *const row = index + (int64_t)y * width + first;
+            float *const front = depth + (int64_t)y * width + first;
+            for (int32_t i = 0; i <= last - first; i++) { /* without a branch: for several pixels at once */
+                const float z = start + (float)i * step;
+                const int nearer = z > front[i];
+                front[i] = nearer ? z : front[i];
+                row[i] = nearer ? (int32_t)t : row[i];
             }
         }
     }
@@ -59,20 +75,25 @@ void rasterise(const double *places, const int32_t *triangles, int64_t count, in
 
 /* Colours of values at the points, times the light, on pixels of finer x finer of the above; each has four bytes.
    facing: cosines between normals and the direction to the eye. table: colours, of low first and high last. */
-void paint(const int32_t *triangles, const int32_t *index, const float *second, const float *third, int32_t width,
-           int32_t height, int32_t finer, const float *values, const float *facing, float darkest, float low,
-           float high, const float *table, int32_t colours, uint8_t *image)
+void paint(const double *places, const int32_t *triangles, const int32_t *index, int32_t width, int32_t height,
+           int32_t finer, const float *values, const float *facing, float darkest, float low, float high,
+           const float *table, int32_t colours, uint8_t *image)
 {
+    int32_t last = -1;
+    struct weights it = {0, 0, 0, 0, 0, 0};
     for (int32_t y = 0; y < height; y++)
         for (int32_t x = 0; x < width; x++, image += 4) {
             float sum[3] = {0, 0, 0};
             int32_t covered = 0;
             for (int32_t j = 0; j < finer; j++)
                 for (int32_t i = 0; i < finer; i++) {
-                    const int64_t at = ((int64_t)y * finer + j) * width * finer + (int64_t)x * finer + i;
-                    if (index[at] < 0) continue;
-                    const int32_t *p = triangles + 3 * (int64_t)index[at];
-                    const float v = second[at], w = third[at], u = 1 - v - w;
+                    const int32_t right = x * finer + i, down = y * finer + j;
+                    const int32_t t = index[(int64_t)down * width * finer + right];
+                    if (t < 0) continue;
+                    const int32_t *p = triangles + 3 * (int64_t)t;
+                    if (t != last) weights_of(places, p, &it), last = t;
+                    const float v = (float)(it.v0 + right * it.vx + down * it.vy);
+                    const float w = (float)(it.w0 + right * it.wx + down * it.wy), u = 1 - v - w;
                     const float value = u * values[p[0]] + v * values[p[1]] + w * values[p[2]];
                     const float away = 1 - (u * facing[p[0]] + v * facing[p[1]] + w * facing[p[2]]);
                     const float light = away > 0 ? 1 - darkest * away * away : 1;

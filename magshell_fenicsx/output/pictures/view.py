@@ -19,9 +19,9 @@ if TYPE_CHECKING:  # takes long to import
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 FUNCTIONS = """
-    void rasterise(const double *, const int32_t *, int64_t, int32_t, int32_t, int32_t *, float *, float *, float *);
-    void paint(const int32_t *, const int32_t *, const float *, const float *, int32_t, int32_t, int32_t, const float *,
-               const float *, float, float, float, const float *, int32_t, uint8_t *);
+    void rasterise(const double *, const int32_t *, int64_t, int32_t, int32_t, int32_t *, float *);
+    void paint(const double *, const int32_t *, const int32_t *, int32_t, int32_t, int32_t, const float *, const float *,
+               float, float, float, const float *, int32_t, uint8_t *);
 """
 FINER = 2  # drawn pixels along each side of a pixel of the picture
 DARKEST = 0.45  # loss of light where the surface is seen edgewise; none where it faces the eye
@@ -88,12 +88,15 @@ class Seen:
         places = camera(pieces.at(r))
         places[:, 0], places[:, 1] = (places[:, 0] - left) * scale - 0.5, (high - places[:, 1]) * scale - 0.5
         self._index = np.empty((height, width), np.int32)
-        self._second, self._third, self._depth = np.empty((3, height, width), np.float32)
-        triangles = pieces.triangles
-        arrays = np.ascontiguousarray(places), triangles, self._index, self._second, self._third, self._depth
-        points, cells, *pixels = (_pointer(array) for array in arrays)
-        library()[1].rasterise(points, cells, len(triangles), width, height, *pixels)
-        self._facing = np.abs(pieces.normals(r) @ camera.axes[2]).astype(np.float32)
+        self._depth = np.empty((height, width), np.float32)
+        self._places, self._r = np.ascontiguousarray(places), r
+        points, cells, *pixels = map(_pointer, (self._places, pieces.triangles, self._index, self._depth))
+        library()[1].rasterise(points, cells, len(pieces.triangles), width, height, *pixels)
+
+    @cached_property
+    def _facing(self) -> NDArray[np.float32]:
+        """Cosines between normals and the direction to the eye, at points."""
+        return np.asarray(np.abs(self._pieces.normals(self._r) @ self.camera.axes[2]), np.float32)
 
     @staticmethod
     def of(surface: Surface, camera: Camera, window: Window) -> "Seen":
@@ -112,13 +115,13 @@ class Seen:
 
     def plain(self, grey: float) -> Image:
         """The image of a surface in one grey."""
-        return self._painted(np.zeros(len(self._facing)), (0.0, 1.0), np.full((1, 3), grey))
+        return self._painted(np.zeros(len(self._places)), (0.0, 1.0), np.full((1, 3), grey))
 
     def _painted(self, values: Array, limits: tuple[float, float], table: Array) -> Image:
         height, width = self.window.shape
         image = np.empty((height, width, 4), np.uint8)
         numbers, colours = values.astype(np.float32), table.astype(np.float32)
-        before = self._pieces.triangles, self._index, self._second, self._third
+        before = self._places, self._pieces.triangles, self._index
         library()[1].paint(
             *map(_pointer, before),
             *(width, height, FINER, _pointer(numbers), _pointer(self._facing), DARKEST, *limits),
