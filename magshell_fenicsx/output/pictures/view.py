@@ -20,8 +20,8 @@ Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 FUNCTIONS = """
     void rasterise(const double *, const int32_t *, int64_t, int32_t, int32_t, int32_t *, float *);
-    void paint(const double *, const int32_t *, const int32_t *, int32_t, int32_t, int32_t, const float *, const float *,
-               float, float, float, const float *, int32_t, uint8_t *);
+    void paint(const double *, const int32_t *, const int32_t *, int32_t, int32_t, int32_t, const float *,
+               const float *, float, float, float, const float *, int32_t, uint8_t *);
 """
 FINER = 2  # drawn pixels along each side of a pixel of the picture
 DARKEST = 0.45  # loss of light where the surface is seen edgewise; none where it faces the eye
@@ -90,8 +90,8 @@ class Seen:
         self._index = np.empty((height, width), np.int32)
         self._depth = np.empty((height, width), np.float32)
         self._places, self._r = np.ascontiguousarray(places), r
-        points, cells, *pixels = map(_pointer, (self._places, pieces.triangles, self._index, self._depth))
-        library()[1].rasterise(points, cells, len(pieces.triangles), width, height, *pixels)
+        corners, pixels = _pointers(self._places, pieces.triangles), _pointers(self._index, self._depth)
+        library()[1].rasterise(*corners, len(pieces.triangles), width, height, *pixels)
 
     @cached_property
     def _facing(self) -> NDArray[np.float32]:
@@ -121,11 +121,10 @@ class Seen:
         height, width = self.window.shape
         image = np.empty((height, width, 4), np.uint8)
         numbers, colours = values.astype(np.float32), table.astype(np.float32)
-        before = self._places, self._pieces.triangles, self._index
         library()[1].paint(
-            *map(_pointer, before),
-            *(width, height, FINER, _pointer(numbers), _pointer(self._facing), DARKEST, *limits),
-            *(_pointer(colours), len(colours), _pointer(image)),
+            *_pointers(self._places, self._pieces.triangles, self._index),
+            *(width, height, FINER, *_pointers(numbers, self._facing), DARKEST, *limits),
+            *(*_pointers(colours), len(colours), *_pointers(image)),
         )
         return image
 
@@ -148,9 +147,9 @@ def library() -> tuple[Any, Any]:
     return native(Path(__file__).with_name("raster.c"), FUNCTIONS, MPI.COMM_SELF)
 
 
-def _pointer(array: NDArray[Any]) -> Any:
+def _pointers(*arrays: NDArray[Any]) -> list[Any]:
     kinds = {"float64": "double[]", "float32": "float[]", "int32": "int32_t[]", "uint8": "uint8_t[]"}
-    return library()[0].from_buffer(kinds[array.dtype.name], array)
+    return [library()[0].from_buffer(kinds[array.dtype.name], array) for array in arrays]
 
 
 def axes_on_screen(direction: Array) -> Array:
