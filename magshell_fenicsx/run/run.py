@@ -9,6 +9,7 @@ from mpi4py import MPI
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.loads.step import PathStep
+from magshell_fenicsx.case.opened import opened
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.continuation.factor import has_cholmod
 from magshell_fenicsx.continuation.fold import FoldLost
@@ -48,7 +49,7 @@ ROUNDING = 1e-9  # a displacement over h as small as this is printed as zero
 
 
 def run(
-    case: Case,
+    case: Case | str | Path,
     out: Path | str | None = None,
     comm: MPI.Comm = MPI.COMM_WORLD,
     say: Say = lambda line: None,
@@ -65,6 +66,8 @@ def run(
 
     Parameters
     ----------
+    case
+        A case, or the path of its file.
     out
         Folder for path.csv, summary.json, fields and pictures; None writes nothing.
     say
@@ -90,6 +93,7 @@ def run(
         If the disk is full before the first point.
     """
     start = time.perf_counter()
+    case = opened(case)
     case = case.with_terms(terms) if terms else case
     watch = Watch(comm, start, time_limit, signals=out is not None)
     say, tell = (say, tell or _ignored) if comm.rank == 0 else (_ignored, _ignored)
