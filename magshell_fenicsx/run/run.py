@@ -56,6 +56,7 @@ def run(
     *,
     tell: Say | None = None,
     resume: bool = False,
+    overwrite: bool = False,
     time_limit: float | None = None,
     pictures: bool = True,
     terms: Sequence[OwnTerm] = (),
@@ -76,6 +77,8 @@ def run(
         Called on rank 0 with a status line, which replaces the one before.
     resume
         Continue the interrupted run in `out`.
+    overwrite
+        Replace what is in `out` even if it is the run of another case file.
     time_limit
         Seconds after which the run stops in the same way.
     pictures
@@ -86,7 +89,8 @@ def run(
     Raises
     ------
     CaseError
-        If building the case finds an error, `out` cannot be written, or it has no run of this case to resume.
+        If building the case finds an error, `out` cannot be written or has a run of another case file, or no run of
+        this case to resume.
     AlreadyComplete
         If the run to be resumed is complete.
     DiskError
@@ -100,7 +104,7 @@ def run(
     if out is None:
         return _run(case, None, comm, say, tell, watch, start, pictures)
     with held_folder(Path(out), comm, make=not resume):
-        open_folder(Path(out), case, comm, resume)
+        open_folder(Path(out), case, comm, resume, overwrite)
         return _run(case, Path(out), comm, say, tell, watch, start, pictures)
 
 
