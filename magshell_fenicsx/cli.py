@@ -272,6 +272,10 @@ def check(case: CaseFile, set_: Settings = None) -> None:
         source = read_source(case, set_ or [])
         read = Case.from_source(source)
         print_line(describe(with_modes(read, world())))
+        if read.ensemble:
+            from magshell_fenicsx.studies.ensemble.door import refuse_unknown_keys
+
+            refuse_unknown_keys(source, read.ensemble)
         if read.design:
             from magshell_fenicsx.studies.design.numbers import refuse_unfit_numbers
 
