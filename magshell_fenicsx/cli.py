@@ -70,6 +70,9 @@ def run(
     set_: Settings = None,
     out: Annotated[Path | None, _folder("results/<case name>/")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="continue the interrupted run in that folder")] = False,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="replace what is in that folder even if another case file made it")
+    ] = False,
     time_limit: Annotated[
         float | None, typer.Option(min=0, metavar="SECONDS", help="stop after this time; --resume continues")
     ] = None,
@@ -85,13 +88,12 @@ def run(
     from magshell_fenicsx.run.run import run as run_case
 
     folder = out or Path("results") / case.stem
+    how: dict[str, Any] = {"resume": resume, "overwrite": overwrite, "time_limit": time_limit, "pictures": pictures}
     try:
         with exit_codes(MeshError, stopped=(DiskError,)):
             read = Case.load(case, set_ or [])
             with live_line(world().size, print_line) as (say, tell):
-                result = run_case(
-                    read, folder, say=say, tell=tell, resume=resume, time_limit=time_limit, pictures=pictures
-                )
+                result = run_case(read, folder, say=say, tell=tell, **how)
     except AlreadyComplete as e:
         print_line(f"complete already: {e.summary['points']} points; results in {folder}/")
         print_line(sentence_of(folder))
@@ -270,6 +272,10 @@ def check(case: CaseFile, set_: Settings = None) -> None:
         source = read_source(case, set_ or [])
         read = Case.from_source(source)
         print_line(describe(with_modes(read, world())))
+        if read.ensemble:
+            from magshell_fenicsx.studies.ensemble.door import refuse_unknown_keys
+
+            refuse_unknown_keys(source, read.ensemble)
         if read.design:
             from magshell_fenicsx.studies.design.numbers import refuse_unfit_numbers
 

@@ -3,6 +3,7 @@
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Self
 
 from pydantic import PrivateAttr
@@ -28,6 +29,11 @@ class WithOwnTerms(Section):
         """The case, with the places of its keys for messages that it does not make itself."""
         self._origin = Origin(place)
         return self
+
+    @property
+    def file_name(self) -> str:
+        """Name of its case file; empty without one."""
+        return Path(self._origin.place(())).name if self._origin.place else ""
 
     def placed(self, message: str) -> str:
         """A message that begins with a key of the case, with the place of this key before it.

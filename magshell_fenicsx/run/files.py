@@ -40,17 +40,50 @@ class AlreadyComplete(Exception):
         self.summary = summary
 
 
-def open_folder(out: Path, case: Case, comm: MPI.Comm, resume: bool) -> None:
+def open_folder(out: Path, case: Case, comm: MPI.Comm, resume: bool, overwrite: bool = False) -> None:
     """Prepare a folder for a new run, or check that the run in it can be resumed.
+
+    Parameters
+    ----------
+    overwrite
+        Whether a new run may replace that of another case file.
 
     Raises
     ------
     CaseError
-        If the folder cannot be written, or has no run of this case to resume.
+        If the folder cannot be written, has a run of another case file, or no run of this case to resume.
     AlreadyComplete
         If the run to be resumed is complete.
     """
-    prepare_folder(out, comm, lambda folder: (_resumed if resume else _emptied)(folder, case))
+
+    def ready(folder: Path) -> None:
+        if resume:
+            _resumed(folder, case)
+            return
+        if not overwrite:
+            _refuse_other_case(folder, case)
+        _emptied(folder, case)
+
+    prepare_folder(out, comm, ready)
+
+
+def _refuse_other_case(out: Path, case: Case) -> None:
+    """A run replaces one of the same case, and one of the same file with other values."""
+    known = _belongs_to(out, case)
+    name = known.get(checkpoint.FILE)
+    if name and Path(name).stem != Path(case.file_name).stem and not checkpoint.is_of(known, case):
+        raise CaseError(f"--out {out}: has a run of {name}, which is kept; give another folder, or --overwrite")
+
+
+def _belongs_to(out: Path, case: Case) -> dict[str, Any]:
+    """What the run in a folder depends on; empty if there is none, or it is not known."""
+    try:
+        if begun := checkpoint.begun_with(out / checkpoint.NAME):
+            return begun
+        summary = json.loads((out / "summary.json").read_text(encoding="utf-8"))
+        return {key: summary[key] for key in ("case", checkpoint.FILE, *case.outside) if key in summary}
+    except (OSError, ValueError, TypeError):
+        return {}
 
 
 def _emptied(out: Path, case: Case) -> None:

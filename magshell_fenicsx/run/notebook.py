@@ -15,6 +15,7 @@ from magshell_fenicsx.output.pictures.curve import curve_figure
 from magshell_fenicsx.output.pictures.layout import png
 from magshell_fenicsx.output.pictures.picture import PICTURES, figures
 from magshell_fenicsx.output.store.known import pole_of
+from magshell_fenicsx.quantities.registry import axes_of
 from magshell_fenicsx.run.rows import rows
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.scene import Scene
@@ -63,9 +64,23 @@ def picture(
 
 
 def curve(scene: Scene, records: Sequence[Record], amplitude: str | None = None) -> "Figure":
-    """The curve of the path, as in curve.png; by default for the amplitude that varied last."""
+    """The curve of the path, as in curve.png; by default for the amplitude that varied last.
+
+    Raises
+    ------
+    ValueError
+        If nothing has varied, or the scene has no such amplitude.
+    """
+    records = list(records)
+    varied = amplitude or (records[-1].amplitude if records else "")
+    if not varied:
+        raise ValueError("curve: nothing has varied in these records: give those of follow or trace, all of them")
     found, place = rows(scene, records), pole_of({"shell": scene.case.shell.model_dump(mode="json")})
-    return _in_line(curve_figure(found, amplitude or records[-1].amplitude, scene.case.output, place))
+    axes = axes_of(varied, found[0])
+    if not all(axis.name in found[0] for axis in axes):
+        there = ", ".join(dict.fromkeys(record.amplitude for record in records if record.amplitude))
+        raise ValueError(f"curve: {varied}: the scene has no such amplitude; these records vary {there or 'none'}")
+    return _in_line(curve_figure(found, varied, scene.case.output, place))
 
 
 def _smooth(surface: Surface, h: float) -> "pyvista.PolyData":

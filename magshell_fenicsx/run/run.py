@@ -9,6 +9,7 @@ from mpi4py import MPI
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.loads.step import PathStep
+from magshell_fenicsx.case.opened import opened
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.continuation.factor import has_cholmod
 from magshell_fenicsx.continuation.fold import FoldLost
@@ -48,13 +49,14 @@ ROUNDING = 1e-9  # a displacement over h as small as this is printed as zero
 
 
 def run(
-    case: Case,
+    case: Case | str | Path,
     out: Path | str | None = None,
     comm: MPI.Comm = MPI.COMM_WORLD,
     say: Say = lambda line: None,
     *,
     tell: Say | None = None,
     resume: bool = False,
+    overwrite: bool = False,
     time_limit: float | None = None,
     pictures: bool = True,
     terms: Sequence[OwnTerm] = (),
@@ -65,6 +67,8 @@ def run(
 
     Parameters
     ----------
+    case
+        A case, or the path of its file.
     out
         Folder for path.csv, summary.json, fields and pictures; None writes nothing.
     say
@@ -73,6 +77,8 @@ def run(
         Called on rank 0 with a status line, which replaces the one before.
     resume
         Continue the interrupted run in `out`.
+    overwrite
+        Replace what is in `out` even if it is the run of another case file.
     time_limit
         Seconds after which the run stops in the same way.
     pictures
@@ -83,20 +89,22 @@ def run(
     Raises
     ------
     CaseError
-        If building the case finds an error, `out` cannot be written, or it has no run of this case to resume.
+        If building the case finds an error, `out` cannot be written or has a run of another case file, or no run of
+        this case to resume.
     AlreadyComplete
         If the run to be resumed is complete.
     DiskError
         If the disk is full before the first point.
     """
     start = time.perf_counter()
+    case = opened(case)
     case = case.with_terms(terms) if terms else case
     watch = Watch(comm, start, time_limit, signals=out is not None)
     say, tell = (say, tell or _ignored) if comm.rank == 0 else (_ignored, _ignored)
     if out is None:
         return _run(case, None, comm, say, tell, watch, start, pictures)
     with held_folder(Path(out), comm, make=not resume):
-        open_folder(Path(out), case, comm, resume)
+        open_folder(Path(out), case, comm, resume, overwrite)
         return _run(case, Path(out), comm, say, tell, watch, start, pictures)
 
 

@@ -11,6 +11,7 @@ from magshell_fenicsx.case.surfaces import Surface
 from magshell_fenicsx.continuation.system import State, dot
 from magshell_fenicsx.continuation.timing import Stopwatch
 from magshell_fenicsx.models.modes import ShellMode
+from magshell_fenicsx.output.store.checkpoint import FILE
 from magshell_fenicsx.output.store.table import LOCATED, Row
 from magshell_fenicsx.platform import sources
 from magshell_fenicsx.platform.environment import fast_blas, versions
@@ -127,6 +128,7 @@ def summary(result: Result, total_s: float) -> dict[str, Any]:
     R_over_h = 1 / material.h
     return {
         "case": (result.adapted.asked if result.adapted else scene.case).model_dump(mode="json", exclude_none=True),
+        FILE: scene.case.file_name,
         **scene.case.outside,
         "sources": sources.ours(),
         "dimensionless": {

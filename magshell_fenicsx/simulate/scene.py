@@ -5,6 +5,7 @@ from collections import defaultdict
 from collections.abc import Sequence
 from functools import cached_property
 from math import copysign, nan
+from pathlib import Path
 
 import numpy as np
 from mpi4py import MPI
@@ -14,6 +15,7 @@ from magshell_fenicsx.assembly.terms import factor_of
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.imperfections.modes import ModesSection
 from magshell_fenicsx.case.loads.time import TimeSection
+from magshell_fenicsx.case.opened import opened
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.case.units import sizes_of
 from magshell_fenicsx.continuation.journal import Journal, NoJournal
@@ -52,6 +54,8 @@ class Scene:
 
     Parameters
     ----------
+    case
+        A case, or the path of its file.
     plan
         The plan of the case; by default `make_plan` makes it.
     terms
@@ -70,13 +74,14 @@ class Scene:
 
     def __init__(
         self,
-        case: Case,
+        case: Case | str | Path,
         comm: MPI.Comm = MPI.COMM_WORLD,
         plan: Plan | None = None,
         *,
         terms: Sequence[OwnTerm] = (),
     ) -> None:
         start = time.perf_counter()
+        case = opened(case)
         if any(isinstance(s, ModesSection) and not (s.file or s.shapes) for s in case.imperfections.values()):
             raise CaseError(
                 "shell.imperfections: kind: modes: compute them first, by simulate.perfect.with_modes(case, comm)"

@@ -11,6 +11,7 @@ from magshell_fenicsx.continuation.control import GivenLoad
 from magshell_fenicsx.continuation.path import SEEN, Control, Quantity, StepOptions
 from magshell_fenicsx.continuation.system import State, max_abs
 from magshell_fenicsx.continuation.walk import MOST_STEPS, Goal, Until
+from magshell_fenicsx.simulate.goals import Amount, goals
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.stage import plain
@@ -24,9 +25,9 @@ def trace(
     *,
     control: Control = "arc",
     until: Until = "limit",
-    targets: Sequence[float] = (),
+    targets: Sequence[Amount] | Amount = (),
     quantity: Quantity = "load",
-    first: float | None = None,
+    first: Amount | None = None,
     steps: int = MOST_STEPS,
 ) -> Iterator[Record]:
     """Follow the equilibria of a scene while one amplitude varies and the others are constant.
@@ -48,7 +49,9 @@ def trace(
         The end of the path, see `Goal`: "limit" at the first instability or the last target, "bifurcation",
         "target" at the last target, "points" after `steps` steps.
     targets
-        Values to be reached by the prescribed quantity or, with arc length, by `quantity`.
+        Values to be reached by the prescribed quantity or, with arc length, by `quantity`: numbers, or text with a unit
+        such as "100 Pa" where the case has units; -Pi_i(u) is then the change of volume ("-80 mm^3"), or the
+        displacement of a force ("2 mm").
     quantity
         "load": the amplitude; "conjugate": -Pi_i(u). Only with arc length.
     first
@@ -60,7 +63,8 @@ def trace(
     Raises
     ------
     ValueError
-        If the scene has no such amplitude, or the length of the first step is unknown.
+        If the scene has no such amplitude, a target has a unit that the case or the amplitude has not, or the length of
+        the first step is unknown.
     Stopped
         If the path is lost, or there is no equilibrium to start from.
     """
@@ -69,6 +73,8 @@ def trace(
     if name not in state.mu:
         raise ValueError(f"trace: {name}: the scene has no such amplitude, only {', '.join(state.mu) or 'none'}")
     of_load = control == "load" or (control == "arc" and quantity == "load")
+    targets = goals(scene, name, "targets", targets, of_load=of_load)
+    first = None if first is None else goals(scene, name, "first", first, of_load=True)[0]
     if until == "target" and not targets:
         raise ValueError("trace: until='target' needs targets")
     if first is None and targets and of_load:

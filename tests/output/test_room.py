@@ -2,18 +2,23 @@
 
 import numpy as np
 import pytest
+from conftest import CASES
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.output import OutputSection
+from magshell_fenicsx.output.fields.outlines import outlines
 from magshell_fenicsx.output.fields.surface import Surface
+from magshell_fenicsx.output.pictures.camera import deflected_place, run_camera, towards
 from magshell_fenicsx.output.pictures.colours import contact_region, moments
 from magshell_fenicsx.output.pictures.layout import Arrow, Panel
 from magshell_fenicsx.output.pictures.numbers import write_numbers
-from magshell_fenicsx.output.pictures.picture import figures
+from magshell_fenicsx.output.pictures.picture import far_said, figures
 from magshell_fenicsx.output.pictures.sources import near_outlines
 from magshell_fenicsx.output.pictures.view import Camera, Window
+from magshell_fenicsx.plan.planner import make_plan
 
 Array = NDArray[np.float64]
 ABOVE = Camera(np.array([0.0, -1e-6, 1.0]))
@@ -58,6 +63,22 @@ def test_a_source_is_drawn_whole_or_not_at_all() -> None:
         Surface(*(vars(surface)[k] for k in ("r0", "u", "n0", "cells", "fields")), (near, far, joining, ring))
     )
     assert [line is ring for line in drawn] == [True]
+
+
+@pytest.mark.parametrize(("farther", "drawn"), [(0.0, True), (1.0, False)])
+def test_a_magnet_beside_a_strip(farther: float, drawn: bool) -> None:
+    """That of the case: drawn, with a camera for which the shell fills more of the picture than for the usual one."""
+    flat = grid(9)
+    r0 = np.column_stack([(flat.r0[:, 0] + 1) / 2, flat.r0[:, 1] / 12, flat.r0[:, 2]])
+    lift = 0.18 * r0[:, :1] ** 2 * [0, 0, 1]
+    lines = outlines(make_plan(Case.load(CASES / "magnet_past_strip.yaml")).loads, {"source": 0.0}, 0.0)
+    lines = tuple(line + np.array([farther, 0, 0]) for line in lines)
+    surface = Surface(r0, lift, flat.n0, flat.cells, {}, lines)
+    assert len(near_outlines(surface)) == (len(lines) if drawn else 0)
+    assert bool(far_said(surface)) != drawn
+    usual = towards(deflected_place(surface))
+    camera = run_camera(surface, OutputSection())
+    assert np.allclose(camera.direction, usual) != drawn
 
 
 @pytest.mark.parametrize(("radius", "alone"), [(0.1, True), (0.6, False)])

@@ -224,6 +224,28 @@ def test_bad_input(settings: list[str], options: dict[str, Any], message: str, t
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize(
+    ("keys", "said"),
+    [
+        ("{mesh.degre: 3, shell.poisson_ratio: 0.4}", "mesh.degre: unknown key; did you mean degree?"),
+        ("{mesg.degree: 3}", "mesg.degree: mesg: unknown key; did you mean mesh?"),
+        ("{shell.imperfections.0.amplitude: 1}", "shell.imperfections.0.amplitude: shell.imperfections: must be a"),
+        ("{shell.poisson_ratio.x: 1}", "shell.poisson_ratio.x: poisson_ratio is a value, not a section"),
+    ],
+)
+def test_keys_that_no_case_has(keys: str, said: str, tmp_path: Path) -> None:
+    """Found by `check` too, with the line of the distribution; a number out of bounds is a matter of the draw."""
+    file = tmp_path / "random.yaml"
+    file.write_text(f"{DIMPLE.read_text(encoding='utf-8')}ensemble:\n  keys: {keys}\n", encoding="utf-8")
+    line = len(file.read_text(encoding="utf-8").splitlines())
+    for command in (["check", file], ["ensemble", file, "--samples", "2", "--seed", "1", "--out", tmp_path / "out"]):
+        done = magshell(*command)
+        assert done.returncode == 2
+        assert f"{file}:{line}: ensemble.keys: {said}" in done.stderr
+        assert "in sample" not in done.stderr
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.slow
 def test_random_dimples(tmp_path: Path) -> None:
     """The case's mesh against one with elements half as large (0.350848)."""

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.output.fields.surface import Surface
 
 Array = NDArray[np.float64]
-FAR = 2.0  # of the shell's extent, from its middle: sources farther away are not drawn
+FAR = 2.5  # of the shell's extent, from its middle: sources farther away are not drawn
 SAME = 1e-3  # of that reach: lines as near as this meet
 
 

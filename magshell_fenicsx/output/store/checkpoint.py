@@ -24,11 +24,12 @@ from magshell_fenicsx.output.store.ordering import Array, Ordering
 from magshell_fenicsx.platform import sources
 
 NAME = "checkpoint"
+FILE = "case_file"  # key with the name of the case file, which changes no result
 
 
 def begin_checkpoint(file: Path, case: Case) -> None:
     """Write an empty checkpoint."""
-    write_whole(file, framed(json.dumps(identity(case)).encode()))
+    write_whole(file, framed(json.dumps({**identity(case), FILE: case.file_name}).encode()))
 
 
 def check_resumable(file: Path, case: Case) -> None:
@@ -75,8 +76,8 @@ def refuse_other(saved: dict[str, Any], case: Case, folder: Path) -> None:
     """
     now, saved = _solved(identity(case)), _solved(saved)
     there, here = saved.get("sources", saved.get("version")), now["sources"]
-    known = {key: value for key, value in saved.items() if key not in ("sources", "version")}
-    if known != {key: value for key, value in now.items() if key != "sources"}:
+    known = _of_case(saved)
+    if known != _of_case(now):
         raise CaseError(f"--resume: {folder} belongs to another run: {_difference(known, now)}; run without --resume")
     if there != here:
         raise OtherSources(
@@ -85,10 +86,20 @@ def refuse_other(saved: dict[str, Any], case: Case, folder: Path) -> None:
         )
 
 
+def is_of(saved: dict[str, Any], case: Case) -> bool:
+    """Whether saved results belong to this case, by whatever sources."""
+    return _of_case(_solved(saved)) == _of_case(_solved(identity(case)))
+
+
+def _of_case(data: dict[str, Any]) -> dict[str, Any]:
+    """Without the program."""
+    return {key: value for key, value in data.items() if key not in ("sources", "version")}
+
+
 def _solved(data: dict[str, Any]) -> dict[str, Any]:
-    """Without how pictures look, which changes no result."""
-    case = data.get("case") or {}
-    return {**data, "case": {key: value for key, value in case.items() if key != "output"}}
+    """Without the name of the file and how pictures look, which change no result."""
+    case = {key: value for key, value in (data.get("case") or {}).items() if key != "output"}
+    return {**{key: value for key, value in data.items() if key != FILE}, "case": case}
 
 
 class Checkpoint:

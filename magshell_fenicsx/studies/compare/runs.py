@@ -71,7 +71,7 @@ def run_model(
             why = "the folder has results of other sources of magshell_fenicsx"
             say(f"{model} at refinement {refinement:g}: computed again, {why}")
         sets = [part for setting in chosen for part in ("--set", setting)]
-        measured = measure("magshell_fenicsx", ["run", str(case), *sets, "--out", str(folder)])
+        measured = measure("magshell_fenicsx", ["run", str(case), *sets, "--out", str(folder), "--overwrite"])
         if not (folder / "summary.json").exists() or measured.code not in (0, 3):
             errors = measured.errors.strip().splitlines()
             raise NothingLeft(f"model: {model}: {errors[-1] if errors else f'exit code {measured.code}'}")

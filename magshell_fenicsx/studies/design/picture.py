@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from magshell_fenicsx.quantities.quantity import IN_UNITS
+from magshell_fenicsx.quantities.registry import quantity
 from magshell_fenicsx.studies.design.between import Between
 from magshell_fenicsx.studies.design.variables import Variables
 
@@ -17,6 +19,7 @@ TITLES = {
     "curvature": r"natural curvature $\kappa R$",
     "deviation": "deviation $w_0/h$",
 }
+SHOWN = {"Hz", *(unit for endings in IN_UNITS.values() for _, unit in endings)}  # on axes
 MARGINS = (-0.03, 0.03)  # beyond the bounds
 
 
@@ -24,23 +27,17 @@ def draw_design(rows: Sequence[dict[str, Any]], results: Sequence[str], vary: Va
     """Write the picture."""
     from matplotlib.figure import Figure
 
+    units = dict.fromkeys(map(_unit, results))
     panels = 1 + (vary.controls is not None) + len(vary.fields)
-    figure = Figure(figsize=(4.6 * panels, 3.8), dpi=160, layout="constrained")
-    history, *others = figure.subplots(1, panels, squeeze=False)[0]
-    number = np.array([row["evaluation"] for row in rows])
-    for result in results:
-        values = np.array([np.nan if row[result] is None else row[result] for row in rows], dtype=float)
-        name = _name(result)
-        (line,) = history.plot(number, values, "-", linewidth=0.8, label=name)
-        best = np.array([row["best"] for row in rows], dtype=bool)
-        history.plot(number[best], values[best], "o", markersize=3, color=line.get_color())
-        if result == "shape":
-            history.set_yscale("log")
-    history.set(xlabel="evaluation (dots: the best so far)")
-    if len(results) == 1:
-        history.set_ylabel(name)
-    else:
-        history.legend(frameon=False, fontsize=8)
+    figure = Figure(figsize=(4.6 * panels, max(3.8, 2.2 * len(units))), dpi=160, layout="constrained")
+    grid = figure.add_gridspec(len(units), panels)
+    above: Any = None
+    for i, unit in enumerate(units):
+        above = figure.add_subplot(grid[i, 0], sharex=above)
+        _draw_history(above, rows, [result for result in results if _unit(result) == unit], unit)
+        above.tick_params(labelbottom=i == len(units) - 1)
+    above.set_xlabel("evaluation (dots: the best so far)")
+    others = [figure.add_subplot(grid[:, i]) for i in range(1, panels)]
     if vary.controls is not None:
         places, vectors = vary.controls.places, vary.vectors(x)
         names = (r"\rho", "z") if vary.controls.around else ("x", "y", "z")
@@ -59,20 +56,63 @@ def draw_design(rows: Sequence[dict[str, Any]], results: Sequence[str], vary: Va
     figure.savefig(file)
 
 
-def _name(result: str) -> str:
-    """A result in words or symbols.
+def _draw_history(axes: Any, rows: Sequence[dict[str, Any]], results: Sequence[str], unit: str) -> None:
+    """Results of one unit over the evaluations."""
+    number, best = (
+        np.array([row[key] for row in rows], dtype=kind) for key, kind in (("evaluation", int), ("best", bool))
+    )
+    for result in results:
+        values = np.array([np.nan if row[result] is None else row[result] for row in rows], dtype=float)
+        (line,) = axes.plot(number, values, "-", linewidth=0.8, label=_name(result))
+        axes.plot(number[best], values[best], "o", markersize=3, color=line.get_color())
+        if result == "shape":
+            axes.set_yscale("log")
+    shown = unit if unit in SHOWN else ""
+    axes.set_ylabel(_name(results[0]) + (f"  ({shown})" if shown else "") if len(results) == 1 else shown)
+    if len(results) > 1:
+        axes.legend(frameon=False, fontsize=8)
+
+
+def _unit(result: str) -> str:
+    """The unit of a result: equal where one axis may show both.
 
     Examples
     --------
-    >>> _name("tip_fz"), _name("omega2_1"), _name("hertz_2"), _name("knockdown")
-    ('tip $f_z$', '$\\\\omega_{1}^2 \\\\rho R^2/E$', 'frequency 2 (Hz)', 'knockdown')
+    >>> [_unit(name) for name in ("buckling_pressure_Pa", "tip_uz_mm", "w_mm", "knockdown", "w_over_h", "hertz_2")]
+    ['Pa', 'mm', 'mm', 'load', 'h', 'Hz']
+    """
+    if found := re.fullmatch(r"(omega2|hertz)_\d+", result):
+        return {"omega2": "omega2", "hertz": "Hz"}[found[1]]
+    if given := _in_units(result):
+        return given[1]
+    own = {"critical_field": quantity("lambda_m").scale, "barrier": quantity("energy").scale, "shape": "shape"}
+    return own.get(result) or quantity(result).scale
+
+
+def _in_units(result: str) -> tuple[str, str] | None:
+    """The name of a result in a unit without its ending, and the unit; the longest ending first: N_m before m."""
+    endings = {ending: unit for each in IN_UNITS.values() for ending, unit in each}
+    for ending in sorted(endings, key=len, reverse=True):
+        if result.endswith(f"_{ending}"):
+            return result.removesuffix(f"_{ending}"), endings[ending]
+    return None
+
+
+def _name(result: str) -> str:
+    """A result in words or symbols, without its unit.
+
+    Examples
+    --------
+    >>> _name("tip_fz"), _name("omega2_1"), _name("hertz_2"), _name("knockdown"), _name("tip_uz_mm")
+    ('tip $f_z$', '$\\\\omega_{1}^2 \\\\rho R^2/E$', 'frequency 2', 'knockdown', 'tip $u_z$')
     """
     if result == "shape":
         return "mean square distance over $R^2$"
     if found := re.fullmatch(r"omega2_(\d+)", result):
         return rf"$\omega_{{{found[1]}}}^2 \rho R^2/E$"
     if found := re.fullmatch(r"hertz_(\d+)", result):
-        return f"frequency {found[1]} (Hz)"
+        return f"frequency {found[1]}"
+    result = given[0] if (given := _in_units(result)) else result
     if found := re.fullmatch(r"(.+)_([fu])([xyz])", result):
         return f"{found[1].replace('_', ' ')} ${found[2]}_{found[3]}$"
     return result.replace("_", " ")

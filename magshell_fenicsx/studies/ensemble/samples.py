@@ -9,6 +9,7 @@ from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.chance.places import NoRoom
 from magshell_fenicsx.case.source import CaseError, Source, override
 from magshell_fenicsx.plan.planner import make_plan
+from magshell_fenicsx.studies.ensemble.door import in_the_file, refuse_unknown_keys
 from magshell_fenicsx.studies.sweep.points import identity
 
 Values = dict[str, Any]
@@ -55,15 +56,15 @@ def make_samples(source: Source, seed: int, numbers: Sequence[int], deleted: int
     section = Case.from_source(source).ensemble
     if section is None:
         raise CaseError(f"{source.name}: ensemble: is missing: it says which keys are random")
+    refuse_unknown_keys(source, section)
     made = []
     for number in numbers:
+        drawn = dict[str, str]()
         try:
             drawn = section.settings(seed, number)
             made.append(_sample(source, number, drawn, deleted))
         except (CaseError, NoRoom) as e:
-            message = str(e)
-            for key in section.keys:
-                message = message.replace(f"--set {key}=", f"{source.name}: ensemble.keys: {key}=")
+            message = in_the_file(str(e), source, {key: text for key, text in drawn.items() if key in section.keys})
             raise CaseError(f"{message}\nin sample {number} of seed {seed}; bounds keep a distribution in") from None
     return made
 

@@ -1,0 +1,81 @@
+"""What programs give to the package: paths in place of cases, numbers with units, and mistakes."""
+
+from typing import Any
+
+import pytest
+from conftest import CASES
+
+import magshell_fenicsx as ms
+
+FILE = CASES / "dimple_buckling.yaml"
+UNITS = [
+    "shell={geometry: hemisphere, radius: 25.2 mm, thickness: 0.28 mm, youngs_modulus: 1.8 MPa, poisson_ratio: 0.5, "
+    "defect: {kind: dimple, amplitude: 1.64, width: 3.2}}"
+]
+
+
+@pytest.fixture(scope="module")
+def plain() -> ms.Scene:
+    return ms.Scene(ms.Case.load(FILE))
+
+
+@pytest.fixture(scope="module")
+def with_units() -> ms.Scene:
+    return ms.Scene(ms.Case.load(FILE, UNITS))
+
+
+def test_the_path_of_a_case(plain: ms.Scene) -> None:
+    assert ms.Scene(str(FILE)).case.model_dump() == plain.case.model_dump()
+    assert ms.run(FILE).knockdown == pytest.approx(0.32623, rel=1e-4)
+    with pytest.raises(ms.CaseError, match=r"nowhere\.yaml: cannot be read"):
+        ms.Scene("nowhere.yaml")
+    with pytest.raises(ms.CaseError, match="give a Case or the path of a case file, not a dict"):
+        ms.run({"shell": 1})  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("target", "more", "column", "value"),
+    [
+        ("20 Pa", {}, "pressure_Pa", 20),
+        ("-80 mm^3", {"control": "conjugate", "first": "5 Pa"}, "volume_change_mm3", -80),
+        (0.05, {}, "p_over_pc", 0.05),
+    ],
+)
+def test_targets_with_units(
+    with_units: ms.Scene, target: float | str, more: dict[str, Any], column: str, value: float
+) -> None:
+    for targets in (target, [target]):
+        records = list(ms.trace(with_units, "pressure", targets=targets, **more))
+        assert ms.columns(with_units, records)[column][-1] == pytest.approx(value, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        ({"targets": ["20 mT"]}, "targets: '20 mT': is not convertible to pascal"),
+        ({"targets": ["many"]}, "targets: 'many': is not a number with a unit"),
+        ({"targets": [None]}, "targets: None: must be a number, or text with a unit"),
+        ({"targets": [0.1], "first": "1 mm"}, "first: '1 mm': is not convertible to pascal"),
+    ],
+)
+def test_mistaken_targets(with_units: ms.Scene, more: dict[str, Any], said: str) -> None:
+    with pytest.raises(ValueError, match=f"trace: {said}"):
+        next(ms.trace(with_units, "pressure", **more))
+
+
+def test_units_that_the_case_has_not(plain: ms.Scene) -> None:
+    with pytest.raises(ValueError, match=r"trace: targets: '20 Pa': has a unit: that needs youngs_modulus"):
+        next(ms.trace(plain, "pressure", targets=["20 Pa"]))
+    own = ms.Scene(FILE, terms=[ms.OwnTerm("foundation", lambda r0, u: u.r[2] ** 2)])
+    with pytest.raises(ValueError, match="trace: targets: '20 Pa': foundation has no unit here: give a number"):
+        next(ms.trace(own, "foundation", targets=["20 Pa"]))
+
+
+def test_curves_of_nothing(plain: ms.Scene) -> None:
+    records = list(ms.trace(plain, "pressure", targets=[0.1]))
+    for none in ([], records[:1]):
+        with pytest.raises(ValueError, match="curve: nothing has varied in these records"):
+            ms.curve(plain, none)
+    with pytest.raises(ValueError, match="curve: lambda: the scene has no such amplitude; these records vary pressure"):
+        ms.curve(plain, records, "lambda")
+    assert ms.curve(plain, records).axes
