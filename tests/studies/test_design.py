@@ -214,7 +214,15 @@ def test_a_target_out_of_reach(strip: Callable[[str], Path], tmp_path: Path) -> 
         ),
         (
             "design: {objective: {minimise: sideways}, remanence: {points: 3}}",
-            "design.objective: sideways: has no gradient here; allowed",
+            "design.objective.minimise: sideways: has no gradient here; allowed",
+        ),
+        (
+            "design: {objective: {maximise: [tip_uz, sideways]}, remanence: {points: 3}}",
+            "strip.yaml:8: design.objective.maximise: sideways: has no gradient here; allowed are knockdown, ",
+        ),
+        (
+            "design: {objective: {maximise: tip_uz}, remanence: {points: 3}, constraints: [{of: mass, same_as: side}]}",
+            "design.constraints.0.same_as: side: has no gradient here; allowed",
         ),
     ],
 )
