@@ -241,6 +241,12 @@ def test_strip_that_becomes_half_a_circle(tmp_path: Path) -> None:
     assert content["verified"]["largest_distance"] < 0.01
 
 
+def test_a_mesh_from_a_file_is_said(tmp_path: Path) -> None:
+    wanted = "design={objective: {maximise: tip_uz}, numbers: {shell.poisson_ratio: [0, 0.3]}, iterations: 1}"
+    done = magshell("design", CASES / "bracket.yaml", "--set", wanted, "--out", tmp_path)
+    assert "verified (on the mesh of the file): tip_uz = -0.0001" in done.stdout
+
+
 @pytest.mark.slow
 def test_hemisphere_that_buckles_late(tmp_path: Path) -> None:
     """1.3 times the knockdown factor of the uniform remanence of the same magnitude; waves are looked at too."""
