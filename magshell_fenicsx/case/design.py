@@ -34,6 +34,7 @@ class ShapeSection(Section):
         return self
 
 
+WANTED = ("maximise", "minimise", "reach", "shape")
 Results = Annotated[
     Annotated[str, Tag("one")] | Annotated[list[str], Tag("several"), Field(min_length=1)],
     Discriminator(lambda data: "several" if isinstance(data, list) else "one"),
@@ -59,7 +60,7 @@ class ObjectiveSection(Section):
 
     @model_validator(mode="after")
     def _one_of_them(self) -> Self:
-        given = [key for key in ("maximise", "minimise", "reach", "shape") if getattr(self, key) is not None]
+        given = [key for key in WANTED if getattr(self, key) is not None]
         if len(given) != 1:
             raise ValueError(f"give one of maximise, minimise, reach and shape, here {', '.join(given) or 'none'}")
         if (self.reach is None) != (self.value is None):
@@ -96,6 +97,11 @@ class LimitSection(Section):
         if self.least is None and self.most is None and self.same_as is None:
             raise ValueError(f"of: {self.of}: give least, most, both, or same_as")
         return self
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The results that it limits."""
+        return (self.of, self.same_as) if self.same_as else (self.of,)
 
 
 class RemanenceVariables(Section):
@@ -201,8 +207,17 @@ class DesignSection(Section):
         found = {"thickness": self.thickness, "curvature": self.curvature, "deviation": self.deviation}
         return {name: section for name, section in found.items() if section}
 
+    def key_of(self, result: str) -> str:
+        """The first key below `design` that names a result."""
+        if result in self.objective.results:
+            return next(f"objective.{key}" for key in WANTED if getattr(self.objective, key) is not None)
+        named = ((f"constraints.{i}", limit) for i, limit in enumerate(self.constraints))
+        return next(
+            f"{key}.{'of' if limit.of == result else 'same_as'}" for key, limit in named if result in limit.names
+        )
+
     @property
     def results(self) -> list[str]:
         """All that are computed: that of the objective first."""
-        limited = (name for limit in self.constraints for name in (limit.of, limit.same_as) if name)
+        limited = (name for limit in self.constraints for name in limit.names)
         return list(dict.fromkeys([*self.objective.results, *limited]))

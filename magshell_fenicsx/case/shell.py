@@ -1,13 +1,14 @@
 """The shell: geometry, thickness, material, defect."""
 
-from typing import Literal, Self
+from typing import Any, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import Field, ModelWrapValidatorHandler, ValidationInfo, model_validator
 
 from magshell_fenicsx.case.expressions import Formula
 from magshell_fenicsx.case.history import Time
 from magshell_fenicsx.case.imperfections.dimple import DimpleSection
 from magshell_fenicsx.case.imperfections.registered import Imperfections
+from magshell_fenicsx.case.imperfections.sized import note_sizes
 from magshell_fenicsx.case.viscosity import Branches
 from magshell_fenicsx.parts.section import Density, Length, Pressure, Section
 
@@ -46,6 +47,14 @@ class ShellSection(Section):
     """Deviations of the mid-surface along its normal, added up"""
     width: float | None = Field(default=None, gt=0, le=10)
     """Of a strip, which must have one [length of the strip]"""
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _imperfections_with_units(
+        cls, data: Any, handler: ModelWrapValidatorHandler[Self], info: ValidationInfo
+    ) -> Self:
+        note_sizes(data, handler, info, with_units=isinstance(data, dict) and data.get("thickness") is not None)
+        return handler(data)
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:

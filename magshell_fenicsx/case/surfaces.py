@@ -10,12 +10,13 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from pydantic import BeforeValidator, Field, ModelWrapValidatorHandler, PrivateAttr, model_validator
+from pydantic import BeforeValidator, Field, ModelWrapValidatorHandler, PrivateAttr, ValidationInfo, model_validator
 
 from magshell_fenicsx.case.expressions import Formula, formula
 from magshell_fenicsx.case.history import Time
 from magshell_fenicsx.case.imperfections.dimple import DimpleSection
 from magshell_fenicsx.case.imperfections.registered import Imperfections
+from magshell_fenicsx.case.imperfections.sized import note_sizes
 from magshell_fenicsx.case.viscosity import Branches
 from magshell_fenicsx.parts.section import Section, in_units, or_number, texts
 
@@ -52,7 +53,7 @@ class SurfaceSection(Section):
 
     @model_validator(mode="wrap")
     @classmethod
-    def _all_with_units_or_none(cls, data: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
+    def _all_with_units_or_none(cls, data: Any, handler: ModelWrapValidatorHandler[Self], info: ValidationInfo) -> Self:
         written = {key: data[key] for key in MEASURES if key in data} if isinstance(data, dict) else {}
         measured = {key: value for key, value in written.items() if isinstance(value, str | int | float)}
         kinds = {isinstance(value, str) for value in measured.values()}
@@ -62,6 +63,7 @@ class SurfaceSection(Section):
             raise ValueError(
                 f"give every length and youngs_modulus a unit, or none of them: {', '.join(bare)} has none"
             )
+        note_sizes(data, handler, info, with_units=kinds == {True})
         section = handler(data)
         modulus = section.youngs_modulus
         if kinds == {True} and modulus is not None and not 1 <= modulus <= 1e13:

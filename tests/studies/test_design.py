@@ -214,7 +214,15 @@ def test_a_target_out_of_reach(strip: Callable[[str], Path], tmp_path: Path) -> 
         ),
         (
             "design: {objective: {minimise: sideways}, remanence: {points: 3}}",
-            "design.objective: sideways: has no gradient here; allowed",
+            "design.objective.minimise: sideways: has no gradient here; allowed",
+        ),
+        (
+            "design: {objective: {maximise: [tip_uz, sideways]}, remanence: {points: 3}}",
+            "strip.yaml:8: design.objective.maximise: sideways: has no gradient here; allowed are knockdown, ",
+        ),
+        (
+            "design: {objective: {maximise: tip_uz}, remanence: {points: 3}, constraints: [{of: mass, same_as: side}]}",
+            "design.constraints.0.same_as: side: has no gradient here; allowed",
         ),
     ],
 )
@@ -231,6 +239,12 @@ def test_strip_that_becomes_half_a_circle(tmp_path: Path) -> None:
     content = design(CASES / "designed_strip.yaml", coarse, tmp_path)
     assert content["best"]["largest_distance"] < 0.01
     assert content["verified"]["largest_distance"] < 0.01
+
+
+def test_a_mesh_from_a_file_is_said(tmp_path: Path) -> None:
+    wanted = "design={objective: {maximise: tip_uz}, numbers: {shell.poisson_ratio: [0, 0.3]}, iterations: 1}"
+    done = magshell("design", CASES / "bracket.yaml", "--set", wanted, "--out", tmp_path)
+    assert "verified (on the mesh of the file): tip_uz = -0.0001" in done.stdout
 
 
 @pytest.mark.slow

@@ -1,11 +1,12 @@
 """A measured imperfection."""
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import Field
 
 from magshell_fenicsx.case.file import FileKeys
 from magshell_fenicsx.case.imperfections.place import ImperfectionSection
+from magshell_fenicsx.case.imperfections.sized import over
 
 
 class DataSection(FileKeys, ImperfectionSection):
@@ -21,7 +22,7 @@ class DataSection(FileKeys, ImperfectionSection):
     """CSV with a header or .npz, its path from the folder of the case"""
     amplitude: float = Field(default=1.0, ge=-1e3, le=1e3)
     """Factor of w0"""
-    noise: float | None = Field(default=None, ge=0, le=50)
+    noise: Annotated[float, over("h")] | None = Field(default=None, ge=0, le=50)
     """Standard deviation of the noise in w0; 0: w0 is exact; estimated by default [h]"""
 
     def account(self) -> str:

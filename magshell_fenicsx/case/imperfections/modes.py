@@ -9,6 +9,7 @@ from pydantic import Field, PrivateAttr, model_validator
 
 from magshell_fenicsx.case.file import FileKeys
 from magshell_fenicsx.case.imperfections.place import ImperfectionSection
+from magshell_fenicsx.case.imperfections.sized import over
 
 Shape = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
@@ -21,7 +22,7 @@ class ModesSection(FileKeys, ImperfectionSection):
     """
 
     kind: Literal["modes"]
-    amplitudes: Annotated[list[Annotated[float, Field(ge=-50, le=50)]], Field(min_length=1, max_length=20)]
+    amplitudes: Annotated[list[Annotated[float, over("h"), Field(ge=-50, le=50)]], Field(min_length=1, max_length=20)]
     """Largest w0 of each mode, the lowest mode first; positive: inwards where the mode is largest [h]"""
     file: str | None = None
     """A mode file of a run (fields/mode_*.vtu), its path from the folder of the case, in place of computed modes"""

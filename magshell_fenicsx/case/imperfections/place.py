@@ -1,11 +1,11 @@
 """Where a local imperfection is, and what all imperfections have in common."""
 
-from math import sqrt
 from typing import Annotated, Any, Self
 
 from pydantic import Field, model_validator
 
 from magshell_fenicsx.case.direction import Direction
+from magshell_fenicsx.case.imperfections.sized import half_width, over
 from magshell_fenicsx.parts.section import Section, or_number, texts
 
 Coordinates = Annotated[list[Annotated[float, or_number("metre")]], Field(min_length=3, max_length=3)]
@@ -51,10 +51,10 @@ class ImperfectionSection(Section):
 class LocalSection(ImperfectionSection):
     """Base of those around a place."""
 
-    amplitude: float = Field(ge=-50, le=50)
+    amplitude: Annotated[float, over("h")] = Field(ge=-50, le=50)
     """Depth δ, inwards; a bump is negative [h]"""
-    width: float = Field(ge=0.05, le=50)
-    """Half-width φo of a dimple, φg of a Gaussian one, times (√(12(1 - ν²)) R/h)^(1/2)"""
+    width: Annotated[float, over("width")] = Field(ge=0.05, le=50)
+    """Half-width φo of a dimple, φg of a Gaussian one, times (√(12(1 - ν²)) R/h)^(1/2); with a unit R φo, R φg"""
     at: At = At.model_construct()
     """Its centre"""
 
@@ -72,8 +72,3 @@ def places_with_units(shell: dict[str, Any]) -> list[str]:
     items = shell.get("imperfections") or []
     points = {i: item["at"].get("point") for i, item in enumerate(items) if "at" in item}
     return [f"shell.imperfections.{i}.at.point" for i, point in points.items() if [*texts(point)]]
-
-
-def half_width(width: float, R_over_h: float, nu: float) -> float:
-    """Width of an imperfection over R (rad), from the width over (h R)^(1/2)/(12 (1 - nu^2))^(1/4)."""
-    return width / sqrt(sqrt(12 * (1 - nu**2)) * R_over_h)

@@ -2,14 +2,15 @@
 
 from collections.abc import Mapping
 from functools import cached_property
-from typing import Literal, Self
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import Field, TypeAdapter, model_validator
+from pydantic import Field, PrivateAttr, ValidationError, ValidationInfo, model_validator
 
 from magshell_fenicsx.case.ensemble import DefectsSection, generator
 from magshell_fenicsx.case.imperfections.dimple import DimpleSection
 from magshell_fenicsx.case.imperfections.gaussian import GaussianSection
-from magshell_fenicsx.case.imperfections.place import ImperfectionSection, half_width
+from magshell_fenicsx.case.imperfections.place import ImperfectionSection
+from magshell_fenicsx.case.imperfections.sized import half_width, over, sizes_noted
 
 
 class RandomSection(ImperfectionSection):
@@ -22,18 +23,21 @@ class RandomSection(ImperfectionSection):
     kind: Literal["random"]
     seed: int = Field(ge=0, le=2**63 - 1)
     """Chooses one of the random shapes"""
-    amplitude: float | None = Field(default=None, ge=-50, le=50)
+    amplitude: Annotated[float, over("h")] | None = Field(default=None, ge=-50, le=50)
     """Standard deviation δ of the field [h]"""
-    length: float | None = Field(default=None, ge=0.05, le=1e3)
+    length: Annotated[float, over("width")] | None = Field(default=None, ge=0.05, le=1e3)
     """Length of correlation ℓ of the field, in the unit of a dimple's width"""
     dimples: DefectsSection | None = None
     """Random dimples, in place of amplitude and length; on spheres"""
 
+    _sizes: Mapping[str, Any] = PrivateAttr(default={})
+
     @model_validator(mode="after")
-    def _one_way(self) -> Self:
+    def _one_way(self, info: ValidationInfo) -> Self:
         if (self.amplitude is None) != (self.length is None) or (self.amplitude is None) == (self.dimples is None):
             raise ValueError("give amplitude and length of a random field, or dimples")
         if self.dimples:
+            self._sizes = sizes_noted(info)
             _ = self.drawn  # refuses what has no room
         return self
 
@@ -51,5 +55,10 @@ class RandomSection(ImperfectionSection):
         if self.dimples is None:
             return {}
         items = self.dimples.draw(generator(self.seed, 0, "shell.imperfections"))
-        kind: TypeAdapter[DimpleSection | GaussianSection] = TypeAdapter(DimpleSection | GaussianSection)
-        return {f"dimples.{i}": kind.validate_python(item) for i, item in enumerate(items)}
+        kind = DimpleSection if self.dimples.kind == "dimple" else GaussianSection
+        try:
+            found = [kind.model_validate(item, context=dict(self._sizes)) for item in items]
+        except ValidationError as e:
+            first = e.errors()[0]
+            raise ValueError(f"dimples: {first['loc'][-1]}: {first['msg'].removeprefix('Value error, ')}") from None
+        return {f"dimples.{i}": each for i, each in enumerate(found)}

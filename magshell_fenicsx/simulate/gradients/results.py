@@ -1,6 +1,6 @@
 """What can be differentiated, by name: columns, shapes, vibrations and barriers at the end of a history."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.simulate.adapt.ending import History
@@ -19,8 +19,8 @@ from magshell_fenicsx.simulate.results import Target, differentiable
 from magshell_fenicsx.simulate.scene import Scene
 
 
-def refuse_no_result(scene: Scene, results: Iterable[str], key: str) -> None:
-    """See before a history that the results at a key have gradients.
+def refuse_no_result(scene: Scene, results: Iterable[str], key: str, *, more: Sequence[str] = ()) -> None:
+    """See before a history that the results at a key have gradients; `more` are allowed there too.
 
     Raises
     ------
@@ -37,7 +37,7 @@ def refuse_no_result(scene: Scene, results: Iterable[str], key: str) -> None:
             elif NAMES.fullmatch(of):
                 refuse_no_vibration(case, of)
             elif of not in FOLDS and of not in columns and of not in start.mu:
-                known = ", ".join((*FOLDS, *columns, BARRIER, *FIRST))
+                known = ", ".join((*FOLDS, *columns, BARRIER, *FIRST, *more))
                 raise CaseError(f"{of}: has no gradient here; allowed are {known}")
         except CaseError as e:
             raise CaseError(f"{key}: {e}") from None

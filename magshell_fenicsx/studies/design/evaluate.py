@@ -71,13 +71,14 @@ def evaluate(
     known: Standing,
 ) -> Evaluation:
     """Follow the path of a case, and differentiate its results; collective. `known` is of the case before."""
-    lost = ""
+    lost, section = "", variables.case.design
+    assert section
     records, history = list[Record](), History()
     try:
         scene = known.of(case, comm)
-        for i, result in enumerate(results):
+        for result in results:
             if result != MASS and result not in targets:
-                refuse_no_result(scene, [result], f"design.{'constraints' if i else 'objective'}")
+                refuse_no_result(scene, [result], f"design.{section.key_of(result)}", more=[MASS])
         for record in follow(scene, search=False):
             records.append(record)
             history.add(record)

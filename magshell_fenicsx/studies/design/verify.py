@@ -37,6 +37,7 @@ def verified(
     if not isinstance(case.shell, MeshSurface):
         settings = [f"mesh.refinement={case.mesh.refinement * section.verify:.6g}"]
         case = Case.load(folder / "best.yaml", settings)
+    how = ", ".join(settings) or "on the mesh of the file"
     result = run(case, folder / "verified", comm)
     values = {name: _value(result, name) for name in problem.results if name not in problem.targets}
     seen = dict[str, float]()
@@ -45,10 +46,10 @@ def verified(
     for name, value in (values | seen).items():
         here = best.values.get(name, best.seen.get(name))
         if value is None:
-            say(f"verified ({', '.join(settings)}): no {name}{f': {result.stopped}' if result.stopped else ''}")
+            say(f"verified ({how}): no {name}{f': {result.stopped}' if result.stopped else ''}")
         elif here is not None:
             away = value / here - 1
-            say(f"verified ({', '.join(settings)}): {name} = {value:.9g}, {_beside(away)} the design's {here:.9g}")
+            say(f"verified ({how}): {name} = {value:.9g}, {_beside(away)} the design's {here:.9g}")
             if abs(away) > FAR:
                 say(f"warning: {name} is another one there: the mesh is too coarse, or there are several equilibria")
     modes = [f"{p['kind']} {p['mode']}".strip() for p in result.limit_points if p["mode"]]

@@ -8,6 +8,7 @@ from typing import Any
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.chance.places import NoRoom
 from magshell_fenicsx.case.source import CaseError, Source, override
+from magshell_fenicsx.parts.section import in_unit
 from magshell_fenicsx.plan.planner import make_plan
 from magshell_fenicsx.studies.ensemble.door import in_the_file, refuse_unknown_keys
 from magshell_fenicsx.studies.sweep.points import identity
@@ -76,7 +77,7 @@ def _sample(source: Source, number: int, drawn: dict[str, str], deleted: int) ->
         override(here, f"{key}={text}")
     values = dict(_numbers(here.data, drawn))
     defects = _defects(here.data)
-    ranked = sorted(defects, key=lambda defect: abs(defect["amplitude"]))
+    ranked = sorted(defects, key=_size)
     if deleted:
         if len(defects) <= deleted:
             raise CaseError(f"--delete-weakest {deleted}: the sample has only {len(defects)} defects")
@@ -111,4 +112,10 @@ def _defects(data: Any) -> list[dict[str, Any]]:
     """The defects with an amplitude."""
     shell = data["shell"]
     listed = shell.get("imperfections") or ([shell["defect"]] if shell.get("defect") else [])
-    return [item for item in listed if isinstance(item.get("amplitude"), float | int)]
+    return [item for item in listed if isinstance(item.get("amplitude"), float | int | str)]
+
+
+def _size(defect: dict[str, Any]) -> float:
+    """Size of the amplitude, over h or in metres."""
+    amplitude = defect["amplitude"]
+    return abs(in_unit(amplitude, "metre") if isinstance(amplitude, str) else float(amplitude))
