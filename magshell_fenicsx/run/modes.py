@@ -22,6 +22,7 @@ from magshell_fenicsx.run.summary import Result
 from magshell_fenicsx.simulate.scene import Scene
 
 Say = Callable[[str], None]
+ROUNDING = 1e-9  # a coordinate over R as small as this is zero
 
 
 def modes_after(result: Result, folder: Path, say: Say) -> None:
@@ -62,7 +63,8 @@ class _Writer:
             surface = self._write(number, str(row["label"]), state, label, vector)
             if surface is not None and self.result.scene.plan.meridian is None:
                 place = surface.r0[np.argmax(np.abs(surface.fields["mode_w"]))]
-                self.result.largest[number] = [float(x) for x in place * self.result.scene.plan.length]
+                exact = np.where(np.abs(place) < ROUNDING, 0.0, place)
+                self.result.largest[number] = [float(x) for x in exact * self.result.scene.plan.length]
             if surface is not None and not label and (m := wave_number(surface)):
                 self.say(f"the null vector at point {number} has {m} waves around e3")
 

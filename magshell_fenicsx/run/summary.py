@@ -11,6 +11,8 @@ from magshell_fenicsx.case.surfaces import Surface
 from magshell_fenicsx.continuation.system import State, dot
 from magshell_fenicsx.continuation.timing import Stopwatch
 from magshell_fenicsx.models.modes import ShellMode
+from magshell_fenicsx.output.fields.frequencies import hertz
+from magshell_fenicsx.output.report.verdict import told_place
 from magshell_fenicsx.output.store.checkpoint import FILE
 from magshell_fenicsx.output.store.table import LOCATED, Row
 from magshell_fenicsx.platform import sources
@@ -93,11 +95,19 @@ class Result:
                 "mode": row["mode"],
                 "branch": row["branch"],
                 "load_error": row["load_error"],
-                **({"mode_at": self.largest[number]} if number in self.largest else {}),
+                **self._mode_at(number),
             }
             for number, row in enumerate(self.rows)
             if row["label"] in LOCATED
         ]
+
+    def _mode_at(self, number: int) -> dict[str, list[float]]:
+        """Where a mode is largest, and the numbers by which it is told."""
+        if number not in self.largest:
+            return {}
+        place, shell = self.largest[number], self.scene.case.shell
+        told = told_place(place, shell.geometry, in_metres=shell.with_units)
+        return {"mode_at": place, **{f"mode_at_{unit}": numbers for unit, numbers in told.items() if unit}}
 
     @property
     def knockdown(self) -> float | None:
@@ -125,7 +135,7 @@ def summary(result: Result, total_s: float) -> dict[str, Any]:
     """The content of summary.json."""
     scene = result.scene
     material, model, newton = scene.plan.material, scene.model, scene.newton
-    R_over_h = 1 / material.h
+    R_over_h, time_unit = 1 / material.h, scene.case.time_unit
     return {
         "case": (result.adapted.asked if result.adapted else scene.case).model_dump(mode="json", exclude_none=True),
         FILE: scene.case.file_name,
@@ -157,7 +167,11 @@ def summary(result: Result, total_s: float) -> dict[str, Any]:
         "barrier": result.barrier,
         "snaps": snaps(result.rows),
         "frequencies": [
-            {"point": number, "omega2": [mode.eigenvalue for mode in modes]}
+            {
+                "point": number,
+                "omega2": [mode.eigenvalue for mode in modes],
+                **({"hertz": [hertz(mode.eigenvalue, time_unit) for mode in modes]} if time_unit else {}),
+            }
             for number, modes in result.frequencies.items()
         ],
         "solutions": solutions(result),

@@ -108,16 +108,28 @@ def _where(place: Sequence[float] | None, summary: Summary) -> Markup:
     """Where a mode is largest, in words; as a direction on a sphere, as imperfections give their places."""
     if place is None:
         return Markup("")
-    shell = summary["case"]["shell"]
-    if shell["geometry"] in ("hemisphere", "cap"):
-        polar = degrees(atan2(hypot(*place[:2]), place[2]))
-        azimuth = degrees(atan2(place[1], place[0])) if polar > ON_AXIS else 0.0
-        found = f"polar {polar:.0f}°, azimuth {round(azimuth)}°"
+    known = summary["dimensions"]
+    in_metres = bool(known["radius"]) and known["units"] == "SI"
+    key, numbers = next(iter(told_place(place, summary["case"]["shell"]["geometry"], in_metres=in_metres).items()))
+    if key == "degrees":
+        found = f"polar {numbers[0]:.0f}°, azimuth {round(numbers[1])}°"
     else:
-        known = summary["dimensions"]
-        size, unit = (1e3, " mm") if known["radius"] and known["units"] == "SI" else (1.0, "")
-        found = f"({', '.join(f'{size * x + 0.0:.3g}' for x in place)}){unit}"
+        found = f"({', '.join(f'{x:.3g}' for x in numbers)}){f' {key}' if key else ''}"
     return Markup("; its mode is largest at {}").format(found)
+
+
+def told_place(place: Sequence[float], geometry: str, *, in_metres: bool) -> dict[str, list[float]]:
+    """The numbers by which a place is told, by their unit: polar and azimuth on a sphere, elsewhere coordinates.
+
+    Examples
+    --------
+    >>> told_place([0.0, 0.03, 0.0], "strip", in_metres=True), told_place([0.0, 2.0, 0.0], "cap", in_metres=True)
+    ({'mm': [0.0, 30.0, 0.0]}, {'degrees': [90.0, 90.0]})
+    """
+    if geometry in ("hemisphere", "cap"):
+        polar = degrees(atan2(hypot(*place[:2]), place[2]))
+        return {"degrees": [polar, degrees(atan2(place[1], place[0])) if polar > ON_AXIS else 0.0]}
+    return {"mm" if in_metres else "": [(1e3 if in_metres else 1.0) * x + 0.0 for x in place]}
 
 
 def _end(summary: Summary, lines: Sequence[Line]) -> Markup:
