@@ -19,6 +19,7 @@ from magshell_fenicsx.studies.ensemble import ensemble as module
 from magshell_fenicsx.studies.ensemble import solve as solving
 from magshell_fenicsx.studies.ensemble.known import KnownFolds
 from magshell_fenicsx.studies.ensemble.samples import Sample, make_samples
+from magshell_fenicsx.studies.ensemble.table import make_row
 from magshell_fenicsx.studies.study.scalar import parse_scalar
 from magshell_fenicsx.studies.sweep.outcome import Outcome
 
@@ -118,6 +119,22 @@ def test_the_weakest_defects_are_deleted() -> None:
     assert [item for item in every if item in kept] == kept
     assert sorted(item.amplitude for item in kept) == sorted(item.amplitude for item in every)[2:]
     assert whole.severest["amplitude"] == max(item.amplitude for item in every)
+
+
+UNITS = (
+    "shell={geometry: hemisphere, radius: 30 mm, thickness: 0.3 mm, youngs_modulus: 1 MPa, poisson_ratio: 0.5, "
+    "imperfections: [{kind: gaussian, amplitude: 0.6, width: 2}, "
+    "{kind: gaussian, amplitude: 0.15 mm, width: 2, at: {polar: 40}}]}"
+)
+
+
+def test_defects_with_and_without_units_are_compared() -> None:
+    """0.15 mm is half of the thickness, and less than 0.6 h; a drawn value with a unit is a number of the table."""
+    keys = "keys: {shell.imperfections.1.amplitude: {kind: uniform, above: 0.1, below: 0.15, unit: mm}}"
+    (sample,) = drawn(f"ensemble={{{keys}}}", UNITS, numbers=range(1))
+    assert sample.severest["amplitude"] == 0.6
+    row = make_row(sample, None, KNOCKDOWN)
+    assert 0.1 < row["shell.imperfections.1.amplitude_mm"] < 0.15
 
 
 def test_interrupted_and_resumed(tmp_path: Path, analytic: list[int], monkeypatch: pytest.MonkeyPatch) -> None:

@@ -58,8 +58,8 @@ def _words(key: str) -> str:
 
     Examples
     --------
-    >>> _words("severest.amplitude"), _words("severest.at.polar")
-    ('amplitude of the most severe defect', 'polar of the most severe defect')
+    >>> _words("severest.amplitude_mm"), _words("severest.at.polar")
+    ('amplitude mm of the most severe defect', 'polar of the most severe defect')
     """
     of, _, last = key.rpartition(".")
     return last.replace("_", " ") + (" of the most severe defect" if of.startswith("severest") else "")

@@ -8,7 +8,6 @@ from typing import Any
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.chance.places import NoRoom
 from magshell_fenicsx.case.source import CaseError, Source, override
-from magshell_fenicsx.parts.section import in_unit
 from magshell_fenicsx.plan.planner import make_plan
 from magshell_fenicsx.studies.ensemble.door import in_the_file, refuse_unknown_keys
 from magshell_fenicsx.studies.sweep.points import identity
@@ -75,16 +74,15 @@ def _sample(source: Source, number: int, drawn: dict[str, str], deleted: int) ->
     del here.data["ensemble"]
     for key, text in drawn.items():
         override(here, f"{key}={text}")
-    values = dict(_numbers(here.data, drawn))
-    defects = _defects(here.data)
-    ranked = sorted(defects, key=_size)
+    values, case = dict(_numbers(here.data, drawn)), Case.from_source(here)
+    ranked = _defects(here.data, case)
     if deleted:
-        if len(defects) <= deleted:
-            raise CaseError(f"--delete-weakest {deleted}: the sample has only {len(defects)} defects")
+        if len(ranked) <= deleted:
+            raise CaseError(f"--delete-weakest {deleted}: the sample has only {len(ranked)} defects")
         gone = {id(defect) for defect in ranked[:deleted]}
         shell = here.data["shell"]
         shell["imperfections"] = [item for item in shell["imperfections"] if id(item) not in gone]
-    case = Case.from_source(here)
+        case = Case.from_source(here)
     make_plan(case)
     return Sample(number, values, dict(_flat("", ranked[-1])) if ranked else {}, case, identity(case))
 
@@ -108,14 +106,12 @@ def _flat(path: str, part: Any) -> Iterator[tuple[str, Any]]:
         yield path, part
 
 
-def _defects(data: Any) -> list[dict[str, Any]]:
-    """The defects with an amplitude."""
+def _defects(data: Any, case: Case) -> list[dict[str, Any]]:
+    """The defects with an amplitude as the case has them, the weakest first; amplitudes with units count over h."""
     shell = data["shell"]
     listed = shell.get("imperfections") or ([shell["defect"]] if shell.get("defect") else [])
-    return [item for item in listed if isinstance(item.get("amplitude"), float | int | str)]
-
-
-def _size(defect: dict[str, Any]) -> float:
-    """Size of the amplitude, over h or in metres."""
-    amplitude = defect["amplitude"]
-    return abs(in_unit(amplitude, "metre") if isinstance(amplitude, str) else float(amplitude))
+    single = getattr(case.shell, "defect", None)
+    sections = case.shell.imperfections or ([single] if single else [])
+    sizes = [getattr(section, "amplitude", None) for section in sections]
+    sized = [(abs(size), item) for size, item in zip(sizes, listed, strict=True) if size is not None]
+    return [item for _, item in sorted(sized, key=lambda pair: pair[0])]

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.studies.ensemble.table import RESULT, SEVEREST, WITHOUT, Row, drawn_keys
+from magshell_fenicsx.studies.ensemble.table import RESULT, WITHOUT, Row, drawn_keys, severest_keys
 from magshell_fenicsx.studies.ensemble.weibull import LEVEL, Weibull, fit, intervals
 
 Array = NDArray[np.float64]
@@ -78,7 +78,8 @@ def correlations(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
     from scipy.stats import pearsonr, spearmanr
 
     found = {}
-    for key in (*SEVEREST, *(key for key in drawn_keys(rows) if not key.startswith("shell.imperfections."))):
+    drawn = [key for key in drawn_keys(rows) if not key.startswith("shell.imperfections.")]
+    for key in (*severest_keys(rows), *drawn):
         pairs = np.array([(x, y) for row in rows if _is_number(x := row.get(key)) and (y := row[RESULT]) is not None])
         if len(pairs) < LEAST or not np.ptp(pairs, axis=0).all():
             continue

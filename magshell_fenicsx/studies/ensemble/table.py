@@ -1,9 +1,10 @@
 """samples.csv: one row per sample."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from magshell_fenicsx.parts.section import number_and_unit
 from magshell_fenicsx.studies.ensemble.samples import Sample
 from magshell_fenicsx.studies.ensemble.solve import FAILED
 from magshell_fenicsx.studies.study.scalar import Scalar
@@ -12,7 +13,7 @@ from magshell_fenicsx.studies.sweep.table import write_csv
 
 Row = dict[str, Any]
 RESULT, WITHOUT = "result", "result_without_weakest"
-SEVEREST = ("severest.amplitude", "severest.width", "severest.at.polar", "severest.at.azimuth")
+SEVEREST = "severest."
 FIRST = ("sample", "status", RESULT)
 LAST = ("found", "factorisations", "dofs", "cpu_s", "wall_s", "why", "point")
 STATUS = {
@@ -40,8 +41,8 @@ def make_row(sample: Sample, outcome: Outcome | None, scalar: Scalar) -> Row:
         "sample": sample.number,
         "status": status,
         RESULT: result,
-        **sample.values,
-        **{f"severest.{key}": number for key, number in sample.severest.items()},
+        **_columns(sample.values),
+        **_columns({f"{SEVEREST}{key}": number for key, number in sample.severest.items()}),
         **(
             computed | {"cpu_s": known.cpu_s, "wall_s": known.wall_s}
             if outcome
@@ -64,15 +65,33 @@ def value(outcome: Outcome | None, scalar: Scalar) -> float | None:
     return scalar.of(summary, [{key: str(v) for key, v in row.items()} for row in outcome.curve])
 
 
+def _columns(values: Mapping[str, Any]) -> Row:
+    """Values by the names of their columns; one with a unit is a number, and its name has the unit.
+
+    Examples
+    --------
+    >>> _columns({"shell.thickness": "0.25 mm", "shell.poisson_ratio": 0.5})
+    {'shell.thickness_mm': 0.25, 'shell.poisson_ratio': 0.5}
+    """
+    found = {}
+    for key, value in values.items():
+        number, unit = number_and_unit(value) if isinstance(value, str) else ("", "")
+        found[f"{key}_{unit}" if unit else key] = float(number) if unit else value
+    return found
+
+
+def severest_keys(rows: Sequence[Row]) -> list[str]:
+    """The columns of the most severe defect."""
+    return list(dict.fromkeys(key for row in rows for key in row if key.startswith(SEVEREST)))
+
+
 def drawn_keys(rows: Sequence[Row]) -> list[str]:
     """The columns of drawn values, in the order of the rows."""
-    others = {*FIRST, *LAST, *SEVEREST, WITHOUT}
-    return list(
-        dict.fromkeys(key for row in rows for key in row if key not in others and not key.startswith("severest."))
-    )
+    others = {*FIRST, *LAST, *severest_keys(rows), WITHOUT}
+    return list(dict.fromkeys(key for row in rows for key in row if key not in others))
 
 
 def write_samples(rows: Sequence[Row], file: Path) -> None:
     """Write samples.csv."""
-    more = [key for key in (WITHOUT, *SEVEREST) if any(key in row for row in rows)]
-    write_csv(rows, (*FIRST, *more, *drawn_keys(rows), *LAST), file)
+    more = [WITHOUT] if any(WITHOUT in row for row in rows) else []
+    write_csv(rows, (*FIRST, *more, *severest_keys(rows), *drawn_keys(rows), *LAST), file)
