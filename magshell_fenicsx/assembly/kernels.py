@@ -3,6 +3,7 @@
 import time
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import ufl
@@ -11,12 +12,13 @@ from ffcx.ir.analysis.valuenumbering import ValueNumberer
 from mpi4py import MPI
 from ufl.core.expr import Expr
 
-from magshell_fenicsx.platform.compiler import SHARED, install_compiler
+from magshell_fenicsx.platform.compiler import MANY, SHARED, install_compiler
 from magshell_fenicsx.platform.index_maps import install_index_maps
 
 # -O1 compiles the tangents five times faster than -O2 and runs 15 % slower; -ffast-math halves the run time.
 # No -march: the cache may be shared by unlike machines, and it gains nothing here.
-JIT_OPTIONS = {"cffi_extra_compile_args": ["-O1", "-g0", "-ffast-math", SHARED], "timeout": 600}
+JIT_OPTIONS: dict[str, Any] = {"cffi_extra_compile_args": ["-O1", "-g0", "-ffast-math", SHARED], "timeout": 600}
+POINT_OPTIONS = {**JIT_OPTIONS, "cffi_extra_compile_args": [*JIT_OPTIONS["cffi_extra_compile_args"], MANY]}
 install_compiler()
 install_index_maps()
 
@@ -54,7 +56,7 @@ class KernelLog:
         """Compile an expression of cell-wise constants, or load it from the cache; collective."""
         start = time.perf_counter()
         anywhere = np.full((1, 1), 0.5)
-        compiled = fem.Expression(expression, anywhere, comm, jit_options=JIT_OPTIONS)
+        compiled = fem.Expression(expression, anywhere, comm, jit_options=POINT_OPTIONS)
         self.seconds += time.perf_counter() - start
         self.names.append(name)
         return compiled

@@ -7,16 +7,20 @@ not depend on mesh, degree or quadrature.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import ufl
 from dolfinx import fem, mesh
 from mpi4py import MPI
 from numpy.typing import NDArray
+from ufl.algorithms.analysis import extract_coefficients, extract_constants
 from ufl.core.expr import Expr
 
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.platform import compat
+from magshell_fenicsx.platform.compiler import many_of
 
 Pair = tuple[int, int]
 
@@ -31,6 +35,7 @@ class Points:
         self._cells = np.argsort(order).astype(np.int32)  # the cell of the p-th value
         self._values = np.empty(0)
         self._constants: list[tuple[NDArray[np.float64], NDArray[np.float64]]] = []  # views: here, and what is copied
+        self._calls = WeakKeyDictionary[fem.Expression, _Call | None]()
 
     def field(self, size: int) -> fem.Function:
         """A vector at each point; the caller fills its array (capacity * size,)."""
@@ -50,8 +55,39 @@ class Points:
         if self._values.size < count * size:
             self._values = np.empty(self.capacity * size)
         values = self._values[: count * size].reshape(count, size)
-        compat.evaluate(expression, self._mesh, self._cells[:count], values)
+        if expression not in self._calls:
+            self._calls[expression] = _Call.of(expression, self.capacity)
+        if call := self._calls[expression]:
+            call(count, values)
+        else:
+            compat.evaluate(expression, self._mesh, self._cells[:count], values)
         return values
+
+
+class _Call:
+    """An expression's function for many points, with what it takes; the values of fields are views."""
+
+    def __init__(self, many: Any, fields: Sequence[fem.Function], constants: Sequence[fem.Constant], n: int) -> None:
+        self._many, self._constants = many, [constant.value for constant in constants]
+        self._fields = [field.x.array for field in fields]
+        self._places = np.array([values.ctypes.data for values in self._fields], np.uintp)
+        self._sizes = np.array([values.size // n for values in self._fields], np.int32)
+
+    @staticmethod
+    def of(expression: fem.Expression, n: int) -> "_Call | None":
+        """That of an expression at storage for n points; None if there is no such function."""
+        compiled, whole = expression._ufcx_expression, expression.ufl_expression
+        if (many := many_of(compiled)) is None:
+            return None
+        known = extract_coefficients(whole)
+        fields = [known[compiled.original_coefficient_positions[i]] for i in range(compiled.num_coefficients)]
+        return _Call(many, fields, extract_constants(whole), n)
+
+    def __call__(self, count: int, values: NDArray[np.float64]) -> None:
+        """Evaluate at the first points, into a contiguous array (count, components)."""
+        constants = np.concatenate([np.ravel(value) for value in (*self._constants, 0.0)])  # never empty
+        fields, sizes, c, out = (array.ctypes.data for array in (self._places, self._sizes, constants, values))
+        self._many(fields, sizes, len(self._sizes), c, count, out)
 
 
 @dataclass(frozen=True)

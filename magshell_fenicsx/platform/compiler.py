@@ -17,13 +17,16 @@ from typing import Any
 import cffi
 from ffcx.codegeneration import jit
 
-SHARED = "-shared"
+from magshell_fenicsx.platform.many import declared, with_many
+
+SHARED, MANY = "-shared", "-DMANY"
 WAIT = 0.05  # s between two looks for what another process compiles
 DECLARATIONS = (
     jit.UFC_HEADER_DECL.format("float64") + jit.UFC_INTEGRAL_DECL + jit.UFC_FORM_DECL + jit.UFC_EXPRESSION_DECL
 )
 OTHERS = jit._compile_objects, jit._load_objects, jit.get_cached_module
 _loaded: dict[Path, tuple[list[Any], Any]] = {}
+_many: dict[int, Any] = {}  # functions by the places of their kernels in memory
 
 
 def _compile_objects(
@@ -43,7 +46,7 @@ def _compile_objects(
 
     _, code = ffcx.compiler.compile_ufl_objects(objects, prefix=module, options=options)
     source = folder / f"{module}.c"
-    source.write_text(code)
+    source.write_text(with_many(code) if MANY in arguments else code)
     compiler = shlex.split(os.environ.get("CC") or sysconfig.get_config_var("CC") or "cc")
     include = f"-I{ffcx.codegeneration.get_include_path()}"
     library = str(source.with_suffix(".so"))
@@ -61,8 +64,20 @@ def _load_objects(folder: Path, module: str, names: list[str]) -> tuple[list[Any
         kind = "ufcx_form *" if module.startswith("libffcx_forms") else "ufcx_expression *"
         lib, ffi = ctypes.CDLL(str(library)), _ffi()
         places = [ctypes.addressof(ctypes.c_char.in_dll(lib, name)) for name in names]  # cffi would parse declarations
-        _loaded[library] = [ffi.cast(kind, place)[0] for place in places], SimpleNamespace(ffi=ffi, lib=lib)
+        objects = [ffi.cast(kind, place)[0] for place in places]
+        _loaded[library] = objects, SimpleNamespace(ffi=ffi, lib=lib)
+        if (many := declared(lib)) is not None:
+            _many[_place(objects[0])] = many
     return _loaded[library]
+
+
+def many_of(expression: Any) -> Any:
+    """The function `evaluate_many` of a loaded expression of FFCx; None if it has none."""
+    return _many.get(_place(expression))
+
+
+def _place(expression: Any) -> int:
+    return int(_ffi().cast("uintptr_t", expression.tabulate_tensor_float64))
 
 
 @cache
