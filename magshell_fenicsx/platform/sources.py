@@ -1,20 +1,21 @@
 """The code that computed a result; results of other code are not reused."""
 
 import hashlib
+import os
 from pathlib import Path
 
 from magshell_fenicsx.platform.version import __version__
 
-SUFFIXES = {".py", ".c", ".html"}
+SUFFIXES = (".py", ".c", ".html")
 
 
 def hashed(folder: Path) -> str:
     """Version and hash of a package's files, comments included, independent of where it is installed."""
-    found = hashlib.sha256()
-    for file in sorted(folder.rglob("*")):
-        if file.suffix in SUFFIXES:
-            content = file.read_bytes()
-            found.update(f"{file.relative_to(folder).as_posix()} {len(content)}\n".encode() + content)
+    found, root = hashlib.sha256(), str(folder)
+    for file in sorted(f"{here}/{name}" for here, _, names in os.walk(root) for name in names):
+        if file.endswith(SUFFIXES):
+            content = Path(file).read_bytes()
+            found.update(f"{file.removeprefix(root)} {len(content)}\n".encode() + content)
     return f"{__version__}+{found.hexdigest()[:16]}"
 
 
