@@ -11,7 +11,7 @@ from magshell_fenicsx.models.reactions import Reaction, reactions
 from magshell_fenicsx.models.shell.parameters import Move
 
 SMALL = 1e-5  # displacement over the length: the nonlinear part is of its square over h^2
-ROUNDING = 1e-8  # of strains over those of such small displacements
+ROUNDING = 5e-8  # of strains, 2e-16, over those of such displacements, h^2 SMALL = 1e-9: 2e-7 at a point, less in a sum
 LIFT = move("lift", "right", shift=[0, 0, SMALL])
 TURN = move("turn", "right", turn=[0, -SMALL, 0], centre=[1, 0, 0])
 EI = PLATE["width"] * 1e-6 / 12  # type: ignore[operator]  # over E
