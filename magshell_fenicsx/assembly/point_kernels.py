@@ -76,7 +76,7 @@ class _Call:
     @staticmethod
     def of(expression: fem.Expression, n: int) -> "_Call | None":
         """That of an expression at storage for n points; None if there is no such function."""
-        compiled, whole = expression._ufcx_expression, expression.ufl_expression
+        compiled, whole = expression.ufcx_expression, expression.ufl_expression
         if (many := many_of(compiled)) is None:
             return None
         known = extract_coefficients(whole)

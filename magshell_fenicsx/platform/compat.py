@@ -37,6 +37,17 @@ def corner_numbers(domain: mesh.Mesh) -> NDArray[np.int32]:
     return np.asarray(dofmaps[0] if isinstance(dofmaps, list) else domain.geometry.dofmap)
 
 
+def kernel_code(objects: Any, module: str, options: dict[str, Any]) -> str:
+    """The C code of FFCx for forms or expressions, whose names begin with `module`."""
+    import ffcx.compiler  # takes long, and only for what is compiled
+
+    try:
+        _, code = ffcx.compiler.compile_ufl_objects(objects, prefix=module, options=options)
+    except TypeError:  # since FFCx 0.10
+        (_, code), _ = ffcx.compiler.compile_ufl_objects(objects, namespace=module, options=options)
+    return str(code)
+
+
 def evaluate(
     expression: fem.Expression, domain: mesh.Mesh, cells: NDArray[np.int32], values: NDArray[np.float64]
 ) -> None:

@@ -15,8 +15,9 @@ from types import SimpleNamespace
 from typing import Any
 
 import cffi
-from ffcx.codegeneration import jit
+from ffcx.codegeneration import get_include_path, jit
 
+from magshell_fenicsx.platform import compat
 from magshell_fenicsx.platform.many import declared, with_many
 
 SHARED, MANY = "-shared", "-DMANY"
@@ -42,13 +43,11 @@ def _compile_objects(
 ) -> Any:
     if SHARED not in arguments:
         return OTHERS[0](decl, objects, names, module, options, folder, arguments, *rest, **others)
-    import ffcx.compiler  # takes long, and only here it is needed
-
-    _, code = ffcx.compiler.compile_ufl_objects(objects, prefix=module, options=options)
+    code = compat.kernel_code(objects, module, options)
     source = folder / f"{module}.c"
     source.write_text(with_many(code) if MANY in arguments else code)
     compiler = shlex.split(os.environ.get("CC") or sysconfig.get_config_var("CC") or "cc")
-    include = f"-I{ffcx.codegeneration.get_include_path()}"
+    include = f"-I{get_include_path()}"
     library = str(source.with_suffix(".so"))
     subprocess.run([*compiler, "-std=c17", "-fPIC", *arguments, include, str(source), "-o", library, "-lm"], check=True)
     source.with_suffix(".c.cached").touch()
