@@ -6,6 +6,7 @@ arithmetic, square roots and powers. Others are called for one point after the o
 
 import ctypes
 import re
+from math import prod
 from typing import Any
 
 NAME = "evaluate_many"
@@ -13,7 +14,9 @@ _LINE = re.compile(r"""double\ \w+\ =\ [-\w+*/(),.\[\]\s]+; | A\[[\w*+\s]+\]\ \+
     | for\ \(int\ iq\ =\ 0;\ iq\ <\ 1;\ \+\+iq\)""", re.VERBOSE)  # fmt: skip
 _DECLARED = re.compile(r"\bdouble (\w+) = (.*);")
 _CALL, _POWER = re.compile(r"\b(\w+)\("), re.compile(r"\bpow\(\w+(\[\d+\])?, -?[\d.e+-]+\)")
-_LANES = """
+_OTHERS = ("coordinate_dofs", "entity_local_index", "quadrature_permutation")  # arguments that no cell gives here
+_LANES = """#if defined(__x86_64__)
+#define HAS_LANES
 typedef double four __attribute__((vector_size(32), aligned(8)));
 #define LANES __attribute__((target("avx2,fma")))
 static inline __attribute__((always_inline)) LANES four four_sqrt(four x)
@@ -39,6 +42,7 @@ static LANES void by_lanes(const double* const* values, const int32_t* sizes, in
       for (int k = 0; k < COUNT; ++k) out[(p + i) * COUNT + k] = A[k][i];
   }
 }
+#endif
 """
 _MANY = """
 /* values: of each field (n, size). out: (n, COUNT). */
@@ -47,7 +51,12 @@ void evaluate_many(const double* const* values, const int32_t* sizes, int32_t fi
 {
   int32_t total = 0;
   for (int32_t j = 0; j < fields; ++j) total += sizes[j];
-CHOICE
+#ifdef HAS_LANES
+  if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma")) {
+    by_lanes(values, sizes, fields, total, c, n, out);
+    return;
+  }
+#endif
   double w[total + 1];
   memset(out, 0, n * COUNT * sizeof(double));
   for (int64_t p = 0; p < n; ++p) {
@@ -58,28 +67,22 @@ CHOICE
   }
 }
 """
-_CHOICE = """  if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma")) {
-    by_lanes(values, sizes, fields, total, c, n, out);
-    return;
-  }"""
 
 
 def with_many(code: str) -> str:
     """The C code of one expression at one point with the function `evaluate_many`; unchanged if it is none."""
     found = re.search(r"void (tabulate_tensor_\w+)\(([^)]*)\)\n(\{\n.*?\n\})\n+static double points_", code, re.DOTALL)
-    counts = re.findall(r"int value_shape_\w+\[\d+\] = \{([\d, ]+)\}", code)
-    if not found or len(counts) > 1 or code.count("void tabulate_tensor_") > 1:
+    shapes = re.findall(r"int value_shape_\w+\[\d+\] = \{([\d, ]+)\}", code)
+    if not found or len(shapes) > 1 or code.count("void tabulate_tensor_") > 1:
         return code
     kernel, arguments, body = found.groups()
-    count = 1
-    for size in counts[0].split(",") if counts else []:
-        count *= int(size)
+    if any(re.search(rf"\b{name}\b", body) for name in _OTHERS):
+        return code
     lanes = _LANES.replace("BODY", _DECLARED.sub(r"__auto_type \1 = 1.0 * (\2);", body)) if _has_lanes(body) else ""
-    many = _MANY.replace("CHOICE", _CHOICE if lanes else "").replace("KERNEL", f"({kernel})")
-    many = many.replace("NONE", ", ".join("0" * (arguments.count(",") - 2)))
-    more = f"#if defined(__x86_64__)\n{lanes}#define HAS_LANES\n#endif\n" if lanes else ""
-    many = many.replace(_CHOICE, f"#ifdef HAS_LANES\n{_CHOICE}\n#endif")
-    return code + (more + many).replace("COUNT", str(count))
+    none = ", ".join("0" * (arguments.count(",") - 2))  # of the arguments after A, w and c
+    many = _MANY.replace("KERNEL", f"({kernel})").replace("NONE", none)
+    count = prod(int(size) for shape in shapes for size in shape.split(","))
+    return code + (lanes + many).replace("COUNT", str(count))
 
 
 def _has_lanes(body: str) -> bool:
