@@ -66,4 +66,4 @@ def test_what_can_be_vectors(line: str, lanes: bool) -> None:
     body = f"{{\n// Unstructured piecewise computations\ndouble sp_0 = w[1] * w[2];\n{line}\n}}"
     code = "#include <math.h>\nvoid tabulate_tensor_e(double* A, const double* w, const double* c)\n" + body
     code += "\n\nstatic double points_e[1] = {0.5};\nstatic int value_shape_e[1] = {2};\n"
-    assert ("by_lanes" in with_many(code)) == lanes
+    assert ("#define HAS_LANES" in with_many(code)) == lanes
