@@ -13,10 +13,14 @@ from figures import figures
 from figures.figures import FIGURES
 
 from magshell_fenicsx import CaseError
+from magshell_fenicsx.case.source import read_source
+from magshell_fenicsx.parts.section import number_and_unit
 from magshell_fenicsx.run.run import run
+from magshell_fenicsx.studies.sweep import axes as axes_module
 from magshell_fenicsx.studies.sweep import chain, sweep_plot
 from magshell_fenicsx.studies.sweep import sweep as module
 from magshell_fenicsx.studies.sweep.axes import parse_axes
+from magshell_fenicsx.studies.sweep.earlier import with_earlier
 from magshell_fenicsx.studies.sweep.points import SweepPoint, make_points
 
 PLATE, DIMPLE, POLE = (CASES / f"{name}.yaml" for name in ("clamped_plate", "dimple_buckling", "pole_indentation"))
@@ -169,6 +173,15 @@ def test_another_sweep_into_a_folder_adds_or_is_refused(tmp_path: Path, computed
     with pytest.raises(CaseError, match=r"has a sweep\.csv of an earlier version; give another folder"):
         plate(tmp_path)
     assert (tmp_path / "sweep.csv").read_text(encoding="utf-8") == after
+
+
+def test_a_large_sweep_reads_each_value_a_few_times(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The work before the first point grows like the number of points."""
+    asked: list[str] = []
+    monkeypatch.setattr(axes_module, "number_and_unit", lambda text: asked.append(text) or number_and_unit(text))
+    axes = parse_axes(["loading.pressure=1e-5:3e-5:15", "shell.poisson_ratio=0.1:0.4:4"])
+    with_earlier(tmp_path, read_source(PLATE), axes, make_points(PLATE, axes))
+    assert len(asked) < 10 * 60
 
 
 def test_parts_of_several_jobs_make_one_table(tmp_path: Path, computed: list[float]) -> None:

@@ -4,6 +4,7 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -34,12 +35,12 @@ class Axis:
         """The keys as in `--over`."""
         return "+".join(self.keys)
 
-    @property
+    @cached_property
     def unit(self) -> str:
         """The unit of its values, that of the first which has one."""
         return next(filter(None, (number_and_unit(value)[1] for value in self.values)), "")
 
-    @property
+    @cached_property
     def numbers(self) -> list[float] | None:
         """The values as numbers, in its unit; None if one of them is a word."""
         try:
