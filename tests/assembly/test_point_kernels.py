@@ -9,6 +9,7 @@ from dolfinx import fem
 from mpi4py import MPI
 from ufl.core.expr import Expr
 
+from magshell_fenicsx.assembly import point_kernels
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.point_kernels import Points
 from magshell_fenicsx.platform.many import with_many
@@ -31,9 +32,11 @@ CASES: dict[str, tuple[Callable[..., Expr], Callable[..., Array]]] = {
 
 
 @pytest.mark.parametrize("name", CASES)
-@pytest.mark.parametrize("count", [1, 4, 11])
-def test_against_numpy(name: str, count: int) -> None:
-    """Also where the number of points is no multiple of four, and after a constant has changed."""
+@pytest.mark.parametrize(("count", "one_call"), [(1, True), (4, True), (11, True), (11, False)])
+def test_against_numpy(name: str, count: int, one_call: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where the number of points is no multiple of four, after a constant has changed, and by dolfinx alone."""
+    if not one_call:
+        monkeypatch.setattr(point_kernels, "many_of", lambda compiled: None)
     expression, expected = CASES[name]
     points, random = Points(11), np.random.default_rng(1)
     a, b, constant = points.field(2), points.field(1), fem.Constant(points._mesh, 0.4)
@@ -45,7 +48,7 @@ def test_against_numpy(name: str, count: int) -> None:
         found = points.evaluate(kernel, count)
         wanted = expected(a.x.array.reshape(-1, 2).T, b.x.array, value)[:count]
         assert found == pytest.approx(wanted, rel=1e-14)
-    assert points._calls[kernel] is not None
+    assert (points._calls[kernel] is not None) == one_call
     assert points.evaluate(kernel, 0).size == 0
 
 
