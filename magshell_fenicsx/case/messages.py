@@ -63,7 +63,9 @@ def explain(error: Any, location: Location, source: Source, case: type[BaseModel
         return f"{place}: {key}: {said}"
     says_all = kind in ("value_error", "literal_error")
     meaning = "" if says_all else _meaning(location, source.data, case)
-    return f"{place}: {key}: {shown(value)}: {said}{meaning}"
+    written = _at(source.data, location, str) if isinstance(value, float) else ""
+    text = f"{shown(written)} is {value:.6g}" if written else shown(value)  # a length with a unit, over that of its key
+    return f"{place}: {key}: {text}: {said}{meaning}"
 
 
 def shown(value: Any) -> str:

@@ -54,7 +54,11 @@ def test_the_same_numbers(shell: str, written: str, number: str) -> None:
         (BARE, "{kind: dimple, amplitude: 1, width: 3 mm}", "a number is in the unit of a dimple's width"),
         (SPHERE, "{kind: dimple, amplitude: 3 Pa, width: 3}", "0.amplitude: '3 Pa': is not convertible to metre"),
         (SPHERE, "{kind: gaussian, amplitude: deep, width: 3}", "0.amplitude: 'deep': is not a number with a unit"),
-        (SPHERE, "{kind: gaussian, amplitude: 30 mm, width: 3}", "must be less than or equal to 50"),
+        (
+            SPHERE,
+            "{kind: gaussian, amplitude: 30 mm, width: 3}",
+            "amplitude: '30 mm' is 107.143: must be less than or equal to 50",
+        ),
         (
             BARE,
             DRAWN.replace("AMPLITUDE", "{kind: normal, mean: 1, deviation: 0.1, unit: mm}"),
