@@ -85,4 +85,4 @@ def table(found: Mapping[str, Any]) -> str:
         lines.append([name, *values])
     rows = "\n".join(f"| {' | '.join(line)} |" for line in lines)
     ratios = "\n".join(f"- {name}: {value:.3g}" for name, value in found["derived"].items())
-    return f"# The benchmark\n\nMedians on {described(found['machine'])}.\n\n{rows}\n\n{ratios}\n"
+    return f"# Numbers of the benchmark\n\nMedians on {described(found['machine'])}.\n\n{rows}\n\n{ratios}\n"

@@ -6,6 +6,7 @@ project = "magshell_fenicsx"
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx-mathjax-offline"]
 html_theme = "furo"
 html_title = "magshell_fenicsx"
+html_show_copyright = False
 source_suffix = {".md": "markdown"}
 exclude_patterns = ["site"]
 myst_enable_extensions = ["dollarmath", "colon_fence"]
