@@ -64,7 +64,7 @@ def explain(error: Any, location: Location, source: Source, case: type[BaseModel
     says_all = kind in ("value_error", "literal_error")
     meaning = "" if says_all else _meaning(location, source.data, case)
     written = _at(source.data, location, str) if isinstance(value, float) else ""
-    text = f"{shown(written)} is {value:.6g}" if written else shown(value)  # a length with a unit, over that of its key
+    text = f"{shown(written)} is {value:.6g}" if written else shown(value)  # its limits are those of the number
     return f"{place}: {key}: {text}: {said}{meaning}"
 
 

@@ -12,7 +12,7 @@ from magshell_fenicsx.continuation.system import State, dot
 from magshell_fenicsx.continuation.timing import Stopwatch
 from magshell_fenicsx.models.modes import ShellMode
 from magshell_fenicsx.output.fields.frequencies import hertz
-from magshell_fenicsx.output.report.verdict import told_place
+from magshell_fenicsx.output.report.verdict import place_in_units
 from magshell_fenicsx.output.store.checkpoint import FILE
 from magshell_fenicsx.output.store.table import LOCATED, Row
 from magshell_fenicsx.platform import sources
@@ -102,12 +102,12 @@ class Result:
         ]
 
     def _mode_at(self, number: int) -> dict[str, list[float]]:
-        """Where a mode is largest, and the numbers by which it is told."""
+        """Where a mode is largest, over R or in m, and in the unit of the report."""
         if number not in self.largest:
             return {}
         place, shell = self.largest[number], self.scene.case.shell
-        told = told_place(place, shell.geometry, in_metres=shell.with_units)
-        return {"mode_at": place, **{f"mode_at_{unit}": numbers for unit, numbers in told.items() if unit}}
+        shown = place_in_units(place, shell.geometry, in_metres=shell.with_units)
+        return {"mode_at": place, **{f"mode_at_{unit}": numbers for unit, numbers in shown.items() if unit}}
 
     @property
     def knockdown(self) -> float | None:

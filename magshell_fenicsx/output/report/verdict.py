@@ -110,7 +110,7 @@ def _where(place: Sequence[float] | None, summary: Summary) -> Markup:
         return Markup("")
     known = summary["dimensions"]
     in_metres = bool(known["radius"]) and known["units"] == "SI"
-    key, numbers = next(iter(told_place(place, summary["case"]["shell"]["geometry"], in_metres=in_metres).items()))
+    key, numbers = next(iter(place_in_units(place, summary["case"]["shell"]["geometry"], in_metres=in_metres).items()))
     if key == "degrees":
         found = f"polar {numbers[0]:.0f}°, azimuth {round(numbers[1])}°"
     else:
@@ -118,13 +118,15 @@ def _where(place: Sequence[float] | None, summary: Summary) -> Markup:
     return Markup("; its mode is largest at {}").format(found)
 
 
-def told_place(place: Sequence[float], geometry: str, *, in_metres: bool) -> dict[str, list[float]]:
-    """The numbers by which a place is told, by their unit: polar and azimuth on a sphere, elsewhere coordinates.
+def place_in_units(place: Sequence[float], geometry: str, *, in_metres: bool) -> dict[str, list[float]]:
+    """A place in the unit of the report: polar and azimuth on a sphere, elsewhere coordinates.
 
     Examples
     --------
-    >>> told_place([0.0, 0.03, 0.0], "strip", in_metres=True), told_place([0.0, 2.0, 0.0], "cap", in_metres=True)
-    ({'mm': [0.0, 30.0, 0.0]}, {'degrees': [90.0, 90.0]})
+    >>> place_in_units([0.0, 0.03, 0.0], "strip", in_metres=True)
+    {'mm': [0.0, 30.0, 0.0]}
+    >>> place_in_units([0.0, 2.0, 0.0], "cap", in_metres=True)
+    {'degrees': [90.0, 90.0]}
     """
     if geometry in ("hemisphere", "cap"):
         polar = degrees(atan2(hypot(*place[:2]), place[2]))
