@@ -66,7 +66,7 @@ def test_summary_and_final_line_in_units(buckled: tuple[Path, str]) -> None:
     said = r"The shell buckles .* k_d = p/p_c = [\d.]+ \([\d.]+ Pa\): a fold, w = .* mm at the pole\."
     assert re.fullmatch(said, sentence)
     assert float(sentence.split("(")[1].split(" Pa")[0]) == pytest.approx(buckling, rel=1e-5)
-    assert not re.search(r"-0(\.0*)?(?![.\d])", printed)
+    assert not re.search(r"(?<![\w/])-0(\.0*)?(?![.\d])", printed)  # a folder may be called pytest-0
 
 
 def numbers_in(part: Any) -> Iterator[float]:
