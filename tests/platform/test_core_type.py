@@ -59,23 +59,37 @@ def test_make_looks_first(target: str) -> None:
 
 
 MAKE = """#!/bin/sh
-echo "$@" "${OPENBLAS_CORETYPE:-}" "ROOT=${ROOT:-}" >> calls
+echo "$@" "${OPENBLAS_CORETYPE:-}" "ROOT=${ROOT:-}" >> "$CALLS"
+[ -e "$CALLS.folders" ] || ls -A "$TMPDIR" "$HOME" "$XDG_CACHE_HOME" >> "$CALLS.folders"
 [ "$1" != "$FAILS" ] || [ -n "$ROOT" ]
+"""
+
+
+GIT = """#!/bin/sh
+[ "$1" = clone ] && cp -r "$3" "$4"
+"""
+IN = """#!/bin/sh
+[ "$1" = python3 ] && echo 0.11 || echo Nehalem
 """
 
 
 @pytest.mark.parametrize("fails", ["", "test", "fast"])
 def test_ci_runs_both(tmp_path: Path, fails: str) -> None:
-    """What fails with another rounding fails the run; what comes after is not begun."""
-    (tmp_path / ".ci").mkdir()
-    shutil.copy(TOP / ".ci" / "run", tmp_path / ".ci" / "run")
-    for name, text in (("make", MAKE), (".ci/in-env", '#!/bin/sh\n[ "$1" = python3 ] && echo 0.11 || echo Nehalem\n')):
-        (tmp_path / name).write_text(text, encoding="utf-8")
-        (tmp_path / name).chmod(0o755)
-    told = without({"PATH": f"{tmp_path}:{os.environ['PATH']}", "FAILS": fails})
-    done = subprocess.run(
-        [tmp_path / ".ci" / "run"], env=told, cwd=tmp_path, capture_output=True, text=True, check=False
-    )
+    """In a clone, with folders that are empty at first. What fails with another rounding fails the run, and ends it."""
+    top, home = tmp_path / "top", tmp_path / "home"
+    (top / ".ci").mkdir(parents=True)
+    home.mkdir()
+    (home / "earlier").touch()
+    shutil.copy(TOP / ".ci" / "run", top / ".ci" / "run")
+    for name, text in (("make", MAKE), ("git", GIT), (".ci/in-env", IN)):
+        (top / name).write_text(text, encoding="utf-8")
+        (top / name).chmod(0o755)
+    more = dict.fromkeys(("TMPDIR", "HOME", "XDG_CACHE_HOME"), str(home))
+    more |= {"PATH": f"{top}:{os.environ['PATH']}", "FAILS": fails, "CALLS": str(tmp_path / "calls")}
+    done = subprocess.run([top / ".ci" / "run"], env=without(more), capture_output=True, text=True, check=False)
+    assert [each.name for each in home.iterdir()] == ["earlier"]
+    listed = (tmp_path / "calls.folders").read_text(encoding="utf-8").splitlines()
+    assert sorted(each.split("/")[-1] for each in listed if each) == ["cache:", "home:", "tmp:"]  # nothing is in them
     calls = [line.split() for line in (tmp_path / "calls").read_text(encoding="utf-8").splitlines()]
     assert (done.returncode != 0) == bool(fails)
     assert calls[0] == ["test", "ROOT="]

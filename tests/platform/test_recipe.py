@@ -1,6 +1,7 @@
 """The recipe for Apptainer has what the Dockerfile has; conda's list has what pyproject.toml needs."""
 
 import re
+import shlex
 import subprocess
 import tomllib
 from pathlib import Path
@@ -16,10 +17,9 @@ def test_recipe_has_the_commands_of_the_dockerfile(tmp_path: Path) -> None:
     made = subprocess.run([TOP / ".ci/apptainer-recipe"], capture_output=True, text=True, check=True).stdout
     head, files, post, *rest = re.split(r"^%\w+.*\n", made, flags=re.MULTILINE)
     assert head.split() == ["Bootstrap:", "docker", "From:", "debian:trixie-slim"]
-    assert all(Path(line.split()[0]).exists() for line in files.splitlines() if line)
-    assert {"/usr/src/magshell/magshell_fenicsx", "/usr/src/magshell/meshes"} <= {
-        line.split()[-1] for line in files.splitlines() if line
-    }
+    pairs = [shlex.split(line) for line in files.splitlines() if line]
+    assert all(Path(source).exists() for source, _ in pairs)
+    assert {"/usr/src/magshell/magshell_fenicsx", "/usr/src/magshell/meshes"} <= {target for _, target in pairs}
     dockerfile = re.sub(r" *\\\n *", " ", (TOP / "Dockerfile").read_text(encoding="utf-8"))
     runs = [line.removeprefix("RUN ") for line in dockerfile.splitlines() if line.startswith("RUN ")]
     assert len(runs) > 3
