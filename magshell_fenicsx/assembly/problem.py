@@ -13,9 +13,9 @@ from petsc4py import PETSc
 
 from magshell_fenicsx.assembly.assemblers import ResidualAssembler, TangentAssembler
 from magshell_fenicsx.assembly.moving import Moving
-from magshell_fenicsx.assembly.parameter import Derivative, FreeParameter
+from magshell_fenicsx.assembly.parameter import Derivative, FreeParameter, Settable
 from magshell_fenicsx.assembly.sliding import Constraint, Projection, Sliding
-from magshell_fenicsx.assembly.terms import FormTerm, Term, factor_of
+from magshell_fenicsx.assembly.terms import Counted, FormTerm, Term, factor_of
 from magshell_fenicsx.continuation.noise import Noise
 from magshell_fenicsx.continuation.system import Amplitudes, Skewed, State, Vector, Weighted
 from magshell_fenicsx.continuation.timing import Stopwatch
@@ -68,8 +68,9 @@ class FiniteElementSystem:
         self.projection = Projection(V, sliding, clamped) if sliding else None
         self.parameters = parameters or {}
         self.moving = moving
-        # constants that a state's amplitudes may have besides their own, and their values without
-        self.settings: dict[str, tuple[fem.Constant, float]] = {}
+        self._counted = [t for t in terms if isinstance(t, Counted)]
+        # numbers that a state's amplitudes may have besides their own, and their values without
+        self.settings: dict[str, tuple[Settable, float]] = {t.setting: (t, 0.0) for t in self._counted}
         self.coordinates = frozenset(self.parameters) | (moving.names if moving else frozenset())
         self.comm = V.mesh.comm
         self.size = V.dofmap.index_map.size_local * V.dofmap.index_map_bs
@@ -261,11 +262,13 @@ class FiniteElementSystem:
         found[: self.size] = (K * given).array
         return found
 
-    def accept(self, u: Vector) -> None:
-        """Accept u as a point of the path; moments count full turns from here."""
-        self.set(u)
-        for term in self.terms:
-            term.accept()
+    def counted(self, state: State, before: Amplitudes) -> State:
+        """The state with the turns of its edges under moments, less than half a turn from those of `before`."""
+        if not self._counted:
+            return state
+        past = {t.setting: before.get(t.setting, 0.0) for t in self._counted}
+        self.at(state.u, state.mu | past)
+        return State(state.u, state.mu | {t.setting: t.angle() for t in self._counted})
 
     def energies(self, u: Vector) -> dict[str, float]:
         """Each term's potential, without its amplitude."""

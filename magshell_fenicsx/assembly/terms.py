@@ -31,9 +31,6 @@ class Term(Protocol):
     def follow(self) -> None:
         """Renew what the energy knows of the present u."""
 
-    def accept(self) -> None:
-        """Accept the present u as a point of the path; turns are counted from here."""
-
     def compile_residual(self) -> None:
         """Compile the forms of `energy` and `add_residual`."""
 
@@ -130,9 +127,6 @@ class FormTerm:
         if self._follow:
             self._follow()
 
-    def accept(self) -> None:
-        """Its energy has no history."""
-
     def compile_residual(self) -> None:
         _ = self.energy_form, self.residual_form
 
@@ -152,6 +146,49 @@ class FormTerm:
         """Add factor times the skew part of the derivative of the work, of a load without potential."""
         self._factor.value = factor
         compat.add_matrix(N, self.skew_form, clamped)
+
+
+class Counted(FormTerm):
+    """-Pi = intensity times the angle of an edge, integrated; the angle goes on beyond half a turn.
+
+    Derivatives know no turns. The energy is that of the angle nearest to `value`, an angle that the state has among its
+    amplitudes, so that it is a function of the state.
+    """
+
+    def count_from(self, past: fem.Constant, whole: float) -> None:
+        """Count the turns.
+
+        Parameters
+        ----------
+        past
+            Cosine and sine of the turn that the angle is counted from; see `edges.turning`.
+        whole
+            Intensity times the edge's length: -Pi of one radian.
+        """
+        self._past, self._whole, self._comm = past, whole, self._u.function_space.mesh.comm
+        self._turned = 0.0
+
+    @property
+    def setting(self) -> str:
+        """Name of `value` among the amplitudes of a state; no user's name has a space."""
+        return f"turn of {self.name}"
+
+    @property
+    def value(self) -> float:
+        """The angle (rad) that turns are counted from; the mean angle of the edge is within pi of it."""
+        return self._turned
+
+    @value.setter
+    def value(self, turned: float) -> None:
+        if turned != self._turned:
+            self._turned, self._past.value = turned, np.array([np.cos(turned), np.sin(turned)])
+
+    def energy(self) -> float:
+        return super().energy() - (self._turned * self._whole if self._comm.rank == 0 else 0.0)
+
+    def angle(self) -> float:
+        """The mean angle of the edge at the present u; collective."""
+        return -float(self._comm.allreduce(self.energy())) / self._whole
 
 
 class DensityTerm(FormTerm, Generic[Density]):
@@ -188,9 +225,6 @@ class LinearTerm:
 
     def follow(self) -> None:
         """It depends on nothing else."""
-
-    def accept(self) -> None:
-        """Its energy has no history."""
 
     def compile_residual(self) -> None:
         """A sum of entries."""

@@ -19,7 +19,7 @@ from magshell_fenicsx.continuation.edge import join, split
 from magshell_fenicsx.continuation.factor import Factorisation
 from magshell_fenicsx.continuation.motion import Motion, constrained, held_back
 from magshell_fenicsx.continuation.newton import MOTION
-from magshell_fenicsx.continuation.system import Amplitudes, Edged, Skewed, System, Vector, dot, max_abs
+from magshell_fenicsx.continuation.system import Amplitudes, Edged, Skewed, State, System, Vector, dot, max_abs
 
 TOLERANCE = 1e-10  # of u in a step, over the system's length or, where that is longer, a tenth of the displacement
 STALLED = 1e-7  # steps below this that shrink no more are rounding
@@ -146,6 +146,8 @@ class Integrator:
         self._K: PETSc.Mat | None = None
         self._factored = 0.0  # the time step of the latest factors
         self._x, self._y = mass.createVecs()
+        # the turns of edges under moments, whose work is counted on
+        self._counted: Callable[[State, Amplitudes], State] = getattr(system, "counted", lambda state, before: state)
 
     def begin(self, t: float, u: Vector, v: Vector, before: Motion | None = None) -> Motion:
         """A motion with the acceleration that the loads after t give it; sums go on from those of `before`.
@@ -163,6 +165,7 @@ class Integrator:
             work += self._kinetic(v, t, False)
         if self.device:
             u, v, mu = constrained(self.system, self.device, inverse, u, v, mu)
+        mu = self._counted(State(u, mu), before.mu if before else mu).mu
         r = self.system.residual(u, mu) + self.drag * self._times(v)
         if self.ground:
             r = r + self._pulled(self.ground.acceleration(t, False) + self.drag * self.ground.velocity(t, False))
@@ -297,7 +300,7 @@ class Integrator:
     def _accepted(self, now: Motion, u: Vector, y: Array, dt: float) -> Motion:
         comm, rule, t = self.system.comm, self.rule, now.t + dt
         a, v = self._rates(now, u, dt)
-        mu = self._at(now, y, 1.0, dt)
+        mu = self._counted(State(u, self._at(now, y, 1.0, dt)), now.mu).mu
         after = Motion(t, u, v, a, mu)
         potentials, moved, w = self._potentials(after, True), u - now.u, (1 - rule.alpha_f) * v + rule.alpha_f * now.v
         work = sum(self._work(name, now, mu, potentials) for name in potentials)

@@ -89,7 +89,7 @@ def functional(scene: Scene, state: State, of: str | Target) -> Functional:
 def differentiable(scene: Scene, state: State) -> list[str]:
     """The columns of path.csv that `functional` takes, and those of them in units."""
     at_pole = AT_POLE if "pole" in scene.model.normals else ()
-    amplitudes = (amplitude(name).column for name in state.mu)
+    amplitudes = (amplitude(name).column for name in state.mu if name not in scene.model.system.settings)
     found = dict.fromkeys(
         ("energy", *_conjugates(scene), *_displacements(scene), *_forces(scene), *at_pole, *amplitudes)
     )

@@ -207,10 +207,9 @@ class Scene:
         }
 
     def energies(self, state: State) -> dict[str, float]:
-        """The energy of each term at an accepted point, over E h R^2; all parts of one field together."""
+        """The energy of each term, over E h R^2; all parts of one field together."""
         model, found = self.model, defaultdict[str, float](float)
         model.system.place(state.mu)
-        model.system.accept(state.u)
         potentials = model.system.energies(state.u)
         for t in model.system.terms:
             name = t.name.removesuffix(" across").removesuffix(" third")

@@ -46,10 +46,13 @@ def followed(stage: Stage, path: Path, start: Point, goal: Goal, branches: PathS
     Stopped
         If the path is lost.
     """
-    walk = Walk(path, start, goal, partial(_checked, stage))
+    walk, counted = Walk(path, start, goal, partial(_checked, stage)), stage.scene.model.system.counted
+    past = start.state.mu
     for record in _followed(stage, walk, branches):
-        yield replace(record, point=stage.point(record.point))
-    return stage.leave(walk.points[-1].state)
+        point = stage.point(record.point)
+        past = (state := counted(point.state, past)).mu
+        yield replace(record, point=replace(point, state=state))
+    return counted(stage.leave(walk.points[-1].state), past)
 
 
 def _checked(stage: Stage, low: Point, high: Point) -> State | None:

@@ -16,7 +16,7 @@ from magshell_fenicsx.assembly.growing import Growing
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.parameter import FreeParameter, make_parameters
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
-from magshell_fenicsx.assembly.terms import FormTerm
+from magshell_fenicsx.assembly.terms import Counted, FormTerm
 from magshell_fenicsx.continuation.system import Vector
 from magshell_fenicsx.models.axisymmetric import jets
 from magshell_fenicsx.models.axisymmetric.dead_load import dead_loads, pole_force
@@ -31,7 +31,6 @@ from magshell_fenicsx.models.observed import Observed
 from magshell_fenicsx.models.shell import edges
 from magshell_fenicsx.models.shell.driving import field_parameters
 from magshell_fenicsx.models.shell.energy import Density
-from magshell_fenicsx.models.shell.moment import Counted
 from magshell_fenicsx.models.shell.moved import Support, moving, rotation_of
 from magshell_fenicsx.models.shell.natural import Shape, natural_field
 from magshell_fenicsx.models.shell.parameters import Condition, EdgeMoment, Loads, Material, Potential, default_penalty
@@ -156,7 +155,7 @@ class MeridianModel(Observed):
             parameters=parameters,
             moving=moving(self.r0, self.supports, loads),
         )
-        self.system.settings = dict(known.setting for known, _ in self.contacts.values())
+        self.system.settings |= dict(known.setting for known, _ in self.contacts.values())
         self._volume = self.kernels.compile("volume energy", 2 * np.pi * volume(jets.revolved(self.u)))
         self._seen = {name: Probe.at(*place, self.r0) for name, place in meridian.points.items()}
         self.normals = {name: probe.normal for name, probe in self._seen.items()}

@@ -13,7 +13,7 @@ from petsc4py import PETSc
 from ufl.core.expr import Expr
 
 from magshell_fenicsx.assembly.kernels import KernelLog
-from magshell_fenicsx.assembly.terms import DensityTerm
+from magshell_fenicsx.assembly.terms import Counted, DensityTerm
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.kinematics import FIRST, Jet
 from magshell_fenicsx.platform import compat
@@ -126,6 +126,10 @@ class ShellTerm(DensityTerm[Density]):
         return self.points.energy(self.name) if self.points else super().energy()
 
 
+class MomentTerm(Counted, ShellTerm):
+    """A moment on an edge of a shell."""
+
+
 class HessianTerm:
     """A term that contributes only a tangent: the Hessian in v, at v = 0, of an energy of u and v.
 
@@ -152,9 +156,6 @@ class HessianTerm:
 
     def follow(self) -> None:
         """It depends on nothing else."""
-
-    def accept(self) -> None:
-        """It has no energy, and so no history."""
 
     def compile_residual(self) -> None:
         """There is none."""

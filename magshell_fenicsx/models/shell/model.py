@@ -239,7 +239,7 @@ class ShellModel(Observed):
         self.system = FiniteElementSystem(
             self.u, terms, held + mirrored, interior, material.h, fast, gradients, parameters, self.moving
         )
-        self.system.settings = dict(known.setting for known, _ in self.contacts.values())
+        self.system.settings |= dict(known.setting for known, _ in self.contacts.values())
         self._served = served
         self._interior, self._held, self.mirror = interior, held, mirror
         self._on_mirror = facets("symmetry")

@@ -25,6 +25,7 @@ from magshell_fenicsx.models.shell.contact import (
 from magshell_fenicsx.models.shell.energy import (
     Density,
     HessianTerm,
+    MomentTerm,
     Parameter,
     ShellTerm,
     cell_quadrature,
@@ -34,7 +35,6 @@ from magshell_fenicsx.models.shell.energy import (
 from magshell_fenicsx.models.shell.free import Constants, constants_of
 from magshell_fenicsx.models.shell.kinematics import CURVED, MOVED, SECOND, Jet
 from magshell_fenicsx.models.shell.laws import FULL, LINEAR, magnetic_densities
-from magshell_fenicsx.models.shell.moment import MomentTerm
 from magshell_fenicsx.models.shell.natural import Shape, grown
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.parameters import ACROSS, Magnetisation, Material

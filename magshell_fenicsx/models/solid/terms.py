@@ -12,13 +12,12 @@ from numpy.typing import NDArray
 from ufl.core.expr import Expr
 
 from magshell_fenicsx.assembly.kernels import KernelLog
-from magshell_fenicsx.assembly.terms import DensityTerm
+from magshell_fenicsx.assembly.terms import Counted, DensityTerm
 from magshell_fenicsx.mesh.hexahedra import MIDDLE, OUTER, Body
 from magshell_fenicsx.models.shell.applied import AppliedField
 from magshell_fenicsx.models.shell.energy import per_area
 from magshell_fenicsx.models.shell.free import Constants, constants_of
 from magshell_fenicsx.models.shell.kinematics import SECOND, Jet
-from magshell_fenicsx.models.shell.moment import Counted
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.parameters import ACROSS, Magnetisation
 from magshell_fenicsx.models.solid import densities, rotation_law
