@@ -79,7 +79,7 @@ def run(
     pictures: Annotated[bool, typer.Option(" /--no-pictures", help="draw none; magshell plot draws them later")] = True,
 ) -> None:
     """Solve a case and write path.csv, summary.json, fields and pictures."""
-    from magshell_fenicsx.case.case import Case
+    from magshell_fenicsx.case.opened import opened
     from magshell_fenicsx.mesh.patch import MeshError
     from magshell_fenicsx.output.report.verdict import sentence_of
     from magshell_fenicsx.output.store.folder import DiskError
@@ -91,7 +91,7 @@ def run(
     how: dict[str, Any] = {"resume": resume, "overwrite": overwrite, "time_limit": time_limit, "pictures": pictures}
     try:
         with exit_codes(MeshError, stopped=(DiskError,)):
-            read = Case.load(case, set_ or [])
+            read = opened(case, world(), set_ or [])
             with live_line(world().size, print_line) as (say, tell):
                 result = run_case(read, folder, say=say, tell=tell, **how)
     except AlreadyComplete as e:
@@ -264,13 +264,14 @@ app.command()(view)
 def check(case: CaseFile, set_: Settings = None) -> None:
     """Validate a case; print what would be built and what is left out."""
     from magshell_fenicsx.case.case import Case
-    from magshell_fenicsx.case.source import CaseError, read_source
+    from magshell_fenicsx.case.opened import read_together, with_same_files
+    from magshell_fenicsx.case.source import CaseError
     from magshell_fenicsx.plan.check import describe
     from magshell_fenicsx.simulate.perfect import with_modes
 
     with exit_codes():
-        source = read_source(case, set_ or [])
-        read = Case.from_source(source)
+        source = read_together(case, world(), set_ or [])
+        read = with_same_files(Case.from_source(source), world())
         print_line(describe(with_modes(read, world())))
         if read.ensemble:
             from magshell_fenicsx.studies.ensemble.door import refuse_unknown_keys

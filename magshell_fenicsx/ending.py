@@ -2,6 +2,7 @@
 
 import signal
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import Any
@@ -10,6 +11,9 @@ from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.platform.plain import typer
 
 INVALID, STOPPED = 2, 3
+FAILED = 32101  # tag of the messages between ranks that fail
+PATIENCE = 5.0  # s in which an error of all ranks reaches the last of them
+DELIVERED = 0.2  # s in which a message is on its way to the terminal
 
 
 def world() -> Any:
@@ -27,10 +31,31 @@ def print_line(line: str) -> None:
 
 
 def failure(message: str, code: int) -> typer.Exit:
-    if world().rank:
+    """Print the message of an error once, and return the end of this rank; ends all if the others have no error."""
+    comm = world()
+    if comm.size > 1 and not _all_fail(comm):
+        print(f"rank {comm.rank}: {message}", file=sys.stderr, flush=True)
+        time.sleep(DELIVERED)
+        comm.Abort(code)  # the other ranks would wait for this one for ever
+    if comm.rank:
         return typer.Exit()  # mpirun ends the job at the first failing rank, and may lose the message of rank 0
     print(message, file=sys.stderr, flush=True)
     return typer.Exit(code)
+
+
+def _all_fail(comm: Any) -> bool:
+    """Whether all ranks come here, as they do with an error of all, before those that have come lose patience."""
+    from mpi4py import MPI
+
+    others, end = [rank for rank in range(comm.size) if rank != comm.rank], time.monotonic() + PATIENCE
+    for rank in others:
+        comm.Isend(bytearray(1), rank, FAILED)
+    came = [comm.Irecv(bytearray(1), rank, FAILED) for rank in others]  # no collective: others may be in one
+    while not MPI.Request.Testall(came):
+        if time.monotonic() > end:
+            return False
+        time.sleep(0.01)
+    return True
 
 
 @contextmanager

@@ -16,7 +16,7 @@ from magshell_fenicsx.case.design import DesignSection
 from magshell_fenicsx.case.ensemble import EnsembleSection
 from magshell_fenicsx.case.expressions import is_formula
 from magshell_fenicsx.case.fields import MagneticSection, layer_average
-from magshell_fenicsx.case.file import digests
+from magshell_fenicsx.case.file import FileKeys, digests
 from magshell_fenicsx.case.frequencies import FrequenciesSection
 from magshell_fenicsx.case.gradients import GradientsSection
 from magshell_fenicsx.case.imperfections.dimple import DimpleSection
@@ -326,8 +326,17 @@ class Case(WithParts):
     def outside(self) -> dict[str, str | None]:
         """Hashes of what is solved besides its own keys: mesh file, other files, user-defined energies."""
         mesh = {"mesh_file": self.shell.digest} if isinstance(self.shell, MeshSurface) else {}
-        sections = self.imperfections | {f"magnetic.applied.sources.{i}": s for i, s in enumerate(self.sources)}
-        return mesh | digests(sections, self.magnetic and self.magnetic.remanent) | self.term_digests
+        return mesh | digests({key: s for key, s in self.readers.items() if s is not self.shell}) | self.term_digests
+
+    @property
+    def readers(self) -> dict[str, FileKeys]:
+        """The sections that read a file, by key; those below `shell` without that."""
+        sections: dict[str, object] = {
+            "shell": self.shell,
+            "magnetic.remanent": self.magnetic and self.magnetic.remanent,
+        }
+        sections |= self.imperfections | {f"magnetic.applied.sources.{i}": s for i, s in enumerate(self.sources)}
+        return {key: s for key, s in sections.items() if isinstance(s, FileKeys) and s.file}
 
     @classmethod
     def load(cls, file: str | Path, settings: Sequence[str] = ()) -> "Case":
@@ -344,6 +353,7 @@ class Case(WithParts):
     def from_source(cls, source: Source) -> "Case":
         """Validate plain data; see `load`."""
         try:
-            return cls.model_validate(source.data, context={"folder": source.folder}).written_at(source.place)
+            context = {"folder": source.folder, "files": source.files}
+            return cls.model_validate(source.data, context=context).written_at(source.place)
         except ValidationError as e:
             raise CaseError(explained(e.errors(), source, cls)) from None

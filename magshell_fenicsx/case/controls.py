@@ -3,11 +3,13 @@
 import csv
 from collections.abc import Sequence
 from pathlib import Path
+from textwrap import shorten
 
 import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.case.source import CaseError
+from magshell_fenicsx.platform.reading import Files, text_of
 
 Array = NDArray[np.float64]
 MOST = 200_000  # points
@@ -15,7 +17,7 @@ PLACES = {3: ("x", "y", "z"), 2: ("rho", "z")}
 VECTORS = {3: ("bx", "by", "bz"), 2: ("b_rho", "b_z")}
 
 
-def read_vectors(file: Path, key: str) -> tuple[Array, Array]:
+def read_vectors(file: Path, key: str, files: Files | None = None) -> tuple[Array, Array]:
     """Places (n, 3) and vectors (n, 3), or both (n, 2), of a CSV file with the columns x, y, z, bx, by, bz or
     rho, z, b_rho, b_z.
 
@@ -25,16 +27,16 @@ def read_vectors(file: Path, key: str) -> tuple[Array, Array]:
         If it has other columns, no row, or what is no number; the message begins with the key.
     """
     try:
-        with file.open(newline="", encoding="utf-8") as stream:
-            header, *rows = [[cell.strip() for cell in row] for row in csv.reader(stream) if row]
-    except (OSError, UnicodeDecodeError, ValueError) as e:
+        lines = text_of((files or Files()).content(file)).splitlines()
+        header, *rows = [[cell.strip() for cell in row] for row in csv.reader(lines) if row]
+    except (OSError, ValueError, csv.Error) as e:
         raise CaseError(f"{key}: {file}: cannot be read: {getattr(e, 'strerror', None) or 'no table'}") from None
     for dim in (3, 2):
         columns = (*PLACES[dim], *VECTORS[dim])
         if sorted(header) == sorted(columns):
             return _numbers(file, key, header, rows, columns, dim)
     allowed = " or ".join(", ".join((*PLACES[dim], *VECTORS[dim])) for dim in (3, 2))
-    raise CaseError(f"{key}: {file}: its columns are {', '.join(header)}; allowed are {allowed}")
+    raise CaseError(f"{key}: {file}: its columns are {shorten(', '.join(header), 200)}; allowed are {allowed}")
 
 
 def _numbers(

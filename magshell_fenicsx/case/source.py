@@ -3,10 +3,13 @@
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from errno import EFBIG
 from pathlib import Path
 from typing import Any
 
 import yaml
+
+from magshell_fenicsx.platform.reading import Files, read_whole
 
 Location = tuple[str | int, ...]
 INSTEAD: dict[Location, str] = {
@@ -40,12 +43,15 @@ class Source:
         Location of a key or item -> "file:line" or the `--set` that gave it.
     folder
         Where the files that it names are.
+    files
+        The contents of these, each read once.
     """
 
     name: str
     data: dict[str, Any]
     places: dict[Location, str] = field(default_factory=dict)
     folder: Path = field(default_factory=Path)
+    files: Files = field(default_factory=Files, compare=False)
 
     def place(self, location: Location) -> str:
         """The place of a key, or of the innermost section around it."""
@@ -64,16 +70,17 @@ def read_source(file: Path, settings: Sequence[str] = ()) -> Source:
         If the file cannot be read, is no YAML mapping, or has a key twice, or a setting is none.
     """
     try:
-        with file.open("rb") as stream:
-            content = stream.read(LARGEST + 1)
-        text = content.decode("utf-8")
+        text = read_whole(file, LARGEST).decode("utf-8")
     except OSError as e:
-        raise CaseError(f"{file}: cannot be read: {e.strerror}") from None
+        large = e.errno == EFBIG
+        raise CaseError(
+            f"{file}: is larger than {LARGEST} bytes, too large for a case file"
+            if large
+            else f"{file}: cannot be read: {e.strerror}"
+        ) from None
     except UnicodeDecodeError:
         raise CaseError(f"{file}: is not a text file in UTF-8") from None
-    if len(content) > LARGEST:
-        raise CaseError(f"{file}: is larger than {LARGEST} bytes, too large for a case file")
-    source = Source(str(file), {}, folder=file.parent)
+    source = Source(str(file), {}, folder=file.parent.absolute())
     node = _parsed(source, lambda: yaml.compose(text, Loader=_Loader))
     if not isinstance(node, yaml.MappingNode):
         raise CaseError(f"{file}: a case file is a mapping of sections (shell, boundary, loading, ...)")

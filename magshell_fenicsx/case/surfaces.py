@@ -4,15 +4,14 @@ Lengths are plain numbers of one unit that the user chooses, or all have units a
 the same holds for Young's modulus, so that loads and results are in the user's units or in SI.
 """
 
-import hashlib
 from math import radians
-from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import BeforeValidator, Field, ModelWrapValidatorHandler, PrivateAttr, ValidationInfo, model_validator
 
 from magshell_fenicsx.case.expressions import Formula, formula
+from magshell_fenicsx.case.file import FileKeys
 from magshell_fenicsx.case.history import Time
 from magshell_fenicsx.case.imperfections.dimple import DimpleSection
 from magshell_fenicsx.case.imperfections.registered import Imperfections
@@ -280,7 +279,7 @@ class RevolutionSurface(SurfaceSection):
         return self
 
 
-class MeshSurface(SurfaceSection):
+class MeshSurface(FileKeys, SurfaceSection):
     """A .msh file: physical groups of surfaces are patches, those of curves are edges.
 
     What a mesh must be, and how to make one: meshes/README.md.
@@ -294,11 +293,6 @@ class MeshSurface(SurfaceSection):
     unit: Annotated[float, BeforeValidator(in_units("metre", bare=True), json_schema_input_type=str)] | None = None
     """Unit of the file's coordinates, such as mm; goes with lengths that have units"""
 
-    _folder: Path = PrivateAttr(default_factory=Path)
-
-    def model_post_init(self, context: Any, /) -> None:
-        self._folder = Path((context or {}).get("folder", "")).absolute()
-
     @model_validator(mode="before")
     @classmethod
     def _unit_of_the_file(cls, data: Any) -> Any:
@@ -309,19 +303,6 @@ class MeshSurface(SurfaceSection):
     @property
     def reference(self) -> float:
         return self.radius
-
-    @property
-    def path(self) -> Path:
-        """Where the file is."""
-        return self._folder / self.file
-
-    @property
-    def digest(self) -> str | None:
-        """Hash of the file's content; None if it cannot be read."""
-        try:
-            return hashlib.sha256(self.path.read_bytes()).hexdigest() if self.path.is_file() else None
-        except OSError:
-            return None
 
 
 Surface = CapSurface | CylinderSurface | PlateSurface | AnnulusSurface | TorusSurface | RevolutionSurface | MeshSurface

@@ -1,7 +1,7 @@
 """Reading a surface mesh from a file of gmsh (.msh), with triangles of order 1, 2 or 3."""
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +12,7 @@ from magshell_fenicsx.mesh.msh_format import Content, parsed
 from magshell_fenicsx.mesh.nodal_normals import nodal_normals
 from magshell_fenicsx.mesh.patch import MeshError, PatchMesh, place_text
 from magshell_fenicsx.mesh.soundness import border_edges, oriented
+from magshell_fenicsx.platform.reading import Files
 
 Array = NDArray[np.float64]
 TRIANGLES, LINES = ("Triangle 3", "Triangle 6", "Triangle 10"), ("Line 2", "Line 3", "Line 4")
@@ -28,11 +29,14 @@ class MeshFile:
         Factor from its coordinates to lengths over R.
     normals
         Whether nodes are places followed by normals, (n, 6), which the triangles around a node have on average.
+    files
+        What has its content.
     """
 
     path: Path
     scale: float
     normals: bool = False
+    files: Files = field(default_factory=Files, compare=False)
 
 
 def in_space(x: Array) -> Array:
@@ -111,10 +115,10 @@ def _content(
     file: MeshFile,
 ) -> tuple[Array, NDArray[np.int64], dict[str, NDArray[np.bool_]], dict[str, NDArray[np.int64]]]:
     """Nodes (n, 3), cells, patches and edges (vertex pairs)."""
-    if not file.path.is_file():
-        raise MeshError(f"{file.path}: there is no such mesh file")
     try:
-        held = parsed(file.path.read_bytes())
+        held = parsed(file.files.content(file.path))
+    except FileNotFoundError:
+        raise MeshError(f"{file.path}: there is no such mesh file") from None
     except OSError as e:
         raise MeshError(f"{file.path}: cannot be read: {e.strerror}") from None
     except MeshError as e:

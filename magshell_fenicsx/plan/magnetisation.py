@@ -29,7 +29,7 @@ def by_points(section: RemanentSection, turn: float = 0.0) -> ByControls:
     CaseError
         If its file cannot be read.
     """
-    places, vectors = read_vectors(section.path, "magnetic.remanent.file")
+    places, vectors = read_vectors(section.path, "magnetic.remanent.file", section.files)
     assert section.filter
     return ByControls(Controls(places, section.filter), vectors, rotation(turn) if turn else None)
 

@@ -152,7 +152,7 @@ def outline(case: Case) -> Outline:
     """The outline of a case's perfect shell."""
     shell = case.shell
     if isinstance(shell, MeshSurface):
-        file = MeshFile(shell.path, (shell.unit or 1.0) / shell.reference, bool(shell.imperfections))
+        file = MeshFile(shell.path, (shell.unit or 1.0) / shell.reference, bool(shell.imperfections), shell.files)
 
         def planes(vectors: Sequence[Array], loosely: bool) -> list[Mirror]:
             try:

@@ -97,7 +97,7 @@ def run(
         If the disk is full before the first point.
     """
     start = time.perf_counter()
-    case = opened(case)
+    case = opened(case, comm)
     case = case.with_terms(terms) if terms else case
     watch = Watch(comm, start, time_limit, signals=out is not None)
     say, tell = (say, tell or _ignored) if comm.rank == 0 else (_ignored, _ignored)

@@ -81,7 +81,7 @@ class Scene:
         terms: Sequence[OwnTerm] = (),
     ) -> None:
         start = time.perf_counter()
-        case = opened(case)
+        case = opened(case, comm)
         if any(isinstance(s, ModesSection) and not (s.file or s.shapes) for s in case.imperfections.values()):
             raise CaseError(
                 "shell.imperfections: kind: modes: compute them first, by simulate.perfect.with_modes(case, comm)"

@@ -65,7 +65,7 @@ def data(section: DataSection, case: Case, drawn: Outline, key: str) -> Flaw:
             _known.clear()
         lengths = Lengths(1 / case.shell.R_over_h, case.shell.reference, case.shell.with_units)
         try:
-            scan = read_scan(section.path, lengths)
+            scan = read_scan(section.path, lengths, section.files)
             _known[this] = _fitted(section, scan, case.shell.geometry, drawn, lengths)
         except ScanError as e:
             raise CaseError(f"shell.{key}.file: {section.file}: {e}") from None

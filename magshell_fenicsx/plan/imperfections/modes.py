@@ -1,9 +1,7 @@
 """Modes of the perfect shell as imperfections."""
 
-import warnings
 from dataclasses import dataclass
 from math import sqrt
-from pathlib import Path
 
 import numpy as np
 import scipy
@@ -16,6 +14,7 @@ from magshell_fenicsx.mesh.mirror import Mirror
 from magshell_fenicsx.mesh.scattered import Scattered, scattered
 from magshell_fenicsx.plan.imperfections.flaw import Flaw
 from magshell_fenicsx.plan.outline import Outline
+from magshell_fenicsx.platform.reading import vtk_data
 
 Array = NDArray[np.float64]
 EQUAL = 1e-4  # part of the largest value within which crests and troughs are equally large
@@ -86,7 +85,7 @@ def modes(section: ModesSection, case: Case, drawn: Outline, key: str) -> Flaw:
     """
     h = 1 / case.shell.R_over_h
     if section.file is not None and section.shapes is None:
-        section.become((_read(section.path, drawn, f"shell.{key}.file: {section.file}"),))
+        section.become((_read(section, drawn, f"shell.{key}.file: {section.file}"),))
     shapes = section.shapes or ()
     amplitudes = tuple(a * h for a in section.amplitudes[: len(shapes)])
     names = [f"mode {i}{f' (m = {s.m})' if isinstance(s, Round) else ''}" for i, s in enumerate(shapes, 1)]
@@ -94,14 +93,12 @@ def modes(section: ModesSection, case: Case, drawn: Outline, key: str) -> Flaw:
     return Flaw(Modes(shapes, amplitudes), 1.2 * sqrt(h), account=", ".join(words) or "modes that the run computes")
 
 
-def _read(file: Path, drawn: Outline, key: str) -> Scattered:
-    import pyvista  # VTK takes long to import
-
+def _read(section: ModesSection, drawn: Outline, key: str) -> Scattered:
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # the error follows
-            found = pyvista.read(file).point_data
+        found = vtk_data(section.files.content(section.path), section.path.suffix).point_data
         r0, w = (np.asarray(found[name], dtype=float) for name in ("r0", "mode_w"))
+    except OSError as e:
+        raise CaseError(f"{key}: cannot be read: {e.strerror or e}") from None
     except Exception as e:  # VTK and pyvista raise many types
         raise CaseError(f"{key}: is no mode file that a run writes (fields/mode_*.vtu): {e}") from None
     if r0.shape != (len(w), 3) or not (np.isfinite(r0).all() and np.isfinite(w).all() and np.abs(w).max() > 0):

@@ -1,15 +1,18 @@
 """Reading measured places and deviations: CSV with a header, or .npz."""
 
+import io
 import re
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from textwrap import shorten
 
 import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.parts.section import in_units
+from magshell_fenicsx.platform.reading import Files, arrays, text_of
 
 Array = NDArray[np.float64]
 HEADER = re.compile(r"\s*(\w+)\s*(?:[\[(]\s*([^\])]+?)\s*[\])])?\s*")  # x, x [mm] or x (mm)
@@ -68,7 +71,7 @@ class Scan:
         return self.columns.get("w0")
 
 
-def read_scan(file: Path, lengths: Lengths) -> Scan:
+def read_scan(file: Path, lengths: Lengths, files: Files | None = None) -> Scan:
     """Read a file.
 
     Raises
@@ -76,14 +79,14 @@ def read_scan(file: Path, lengths: Lengths) -> Scan:
     ScanError
         If it cannot be read, or has not the columns.
     """
-    known, units = table(file)
+    known, units = table(file, files or Files())
     wanted = next(
         (names for names in PLACES if set(names) <= known.keys() and ("w0" in known or len(names) == 3)), None
     )
     if wanted is None:
         raise ScanError(
-            f"has the columns {', '.join(map(repr, known))}; needed are x, y, z, w0, or x, y, z of the real "
-            "surface, or polar, azimuth, w0 of a sphere, or azimuth, z, w0 of a cylinder"
+            f"has the columns {shorten(', '.join(map(repr, known)), 200)}; needed are x, y, z, w0, or x, y, z of the "
+            "real surface, or polar, azimuth, w0 of a sphere, or azimuth, z, w0 of a cylinder"
         )
     names = [*wanted, *(["w0"] if "w0" in known else [])]
     if "w0" in units and units["w0"] is None and any(units[name] for name in wanted if name not in ANGLES):
@@ -91,7 +94,7 @@ def read_scan(file: Path, lengths: Lengths) -> Scan:
     return _finite(names, [known[name] * _factor(units[name], name, lengths) for name in names])
 
 
-def table(file: Path) -> tuple[dict[str, Array], dict[str, str | None]]:
+def table(file: Path, files: Files) -> tuple[dict[str, Array], dict[str, str | None]]:
     """The columns of a CSV file or the arrays of an .npz file, and their units, by name.
 
     Raises
@@ -100,14 +103,20 @@ def table(file: Path) -> tuple[dict[str, Array], dict[str, str | None]]:
         If it cannot be read, or has a column twice.
     """
     try:
-        if file.stat().st_size > LARGEST:
-            raise ScanError(f"is larger than {LARGEST // 1_000_000} MB; leave out rows")
-        columns = _npz(file) if file.suffix == ".npz" else _csv(file)
+        content = files.content(file)
     except OSError as e:
         raise ScanError(f"cannot be read: {e.strerror or e}") from None
+    if len(content) > LARGEST:
+        raise ScanError(f"is larger than {LARGEST // 1_000_000} MB; leave out rows")
+    try:
+        columns = arrays(content) if file.suffix == ".npz" else _csv(text_of(content))
+    except ScanError:
+        raise
+    except ValueError as e:
+        raise ScanError(str(e)) from None
     units = dict(_named(header) for header in columns)
     if len(units) < len(columns):
-        raise ScanError(f"has a column twice: {', '.join(columns)}")
+        raise ScanError(f"has a column twice: {shorten(', '.join(columns), 200)}")
     return {name: np.asarray(v, dtype=float) for name, v in zip(units, columns.values(), strict=True)}, units
 
 
@@ -137,26 +146,16 @@ def _named(header: str) -> tuple[str, str | None]:
     return (found[1], found[2]) if found else (header, None)
 
 
-def _npz(file: Path) -> dict[str, Array]:
-    try:
-        with np.load(file, allow_pickle=False) as stored:
-            return {name: np.asarray(stored[name], dtype=float) for name in stored.files}
-    except OSError:
-        raise
-    except Exception as e:  # whatever is wrong in a zip file of arrays
-        raise ScanError(f"is no .npz file of arrays of numbers: {e}") from None
-
-
-def _csv(file: Path) -> dict[str, Array]:
-    with file.open(encoding="utf-8-sig", errors="replace") as stream:
-        header = next((line for line in stream if line.strip()), "").lstrip("# ").strip()
-        mark = next((mark for mark in (";", "\t", ",") if mark in header), None)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of an empty file
-            try:
-                rows = np.genfromtxt(stream, delimiter=mark, ndmin=2, comments="#")
-            except ValueError as e:
-                raise ScanError(f"has rows of different lengths: {str(e).splitlines()[-1].strip()}") from None
+def _csv(text: str) -> dict[str, Array]:
+    stream = io.StringIO(text)
+    header = next((line for line in stream if line.strip()), "").lstrip("# ").strip()
+    mark = next((mark for mark in (";", "\t", ",") if mark in header), None)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of an empty file
+        try:
+            rows = np.genfromtxt(stream, delimiter=mark, ndmin=2, comments="#")
+        except ValueError as e:
+            raise ScanError(f"has rows of different lengths: {str(e).splitlines()[-1].strip()}") from None
     names = [
         name.strip() for name in (header.split(mark) if mark else re.findall(r"\w+(?:\s*[\[(][^\])]*[\])])?", header))
     ]

@@ -1,7 +1,7 @@
 """A field that is known on a rectilinear grid, as a C2 cubic spline."""
 
-from functools import lru_cache
 from itertools import combinations_with_replacement
+from math import prod
 from pathlib import Path
 
 import numpy as np
@@ -15,10 +15,12 @@ from magshell_fenicsx.parts.section import in_units
 from magshell_fenicsx.plan.imperfections.scan import ScanError, table
 from magshell_fenicsx.plan.lines import edges
 from magshell_fenicsx.plan.sources.known import Array, Known
+from magshell_fenicsx.platform.reading import Files, vtk_data
 
 PLACES, FIELD = ("x", "y", "z"), ("Bx", "By", "Bz")
 VTK, DEGREE = (".vtk", ".vti", ".vtr", ".vts"), 3
 SAME = 1e-6  # of the distance between places: rounding of a table
+_known: dict[tuple[Path, str], tuple[list[Array], Array]] = {}  # a run plans its case several times
 
 
 def grid(section: GridSection, case: Case, key: str) -> Known:
@@ -30,7 +32,7 @@ def grid(section: GridSection, case: Case, key: str) -> Known:
         If the file is no such grid.
     """
     try:
-        axes, values = read(section.path, section.digest)
+        axes, values = read(section.path, section.digest, section.files)
     except ScanError as e:
         raise CaseError(f"{key}.file: {section.file}: {e}") from None
     spline = _spline(axes, values)
@@ -59,8 +61,7 @@ def _spline(axes: list[Array], values: Array) -> "scipy.interpolate.NdBSpline":
     return scipy.interpolate.NdBSpline(tuple(knots), values, DEGREE, extrapolate=False)
 
 
-@lru_cache(maxsize=8)
-def read(file: Path, digest: str | None) -> tuple[list[Array], Array]:
+def read(file: Path, digest: str | None, files: Files) -> tuple[list[Array], Array]:
     """The places along each axis in m, and B (nx, ny, nz, 3) in T. A file is read again if its `digest` has changed.
 
     Raises
@@ -68,28 +69,39 @@ def read(file: Path, digest: str | None) -> tuple[list[Array], Array]:
     ScanError
         If it cannot be read, or is no rectilinear grid.
     """
-    x, B = _vtk(file) if file.suffix in VTK else _table(file)
+    if digest is None or (file, digest) not in _known:
+        if len(_known) > 3:
+            _known.clear()
+        _known[file, digest or ""] = _gridded(*(_vtk(file, files) if file.suffix in VTK else _table(file, files)))
+    return _known[file, digest or ""]
+
+
+def _gridded(x: Array, B: Array) -> tuple[list[Array], Array]:
+    """The places along each axis, and the values (nx, ny, nz, 3), of rows in any order."""
     axes = [_places(x[:, i]) for i in range(3)]
     shape = tuple(len(axis) for axis in axes)
     if min(shape) <= DEGREE:
         raise ScanError(f"has {' x '.join(map(str, shape))} places: a cubic spline needs four along each axis")
-    where = tuple(_nearest(axis, x[:, i]) for i, axis in enumerate(axes))
-    values = np.full((*shape, 3), np.nan)
-    values[where] = B
-    if len(x) != np.prod(shape) or not np.isfinite(values).all():
+    values = np.full((len(x), 3), np.nan)
+    if len(x) == prod(shape):  # scattered places have far more places along the axes than rows
+        where = tuple(_nearest(axis, x[:, i]) for i, axis in enumerate(axes))
+        values[np.ravel_multi_index(where, shape)] = B
+    if not np.isfinite(values).all():
         raise ScanError(
             f"is no rectilinear grid of finite numbers: {len(x)} rows with {' x '.join(map(str, shape))} "
             "different places along the axes"
         )
-    return axes, values
+    return axes, values.reshape(*shape, 3)
 
 
-def _table(file: Path) -> tuple[Array, Array]:
-    known, units = table(file)
+def _table(file: Path, files: Files) -> tuple[Array, Array]:
+    known, units = table(file, files)
     if missing := [name for name in (*PLACES, *FIELD) if name not in known]:
         raise ScanError(f"has no column {', '.join(missing)}; needed are {', '.join((*PLACES, *FIELD))}")
-    if file.suffix == ".npz" and known["Bx"].ndim == 3 and known["x"].ndim == 1:  # the places along each axis
-        known |= dict(zip(PLACES, np.meshgrid(*(known[name] for name in PLACES), indexing="ij"), strict=True))
+    axes = [known[name] for name in PLACES]
+    on_axes = file.suffix == ".npz" and known["Bx"].ndim == 3 and {a.ndim for a in axes} == {1}
+    if on_axes and known["Bx"].size == prod(a.size for a in axes):  # the places along each axis
+        known |= dict(zip(PLACES, np.meshgrid(*axes, indexing="ij"), strict=True))
     columns = [known[name].ravel() * _size(units[name], name) for name in (*PLACES, *FIELD)]
     if len({len(column) for column in columns}) > 1:
         raise ScanError("its arrays have different lengths")
@@ -104,13 +116,11 @@ def _size(unit: str | None, name: str) -> float:
         raise ScanError(f"column {name}: its unit {unit} {e}") from None
 
 
-def _vtk(file: Path) -> tuple[Array, Array]:
-    import pyvista
-
+def _vtk(file: Path, files: Files) -> tuple[Array, Array]:
     try:
-        data = pyvista.read(file)
-    except OSError as e:
-        raise ScanError(f"cannot be read: {e.strerror or e}") from None
+        data = vtk_data(files.content(file), file.suffix)
+    except (OSError, ValueError) as e:
+        raise ScanError(f"cannot be read: {getattr(e, 'strerror', None) or e}") from None
     if "B" not in data.point_data or np.shape(data.point_data["B"]) != (data.n_points, 3):
         raise ScanError("has no vector B at its points")
     return np.array(data.points, dtype=float), np.array(data.point_data["B"], dtype=float)

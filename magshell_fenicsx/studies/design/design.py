@@ -19,7 +19,8 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.source import CaseError, read_source
+from magshell_fenicsx.case.opened import read_together, with_same_files
+from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.output.store.durable import write_whole
 from magshell_fenicsx.output.store.folder import by_first, held_folder
 from magshell_fenicsx.platform import sources
@@ -174,8 +175,8 @@ def design(
     Missed
         After everything is written: if a target is not reached, a constraint not kept, or no optimum found.
     """
-    source = read_source(Path(file), settings)
-    case, folder = Case.from_source(source), Path(out)
+    source = read_together(file, comm, settings)
+    case, folder = with_same_files(Case.from_source(source), comm), Path(out)
     if case.design is None:
         raise CaseError(f"{file}: design: is missing: it says what varies and what is wanted")
     try:

@@ -280,7 +280,7 @@ def _controls(case: Case, design: DesignSection) -> tuple[Controls, Array]:
     if count is None:
         if not magnetic.remanent.file:
             raise CaseError("design.remanence: give points, or magnetic.remanent of kind: points")
-        places, vectors = read_vectors(magnetic.remanent.path, "magnetic.remanent.file")
+        places, vectors = read_vectors(magnetic.remanent.path, "magnetic.remanent.file", magnetic.remanent.files)
         return Controls(places, width or magnetic.remanent.filter or 1.0), vectors
     plan = make_plan(case)
     places, width = _spread(case, plan, count, width)

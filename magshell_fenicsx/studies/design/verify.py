@@ -6,8 +6,8 @@ from typing import Any
 
 from mpi4py import MPI
 
-from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.design import DesignSection
+from magshell_fenicsx.case.opened import opened
 from magshell_fenicsx.case.surfaces import MeshSurface
 from magshell_fenicsx.run.run import run
 from magshell_fenicsx.run.summary import Result
@@ -32,11 +32,11 @@ def verified(
     say: Callable[[str], None],
 ) -> dict[str, Any]:
     """The results of best.yaml by `run` into verified/, and what its excluded modes say; collective."""
-    case = Case.load(folder / "best.yaml")
+    case = opened(folder / "best.yaml", comm)
     settings = []
     if not isinstance(case.shell, MeshSurface):
         settings = [f"mesh.refinement={case.mesh.refinement * section.verify:.6g}"]
-        case = Case.load(folder / "best.yaml", settings)
+        case = opened(folder / "best.yaml", comm, settings)
     how = ", ".join(settings) or "on the mesh of the file"
     result = run(case, folder / "verified", comm)
     values = {name: _value(result, name) for name in problem.results if name not in problem.targets}

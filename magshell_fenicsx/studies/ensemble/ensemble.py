@@ -12,6 +12,7 @@ from magshell_fenicsx.case.source import CaseError, read_source
 from magshell_fenicsx.output.store.durable import write_whole
 from magshell_fenicsx.output.store.folder import by_first, prepare_folder
 from magshell_fenicsx.platform import sources
+from magshell_fenicsx.platform.first import from_first
 from magshell_fenicsx.platform.terminal import print_line
 from magshell_fenicsx.studies.ensemble.known import KnownFolds
 from magshell_fenicsx.studies.ensemble.picture import draw_ensemble
@@ -83,10 +84,12 @@ def ensemble(
         If the tables cannot be written.
     """
     scalar, numbers, ending = parse_scalar(result), _numbers(samples, seed, part), _ending(part)
-    source = read_source(Path(file), settings)
-    variants = [
-        make_samples(source, seed, numbers, deleted) for deleted in ([0, delete_weakest] if delete_weakest else [0])
-    ]
+
+    def drawn() -> list[list[Sample]]:
+        source = read_source(Path(file), settings)
+        return [make_samples(source, seed, numbers, less) for less in ([0, delete_weakest] if delete_weakest else [0])]
+
+    variants = from_first(comm, drawn)
     every = {sample.key: sample for variant in variants for sample in variant}
     folder = Path(out)
     if resume or merge:

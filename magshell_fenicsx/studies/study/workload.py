@@ -11,7 +11,7 @@ from typing import Any
 
 from mpi4py import MPI
 
-from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.opened import opened
 from magshell_fenicsx.run.rows import RowMaker
 from magshell_fenicsx.run.snaps import snaps
 from magshell_fenicsx.run.summary import Result
@@ -71,7 +71,7 @@ KINDS: dict[str, Callable[[Scene, list[str]], Report]] = {"path": path, "iterati
 def main(kind: str, case: str, settings: str, results: str) -> None:
     """Build the scene of a case, do the work, print the times."""
     comm = MPI.COMM_WORLD
-    scene = Scene(with_modes(Case.load(case, json.loads(settings)), comm), comm)
+    scene = Scene(with_modes(opened(case, comm, json.loads(settings)), comm), comm)
     report = KINDS[kind](scene, json.loads(results))
     if comm.rank == 0:
         model = scene.model

@@ -8,6 +8,9 @@ from contextlib import contextmanager
 import numpy as np
 from mpi4py import MPI
 
+from magshell_fenicsx.case.source import CaseError
+from magshell_fenicsx.output.store.folder import DiskError
+
 
 def deal(count: int, comm: MPI.Intracomm) -> Iterator[int]:
     """Distribute the numbers 0 to count - 1; the next free rank gets the next number. Collective.
@@ -38,10 +41,10 @@ def together(comm: MPI.Intracomm) -> Iterator[None]:
     """Wait at the end for all ranks; an error on one of several ends all, which would wait for it for ever."""
     try:
         yield
-    except BaseException:
+    except BaseException as e:
         if comm.size == 1:
             raise
-        traceback.print_exc()
-        sys.stderr.flush()
-        comm.Abort(1)
+        code = 2 if isinstance(e, CaseError) else 3 if isinstance(e, DiskError) else 1
+        print(f"rank {comm.rank}: {e if code > 1 else traceback.format_exc()}", file=sys.stderr, flush=True)
+        comm.Abort(code)
     comm.Barrier()

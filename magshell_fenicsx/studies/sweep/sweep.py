@@ -8,13 +8,14 @@ from mpi4py import MPI
 
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.output.store.folder import by_first, prepare_folder
+from magshell_fenicsx.platform.first import from_first
 from magshell_fenicsx.platform.terminal import print_line
 from magshell_fenicsx.studies.sweep.axes import Axis, parse_axes
 from magshell_fenicsx.studies.sweep.chain import Known, make_chains, run_chain
 from magshell_fenicsx.studies.sweep.deal import deal, together
 from magshell_fenicsx.studies.sweep.earlier import TABLE, with_earlier
 from magshell_fenicsx.studies.sweep.outcome import Outcome, load, save
-from magshell_fenicsx.studies.sweep.points import SweepPoint, identity, make_points, swept_source
+from magshell_fenicsx.studies.sweep.points import SweepPoint, make_points, swept_source
 from magshell_fenicsx.studies.sweep.sweep_plot import draw_sweep
 from magshell_fenicsx.studies.sweep.table import write_curves, write_sweep
 
@@ -66,15 +67,15 @@ def sweep(
     Raises
     ------
     CaseError
-        Before the first point, if a point is not a valid case, `out` cannot be written or has another sweep; or if the
-        mesh file changes.
+        Before the first point, if a point is not a valid case, or `out` cannot be written or has another sweep.
     DiskError
         If the tables cannot be written.
     """
     axes = parse_axes(over)
-    asked = make_points(Path(file), axes, settings)
+    source = from_first(comm, lambda: swept_source(Path(file), axes, settings))
+    asked = from_first(comm, lambda: make_points(Path(file), axes, settings))
     share = share_of(part, len(asked))
-    source, folder = swept_source(Path(file), axes, settings), prepare_folder(Path(out), comm, _ready)
+    folder = prepare_folder(Path(out), comm, _ready)
     points = by_first(comm, lambda: with_earlier(folder, source, axes, asked))
     before = len(points) - len(asked)
     files = [folder / "points" / f"{point.key}.json" for point in points]
@@ -92,8 +93,6 @@ def sweep(
     with together(comm):
         for chain in deal(len(chains), comm):
             for number, outcome in run_chain(chains[chain], shared):
-                if identity(points[number].case) != points[number].key:
-                    raise CaseError(f"{file}: its mesh file was changed during the sweep; start it again")
                 save(outcome, points[number].case, files[number])
                 place = f"{missing.index(number) + 1:4d}/{len(missing)}"
                 say(f"{place}  {points[number].label}: {_result(outcome)}, {outcome.wall_s:.1f} s")

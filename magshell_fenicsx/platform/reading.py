@@ -1,0 +1,197 @@
+"""Reading the files that a case names: each once, whole, of a limited size, and what it declares before it is unpacked.
+
+A case may come from somebody else. A file that it names may be a device or a pipe, may unpack to a million times its
+size, or may change while it is read; a message then says so before memory or time is spent.
+"""
+
+import hashlib
+import io
+import logging
+import os
+import re
+import stat
+import warnings
+import zipfile
+from errno import EFBIG, EINVAL, EISDIR
+from math import prod
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    import pyvista
+
+LARGEST = 500_000_000  # bytes of a file
+UNPACKED = 500_000_000  # bytes of numbers that a packed file may declare
+LONGEST = 10_000  # characters in a line of a table
+EXTENT = re.compile(rb"""\b(?:Whole)?Extent\s*=\s*["']([^"']*)["']""")
+COUNT = re.compile(rb"""\bNumberOf(?:Points|Cells|Tuples|Verts|Lines|Strips|Polys)\s*=\s*["']\s*(\d+)""")
+WIDTH = re.compile(rb"""<\s*(?:P?DataArray|Array)\b[^>]*""")
+COMPONENTS = re.compile(rb"""\bNumberOfComponents\s*=\s*["']\s*(\d+)""")
+LEGACY_GRID = re.compile(rb"^[ \t]*DIMENSIONS\s+(\d+)\s+(\d+)\s+(\d+)", re.M)
+LEGACY = re.compile(rb"^[ \t]*(?:POINTS|POINT_DATA|CELL_DATA|[XYZ]_COORDINATES|CELLS|CELL_TYPES)\s+(\d+)", re.M)
+LEGACY_ARRAY = re.compile(rb"^[ \t]*\S+[ \t]+(\d+)[ \t]+(\d+)[ \t]+[a-z_]+[ \t]*\r?$", re.M)
+
+
+def read_whole(file: Path, largest: int = LARGEST) -> bytes:
+    """The content of a regular file, as long as it is when it is opened.
+
+    Raises
+    ------
+    OSError
+        If it cannot be read, is a folder, a device or a pipe, or has more bytes than `largest`.
+    """
+    try:
+        _refuse_special(file, file.stat().st_mode)
+        number = os.open(file, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)  # never waits for a writer
+    except ValueError:
+        raise OSError(EINVAL, "its name has a zero byte", str(file)) from None
+    with os.fdopen(number, "rb") as stream:
+        about = os.fstat(number)
+        _refuse_special(file, about.st_mode)
+        if about.st_size > largest:
+            raise OSError(EFBIG, f"it is larger than {largest} bytes", str(file))
+        return stream.read(about.st_size)
+
+
+def _refuse_special(file: Path, mode: int) -> None:
+    if stat.S_ISDIR(mode):
+        raise IsADirectoryError(EISDIR, os.strerror(EISDIR), str(file))
+    if not stat.S_ISREG(mode):
+        raise OSError(EINVAL, "it is a device or a pipe; copy its content into a file", str(file))
+
+
+class Files:
+    """Contents of files, each as it was when it was first read.
+
+    A case and all copies of it have one of these, and on several ranks what rank 0 has read.
+
+    Attributes
+    ----------
+    shared
+        Whether all ranks have the same contents.
+    """
+
+    def __init__(self) -> None:
+        self.contents: dict[Path, bytes | OSError] = {}
+        self.shared = False
+        self._digests: dict[Path, str] = {}
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Self:
+        return self
+
+    def content(self, file: Path) -> bytes:
+        """The content of a file.
+
+        Raises
+        ------
+        OSError
+            See `read_whole`; the same each time.
+        """
+        if file not in self.contents:
+            try:
+                self.contents[file] = read_whole(file)
+            except OSError as e:
+                self.contents[file] = e
+        known = self.contents[file]
+        if isinstance(known, OSError):
+            raise known.with_traceback(None)
+        return known
+
+    def digest(self, file: Path) -> str | None:
+        """Hash of the content of a file; None if it cannot be read."""
+        if file not in self._digests:
+            try:
+                self._digests[file] = hashlib.sha256(self.content(file)).hexdigest()
+            except OSError:
+                return None
+        return self._digests[file]
+
+
+def text_of(content: bytes) -> str:
+    """The text of a table.
+
+    Raises
+    ------
+    ValueError
+        If one of its lines is longer than any row of numbers.
+    """
+    text = io.TextIOWrapper(io.BytesIO(content), encoding="utf-8-sig", errors="replace").read()
+    if long := next((number for number, line in enumerate(io.StringIO(text), 1) if len(line) > LONGEST), None):
+        raise ValueError(f"line {long} has more than {LONGEST} characters")
+    return text
+
+
+def arrays(content: bytes) -> dict[str, NDArray[np.float64]]:
+    """The arrays of numbers in an .npz file.
+
+    Raises
+    ------
+    ValueError
+        If it is none, has objects, or would unpack to more than `UNPACKED` bytes.
+    """
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            total = sum(_declared(archive, member) for member in archive.infolist())
+        if total <= UNPACKED:
+            with np.load(io.BytesIO(content), allow_pickle=False) as stored:
+                return {name: np.asarray(stored[name], dtype=float) for name in stored.files}
+    except Exception as e:  # whatever is wrong in a zip file of arrays
+        raise ValueError(f"is no .npz file of arrays of numbers: {e}") from None
+    raise ValueError(f"its arrays have {total:.3g} bytes; allowed at most {UNPACKED:.3g}")
+
+
+def _declared(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> int:
+    """The bytes of an array as floats, from its head alone; at least those that the archive declares."""
+    known: Any = np.lib.format
+    with archive.open(member) as stream:
+        version = known.read_magic(stream)
+        head = known.read_array_header_1_0 if version == (1, 0) else known.read_array_header_2_0
+        shape, _, kind = head(stream)
+    return max(member.file_size, prod(map(int, shape)) * max(int(kind.itemsize), 8))
+
+
+def vtk_data(content: bytes, suffix: str) -> "pyvista.DataSet":
+    """What VTK reads in a file; its own lines about damaged files are not printed.
+
+    Raises
+    ------
+    ValueError
+        If it declares more numbers than `UNPACKED` bytes hold, or VTK cannot read it.
+    """
+    if (size := _declared_by_vtk(content)) > UNPACKED:
+        raise ValueError(f"declares {size:.3g} bytes of numbers; allowed at most {UNPACKED:.3g}")
+    import pyvista  # VTK takes long to import
+    from vtkmodules.vtkCommonCore import vtkObject
+
+    shown, before = vtkObject.GetGlobalWarningDisplay(), logging.root.manager.disable
+    with TemporaryDirectory() as folder, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        copied = Path(folder) / f"data{suffix}"
+        copied.write_bytes(content)
+        try:
+            vtkObject.GlobalWarningDisplayOff()
+            logging.disable()
+            return pyvista.read(copied)
+        except Exception as e:  # VTK and pyvista raise many types
+            raise ValueError(str(e).replace(str(copied), "the file") or type(e).__name__) from None
+        finally:
+            logging.disable(before)
+            vtkObject.SetGlobalWarningDisplay(shown)
+
+
+def _declared_by_vtk(content: bytes) -> int:
+    """Bytes of the numbers that the heads in a VTK file declare: of its points and of all arrays at them."""
+    if b"<VTKFile" not in content[:4096]:
+        counts = [prod(map(int, found)) for found in LEGACY_GRID.findall(content)]
+        counts += [int(found) for found in LEGACY.findall(content)]
+        fields = [int(width) * int(count) for width, count in LEGACY_ARRAY.findall(content)]
+        return 8 * (3 * max(counts, default=0) + sum(fields))
+    extents = [[int(n) for n in re.findall(rb"-?\d+", found)] for found in EXTENT.findall(content)]
+    points = [prod(abs(b - a) + 1 for a, b in zip(each[::2], each[1::2], strict=False)) for each in extents]
+    most = max([*points, *(int(n) for n in COUNT.findall(content))], default=0)
+    widths = [int(found[1]) if (found := COMPONENTS.search(tag)) else 1 for tag in WIDTH.findall(content)]
+    return 8 * most * (3 + sum(widths))
