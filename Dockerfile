@@ -13,10 +13,14 @@ FROM env
 COPY . /usr/src/magshell
 RUN python3 -m pip install --no-deps --no-index --no-build-isolation --no-cache-dir \
         --break-system-packages /usr/src/magshell
-# Kernels are compiled here once; whatever user runs the image may read them and add others.
-ENV XDG_CACHE_HOME=/var/cache/magshell MPLCONFIGDIR=/var/cache/magshell/matplotlib HOME=/tmp
+# Kernels are compiled here once. Whoever runs the image reads them; nobody but root may change them, and others go to
+# a private folder (~/.cache/magshell, or in /tmp).
+ENV XDG_CACHE_HOME=/var/cache/magshell MPLCONFIGDIR=/tmp/matplotlib HOME=/tmp
 RUN magshell info --compile \
- && mkdir -p /work "$MPLCONFIGDIR" \
- && chmod -R a+rwX /work "$XDG_CACHE_HOME"
+ && rm -rf "$MPLCONFIGDIR" \
+ && chmod -R a+rX,go-w "$XDG_CACHE_HOME" \
+ && useradd --uid 1000 --home-dir /tmp --no-create-home magshell \
+ && mkdir -p -m 1777 /work
+USER magshell
 WORKDIR /work
 ENTRYPOINT ["magshell"]

@@ -336,11 +336,13 @@ def info(
     from magshell_fenicsx.platform.kept import kernel_cache
     from magshell_fenicsx.simulate.precompile import precompile
 
+    with exit_codes():
+        kernels = kernel_cache()
     for name, number in versions().items():
         print_line(f"{name:18} {number}")
     print_line(f"{'blas':18} {fast_blas() or 'reference (slow: install OpenBLAS)'}")
     print_line(f"{'ranks':18} {world().size}")
-    print_line(f"{'kernel cache':18} {kernel_cache()}")
+    print_line(f"{'kernel cache':18} {kernels}")
     if compile_:
         from magshell_fenicsx.output.pictures.view import library
 

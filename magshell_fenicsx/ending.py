@@ -8,6 +8,7 @@ from contextlib import contextmanager, suppress
 from typing import Any
 
 from magshell_fenicsx.case.source import CaseError
+from magshell_fenicsx.platform.kept import UnsafeCache
 from magshell_fenicsx.platform.plain import typer
 
 INVALID, STOPPED = 2, 3
@@ -63,7 +64,7 @@ def exit_codes(invalid: type[Exception] = CaseError, stopped: tuple[type[Excepti
     """Turn an invalid input (`CaseError` and `invalid`) or an early stop into a message and its exit code."""
     try:
         yield
-    except (CaseError, invalid) as e:
+    except (CaseError, UnsafeCache, invalid) as e:
         raise failure(str(e), INVALID) from None
     except stopped as e:
         raise failure(f"stopped early: {e}", STOPPED) from None

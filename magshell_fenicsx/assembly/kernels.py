@@ -14,6 +14,7 @@ from ufl.core.expr import Expr
 
 from magshell_fenicsx.platform.compiler import MANY, SHARED, install_compiler
 from magshell_fenicsx.platform.index_maps import install_index_maps
+from magshell_fenicsx.platform.kept import kernel_cache
 
 # -O1 compiles the tangents five times faster than -O2 and runs 15 % slower; -ffast-math halves the run time.
 # No -march: the cache may be shared by unlike machines, and it gains nothing here.
@@ -43,7 +44,7 @@ class KernelLog:
     def compile(self, name: str, expression: ufl.Form) -> fem.Form:
         """Compile a form, or load it from the cache."""
         start = time.perf_counter()
-        form = fem.form(expression, jit_options=JIT_OPTIONS)
+        form = fem.form(expression, jit_options={**JIT_OPTIONS, "cache_dir": kernel_cache()})
         self.seconds += time.perf_counter() - start
         self.names.append(name)
         return form
@@ -55,8 +56,8 @@ class KernelLog:
     def compile_expression(self, name: str, expression: Expr, comm: MPI.Comm) -> fem.Expression:
         """Compile an expression of cell-wise constants, or load it from the cache; collective."""
         start = time.perf_counter()
-        anywhere = np.full((1, 1), 0.5)
-        compiled = fem.Expression(expression, anywhere, comm, jit_options=POINT_OPTIONS)
+        anywhere, options = np.full((1, 1), 0.5), {**POINT_OPTIONS, "cache_dir": kernel_cache()}
+        compiled = fem.Expression(expression, anywhere, comm, jit_options=options)
         self.seconds += time.perf_counter() - start
         self.names.append(name)
         return compiled

@@ -18,6 +18,7 @@ import cffi
 from ffcx.codegeneration import get_include_path, jit
 
 from magshell_fenicsx.platform import compat
+from magshell_fenicsx.platform.kept import kept_file, trusted
 from magshell_fenicsx.platform.many import declared, with_many
 
 SHARED, MANY = "-shared", "-DMANY"
@@ -50,7 +51,8 @@ def _compile_objects(
     include = f"-I{get_include_path()}"
     library = str(source.with_suffix(".so"))
     subprocess.run([*compiler, "-std=c17", "-fPIC", *arguments, include, str(source), "-o", library, "-lm"], check=True)
-    source.with_suffix(".c.cached").touch()
+    Path(library).chmod(0o755)  # whatever the umask: what others may write is not trusted
+    source.with_suffix(".c.cached").touch(mode=0o644)
     return code
 
 
@@ -88,12 +90,16 @@ def _ffi() -> cffi.FFI:
 
 
 def _get_cached_module(module: str, names: list[str], folder: Path, timeout: int) -> tuple[Any, Any]:
+    if (there := kept_file(f"{module}.so")) and there.with_suffix(".c.cached").exists():
+        return _load_objects(there.parent, module, names)
     source, end = Path(folder) / f"{module}.c", time.monotonic() + timeout
     source.parent.mkdir(exist_ok=True, parents=True)
+    _discard_strange(source)
     while True:
         try:
-            with source.open("x"):  # who makes the file compiles it; FFCx would load as its own what appears meanwhile
-                return None, None
+            # who makes the file compiles it; FFCx would load as its own what appears meanwhile
+            os.close(os.open(source, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o644))
+            return None, None
         except FileExistsError:
             pass
         while not source.with_suffix(".c.cached").exists() and source.exists() and time.monotonic() < end:
@@ -102,6 +108,14 @@ def _get_cached_module(module: str, names: list[str], folder: Path, timeout: int
             return _load_objects(folder, module, names)
         if source.exists() or time.monotonic() >= end:
             return OTHERS[2](module, names, folder, timeout)  # type: ignore[no-any-return]
+
+
+def _discard_strange(source: Path) -> None:
+    """Remove a kernel that another user has put here, or may have changed: it is compiled again."""
+    there = list(source.parent.glob(f"{source.stem}*"))
+    if not all(map(trusted, there)):
+        for file in there:
+            file.unlink(missing_ok=True)
 
 
 def install_compiler() -> None:

@@ -11,7 +11,7 @@ import cffi
 from mpi4py import MPI
 
 from magshell_fenicsx.platform.first import from_first
-from magshell_fenicsx.platform.kept import kernel_cache
+from magshell_fenicsx.platform.kept import kept_file, kernel_cache
 
 OPTIONS = ["-O3", "-g0"]
 
@@ -28,15 +28,17 @@ def native(source: Path, declarations: str, comm: MPI.Comm) -> tuple[Any, Any]:
     key = hashlib.sha256(repr((text, declarations, OPTIONS, sys.version, cffi.__version__)).encode()).hexdigest()[:16]
     name, folder = f"magshell_{source.stem}_{key}", kernel_cache()
 
-    def compiled() -> None:
-        if not (folder / f"{name}.so").is_file():
-            try:
-                _compile(name, folder, text, declarations)
-            except (OSError, cffi.VerificationError) as e:
-                raise RuntimeError(f"{source.name} cannot be compiled into {folder}: {e}") from None
+    def compiled() -> Path:
+        if there := kept_file(f"{name}.so"):
+            return there
+        try:
+            _compile(name, folder, text, declarations)
+        except (OSError, cffi.VerificationError) as e:
+            raise RuntimeError(f"{source.name} cannot be compiled into {folder}: {e}") from None
+        return folder / f"{name}.so"
 
-    from_first(comm, compiled)
-    spec = importlib.util.spec_from_file_location(name, folder / f"{name}.so")
+    library = from_first(comm, compiled)
+    spec = importlib.util.spec_from_file_location(name, library)
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
@@ -51,4 +53,6 @@ def _compile(name: str, folder: Path, text: str, declarations: str) -> None:
     builder.cdef(declarations)
     builder.set_source(name, text, extra_compile_args=OPTIONS)
     with TemporaryDirectory(dir=folder) as scratch:
-        Path(builder.compile(tmpdir=scratch)).replace(folder / f"{name}.so")
+        made = Path(builder.compile(tmpdir=scratch))
+        made.chmod(0o755)  # whatever the umask: what others may write is not trusted
+        made.replace(folder / f"{name}.so")

@@ -1,10 +1,12 @@
-"""What is kept beside the kernels."""
+"""Where kernels and what is kept beside them come from: nobody else may have put it there."""
 
+import os
 from pathlib import Path
 
 import pytest
+from command import started
 
-from magshell_fenicsx.platform import kept
+from magshell_fenicsx.platform import compiler, kept
 
 
 def test_what_is_kept_is_recalled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -21,3 +23,89 @@ def test_without_a_folder_nothing_is_kept(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.setattr(kept, "kernel_cache", lambda: tmp_path / "file")
     kept.keep("name", b"content")
     assert kept.recall("name") is None
+
+
+@pytest.fixture
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A home and a folder for temporary files that are the user's own."""
+    (tmp_path / "home").mkdir()
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    monkeypatch.setattr(kept.tempfile, "gettempdir", lambda: str(tmp_path / "home"))
+    return tmp_path / "home"
+
+
+def folder(path: Path, mode: int) -> Path:
+    path.mkdir(parents=True)
+    path.chmod(mode)
+    return path
+
+
+def test_folders_of_kernels(tmp_path: Path, home: Path) -> None:
+    """One's own is used; beside others only a private one in a sticky folder; else one at home."""
+    own = home / ".cache" / "magshell"
+    assert kept._folders(tmp_path / "new") == (tmp_path / "new",)
+    assert kept._folders(folder(tmp_path / "own", 0o755)) == (tmp_path / "own",)
+    sticky = folder(tmp_path / "sticky", 0o1777)
+    assert kept._folders(sticky) == (sticky / f"user_{os.getuid()}",)
+    assert (sticky / f"user_{os.getuid()}").stat().st_mode & 0o777 == 0o700
+    assert kept._folders(sticky / "fenics") == (sticky / "fenics",)  # nobody can move it away
+    assert kept._folders(folder(tmp_path / "open", 0o777)) == (own,)
+    assert kept._folders(tmp_path / "open" / "fenics") == (own,)
+    (tmp_path / "link").symlink_to(tmp_path / "open")
+    assert kept._folders(tmp_path / "link") == (own,)
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="only root gives files away")
+def test_folders_of_others(tmp_path: Path, home: Path) -> None:
+    """Nothing in them is taken, nor a private folder that another user has made before."""
+    foreign, sticky = folder(tmp_path / "foreign", 0o755), folder(tmp_path / "sticky", 0o1777)
+    os.chown(foreign, 12345, 12345)
+    assert kept._folders(foreign) == (home / ".cache" / "magshell",)
+    os.chown(folder(sticky / "user_0", 0o700), 12345, 12345)
+    assert kept._folders(sticky) == (home / ".cache" / "magshell",)
+    file = foreign / "libffcx.so"
+    file.touch(0o644)
+    assert kept.trusted(file)
+    os.chown(file, 12345, 12345)
+    assert not kept.trusted(file)
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="root owns the image")
+def test_an_image_is_read_by_any_user(tmp_path: Path, home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Kernels of root's that nobody else may write are taken; new ones go to a private folder."""
+    image, own = folder(tmp_path / "image", 0o755), home / ".cache" / "magshell"
+    (image / "kernel").write_bytes(b"compiled")
+    monkeypatch.setattr(kept, "_usual", lambda: image)
+    monkeypatch.setattr(kept.os, "getuid", lambda: 12345)
+    monkeypatch.setattr(kept.os, "access", lambda path, how: path != image)
+    monkeypatch.setattr(kept, "_candidates", lambda usual: iter([usual, own]))
+    assert kept._folders(image) == (own, image)
+    assert kept.recall("kernel") == b"compiled"
+    kept.keep("another", b"new")
+    assert (own / "another").read_bytes() == b"new"
+
+
+def test_a_kernel_that_others_may_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is not loaded: it is compiled again, with whatever lies beside it."""
+    monkeypatch.setattr(kept, "_usual", lambda: tmp_path)
+    monkeypatch.setattr(compiler, "_load_objects", lambda place, module, names: (["loaded"], module))
+    for end, mode in ((".so", 0o666), (".c", 0o644), (".c.cached", 0o644)):
+        (tmp_path / f"kernel{end}").touch()
+        (tmp_path / f"kernel{end}").chmod(mode)
+    assert kept.kept_file("kernel.so") is None
+    assert compiler._get_cached_module("kernel", ["form"], tmp_path, 1) == (None, None)
+    assert [file.name for file in tmp_path.iterdir()] == ["kernel.c"]
+    for end in (".so", ".c.cached"):
+        (tmp_path / f"kernel{end}").touch(0o644)
+    assert compiler._get_cached_module("kernel", ["form"], tmp_path, 1) == (["loaded"], "kernel")
+
+
+def test_no_private_folder_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One message that says what to do."""
+    shared = folder(tmp_path / "shared", 0o777)
+    for name in ("XDG_CACHE_HOME", "HOME", "TMPDIR"):
+        monkeypatch.setenv(name, str(shared))
+    done = started("info")
+    assert done.returncode == 2
+    assert done.stderr.startswith(f"kernel cache {shared}/fenics: others may write to it or own it, ")
+    assert done.stderr.endswith("set XDG_CACHE_HOME to a folder that you own and nobody else may write (chmod go-w)\n")
