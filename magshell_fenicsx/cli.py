@@ -35,6 +35,14 @@ def _folder(default: str) -> Any:
     return typer.Option(help=f"output folder; default {default}", autocompletion=left_to_the_shell)
 
 
+def _chosen(out: str | None, default: str) -> Path:
+    """The folder of an option, or the default one in results/."""
+    from magshell_fenicsx.output.store.folder import given_folder
+
+    with exit_codes():
+        return Path("results") / default if out is None else given_folder(out)
+
+
 def main() -> None:
     """Run the program."""
     gc.set_threshold(100_000, 5, 5)  # Python's own would look for garbage two hundred times in a small run
@@ -68,10 +76,10 @@ def options(
 def run(
     case: CaseFile,
     set_: Settings = None,
-    out: Annotated[Path | None, _folder("results/<case name>/")] = None,
+    out: Annotated[str | None, _folder("results/<case name>/")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="continue the interrupted run in that folder")] = False,
     overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="replace what is in that folder even if another case file made it")
+        bool, typer.Option("--overwrite", help="replace the run in that folder even if it is another's, or unfinished")
     ] = False,
     time_limit: Annotated[
         float | None, typer.Option(min=0, metavar="SECONDS", help="stop after this time; --resume continues")
@@ -87,7 +95,7 @@ def run(
     from magshell_fenicsx.run.files import AlreadyComplete
     from magshell_fenicsx.run.run import run as run_case
 
-    folder = out or Path("results") / case.stem
+    folder = _chosen(out, case.stem)
     how: dict[str, Any] = {"resume": resume, "overwrite": overwrite, "time_limit": time_limit, "pictures": pictures}
     try:
         with exit_codes(MeshError, stopped=(DiskError,)):
@@ -115,7 +123,7 @@ def sweep(
     case: CaseFile,
     over: Over,
     set_: Settings = None,
-    out: Annotated[Path | None, _folder("results/<case name>_sweep/")] = None,
+    out: Annotated[str | None, _folder("results/<case name>_sweep/")] = None,
     full_paths: Annotated[
         bool, typer.Option("--full-paths", help="compute the full path at every point; follow no fold")
     ] = False,
@@ -127,7 +135,7 @@ def sweep(
     from magshell_fenicsx.output.store.folder import DiskError
     from magshell_fenicsx.studies.sweep.sweep import sweep as run_sweep
 
-    folder = out or Path("results") / f"{case.stem}_sweep"
+    folder = _chosen(out, f"{case.stem}_sweep")
     with exit_codes(stopped=(DiskError,)):
         done = run_sweep(case, over, set_ or [], folder, full_paths=full_paths, part=part)
     print_line(f"results in {folder}/")
@@ -144,14 +152,14 @@ def study(
     reference: Annotated[float | None, typer.Option(help="exact value for the errors; default the finest run")] = None,
     ranks: Annotated[str, typer.Option(metavar="N,N", help="numbers of MPI ranks for each point")] = "1",
     repeat: Annotated[int, typer.Option(min=1, help="runs of each point; medians are reported")] = 3,
-    out: Annotated[Path | None, _folder("results/<case name>_study/")] = None,
+    out: Annotated[str | None, _folder("results/<case name>_study/")] = None,
 ) -> None:
     """Measure error against run time over meshes, degrees, models and ranks; keep the runs in the folder."""
     from magshell_fenicsx.output.store.folder import DiskError
     from magshell_fenicsx.studies.study.study import parse_ranks
     from magshell_fenicsx.studies.study.study import study as run_study
 
-    folder = out or Path("results") / f"{case.stem}_study"
+    folder = _chosen(out, f"{case.stem}_study")
     with exit_codes(stopped=(DiskError,)):
         numbers, settings = parse_ranks(ranks), set_ or []
         done = run_study(
@@ -179,14 +187,14 @@ def ensemble(
         list[Path] | None,
         typer.Option(metavar="DIR", help="take the samples of the jobs' folders, compute none; repeat it"),
     ] = None,
-    out: Annotated[Path | None, _folder("results/<case name>_ensemble/")] = None,
+    out: Annotated[str | None, _folder("results/<case name>_ensemble/")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="continue the interrupted ensemble in that folder")] = False,
 ) -> None:
     """Run random samples of a case (its section `ensemble`) and fit their statistics; keep finished samples."""
     from magshell_fenicsx.output.store.folder import DiskError
     from magshell_fenicsx.studies.ensemble.ensemble import ensemble as run_ensemble
 
-    folder = out or Path("results") / f"{case.stem}_ensemble"
+    folder = _chosen(out, f"{case.stem}_ensemble")
     with exit_codes(stopped=(DiskError,)):
         done = run_ensemble(
             case,
@@ -213,7 +221,7 @@ def ensemble(
 def design(
     case: CaseFile,
     set_: Settings = None,
-    out: Annotated[Path | None, _folder("results/<case name>_design/")] = None,
+    out: Annotated[str | None, _folder("results/<case name>_design/")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="continue the interrupted design in that folder")] = False,
 ) -> None:
     """Vary a case for a result (its section `design`); write the best case, its table and picture, and verify it."""
@@ -222,7 +230,7 @@ def design(
     from magshell_fenicsx.studies.design.design import Missed
     from magshell_fenicsx.studies.design.design import design as run_design
 
-    folder = out or Path("results") / f"{case.stem}_design"
+    folder = _chosen(out, f"{case.stem}_design")
     with exit_codes(MeshError, stopped=(DiskError, Missed)):
         run_design(case, set_ or [], folder, resume=resume, say=print_line)
     print_line(f"results in {folder}/")
@@ -238,7 +246,7 @@ def compare(
     solid: Annotated[
         str, typer.Option(metavar="R,R", help="refinements of the solid's mesh; three give error against run time")
     ] = "1",
-    out: Annotated[Path | None, _folder("results/<case name>_compare/")] = None,
+    out: Annotated[str | None, _folder("results/<case name>_compare/")] = None,
 ) -> None:
     """Run a case as a shell and as a solid; compare their curves and run times."""
     from magshell_fenicsx.output.store.folder import DiskError
@@ -246,7 +254,7 @@ def compare(
     from magshell_fenicsx.studies.compare.compare import parse_refinements
     from magshell_fenicsx.studies.compare.runs import NothingLeft
 
-    folder = out or Path("results") / f"{case.stem}_compare"
+    folder = _chosen(out, f"{case.stem}_compare")
     with exit_codes(stopped=(DiskError, NothingLeft)):
         refinements = parse_refinements(shell, solid)
         done = run_comparison(case, set_ or [], refinements=refinements, out=folder, say=print_line)

@@ -2,9 +2,11 @@
 
 import json
 import math
+import re
 from dataclasses import replace
+from contextlib import suppress
+from datetime import datetime
 from pathlib import Path
-from shutil import rmtree
 from typing import Any
 
 from mpi4py import MPI
@@ -15,20 +17,16 @@ from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.output.fields.gathering import gatherer
 from magshell_fenicsx.output.fields.outlines import DRIVEN, STILL, outlines
 from magshell_fenicsx.output.fields.surface import turned
-from magshell_fenicsx.output.fields.vtu import About, FieldSeries
-from magshell_fenicsx.output.pictures.picture import PICTURES
+from magshell_fenicsx.output.fields.vtu import About, FieldSeries, is_whole, point_file
 from magshell_fenicsx.output.store import checkpoint
-from magshell_fenicsx.output.store.durable import sync_folder, write_whole
-from magshell_fenicsx.output.store.folder import by_first, prepare_folder
-from magshell_fenicsx.output.store.table import PathTable, Row
+from magshell_fenicsx.output.store.durable import Damaged, read_object, sync_folder, write_whole
+from magshell_fenicsx.output.store.folder import DiskError, by_first, prepare_folder
+from magshell_fenicsx.output.store.known import SUMMARY, read_summary
+from magshell_fenicsx.output.store.table import PathTable, Row, read_lines
+from magshell_fenicsx.output.store.written import MESH, OF_PATH, note, refuse_foreign, remove, written
 from magshell_fenicsx.simulate.scene import Scene
 
-DRAWN = (*PICTURES, "curve", "instabilities", "modes", "frequencies", "solutions", "gradients")
-LAST_FILES = (
-    *("summary.json", "report.html", "stability.csv", "frequencies.csv", "animation.gif"),
-    *(f"{name}{end}.{kind}" for name in DRAWN for end in ("", "_[0-9]*") for kind in ("png", "svg", "pdf")),
-)
-MESH = "mesh.json"  # the mesh chosen for a tolerance
+INTERRUPTED = re.compile(r"^interrupted by |cannot be (written|read): ")
 COMPARED = ("p_over_pc", "lambda_m", "force", "w_over_h", "w_pole_over_h")
 
 
@@ -41,81 +39,103 @@ class AlreadyComplete(Exception):
 
 
 def open_folder(out: Path, case: Case, comm: MPI.Comm, resume: bool, overwrite: bool = False) -> None:
-    """Prepare a folder for a new run, or check that the run in it can be resumed.
+    """See that a folder can take a new run, or that the run in it can be resumed; nothing in it is changed.
 
     Parameters
     ----------
     overwrite
-        Whether a new run may replace that of another case file.
+        Whether a new run may replace that of another case file, or an interrupted one.
 
     Raises
     ------
     CaseError
-        If the folder cannot be written, has a run of another case file, or no run of this case to resume.
+        If the folder cannot be written, has files that no run has written, a run of another case file, an interrupted
+        one or a damaged one; or no run of this case to resume.
     AlreadyComplete
         If the run to be resumed is complete.
     """
 
     def ready(folder: Path) -> None:
+        refuse_foreign(folder)
         if resume:
-            _resumed(folder, case)
-            return
-        if not overwrite:
+            _refuse_no_resuming(folder, case)
+        elif not overwrite:
             _refuse_other_case(folder, case)
-        _emptied(folder, case)
+            _refuse_interrupted(folder)
 
     prepare_folder(out, comm, ready)
 
 
 def _refuse_other_case(out: Path, case: Case) -> None:
     """A run replaces one of the same case, and one of the same file with other values."""
-    known = _belongs_to(out, case)
+    try:
+        known = belongs_to(out, case)
+    except Damaged as e:
+        raise CaseError(f"{e}; --overwrite replaces the run that is there") from None
     name = known.get(checkpoint.FILE)
     if name and Path(name).stem != Path(case.file_name).stem and not checkpoint.is_of(known, case):
         raise CaseError(f"--out {out}: has a run of {name}, which is kept; give another folder, or --overwrite")
 
 
-def _belongs_to(out: Path, case: Case) -> dict[str, Any]:
-    """What the run in a folder depends on; empty if there is none, or it is not known."""
-    try:
-        if begun := checkpoint.begun_with(out / checkpoint.NAME):
-            return begun
-        summary = json.loads((out / "summary.json").read_text(encoding="utf-8"))
-        return {key: summary[key] for key in ("case", checkpoint.FILE, *case.outside) if key in summary}
-    except (OSError, ValueError, TypeError):
-        return {}
+def belongs_to(out: Path, case: Case) -> dict[str, Any]:
+    """What the run in a folder depends on; empty without checkpoint and summary.json.
+
+    Raises
+    ------
+    Damaged
+        If it cannot be read.
+    """
+    if begun := checkpoint.begun_with(out / checkpoint.NAME):
+        return begun
+    summary = read_object(out / SUMMARY) if (out / SUMMARY).exists() else {}
+    return {key: summary[key] for key in ("case", checkpoint.FILE, *case.outside) if key in summary}
 
 
-def _emptied(out: Path, case: Case) -> None:
-    """Delete the files of an earlier run and begin a checkpoint."""
-    for name in (checkpoint.NAME, "path.csv", MESH):
-        (out / name).unlink(missing_ok=True)
-    _remove_last_files(out)
-    rmtree(out / "fields", ignore_errors=True)
-    checkpoint.begin_checkpoint(out / checkpoint.NAME, case)
+def _refuse_interrupted(out: Path) -> None:
+    """A run that has ended, also where its solver could not go on, may be repeated; one that can go on is kept."""
+    file, table = out / checkpoint.NAME, out / "path.csv"
+    points = max(table.read_bytes().count(b"\n") - 1, 0) if table.exists() else 0
+    if not file.exists() or (points < 2 and not (out / MESH).exists()):  # the undeformed shell alone is no loss
+        return
+    how = "killed, or its machine stopped"
+    if (out / SUMMARY).exists():
+        stopped = read_object(out / SUMMARY).get("stopped")
+        if not (isinstance(stopped, str) and INTERRUPTED.search(stopped)):
+            return
+        how = stopped
+    when = datetime.fromtimestamp(file.stat().st_mtime).strftime("%Y-%m-%d %H:%M")
+    raise CaseError(
+        f"--out {out}: has a run that was not finished: {points} point{'s' * (points != 1)}, the last on {when}; "
+        f"{how}. Give --resume to continue it, or --overwrite to start again"
+    )
 
 
-def _resumed(out: Path, case: Case) -> None:
-    """Check that the run can be resumed, and delete the files that the end of a run writes."""
+def _refuse_no_resuming(out: Path, case: Case) -> None:
+    """See that the run can be resumed."""
     file = out / checkpoint.NAME
-    if not file.exists() and (out / "summary.json").exists():
-        summary = json.loads((out / "summary.json").read_text(encoding="utf-8"))
+    if not file.exists() and (out / SUMMARY).exists():
+        summary = read_summary(out)
         if summary["stopped"] is None:
             kept = {key: summary[key] for key in ("case", "sources", *case.outside) if key in summary}
             checkpoint.refuse_other({"version": summary["versions"]["magshell_fenicsx"], **kept}, case, out)
+            for number in range(len(read_lines(out / "path.csv"))):
+                if not is_whole(out / "fields" / point_file(number)):
+                    raise Damaged(f"{out / 'fields' / point_file(number)}: is damaged: it is cut off, or missing")
             raise AlreadyComplete(summary)
     checkpoint.check_resumable(file, case)
-    _remove_last_files(out)
-
-
-def _remove_last_files(out: Path) -> None:
-    for pattern in LAST_FILES:
-        for file in out.glob(pattern):
-            file.unlink()
 
 
 class RunFiles:
     """Writes the files of a run; every method is collective, and rank 0 writes.
+
+    A new run changes nothing in the folder before `begin`: one that is refused loses no earlier results.
+
+    Parameters
+    ----------
+    resume
+        Whether the run in the folder goes on.
+    mesh
+        The content of mesh.json, if the case has a tolerance.
 
     Raises
     ------
@@ -132,12 +152,43 @@ class RunFiles:
         Run time in seconds of the interrupted run up to the last of these points.
     """
 
-    def __init__(self, folder: Path, scene: Scene) -> None:
-        self._folder, self._scene, self._comm = folder, scene, scene.comm
-        self.journal = checkpoint.Checkpoint(folder / checkpoint.NAME, scene.model.V, scene.comm)
+    journal: checkpoint.Checkpoint | None = None
+
+    def __init__(self, folder: Path, scene: Scene, *, resume: bool, mesh: bytes | None = None) -> None:
+        self._folder, self._scene, self._comm, self._mesh = folder, scene, scene.comm, mesh
         self._gatherer = gatherer(scene.model, scene.comm)
+        self.kept, self._rows, self.elapsed = 0, list[dict[str, str]](), 0.0
+        if resume:
+            self.begin(again=True)
+            self.elapsed = float(self._rows[-1]["wall_s"]) if self._rows else 0.0
+
+    def begin(self, *, again: bool = False) -> None:
+        """Make room for the files of the run, which has its first point, and open them.
+
+        Parameters
+        ----------
+        again
+            Keep the path of an interrupted run, and only delete what the end of a run writes.
+        """
+        by_first(self._comm, self._make_room_again if again else self._make_room)
         self.kept, self._rows = by_first(self._comm, self._open)
-        self.elapsed = float(self._rows[-1]["wall_s"]) if self._rows else 0.0
+        self.journal = checkpoint.Checkpoint(self._folder / checkpoint.NAME, self._scene.model.V, self._comm)
+
+    def _make_room(self) -> None:
+        """Replace an earlier run by an empty checkpoint; whenever this is killed, what is there is known as a run's."""
+        folder, file = self._folder, self._folder / checkpoint.NAME
+        new, earlier = file.with_name(f"{file.name}.new"), written(folder)
+        write_whole(new, checkpoint.begun(self._scene.case))  # a full disk stops here
+        remove(folder, earlier - {SUMMARY, file.name})
+        if self._mesh:
+            write_whole(folder / MESH, self._mesh)
+        new.replace(file)
+        remove(folder, earlier & {SUMMARY})
+
+    def _make_room_again(self) -> None:
+        remove(self._folder, {n for n in written(self._folder) if n not in OF_PATH and not n.startswith("fields/")})
+        if self._mesh and not (self._folder / MESH).exists():
+            write_whole(self._folder / MESH, self._mesh)
 
     def _open(self) -> tuple[int, list[dict[str, str]]]:
         begun = checkpoint.begun_with(self._folder / checkpoint.NAME) or {}
@@ -182,16 +233,19 @@ class RunFiles:
 
         def write() -> None:  # names the mesh file and the sources as they were at the start
             data = (json.dumps({**content, **self._begun_with}, indent=2) + "\n").encode()
-            write_whole(self._folder / "summary.json", data)
+            write_whole(self._folder / SUMMARY, data)
 
         by_first(self._comm, write)
 
     def close(self, complete: bool) -> None:
-        """Close the files; at the end of a complete run, delete the checkpoint."""
+        """Close the files; at the end of a complete run, delete the checkpoint. Write down which are the run's."""
+        assert self.journal
         by_first(self._comm, lambda: self._table.close())
         self.journal.close()
         if complete:
             self.journal.remove()
+        with suppress(DiskError):  # without the list, summary.json says that they are
+            by_first(self._comm, lambda: note(self._folder))
 
 
 def _same(row: Row, there: dict[str, str]) -> None:
@@ -200,4 +254,7 @@ def _same(row: Row, there: dict[str, str]) -> None:
         math.isclose(float(row[key]), float(there[key]), rel_tol=1e-6, abs_tol=1e-9) for key in COMPARED
     )
     if not same:
-        raise CaseError(f"--resume: point {row['point']} differs from path.csv; run without --resume")
+        raise CaseError(
+            f"--resume: point {row['point']} differs from path.csv; give another folder, or --overwrite in place of "
+            "--resume"
+        )

@@ -18,13 +18,14 @@ from magshell_fenicsx.continuation.journal import NoJournal
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.output.report.report import write_report
-from magshell_fenicsx.output.store.durable import write_whole
-from magshell_fenicsx.output.store.folder import DiskError, by_first, held_folder
+from magshell_fenicsx.output.store.durable import Damaged
+from magshell_fenicsx.output.store.folder import DiskError, by_first, given_folder, held_folder
 from magshell_fenicsx.output.store.table import LOCATED, SOLUTION, Row
+from magshell_fenicsx.output.store.written import MESH
 from magshell_fenicsx.platform.environment import fast_blas
 from magshell_fenicsx.quantities.quantity import spelled
 from magshell_fenicsx.quantities.registry import amplitude, shown
-from magshell_fenicsx.run.files import MESH, RunFiles, open_folder
+from magshell_fenicsx.run.files import RunFiles, open_folder
 from magshell_fenicsx.run.frequencies import frequencies_after, wanted
 from magshell_fenicsx.run.gradients import gradients_after, refuse_unknown
 from magshell_fenicsx.run.interrupt import Interrupted, Stoppable, Watch
@@ -78,7 +79,7 @@ def run(
     resume
         Continue the interrupted run in `out`.
     overwrite
-        Replace what is in `out` even if it is the run of another case file.
+        Replace the run in `out` even if it is that of another case file, or was interrupted.
     time_limit
         Seconds after which the run stops in the same way.
     pictures
@@ -89,23 +90,26 @@ def run(
     Raises
     ------
     CaseError
-        If building the case finds an error, `out` cannot be written or has a run of another case file, or no run of
-        this case to resume.
+        If building the case finds an error, `out` cannot be written, has files that no run has written, a run of
+        another case file or an interrupted one, or no run of this case to resume; what is in `out` stays as it is.
     AlreadyComplete
         If the run to be resumed is complete.
     DiskError
         If the disk is full before the first point.
     """
     start = time.perf_counter()
+    folder = None if out is None else given_folder(out)
+    if time_limit is not None and not time_limit >= 0:
+        raise CaseError(f"--time-limit {time_limit}: must be a number of seconds, 0 or more")
     case = opened(case, comm)
     case = case.with_terms(terms) if terms else case
     watch = Watch(comm, start, time_limit, signals=out is not None)
     say, tell = (say, tell or _ignored) if comm.rank == 0 else (_ignored, _ignored)
-    if out is None:
-        return _run(case, None, comm, say, tell, watch, start, pictures)
-    with held_folder(Path(out), comm, make=not resume):
-        open_folder(Path(out), case, comm, resume, overwrite)
-        return _run(case, Path(out), comm, say, tell, watch, start, pictures)
+    if folder is None:
+        return _run(case, None, comm, say, tell, watch, start, pictures, resume=False)
+    with held_folder(folder, comm, make=not resume):
+        open_folder(folder, case, comm, resume, overwrite)
+        return _run(case, folder, comm, say, tell, watch, start, pictures, resume=resume)
 
 
 def _ignored(line: str) -> None:
@@ -113,7 +117,16 @@ def _ignored(line: str) -> None:
 
 
 def _run(
-    case: Case, folder: Path | None, comm: MPI.Comm, say: Say, tell: Say, watch: Watch, start: float, pictures: bool
+    case: Case,
+    folder: Path | None,
+    comm: MPI.Comm,
+    say: Say,
+    tell: Say,
+    watch: Watch,
+    start: float,
+    pictures: bool,
+    *,
+    resume: bool,
 ) -> Result:
     """Run a case in a prepared folder; `start` is in seconds of `time.perf_counter`."""
 
@@ -122,7 +135,7 @@ def _run(
 
     try:
         with_modes(case, comm)
-        found = _mesh_for_tolerance(case, folder, comm, say, doing)
+        found = _mesh_for_tolerance(case, folder if resume else None, comm, say, doing)
         doing("mesh and kernels")
         scene = found.choice.scene(case, comm) if found else Scene(case, comm)
         refuse_unknown(scene)
@@ -136,16 +149,17 @@ def _run(
         say("warning: PETSc uses the reference BLAS; install OpenBLAS to factor seven times faster")
     if comm.size == 1 and not has_cholmod():
         say("warning: PETSc has no CHOLMOD, which factors tangents that are positive definite in half of the time")
-    files = RunFiles(folder, scene) if folder else None
+    mesh = found.to_json() if found else None
+    files = RunFiles(folder, scene, resume=resume, mesh=mesh) if folder else None
     if files and files.kept:
         start -= files.elapsed
         say(f"resuming after {files.kept} points")
     interrupted: RuntimeError | None = None
     scene.progress = progress = RunProgress(scene, tell, start)
     with watch:
-        scene.journal = Stoppable(files.journal if files else NoJournal(), watch)
+        scene.journal = Stoppable(NoJournal(), watch)
         try:
-            _follow(result, files, say, progress, start)
+            _follow(result, files, say, progress, start, watch)
             for step in scene.case.programme:
                 if step.load.search and not any(int(result.rows[i]["step"]) == step.number for i in result.found):
                     say(f"warning: the search at the end of step {step.number} has found no further solution")
@@ -155,7 +169,7 @@ def _run(
             result.stopped = str(e)
         except (Interrupted, DiskError) as e:
             interrupted, result.stopped = e, str(e)
-        if files and folder:
+        if files and folder and files.journal:
             result.replayed = files.journal.replayed
             try:
                 files.summarise(summary(result, time.perf_counter() - start))
@@ -173,7 +187,8 @@ def _run(
                 interrupted = interrupted or e
             files.close(complete=not interrupted and not result.stopped)
     if interrupted:
-        hint = f"; the results so far are in {folder}/, and --resume continues from there" if folder else ""
+        begun = files is not None and files.journal is not None
+        hint = f"; the results so far are in {folder}/, and --resume continues from there" if begun else ""
         result.stopped = f"{interrupted}{hint}"
     return result
 
@@ -186,20 +201,20 @@ def _draw(folder: Path) -> None:
 
 
 def _mesh_for_tolerance(case: Case, folder: Path | None, comm: MPI.Comm, say: Say, doing: Say) -> Adapted | None:
-    """The mesh for the case's tolerance, saved for a resumed run; None for the default mesh."""
+    """The mesh for the case's tolerance, that of an interrupted run if its folder has one; None for the default."""
     if case.mesh.tolerance is None:
         return None
     file = folder / MESH if folder else None
     if file and (known := by_first(comm, lambda: file.read_bytes() if file.exists() else b"", "cannot be read")):
-        return Adapted.from_json(case, known)
+        try:
+            return Adapted.from_json(case, known)
+        except (ValueError, KeyError, TypeError, IndexError) as e:
+            raise Damaged(f"{file}: is damaged: {type(e).__name__}: {e}") from None
     try:
-        found = adapted(case, comm, say, doing)
+        return adapted(case, comm, say, doing)
     except NoResult as e:
         say(f"warning: mesh.tolerance ignored, this run has no scalar result: {e}")
         return None
-    if file:
-        by_first(comm, partial(write_whole, file, found.to_json()))
-    return found
 
 
 def _sensitivities(result: Result) -> dict[str, float]:
@@ -226,10 +241,17 @@ def _barrier(result: Result) -> float | None:
     return barrier(result.scene, steps[-1], begin.point.state, result.history.last.point.state)
 
 
-def _follow(result: Result, files: RunFiles | None, say: Say, progress: RunProgress, start: float) -> None:
+def _follow(
+    result: Result, files: RunFiles | None, say: Say, progress: RunProgress, start: float, watch: Watch
+) -> None:
     """Compute the history of a scene and write it point by point."""
     scene, made = result.scene, RowMaker(result.scene)
     for record in follow(scene):
+        if files and not result.rows:
+            if files.journal is None:
+                files.begin()
+            assert files.journal
+            scene.journal = Stoppable(files.journal, watch)  # before the first solve of a step
         result.history.add(record)
         row = made.row(record, time.perf_counter() - start)
         result.rows.append(row)

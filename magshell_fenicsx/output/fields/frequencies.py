@@ -8,6 +8,7 @@ from math import pi, sqrt
 from pathlib import Path
 
 from magshell_fenicsx.output.fields.modes import WAVES, Mode
+from magshell_fenicsx.output.store.durable import Damaged
 
 NAME = "frequencies.csv"
 COLUMNS = ("point", "wave", "omega2", "hertz")
@@ -56,8 +57,11 @@ def read_frequencies(folder: Path) -> list[Frequency]:
     """The rows of a run's folder; none without the file."""
     if not (folder / NAME).exists():
         return []
-    with (folder / NAME).open(encoding="utf-8", newline="") as stream:
-        return [
-            Frequency(int(line["point"]), line["wave"], float(line["omega2"]), float(line["hertz"] or "nan"))
-            for line in csv.DictReader(stream)
-        ]
+    try:
+        with (folder / NAME).open(encoding="utf-8", newline="") as stream:
+            return [
+                Frequency(int(line["point"]), line["wave"], float(line["omega2"]), float(line["hertz"] or "nan"))
+                for line in csv.DictReader(stream)
+            ]
+    except (KeyError, ValueError, TypeError, csv.Error) as e:
+        raise Damaged(f"{folder / NAME}: is damaged: {type(e).__name__}: {e}") from None

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.models.shell.driven import carried
 from magshell_fenicsx.models.shell.parameters import Loads
+from magshell_fenicsx.output.store.durable import Damaged
 
 Array = NDArray[np.float64]
 ARRAY = re.compile(r'Name="(\w+)" [^>]*>([^<]*)</DataArray>')  # in the files of `vtp_content`
@@ -58,6 +59,9 @@ def read_outlines(folder: Path, number: int) -> tuple[Array, ...]:
     file = file if file.exists() else folder / STILL
     if not file.exists():
         return ()
-    parts = {name: text.split() for name, text in ARRAY.findall(file.read_text(encoding="utf-8"))}
-    ends = np.array(parts["offsets"], dtype=int)
-    return tuple(np.split(np.array(parts["Points"], dtype=float).reshape(-1, 3), ends[:-1]))
+    try:
+        parts = {name: text.split() for name, text in ARRAY.findall(file.read_text(encoding="utf-8"))}
+        ends = np.array(parts["offsets"], dtype=int)
+        return tuple(np.split(np.array(parts["Points"], dtype=float).reshape(-1, 3), ends[:-1]))
+    except (KeyError, ValueError) as e:
+        raise Damaged(f"{file}: is damaged: {type(e).__name__}: {e}") from None

@@ -1,5 +1,6 @@
 """Fields for ParaView: a .vtu file with curved triangles per point, and a .pvd list; pictures read them back."""
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.output.fields.outlines import vtp_content
 from magshell_fenicsx.output.fields.surface import LAGRANGE_HEXAHEDRON, LAGRANGE_TRIANGLE, TRIANGLE, Surface
-from magshell_fenicsx.output.store.durable import write_whole
+from magshell_fenicsx.output.store.durable import Damaged, write_whole
 
 if TYPE_CHECKING:  # VTK takes long to import
     from vtkmodules.vtkCommonDataModel import vtkUnstructuredGrid
@@ -79,15 +80,42 @@ def read_vtu(file: Path) -> tuple[Surface, About]:
     Raises
     ------
     CaseError
-        If an earlier version wrote it, without the data of `About`.
+        If an earlier version wrote it, without the data of `About`, or it is damaged.
     """
-    from vtkmodules.util.numpy_support import vtk_to_numpy
+    from vtkmodules.vtkCommonCore import vtkObject
     from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridReader
 
-    reader = vtkXMLUnstructuredGridReader()
+    if not is_whole(file):
+        raise Damaged(f"{file}: is damaged: {'it is cut off' if file.exists() else 'it is missing'}")
+    errors, reader, shown = list[str](), vtkXMLUnstructuredGridReader(), vtkObject.GetGlobalWarningDisplay()
+    reader.AddObserver("ErrorEvent", lambda _, event: errors.append(event))
     reader.SetFileName(str(file))
-    reader.Update()
-    grid = reader.GetOutput()
+    vtkObject.GlobalWarningDisplayOff()  # the message follows
+    try:
+        reader.Update()
+        found = _surface(reader.GetOutput(), file)
+    except (KeyError, ValueError, IndexError, TypeError, AttributeError) as e:
+        raise Damaged(f"{file}: is damaged: {type(e).__name__}: {e}") from None
+    finally:
+        vtkObject.SetGlobalWarningDisplay(shown)
+    if errors or reader.GetErrorCode():
+        raise Damaged(f"{file}: is damaged: VTK cannot read it")
+    return found
+
+
+def is_whole(file: Path) -> bool:
+    """Whether there is a file of VTK in XML with its beginning and its end."""
+    if not file.is_file():
+        return False
+    with file.open("rb") as stream:
+        head, size = stream.read(200), stream.seek(0, os.SEEK_END)
+        stream.seek(max(size - 40, 0))
+        return b"<VTKFile" in head and stream.read().rstrip().endswith(b"</VTKFile>")
+
+
+def _surface(grid: "vtkUnstructuredGrid", file: Path) -> tuple[Surface, About]:
+    """What a grid of `unstructured_grid` has; whatever is raised, it is none."""
+    from vtkmodules.util.numpy_support import vtk_to_numpy
 
     def arrays(of: Any) -> dict[str, Array]:
         return {of.GetArrayName(i): vtk_to_numpy(of.GetArray(i)) for i in range(of.GetNumberOfArrays())}
@@ -98,9 +126,13 @@ def read_vtu(file: Path) -> tuple[Surface, About]:
     if "h_over_R" not in numbers:
         raise CaseError(f"{file} is of an earlier version: run the case again")
     about = About(float(numbers["h_over_R"][0]), float(numbers["poisson_ratio"][0]), numbers.get("mirror"))
-    r0 = data["r0"]
+    r0, u, n0 = (data[name] for name in ("r0", "u_over_h", "n0"))
+    if {r0.shape, u.shape, n0.shape} != {(len(r0), 3)} or not 0 <= cells.min(initial=-1) <= cells.max() < len(r0):
+        raise ValueError("its cells have no nodes")
+    if not all(np.isfinite(values).all() for values in (r0, u, n0)):
+        raise ValueError("a node is nowhere")
     jumps = (float(numbers[name][0]) if name in numbers else None for name in JUMPS)
-    return Surface(r0, data["u_over_h"] * about.h, data["n0"], cells, fields, (), *jumps), about
+    return Surface(r0, u * about.h, n0, cells, fields, (), *jumps), about
 
 
 class FieldSeries:
@@ -114,14 +146,14 @@ class FieldSeries:
     Attributes
     ----------
     kept
-        Number of leading points whose files exist.
+        Number of leading points whose files are whole.
     """
 
     def __init__(self, folder: Path, about: About, outlines: str = "") -> None:
         self._folder, self._about, self._outlines = folder, about, outlines
         folder.mkdir(exist_ok=True)
         self.kept = 0
-        while (folder / point_file(self.kept)).exists():
+        while all(map(is_whole, self._files(self.kept))):
             self.kept += 1
         self._numbers = list(range(self.kept))
         if self.kept:
@@ -140,6 +172,11 @@ class FieldSeries:
         write_whole(self._folder / point_file(number), vtu_content(surface, self._about))
         self._numbers.append(number)
         self._write_list()
+
+    def _files(self, number: int) -> list[Path]:
+        """The files of a point."""
+        names = [point_file(number), *([self._outlines.format(number)] if self._outlines else [])]
+        return [self._folder / name for name in names]
 
     def _write_list(self) -> None:
         files = [(n, 0, point_file(n)) for n in self._numbers]

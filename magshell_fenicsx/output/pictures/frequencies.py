@@ -26,7 +26,7 @@ def frequencies_figure(found: Sequence[Frequency], rows: Sequence[Row], style: O
     places = {int(row["point"]): float(row[column.name]) if column else 0.0 for row in rows}
     lines = defaultdict[tuple[str, int], list[tuple[float, float]]](list)
     count = defaultdict[tuple[int, str], int](int)
-    for it in found:
+    for it in (it for it in found if it.point in places):
         lines[it.wave, count[it.point, it.wave]].append((places[it.point], it.omega2))
         count[it.point, it.wave] += 1
     width = (style.width or ONE) / INCH

@@ -28,6 +28,7 @@ from magshell_fenicsx.output.report.report import write_report
 from magshell_fenicsx.output.store.durable import write_whole
 from magshell_fenicsx.output.store.known import case_in, pole_of, style_of
 from magshell_fenicsx.output.store.table import SOLUTION, Row, read_rows
+from magshell_fenicsx.output.store.written import note, refuse_foreign
 
 MOST_PANELS = 12
 MOST_FRAMES = 40
@@ -76,13 +77,19 @@ class Drawn:
 def plot(
     folder: Path, point: int | None = None, animation: bool = False, options: Mapping[str, Any] | None = None
 ) -> list[str]:
-    """Draw the pictures again, also animation.gif if requested, and write report.html again; see `draw`."""
+    """Draw the pictures again, also animation.gif if requested, and write report.html again; see `draw`.
+
+    A picture of somebody else in the folder is refused, not replaced.
+    """
+    _rows(folder)  # there is a run
+    refuse_foreign(folder)
     drawn = draw(folder, point, options)
     if animation:
         drawn.append(draw_animation(folder, options))
     if point is None and (folder / "summary.json").exists():
         write_report(folder)
         drawn.append("report.html")
+    note(folder, drawn)
     return drawn
 
 

@@ -14,6 +14,7 @@ from magshell_fenicsx.output.pictures.captions import named_value
 from magshell_fenicsx.output.pictures.curve import numbered
 from magshell_fenicsx.output.pictures.mode_picture import modes_figure
 from magshell_fenicsx.output.pictures.view import Camera
+from magshell_fenicsx.output.store.durable import Damaged
 from magshell_fenicsx.output.store.table import LOCATED, OWN_MODES, Row
 from magshell_fenicsx.quantities.registry import amplitude
 
@@ -42,11 +43,16 @@ def mode_figures(
     table = folder / "stability.csv"
     if not table.exists():
         return
-    with table.open(encoding="utf-8", newline="") as stream:
-        listed = list(csv.DictReader(stream))
+    try:
+        with table.open(encoding="utf-8", newline="") as stream:
+            listed = [
+                (int(line["point"]), Mode(line["mode"], float(line["eigenvalue"]))) for line in csv.DictReader(stream)
+            ]
+    except (KeyError, ValueError, TypeError, csv.Error) as e:
+        raise Damaged(f"{table}: is damaged: {type(e).__name__}: {e}") from None
     for row in rows:
         point = int(row["point"])
-        modes = [Mode(line["mode"], float(line["eigenvalue"])) for line in listed if int(line["point"]) == point]
+        modes = [mode for number, mode in listed if number == point]
         files = [(mode_file(folder, point, str(n), mode.label), n, mode) for n, mode in enumerate(modes, 1)]
         if panels := [(read_vtu(file)[0], mode_caption(n, mode)) for file, n, mode in files if file.exists()]:
             yield f"modes_{point:04d}", _figure(panels, style, camera)

@@ -1,7 +1,5 @@
 """The result of a run in one sentence, for its report."""
 
-import csv
-import json
 import re
 from collections.abc import Mapping, Sequence
 from html import unescape
@@ -13,8 +11,8 @@ from markupsafe import Markup
 
 from magshell_fenicsx.output.report.html_numbers import above_rounding, number
 from magshell_fenicsx.output.report.report_path import Line, head, symbol
-from magshell_fenicsx.output.store.known import pole_of
-from magshell_fenicsx.output.store.table import LOCATED, OWN_MODES, pole_name
+from magshell_fenicsx.output.store.known import pole_of, read_summary
+from magshell_fenicsx.output.store.table import LOCATED, OWN_MODES, pole_name, read_lines
 from magshell_fenicsx.quantities.quantity import PLAIN, Quantity
 from magshell_fenicsx.quantities.registry import amplitude, axes_of, shown
 
@@ -83,11 +81,9 @@ def sentence_of(folder: Path) -> str:
     return plain(verdict(*read_run(folder)))
 
 
-def read_run(folder: Path) -> tuple[Summary, list[Line]]:
+def read_run(folder: Path) -> tuple[Summary, Sequence[Line]]:
     """summary.json and the rows of path.csv, as text."""
-    with (folder / "path.csv").open(encoding="utf-8", newline="") as stream:
-        lines = list[Line](csv.DictReader(stream))
-    return json.loads((folder / "summary.json").read_text(encoding="utf-8")), lines
+    return read_summary(folder), read_lines(folder / "path.csv")
 
 
 def _instability(line: Line, summary: Summary, lines: Sequence[Line], mode_at: Sequence[float] | None) -> Markup:

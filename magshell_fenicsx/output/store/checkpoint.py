@@ -17,7 +17,7 @@ from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.continuation.point import Point
 from magshell_fenicsx.continuation.system import State
-from magshell_fenicsx.output.store.durable import AppendedFile, write_whole
+from magshell_fenicsx.output.store.durable import AppendedFile, Damaged
 from magshell_fenicsx.output.store.folder import by_first
 from magshell_fenicsx.output.store.framing import framed, read_frame
 from magshell_fenicsx.output.store.ordering import Array, Ordering
@@ -27,9 +27,9 @@ NAME = "checkpoint"
 FILE = "case_file"  # key with the name of the case file, which changes no result
 
 
-def begin_checkpoint(file: Path, case: Case) -> None:
-    """Write an empty checkpoint."""
-    write_whole(file, framed(json.dumps({**identity(case), FILE: case.file_name}).encode()))
+def begun(case: Case) -> bytes:
+    """The content of an empty checkpoint."""
+    return framed(json.dumps({**identity(case), FILE: case.file_name}).encode())
 
 
 def check_resumable(file: Path, case: Case) -> None:
@@ -38,7 +38,7 @@ def check_resumable(file: Path, case: Case) -> None:
     Raises
     ------
     CaseError
-        If there is no checkpoint, or it belongs to another case or other sources.
+        If there is no checkpoint, it is damaged, or it belongs to another case or other sources.
     """
     saved = begun_with(file)
     if saved is None:
@@ -47,13 +47,25 @@ def check_resumable(file: Path, case: Case) -> None:
 
 
 def begun_with(file: Path) -> dict[str, Any] | None:
-    """The `identity` of the run that began a checkpoint; None if there is no checkpoint."""
+    """The `identity` of the run that began a checkpoint; None if there is no checkpoint.
+
+    Raises
+    ------
+    Damaged
+        If its head cannot be read.
+    """
     try:
         with file.open("rb") as stream:
             head = read_frame(stream)
     except FileNotFoundError:
         return None
-    return None if head is None else dict(json.loads(head))
+    try:
+        known = json.loads(head or b"")
+    except ValueError:
+        known = None
+    if not isinstance(known, dict):
+        raise Damaged(f"{file}: is damaged: its head cannot be read")
+    return known
 
 
 def identity(case: Case) -> dict[str, Any]:
@@ -78,11 +90,14 @@ def refuse_other(saved: dict[str, Any], case: Case, folder: Path) -> None:
     there, here = saved.get("sources", saved.get("version")), now["sources"]
     known = _of_case(saved)
     if known != _of_case(now):
-        raise CaseError(f"--resume: {folder} belongs to another run: {_difference(known, now)}; run without --resume")
+        raise CaseError(
+            f"--resume: {folder} belongs to another run: {_difference(known, now)}; "
+            "give another folder, or --overwrite in place of --resume"
+        )
     if there != here:
         raise OtherSources(
             f"--resume: {folder} was computed by other sources of magshell_fenicsx ({there}; these are {here}); "
-            "run without --resume, which computes it again"
+            "--overwrite in place of --resume computes it again"
         )
 
 

@@ -1,7 +1,32 @@
 """Files that stay readable after a kill, a crash or a full disk."""
 
+import json
 import os
 from pathlib import Path
+from typing import Any
+
+from magshell_fenicsx.case.source import CaseError
+
+
+class Damaged(CaseError):
+    """A file of results is not what the program wrote; the message names it and says what is wrong."""
+
+
+def read_object(file: Path) -> dict[str, Any]:
+    """The JSON object in a file of results.
+
+    Raises
+    ------
+    Damaged
+        If there is none.
+    """
+    try:
+        found = json.loads(file.read_bytes())
+    except (ValueError, RecursionError) as e:
+        raise Damaged(f"{file}: is damaged: no JSON: {e}") from None
+    if not isinstance(found, dict):
+        raise Damaged(f"{file}: is damaged: no JSON object")
+    return found
 
 
 def write_whole(file: Path, content: bytes) -> None:

@@ -19,6 +19,19 @@ class DiskError(RuntimeError):
     """A file could not be written or read; the message has its name and the reason."""
 
 
+def given_folder(out: Path | str) -> Path:
+    """The folder that a user names.
+
+    Raises
+    ------
+    CaseError
+        If the name is empty, as that of a variable which is not set: the working folder is `.`.
+    """
+    if out == "":
+        raise CaseError("--out: is empty; give the name of a folder, . for the working folder")
+    return Path(out)
+
+
 def prepare_folder(out: Path, comm: MPI.Comm, make: Callable[[Path], None]) -> Path:
     """Let rank 0 prepare a folder; collective.
 

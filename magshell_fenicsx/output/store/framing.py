@@ -1,5 +1,6 @@
 """A sequence of byte strings in one file, each with its length and checksum."""
 
+import os
 import struct
 import zlib
 from typing import BinaryIO
@@ -27,8 +28,8 @@ def read_frame(stream: BinaryIO) -> bytes | None:
     head = stream.read(HEAD.size)
     if len(head) == HEAD.size:
         mark, length, checksum = HEAD.unpack(head)
-        content = stream.read(length) if mark == MARK else b""
-        if mark == MARK and len(content) == length and zlib.crc32(content) == checksum:
+        left = stream.seek(0, os.SEEK_END) - stream.seek(start + HEAD.size)  # a damaged length may be any number
+        if mark == MARK and length <= left and zlib.crc32(content := stream.read(length)) == checksum:
             return content
     stream.seek(start)
     return None

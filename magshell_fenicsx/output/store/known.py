@@ -8,20 +8,73 @@ from typing import Any
 from magshell_fenicsx.case.options import output_section
 from magshell_fenicsx.case.output import OutputSection
 from magshell_fenicsx.output.store import checkpoint
+from magshell_fenicsx.output.store.durable import Damaged, read_object
 from magshell_fenicsx.output.store.table import POLE
 
+SUMMARY = "summary.json"
+NUMBER, NOTHING = (int, float), type(None)
+PHASES = ("jit_s", "setup_s", "assembly_s", "factor_s", "solve_s", "output_s", "total_s")
+GROUPS = ("radius_to_thickness", "poisson_ratio", "lambda_m", "Lambda_m", "pc_over_E")
+SHAPE: dict[str, Any] = {  # the types of what is read from summary.json; a key with ? may be absent, [dict] is a list
+    "case": {"model": str, "shell": {"geometry": str}, "mesh": dict, "magnetic?": dict, "loading?": (dict, list)},
+    "dimensionless": dict.fromkeys(GROUPS, NUMBER),
+    "dimensions": {**dict.fromkeys(("radius", "thickness", "youngs_modulus"), (*NUMBER, NOTHING)), "units": str},
+    "in_units?": dict,
+    "model": {"included": list, "left_out": list},
+    "stopped": (str, NOTHING),
+    "limit_points": [dict],
+    "sensitivities": dict,
+    "gradients?": dict,
+    "knockdown": (*NUMBER, NOTHING),
+    "barrier?": (*NUMBER, NOTHING),
+    "solutions?": [dict],
+    "points": int,
+    "mesh": dict.fromkeys(("cells", "dofs", "degree"), int),
+    "tolerance?": {"tolerance": NUMBER, "error_estimate": (*NUMBER, NOTHING), "rounds": [dict]},
+    "timing": dict.fromkeys(PHASES, NUMBER),
+    **dict.fromkeys(("factorisations", "iterations", "ranks"), int),
+    "blas": str,
+    "versions": {"magshell_fenicsx": str},
+}
 NAMES = {"hemisphere": POLE, "disc": "the centre", "strip": "the tip", "mesh": "the highest vertex"}
 
 
 def case_in(folder: Path) -> dict[str, Any]:
     """The resolved case of a folder's summary.json or checkpoint; empty without both."""
-    file = folder / "summary.json"
-    begun = (
-        json.loads(file.read_text(encoding="utf-8"))
-        if file.exists()
-        else checkpoint.begun_with(folder / checkpoint.NAME)
-    )
-    return dict((begun or {}).get("case") or {})
+    if (folder / SUMMARY).exists():
+        return dict(read_summary(folder)["case"])
+    return dict((checkpoint.begun_with(folder / checkpoint.NAME) or {}).get("case") or {})
+
+
+def read_summary(folder: Path) -> dict[str, Any]:
+    """The content of summary.json.
+
+    Raises
+    ------
+    Damaged
+        If it lacks something that reports and comparisons read.
+    """
+    found = read_object(folder / SUMMARY)
+    if wrong := _unlike(found, SHAPE):
+        raise Damaged(f"{folder / SUMMARY}: is damaged, or of an earlier version: {wrong}")
+    return found
+
+
+def _unlike(found: Mapping[str, Any], shape: Mapping[str, Any], around: str = "") -> str:
+    """The first key whose value is none that a run writes, in words; empty if there is none."""
+    for name, kind in shape.items():
+        key = name.removesuffix("?")
+        if key not in found:
+            if name != key:
+                continue
+            return f"it has no {around}{key}"
+        value, items = found[key], isinstance(kind, list)
+        there = all(isinstance(each, dict) for each in value) if items and isinstance(value, list) else not items
+        if not there or not isinstance(value, list if items else dict if isinstance(kind, dict) else kind):
+            return f"its {around}{key} is {json.dumps(value)[:40]}"
+        if isinstance(kind, dict) and (wrong := _unlike(value, kind, f"{around}{key}.")):
+            return wrong
+    return ""
 
 
 def style_of(case: Mapping[str, Any], options: Mapping[str, Any] | None = None) -> OutputSection:

@@ -60,7 +60,10 @@ class Ordering:
         one_to_one = np.array_equal(np.sort(np.concatenate(parts)), np.arange(len(known)))
         close = np.all(distance < CLOSE * np.abs(known).max())
         if not comm.allreduce(bool(one_to_one and close), MPI.LAND):
-            raise CaseError("--resume: the mesh differs from the checkpoint's; run without --resume")
+            raise CaseError(
+                "--resume: the mesh differs from the checkpoint's; give another folder, or --overwrite in place of "
+                "--resume"
+            )
         return np.asarray(number)
 
     def gather(self, u: Vector) -> Array:

@@ -2,12 +2,12 @@
 
 import csv
 import io
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from magshell_fenicsx.output.store.durable import AppendedFile
-from magshell_fenicsx.quantities.registry import OF_EVERY_RUN
+from magshell_fenicsx.output.store.durable import AppendedFile, Damaged
+from magshell_fenicsx.quantities.registry import OF_EVERY_RUN, amplitude, quantity
 
 COLUMNS = tuple(q.name for q in OF_EVERY_RUN)
 TEXTS = tuple(q.name for q in OF_EVERY_RUN if q.kind == "text")
@@ -54,16 +54,12 @@ class PathTable:
 
     def __init__(self, file: Path, extra: Sequence[str] = ()) -> None:
         self._columns = (*COLUMNS, *extra)
-        lines = file.read_bytes().decode().splitlines(keepends=True) if file.exists() else []
-        self.kept: list[dict[str, str]] = []
         header = _line(self._columns)
-        length = len(header) if lines[:1] == [header] else 0
-        for line in lines[1:] if length else []:
-            values = next(csv.reader([line]))
-            if not line.endswith("\n") or values[0] != str(len(self.kept)) or len(values) != len(self._columns):
-                break
-            self.kept.append(dict(zip(self._columns, values, strict=True)))
-            length += len(line.encode())
+        content = file.read_bytes() if file.exists() else b""
+        length = content.rfind(b"\n") + 1
+        if length and not content.startswith(header.encode()):
+            raise Damaged(f"{file}: is damaged: its columns are not those of this run")
+        self.kept = read_lines(file) if length else []
         self._file = AppendedFile(file, length)
         if not length:
             self._file.append(header.encode())
@@ -91,12 +87,59 @@ def _line(values: Iterable[Any]) -> str:
     return stream.getvalue()
 
 
+def is_path(file: Path) -> bool:
+    """Whether a file begins as a path.csv does."""
+    try:
+        with file.open("rb") as stream:
+            return stream.readline(1000).startswith(",".join(COLUMNS[:4]).encode())
+    except OSError:
+        return False
+
+
 def read_rows(file: Path) -> list[Row]:
-    """The complete rows of a path.csv, also after a kill."""
-    text = file.read_text(encoding="utf-8")
-    rows = csv.DictReader(io.StringIO(text[: text.rfind("\n") + 1], newline=""))
-    return [{key: v if key in TEXTS else _number(v) for key, v in row.items()} for row in rows]
+    """The complete rows of a path.csv, also after a kill; see `read_lines`."""
+    return [{key: v if key in TEXTS else _number(v) for key, v in row.items()} for row in read_lines(file)]
+
+
+def read_lines(file: Path) -> list[dict[str, str]]:
+    """The same as text.
+
+    Raises
+    ------
+    Damaged
+        With the first line that is not a run's.
+    """
+    try:
+        text = file.read_bytes().decode()
+        lines = list(csv.reader(io.StringIO(text[: text.rfind("\n") + 1], newline=""), strict=True))
+    except (UnicodeDecodeError, csv.Error) as e:
+        raise Damaged(f"{file}: is damaged: no table in UTF-8: {e}") from None
+    head = lines[0] if lines else []
+    if missing := [name for name in COLUMNS if name not in head]:
+        raise Damaged(f"{file}: is damaged, or of an earlier version: it has no column {missing[0]}")
+    counts = {name for name in head if quantity(name).kind == "count"}
+    rows = []
+    for number, values in enumerate(lines[1:]):
+        rows.append(dict(zip(head, values, strict=False)))
+        if len(values) != len(head):
+            raise Damaged(f"{file}: is damaged: line {number + 2} has {len(values)} values, its header {len(head)}")
+        if wrong := _wrong(number, rows[-1], counts):
+            raise Damaged(f"{file}: is damaged: line {number + 2} has {wrong} = {rows[-1][wrong]!r}")
+    return rows
+
+
+def _wrong(number: int, row: Mapping[str, str], counts: Collection[str]) -> str:
+    """The first column whose value no run writes; empty if there is none."""
+    for key, text in row.items():
+        try:
+            if key not in TEXTS and not isinstance(_number(text), int) and key in counts:
+                return key
+        except ValueError:
+            return key
+    if row["point"] != str(number):
+        return "point"
+    return "amplitude" if row["amplitude"] and amplitude(row["amplitude"]).column not in row else ""
 
 
 def _number(text: str) -> float | int:
-    return int(text) if text.lstrip("-").isdigit() else float(text)
+    return int(text) if text.removeprefix("-").isdecimal() else float(text)
