@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from magshell_fenicsx.cli_pictures import plot, view
-from magshell_fenicsx.ending import STOPPED, exit_codes, failure, print_line, world
+from magshell_fenicsx.ending import STOPPED, exit_codes, failure, print_line, refuse_lost, world
 from magshell_fenicsx.platform.completion import case_files, left_to_the_shell
 from magshell_fenicsx.platform.plain import typer
+from magshell_fenicsx.platform.terminal import open_standard_streams
 from magshell_fenicsx.platform.version import __version__
 
 app = typer.Typer(
@@ -45,6 +46,7 @@ def _chosen(out: str | None, default: str) -> Path:
 
 def main() -> None:
     """Run the program."""
+    open_standard_streams()
     gc.set_threshold(100_000, 5, 5)  # Python's own would look for garbage two hundred times in a small run
     signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # sent by `magshell ... | head`; PETSc would report a crash
     try:
@@ -292,6 +294,7 @@ def check(case: CaseFile, set_: Settings = None) -> None:
                 refuse_unfit_numbers(source, read, read.design)
             except CaseError as e:
                 raise CaseError(read.placed(str(e))) from None
+    refuse_lost()
 
 
 def _names() -> list[str]:
@@ -316,6 +319,7 @@ def example(
     if name is None:
         for known, where in examples().items():
             print_line(f"{known:24} {title(where)}")
+        refuse_lost()
         return
     if world().rank:
         return
@@ -333,6 +337,7 @@ def schema(
     from magshell_fenicsx.case.schema import schema_text
 
     print_line((reference() if markdown else schema_text()).removesuffix("\n"))
+    refuse_lost()
 
 
 @app.command()
@@ -358,3 +363,4 @@ def info(
             library()
         for degree in (3, 4):
             print_line(f"compiled degree {degree} in {precompile(degree):.1f} s")
+    refuse_lost()

@@ -9,6 +9,7 @@ from typing import Any
 
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.platform.kept import UnsafeCache
+from magshell_fenicsx.platform import terminal
 from magshell_fenicsx.platform.plain import typer
 
 INVALID, STOPPED = 2, 3
@@ -28,7 +29,7 @@ def print_line(line: str) -> None:
     if world().rank == 0:
         with suppress(ValueError):  # elsewhere than in the main thread
             signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # again: PETSc has taken it if it was imported since `main`
-        print(line, flush=True)
+        terminal.print_line(line)
 
 
 def failure(message: str, code: int) -> typer.Exit:
@@ -40,7 +41,8 @@ def failure(message: str, code: int) -> typer.Exit:
         comm.Abort(code)  # the other ranks would wait for this one for ever
     if comm.rank:
         return typer.Exit()  # mpirun ends the job at the first failing rank, and may lose the message of rank 0
-    print(message, file=sys.stderr, flush=True)
+    with suppress(OSError):  # a full disk: the exit code says it
+        print(message, file=sys.stderr, flush=True)
     return typer.Exit(code)
 
 
@@ -57,6 +59,12 @@ def _all_fail(comm: Any) -> bool:
             return False
         time.sleep(0.01)
     return True
+
+
+def refuse_lost() -> None:
+    """End a command whose only result is what it prints, if that was not written."""
+    if terminal.lost:
+        raise failure(f"stopped early: {terminal.lost[0]}", STOPPED)
 
 
 @contextmanager

@@ -39,7 +39,7 @@ def explain(error: Any, location: Location, source: Source, case: type[BaseModel
     said = re.sub(r"^\w+ should have (at \w+ \d+) items? after validation, not", r"must have \1 items, not", said)
     if about := re.match(r"(\w+(\.[^.:]+)+): ", said):  # a rule between sections names its own key
         keys = about[1].split(".")
-        location, said = tuple(int(key) if key.isdigit() else key for key in keys), said[about.end() :]
+        location, said = tuple(int(key) if key.isdecimal() else key for key in keys), said[about.end() :]
     place, key = source.place(location), dotted(location) or "case"
     if kind == "extra_forbidden":
         allowed = _allowed_keys(location[:-1], source.data, case)

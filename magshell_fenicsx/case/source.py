@@ -148,7 +148,7 @@ def override(source: Source, assignment: str) -> None:
     location: list[str | int] = []
     for i, key in enumerate(keys):
         if isinstance(section, list):
-            if not key.isdigit() or int(key) >= len(section):
+            if not key.isdecimal() or int(key) >= len(section):
                 there = f"items 0 to {len(section) - 1}" if section else "no items"
                 raise CaseError(f"--set {assignment}: {'.'.join(keys[: i + 1])}: the list has {there}")
         elif not isinstance(section, dict):

@@ -44,7 +44,7 @@ class WithOwnTerms(Section):
         if not (about and self._origin.place) or about[1].split(".")[0] not in type(self).model_fields:
             return message
         keys = [*about[1].split("."), *([about[2]] if about[2] else [])]
-        return f"{self._origin.place(tuple(int(key) if key.isdigit() else key for key in keys))}: {message}"
+        return f"{self._origin.place(tuple(int(key) if key.isdecimal() else key for key in keys))}: {message}"
 
     @property
     def own_terms(self) -> tuple[OwnTerm, ...]:

@@ -3,8 +3,8 @@
 import json
 import math
 import re
-from dataclasses import replace
 from contextlib import suppress
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any

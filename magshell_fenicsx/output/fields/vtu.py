@@ -127,7 +127,11 @@ def _surface(grid: "vtkUnstructuredGrid", file: Path) -> tuple[Surface, About]:
         raise CaseError(f"{file} is of an earlier version: run the case again")
     about = About(float(numbers["h_over_R"][0]), float(numbers["poisson_ratio"][0]), numbers.get("mirror"))
     r0, u, n0 = (data[name] for name in ("r0", "u_over_h", "n0"))
-    if {r0.shape, u.shape, n0.shape} != {(len(r0), 3)} or not 0 <= cells.min(initial=-1) <= cells.max() < len(r0):
+    if (
+        {r0.shape, u.shape, n0.shape} != {(len(r0), 3)}
+        or not cells.size
+        or not 0 <= cells.min() <= cells.max() < len(r0)
+    ):
         raise ValueError("its cells have no nodes")
     if not all(np.isfinite(values).all() for values in (r0, u, n0)):
         raise ValueError("a node is nowhere")

@@ -147,7 +147,7 @@ def _numbers(samples: int, seed: int, part: str | None) -> range:
     if part is None:
         return range(samples)
     first, slash, count = part.partition("/")
-    if not (slash and first.isdigit() and count.isdigit() and 1 <= int(first) <= int(count) <= samples):
+    if not (slash and first.isdecimal() and count.isdecimal() and 1 <= int(first) <= int(count) <= samples):
         raise CaseError(f"--part {part}: write it as i/n with 1 <= i <= n, and n at most the number of samples")
     return range(int(first) - 1, samples, int(count))
 

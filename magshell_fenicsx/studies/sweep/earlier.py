@@ -72,6 +72,6 @@ def _base(source: Source, axes: Sequence[Axis]) -> str:
             part = part[int(name)] if isinstance(part, list) else part.get(name, {}) if isinstance(part, dict) else {}
         if isinstance(part, dict):
             part.pop(last, None)
-        elif isinstance(part, list) and last.isdigit() and int(last) < len(part):
+        elif isinstance(part, list) and last.isdecimal() and int(last) < len(part):
             part[int(last)] = None
     return hashlib.sha256(json.dumps(data, sort_keys=True, default=str).encode()).hexdigest()[:16]

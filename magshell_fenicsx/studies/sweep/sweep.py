@@ -123,7 +123,7 @@ def share_of(part: str | None, count: int) -> range:
     (range(0, 2), range(2, 5))
     """
     first, slash, number = (part or "1/1").partition("/")
-    if not (slash and first.isdigit() and number.isdigit() and 1 <= int(first) <= int(number) <= count):
+    if not (slash and first.isdecimal() and number.isdecimal() and 1 <= int(first) <= int(number) <= count):
         raise CaseError(f"--part {part}: write it as i/n with 1 <= i <= n, and n at most the number of points")
     i, n = int(first), int(number)
     return range((i - 1) * count // n, i * count // n)
