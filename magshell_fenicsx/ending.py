@@ -8,14 +8,15 @@ from contextlib import contextmanager, suppress
 from typing import Any
 
 from magshell_fenicsx.case.source import CaseError
-from magshell_fenicsx.platform.kept import UnsafeCache
 from magshell_fenicsx.platform import terminal
+from magshell_fenicsx.platform.kept import UnsafeCache
 from magshell_fenicsx.platform.plain import typer
 
 INVALID, STOPPED = 2, 3
 FAILED = 32101  # tag of the messages between ranks that fail
 PATIENCE = 5.0  # s in which an error of all ranks reaches the last of them
 DELIVERED = 0.2  # s in which a message is on its way to the terminal
+UNWRITTEN = "kernels cannot be compiled into"
 
 
 def world() -> Any:
@@ -69,10 +70,17 @@ def refuse_lost() -> None:
 
 @contextmanager
 def exit_codes(invalid: type[Exception] = CaseError, stopped: tuple[type[Exception], ...] = ()) -> Iterator[None]:
-    """Turn an invalid input (`CaseError` and `invalid`) or an early stop into a message and its exit code."""
+    """Turn an invalid input (`CaseError` and `invalid`) or an early stop into a message and its exit code.
+
+    An early stop is also a kernel that cannot be written, for which dolfinx raises the same on all ranks.
+    """
     try:
         yield
     except (CaseError, UnsafeCache, invalid) as e:
         raise failure(str(e), INVALID) from None
     except stopped as e:
         raise failure(f"stopped early: {e}", STOPPED) from None
+    except RuntimeError as e:
+        if UNWRITTEN in str(e) or (world().rank and "Failed just-in-time compilation" in str(e)):
+            raise failure(f"stopped early: {str(e)[str(e).find(UNWRITTEN) :]}", STOPPED) from None
+        raise

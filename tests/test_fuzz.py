@@ -57,7 +57,9 @@ def test_mutated_case_files_are_refused_or_work(tmp_path: Path, count: int, runs
     for content in list(accepted)[::step]:
         file.write_bytes(content)
         out = str(tmp_path / "out")
-        code = invoke("run", str(file), "--out", out, "--time-limit", str(RUN_TIME), *COARSE, limit=RUN_LIMIT)
+        code = invoke(
+            "run", str(file), "--out", out, "--overwrite", "--time-limit", str(RUN_TIME), *COARSE, limit=RUN_LIMIT
+        )
         assert code in (0, 2, 3), content
 
 

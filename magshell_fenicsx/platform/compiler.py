@@ -5,10 +5,14 @@ Only kernels with `SHARED` among the compiler's arguments are concerned: other p
 
 import ctypes
 import os
+import re
 import shlex
 import subprocess
+import sys
 import sysconfig
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
@@ -22,6 +26,7 @@ from magshell_fenicsx.platform.kept import kept_file, trusted
 from magshell_fenicsx.platform.many import declared, with_many
 
 SHARED, MANY = "-shared", "-DMANY"
+FULL = re.compile("No space left on device|Disk quota exceeded|File too large|Read-only file system")
 WAIT = 0.05  # s between two looks for what another process compiles
 DECLARATIONS = (
     jit.UFC_HEADER_DECL.format("float64") + jit.UFC_INTEGRAL_DECL + jit.UFC_FORM_DECL + jit.UFC_EXPRESSION_DECL
@@ -46,14 +51,30 @@ def _compile_objects(
         return OTHERS[0](decl, objects, names, module, options, folder, arguments, *rest, **others)
     code = compat.kernel_code(objects, module, options)
     source = folder / f"{module}.c"
-    source.write_text(with_many(code) if MANY in arguments else code)
+    with written_into(folder):
+        source.write_text(with_many(code) if MANY in arguments else code)
     compiler = shlex.split(os.environ.get("CC") or sysconfig.get_config_var("CC") or "cc")
     include = f"-I{get_include_path()}"
     library = str(source.with_suffix(".so"))
-    subprocess.run([*compiler, "-std=c17", "-fPIC", *arguments, include, str(source), "-o", library, "-lm"], check=True)
-    Path(library).chmod(0o755)  # whatever the umask: what others may write is not trusted
-    source.with_suffix(".c.cached").touch(mode=0o644)
+    command = [*compiler, "-std=c17", "-fPIC", *arguments, include, str(source), "-o", library, "-lm"]
+    with written_into(folder):
+        done = subprocess.run(command, stderr=subprocess.PIPE, text=True, errors="replace", check=False)
+        print(done.stderr, end="", file=sys.stderr)
+        if done.returncode and (full := FULL.search(done.stderr)):  # of its own, or of the folder for temporary files
+            raise OSError(0, full[0])
+        done.check_returncode()
+        Path(library).chmod(0o755)  # whatever the umask: what others may write is not trusted
+        source.with_suffix(".c.cached").touch(mode=0o644)
     return code
+
+
+@contextmanager
+def written_into(folder: Path) -> Iterator[None]:
+    """Turn an error of the disk into one that names the cache; dolfinx passes on only its words on several ranks."""
+    try:
+        yield
+    except OSError as e:
+        raise RuntimeError(f"kernels cannot be compiled into {folder}: {e.strerror}") from None
 
 
 def _load_objects(folder: Path, module: str, names: list[str]) -> tuple[list[Any], Any]:
@@ -93,15 +114,14 @@ def _get_cached_module(module: str, names: list[str], folder: Path, timeout: int
     if (there := kept_file(f"{module}.so")) and there.with_suffix(".c.cached").exists():
         return _load_objects(there.parent, module, names)
     source, end = Path(folder) / f"{module}.c", time.monotonic() + timeout
-    source.parent.mkdir(exist_ok=True, parents=True)
-    _discard_strange(source)
+    with written_into(folder):
+        source.parent.mkdir(exist_ok=True, parents=True)
+        _discard_strange(source)
     while True:
-        try:
+        with written_into(folder), suppress(FileExistsError):
             # who makes the file compiles it; FFCx would load as its own what appears meanwhile
             os.close(os.open(source, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o644))
             return None, None
-        except FileExistsError:
-            pass
         while not source.with_suffix(".c.cached").exists() and source.exists() and time.monotonic() < end:
             time.sleep(WAIT)
         if source.with_suffix(".so").exists() and source.with_suffix(".c.cached").exists():

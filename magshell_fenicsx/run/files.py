@@ -23,7 +23,7 @@ from magshell_fenicsx.output.store.durable import Damaged, read_object, sync_fol
 from magshell_fenicsx.output.store.folder import DiskError, by_first, prepare_folder
 from magshell_fenicsx.output.store.known import SUMMARY, read_summary
 from magshell_fenicsx.output.store.table import PathTable, Row, read_lines
-from magshell_fenicsx.output.store.written import MESH, OF_PATH, note, refuse_foreign, remove, written
+from magshell_fenicsx.output.store.written import MESH, OF_PATH, note, refuse_unwritten, remove, written
 from magshell_fenicsx.simulate.scene import Scene
 
 INTERRUPTED = re.compile(r"^interrupted by |cannot be (written|read): ")
@@ -56,7 +56,7 @@ def open_folder(out: Path, case: Case, comm: MPI.Comm, resume: bool, overwrite: 
     """
 
     def ready(folder: Path) -> None:
-        refuse_foreign(folder)
+        refuse_unwritten(folder)
         if resume:
             _refuse_no_resuming(folder, case)
         elif not overwrite:

@@ -48,15 +48,88 @@ def test_the_same_case_in_another_file(out: Path, tmp_path: Path) -> None:
     assert magshell("run", other(tmp_path), *SMALL, "--out", out).returncode == 0
 
 
-def test_an_interrupted_run_is_kept_too(tmp_path: Path) -> None:
-    checkpoint.begin_checkpoint(tmp_path / "checkpoint", ms.Case.load(FILE))
+def test_an_interrupted_run_of_another_file_is_kept_too(tmp_path: Path) -> None:
+    (tmp_path / "checkpoint").write_bytes(checkpoint.begun(ms.Case.load(FILE)))
     with pytest.raises(ms.CaseError, match=r"has a run of dimple_buckling\.yaml"):
         ms.run(other(tmp_path, "symmetry: half\n"), tmp_path)
     assert (tmp_path / "checkpoint").exists()
 
 
-@pytest.mark.parametrize("content", ["", "[]", '{"case": {}}'])
-def test_a_folder_of_nobody_known(tmp_path: Path, content: str) -> None:
-    """Without a name, as in results of earlier versions."""
-    (tmp_path / "summary.json").write_text(content, encoding="utf-8")
-    assert magshell("run", FILE, *SMALL, "--out", tmp_path).returncode == 0
+def content(folder: Path) -> dict[str, bytes]:
+    """Every file of a folder."""
+    return {str(file.relative_to(folder)): file.read_bytes() for file in folder.rglob("*") if file.is_file()}
+
+
+@pytest.mark.parametrize("ranks", [0, 2])
+@pytest.mark.parametrize(
+    "setting", ['shell.thickness_factor="1/0"', "gradients={of: [nope], by: [lambda_m]}"], ids=["scene", "gradients"]
+)
+def test_what_is_refused_loses_nothing(out: Path, setting: str, ranks: int) -> None:
+    """Also if it is refused only when its scene is built."""
+    before = content(out)
+    for how in ([], ["--overwrite"]):
+        assert magshell("run", FILE, *SMALL, "--set", setting, "--out", out, *how, ranks=ranks).returncode == 2
+        assert content(out) == before
+
+
+def test_what_is_refused_leaves_no_folder(tmp_path: Path) -> None:
+    with pytest.raises(ms.CaseError, match="nope"):
+        ms.run(ms.Case.load(FILE, ["gradients={of: [nope], by: [lambda_m]}"]), tmp_path / "new")
+    assert not (tmp_path / "new").exists()
+
+
+MINE = ("path.csv", "summary.json", "mesh.json", "report.html", "shell.png", "fields/point_0000.vtu")
+
+
+@pytest.mark.parametrize("text", ["", "[]", '{"case": {}}', "mine"])
+def test_files_of_others_are_refused(tmp_path: Path, text: str) -> None:
+    """A folder without a run, with names that a run would write."""
+    (tmp_path / "fields").mkdir()
+    for name in (*MINE, "notes.txt", "fields/mine.csv"):
+        (tmp_path / name).write_text(text, encoding="utf-8")
+    before = content(tmp_path)
+    for how in ([], ["--overwrite"], ["--resume"]):
+        refused = magshell("run", FILE, *SMALL, "--out", tmp_path, *how)
+        assert refused.returncode == 2
+        assert refused.stderr == (
+            f"{tmp_path}: has files that a run would replace and that none is known to have written: "
+            f"{', '.join(sorted(MINE))}; move them away, or give another folder\n"
+        )
+        assert content(tmp_path) == before
+
+
+def test_files_of_others_stay(out: Path) -> None:
+    """Under names that no run writes they survive, also beside its own; added later under such a name, they are seen."""
+    mine = ("notes.txt", "shell_1.png", "fields/mine.csv", "fields/point_mine.vtu")
+    for name in mine:
+        (out / name).write_text("mine", encoding="utf-8")
+    (out / "animation.gif").write_text("mine", encoding="utf-8")
+    refused = magshell("run", FILE, *SMALL, "--out", out)
+    assert refused.returncode == 2
+    assert "none is known to have written: animation.gif; move" in refused.stderr
+    assert "animation.gif" in magshell("plot", out).stderr
+    (out / "animation.gif").rename(out / "mine.gif")
+    for how in ([], ["--overwrite"]):
+        assert magshell("run", FILE, *SMALL, "--out", out, *how).returncode == 0
+    assert {name for name, text in content(out).items() if text == b"mine"} == {*mine, "mine.gif"}
+
+
+def test_results_of_earlier_versions(out: Path) -> None:
+    """They have no list of what is theirs: their summary.json says that all is."""
+    (out / "written.txt").unlink()
+    assert magshell("plot", out, "--point", 1).returncode == 0
+    assert "fields/path.pvd\n" in (out / "written.txt").read_text(encoding="utf-8")
+    assert "shell_0001.png\n" in (out / "written.txt").read_text(encoding="utf-8")
+    assert magshell("run", FILE, *SMALL, "--out", out).returncode == 0
+    assert not (out / "shell_0001.png").exists()
+
+
+def test_no_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """`--out "$NOT_SET"` does not mean the working folder."""
+    monkeypatch.chdir(tmp_path)
+    for command in (["run", FILE], ["sweep", FILE, "--over", "mesh.degree=2,3"], ["design", FILE]):
+        refused = magshell(*command, "--out", "")
+        assert (refused.returncode, list(tmp_path.iterdir())) == (2, [])
+        assert refused.stderr.startswith("--out: is empty; give the name of a folder")
+    with pytest.raises(ms.CaseError, match="--out: is empty"):
+        ms.run(FILE, "")

@@ -28,7 +28,7 @@ from magshell_fenicsx.output.report.report import write_report
 from magshell_fenicsx.output.store.durable import write_whole
 from magshell_fenicsx.output.store.known import case_in, pole_of, style_of
 from magshell_fenicsx.output.store.table import SOLUTION, Row, read_rows
-from magshell_fenicsx.output.store.written import note, refuse_foreign
+from magshell_fenicsx.output.store.written import note, refuse_unwritten
 
 MOST_PANELS = 12
 MOST_FRAMES = 40
@@ -82,7 +82,7 @@ def plot(
     A picture of somebody else in the folder is refused, not replaced.
     """
     _rows(folder)  # there is a run
-    refuse_foreign(folder)
+    refuse_unwritten(folder)
     drawn = draw(folder, point, options)
     if animation:
         drawn.append(draw_animation(folder, options))

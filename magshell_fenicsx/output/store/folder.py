@@ -1,11 +1,12 @@
 """The output folder: making it, locking it, and disk access through rank 0."""
 
 import fcntl
+import json
 import os
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 from mpi4py import MPI
 
@@ -13,6 +14,8 @@ from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.platform.first import from_first
 
 T = TypeVar("T")
+MOST_NAMED = 6
+OF_POINTS = {"outcome", "evaluation", "samples"}  # keys of the files in points/
 
 
 class DiskError(RuntimeError):
@@ -30,6 +33,60 @@ def given_folder(out: Path | str) -> Path:
     if out == "":
         raise CaseError("--out: is empty; give the name of a folder, . for the working folder")
     return Path(out)
+
+
+def refuse_foreign(folder: Path, names: Iterable[str], what: str) -> None:
+    """Refuse to replace files that are not known as results.
+
+    Raises
+    ------
+    CaseError
+        With their names, if there are any.
+    """
+    if foreign := sorted(names):
+        more = f" and {len(foreign) - MOST_NAMED} more" * (len(foreign) > MOST_NAMED)
+        raise CaseError(
+            f"{folder}: has files that {what} would replace and that none is known to have written: "
+            f"{', '.join(foreign[:MOST_NAMED])}{more}; move them away, or give another folder"
+        )
+
+
+def refuse_others(folder: Path, names: Sequence[str], kept: Collection[str], what: str, case: str = "") -> None:
+    """Refuse a folder for the tables of many runs that has those of another case file, or files of others.
+
+    Parameters
+    ----------
+    names
+        The tables; the first is a JSON object with the keys `kept`, and the name of the case file as `case`.
+    case
+        The name of the case file, if another one is refused.
+
+    Raises
+    ------
+    CaseError
+        On the rank that calls.
+    """
+    known = _object(folder / names[0])
+    if known.keys() >= set(kept):
+        name = known.get("case")
+        if case and isinstance(name, str) and Path(name).stem != Path(case).stem:
+            raise CaseError(f"--out {folder}: has {what} of {name}, which is kept; give another folder")
+    elif not any(_object(file).keys() & OF_POINTS for file in (folder / "points").glob("*.json")):
+        # of an interrupted one there would be points
+        refuse_foreign(folder, (name for name in names if _size(folder / name)), what)
+
+
+def _object(file: Path) -> dict[str, Any]:
+    """The JSON object in a file; empty if there is none."""
+    try:
+        known = json.loads(file.read_bytes())
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return known if isinstance(known, dict) else {}
+
+
+def _size(file: Path) -> int:
+    return file.stat().st_size if file.exists() else 0
 
 
 def prepare_folder(out: Path, comm: MPI.Comm, make: Callable[[Path], None]) -> Path:
@@ -78,12 +135,16 @@ def held_folder(out: Path, comm: MPI.Comm, make: bool) -> Iterator[None]:
         except OSError:
             pass  # a file system without locks
 
+    new = make and not out.exists()
     try:
         prepare_folder(out, comm, hold)
         yield
     finally:
         for n in number:
             os.close(n)
+            with suppress(OSError):  # what was refused leaves no empty folder
+                if new:
+                    out.rmdir()
 
 
 def by_first(

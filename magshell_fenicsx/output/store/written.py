@@ -6,10 +6,10 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.output.pictures.picture import PICTURES
 from magshell_fenicsx.output.store import checkpoint
 from magshell_fenicsx.output.store.durable import Damaged, read_object, write_whole
+from magshell_fenicsx.output.store.folder import refuse_foreign
 from magshell_fenicsx.output.store.table import is_path
 
 NAME = "written.txt"
@@ -23,7 +23,6 @@ NAMES = re.compile(
     rf"|({'|'.join(DRAWN)})(_\d{{4,}})?\.(png|svg|pdf)"
     r"|fields(/(path\.pvd|outlines(_\d{4,})?\.vtp|(point_\d{4,}|mode_\d{4,}_.+|gradients_.+)\.vtu))?"
 )
-MOST_NAMED = 6
 
 
 def of_names(folder: Path) -> set[str]:
@@ -57,7 +56,7 @@ def _is_of_run(read: Callable[[], dict[str, Any] | None]) -> bool:
     return False
 
 
-def refuse_foreign(folder: Path) -> None:
+def refuse_unwritten(folder: Path) -> None:
     """Refuse to write where a file that no run has written has a name that runs use.
 
     Raises
@@ -65,17 +64,7 @@ def refuse_foreign(folder: Path) -> None:
     CaseError
         With the names of these files.
     """
-    refuse_files(folder, of_names(folder) - written(folder), "a run")
-
-
-def refuse_files(folder: Path, names: Iterable[str], what: str) -> None:
-    """Refuse to replace files."""
-    if foreign := sorted(names):
-        more = f" and {len(foreign) - MOST_NAMED} more" * (len(foreign) > MOST_NAMED)
-        raise CaseError(
-            f"{folder}: has files that {what} would replace and that none is known to have written: "
-            f"{', '.join(foreign[:MOST_NAMED])}{more}; move them away, or give another folder"
-        )
+    refuse_foreign(folder, of_names(folder) - written(folder), "a run")
 
 
 def note(folder: Path, more: Iterable[str] = ()) -> None:

@@ -14,7 +14,7 @@ from magshell_fenicsx.case.loads.field import FieldBefore, RotationSection
 from magshell_fenicsx.case.loads.time import TimeSection
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.output.store.durable import write_whole
-from magshell_fenicsx.output.store.folder import by_first, held_folder
+from magshell_fenicsx.output.store.folder import by_first, given_folder, held_folder, refuse_others
 from magshell_fenicsx.studies.compare.curves import Difference, amplitude_of, differences, judged, places, time_at
 from magshell_fenicsx.studies.compare.picture import draw_comparison
 from magshell_fenicsx.studies.compare.runs import MODELS, ModelName, ModelRun, NothingLeft, run_model
@@ -65,13 +65,15 @@ def compare(
     NothingLeft
         If a run left no results.
     """
-    file, folder = Path(file), Path(out)
+    file, folder = Path(file), given_folder(out)
     for model in MODELS:
         case = Case.load(file, [*settings, f"model={model}", *(["solid=null"] if model == "shell" else [])])
     if not case.programme or isinstance(case.programme[-1].load, FieldBefore | RotationSection | TimeSection):
         raise CaseError("compare: needs a load whose curve can be compared: pressure, indentation or field")
     with held_folder(folder, MPI.COMM_SELF, make=True):
         runs: dict[ModelName, list[ModelRun]] = {}
+        tables = ("compare.json", "compare.csv", "compare.png")
+        refuse_others(folder, tables, ("difference", "runs"), "a comparison", file.name)
         for model in MODELS:
             for refinement in sorted(set(refinements[model])):
                 done = run_model(file, settings, model, refinement, folder / f"{model}_{refinement:g}", say)
@@ -85,7 +87,7 @@ def compare(
             raise CaseError(f"compare: the shell ended while {ends[0]} varied, the solid while {ends[1]} did")
         found = differences(shell, solid)
         at = max(places([run for model in MODELS for run in runs[model]]), default=None)
-        content = _content(runs, at, found)
+        content = {"case": file.name, **_content(runs, at, found)}
         rows = [{**asdict(d), "relative": d.relative} for d in found]
         columns = (*(f.name for f in fields(Difference)), "relative")
         by_first(MPI.COMM_SELF, partial(write_csv, rows, columns, folder / "compare.csv"))

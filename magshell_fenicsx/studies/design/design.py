@@ -22,7 +22,7 @@ from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.opened import read_together, with_same_files
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.output.store.durable import write_whole
-from magshell_fenicsx.output.store.folder import by_first, held_folder
+from magshell_fenicsx.output.store.folder import by_first, given_folder, held_folder, refuse_others
 from magshell_fenicsx.platform import sources
 from magshell_fenicsx.platform.terminal import print_line
 from magshell_fenicsx.simulate.results import Target
@@ -113,9 +113,11 @@ class Design:
         try:
             content = json.loads(file.read_text(encoding="utf-8"))
             mine = content["design"] == self._mine and content["sources"] == sources.ours()
-            return Evaluation(**content["evaluation"]) if mine else None
+            found = Evaluation(**content["evaluation"]) if mine else None
         except (FileNotFoundError, ValueError, KeyError, TypeError):
             return None
+        parts = (found.values, found.gradients, found.beside, found.seen) if found else ()
+        return found if all(isinstance(part, dict) for part in parts) else None
 
     def _add(self, x: Array, found: Evaluation, name: str) -> None:
         self.tried.append((x, found))
@@ -139,6 +141,8 @@ class Design:
         self.say(f"{row['evaluation']:5d}  {values}{note}{'  best' if row['best'] else ''}")
 
     def _write(self) -> None:
+        if not any(found.values for _, found in self.tried) and (self.folder / "design.csv").exists():
+            return  # one that cannot start replaces nothing
         columns = list(dict.fromkeys(key for row in self.rows for key in row))
         write_csv(self.rows, columns, self.folder / "design.csv")
 
@@ -175,8 +179,13 @@ def design(
     Missed
         After everything is written: if a target is not reached, a constraint not kept, or no optimum found.
     """
+<<<<<<< HEAD
     source = read_together(file, comm, settings)
     case, folder = with_same_files(Case.from_source(source), comm), Path(out)
+=======
+    source = read_source(Path(file), settings)
+    case, folder = Case.from_source(source), given_folder(out)
+>>>>>>> e4ecc95 (Studies refuse the folders of others; tests of what a run may replace)
     if case.design is None:
         raise CaseError(f"{file}: design: is missing: it says what varies and what is wanted")
     try:
@@ -184,6 +193,8 @@ def design(
     except CaseError as e:
         raise CaseError(case.placed(str(e))) from None
     with held_folder(folder, comm, make=True):
+        tables = ("summary.json", "design.csv", "best.yaml", "best.csv", "design.png")
+        by_first(comm, lambda: refuse_others(folder, tables, ("objective", "best"), "a design", Path(file).name))
         by_first(comm, lambda: (folder / "points").mkdir(exist_ok=True))
         if resume and not by_first(comm, lambda: any((folder / "points").glob("*.json"))):
             raise CaseError(f"{folder}: has no evaluation to resume")

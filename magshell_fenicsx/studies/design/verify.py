@@ -38,7 +38,7 @@ def verified(
         settings = [f"mesh.refinement={case.mesh.refinement * section.verify:.6g}"]
         case = opened(folder / "best.yaml", comm, settings)
     how = ", ".join(settings) or "on the mesh of the file"
-    result = run(case, folder / "verified", comm)
+    result = run(case, folder / "verified", comm, overwrite=True)  # the folder is the design's
     values = {name: _value(result, name) for name in problem.results if name not in problem.targets}
     seen = dict[str, float]()
     for target in problem.targets.values():

@@ -10,7 +10,7 @@ from mpi4py import MPI
 
 from magshell_fenicsx.case.source import CaseError, read_source
 from magshell_fenicsx.output.store.durable import write_whole
-from magshell_fenicsx.output.store.folder import by_first, prepare_folder
+from magshell_fenicsx.output.store.folder import by_first, given_folder, prepare_folder, refuse_others
 from magshell_fenicsx.platform import sources
 from magshell_fenicsx.platform.first import from_first
 from magshell_fenicsx.platform.terminal import print_line
@@ -91,11 +91,17 @@ def ensemble(
 
     variants = from_first(comm, drawn)
     every = {sample.key: sample for variant in variants for sample in variant}
-    folder = Path(out)
+    folder, name = given_folder(out), Path(file).name
     if resume or merge:
         places = [Path(place) for place in merge] or [folder]
         by_first(comm, lambda: _refuse_strange(places, every), "cannot be read")
-    prepare_folder(folder, comm, lambda out: (out / "points").mkdir(parents=True, exist_ok=True))
+
+    def ready(out: Path) -> None:
+        tables = (f"summary{ending}.json", f"samples{ending}.csv", f"ensemble{ending}.png", f"report{ending}.md")
+        refuse_others(out, tables, ("seed", "samples"), "an ensemble", name)
+        (out / "points").mkdir(parents=True, exist_ok=True)
+
+    prepare_folder(folder, comm, ready)
     if merge:
         by_first(comm, lambda: _copy(every, [Path(place) for place in merge], folder))
     missing = (
@@ -109,7 +115,7 @@ def ensemble(
     _compute([every[key] for key in missing], scalar, folder, comm, say)
     rows = [_row(each, folder, scalar) for each in zip(*variants, strict=True)]
     content = {
-        "case": Path(file).name,
+        "case": name,
         "settings": list(settings),
         "seed": seed,
         "samples": samples,

@@ -70,9 +70,12 @@ def of_others(file: Path, origin: Origin) -> bool:
 
 def _read(file: Path) -> Measured | None:
     try:
-        return Measured(**json.loads(file.read_text(encoding="utf-8")))
+        found = Measured(**json.loads(file.read_text(encoding="utf-8")))
     except (OSError, ValueError, TypeError):
         return None
+    lists = isinstance(found.samples, list) and isinstance(found.rows, list) and isinstance(found.summary, dict | None)
+    sound = lists and all(isinstance(each, dict) and each.keys() >= set(TIMES) for each in found.samples)
+    return found if sound and all(isinstance(row, dict) for row in found.rows) else None
 
 
 def _is_of(origin: Origin, summary: Mapping[str, Any] | None) -> bool:

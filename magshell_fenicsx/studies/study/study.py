@@ -12,7 +12,7 @@ from mpi4py import MPI
 
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.output.store.durable import write_whole
-from magshell_fenicsx.output.store.folder import by_first, held_folder
+from magshell_fenicsx.output.store.folder import by_first, given_folder, held_folder, refuse_others
 from magshell_fenicsx.platform import sources
 from magshell_fenicsx.platform.terminal import print_line
 from magshell_fenicsx.studies.study.machine import fingerprint
@@ -88,8 +88,10 @@ def study(
     """
     scalar, axes = parse_scalar(result), parse_axes(over)
     _check(reference, ranks, repeat)
-    points, folder, machine, runs = make_points(Path(file), axes, settings), Path(out), fingerprint(), []
+    points, folder, machine, runs = make_points(Path(file), axes, settings), given_folder(out), fingerprint(), []
     with held_folder(folder, MPI.COMM_WORLD, make=True):
+        tables = ("study.json", "study.csv", "study.md", "study.png")
+        refuse_others(folder, tables, ("machine", "result"), "a study", Path(file).name)
         by_first(MPI.COMM_WORLD, lambda: (folder / "points").mkdir(exist_ok=True))
         files = {
             (i, n): folder / "points" / f"{point.key}-{n}.json" for i, point in enumerate(points) for n in set(ranks)

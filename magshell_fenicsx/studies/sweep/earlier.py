@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from magshell_fenicsx.case.source import CaseError, Source
-from magshell_fenicsx.output.store.durable import write_whole
+from magshell_fenicsx.output.store.durable import Damaged, read_object, write_whole
 from magshell_fenicsx.studies.sweep.axes import MOST_POINTS, Axis
 from magshell_fenicsx.studies.sweep.points import SweepPoint, make_point
 
@@ -55,11 +55,23 @@ def _place(values: Sequence[str], axes: Sequence[Axis]) -> tuple[str, ...]:
 
 
 def _read(file: Path) -> dict[str, Any] | None:
-    try:
-        found = json.loads(file.read_text(encoding="utf-8"))
-        return found if {"keys", "base", "points"} <= found.keys() else None
-    except (OSError, ValueError, AttributeError):
+    if not file.exists():
         return None
+    found = read_object(file)
+    keys, points = found.get("keys"), found.get("points")
+    if not (isinstance(found.get("base"), str) and _are_words(keys) and _are_words(points, of=len(keys or ""))):
+        raise Damaged(f"{file}: is damaged: no keys, base and points of a sweep")
+    return found
+
+
+def _are_words(lists: object, of: int | None = None) -> bool:
+    """Whether it is a list of lists of text, each with so many items."""
+    return isinstance(lists, list) and all(
+        isinstance(each, list)
+        and len(each) in (of, len(each) if of is None else of)
+        and all(isinstance(v, str) for v in each)
+        for each in lists
+    )
 
 
 def _base(source: Source, axes: Sequence[Axis]) -> str:

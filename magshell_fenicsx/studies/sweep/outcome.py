@@ -111,6 +111,21 @@ def load(file: Path) -> Outcome | None:
     """Read a point's file; None if it is missing, damaged or from other sources."""
     try:
         content = json.loads(file.read_text(encoding="utf-8"))
-        return Outcome(**content["outcome"]) if content["sources"] == sources.ours() else None
+        found = Outcome(**content["outcome"]) if content["sources"] == sources.ours() else None
     except (OSError, ValueError, KeyError, TypeError):
         return None
+    return found if found is None or _is_sound(found) else None
+
+
+def _is_sound(found: Outcome) -> bool:
+    """Whether it has the types that `save` has written."""
+    number, nothing = (int, float), type(None)
+    return (
+        isinstance(found.curve, list)
+        and all(isinstance(row, dict) for row in found.curve)
+        and isinstance(found.limit, dict | None)
+        and isinstance(found.in_units, dict)
+        and all(isinstance(v, (*number, nothing)) for v in (found.knockdown, found.barrier, found.dofs))
+        and all(isinstance(v, number) for v in (found.wall_s, found.cpu_s, found.factorisations))
+        and isinstance(found.stopped, str | None)
+    )
