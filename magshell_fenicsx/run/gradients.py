@@ -21,6 +21,7 @@ from magshell_fenicsx.output.fields.vtu import About, vtu_content
 from magshell_fenicsx.output.store.durable import write_whole
 from magshell_fenicsx.output.store.folder import by_first
 from magshell_fenicsx.run.summary import Result
+from magshell_fenicsx.simulate.follow import BEYOND
 from magshell_fenicsx.simulate.gradients.adjoint import Adjoint
 from magshell_fenicsx.simulate.gradients.density import density
 from magshell_fenicsx.simulate.gradients.fields import FIELDS
@@ -103,8 +104,9 @@ def _adjoint(result: Result, of: str) -> tuple[str, Adjoint]:
     scene, history = result.scene, result.history
     if of in FOLDS:
         return instabilities(scene, history.located, of, 1)[0]
-    if result.stopped or history.end is None:
-        raise Lost(result.stopped or "the path has no end")
+    beyond = next((remark for remark in result.remarks if remark.startswith(BEYOND)), None)
+    if result.stopped or beyond or history.end is None:
+        raise Lost(result.stopped or beyond or "the path has no end")
     refuse_moving(scene, history.end, of)
     return adjoint_at_end(scene, history, of)
 

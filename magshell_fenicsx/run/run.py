@@ -246,7 +246,7 @@ def _follow(
 ) -> None:
     """Compute the history of a scene and write it point by point."""
     scene, made = result.scene, RowMaker(result.scene)
-    for record in follow(scene):
+    for record in follow(scene, remark=result.remarks.append):
         if files and not result.rows:
             if files.journal is None:
                 files.begin()

@@ -38,6 +38,9 @@ class Result:
         The same at the located instabilities, by row number.
     stopped
         Why the run ended before its target; None if it reached it.
+    remarks
+        What the result must not be read without: why the path stopped beyond its first instability with
+        `until: limit`, or that a snap starts from a shell that has buckled before.
     replayed
         Number of solves taken from a checkpoint.
     sensitivities
@@ -68,6 +71,7 @@ class Result:
     rows: list[Row] = field(default_factory=list)
     singular: dict[int, State] = field(default_factory=dict)
     stopped: str | None = None
+    remarks: list[str] = field(default_factory=list)
     replayed: int = 0
     sensitivities: dict[str, float] = field(default_factory=dict)
     output: Stopwatch = field(default_factory=Stopwatch)
@@ -159,6 +163,7 @@ def summary(result: Result, total_s: float) -> dict[str, Any]:
             "penalty": model.sigma,
         },
         "stopped": result.stopped,
+        "remarks": result.remarks,
         "limit_points": result.limit_points,
         "sensitivities": result.sensitivities,
         "gradients": result.gradients,

@@ -1,26 +1,39 @@
 """The history of a case: the steps of its programme, one after the other."""
 
-from collections.abc import Iterator
+import warnings
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 from magshell_fenicsx.case.loads.step import PathStep
 from magshell_fenicsx.continuation.point import Point
+from magshell_fenicsx.output.store.table import OWN_MODES
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.search import searched
 from magshell_fenicsx.simulate.steps import LOCATED, held_by, records_of
 from magshell_fenicsx.simulate.touch import refuse_penetration
 from magshell_fenicsx.simulate.transient import released
-from magshell_fenicsx.simulate.walked import Walked
+from magshell_fenicsx.simulate.walked import Walked, amount
+
+BEYOND = "beyond the first instability"  # what the remark of a path begins with that stops after its answer
 
 
-def follow(scene: Scene, *, search: bool = True) -> Iterator[Record]:
+def _warned(remark: str) -> None:
+    warnings.warn(remark, stacklevel=3)
+
+
+def follow(scene: Scene, *, search: bool = True, remark: Callable[[str], None] = _warned) -> Iterator[Record]:
     """Compute the history of a scene; yields every accepted point.
+
+    With `until: limit` as its end, a history has its answer at the first instability: what stops it beyond that is a
+    remark.
 
     Parameters
     ----------
     search
         Whether steps search for the further solutions that they request.
+    remark
+        Called with one sentence on what the result must not be read without.
 
     Raises
     ------
@@ -37,22 +50,42 @@ def follow(scene: Scene, *, search: bool = True) -> Iterator[Record]:
     for step in steps:
         where = f"step {step.number} of {len(steps)} ({step.kind}): " if isinstance(scene.case.loading, list) else ""
         scene.progress.beginning(step.number)
-        walked, last, record = Walked(records_of(scene, step, state)), "", None
+        walked, last, record, first = Walked(records_of(scene, step, state)), "", None, None
         try:
             for record in walked:
                 last = record.label
                 yield replace(record, step=step.number)
                 refuse_penetration(scene, record.point.state)
+                if last in LOCATED and not (first or record.branch or scene.watch.unlocated):
+                    first = record
             if isinstance(step.load, PathStep) and step.load.then == "snap" and record:
+                if record.excluded_pivots:
+                    remark(where + _buckled(scene, record, first))
                 walked = Walked(released(scene, step.load.snap, record, held_by(scene, step, record.point.state)))
                 for record in walked:
                     last = record.label
                     yield replace(record, step=step.number)
                     refuse_penetration(scene, record.point.state)
         except Stopped as e:
-            raise Stopped(f"{where}{e}") from None
+            if not (first and step is steps[-1] and step.until == "limit" and not getattr(step.load, "then", None)):
+                raise Stopped(f"{where}{e}") from None
+            remark(f"{BEYOND} the path stopped: {where}{e}")
+            return
         begin, state = state, walked.end
         for record in searched(scene, step, begin, state) if search else ():
             yield replace(record, step=step.number)
         if step is not steps[-1] and step.until in ("limit", "bifurcation") and last in LOCATED:
             raise Stopped(f"{where}ends at a {last}, from which the next step cannot start")
+
+
+def _buckled(scene: Scene, fold: Record, first: Record | None) -> str:
+    """What a snap begins at, where modes that the model excludes are unstable before it."""
+    count = fold.excluded_pivots
+    since = "from the start of the step on"
+    if first and first.mode not in OWN_MODES:
+        value = amount(scene, first.amplitude, first.point.state.mu[first.amplitude])
+        since = f"the first of them ({first.mode}) since {value}"
+    return (
+        f"the snap starts from a shell that has buckled before: at its fold {count} mode{'s' * (count != 1)} that the "
+        f"model excludes {'are' if count != 1 else 'is'} unstable, {since}; symmetry: none follows them"
+    )

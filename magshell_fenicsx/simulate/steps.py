@@ -25,6 +25,7 @@ from magshell_fenicsx.simulate.transient import motion
 from magshell_fenicsx.simulate.walked import Records, Walked, followed
 
 LOCATED = ("fold", "bifurcation")
+SHARP = 1e-9  # least step along a contact: folds are as sharp as the penalty's stiffness changes, over 1e-3 h of gap
 EASY, HARD = 4, 8  # matrices of a step along a contact, whose rim moves from point to point before it settles
 
 
@@ -54,7 +55,8 @@ def records_of(scene: Scene, step: ProgrammeStep, state: State) -> Records:
     if drive.step is not None:
         path = path.in_steps(StepOptions(drive.step, 2 * drive.step, 1e-4 * drive.step))
     if isinstance(load, ContactSection):
-        path = path.in_steps(replace(path.options, easy=EASY, few=EASY, hard=HARD))
+        o = path.options
+        path = path.in_steps(replace(o, easy=EASY, few=EASY, hard=HARD, smallest=min(o.smallest, SHARP)))
     if drive.end is not None and not drive.targets and load.until == "target":  # it is there
         yield Record("target", step.name, stage.point(start))
         return state

@@ -1,21 +1,24 @@
 """The first contact of a body: free flight, which is no equilibrium path that arc length could measure."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import CubicHermiteSpline
 
 from magshell_fenicsx.case.loading import ProgrammeStep
 from magshell_fenicsx.case.loads.contact import ContactSection
 from magshell_fenicsx.continuation.control import GivenLoad
 from magshell_fenicsx.continuation.point import PathStopped, Point
-from magshell_fenicsx.continuation.system import State
+from magshell_fenicsx.continuation.system import State, max_abs
 from magshell_fenicsx.simulate.record import Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.stage import Stage
 
 DEEP = tuple(2e-3 / 4**i for i in range(7))  # of h: how far past the first contact the path begins, at the first try
 NEAR = 1e-7  # of h: a smaller gap is none
+FALLEN, ALIKE = 0.1, 0.02  # of h, how far a path that returns is from its turn; of that, how far from the way there
 MOST = 1000  # approaches by the least gap
 STIFFER, MOST_STIFF = 4.0, 1e4  # how much stiffer a body becomes at once, and at most
 
@@ -82,6 +85,46 @@ def refuse_crossing(stage: Stage, low: Point, high: Point) -> None:
             ends.append((known.places, state.mu))
         if said := [each for each in model.system.comm.allgather(known.passed(*ends)) if each]:
             raise PathStopped(said[0], low)
+
+
+def refuse_return(stage: Stage, name: str, points: Sequence[Point], high: Point) -> None:
+    """See that a body does not go back the way it came, as behind a fold at which it holds the shell in place no more.
+
+    Parameters
+    ----------
+    name
+        The amplitude that varies.
+    points
+        The path up to here.
+    high
+        The next point.
+
+    Raises
+    ------
+    PathStopped
+        If it does, or if it no longer touches the shell and moves away from it.
+    """
+    model, comm, low = stage.scene.model, stage.scene.comm, points[-1]
+    if name not in model.contacts:
+        return
+    mu, h = [point.state.mu[name] for point in (*points, high)], stage.newton.system.length
+    top = int(np.argmax(np.abs(np.subtract(mu, mu[0]))))
+    fallen = max_abs(comm, high.state.u - points[min(top, len(points) - 1)].state.u)
+    if top == len(points) or fallen < FALLEN * h:
+        return
+    for a, b in pairwise(points[: top + 1]):
+        x, y = a.state.mu[name], b.state.mu[name]
+        if (mu[-1] - x) * (mu[-1] - y) > 0 or not a.dmu or not b.dmu:
+            continue
+        t = CubicHermiteSpline([x, y], [a.state.u, b.state.u], [a.du / a.dmu, b.du / b.dmu])(mu[-1])
+        if max_abs(comm, high.state.u - t) < ALIKE * fallen:
+            raise PathStopped(
+                "the body goes back the way it came: at its fold the shell snaps under a given approach", low
+            )
+    if max_abs(comm, high.du) == 0:
+        depths = [model.touching(stage.leave(point.state), name).penetration for point in (low, high)]
+        if depths[1] < min(depths[0], 0.0):
+            raise PathStopped("the body has left the shell: at its fold the shell snaps under a given approach", high)
 
 
 def refuse_penetration(scene: Scene, state: State) -> None:

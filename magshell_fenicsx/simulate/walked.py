@@ -2,7 +2,7 @@
 
 from collections.abc import Generator, Iterable, Iterator
 from dataclasses import replace
-from functools import partial
+from itertools import pairwise
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from magshell_fenicsx.quantities.registry import amplitude, quantity
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.stage import LONGEST, Stage
-from magshell_fenicsx.simulate.touch import refuse_crossing, stiffer
+from magshell_fenicsx.simulate.touch import refuse_crossing, refuse_return, stiffer
 
 BEYOND = 2.0  # a walk ends at this multiple of the load of the first excluded instability
 
@@ -46,7 +46,7 @@ def followed(stage: Stage, path: Path, start: Point, goal: Goal, branches: PathS
     Stopped
         If the path is lost.
     """
-    walk, counted = Walk(path, start, goal, partial(_checked, stage)), stage.scene.model.system.counted
+    walk, counted = _walk(stage, path, start, goal), stage.scene.model.system.counted
     past = start.state.mu
     for record in _followed(stage, walk, branches):
         point = stage.point(record.point)
@@ -55,49 +55,71 @@ def followed(stage: Stage, path: Path, start: Point, goal: Goal, branches: PathS
     return counted(stage.leave(walk.points[-1].state), past)
 
 
-def _checked(stage: Stage, low: Point, high: Point) -> State | None:
-    """See `Walk`: bodies become stiffer; a magnet between the points ends the walk."""
-    refuse_crossing(stage, low, high)
-    return stiffer(stage, low, high)
+def _walk(stage: Stage, path: Path, start: Point, goal: Goal) -> Walk:
+    """A walk on which bodies become stiffer; a magnet between two points ends it, and a body that goes back."""
+
+    def checked(low: Point, high: Point) -> State | None:
+        refuse_crossing(stage, low, high)
+        if goal.until != "points":
+            refuse_return(stage, path.name, walk.points, high)
+        return stiffer(stage, low, high)
+
+    walk = Walk(path, start, goal, checked)
+    return walk
 
 
 def _followed(stage: Stage, walk: Walk, branches: PathStep | None) -> Iterator[Record]:
     stage.scene.progress.doing("looking for modes that the model excludes")
     path, start, goal = walk.path, walk.points[0], walk.goal
-    crossing, lost, watch = None, "", stage.scene.watch
+    crossing, fold, lost, watch = None, "", "", stage.scene.watch
     furthest = np.inf  # amplitude, once an excluded mode is unstable
     for known in stage.scene.model.fields:
         known.lost = ""
     watch.begin(path, start, stage.leave)
-    try:
-        for label, point in walk:
-            mode, located = "", label in ("fold", "bifurcation")
-            excluded = list(_excluded(path, watch.pass_to(point, look=located)))
-            if excluded and goal.until == "bifurcation":
-                yield excluded[0]
-                break
-            yield from excluded
-            if excluded and goal.until == "limit":
-                furthest = min(furthest, BEYOND * abs(excluded[0].point.state.mu[path.name]))
-            if label == "bifurcation":
-                here = branching(_by_arc(stage, path), point)
-                crossing = crossing or here
-                mode = ("symmetric" if here.symmetric else "asymmetric") if here else ""
-            yield Record(label, path.name, point, mode, excluded_pivots=watch.unstable)
-            if abs(point.state.mu[path.name]) > furthest:
-                break
-    except PathStopped as e:
-        lost = _why(stage.scene, path, e, walk.points) + stage.scene.nowhere()
-    yield from _excluded(path, watch.end())
-    if lost and path.control == "load":
+    onward: Walk | None = walk
+    while onward:
+        walk, path, onward = onward, onward.path, None
+        try:
+            for label, point in walk:
+                mode, located = "", label in ("fold", "bifurcation")
+                excluded = list(_excluded(path, watch.pass_to(point, look=located)))
+                if excluded and goal.until == "bifurcation":
+                    yield excluded[0]
+                    break
+                yield from excluded
+                if excluded and goal.until == "limit":
+                    furthest = min(furthest, BEYOND * abs(excluded[0].point.state.mu[path.name]))
+                if label == "bifurcation":
+                    here = branching(_by_arc(stage, path), point)
+                    crossing = crossing or here
+                    mode = ("symmetric" if here.symmetric else "asymmetric") if here else ""
+                if label == "fold":
+                    fold = f"; the last fold is at {amount(stage.scene, path.name, point.state.mu[path.name])}"
+                yield Record(label, path.name, point, mode, excluded_pivots=watch.unstable)
+                if abs(point.state.mu[path.name]) > furthest:
+                    break
+        except PathStopped as e:
+            lost = _why(stage.scene, path, e, walk.points) + fold + stage.scene.nowhere()
+            onward = _onward(stage, walk)
+        excluded = list(_excluded(path, watch.end()))
+        if excluded and lost and goal.until == "bifurcation":
+            yield excluded[0]
+            lost = ""
+            break
+        yield from excluded
+        if excluded and goal.until == "limit":
+            furthest = min(furthest, BEYOND * abs(excluded[0].point.state.mu[path.name]))
+        if onward:
+            stage.scene.progress.doing("going on by arc length")
+            lost = ""
+            watch.begin(onward.path, onward.points[0], stage.leave)
+    if lost and path.control == "load" and goal.targets:
         for found in _fold_ahead(stage, path, walk.points):
             yield found
             if found.label == "fold":
-                at = _amount(stage.scene, path.name, found.point.state.mu[path.name])
-                before = (
-                    f", before its target, {_amount(stage.scene, path.name, goal.targets[-1])}" if goal.targets else ""
-                )
-                lost = f"load control cannot pass the fold at {at}{before}; {lost}"
+                at = amount(stage.scene, path.name, found.point.state.mu[path.name])
+                target = amount(stage.scene, path.name, goal.targets[-1])
+                lost = f"load control cannot pass the fold at {at}, before its target, {target}; {lost}"
     if watch.unlocated:
         why = f"a mode that the reduced model excludes is unstable from an unknown point on: {watch.unlocated}"
         lost = f"{lost}; {why}" if lost else why
@@ -105,6 +127,22 @@ def _followed(stage: Stage, walk: Walk, branches: PathStep | None) -> Iterator[R
         raise Stopped(lost)
     if branches and branches.branches and crossing:
         yield from _branches(stage, path, crossing, goal, branches.points)
+
+
+def _onward(stage: Stage, walk: Walk) -> Walk | None:
+    """A walk by arc length from where another one stopped; None if it must not or cannot be.
+
+    An instability is where it is however the path is controlled: only a target belongs to its control.
+    """
+    path, goal, points = walk.path, walk.goal, walk.points
+    if path.control == "arc" or goal.targets:
+        return None
+    last, name, metric = points[-1], path.name, path.metric
+    moved = [metric.norm(b.state.u - a.state.u, b.state.mu[name] - a.state.mu[name]) for a, b in pairwise(points)]
+    first = float(np.median(moved or [path.options.first * metric.norm(last.du, last.dmu)]))
+    by_arc = stage.path(name, "arc", StepOptions(first, LONGEST * first, 1e-6 * first), metric.scale)
+    start = by_arc.start(last.state, last.dmu * (last.s - points[-2].s if moved else goal.sense))
+    return _walk(stage, by_arc, start, goal)
 
 
 def _branches(stage: Stage, path: Path, crossing: Branching, goal: Goal, steps: int) -> Iterator[Record]:
@@ -158,7 +196,7 @@ def _excluded(path: Path, crossings: Iterable[Crossing]) -> Iterator[Record]:
         yield Record("bifurcation", path.name, found.point, found.label, excluded_pivots=found.unstable)
 
 
-def _amount(scene: Scene, name: str, value: float) -> str:
+def amount(scene: Scene, name: str, value: float) -> str:
     """The value of an amplitude, as "pressure = 0.326233 (53.7 Pa)"."""
     column = amplitude(name).column
     known = scene.sizes.column(column)
@@ -169,7 +207,7 @@ def _amount(scene: Scene, name: str, value: float) -> str:
 def _why(scene: Scene, path: Path, stop: PathStopped, points: list[Point]) -> str:
     """The message for a lost path; it names a fold in the controlled quantity."""
     here = stop.point
-    where = f"the last point has {_amount(scene, path.name, here.state.mu[path.name])}: {stop}"
+    where = f"the last point has {amount(scene, path.name, here.state.mu[path.name])}: {stop}"
     if path.control == "load":
         return f"load control stopped; {where}. To pass a limit point, use control: arc"
     before = points[-2] if len(points) > 1 else here

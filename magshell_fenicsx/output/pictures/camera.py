@@ -15,7 +15,7 @@ LARGER = 1.15  # the shell must fill so much more of the picture
 
 
 def run_camera(surface: Surface, style: OutputSection) -> Camera:
-    """The camera of all pictures of a run, from the shell at its last point."""
+    """The camera of all pictures of a run, from the shell at the point that the run is about."""
     if style.camera is None:
         return _best(surface, deflected_place(surface))
     polar, azimuth = np.radians([style.camera.polar, style.camera.azimuth])

@@ -26,7 +26,7 @@ from magshell_fenicsx.output.pictures.solutions import searched, solutions_figur
 from magshell_fenicsx.output.pictures.view import Camera
 from magshell_fenicsx.output.report.report import write_report
 from magshell_fenicsx.output.store.durable import write_whole
-from magshell_fenicsx.output.store.known import case_in, pole_of, style_of
+from magshell_fenicsx.output.store.known import case_in, headline, pole_of, style_of
 from magshell_fenicsx.output.store.table import SOLUTION, Row, read_rows
 from magshell_fenicsx.output.store.written import note, refuse_unwritten
 
@@ -53,6 +53,7 @@ class Drawn:
         self.rows = _rows(folder)
         self.on_path = [row for row in self.rows if row["label"] != SOLUTION]
         self._case = case_in(folder)
+        self.headline = headline(self._case, self.rows)
         self.style = style_of(self._case, options)
         self._points: dict[int, tuple[Surface, About]] = {}
 
@@ -64,7 +65,7 @@ class Drawn:
     @cached_property
     def camera(self) -> Camera:
         """Of all pictures of the run."""
-        return run_camera(self.at(self.on_path[-1])[0], self.style)
+        return run_camera(self.at(self.headline)[0], self.style)
 
     def at(self, row: Row) -> tuple[Surface, About]:
         """The whole deformed shell at a point."""
@@ -132,7 +133,7 @@ def _of_point(run: Drawn, point: int) -> Iterator[tuple[str, bytes]]:
 
 def _of_run(run: Drawn) -> Iterator[tuple[str, bytes]]:
     style, last = run.style, run.on_path[-1]
-    surface, about = run.at(last)
+    surface, about = run.at(run.headline)
     if amplitude := str(last["amplitude"]):
         yield from written(curve_figure(run.rows, amplitude, style, run.place), style, "curve")
     for name, figure in figures(surface, about.h, style, run.camera).items():

@@ -23,7 +23,7 @@
   const corner = c => { const out = new Uint32Array(triangles.length / 3); for (let i = 0; i < out.length; i++) out[i] = triangles[3 * i + c]; return out; };
   const signed = [[0, "#053061"], [0.1, "#2166ac"], [0.2, "#4393c3"], [0.3, "#92c5de"], [0.4, "#d1e5f0"], [0.5, "#ffffff"],
     [0.6, "#fddbc7"], [0.7, "#f4a582"], [0.8, "#d6604d"], [0.9, "#b2182b"], [1, "#67001f"]];
-  const state = {frame: about.frames.length - 1, field: 0, factor: 1};
+  const state = {frame: about.opens, field: 0, factor: 1};
 
   const option = (select, value, text) => { const o = document.createElement("option"); o.value = value; o.innerHTML = text; select.append(o); };
   about.fields.forEach((f, i) => option(part("field"), i, f.label));

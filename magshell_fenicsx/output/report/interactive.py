@@ -24,7 +24,7 @@ from magshell_fenicsx.output.pictures.camera import run_camera
 from magshell_fenicsx.output.pictures.colours import SCALARS, couple
 from magshell_fenicsx.output.pictures.sources import near_outlines
 from magshell_fenicsx.output.pictures.thinned import Thinned, thinned
-from magshell_fenicsx.output.store.known import pole_of, style_of
+from magshell_fenicsx.output.store.known import headline, pole_of, style_of
 from magshell_fenicsx.output.store.table import LOCATED, POLE, SOLUTION, Row, pole_name, read_rows
 from magshell_fenicsx.platform.kept import keep, recall
 from magshell_fenicsx.quantities.registry import amplitude, axes_of, quantity
@@ -63,7 +63,8 @@ def interactive(folder: Path, case: Mapping[str, Any]) -> Interactive | None:
     if len(rows) < 2 or (library := plotly()) is None:
         return None
     last = next(row for row in reversed(rows) if row["label"] != SOLUTION)
-    surface, about = read_point(fields, int(last["point"]))
+    about_row = headline(case, rows)
+    surface, about = read_point(fields, int(about_row["point"]))
     mesh = thinned(surface, MOST_VALUES // FEWEST_FRAMES)
     frames = chosen_frames(rows, min(MOST_FRAMES, MOST_VALUES // mesh.count))
     shells = [read_point(fields, int(row["point"]))[0] for row in frames]
@@ -71,6 +72,7 @@ def interactive(folder: Path, case: Mapping[str, Any]) -> Interactive | None:
     content: dict[str, Any] = {
         **_path(rows, last, pole_of(case)),
         "frames": [rows.index(row) for row in frames],
+        "opens": frames.index(about_row) if about_row in frames else len(frames) - 1,
         "h": about.h,
         "camera": run_camera(surface, style_of(case)).direction.tolist(),
         "r0": packed.add(mesh.at(surface.r0), np.uint16),

@@ -16,8 +16,8 @@ from magshell_fenicsx.output.report.light import light
 from magshell_fenicsx.output.report.report_path import Line, head, path_table, pole_head, symbol
 from magshell_fenicsx.output.report.verdict import Summary, amount, located, read_run, value, verdict
 from magshell_fenicsx.output.store.durable import write_whole
-from magshell_fenicsx.output.store.known import pole_of
-from magshell_fenicsx.output.store.table import stability
+from magshell_fenicsx.output.store.known import headline, pole_of
+from magshell_fenicsx.output.store.table import SOLUTION, Row, read_rows, stability
 from magshell_fenicsx.platform.kept import keep, recall
 from magshell_fenicsx.quantities.registry import amplitude, shown
 
@@ -106,7 +106,7 @@ def _content(folder: Path, playable: bool) -> dict[str, Any]:
         "verdict": verdict(summary, lines),
         "groups": _groups(summary),
         "dimensions": _dimensions(summary),
-        "pictures": list(_pictures(folder, moving=played is None)),
+        "pictures": list(_pictures(folder, _shown(summary["case"], read_rows(folder / "path.csv")), played is None)),
         "interactive": played,
         "pole": pole_head(lines[0] if lines else {}, pole_of(summary["case"])),
         "heads": {name: _head(name, lines[0] if lines else {}) for name in SOLUTION_COLUMNS},
@@ -168,9 +168,16 @@ def _dimensions(summary: Summary) -> list[tuple[Markup, Markup, str]]:
     ]
 
 
-def _pictures(folder: Path, *, moving: bool) -> Iterator[tuple[str, str, bool]]:
+def _shown(case: dict[str, Any], rows: Sequence[Row]) -> str:
+    """The point at which pictures show the shell, in words."""
+    row, last = headline(case, rows), [row for row in rows if row["label"] != SOLUTION][-1]
+    return "the last point" if row is last else f"point {row['point']}, the first instability"
+
+
+def _pictures(folder: Path, shown_at: str, moving: bool) -> Iterator[tuple[str, str, bool]]:
     """Source and caption of each picture in the folder, and whether it is shown small."""
-    for pattern, caption in PICTURES.items():
+    for pattern, told in PICTURES.items():
+        caption = told.replace("the last point", shown_at)
         for file in sorted(folder.glob(pattern)) if moving or pattern != "animation.gif" else []:
             content = base64.b64encode(light(file.read_bytes())).decode()
             yield f"data:image/{file.suffix[1:]};base64,{content}", caption, pattern in SMALL

@@ -43,10 +43,27 @@ def verdict(summary: Summary, lines: Sequence[Line]) -> Markup:
         )
     if summary.get("barrier") is not None:
         sentences.append(_barrier(summary))
+    sentences += _error(summary)
+    sentences += [Markup("{}.").format(remark[0].upper() + remark[1:]) for remark in summary.get("remarks", [])]
     if summary["stopped"]:
         points = f"{len(lines)} point{'s' * (len(lines) != 1)}"
         sentences.insert(0, Markup("The run stopped early, after {}: {}.").format(points, summary["stopped"]))
     return Markup(" ").join(sentences)
+
+
+def _error(summary: Summary) -> list[Markup]:
+    """The estimated error of a run with a tolerance, and the best estimate of its rounds if that is another."""
+    known = summary.get("tolerance") or {}
+    if (estimate := known.get("error_estimate")) is None:
+        return []
+    said, best = (
+        Markup("The estimated relative error of the result is {}").format(number(estimate, 2)),
+        known.get("best"),
+    )
+    if best and best["error_estimate"] < estimate:
+        least = number(best["error_estimate"], 2)
+        said += Markup("; another mesh gives {} with {}").format(number(best["result"], 9), least)
+    return [said + "."]
 
 
 def _barrier(summary: Summary) -> Markup:

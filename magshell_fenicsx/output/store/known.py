@@ -1,7 +1,7 @@
 """What a run's folder says of its case, of a finished or an interrupted run."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +9,7 @@ from magshell_fenicsx.case.options import output_section
 from magshell_fenicsx.case.output import OutputSection
 from magshell_fenicsx.output.store import checkpoint
 from magshell_fenicsx.output.store.durable import Damaged, read_object
-from magshell_fenicsx.output.store.table import POLE
+from magshell_fenicsx.output.store.table import LOCATED, POLE, SOLUTION, Row
 
 SUMMARY = "summary.json"
 NUMBER, NOTHING = (int, float), type(None)
@@ -86,6 +86,19 @@ def style_of(case: Mapping[str, Any], options: Mapping[str, Any] | None = None) 
         If an option is wrong.
     """
     return output_section(case.get("output") or {}, options or {})
+
+
+def headline(case: Mapping[str, Any], rows: Sequence[Row]) -> Row:
+    """The row that a run is about, at which its pictures show the shell.
+
+    With `until: limit` at its end that is the first instability, even if the path goes on from there.
+    """
+    path = [row for row in rows if row["label"] != SOLUTION]
+    loading = case.get("loading") or {}
+    last = loading[-1] if isinstance(loading, list) else loading
+    asked = last.get("until") == "limit" and not (last.get("then") or last.get("branches"))
+    located = (row for row in path if row["label"] in LOCATED and not row["branch"])
+    return next(located, path[-1]) if asked else path[-1]
 
 
 def pole_of(case: Mapping[str, Any]) -> str:

@@ -77,16 +77,19 @@ class Adapted:
     def account(self, result: float | None) -> dict[str, Any]:
         """The entry of summary.json; without an estimate if the run ended at another result than the rounds.
 
+        The chosen mesh may be a cheaper one than that of the best estimate, which is there too.
+
         Parameters
         ----------
         result
             Result of the run (`Ending.value`), or None.
         """
-        best = self.best
+        best, least = self.best, min(self.rounds, key=lambda each: each.estimate)
         same = result is not None and abs(result - best.result) <= best.estimate * abs(best.result)
         return {
             "tolerance": self.asked.mesh.tolerance,
             "error_estimate": best.estimate if same else None,
+            "best": {"result": least.result, "error_estimate": least.estimate} if same else None,
             "rounds": [asdict(r) for r in self.rounds],
         }
 

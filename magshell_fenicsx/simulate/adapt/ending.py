@@ -110,7 +110,7 @@ def by_path(scene: Scene) -> Ending:
     """
     history, stopped = History(), None
     try:
-        for record in follow(scene, search=False):
+        for record in follow(scene, search=False, remark=lambda text: None):
             history.add(record)
     except Stopped as e:
         stopped = str(e)

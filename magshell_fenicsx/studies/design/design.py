@@ -179,13 +179,8 @@ def design(
     Missed
         After everything is written: if a target is not reached, a constraint not kept, or no optimum found.
     """
-<<<<<<< HEAD
     source = read_together(file, comm, settings)
-    case, folder = with_same_files(Case.from_source(source), comm), Path(out)
-=======
-    source = read_source(Path(file), settings)
-    case, folder = Case.from_source(source), given_folder(out)
->>>>>>> e4ecc95 (Studies refuse the folders of others; tests of what a run may replace)
+    case, folder = with_same_files(Case.from_source(source), comm), given_folder(out)
     if case.design is None:
         raise CaseError(f"{file}: design: is missing: it says what varies and what is wanted")
     try:

@@ -11,7 +11,7 @@ from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.continuation.fold import FoldLost
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.simulate.adapt.ending import History
-from magshell_fenicsx.simulate.follow import follow
+from magshell_fenicsx.simulate.follow import BEYOND, follow
 from magshell_fenicsx.simulate.gradients.adjoint import Adjoint
 from magshell_fenicsx.simulate.gradients.gradient import derivative
 from magshell_fenicsx.simulate.gradients.instabilities import (
@@ -73,13 +73,13 @@ def evaluate(
     """Follow the path of a case, and differentiate its results; collective. `known` is of the case before."""
     lost, section = "", variables.case.design
     assert section
-    records, history = list[Record](), History()
+    records, history, remarks = list[Record](), History(), list[str]()
     try:
         scene = known.of(case, comm)
         for result in results:
             if result != MASS and result not in targets:
                 refuse_no_result(scene, [result], f"design.{section.key_of(result)}", more=[MASS])
-        for record in follow(scene, search=False):
+        for record in follow(scene, search=False, remark=remarks.append):
             records.append(record)
             history.add(record)
             if _enough(records, results):
@@ -88,6 +88,7 @@ def evaluate(
         return Evaluation(note=f"no shell: {e}")
     except Stopped as e:
         lost = str(e)
+    lost = lost or next((text for text in remarks if text.startswith(BEYOND)), "")
     made, notes = Evaluation(), [f"the path is lost: {lost}"] if lost else []
     try:
         for result in results:

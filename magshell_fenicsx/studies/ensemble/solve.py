@@ -64,7 +64,7 @@ def _along_path(sample: Sample, scene: Scene, known: KnownFolds) -> Outcome:
     """The fold from the first point of the path that leads to it, or the end of the path."""
     result, made, tries = Result(scene, scene.unloaded()), RowMaker(scene), MOST_TRIES
     try:
-        for record in follow(scene):
+        for record in follow(scene, remark=result.remarks.append):
             result.rows.append(made.row(record, 0.0))
             if record.amplitude != "pressure" or record.mode or record.label == "bifurcation":
                 continue

@@ -32,7 +32,7 @@ def path(scene: Scene, results: list[str]) -> Report:
 
     def solve() -> None:
         try:
-            for record in follow(scene):
+            for record in follow(scene, remark=result.remarks.append):
                 result.rows.append(made.row(record, 0.0))
         except Stopped as e:
             result.stopped = str(e)

@@ -7,12 +7,8 @@ from pathlib import Path
 from mpi4py import MPI
 
 from magshell_fenicsx.case.source import CaseError
-<<<<<<< HEAD
-from magshell_fenicsx.output.store.folder import by_first, prepare_folder
-from magshell_fenicsx.platform.first import from_first
-=======
 from magshell_fenicsx.output.store.folder import by_first, given_folder, prepare_folder, refuse_others
->>>>>>> e4ecc95 (Studies refuse the folders of others; tests of what a run may replace)
+from magshell_fenicsx.platform.first import from_first
 from magshell_fenicsx.platform.terminal import print_line
 from magshell_fenicsx.studies.sweep.axes import Axis, parse_axes
 from magshell_fenicsx.studies.sweep.chain import Known, make_chains, run_chain
@@ -79,11 +75,7 @@ def sweep(
     source = from_first(comm, lambda: swept_source(Path(file), axes, settings))
     asked = from_first(comm, lambda: make_points(Path(file), axes, settings))
     share = share_of(part, len(asked))
-<<<<<<< HEAD
-    folder = prepare_folder(Path(out), comm, _ready)
-=======
-    source, folder = swept_source(Path(file), axes, settings), prepare_folder(given_folder(out), comm, _ready)
->>>>>>> e4ecc95 (Studies refuse the folders of others; tests of what a run may replace)
+    folder = prepare_folder(given_folder(out), comm, _ready)
     points = by_first(comm, lambda: with_earlier(folder, source, axes, asked))
     before = len(points) - len(asked)
     files = [folder / "points" / f"{point.key}.json" for point in points]
