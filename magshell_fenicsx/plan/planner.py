@@ -28,6 +28,7 @@ from magshell_fenicsx.models.shell.parameters import Condition, Held, Material
 from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.plan.account import account
 from magshell_fenicsx.plan.bodies.registered import body_leaves, contacts, pressed
+from magshell_fenicsx.plan.columns import refuse_twice
 from magshell_fenicsx.plan.imperfections.flaw import Flaw, in_frame
 from magshell_fenicsx.plan.imperfections.registered import flaws
 from magshell_fenicsx.plan.imperfections.rims import MOST_RIMS, Spot, different, spots
@@ -126,7 +127,7 @@ def make_plan(case: Case, terms: Sequence[OwnTerm] = ()) -> Plan:
     included, left_out = account(case, all_loads, model, plane, len(rims))
     included += [f"{key}: {flaw.account}" for key, flaw in found.items() if flaw.account]
     sample = sample if len(sample) else drawn.sample()
-    return Plan(
+    plan = Plan(
         material=material,
         loads=all_loads,
         conditions=conditions,
@@ -148,6 +149,8 @@ def make_plan(case: Case, terms: Sequence[OwnTerm] = ()) -> Plan:
         pressed=tuple((size, reach) for _, reach, size in touched),
         warning=sources_beside(case, sample) or _wrong_unit(case, sample),
     )
+    refuse_twice(case, plan)
+    return plan
 
 
 def _wrong_unit(case: Case, places: Array) -> str | None:

@@ -14,10 +14,8 @@ from numpy.typing import NDArray
 from magshell_fenicsx.assembly.terms import factor_of
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.imperfections.modes import ModesSection
-from magshell_fenicsx.case.loads.time import TimeSection
 from magshell_fenicsx.case.opened import opened
 from magshell_fenicsx.case.source import CaseError
-from magshell_fenicsx.case.units import sizes_of
 from magshell_fenicsx.continuation.journal import Journal, NoJournal
 from magshell_fenicsx.continuation.listener import NoProgress, Progress
 from magshell_fenicsx.continuation.newton import BorderedNewton, NewtonOptions
@@ -26,7 +24,6 @@ from magshell_fenicsx.continuation.watch import Watch
 from magshell_fenicsx.mesh.frame import rotation
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.reacting import (
-    columns,
     motion_columns,
     motion_size,
     observed_reactions,
@@ -38,9 +35,17 @@ from magshell_fenicsx.models.shell.openings import no_potential
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.supports import refuse_loose
 from magshell_fenicsx.models.solid.model import SolidModel
+from magshell_fenicsx.plan.columns import (
+    also_displaced,
+    extra_columns,
+    only_turns,
+    own_amplitudes,
+    sizes_in_units,
+    support_columns,
+)
 from magshell_fenicsx.plan.plan import Plan
 from magshell_fenicsx.plan.planner import make_plan
-from magshell_fenicsx.quantities.registry import IN_TIME, OF_EVERY_RUN, amplitude, contact_columns
+from magshell_fenicsx.quantities.registry import amplitude, contact_columns
 from magshell_fenicsx.quantities.units import Sizes
 from magshell_fenicsx.simulate.build import build_meridian_model, build_model, build_solid_model
 from magshell_fenicsx.simulate.direction import directions, field_angle, field_size
@@ -191,7 +196,7 @@ class Scene:
             "magnetic": sum(energies[name] for name in ("magnetic", "magnetic gradient", "U1", "Uq", "Utau", "couple")),
             **{name: energies[name] for name in ("U1", "Uq", "Utau")},
             **{self._column(name): state.mu[name] for name in (*loads.forces, *loads.dead)},
-            **{f"w_{name}_over_h": model.loaded_deflection(state.u, name) / h for name in self._also_displaced},
+            **{f"w_{name}_over_h": model.loaded_deflection(state.u, name) / h for name in also_displaced(loads)},
             **self._observe_points(state),
             **{name: state.mu[name] for name in self._own_amplitudes},
             **self._observe_supports(state),
@@ -220,12 +225,7 @@ class Scene:
     @property
     def _own_amplitudes(self) -> dict[str, float]:
         """The amplitudes of natural shape, imperfections, user-defined energies and parameters, with initial values."""
-        terms, natural = self.plan.loads.own, self.plan.loads.natural
-        grown = dict.fromkeys(natural.amplitudes, 0.0) if natural else {}
-        grown |= dict.fromkeys(self.plan.loads.growing, 0.0)
-        return (
-            grown | {term.name: term.value for term in terms} | {p.name: p.value for term in terms for p in term.free}
-        )
+        return own_amplitudes(self.plan.loads)
 
     @property
     def motions(self) -> frozenset[str]:
@@ -240,22 +240,12 @@ class Scene:
     @cached_property
     def sizes(self) -> Sizes:
         """The sizes of the case's units."""
-        moments = {column for name, column in motion_columns(self.plan.loads).items() if self._only_turns(name)}
-        return sizes_of(self.case, moments)
+        return sizes_in_units(self.case, self.plan)
 
     @cached_property
     def extra_columns(self) -> tuple[str, ...]:
         """The columns of a row besides those of every run; the last ones are those in the case's units."""
-        named = tuple(f"{point}_u{axis}" for point in self.case.points for axis in "xyz")
-        own = (*self._own_amplitudes, *(column for term in self.plan.loads.own for column in term.observed))
-        factors = (self._column(name) for name in (*self.plan.loads.forces, *self.plan.loads.dead) if name != "force")
-        displaced = (f"w_{name}_over_h" for name in self._also_displaced)
-        moves = any(isinstance(s.load, TimeSection) or getattr(s.load, "then", None) for s in self.case.programme)
-        clock = tuple(q.name for q in IN_TIME) if moves else ()
-        sources = (*self.sources, *self.sources.values())
-        contacts = (column for name in self.model.contacts for column in contact_columns(name) if column != "force")
-        extra = (*factors, *displaced, *named, *own, *self.support_columns, *sources, *contacts, *clock)
-        return (*extra, *self.sizes.columns((*(q.name for q in OF_EVERY_RUN), *extra)))
+        return extra_columns(self.case, self.plan)
 
     def stored(self, state: State, energy: float) -> float:
         """The energy of the shell itself: without the potentials of the loads."""
@@ -266,8 +256,7 @@ class Scene:
     @property
     def support_columns(self) -> tuple[str, ...]:
         """The factors of motions, their reactions, and those of all supports."""
-        motions = motion_columns(self.plan.loads)
-        return (*motions, *motions.values(), *(columns(self.plan.supports) if self.plan.reactions else ()))
+        return support_columns(self.plan)
 
     def _observe_supports(self, state: State) -> dict[str, float]:
         """Forces and moments in the case's units."""
@@ -301,12 +290,6 @@ class Scene:
             found |= {name: state.mu[name], column: -potential / self.conjugate_unit(name)}
         return found
 
-    @property
-    def _also_displaced(self) -> tuple[str, ...]:
-        """Amplitudes with a displacement besides the one of the column w_over_h."""
-        loads = self.plan.loads
-        return tuple(name for name in (*loads.forces, *loads.dead) if name != loads.displaced)
-
     @staticmethod
     def _column(name: str) -> str:
         return amplitude(name).column
@@ -323,7 +306,7 @@ class Scene:
             return -material.classical_pressure / material.h / model.multiplicity
         if name in self.motions:
             force = (self.case.shell.modulus or 1.0) * material.h * self.plan.length**2
-            arm = self.plan.length if self._only_turns(name) else 1.0
+            arm = self.plan.length if only_turns(self.plan.loads, name) else 1.0
             return -motion_size(self.plan.loads, name) / (force * arm * model.multiplicity)
         if name in model.contacts:
             return -model.force_unit * material.h
@@ -334,10 +317,6 @@ class Scene:
         if name in model.loads.forces:
             return model.force_unit * material.h
         return model.load_size.get(name, 0.0) / self.plan.length
-
-    def _only_turns(self, name: str) -> bool:
-        """Whether a motion has rotations alone, so that its reaction is a moment."""
-        return not any(m.motion.shift.any() for m in self.plan.loads.moves if m.motion.name == name)
 
     def _observe_points(self, state: State) -> dict[str, float]:
         """The displacements of named points in the unit of the shell's lengths."""
