@@ -4,9 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from petsc4py import PETSc
 from scipy.linalg import lapack
-from scipy.sparse import csr_array
+from scipy.sparse import coo_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 Array = NDArray[np.float64]
@@ -17,17 +16,16 @@ class Banded:
 
     Parameters
     ----------
-    pattern
-        A matrix with the sparsity pattern, on one rank.
+    rows, columns
+        Of each entry of the pattern.
     held
         Rows and columns that are replaced by those of the unit matrix.
     """
 
-    def __init__(self, pattern: PETSc.Mat, held: NDArray[np.int32]) -> None:
-        first, columns, _ = pattern.getValuesCSR()
-        n = len(first) - 1
-        rows = np.repeat(np.arange(n), np.diff(first))
-        order = reverse_cuthill_mckee(csr_array((np.ones(len(columns)), columns, first), (n, n)), symmetric_mode=True)
+    def __init__(self, rows: NDArray[np.int64], columns: NDArray[np.int64], held: NDArray[np.int32]) -> None:
+        n = int(rows.max()) + 1
+        pattern = coo_array((np.ones(len(rows)), (rows, columns)), (n, n)).tocsr()
+        order = reverse_cuthill_mckee(pattern, symmetric_mode=True)
         place = np.empty(n, dtype=np.int64)
         place[order] = np.arange(n)
         i, j = place[rows], place[columns]
@@ -39,13 +37,15 @@ class Banded:
         self._at = (i - j) + j * self._shape[0]  # in LAPACK's lower band, column by column
         self._ones = place[held]
 
-    def entries(self, values: Sequence[Array]) -> Array:
-        """The entries (matrices, kept) of some matrices that `positive` needs."""
-        return np.stack([v[self._kept] for v in values])
+    def bands(self, values: Sequence[Array]) -> Array:
+        """The lower bands (matrices, entries) of some matrices, with ones on the diagonal of what is held."""
+        found = np.zeros((len(values), self._shape[0] * self._shape[1]))
+        for band, v in zip(found, values, strict=True):
+            band[self._at] = v.ravel()[self._kept]
+        found[:, self._ones * self._shape[0]] = 1.0
+        return found
 
-    def positive(self, entries: Array, weights: Sequence[float]) -> bool:
-        """Whether the weighted sum of the matrices is positive definite."""
-        band = np.zeros(self._shape, order="F")
-        band.ravel(order="K")[self._at] = np.asarray(weights) @ entries
-        band[0, self._ones] = 1.0
+    def positive(self, bands: Array, weights: Array) -> bool:
+        """Whether the weighted sum of some matrices is positive definite; the weights' sum is one."""
+        band = (weights @ bands).reshape(self._shape, order="F")
         return bool(lapack.dpbtrf(band, lower=1, overwrite_ab=1)[1] == 0)

@@ -56,12 +56,15 @@ class Walk:
     ----------
     points
         The start, the steps so far, and the instability or target that ended the walk.
+    done
+        Whether the last point ends the walk.
     """
 
     def __init__(
         self, path: Path, start: Point, goal: Goal, renew: Callable[[Point, Point], State | None] | None = None
     ) -> None:
         self.path, self.goal, self.points, self._renew = path, goal, [start], renew
+        self.done = False
         self._folds: list[Point] = []
 
     def __iter__(self) -> Iterator[tuple[Label, Point]]:
@@ -84,14 +87,15 @@ class Walk:
                 except PathStopped:  # the step had left the branch: approach in shorter steps
                     shorter = abs(point.s - low.s) / 4
                     break
-                for label, found, ends in between:
+                for label, found, self.done in between:
                     yield label, found
                     if label == "fold":
                         self._refuse_loop(found)
-                    if ends:
+                    if self.done:
                         self.points.append(found)
                         return
                 self.points.append(point)
+                self.done = not self._ahead() or (self.goal.until == "points" and len(self.points) > self.goal.steps)
                 yield ("target" if reached else "step"), point
                 if len(self.points) > self.goal.steps:
                     if self.goal.until == "points":

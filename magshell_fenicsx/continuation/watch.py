@@ -74,19 +74,17 @@ class _Look:
 class Watch:
     """Looks along a path for the unstable directions that a model excludes.
 
-    A look counts the unstable directions at a point. Several families get a look at every accepted point that is
-    farther than `apart` from the last look. The tangent of a single family costs as much as the model's. So a point is
-    skipped if the softest mode would not yet be neutral there, even if it softened `FASTER` times as fast per length of
-    the path as between the last two looks. At first no point is skipped, then at most one in a row, two, and
-    `MOST_PASSED`. If the next look shows that the mode softened faster, and to less than a half, or that the number of
-    unstable directions has changed, all skipped points get a look.
+    A look counts the unstable directions at a point. Several families get a look at every accepted point. The tangent
+    of a single family costs as much as the model's. So a point is skipped if the softest mode would not yet be neutral
+    there, even if it softened `FASTER` times as fast per length of the path as between the last two looks. At first no
+    point is skipped, then at most one in a row, two, and `MOST_PASSED`. If the next look shows that the mode softened
+    faster, and to less than a half, or that the number of unstable directions has changed, all skipped points
+    get a look.
 
     Parameters
     ----------
     excluded
         None if the model excludes no modes.
-    apart
-        Length of a path.
 
     Attributes
     ----------
@@ -94,8 +92,8 @@ class Watch:
         The reason why a change could not be located, for the first such change; "" if there is none.
     """
 
-    def __init__(self, excluded: Excluded | None, apart: float = 0.0) -> None:
-        self._excluded, self._apart = excluded, apart
+    def __init__(self, excluded: Excluded | None) -> None:
+        self._excluded = excluded
         self._families = excluded.families if excluded else []
         self._looked: _Look | None = None
         self._u: Vector | None = None
@@ -143,7 +141,7 @@ class Watch:
         name, last = self._path.name, self._last.state
         self._along += self._path.metric.norm(point.state.u - last.u, point.state.mu[name] - last.mu[name])
         self._last, self._u = point, point.state.u
-        if not look and (self._near if len(self._families) > 1 else self._still_stiff):
+        if not look and len(self._families) == 1 and self._still_stiff:
             self._passed.append((point, self._along))
             return []
         return self._changes()
@@ -154,11 +152,6 @@ class Watch:
             return []
         self._passed = [passed for passed in self._passed if passed[0] is not self._last]
         return self._changes()
-
-    @property
-    def _near(self) -> bool:
-        """Whether the last point is near the last look."""
-        return self._looked is not None and self._along - self._looked.along < self._apart
 
     @property
     def _still_stiff(self) -> bool:

@@ -51,7 +51,6 @@ from magshell_fenicsx.simulate.build import build_meridian_model, build_model, b
 from magshell_fenicsx.simulate.direction import directions, field_angle, field_size
 
 Array = NDArray[np.float64]
-APART = 0.3  # of h, about: a path along a contact has shorter steps than waves around the axis need
 
 
 class Scene:
@@ -124,7 +123,7 @@ class Scene:
     @cached_property
     def watch(self) -> Watch:
         """The watch over the modes that the model excludes. Its first use compiles their kernels."""
-        return Watch(self.model.excluded_modes, APART if self.model.contacts else 0.0)
+        return Watch(self.model.excluded_modes)
 
     def nowhere(self) -> str:
         """Where a step since the beginning of a walk has found no field, in words after a message; collective."""

@@ -82,7 +82,8 @@ def _followed(stage: Stage, walk: Walk, branches: PathStep | None) -> Iterator[R
         try:
             for label, point in walk:
                 mode, located = "", label in ("fold", "bifurcation")
-                excluded = list(_excluded(path, watch.pass_to(point, look=located)))
+                beyond = walk.done or abs(point.state.mu[path.name]) > furthest
+                excluded = list(_excluded(path, watch.pass_to(point, look=located or beyond)))
                 if excluded and goal.until == "bifurcation":
                     yield excluded[0]
                     break
@@ -157,7 +158,9 @@ def _branches(stage: Stage, path: Path, crossing: Branching, goal: Goal, steps: 
         yield Record("step", path.name, start, branch=number, excluded_pivots=watch.unstable)
         try:
             for label, point in walk:
-                for found in _excluded(by_arc, watch.pass_to(point, look=label in ("fold", "bifurcation"))):
+                for found in _excluded(
+                    by_arc, watch.pass_to(point, look=walk.done or label in ("fold", "bifurcation"))
+                ):
                     yield replace(found, branch=number)
                 yield Record(label, path.name, point, branch=number, excluded_pivots=watch.unstable)
         except PathStopped as e:

@@ -51,17 +51,12 @@ class Several:
 
 
 def watched(
-    families: Sequence[Diagonal],
-    control: Control = "arc",
-    step: float = 0.05,
-    points: int = 60,
-    start: float = 0.0,
-    apart: float = 0.0,
+    families: Sequence[Diagonal], control: Control = "arc", step: float = 0.05, points: int = 60, start: float = 0.0
 ) -> tuple[list[Crossing], list[tuple[float, int]]]:
     """All crossings, and the number of unstable directions that was told at every x."""
     toy, load = snap_through(), start**3 - 3 * start**2 + 2 * start
     path = Path(BorderedNewton(toy), "load", control, StepOptions(step, step, 1e-7))
-    watch, first = Watch(Several(families), apart), path.start(State(np.array([start]), {"load": load}))
+    watch, first = Watch(Several(families)), path.start(State(np.array([start]), {"load": load}))
     watch.begin(path, first)
     found, told = list[Crossing](), list[tuple[float, int]]()
     for _, point in Walk(path, first, Goal("points", steps=points)):
@@ -109,19 +104,6 @@ def test_several_crossings_in_one_step_come_in_their_order() -> None:
     found, told = watched(families, step=0.2, points=8)
     assert places(found) == [("c", 0.0, 1), ("a", 0.501, 1), ("b", 0.505, 2), ("c", 0.507, 2), ("a", 0.509, 2)]
     assert [unstable for x, unstable in told if x > 0.51] == [3] * sum(x > 0.51 for x, _ in told)
-
-
-def test_several_families_far_apart() -> None:
-    """With short steps most points get no look; what changes is located all the same, also before the last point."""
-
-    def families() -> list[Diagonal]:
-        return [Diagonal("a", lambda x: [0.501 - x]), Diagonal("b", lambda x: [(x - 0.505) * (x - 1.4)])]
-
-    near, far = families(), families()
-    found, _ = watched(far, apart=0.3)
-    assert places(found) == places(watched(near)[0])
-    assert len(found) == 3
-    assert len(far[0].looks) < 0.7 * len(near[0].looks)
 
 
 def test_a_mode_of_another_symmetry_is_seen() -> None:

@@ -5,8 +5,9 @@ so the second variation of an axisymmetric energy is pi times the sum of that of
 cosine's and of the sine's coefficients: one form on the meridian with m as a number.
 """
 
-from collections.abc import Sequence
-from math import ceil, sqrt
+from collections.abc import Iterator, Sequence
+from functools import cache, cached_property
+from math import ceil, comb, sqrt
 
 import numpy as np
 import ufl
@@ -14,6 +15,7 @@ from dolfinx import fem
 from dolfinx.fem import petsc as fem_petsc
 from numpy.typing import NDArray
 from petsc4py import PETSc
+from scipy.sparse import coo_array
 
 from magshell_fenicsx.assembly.at_zero import at_zero
 from magshell_fenicsx.assembly.kernels import KernelLog
@@ -28,6 +30,8 @@ from magshell_fenicsx.models.axisymmetric.energies import INTERIOR, Energy
 from magshell_fenicsx.models.axisymmetric.meridian import Meridian
 from magshell_fenicsx.models.axisymmetric.supports import Supports
 from magshell_fenicsx.platform import compat
+
+DEGREE = 4  # of the matrix of a wave as a polynomial in m
 
 
 class Waves:
@@ -74,8 +78,10 @@ class Waves:
         pattern = next(form for e, (_, form) in zip(kept, self._forms, strict=True) if e.name == INTERIOR)
         self._K = fem_petsc.create_matrix(pattern)
         self._K.setOption(PETSc.Mat.Option.SYMMETRIC, True)
-        self._nodes = 1 + (self.largest - 1) * (1 - np.cos(np.pi * np.arange(5) / 4)) / 2
-        self._parts = [fem_petsc.create_matrix(pattern) for _ in self._nodes]
+        self._nodes = self.largest * np.sin(np.pi / 4 * np.array([0, 1, 2, -1, -2]))
+        self._weights = _lagrange(self._nodes, np.arange(self.largest + 1))
+        self._pieces = [_Piece(2, self.largest, self._nodes)]
+        self._part = fem.create_matrix(pattern)
         self._interpolated: PETSc.Mat | None = None
         self._bands: list[Banded] = []
         self._factorisation, self._counting = Factorisation(V.mesh.comm), Factorisation(V.mesh.comm)
@@ -110,32 +116,69 @@ class Waves:
         """Number of unstable directions among the waves 1, 2, ... `largest`.
 
         A jet of a wave is quadratic in m, and so Q_m is a polynomial of degree 4: its matrices are interpolated
-        between five. Only those that are not positive definite are factored for their inertia.
+        between five, of m = 0, +-a and +-b. Q_-m is Q_m of the mirrored wave (U, -V, W), and so three are
+        assembled. Only those that are not positive definite are factored for their inertia.
         """
         self._system.at(state.u, state.mu)
-        for part, node in zip(self._parts, self._nodes, strict=True):
-            self._assemble(part, state, node, [])
+        values = [self._entries(state, m) for m in self._nodes[:3]]
+        values += [_mirrored(v) for v in values[1:]]
         if not self._bands:
-            self._bands = [Banded(self._parts[0], self._rows(m)) for m in (1, 2)]
-        values, found = [part.getValuesCSR()[2] for part in self._parts], list[int]()
-        entries = [band.entries(values) for band in self._bands]
-        for m in range(1, self.largest + 1):
-            weights = _lagrange(self._nodes, m)
-            definite = self._bands[m > 1].positive(entries[m > 1], weights)
-            found.append(0 if definite else self._interpolated_pivots(m, weights))
+            self._bands = [Banded(*self._sparsity, self._rows(m)) for m in (1, 2)]
+        found = [0] * self.largest
+        for m in self._indefinite(values):
+            found[m - 1] = self._interpolated_pivots(m, values)
         return found
 
-    def _interpolated_pivots(self, m: int, weights: Sequence[float]) -> int:
+    def _entries(self, state: State, m: float) -> NDArray[np.float64]:
+        """The entries (pairs of nodes, 3, 3) of Q_m's matrix, with nothing held, at the displacement of the system."""
+        self._m.value = m
+        self._part.set_value(0.0)
+        for form in self._present(state):
+            fem.assemble_matrix(self._part, form)
+        return np.array(self._part.data).reshape(-1, 3, 3)
+
+    @cached_property
+    def _sparsity(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Rows and columns of these entries."""
+        first, second = (a.astype(np.int64) for a in (self._part.indptr, self._part.indices))
+        row = np.repeat(np.arange(len(first) - 1), np.diff(first))
+        rows, columns = (3 * a[:, None, None] + np.zeros((3, 3), dtype=np.int64) for a in (row, second))
+        return (rows + np.arange(3)[:, None]).ravel(), (columns + np.arange(3)).ravel()
+
+    def _indefinite(self, values: Sequence[NDArray[np.float64]]) -> list[int]:
+        """The waves whose matrices are not positive definite.
+
+        On a piece of the axis of m the matrix is a mean of its five Bernstein coefficients with weights that are not
+        negative: if these are positive definite, it is so for every m of the piece. Else the piece is halved, for the
+        next states too, until its waves are as few as coefficients.
+        """
+        first, rest = (known.bands(values) for known in self._bands)
+        definite = cache(lambda m: self._bands[1].positive(rest, self._weights[m]))
+        indefinite = set[int]() if self._bands[0].positive(first, self._weights[1]) else {1}
+        halved, self._pieces = self._pieces, []
+        while halved:
+            piece = halved.pop()
+            ends = definite(piece.first) and definite(piece.last)
+            if piece.short:
+                indefinite |= {m for m in range(piece.first, piece.last + 1) if not definite(m)}
+            elif not (ends and all(self._bands[1].positive(rest, weights) for weights in piece.inner)):
+                halved += piece.halves(self._nodes)
+                continue
+            self._pieces.append(piece)
+        return sorted(indefinite)
+
+    def _interpolated_pivots(self, m: int, values: Sequence[NDArray[np.float64]]) -> int:
+        entries = self._weights[m] @ np.reshape(values, (len(values), -1))
+        K = coo_array((entries, self._sparsity)).tocsr()
+        first, columns = (a.astype(PETSc.IntType) for a in (K.indptr, K.indices))
         if self._interpolated is None:
-            self._interpolated = self._parts[0].copy()
+            self._interpolated = PETSc.Mat().createAIJ(K.shape, csr=(first, columns, K.data), comm=self._K.comm)
             self._interpolated.setOption(PETSc.Mat.Option.SYMMETRIC, True)
             self._interpolated.setOption(PETSc.Mat.Option.KEEP_NONZERO_PATTERN, True)
-        K = self._interpolated
-        K.zeroEntries()
-        for part, weight in zip(self._parts, weights, strict=True):
-            K.axpy(weight, part, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
-        K.zeroRowsColumnsLocal(self._rows(m), 1.0)
-        self._counting.factor(K)
+        self._interpolated.setValuesCSR(first, columns, K.data)
+        self._interpolated.assemble()
+        self._interpolated.zeroRowsColumns(self._rows(m), 1.0)
+        self._counting.factor(self._interpolated)
         return self._counting.negative_pivots
 
     def _rows(self, m: int) -> NDArray[np.int32]:
@@ -160,11 +203,16 @@ class Waves:
         """Q_m's matrix at the displacement that the system has."""
         self._m.value = m
         K.zeroEntries()
+        for form in self._present(state):
+            compat.add_matrix(K, form, held)
+        compat.finish_matrix(K, self.V, held)
+
+    def _present(self, state: State) -> Iterator[fem.Form]:
+        """The forms of the terms that are not zero, each with its amplitude."""
         for amplitude, form in self._forms:
             self._factor.value = 1.0 if amplitude is None else state.mu[amplitude]
             if self._factor.value:
-                compat.add_matrix(K, form, held)
-        compat.finish_matrix(K, self.V, held)
+                yield form
 
     def _second(self, e: Energy) -> ufl.Form:
         energy, v = self._of_wave(e)
@@ -178,7 +226,37 @@ class Waves:
         return np.pi * (e.added(u, cosine) + e.added(u, sine)), v
 
 
-def _lagrange(nodes: NDArray[np.float64], at: float) -> list[float]:
-    """What the values at some nodes weigh in their polynomial's value elsewhere."""
+class _Piece:
+    """The waves from a first to a last one.
+
+    Attributes
+    ----------
+    inner
+        What the values at the nodes weigh in the inner three Bernstein coefficients on the piece.
+    """
+
+    def __init__(self, first: int, last: int, nodes: NDArray[np.float64]) -> None:
+        self.first, self.last, self.short = first, last, last - first < DEGREE
+        places = np.arange(DEGREE + 1) / DEGREE
+        bernstein = [comb(DEGREE, i) * places**i * (1 - places) ** (DEGREE - i) for i in range(DEGREE + 1)]
+        values = _lagrange(nodes, first + (last - first) * places)
+        self.inner = np.linalg.solve(np.stack(bernstein, axis=1), values)[1:-1]
+
+    def halves(self, nodes: NDArray[np.float64]) -> list["_Piece"]:
+        middle = (self.first + self.last) // 2
+        return [_Piece(self.first, middle, nodes), _Piece(middle, self.last, nodes)]
+
+
+def _lagrange(nodes: NDArray[np.float64], at: NDArray[np.float64] | NDArray[np.int64]) -> NDArray[np.float64]:
+    """What the values at some nodes weigh in their polynomial's values at other places; (places, nodes)."""
     others = [np.delete(nodes, i) for i in range(len(nodes))]
-    return [float(np.prod((at - rest) / (node - rest))) for node, rest in zip(nodes, others, strict=True)]
+    columns = [np.prod((at[:, None] - rest) / (node - rest), axis=1) for node, rest in zip(nodes, others, strict=True)]
+    return np.stack(columns, axis=1)
+
+
+def _mirrored(entries: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The entries of Q_-m from those of Q_m: with -V in place of V, P = U + V becomes P - 2 V."""
+    found = entries.copy()
+    found[:, :, 1] = -2 * found[:, :, 0] - found[:, :, 1]
+    found[:, 1] = -2 * found[:, 0] - found[:, 1]
+    return found

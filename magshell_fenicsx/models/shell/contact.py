@@ -206,11 +206,15 @@ class Pressing:
         self._seen = u.copy(), approach, k
         self._known = y = at_quadrature(self._u, self._points) - approach * self.motion
         self.gap, n, N = self.contact.gap((self._r0 + y).reshape(-1, 3), 0.0, self._half)
-        value, first, second = penalty(-self.gap, k, SOFT * self._h)
-        H = second[:, None, None] * n[:, :, None] * n[:, None, :] - first[:, None, None] * N
+        pressed = self.gap < 0  # few of the points
+        value, first, second = (a[:, None] for a in penalty(-self.gap[pressed], k, SOFT * self._h))
+        n, N = n[pressed], N[pressed]
+        H = second[..., None] * n[:, :, None] * n[:, None, :] - first[..., None] * N
         pairs = H[:, *PAIRS] * np.where(PAIRS[0] == PAIRS[1], 0.5, 1.0)
-        flat = [a.reshape(*y.shape[:2], -1) for a in (y, value, -first[:, None] * n, pairs)]
-        self.polynomial.renew(np.concatenate(flat, axis=-1))
+        flat = np.zeros((*y.shape[:2], SIZE))
+        flat[..., :3] = y
+        flat.reshape(-1, SIZE)[pressed, 3:] = np.concatenate([value, -first * n, pairs], axis=1)
+        self.polynomial.renew(flat)
 
     def renew_place(self) -> None:
         """Take the placement anew."""
