@@ -1,7 +1,7 @@
 """Element size over a surface: small where the solution varies over the length sqrt(Rh)."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from math import inf, log1p, pi, sqrt
 from typing import Protocol
@@ -54,6 +54,39 @@ class Disc:
         outer = g * (reach - a) / s
         around = 2 * pi * (a / (s * g) * outer / (1 + outer) + (log1p(outer) - outer / (1 + outer)) / g**2)
         return PER_AREA * (pi * a**2 / s**2 + around)
+
+
+@dataclass(frozen=True)
+class Squares:
+    """Elements of some sizes (n,) within squares with `centres` (n, 2) and half sides (n,), growing outside."""
+
+    centres: NDArray[np.float64]
+    halves: NDArray[np.float64]
+    sizes: NDArray[np.float64]
+    growth: float = 0.4
+
+    @property
+    def size(self) -> float:
+        return float(self.sizes.min())
+
+    def finer(self, refinement: float) -> "Squares":
+        """With elements that are smaller by a factor."""
+        return replace(self, sizes=self.sizes / refinement)
+
+    def __call__(self, x: NDArray[np.float64]) -> float:
+        away = np.maximum(np.abs(x - self.centres) - self.halves[:, None], 0.0)
+        return float((self.sizes + self.growth * np.hypot(*away.T)).min())
+
+    def across(self, axis: int, x: float) -> float:
+        away = np.maximum(np.abs(x - self.centres[:, axis]) - self.halves, 0.0)
+        return float((self.sizes + self.growth * away).min())
+
+    def cells(self, reach: float) -> float:
+        """Those in the squares, and around a disc of their area."""
+        area, s, g = 4 * self.halves**2, self.size, self.growth
+        disc = Disc((0.0, 0.0), sqrt(float(area.sum()) / pi), s, g)
+        within = Disc((0.0, 0.0), disc.radius, s, g).cells(min(disc.radius, reach))
+        return float(PER_AREA * (area / self.sizes**2).sum() + max(disc.cells(reach) - within, 0.0))
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,7 @@ Array = NDArray[np.float64]
 class ByFormula:
     """Vectors of numbers and formulas of the undeformed place, in a frame and a unit of length of their own."""
 
+    by_formula: ClassVar[bool] = True
     of_position: Sequence[Callable[[Array, Array, Array], Array]]
     frame: Array
     length: float
@@ -25,6 +27,17 @@ class ByFormula:
         x = np.moveaxis(self.length * r0 @ self.frame, -1, 0)
         found = self.factor * np.stack([f(*x) for f in self.of_position], axis=-1)
         return found @ self.frame.T if self.vectors else found
+
+
+@dataclass(frozen=True)
+class Inwards:
+    """A pressure by formula, which is against the normal."""
+
+    by_formula: ClassVar[bool] = True
+    pressure: ByFormula
+
+    def __call__(self, r0: Array, n0: Array) -> Array:
+        return -self.pressure(r0, n0) * n0
 
 
 def function(value: float | str) -> Callable[[Array, Array, Array], Array]:

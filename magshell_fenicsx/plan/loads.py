@@ -30,7 +30,7 @@ from magshell_fenicsx.models.shell.parameters import (
     Potential,
 )
 from magshell_fenicsx.models.shell.patterns import Inside, Pattern
-from magshell_fenicsx.plan.by_formula import ByFormula, function
+from magshell_fenicsx.plan.by_formula import ByFormula, Inwards, function
 from magshell_fenicsx.plan.magnetisation import magnetisation
 from magshell_fenicsx.plan.moves import moves
 from magshell_fenicsx.plan.natural import natural
@@ -174,8 +174,7 @@ def _pattern(load: DeadLoadSection, Q: Array, length: float, factor: float) -> P
     if load.vector is not None:
         return ByFormula([function(v) for v in load.vector], Q, length, factor, vectors=True)
     assert load.pressure is not None
-    p = ByFormula([function(load.pressure)], Q, length, factor)
-    return lambda r0, n0: -p(r0, n0) * n0
+    return Inwards(ByFormula([function(load.pressure)], Q, length, factor))
 
 
 def potentials(case: Case) -> list[OwnTerm]:

@@ -29,6 +29,7 @@ from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.plan.account import account
 from magshell_fenicsx.plan.bodies.registered import body_leaves, contacts, pressed
 from magshell_fenicsx.plan.columns import refuse_twice
+from magshell_fenicsx.plan.formulas import refinements, refuse_unfit_formulas, written
 from magshell_fenicsx.plan.imperfections.flaw import Flaw, in_frame
 from magshell_fenicsx.plan.imperfections.registered import flaws
 from magshell_fenicsx.plan.imperfections.rims import MOST_RIMS, Spot, different, spots
@@ -70,6 +71,8 @@ def make_plan(case: Case, terms: Sequence[OwnTerm] = ()) -> Plan:
     places = indented(case, drawn)
     sample = np.zeros((0, 3)) if isinstance(case.shell, MeshSurface) else drawn.sample()
     refuse_unbounded_fields(case, sample)
+    formulas = written(case)
+    refuse_unfit_formulas(formulas, sample if len(sample) or not formulas else drawn.sample())
     terms = (*case.own_terms, *terms)
     energies = surface_terms(case, terms)
     parts = left(case, drawn, places, (*energies, *potentials(case)))
@@ -99,7 +102,8 @@ def make_plan(case: Case, terms: Sequence[OwnTerm] = ()) -> Plan:
     everywhere = min((flaw.size for flaw in found.values() if flaw.centre is None), default=inf)
     bodies = contacts(case, perfect, drawn, turn)
     touched = [(drawn.inverse(c.front), travel(material.h, pressed(case, c.body), c.size), c.size) for c in bodies]
-    size = grading(case, drawn, material.h, local, everywhere, loaded, touched)
+    varying = [] if axisymmetric else refinements(case, formulas, drawn, turn, material.h)
+    size = grading(case, drawn, material.h, local, everywhere, loaded, touched, varying)
     drawn = imperfect(perfect, found, turn, still)
     shape = drawn.chart(beyond, size)
     if isinstance(shape, Grid) and beyond:  # what a point needs, its image needs too
@@ -284,4 +288,4 @@ def _thickness(case: Case, turn: float) -> Thickness | None:
     if not factor:
         return None
     told, Q = formula(factor), rotation(turn)
-    return Thickness(lambda x, y, z: told(*(Q.T @ np.stack([x, y, z]))) if turn else told(x, y, z))
+    return Thickness(lambda x, y, z: told(*np.tensordot(Q.T, np.stack([x, y, z]), 1)) if turn else told(x, y, z))

@@ -29,6 +29,7 @@ def grading(
     everywhere: float,
     loaded: Sequence[Loaded],
     pressed: Sequence[Pressed] = (),
+    varying: Sequence[Feature] = (),
 ) -> Grading:
     """Sizes for 1e-4 in k_d and 1e-3 in F at degree 4; the case's own size is everywhere the same.
 
@@ -40,13 +41,15 @@ def grading(
         The concentrated loads.
     pressed
         Where bodies press.
+    varying
+        Where formulas vary.
     """
     if case.mesh.size is not None or isinstance(case.shell, MeshSurface):
         return Grading([], _uniform(case, h))
     features = [*_rim(case, outline, h), *_imperfections(case, outline, h, spots)]
     for place, indentations in loaded:
         features += _load(case, h, place, indentations)
-    features += [feature for one in pressed for feature in _contact(case, h, *one)]
+    features += [*(feature for one in pressed for feature in _contact(case, h, *one)), *varying]
     return Grading(features, min(_largest(case, outline, h, local=bool(spots)), everywhere) / case.mesh.refinement)
 
 

@@ -92,7 +92,7 @@ def _put(model: ShellModel | MeridianModel, plan: Plan) -> None:
     there = {c.name: c for t in model.system.terms if isinstance(t, FormTerm) for c in t.form.coefficients()}
     if magnetic and callable(magnetic.remanent):
         field = of_meridian.pattern_field if meridian else patterns.pattern_field
-        there["Br"].x.array[:] = field(magnetic.remanent, r0).x.array
+        there["Br"].x.array[:] = field(magnetic.remanent, r0)[0].x.array
     if plan.thickness and model.thickness:
         if isinstance(model, MeridianModel):
             factor = of_meridian.thickness_field(plan.thickness, r0)
@@ -100,7 +100,6 @@ def _put(model: ShellModel | MeridianModel, plan: Plan) -> None:
             factor = thickness_field(plan.thickness, r0, model.midsurface)
         model.thickness.x.array[:] = factor.x.array
     if natural:
-        x, normals = of_meridian.places(r0) if meridian else patterns.places(r0)
-        there["natural"].x.array[:] = natural_field(natural, x, normals, model.V).x.array
+        there["natural"].x.array[:] = natural_field(natural, patterns.cells_of(r0), model.V).x.array
     if isinstance(model, ShellModel):
         model.retake()

@@ -32,9 +32,10 @@ def dead_loads(name: str, loads: Sequence[DeadLoad], factory: EnergyFactory, log
         else:
             over = factory.area()
         if not isinstance(load, PointForce) and callable(load.force):
-            along = pattern_field(load.force, factory.r0, FINER)
+            along, whole = pattern_field(load.force, factory.r0, FINER)
             parts.append((along, over))
-            size += _integral(ufl.sqrt(ufl.dot(along, along)), over, log)
+            fitted = whole is not None and isinstance(load, AreaForce)
+            size += whole if fitted else _integral(ufl.sqrt(ufl.dot(along, along)), over, log)
             continue
         whole = _whole(over, factory, log)
         if isinstance(load, AreaForce) and isinstance(load.force, float):

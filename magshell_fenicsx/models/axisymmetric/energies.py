@@ -123,7 +123,7 @@ class EnergyFactory:
         A field in space is known at the displacement u, of the meridian.
         """
         j0, t, pattern = self.j0, self._t, field.remanent
-        Br = pattern_field(pattern, self.r0) if callable(pattern) else self.constant(pattern)
+        Br = pattern_field(pattern, self.r0)[0] if callable(pattern) else self.constant(pattern)
 
         def term(name: str, density: MagneticDensity, Ba: Expr) -> Energy:
             return self._cells(name, lambda u: t * density(j0, u, Br, Ba), "lambda_m", linear=name in LINEAR)

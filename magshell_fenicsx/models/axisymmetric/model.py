@@ -23,7 +23,7 @@ from magshell_fenicsx.models.axisymmetric.dead_load import dead_loads, pole_forc
 from magshell_fenicsx.models.axisymmetric.energies import INTERIOR, Energy, EnergyFactory
 from magshell_fenicsx.models.axisymmetric.instability import ExcludedWaves
 from magshell_fenicsx.models.axisymmetric.meridian import Meridian
-from magshell_fenicsx.models.axisymmetric.pattern import places, thickness_field
+from magshell_fenicsx.models.axisymmetric.pattern import thickness_field
 from magshell_fenicsx.models.axisymmetric.probe import Array, Probe
 from magshell_fenicsx.models.axisymmetric.supports import openings, supports
 from magshell_fenicsx.models.axisymmetric.waves import Waves
@@ -34,6 +34,7 @@ from magshell_fenicsx.models.shell.energy import Density
 from magshell_fenicsx.models.shell.moved import Support, moving, rotation_of
 from magshell_fenicsx.models.shell.natural import Shape, natural_field
 from magshell_fenicsx.models.shell.parameters import Condition, EdgeMoment, Loads, Material, Potential, default_penalty
+from magshell_fenicsx.models.shell.patterns import cells_of
 from magshell_fenicsx.models.shell.supports import held_on
 from magshell_fenicsx.models.shell.thickness import Thickness
 
@@ -95,7 +96,7 @@ class MeridianModel(Observed):
         self.thickness = thickness_field(thickness, self.r0) if thickness else None
         free, shape = dict[str, fem.Constant](), None
         if loads.natural:
-            shape = Shape.of(natural_field(loads.natural, *places(self.r0), V), loads.natural, free)
+            shape = Shape.of(natural_field(loads.natural, cells_of(self.r0), V), loads.natural, free)
         factory = EnergyFactory(meridian, self.r0, material, self.sigma, degree, self.thickness, shape, free)
         self.factory = factory = replace(factory, drawn=self.growing and self.growing.drawn)
         self.held = supports(meridian, conditions)

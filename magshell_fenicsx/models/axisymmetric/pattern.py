@@ -4,26 +4,29 @@ import numpy as np
 from dolfinx import fem
 from numpy.typing import NDArray
 
-from magshell_fenicsx.models.shell.patterns import Pattern, inside
-from magshell_fenicsx.models.shell.thickness import Thickness, nodal_thickness
+from magshell_fenicsx.models.shell.patterns import Pattern, cells_of, inside, shown
+from magshell_fenicsx.models.shell.thickness import Thickness, nodal_thickness, refuse_unfit
 
 Array = NDArray[np.float64]
 
 
-def pattern_field(pattern: Pattern, r0: fem.Function, finer: int = 0) -> fem.Function:
-    """The pattern along (e_rho, e_theta, e_z) at the nodes of every cell; see `shell.patterns.pattern_field`."""
+def pattern_field(pattern: Pattern, r0: fem.Function, finer: int = 0) -> tuple[fem.Function, float | None]:
+    """The pattern along (e_rho, e_theta, e_z) in every cell; see `shell.patterns.pattern_field`."""
     V = r0.function_space
     Q = fem.functionspace(V.mesh, ("DG", V.element.basix_element.degree + finer, (3,)))
     field = fem.Function(Q, name="Br")
     nodes, normals = places(r0, Q.element.basix_element.points)
-    field.x.array.reshape(-1, 3)[Q.dofmap.list] = pattern(inside(nodes), normals)
-    return field
+    fit = shown(pattern, cells_of(r0), pattern(inside(nodes), normals), Q.element.basix_element)
+    field.x.array.reshape(-1, 3)[Q.dofmap.list] = fit.nodal
+    return field, None if fit.smooth else 2 * np.pi * fit.size
 
 
 def thickness_field(thickness: Thickness, r0: fem.Function) -> fem.Function:
     """h(x)/h at the nodes of every cell; see `models.shell.thickness`."""
     nodes, _ = places(r0)
-    return nodal_thickness(thickness.at(nodes), nodes, r0.function_space)
+    values = thickness.at(nodes)
+    refuse_unfit(values, nodes, r0.function_space.mesh.comm)
+    return nodal_thickness(thickness.shown(cells_of(r0), values), nodes, r0.function_space)
 
 
 def places(r0: fem.Function, at: Array | None = None) -> tuple[Array, Array]:

@@ -16,7 +16,7 @@ from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.energy import edge_quadrature
 from magshell_fenicsx.models.shell.load_vector import Entries, Weighted, entries
 from magshell_fenicsx.models.shell.parameters import AreaForce, DeadLoad, EdgeForce, EdgeMoment, PointForce, Potential
-from magshell_fenicsx.models.shell.patterns import FINER, Pattern, pattern_field
+from magshell_fenicsx.models.shell.patterns import FINER, Pattern, pattern_field, pattern_on_edge
 from magshell_fenicsx.models.shell.point_load import point_entries
 from magshell_fenicsx.models.shell.thickness import patch_of
 
@@ -38,8 +38,8 @@ class Measures(Protocol):
     def area(self, patch: str | None) -> Weighted:
         """Undeformed area of a named patch, or of all."""
 
-    def field(self, pattern: Pattern) -> Expr:
-        """A pattern on the undeformed mid-surface."""
+    def field(self, pattern: Pattern, edge: str | None) -> tuple[Expr, float | None]:
+        """A pattern on the undeformed mid-surface, or a named edge, and the integral of its size, see `pattern_field`."""
 
     def at_point(self, name: str, force: NDArray[np.float64]) -> Entries:
         """The load vector of a force at a named vertex."""
@@ -72,10 +72,12 @@ def assemble_dead_loads(loads: Sequence[DeadLoad], V: fem.FunctionSpace, on: Mea
     def spread(along: Expr, measure: Weighted) -> None:
         parts.append(entries(V, along, measure, log))
 
-    def spread_pattern(pattern: Pattern, measure: Weighted) -> float:
+    def spread_pattern(pattern: Pattern, measure: Weighted, edge: str | None = None, *, part: bool = False) -> float:
         """The integral of its size."""
-        along = on.field(pattern)
+        along, whole = on.field(pattern, edge)
         spread(along, measure)
+        if whole is not None and not part:
+            return whole
         form = log.compile("load size", ufl.sqrt(ufl.dot(along, along)) * measure)
         return float(V.mesh.comm.allreduce(fem.assemble_scalar(form)))
 
@@ -86,7 +88,7 @@ def assemble_dead_loads(loads: Sequence[DeadLoad], V: fem.FunctionSpace, on: Mea
         elif isinstance(load, EdgeForce):
             ds = on.edge(load.edge)
             if callable(load.force):
-                size += spread_pattern(load.force, ds)
+                size += spread_pattern(load.force, ds, load.edge)
                 continue
             length = ds.total(V, log)
             force = np.asarray(load.force / length) if load.total else load.force
@@ -95,7 +97,7 @@ def assemble_dead_loads(loads: Sequence[DeadLoad], V: fem.FunctionSpace, on: Mea
         elif isinstance(load, AreaForce):
             dx = on.area(load.patch)
             if callable(load.force):
-                size += spread_pattern(load.force, dx)
+                size += spread_pattern(load.force, dx, part=load.patch is not None)
                 continue
             if isinstance(load.force, float):
                 along, strength = -constant(load.force) * on.normal, abs(load.force)
@@ -142,8 +144,10 @@ class SurfaceMeasures:
             weight = weight * within(domain, patch_of(self._midsurface.patches, patch))
         return Weighted(weight, dx)
 
-    def field(self, pattern: Pattern) -> Expr:
-        return pattern_field(pattern, self._r0, FINER)
+    def field(self, pattern: Pattern, edge: str | None) -> tuple[Expr, float | None]:
+        if edge is None:
+            return pattern_field(pattern, self._r0, FINER)
+        return pattern_on_edge(pattern, self._r0, self._midsurface.edges[edge], FINER)
 
     def at_point(self, name: str, force: NDArray[np.float64]) -> Entries:
         return point_entries(self._V, self._midsurface.points[name], force)

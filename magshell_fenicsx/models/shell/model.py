@@ -41,7 +41,7 @@ from magshell_fenicsx.models.shell.parameters import (
     Potential,
     default_penalty,
 )
-from magshell_fenicsx.models.shell.patterns import by_patch, places
+from magshell_fenicsx.models.shell.patterns import by_patch, cells_of
 from magshell_fenicsx.models.shell.point_load import patch_entries, point_entries, vertex_normal
 from magshell_fenicsx.models.shell.residual import FastResidual, renew
 from magshell_fenicsx.models.shell.sites import Site
@@ -129,7 +129,7 @@ class ShellModel(Observed):
             cells = midsurface.mesh.topology.index_map(2)
             grown = loads.natural.on(midsurface.patches, cells.size_local + cells.num_ghosts)
             loads = self.loads = replace(loads, natural=grown)
-            shape = Shape.of(natural_field(grown, *places(self.r0), self.V), grown, free)
+            shape = Shape.of(natural_field(grown, cells_of(self.r0), self.V), grown, free)
         folded = midsurface.read and largest_fold(self.r0, degree) > FOLD
         of_shell = material, self.sigma, degree, self.kernels, factor, shape, free, folded
         self.factory = factory = TermFactory(self.r0, self.u, *of_shell, drawn=self.growing and self.growing.drawn)

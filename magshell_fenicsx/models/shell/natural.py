@@ -22,6 +22,7 @@ from ufl.core.expr import Expr
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.energy import Density, Parameter
+from magshell_fenicsx.models.shell.fitted import Cells, fitted
 from magshell_fenicsx.models.shell.free import Constants
 from magshell_fenicsx.models.shell.kinematics import Jet
 from magshell_fenicsx.models.shell.patterns import Pattern, by_patch
@@ -111,15 +112,16 @@ def meridians(r0: Array, n0: Array) -> Array:
     return np.where(off, np.cross(np.stack([-y, x, 0 * x], axis=-1), n0), np.array([1.0, 0.0, 0.0]))
 
 
-def natural_field(natural: Natural, r0: Array, n0: Array, V: fem.FunctionSpace) -> fem.Function:
-    """The natural shape at the nodes (cells, nodes, 3) of every cell of V, free to jump between cells; collective.
+def natural_field(natural: Natural, cells: Cells, V: fem.FunctionSpace) -> fem.Function:
+    """The natural shape in every cell of V, free to jump between cells; collective.
 
     Raises
     ------
     MeshError
         On every rank, if a number is not finite, a stretch is out of bounds, or the frame has no direction.
     """
-    said = None
+    said, element = None, V.element.basix_element
+    r0, n0, _ = cells.at(element.points)
     try:
         _refuse_unfit(natural, r0, n0)
         T, kappa, t = natural.at(r0, n0)
@@ -127,11 +129,19 @@ def natural_field(natural: Natural, r0: Array, n0: Array, V: fem.FunctionSpace) 
         said = str(e)
     if problems := [text for text in V.mesh.comm.allgather(said) if text]:
         raise MeshError(problems[0])
-    Q = fem.functionspace(V.mesh, ("DG", V.element.basix_element.degree, (SIZE,)))
+    Q = fem.functionspace(V.mesh, ("DG", element.degree, (SIZE,)))
     field = fem.Function(Q, name="natural")
-    values = np.concatenate([kappa[..., *FIELD], T[..., *FIELD], t[..., None]], axis=-1)
+    values = _numbers(T, kappa, t)
+    if any(getattr(each, "by_formula", False) for each in (natural.stretch, natural.curvature)):
+        of = fitted(lambda x, n: _numbers(*natural.at(x, n)), cells, values, element, element.degree, bounded=True)
+        values = of.nodal
     field.x.array.reshape(-1, SIZE)[Q.dofmap.list] = values
     return field
+
+
+def _numbers(T: Array, kappa: Array, t: Array) -> Array:
+    """Those of a field."""
+    return np.concatenate([kappa[..., *FIELD], T[..., *FIELD], t[..., None]], axis=-1)
 
 
 def _refuse_unfit(natural: Natural, r0: Array, n0: Array) -> None:

@@ -2,13 +2,16 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import ClassVar
 
+import basix
 import numpy as np
 from dolfinx import fem
 from mpi4py import MPI
 from numpy.typing import NDArray
 
 from magshell_fenicsx.mesh.patch import MeshError
+from magshell_fenicsx.models.shell.fitted import Cells, Element, Fit, fitted
 
 Array = NDArray[np.float64]
 LARGEST = 1e6  # of a remanence's components
@@ -45,6 +48,7 @@ class Uniform:
 class Components:
     """Three functions of x, y, z, perhaps of a frame whose axes (3, 3), told in this one, are columns of `frame`."""
 
+    by_formula: ClassVar[bool] = True
     of_position: list[Callable[[Array, Array, Array], Array]]
     frame: Array | None = None
 
@@ -111,13 +115,17 @@ def by_patch(
     return ByPatch(found)
 
 
-def pattern_field(pattern: Pattern, r0: fem.Function, finer: int = 0) -> fem.Function:
-    """The pattern at the nodes of every cell, free to jump from cell to cell; collective.
+def pattern_field(pattern: Pattern, r0: fem.Function, finer: int = 0) -> tuple[fem.Function, float | None]:
+    """The pattern in every cell, free to jump from cell to cell, see `shown`; collective.
 
     Parameters
     ----------
     finer
         By how much the degree of the field is above that of r0.
+
+    Returns
+    -------
+    The field, and the integral of its size; None where the field itself has it.
 
     Raises
     ------
@@ -129,8 +137,68 @@ def pattern_field(pattern: Pattern, r0: fem.Function, finer: int = 0) -> fem.Fun
     nodes, n0 = places(r0, Q.element.basix_element.points)
     field = fem.Function(Q, name="Br")
     refuse_unbounded(pattern(nodes, n0), nodes, V.mesh.comm, "loading.loads" if finer else "magnetic.remanent")
-    field.x.array.reshape(-1, 3)[Q.dofmap.list] = pattern(inside(nodes), n0)
-    return field
+    fit = shown(pattern, cells_of(r0), pattern(inside(nodes), n0), Q.element.basix_element)
+    field.x.array.reshape(-1, 3)[Q.dofmap.list] = fit.nodal
+    return field, None if fit.smooth else fit.size
+
+
+def pattern_on_edge(
+    pattern: Pattern, r0: fem.Function, facets: NDArray[np.int32], finer: int
+) -> tuple[fem.Function, float | None]:
+    """The same field on some facets of the boundary, where alone it is right: the moments are those along them."""
+    V = r0.function_space
+    field, _ = pattern_field(Nodal(pattern), r0, finer)
+    Q, topology = field.function_space, V.mesh.topology
+    topology.create_connectivity(1, 2)
+    topology.create_connectivity(2, 1)
+    cells = np.array([topology.connectivity(1, 2).links(f)[0] for f in facets], dtype=np.int64)
+    local = [int(np.flatnonzero(topology.connectivity(2, 1).links(c) == f)[0]) for c, f in zip(cells, facets, strict=True)]
+    element, on = Q.element.basix_element, V.element.basix_element
+    corners, ends = basix.geometry(element.cell_type), basix.topology(element.cell_type)[1]
+    line, along = (
+        basix.create_element(basix.ElementFamily.P, basix.CellType.interval, one.degree, basix.LagrangeVariant.gll_warped)
+        for one in (on, element)
+    )
+
+    def side(points: Array, number: int) -> Array:
+        a, b = corners[ends[number]]
+        return np.asarray(a + points * (b - a))
+
+    placed = np.array([on.tabulate(0, side(line.points, i))[0, :, :, 0] for i in range(3)])
+    nodal = np.matmul(placed[local], r0.x.array.reshape(-1, 3)[V.dofmap.list[cells]]).reshape(len(cells), -1, 3)
+    owned = int(np.sum(facets < topology.index_map(1).size_local))
+    edge = Cells(line, nodal, owned, V.mesh.comm)
+    x, normals, _ = edge.at(along.points)
+    fit = shown(pattern, edge, pattern(inside(x), normals), along)
+    near = [[int(np.argmin(np.linalg.norm(element.points - p, axis=1))) for p in side(along.points, i)] for i in range(3)]
+    values = field.x.array.reshape(-1, 3)
+    for cell, number, vectors in zip(cells, local, fit.nodal, strict=True) if not fit.smooth else ():
+        values[Q.dofmap.list[cell][near[number]]] = vectors
+    return field, None if fit.smooth else fit.size
+
+
+@dataclass(frozen=True)
+class Nodal:
+    """A pattern that is interpolated, whatever it is."""
+
+    pattern: Pattern
+
+    def __call__(self, r0: Array, n0: Array) -> Array:
+        return self.pattern(r0, n0)
+
+
+def cells_of(r0: fem.Function) -> Cells:
+    """The cells of a placement, or of a meridian's."""
+    V = r0.function_space
+    owned = V.mesh.topology.index_map(V.mesh.topology.dim).size_local
+    return Cells(V.element.basix_element, r0.x.array.reshape(-1, V.dofmap.bs)[V.dofmap.list], owned, V.mesh.comm)
+
+
+def shown(pattern: Pattern, cells: Cells, nodal: Array, element: Element) -> Fit:
+    """A pattern in every cell from its values at the nodes: a formula as it has the same moments; collective."""
+    if not getattr(pattern, "by_formula", False):
+        return Fit(nodal, smooth=True, size=0.0)
+    return fitted(pattern, cells, nodal, element, cells.element.degree)
 
 
 def inside(nodes: Array) -> Array:

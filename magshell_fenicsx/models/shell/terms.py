@@ -121,7 +121,7 @@ class TermFactory:
     def magnetic(self, field: Magnetisation) -> list[ShellTerm]:
         """The terms of the chosen energy, linear in the applied field, with the amplitude lambda_m."""
         pattern = field.remanent
-        Br = pattern_field(pattern, self.r0) if callable(pattern) else self._constant(pattern)
+        Br = pattern_field(pattern, self.r0)[0] if callable(pattern) else self._constant(pattern)
         if field.in_space:
             known = AppliedField(field.in_space, self.r0, self.u, cell_quadrature(self.degree), field.driven)
             self.fields.append(known)

@@ -12,8 +12,11 @@ from ufl.core.expr import Expr
 from magshell_fenicsx.mesh.midsurface import Midsurface
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.shell.energy import Density
+from magshell_fenicsx.models.shell.fitted import Cells, fitted
+from magshell_fenicsx.models.shell.patterns import cells_of
 
 Array = NDArray[np.float64]
+LEAST_FACTOR, MOST_FACTOR = 1e-3, 1e3
 
 
 @dataclass(frozen=True)
@@ -27,6 +30,14 @@ class Thickness:
         """Its values at places (..., 3), without patches."""
         return np.array(self.of_position(*np.moveaxis(x, -1, 0))) if self.of_position else np.ones(x.shape[:-1])
 
+    def shown(self, cells: Cells, nodal: Array) -> Array:
+        """The values (cells, nodes) of a formula as `fitted`; collective."""
+        if self.of_position is None:
+            return nodal
+        element = cells.element
+        fit = fitted(lambda x, n: self.at(x)[..., None], cells, nodal[..., None], element, element.degree, bounded=True)
+        return fit.nodal[..., 0]
+
 
 def refuse_unfit(factors: Array, x: Array, comm: MPI.Comm) -> None:
     """Look at what multiplies the thickness at places (..., 3); collective.
@@ -36,10 +47,13 @@ def refuse_unfit(factors: Array, x: Array, comm: MPI.Comm) -> None:
     MeshError
         On every rank, if it is not positive somewhere.
     """
-    bad = x[~((factors > 1e-3) & (factors < 1e3))][:1].tolist()
+    bad = x[~((factors >= LEAST_FACTOR) & (factors <= MOST_FACTOR))][:1].tolist()
     if said := [place for places in comm.allgather(bad) for place in places]:
         x1, x2, x3 = said[0]
-        raise MeshError(f"thickness_factor is not within 0.001 to 1000 at (x, y, z)/R = ({x1:.3g}, {x2:.3g}, {x3:.3g})")
+        raise MeshError(
+            f"shell.thickness_factor: is not within {LEAST_FACTOR:g} to {MOST_FACTOR:g} at (x, y, z)/R = "
+            f"({x1:.3g}, {x2:.3g}, {x3:.3g})"
+        )
 
 
 def thickness_field(thickness: Thickness, r0: fem.Function, midsurface: Midsurface) -> fem.Function:
@@ -53,6 +67,8 @@ def thickness_field(thickness: Thickness, r0: fem.Function, midsurface: Midsurfa
     V = r0.function_space
     nodes = r0.x.array.reshape(-1, 3)[V.dofmap.list]
     values = thickness.at(nodes)
+    refuse_unfit(values, nodes, V.mesh.comm)
+    values = thickness.shown(cells_of(r0), values)
     for name, factor in (thickness.patches or {}).items():
         values[patch_of(midsurface.patches, name, "shell.thickness_factor")] = factor
     return nodal_thickness(values, nodes, V)

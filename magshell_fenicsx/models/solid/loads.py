@@ -1,5 +1,7 @@
 """Concentrated and spread loads of a solid: the entries of their load vectors."""
 
+from dataclasses import replace
+
 import numpy as np
 import ufl
 from dolfinx import fem
@@ -11,9 +13,9 @@ from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.mesh.hexahedra import MIDDLE, OUTER, Body
 from magshell_fenicsx.models.shell.dead_load import within
 from magshell_fenicsx.models.shell.load_vector import Entries, Weighted, averaged, smooth
-from magshell_fenicsx.models.shell.patterns import Pattern, refuse_unbounded
+from magshell_fenicsx.models.shell.patterns import Pattern, refuse_unbounded, shown
 from magshell_fenicsx.models.shell.thickness import patch_of
-from magshell_fenicsx.models.solid.remanence import places
+from magshell_fenicsx.models.solid.remanence import cells_of_body, places
 from magshell_fenicsx.models.solid.terms import face_measure
 from magshell_fenicsx.platform import compat
 
@@ -45,14 +47,17 @@ class BodyMeasures:
             weight = weight * within(body.mesh, patch_of(body.patches, patch))
         return Weighted(weight, ufl.Measure("dx", domain=body.mesh, metadata={"quadrature_degree": 4}))
 
-    def field(self, pattern: Pattern) -> Expr:
+    def field(self, pattern: Pattern, edge: str | None) -> tuple[Expr, float | None]:
         nodes, normals = places(self._V)
         z = self._body.at_nodes(self._V, (self._body.heights - MIDDLE) * self._body.thickness)[self._V.dofmap.list]
         field = fem.Function(fem.functionspace(self._V.mesh, ("DG", self._V.element.basix_element.degree, (3,))))
         vectors = pattern(nodes - z[..., None] * normals, normals)
         refuse_unbounded(vectors, nodes, self._V.mesh.comm, "loading.loads")
+        if edge is None:
+            middle = replace(cells_of_body(self._V), nodal=nodes - z[..., None] * normals)
+            vectors = shown(pattern, middle, vectors, field.function_space.element.basix_element).nodal
         field.x.array.reshape(-1, 3)[field.function_space.dofmap.list] = vectors
-        return field
+        return field, None
 
     def at_point(self, name: str, force: Array) -> Entries:
         """Over a patch of the radius h, or of the elements around the point where these are larger."""

@@ -17,7 +17,7 @@ from ufl.core.expr import Expr
 
 from magshell_fenicsx.mesh.hexahedra import MIDDLE, Body
 from magshell_fenicsx.models.shell.natural import SIZE, Natural, Shape, natural_field
-from magshell_fenicsx.models.solid.remanence import places
+from magshell_fenicsx.models.solid.remanence import cells_of_body, places
 from magshell_fenicsx.models.solid.terms import Density
 
 Array = NDArray[np.float64]
@@ -36,7 +36,7 @@ def body_shape(natural: Natural, body: Body, V: fem.FunctionSpace, free: dict[st
     nodes, normals = places(V)
     Z = fem.functionspace(V.mesh, ("Lagrange", V.element.basix_element.degree, (1,)))
     z = body.at_nodes(Z, (body.heights - MIDDLE) * body.thickness)[Z.dofmap.list]
-    numbers = natural_field(natural, nodes, normals, V)
+    numbers = natural_field(natural, cells_of_body(V), V)
     Q = fem.functionspace(V.mesh, ("DG", V.element.basix_element.degree, (HEIGHT + 1,)))
     field = fem.Function(Q, name="natural")
     rows = field.x.array.reshape(-1, HEIGHT + 1)

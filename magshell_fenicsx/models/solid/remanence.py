@@ -7,8 +7,9 @@ from dolfinx import fem
 from numpy.typing import NDArray
 
 from magshell_fenicsx.mesh.hexahedra import Body
+from magshell_fenicsx.models.shell.fitted import Cells
 from magshell_fenicsx.models.shell.parameters import Magnetisation
-from magshell_fenicsx.models.shell.patterns import ByPatch, Pattern, by_patch, inside, refuse_unbounded
+from magshell_fenicsx.models.shell.patterns import ByPatch, Pattern, by_patch, inside, refuse_unbounded, shown
 
 Array = NDArray[np.float64]
 
@@ -25,8 +26,15 @@ def remanence_field(pattern: Pattern, V: fem.FunctionSpace) -> fem.Function:
     Q = fem.functionspace(V.mesh, ("DG", V.element.basix_element.degree, (3,)))
     field = fem.Function(Q, name="Br")
     refuse_unbounded(pattern(nodes, normals), nodes, V.mesh.comm)
-    field.x.array.reshape(-1, 3)[Q.dofmap.list] = pattern(inside(nodes), normals)
+    fit = shown(pattern, cells_of_body(V), pattern(inside(nodes), normals), Q.element.basix_element)
+    field.x.array.reshape(-1, 3)[Q.dofmap.list] = fit.nodal
     return field
+
+
+def cells_of_body(V: fem.FunctionSpace) -> Cells:
+    """The cells of a body."""
+    owned = V.mesh.topology.index_map(3).size_local
+    return Cells(V.element.basix_element, V.tabulate_dof_coordinates()[V.dofmap.list], owned, V.mesh.comm)
 
 
 def places(V: fem.FunctionSpace) -> tuple[Array, Array]:

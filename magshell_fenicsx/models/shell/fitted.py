@@ -1,0 +1,265 @@
+"""Formulas on cells: interpolated where they are smooth, else the polynomials with the same moments.
+
+A formula that varies within a cell, or jumps there, is not what its values at the nodes show: a load on a disc between
+the nodes would be none. The polynomial p of the displacement's degree k with
+
+    integral of p q = integral of f q    over the cell, for each polynomial q of the degree k,
+
+does the same work on every displacement, up to the curvature of the cell. Its integrals come from parts of the cell that
+are divided until each agrees with its own parts. Where f is a polynomial of the degree k, p is f.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import basix
+import numpy as np
+from mpi4py import MPI
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Numbers = NDArray[np.int64]
+Values = Callable[[Array, Array], Array]  # places and normals (cells, n, 3) -> (cells, n, components)
+Element = basix.finite_element.FiniteElement
+INTERVAL, TRIANGLE = basix.CellType.interval, basix.CellType.triangle
+AGREED = 1e-4  # of the integral of |f|: interpolated formulas differ by less
+SMOOTH = 1e-6  # of the largest value: cells that differ by less stay interpolated
+PART = 5e-8  # of the integral of |f|: a part of a cell that differs by more is divided
+DEEPEST, MOST = 9, 400_000  # divisions, parts of all cells
+VISIBLE = 0.01  # of what the polynomials leave: a cell that counts
+AT_ONCE = 4096  # parts that are evaluated together
+FIRST = {1: 4, 2: 2, 3: 2}  # divisions of every cell, by its dimension
+RULE = {1: 7, 2: 6, 3: 4}  # degree of the rule on each part
+CHILDREN = {  # corner and scale along each axis of the parts of an interval, a triangle, a body's cell (in its surface)
+    1: [((0.0,), (0.5,)), ((0.5,), (0.5,))],
+    2: [((x, y), (s, s)) for x, y, s in ((0, 0, 0.5), (0.5, 0, 0.5), (0, 0.5, 0.5), (0.5, 0.5, -0.5))],
+    3: [((x, y, 0.0), (0.5, 0.5, 1.0)) for x in (0.0, 0.5) for y in (0.0, 0.5)],
+}
+
+
+@dataclass(frozen=True)
+class Cells:
+    """The cells of this rank with their places, polynomials in each.
+
+    Attributes
+    ----------
+    element
+        Of the placement.
+    nodal
+        (cells, nodes, 3) of a surface, an edge (without normals) or a body, of whose cells the third axis is across;
+        (cells, nodes, 2) of a meridian, rho and z.
+    owned
+        How many are this rank's own; they come first.
+    """
+
+    element: Element
+    nodal: Array
+    owned: int
+    comm: MPI.Comm
+
+    @property
+    def dimension(self) -> int:
+        return {INTERVAL: 1, TRIANGLE: 2}.get(self.element.cell_type, 3)
+
+    def at(self, X: Array, cells: Numbers | slice = slice(None)) -> tuple[Array, Array, Array]:
+        """Places and normals (cells, n, 3), and length or area over that of the reference cell (cells, n).
+
+        At reference points (n, dimension), or at points (cells, n, dimension) of each cell.
+        """
+        nodal, d = self.nodal[cells], self.dimension
+        table = self.element.tabulate(1, X.reshape(-1, d))[..., 0]
+        table = table.reshape(1 + d, *X.shape[:-1], nodal.shape[1])
+        x, *slopes = (np.matmul(each, nodal) for each in table)
+        if d == 1:
+            if x.shape[-1] == 3:
+                return x, np.zeros_like(x), np.linalg.norm(slopes[0], axis=-1)
+            (rho, z), (rho_s, z_s) = np.moveaxis(x, -1, 0), np.moveaxis(slopes[0], -1, 0)
+            length = np.hypot(rho_s, z_s)
+            normals = np.stack([-z_s, 0 * z_s, rho_s], axis=-1) / length[..., None]
+            return np.stack([rho, 0 * rho, z], axis=-1), normals, rho * length
+        m = np.cross(slopes[0], slopes[1])
+        size = np.linalg.norm(m, axis=-1)
+        return x, m / size[..., None], size
+
+    def sum(self, of_cells: Array) -> Array:
+        """The sum over the cells of all ranks; collective."""
+        return np.asarray(self.comm.allreduce(of_cells[: self.owned].sum(axis=0)))
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A formula on cells.
+
+    Attributes
+    ----------
+    nodal
+        (cells, nodes, components): as they were where the formula is smooth.
+    smooth
+        Whether it is everywhere, on all ranks.
+    size
+        The integral of |f|.
+    missed
+        By how much integrals of f may still be wrong, over that of |f|.
+    rest
+        The root of the integral of |f - p|^2 over that of |f|^2, of all cells.
+    widest
+        The largest side of a cell that misses a visible part of that.
+    """
+
+    nodal: Array
+    smooth: bool
+    size: float
+    missed: float = 0.0
+    rest: float = 0.0
+    widest: float = 0.0
+
+
+@dataclass(frozen=True)
+class _Parts:
+    """Images of the reference cell in it, X = corner + sides * X', each of a cell."""
+
+    cell: Numbers
+    corner: Array
+    sides: Array
+
+    def __getitem__(self, which: slice | NDArray[np.bool_]) -> "_Parts":
+        return _Parts(self.cell[which], self.corner[which], self.sides[which])
+
+    def of(self, cells: Numbers) -> "_Parts":
+        """The same in each of some cells."""
+        times = len(cells)
+        return _Parts(np.repeat(cells, len(self.cell)), np.tile(self.corner, (times, 1)), np.tile(self.sides, (times, 1)))
+
+    @classmethod
+    def together(cls, several: "Sequence[_Parts]") -> "_Parts":
+        return cls(*(np.concatenate([getattr(one, name) for one in several]) for name in ("cell", "corner", "sides")))
+
+    def pieces(self) -> "list[_Parts]":
+        """A few at a time."""
+        return [self[i : i + AT_ONCE] for i in range(0, len(self.cell), AT_ONCE)]
+
+    def divided(self) -> "_Parts":
+        """The parts of the first, those of the second, and so on."""
+        children = CHILDREN[self.corner.shape[1]]
+        at, by = (np.array(v, dtype=float) for v in zip(*children, strict=True))
+        d = self.corner.shape[1]
+        corner = self.corner[:, None] + self.sides[:, None] * at
+        return _Parts(
+            np.repeat(self.cell, len(children)), corner.reshape(-1, d), (self.sides[:, None] * by).reshape(-1, d)
+        )
+
+    def rule(self, points: Array, weights: Array) -> tuple[Array, Array]:
+        """Points (parts, q, d) and weights (parts, q)."""
+        X = self.corner[:, None] + self.sides[:, None] * points
+        return X, np.abs(self.sides.prod(axis=1))[:, None] * weights
+
+
+def fitted(
+    values: Values, cells: Cells, nodal: Array, element: Element, degree: int, *, bounded: bool = False
+) -> Fit:
+    """A formula whose values at the nodes of each cell are known; collective.
+
+    Parameters
+    ----------
+    nodal, element
+        (cells, nodes, components) at the points of the element.
+    degree
+        Of the polynomials with the same moments, at most that of the element.
+    bounded
+        Whether they stay between the least and the largest value in a cell; of their moments the first is kept.
+    """
+    d = cells.dimension
+    points, weights = basix.make_quadrature(cells.element.cell_type, RULE[d])
+    parts = _Parts(np.zeros(1, np.int64), np.zeros((1, d)), np.ones((1, d)))
+    for _ in range(FIRST[d]):
+        parts = parts.divided()
+    X, w = (v.reshape(-1, *v.shape[2:]) for v in parts.rule(points, weights))
+    x, normals, area = cells.at(X)
+    f = values(x, normals)
+    off = np.linalg.norm(np.matmul(element.tabulate(0, X)[0, :, :, 0], nodal) - f, axis=-1)
+    magnitude, area = np.linalg.norm(f, axis=-1), area * w
+    sums = cells.sum(np.stack([(area * v).sum(axis=1) for v in (magnitude, off, magnitude**2)], axis=-1))
+    size, differs, square = map(float, sums)
+    if not differs > AGREED * size:
+        return Fit(nodal, smooth=True, size=size)
+    largest = cells.comm.allreduce(float(magnitude.max(initial=0.0)), MPI.MAX)
+    chosen = np.flatnonzero(off @ w > SMOOTH * largest * w.sum())
+    scale, sizes = area.sum(axis=1) / w.sum(), (area * magnitude).sum(axis=1)
+    space = basix.create_element(basix.ElementFamily.P, element.cell_type, degree, basix.LagrangeVariant.gll_warped)
+    moments, sizes[chosen], squares, missed = _moments(values, cells, chosen, scale, parts, PART * size, space)
+    Y, v = basix.make_quadrature(element.cell_type, 2 * degree)
+    phi = space.tabulate(0, Y)[0, :, :, 0]
+    p = np.linalg.solve(phi.T @ (v[:, None] * phi), moments)
+    unshown, lost = np.zeros(len(scale)), squares - np.einsum("q,cqi->c", v, np.matmul(phi, p) ** 2)
+    unshown[chosen] = scale[chosen] * np.maximum(lost, 0.0)
+    size, rest = float(cells.sum(sizes)), float(cells.sum(unshown))
+    side = np.sqrt(2.0) * scale ** (1 / min(d, 2))
+    widest = cells.comm.allreduce(float(side[unshown > VISIBLE * rest].max(initial=0.0)), MPI.MAX)
+    at_nodes = np.matmul(space.tabulate(0, element.points)[0, :, :, 0], p)
+    if bounded:
+        mean = np.einsum("q,cqi->ci", v, np.matmul(phi, p))[:, None] / v.sum()
+        at_nodes = _bounded(at_nodes, mean, np.matmul(space.tabulate(0, X)[0, :, :, 0], p), f[chosen])
+    new = nodal.copy()
+    new[chosen] = at_nodes
+    return Fit(new, False, size, missed / size, float(np.sqrt(rest / square)), widest)
+
+
+def _moments(
+    values: Values, cells: Cells, chosen: Numbers, scale: Array, parts: _Parts, threshold: float, space: Element
+) -> tuple[Array, Array, Array, float]:
+    """Integrals of f times each function (cells, functions, components), of |f| and |f|^2 (cells,), and their error.
+
+    Over the reference cell, but of |f| and the error over the surface; collective.
+    """
+    points, weights = basix.make_quadrature(space.cell_type, RULE[cells.dimension])
+    number = np.zeros(len(cells.nodal), np.int64)
+    number[chosen] = np.arange(len(chosen))
+    ahead = parts.of(chosen)
+
+    def evaluated(some: _Parts) -> tuple[Array, Array, Array, Array]:
+        X, w = some.rule(points, weights)
+        x, normals, area = cells.at(X, some.cell)
+        return X, w, area * w, values(x, normals)
+
+    def integrals(w: Array, f: Array) -> Array:
+        return np.einsum("pq,pqi->pi", w, f)
+
+    components = values(*cells.at(points[:1], np.zeros(0, np.int64))[:2]).shape[-1]
+    found = np.zeros((len(chosen), space.dim, components))
+    sizes, squares, errors, each = np.zeros(len(chosen)), np.zeros(len(chosen)), 0.0, len(CHILDREN[cells.dimension])
+    whole = [integrals(w, f) for _, w, _, f in map(evaluated, ahead.pieces())]
+    for depth in range(DEEPEST + 1):
+        last = depth == DEEPEST or cells.comm.allreduce(len(ahead.cell)) > MOST
+        rest, left = list[_Parts](), list[Array]()
+        for now, before in zip(ahead.pieces(), whole, strict=True):
+            smaller = now.divided()
+            X, w, area, f = evaluated(smaller)
+            fine = integrals(w, f)
+            error = scale[now.cell] * np.linalg.norm(fine.reshape(len(before), each, -1).sum(axis=1) - before, axis=1)
+            done = (error <= threshold) | last
+            errors += float((error[done & (now.cell < cells.owned)] ** 2).sum())
+            kept = np.repeat(done, each)
+            at, size = number[smaller.cell[kept]], np.linalg.norm(f[kept], axis=-1)
+            phi = space.tabulate(0, X[kept].reshape(-1, X.shape[-1]))[0, :, :, 0].reshape(*size.shape, space.dim)
+            np.add.at(found, at, np.matmul(np.swapaxes(w[kept][..., None] * phi, 1, 2), f[kept]))
+            np.add.at(sizes, at, (area[kept] * size).sum(axis=1))
+            np.add.at(squares, at, (w[kept] * size**2).sum(axis=1))
+            rest.append(smaller[~kept])
+            left.append(fine[~kept])
+        ahead = _Parts.together(rest) if rest else ahead
+        if not cells.comm.allreduce(len(ahead.cell)):
+            break
+        together = np.concatenate([np.empty((0, components)), *left])
+        whole = [together[i : i + AT_ONCE] for i in range(0, len(together), AT_ONCE)]
+    return found, sizes, squares, float(np.sqrt(cells.comm.allreduce(errors)))
+
+
+def _bounded(at_nodes: Array, mean: Array, between: Array, f: Array) -> Array:
+    """Polynomials (cells, nodes, components) drawn towards their means until they have no values that f has not."""
+    low, high = f.min(axis=1, keepdims=True), f.max(axis=1, keepdims=True)
+    every = np.concatenate([at_nodes, between], axis=1)
+    share = np.ones_like(mean)
+    for bound, extreme in ((low, every.min(axis=1, keepdims=True)), (high, every.max(axis=1, keepdims=True))):
+        away = extreme - mean
+        share = np.minimum(share, np.where(np.abs(away) > 0, (bound - mean) / np.where(away == 0, 1.0, away), 1.0))
+    return np.asarray(mean + np.clip(share, 0.0, 1.0) * (at_nodes - mean))

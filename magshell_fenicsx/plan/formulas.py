@@ -1,0 +1,203 @@
+"""The formulas of a case in the undeformed place: that they have sensible values, and where elements must be small."""
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from math import ceil, sqrt
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.loads.dead import DeadSection
+from magshell_fenicsx.case.messages import shown
+from magshell_fenicsx.case.source import CaseError
+from magshell_fenicsx.mesh.frame import rotation
+from magshell_fenicsx.mesh.grading import Squares
+from magshell_fenicsx.mesh.grid import Grid
+from magshell_fenicsx.mesh.msh import MeshFile
+from magshell_fenicsx.mesh.shapes import DiscShape, Shape, StripShape
+from magshell_fenicsx.models.shell.natural import LARGEST, SMALLEST
+from magshell_fenicsx.models.shell.patterns import LARGEST as LARGEST_VECTOR
+from magshell_fenicsx.models.shell.thickness import LEAST_FACTOR, MOST_FACTOR
+from magshell_fenicsx.plan.by_formula import function
+from magshell_fenicsx.plan.outline import ANY, Outline
+
+Array = NDArray[np.float64]
+SAMPLES = 20  # along each side of a square of the chart
+COARSEST, MOST_FIRST, MOST_SQUARES = 0.2, 800, 3000  # side of the first squares over R, how many, and how many later
+DEGREE = 4  # of the polynomials that are compared
+RESOLVED = 0.05  # of the largest value: root of the mean square that a polynomial may miss in a square
+SHOWN = 0.45  # of sqrt(Rh): elements of this size show loads of any width
+CURVATURE = 1e6  # of a natural shape, over 1/R
+LOCAL = (np.stack(np.meshgrid(*[np.arange(SAMPLES)] * 2, indexing="ij"), axis=-1).reshape(-1, 2) + 0.5) / SAMPLES - 0.5
+_POWERS = [(i, j) for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i)]
+BASIS = np.linalg.qr(np.stack([(2 * LOCAL[:, 0]) ** i * (2 * LOCAL[:, 1]) ** j for i, j in _POWERS], axis=-1))[0]
+
+
+@dataclass(frozen=True)
+class Written:
+    """A key of the case with formulas of the undeformed place.
+
+    Attributes
+    ----------
+    of_place
+        Places (n, 3) over R in the frame of the case -> each formula's values (n, formulas), in the case's unit.
+    least, most
+        Allowed values.
+    """
+
+    key: str
+    texts: tuple[str, ...]
+    of_place: Callable[[Array], Array]
+    least: float
+    most: float
+
+
+def written(case: Case) -> list[Written]:
+    """Those of thickness, remanence, dead loads and natural shape."""
+    return list(_written(case))
+
+
+def _written(case: Case) -> Iterator[Written]:
+    R = case.shell.reference
+
+    def one(key: str, values: Iterable[float | str], least: float, most: float, length: float = R) -> Iterator[Written]:
+        texts = tuple(v for v in values if isinstance(v, str))
+        functions = [function(text) for text in texts]
+        if texts:
+            yield Written(key, texts, lambda x: np.stack([f(*(length * x).T) for f in functions], -1), least, most)
+
+    if isinstance(case.thickness_factor, str):
+        yield from one("shell.thickness_factor", [case.thickness_factor], LEAST_FACTOR, MOST_FACTOR, 1.0)
+    if case.magnetic and case.magnetic.remanent.components:
+        key = "magnetic.remanent.components"
+        yield from one(key, case.magnetic.remanent.components, -LARGEST_VECTOR, LARGEST_VECTOR, 1.0)
+    for step in case.programme:
+        if isinstance(step.load, DeadSection):
+            for i, load in enumerate(step.load.loads):
+                for name in ("per_length", "per_area", "pressure"):
+                    value = getattr(load, name)
+                    unit = case.scales.E * case.scales.h / (R if name != "per_length" else 1.0)
+                    most = LARGEST_VECTOR * unit
+                    values = value if isinstance(value, list) else [value]
+                    yield from one(f"{step.key}.loads.{i}.{name}", values, -most, most)
+    for name, least, most in (("stretch", SMALLEST, LARGEST), ("curvature", -CURVATURE / R, CURVATURE / R)):
+        value = getattr(case.natural, name, None)
+        values = value if isinstance(value, list) else [] if isinstance(value, dict) else [value]
+        yield from one(f"natural.{name}", values, least, most)
+
+
+def refuse_unfit_formulas(formulas: Sequence[Written], x: Array) -> None:
+    """Look at the values at places (n, 3) over R of the undeformed shell.
+
+    Raises
+    ------
+    CaseError
+        With the first place where one is not finite or out of bounds.
+    """
+    for each in formulas:
+        values = each.of_place(x)
+        bad = ~((values >= each.least) & (values <= each.most))
+        if bad.any():
+            row, i = np.argwhere(bad)[0]
+            place = ", ".join(f"{c:.3g}" for c in x[row])
+            bounds = f"{each.least:.4g} to {each.most:.4g}"
+            raise CaseError(
+                f"{each.key}: {shown(each.texts[i])}: is {values[row, i]:.4g} at (x, y, z)/R = ({place}): "
+                f"allowed {bounds}"
+            )
+
+
+def squares(places: Callable[[Array], Array], outline: Outline, sizes: "Sizes", finest: float) -> Squares | None:
+    """Squares of the chart in which elements must be small; None if there are none, or the chart is a mesh file's.
+
+    Squares are divided until the elements that they need are no smaller than they, or as small as `finest`.
+
+    Parameters
+    ----------
+    places
+        Chart (n, 2) -> places (n, 3) over R in the frame of the case.
+    sizes
+        Places (squares, n, 3), which of them are inside, and the side of the squares -> size of elements of each.
+    """
+    shape = outline.chart(None, ANY)
+    if isinstance(shape, MeshFile):
+        return None
+    low, high = extent(shape)
+    side = max(min(COARSEST, *(high - low)), float(np.sqrt(np.prod(high - low) / MOST_FIRST)))
+    t = [a + side * (np.arange(ceil((b - a) / side - 1e-9)) + 0.5) for a, b in zip(low, high, strict=True)]
+    centres = np.stack(np.meshgrid(*t, indexing="ij"), axis=-1).reshape(-1, 2)
+    found, largest = list[tuple[Array, float, Array]](), side
+    while len(centres) and len(centres) <= MOST_SQUARES:
+        chart = centres[:, None] + side * LOCAL
+        inside = within(shape, chart)
+        kept = inside.any(axis=1)
+        centres, chart, inside = centres[kept], chart[kept], inside[kept]
+        size = sizes(places(chart.reshape(-1, 2)).reshape(*chart.shape[:2], 3), inside, side)
+        small = (size < side) & (side > finest)
+        leaves = ~small & (np.maximum(size, finest) < largest)
+        found.append((centres[leaves], side, np.maximum(size[leaves], finest)))
+        side /= 2
+        offsets = side / 2 * np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])
+        centres = (centres[small][:, None] + offsets).reshape(-1, 2)
+    if len(centres):  # so many that they are all alike: as small as can be paid for
+        found.append((centres, side, np.full(len(centres), max(side, finest))))
+    if not sum(len(each) for each, _, _ in found):
+        return None
+    sides = np.concatenate([np.full(len(each), s) for each, s, _ in found])
+    return Squares(np.concatenate([c for c, _, _ in found]), sides / 2, np.concatenate([s for _, _, s in found]))
+
+
+Sizes = Callable[[Array, NDArray[np.bool_], float], Array]
+
+
+def extent(shape: Shape | Grid) -> tuple[Array, Array]:
+    """Lower and upper corner of a chart."""
+    if isinstance(shape, Grid):
+        return np.array(shape.low), np.array(shape.high)
+    if isinstance(shape, StripShape):
+        return np.array([0.0, -shape.width / 2]), np.array([1.0, shape.width / 2])
+    return np.full(2, -shape.reach), np.full(2, shape.reach)
+
+
+def within(shape: Shape | Grid, chart: Array) -> NDArray[np.bool_]:
+    """Whether points (..., 2) belong to a chart."""
+    if isinstance(shape, DiscShape):
+        return np.asarray(np.hypot(chart[..., 0], chart[..., 1]) <= shape.reach)
+    low, high = extent(shape)
+    return np.asarray(((chart >= low) & (chart <= high)).all(axis=-1))
+
+
+def shown_by_polynomials(values: Callable[[Array], Array]) -> Sizes:
+    """Elements that show a formula of places (n, 3): smaller than squares where a polynomial is not it.
+
+    What is shorter than `finest` of `squares` bends no shell, and its moments are exact on elements of any size.
+    """
+    largest = 0.0
+
+    def sizes(x: Array, inside: NDArray[np.bool_], side: float) -> Array:
+        nonlocal largest
+        f = values(x.reshape(-1, 3)).reshape(*x.shape[:2], -1)
+        good = inside & np.isfinite(f).all(axis=-1)
+        f = np.where(good[..., None], f, 0.0)
+        largest = max(largest, float(np.abs(f).max(initial=0.0)))
+        off = f - BASIS @ (BASIS.T @ f)
+        for i in np.flatnonzero(~good.all(axis=1)):
+            Q = np.linalg.qr(BASIS[good[i]])[0]
+            off[i], g = 0.0, f[i][good[i]]
+            off[i][good[i]] = g - Q @ (Q.T @ g)
+        error = np.sqrt((off**2).sum(axis=-1).mean(axis=1))
+        return np.where(error > RESOLVED * largest, side / 2, side)
+
+    return sizes
+
+
+def refinements(case: Case, formulas: Sequence[Written], drawn: Outline, turn: float, h: float) -> list[Squares]:
+    """Where formulas need small elements, in the chart of a frame that is turned about e3 (rad)."""
+    Q, finest = rotation(turn), SHOWN * sqrt(h)
+
+    def places(chart: Array) -> Array:
+        return drawn.embedding(chart) @ Q
+
+    found = (squares(places, drawn, shown_by_polynomials(each.of_place), finest) for each in formulas)
+    return [each.finer(case.mesh.refinement) for each in found if each]
