@@ -26,8 +26,8 @@ Array = NDArray[np.float64]
 SAMPLES = 20  # along each side of a square of the chart
 COARSEST, MOST_FIRST, MOST_SQUARES = 0.2, 800, 3000  # side of the first squares over R, how many, and how many later
 DEGREE = 4  # of the polynomials that are compared
-RESOLVED = 0.05  # of the largest value: root of the mean square that a polynomial may miss in a square
-SHOWN = 0.45  # of sqrt(Rh): elements of this size show loads of any width
+SHOWN, SMALLEST_SQUARE = 0.25, 0.1  # of sqrt(Rh) and of h: elements of this size show loads, and all else
+MISSED = 0.003  # of the variance of a formula: what polynomials on squares may miss of it
 CURVATURE = 1e6  # of a natural shape, over 1/R
 LOCAL = (np.stack(np.meshgrid(*[np.arange(SAMPLES)] * 2, indexing="ij"), axis=-1).reshape(-1, 2) + 0.5) / SAMPLES - 0.5
 _POWERS = [(i, j) for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i)]
@@ -44,6 +44,9 @@ class Written:
         Places (n, 3) over R in the frame of the case -> each formula's values (n, formulas), in the case's unit.
     least, most
         Allowed values.
+    load
+        Whether it is a load: what is shorter than about sqrt(Rh) bends no shell then, and its moments are exact on
+        elements of any size. Strains follow all else down to its last detail.
     """
 
     key: str
@@ -51,6 +54,7 @@ class Written:
     of_place: Callable[[Array], Array]
     least: float
     most: float
+    load: bool = False
 
 
 def written(case: Case) -> list[Written]:
@@ -61,11 +65,17 @@ def written(case: Case) -> list[Written]:
 def _written(case: Case) -> Iterator[Written]:
     R = case.shell.reference
 
-    def one(key: str, values: Iterable[float | str], least: float, most: float, length: float = R) -> Iterator[Written]:
+    def one(
+        key: str, values: Iterable[float | str], least: float, most: float, length: float = R, *, load: bool = False
+    ) -> Iterator[Written]:
         texts = tuple(v for v in values if isinstance(v, str))
         functions = [function(text) for text in texts]
+
+        def of_place(x: Array) -> Array:
+            return np.stack([f(*(length * x).T) for f in functions], axis=-1)
+
         if texts:
-            yield Written(key, texts, lambda x: np.stack([f(*(length * x).T) for f in functions], -1), least, most)
+            yield Written(key, texts, of_place, least, most, load)
 
     if isinstance(case.thickness_factor, str):
         yield from one("shell.thickness_factor", [case.thickness_factor], LEAST_FACTOR, MOST_FACTOR, 1.0)
@@ -80,7 +90,7 @@ def _written(case: Case) -> Iterator[Written]:
                     unit = case.scales.E * case.scales.h / (R if name != "per_length" else 1.0)
                     most = LARGEST_VECTOR * unit
                     values = value if isinstance(value, list) else [value]
-                    yield from one(f"{step.key}.loads.{i}.{name}", values, -most, most)
+                    yield from one(f"{step.key}.loads.{i}.{name}", values, -most, most, load=True)
     for name, least, most in (("stretch", SMALLEST, LARGEST), ("curvature", -CURVATURE / R, CURVATURE / R)):
         value = getattr(case.natural, name, None)
         values = value if isinstance(value, list) else [] if isinstance(value, dict) else [value]
@@ -169,35 +179,37 @@ def within(shape: Shape | Grid, chart: Array) -> NDArray[np.bool_]:
 
 
 def shown_by_polynomials(values: Callable[[Array], Array]) -> Sizes:
-    """Elements that show a formula of places (n, 3): smaller than squares where a polynomial is not it.
-
-    What is shorter than `finest` of `squares` bends no shell, and its moments are exact on elements of any size.
-    """
-    largest = 0.0
+    """Elements that show a formula of places (n, 3): smaller than the squares where polynomials miss most of it."""
+    whole, mean = 0.0, None
 
     def sizes(x: Array, inside: NDArray[np.bool_], side: float) -> Array:
-        nonlocal largest
+        nonlocal whole, mean
         f = values(x.reshape(-1, 3)).reshape(*x.shape[:2], -1)
         good = inside & np.isfinite(f).all(axis=-1)
-        f = np.where(good[..., None], f, 0.0)
-        largest = max(largest, float(np.abs(f).max(initial=0.0)))
-        off = f - BASIS @ (BASIS.T @ f)
+        mean = f[good].mean(axis=0) if mean is None else mean
+        f = np.where(good[..., None], f - mean, 0.0)
+        missed = f - BASIS @ (BASIS.T @ f)
         for i in np.flatnonzero(~good.all(axis=1)):
             Q = np.linalg.qr(BASIS[good[i]])[0]
-            off[i], g = 0.0, f[i][good[i]]
-            off[i][good[i]] = g - Q @ (Q.T @ g)
-        error = np.sqrt((off**2).sum(axis=-1).mean(axis=1))
-        return np.where(error > RESOLVED * largest, side / 2, side)
+            missed[i], g = 0.0, f[i][good[i]]
+            missed[i][good[i]] = g - Q @ (Q.T @ g)
+        area = (side / SAMPLES) ** 2
+        whole = max(whole, area * float((f**2).sum()))
+        squared = area * (missed**2).sum(axis=(1, 2))
+        order = np.argsort(squared)
+        fine = np.empty(len(f), dtype=bool)
+        fine[order] = np.cumsum(squared[order]) <= MISSED * whole
+        return np.where(fine, side, side / 2)
 
     return sizes
 
 
 def refinements(case: Case, formulas: Sequence[Written], drawn: Outline, turn: float, h: float) -> list[Squares]:
     """Where formulas need small elements, in the chart of a frame that is turned about e3 (rad)."""
-    Q, finest = rotation(turn), SHOWN * sqrt(h)
+    Q = rotation(turn)
 
     def places(chart: Array) -> Array:
         return drawn.embedding(chart) @ Q
 
-    found = (squares(places, drawn, shown_by_polynomials(each.of_place), finest) for each in formulas)
+    found = (squares(places, drawn, shown_by_polynomials(each.of_place), (SHOWN * sqrt(h) if each.load else SMALLEST_SQUARE * h)) for each in formulas)
     return [each.finer(case.mesh.refinement) for each in found if each]
