@@ -7,6 +7,7 @@ the column C = dg/du, and the amplitude is the force of this constraint.
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +40,8 @@ class Motion:
         dPi/dmu of the loads.
     error
         Estimated error of the last step, over the system's length.
+    memory
+        What viscous forces remember of the steps so far: a step that is refused leaves it.
     """
 
     t: float
@@ -50,6 +53,7 @@ class Motion:
     dissipated: float = 0.0
     potentials: dict[str, float] = field(default_factory=dict)
     error: float = np.inf
+    memory: Any = None
 
 
 def constrained(

@@ -38,7 +38,7 @@ class Viscous(Protocol):
     Attributes
     ----------
     memory
-        What they remember of earlier steps; `accept` replaces it.
+        What they remember of the steps to u0; `accept` replaces it.
     """
 
     memory: Any
@@ -174,7 +174,8 @@ class Integrator:
         a = -inverse(r)
         if self.device:
             a, mu = held_back(self.system, self.device, inverse, Motion(t, u, v, a, mu))
-        now = Motion(t, u, v, a, mu, work, dissipated)
+        memory = before.memory if before else self.viscous and self.viscous.memory
+        now = Motion(t, u, v, a, mu, work, dissipated, memory=memory)
         return replace(now, potentials=self._potentials(now, False))
 
     def _inverse_mass(self) -> Callable[[Vector], Vector]:
@@ -207,6 +208,8 @@ class Integrator:
     def step(self, now: Motion, dt: float) -> Motion | str:
         """The motion after a step; else the reason why there is none."""
         comm = self.system.comm
+        if self.viscous:
+            self.viscous.memory = now.memory
         u = now.u + dt * now.v
         if now.error < SMOOTH:
             u = u + dt**2 / 2 * now.a
@@ -313,8 +316,9 @@ class Integrator:
         if self.viscous:
             lost += dot(comm, moved, self.viscous.accept(now.u, u, dt))
         error = abs(rule.beta - 1 / 6) * dt**2 * max_abs(comm, a - now.a) / self.system.length
+        memory, dissipated = self.viscous and self.viscous.memory, now.dissipated + lost
         return replace(
-            after, work=now.work + work, dissipated=now.dissipated + lost, potentials=potentials, error=error
+            after, work=now.work + work, dissipated=dissipated, potentials=potentials, error=error, memory=memory
         )
 
     def _potentials(self, now: Motion, before: bool) -> dict[str, float]:

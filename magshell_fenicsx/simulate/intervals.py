@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import scipy
 
@@ -37,16 +36,6 @@ class Intervals:
     steps: TimeSteps
     marks: Collection[float]
 
-    @property
-    def memory(self) -> Any:
-        """What the shell remembers besides its state: strains of branches."""
-        return self.integrator.viscous.memory if self.integrator.viscous else None
-
-    @memory.setter
-    def memory(self, known: Any) -> None:
-        if self.integrator.viscous:
-            self.integrator.viscous.memory = known
-
     def moved(self, now: Motion, dt: float, end: float) -> tuple[Motion, float]:
         """The motion at a later time, and the step to go on with."""
         for t in [*sorted(t for t in self.marks if now.t < t < end), end]:
@@ -56,15 +45,13 @@ class Intervals:
         return now, dt
 
     def crossing(self, now: Motion, dt: float, end: Motion, beyond: Callable[[Motion], float]) -> float:
-        """The time between two motions at which a function of them changes its sign; the memory stays."""
-        memory, close, ends = self.memory, CLOSE * (end.t - now.t), {now.t: now, end.t: end}
+        """The time between two motions at which a function of them changes its sign."""
+        close, ends = CLOSE * (end.t - now.t), {now.t: now, end.t: end}
 
         def at(t: float) -> float:
-            self.memory = memory
             return beyond(ends.get(t) or self.moved(now, dt, t)[0])
 
         found = float(scipy.optimize.brentq(at, now.t, end.t, xtol=close))
-        self.memory = memory
         return max(found, now.t + close)
 
     def journalled(self, now: Motion, dt: float, end: float) -> tuple[Motion, float, Point]:

@@ -81,10 +81,9 @@ def motion(scene: Scene, load: TimeSection, state: State, held: Mapping[str, Hel
     walk, watched = Intervals(scene, integrator, held, steps, loads.marks), _watched(scene, load.event, state)
     ended = ""
     for end in outputs:
-        before, first, memory = now, dt, walk.memory
+        before, first = now, dt
         now, dt, point = walk.journalled(before, first, end)
         if watched and watched(before) * watched(now) <= 0 and watched(now) != watched(before):
-            walk.memory = memory
             now, dt, point = walk.journalled(before, first, walk.crossing(before, first, now, watched))
             ended = "event"
         kinetic = integrator.kinetic(now)
