@@ -15,7 +15,8 @@ class TimeSteps:
     Attributes
     ----------
     fixed
-        The longest step, which is halved only where Newton's method fails; None: steps for the tolerance.
+        The longest step, which is halved where Newton's method fails, and doubled again after two steps that
+        succeed; None: steps for the tolerance.
     tolerance
         Largest estimated error of a step, over the system's length (O. C. Zienkiewicz and Y. M. Xie, Earthquake
         Engineering and Structural Dynamics 20, 1991).
@@ -49,14 +50,14 @@ def advance(integrator: Integrator, now: Motion, end: float, steps: TimeSteps, d
     TimeStopped
         If even a tiny step fails.
     """
-    begin = now.t
+    begin, failed = now.t, False
     while end - now.t > 1e-9 * (end - begin):
         way = end - now.t
         dt = min(dt, steps.fixed or dt)
         length = way / np.ceil(way / dt * (1 - 1e-9))
         found = integrator.step(now, length)
         if isinstance(found, str):
-            dt = length / 2
+            dt, failed = length / 2, True
             if dt < 1e-6 * steps.first:
                 raise TimeStopped(f"the time step has become too small: {found}", now)
             continue
@@ -66,5 +67,8 @@ def advance(integrator: Integrator, now: Motion, end: float, steps: TimeSteps, d
                 dt = max(0.3, change) * length
                 continue
             dt = length * min(change, 2.0) if change > 1.3 else max(length, dt if change > 1 else 0.0)
+        elif not failed:
+            dt = max(dt, 2 * length)
+        failed = False
         now = found
     return replace(now, t=end), dt

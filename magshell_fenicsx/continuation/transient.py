@@ -26,6 +26,7 @@ STALLED = 1e-7  # steps below this that shrink no more are rounding
 MOST = 20  # iterations
 SLOW = 0.2  # new factors if a step is longer than this part of the one before
 SMOOTH = 1e-2  # error of the last step up to which the acceleration predicts the next: in stiff motions it alternates
+ROUNDING = 1e-8  # changes of the acceleration times the square of the time step, from iterations that end at TOLERANCE
 OTHER = 0.05  # relative change of the time step after which factors are renewed
 GAUSS = ((0.5 - np.sqrt(1 / 12), 0.5), (0.5 + np.sqrt(1 / 12), 0.5))  # exact for the membrane's energy, of degree 4
 Array = NDArray[np.float64]
@@ -39,9 +40,12 @@ class Viscous(Protocol):
     ----------
     memory
         What they remember of the steps to u0; `accept` replaces it.
+    slowness
+        Longest time in which they let a displacement creep to its end, so that errors of steps add up.
     """
 
     memory: Any
+    slowness: float
 
     def force(self, u0: Vector, u1: Vector, v: Vector, part: float, dt: float) -> Vector:
         """The force at a part of the step from u0 to u1, with the velocity v there; zero at supports."""
@@ -49,8 +53,14 @@ class Viscous(Protocol):
     def stiffness(self, dt: float, rate: float) -> float:
         """Its derivative by u1, in parts of the tangent; dv/du at the end is `rate`."""
 
+    def begin(self) -> None:
+        """A motion begins, or a load has a corner."""
+
     def accept(self, u0: Vector, u1: Vector, dt: float) -> Vector:
         """Go on from u1; the latest force."""
+
+    def doubt(self, u0: Vector, u1: Vector, dt: float) -> Vector | None:
+        """The force at u1 of which an estimate of the error is made; None without an estimate."""
 
 
 class Ground(Protocol):
@@ -174,8 +184,10 @@ class Integrator:
         a = -inverse(r)
         if self.device:
             a, mu = held_back(self.system, self.device, inverse, Motion(t, u, v, a, mu))
-        memory = before.memory if before else self.viscous and self.viscous.memory
-        now = Motion(t, u, v, a, mu, work, dissipated, memory=memory)
+        if self.viscous:
+            self.viscous.memory = before.memory if before else self.viscous.memory
+            self.viscous.begin()
+        now = Motion(t, u, v, a, mu, work, dissipated, memory=self.viscous and self.viscous.memory)
         return replace(now, potentials=self._potentials(now, False))
 
     def _inverse_mass(self) -> Callable[[Vector], Vector]:
@@ -313,13 +325,30 @@ class Integrator:
             lost = self.drag * dot(comm, along, self.ground.times(w))
         else:
             lost = self.drag * dot(comm, moved, self._times(w)) if self.drag else 0.0
+        error = self._error(now, after, dt)
         if self.viscous:
             lost += dot(comm, moved, self.viscous.accept(now.u, u, dt))
-        error = abs(rule.beta - 1 / 6) * dt**2 * max_abs(comm, a - now.a) / self.system.length
         memory, dissipated = self.viscous and self.viscous.memory, now.dissipated + lost
         return replace(
             after, work=now.work + work, dissipated=dissipated, potentials=potentials, error=error, memory=memory
         )
+
+    def _error(self, now: Motion, after: Motion, dt: float) -> float:
+        """Estimated error of a step, over the system's length."""
+        comm, of = self.system.comm, self.system.length
+        change = max_abs(comm, after.a - now.a)
+        error = abs(self.rule.beta - 1 / 6) * dt**2 * change / of
+        if self.viscous is None:
+            return error
+        if self.viscous.slowness > dt and dt**2 * change > ROUNDING * of:  # errors add up in the motion's own time
+            most = max(max_abs(comm, after.a), change)
+            error *= max(1.0, min(self.viscous.slowness, max_abs(comm, after.v) / max(most, 1e-300)) / dt)
+        doubt = self.viscous.doubt(now.u, after.u, dt)
+        if doubt is not None:
+            whole = self.device.padded(doubt) if self.device else doubt
+            d = self.factorisation.solve((1 - self.rule.alpha_f) * whole)
+            error = max(error, max_abs(comm, split(d, len(self._free), comm)[0]) / of)
+        return error
 
     def _potentials(self, now: Motion, before: bool) -> dict[str, float]:
         """dPi/dmu of the loads; of supports that move with the forces of inertia and drag."""

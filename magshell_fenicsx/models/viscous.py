@@ -37,6 +37,23 @@ class Branch:
 
 
 @dataclass(frozen=True)
+class Memory:
+    """What a step leaves.
+
+    Attributes
+    ----------
+    strains
+        q of each branch, (cells, places, 12).
+    rate, dt
+        Mean rate of the strain along the step and its length; None where the motion begins or turns a corner.
+    """
+
+    strains: list[Array]
+    rate: Array | None = None
+    dt: float = 0.0
+
+
+@dataclass(frozen=True)
 class Edge:
     """Edges that hold the normal, or lie on a mirror plane.
 
@@ -101,7 +118,9 @@ class Viscosity:
     Attributes
     ----------
     memory
-        q of each branch, (cells, places, 12).
+        Of the steps so far.
+    slowness
+        `kelvin`.
     """
 
     def __init__(
@@ -112,7 +131,7 @@ class Viscosity:
         kelvin: float,
         branches: Sequence[Branch],
     ) -> None:
-        self._model, self._mu, self._kelvin, self._branches = model, dict(mu), kelvin, branches
+        self._model, self._mu, self._branches, self.slowness = model, dict(mu), branches, kelvin
         V, Q, self._jets = model.V, surface.stresses, surface.tables
         self._frame = TangentFrame.of(self._jets(model.r0.x.array))
         self._field, self._places = fem.Function(Q, name="viscous"), Q.dofmap.list
@@ -120,39 +139,70 @@ class Viscosity:
         works = _works(model, surface, self._given)
         gradients = [ufl.derivative(surface.whole * work, model.u, ufl.TestFunction(V)) for work in works]
         self._forms = [model.kernels.compile(f"viscous residual {i}", form) for i, form in enumerate(gradients)]
-        self.memory = [np.zeros((*self._places.shape, SIZE)) for _ in branches]
-        self._known: tuple[Vector, Array] | None = None
+        self.memory = Memory([np.zeros((*self._places.shape, SIZE)) for _ in branches])
+        self._first = self._last = np.empty(0), np.empty(0)  # displacements and their strains
         self._force = np.zeros(model.system.size)
 
     def force(self, u0: Vector, u1: Vector, v: Vector, part: float, dt: float) -> Vector:
         """The forces at a part of the step from u0 to u1, with the velocity v there."""
         at = u0 + part * (u1 - u0)
-        stress = self._kelvin * self._rate(at, v) if self._kelvin else 0.0
-        for branch, q in zip(self._branches, self.memory, strict=True):
-            stress = stress + branch.modulus * (part * self._evolved(branch, q, u0, u1, dt) + (1 - part) * q)
-        self._field.x.array.reshape(-1, SIZE)[self._places] = stress
-        given, system = self._given, self._model.system
-        given.stiffness.value = self.stiffness(dt, 2 / dt) if dt else 0.0
-        for field, displacement in ((given.before, u0), (given.after, at)):
-            field.x.array[:] = system.with_ghosts(displacement, self._mu)
-        self._force = self._model.system.gradient_of(at, self._mu, self._forms)
+        stress = self.slowness * self._rate(at, v) if self.slowness else np.zeros((*self._places.shape, SIZE))
+        if self._branches:
+            for branch, q, end in zip(self._branches, self.memory.strains, self._evolved(u0, u1, dt), strict=True):
+                stress += branch.modulus * (part * end + (1 - part) * q)
+        self._force = self._forces(stress, u0, at, self.stiffness(dt, 2 / dt) if dt else 0.0)
         return self._force
 
     def stiffness(self, dt: float, rate: float) -> float:
         """What a step adds to the elastic tangent, in parts of it; `rate` is dv/du at its end."""
-        return self._kelvin * rate + sum(b.modulus * _share(b, dt) for b in self._branches)
+        return self.slowness * rate + sum(b.modulus * (_share(b, dt) + self._bend(b, dt) / dt) for b in self._branches)
+
+    def begin(self) -> None:
+        """A motion begins or turns a corner: the rate of strain before it says nothing about the next step."""
+        self.memory = Memory(self.memory.strains)
 
     def accept(self, u0: Vector, u1: Vector, dt: float) -> Vector:
         """Go on from u1; the force that the step was solved with."""
-        self.memory = [self._evolved(b, q, u0, u1, dt) for b, q in zip(self._branches, self.memory, strict=True)]
+        if self._branches:
+            self.memory = Memory(self._evolved(u0, u1, dt), self._change(u0, u1) / dt, dt)
         return self._force
 
-    def _evolved(self, branch: Branch, q: Array, u0: Vector, u1: Vector, dt: float) -> Array:
-        """q at the end of a step along which the strain grows evenly."""
-        if self._known is None or self._known[0] is not u0:
-            self._known = u0, self._strain(u0)
-        change = self._strain(u1) - self._known[1]
-        return np.asarray(np.exp(-dt / branch.time) * q + _share(branch, dt) * change)
+    def doubt(self, u0: Vector, u1: Vector, dt: float) -> Vector | None:
+        """The force at the end by which the curvature of the strain in time counts; None if nothing does."""
+        rate = self.memory.rate
+        if rate is None:
+            return None
+        bend = self._change(u0, u1) / dt - rate
+        return self._forces(sum(b.modulus * self._bend(b, dt) for b in self._branches) * bend, u1, u1, 0.0)
+
+    def _forces(self, stress: Array, u0: Vector, u1: Vector, stiffness: float) -> Vector:
+        """Of a stress at nodes, and of edges that open from u0 to u1."""
+        given, system = self._given, self._model.system
+        self._field.x.array.reshape(-1, SIZE)[self._places] = stress
+        given.stiffness.value = stiffness
+        for field, displacement in ((given.before, u0), (given.after, u1)):
+            field.x.array[:] = system.with_ghosts(displacement, self._mu)
+        return system.gradient_of(u1, self._mu, self._forms)
+
+    def _evolved(self, u0: Vector, u1: Vector, dt: float) -> list[Array]:
+        """q at the end of a step, its strain quadratic in time through the end of the step before and both of its own."""
+        change, rate = self._change(u0, u1), self.memory.rate
+        bend = 0.0 if rate is None else change / dt - rate
+        return [
+            np.asarray(np.exp(-dt / b.time) * q + _share(b, dt) * change + self._bend(b, dt) * bend)
+            for b, q in zip(self._branches, self.memory.strains, strict=True)
+        ]
+
+    def _bend(self, branch: Branch, dt: float) -> float:
+        """What a change of the mean rate from the step before to this one leaves in the spring."""
+        return 0.0 if self.memory.rate is None else _bent(dt / branch.time) * dt * 2 * dt / (dt + self.memory.dt)
+
+    def _change(self, u0: Vector, u1: Vector) -> Array:
+        if self._first[0] is not u0:
+            self._first = self._last if self._last[0] is u0 else (u0, self._strain(u0))
+        if self._last[0] is not u1:
+            self._last = u1, self._strain(u1)
+        return self._last[1] - self._first[1]
 
     def _rate(self, u: Vector, v: Vector) -> Array:
         size = max_abs(self._model.system.comm, v)
@@ -173,6 +223,13 @@ class Viscosity:
 def _share(branch: Branch, dt: float) -> float:
     """The part of a strain that grows evenly in a step and that is left in the spring at its end."""
     return float(-np.expm1(-dt / branch.time) * branch.time / dt) if dt else 1.0
+
+
+def _bent(z: float) -> float:
+    """The integral of exp(-z (1 - s)) (s - 1/2) over a step, 0 to 1."""
+    if z < 1e-2:
+        return z / 12 - z**2 / 24 + z**3 / 80
+    return float((1 + np.exp(-z)) / (2 * z) + np.expm1(-z) / z**2)
 
 
 @dataclass(frozen=True)
