@@ -79,6 +79,15 @@ class Factorisation:
             self.negative_pivots += self._edge.negative_pivots
 
     @property
+    def habit(self) -> int:
+        """-1 if CHOLMOD is tried first, else the number of successive matrices without a negative pivot."""
+        return -1 if self._definite else self._calm
+
+    @habit.setter
+    def habit(self, known: int) -> None:
+        self._definite, self._calm = self._has_cholmod and known < 0, max(known, 0)
+
+    @property
     def size(self) -> tuple[int, int]:
         """Rows of the matrix last factored: on this rank, and on all."""
         edge = self._edge.count if self._edge else 0

@@ -155,10 +155,14 @@ class Path:
 
     def recorded(self, find: Callable[[], Point | str]) -> Point | str:
         """The result of `find`, or the result of an interrupted run at this place in the journal."""
-        known = self._journal.replay()
+        known, factors = self._journal.replay(), self.newton.factorisation
         if known is not None:
+            if isinstance(known, Point):
+                factors.habit = known.habit
             return known
         found = find()
+        if isinstance(found, Point):
+            found = replace(found, habit=factors.habit)
         self._journal.record(found)
         return found
 

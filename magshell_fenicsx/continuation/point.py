@@ -27,6 +27,8 @@ class Point:
         Estimated error of u, over the system's length.
     load_error
         The estimated error of the amplitude of an instability.
+    habit
+        That of the factorisation after it, by which a resumed run goes on with the same rounding.
     """
 
     state: State
@@ -39,6 +41,7 @@ class Point:
     factorisations: int = 0
     error: float = 0.0
     load_error: float = 0.0
+    habit: int = -1
 
     def per(self, rate: float) -> "Point":
         """The point with its tangent divided by `rate`."""

@@ -108,6 +108,16 @@ class Rule:
         return cls(m, f, (1 - m + f) ** 2 / 4, 0.5 - m + f, at)
 
 
+@dataclass(frozen=True)
+class Factored:
+    """What the latest factors belong to: a displacement, amplitudes, a time step; and the habit that chose the method."""
+
+    u: Vector
+    mu: dict[str, float]
+    dt: float
+    habit: int
+
+
 class Integrator:
     """Makes steps in time; factors are kept while they serve.
 
@@ -132,6 +142,8 @@ class Integrator:
     ----------
     steps, iterations
         Work so far.
+    factored
+        What the latest factors belong to; None if the next step makes new ones.
     """
 
     def __init__(
@@ -154,7 +166,7 @@ class Integrator:
         self.factorisation = Factorisation(system.comm)
         self.steps = self.iterations = 0
         self._K: PETSc.Mat | None = None
-        self._factored = 0.0  # the time step of the latest factors
+        self.factored: Factored | None = None
         self._x, self._y = mass.createVecs()
         # the turns of edges under moments, whose work is counted on
         self._counted: Callable[[State, Amplitudes], State] = getattr(system, "counted", lambda state, before: state)
@@ -228,7 +240,7 @@ class Integrator:
         y = self.device.unknowns(now.mu) if self.device else np.empty(0)
         pull = self._pull(now, dt)
         last, fresh = np.inf, False
-        if abs(dt - self._factored) > OTHER * dt:
+        if self.factored is None or abs(dt - self.factored.dt) > OTHER * dt:
             self._factor(now, u, y, dt)
             fresh = True
         for _ in range(MOST):
@@ -250,7 +262,7 @@ class Integrator:
                 self._factor(now, u, y, dt)
                 fresh = True
             last = size
-        self._factored = 0.0
+        self.factored = None
         return "Newton's method does not converge"
 
     def _pull(self, now: Motion, dt: float) -> Vector:
@@ -292,8 +304,14 @@ class Integrator:
 
     def _factor(self, now: Motion, u: Vector, y: Array, dt: float) -> None:
         """Factor the derivative of `_unbalanced` by u and y, with one tangent for all parts of the step."""
-        rule, part = self.rule, 1 - self.rule.alpha_f
+        part = 1 - self.rule.alpha_f
         here, mu = now.u + part * (u - now.u), self._at(now, y, part, dt)
+        self.factor(Factored(here, mu, dt, self.factorisation.habit))
+
+    def factor(self, at: Factored) -> None:
+        """Make these factors."""
+        self.factorisation.habit = at.habit
+        rule, part, here, mu, dt = self.rule, 1 - self.rule.alpha_f, at.u, at.mu, at.dt
         tangent = self.system.tangent(here, mu)
         assert not isinstance(tangent, Edged)
         K = tangent.K if isinstance(tangent, Skewed) else tangent
@@ -310,7 +328,7 @@ class Integrator:
             self.factorisation.factor(Edged(whole, [part * c for c in C], part * D, self.device.multipliers))
         else:
             self.factorisation.factor(whole)
-        self._factored = dt
+        self.factored = at
 
     def _accepted(self, now: Motion, u: Vector, y: Array, dt: float) -> Motion:
         comm, rule, t = self.system.comm, self.rule, now.t + dt

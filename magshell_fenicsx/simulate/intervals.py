@@ -1,7 +1,7 @@
 """The rows of a motion: its states at given times, from the journal where it has them."""
 
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import scipy
 
@@ -10,7 +10,7 @@ from magshell_fenicsx.continuation.device import Held
 from magshell_fenicsx.continuation.motion import Motion
 from magshell_fenicsx.continuation.point import Point
 from magshell_fenicsx.continuation.system import State
-from magshell_fenicsx.continuation.transient import Integrator
+from magshell_fenicsx.continuation.transient import Factored, Integrator
 from magshell_fenicsx.simulate.record import Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.stage import staged
@@ -35,6 +35,7 @@ class Intervals:
     held: Mapping[str, Held]
     steps: TimeSteps
     marks: Collection[float]
+    _last: Point | None = field(default=None, init=False)  # of the journal, what the factors belonged to
 
     def moved(self, now: Motion, dt: float, end: float) -> tuple[Motion, float]:
         """The motion at a later time, and the step to go on with."""
@@ -55,16 +56,24 @@ class Intervals:
         return max(found, now.t + close)
 
     def journalled(self, now: Motion, dt: float, end: float) -> tuple[Motion, float, Point]:
-        """The motion at a later time, the step to go on with, and the point there; in the journal as two points."""
+        """The motion at a later time, the step to go on with, and the point there.
+
+        In the journal these are three points: the motion, what it needs besides, and what the latest factors belong to.
+        """
         scene, integrator = self.scene, self.integrator
-        first, second = scene.journal.replay(), None
-        if isinstance(first, Point):
-            second = scene.journal.replay()
+        known = list[Point]()
+        while len(known) < 3 and isinstance(part := scene.journal.replay(), Point):
+            known.append(part)
         again = integrator.viscous is not None  # the journal has no place for a branch's strains: computed again
-        if isinstance(first, Point) and isinstance(second, Point) and not again:
+        if len(known) == 3 and not again:
+            first, second, self._last = known
+            scene.newton.factorisation.habit = first.habit
             mu, potentials = dict(first.state.mu), dict(second.state.mu)
             u, v, a = first.state.u, first.du, second.state.u
             return Motion(first.s, u, v, a, mu, second.s, second.dmu, potentials, second.error), first.dmu, first
+        if self._last:
+            self._refactor(self._last)
+            self._last = None
         before = integrator.steps, integrator.iterations, integrator.factorisation.count
         scene.progress.trying(Point(State(now.u, now.mu), now.t, now.v, 0.0, 0, 0), end - now.t)
         try:
@@ -75,9 +84,18 @@ class Intervals:
         state = scene.model.system.placed(State(now.u, now.mu))
         stage = staged(scene, state, self.held)
         pivots = stage.newton.factor_at(stage.enter(state)).negative_pivots
-        point = Point(state, now.t, now.v, dt, pivots, pivots, *spent)
-        rest = Point(State(now.a, now.potentials), now.work, 0.0 * now.a, now.dissipated, 0, 0, error=now.error)
-        for known, part in ((first, point), (second, rest)):
-            if known is None:
-                scene.journal.record(part)
+        still = 0.0 * now.a
+        point = Point(state, now.t, now.v, dt, pivots, pivots, *spent, habit=scene.newton.factorisation.habit)
+        rest = Point(State(now.a, now.potentials), now.work, still, now.dissipated, 0, 0, error=now.error)
+        made = integrator.factored or Factored(still, {}, 0.0, integrator.factorisation.habit)
+        factors = Point(State(made.u, made.mu), made.dt, still, 0.0, 0, 0, habit=made.habit)
+        for part in (point, rest, factors)[len(known) :]:
+            scene.journal.record(part)
         return now, dt, point
+
+    def _refactor(self, last: Point) -> None:
+        """The factors that the run had kept: others end its iterations elsewhere, within their tolerance."""
+        if last.s:
+            self.integrator.factor(Factored(last.state.u, dict(last.state.mu), last.s, last.habit))
+        else:
+            self.integrator.factorisation.habit = last.habit
