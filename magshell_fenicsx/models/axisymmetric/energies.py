@@ -174,7 +174,7 @@ class EnergyFactory:
         """As that of `shell.terms`; the integrals are of the whole shell."""
         rule, approach = CONTACT * self.degree, self.free.setdefault(contact.amplitude, self.constant(0.0))
         known = Pressing(contact, self.material.h, self.r0, u, approach, rule, self.thickness)
-        j0, parameters = self.j0, (known.polynomial, self.constant(known.motion), approach)
+        j0, parameters = self.j0, known.parameters
         dx = ufl.Measure("dx", domain=self.meridian.mesh, metadata={"quadrature_degree": rule})
 
         def over(of: Callable[..., Expr]) -> Callable[[Jet], ufl.Form]:

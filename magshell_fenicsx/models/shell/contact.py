@@ -25,6 +25,7 @@ Distance = Callable[[Array], tuple[Array, Array, Array]]  # places (n, 3) over R
 SOFT = 1e-3  # of h: the penalty's stiffness grows from zero over this penetration
 PAIRS = np.triu_indices(3)
 SIZE = 3 + 1 + 3 + 6  # y*, psi*, its gradient, its Hessian by pairs i <= j
+FACE = 1 + 1 + 3  # t*, the derivative of psi* by the thickness factor t, and that of its gradient
 PRESSED = 1e-3  # of the largest pressure: less does not count as contact
 
 
@@ -52,6 +53,9 @@ class Contact:
         Whether the case gives its stiffness, which then stays.
     size
         Radius over R of what touches, such as a ball's; infinite for a plane.
+    start, lift
+        Of a body that starts at the shell's face: the place (3,) of the mid-surface there, and from it to the face;
+        None of one with a position of its own.
     """
 
     body: str
@@ -63,6 +67,8 @@ class Contact:
     bound: float
     size: float
     given: bool = False
+    start: Array | None = None
+    lift: Array | None = None
 
     def gap(self, x: Array, approach: float, half: float | Array) -> tuple[Array, Array, Array]:
         """The gap at places (n, 3) with its gradient and Hessian; `approach` and half the thickness over R."""
@@ -90,15 +96,22 @@ def penalty(s: Array, k: float, soft: float) -> tuple[Array, Array, Array]:
     return value, first, second
 
 
-def contact_energy(r0: Jet, u: Jet, P: Expr, motion: Expr, approach: Expr) -> Expr:
-    """psi per undeformed area from its polynomial P (`SIZE`,); `motion` is d for an approach of one."""
+def contact_energy(r0: Jet, u: Jet, P: Expr, motion: Expr, approach: Expr, *face: Expr) -> Expr:
+    """psi per undeformed area from its polynomial P (`SIZE`,); `motion` is d for an approach of one.
+
+    Where the thickness varies, its factor (1,) and what psi changes by with it (`FACE`,) are given too.
+    """
     s = _moved(u, P, motion, approach)
     pairs = enumerate(zip(*PAIRS, strict=True))
     second = sum(P[7 + n] * s[int(i)] * s[int(j)] for n, (i, j) in pairs)
-    return P[3] + ufl.dot(_gradient(P), s) + second
+    psi = P[3] + ufl.dot(_gradient(P), s) + second
+    if not face:
+        return psi
+    t, F = face
+    return psi + (t[0] - F[0]) * (F[1] + ufl.dot(ufl.as_vector([F[2 + i] for i in range(3)]), s))
 
 
-def contact_pressure(r0: Jet, u: Jet, P: Expr, motion: Expr, approach: Expr) -> Expr:
+def contact_pressure(r0: Jet, u: Jet, P: Expr, motion: Expr, approach: Expr, *face: Expr) -> Expr:
     """The pressure on the shell per undeformed area, at the state of P."""
     return ufl.sqrt(ufl.dot(_gradient(P), _gradient(P)))
 
@@ -106,7 +119,7 @@ def contact_pressure(r0: Jet, u: Jet, P: Expr, motion: Expr, approach: Expr) -> 
 def pressed_radius(front: Expr, along: Expr) -> Callable[..., Expr]:
     """The pressure times the distance from the axis of the approach."""
 
-    def density(r0: Jet, u: Jet, P: Expr, motion: Expr, approach: Expr) -> Expr:
+    def density(r0: Jet, u: Jet, P: Expr, motion: Expr, approach: Expr, *face: Expr) -> Expr:
         x = r0.r + u.r - front
         off = x - ufl.dot(x, along) * along
         return contact_pressure(r0, u, P, motion, approach) * ufl.sqrt(ufl.dot(off, off))
@@ -158,8 +171,10 @@ class Pressing:
 
     Attributes
     ----------
+    parameters
+        Those of the densities.
     polynomial
-        The parameter of the densities.
+        The first of them.
     stiffness
         That of the present state.
     """
@@ -179,8 +194,10 @@ class Pressing:
         self.polynomial = PointField(V.mesh, degree, SIZE)
         self._points, self._degree = self.polynomial.points, degree
         self._placement, self._r0 = r0, at_quadrature(r0, self._points)
-        factor = 1.0 if thickness is None else at_quadrature(thickness, self._points)[..., 0].ravel()
-        self._half = h / 2 * factor
+        self._factor = 1.0 if thickness is None else at_quadrature(thickness, self._points)[..., 0].ravel()
+        self._face = None if thickness is None else PointField(V.mesh, degree, FACE)
+        motion = fem.Constant(V.mesh, h * contact.direction)
+        self.parameters = (self.polynomial, motion, approach, *(() if self._face is None else (thickness, self._face)))
         self._owned = V.mesh.topology.index_map(V.mesh.topology.dim).size_local
         self._known: Array = np.empty(0)
         self.stiffness = fem.Constant(V.mesh, contact.stiffness)
@@ -205,7 +222,7 @@ class Pressing:
             return
         self._seen = u.copy(), approach, k
         self._known = y = at_quadrature(self._u, self._points) - approach * self.motion
-        self.gap, n, N = self.contact.gap((self._r0 + y).reshape(-1, 3), 0.0, self._half)
+        self.gap, n, N = self.contact.gap((self._r0 + y).reshape(-1, 3), 0.0, self._h / 2 * self._factor)
         pressed = self.gap < 0  # few of the points
         value, first, second = (a[:, None] for a in penalty(-self.gap[pressed], k, SOFT * self._h))
         n, N = n[pressed], N[pressed]
@@ -215,6 +232,11 @@ class Pressing:
         flat[..., :3] = y
         flat.reshape(-1, SIZE)[pressed, 3:] = np.concatenate([value, -first * n, pairs], axis=1)
         self.polynomial.renew(flat)
+        if self._face is not None:
+            by_t = np.zeros((len(self.gap), FACE))
+            by_t[:, 0] = self._factor
+            by_t[pressed, 1:] = self._h / 2 * np.concatenate([first, -second * n], axis=1)
+            self._face.renew(by_t.reshape(*y.shape[:2], FACE))
 
     def renew_place(self) -> None:
         """Take the placement anew."""

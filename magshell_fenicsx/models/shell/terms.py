@@ -180,7 +180,7 @@ class TermFactory:
         """The energy of a body, what it knows of it, and the integrals of its pressure and of that times its radius."""
         rule, approach = contact_quadrature(self.degree), self.free.setdefault(contact.amplitude, self._constant(0.0))
         known = Pressing(contact, self.material.h, self.r0, self.u, approach, rule, self.thickness)
-        parameters = (known.polynomial, self._constant(known.motion), approach)
+        parameters = known.parameters
         density = Density(per_area(contact_energy), parameters, ("r",), quadrature=rule)
         term = self._cells(f"contact {contact.body}", density, follow=known.follow)
         arguments, dx = (*self.jets(), *parameters), self.dx(rule)

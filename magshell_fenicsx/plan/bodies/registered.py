@@ -90,6 +90,7 @@ def _contact(case: Case, perfect: Outline, drawn: Outline, turn: float, name: st
         section.penetration,
         size,
         section.stiffness is not None,
+        *((Q @ here, placed.front - Q @ here) if section.position is None else ()),
     )
     depth = -least_gap(found, drawn, Q, half)
     if depth > WITHIN * h:

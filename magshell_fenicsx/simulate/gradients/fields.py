@@ -6,9 +6,10 @@ the perfect one. By a deviation what is attached to the material (remanence, thi
 with it, and the triangulation stays.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
+import basix
 import numpy as np
 from dolfinx import fem
 from numpy.typing import NDArray
@@ -25,6 +26,7 @@ from magshell_fenicsx.models.shell import patterns
 from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.shell.natural import Natural
 from magshell_fenicsx.models.shell.patterns import Uniform
+from magshell_fenicsx.models.shell.slopes import Slope
 from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.models.solid import remanence as of_body
 from magshell_fenicsx.models.solid.model import SolidModel
@@ -82,7 +84,10 @@ def by_field(adjoint: Adjoint, name: str) -> FieldGradient:
         shares += _of_parameters(scene, place, name)
         if not number:
             shares += [Share(t, c * factor_of(t.amplitude, place.state.mu), 0.0) for t, c in along(scene, adjoint)]
-        parts.append(summed(shares, f, model.u, _contracted(scene, place), model.kernels))
+        w = _contracted(scene, place)
+        parts.append(summed(shares, f, model.u, w, model.kernels))
+        if name == "thickness":
+            parts.append(_of_starts(scene, shares, f, w))
     assert f
     forces = np.sum(parts, axis=0)
     places, normals = (v[: len(forces)] for v in places_of(scene, f))
@@ -111,10 +116,61 @@ def _of_parameters(scene: Scene, place: Place, name: str) -> list[Share]:
     system, c, found = scene.model.system, place.conjugates, list[Share]()
     for each in c.keys() & system.parameters.keys():
         for slope in system.parameters[each].slopes:
+            if isinstance(slope, Slope) and not slope.density.on_edges:
+                slope = _as_form(scene, slope)
             if not isinstance(slope, FormTerm):
                 raise CaseError(f"{name}: the conjugate of {each} has no gradient by this field")
             found.append(Share(slope, c[each] * factor_of(slope.amplitude, place.state.mu), 0.0))
     return found
+
+
+def _as_form(scene: Scene, slope: Slope) -> FormTerm:
+    """A derivative at points as a form."""
+    assert isinstance(scene.model, ShellModel)
+    factory, density = scene.model.factory, slope.density
+    energy = density.of(*factory.jets(), *density.parameters) * factory.dx(density.quadrature)
+    return FormTerm(slope.name, energy, scene.model.u, scene.model.kernels, slope.amplitude)
+
+
+def _of_starts(scene: Scene, shares: Sequence[Share], f: fem.Function, w: fem.Function) -> Array:
+    """By the thickness at the places where bodies start from the shell's face, which lifts them; collective.
+
+    To lift a body is to lower the whole shell for this body alone.
+    """
+    model, domain = scene.model, f.function_space.mesh
+    axes = [0, 2] if isinstance(model, MeridianModel) else [0, 1, 2]
+    found = np.zeros(
+        (domain.topology.index_map(domain.topology.dim).size_local, f.function_space.element.space_dimension)
+    )
+    for contact in scene.plan.loads.contacts:
+        if contact.start is None or contact.lift is None:
+            continue
+        of_body = [share for share in shares if share.term.name.startswith(f"contact {contact.body}")]
+        forces = domain.comm.allreduce(summed(of_body, model.u, model.u, w, model.kernels).sum(axis=(0, 1)))
+        if (there := _basis_at(model, f, contact.start[axes])) is not None:
+            found[there[0]] -= float(forces @ contact.lift[axes]) * there[1]
+    return found[..., None]
+
+
+def _basis_at(model: ShellModel | MeridianModel, f: fem.Function, x: Array) -> tuple[int, Array] | None:
+    """The cell of a place of the surface and its basis functions' values there; None on other ranks; collective.
+
+    In the cell it is the nearest place on the plane of the corners.
+    """
+    element, nodes = f.function_space.element.basix_element, model.V.element.basix_element.points
+    corners = [int(np.abs(nodes - corner).sum(axis=1).argmin()) for corner in basix.geometry(element.cell_type)]
+    topology, comm = f.function_space.mesh.topology, f.function_space.mesh.comm
+    cells = model.V.dofmap.list[: topology.index_map(topology.dim).size_local, corners]
+    first, *others = np.moveaxis(model.r0.x.array.reshape(-1, len(x))[cells], 1, 0)
+    sides = np.stack([other - first for other in others], axis=-1)  # (cells, components, dimension)
+    at = np.einsum("cdi,ci->cd", np.linalg.pinv(sides), x - first)
+    beyond = np.maximum(0.0, np.maximum(-at.min(axis=1), at.sum(axis=1) - 1))
+    far = beyond + np.linalg.norm(np.einsum("cid,cd->ci", sides, at) - (x - first), axis=1)
+    least = comm.allgather(float(far.min(initial=np.inf)))
+    if comm.rank != int(np.argmin(least)):
+        return None
+    nearest = int(far.argmin())
+    return nearest, element.tabulate(0, at[nearest][None])[0, 0, :, 0]
 
 
 def _contracted(scene: Scene, place: Place) -> fem.Function:
