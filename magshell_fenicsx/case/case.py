@@ -1,6 +1,7 @@
 """The whole case: its sections and what they must have in common."""
 
 from collections.abc import Iterable, Mapping, Sequence
+from copy import deepcopy
 from functools import cached_property
 from math import pi, radians
 from pathlib import Path
@@ -45,6 +46,7 @@ from magshell_fenicsx.case.surfaces import CapSurface, MeshSurface, RevolutionSu
 from magshell_fenicsx.case.targets import NOTED
 from magshell_fenicsx.case.viscosity import refuse_unfit_viscosity
 from magshell_fenicsx.parts.chosen import Chosen
+from magshell_fenicsx.parts.own import Origin
 from magshell_fenicsx.parts.part import Part, Scales
 from magshell_fenicsx.parts.registered import PARTS, WithParts
 from magshell_fenicsx.parts.section import texts
@@ -354,6 +356,7 @@ class Case(WithParts):
         """Validate plain data; see `load`."""
         try:
             context = {"folder": source.folder, "files": source.files}
-            return cls.model_validate(source.data, context=context).written_at(source.place)
+            case = cls.model_validate(source.data, context=context)
+            return case.written_as(Origin(source.place, deepcopy(source.data), context))
         except ValidationError as e:
             raise CaseError(explained(e.errors(), source, cls)) from None

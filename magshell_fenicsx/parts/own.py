@@ -4,7 +4,7 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 from pydantic import PrivateAttr
 
@@ -14,9 +14,19 @@ from magshell_fenicsx.parts.section import Section
 
 @dataclass(frozen=True)
 class Origin:
-    """Where the keys of a case were written; equal cases may come from different files."""
+    """Where the keys of a case were written, and what; equal cases may come from different files.
+
+    Attributes
+    ----------
+    data
+        Of `Source`; None without one.
+    context
+        With which these are validated: their folder and the files that were read.
+    """
 
     place: Callable[[tuple[str | int, ...]], str] | None = field(default=None, compare=False)
+    data: dict[str, Any] | None = field(default=None, compare=False, repr=False)
+    context: dict[str, Any] = field(default_factory=dict, compare=False, repr=False)
 
 
 class WithOwnTerms(Section):
@@ -25,10 +35,15 @@ class WithOwnTerms(Section):
     _own_terms: tuple[OwnTerm, ...] = PrivateAttr(default=())
     _origin: Origin = PrivateAttr(default=Origin())
 
-    def written_at(self, place: Callable[[tuple[str | int, ...]], str]) -> Self:
+    def written_as(self, origin: Origin) -> Self:
         """The case, with the places of its keys for messages that it does not make itself."""
-        self._origin = Origin(place)
+        self._origin = origin
         return self
+
+    @property
+    def origin(self) -> Origin:
+        """Where and how it was written."""
+        return self._origin
 
     @property
     def file_name(self) -> str:

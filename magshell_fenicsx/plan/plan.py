@@ -42,6 +42,8 @@ class Span:
         The largest of the meridian over 1/R, at least 1.
     largest
         Size of cells that shows the imperfections.
+    vertices
+        Those of its mesh, if that is given.
     """
 
     length: float
@@ -52,6 +54,7 @@ class Span:
     place: Callable[[NDArray[np.float64]], tuple[float, float]]
     curvature: float = 1.0
     largest: float = inf
+    vertices: NDArray[np.float64] | None = None
 
     def sample(self) -> NDArray[np.float64]:
         """Places (n, 3) along it, its ends among them."""

@@ -185,6 +185,8 @@ def meridian_vertices(plan: Plan, refinement: float) -> Array:
     """Vertices of the meridian's mesh, in the chart."""
     span = plan.meridian
     assert span
+    if span.vertices is not None:
+        return span.vertices
     pole = span.names[0] is None
     h = plan.material.h / span.curvature
     reach = max((one[1] for one in plan.pressed), default=0.0)

@@ -203,6 +203,7 @@ class Pressing:
         self.stiffness = fem.Constant(V.mesh, contact.stiffness)
         self._seen: tuple[Array, float, float] = np.empty(0), 0.0, 0.0  # displacement, approach and stiffness
         self.gap: Array = np.empty(0)
+        self._about: Array | None = None
         self.follow()
 
     @property
@@ -223,8 +224,12 @@ class Pressing:
         self._seen = u.copy(), approach, k
         self._known = y = at_quadrature(self._u, self._points) - approach * self.motion
         self.gap, n, N = self.contact.gap((self._r0 + y).reshape(-1, 3), 0.0, self._h / 2 * self._factor)
-        pressed = self.gap < 0  # few of the points
-        value, first, second = (a[:, None] for a in penalty(-self.gap[pressed], k, SOFT * self._h))
+        about = self.gap if self._about is None else self._about
+        pressed = about < 0  # few of the points
+        value, first, second = (a[:, None] for a in penalty(-about[pressed], k, SOFT * self._h))
+        if self._about is not None:
+            more = (about - self.gap)[pressed, None]
+            value, first = value + more * (first + more / 2 * second), first + more * second
         n, N = n[pressed], N[pressed]
         H = second[..., None] * n[:, :, None] * n[:, None, :] - first[..., None] * N
         pairs = H[:, *PAIRS] * np.where(PAIRS[0] == PAIRS[1], 0.5, 1.0)
@@ -237,6 +242,13 @@ class Pressing:
             by_t[:, 0] = self._factor
             by_t[pressed, 1:] = self._h / 2 * np.concatenate([first, -second * n], axis=1)
             self._face.renew(by_t.reshape(*y.shape[:2], FACE))
+
+    def expand_about(self, other: "Pressing") -> None:
+        """Take in place of the penalty its Taylor polynomial about the present gap of the same contact elsewhere.
+
+        For differences by a number of the case: a body that is hard closes or opens within a far smaller way.
+        """
+        self._about, self._seen = other.gap, (np.empty(0), 0.0, 0.0)
 
     def renew_place(self) -> None:
         """Take the placement anew."""

@@ -102,6 +102,8 @@ class Adjoint:
         J.
     gas
         Whether a conjugate is that of a gas, whose law has numbers of the case.
+    free
+        The amplitude that J is; "" where it is given.
     scale
         Of the unit (`Quantity.scale`) that J is asked for in, as which `derivative` gives dJ/dp; "": it has none.
     """
@@ -113,6 +115,7 @@ class Adjoint:
     directions: Sequence[Direction] = ()
     value: float = 0.0
     gas: bool = False
+    free: str = ""
     scale: str = ""
 
     @property
@@ -154,7 +157,8 @@ def adjoint_of_instability(scene: Scene, record: Record, fold: Fold | None = Non
     rows = stage.device.rates(left) if stage.device else {}
     w = stage.device.displacement(left) if stage.device else left
     here = Place(stage.leave(fold.state), np.array(w), rows)
-    return Adjoint(scene, [here], value=fold.value, gas=with_gas(held_at(scene, record, record.point.state)))
+    gas = with_gas(held_at(scene, record, record.point.state))
+    return Adjoint(scene, [here], value=fold.value, gas=gas, free=fold.name)
 
 
 def _of_wave(scene: Scene, record: Record) -> Adjoint:
@@ -169,7 +173,7 @@ def _of_wave(scene: Scene, record: Record) -> Adjoint:
     rate = Q.by_mu[record.amplitude] + w @ system.load(state.u, state.mu, record.amplitude)
     value = state.mu[record.amplitude] - Q.value / rate  # what locating it has left, to second order
     along = Direction(phi, m, stiffness=float(-1 / rate))
-    return Adjoint(scene, [Place(state, -w / rate)], directions=[along], value=float(value))
+    return Adjoint(scene, [Place(state, -w / rate)], directions=[along], value=float(value), free=record.amplitude)
 
 
 def variation(model: MeridianModel, state: State, phi: Vector, m: int, names: Iterable[str]) -> Functional:

@@ -86,7 +86,7 @@ def by_field(adjoint: Adjoint, name: str) -> FieldGradient:
             shares += [Share(t, c * factor_of(t.amplitude, place.state.mu), 0.0) for t, c in along(scene, adjoint)]
         w = _contracted(scene, place)
         parts.append(summed(shares, f, model.u, w, model.kernels))
-        if name == "thickness":
+        if name == "thickness" and scene.plan.loads.contacts:
             parts.append(_of_starts(scene, shares, f, w))
     assert f
     forces = np.sum(parts, axis=0)
@@ -138,6 +138,7 @@ def _of_starts(scene: Scene, shares: Sequence[Share], f: fem.Function, w: fem.Fu
     To lift a body is to lower the whole shell for this body alone.
     """
     model, domain = scene.model, f.function_space.mesh
+    assert not isinstance(model, SolidModel)  # on which no bodies press
     axes = [0, 2] if isinstance(model, MeridianModel) else [0, 1, 2]
     found = np.zeros(
         (domain.topology.index_map(domain.topology.dim).size_local, f.function_space.element.space_dimension)

@@ -1,11 +1,13 @@
 """Derivatives by single numbers: an amplitude, or a key of the case."""
 
+from collections.abc import Callable
+
 from magshell_fenicsx.assembly.terms import factor_of
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.case.units import sizes_of
 from magshell_fenicsx.continuation.system import State, dot
 from magshell_fenicsx.simulate.gradients.adjoint import Adjoint, Place, along
-from magshell_fenicsx.simulate.numbers import carried, number_of, scene_with, with_number
+from magshell_fenicsx.simulate.numbers import carried, goals, number_of, scene_with, with_number
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.transfer import transfer
 
@@ -35,22 +37,38 @@ def by_number(adjoint: Adjoint, key: str) -> float:
     value = number_of(scene.case, key)
     if adjoint.gas and key.startswith("shell."):
         raise CaseError(f"{key}: has no derivative while a gas is held, whose law depends on it")
-    step = STEP * (abs(value) or 1.0)
 
     def contracted(p: float) -> float:
-        other = scene_with(scene, key, p)
-        states = [carried(scene, other, _moved(scene, other, place.state)) for place in adjoint.places]
-        states = [other.model.system.placed(state) for state in states]
-        total = sum(_at(scene, other, *each) for each in zip(adjoint.places, states, strict=True))
+        other, own = scene_with(scene, key, p), {adjoint.free, *adjoint.places[0].rows}
+        total = 0.0
+        for place in reversed(adjoint.places):  # the last one, whose state stays, is the first
+            state = carried(scene, other, _moved(scene, other, place.state), own)
+            state = other.model.system.placed(state)
+            _expand(scene, other, place.state)
+            total += _at(scene, other, place, state) + (0.0 if adjoint.by_itself else _own(other, place, state))
         if adjoint.by_itself:
-            total += adjoint.by_itself(other, states[0])
-        else:
-            total += sum(_own(other, *each) for each in zip(adjoint.places, states, strict=True))
-        other.model.system.at(states[0].u, states[0].mu)
-        energies = sum(c * factor_of(t.amplitude, states[0].mu) * t.energy() for t, c in along(other, adjoint))
+            total += adjoint.by_itself(other, state)
+        other.model.system.at(state.u, state.mu)
+        energies = sum(c * factor_of(t.amplitude, state.mu) * t.energy() for t, c in along(other, adjoint))
         return float(total + other.model.system.comm.allreduce(energies))
 
-    return (contracted(value + step) - contracted(value - step)) / (2 * step)
+    return _slope(contracted, value)
+
+
+def _slope(f: Callable[[float], float], value: float) -> float:
+    """df/dp at a value by a difference of second order, on the side where numbers are allowed."""
+    step, found, refused = STEP * (abs(value) or 1.0), dict[int, float](), list[CaseError]()
+    for way in (1, -1):
+        try:
+            found[way] = f(value + way * step)
+        except CaseError as e:
+            refused.append(e)
+    if len(found) == 2:
+        return (found[1] - found[-1]) / (2 * step)
+    if not found:
+        raise refused[0]
+    ((way, near),) = found.items()
+    return way * (4 * near - 3 * f(value) - f(value + 2 * way * step)) / (2 * step)
 
 
 def size_by_number(adjoint: Adjoint, key: str) -> float:
@@ -58,10 +76,15 @@ def size_by_number(adjoint: Adjoint, key: str) -> float:
     if not adjoint.scale:
         return 0.0
     case = adjoint.scene.case
-    value = number_of(case, key)
-    step = STEP * (abs(value) or 1.0)
-    low, high = (sizes_of(with_number(case, key, value + d)).of[adjoint.scale] for d in (-step, step))
-    return (high - low) / (2 * step)
+    return _slope(lambda p: sizes_of(with_number(case, key, p)).of[adjoint.scale], number_of(case, key))
+
+
+def _expand(scene: Scene, other: Scene, state: State) -> None:
+    """Take the penalties of bodies in another scene on the same mesh as polynomials about a state of the first one."""
+    if scene.model.contacts:
+        scene.model.system.at(state.u, state.mu)
+    for name, (pressing, _) in scene.model.contacts.items():
+        other.model.contacts[name][0].expand_about(pressing)
 
 
 def _moved(scene: Scene, other: Scene, state: State) -> State:
@@ -72,9 +95,10 @@ def _at(scene: Scene, other: Scene, place: Place, state: State) -> float:
     """The residual and the rows of a place in another scene; what is held stays the same number of its unit."""
     system, here = other.model.system, place.state
     found = dot(system.comm, transfer(scene, other, place.w), system.forces(state.u, state.mu))
+    targets = goals(scene, other, "conjugate")
     for name, c in place.rows.items():
         held = -scene.model.system.potential(here.u, here.mu, name)
-        unit = other.conjugate_unit(name) / scene.conjugate_unit(name)
+        unit = other.conjugate_unit(name) / scene.conjugate_unit(name) * targets.get(name, 1.0)
         found += c * (system.potential(state.u, state.mu, name) + unit * held)
     return float(found)
 
