@@ -7,6 +7,7 @@ import numpy as np
 from dolfinx import fem
 from numpy.typing import NDArray
 
+from magshell_fenicsx.assembly.lids import Pressed
 from magshell_fenicsx.assembly.motion import Motion, Pair, moved, turned
 
 Array = NDArray[np.float64]
@@ -50,9 +51,12 @@ class Moving:
     ----------
     r0
         The placement.
+    pressed
+        What a live pressure does at edges that move.
     """
 
-    def __init__(self, r0: fem.Function, bodies: Sequence[Body]) -> None:
+    def __init__(self, r0: fem.Function, bodies: Sequence[Body], pressed: Pressed | None = None) -> None:
+        self.pressed = pressed
         self._axes = list(PLANE[r0.function_space.dofmap.index_map_bs])
         self._r0, self._bodies = r0, bodies
         places = in_space(r0.x.array, len(self._axes))
@@ -84,6 +88,12 @@ class Moving:
         for body, places in self._with(name, other):
             found[body.dofs] = self._components(body, moved(body.motions, mu, places).twice[name, other])
         return found
+
+    def on_edges(self, u: Array) -> Array:
+        """Nodal forces of p = 1 that the derivative of its potential does not have, see `Pressed.on_edges`."""
+        if not (self.pressed and self.pressed.curves):
+            return np.zeros_like(u)
+        return self.pressed.on_edges(self._r0.x.array.reshape(-1, 3), u.reshape(-1, 3)).ravel()
 
     def turning(self, mu: Amplitudes, name: str) -> Iterator[tuple[str, Array]]:
         """Edges that the motion turns, each with A = Q dQ^T/dmu (3, 3)."""

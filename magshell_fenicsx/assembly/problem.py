@@ -67,7 +67,7 @@ class FiniteElementSystem:
         sliding = [c for c in held if isinstance(c, Sliding)]
         self.projection = Projection(V, sliding, clamped) if sliding else None
         self.parameters = parameters or {}
-        self.moving = moving
+        self.moving, self._pressed = moving, moving.pressed if moving else None
         self._counted = [t for t in terms if isinstance(t, Counted)]
         # numbers that a state's amplitudes may have besides their own, and their values without
         self.settings: dict[str, tuple[Settable, float]] = {t.setting: (t, 0.0) for t in self._counted}
@@ -161,7 +161,10 @@ class FiniteElementSystem:
     def forces(self, u: Vector, mu: Amplitudes, name: str = "") -> Vector:
         """dPi/du at all nodes, of all terms or of one: of all at supports the forces of these on the shell."""
         self.at(u, mu)
-        return self._summed(self._gradient({name: 1.0} if name else self._factors(mu)), held=False)
+        part = self._gradient({name: 1.0} if name else self._factors(mu))
+        if self.moving and self._pressed and not name:
+            part += mu.get(self._pressed.load, 0.0) * self.moving.on_edges(self.u.x.array)
+        return self._summed(part, held=False)
 
     def step_along(self, v: Vector, part: float) -> float:
         """What v is multiplied by so that its largest entry is a part of the system's length; collective."""
@@ -183,7 +186,10 @@ class FiniteElementSystem:
     def load(self, u: Vector, mu: Amplitudes, name: str, *, held: bool = True) -> Vector:
         """d2Pi/du dmu, zero at supports if `held`."""
         self.at(u, mu)
-        return self._summed(self._column(mu, name), held=held)
+        part = self._column(mu, name)
+        if self.moving and self._pressed and name == self._pressed.load and not held:
+            part += self.moving.on_edges(self.u.x.array)
+        return self._summed(part, held=held)
 
     def potential(self, u: Vector, mu: Amplitudes, name: str) -> float:
         self.at(u, mu)
@@ -196,7 +202,19 @@ class FiniteElementSystem:
             here = sum(factor_of(slope.amplitude, mu) * slope.energy() for slope in slopes)
         else:
             here = sum(t.energy() for t in self.terms if t.amplitude == name)
-        return float(self.comm.allreduce(here))
+        return float(self.comm.allreduce(here)) + self._of_lids(mu, name)
+
+    def _of_lids(self, mu: Amplitudes, *names: str) -> float:
+        """The derivative of p V, V what the lids sweep, by one or two amplitudes."""
+        if self._pressed is None:
+            return 0.0
+        load, unit = self._pressed.load, self._pressed.unit
+        motions = [name for name in names if name != load]
+        if len(names) - len(motions) > 1:
+            return 0.0
+        factor = unit if len(motions) < len(names) else unit * mu.get(load, 0.0)
+        derivative = (self._pressed.swept, self._pressed.slope, self._pressed.bend)[len(motions)]
+        return factor * derivative(mu, *motions)
 
     def curvature(self, u: Vector, mu: Amplitudes, name: str, other: str) -> float:
         if not {name, other} & self.coordinates:
@@ -204,7 +222,7 @@ class FiniteElementSystem:
         self.at(u, mu)
         if self.moving and {name, other} & self.moving.names:
             here = self._motion_curvature(self.moving, mu, *sorted((name, other), key=self.moving.names.__contains__))
-            return float(self.comm.allreduce(here))
+            return float(self.comm.allreduce(here)) + self._of_lids(mu, name, other)
         if name not in self.parameters:
             name, other = other, name
         parameter = self.parameters[name]
@@ -270,10 +288,13 @@ class FiniteElementSystem:
         self.at(state.u, state.mu | past)
         return State(state.u, state.mu | {t.setting: t.angle() for t in self._counted})
 
-    def energies(self, u: Vector) -> dict[str, float]:
-        """Each term's potential, without its amplitude."""
-        self.set(u)
-        return {t.name: float(self.comm.allreduce(t.energy())) for t in self.terms}
+    def energies(self, u: Vector, mu: Amplitudes | None = None) -> dict[str, float]:
+        """Each term's potential, without its amplitude; of supports that do not move if none are given."""
+        self.set(u) if mu is None else self.at(u, mu)
+        potentials = {t.name: float(self.comm.allreduce(t.energy())) for t in self.terms}
+        if mu and self._pressed and self._pressed.load in potentials:
+            potentials[self._pressed.load] += self._of_lids(mu, self._pressed.load)
+        return potentials
 
     def integral(self, u: Vector, form: fem.Form) -> float:
         """The value of a compiled form at a displacement, summed over all ranks."""

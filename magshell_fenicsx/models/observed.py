@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.assembly.growing import Growing
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.assembly.terms import LinearTerm
-from magshell_fenicsx.continuation.system import State, Vector
+from magshell_fenicsx.continuation.system import Amplitudes, State, Vector
 from magshell_fenicsx.models.shell.applied import AppliedField
 from magshell_fenicsx.models.shell.contact import Pressing, Region
 from magshell_fenicsx.models.shell.dead_load import DeadLoads
@@ -80,9 +80,11 @@ class Observed:
         """The undeformed displacement."""
         return np.zeros(self.system.size)
 
-    def volume_change(self, u: Vector) -> float:
-        """Delta V/R^3 of the whole shell."""
-        return self.multiplicity * self.system.integral(u, self._volume)
+    def volume_change(self, u: Vector, mu: Amplitudes | None = None) -> float:
+        """Delta V/R^3 of the whole shell, whose supports move by these amplitudes."""
+        moving = self.system.moving
+        lids = moving.pressed.swept(mu) if mu and moving and moving.pressed else 0.0
+        return self.multiplicity * (self.system.integral(u, self._volume) + lids)
 
     def deflection(self, u: Vector, point: str) -> float:
         """w/R = -u . n0 at a named vertex."""

@@ -51,7 +51,7 @@ OF_EVERY_RUN = (
     Quantity(
         "volume_change",
         "change of volume",
-        "Change of the volume under the shell, negative where it shrinks.",
+        "Change of the volume under the shell, with rigid lids on closed edges that move; negative where it shrinks.",
         "displacement",
         "ΔV/R³",
         "R³",

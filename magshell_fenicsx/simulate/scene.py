@@ -186,7 +186,7 @@ class Scene:
             "w_over_h": model.loaded_deflection(state.u, loads.displaced) / h if loads.displaced else pole,
             "w_pole_over_h": pole,
             "w_point_over_h": model.deflection(state.u, force.point) / h if force else pole,
-            "volume_change": model.volume_change(state.u),
+            "volume_change": model.volume_change(state.u, state.mu),
             "energy": sum(energies.values()),
             "stretching": energies["membrane"] if split else nan,
             "bending": sum(v for name, v in energies.items() if name == "bending" or name.endswith(" edges"))
@@ -213,8 +213,7 @@ class Scene:
     def energies(self, state: State) -> dict[str, float]:
         """The energy of each term, over E h R^2; all parts of one field together."""
         model, found = self.model, defaultdict[str, float](float)
-        model.system.place(state.mu)
-        potentials = model.system.energies(state.u)
+        potentials = model.system.energies(state.u, state.mu)
         for t in model.system.terms:
             name = t.name.removesuffix(" across").removesuffix(" third")
             name = "magnetic gradient" if name.startswith("magnetic gradient") else name

@@ -59,7 +59,8 @@ class EdgeSection(PathStep):
     """Supports that move, all in proportion to one factor.
 
     Its conjugate is the reaction: the forces of the supports along their translations (their work over the sum of the
-    lengths of these), without translations the moments about the axes. Later steps may move the same supports again,
+    lengths of these), without translations the moments about the axes; with a pressure, that on the rigid lids
+    which close such edges counts. Later steps may move the same supports again,
     from where they are then.
     """
 

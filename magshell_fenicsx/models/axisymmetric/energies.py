@@ -141,13 +141,8 @@ class EnergyFactory:
             terms.append(term("magnetic gradient", density, self.constant(field.gradient)))
         return terms
 
-    def pressure(self) -> Energy:
-        """Amplitude p/p_c; potential p Delta V, of a live pressure."""
-        unit = self.constant(self.material.classical_pressure / self.material.h)
-        return Energy("pressure", lambda u: unit * self.volume_change(u), "pressure")
-
-    def pressure_beside_edges(self, *, potential: bool) -> Energy:
-        """The same where an end moves or lies in another plane than z = 0, with a potential or without."""
+    def pressure(self, *, potential: bool) -> Energy:
+        """Amplitude p/p_c of a live pressure: the potential p Delta V, or its virtual work where it has none."""
         j0, unit = self.j0, self.constant(self.material.classical_pressure / self.material.h)
 
         def work(u: Jet, v: Jet) -> ufl.Form:
@@ -156,7 +151,7 @@ class EnergyFactory:
         return Energy("pressure", lambda u: unit * self.swept_volume(u), "pressure", work=None if potential else work)
 
     def swept_volume(self, u: Jet) -> ufl.Form:
-        """Delta V/R^3 per radian where an end moves."""
+        """Delta V/R^3 per radian when its points move straight to their places."""
         return densities.swept(*self._from_drawn(u)) * self.dx()
 
     def own(self, term: OwnTerm, amplitude: str | None = None) -> Energy:

@@ -14,6 +14,7 @@ from dolfinx import fem
 
 from magshell_fenicsx.assembly.growing import Growing
 from magshell_fenicsx.assembly.kernels import KernelLog
+from magshell_fenicsx.assembly.lids import Lid, Pressed
 from magshell_fenicsx.assembly.parameter import FreeParameter, make_parameters
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.assembly.terms import Counted, FormTerm
@@ -31,7 +32,7 @@ from magshell_fenicsx.models.observed import Observed
 from magshell_fenicsx.models.shell import edges
 from magshell_fenicsx.models.shell.driving import field_parameters
 from magshell_fenicsx.models.shell.energy import Density
-from magshell_fenicsx.models.shell.moved import Support, moving, rotation_of
+from magshell_fenicsx.models.shell.moved import PRESSURE, Support, motions_of, moving, rotation_of
 from magshell_fenicsx.models.shell.natural import Shape, natural_field
 from magshell_fenicsx.models.shell.parameters import Condition, EdgeMoment, Loads, Material, Potential, default_penalty
 from magshell_fenicsx.models.shell.patterns import cells_of
@@ -113,13 +114,10 @@ class MeridianModel(Observed):
             self.energies.append(factory.mirror_edges(self.held.mirror))
         if loads.magnetic:
             self.energies += factory.magnetic(loads.magnetic, self.u)
-        volume = factory.volume_change
-        beside, self.without_potential = openings(meridian, conditions)
-        if loads.pressure and (beside or loads.moves):
-            self.energies.append(factory.pressure_beside_edges(potential=not self.without_potential))
-            volume = factory.swept_volume
-        elif loads.pressure:
-            self.energies.append(factory.pressure())
+        free_ends, self.without_potential = openings(meridian, conditions)
+        volume = factory.swept_volume if loads.pressure or (loads.moves and not free_ends) else factory.volume_change
+        if loads.pressure:
+            self.energies.append(factory.pressure(potential=not self.without_potential))
         self.energies += [factory.own(term) for term in loads.own]
         u = jets.revolved(self.u)
         self.observed = self.kernels.compile_all(factory.observed(term, u) for term in loads.own)
@@ -147,15 +145,8 @@ class MeridianModel(Observed):
         if self.growing:
             parameters |= self.growing.parameters(terms, parameters)
             self.growing.renewed += self._renewals
-        self.system = FiniteElementSystem(
-            self.u,
-            terms,
-            held,
-            pattern,
-            material.h,
-            parameters=parameters,
-            moving=moving(self.r0, self.supports, loads),
-        )
+        moves = moving(self.r0, self.supports, loads, None if free_ends else self._pressed())
+        self.system = FiniteElementSystem(self.u, terms, held, pattern, material.h, parameters=parameters, moving=moves)
         self.system.settings |= dict(known.setting for known, _ in self.contacts.values())
         self._volume = self.kernels.compile("volume energy", 2 * np.pi * volume(jets.revolved(self.u)))
         self._seen = {name: Probe.at(*place, self.r0) for name, place in meridian.points.items()}
@@ -178,6 +169,17 @@ class MeridianModel(Observed):
         u, v = jets.revolved(self.u), jets.revolved(ufl.TestFunction(self.V))
         work, energy = 2 * np.pi * e.work(u, v) if e.work else None, 2 * np.pi * e.of(u)
         return FormTerm(e.name, energy, self.u, self.kernels, e.amplitude, linear=e.linear, work=work, follow=e.follow)
+
+    def _pressed(self) -> Pressed:
+        """What a live pressure does at the ends that move, along e3: on each is a lid."""
+        ends = {name: self.meridian.parameter(name) for name in self.meridian.ends}
+        first = min(self.meridian.mesh.geometry.x[:, 0])
+        lids = [
+            Lid.over_ring(self.meridian.section(np.array([s]))[0, 0], motions, last=s > first)
+            for name, s in ends.items()
+            if (motions := motions_of(self.loads, name))
+        ]
+        return Pressed(PRESSURE, self.material.classical_pressure / self.material.h, lids)
 
     def _moment(self, name: str, load: EdgeMoment, amplitude: str) -> Counted:
         facets, constant = self.meridian.ends[load.edge], self.factory.constant

@@ -101,12 +101,10 @@ def supports(meridian: Meridian, conditions: Mapping[str, Condition]) -> Support
     return Supports(meridian.axis, parts[0], parts[1], parts[2], named)
 
 
-def openings(meridian: Meridian, conditions: Mapping[str, Condition]) -> tuple[bool, tuple[str, ...]]:
-    """Whether p V from the origin would load an edge too, and the ends where a live pressure has no potential."""
+def openings(meridian: Meridian, conditions: Mapping[str, Condition]) -> tuple[list[str], tuple[str, ...]]:
+    """The ends that are not held, and those of them where a live pressure has no potential."""
     places = {name: meridian.section(np.array([meridian.parameter(name)]))[0] for name in meridian.ends}
-    moved, open_at = ring_openings(places, conditions)
-    beside = [name for name, c in conditions.items() if c == "plane" and abs(places[name][1]) > STRAIGHT]
-    return bool(moved or beside), open_at
+    return ring_openings(places, conditions)
 
 
 def _refuse_slanting(meridian: Meridian, name: str) -> None:

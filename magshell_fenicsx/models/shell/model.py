@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.growing import Growing
 from magshell_fenicsx.assembly.kernels import KernelLog
+from magshell_fenicsx.assembly.lids import Curve, triangle_sides
 from magshell_fenicsx.assembly.parameter import FreeParameter
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.assembly.sliding import Constraint, held_along
@@ -28,7 +29,7 @@ from magshell_fenicsx.models.shell.energy import ShellTerm
 from magshell_fenicsx.models.shell.fast_tangent import FastTangent, make_sites
 from magshell_fenicsx.models.shell.folds import FOLD, largest_fold
 from magshell_fenicsx.models.shell.gradients import PointTerm
-from magshell_fenicsx.models.shell.moved import Support, moving, rotation_of
+from magshell_fenicsx.models.shell.moved import Support, motions_of, moving, pressed_edges, rotation_of
 from magshell_fenicsx.models.shell.natural import Shape, natural_field
 from magshell_fenicsx.models.shell.openings import openings
 from magshell_fenicsx.models.shell.parameters import (
@@ -179,15 +180,13 @@ class ShellModel(Observed):
             self.supports[name] = Support.of(here, edge, turn)
         self.supports |= on_planes
         closing = closing_point(planes)
-        moved, self.without_potential = openings(self.r0, midsurface.edges, conditions)
-        volume = factory.volume_change(np.zeros(3) if closing is None else closing)
+        free_edges, self.without_potential = openings(self.r0, midsurface.edges, conditions)
+        swept = loads.pressure or (loads.moves and not free_edges)
+        volume = factory.swept_volume() if swept else factory.volume_change(np.zeros(3) if closing is None else closing)
         if loads.magnetic:
             terms += factory.magnetic(loads.magnetic)
-        if loads.pressure and (moved or loads.moves or closing is None):
-            terms.append(factory.pressure_beside_edges(potential=not self.without_potential))
-            volume = factory.swept_volume()
-        elif loads.pressure and closing is not None:
-            terms.append(factory.pressure(closing))
+        if loads.pressure:
+            terms.append(factory.pressure(potential=not self.without_potential))
         terms += [factory.own(term) for term in loads.own]
         self.observed = self.kernels.compile_all(factory.observed(term) for term in loads.own)
         self.contacts = {}
@@ -208,7 +207,17 @@ class ShellModel(Observed):
             ]
             terms += [factory.own(load.term, name) for load in dead if isinstance(load, Potential)]
         self._sites = make_sites(self.r0, degree, terms, self.kernels, factory.prestress())
-        self.moving = moving(self.r0, self.supports, loads)
+        at_edges = None
+        if loads.moves and not free_edges:
+            in_planes = {name for name, c in conditions.items() if c in ("symmetry", "plane")}
+            curves = {
+                name: Curve.of(V, side, triangle_sides())
+                for name, side in midsurface.edges.items()
+                if name in in_planes or motions_of(loads, name)
+            }
+            unit = material.classical_pressure / material.h
+            at_edges = pressed_edges(self.r0, curves, in_planes, loads, unit, closing)
+        self.moving = moving(self.r0, self.supports, loads, at_edges)
         self._near, self._beside = None, list[Site]()
         if self.moving:
             near = make_sites(self.r0, degree, terms, self.kernels, chosen=self.moving.cells)

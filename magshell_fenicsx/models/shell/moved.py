@@ -1,15 +1,18 @@
 """Supports that move: what is held, and the bodies that the motions of the loads make of them."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from dolfinx import fem
 from numpy.typing import NDArray
 
+from magshell_fenicsx.assembly.lids import Curve, Lid, Pressed, ends
 from magshell_fenicsx.assembly.motion import Motion
 from magshell_fenicsx.assembly.moving import Body, Moving
 from magshell_fenicsx.models.shell.parameters import Loads
+
+PRESSURE = "pressure"  # its amplitude
 
 
 @dataclass(frozen=True)
@@ -47,8 +50,51 @@ def rotation_of(loads: Loads, name: str, V: fem.FunctionSpace) -> fem.Constant |
     return fem.Constant(V.mesh, np.eye(3)) if turns else None
 
 
-def moving(r0: fem.Function, supports: Mapping[str, Support], loads: Loads) -> Moving | None:
+def moving(
+    r0: fem.Function, supports: Mapping[str, Support], loads: Loads, pressed: Pressed | None = None
+) -> Moving | None:
     """The nodes that move; None without motions."""
     moved = {name: motions_of(loads, name) for name in supports}
     bodies = [Body(moved[name], s.dofs, s.edge, s.turn) for name, s in supports.items() if moved[name]]
-    return Moving(r0, bodies) if bodies else None
+    return Moving(r0, bodies, pressed) if bodies else None
+
+
+def pressed_edges(
+    r0: fem.Function,
+    curves: Mapping[str, Curve],
+    planes: Collection[str],
+    loads: Loads,
+    unit: float,
+    closing: NDArray[np.float64] | None,
+) -> Pressed:
+    """What a live pressure does at the edges that move, of a shell of which no edge is free; collective.
+
+    Edges that move alike have one lid, if together they are closed or end on planes of symmetry.
+
+    Parameters
+    ----------
+    curves
+        Of the edges that move and of those on planes of symmetry, by name.
+    planes
+        The names of these.
+    unit
+        Of the pressure.
+    closing
+        A point (3,) of all planes of symmetry; None if they have none.
+    """
+    comm, x = r0.function_space.mesh.comm, r0.x.array.reshape(-1, 3)
+    alike = dict[tuple[object, ...], list[str]]()
+    for name in curves:
+        if motions := motions_of(loads, name):
+            same = tuple((m.name, *(part.tobytes() for part in (m.shift, m.turn, m.centre))) for m in motions)
+            alike.setdefault(same, []).append(name)
+    on_planes = np.concatenate([np.empty(0, np.int64), *(curves[name].corners.ravel() for name in planes)])
+    on_any = np.concatenate(comm.allgather(on_planes))
+    lids = []
+    for names in alike.values():
+        of_lid = [curves[name] for name in names]
+        open_at = ends(of_lid, comm)
+        if not len(open_at) or (closing is not None and np.isin(open_at, on_any).all()):
+            origin = np.zeros(3) if closing is None else closing
+            lids.append(Lid.over(of_lid, x, motions_of(loads, names[0]), origin, comm))
+    return Pressed(PRESSURE, unit, lids, [curves[name] for names in alike.values() for name in names])

@@ -146,14 +146,8 @@ class TermFactory:
             terms.append(self._cells("magnetic gradient", self._thick(density, None), "lambda_m"))
         return terms
 
-    def pressure(self, origin: NDArray[np.float64]) -> ShellTerm:
-        """Amplitude p/p_c; potential p Delta V, of a live pressure; `origin` as of `volume_change`."""
-        unit = self._constant(self.material.classical_pressure / self.material.h)
-        parameters = (unit, self._constant(origin)) if origin.any() else (unit,)
-        return self._cells("pressure", Density(densities.pressure, parameters, parts=MOVED), "pressure", drawn=True)
-
-    def pressure_beside_edges(self, *, potential: bool) -> ShellTerm:
-        """The same where edges move that lie in no planes with a common point, with a potential or without."""
+    def pressure(self, *, potential: bool) -> ShellTerm:
+        """Amplitude p/p_c of a live pressure: the potential p Delta V, or its virtual work where it has none."""
         unit = self._constant(self.material.classical_pressure / self.material.h)
         work = None if potential else densities.following
         return self._cells(
@@ -161,7 +155,7 @@ class TermFactory:
         )
 
     def swept_volume(self) -> ufl.Form:
-        """Delta V/R^3 of the modelled part where edges move."""
+        """Delta V/R^3 of the modelled part when its points move straight to their places."""
         return densities.swept(*self._jets_from_drawn()) * self.dx()
 
     def own(self, term: OwnTerm, amplitude: str | None = None) -> ShellTerm:

@@ -13,18 +13,19 @@ from dolfinx import fem
 from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.kernels import KernelLog
+from magshell_fenicsx.assembly.lids import Curve, level_sides
 from magshell_fenicsx.assembly.parameter import FreeParameter, make_parameters
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.assembly.sliding import Constraint, held_along
 from magshell_fenicsx.assembly.terms import LinearTerm, Term
-from magshell_fenicsx.mesh.hexahedra import OUTER, Body, quadratic
+from magshell_fenicsx.mesh.hexahedra import MIDDLE, OUTER, Body, quadratic
 from magshell_fenicsx.mesh.mirror import Y0, Mirror
 from magshell_fenicsx.models.observed import Observed
 from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes
 from magshell_fenicsx.models.shell.dead_load import assemble_dead_loads
 from magshell_fenicsx.models.shell.driving import field_parameters
 from magshell_fenicsx.models.shell.fast_tangent import FastTangent
-from magshell_fenicsx.models.shell.moved import moving
+from magshell_fenicsx.models.shell.moved import motions_of, moving, pressed_edges
 from magshell_fenicsx.models.shell.openings import openings
 from magshell_fenicsx.models.shell.parameters import Condition, EdgeMoment, Loads, Material, Potential
 from magshell_fenicsx.models.shell.supports import closing_point
@@ -33,7 +34,7 @@ from magshell_fenicsx.models.solid.material import NeoHookean
 from magshell_fenicsx.models.solid.natural import body_shape, grown
 from magshell_fenicsx.models.solid.remanence import in_cells
 from magshell_fenicsx.models.solid.sites import make_sites
-from magshell_fenicsx.models.solid.supports import in_middle, supports
+from magshell_fenicsx.models.solid.supports import ROUNDING, in_middle, supports
 from magshell_fenicsx.models.solid.terms import Density, TermFactory
 
 Array = NDArray[np.float64]
@@ -100,17 +101,14 @@ class SolidModel(Observed):
         self._held, planes, self.supports = supports(body, self.r0, conditions)
         origin = closing_point([mirror, *planes] if self.multiplicity == 2 else planes)
         ends = {name: facets for name, facets in body.faces.items() if name != OUTER}
-        moved, self.without_potential = openings(self.r0, ends, conditions, in_middle(body, V))
-        if loads.pressure and (moved or loads.moves):
-            origin = None
-        elif not loads.pressure and origin is None:
-            origin = np.zeros(3)
+        free_ends, self.without_potential = openings(self.r0, ends, conditions, in_middle(body, V))
+        swept = loads.pressure or (loads.moves and not free_ends)
         self._terms: list[Term] = [self._pattern, factory.compression()]
         if loads.magnetic:
             self._terms += factory.magnetic(loads.magnetic)
         if loads.pressure:
             potential = not self.without_potential
-            self._terms += factory.pressure(material.classical_pressure, origin, potential=potential)
+            self._terms += factory.pressure(material.classical_pressure, potential=potential)
         self._terms += [factory.own(term) for term in loads.own]
         self.observed = self.kernels.compile_all(factory.observed(term) for term in loads.own)
         self.load_size, self.contacts = {}, {}
@@ -129,9 +127,20 @@ class SolidModel(Observed):
         self._faces = [body.faces[n] for n, c in conditions.items() if c == "symmetry"]
         self.mirror = mirror
         self._sites = make_sites(body, self.r0, self._terms, self.kernels)
-        self._moving = moving(self.r0, self.supports, loads)
+        at_edges = None
+        if loads.moves and not free_ends:
+            in_planes = {name for name, c in conditions.items() if c in MIRRORS}
+            curves = {
+                name: self._rim(ends[name], MIDDLE if name in hinged else 1.0)
+                for name in ends
+                if name in in_planes or motions_of(loads, name)
+            }
+            unit = material.classical_pressure / material.h
+            at_edges = pressed_edges(self.r0, curves, in_planes, loads, unit, origin)
+        self._moving = moving(self.r0, self.supports, loads, at_edges)
         self.system = self._system(self._held + self._held_on_mirror([mirror.normal]))
-        self.observe(self.kernels.compile("volume energy", factory.volume_change(origin)), body.points)
+        volume = factory.volume_change(None if swept else np.zeros(3) if origin is None else origin)
+        self.observe(self.kernels.compile("volume energy", volume), body.points)
 
     @cached_property
     def excluded_modes(self) -> AntisymmetricModes | None:
@@ -139,6 +148,14 @@ class SolidModel(Observed):
         if self.multiplicity == 1:
             return None
         return AntisymmetricModes(self._system(self._held + self._held_on_mirror(self.mirror.in_plane)))
+
+    def _rim(self, facets: NDArray[np.int32], height: float) -> Curve:
+        """Where the pressed surface ends on the faces of an end, at a height over the thickness."""
+        links = self.body.mesh.topology.connectivity(2, 3)
+        low, high = self.body.between[links.array[links.offsets[facets]]].T
+        inside = (low < height - ROUNDING) & (height < high + ROUNDING)
+        part = (height - low[inside]) / (high - low)[inside]
+        return Curve.of(self.V, facets[inside], level_sides(float(part[0]) if len(part) else 1.0))
 
     def _held_on_mirror(self, directions: Iterable[Array]) -> list[Constraint]:
         return [held_along(self.V, 2, facets, along) for facets in self._faces for along in directions]

@@ -128,11 +128,8 @@ class TermFactory:
             terms.append(self._bulk("magnetic gradient", density, "lambda_m"))
         return terms
 
-    def pressure(self, classical: float, origin: Array | None, *, potential: bool = True) -> list[SolidTerm]:
-        """Amplitude p/p_c, `classical` being p_c/E; on the outer face, and above the middle line of hinged ends.
-
-        `origin` is a point of all symmetry planes; None where edges move, with a `potential` or without.
-        """
+    def pressure(self, classical: float, *, potential: bool = True) -> list[SolidTerm]:
+        """Amplitude p/p_c, `classical` being p_c/E; on the outer face, and above the middle line of hinged ends."""
         v = None if potential else ufl.TestFunction(self.u.function_space)
         return [
             SolidTerm(
@@ -144,7 +141,7 @@ class TermFactory:
                 "pressure",
                 work=None if v is None else self._on_faces([density], v),
             )
-            for name, density in self._enclosing(classical / self.h, origin, potential=potential).items()
+            for name, density in self._enclosing(classical / self.h, None, potential=potential).items()
         ]
 
     def own(self, term: OwnTerm, amplitude: str | None = None) -> SolidTerm:
@@ -168,7 +165,7 @@ class TermFactory:
         return Density(on_face, parameters, ON_FACE, where="outer", facets=self.body.faces[OUTER])
 
     def volume_change(self, origin: Array | None) -> ufl.Form:
-        """Delta V/R^3 under the outer face of the modelled part."""
+        """Delta V/R^3 under the outer face of the modelled part, from an origin; None: when points move straight."""
         return self._on_faces(list(self._enclosing(1.0, origin).values()))
 
     def moment(self, name: str, edge: str, intensity: float, amplitude: str) -> EndMoment:
