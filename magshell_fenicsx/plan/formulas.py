@@ -211,5 +211,10 @@ def refinements(case: Case, formulas: Sequence[Written], drawn: Outline, turn: f
     def places(chart: Array) -> Array:
         return drawn.embedding(chart) @ Q
 
-    found = (squares(places, drawn, shown_by_polynomials(each.of_place), (SHOWN * sqrt(h) if each.load else SMALLEST_SQUARE * h)) for each in formulas)
+    found = (
+        squares(
+            places, drawn, shown_by_polynomials(each.of_place), (SHOWN * sqrt(h) if each.load else SMALLEST_SQUARE * h)
+        )
+        for each in formulas
+    )
     return [each.finer(case.mesh.refinement) for each in found if each]

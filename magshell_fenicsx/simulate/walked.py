@@ -46,13 +46,16 @@ def followed(stage: Stage, path: Path, start: Point, goal: Goal, branches: PathS
     Stopped
         If the path is lost.
     """
-    walk, counted = _walk(stage, path, start, goal), stage.scene.model.system.counted
+    records, counted = (
+        Walked(_followed(stage, _walk(stage, path, start, goal), branches)),
+        stage.scene.model.system.counted,
+    )
     past = start.state.mu
-    for record in _followed(stage, walk, branches):
+    for record in records:
         point = stage.point(record.point)
         past = (state := counted(point.state, past)).mu
         yield replace(record, point=replace(point, state=state))
-    return counted(stage.leave(walk.points[-1].state), past)
+    return counted(stage.leave(records.end), past)
 
 
 def _walk(stage: Stage, path: Path, start: Point, goal: Goal) -> Walk:
@@ -68,7 +71,8 @@ def _walk(stage: Stage, path: Path, start: Point, goal: Goal) -> Walk:
     return walk
 
 
-def _followed(stage: Stage, walk: Walk, branches: PathStep | None) -> Iterator[Record]:
+def _followed(stage: Stage, walk: Walk, branches: PathStep | None) -> Records:
+    """The same with the points of the stage's system; the state at the end of the last walk."""
     stage.scene.progress.doing("looking for modes that the model excludes")
     path, start, goal = walk.path, walk.points[0], walk.goal
     crossing, fold, lost, watch = None, "", "", stage.scene.watch
@@ -128,6 +132,7 @@ def _followed(stage: Stage, walk: Walk, branches: PathStep | None) -> Iterator[R
         raise Stopped(lost)
     if branches and branches.branches and crossing:
         yield from _branches(stage, path, crossing, goal, branches.points)
+    return walk.points[-1].state
 
 
 def _onward(stage: Stage, walk: Walk) -> Walk | None:

@@ -128,7 +128,9 @@ class _Parts:
     def of(self, cells: Numbers) -> "_Parts":
         """The same in each of some cells."""
         times = len(cells)
-        return _Parts(np.repeat(cells, len(self.cell)), np.tile(self.corner, (times, 1)), np.tile(self.sides, (times, 1)))
+        return _Parts(
+            np.repeat(cells, len(self.cell)), np.tile(self.corner, (times, 1)), np.tile(self.sides, (times, 1))
+        )
 
     @classmethod
     def together(cls, several: "Sequence[_Parts]") -> "_Parts":
@@ -154,9 +156,7 @@ class _Parts:
         return X, np.abs(self.sides.prod(axis=1))[:, None] * weights
 
 
-def fitted(
-    values: Values, cells: Cells, nodal: Array, element: Element, degree: int, *, bounded: bool = False
-) -> Fit:
+def fitted(values: Values, cells: Cells, nodal: Array, element: Element, degree: int, *, bounded: bool = False) -> Fit:
     """A formula whose values at the nodes of each cell are known; collective.
 
     Parameters

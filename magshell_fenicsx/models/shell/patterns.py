@@ -152,11 +152,15 @@ def pattern_on_edge(
     topology.create_connectivity(1, 2)
     topology.create_connectivity(2, 1)
     cells = np.array([topology.connectivity(1, 2).links(f)[0] for f in facets], dtype=np.int64)
-    local = [int(np.flatnonzero(topology.connectivity(2, 1).links(c) == f)[0]) for c, f in zip(cells, facets, strict=True)]
+    local = [
+        int(np.flatnonzero(topology.connectivity(2, 1).links(c) == f)[0]) for c, f in zip(cells, facets, strict=True)
+    ]
     element, on = Q.element.basix_element, V.element.basix_element
     corners, ends = basix.geometry(element.cell_type), basix.topology(element.cell_type)[1]
     line, along = (
-        basix.create_element(basix.ElementFamily.P, basix.CellType.interval, one.degree, basix.LagrangeVariant.gll_warped)
+        basix.create_element(
+            basix.ElementFamily.P, basix.CellType.interval, one.degree, basix.LagrangeVariant.gll_warped
+        )
         for one in (on, element)
     )
 
@@ -170,7 +174,9 @@ def pattern_on_edge(
     edge = Cells(line, nodal, owned, V.mesh.comm)
     x, normals, _ = edge.at(along.points)
     fit = shown(pattern, edge, pattern(inside(x), normals), along)
-    near = [[int(np.argmin(np.linalg.norm(element.points - p, axis=1))) for p in side(along.points, i)] for i in range(3)]
+    near = [
+        [int(np.argmin(np.linalg.norm(element.points - p, axis=1))) for p in side(along.points, i)] for i in range(3)
+    ]
     values = field.x.array.reshape(-1, 3)
     for cell, number, vectors in zip(cells, local, fit.nodal, strict=True) if not fit.smooth else ():
         values[Q.dofmap.list[cell][near[number]]] = vectors
