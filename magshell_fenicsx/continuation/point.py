@@ -53,8 +53,14 @@ class Point:
 
 
 class PathStopped(RuntimeError):
-    """The path could not be followed further; `point` is the last accepted one."""
+    """The path could not be followed further; `point` is the last accepted one.
 
-    def __init__(self, reason: str, point: Point) -> None:
+    Attributes
+    ----------
+    final
+        Whether it could not be followed in another way either.
+    """
+
+    def __init__(self, reason: str, point: Point, *, final: bool = False) -> None:
         super().__init__(reason)
-        self.point = point
+        self.point, self.final = point, final

@@ -100,7 +100,9 @@ class Walk:
                 if len(self.points) > self.goal.steps:
                     if self.goal.until == "points":
                         return
-                    raise PathStopped(f"{self.goal.steps} steps have not reached the {self.goal.until}", point)
+                    raise PathStopped(
+                        f"{self.goal.steps} steps have not reached the {self.goal.until}", point, final=True
+                    )
             if shorter is None:
                 return
             if shorter < options.smallest:
@@ -113,7 +115,8 @@ class Walk:
         mu = fold.state.mu[name]
         for known in self._folds[:-1]:
             if self.path.metric.norm(u - known.state.u, mu - known.state.mu[name]) < SAME:
-                raise PathStopped("the path has come back to this fold: a closed loop, which leads nowhere else", fold)
+                said = "the path has come back to this fold: a closed loop, which leads nowhere else"
+                raise PathStopped(said, fold, final=True)
         self._folds.append(fold)
 
     @property

@@ -144,8 +144,8 @@ def _energy(term: OwnTerm, outline: Outline) -> Leaves:
         turned = outline.round and mirror.through_e3 and mirror.azimuth != 0
         return term.mirrored(Y0 if turned else mirror) and (not turned or term.turns)
 
-    shared = term.mirrored(Y0) and term.turns
-    return Leaves(None if shared else f"the energy {term.name} does not share it", (), mirrors, term.name)
+    shared, name = term.mirrored(Y0) and term.turns, term.name + (" or what it observes" if term.observed else "")
+    return Leaves(None if shared else f"the energy {name} does not share it", (), mirrors, name)
 
 
 def _shape(case: Case, outline: Outline) -> Leaves:

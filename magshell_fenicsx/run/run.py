@@ -273,7 +273,8 @@ def _follow(
 
 
 def _line(row: Row) -> str:
-    load = "load_factor" if "load_factor" in row else "force"
+    pressed = amplitude(str(row["amplitude"])).conjugate  # of several bodies each has its own force
+    load = "load_factor" if "load_factor" in row else pressed if pressed.startswith("force_") else "force"
     formats = {"lambda_m": "+.4e", "p_over_pc": ".6f", load: "9.5f"}
     if row["amplitude"] and (varied := amplitude(str(row["amplitude"])).column) not in formats:
         formats[varied] = "9.5f"

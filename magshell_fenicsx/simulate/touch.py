@@ -84,7 +84,7 @@ def refuse_crossing(stage: Stage, low: Point, high: Point) -> None:
             model.system.with_ghosts(state.u, state.mu)
             ends.append((known.places, state.mu))
         if said := [each for each in model.system.comm.allgather(known.passed(*ends)) if each]:
-            raise PathStopped(said[0], low)
+            raise PathStopped(said[0], low, final=True)
 
 
 def refuse_return(stage: Stage, name: str, points: Sequence[Point], high: Point) -> None:
@@ -118,13 +118,13 @@ def refuse_return(stage: Stage, name: str, points: Sequence[Point], high: Point)
             continue
         t = CubicHermiteSpline([x, y], [a.state.u, b.state.u], [a.du / a.dmu, b.du / b.dmu])(mu[-1])
         if max_abs(comm, high.state.u - t) < ALIKE * fallen:
-            raise PathStopped(
-                "the body goes back the way it came: at its fold the shell snaps under a given approach", low
-            )
+            said = "the body goes back the way it came: at its fold the shell snaps under a given approach"
+            raise PathStopped(said, low, final=True)
     if max_abs(comm, high.du) == 0:
         depths = [model.touching(stage.leave(point.state), name).penetration for point in (low, high)]
         if depths[1] < min(depths[0], 0.0):
-            raise PathStopped("the body has left the shell: at its fold the shell snaps under a given approach", high)
+            said = "the body has left the shell: at its fold the shell snaps under a given approach"
+            raise PathStopped(said, high, final=True)
 
 
 def refuse_penetration(scene: Scene, state: State) -> None:

@@ -105,7 +105,7 @@ def _followed(stage: Stage, walk: Walk, branches: PathStep | None) -> Records:
                     break
         except PathStopped as e:
             lost = _why(stage.scene, path, e, walk.points) + fold + stage.scene.nowhere()
-            onward = _onward(stage, walk)
+            onward = None if e.final else _onward(stage, walk)
         excluded = list(_excluded(path, watch.end()))
         if excluded and lost and goal.until == "bifurcation":
             yield excluded[0]

@@ -66,3 +66,36 @@ def test_symmetry_that_a_motion_leaves(moves: list[Any], normal: list[float] | N
 def test_messages(moves: list[Any], step: dict[str, Any], words: str) -> None:
     with pytest.raises(CaseError, match=words):
         case(*moves, **step)
+
+
+BODY = {"plate": {"kind": "plane", "at": {"point": [1.0, 0.25, 0.0]}, "direction": [0, 0, -1]}}
+
+
+@pytest.mark.parametrize(
+    ("name", "more", "words"),
+    [
+        ("left_fx", {}, r"loading\.name: left_fx: another column of path\.csv"),
+        ("tip_uz", {"points": {"tip": [1, 0.25, 0]}}, r"loading\.name: tip_uz: another column of path\.csv"),
+        ("stiffness_plate", {"bodies": BODY}, r"loading\.name: stiffness_plate: another amplitude"),
+        ("left_uz", {"points": {"tip": [1, 0.25, 0]}}, None),
+    ],
+)
+def test_names_that_other_columns_have(name: str, more: dict[str, Any], words: str | None) -> None:
+    """Of reactions, points and bodies; what no other column has is a name."""
+    given = case(PUSH, name=name)
+    asked = Case.from_source(Source("test", given.model_dump(mode="json", exclude_none=True) | more))
+    if words is None:
+        assert make_plan(asked).reactions
+        return
+    with pytest.raises(CaseError, match=words):
+        make_plan(asked)
+
+
+def test_names_that_columns_in_units_have() -> None:
+    """`left_fx_N` is the reaction of the clamped edge in newtons."""
+    shell = {"geometry": "plate", "length": "100 mm", "width": "20 mm", "thickness": "1 mm", "youngs_modulus": "1 MPa"}
+    move = {"supports": ["right"], "translation": ["0 mm", "0 mm", "1 mm"]}
+    data = {"shell": shell | {"poisson_ratio": 0.3}, "boundary": {"left": "clamped", "right": "clamped"}}
+    data |= {"loading": {"kind": "edge", "name": "left_fx_N", "moves": [move], "points": 1}}
+    with pytest.raises(CaseError, match=r"left_fx_N: another column of path\.csv of this case has this name"):
+        make_plan(Case.from_source(Source("test", data)))

@@ -77,6 +77,7 @@ def test_places() -> None:
         ({"kind": "rod", "radius": 0.2, "edge": 0.1}, "meridian"),
         ({"kind": "cylinder", "radius": 0.2, "axis": [1, 2, 0]}, "half"),
         ({"kind": "box", "size": [0.2, 0.3, 0.3], "edge": 0.05, "axis": [1, 0, 0]}, "half"),
+        ({"kind": "box", "size": [0.2, 0.3, 0.3], "edge": 0.05, "axis": [1, 2, 0]}, "half"),
         ({"kind": "plane", "at": {"polar": 20}}, "half"),
         ({"kind": "box", "size": [0.2, 0.3, 0.3], "edge": 0.05, "axis": [1, 1, 0], "at": {"polar": 20}}, "full"),
     ],
@@ -85,6 +86,19 @@ def test_symmetry(body: dict[str, Any], model: str) -> None:
     """`symmetry: auto` finds the smallest model that a body leaves."""
     found = plan({"a": body}, symmetry="auto")
     assert ("meridian" if found.axisymmetric else "half" if found.half else "full") == model
+
+
+def test_plane_of_an_oblique_box() -> None:
+    """It holds the axis or is normal to it; another body that is not in the one leaves the other."""
+    box = {"kind": "box", "size": [0.2, 0.3, 0.3], "edge": 0.05, "axis": [1, 2, 0]}
+    found = plan({"a": box}, symmetry="half")
+    along = np.degrees(np.arctan2(2, 1))
+    assert np.degrees(found.azimuth) % 90 == pytest.approx(along)
+    across = np.array([-2, 1]) / np.sqrt(5)
+    ball = {"kind": "sphere", "radius": 0.1, "position": [*(0.6 * across), 2.0], "direction": [0, 0, -1]}
+    found = plan({"a": box, "b": ball}, symmetry="auto")
+    assert found.half
+    assert np.degrees(found.azimuth) % 180 == pytest.approx((along + 90) % 180)
 
 
 APART = {"kind": "sphere", "radius": 0.2, "position": [0.3, 0, 1.5]}

@@ -41,14 +41,17 @@ def indentation(tolerance: float) -> Case:
 
 
 def check(case: Case, reference: float) -> Adapted:
-    """The path on the mesh that was found ends where the rounds did, with an error as it was asked for."""
+    """The path on the mesh that was found ends where the rounds did, with an error as it was asked for.
+
+    On a meridian, whose cells cost nothing, it may be far smaller.
+    """
     mesh, tolerance = adapted(case, COMM), case.mesh.tolerance
     assert tolerance
     end = by_path(mesh.choice.scene(case, COMM))
     error = abs(end.value / reference - 1)
     assert end.value == pytest.approx(mesh.best.result, rel=1e-7)
-    assert tolerance / 10 < error < tolerance
-    assert error < mesh.best.estimate
+    assert (0.0 if mesh.choice.applied(case)[1].axisymmetric else tolerance / 10) < error < tolerance
+    assert error < max(mesh.best.estimate, 1e-8)
     return mesh
 
 

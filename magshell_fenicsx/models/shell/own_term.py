@@ -58,7 +58,8 @@ class OwnTerm:
     value
         mu of the undeformed shell, which a path keeps unless it varies mu.
     observed
-        Column -> density as above; mu times its integral is observed along a path.
+        Column -> density as above; mu times its integral over the whole shell is observed along a path. A model has
+        only the symmetries that these leave too.
 
     Raises
     ------
@@ -114,7 +115,7 @@ class OwnTerm:
 
     @cached_property
     def turns(self) -> bool:
-        """Whether its value stays if shell and displacement turn about e3; at random jets."""
+        """Whether it, and what it observes, stays if shell and displacement turn about e3; at random jets."""
 
         def turned(jet: Array, angle: float) -> Array:
             c, s = np.cos(angle), np.sin(angle)
@@ -123,7 +124,7 @@ class OwnTerm:
         return all(self._same((r0, u), (turned(r0, a), turned(u, a))) for a, (r0, u) in enumerate(_random_jets(), 1))
 
     def mirrored(self, mirror: Mirror) -> bool:
-        """Whether its value stays if shell and displacement are mirrored; at random jets."""
+        """Whether it, and what it observes, stays if shell and displacement are mirrored; at random jets."""
         # the first coordinate changes places with the second, so that the normal stays outward
         order, S = [("r", *CURVED).index(name) for name in ("r", "r2", "r1", "r22", "r12", "r11")], mirror.reflection
 
@@ -135,7 +136,7 @@ class OwnTerm:
     @property
     def digest(self) -> str:
         """A hash of its name, its amplitude and its values at random jets."""
-        values = [self._value(r0, u) for r0, u in _random_jets()]
+        values = [self._value(r0, u, self.density) for r0, u in _random_jets()]
         free = [(p.name, p.value) for p in self.free]
         text = f"{self.name} {self.value!r} {free} {sorted(self.observed)} {[f'{v:.9e}' for v in values]}"
         return hashlib.sha256(text.encode()).hexdigest()[:16]
@@ -147,7 +148,7 @@ class OwnTerm:
         V = ufl.FunctionSpace(domain, basix.ufl.element("DG", "triangle", 0, shape=(3,)))
         r0, u = (Jet(*(ufl.variable(ufl.Coefficient(V)) for _ in range(1 + len(CURVED)))) for _ in range(2))
         try:
-            return self._at(r0, u), r0, u
+            return self._at(r0, u, self.density), r0, u
         except Exception as e:  # of any kind: the density is the user's own program
             said = f"{type(e).__name__}: {e}"
             raise ValueError(
@@ -170,18 +171,21 @@ class OwnTerm:
         found = extract_coefficients(self._symbolic[0])
         return tuple(name for name in ("r", *CURVED) if getattr(jet, name).ufl_operands[0] in found)
 
-    def _at(self, r0: Jet, u: Jet) -> Expr:
-        return ufl.as_ufl(self.density(r0, u, *(_as_expression(p) for p in self.parameters)))
+    def _at(self, r0: Jet, u: Jet, density: Callable[..., Expr]) -> Expr:
+        return ufl.as_ufl(density(r0, u, *(_as_expression(p) for p in self.parameters)))
 
     def _same(self, *pairs: tuple[Array, Array]) -> bool:
-        """Whether the density is the same at two pairs of jets (6, 3)."""
-        here, there = (self._value(*pair) for pair in pairs)
-        return abs(here - there) <= SAME * max(abs(here), abs(there))  # never of nan: no symmetry is known
+        """Whether the density, and each that is observed, is the same at two pairs of jets (6, 3)."""
+        for density in (self.density, *self.observed.values()):
+            here, there = (self._value(*pair, density) for pair in pairs)
+            if not abs(here - there) <= SAME * max(abs(here), abs(there)):  # nan: no symmetry is known
+                return False
+        return True
 
-    def _value(self, r0: Array, u: Array) -> float:
-        """The density at jets (6, 3); nan where it has none, as a root of less than zero."""
+    def _value(self, r0: Array, u: Array, density: Callable[..., Expr]) -> float:
+        """A density at jets (6, 3); nan where it has none, as a root of less than zero."""
         try:
-            return float(apply_algebra_lowering(self._at(_as_jet(r0), _as_jet(u)))(()))
+            return float(apply_algebra_lowering(self._at(_as_jet(r0), _as_jet(u), density))(()))
         except (ArithmeticError, TypeError, ValueError):
             return np.nan
 

@@ -1,7 +1,7 @@
 """The rigid bodies of a case in the model's terms, from the function of each kind."""
 
 from collections.abc import Callable
-from math import inf
+from math import atan2, inf
 from typing import Any
 
 import numpy as np
@@ -129,8 +129,9 @@ def body_leaves(contact: Contact) -> Leaves:
 
     turns = all(alike(Q, x @ Q.T) for Q in (rotation(1.0), rotation(2.5)))
     tilted = [contact.front, d, *([contact.distance.axis] if hasattr(contact.distance, "axis") else [])]
+    between = tuple(atan2(v[1], v[0]) for v in getattr(contact.distance, "axes", ()) if np.hypot(*v[:2]) > scale)
 
     def mirrors(mirror: Mirror) -> bool:
         return alike(mirror.reflection, mirror.image(x))
 
-    return Leaves(None if turns else f"bodies.{contact.body} is not turned about e3", tilted, mirrors)
+    return Leaves(None if turns else f"bodies.{contact.body} is not turned about e3", tilted, mirrors, azimuths=between)

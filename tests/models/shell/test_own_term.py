@@ -19,6 +19,7 @@ from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.shell.parameters import AreaForce, Loads, Material
 from magshell_fenicsx.plan.planner import make_plan
+from magshell_fenicsx.simulate.follow import follow
 
 E1, E2, E3 = np.eye(3)
 Density = Callable[..., Expr]
@@ -89,6 +90,48 @@ def test_density_that_is_not_defined_everywhere() -> None:
     term = OwnTerm("own", lambda r0, u: ufl.ln(r0.r[2]) * u.r[2])
     assert not term.turns
     assert not term.mirrored(Y0)
+
+
+OBSERVED: dict[str, tuple[Density, bool, bool]] = {
+    # whether it turns about e3, whether it is mirrored in y = 0
+    "u_x": (lambda r0, u: u.r[0], False, True),
+    "u_y": (lambda r0, u: u.r[1], False, False),
+    "u_z": (lambda r0, u: u.r[2], True, True),
+    "twist": (twisting, True, False),
+}
+
+
+@pytest.mark.parametrize("name", OBSERVED)
+def test_symmetry_of_what_is_observed(name: str) -> None:
+    """Beside an energy that turns and mirrors."""
+    of, turns, mirrors = OBSERVED[name]
+    term = OwnTerm("own", winkler, (), observed={"seen": of})
+    assert (term.turns, term.mirrored(Y0)) == (turns, mirrors)
+
+
+def test_whole_value_of_what_is_observed() -> None:
+    """A cap under a load along x: the sum of u_y cancels, and that of u_x is the same on the model that is found."""
+    shell = {"geometry": "cap", "radius": 1.0, "thickness": 0.05, "poisson_ratio": 0.3, "youngs_modulus": 1.0}
+    loads = [{"over": "all", "per_area": [1e-7, 0, 0]}]
+    data = {"shell": shell, "boundary": {"rim": "clamped"}, "mesh": {"degree": 2, "refinement": 0.4}}
+    data |= {"loading": {"kind": "dead", "loads": loads, "factor": 1, "points": 1}}
+
+    def observed(symmetry: str, **columns: Density) -> tuple[str, dict[str, float]]:
+        case = Case.from_source(Source("test", data | {"symmetry": symmetry}))
+        scene = Scene(case, terms=[OwnTerm("springs", winkler, value=1e-6, observed=columns)])
+        *_, end = follow(scene)
+        values = scene.observe(end.point.state)
+        return scene.plan.included[0], {name: values[name] for name in columns}
+
+    along, across = OBSERVED["u_x"][0], OBSERVED["u_y"][0]
+    half, found = observed("auto", along=along)
+    assert half.startswith("half")
+    full, both = observed("auto", along=along, across=across)
+    assert full.startswith("full")
+    assert found["along"] == pytest.approx(both["along"], rel=1e-2)  # the two meshes differ
+    assert abs(both["across"]) < 1e-3 * abs(both["along"])
+    with pytest.raises(CaseError, match="symmetry: half: the energy springs or what it observes does not share it"):
+        observed("half", across=across)
 
 
 @pytest.mark.parametrize("energy", ["magnetic", "magnetic_first", "magnetic_torque", "magnetic_tau", "magnetic_couple"])
