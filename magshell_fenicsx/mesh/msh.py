@@ -95,6 +95,15 @@ def _whole(file: MeshFile) -> PatchMesh:
     return PatchMesh(nodes, cells, in_space, edges, patches=patches)
 
 
+def cell_count(file: MeshFile) -> int:
+    """How many triangles are in it; none in a file that cannot be read, which `read_msh` reports."""
+    try:
+        held = parsed(file.files.content(file.path))
+    except (OSError, MeshError):
+        return 0
+    return sum(len(nodes) for _, dim, _, nodes in held.blocks if dim == 2)
+
+
 def _vertices(nodes: Array, cells: NDArray[np.int64], points: Mapping[str, Array], scale: float) -> dict[str, Array]:
     corners = nodes[np.unique(cells[:, :3])]
     highest = corners[np.lexsort(np.round(corners[:, :3], 9).T)[-1]]

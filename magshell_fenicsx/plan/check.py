@@ -10,6 +10,7 @@ from magshell_fenicsx.mesh.msh import MeshFile
 from magshell_fenicsx.mesh.patch import MeshError, PatchMesh
 from magshell_fenicsx.models.shell.openings import no_potential, ring_openings
 from magshell_fenicsx.plan.body import layers
+from magshell_fenicsx.plan.limits import refuse_beyond_memory
 from magshell_fenicsx.plan.names import open_edges
 from magshell_fenicsx.plan.outline import outline
 from magshell_fenicsx.plan.plan import Plan
@@ -33,6 +34,7 @@ def describe(case: Case) -> str:
 
 def _described(case: Case) -> str:
     plan = make_plan(case)
+    too_large = None if case.mesh.tolerance else refuse_beyond_memory(case, plan)
     if all(condition in ("free", "symmetry") for condition in plan.conditions.values()):
         raise CaseError("boundary: nothing is held: clamp an edge or a patch, or hold points, for instance")
     numbers = {
@@ -60,8 +62,7 @@ def _described(case: Case) -> str:
         left_out.append("ensemble: random values (magshell ensemble alone draws them)")
     left_out = left_out or ["nothing"]
     lines += ["built:", *(f"  {item}" for item in plan.included), "left out:", *(f"  {item}" for item in left_out)]
-    if plan.warning:
-        lines.append(f"warning: {plan.warning}")
+    lines += [f"warning: {said}" for said in (plan.warning, too_large) if said]
     return "\n".join(lines)
 
 

@@ -1,5 +1,8 @@
 """What a case may ask for that could not be built: refused before anything is."""
 
+from dataclasses import dataclass
+from math import log
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -7,35 +10,91 @@ from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.expressions import formula, with_derivatives
 from magshell_fenicsx.case.messages import shown
 from magshell_fenicsx.case.source import CaseError
+from magshell_fenicsx.case.surfaces import MeshSurface
 from magshell_fenicsx.plan.body import layers
+from magshell_fenicsx.plan.plan import Plan
 from magshell_fenicsx.plan.sources.registered import placed
+from magshell_fenicsx.platform.memory import GIVEN, available
 
 Array = NDArray[np.float64]
-MOST_UNKNOWNS = 2_000_000  # whose factors fill the memory of a large workstation
+PROCESS = 0.25e9  # bytes of a process before its model
+PER_UNKNOWN = {2: 1.0e3, 3: 1.1e3, 4: 1.3e3, 5: 1.65e3}  # degree -> bytes over N ln N, full shells
+SOLID = 0.7e3  # likewise of a body
+EXCLUDED, INDEFINITE = 0.6, 0.7  # added parts: for the modes that a half excludes, and past an instability
 SOURCES = 1e-9  # of the field's derivatives: rounding
 SMALLEST_FIELD, LARGEST_FIELD = 1e-12, 10.0  # of lambda_m: rounding, and a thousand times what destabilises a shell
 
 
-def refuse_too_many(case: Case, cells: float, hint: str = "") -> None:
+@dataclass(frozen=True)
+class Memory:
+    """What a run takes, estimated: `unknowns` of a case, of which each of some ranks has a part.
+
+    Attributes
+    ----------
+    least
+        Bytes on a path where the tangent stays positive definite, as measured (docs/scale.md).
+    most
+        On one past an instability, where factors of CHOLMOD and of MUMPS are kept.
+    """
+
+    unknowns: float
+    least: float
+    most: float
+
+    @classmethod
+    def of(cls, case: Case, unknowns: float, *, half: bool = False, ranks: int = 1, here: int = 1) -> "Memory":
+        """That of `here` of the `ranks` of a run, which are those on one machine."""
+        each = SOLID if case.model == "solid" else PER_UNKNOWN.get(case.degree, PER_UNKNOWN[max(PER_UNKNOWN)])
+        shared = each * unknowns * log(max(unknowns, 2.0)) * here / ranks
+        least = PROCESS * here + shared * (1 + EXCLUDED * half)
+        return cls(unknowns, least, least + INDEFINITE * shared)
+
+    def words(self, free: float) -> str:
+        return f"{self.least / 1e9:.3g} to {self.most / 1e9:.3g} GB of memory, and {free / 1e9:.3g} GB are free"
+
+
+def unknowns_of(case: Case, cells: float) -> float:
     """Estimate the unknowns of a number of triangles before they are made: of degree k, one brings 3 k^2/2.
 
     The body over it brings three hexahedra of degree 2 in each layer.
+    """
+    return cells * (36 * (2 * len(layers(case)) - 1) if case.model == "solid" else 1.5 * case.degree**2)
+
+
+def refuse_beyond_memory(case: Case, plan: Plan, ranks: int = 1, here: int = 1) -> str | None:
+    """What is to be said of a model that may be too large past an instability; None of others.
+
+    Parameters
+    ----------
+    ranks, here
+        The processes of the run, and those of them on this machine.
 
     Raises
     ------
     CaseError
-        If the unknowns are more than `MOST_UNKNOWNS`.
+        If even the least memory that it takes is not there.
     """
-    per_triangle = 1.5 * case.degree**2
-    if case.model == "solid":
-        per_triangle = 36 * (2 * len(layers(case)) - 1)
-    unknowns = per_triangle * cells
-    if unknowns > MOST_UNKNOWNS:
-        raise CaseError(
-            f"mesh: about {unknowns:.1e} unknowns at radius/thickness {case.shell.R_over_h:g}, at most "
-            f"{MOST_UNKNOWNS:.0e} are built: lower mesh.refinement ({case.mesh.refinement:g}) or mesh.degree "
-            f"({case.degree}){hint}"
+    try:
+        free = available()
+    except ValueError as e:
+        raise CaseError(str(e)) from None
+    needed = Memory.of(case, plan.unknowns, half=plan.half, ranks=ranks, here=here)
+    if plan.axisymmetric or needed.most <= free:
+        return None
+    if needed.least <= free:
+        return (
+            f"mesh: about {needed.unknowns:.2g} unknowns take {needed.words(free)}: past an instability that may be "
+            "too little"
         )
+    how = f"lower mesh.refinement ({case.mesh.refinement:g}) or mesh.degree ({case.degree})"
+    if isinstance(case.shell, MeshSurface):
+        how = f"take a coarser mesh file, or a lower mesh.degree ({case.degree})"
+    hint = "" if plan.half else "; where shell, fields and loads have a mirror plane, symmetry: half halves it"
+    raise CaseError(
+        f"mesh: about {needed.unknowns:.2g} unknowns at radius/thickness {case.shell.R_over_h:g} take "
+        f"{needed.words(free)}: {how}{hint}; ranks on several machines share it; {GIVEN}=GB in the environment "
+        "says what to count on in place of what is free"
+    )
 
 
 def refuse_unbounded_fields(case: Case, r0: Array) -> None:

@@ -91,6 +91,8 @@ class Plan:
         What is unphysical, if anything.
     within
         Name of the patch of each dimple -> whether places (n, 3) are within its rim.
+    unknowns
+        About how many there will be, if the meridian is not modelled.
     """
 
     material: Material
@@ -113,6 +115,7 @@ class Plan:
     reactions: bool = False
     warning: str | None = None
     within: Mapping[str, Inside] = field(default_factory=dict)
+    unknowns: float = 0.0
 
     @property
     def axisymmetric(self) -> bool:

@@ -19,7 +19,7 @@ from magshell_fenicsx.mesh.frame import rotation
 from magshell_fenicsx.mesh.grading import Grading
 from magshell_fenicsx.mesh.grid import Grid
 from magshell_fenicsx.mesh.mirror import CUT, Y0, Mirror
-from magshell_fenicsx.mesh.msh import MeshFile
+from magshell_fenicsx.mesh.msh import MeshFile, cell_count
 from magshell_fenicsx.mesh.rimmed import RimmedGrid
 from magshell_fenicsx.mesh.shapes import DiscShape, StripShape
 from magshell_fenicsx.models.axisymmetric.meridian import graded_vertices
@@ -34,7 +34,7 @@ from magshell_fenicsx.plan.imperfections.flaw import Flaw, in_frame
 from magshell_fenicsx.plan.imperfections.registered import flaws
 from magshell_fenicsx.plan.imperfections.rims import MOST_RIMS, Spot, different, spots
 from magshell_fenicsx.plan.imperfections.symmetry import leaves
-from magshell_fenicsx.plan.limits import refuse_too_many, refuse_unbounded_fields, sources_beside
+from magshell_fenicsx.plan.limits import refuse_unbounded_fields, sources_beside, unknowns_of
 from magshell_fenicsx.plan.loads import indented, loads, potentials, refuse_wide_patch
 from magshell_fenicsx.plan.magnetisation import magnetisation
 from magshell_fenicsx.plan.names import refuse_unfit_ends
@@ -113,8 +113,6 @@ def make_plan(case: Case, terms: Sequence[OwnTerm] = ()) -> Plan:
     rims = different(local)
     shape = _matched(shape, local, rims if len(rims) <= MOST_RIMS else ())
     span = drawn.span if axisymmetric else None
-    if not span:
-        _refuse_too_large(case, shape, size, half=half)
     conditions = edge_conditions(case.boundary, turn)
     supports = tuple(name for name, condition in conditions.items() if condition != "free")
     if beyond:
@@ -152,6 +150,7 @@ def make_plan(case: Case, terms: Sequence[OwnTerm] = ()) -> Plan:
         reactions=bool(all_loads.moves) if case.reactions is None else case.reactions,
         pressed=tuple((size, reach) for _, reach, size in touched),
         warning=sources_beside(case, sample) or _wrong_unit(case, sample),
+        unknowns=0.0 if span else unknowns_of(case, _cells(shape, size, half=half)),
     )
     refuse_twice(case, plan)
     return plan
@@ -269,12 +268,11 @@ def _place(case: Case, drawn: Outline, name: str, place: Array, turn: float, hal
     return drawn.on_half(found) if half else found
 
 
-def _refuse_too_large(case: Case, shape: Chart | RimmedGrid, size: Grading, *, half: bool) -> None:
+def _cells(shape: Chart | RimmedGrid, size: Grading, *, half: bool) -> float:
+    """About how many triangles there will be."""
     if isinstance(shape, MeshFile):
-        return
-    cells = shape.cells * (0.5 if half else 1.0) if isinstance(shape, Grid) else size.cells(shape)
-    hint = "" if half else "; where shell, fields and loads have a mirror plane, symmetry: half halves it"
-    refuse_too_many(case, cells, hint)
+        return cell_count(shape) * (0.5 if half else 1.0)
+    return shape.cells * (0.5 if half else 1.0) if isinstance(shape, Grid) else size.cells(shape)
 
 
 def _turned(components: tuple[int, ...], turn: float) -> list[int]:

@@ -143,8 +143,8 @@ def _run(
         raise type(e)(case.placed(str(e))) from None
     result = Result(scene, scene.unloaded(), adapted=found)
     say(f"{', '.join(scene.plan.included)}: {scene.cells} cells, {scene.model.system.dofs} unknowns")
-    if scene.plan.warning:
-        say(f"warning: {scene.plan.warning}")
+    for warning in scene.warnings:
+        say(f"warning: {warning}")
     if fast_blas() is None:
         say("warning: PETSc uses the reference BLAS; install OpenBLAS to factor seven times faster")
     if comm.size == 1 and not has_cholmod():

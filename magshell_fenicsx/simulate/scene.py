@@ -43,6 +43,7 @@ from magshell_fenicsx.plan.columns import (
     sizes_in_units,
     support_columns,
 )
+from magshell_fenicsx.plan.limits import refuse_beyond_memory
 from magshell_fenicsx.plan.plan import Plan
 from magshell_fenicsx.plan.planner import make_plan
 from magshell_fenicsx.quantities.registry import amplitude, contact_columns
@@ -72,6 +73,8 @@ class Scene:
     journal, progress
         The record of the solver's results for an interrupted run, and the listener to its status. The caller that
         runs the scene sets both.
+    warnings
+        What is unphysical, or may be too large.
     setup_s
         Time to build the scene in seconds, without compiling kernels.
     """
@@ -91,6 +94,7 @@ class Scene:
                 "shell.imperfections: kind: modes: compute them first, by simulate.perfect.with_modes(case, comm)"
             )
         self.case, self.plan, self.comm = case, plan or make_plan(case, terms), comm
+        self.warnings = [said for said in (self.plan.warning, _beyond_memory(case, self.plan, comm)) if said]
         self.model: ShellModel | MeridianModel | SolidModel
         if self.plan.axisymmetric:
             self.model = build_meridian_model(case, self.plan)
@@ -323,3 +327,22 @@ class Scene:
             u = self.plan.length * self.model.displacement(state.u, point) @ rotation(self.plan.azimuth)
             found |= {f"{point}_u{axis}": float(c) for axis, c in zip("xyz", u, strict=True)}
         return found
+
+
+def _beyond_memory(case: Case, plan: Plan, comm: MPI.Comm) -> str | None:
+    """See `refuse_beyond_memory`; every rank asks its own machine, and the first refusal is that of all."""
+    if comm.size == 1:
+        return refuse_beyond_memory(case, plan)
+    machine = comm.Split_type(MPI.COMM_TYPE_SHARED)
+    here = machine.size
+    machine.Free()
+    said: str | CaseError | None
+    try:
+        said = refuse_beyond_memory(case, plan, comm.size, here)
+    except CaseError as e:
+        said = e
+    every = comm.allgather(said)
+    for each in every:
+        if isinstance(each, CaseError):
+            raise each
+    return next((each for each in every if each), None)

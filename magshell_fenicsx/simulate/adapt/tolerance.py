@@ -11,13 +11,15 @@ on a grid and on a surface of few cells the error may be far below a loose toler
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from mpi4py import MPI
 
 from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.mesh.grid import Grid
-from magshell_fenicsx.plan.limits import MOST_UNKNOWNS
+from magshell_fenicsx.plan.limits import refuse_beyond_memory
 from magshell_fenicsx.simulate.adapt.choice import Adapted, Choice, Round
 from magshell_fenicsx.simulate.adapt.ending import Ending, NoResult, by_path, from_near
 from magshell_fenicsx.simulate.adapt.indicator import indicators
@@ -133,6 +135,15 @@ def _remeshed(choice: Choice, coarse: Solved, fine: Solved, reduction: float) ->
         return None
     centres, shares = indicators(coarse, fine)
     size, more = equidistributed(scene.plan.size, centres, shares, order, reduction, scene.plan.material.h)
-    if fine[0].model.system.dofs * more > MOST_UNKNOWNS / 2:  # half of the limit, since this is an estimate
+    if not _fits(fine[0], 2 * fine[0].model.system.dofs * more):  # twice, since this is an estimate
         return None
     return Choice(degree, round(choice.refinement * more**0.5, 3), size)
+
+
+def _fits(scene: Scene, unknowns: float) -> bool:
+    """Whether a finer mesh fits into the memory of all ranks; collective."""
+    try:
+        refuse_beyond_memory(scene.case, replace(scene.plan, unknowns=unknowns), scene.comm.size, scene.comm.size)
+    except CaseError:
+        return not scene.comm.allreduce(1)
+    return not scene.comm.allreduce(0)

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.source import CaseError, Source, override, read_source
+from magshell_fenicsx.plan.limits import refuse_beyond_memory
 from magshell_fenicsx.plan.planner import make_plan
 from magshell_fenicsx.studies.sweep.axes import MOST_POINTS, Axis
 
@@ -77,7 +78,7 @@ def make_point(source: Source, axes: Sequence[Axis], values: Sequence[str]) -> S
         for assignment in assignments:
             override(here, assignment)
         case = Case.from_source(here)
-        make_plan(case)  # raises the errors of the plan, such as a missing mirror plane
+        refuse_beyond_memory(case, make_plan(case))  # raises the errors of the plan, such as a missing mirror plane
     except CaseError as e:
         message = str(e)
         for assignment in assignments:
