@@ -14,7 +14,7 @@ from magshell_fenicsx.case.surfaces import MeshSurface
 from magshell_fenicsx.plan.body import layers
 from magshell_fenicsx.plan.plan import Plan
 from magshell_fenicsx.plan.sources.registered import placed
-from magshell_fenicsx.platform.memory import GIVEN, available
+from magshell_fenicsx.platform.memory import available
 
 Array = NDArray[np.float64]
 PROCESS = 0.25e9  # bytes of a process before its model
@@ -92,7 +92,7 @@ def refuse_beyond_memory(case: Case, plan: Plan, ranks: int = 1, here: int = 1) 
     hint = "" if plan.half else "; where shell, fields and loads have a mirror plane, symmetry: half halves it"
     raise CaseError(
         f"mesh: about {needed.unknowns:.2g} unknowns at radius/thickness {case.shell.R_over_h:g} take "
-        f"{needed.words(free)}: {how}{hint}; ranks on several machines share it; {GIVEN}=GB in the environment "
+        f"{needed.words(free)}: {how}{hint}; ranks on several machines share it; MAGSHELL_MEMORY=GB in the environment "
         "says what to count on in place of what is free"
     )
 

@@ -20,7 +20,7 @@ def available(root: Path = Path("/")) -> float:
         try:
             return 1e9 * _positive(given)
         except ValueError:
-            raise ValueError(f"{GIVEN}={given}: give the GB to count on, such as {GIVEN}=64") from None
+            raise ValueError(f"MAGSHELL_MEMORY={given}: give the GB to count on, such as MAGSHELL_MEMORY=64") from None
     return min([*_of_machine(root), *_of_groups(root), *_of_limit(root)], default=float("inf"))
 
 

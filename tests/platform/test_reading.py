@@ -103,7 +103,7 @@ REFUSED = [
     ("data", "zero.csv", SPECIAL),
     ("grid", "zero.vti", SPECIAL),
     ("mesh", "zero.msh", SPECIAL),
-    ("modes", "zero.vti", SPECIAL),
+    ("modes", "zero.vti", "is no mode file that a run writes (fields/mode_*.vtu): it is a device or a pipe"),
     ("data", "folder.csv", "cannot be read: Is a directory"),
     ("data", "bomb.npz", "its arrays have 3.92e+10 bytes; allowed at most 5e+08"),
     ("grid", "bomb.npz", "its arrays have 3.92e+10 bytes; allowed at most 5e+08"),

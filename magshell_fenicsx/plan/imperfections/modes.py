@@ -97,10 +97,9 @@ def _read(section: ModesSection, drawn: Outline, key: str) -> Scattered:
     try:
         found = vtk_data(section.files.content(section.path), section.path.suffix).point_data
         r0, w = (np.asarray(found[name], dtype=float) for name in ("r0", "mode_w"))
-    except OSError as e:
-        raise CaseError(f"{key}: cannot be read: {e.strerror or e}") from None
     except Exception as e:  # VTK and pyvista raise many types
-        raise CaseError(f"{key}: is no mode file that a run writes (fields/mode_*.vtu): {e}") from None
+        said = getattr(e, "strerror", None) or e
+        raise CaseError(f"{key}: is no mode file that a run writes (fields/mode_*.vtu): {said}") from None
     if r0.shape != (len(w), 3) or not (np.isfinite(r0).all() and np.isfinite(w).all() and np.abs(w).max() > 0):
         raise CaseError(f"{key}: the mode has no finite displacement")
     sample = drawn.sample()
