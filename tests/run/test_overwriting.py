@@ -99,7 +99,7 @@ def test_files_of_others_are_refused(tmp_path: Path, text: str) -> None:
 
 
 def test_files_of_others_stay(out: Path) -> None:
-    """Under names that no run writes they survive, also beside its own; added later under such a name, they are seen."""
+    """Under names that no run writes they survive, also beside its own; under such a name they are refused."""
     mine = ("notes.txt", "shell_1.png", "fields/mine.csv", "fields/point_mine.vtu")
     for name in mine:
         (out / name).write_text("mine", encoding="utf-8")
