@@ -18,11 +18,12 @@ from magshell_fenicsx.output.fields.gathering import gatherer
 from magshell_fenicsx.output.fields.outlines import DRIVEN, STILL, outlines
 from magshell_fenicsx.output.fields.surface import turned
 from magshell_fenicsx.output.fields.vtu import About, FieldSeries, is_whole, point_file
+from magshell_fenicsx.output.report.verdict import read_run
 from magshell_fenicsx.output.store import checkpoint
 from magshell_fenicsx.output.store.durable import Damaged, read_object, sync_folder, write_whole
 from magshell_fenicsx.output.store.folder import DiskError, by_first, prepare_folder
 from magshell_fenicsx.output.store.known import SUMMARY, read_summary
-from magshell_fenicsx.output.store.table import PathTable, Row, read_lines
+from magshell_fenicsx.output.store.table import PathTable, Row
 from magshell_fenicsx.output.store.written import MESH, OF_PATH, note, refuse_unwritten, remove, written
 from magshell_fenicsx.simulate.scene import Scene
 
@@ -118,7 +119,7 @@ def _refuse_no_resuming(out: Path, case: Case) -> None:
         if summary["stopped"] is None:
             kept = {key: summary[key] for key in ("case", "sources", *case.outside) if key in summary}
             checkpoint.refuse_other({"version": summary["versions"]["magshell_fenicsx"], **kept}, case, out)
-            for number in range(len(read_lines(out / "path.csv"))):
+            for number in range(len(read_run(out)[1])):
                 if not is_whole(out / "fields" / point_file(number)):
                     raise Damaged(f"{out / 'fields' / point_file(number)}: is damaged: it is cut off, or missing")
             raise AlreadyComplete(summary)

@@ -11,6 +11,7 @@ from markupsafe import Markup
 
 from magshell_fenicsx.output.report.html_numbers import above_rounding, number
 from magshell_fenicsx.output.report.report_path import Line, head, symbol
+from magshell_fenicsx.output.store.durable import Damaged
 from magshell_fenicsx.output.store.known import pole_of, read_summary
 from magshell_fenicsx.output.store.table import LOCATED, OWN_MODES, pole_name, read_lines
 from magshell_fenicsx.quantities.quantity import PLAIN, Quantity
@@ -28,7 +29,7 @@ def located(lines: Sequence[Line]) -> list[Line]:
 def verdict(summary: Summary, lines: Sequence[Line]) -> Markup:
     """The result, and the reason if the run stopped early."""
     loading = summary["case"].get("loading") or {}
-    until = (loading[-1] if isinstance(loading, list) else loading).get("until", "target")
+    until = ((loading[-1] or {}) if isinstance(loading, list) else loading).get("until", "target")
     first = next((line for line in located(lines) if line["branch"] == "0"), None)
     sentences = [_end(summary, lines)] if not first or until in ("target", "points") else []
     if first:
@@ -99,8 +100,22 @@ def sentence_of(folder: Path) -> str:
 
 
 def read_run(folder: Path) -> tuple[Summary, Sequence[Line]]:
-    """summary.json and the rows of path.csv, as text."""
-    return read_summary(folder), read_lines(folder / "path.csv")
+    """summary.json and the rows of path.csv, as text.
+
+    Raises
+    ------
+    Damaged
+        If one of them cannot be read, or they do not belong together.
+    """
+    try:
+        summary, lines = read_summary(folder), read_lines(folder / "path.csv")
+    except OSError as e:
+        raise Damaged(f"{e.filename}: is damaged: it cannot be read: {e.strerror}") from None
+    if len(lines) != summary["points"]:
+        raise Damaged(
+            f"{folder / 'path.csv'}: is damaged: it has {len(lines)} points, and summary.json says {summary['points']}"
+        )
+    return summary, lines
 
 
 def _instability(line: Line, summary: Summary, lines: Sequence[Line], mode_at: Sequence[float] | None) -> Markup:

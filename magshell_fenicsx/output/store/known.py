@@ -15,22 +15,31 @@ SUMMARY = "summary.json"
 NUMBER, NOTHING = (int, float), type(None)
 PHASES = ("jit_s", "setup_s", "assembly_s", "factor_s", "solve_s", "output_s", "total_s")
 GROUPS = ("radius_to_thickness", "poisson_ratio", "lambda_m", "Lambda_m", "pc_over_E")
-SHAPE: dict[str, Any] = {  # the types of what is read from summary.json; a key with ? may be absent, [dict] is a list
-    "case": {"model": str, "shell": {"geometry": str}, "mesh": dict, "magnetic?": dict, "loading?": (dict, list)},
+NUMBERS = {"*": NUMBER}
+SECTIONS = {"remanent?": dict, "applied?": dict}
+# the types of what is read from summary.json; a key with ? may be absent, * is every key, [...] a list of such items
+SHAPE: dict[str, Any] = {
+    "case": {
+        "model": str,
+        "shell": {"geometry": str},
+        **dict.fromkeys(("mesh", "output?"), dict),
+        "magnetic?": SECTIONS,
+        "loading?": (dict, list),
+    },
     "dimensionless": dict.fromkeys(GROUPS, NUMBER),
     "dimensions": {**dict.fromkeys(("radius", "thickness", "youngs_modulus"), (*NUMBER, NOTHING)), "units": str},
-    "in_units?": dict,
-    "model": {"included": list, "left_out": list},
+    "in_units?": NUMBERS,
+    "model": {"included": [str], "left_out": [str]},
     "stopped": (str, NOTHING),
-    "limit_points": [dict],
-    "sensitivities": dict,
-    "gradients?": dict,
+    "limit_points": [{"mode_at?": [NUMBER]}],
+    "sensitivities": NUMBERS,
+    "gradients?": {"*": {"value": NUMBER, "numbers": NUMBERS, "fields": dict}},
     "knockdown": (*NUMBER, NOTHING),
     "barrier?": (*NUMBER, NOTHING),
-    "solutions?": [dict],
+    "solutions?": [{"point": int, "stable": bool, "residual": NUMBER}],
     "points": int,
     "mesh": dict.fromkeys(("cells", "dofs", "degree"), int),
-    "tolerance?": {"tolerance": NUMBER, "error_estimate": (*NUMBER, NOTHING), "rounds": [dict]},
+    "tolerance?": {"tolerance": NUMBER, "error_estimate": (*NUMBER, NOTHING), "rounds": [{"result": NUMBER}]},
     "timing": dict.fromkeys(PHASES, NUMBER),
     **dict.fromkeys(("factorisations", "iterations", "ranks"), int),
     "blas": str,
@@ -60,21 +69,20 @@ def read_summary(folder: Path) -> dict[str, Any]:
     return found
 
 
-def _unlike(found: Mapping[str, Any], shape: Mapping[str, Any], around: str = "") -> str:
-    """The first key whose value is none that a run writes, in words; empty if there is none."""
-    for name, kind in shape.items():
-        key = name.removesuffix("?")
-        if key not in found:
-            if name != key:
-                continue
-            return f"it has no {around}{key}"
-        value, items = found[key], isinstance(kind, list)
-        there = all(isinstance(each, dict) for each in value) if items and isinstance(value, list) else not items
-        if not there or not isinstance(value, list if items else dict if isinstance(kind, dict) else kind):
-            return f"its {around}{key} is {json.dumps(value)[:40]}"
-        if isinstance(kind, dict) and (wrong := _unlike(value, kind, f"{around}{key}.")):
-            return wrong
-    return ""
+def _unlike(value: Any, kind: Any, key: str = "") -> str:
+    """The first place where a value is none that a run writes, in words; empty if there is none; see `SHAPE`."""
+    within: list[tuple[Any, Any, str]] = []
+    if isinstance(kind, list) and isinstance(value, list):
+        within = [(each, kind[0], f"{key}.{i}") for i, each in enumerate(value)]
+    elif isinstance(kind, dict) and isinstance(value, dict):
+        inner = dict.fromkeys(value, kind["*"]) if "*" in kind else kind
+        for name in (name for name in inner if not name.endswith("?") and name not in value):
+            return f"it has no {key}.{name}".replace(" .", " ")
+        known = {name: name.removesuffix("?") for name in inner}
+        within = [(value[k], inner[name], f"{key}.{k}") for name, k in known.items() if k in value]
+    elif isinstance(kind, list | dict) or not isinstance(value, kind):
+        return f"its {key.removeprefix('.')} is {json.dumps(value)[:40]}"
+    return next((wrong for each in within if (wrong := _unlike(*each))), "")
 
 
 def style_of(case: Mapping[str, Any], options: Mapping[str, Any] | None = None) -> OutputSection:
