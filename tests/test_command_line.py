@@ -1,6 +1,8 @@
 """Exit codes, messages and files of the command line."""
 
 import json
+import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -199,3 +201,58 @@ def test_info() -> None:
     done = magshell("info")
     assert done.returncode == 0
     assert "openblas" in done.stdout
+
+
+SMALL = (CASES / "dimple_buckling.yaml", "--set=mesh={refinement: 0.3, degree: 2}", "--no-pictures")
+CLOSED = "exec {python} -m magshell_fenicsx run {case} --out {out} <&- >&- 2>&-"
+
+
+def test_standard_output_on_a_full_disk(tmp_path: Path) -> None:
+    """A run goes on: its results are in its folder. What only prints says that nothing was printed."""
+    for words, code in (("run", *SMALL, "--out", tmp_path / "out"), 0), (("schema",), 3):
+        command = [sys.executable, "-m", "magshell_fenicsx", *map(str, words)]
+        with Path("/dev/full").open("w") as full:
+            done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+        said = "standard output cannot be written: No space left on device"
+        assert done.returncode == code
+        assert done.stderr.splitlines() == [
+            f"warning: {said}; nothing more is printed",
+            *[f"stopped early: {said}"][:code],
+        ]
+    assert len(read_path(tmp_path / "out")) == 5
+
+
+def test_closed_descriptors(tmp_path: Path) -> None:
+    """No file of the run takes their numbers."""
+    words = CLOSED.format(python=sys.executable, case=shlex.join(map(str, SMALL)), out=tmp_path / "out")
+    assert subprocess.run(["sh", "-c", words], check=False).returncode == 0
+    assert len(read_path(tmp_path / "out")) == 5
+
+
+def test_a_kernel_cache_that_cannot_be_written(tmp_path: Path) -> None:
+    cache, command = "/dev/null/cache", [sys.executable, "-m", "magshell_fenicsx", "run", *map(str, SMALL)]
+    environment = {**os.environ, "XDG_CACHE_HOME": cache}
+    done = subprocess.run(
+        [*command, "--out", tmp_path / "out"], env=environment, capture_output=True, text=True, check=False
+    )
+    said = f"stopped early: kernels cannot be compiled into {cache}/fenics: Not a directory\n"
+    assert (done.returncode, done.stderr) == (3, said)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("check", CASES / "programme.yaml", "--set", "loading.²=1"),
+        ("sweep", SMALL[0], "--over", "mesh.degree=2,3,4", "--part", "²/³"),
+        ("ensemble", CASES / "random_dimples.yaml", "--samples=3", "--seed=1", "--part", "¹/²"),
+        ("run", *SMALL, "--time-limit", "nan"),
+    ],
+    ids=["item of a list", "part of a sweep", "part of an ensemble", "time limit"],
+)
+def test_no_numbers(tmp_path: Path, words: tuple[str | Path, ...]) -> None:
+    out = () if words[0] == "check" else ("--out", tmp_path / "out")
+    done = magshell(*words, *out)
+    assert done.returncode == 2
+    assert str(words[-1]) in done.stderr
+    assert not (tmp_path / "out").exists()
