@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from math import ceil, sqrt
+from math import ceil, inf, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,7 @@ from magshell_fenicsx.case.loads.dead import DeadSection
 from magshell_fenicsx.case.messages import shown
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.mesh.frame import rotation
-from magshell_fenicsx.mesh.grading import Squares
+from magshell_fenicsx.mesh.grading import PER_AREA, Squares
 from magshell_fenicsx.mesh.grid import Grid
 from magshell_fenicsx.mesh.msh import MeshFile
 from magshell_fenicsx.mesh.shapes import DiscShape, Shape, StripShape
@@ -20,6 +20,7 @@ from magshell_fenicsx.models.shell.natural import LARGEST, SMALLEST
 from magshell_fenicsx.models.shell.patterns import LARGEST as LARGEST_VECTOR
 from magshell_fenicsx.models.shell.thickness import LEAST_FACTOR, MOST_FACTOR
 from magshell_fenicsx.plan.by_formula import function
+from magshell_fenicsx.plan.imperfections.flaw import Flaw
 from magshell_fenicsx.plan.outline import ANY, Outline
 
 Array = NDArray[np.float64]
@@ -27,6 +28,8 @@ SAMPLES = 20  # along each side of a square of the chart
 COARSEST, MOST_FIRST, MOST_SQUARES = 0.2, 800, 3000  # side of the first squares over R, how many, and how many later
 DEGREE = 4  # of the polynomials that are compared
 SHOWN, SMALLEST_SQUARE = 0.25, 0.1  # of sqrt(Rh) and of h: elements of this size show loads, and all else
+SMALLEST_FLAW = 0.25  # of h
+CHEAPER = 0.5  # of as many elements as small ones everywhere are: a graded mesh is worth while
 MISSED = 0.003  # of the variance of a formula: what polynomials on squares may miss of it
 CURVATURE = 1e6  # of a natural shape, over 1/R
 LOCAL = (np.stack(np.meshgrid(*[np.arange(SAMPLES)] * 2, indexing="ij"), axis=-1).reshape(-1, 2) + 0.5) / SAMPLES - 0.5
@@ -218,3 +221,38 @@ def refinements(case: Case, formulas: Sequence[Written], drawn: Outline, turn: f
         for each in formulas
     )
     return [each.finer(case.mesh.refinement) for each in found if each]
+
+
+def of_imperfections(
+    flaws: Iterable[Flaw], perfect: Outline, turn: float, case: Case, h: float
+) -> tuple[list[Squares], float]:
+    """Where imperfections without a centre need small elements, and the size that shows the others everywhere."""
+    Q, everywhere, local = rotation(turn), inf, list[Squares]()
+    shape = perfect.chart(None, ANY)
+
+    def places(chart: Array) -> Array:
+        return perfect.perfect(chart) @ Q
+
+    for flaw in flaws:
+        found = flaw.sizes and squares(places, perfect, _smallest(flaw.sizes), SMALLEST_FLAW * h)
+        if found is None:
+            everywhere = min(everywhere, flaw.size)
+            continue
+        low, high = extent(shape)
+        alike = PER_AREA * float(np.prod(high - low)) / found.size**2
+        if found.cells(float(np.linalg.norm(high - low)) / 2) < CHEAPER * alike:
+            local.append(found.finer(case.mesh.refinement))
+        else:
+            everywhere = min(everywhere, found.size)
+    return local, everywhere
+
+
+def _smallest(of_place: Callable[[Array], Array]) -> Sizes:
+    """Elements that are the smallest which places (n, 3) of a square need; a quarter of the places is looked at."""
+
+    def sizes(x: Array, inside: NDArray[np.bool_], side: float) -> Array:
+        x, inside = (v.reshape(len(v), SAMPLES, SAMPLES, *v.shape[2:])[:, ::2, ::2] for v in (x, inside))
+        found = of_place(x.reshape(-1, 3)).reshape(inside.shape)
+        return np.asarray(np.where(inside, found, inf).min(axis=(1, 2)))
+
+    return sizes

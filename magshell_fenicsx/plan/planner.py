@@ -16,7 +16,7 @@ from magshell_fenicsx.case.loads.indentation import IndentationSection
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.case.surfaces import MeshSurface
 from magshell_fenicsx.mesh.frame import rotation
-from magshell_fenicsx.mesh.grading import Grading
+from magshell_fenicsx.mesh.grading import Grading, Squares
 from magshell_fenicsx.mesh.grid import Grid
 from magshell_fenicsx.mesh.mirror import CUT, Y0, Mirror
 from magshell_fenicsx.mesh.msh import MeshFile, cell_count
@@ -29,7 +29,7 @@ from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.plan.account import account
 from magshell_fenicsx.plan.bodies.registered import body_leaves, contacts, pressed
 from magshell_fenicsx.plan.columns import refuse_twice
-from magshell_fenicsx.plan.formulas import refinements, refuse_unfit_formulas, written
+from magshell_fenicsx.plan.formulas import of_imperfections, refinements, refuse_unfit_formulas, written
 from magshell_fenicsx.plan.imperfections.flaw import Flaw, in_frame
 from magshell_fenicsx.plan.imperfections.registered import flaws
 from magshell_fenicsx.plan.imperfections.rims import MOST_RIMS, Spot, different, spots
@@ -99,10 +99,13 @@ def make_plan(case: Case, terms: Sequence[OwnTerm] = ()) -> Plan:
         there = (step.load for step in case.programme if under.get(step.name) == point)
         loaded.append((points[point], [load for load in there if isinstance(load, IndentationSection)]))
     local = [] if isinstance(case.shell, MeshSurface) else spots(found.items(), perfect, turn)
-    everywhere = min((flaw.size for flaw in found.values() if flaw.centre is None), default=inf)
+    wide = [flaw for flaw in found.values() if flaw.centre is None]
+    everywhere, varying = min((flaw.size for flaw in wide), default=inf), list[Squares]()
     bodies = contacts(case, perfect, drawn, turn)
     touched = [(drawn.inverse(c.front), travel(material.h, pressed(case, c.body), c.size), c.size) for c in bodies]
-    varying = [] if axisymmetric else refinements(case, formulas, drawn, turn, material.h)
+    if not (axisymmetric or case.mesh.size):
+        varying, everywhere = of_imperfections(wide, perfect, turn, case, material.h)
+        varying += refinements(case, formulas, drawn, turn, material.h)
     size = grading(case, drawn, material.h, local, everywhere, loaded, touched, varying)
     drawn = imperfect(perfect, found, turn, still)
     shape = drawn.chart(beyond, size)

@@ -36,6 +36,9 @@ class Flaw:
         Whether the curvature jumps there.
     account
         What it was made from, for people.
+    sizes
+        Places (n, 3) -> element sizes (n,) that show it there, of one that is everywhere and varies more in some places;
+        None where they are alike.
     """
 
     deviation: Deviation
@@ -45,6 +48,7 @@ class Flaw:
     reach: float = inf
     rim: bool = False
     account: str = ""
+    sizes: Callable[[Array], Array] | None = None
 
     def inside(self, places: Array) -> NDArray[np.bool_]:
         """Whether places (n, 3) are within its rim."""

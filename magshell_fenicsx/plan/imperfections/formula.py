@@ -15,6 +15,8 @@ from magshell_fenicsx.plan.outline import Outline
 
 Array = NDArray[np.float64]
 DEEPEST = 0.5  # over R
+WIDE = 1e5  # over R: elements of any size show it
+ALIKE = 0.2  # of the surface: where so much needs small elements, all get them
 
 
 @dataclass(frozen=True)
@@ -45,7 +47,16 @@ def by_formula(section: FormulaSection, case: Case, drawn: Outline, key: str) ->
             f"shell.{key}.w0: {shown(section.w0)}: has no finite value, or one above half a radius, at (x, y, z)/R = "
             f"({place})"
         )
-    found = with_derivatives(section.w0)(x)
-    curved = np.nan_to_num(np.linalg.norm(found.hessian, axis=(0, 1))).max()
-    largest = np.ptp(found.value)
-    return Flaw(deviation, 2.5 * np.sqrt(largest / 2 / curved) if curved * largest > 0 else np.inf)
+    largest, derived = np.ptp(deviation(x)) / abs(deviation.factor or 1.0), with_derivatives(section.w0)
+
+    def sizes(places: Array) -> Array:
+        """2.5/k of the wave with the depth of the whole and the curvature of each place."""
+        found = derived(places)
+        curved = np.nan_to_num(np.linalg.norm(found.hessian, axis=(0, 1)))
+        depth = max(largest, float(np.ptp(np.nan_to_num(found.value))))
+        return np.asarray(2.5 * np.sqrt(depth / 2 / np.maximum(curved, 1e-300 + 1e-12 * depth)))
+
+    at = sizes(x)
+    size = float(at.min()) if largest > 0 and at.min() < WIDE else np.inf
+    local = not (at < 2 * size).mean() > ALIKE
+    return Flaw(deviation, size, sizes=sizes if local else None)
