@@ -55,6 +55,8 @@ class Result:
         States at the points whose frequencies are requested, by row number; not of the start and the end.
     frequencies
         The natural modes, by row number.
+    contact_changes
+        Beside bodies how much their omega^2 depend on the bodies' stiffness; see `frequencies.contact_changes`.
     found
         The states of the solutions that searches have found, by row number.
     barrier
@@ -82,6 +84,7 @@ class Result:
     found: dict[int, State] = field(default_factory=dict)
     kept: dict[int, State] = field(default_factory=dict)
     frequencies: dict[int, list[ShellMode]] = field(default_factory=dict)
+    contact_changes: dict[int, list[float]] = field(default_factory=dict)
     gradients: dict[str, dict[str, Any]] = field(default_factory=dict)
     largest: dict[int, list[float]] = field(default_factory=dict)
 
@@ -176,6 +179,7 @@ def summary(result: Result, total_s: float) -> dict[str, Any]:
                 "point": number,
                 "omega2": [mode.eigenvalue for mode in modes],
                 **({"hertz": [hertz(mode.eigenvalue, time_unit) for mode in modes]} if time_unit else {}),
+                **({"contact_change": result.contact_changes[number]} if number in result.contact_changes else {}),
             }
             for number, modes in result.frequencies.items()
         ],

@@ -1,4 +1,4 @@
-"""The first contact of a body: free flight, which is no equilibrium path that arc length could measure."""
+"""Contact of bodies: the first one, a free flight that arc length could not measure, and how stiff bodies must be."""
 
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
@@ -12,6 +12,7 @@ from magshell_fenicsx.case.loads.contact import ContactSection
 from magshell_fenicsx.continuation.control import GivenLoad
 from magshell_fenicsx.continuation.point import PathStopped, Point
 from magshell_fenicsx.continuation.system import State, max_abs
+from magshell_fenicsx.models.shell.contact import Contact
 from magshell_fenicsx.simulate.record import Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.stage import Stage
@@ -21,6 +22,7 @@ NEAR = 1e-7  # of h: a smaller gap is none
 FALLEN, ALIKE = 0.1, 0.02  # of h, how far a path that returns is from its turn; of that, how far from the way there
 MOST = 1000  # approaches by the least gap
 STIFFER, MOST_STIFF = 4.0, 1e4  # how much stiffer a body becomes at once, and at most
+RIGID, MOVED, MOST_RAISED = 2.0, 0.05, 4  # penetrations, thicknesses, times: see `rigid`
 
 
 def touched(scene: Scene, step: ProgrammeStep, state: State) -> State:
@@ -144,3 +146,41 @@ def refuse_penetration(scene: Scene, state: State) -> None:
                 f"the penetration of the body {contact.body} is {deep:.3g} h, more than bodies.{contact.body}."
                 f"penetration: {contact.bound:g}; its stiffness is {k:.4g}: give four times as much"
             )
+
+
+def touching(scene: Scene, state: State) -> list[Contact]:
+    """The bodies that touch."""
+    contacts = scene.plan.loads.contacts
+    return [contact for contact in contacts if scene.model.touching(state, contact.amplitude).penetration > 0]
+
+
+def hardened(scene: Scene, state: State, bodies: list[Contact]) -> State | None:
+    """The equilibrium near a state with these bodies `STIFFER` times as stiff; None if there is none within `MOVED`."""
+    k = {contact.setting: STIFFER * state.mu.get(contact.setting, contact.stiffness) for contact in bodies}
+    name = bodies[0].amplitude
+    outcome = scene.newton.solve(State(state.u, {**state.mu, **k}), name, GivenLoad(name, state.mu[name]))
+    if not outcome.converged or _moved(scene, state, outcome.state) > MOVED * scene.plan.material.h:
+        return None
+    return outcome.state
+
+
+def rigid(scene: Scene, state: State) -> State:
+    """The state between bodies so stiff that their stiffness does not decide where the shell touches; collective.
+
+    A shell that a soft body lets go lies flat on a harder one. So the bodies that touch become stiffer, until the
+    shell moves by at most `RIGID` times the penetration. A given stiffness stays.
+    """
+    for _ in range(MOST_RAISED):
+        bodies = [contact for contact in touching(scene, state) if not contact.given]
+        harder = hardened(scene, state, bodies) if bodies else None
+        if harder is None:
+            break
+        deep = max(scene.model.touching(state, contact.amplitude).penetration for contact in bodies)
+        state, moved = harder, _moved(scene, state, harder)
+        if moved <= RIGID * deep:
+            break
+    return state
+
+
+def _moved(scene: Scene, state: State, other: State) -> float:
+    return max_abs(scene.model.system.comm, other.u - state.u)

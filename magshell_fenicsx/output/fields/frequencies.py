@@ -12,6 +12,7 @@ from magshell_fenicsx.output.store.durable import Damaged
 
 NAME = "frequencies.csv"
 COLUMNS = ("point", "wave", "omega2", "hertz")
+CONTACT_CHANGE = "contact_change"  # of omega2, relative, if the bodies that touch are four times as stiff
 
 
 @dataclass(frozen=True)
@@ -40,16 +41,21 @@ def hertz(omega2: float, time_unit: float | None) -> float | None:
     return sqrt(omega2) / (2 * pi * time_unit) if time_unit and omega2 >= 0 else None
 
 
-def frequency_table(found: Mapping[int, Sequence[Mode]], own: str, time_unit: float | None) -> bytes:
-    """The file: modes of each point, ascending."""
+def frequency_table(
+    found: Mapping[int, Sequence[Mode]],
+    own: str,
+    time_unit: float | None,
+    contact_changes: Mapping[int, Sequence[float]],
+) -> bytes:
+    """The file: modes of each point, ascending; `contact_changes` is a column where there are bodies."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(COLUMNS)
+    writer.writerow((*COLUMNS, CONTACT_CHANGE) if contact_changes else COLUMNS)
     for point, modes in found.items():
-        for mode in modes:
+        for n, mode in enumerate(modes):
             f = hertz(mode.eigenvalue, time_unit)
             row = (point, wave_of(mode.label, own), repr(mode.eigenvalue), "" if f is None else repr(f))
-            writer.writerow(row)
+            writer.writerow((*row, repr(contact_changes[point][n])) if contact_changes else row)
     return text.getvalue().encode()
 
 

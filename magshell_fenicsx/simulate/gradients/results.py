@@ -17,6 +17,7 @@ from magshell_fenicsx.simulate.gradients.vibration import (
 )
 from magshell_fenicsx.simulate.results import Target, differentiable
 from magshell_fenicsx.simulate.scene import Scene
+from magshell_fenicsx.simulate.touch import rigid
 
 
 def refuse_no_result(scene: Scene, results: Iterable[str], key: str, *, more: Sequence[str] = ()) -> None:
@@ -72,5 +73,5 @@ def vibration_at_end(scene: Scene, history: History, of: str) -> float | None:
     if not NAMES.fullmatch(of):
         return None
     assert history.end
-    state = scene.model.system.placed(history.end.point.state)
+    state = rigid(scene, scene.model.system.placed(history.end.point.state))
     return frequency(scene.case, of, vibration(scene, state, of).value)

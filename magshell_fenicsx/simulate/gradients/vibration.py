@@ -42,6 +42,7 @@ from magshell_fenicsx.simulate.gradients.instabilities import Lost
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.results import Functional
 from magshell_fenicsx.simulate.scene import Scene
+from magshell_fenicsx.simulate.touch import rigid
 
 FIRST = ("omega2_1", "hertz_1")
 NAMES = re.compile(r"(omega2|hertz)_([1-9]\d?)")
@@ -176,7 +177,7 @@ def adjoints_of_vibrations(
     CaseError
         If the mode leaves the symmetry of the model.
     """
-    state = scene.model.system.placed(record.point.state)
+    state = rigid(scene, scene.model.system.placed(record.point.state))
     held = held_at(scene, record, state, hold)
     found = vibrations(scene, state, of, beside=beside, most=most)
     return [(each.kind, _adjoint(scene, state, of, each, held)) for each in found]
