@@ -164,8 +164,8 @@ def swept(r0: Jet, u: Jet, unit: Expr | float = 1.0) -> Expr:
     It is the work of p = 1 in that unit, and its potential wherever there is one: whatever the edges are, no
     origin and no faces that close the volume enter.
     """
-    mean = kin.area_vector(r0) + (ufl.cross(r0.r1, u.r2) + ufl.cross(u.r1, r0.r2)) / 2 + kin.area_vector(u) / 3
-    return unit * ufl.dot(u.r, mean)
+    halfway = ufl.cross(r0.r1 + u.r1 / 2, r0.r2 + u.r2 / 2)
+    return unit * ufl.dot(u.r, halfway + kin.area_vector(u) / 12)
 
 
 def following(r0: Jet, u: Jet, v: Jet, unit: Expr | float = 1.0) -> Expr:
