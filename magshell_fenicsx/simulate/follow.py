@@ -15,7 +15,7 @@ from magshell_fenicsx.simulate.touch import refuse_penetration
 from magshell_fenicsx.simulate.transient import released
 from magshell_fenicsx.simulate.walked import Walked, amount
 
-BEYOND = "beyond the first instability"  # what the remark of a path begins with that stops after its answer
+BEYOND = "beyond the first instability the path stopped: "  # how the remark of a path begins that has its answer
 
 
 def _warned(remark: str) -> None:
@@ -69,7 +69,7 @@ def follow(scene: Scene, *, search: bool = True, remark: Callable[[str], None] =
         except Stopped as e:
             if not (first and step is steps[-1] and step.until == "limit" and not getattr(step.load, "then", None)):
                 raise Stopped(f"{where}{e}") from None
-            remark(f"{BEYOND} the path stopped: {where}{e}")
+            remark(f"{BEYOND}{where}{e}")
             return
         begin, state = state, walked.end
         for record in searched(scene, step, begin, state) if search else ():
