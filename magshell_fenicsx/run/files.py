@@ -25,6 +25,7 @@ from magshell_fenicsx.output.store.folder import DiskError, by_first, prepare_fo
 from magshell_fenicsx.output.store.known import SUMMARY, read_summary
 from magshell_fenicsx.output.store.table import PathTable, Row
 from magshell_fenicsx.output.store.written import MESH, OF_PATH, note, refuse_unwritten, remove, written
+from magshell_fenicsx.output.store.written import NAME as LIST
 from magshell_fenicsx.simulate.scene import Scene
 
 INTERRUPTED = re.compile(r"^interrupted by |cannot be (written|read): ")
@@ -119,7 +120,11 @@ def _refuse_no_resuming(out: Path, case: Case) -> None:
         if summary["stopped"] is None:
             kept = {key: summary[key] for key in ("case", "sources", *case.outside) if key in summary}
             checkpoint.refuse_other({"version": summary["versions"]["magshell_fenicsx"], **kept}, case, out)
-            for number in range(len(read_run(out)[1])):
+            try:
+                points = len(read_run(out)[1])
+            except FileNotFoundError as e:
+                raise Damaged(f"{e.filename}: is damaged: it is cut off, or missing") from None
+            for number in range(points):
                 if not is_whole(out / "fields" / point_file(number)):
                     raise Damaged(f"{out / 'fields' / point_file(number)}: is damaged: it is cut off, or missing")
             raise AlreadyComplete(summary)
@@ -133,6 +138,8 @@ class RunFiles:
 
     Parameters
     ----------
+    begun
+        The content of an empty checkpoint, as the case and its files were before the scene was built.
     resume
         Whether the run in the folder goes on.
     mesh
@@ -155,8 +162,8 @@ class RunFiles:
 
     journal: checkpoint.Checkpoint | None = None
 
-    def __init__(self, folder: Path, scene: Scene, *, resume: bool, mesh: bytes | None = None) -> None:
-        self._folder, self._scene, self._comm, self._mesh = folder, scene, scene.comm, mesh
+    def __init__(self, folder: Path, scene: Scene, begun: bytes, *, resume: bool, mesh: bytes | None = None) -> None:
+        self._folder, self._scene, self._comm, self._new, self._mesh = folder, scene, scene.comm, begun, mesh
         self._gatherer = gatherer(scene.model, scene.comm)
         self.kept, self._rows, self.elapsed = 0, list[dict[str, str]](), 0.0
         if resume:
@@ -179,7 +186,7 @@ class RunFiles:
         """Replace an earlier run by an empty checkpoint; whenever this is killed, what is there is known as a run's."""
         folder, file = self._folder, self._folder / checkpoint.NAME
         new, earlier = file.with_name(f"{file.name}.new"), written(folder)
-        write_whole(new, checkpoint.begun(self._scene.case))  # a full disk stops here
+        write_whole(new, self._new)  # a full disk stops here
         remove(folder, earlier - {SUMMARY, file.name})
         if self._mesh:
             write_whole(folder / MESH, self._mesh)
@@ -245,8 +252,13 @@ class RunFiles:
         self.journal.close()
         if complete:
             self.journal.remove()
+
+        def listed() -> None:
+            (self._folder / LIST).unlink(missing_ok=True)  # `plot` may have made one meanwhile
+            note(self._folder)
+
         with suppress(DiskError):  # without the list, summary.json says that they are
-            by_first(self._comm, lambda: note(self._folder))
+            by_first(self._comm, listed)
 
 
 def _same(row: Row, there: dict[str, str]) -> None:

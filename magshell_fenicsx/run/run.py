@@ -18,6 +18,7 @@ from magshell_fenicsx.continuation.journal import NoJournal
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.output.report.report import write_report
+from magshell_fenicsx.output.store import checkpoint
 from magshell_fenicsx.output.store.durable import Damaged
 from magshell_fenicsx.output.store.folder import DiskError, by_first, given_folder, held_folder
 from magshell_fenicsx.output.store.table import LOCATED, SOLUTION, Row
@@ -133,6 +134,7 @@ def _run(
     def doing(what: str) -> None:
         tell(waiting(what, time.perf_counter() - start))
 
+    begun = by_first(comm, partial(checkpoint.begun, case), "cannot be read") if folder else b""
     try:
         with_modes(case, comm)
         found = _mesh_for_tolerance(case, folder if resume else None, comm, say, doing)
@@ -150,7 +152,7 @@ def _run(
     if comm.size == 1 and not has_cholmod():
         say("warning: PETSc has no CHOLMOD, which factors tangents that are positive definite in half of the time")
     mesh = found.to_json() if found else None
-    files = RunFiles(folder, scene, resume=resume, mesh=mesh) if folder else None
+    files = RunFiles(folder, scene, begun, resume=resume, mesh=mesh) if folder else None
     if files and files.kept:
         start -= files.elapsed
         say(f"resuming after {files.kept} points")
@@ -187,8 +189,8 @@ def _run(
                 interrupted = interrupted or e
             files.close(complete=not interrupted and not result.stopped)
     if interrupted:
-        begun = files is not None and files.journal is not None
-        hint = f"; the results so far are in {folder}/, and --resume continues from there" if begun else ""
+        there = files is not None and files.journal is not None
+        hint = f"; the results so far are in {folder}/, and --resume continues from there" if there else ""
         result.stopped = f"{interrupted}{hint}"
     return result
 

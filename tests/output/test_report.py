@@ -79,7 +79,8 @@ def page(folder: Path, rows: list[dict[str, Any]], pictures: dict[str, bytes] | 
     for number, row in enumerate([{}, *rows]):
         lines.append(",".join(str((START | {"point": number} | row).get(name, 0.0)) for name in columns))
     (folder / "path.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    (folder / "summary.json").write_text(json.dumps(copy.deepcopy(SUMMARY) | changes), encoding="utf-8")
+    summary = copy.deepcopy(SUMMARY) | {"points": len(rows) + 1} | changes
+    (folder / "summary.json").write_text(json.dumps(summary), encoding="utf-8")
     for name, content in (pictures or {}).items():
         (folder / name).write_bytes(content)
     write_report(folder)

@@ -17,8 +17,11 @@ import magshell_fenicsx
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.output.store import checkpoint
+from magshell_fenicsx.output.store.known import GROUPS, PHASES
+from magshell_fenicsx.output.store.table import COLUMNS, TEXTS
+from magshell_fenicsx.output.store.written import MESH
 from magshell_fenicsx.platform import sources
-from magshell_fenicsx.run.files import MESH, AlreadyComplete
+from magshell_fenicsx.run.files import AlreadyComplete
 from magshell_fenicsx.run.run import run
 from magshell_fenicsx.studies.compare import runs
 from magshell_fenicsx.studies.study import sample
@@ -106,7 +109,7 @@ def test_a_complete_run_of_other_sources(tmp_path: Path, edited: Any, no_picture
 def test_what_differs_is_told(tmp_path: Path, edited: Any) -> None:
     """The case where it does, else the sources; what an earlier version of the program left is of others."""
     case, file = Case.load(BUCKLING), tmp_path / "checkpoint"
-    checkpoint.begin_checkpoint(file, case)
+    file.write_bytes(checkpoint.begun(case))
     checkpoint.check_resumable(file, case)
     known = checkpoint.identity(case)
     edited()
@@ -156,6 +159,22 @@ def test_points_of_a_sweep(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, edit
     assert [point["sources"] for point in kept] == 3 * [OTHER]
 
 
+SUMMARY = {
+    "case": {"model": "shell", "shell": {"geometry": "hemisphere"}, "mesh": {}},
+    "dimensionless": dict.fromkeys(GROUPS, 1.0),
+    "dimensions": {"radius": None, "thickness": None, "youngs_modulus": None, "units": "SI"},
+    "model": {"included": [], "left_out": []},
+    "stopped": None,
+    "sensitivities": {},
+    "knockdown": 0.3,
+    "mesh": {"cells": 9, "dofs": 99, "degree": 3},
+    "timing": dict.fromkeys(PHASES, 0.0),
+    **dict.fromkeys(("points", "factorisations", "iterations", "ranks"), 1),
+    "blas": "openblas",
+    "versions": {"magshell_fenicsx": "0.1.0"},
+}
+
+
 def faked(monkeypatch: pytest.MonkeyPatch, module: Any) -> list[str]:
     """Runs that leave a summary at once, by which sources it says."""
     by: list[str] = []
@@ -164,11 +183,9 @@ def faked(monkeypatch: pytest.MonkeyPatch, module: Any) -> list[str]:
         out = Path(words[words.index("--out") + 1])
         out.mkdir(parents=True, exist_ok=True)
         by.append(sources.ours())
-        mesh, timing = {"cells": 9, "dofs": 99, "degree": 3}, {"jit_s": 0.0}
-        found = {"stopped": None, "knockdown": 0.3, "factorisations": 9, "iterations": 9}
-        content = {"sources": by[-1], "mesh": mesh, "timing": timing, **found}
-        (out / "summary.json").write_text(json.dumps(content), encoding="utf-8")
-        (out / "path.csv").write_text("point\n0\n", encoding="utf-8")
+        (out / "summary.json").write_text(json.dumps({**SUMMARY, "sources": by[-1]}), encoding="utf-8")
+        row = {name: "" if name in TEXTS else "0" for name in COLUMNS}
+        (out / "path.csv").write_text(f"{','.join(row)}\n{','.join(row.values())}\n", encoding="utf-8")
         return Usage(0, 1.0, 1.0, 100.0, "", "")
 
     monkeypatch.setattr(module, "measure", measure)

@@ -107,10 +107,7 @@ def read_run(folder: Path) -> tuple[Summary, Sequence[Line]]:
     Damaged
         If one of them cannot be read, or they do not belong together.
     """
-    try:
-        summary, lines = read_summary(folder), read_lines(folder / "path.csv")
-    except OSError as e:
-        raise Damaged(f"{e.filename}: is damaged: it cannot be read: {e.strerror}") from None
+    summary, lines = read_summary(folder), read_lines(folder / "path.csv")
     if len(lines) != summary["points"]:
         raise Damaged(
             f"{folder / 'path.csv'}: is damaged: it has {len(lines)} points, and summary.json says {summary['points']}"

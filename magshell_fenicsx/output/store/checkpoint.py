@@ -63,7 +63,7 @@ def begun_with(file: Path) -> dict[str, Any] | None:
         known = json.loads(head or b"")
     except ValueError:
         known = None
-    if not isinstance(known, dict):
+    if not isinstance(known, dict) or not isinstance(known.get("case"), dict):
         raise Damaged(f"{file}: is damaged: its head cannot be read")
     return known
 

@@ -102,7 +102,8 @@ def prepare_folder(out: Path, comm: MPI.Comm, make: Callable[[Path], None]) -> P
         try:
             make(out)
         except OSError as e:
-            raise CaseError(f"--out {out}: cannot be written: {e.strerror}") from None
+            within = e.filename is not None and Path(e.filename) != out
+            raise CaseError(f"--out {out}: {f'{e.filename} ' * within}cannot be written: {e.strerror}") from None
         return out
 
     return from_first(comm, made)

@@ -31,7 +31,7 @@ SHAPE: dict[str, Any] = {
     "in_units?": NUMBERS,
     "model": {"included": [str], "left_out": [str]},
     "stopped": (str, NOTHING),
-    "limit_points": [{"mode_at?": [NUMBER]}],
+    "limit_points?": [{"mode_at?": [NUMBER]}],
     "sensitivities": NUMBERS,
     "gradients?": {"*": {"value": NUMBER, "numbers": NUMBERS, "fields": dict}},
     "knockdown": (*NUMBER, NOTHING),

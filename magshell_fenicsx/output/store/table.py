@@ -132,7 +132,7 @@ def _wrong(number: int, row: Mapping[str, str], counts: Collection[str]) -> str:
     """The first column whose value no run writes; empty if there is none."""
     for key, text in row.items():
         try:
-            if key not in TEXTS and not isinstance(_number(text), int) and key in counts:
+            if key not in TEXTS and not float(text).is_integer() and key in counts:
                 return key
         except ValueError:
             return key

@@ -36,16 +36,19 @@ def written(folder: Path) -> set[str]:
     """Those of `of_names` that a run is known to have written.
 
     They are listed in written.txt at the end of a run. Without it they are all, if summary.json is a run's, as of
-    earlier versions; and the files of a path, if only checkpoint or path.csv is, as after a kill.
+    earlier versions. The files of a path are, if checkpoint is, also after a kill, or without the list path.csv.
     """
-    there, table = of_names(folder), folder / NAME
-    if NAME in there and (text := table.read_text(encoding="utf-8", errors="replace")).startswith(FIRST):
-        return there & {NAME, *text.splitlines()}
-    if _is_of_run(lambda: read_object(folder / "summary.json")):
+    there, found = of_names(folder), set[str]()
+    text = (folder / NAME).read_text(encoding="utf-8", errors="replace") if (folder / NAME).is_file() else ""
+    if text.startswith(FIRST):
+        found = there & {NAME, *text.splitlines()}
+    elif _is_of_run(lambda: read_object(folder / "summary.json")):
         return there
-    if _is_of_run(lambda: checkpoint.begun_with(folder / checkpoint.NAME)) or is_path(folder / "path.csv"):
-        return {name for name in there if name in OF_PATH or name.startswith("fields/")}
-    return set()
+    if _is_of_run(lambda: checkpoint.begun_with(folder / checkpoint.NAME)) or (
+        not found and is_path(folder / "path.csv")
+    ):
+        found |= {name for name in there if name in OF_PATH or name.startswith("fields/")}
+    return found
 
 
 def _is_of_run(read: Callable[[], dict[str, Any] | None]) -> bool:
