@@ -60,16 +60,18 @@ def content(folder: Path) -> dict[str, bytes]:
     return {str(file.relative_to(folder)): file.read_bytes() for file in folder.rglob("*") if file.is_file()}
 
 
-@pytest.mark.parametrize("ranks", [0, 2])
+REFUSED = {"scene": 'shell.thickness_factor="1/0"', "gradients": "gradients={of: [nope], by: [lambda_m]}"}
+
+
 @pytest.mark.parametrize(
-    "setting", ['shell.thickness_factor="1/0"', "gradients={of: [nope], by: [lambda_m]}"], ids=["scene", "gradients"]
+    ("what", "how", "ranks"), [("scene", "", 0), ("gradients", "--overwrite", 0), ("scene", "", 2)]
 )
-def test_what_is_refused_loses_nothing(out: Path, setting: str, ranks: int) -> None:
+def test_what_is_refused_loses_nothing(out: Path, what: str, how: str, ranks: int) -> None:
     """Also if it is refused only when its scene is built."""
     before = content(out)
-    for how in ([], ["--overwrite"]):
-        assert magshell("run", FILE, *SMALL, "--set", setting, "--out", out, *how, ranks=ranks).returncode == 2
-        assert content(out) == before
+    refused = magshell("run", FILE, *SMALL, "--set", REFUSED[what], "--out", out, *([how] if how else []), ranks=ranks)
+    assert refused.returncode == 2
+    assert content(out) == before
 
 
 def test_what_is_refused_leaves_no_folder(tmp_path: Path) -> None:

@@ -129,7 +129,7 @@ def test_the_mesh_for_a_tolerance(tmp_path: Path, edited: Any, no_pictures: None
     edited()
     with pytest.raises(checkpoint.OtherSources):
         run(case, tmp_path, resume=True)
-    assert run(case, tmp_path).stopped is None
+    assert run(case, tmp_path, overwrite=True).stopped is None
     assert (tmp_path / MESH).read_bytes() != b"of these sources"
 
 
