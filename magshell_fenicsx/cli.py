@@ -283,6 +283,13 @@ def check(case: CaseFile, set_: Settings = None) -> None:
         source = read_together(case, world(), set_ or [])
         read = with_same_files(Case.from_source(source), world())
         print_line(describe(with_modes(read, world())))
+        if read.gradients or read.design:
+            from magshell_fenicsx.simulate.gradients.expected import refuse_unknown_results
+
+            try:
+                refuse_unknown_results(read)
+            except CaseError as e:
+                raise CaseError(read.placed(str(e))) from None
         if read.ensemble:
             from magshell_fenicsx.studies.ensemble.door import refuse_unknown_keys
 

@@ -28,7 +28,7 @@ from magshell_fenicsx.simulate.gradients.fields import FIELDS
 from magshell_fenicsx.simulate.gradients.gradient import derivative
 from magshell_fenicsx.simulate.gradients.instabilities import FOLDS, Lost, instabilities, refuse_moving
 from magshell_fenicsx.simulate.gradients.results import adjoint_at_end, refuse_no_result
-from magshell_fenicsx.simulate.numbers import number_of
+from magshell_fenicsx.simulate.numbers import refuse_unknown_parameters
 from magshell_fenicsx.simulate.scene import Scene
 
 Say = Callable[[str], None]
@@ -48,12 +48,7 @@ def refuse_unknown(scene: Scene) -> None:
     if section is None:
         return
     refuse_no_result(scene, section.of, "gradients.of")
-    try:
-        for by in section.by:
-            if by not in FIELDS and by not in start.mu:
-                number_of(scene.case, by)
-    except CaseError as e:
-        raise CaseError(f"gradients.by: {e}") from None
+    refuse_unknown_parameters(scene.case, section.by, start)
 
 
 def gradients_after(result: Result, folder: Path, say: Say) -> None:

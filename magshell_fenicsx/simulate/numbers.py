@@ -4,7 +4,7 @@ The case is the one that a file with this number would give: lengths with units 
 dimple's width change with these.
 """
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from copy import deepcopy
 from dataclasses import replace
 from typing import Any
@@ -13,6 +13,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.gradients import FIELDS
 from magshell_fenicsx.case.imperfections.dimple import DimpleSection
 from magshell_fenicsx.case.imperfections.modes import ModesSection
 from magshell_fenicsx.case.source import CaseError
@@ -109,6 +110,22 @@ def _replaced(part: Any, key: str, value: float) -> Any:
     if isinstance(part, dict):
         return {name: _replaced(item, rest, value) if name == first else item for name, item in part.items()}
     return part.model_copy(update={first: _replaced(getattr(part, first), rest, value)})
+
+
+def refuse_unknown_parameters(case: Case, names: Iterable[str], start: State) -> None:
+    """See that gradients can be taken by fields, amplitudes and numbers with these names.
+
+    Raises
+    ------
+    CaseError
+        If one is none of the case.
+    """
+    try:
+        for by in names:
+            if by not in FIELDS and by not in start.mu:
+                number_of(case, by)
+    except CaseError as e:
+        raise CaseError(f"gradients.by: {e}") from None
 
 
 def scene_with(scene: Scene, key: str, value: float) -> Scene:
