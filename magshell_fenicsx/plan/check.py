@@ -10,6 +10,7 @@ from magshell_fenicsx.mesh.msh import MeshFile
 from magshell_fenicsx.mesh.patch import MeshError, PatchMesh
 from magshell_fenicsx.models.shell.openings import no_potential, ring_openings
 from magshell_fenicsx.plan.body import layers
+from magshell_fenicsx.plan.formulas import cells_of_patch, unshown, written
 from magshell_fenicsx.plan.limits import refuse_beyond_memory
 from magshell_fenicsx.plan.names import open_edges
 from magshell_fenicsx.plan.outline import outline
@@ -62,7 +63,10 @@ def _described(case: Case) -> str:
         left_out.append("ensemble: random values (magshell ensemble alone draws them)")
     left_out = left_out or ["nothing"]
     lines += ["built:", *(f"  {item}" for item in plan.included), "left out:", *(f"  {item}" for item in left_out)]
-    lines += [f"warning: {said}" for said in (plan.warning, too_large) if said]
+    missed: list[str] = []
+    if patch and (formulas := written(case)):
+        missed = unshown(formulas, cells_of_patch(patch, case.degree), plan.azimuth, plan.material.h)
+    lines += [f"warning: {said}" for said in (plan.warning, too_large, *missed) if said]
     return "\n".join(lines)
 
 

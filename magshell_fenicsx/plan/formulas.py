@@ -4,7 +4,9 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from math import ceil, inf, sqrt
 
+import basix
 import numpy as np
+from mpi4py import MPI
 from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
@@ -15,7 +17,9 @@ from magshell_fenicsx.mesh.frame import rotation
 from magshell_fenicsx.mesh.grading import PER_AREA, Squares
 from magshell_fenicsx.mesh.grid import Grid
 from magshell_fenicsx.mesh.msh import MeshFile
+from magshell_fenicsx.mesh.patch import PatchMesh
 from magshell_fenicsx.mesh.shapes import DiscShape, Shape, StripShape
+from magshell_fenicsx.models.shell.fitted import Cells, fitted
 from magshell_fenicsx.models.shell.natural import LARGEST, SMALLEST
 from magshell_fenicsx.models.shell.patterns import LARGEST as LARGEST_VECTOR
 from magshell_fenicsx.models.shell.thickness import LEAST_FACTOR, MOST_FACTOR
@@ -29,6 +33,7 @@ COARSEST, MOST_FIRST, MOST_SQUARES = 0.2, 800, 3000  # side of the first squares
 DEGREE = 4  # of the polynomials that are compared
 SHOWN, SMALLEST_SQUARE = 0.25, 0.1  # of sqrt(Rh) and of h: elements of this size show loads, and all else
 SMALLEST_FLAW = 0.25  # of h
+TOTAL, SQUARE = 1e-3, 0.02  # of the integrals of a formula's size and of its square, which cells may miss
 CHEAPER = 0.5  # of as many elements as small ones everywhere are: a graded mesh is worth while
 MISSED = 0.003  # of the variance of a formula: what polynomials on squares may miss of it
 CURVATURE = 1e6  # of a natural shape, over 1/R
@@ -214,12 +219,8 @@ def refinements(case: Case, formulas: Sequence[Written], drawn: Outline, turn: f
     def places(chart: Array) -> Array:
         return drawn.embedding(chart) @ Q
 
-    found = (
-        squares(
-            places, drawn, shown_by_polynomials(each.of_place), (SHOWN * sqrt(h) if each.load else SMALLEST_SQUARE * h)
-        )
-        for each in formulas
-    )
+    finest = {True: SHOWN * sqrt(h), False: SMALLEST_SQUARE * h}
+    found = (squares(places, drawn, shown_by_polynomials(each.of_place), finest[each.load]) for each in formulas)
     return [each.finer(case.mesh.refinement) for each in found if each]
 
 
@@ -256,3 +257,38 @@ def _smallest(of_place: Callable[[Array], Array]) -> Sizes:
         return np.asarray(np.where(inside, found, inf).min(axis=(1, 2)))
 
     return sizes
+
+
+def unshown(formulas: Sequence[Written], cells: Cells, turn: float, h: float) -> list[str]:
+    """What the cells miss of formulas, in words; collective."""
+    Q, element, said = rotation(turn), cells.element, list[str]()
+    for each in formulas:
+
+        def values(x: Array, n: Array, each: Written = each) -> Array:
+            return each.of_place(x.reshape(-1, 3) @ Q).reshape(*x.shape[:-1], -1)
+
+        x, normals, _ = cells.at(element.points)
+        fit = fitted(values, cells, values(x, normals), element, element.degree)
+        missed = fit.rest**2
+        if fit.missed > TOTAL:
+            wrong = f"{100 * fit.missed:.2g} %"
+            said.append(f"{each.key}: its integral over the mesh may be wrong by {wrong}: it varies too much")
+        elif missed > SQUARE and not (each.load and fit.widest < 2 * SHOWN * sqrt(h)):
+            said.append(
+                f"{each.key}: varies within elements of up to {fit.widest:.2g} R: its integral is right, but "
+                f"{100 * missed:.2g} % of that of its square is not shown; take a smaller mesh.size or a larger "
+                "mesh.refinement"
+            )
+    return said
+
+
+def cells_of_patch(patch: PatchMesh, degree: int) -> Cells:
+    """The cells of a triangulation, with the places of a model of that degree."""
+    element = basix.create_element(
+        basix.ElementFamily.P, basix.CellType.triangle, degree, basix.LagrangeVariant.gll_warped
+    )
+    corners = patch.nodes[patch.cells[:, :3]]
+    X = element.points
+    chart = corners[:, :1] + np.einsum("qk,ckd->cqd", X, corners[:, 1:] - corners[:, :1])
+    places = patch.embedding(chart.reshape(-1, chart.shape[-1])).reshape(*chart.shape[:2], 3)
+    return Cells(element, places, len(places), MPI.COMM_SELF)

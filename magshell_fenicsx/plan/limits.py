@@ -22,6 +22,7 @@ PER_UNKNOWN = {2: 1.0e3, 3: 1.1e3, 4: 1.3e3, 5: 1.65e3}  # degree -> bytes over 
 SOLID = 0.7e3  # likewise of a body
 EXCLUDED, INDEFINITE = 0.6, 0.7  # added parts: for the modes that a half excludes, and past an instability
 SOURCES = 1e-9  # of the field's derivatives: rounding
+LARGEST_RATIO = 1e6  # of a field over its unit, as of a remanence
 SMALLEST_FIELD, LARGEST_FIELD = 1e-12, 10.0  # of lambda_m: rounding, and a thousand times what destabilises a shell
 
 
@@ -114,7 +115,14 @@ def refuse_unbounded_fields(case: Case, r0: Array) -> None:
     if not case.magnetic:
         return
     for source in placed(case):
-        bad = r0[~np.isfinite(source(r0)[0]).all(axis=1)]
+        B = source(r0)[0]
+        if len(strong := r0[np.isfinite(B).all(axis=1) & (np.abs(B) > LARGEST_RATIO).any(axis=1)]):
+            x, y, z = strong[0]
+            raise CaseError(
+                f"{source.key}: its field is above {LARGEST_RATIO:g} times the unit of the field at (x, y, z)/R = "
+                f"({x:.3g}, {y:.3g}, {z:.3g})"
+            )
+        bad = r0[~np.isfinite(B).all(axis=1)]
         if len(bad):
             x, y, z = bad[0]
             raise CaseError(

@@ -24,7 +24,6 @@ from magshell_fenicsx.run.summary import Result
 from magshell_fenicsx.simulate.follow import BEYOND
 from magshell_fenicsx.simulate.gradients.adjoint import Adjoint
 from magshell_fenicsx.simulate.gradients.density import density
-from magshell_fenicsx.simulate.gradients.fields import FIELDS
 from magshell_fenicsx.simulate.gradients.gradient import derivative
 from magshell_fenicsx.simulate.gradients.instabilities import FOLDS, Lost, instabilities, refuse_moving
 from magshell_fenicsx.simulate.gradients.results import adjoint_at_end, refuse_no_result

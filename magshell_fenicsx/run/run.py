@@ -145,7 +145,7 @@ def _run(
         raise type(e)(case.placed(str(e))) from None
     result = Result(scene, scene.unloaded(), adapted=found)
     say(f"{', '.join(scene.plan.included)}: {scene.cells} cells, {scene.model.system.dofs} unknowns")
-    for warning in scene.warnings:
+    for warning in (*scene.warnings, *scene.unshown):
         say(f"warning: {warning}")
     if fast_blas() is None:
         say("warning: PETSc uses the reference BLAS; install OpenBLAS to factor seven times faster")

@@ -161,6 +161,7 @@ def summary(result: Result, total_s: float) -> dict[str, Any]:
         "model": {
             "included": scene.plan.included,
             "left_out": scene.left_out,
+            **({"not_shown": scene.unshown} if scene.unshown else {}),
             "kernels": model.kernels.names,
             "forms": len(model.kernels.names),
             "penalty": model.sigma,

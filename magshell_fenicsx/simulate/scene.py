@@ -33,8 +33,10 @@ from magshell_fenicsx.models.reacting import (
 from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.shell.openings import no_potential
 from magshell_fenicsx.models.shell.own_term import OwnTerm
+from magshell_fenicsx.models.shell.patterns import cells_of
 from magshell_fenicsx.models.shell.supports import refuse_loose
 from magshell_fenicsx.models.solid.model import SolidModel
+from magshell_fenicsx.models.solid.remanence import cells_of_body
 from magshell_fenicsx.plan.columns import (
     also_displaced,
     extra_columns,
@@ -43,6 +45,7 @@ from magshell_fenicsx.plan.columns import (
     sizes_in_units,
     support_columns,
 )
+from magshell_fenicsx.plan.formulas import unshown, written
 from magshell_fenicsx.plan.limits import refuse_beyond_memory
 from magshell_fenicsx.plan.plan import Plan
 from magshell_fenicsx.plan.planner import make_plan
@@ -128,6 +131,15 @@ class Scene:
     def watch(self) -> Watch:
         """The watch over the modes that the model excludes. Its first use compiles their kernels."""
         return Watch(self.model.excluded_modes)
+
+    @cached_property
+    def unshown(self) -> list[str]:
+        """What the mesh misses of the case's formulas, in words; collective."""
+        model, formulas = self.model, written(self.case)
+        if not formulas:
+            return []
+        cells = cells_of_body(model.V) if isinstance(model, SolidModel) else cells_of(model.r0)
+        return unshown(formulas, cells, self.plan.azimuth, self.plan.material.h)
 
     def nowhere(self) -> str:
         """Where a step since the beginning of a walk has found no field, in words after a message; collective."""

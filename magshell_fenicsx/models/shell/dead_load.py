@@ -39,7 +39,7 @@ class Measures(Protocol):
         """Undeformed area of a named patch, or of all."""
 
     def field(self, pattern: Pattern, edge: str | None) -> tuple[Expr, float | None]:
-        """A pattern on the undeformed mid-surface, or a named edge, and the integral of its size, see `pattern_field`."""
+        """A pattern on the undeformed mid-surface or an edge, and the integral of its size as of `pattern_field`."""
 
     def at_point(self, name: str, force: NDArray[np.float64]) -> Entries:
         """The load vector of a force at a named vertex."""

@@ -5,8 +5,8 @@ the nodes would be none. The polynomial p of the displacement's degree k with
 
     integral of p q = integral of f q    over the cell, for each polynomial q of the degree k,
 
-does the same work on every displacement, up to the curvature of the cell. Its integrals come from parts of the cell that
-are divided until each agrees with its own parts. Where f is a polynomial of the degree k, p is f.
+does the same work on every displacement, up to the curvature of the cell. Its integrals come from parts of the cell
+that are divided until each agrees with its own parts. Where f is a polynomial of the degree k, p is f.
 """
 
 from collections.abc import Callable, Sequence
@@ -128,9 +128,8 @@ class _Parts:
     def of(self, cells: Numbers) -> "_Parts":
         """The same in each of some cells."""
         times = len(cells)
-        return _Parts(
-            np.repeat(cells, len(self.cell)), np.tile(self.corner, (times, 1)), np.tile(self.sides, (times, 1))
-        )
+        numbers = np.repeat(cells, len(self.cell))
+        return _Parts(numbers, np.tile(self.corner, (times, 1)), np.tile(self.sides, (times, 1)))
 
     @classmethod
     def together(cls, several: "Sequence[_Parts]") -> "_Parts":
@@ -186,7 +185,8 @@ def fitted(values: Values, cells: Cells, nodal: Array, element: Element, degree:
     chosen = np.flatnonzero(off @ w > SMOOTH * largest * w.sum())
     scale, sizes = area.sum(axis=1) / w.sum(), (area * magnitude).sum(axis=1)
     space = basix.create_element(basix.ElementFamily.P, element.cell_type, degree, basix.LagrangeVariant.gll_warped)
-    moments, sizes[chosen], squares, missed = _moments(values, cells, chosen, scale, parts, PART * size, space)
+    found = _moments(values, cells, chosen, scale, parts, PART * size, space, nodal.shape[-1])
+    moments, sizes[chosen], squares, missed = found
     Y, v = basix.make_quadrature(element.cell_type, 2 * degree)
     phi = space.tabulate(0, Y)[0, :, :, 0]
     p = np.linalg.solve(phi.T @ (v[:, None] * phi), moments)
@@ -205,7 +205,14 @@ def fitted(values: Values, cells: Cells, nodal: Array, element: Element, degree:
 
 
 def _moments(
-    values: Values, cells: Cells, chosen: Numbers, scale: Array, parts: _Parts, threshold: float, space: Element
+    values: Values,
+    cells: Cells,
+    chosen: Numbers,
+    scale: Array,
+    parts: _Parts,
+    threshold: float,
+    space: Element,
+    components: int,
 ) -> tuple[Array, Array, Array, float]:
     """Integrals of f times each function (cells, functions, components), of |f| and |f|^2 (cells,), and their error.
 
@@ -224,7 +231,6 @@ def _moments(
     def integrals(w: Array, f: Array) -> Array:
         return np.einsum("pq,pqi->pi", w, f)
 
-    components = values(*cells.at(points[:1], np.zeros(0, np.int64))[:2]).shape[-1]
     found = np.zeros((len(chosen), space.dim, components))
     sizes, squares, errors, each = np.zeros(len(chosen)), np.zeros(len(chosen)), 0.0, len(CHILDREN[cells.dimension])
     whole = [integrals(w, f) for _, w, _, f in map(evaluated, ahead.pieces())]

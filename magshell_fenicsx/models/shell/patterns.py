@@ -152,17 +152,12 @@ def pattern_on_edge(
     topology.create_connectivity(1, 2)
     topology.create_connectivity(2, 1)
     cells = np.array([topology.connectivity(1, 2).links(f)[0] for f in facets], dtype=np.int64)
-    local = [
-        int(np.flatnonzero(topology.connectivity(2, 1).links(c) == f)[0]) for c, f in zip(cells, facets, strict=True)
-    ]
+    pairs = zip(cells, facets, strict=True)
+    local = [int(np.flatnonzero(topology.connectivity(2, 1).links(c) == f)[0]) for c, f in pairs]
     element, on = Q.element.basix_element, V.element.basix_element
     corners, ends = basix.geometry(element.cell_type), basix.topology(element.cell_type)[1]
-    line, along = (
-        basix.create_element(
-            basix.ElementFamily.P, basix.CellType.interval, one.degree, basix.LagrangeVariant.gll_warped
-        )
-        for one in (on, element)
-    )
+    family, interval, variant = basix.ElementFamily.P, basix.CellType.interval, basix.LagrangeVariant.gll_warped
+    line, along = (basix.create_element(family, interval, one.degree, variant) for one in (on, element))
 
     def side(points: Array, number: int) -> Array:
         a, b = corners[ends[number]]
@@ -174,9 +169,8 @@ def pattern_on_edge(
     edge = Cells(line, nodal, owned, V.mesh.comm)
     x, normals, _ = edge.at(along.points)
     fit = shown(pattern, edge, pattern(inside(x), normals), along)
-    near = [
-        [int(np.argmin(np.linalg.norm(element.points - p, axis=1))) for p in side(along.points, i)] for i in range(3)
-    ]
+    nodes = element.points
+    near = [[int(np.argmin(np.linalg.norm(nodes - p, axis=1))) for p in side(along.points, i)] for i in range(3)]
     values = field.x.array.reshape(-1, 3)
     for cell, number, vectors in zip(cells, local, fit.nodal, strict=True) if not fit.smooth else ():
         values[Q.dofmap.list[cell][near[number]]] = vectors

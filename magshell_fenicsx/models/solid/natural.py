@@ -33,7 +33,7 @@ def body_shape(natural: Natural, body: Body, V: fem.FunctionSpace, free: dict[st
         As `natural_field`, or if the body has no such patch.
     """
     natural = natural.on(body.patches, len(body.between))
-    nodes, normals = places(V)
+    _, normals = places(V)
     Z = fem.functionspace(V.mesh, ("Lagrange", V.element.basix_element.degree, (1,)))
     z = body.at_nodes(Z, (body.heights - MIDDLE) * body.thickness)[Z.dofmap.list]
     numbers = natural_field(natural, cells_of_body(V), V)

@@ -37,8 +37,8 @@ class Flaw:
     account
         What it was made from, for people.
     sizes
-        Places (n, 3) -> element sizes (n,) that show it there, of one that is everywhere and varies more in some places;
-        None where they are alike.
+        Places (n, 3) -> element sizes (n,) that show it there, of one without a centre that varies more in some
+        places; None where they are alike.
     """
 
     deviation: Deviation
