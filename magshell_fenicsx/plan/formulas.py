@@ -188,7 +188,8 @@ def within(shape: Shape | Grid, chart: Array) -> NDArray[np.bool_]:
 
 def shown_by_polynomials(values: Callable[[Array], Array]) -> Sizes:
     """Elements that show a formula of places (n, 3): smaller than the squares where polynomials miss most of it."""
-    whole, mean = 0.0, None
+    whole: float = 0.0
+    mean: Array | None = None
 
     def sizes(x: Array, inside: NDArray[np.bool_], side: float) -> Array:
         nonlocal whole, mean
@@ -273,7 +274,7 @@ def unshown(formulas: Sequence[Written], cells: Cells, turn: float, h: float) ->
         if fit.missed > TOTAL:
             wrong = f"{100 * fit.missed:.2g} %"
             said.append(f"{each.key}: its integral over the mesh may be wrong by {wrong}: it varies too much")
-        elif missed > SQUARE and not (each.load and fit.widest < 2 * SHOWN * sqrt(h)):
+        elif missed > SQUARE and not (each.load and fit.widest < 4 * SHOWN * sqrt(h)):
             said.append(
                 f"{each.key}: varies within elements of up to {fit.widest:.2g} R: its integral is right, but "
                 f"{100 * missed:.2g} % of that of its square is not shown; take a smaller mesh.size or a larger "

@@ -35,7 +35,7 @@ def dead_loads(name: str, loads: Sequence[DeadLoad], factory: EnergyFactory, log
             along, whole = pattern_field(load.force, factory.r0, FINER)
             parts.append((along, over))
             fitted = whole is not None and isinstance(load, AreaForce)
-            size += whole if fitted else _integral(ufl.sqrt(ufl.dot(along, along)), over, log)
+            size += whole if fitted and whole is not None else _integral(ufl.sqrt(ufl.dot(along, along)), over, log)
             continue
         whole = _whole(over, factory, log)
         if isinstance(load, AreaForce) and isinstance(load.force, float):

@@ -11,6 +11,7 @@ that are divided until each agrees with its own parts. Where f is a polynomial o
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import basix
 import numpy as np
@@ -20,7 +21,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
 Values = Callable[[Array, Array], Array]  # places and normals (cells, n, 3) -> (cells, n, components)
-Element = basix.finite_element.FiniteElement
+Element: TypeAlias = basix.finite_element.FiniteElement
 INTERVAL, TRIANGLE = basix.CellType.interval, basix.CellType.triangle
 AGREED = 1e-4  # of the integral of |f|: interpolated formulas differ by less
 SMOOTH = 1e-6  # of the largest value: cells that differ by less stay interpolated
