@@ -71,7 +71,7 @@ class Squares:
 
     def finer(self, refinement: float) -> "Squares":
         """With elements that are smaller by a factor."""
-        return replace(self, sizes=self.sizes / refinement)
+        return replace(self, sizes=np.asarray(self.sizes / refinement, dtype=np.float64))
 
     def __call__(self, x: NDArray[np.float64]) -> float:
         away = np.maximum(np.abs(x - self.centres) - self.halves[:, None], 0.0)

@@ -247,7 +247,7 @@ def test_fields_of_what_is_held() -> None:
         ({}, "give curvature, stretch, or both"),
         ({"stretch": 0}, "0.05"),
         ({"stretch": "1 - 3*z"}, "natural.stretch: is not within 0.05 to 20 at"),
-        ({"curvature": "1/(x - x)"}, "natural.curvature: has no finite value"),
+        ({"curvature": "1/(x - x)"}, r"natural.curvature: .*: is .* at"),
         ({"curvature": "5/m"}, "natural.curvature: has a unit"),
         ({"curvature": {"rest": 1}}, "natural.curvature: the shell has no dimple"),
         ({"curvature": [1, 0, 0], "along": [0, 0, 1]}, "natural.along: has no direction in the surface"),
