@@ -12,6 +12,7 @@ from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.transfer import transfer
 
 STEP = 1e-4  # of a number, or of one where it is smaller
+BESIDE = 1e-5  # the same beside bodies, whose penetration is far smaller than what they move by
 
 
 def by_amplitude(adjoint: Adjoint, name: str) -> float:
@@ -52,12 +53,12 @@ def by_number(adjoint: Adjoint, key: str) -> float:
         energies = sum(c * factor_of(t.amplitude, state.mu) * t.energy() for t, c in along(other, adjoint))
         return float(total + other.model.system.comm.allreduce(energies))
 
-    return _slope(contracted, value)
+    return _slope(contracted, value, BESIDE if scene.model.contacts else STEP)
 
 
-def _slope(f: Callable[[float], float], value: float) -> float:
+def _slope(f: Callable[[float], float], value: float, part: float = STEP) -> float:
     """df/dp at a value by a difference of second order, on the side where numbers are allowed."""
-    step, found, refused = STEP * (abs(value) or 1.0), dict[int, float](), list[CaseError]()
+    step, found, refused = part * (abs(value) or 1.0), dict[int, float](), list[CaseError]()
     for way in (1, -1):
         try:
             found[way] = f(value + way * step)
