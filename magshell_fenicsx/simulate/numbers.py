@@ -182,6 +182,8 @@ def carried(old: Scene, new: Scene, state: State, own: Collection[str] = ()) -> 
     ratios, fields = goals(old, new, "load"), [name for name in state.mu if name.startswith("lambda_")]
     for contact, other in zip(old.plan.loads.contacts, new.plan.loads.contacts, strict=True):
         ratios[contact.setting] = other.stiffness / contact.stiffness
+    given, now = old.unloaded().mu, new.unloaded().mu  # stiffnesses of parts are amplitudes too
+    ratios |= {name: now[name] / value for name, value in given.items() if value and name in now}
     if "lambda_m" in state.mu and new.case.lambda_m != old.case.lambda_m:
         if not old.case.lambda_m:
             raise CaseError("magnetic: a field of zero has no derivative by a number: take by: lambda_m")
