@@ -1,0 +1,136 @@
+"""Gradients by keys of a case against differences of whole runs of cases with another number, on the same mesh."""
+
+from collections.abc import Sequence
+from functools import cache
+
+import numpy as np
+import pytest
+import yaml
+
+from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.source import CaseError, Source, override
+from magshell_fenicsx.parts.section import si_size
+from magshell_fenicsx.plan.planner import make_plan
+from magshell_fenicsx.simulate.adapt.ending import History
+from magshell_fenicsx.simulate.follow import follow
+from magshell_fenicsx.simulate.gradients.adjoint import Adjoint
+from magshell_fenicsx.simulate.gradients.gradient import derivative
+from magshell_fenicsx.simulate.gradients.instabilities import FOLDS, instabilities
+from magshell_fenicsx.simulate.gradients.results import adjoint_at_end
+from magshell_fenicsx.simulate.numbers import number_of, on_mesh_of
+from magshell_fenicsx.simulate.record import Record
+from magshell_fenicsx.simulate.scene import Scene
+
+CAP = """
+shell:
+  geometry: cap
+  radius: 20 mm
+  thickness: 0.4 mm
+  polar: 60
+  youngs_modulus: 1 MPa
+  poisson_ratio: 0.45
+  density: 1200 kg/m^3
+  imperfections: [{kind: dimple, amplitude: 0.2 mm, width: 5 mm}, {kind: gaussian, amplitude: -0.3, width: 4}]
+boundary: {rim: clamped}
+points: {A: [0, 0, 20 mm]}
+mesh: {degree: 3}
+"""
+STATE = """
+foundation: {stiffness: 20 kPa/mm}
+natural: {curvature: 5/m}
+magnetic: {remanent: {flux_density: 80 mT}, applied: {flux_density: 10 mT}}
+loading:
+  - {kind: natural, curvature: 1, points: 1}
+  - {kind: field, points: 1}
+  - {kind: pressure, control: load, until: target, pressure: 20 Pa, points: 1}
+  - {kind: indentation, at: {polar: 0}, depth: 0.1 mm, points: 1}
+reactions: true
+"""
+PRESSED = """
+magnetic:
+  remanent: {flux_density: 80 mT}
+  applied:
+    sources: [{kind: cylinder, diameter: 20 mm, height: 10 mm, polarization: 1.2 T, position: [0, 0, -15 mm]}]
+bodies: {ball: {kind: sphere, radius: 8 mm, at: {polar: 0}, stiffness: 1.0e+6}}
+loading: [{kind: field, points: 1}, {kind: contact, approach: 0.6 mm, points: 1}]
+"""
+BUCKLED = """
+magnetic: {remanent: {flux_density: 80 mT}, applied: {flux_density: 10 mT}}
+loading: {kind: pressure, until: limit}
+"""
+CASES = {"state": STATE, "pressed": PRESSED, "buckled": BUCKLED}
+RESULTS = {
+    "state": ("force_N", "energy", "rim_fz"),
+    "pressed": ("force_N", "A_uz", "energy"),
+    "buckled": ("knockdown", "buckling_pressure_Pa"),
+}
+KEYS = {
+    "state": {"shell.poisson_ratio": "", "shell.thickness": "mm", "foundation.stiffness": "kPa/mm"},
+    "pressed": {
+        "shell.poisson_ratio": "",
+        "shell.thickness": "mm",
+        "shell.thickness_factor": "",
+        "bodies.ball.radius": "mm",
+    },
+    "buckled": {"shell.poisson_ratio": "", "shell.thickness": "mm"},
+}
+EXACT = {"state": 1e-6, "buckled": 1e-5, "pressed": 2e-4}  # a penalty has kinks where points begin to press
+STEP = 1e-4  # of a number
+
+
+def case_of(name: str, settings: Sequence[str] = ()) -> Case:
+    source = Source(name, yaml.safe_load(CAP + CASES[name]))
+    if name == "pressed":  # the edge of a dimple would be a further kink
+        source.data["shell"]["imperfections"] = [{"kind": "gaussian", "amplitude": 0.5, "width": 2}]
+    for setting in settings:
+        override(source, setting)
+    return Case.from_source(source)
+
+
+def run(scene: Scene) -> tuple[Scene, list[Record], History]:
+    records, history = list(follow(scene)), History()
+    for record in records:
+        history.add(record)
+    return scene, records, history
+
+
+def adjoint(ran: tuple[Scene, list[Record], History], of: str) -> Adjoint:
+    scene, records, history = ran
+    return instabilities(scene, records, of, 1)[0][1] if of in FOLDS else adjoint_at_end(scene, history, of)[1]
+
+
+@cache
+def given(name: str) -> tuple[tuple[Scene, list[Record], History], dict[str, Adjoint]]:
+    """The run of a case, and the adjoints of its results."""
+    ran = run(Scene(case_of(name)))
+    return ran, {of: adjoint(ran, of) for of in RESULTS[name]}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "key"), [(name, key) for name, keys in KEYS.items() for key in keys])
+def test_number(name: str, key: str) -> None:
+    """Imperfections in both kinds of units, targets with units, stiffnesses of parts, and bodies follow the number."""
+    (scene, *_), found = given(name)
+    by_field = key == "shell.thickness_factor"
+    value, unit = 1.0 if by_field else number_of(scene.case, key), KEYS[name][key]
+    results = dict[int, dict[str, float]]()
+    for way in (-1, 1):
+        number = value * (1 + way * STEP) / si_size(unit)
+        other = case_of(
+            name, [f'{key}="{number!r}{" " * bool(unit)}{unit}"' if unit or by_field else f"{key}={number!r}"]
+        )
+        ran = run(Scene(other, scene.comm, on_mesh_of(scene, make_plan(other))))
+        results[way] = {of: adjoint(ran, of).shown for of in found}
+    for of, each in found.items():
+        slope = derivative(each, "thickness" if by_field else key)
+        if not isinstance(slope, float):
+            slope = float(slope.within(np.ones(len(slope.forces), dtype=bool))[0])
+        expected = (results[1][of] - results[-1][of]) / (2 * STEP * value)
+        assert slope == pytest.approx(expected, rel=EXACT[name], abs=1e-6 * abs(each.shown / value)), of
+
+
+def test_modes_of_the_perfect_shell_change() -> None:
+    """They are found again in every run."""
+    case = case_of("buckled", ["shell.imperfections=[{kind: modes, amplitudes: [0.1]}]"])
+    with pytest.raises(CaseError, match=r"shell\.poisson_ratio: the modes of the perfect shell"):
+        number_of(case, "shell.poisson_ratio")
