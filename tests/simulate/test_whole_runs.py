@@ -54,14 +54,16 @@ magnetic:
 bodies: {ball: {kind: sphere, radius: 8 mm, at: {polar: 0}, stiffness: 1.0e+6}}
 loading: [{kind: field, points: 1}, {kind: contact, approach: 0.6 mm, points: 1}]
 """
+HELD = PRESSED.replace("approach: 0.6 mm", "force: 5 mN")  # by arc length to a target of the force
 BUCKLED = """
 magnetic: {remanent: {flux_density: 80 mT}, applied: {flux_density: 10 mT}}
 loading: {kind: pressure, until: limit}
 """
-CASES = {"state": STATE, "pressed": PRESSED, "buckled": BUCKLED}
+CASES = {"state": STATE, "pressed": PRESSED, "held": HELD, "buckled": BUCKLED}
 RESULTS = {
     "state": ("force_N", "energy", "rim_fz"),
     "pressed": ("force_N", "A_uz", "energy"),
+    "held": ("A_uz", "approach"),
     "buckled": ("knockdown", "buckling_pressure_Pa"),
 }
 KEYS = {
@@ -72,15 +74,21 @@ KEYS = {
         "shell.thickness_factor": "",
         "bodies.ball.radius": "mm",
     },
+    "held": {"shell.poisson_ratio": ""},
     "buckled": {"shell.poisson_ratio": "", "shell.thickness": "mm"},
 }
-EXACT = {"state": 1e-6, "buckled": 1e-5, "pressed": 2e-4}  # a penalty has kinks where points begin to press
+EXACT = {
+    "state": 1e-6,
+    "buckled": 1e-5,
+    "pressed": 2e-4,
+    "held": 2e-4,
+}  # a penalty has kinks where points begin to press
 STEP = 1e-4  # of a number
 
 
 def case_of(name: str, settings: Sequence[str] = ()) -> Case:
     source = Source(name, yaml.safe_load(CAP + CASES[name]))
-    if name == "pressed":  # the edge of a dimple would be a further kink
+    if name in ("pressed", "held"):  # the edge of a dimple would be a further kink
         source.data["shell"]["imperfections"] = [{"kind": "gaussian", "amplitude": 0.5, "width": 2}]
     for setting in settings:
         override(source, setting)

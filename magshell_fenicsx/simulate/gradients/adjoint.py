@@ -250,7 +250,7 @@ def held_at(
     if hold is None and step:
         held |= held_by(scene, step, state)
         load = step.load
-        if isinstance(load, PathStep) and load.control == load.conjugate_control:
+        if isinstance(load, PathStep) and _by_conjugate(load, record):
             held[step.name] = -scene.model.system.potential(state.u, state.mu, step.name)
     for name, how in (hold or {}).items():
         if name not in state.mu or how not in ("load", "conjugate"):
@@ -258,6 +258,12 @@ def held_at(
         if how == "conjugate":
             held[name] = -scene.model.system.potential(state.u, state.mu, name)
     return held
+
+
+def _by_conjugate(load: PathStep, record: Record) -> bool:
+    """Whether the conjugate is what is prescribed at a record."""
+    goal = load.target if record.label == "target" and load.until == "target" else None
+    return load.control == load.conjugate_control or (goal is not None and goal[0].quantity == "conjugate")
 
 
 def along(scene: Scene, adjoint: Adjoint) -> list[tuple[FormTerm, float]]:
