@@ -1,5 +1,6 @@
 """Steps in time up to a given time, of a fixed length or for a tolerance."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -37,13 +38,22 @@ class TimeStopped(RuntimeError):
         self.motion = motion
 
 
-def advance(integrator: Integrator, now: Motion, end: float, steps: TimeSteps, dt: float) -> tuple[Motion, float]:
+def advance(
+    integrator: Integrator,
+    now: Motion,
+    end: float,
+    steps: TimeSteps,
+    dt: float,
+    between: Callable[[], None] = lambda: None,
+) -> tuple[Motion, float]:
     """The motion at a later time, and the step to go on with.
 
     Parameters
     ----------
     dt
         The step to begin with.
+    between
+        Called before every step; may raise an exception to stop.
 
     Raises
     ------
@@ -52,6 +62,7 @@ def advance(integrator: Integrator, now: Motion, end: float, steps: TimeSteps, d
     """
     begin, failed = now.t, False
     while end - now.t > 1e-9 * (end - begin):
+        between()
         way = end - now.t
         dt = min(dt, steps.fixed or dt)
         length = way / np.ceil(way / dt * (1 - 1e-9))

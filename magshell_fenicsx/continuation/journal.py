@@ -21,6 +21,12 @@ class Journal(Protocol):
     def record(self, found: Point | str) -> None:
         """Keep a result. Collective."""
 
+    def check(self, known: bool) -> None:
+        """Between two steps in time towards one result, which may be `known` already. Collective.
+
+        It may raise an exception to stop the history.
+        """
+
 
 class NoJournal:
     """Keeps nothing."""
@@ -29,4 +35,7 @@ class NoJournal:
         return None
 
     def record(self, found: Point | str) -> None:
+        pass
+
+    def check(self, known: bool) -> None:
         pass

@@ -110,7 +110,7 @@ class Rule:
 
 @dataclass(frozen=True)
 class Factored:
-    """What the latest factors belong to: a displacement, amplitudes, a time step; and the habit that chose the method."""
+    """What the latest factors belong to, and the `Factorisation.habit` with which they were made."""
 
     u: Vector
     mu: dict[str, float]

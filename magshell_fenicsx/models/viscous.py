@@ -140,7 +140,8 @@ class Viscosity:
         gradients = [ufl.derivative(surface.whole * work, model.u, ufl.TestFunction(V)) for work in works]
         self._forms = [model.kernels.compile(f"viscous residual {i}", form) for i, form in enumerate(gradients)]
         self.memory = Memory([np.zeros((*self._places.shape, SIZE)) for _ in branches])
-        self._first = self._last = np.empty(0), np.empty(0)  # displacements and their strains
+        self._first: tuple[Vector, Array] = np.empty(0), np.empty(0)  # displacements and their strains
+        self._last: tuple[Vector, Array] = self._first
         self._force = np.zeros(model.system.size)
 
     def force(self, u0: Vector, u1: Vector, v: Vector, part: float, dt: float) -> Vector:
@@ -164,7 +165,7 @@ class Viscosity:
     def accept(self, u0: Vector, u1: Vector, dt: float) -> Vector:
         """Go on from u1; the force that the step was solved with."""
         if self._branches:
-            self.memory = Memory(self._evolved(u0, u1, dt), self._change(u0, u1) / dt, dt)
+            self.memory = Memory(self._evolved(u0, u1, dt), np.asarray(self._change(u0, u1) / dt), dt)
         return self._force
 
     def doubt(self, u0: Vector, u1: Vector, dt: float) -> Vector | None:
@@ -185,7 +186,7 @@ class Viscosity:
         return system.gradient_of(u1, self._mu, self._forms)
 
     def _evolved(self, u0: Vector, u1: Vector, dt: float) -> list[Array]:
-        """q at the end of a step, its strain quadratic in time through the end of the step before and both of its own."""
+        """q at the end of a step; the strain is quadratic in time through its ends and the begin of the step before."""
         change, rate = self._change(u0, u1), self.memory.rate
         bend = 0.0 if rate is None else change / dt - rate
         return [

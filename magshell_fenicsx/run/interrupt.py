@@ -1,4 +1,4 @@
-"""Stopping a run between two solves, by a signal or a time limit."""
+"""Stopping a run between two solves or two steps in time, by a signal or a time limit."""
 
 import signal
 import threading
@@ -50,15 +50,15 @@ class Watch:
         for number, handler in self._before.items():
             signal.signal(number, handler)
 
-    def check(self) -> None:
-        """Stop if a rank has been asked to; collective.
+    def check(self, *, limited: bool = True) -> None:
+        """Stop if a rank has been asked to, or at the time limit if `limited`; collective.
 
         Raises
         ------
         Interrupted
             On every rank, if any has been asked to stop.
         """
-        if self._limit is not None and time.perf_counter() - self._start >= self._limit:
+        if limited and self._limit is not None and time.perf_counter() - self._start >= self._limit:
             self._reason = self._reason or f"the time limit of {self._limit:g} s"
         reason = next(filter(None, self._comm.allgather(self._reason)), None)
         if reason:
@@ -84,3 +84,6 @@ class Stoppable:
 
     def record(self, found: Point | str) -> None:
         self._journal.record(found)
+
+    def check(self, known: bool) -> None:
+        self._watch.check(limited=not known)  # a way that is only computed again must end, or no resumed run gets on

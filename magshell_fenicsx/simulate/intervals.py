@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 
 import scipy
 
@@ -37,17 +38,19 @@ class Intervals:
     marks: Collection[float]
     _last: Point | None = field(default=None, init=False)  # of the journal, what the factors belonged to
 
-    def moved(self, now: Motion, dt: float, end: float) -> tuple[Motion, float]:
-        """The motion at a later time, and the step to go on with."""
+    def moved(self, now: Motion, dt: float, end: float, *, known: bool = False) -> tuple[Motion, float]:
+        """The motion at a later time, which may be `known` already, and the step to go on with."""
+        between = partial(self.scene.journal.check, known)
         for t in [*sorted(t for t in self.marks if now.t < t < end), end]:
             if now.t in self.marks:  # a jump: the acceleration after it
                 now = self.integrator.begin(now.t, now.u, now.v, now)
-            now, dt = advance(self.integrator, now, t, self.steps, dt)
+            now, dt = advance(self.integrator, now, t, self.steps, dt, between)
         return now, dt
 
     def crossing(self, now: Motion, dt: float, end: Motion, beyond: Callable[[Motion], float]) -> float:
         """The time between two motions at which a function of them changes its sign."""
         close, ends = CLOSE * (end.t - now.t), {now.t: now, end.t: end}
+        self._refactor()
 
         def at(t: float) -> float:
             return beyond(ends.get(t) or self.moved(now, dt, t)[0])
@@ -71,13 +74,11 @@ class Intervals:
             mu, potentials = dict(first.state.mu), dict(second.state.mu)
             u, v, a = first.state.u, first.du, second.state.u
             return Motion(first.s, u, v, a, mu, second.s, second.dmu, potentials, second.error), first.dmu, first
-        if self._last:
-            self._refactor(self._last)
-            self._last = None
+        self._refactor()
         before = integrator.steps, integrator.iterations, integrator.factorisation.count
         scene.progress.trying(Point(State(now.u, now.mu), now.t, now.v, 0.0, 0, 0), end - now.t)
         try:
-            now, dt = self.moved(now, dt, end)
+            now, dt = self.moved(now, dt, end, known=len(known) == 3)
         except TimeStopped as e:
             raise Stopped(str(e)) from None
         spent = integrator.iterations - before[1], integrator.factorisation.count - before[2]
@@ -93,9 +94,10 @@ class Intervals:
             scene.journal.record(part)
         return now, dt, point
 
-    def _refactor(self, last: Point) -> None:
-        """The factors that the run had kept: others end its iterations elsewhere, within their tolerance."""
-        if last.s:
+    def _refactor(self) -> None:
+        """Make the factors that the run had kept: others end iterations elsewhere, within their tolerance."""
+        last, self._last = self._last, None
+        if last and last.s:
             self.integrator.factor(Factored(last.state.u, dict(last.state.mu), last.s, last.habit))
-        else:
+        elif last:
             self.integrator.factorisation.habit = last.habit
