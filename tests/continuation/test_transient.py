@@ -134,3 +134,18 @@ def test_adaptive_steps_and_the_balance_of_energy() -> None:
     assert errors[1] < errors[0] / 10
     assert abs(balance[1]) < abs(balance[0]) / 10
     assert integrator.iterations < 6 * integrator.steps
+
+
+def test_a_fixed_step_grows_again() -> None:
+    """A step that fails at the begin alone is short there alone."""
+    integrator = column(1.0)[1]
+    solve, taken = integrator.step, list[float]()
+
+    def failing(now: Motion, dt: float) -> Motion | str:
+        taken.append(dt)
+        return "no" if now.t < 0.1 and dt > 0.02 else solve(now, dt)
+
+    integrator.step = failing  # type: ignore[method-assign]
+    advance(integrator, integrator.begin(0.0, START, np.zeros(2)), 2.0, TimeSteps(0.1, 1.0, 0.1), 0.1)
+    assert taken[-1] > 0.09
+    assert len(taken) < 45

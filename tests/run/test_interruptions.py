@@ -69,6 +69,31 @@ def test_signal(tmp_path: Path, reference: Path, no_pictures: None, ranks: int, 
     check_goes_on(out, reference)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("ranks", [0, 2])
+def test_stiff_motion(tmp_path: Path, ranks: int) -> None:
+    """A row that would take hours ends at the next step in time, by a signal to one rank or the time limit."""
+    case, out = tmp_path / "case.yaml", tmp_path / "out"
+    case.write_text(
+        "shell: {geometry: hemisphere, radius_to_thickness: 20, poisson_ratio: 0.3}\n"
+        "boundary: {equator: clamped}\n"
+        'loading: {kind: time, duration: 1, history: {pressure: "exp(1000*t)"}}\n'
+        "mesh: {refinement: 0.5, degree: 3}\n"
+    )
+    run = start("run", case, "--out", out, ranks=ranks)
+    wait_for_rows(run, out, 2)
+    os.kill(processes(run, ranks)[-1], signal.SIGTERM)
+    run.communicate(timeout=20)
+    assert run.returncode == 3
+    rows = read_path(out)
+    assert json.loads((out / "summary.json").read_text(encoding="utf-8"))["stopped"] == "interrupted by SIGTERM"
+    again = start("run", case, "--out", out, "--resume", "--time-limit", "3", ranks=ranks)
+    again.communicate(timeout=40)
+    assert again.returncode == 3
+    assert "time limit of 3 s" in json.loads((out / "summary.json").read_text(encoding="utf-8"))["stopped"]
+    assert read_path(out) == rows
+
+
 def test_second_interrupt_stops_at_once() -> None:
     """The first only has the next check stop the run; afterwards signals do again what they did."""
     found = signal.signal(signal.SIGINT, signal.default_int_handler)  # background jobs begin with SIGINT ignored

@@ -1,5 +1,6 @@
 """Snaps of a dimpled hemisphere, the pressure held or the volume: at rest it is on a branch of the static path."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -7,7 +8,9 @@ import pytest
 
 from magshell_fenicsx import Case, Scene
 from magshell_fenicsx.case.source import CaseError, Source
-from magshell_fenicsx.run.rows import rows
+from magshell_fenicsx.continuation.point import Point
+from magshell_fenicsx.run.interrupt import Interrupted
+from magshell_fenicsx.run.rows import columns, rows
 from magshell_fenicsx.run.snaps import snaps
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.trace import trace
@@ -59,3 +62,52 @@ def test_pressure_held() -> None:
 def test_own_conjugate_goes_with_a_limit() -> None:
     with pytest.raises(CaseError, match=r"hold.pressure: this step drives pressure"):
         case_of(100, 0.5, hold={"pressure": "conjugate"}, until="target", volume_change=-0.01)
+
+
+class Kept:
+    """A journal in memory that begins with known results, and stops a motion at a number of steps in time."""
+
+    def __init__(self, known: Sequence[Point | str] = (), steps: float = np.inf) -> None:
+        self.found, self._known, self._steps = list[Point | str](), list(known), steps
+
+    def replay(self) -> Point | str | None:
+        if len(self.found) == len(self._known):
+            return None
+        self.found.append(self._known[len(self.found)])
+        return self.found[-1]
+
+    def record(self, found: Point | str) -> None:
+        self.found.append(found)
+        self._known.append(found)
+
+    def check(self, known: bool) -> None:
+        self._steps -= 1
+        if self._steps < 0:
+            raise Interrupted
+
+
+@pytest.mark.slow
+def test_a_resumed_snap_is_the_same() -> None:
+    """From before, at and after the fold, and from within the motion, whose interruption is between two steps."""
+
+    def numbers(journal: Kept) -> dict[str, Any]:
+        scene = Scene(case)
+        scene.journal = journal
+        return columns(scene, follow(scene))
+
+    defect = {"kind": "dimple", "amplitude": 1, "width": 3}
+    shell = {"geometry": "hemisphere", "radius_to_thickness": 50, "poisson_ratio": 0.3, "defect": defect}
+    snap = {"kind": "pressure", "until": "limit", "then": "snap"}
+    data = {"shell": shell, "boundary": {"equator": "clamped"}, "loading": snap}
+    case = Case.from_source(Source("test", data | {"mesh": {"refinement": 0.5, "degree": 3}}))
+    whole = Kept()
+    wanted = numbers(whole)
+    stopped = Kept(steps=100)
+    with pytest.raises(Interrupted):
+        numbers(stopped)
+    assert len(stopped.found) > 12
+    for known in (whole.found[:4], whole.found[:5], whole.found[:8], whole.found[:11], whole.found[:40], stopped.found):
+        found = numbers(Kept(known))
+        for column, values in wanted.items():
+            if values.dtype.kind == "f":
+                assert np.nanmax(np.abs(found[column] - values), initial=0) <= 1e-12 * np.nanmax(np.abs(values)), column
