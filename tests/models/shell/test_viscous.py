@@ -67,28 +67,28 @@ TIME = 1e4 / OMEGA
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("shell", "fast"),
-    [({"relaxation": [{"modulus": 1.0, "time": TIME / 2}]}, 0.5), ({"viscosity": TIME}, 1.0)],
+    ("shell", "fast", "tightest"),
+    [({"relaxation": [{"modulus": 1.0, "time": TIME / 2}]}, 0.5, 1e-4), ({"viscosity": TIME}, 1.0, 1e-5)],
     ids=["Maxwell", "Kelvin and Voigt"],
 )
-def test_creep_with_steps_for_a_tolerance(shell: dict[str, Any], fast: float) -> None:
+def test_creep_with_steps_for_a_tolerance(shell: dict[str, Any], fast: float, tightest: float) -> None:
     """Under a load that is there at once w is 1 - c exp(-t/TIME), c = 1/2 or 1, to the tolerance asked.
 
     Many steps are refused while the shell still rings.
     """
-    load = {"kind": "pressure", "control": "load", "until": "target", "pressure": 1e-5, "points": 1}
+    load = {"kind": "pressure", "control": "load", "until": "target", "pressure": 5e-5, "points": 1}
     still = Scene(steps_of({}, [load]))
     rest = columns(still, follow(still))["w_over_h"][-1]
-    assert 0.01 < rest < 0.5
-    for tolerance, points in ((1e-2, 2), (1e-3, 2), (1e-3, 20), (1e-4, 2)):
-        history = {"pressure": {"kind": "step", "to": 1e-5}}
+    assert 0.2 < rest < 0.3
+    for tolerance, points in ((1e-2, 2), (1e-3, 2), (1e-3, 20), (tightest, 2)):
+        history = {"pressure": {"kind": "step", "to": 5e-5}}
         step = {"kind": "time", "duration": TIME, "points": points, "tolerance": tolerance, "history": history}
-        scene = Scene(steps_of(shell, [step | {"drag": 2 * OMEGA}]))
+        drag = {} if "viscosity" in shell else {"drag": 2 * OMEGA}  # of 2e-4 of TIME
+        scene = Scene(steps_of(shell, [step | drag]))
         found = columns(scene, follow(scene))
         exact = rest * (1 - fast * np.exp(-found["time"][1:] / TIME))
         error = np.abs(found["w_over_h"][1:] - exact).max()
         assert error < tolerance
-        assert error < 2e-3 * rest
         assert np.sum(found["iterations"]) < 6000
 
 
