@@ -96,6 +96,7 @@ class Watch:
         self._excluded = excluded
         self._families = excluded.families if excluded else []
         self._looked: _Look | None = None
+        self._before: tuple[int, ...] = ()
         self._u: Vector | None = None
         self._passed: list[tuple[Point, float]] = []
         self.unlocated = ""
@@ -111,7 +112,7 @@ class Watch:
         """Begin to watch a path at its first point.
 
         If that is not the last point of the path before, it gets a look only if the second point is unstable. If it is
-        unstable too, `pass_to` returns it as a crossing.
+        unstable too, `pass_to` returns it as a crossing of each family whose number is not that of the last look.
 
         Parameters
         ----------
@@ -120,6 +121,7 @@ class Watch:
         look
             Whether the first point gets a look now; then it is no crossing.
         """
+        self._before = self._looked.counts if self._looked else (0,) * len(self._families)
         known = self._looked if start.state.u is self._u and not self._passed else None
         self._path, self._expand, self._last, self._u, self._along = path, expand, start, start.state.u, 0.0
         self._rate: float | None = None
@@ -183,9 +185,9 @@ class Watch:
         return found
 
     def _at_start(self, look: _Look) -> Iterator[Crossing]:
-        """The families that are unstable at the first point."""
-        for family, count in zip(self._families, look.counts, strict=True):
-            if count:
+        """The families that are unstable at the first point, and were not so on the path before."""
+        for family, count, before in zip(self._families, look.counts, self._before, strict=True):
+            if count and count != before:
                 yield Crossing(family.label, look.point, sum(look.counts))
 
     def _between(self, low: _Look, high: _Look) -> list[Crossing]:

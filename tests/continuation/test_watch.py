@@ -113,6 +113,21 @@ def test_a_mode_of_another_symmetry_is_seen() -> None:
     assert places(found) == [("excluded", 1.2, 0)]
 
 
+def test_what_was_unstable_before_is_no_crossing() -> None:
+    """A path that begins with the instabilities with which another one ended, elsewhere."""
+    family = Several([Diagonal("a", lambda x: [0.2 - x]), Diagonal("b", lambda x: [5.0])])
+    path = Path(BorderedNewton(snap_through()), "load", "arc", StepOptions(0.05, 0.05, 1e-7))
+    watch, found = Watch(family), list[Crossing]()
+    for x in (0.0, 0.4):
+        start = path.start(State(np.array([x]), {"load": x**3 - 3 * x**2 + 2 * x}))
+        watch.begin(path, start)
+        for _, point in Walk(path, start, Goal("points", steps=20)):
+            found += watch.pass_to(point)
+    assert [c.label for c in found] == ["a"]
+    assert found[0].point.state.u[0] == pytest.approx(0.2)
+    assert watch.unstable == 1
+
+
 def test_crossing_that_cannot_be_located_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     """And the path goes on."""
 

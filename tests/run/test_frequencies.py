@@ -232,3 +232,34 @@ def test_mistakes(setting: str, message: str) -> None:
     with pytest.raises(CaseError) as error:
         Case.load(CASES / "dimple_buckling.yaml", [setting])
     assert message in str(error.value)
+
+
+@pytest.mark.slow
+def test_frequencies_under_a_plate_are_those_of_a_rigid_one(tmp_path: Path) -> None:
+    """The half shell's omega^2; the default stiffness, if given, lets the disc leave the plate, which is reported."""
+    cap = tmp_path / "cap.yaml"
+    cap.write_text(
+        "shell: {geometry: cap, radius: 1, thickness: 0.02, poisson_ratio: 0.3, polar: 60}\n"
+        "boundary: {rim: clamped}\nbodies: {plate: {kind: plane}}\nmesh: {degree: 3}\n"
+        "loading: {kind: contact, approach: 2, points: 1}\nfrequencies: {count: 4, at: end}\n"
+    )
+    half = {1: 0.7640, 2: 1.0247, 0: 1.0445, 3: 1.1043}  # by the half shell on its default mesh
+    for stiffness in ("", "3e5", "91575.1"):
+        out = tmp_path / f"k{stiffness}"
+        done = magshell(
+            "run",
+            cap,
+            "--no-pictures",
+            "--out",
+            out,
+            *([f"--set=bodies.plate.stiffness={stiffness}"] if stiffness else []),
+        )
+        found = [(int(r["wave"]), float(r["omega2"]), float(r["contact_change"])) for r in table(out)]
+        soft = [wave for wave, _, change in found if change > 1e-3]
+        if stiffness == "91575.1":
+            assert soft == [0]
+            assert "depends on the stiffness of the bodies" in done.stdout
+        else:
+            assert {wave: value for wave, value, _ in found} == pytest.approx(half, rel=3e-3)
+            assert not soft
+            assert "depends on the stiffness" not in done.stdout
