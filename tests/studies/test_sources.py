@@ -232,6 +232,11 @@ def test_runs_of_a_comparison(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, e
     why = "the folder has results of other sources of magshell_fenicsx"
     assert said == [f"shell at refinement 0.5: computed again, {why}"]
     assert measured() == 0
+    for name in ("path.csv", "summary.json"):
+        file = tmp_path / "shell" / name
+        file.write_text("{", encoding="utf-8")
+        assert (measured(), measured()) == (1, 0)
+        assert said[-1].startswith(f"shell at refinement 0.5: computed again, {file}: is damaged")
 
 
 def test_a_mesh_file_that_changes_on_the_way(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
