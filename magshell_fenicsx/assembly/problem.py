@@ -296,16 +296,27 @@ class FiniteElementSystem:
             potentials[self._pressed.load] += self._of_lids(mu, self._pressed.load)
         return potentials
 
+    def stored(self, u: Vector, mu: Amplitudes) -> float:
+        """The energy without the potentials of loads."""
+        self.at(u, mu)
+        own = (t for t in self.terms if t.amplitude is None or t.amplitude in self.coordinates)
+        return float(self.comm.allreduce(sum(factor_of(t.amplitude, mu) * t.energy() for t in own)))
+
     def integral(self, u: Vector, form: fem.Form) -> float:
         """The value of a compiled form at a displacement, summed over all ranks."""
         self.set(u)
         return float(self.comm.allreduce(fem.assemble_scalar(form)))
 
-    def tangent(self, u: Vector, mu: Amplitudes, stress: Sequence[Weighted] = ()) -> PETSc.Mat | Skewed:
+    def tangent(
+        self, u: Vector, mu: Amplitudes, stress: Sequence[Weighted] = (), times: Mapping[str, float] | None = None
+    ) -> PETSc.Mat | Skewed:
+        """See `System`; `times` multiplies the tangents of some terms, by name."""
         with self.assembly:
             whole = [(weight, self.with_ghosts(v, mu)) for weight, v in stress]
             self.at(u, mu)
             factors = self._factors(mu)
+            for name, size in (times or {}).items():
+                factors[name] *= size
             K = (
                 self._assembler.tangent(factors, whole)
                 if self._assembler

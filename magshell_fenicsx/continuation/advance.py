@@ -8,6 +8,10 @@ import numpy as np
 from magshell_fenicsx.continuation.motion import Motion
 from magshell_fenicsx.continuation.transient import Integrator
 
+ATONCE, LEAST = 0.1, 1e-2  # parts of what the balance may still lack, and of all that it may, in one step
+SPENT = 0.3  # of its share: a step after one that leaks more is not longer
+SMALLEST = 1e-6  # of the first step
+
 
 @dataclass(frozen=True)
 class TimeSteps:
@@ -23,11 +27,19 @@ class TimeSteps:
         Engineering and Structural Dynamics 20, 1991).
     first
         First step without `fixed`.
+    balance
+        Beside a body: what the balance of energy may lack, over its turnover.
     """
 
     fixed: float | None
     tolerance: float
     first: float
+    balance: float = 1e-2
+
+    def share(self, now: Motion) -> float:
+        """What the last step may have added to the imbalance: a part of what is left of the allowance."""
+        allowed = self.balance * now.turnover
+        return max(ATONCE * (allowed - abs(now.imbalance)), LEAST * allowed)
 
 
 class TimeStopped(RuntimeError):
@@ -60,7 +72,7 @@ def advance(
     TimeStopped
         If even a tiny step fails.
     """
-    begin, failed = now.t, False
+    begin, failed, now = now.t, False, integrator.balanced(now) if np.isnan(now.imbalance) else now
     while end - now.t > 1e-9 * (end - begin):
         between()
         way = end - now.t
@@ -69,17 +81,33 @@ def advance(
         found = integrator.step(now, length)
         if isinstance(found, str):
             dt, failed = length / 2, True
-            if dt < 1e-6 * steps.first:
+            if dt < SMALLEST * steps.first:
                 raise TimeStopped(f"the time step has become too small: {found}", now)
             continue
         if steps.fixed is None:
             change = 0.9 * (steps.tolerance / max(found.error, 1e-300)) ** (1 / 3)
-            if found.error > steps.tolerance and length > 1e-6 * steps.first:
+            if found.error > steps.tolerance and length > SMALLEST * steps.first:
                 dt = max(0.3, change) * length
                 continue
+            leak = abs(found.imbalance - now.imbalance) / steps.share(found)  # nan where it is not checked
+            if leak > 1 and abs(found.imbalance) > abs(now.imbalance):
+                if length <= SMALLEST * steps.first:
+                    raise TimeStopped(unbalanced(now, found), now)
+                dt = max(0.3, 0.8 / leak**0.5) * length
+                continue
+            change = min(change, 1.0) if leak > SPENT else change
             dt = length * min(change, 2.0) if change > 1.3 else max(length, dt if change > 1 else 0.0)
         elif not failed:
             dt = max(dt, 2 * length)
         failed = False
         now = found
     return replace(now, t=end), dt
+
+
+def unbalanced(now: Motion, after: Motion) -> str:
+    """What the balance of energy lacks between two motions, in words."""
+    leak = after.imbalance - now.imbalance
+    return (
+        f"the balance of energy {'gains' if leak > 0 else 'loses'} {abs(leak) / after.turnover:.2g} of the energies in "
+        f"a step of {after.t - now.t:.2g}, whatever its length: give a body less stiffness, or a larger tolerance"
+    )

@@ -42,6 +42,9 @@ class Motion:
         Estimated error of the last step, over the system's length.
     memory
         What viscous forces remember of the steps so far: a step that is refused leaves it.
+    imbalance, turnover
+        Kinetic + stored + dissipated - work, less its value at the begin, and the sum of their magnitudes; nan where
+        the balance is not checked.
     """
 
     t: float
@@ -54,6 +57,8 @@ class Motion:
     potentials: dict[str, float] = field(default_factory=dict)
     error: float = np.inf
     memory: Any = None
+    imbalance: float = np.nan
+    turnover: float = np.nan
 
 
 def constrained(

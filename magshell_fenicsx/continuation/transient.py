@@ -19,11 +19,13 @@ from magshell_fenicsx.continuation.edge import join, split
 from magshell_fenicsx.continuation.factor import Factorisation
 from magshell_fenicsx.continuation.motion import Motion, constrained, held_back
 from magshell_fenicsx.continuation.newton import MOTION
-from magshell_fenicsx.continuation.system import Amplitudes, Edged, Skewed, State, System, Vector, dot, max_abs
+from magshell_fenicsx.continuation.system import Amplitudes, Edged, Skewed, State, System, Tangent, Vector, dot, max_abs
 
 TOLERANCE = 1e-10  # of u in a step, over the system's length or, where that is longer, a tenth of the displacement
-STALLED = 1e-7  # steps below this that shrink no more are rounding
+STALLED = 1e-7  # steps below this that shrink no more, with new factors, may be rounding
+ROUNDING = 10.0  # steps up to this many times the rounding error are
 MOST = 20  # iterations
+PATIENCE = 2  # steps with new factors that may grow beside a body: they find what touches
 SLOW = 0.2  # new factors if a step is longer than this part of the one before
 SMOOTH = 1e-2  # error of the last step up to which the acceleration predicts the next: in stiff motions it alternates
 ROUNDING = 1e-8  # changes of the acceleration times the square of the time step, from iterations that end at TOLERANCE
@@ -50,8 +52,8 @@ class Viscous(Protocol):
     def force(self, u0: Vector, u1: Vector, v: Vector, part: float, dt: float) -> Vector:
         """The force at a part of the step from u0 to u1, with the velocity v there; zero at supports."""
 
-    def stiffness(self, dt: float, rate: float) -> float:
-        """Its derivative by u1, in parts of the tangent; dv/du at the end is `rate`."""
+    def tangent(self, u: Vector, mu: Amplitudes, dt: float, rate: float) -> Tangent:
+        """The system's tangent with the derivative of the force by u1; dv/du at the end is `rate`."""
 
     def begin(self) -> None:
         """A motion begins, or a load has a corner."""
@@ -61,6 +63,27 @@ class Viscous(Protocol):
 
     def doubt(self, u0: Vector, u1: Vector, dt: float) -> Vector | None:
         """The force at u1 of which an estimate of the error is made; None without an estimate."""
+
+
+class Averaged(Protocol):
+    """Forces of contact, which set in and cease within a step: each step takes their mean along its way.
+
+    Attributes
+    ----------
+    names
+        Amplitudes that are positions of what touches.
+    """
+
+    names: frozenset[str]
+
+    def along(self, begin: State, end: State, part: float) -> None:
+        """Let the system's forces at this part of a step be its mean ones, until `present`."""
+
+    def present(self) -> None:
+        """Let the system have the forces of its state again."""
+
+    def stored(self, u: Vector, mu: Amplitudes) -> float:
+        """The energy without the potentials of loads."""
 
 
 class Ground(Protocol):
@@ -135,6 +158,8 @@ class Integrator:
         Amplitudes that are positions and move.
     ground
         Supports that move.
+    averaged
+        Contacts, beside which the balance of energy is checked in each step.
     device
         Amplitudes that are unknown, since their conjugates are held at the end of each step; None: all are loads.
 
@@ -157,10 +182,11 @@ class Integrator:
         driven: Collection[str] = (),
         device: Device | None = None,
         ground: Ground | None = None,
+        averaged: Averaged | None = None,
     ) -> None:
         self.system, self.mass, self.loads, self.drag, self.viscous = system, mass, loads, drag, viscous
         self.rule = Rule.of(rho)
-        self.ground = ground
+        self.ground, self.averaged, self._total = ground, averaged, np.nan
         self.device, self._free = device, tuple(device.names) if device else ()
         self._driven = frozenset({*driven, *self._free})
         self.factorisation = Factorisation(system.comm)
@@ -200,7 +226,24 @@ class Integrator:
             self.viscous.memory = before.memory if before else self.viscous.memory
             self.viscous.begin()
         now = Motion(t, u, v, a, mu, work, dissipated, memory=self.viscous and self.viscous.memory)
-        return replace(now, potentials=self._potentials(now, False))
+        if self.averaged and not before:
+            self._total = self.kinetic(now) + self.averaged.stored(u, mu)
+        return self.balanced(replace(now, potentials=self._potentials(now, False)))
+
+    def jumps(self, t: float) -> bool:
+        """Whether a motion begins anew at a kink or jump of the loads.
+
+        Beside a body it does not at a kink: the acceleration is continuous, and that of what is left of the residual
+        would be large where the contact is stiff.
+        """
+        return not self.averaged or self.ground is not None or self.loads(t, True) != self.loads(t, False)
+
+    def balanced(self, now: Motion) -> Motion:
+        """The motion with its imbalance, where that is checked."""
+        if not self.averaged:
+            return now
+        entries = self.kinetic(now), self.averaged.stored(now.u, now.mu), now.dissipated, -now.work
+        return replace(now, imbalance=sum(entries) - self._total, turnover=sum(map(abs, entries)))
 
     def _inverse_mass(self) -> Callable[[Vector], Vector]:
         M = self.mass.copy()
@@ -231,6 +274,13 @@ class Integrator:
 
     def step(self, now: Motion, dt: float) -> Motion | str:
         """The motion after a step; else the reason why there is none."""
+        try:
+            return self._step(now, dt)
+        finally:
+            if self.averaged:
+                self.averaged.present()
+
+    def _step(self, now: Motion, dt: float) -> Motion | str:
         comm = self.system.comm
         if self.viscous:
             self.viscous.memory = now.memory
@@ -239,7 +289,7 @@ class Integrator:
             u = u + dt**2 / 2 * now.a
         y = self.device.unknowns(now.mu) if self.device else np.empty(0)
         pull = self._pull(now, dt)
-        last, fresh = np.inf, False
+        last, fresh, grown = np.inf, False, 0
         if self.factored is None or abs(dt - self.factored.dt) > OTHER * dt:
             self._factor(now, u, y, dt)
             fresh = True
@@ -253,11 +303,13 @@ class Integrator:
             if not np.isfinite(size):
                 return "the step is not a number"
             tolerance = TOLERANCE * max(1.0, MOTION * max_abs(comm, u) / self.system.length)
-            if size <= tolerance or (size <= STALLED and size > last / 2):
+            stalled = size <= STALLED and size > last / 2 and fresh
+            if size <= tolerance or (stalled and size <= ROUNDING * self._rounding(now, u, y, dt)):
                 self.steps += 1
                 return self._accepted(now, u, y, dt)
             if size > SLOW * last:
-                if fresh and size > last:
+                grown = grown + 1 if fresh and size > last else 0
+                if grown > (PATIENCE if self.averaged else 0):
                     break
                 self._factor(now, u, y, dt)
                 fresh = True
@@ -293,6 +345,7 @@ class Integrator:
     def _unbalanced(self, now: Motion, u: Vector, y: Array, v: Vector, a: Vector, dt: float) -> Vector:
         rule = self.rule
         m, f = rule.alpha_m, rule.alpha_f
+        self._average(now, u, y, dt)
         r = self._times((1 - m) * a + m * now.a + self.drag * ((1 - f) * v + f * now.v))
         for part, weight in rule.forces:
             r = r + weight * self.system.residual(now.u + part * (u - now.u), self._at(now, y, part, dt))
@@ -300,27 +353,48 @@ class Integrator:
             r = r + self.viscous.force(now.u, u, (1 - f) * v + f * now.v, 1 - f, dt)
         if self.device is None:
             return r
+        if self.averaged:
+            self.averaged.present()
         return join(r, (1 - f) * self.device.rows(u, self._at(now, y, 1.0, dt)), self.system.comm)
+
+    def _average(self, now: Motion, u: Vector, y: Array, dt: float) -> None:
+        if self.averaged:
+            end = State(u, self._at(now, y, 1.0, dt))
+            self.averaged.along(State(now.u, now.mu), end, 1 - self.rule.alpha_f)
+
+    def _rounding(self, now: Motion, u: Vector, y: Array, dt: float) -> float:
+        """The size of a step that rounding of the forces makes, from their change when u is rounded differently."""
+        side = np.random.default_rng(self.system.comm.rank).choice([-1.0, 1.0], u.size)
+
+        def unbalanced(u: Vector) -> Vector:
+            a, v = self._rates(now, u, dt)
+            return self._unbalanced(now, u, y, v, a, dt)
+
+        change = unbalanced(u + side * np.spacing(u)) - unbalanced(u)
+        d, _ = split(self.factorisation.solve(change), y.size, self.system.comm)
+        return max_abs(self.system.comm, d) / self.system.length
 
     def _factor(self, now: Motion, u: Vector, y: Array, dt: float) -> None:
         """Factor the derivative of `_unbalanced` by u and y, with one tangent for all parts of the step."""
         part = 1 - self.rule.alpha_f
         here, mu = now.u + part * (u - now.u), self._at(now, y, part, dt)
+        self._average(now, u, y, dt)
         self.factor(Factored(here, mu, dt, self.factorisation.habit))
 
     def factor(self, at: Factored) -> None:
         """Make these factors."""
         self.factorisation.habit = at.habit
         rule, part, here, mu, dt = self.rule, 1 - self.rule.alpha_f, at.u, at.mu, at.dt
-        tangent = self.system.tangent(here, mu)
+        rate = rule.gamma / (rule.beta * dt)
+        tangent = self.viscous.tangent(here, mu, dt, rate) if self.viscous else self.system.tangent(here, mu)
         assert not isinstance(tangent, Edged)
         K = tangent.K if isinstance(tangent, Skewed) else tangent
         if self._K is None:
             self._K = K.duplicate()
             self._K.setOption(PETSc.Mat.Option.SYMMETRIC, True)
         K.copy(self._K, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
-        self._K.scale(part * (1 + (self.viscous.stiffness(dt, rule.gamma / (rule.beta * dt)) if self.viscous else 0)))
-        inertia = (1 - rule.alpha_m) / (rule.beta * dt**2) + self.drag * part * rule.gamma / (rule.beta * dt)
+        self._K.scale(part)
+        inertia = (1 - rule.alpha_m) / (rule.beta * dt**2) + self.drag * part * rate
         self._K.axpy(inertia, self.mass, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
         whole = Skewed(self._K, part * tangent.N) if isinstance(tangent, Skewed) else self._K
         if self.device:
@@ -334,9 +408,15 @@ class Integrator:
         comm, rule, t = self.system.comm, self.rule, now.t + dt
         a, v = self._rates(now, u, dt)
         mu = self._counted(State(u, self._at(now, y, 1.0, dt)), now.mu).mu
-        after = Motion(t, u, v, a, mu)
+        after, mean = Motion(t, u, v, a, mu), dict[str, float]()
+        if self.averaged and self._driven & self.averaged.names:
+            part = 1 - rule.alpha_f
+            self._average(now, u, y, dt)
+            place = now.u + part * (u - now.u), self._at(now, y, part, dt)
+            mean = {name: self.system.potential(*place, name) for name in self._driven & self.averaged.names}
+            self.averaged.present()
         potentials, moved, w = self._potentials(after, True), u - now.u, (1 - rule.alpha_f) * v + rule.alpha_f * now.v
-        work = sum(self._work(name, now, mu, potentials) for name in potentials)
+        work = sum(self._work(name, now, mu, potentials, mean.get(name)) for name in potentials)
         if self.ground and self.drag:
             ends = self.ground.velocity(now.t, False), self.ground.velocity(t, True)
             along, w = moved + dt / 2 * (ends[0] + ends[1]), w + (1 - rule.alpha_f) * ends[1] + rule.alpha_f * ends[0]
@@ -347,9 +427,8 @@ class Integrator:
         if self.viscous:
             lost += dot(comm, moved, self.viscous.accept(now.u, u, dt))
         memory, dissipated = self.viscous and self.viscous.memory, now.dissipated + lost
-        return replace(
-            after, work=now.work + work, dissipated=dissipated, potentials=potentials, error=error, memory=memory
-        )
+        after = replace(after, work=now.work + work, dissipated=dissipated, memory=memory)
+        return self.balanced(replace(after, potentials=potentials, error=error))
 
     def _error(self, now: Motion, after: Motion, dt: float) -> float:
         """Estimated error of a step, over the system's length."""
@@ -379,11 +458,13 @@ class Integrator:
                 found[name] += dot(self.system.comm, forces, self.ground.along(mu, name))
         return found
 
-    def _work(self, name: str, now: Motion, mu: Mapping[str, float], potentials: Mapping[str, float]) -> float:
-        """In a step: of a load on its displacement, of a position that moves on what it meets."""
+    def _work(
+        self, name: str, now: Motion, mu: Mapping[str, float], potentials: Mapping[str, float], mean: float | None
+    ) -> float:
+        """In a step: of a load on its displacement, of a position that moves on what it meets, with its mean force."""
         a, b = now.potentials[name], potentials[name]
         if name in self.system.coordinates:
-            return (a + b) / 2 * (mu[name] - now.mu[name])
+            return ((a + b) / 2 if mean is None else mean) * (mu[name] - now.mu[name])
         return -(now.mu[name] + mu[name]) / 2 * (b - a)
 
     def _times(self, x: Vector) -> Vector:

@@ -14,7 +14,7 @@ from dolfinx import fem
 from numpy.typing import NDArray
 from ufl.core.expr import Expr
 
-from magshell_fenicsx.continuation.system import Amplitudes, Vector, max_abs
+from magshell_fenicsx.continuation.system import Amplitudes, Tangent, Vector, max_abs
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.shell import densities, edges
 from magshell_fenicsx.models.shell import kinematics as kin
@@ -139,6 +139,8 @@ class Viscosity:
         works = _works(model, surface, self._given)
         gradients = [ufl.derivative(surface.whole * work, model.u, ufl.TestFunction(V)) for work in works]
         self._forms = [model.kernels.compile(f"viscous residual {i}", form) for i, form in enumerate(gradients)]
+        names = (term.name for term in model.system.terms)
+        self._strained = [name for name in names if name in ("membrane", "bending") or name.endswith(" edges")]
         self.memory = Memory([np.zeros((*self._places.shape, SIZE)) for _ in branches])
         self._first: tuple[Vector, Array] = np.empty(0), np.empty(0)  # displacements and their strains
         self._last: tuple[Vector, Array] = self._first
@@ -153,6 +155,11 @@ class Viscosity:
                 stress += branch.modulus * (part * end + (1 - part) * q)
         self._force = self._forces(stress, u0, at, self.stiffness(dt, 2 / dt) if dt else 0.0)
         return self._force
+
+    def tangent(self, u: Vector, mu: Amplitudes, dt: float, rate: float) -> Tangent:
+        """The system's tangent with that of these forces, which stiffen the shell, but no body that it touches."""
+        stiffer = 1 + self.stiffness(dt, rate)
+        return self._model.system.tangent(u, mu, times=dict.fromkeys(self._strained, stiffer))
 
     def stiffness(self, dt: float, rate: float) -> float:
         """What a step adds to the elastic tangent, in parts of it; `rate` is dv/du at its end."""

@@ -185,6 +185,11 @@ IN_TIME = (  # of runs with a step of kind: time
     _energy(
         "work", "work", "Work of the loads in steps of kind: time, kinetic + stored + dissipated less what was stored."
     ),
+    _energy(
+        "imbalance",
+        "error of the balance",
+        "Kinetic + stored + dissipated - work less its value where the step begins: what the steps in time gain or lose.",
+    ),
 )
 QUANTITIES = {q.name: q for q in (*OF_EVERY_RUN, *OF_SOME_RUNS, *OF_CONTACTS, *IN_TIME)}
 AMPLITUDES = {

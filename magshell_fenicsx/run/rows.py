@@ -1,10 +1,12 @@
 """Records of a history as rows of path.csv, and as columns."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
+from magshell_fenicsx.case.loading import ProgrammeStep
+from magshell_fenicsx.case.loads.time import TimeSection
 from magshell_fenicsx.output.store.table import COLUMNS, Row
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.scene import Scene
@@ -56,7 +58,26 @@ class RowMaker:
         since = {name: record.clock.get(name, 0.0) for name in CLOCK}
         self._clock = {name: self._begun[name] + since[name] for name in CLOCK}
         stored = self._scene.stored(record.point.state, values["energy"])
-        return {**self._clock, "kinetic": record.clock.get("kinetic", 0.0), "stored": stored}
+        own = {name: record.clock.get(name, 0.0) for name in ("kinetic", "imbalance")}
+        return {**self._clock, **own, "stored": stored}
+
+
+def imbalances(programme: Iterable[ProgrammeStep], found: Sequence[Row]) -> Iterator[str]:
+    """What steps in time gain or lose beyond `balance`, in words."""
+    for step in programme:
+        over = getattr(step.load, "balance", TimeSection.model_fields["balance"].default)
+        parts = [_imbalance(row) for row in found if row["step"] == step.number and row.get("imbalance")]
+        if parts and abs(worst := max(parts, key=abs)) > over:
+            yield (
+                f"step {step.number}: its steps in time {'gain' if worst > 0 else 'lose'} {abs(worst):.2g} of the "
+                f"energies, more than balance: {over:g}; take a smaller step, tolerance or balance, or rho_inf: 1, "
+                "which loses none"
+            )
+
+
+def _imbalance(row: Row) -> float:
+    """That of a row over its energies."""
+    return float(row["imbalance"]) / sum(abs(float(row[name])) for name in ("kinetic", "stored", "dissipated", "work"))
 
 
 def rows(scene: Scene, records: Iterable[Record]) -> list[Row]:

@@ -31,7 +31,7 @@ from magshell_fenicsx.run.frequencies import frequencies_after, wanted
 from magshell_fenicsx.run.gradients import gradients_after, refuse_unknown
 from magshell_fenicsx.run.interrupt import Interrupted, Stoppable, Watch
 from magshell_fenicsx.run.modes import modes_after
-from magshell_fenicsx.run.rows import RowMaker
+from magshell_fenicsx.run.rows import RowMaker, imbalances
 from magshell_fenicsx.run.status import RunProgress, waiting
 from magshell_fenicsx.run.summary import Result, summary
 from magshell_fenicsx.simulate.adapt.choice import Adapted
@@ -165,6 +165,8 @@ def _run(
             for step in scene.case.programme:
                 if step.load.search and not any(int(result.rows[i]["step"]) == step.number for i in result.found):
                     say(f"warning: the search at the end of step {step.number} has found no further solution")
+            for said in imbalances(scene.case.programme, result.rows):
+                say(f"warning: {said}")
             result.sensitivities = _sensitivities(result)
             result.barrier = _barrier(result)
         except (Stopped, NoEigenpair) as e:

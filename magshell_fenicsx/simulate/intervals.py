@@ -42,7 +42,7 @@ class Intervals:
         """The motion at a later time, which may be `known` already, and the step to go on with."""
         between = partial(self.scene.journal.check, known)
         for t in [*sorted(t for t in self.marks if now.t < t < end), end]:
-            if now.t in self.marks:  # a jump: the acceleration after it
+            if now.t in self.marks and self.integrator.jumps(now.t):  # the acceleration after it
                 now = self.integrator.begin(now.t, now.u, now.v, now)
             now, dt = advance(self.integrator, now, t, self.steps, dt, between)
         return now, dt
@@ -97,7 +97,9 @@ class Intervals:
     def _refactor(self) -> None:
         """Make the factors that the run had kept: others end iterations elsewhere, within their tolerance."""
         last, self._last = self._last, None
-        if last and last.s:
+        if self.integrator.averaged:  # beside a body factors belong to a whole step: each interval makes its own
+            self.integrator.factored = None
+        if last and last.s and not self.integrator.averaged:
             self.integrator.factor(Factored(last.state.u, dict(last.state.mu), last.s, last.habit))
         elif last:
             self.integrator.factorisation.habit = last.habit

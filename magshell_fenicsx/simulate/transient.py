@@ -19,6 +19,7 @@ from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.axisymmetric.viscous import surface_of as of_meridian
 from magshell_fenicsx.models.mass import mass, whole_mass
 from magshell_fenicsx.models.modes import ShellModes
+from magshell_fenicsx.models.shell.contact import Pressings
 from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.shell.viscous import surface_of as of_shell
 from magshell_fenicsx.models.viscous import Branch, Viscosity
@@ -67,7 +68,11 @@ def motion(scene: Scene, load: TimeSection, state: State, held: Mapping[str, Hel
             raise CaseError(f"history.{next(iter(moving))}: a viscous shell needs supports that are at rest")
         carried = state.ground if isinstance(state, Moving) else None
         ground = Ground(system, whole_mass(scene.model), lambda t, b: (loads(t, b), loads.rates(t, b, moving)), carried)
-    integrator = Integrator(system, mass(scene.model), loads, load.rho_inf, drag, viscous, load.drives, device, ground)
+    pressings = {name: known for name, (known, _) in scene.model.contacts.items()}
+    touching = Pressings(system, pressings) if pressings else None
+    integrator = Integrator(
+        system, mass(scene.model), loads, load.rho_inf, drag, viscous, load.drives, device, ground, touching
+    )
     u, v = state.u, state.v if isinstance(state, Moving) else 0.0 * state.u
     if load.push:
         u, v = pushed(scene, load.push, state, v)
@@ -75,8 +80,9 @@ def motion(scene: Scene, load: TimeSection, state: State, held: Mapping[str, Hel
         v = v + by_formula(scene, load.velocity)
     now, duration = integrator.begin(0.0, u, v), time_of(case, load.duration)
     fixed = None if load.step is None else time_of(case, load.step)
-    steps = TimeSteps(fixed, load.tolerance, fixed or duration / load.points / 10)
+    steps = TimeSteps(fixed, load.tolerance, fixed or duration / load.points / 10, load.balance)
     dt, most = steps.first, integrator.kinetic(now)
+    total = most + system.stored(now.u, now.mu)
     outputs = [duration * i / load.points for i in range(1, load.points + 1)]
     walk, watched = Intervals(scene, integrator, held, steps, loads.marks), _watched(scene, load.event, state)
     ended = ""
@@ -93,6 +99,8 @@ def motion(scene: Scene, load: TimeSection, state: State, held: Mapping[str, Hel
             "kinetic": scene.model.multiplicity * kinetic,
             "dissipated": scene.model.multiplicity * now.dissipated,
             "work": scene.model.multiplicity * now.work,
+            "imbalance": scene.model.multiplicity
+            * (kinetic + system.stored(now.u, now.mu) + now.dissipated - now.work - total),
         }
         excluded = scene.model.excluded_modes
         unseen = sum(excluded.counts(point.state)) if excluded else 0

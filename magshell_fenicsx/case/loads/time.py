@@ -56,6 +56,10 @@ class TimeSection(Step):
     """Fixed time step; by default steps follow from `tolerance`"""
     tolerance: float = Field(default=1e-3, ge=1e-9, le=1)
     """Largest estimated error of a time step [h]"""
+    balance: float = Field(default=1e-2, ge=1e-9, le=1)
+    """Largest error of the balance of energy (column imbalance), over kinetic + stored + dissipated + work; beside a
+    body a time step with more than its share is repeated with a smaller one, unless `step` is given; a run warns where
+    it is larger"""
     drag: Rate = 0.0
     """Force over mass and velocity; free vibrations fade at half of it [per unit of time; 20 Hz is 20 per second]"""
     push: PushSection | None = None

@@ -6,7 +6,7 @@ applied field (`applied`), the polynomial of second order in y = u - a d at the 
 penalty itself, by the displacement and by the approach, for every shape of a body.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import basix
@@ -18,6 +18,8 @@ from numpy.typing import NDArray
 from ufl.core.expr import Expr
 
 from magshell_fenicsx.assembly.point_field import PointField, at_quadrature
+from magshell_fenicsx.assembly.problem import FiniteElementSystem
+from magshell_fenicsx.continuation.system import Amplitudes, State, Vector
 from magshell_fenicsx.models.shell.kinematics import Jet
 
 Array = NDArray[np.float64]
@@ -28,6 +30,7 @@ SOFT = 1e-3  # of h: the penalty's stiffness grows from zero over this penetrati
 PAIRS = np.triu_indices(3)
 SIZE = 3 + 1 + 3 + 6  # y*, psi*, its gradient, its Hessian by pairs i <= j
 FACE = 1 + 1 + 3  # t*, the derivative of psi* by the thickness factor t, and that of its gradient
+ROUNDING = 1e-5  # of the soft penetration: a smaller change of it is no divisor
 PRESSED = 1e-3  # of the largest pressure: less does not count as contact
 
 
@@ -96,6 +99,17 @@ def penalty(s: Array, k: float, soft: float) -> tuple[Array, Array, Array]:
     first = np.where(full, k * (t - soft / 2), k * t**2 / (2 * soft))
     value = np.where(full, k * (t**2 / 2 - t * soft / 2 + soft**2 / 6), k * t**3 / (6 * soft))
     return value, first, second
+
+
+def mean_pressure(s0: Array, s1: Array, k: float, soft: float) -> tuple[Array, Array]:
+    """(psi(s1) - psi(s0))/(s1 - s0) and its derivative by s1."""
+    (v0, p0, _), (v1, p1, k1) = penalty(s0, k, soft), penalty(s1, k, soft)
+    _, middle, stiff = penalty((s0 + s1) / 2, k, soft)
+    simpson, slope = (p0 + 4 * middle + p1) / 6, (2 * stiff + k1) / 6  # exact where psi'' has no kink between
+    across = (np.digitize(s0, (0.0, soft)) != np.digitize(s1, (0.0, soft))) & (np.abs(s1 - s0) > ROUNDING * soft)
+    ds = np.where(across, s1 - s0, 1.0)
+    mean = np.where(across, (v1 - v0) / ds, simpson)
+    return mean, np.where(across, (p1 - mean) / ds, slope)
 
 
 def contact_energy(r0: Jet, u: Jet, P: Expr, motion: Expr, approach: Expr, *face: Expr) -> Expr:
@@ -204,6 +218,7 @@ class Pressing:
         self._known: Array = np.empty(0)
         self.stiffness = fem.Constant(V.mesh, contact.stiffness)
         self._seen: tuple[Array, float, float] = np.empty(0), 0.0, 0.0  # displacement, approach and stiffness
+        self._mean: tuple[Array, Array] | None = None  # gradient and Hessian of a step, in place of the present ones
         self.gap: Array = np.empty(0)
         self._about: Array | None = None
         self.follow()
@@ -224,7 +239,10 @@ class Pressing:
         if (approach, k) == self._seen[1:] and np.array_equal(u, self._seen[0]):
             return
         self._seen = u.copy(), approach, k
-        self._known = y = at_quadrature(self._u, self._points) - approach * self.motion
+        self._known = y = self.place
+        if self._mean:
+            self._renew(y, np.ones(len(self._mean[0]), dtype=bool), np.zeros((len(self._mean[0]), 1)), *self._mean)
+            return
         self.gap, n, N = self.contact.gap((self._r0 + y).reshape(-1, 3), 0.0, self._h / 2 * self._factor)
         about = self.gap if self._about is None else self._about
         pressed = about < 0  # few of the points
@@ -234,16 +252,20 @@ class Pressing:
             value, first = value + more * (first + more / 2 * second), first + more * second
         n, N = n[pressed], N[pressed]
         H = second[..., None] * n[:, :, None] * n[:, None, :] - first[..., None] * N
-        pairs = H[:, *PAIRS] * np.where(PAIRS[0] == PAIRS[1], 0.5, 1.0)
-        flat = np.zeros((*y.shape[:2], SIZE))
-        flat[..., :3] = y
-        flat.reshape(-1, SIZE)[pressed, 3:] = np.concatenate([value, -first * n, pairs], axis=1)
-        self.polynomial.renew(flat)
+        self._renew(y, pressed, value, -first * n, H)
         if self._face is not None:
             by_t = np.zeros((len(self.gap), FACE))
             by_t[:, 0] = self._factor
             by_t[pressed, 1:] = self._h / 2 * np.concatenate([first, -second * n], axis=1)
             self._face.renew(by_t.reshape(*y.shape[:2], FACE))
+
+    def _renew(self, y: Array, pressed: NDArray[np.bool_], value: Array, gradient: Array, H: Array) -> None:
+        """Of the pressed points psi, its gradient and its Hessian are given."""
+        pairs = H[:, *PAIRS] * np.where(PAIRS[0] == PAIRS[1], 0.5, 1.0)
+        flat = np.zeros((*y.shape[:2], SIZE))
+        flat[..., :3] = y
+        flat.reshape(-1, SIZE)[pressed, 3:] = np.concatenate([value, gradient, pairs], axis=1)
+        self.polynomial.renew(flat)
 
     def expand_about(self, other: "Pressing") -> None:
         """Take in place of the penalty its Taylor polynomial about the present gap of the same contact elsewhere.
@@ -251,6 +273,49 @@ class Pressing:
         For differences by a number of the case: a body that is hard closes or opens within a far smaller way.
         """
         self._about, self._seen = other.gap, (np.empty(0), 0.0, 0.0)
+
+    @property
+    def place(self) -> Array:
+        """y = u - a d at the points, (cells, points, 3)."""
+        return at_quadrature(self._u, self._points) - float(self._approach.value) * self.motion
+
+    def average(self, begin: Array, end: Array, part: float) -> None:
+        """Take the forces of a step in place of the present ones, until `present`; see docs/theory.md, Motion.
+
+        Their product with the change of y is that of psi, plus what the step dissipates: the mean gradient is that of
+        psi along the normal, over the penetration and not over time, so that it counts where contact sets in or ceases.
+
+        Parameters
+        ----------
+        begin, end
+            `place` at both ends of the step.
+        part
+            Of the step at which the system has its forces.
+        """
+        k, soft, places = float(self.stiffness.value), SOFT * self._h, (begin, (begin + end) / 2, end)
+        half = self._h / 2 * self._factor
+        gaps, n, N = zip(
+            *(self.contact.gap((self._r0 + y).reshape(-1, 3), 0.0, half) for y in places), strict=True
+        )
+        s0, _, s1 = (-gap for gap in gaps)
+        mean, slope = mean_pressure(s0, s1, k, soft)
+        normal, bend = (n[0] + 4 * n[1] + n[2]) / 6, (2 * N[1] + N[2]) / 6
+        (_, p0, _), (_, p1, stiff) = penalty(s0, k, soft), penalty(s1, k, soft)
+
+        def outer(a: Array) -> Array:
+            return a[:, :, None] * a[:, None, :]
+
+        def times(c: Array, a: Array) -> Array:
+            return c.reshape(-1, *[1] * (a.ndim - 1)) * a
+
+        late = part - 0.5
+        gradient = -times(mean, normal) - late * (times(p1, n[2]) - times(p0, n[0]))
+        H = times(slope, outer(normal)) - times(mean, bend) + late * (times(stiff, outer(n[2])) - times(p1, N[2]))
+        self._mean, self._seen = (gradient, np.asarray(H / part)), (np.empty(0), 0.0, 0.0)
+
+    def present(self) -> None:
+        """Take the present forces again."""
+        self._mean, self._seen = None, (np.empty(0), 0.0, 0.0)
 
     def renew_place(self) -> None:
         """Take the placement anew."""
@@ -274,3 +339,38 @@ class Pressing:
         inner = comm.allreduce(float(from_axis.min(initial=np.inf)), MPI.MIN)
         outer = comm.allreduce(float(from_axis.max(initial=0.0)), MPI.MAX)
         return Region(penetration, radius, inner if most else 0.0, outer)
+
+
+class Pressings:
+    """All contacts of a system in steps in time; a `continuation.transient.Averaged`.
+
+    Attributes
+    ----------
+    names
+        The approaches.
+    """
+
+    def __init__(self, system: FiniteElementSystem, pressings: Mapping[str, Pressing]) -> None:
+        self._system, self._pressings, self.names = system, list(pressings.values()), frozenset(pressings)
+        self._begin: tuple[Vector, list[Array]] | None = None
+
+    def along(self, begin: State, end: State, part: float) -> None:
+        """Take the forces of a step at a part of it, see `Pressing.average`."""
+        if self._begin is None or self._begin[0] is not begin.u:
+            self._begin = begin.u, self._places(begin)
+        for pressing, y0, y1 in zip(self._pressings, self._begin[1], self._places(end), strict=True):
+            pressing.average(y0, y1, part)
+
+    def present(self) -> None:
+        """Take the present forces again."""
+        for pressing in self._pressings:
+            pressing.present()
+
+    def _places(self, state: State) -> list[Array]:
+        self._system.with_ghosts(state.u, state.mu)
+        return [pressing.place for pressing in self._pressings]
+
+    def stored(self, u: Vector, mu: Amplitudes) -> float:
+        """The energy of the shell itself with that of the contacts."""
+        self.present()
+        return self._system.stored(u, mu)
