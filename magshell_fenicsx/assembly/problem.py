@@ -75,6 +75,7 @@ class FiniteElementSystem:
         self.comm = V.mesh.comm
         self.size = V.dofmap.index_map.size_local * V.dofmap.index_map_bs
         self.dofs = V.dofmap.index_map.size_global * V.dofmap.index_map_bs
+        self.strange: list[str] = []  # terms that were not numbers at the latest residual that was none
         self.assembly, self.noise = Stopwatch(), Noise.from_environment()
         fixed = np.unique(np.concatenate([np.empty(0, dtype=np.int32), *(bc.dof_indices()[0] for bc in clamped)]))
         self._fixed = fixed[fixed < self.size]
@@ -153,10 +154,24 @@ class FiniteElementSystem:
         self.at(u, mu)
         factors = self._factors(mu)
         if self.noise is None:
-            return self._summed(self._gradient(factors))
+            found = self._summed(self._gradient(factors))
+            if not self._finite(found.sum()):
+                self.strange = self._not_numbers(factors)
+            return found
         first = self.u.function_space.dofmap.index_map.local_range[0] * self.u.function_space.dofmap.index_map_bs
         parts = [self._summed(self._gradient({name: factor})) for name, factor in factors.items()]
         return np.asarray(np.sum([self.noise.on_vector(part, first) for part in parts], axis=0))
+
+    def _finite(self, value: float) -> bool:
+        """Whether a number is one on all ranks."""
+        here = bool(np.isfinite(value))
+        return here if self.comm.size == 1 else bool(self.comm.allreduce(here, MPI.LAND))
+
+    def _not_numbers(self, factors: Mapping[str, float]) -> list[str]:
+        """The terms whose energy or gradient at the present u is not a number; collective."""
+        used = [t for t in self.terms if factors[t.name]]
+        sizes = {t.name: t.energy() + self._gradient({t.name: 1.0}).sum() for t in used}
+        return [name for name, size in sizes.items() if not self._finite(size)] or ["the sum of all terms"]
 
     def forces(self, u: Vector, mu: Amplitudes, name: str = "") -> Vector:
         """dPi/du at all nodes, of all terms or of one: of all at supports the forces of these on the shell."""

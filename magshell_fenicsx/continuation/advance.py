@@ -8,7 +8,7 @@ import numpy as np
 from magshell_fenicsx.continuation.motion import Motion
 from magshell_fenicsx.continuation.transient import Integrator
 
-ATONCE, LEAST = 0.1, 1e-2  # parts of what the balance may still lack, and of all that it may, in one step
+ATONCE, LEAST = 0.1, 5e-3  # parts of what the balance may still lack, and of all that it may, in one step
 SPENT = 0.3  # of its share: a step after one that leaks more is not longer
 SMALLEST = 1e-6  # of the first step
 

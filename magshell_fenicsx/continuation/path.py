@@ -68,6 +68,10 @@ class _Far:
     looks: int = 0
 
 
+class NotANumber(RuntimeError):
+    """A path cannot begin: its tangent is not a number."""
+
+
 class Path:
     """An equilibrium path in one amplitude, the others being fixed.
 
@@ -111,6 +115,8 @@ class Path:
             The sign of dmu/ds with control by arc length.
         """
         response = self.newton.response(state, self.name, GivenLoad(self.name, 0.0), exact=True)
+        if not np.isfinite(dot(self.system.comm, response.du, response.du)):
+            raise NotANumber("the tangent at its begin is not a number")
         if self.control == "arc":
             s, rate = 0.0, float(np.copysign(self.metric.norm(response.du, 1.0), sense))
         else:
@@ -224,7 +230,7 @@ class Path:
                     leaps += 1
                     over = found == HIDDEN and leaps <= MOST_LEAPS  # step over the singular tangent
                     step = 2 * length if over else length / 2
-                    if step < self.options.smallest:
+                    if not step >= self.options.smallest:
                         raise PathStopped(found, here)
                     continue
                 leaps = 0

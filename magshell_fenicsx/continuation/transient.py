@@ -22,8 +22,9 @@ from magshell_fenicsx.continuation.newton import MOTION
 from magshell_fenicsx.continuation.system import Amplitudes, Edged, Skewed, State, System, Tangent, Vector, dot, max_abs
 
 TOLERANCE = 1e-10  # of u in a step, over the system's length or, where that is longer, a tenth of the displacement
+FLOOR = 1e-3  # of the length: energies below that of such a displacement count as none
 STALLED = 1e-7  # steps below this that shrink no more, with new factors, may be rounding
-ROUNDING = 10.0  # steps up to this many times the rounding error are
+ROUNDED = 10.0  # steps up to this many times the rounding error are
 MOST = 20  # iterations
 PATIENCE = 2  # steps with new factors that may grow beside a body: they find what touches
 SLOW = 0.2  # new factors if a step is longer than this part of the one before
@@ -243,7 +244,11 @@ class Integrator:
         if not self.averaged:
             return now
         entries = self.kinetic(now), self.averaged.stored(now.u, now.mu), now.dissipated, -now.work
-        return replace(now, imbalance=sum(entries) - self._total, turnover=sum(map(abs, entries)))
+        return replace(
+            now,
+            imbalance=sum(entries) - self._total,
+            turnover=sum(map(abs, entries)) + (FLOOR * self.system.length) ** 2,
+        )
 
     def _inverse_mass(self) -> Callable[[Vector], Vector]:
         M = self.mass.copy()
@@ -304,7 +309,7 @@ class Integrator:
                 return "the step is not a number"
             tolerance = TOLERANCE * max(1.0, MOTION * max_abs(comm, u) / self.system.length)
             stalled = size <= STALLED and size > last / 2 and fresh
-            if size <= tolerance or (stalled and size <= ROUNDING * self._rounding(now, u, y, dt)):
+            if size <= tolerance or (stalled and size <= ROUNDED * self._rounding(now, u, y, dt)):
                 self.steps += 1
                 return self._accepted(now, u, y, dt)
             if size > SLOW * last:

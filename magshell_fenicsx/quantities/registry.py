@@ -188,7 +188,7 @@ IN_TIME = (  # of runs with a step of kind: time
     _energy(
         "imbalance",
         "error of the balance",
-        "Kinetic + stored + dissipated - work less its value where the step begins: what the steps in time gain or lose.",
+        "Kinetic + stored + dissipated - work less its value where the step begins: what steps in time gain or lose.",
     ),
 )
 QUANTITIES = {q.name: q for q in (*OF_EVERY_RUN, *OF_SOME_RUNS, *OF_CONTACTS, *IN_TIME)}

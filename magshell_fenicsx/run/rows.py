@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.case.loading import ProgrammeStep
 from magshell_fenicsx.case.loads.time import TimeSection
+from magshell_fenicsx.continuation.transient import FLOOR
 from magshell_fenicsx.output.store.table import COLUMNS, Row
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.scene import Scene
@@ -62,11 +63,11 @@ class RowMaker:
         return {**self._clock, **own, "stored": stored}
 
 
-def imbalances(programme: Iterable[ProgrammeStep], found: Sequence[Row]) -> Iterator[str]:
-    """What steps in time gain or lose beyond `balance`, in words."""
+def imbalances(programme: Iterable[ProgrammeStep], found: Sequence[Row], length: float) -> Iterator[str]:
+    """What steps in time gain or lose beyond `balance`, in words; `length` is the system's."""
     for step in programme:
         over = getattr(step.load, "balance", TimeSection.model_fields["balance"].default)
-        parts = [_imbalance(row) for row in found if row["step"] == step.number and row.get("imbalance")]
+        parts = [_imbalance(row, length) for row in found if row["step"] == step.number and row.get("imbalance")]
         if parts and abs(worst := max(parts, key=abs)) > over:
             yield (
                 f"step {step.number}: its steps in time {'gain' if worst > 0 else 'lose'} {abs(worst):.2g} of the "
@@ -75,9 +76,10 @@ def imbalances(programme: Iterable[ProgrammeStep], found: Sequence[Row]) -> Iter
             )
 
 
-def _imbalance(row: Row) -> float:
+def _imbalance(row: Row, length: float) -> float:
     """That of a row over its energies."""
-    return float(row["imbalance"]) / sum(abs(float(row[name])) for name in ("kinetic", "stored", "dissipated", "work"))
+    energies = sum(abs(float(row[name])) for name in ("kinetic", "stored", "dissipated", "work"))
+    return float(row["imbalance"]) / (energies + (FLOOR * length) ** 2)
 
 
 def rows(scene: Scene, records: Iterable[Record]) -> list[Row]:

@@ -165,7 +165,7 @@ def _run(
             for step in scene.case.programme:
                 if step.load.search and not any(int(result.rows[i]["step"]) == step.number for i in result.found):
                     say(f"warning: the search at the end of step {step.number} has found no further solution")
-            for said in imbalances(scene.case.programme, result.rows):
+            for said in imbalances(scene.case.programme, result.rows, scene.model.system.length):
                 say(f"warning: {said}")
             result.sensitivities = _sensitivities(result)
             result.barrier = _barrier(result)

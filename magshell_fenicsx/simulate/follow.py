@@ -5,7 +5,9 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 from magshell_fenicsx.case.loads.step import PathStep
+from magshell_fenicsx.continuation.path import NotANumber
 from magshell_fenicsx.continuation.point import Point
+from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.output.store.table import OWN_MODES
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
@@ -41,6 +43,7 @@ def follow(scene: Scene, *, search: bool = True, remark: Callable[[str], None] =
         If a path is lost, a step before the last ends at an instability, or the field alone makes the shell unstable.
     """
     state, steps = scene.unloaded(), scene.case.programme
+    _refuse_not_numbers(scene, state, "")
     pivots = scene.newton.factor_at(state).negative_pivots
     yield Record("start", "", Point(state, 0.0, 0.0 * state.u, 0.0, pivots, pivots, 0, 1))
     if pivots:
@@ -50,6 +53,7 @@ def follow(scene: Scene, *, search: bool = True, remark: Callable[[str], None] =
     for step in steps:
         where = f"step {step.number} of {len(steps)} ({step.kind}): " if isinstance(scene.case.loading, list) else ""
         scene.progress.beginning(step.number)
+        _refuse_not_numbers(scene, state, where)
         walked, last, record, first = Walked(records_of(scene, step, state)), "", None, None
         try:
             for record in walked:
@@ -66,10 +70,12 @@ def follow(scene: Scene, *, search: bool = True, remark: Callable[[str], None] =
                     last = record.label
                     yield replace(record, step=step.number)
                     refuse_penetration(scene, record.point.state)
-        except Stopped as e:
+        except (Stopped, NotANumber) as e:
+            names = scene.model.system.strange
+            strange = f"; where it was tried last, {' and '.join(names)} was not a number" if names else ""
             if not (first and step is steps[-1] and step.until == "limit" and not getattr(step.load, "then", None)):
-                raise Stopped(f"{where}{e}") from None
-            remark(f"{BEYOND}{where}{e}")
+                raise Stopped(f"{where}{e}{strange}") from None
+            remark(f"{BEYOND}{where}{e}{strange}")
             return
         begin, state = state, walked.end
         for record in searched(scene, step, begin, state) if search else ():
@@ -89,3 +95,18 @@ def _buckled(scene: Scene, fold: Record, first: Record | None) -> str:
         f"the snap starts from a shell that has buckled before: at its fold {count} mode{'s' * (count != 1)} that the "
         f"model excludes {'are' if count != 1 else 'is'} unstable, {since}; symmetry: none follows them"
     )
+
+
+def _refuse_not_numbers(scene: Scene, state: State, where: str) -> None:
+    """See that the forces at a state are numbers: no step could be small enough.
+
+    Raises
+    ------
+    Stopped
+        With the terms that are not.
+    """
+    system = scene.model.system
+    system.strange = []
+    system.residual(state.u, state.mu)
+    if system.strange:
+        raise Stopped(f"{where}{' and '.join(system.strange)} is not a number at its begin, in value or derivative")
