@@ -8,7 +8,7 @@ import numpy as np
 from magshell_fenicsx.continuation.motion import Motion
 from magshell_fenicsx.continuation.transient import Integrator
 
-ATONCE, LEAST = 0.1, 5e-3  # parts of what the balance may still lack, and of all that it may, in one step
+ATONCE = 0.1  # part of what the balance may lack that one step may make
 SPENT = 0.3  # of its share: a step after one that leaks more is not longer
 SMALLEST = 1e-6  # of the first step
 
@@ -37,9 +37,8 @@ class TimeSteps:
     balance: float = 1e-2
 
     def share(self, now: Motion) -> float:
-        """What the last step may have added to the imbalance: a part of what is left of the allowance."""
-        allowed = self.balance * now.turnover
-        return max(ATONCE * (allowed - abs(now.imbalance)), LEAST * allowed)
+        """What the last step may have added to the imbalance."""
+        return ATONCE * self.balance * now.turnover
 
 
 class TimeStopped(RuntimeError):

@@ -281,6 +281,8 @@ class Integrator:
         """The motion after a step; else the reason why there is none."""
         try:
             return self._step(now, dt)
+        except np.linalg.LinAlgError:
+            return "a body whose force is held has left the shell, and has no mass"
         finally:
             if self.averaged:
                 self.averaged.present()
