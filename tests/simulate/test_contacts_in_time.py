@@ -70,7 +70,7 @@ HELD = {
 
 
 def test_a_viscous_cap_stays_on_its_ball() -> None:
-    """Held by a gas under a small ramp: in balance, few iterations, and a viscosity changed by 1e-12 changes nothing."""
+    """Under a small ramp: in balance, in few iterations, and a viscosity changed by 1e-12 changes nothing."""
     ramp = {"history": {"pressure": {"kind": "ramp", "to": 1e-3, "over": 1.0}}}
     moving = {"kind": "time", "duration": 3.0, "points": 3, "drag": 0.05, **ramp}
     ends = []
