@@ -108,5 +108,5 @@ def unbalanced(now: Motion, after: Motion) -> str:
     leak = after.imbalance - now.imbalance
     return (
         f"the balance of energy {'gains' if leak > 0 else 'loses'} {abs(leak) / after.turnover:.2g} of the energies in "
-        f"a step of {after.t - now.t:.2g}, whatever its length: give a body less stiffness, or a larger tolerance"
+        f"a step of {after.t - now.t:.2g}, whatever its length: give a body less stiffness, or a larger balance"
     )

@@ -40,7 +40,7 @@ def test_the_mean_pressure_times_the_change_of_penetration_is_that_of_the_energy
 
 @pytest.mark.parametrize("symmetry", ["axisymmetric", pytest.param("half", marks=pytest.mark.slow)])
 def test_an_impact_conserves_energy(symmetry: str) -> None:
-    """A plate thrown at a ball bounces off: with rho_inf: 1 nothing is lost but by bending, whose energy is no quartic."""
+    """A plate thrown at a ball: with rho_inf: 1 nothing is lost but by bending, whose energy is no quartic."""
     coarse = {"degree": 2, "refinement": 0.2} if symmetry == "half" else PLATE["mesh"]
     moving = THROWN | {"duration": 2.0, "step": 0.05, "rho_inf": 1.0}
     _, found = found_of(PLATE, APART, moving, symmetry=symmetry, mesh=coarse)
