@@ -43,7 +43,11 @@ def follow(scene: Scene, *, search: bool = True, remark: Callable[[str], None] =
         If a path is lost, a step before the last ends at an instability, or the field alone makes the shell unstable.
     """
     state, steps = scene.unloaded(), scene.case.programme
-    _refuse_not_numbers(scene, state, "")
+    try:
+        _refuse_not_numbers(scene, state, "")
+    except Stopped:
+        yield Record("start", "", Point(state, 0.0, 0.0 * state.u, 0.0, 0, 0))
+        raise
     pivots = scene.newton.factor_at(state).negative_pivots
     yield Record("start", "", Point(state, 0.0, 0.0 * state.u, 0.0, pivots, pivots, 0, 1))
     if pivots:

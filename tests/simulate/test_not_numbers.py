@@ -46,6 +46,7 @@ def test_at_the_begin(energy: object, tmp_path: Path) -> None:
     case = Case.from_source(Source("test", {**CAP, "loading": [LOADED]}))
     found = run(case, tmp_path / "out", terms=[OwnTerm("own", energy, value=1.0)], pictures=False)  # type: ignore[arg-type]
     assert found.stopped == "own is not a number at its begin, in value or derivative"
+    assert len(found.rows) == 1
     assert (tmp_path / "out" / "summary.json").exists()
 
 
