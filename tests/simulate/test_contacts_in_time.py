@@ -19,7 +19,7 @@ PLATE = {
     "mesh": {"degree": 3, "refinement": 0.3},
 }
 APART = {"kind": "contact", "approach": -0.5, "points": 1}
-THROWN = {"kind": "time", "points": 4, "velocity": ["0", "0", "0.01*(1-x**2-y**2)**2"]}
+THROWN = {"kind": "time", "points": 10, "velocity": ["0", "0", "0.01*(1-x**2-y**2)**2"]}
 
 
 def found_of(base: dict[str, Any], *steps: dict[str, Any], **sections: Any) -> tuple[Case, list[dict[str, Any]]]:
