@@ -294,9 +294,7 @@ class Pressing:
         """
         k, soft, places = float(self.stiffness.value), SOFT * self._h, (begin, (begin + end) / 2, end)
         half = self._h / 2 * self._factor
-        gaps, n, N = zip(
-            *(self.contact.gap((self._r0 + y).reshape(-1, 3), 0.0, half) for y in places), strict=True
-        )
+        gaps, n, N = zip(*(self.contact.gap((self._r0 + y).reshape(-1, 3), 0.0, half) for y in places), strict=True)
         s0, _, s1 = (-gap for gap in gaps)
         mean, slope = mean_pressure(s0, s1, k, soft)
         normal, bend = (n[0] + 4 * n[1] + n[2]) / 6, (2 * N[1] + N[2]) / 6
