@@ -229,15 +229,16 @@ def test_closed_descriptors(tmp_path: Path) -> None:
     assert len(read_path(tmp_path / "out")) == 5
 
 
+@pytest.mark.slow
 def test_a_kernel_cache_that_cannot_be_written(tmp_path: Path) -> None:
-    cache, command = "/dev/null/cache", [sys.executable, "-m", "magshell_fenicsx", "run", *map(str, SMALL)]
-    environment = {**os.environ, "XDG_CACHE_HOME": cache}
+    """Another folder of the user's own takes its place."""
+    command = [sys.executable, "-m", "magshell_fenicsx", "run", *map(str, SMALL), "--no-pictures"]
+    environment = {**os.environ, "XDG_CACHE_HOME": "/dev/null/cache", "HOME": str(tmp_path)}
     done = subprocess.run(
         [*command, "--out", tmp_path / "out"], env=environment, capture_output=True, text=True, check=False
     )
-    said = f"stopped early: kernels cannot be compiled into {cache}/fenics: Not a directory\n"
-    assert (done.returncode, done.stderr) == (3, said)
-    assert not (tmp_path / "out").exists()
+    assert (done.returncode, done.stderr) == (0, "")
+    assert list(tmp_path.glob(".cache/magshell/**/*.so"))
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,7 @@ from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.openings import moving
 from magshell_fenicsx.plan.check import describe
+from magshell_fenicsx.plan.limits import refuse_beyond_memory
 from magshell_fenicsx.plan.planner import make_plan
 from magshell_fenicsx.simulate.build import build_midsurface
 
@@ -236,8 +237,9 @@ def test_a_half_is_not_told_to_take_half(symmetry: str) -> None:
         "boundary": {"rim": "clamped"},
         "mesh": {"refinement": 20},
     }
+    case = Case.from_source(Source("test", data))
     with pytest.raises(CaseError) as error:
-        make_plan(Case.from_source(Source("test", data)))
+        refuse_beyond_memory(case, make_plan(case))
     assert "unknowns" in str(error.value)
     assert ("symmetry: half halves it" in str(error.value)) == (symmetry == "none")
 

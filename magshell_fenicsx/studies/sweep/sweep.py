@@ -137,7 +137,8 @@ def _missing(points: Sequence[SweepPoint], files: Sequence[Path]) -> list[int]:
 
 def _ready(out: Path) -> None:
     refuse_others(out, (NAME, TABLE, "curves.csv", "sweep.png"), ("keys", "base", "points"), "a sweep")
-    (out / "points").mkdir(parents=True, exist_ok=True)
+    for folder in (out, out / "points"):
+        folder.mkdir(parents=True, exist_ok=True)
     (out / TABLE).touch()
 
 
