@@ -1,4 +1,4 @@
-"""A moving state, and what a loading device makes of it where it begins.
+"""A moving state, what acts on it, and what a loading device makes of it where it begins.
 
 A device holds the conjugates q of some amplitudes: g(u, mu) = dPi/dmu + q = 0. Where g depends on its own amplitude (a
 gas, a body that is pressed on) that follows from u. Otherwise g constrains u: C.v = 0 and C.a + v.(dC/du v) = 0 with
@@ -7,13 +7,13 @@ the column C = dg/du, and the amplitude is the force of this constraint.
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.device import Device
-from magshell_fenicsx.continuation.system import Amplitudes, System, Vector, dot, max_abs
+from magshell_fenicsx.continuation.system import Amplitudes, State, System, Tangent, Vector, dot, max_abs
 
 Array = NDArray[np.float64]
 Inverse = Callable[[Vector], Vector]
@@ -59,6 +59,84 @@ class Motion:
     memory: Any = None
     imbalance: float = np.nan
     turnover: float = np.nan
+
+
+class Viscous(Protocol):
+    """Forces that depend on the strains along a step.
+
+    Attributes
+    ----------
+    memory
+        What they remember of the steps to u0; `accept` replaces it.
+    slowness
+        Longest time in which they let a displacement creep to its end, so that errors of steps add up.
+    """
+
+    memory: Any
+    slowness: float
+
+    def force(self, u0: Vector, u1: Vector, v: Vector, part: float, dt: float) -> Vector:
+        """The force at a part of the step from u0 to u1, with the velocity v there; zero at supports."""
+
+    def tangent(self, u: Vector, mu: Amplitudes, dt: float, rate: float) -> Tangent:
+        """The system's tangent with the derivative of the force by u1; dv/du at the end is `rate`."""
+
+    def begin(self) -> None:
+        """A motion begins, or a load has a corner."""
+
+    def accept(self, u0: Vector, u1: Vector, dt: float) -> Vector:
+        """Go on from u1; the latest force."""
+
+    def doubt(self, u0: Vector, u1: Vector, dt: float) -> Vector | None:
+        """The force at u1 of which an estimate of the error is made; None without an estimate."""
+
+
+class Averaged(Protocol):
+    """Forces of contact, which set in and cease within a step: each step takes their mean along its way.
+
+    Attributes
+    ----------
+    names
+        Amplitudes that are positions of what touches.
+    """
+
+    names: frozenset[str]
+
+    def along(self, begin: State, end: State, part: float) -> None:
+        """Let the system's forces at this part of a step be its mean ones, until `present`."""
+
+    def present(self) -> None:
+        """Let the system have the forces of its state again."""
+
+    def stored(self, u: Vector, mu: Amplitudes) -> float:
+        """The energy without the potentials of loads."""
+
+
+class Ground(Protocol):
+    """Supports that move; see `assembly.ground`.
+
+    Attributes
+    ----------
+    names
+        Their amplitudes.
+    """
+
+    names: frozenset[str]
+
+    def velocity(self, t: float, before: bool) -> Vector:
+        """Of supports."""
+
+    def acceleration(self, t: float, before: bool) -> Vector:
+        """Of supports."""
+
+    def along(self, mu: Amplitudes, name: str) -> Vector:
+        """Their displacement by an amplitude."""
+
+    def times(self, x: Vector) -> Vector:
+        """The mass of all nodes times a vector."""
+
+    def held(self, x: Vector) -> Vector:
+        """With zeros at supports."""
 
 
 def constrained(

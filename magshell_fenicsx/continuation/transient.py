@@ -8,7 +8,6 @@ rho < 1, but shows neither its acceleration, without which a resumed run is anot
 
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,9 +16,9 @@ from petsc4py import PETSc
 from magshell_fenicsx.continuation.device import Device
 from magshell_fenicsx.continuation.edge import join, split
 from magshell_fenicsx.continuation.factor import Factorisation
-from magshell_fenicsx.continuation.motion import Motion, constrained, held_back
+from magshell_fenicsx.continuation.motion import Averaged, Ground, Motion, Viscous, constrained, held_back
 from magshell_fenicsx.continuation.newton import MOTION
-from magshell_fenicsx.continuation.system import Amplitudes, Edged, Skewed, State, System, Tangent, Vector, dot, max_abs
+from magshell_fenicsx.continuation.system import Amplitudes, Edged, Skewed, State, System, Vector, dot, max_abs
 
 TOLERANCE = 1e-10  # of u in a step, over the system's length or, where that is longer, a tenth of the displacement
 FLOOR = 1e-3  # of the length: energies below that of such a displacement count as none
@@ -34,84 +33,6 @@ OTHER = 0.05  # relative change of the time step after which factors are renewed
 GAUSS = ((0.5 - np.sqrt(1 / 12), 0.5), (0.5 + np.sqrt(1 / 12), 0.5))  # exact for the membrane's energy, of degree 4
 Array = NDArray[np.float64]
 Loads = Callable[[float, bool], dict[str, float]]  # mu(t), at a jump before or after it
-
-
-class Viscous(Protocol):
-    """Forces that depend on the strains along a step.
-
-    Attributes
-    ----------
-    memory
-        What they remember of the steps to u0; `accept` replaces it.
-    slowness
-        Longest time in which they let a displacement creep to its end, so that errors of steps add up.
-    """
-
-    memory: Any
-    slowness: float
-
-    def force(self, u0: Vector, u1: Vector, v: Vector, part: float, dt: float) -> Vector:
-        """The force at a part of the step from u0 to u1, with the velocity v there; zero at supports."""
-
-    def tangent(self, u: Vector, mu: Amplitudes, dt: float, rate: float) -> Tangent:
-        """The system's tangent with the derivative of the force by u1; dv/du at the end is `rate`."""
-
-    def begin(self) -> None:
-        """A motion begins, or a load has a corner."""
-
-    def accept(self, u0: Vector, u1: Vector, dt: float) -> Vector:
-        """Go on from u1; the latest force."""
-
-    def doubt(self, u0: Vector, u1: Vector, dt: float) -> Vector | None:
-        """The force at u1 of which an estimate of the error is made; None without an estimate."""
-
-
-class Averaged(Protocol):
-    """Forces of contact, which set in and cease within a step: each step takes their mean along its way.
-
-    Attributes
-    ----------
-    names
-        Amplitudes that are positions of what touches.
-    """
-
-    names: frozenset[str]
-
-    def along(self, begin: State, end: State, part: float) -> None:
-        """Let the system's forces at this part of a step be its mean ones, until `present`."""
-
-    def present(self) -> None:
-        """Let the system have the forces of its state again."""
-
-    def stored(self, u: Vector, mu: Amplitudes) -> float:
-        """The energy without the potentials of loads."""
-
-
-class Ground(Protocol):
-    """Supports that move; see `assembly.ground`.
-
-    Attributes
-    ----------
-    names
-        Their amplitudes.
-    """
-
-    names: frozenset[str]
-
-    def velocity(self, t: float, before: bool) -> Vector:
-        """Of supports."""
-
-    def acceleration(self, t: float, before: bool) -> Vector:
-        """Of supports."""
-
-    def along(self, mu: Amplitudes, name: str) -> Vector:
-        """Their displacement by an amplitude."""
-
-    def times(self, x: Vector) -> Vector:
-        """The mass of all nodes times a vector."""
-
-    def held(self, x: Vector) -> Vector:
-        """With zeros at supports."""
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,8 @@ from dataclasses import replace
 
 from magshell_fenicsx.quantities.quantity import Amplitude, Kind, Quantity
 
+OWN_MODES = ("", "symmetric", "asymmetric")  # in the column of modes: those of the model itself; it excludes all others
+
 
 def _energy(name: str, words: str, meaning: str, symbol: str = "") -> Quantity:
     return Quantity(name, words, meaning, "energy", symbol, "E h R²", "J")

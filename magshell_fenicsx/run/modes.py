@@ -17,7 +17,7 @@ from magshell_fenicsx.output.fields.surface import Surface
 from magshell_fenicsx.output.fields.vtu import About
 from magshell_fenicsx.output.store.durable import write_whole
 from magshell_fenicsx.output.store.folder import by_first
-from magshell_fenicsx.output.store.table import OWN_MODES
+from magshell_fenicsx.quantities.registry import OWN_MODES
 from magshell_fenicsx.run.summary import Result
 from magshell_fenicsx.simulate.scene import Scene
 

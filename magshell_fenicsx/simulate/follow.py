@@ -8,7 +8,7 @@ from magshell_fenicsx.case.loads.step import PathStep
 from magshell_fenicsx.continuation.path import NotANumber
 from magshell_fenicsx.continuation.point import Point
 from magshell_fenicsx.continuation.system import State
-from magshell_fenicsx.output.store.table import OWN_MODES
+from magshell_fenicsx.quantities.registry import OWN_MODES
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.search import searched

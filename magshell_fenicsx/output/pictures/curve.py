@@ -13,9 +13,9 @@ from magshell_fenicsx.case.output import OutputSection
 from magshell_fenicsx.output.pictures.bars import number_format
 from magshell_fenicsx.output.pictures.layout import INCH, ONE, SEVERAL, drawing
 from magshell_fenicsx.output.pictures.numbers import write_numbers
-from magshell_fenicsx.output.store.table import LOCATED, OWN_MODES, POLE, SOLUTION, Row, pole_name
+from magshell_fenicsx.output.store.table import LOCATED, POLE, SOLUTION, Row, pole_name
+from magshell_fenicsx.quantities.registry import OWN_MODES, axes_of, quantity, shown
 from magshell_fenicsx.quantities.registry import amplitude as registered
-from magshell_fenicsx.quantities.registry import axes_of, quantity, shown
 
 if TYPE_CHECKING:  # takes long to import
     from matplotlib.axes import Axes

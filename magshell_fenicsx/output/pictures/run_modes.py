@@ -15,8 +15,8 @@ from magshell_fenicsx.output.pictures.curve import numbered
 from magshell_fenicsx.output.pictures.mode_picture import modes_figure
 from magshell_fenicsx.output.pictures.view import Camera
 from magshell_fenicsx.output.store.durable import Damaged
-from magshell_fenicsx.output.store.table import LOCATED, OWN_MODES, Row
-from magshell_fenicsx.quantities.registry import amplitude
+from magshell_fenicsx.output.store.table import LOCATED, Row
+from magshell_fenicsx.quantities.registry import OWN_MODES, amplitude
 
 if TYPE_CHECKING:  # takes long to import
     from matplotlib.figure import Figure

@@ -13,9 +13,9 @@ from magshell_fenicsx.output.report.html_numbers import above_rounding, number
 from magshell_fenicsx.output.report.report_path import Line, head, symbol
 from magshell_fenicsx.output.store.durable import Damaged
 from magshell_fenicsx.output.store.known import pole_of, read_summary
-from magshell_fenicsx.output.store.table import LOCATED, OWN_MODES, pole_name, read_lines
+from magshell_fenicsx.output.store.table import LOCATED, pole_name, read_lines
 from magshell_fenicsx.quantities.quantity import PLAIN, Quantity
-from magshell_fenicsx.quantities.registry import amplitude, axes_of, shown
+from magshell_fenicsx.quantities.registry import OWN_MODES, amplitude, axes_of, shown
 
 Summary = Mapping[str, Any]
 ON_AXIS = 0.5  # degrees: an azimuth there is that of a node beside the pole

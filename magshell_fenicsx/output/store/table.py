@@ -15,7 +15,6 @@ Row = dict[str, float | int | str]
 POLE = "the pole"
 LOCATED = ("fold", "bifurcation")
 SOLUTION = "solution"  # label of what a search found
-OWN_MODES = ("", "symmetric", "asymmetric")  # modes of the model itself; it excludes all other modes
 
 
 def pole_name(row: Mapping[str, object], pole: str = POLE) -> str:

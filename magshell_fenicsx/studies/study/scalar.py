@@ -10,8 +10,8 @@ from typing import Any
 from scipy.interpolate import barycentric_interpolate
 
 from magshell_fenicsx.case.source import CaseError
-from magshell_fenicsx.output.store.table import COLUMNS, OWN_MODES, TEXTS
-from magshell_fenicsx.quantities.registry import IN_TIME, quantity
+from magshell_fenicsx.output.store.table import COLUMNS, TEXTS
+from magshell_fenicsx.quantities.registry import IN_TIME, OWN_MODES, quantity
 
 BARE = (*(column for column in COLUMNS if column not in TEXTS), *(q.name for q in IN_TIME))
 NUMBERS = (*BARE, *(each.name for name in BARE for each in quantity(name).in_units))

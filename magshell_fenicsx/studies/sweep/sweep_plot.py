@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from magshell_fenicsx.output.store.table import OWN_MODES
-from magshell_fenicsx.quantities.registry import axes_of
+from magshell_fenicsx.quantities.registry import OWN_MODES, axes_of
 from magshell_fenicsx.studies.sweep.axes import Axis, along
 from magshell_fenicsx.studies.sweep.outcome import Outcome
 from magshell_fenicsx.studies.sweep.points import SweepPoint, short
