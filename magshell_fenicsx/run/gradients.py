@@ -97,7 +97,7 @@ def _adjoint(result: Result, of: str) -> tuple[str, Adjoint]:
     """What the derivatives of a result are contracted with, and of which kind it is."""
     scene, history = result.scene, result.history
     if of in FOLDS:
-        return instabilities(scene, history.located, of, 1)[0]
+        return instabilities(scene, history.located, of, 1, history.begins)[0]
     beyond = next((remark for remark in result.remarks if remark.startswith(BEYOND)), None)
     if result.stopped or beyond or history.end is None:
         raise Lost(result.stopped or beyond or "the path has no end")

@@ -44,6 +44,17 @@ def gas(scene: Scene, section: GasSection, state: State) -> Conjugate:
     return conjugate
 
 
+def gas_by_begin(scene: Scene, section: GasSection, state: State, p: float) -> tuple[float, float]:
+    """What the conjugate at p/p_c changes by with that of the state where the gas was closed in, and with p there."""
+    unit, (now, then) = scene.conjugate_unit("pressure"), (p, state.mu["pressure"])
+    q = -scene.model.system.potential(state.u, state.mu, "pressure")
+    at_now, slope = gas(scene, section, state)(now)
+    first = section.volume or volume(scene.case)
+    ahead = (at_now / unit + first) / slope * unit  # ambient - p
+    share = (ahead + now - then) / ahead
+    return share, -(unit * first + q) / ahead
+
+
 def volume(case: Case) -> float:
     """The volume between a spherical shell without its dimple and the plane of its edge, over R^3.
 

@@ -171,15 +171,17 @@ def on_mesh_of(scene: Scene, new: Plan) -> Plan:
     )
 
 
-def carried(old: Scene, new: Scene, state: State, own: Collection[str] = ()) -> State:
+def carried(old: Scene, new: Scene, state: State, own: Collection[str] = (), steps: int | None = None) -> State:
     """The state with the loads of the new case: where its targets are other numbers, amplitudes are in proportion.
 
     Parameters
     ----------
     own
         Amplitudes that are results, or follow from what is held.
+    steps
+        How many steps of the programme led to the state; None: all.
     """
-    ratios, fields = goals(old, new, "load"), [name for name in state.mu if name.startswith("lambda_")]
+    ratios, fields = goals(old, new, "load", steps), [name for name in state.mu if name.startswith("lambda_")]
     for contact, other in zip(old.plan.loads.contacts, new.plan.loads.contacts, strict=True):
         ratios[contact.setting] = other.stiffness / contact.stiffness
     given, now = old.unloaded().mu, new.unloaded().mu  # stiffnesses of parts are amplitudes too
@@ -193,10 +195,10 @@ def carried(old: Scene, new: Scene, state: State, own: Collection[str] = ()) -> 
     )
 
 
-def goals(old: Scene, new: Scene, quantity: str) -> dict[str, float]:
+def goals(old: Scene, new: Scene, quantity: str, steps: int | None = None) -> dict[str, float]:
     """Amplitude -> target of the new case over that of the old one, where they differ: those that have units."""
     found = dict[str, float]()
-    for before, after in zip(old.case.programme, new.case.programme, strict=True):
+    for before, after in zip(old.case.programme[:steps], new.case.programme[:steps], strict=True):
         one, two = before.load.target, after.load.target
         if one and two and one[0].quantity == quantity and one[1] and one[1] != two[1]:
             found[before.name] = two[1] / one[1]

@@ -50,18 +50,22 @@ class Ending:
 class History:
     """The records of a run that its end depends on.
 
-    `begin` is the last one before the last step, `last` the last one that is no instability, `end` the last one of all.
+    `begins` are the last ones before each step, `begin` that before the last one,
+    `last` the last one that is no instability, `end` the last one of all.
     """
 
     last: Record | None = None
     end: Record | None = None
     begin: Record | None = None
     located: list[Record] = field(default_factory=list)
+    begins: dict[int, Record] = field(default_factory=dict)
 
     def add(self, record: Record) -> None:
         if record.branch:
             return
         self.end = record
+        if self.last and record.step != self.last.step:
+            self.begins.setdefault(record.step, self.last)
         if record.label in ("fold", "bifurcation"):
             self.located.append(record)
         else:

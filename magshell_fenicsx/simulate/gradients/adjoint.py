@@ -9,17 +9,21 @@ Where a wave phi is neutral that a meridian does not see, Q(phi; u, mu, p) = 0 f
 
     dmu/dp = -(Q_p + w . R_p)/(Q_mu + w . R_mu),    K w = -Q_u.
 
-The equations of vibrations and of energy barriers are contracted at several displacements: `Place`.
+The equations of vibrations and of energy barriers are contracted at several displacements: `Place`. So are those of
+states under a conjugate q that a step holds: it is q = -Pi_mu of the state where the step began, which p changes too.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
 from typing import TypeAlias
 
 import numpy as np
 
 from magshell_fenicsx.assembly.terms import FormTerm, factor_of
-from magshell_fenicsx.case.loads.step import PathStep
+from magshell_fenicsx.case.loading import ProgrammeStep
+from magshell_fenicsx.case.loads.field import RotationSection
+from magshell_fenicsx.case.loads.step import Gas, PathStep
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.continuation.device import Conjugate, Device
 from magshell_fenicsx.continuation.fold import Fold
@@ -27,6 +31,7 @@ from magshell_fenicsx.continuation.inverse import nearest_to_zero
 from magshell_fenicsx.continuation.system import State, System, Vector, dot
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.mass import mass_along
+from magshell_fenicsx.simulate.gas import gas_by_begin
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.results import Functional, Target, force_unit, functional, in_units
 from magshell_fenicsx.simulate.scene import Scene
@@ -35,6 +40,10 @@ from magshell_fenicsx.simulate.steps import held_by
 from magshell_fenicsx.simulate.transfer import transfer
 
 WAVE = "m = "  # what the mode of a wave begins with
+SAME = 1e-5  # a conjugate is still the one that was held, relative to the larger of it and its unit
+
+Begins: TypeAlias = Mapping[int, Record]  # number of a step -> the last record before it
+NONE: Begins = MappingProxyType({})
 
 
 @dataclass(frozen=True)
@@ -49,6 +58,14 @@ class Place:
         c_i of the rows of the device: of amplitudes that are unknown there, as their conjugates are held.
     energy, potentials
         c, and c_i of what J itself contains.
+    follows
+        Amplitudes of the rows whose conjugates are those of a later place.
+    steps
+        How many steps of the programme led to this place, where a later step began; None: all of the record's.
+    driven
+        Amplitudes that have changed since.
+    gas
+        Whether the conjugate of a gas is held there.
     """
 
     state: State
@@ -56,6 +73,10 @@ class Place:
     rows: Mapping[str, float] = field(default_factory=dict)
     energy: float = 0.0
     potentials: Mapping[str, float] = field(default_factory=dict)
+    follows: frozenset[str] = frozenset()
+    steps: int | None = None
+    driven: frozenset[str] = frozenset()
+    gas: bool = False
 
     @property
     def conjugates(self) -> dict[str, float]:
@@ -133,15 +154,16 @@ class Adjoint:
         return self.places[0].state
 
 
-def adjoint_of_instability(scene: Scene, record: Record, fold: Fold | None = None) -> Adjoint:
+def adjoint_of_instability(scene: Scene, record: Record, fold: Fold | None = None, begins: Begins = NONE) -> Adjoint:
     """The adjoint of the amplitude where a fold or a neutral wave is.
 
-    A fold takes no factorisation but its own, a wave one of the tangent and one of its second variation.
+    A fold takes no factorisation but its own, a wave one of the tangent and one of its second variation; a conjugate
+    that the step holds takes one where the step began.
 
     Raises
     ------
     CaseError
-        If the record is another instability.
+        If the record is another instability, or what it holds has no derivative.
     """
     if record.mode.startswith(WAVE):
         return _of_wave(scene, record)
@@ -158,7 +180,7 @@ def adjoint_of_instability(scene: Scene, record: Record, fold: Fold | None = Non
     w = stage.device.displacement(left) if stage.device else left
     here = Place(stage.leave(fold.state), np.array(w), rows)
     gas = with_gas(held_at(scene, record, record.point.state))
-    return Adjoint(scene, [here], value=fold.value, gas=gas, free=fold.name)
+    return Adjoint(scene, with_begins(scene, record, here, begins), value=fold.value, gas=gas, free=fold.name)
 
 
 def _of_wave(scene: Scene, record: Record) -> Adjoint:
@@ -188,13 +210,15 @@ def variation(model: MeridianModel, state: State, phi: Vector, m: int, names: It
     return Functional(value, system.held(by_u), by_mu)
 
 
-def adjoint(scene: Scene, record: Record, of: str | Target, hold: Mapping[str, str] | None = None) -> Adjoint:
-    """The adjoint of a result at a regular state; one factorisation and one solve.
+def adjoint(
+    scene: Scene, record: Record, of: str | Target, hold: Mapping[str, str] | None = None, begins: Begins = NONE
+) -> Adjoint:
+    """The adjoint of a result at a regular state; one factorisation and one solve, and these of a step's begin again.
 
     Raises
     ------
     CaseError
-        If the scene has no such result.
+        If the scene has no such result, or what the step holds has no derivative.
     """
     state = scene.model.system.placed(record.point.state)
     column, scale = in_units(scene, state, of) if isinstance(of, str) else (of, "")
@@ -209,8 +233,54 @@ def adjoint(scene: Scene, record: Record, of: str | Target, hold: Mapping[str, s
         by_itself = lambda there, _: found.value * force_unit(there) / unit  # noqa: E731
         w = w + found.reaction
     here = Place(state, w, rows, found.energy, found.potentials)
-    gas = with_gas(held)
-    return Adjoint(scene, [here], found.by_mu, by_itself, value=found.value, gas=gas, scale=scale)
+    gas, places = with_gas(held), [here] if hold is not None else with_begins(scene, record, here, begins)
+    return Adjoint(scene, places, found.by_mu, by_itself, value=found.value, gas=gas, scale=scale)
+
+
+def with_begins(scene: Scene, record: Record, place: Place, begins: Begins) -> list[Place]:
+    """A place at a record, and those where its step and earlier ones began whose conjugates it holds; collective.
+
+    Raises
+    ------
+    CaseError
+        If it is not known where a step began.
+    """
+    step = scene.case.programme[record.step - 1] if record.step else None
+    held = {name: place.rows[name] for name in held_by_step(step) if place.rows.get(name)} if step else {}
+    if not step or not held:
+        return [place]
+    if record.step not in begins:
+        raise CaseError(f"{step.key}.hold: {', '.join(held)}: give begin, the record before this step")
+    begin, system, c, by_mu = begins[record.step], scene.model.system, dict[str, float](), dict[str, float]()
+    before = system.placed(begin.point.state)
+    for name, row in held.items():
+        law = step.load.hold[name]
+        if isinstance(law, Gas):
+            share, by_mu[name] = gas_by_begin(scene, law.gas, before, place.state.mu[name])
+            by_mu[name] *= row
+            c[name] = -row * share
+            continue
+        now, then = (system.potential(state.u, state.mu, name) for state in (place.state, before))
+        if abs(now - then) > SAME * max(abs(now), abs(scene.conjugate_unit(name))):
+            raise CaseError(
+                f"{step.key}.hold.{name}: no gradient, as it is not held from the last point before the step"
+            )
+        c[name] = -row
+    slope = np.sum([c_i * system.load(before.u, before.mu, name) for name, c_i in c.items()], axis=0)
+    held_before = held_at(scene, begin, before)
+    w, rows = solved(scene, before, Functional(0.0, slope, by_mu, c), held_before)
+    driven = {other.name for other in scene.case.programme[begin.step : record.step]}
+    if any(isinstance(other.load, RotationSection) for other in scene.case.programme[begin.step : record.step]):
+        driven |= {name for name in before.mu if name.startswith("lambda_")}
+    own = Place(
+        before, w, rows, potentials=c, steps=begin.step, driven=place.driven | driven, gas=with_gas(held_before)
+    )
+    return [replace(place, follows=frozenset(held)), *with_begins(scene, begin, own, begins)]
+
+
+def held_by_step(step: ProgrammeStep) -> list[str]:
+    """The amplitudes whose conjugates a step holds as they are where it begins."""
+    return [name for name, how in step.load.hold.items() if how != "load" and name != step.name]
 
 
 Held: TypeAlias = Mapping[str, float | Conjugate]  # amplitude -> its conjugate

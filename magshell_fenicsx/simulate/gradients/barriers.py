@@ -12,7 +12,7 @@ import numpy as np
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.simulate.barrier import barrier
-from magshell_fenicsx.simulate.gradients.adjoint import Adjoint, Place, held_at, solved
+from magshell_fenicsx.simulate.gradients.adjoint import NONE, Adjoint, Begins, Place, held_at, solved, with_begins
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.results import Functional
 from magshell_fenicsx.simulate.scene import Scene
@@ -32,7 +32,7 @@ def refuse_no_barrier(case: Case) -> None:
         raise CaseError("barrier: needs a last step with until: zero")
 
 
-def adjoint_of_barrier(scene: Scene, begin: Record | None, end: Record) -> Adjoint:
+def adjoint_of_barrier(scene: Scene, begin: Record | None, end: Record, begins: Begins = NONE) -> Adjoint:
     """The adjoint of the barrier between the begin and the end of the last step.
 
     Raises
@@ -55,5 +55,6 @@ def adjoint_of_barrier(scene: Scene, begin: Record | None, end: Record) -> Adjoi
     w, rows = 0.0 * before.u, dict[str, float]()
     if change:
         w, rows = solved(scene, before, Functional(0.0, slope, potentials=q), held_at(scene, begin, before))
-    places = [Place(after, 0.0 * after.u, dict.fromkeys(held, 0.0), whole), Place(before, w, rows, -whole, q)]
+    there = Place(before, w, rows, -whole, q, steps=begin.step)
+    places = [Place(after, 0.0 * after.u, dict.fromkeys(held, 0.0), whole), *with_begins(scene, begin, there, begins)]
     return Adjoint(scene, places, value=barrier(scene, step, before, after))

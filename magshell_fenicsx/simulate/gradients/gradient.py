@@ -53,7 +53,7 @@ def gradient(
         Amplitude -> "load" or "conjugate": what stays while p changes. By default what the record's step holds, and
         the displacement where that is its control.
     begin
-        Of a barrier: the record before the last step.
+        Of a barrier, and of a step that holds conjugates: the last record before the step.
 
     Returns
     -------
@@ -68,10 +68,11 @@ def gradient(
     """
     if isinstance(of, str) and of in FOLDS and record.amplitude != FOLDS[of]:
         raise CaseError(f"{of}: the record is of {record.amplitude or 'the start'}, not of {FOLDS[of]}")
+    begins = {record.step: begin} if begin else {}
     if of == "instability" or (isinstance(of, str) and of in FOLDS):
-        found = as_asked(adjoint_of_instability(scene, record, fold), of)
+        found = as_asked(adjoint_of_instability(scene, record, fold, begins), of)
     else:
-        found = adjoint_at_end(scene, History(record, record, begin), of, hold)[1]
+        found = adjoint_at_end(scene, History(record, record, begin, begins=begins), of, hold)[1]
     return {name: derivative(found, name) for name in ([by] if isinstance(by, str) else by)}
 
 

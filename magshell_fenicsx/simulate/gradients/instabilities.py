@@ -5,7 +5,7 @@ from dataclasses import replace
 
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.quantities import registry as quantities
-from magshell_fenicsx.simulate.gradients.adjoint import Adjoint, adjoint_of_instability
+from magshell_fenicsx.simulate.gradients.adjoint import NONE, Adjoint, Begins, adjoint_of_instability
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.results import Target, in_units
 from magshell_fenicsx.simulate.scene import Scene
@@ -75,13 +75,17 @@ def as_asked(found: Adjoint, of: object) -> Adjoint:
     return replace(found, scale=SCALES[str(of)])
 
 
-def instabilities(scene: Scene, records: Sequence[Record], of: str, most: int = MOST) -> list[tuple[str, Adjoint]]:
+def instabilities(
+    scene: Scene, records: Sequence[Record], of: str, most: int = MOST, begins: Begins = NONE
+) -> list[tuple[str, Adjoint]]:
     """The instabilities of a path by name, the lowest first, and what their derivatives are contracted with.
 
     Parameters
     ----------
     of
         One of `FOLDS`.
+    begins
+        Number of a step -> the last record before it, where steps hold conjugates.
 
     Raises
     ------
@@ -94,7 +98,7 @@ def instabilities(scene: Scene, records: Sequence[Record], of: str, most: int = 
     for record in [r for r in there if load(r, amplitude) <= BESIDE * load(there[0], amplitude)][:most]:
         name = record.mode or record.label
         try:
-            found.append((name, as_asked(adjoint_of_instability(scene, record), of)))
+            found.append((name, as_asked(adjoint_of_instability(scene, record, begins=begins), of)))
         except CaseError as e:
             if not found:
                 raise Lost(str(e)) from None

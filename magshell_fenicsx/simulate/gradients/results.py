@@ -56,10 +56,10 @@ def adjoint_at_end(
     """
     assert history.end
     if of == BARRIER:
-        return "", adjoint_of_barrier(scene, history.begin, history.end)
+        return "", adjoint_of_barrier(scene, history.begin, history.end, history.begins)
     if isinstance(of, str) and NAMES.fullmatch(of):
-        return adjoints_of_vibrations(scene, history.end, of, hold)[0]
-    return "", adjoint(scene, history.end, of, hold)
+        return adjoints_of_vibrations(scene, history.end, of, hold, begins=history.begins)[0]
+    return "", adjoint(scene, history.end, of, hold, history.begins)
 
 
 def vibration_at_end(scene: Scene, history: History, of: str) -> float | None:

@@ -17,8 +17,9 @@ BESIDE = 1e-5  # the same beside bodies, whose penetration is far smaller than w
 
 def by_amplitude(adjoint: Adjoint, name: str) -> float:
     scene, system, found = adjoint.scene, adjoint.scene.model.system, adjoint.by_mu.get(name, 0.0)
-    given = [place for place in adjoint.places if name not in place.rows]
-    if not given:
+    first = adjoint.places[0]
+    given = [place for place in adjoint.places if name not in {*place.rows, *place.driven}]
+    if not given or name in first.follows:
         raise CaseError(f"{name}: is unknown here, as its conjugate is held")
     for place in given:
         u, mu = place.state.u, place.state.mu
@@ -36,17 +37,19 @@ def by_number(adjoint: Adjoint, key: str) -> float:
     """By a central difference of the contracted equations, on the same mesh: nothing is solved."""
     scene = adjoint.scene
     value = number_of(scene.case, key)
-    if adjoint.gas and key.startswith("shell."):
+    if (adjoint.gas or any(place.gas for place in adjoint.places)) and key.startswith("shell."):
         raise CaseError(f"{key}: has no derivative while a gas is held, whose law depends on it")
 
     def contracted(p: float) -> float:
-        other, own = scene_with(scene, key, p), {adjoint.free, *adjoint.places[0].rows}
-        total = 0.0
+        other, first, total = scene_with(scene, key, p), adjoint.places[0], 0.0
         for place in reversed(adjoint.places):  # the last one, whose state stays, is the first
-            state = carried(scene, other, _moved(scene, other, place.state), own)
+            own = {*place.rows, *([adjoint.free] if place.steps is None else [])}
+            state = carried(scene, other, _moved(scene, other, place.state), own, place.steps)
             state = other.model.system.placed(state)
             _expand(scene, other, place.state)
-            total += _at(scene, other, place, state) + (0.0 if adjoint.by_itself else _own(other, place, state))
+            total += _at(scene, other, place, state) + (
+                0.0 if adjoint.by_itself and place is first else _own(other, place, state)
+            )
         if adjoint.by_itself:
             total += adjoint.by_itself(other, state)
         other.model.system.at(state.u, state.mu)
@@ -96,11 +99,12 @@ def _at(scene: Scene, other: Scene, place: Place, state: State) -> float:
     """The residual and the rows of a place in another scene; what is held stays the same number of its unit."""
     system, here = other.model.system, place.state
     found = dot(system.comm, transfer(scene, other, place.w), system.forces(state.u, state.mu))
-    targets = goals(scene, other, "conjugate")
+    targets = goals(scene, other, "conjugate", place.steps)
     for name, c in place.rows.items():
         held = -scene.model.system.potential(here.u, here.mu, name)
         unit = other.conjugate_unit(name) / scene.conjugate_unit(name) * targets.get(name, 1.0)
-        found += c * (system.potential(state.u, state.mu, name) + unit * held)
+        same = 1.0 if name in place.follows else unit
+        found += c * (system.potential(state.u, state.mu, name) + same * held)
     return float(found)
 
 

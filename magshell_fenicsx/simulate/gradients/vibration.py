@@ -16,7 +16,7 @@ exact. Of waves around a meridian the second variation is a form of its own.
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -28,14 +28,17 @@ from magshell_fenicsx.continuation.system import State, dot, symmetric_part
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.modes import TORSION, ShellMode, ShellModes
 from magshell_fenicsx.simulate.gradients.adjoint import (
+    NONE,
     WAVE,
     Adjoint,
+    Begins,
     Direction,
     Held,
     Place,
     held_at,
     solved,
     variation,
+    with_begins,
     with_gas,
 )
 from magshell_fenicsx.simulate.gradients.instabilities import Lost
@@ -162,6 +165,7 @@ def adjoints_of_vibrations(
     *,
     beside: float = 1.0,
     most: int = 1,
+    begins: Begins = NONE,
 ) -> list[tuple[str, Adjoint]]:
     """The kinds of vibrations about a regular state, and their adjoints: one factorisation more for each.
 
@@ -169,6 +173,8 @@ def adjoints_of_vibrations(
     ----------
     beside, most
         As of `vibrations`.
+    begins
+        Number of a step -> the last record before it.
 
     Raises
     ------
@@ -180,7 +186,16 @@ def adjoints_of_vibrations(
     state = rigid(scene, scene.model.system.placed(record.point.state))
     held = held_at(scene, record, state, hold)
     found = vibrations(scene, state, of, beside=beside, most=most)
-    return [(each.kind, _adjoint(scene, state, of, each, held)) for each in found]
+    made = [(each.kind, _adjoint(scene, state, of, each, held)) for each in found]
+    if hold is not None:
+        return made
+    return [(kind, replace(a, places=_with_begins(scene, record, a.places, begins))) for kind, a in made]
+
+
+def _with_begins(scene: Scene, record: Record, places: Sequence[Place], begins: Begins) -> list[Place]:
+    first, *displaced = places
+    first, *earlier = with_begins(scene, record, first, begins)
+    return [first, *displaced, *earlier]
 
 
 def _adjoint(scene: Scene, state: State, of: str, found: Vibration, held: Held) -> Adjoint:
@@ -199,7 +214,7 @@ def _adjoint(scene: Scene, state: State, of: str, found: Vibration, held: Held) 
         step = scene.model.system.step_along(mode.vector, AWAY)
         for way, weight in CENTRAL.items():
             moved = State(state.u + way * step * mode.vector, state.mu)
-            places.append(Place(moved, c * weight / step * mode.vector))
+            places.append(Place(moved, c * weight / step * mode.vector, dict.fromkeys(rows, 0.0)))
         directions.append(Direction(mode.vector, None, inertia=-c * mode.eigenvalue))
     by_itself = lambda there, _: frequency(there.case, of, found.value)  # noqa: E731
     gas = with_gas(held)

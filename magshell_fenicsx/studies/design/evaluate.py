@@ -12,7 +12,7 @@ from magshell_fenicsx.continuation.fold import FoldLost
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.simulate.adapt.ending import History
 from magshell_fenicsx.simulate.follow import BEYOND, follow
-from magshell_fenicsx.simulate.gradients.adjoint import Adjoint
+from magshell_fenicsx.simulate.gradients.adjoint import Adjoint, Begins
 from magshell_fenicsx.simulate.gradients.gradient import derivative
 from magshell_fenicsx.simulate.gradients.instabilities import (
     BESIDE,
@@ -100,7 +100,7 @@ def evaluate(
             if lost and result not in FOLDS:
                 return Evaluation(note=notes[0])
             if result in LOWEST:
-                found = _lowest(scene, records, result)
+                found = _lowest(scene, records, result, history.begins)
                 notes.append("lowest: " + ", ".join(f"{name or 'mode'} at {each.shown:.6g}" for name, each in found))
             else:
                 refuse_moving(scene, records[-1], targets.get(result, result))
@@ -122,11 +122,11 @@ def evaluate(
     return replace(made, note="; ".join(notes))
 
 
-def _lowest(scene: Scene, records: Sequence[Record], result: str) -> list[tuple[str, Adjoint]]:
+def _lowest(scene: Scene, records: Sequence[Record], result: str, begins: Begins) -> list[tuple[str, Adjoint]]:
     """The lowest instabilities or vibrations, and what their derivatives are contracted with."""
     if result in FOLDS:
-        return instabilities(scene, records, result)
-    return adjoints_of_vibrations(scene, records[-1], result, beside=BESIDE, most=MOST)
+        return instabilities(scene, records, result, begins=begins)
+    return adjoints_of_vibrations(scene, records[-1], result, beside=BESIDE, most=MOST, begins=begins)
 
 
 def _enough(records: Sequence[Record], results: Sequence[str]) -> bool:
