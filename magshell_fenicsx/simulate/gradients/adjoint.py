@@ -305,9 +305,11 @@ def solved(scene: Scene, state: State, of: Functional, held: Held) -> tuple[Vect
 
 
 def mixed(scene: Scene, state: State, of: Functional, name: str) -> float:
-    """What the potentials in J change by with an amplitude."""
+    """What the potentials and the reaction in J change by with an amplitude."""
     system = scene.model.system
     changes = sum(c * system.curvature(state.u, state.mu, i, name) for i, c in of.potentials.items())
+    if of.reaction is not None:
+        changes += dot(system.comm, of.reaction, system.load(state.u, state.mu, name, held=False))
     return float(changes + (of.energy and of.energy * system.potential(state.u, state.mu, name)))
 
 
