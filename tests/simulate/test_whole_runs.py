@@ -59,14 +59,32 @@ BUCKLED = """
 magnetic: {remanent: {flux_density: 80 mT}, applied: {flux_density: 10 mT}}
 loading: {kind: pressure, until: limit}
 """
-CASES = {"state": STATE, "pressed": PRESSED, "held": HELD, "buckled": BUCKLED}
+SEALED = STATE.replace("depth: 0.1 mm, points: 1}", "depth: 0.1 mm, points: 1, hold: {pressure: conjugate}}")
+GAS = SEALED.replace("pressure: conjugate", "pressure: {gas: {ambient: 100 Pa}}")
+AGAIN = "  - {kind: field, factor: 1.5, points: 1, hold: {pressure: HELD, force: conjugate}}\nreactions: true\n"
+CHAIN = SEALED.replace("reactions: true\n", AGAIN.replace("HELD", "conjugate"))
+CASES = {
+    "sealed": SEALED,
+    "chain": CHAIN,
+    "gas": GAS,
+    "state": STATE,
+    "pressed": PRESSED,
+    "held": HELD,
+    "buckled": BUCKLED,
+}
 RESULTS = {
+    "sealed": ("force_N", "pressure_Pa", "rim_fz"),
+    "chain": ("force_N", "pressure_Pa"),
+    "gas": ("force_N", "pressure_Pa"),
     "state": ("force_N", "energy", "rim_fz"),
     "pressed": ("force_N", "A_uz", "energy"),
     "held": ("A_uz", "approach"),
     "buckled": ("knockdown", "buckling_pressure_Pa"),
 }
 KEYS = {
+    "sealed": {"shell.poisson_ratio": "", "shell.thickness_factor": ""},
+    "chain": {"shell.poisson_ratio": ""},
+    "gas": {"magnetic.remanent.flux_density": "mT", "shell.thickness_factor": ""},
     "state": {"shell.poisson_ratio": "", "shell.thickness": "mm", "foundation.stiffness": "kPa/mm"},
     "pressed": {
         "shell.poisson_ratio": "",
@@ -78,6 +96,9 @@ KEYS = {
     "buckled": {"shell.poisson_ratio": "", "shell.thickness": "mm"},
 }
 EXACT = {
+    "sealed": 5e-6,
+    "chain": 5e-6,
+    "gas": 5e-6,
     "state": 1e-6,
     "buckled": 1e-5,
     "pressed": 2e-4,
@@ -104,7 +125,11 @@ def run(scene: Scene) -> tuple[Scene, list[Record], History]:
 
 def adjoint(ran: tuple[Scene, list[Record], History], of: str) -> Adjoint:
     scene, records, history = ran
-    return instabilities(scene, records, of, 1)[0][1] if of in FOLDS else adjoint_at_end(scene, history, of)[1]
+    return (
+        instabilities(scene, records, of, 1, history.begins)[0][1]
+        if of in FOLDS
+        else adjoint_at_end(scene, history, of)[1]
+    )
 
 
 @cache
@@ -135,6 +160,16 @@ def test_number(name: str, key: str) -> None:
             slope = float(slope.within(np.ones(len(slope.forces), dtype=bool))[0])
         expected = (results[1][of] - results[-1][of]) / (2 * STEP * value)
         assert slope == pytest.approx(expected, rel=EXACT[name], abs=1e-6 * abs(each.shown / value)), of
+
+
+@pytest.mark.slow
+def test_frequencies_where_a_body_touches() -> None:
+    """They have no gradient there; where the body is apart they have one."""
+    apart = ["bodies.ball={kind: sphere, radius: 8 mm, position: [0, 0, 40 mm]}", "loading=[{kind: field, points: 1}]"]
+    ran = {settings: run(Scene(case_of("pressed", settings))) for settings in ((), tuple(apart))}
+    with pytest.raises(CaseError, match=r"omega2_1: has no gradient where a body touches the shell \(ball\)"):
+        adjoint(ran[()], "omega2_1")
+    assert adjoint(ran[tuple(apart)], "omega2_1").value > 0
 
 
 def test_modes_of_the_perfect_shell_change() -> None:
