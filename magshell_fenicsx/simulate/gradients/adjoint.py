@@ -127,6 +127,8 @@ class Adjoint:
         The amplitude that J is; "" where it is given.
     scale
         Of the unit (`Quantity.scale`) that J is asked for in, as which `derivative` gives dJ/dp; "": it has none.
+    left
+        Amplitudes that are loads as an earlier step has left them, which was not controlled by them.
     """
 
     scene: Scene
@@ -138,6 +140,7 @@ class Adjoint:
     gas: bool = False
     free: str = ""
     scale: str = ""
+    left: frozenset[str] = frozenset()
 
     @property
     def size(self) -> float:
@@ -180,7 +183,7 @@ def adjoint_of_instability(scene: Scene, record: Record, fold: Fold | None = Non
     w = stage.device.displacement(left) if stage.device else left
     here = Place(stage.leave(fold.state), np.array(w), rows)
     gas = with_gas(held_at(scene, record, record.point.state))
-    return Adjoint(scene, with_begins(scene, record, here, begins), value=fold.value, gas=gas, free=fold.name)
+    return with_begins(Adjoint(scene, [here], value=fold.value, gas=gas, free=fold.name), record, begins)
 
 
 def _of_wave(scene: Scene, record: Record) -> Adjoint:
@@ -233,49 +236,98 @@ def adjoint(
         by_itself = lambda there, _: found.value * force_unit(there) / unit  # noqa: E731
         w = w + found.reaction
     here = Place(state, w, rows, found.energy, found.potentials)
-    gas, places = with_gas(held), [here] if hold is not None else with_begins(scene, record, here, begins)
-    return Adjoint(scene, places, found.by_mu, by_itself, value=found.value, gas=gas, scale=scale)
+    made = Adjoint(scene, [here], found.by_mu, by_itself, value=found.value, gas=with_gas(held), scale=scale)
+    return with_begins(made, record, begins) if hold is None else made
 
 
-def with_begins(scene: Scene, record: Record, place: Place, begins: Begins) -> list[Place]:
-    """A place at a record, and those where its step and earlier ones began whose conjugates it holds; collective.
+def with_begins(adjoint: Adjoint, record: Record, begins: Begins) -> Adjoint:
+    """An adjoint at a record with the places where steps began whose state it depends on; collective.
+
+    It depends on conjugates that a step holds, and on loads as a step has left them by which it was not controlled.
 
     Raises
     ------
     CaseError
         If it is not known where a step began.
     """
-    step = scene.case.programme[record.step - 1] if record.step else None
-    held = {name: place.rows[name] for name in held_by_step(step) if place.rows.get(name)} if step else {}
-    if not step or not held:
-        return [place]
-    if record.step not in begins:
-        raise CaseError(f"{step.key}.hold: {', '.join(held)}: give begin, the record before this step")
-    begin, system, c, by_mu = begins[record.step], scene.model.system, dict[str, float](), dict[str, float]()
-    before = system.placed(begin.point.state)
-    for name, row in held.items():
-        law = step.load.hold[name]
-        if isinstance(law, Gas):
-            share, by_mu[name] = gas_by_begin(scene, law.gas, before, place.state.mu[name])
-            by_mu[name] *= row
-            c[name] = -row * share
+    scene, places, left = adjoint.scene, list(adjoint.places), set[str]()
+    part: Adjoint | None = adjoint
+    at = 0  # of the place at the record
+    loads, driven = dict[str, float](), set[str]()  # dJ/dmu of loads as earlier steps have left them
+    while record.step:
+        place, step, system = (
+            part.places[0] if part else None,
+            scene.case.programme[record.step - 1],
+            scene.model.system,
+        )
+        earlier = scene.case.programme[: record.step - 1]
+        driven |= _driven(step, record.point.state.mu)
+        held = {name: place.rows[name] for name in held_by_step(step) if place.rows.get(name)} if place else {}
+        if record.step not in begins:
+            if held:
+                raise CaseError(f"{step.key}.hold: {', '.join(held)}: give begin, the record before this step")
+            break
+        begin, c, by_mu = begins[record.step], dict[str, float](), dict[str, float]()
+        before = system.placed(begin.point.state)
+        held_before = held_at(scene, begin, before)
+        if part and place:
+            drawn = {name for each in earlier for name in (each.name, *held_by_step(each))} & place.state.mu.keys()
+            for name in drawn - place.rows.keys() - driven:
+                loads[name] = loads.get(name, 0.0) + by_load(part, name)
+        for name, row in held.items():
+            assert place
+            law = step.load.hold[name]
+            if isinstance(law, Gas):
+                share, slope = gas_by_begin(scene, law.gas, before, place.state.mu[name])
+                c[name], by_mu[name] = -row * share, row * slope
+                continue
+            now, then = (system.potential(state.u, state.mu, name) for state in (place.state, before))
+            if abs(now - then) > SAME * max(abs(now), abs(scene.conjugate_unit(name))):
+                raise CaseError(
+                    f"{step.key}.hold.{name}: no gradient, as it is not held from the last point before the step"
+                )
+            c[name] = -row
+        for name in loads.keys() & held_before.keys():
+            by_mu[name] = by_mu.get(name, 0.0) + loads.pop(name)
+            left.add(name)
+        if place and held:
+            places[at] = replace(place, follows=frozenset(held))
+        part = None
+        if c or any(by_mu.values()):
+            slope_u = np.zeros(system.size)
+            for name, c_i in c.items():
+                slope_u += c_i * system.load(before.u, before.mu, name)
+            w, rows = solved(scene, before, Functional(0.0, slope_u, by_mu, c), held_before)
+            gas = with_gas(held_before)
+            own = Place(before, w, rows, potentials=c, steps=begin.step, driven=frozenset(driven), gas=gas)
+            at = len(places)
+            places.append(own)
+            part = Adjoint(scene, [own])
+        record = begin
+    return replace(adjoint, places=places, left=frozenset(left))
+
+
+def _driven(step: ProgrammeStep, mu: Mapping[str, float]) -> set[str]:
+    """The amplitudes that a step changes as it is given."""
+    fields = isinstance(step.load, RotationSection)
+    return {step.name} | ({name for name in mu if name.startswith("lambda_")} if fields else set())
+
+
+def by_load(adjoint: Adjoint, name: str) -> float:
+    """dJ/dmu of an amplitude that is given at all places where it is the same."""
+    scene, system, found = adjoint.scene, adjoint.scene.model.system, adjoint.by_mu.get(name, 0.0)
+    for place in adjoint.places:
+        if name in place.rows or name in place.driven:
             continue
-        now, then = (system.potential(state.u, state.mu, name) for state in (place.state, before))
-        if abs(now - then) > SAME * max(abs(now), abs(scene.conjugate_unit(name))):
-            raise CaseError(
-                f"{step.key}.hold.{name}: no gradient, as it is not held from the last point before the step"
-            )
-        c[name] = -row
-    slope = np.sum([c_i * system.load(before.u, before.mu, name) for name, c_i in c.items()], axis=0)
-    held_before = held_at(scene, begin, before)
-    w, rows = solved(scene, before, Functional(0.0, slope, by_mu, c), held_before)
-    driven = {other.name for other in scene.case.programme[begin.step : record.step]}
-    if any(isinstance(other.load, RotationSection) for other in scene.case.programme[begin.step : record.step]):
-        driven |= {name for name in before.mu if name.startswith("lambda_")}
-    own = Place(
-        before, w, rows, potentials=c, steps=begin.step, driven=place.driven | driven, gas=with_gas(held_before)
-    )
-    return [replace(place, follows=frozenset(held)), *with_begins(scene, begin, own, begins)]
+        u, mu = place.state.u, place.state.mu
+        found += dot(system.comm, place.w, system.load(u, mu, name, held=False))
+        found += place.energy and place.energy * system.potential(u, mu, name)
+        found += sum(c * system.curvature(u, mu, i, name) for i, c in place.conjugates.items())
+    if adjoint.directions:
+        system.at(adjoint.state.u, adjoint.state.mu)
+        own = sum(c * term.energy() for term, c in along(scene, adjoint) if term.amplitude == name)
+        found += system.comm.allreduce(own)
+    return float(found)
 
 
 def held_by_step(step: ProgrammeStep) -> list[str]:

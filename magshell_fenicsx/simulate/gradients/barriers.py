@@ -55,6 +55,11 @@ def adjoint_of_barrier(scene: Scene, begin: Record | None, end: Record, begins: 
     w, rows = 0.0 * before.u, dict[str, float]()
     if change:
         w, rows = solved(scene, before, Functional(0.0, slope, potentials=q), held_at(scene, begin, before))
-    there = Place(before, w, rows, -whole, q, steps=begin.step)
-    places = [Place(after, 0.0 * after.u, dict.fromkeys(held, 0.0), whole), *with_begins(scene, begin, there, begins)]
-    return Adjoint(scene, places, value=barrier(scene, step, before, after))
+    at_begin = Place(before, w, rows, -whole, q, steps=begin.step)
+    earlier = with_begins(Adjoint(scene, [at_begin]), begin, begins)
+    still, unknown = 0.0 * after.u, dict.fromkeys(held, 0.0)
+    ends = [Place(after, still, unknown, whole), Place(before, still, unknown, -whole)]
+    left = with_begins(Adjoint(scene, ends), end, begins)  # loads as earlier steps have left them
+    places = [ends[0], *earlier.places, *left.places[2:]]
+    value, names = barrier(scene, step, before, after), earlier.left | left.left
+    return Adjoint(scene, places, value=value, left=names)

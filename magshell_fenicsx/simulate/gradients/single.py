@@ -6,7 +6,7 @@ from magshell_fenicsx.assembly.terms import factor_of
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.case.units import sizes_of
 from magshell_fenicsx.continuation.system import State, dot
-from magshell_fenicsx.simulate.gradients.adjoint import Adjoint, Place, along
+from magshell_fenicsx.simulate.gradients.adjoint import Adjoint, Place, along, by_load
 from magshell_fenicsx.simulate.numbers import carried, goals, number_of, scene_with, with_number
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.transfer import transfer
@@ -16,21 +16,11 @@ BESIDE = 1e-5  # the same beside bodies, whose penetration is far smaller than w
 
 
 def by_amplitude(adjoint: Adjoint, name: str) -> float:
-    scene, system, found = adjoint.scene, adjoint.scene.model.system, adjoint.by_mu.get(name, 0.0)
-    first = adjoint.places[0]
-    given = [place for place in adjoint.places if name not in {*place.rows, *place.driven}]
-    if not given or name in first.follows:
+    if name in adjoint.places[0].follows or all(name in {*place.rows, *place.driven} for place in adjoint.places):
         raise CaseError(f"{name}: is unknown here, as its conjugate is held")
-    for place in given:
-        u, mu = place.state.u, place.state.mu
-        found += dot(system.comm, place.w, system.load(u, mu, name, held=False))
-        found += place.energy and place.energy * system.potential(u, mu, name)
-        found += sum(c * system.curvature(u, mu, i, name) for i, c in place.conjugates.items())
-    if adjoint.directions:
-        system.at(adjoint.state.u, adjoint.state.mu)
-        own = sum(c * term.energy() for term, c in along(scene, adjoint) if term.amplitude == name)
-        found += system.comm.allreduce(own)
-    return float(found)
+    if name in adjoint.left:
+        raise CaseError(f"{name}: is a load here as an earlier step has left it, which was not controlled by it")
+    return by_load(adjoint, name)
 
 
 def by_number(adjoint: Adjoint, key: str) -> float:
@@ -43,7 +33,7 @@ def by_number(adjoint: Adjoint, key: str) -> float:
     def contracted(p: float) -> float:
         other, first, total = scene_with(scene, key, p), adjoint.places[0], 0.0
         for place in reversed(adjoint.places):  # the last one, whose state stays, is the first
-            own = {*place.rows, *([adjoint.free] if place.steps is None else [])}
+            own = {*place.rows, *adjoint.left, *([adjoint.free] if place.steps is None else [])}
             state = carried(scene, other, _moved(scene, other, place.state), own, place.steps)
             state = other.model.system.placed(state)
             _expand(scene, other, place.state)

@@ -16,7 +16,7 @@ exact. Of waves around a meridian the second variation is a form of its own.
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -192,15 +192,7 @@ def adjoints_of_vibrations(
     held = held_at(scene, record, state, hold)
     found = vibrations(scene, state, of, beside=beside, most=most)
     made = [(each.kind, _adjoint(scene, state, of, each, held)) for each in found]
-    if hold is not None:
-        return made
-    return [(kind, replace(a, places=_with_begins(scene, record, a.places, begins))) for kind, a in made]
-
-
-def _with_begins(scene: Scene, record: Record, places: Sequence[Place], begins: Begins) -> list[Place]:
-    first, *displaced = places
-    first, *earlier = with_begins(scene, record, first, begins)
-    return [first, *displaced, *earlier]
+    return made if hold is not None else [(kind, with_begins(each, record, begins)) for kind, each in made]
 
 
 def _adjoint(scene: Scene, state: State, of: str, found: Vibration, held: Held) -> Adjoint:
