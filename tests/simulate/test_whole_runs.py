@@ -63,7 +63,12 @@ SEALED = STATE.replace("depth: 0.1 mm, points: 1}", "depth: 0.1 mm, points: 1, h
 GAS = SEALED.replace("pressure: conjugate", "pressure: {gas: {ambient: 100 Pa}}")
 AGAIN = "  - {kind: field, factor: 1.5, points: 1, hold: {pressure: HELD, force: conjugate}}\nreactions: true\n"
 CHAIN = SEALED.replace("reactions: true\n", AGAIN.replace("HELD", "conjugate"))
+LEFT = """
+magnetic: {remanent: {flux_density: 80 mT}, applied: {flux_density: 10 mT}}
+loading: [{kind: indentation, at: {polar: 0}, depth: 0.1 mm, points: 1}, {kind: field, points: 1}]
+"""  # the force of the first step stays, which follows from its depth
 CASES = {
+    "left": LEFT,
     "sealed": SEALED,
     "chain": CHAIN,
     "gas": GAS,
@@ -73,6 +78,7 @@ CASES = {
     "buckled": BUCKLED,
 }
 RESULTS = {
+    "left": ("A_uz", "energy"),
     "sealed": ("force_N", "pressure_Pa", "rim_fz"),
     "chain": ("force_N", "pressure_Pa"),
     "gas": ("force_N", "pressure_Pa"),
@@ -82,6 +88,7 @@ RESULTS = {
     "buckled": ("knockdown", "buckling_pressure_Pa"),
 }
 KEYS = {
+    "left": {"shell.poisson_ratio": ""},
     "sealed": {"shell.poisson_ratio": "", "shell.thickness_factor": ""},
     "chain": {"shell.poisson_ratio": ""},
     "gas": {"magnetic.remanent.flux_density": "mT", "shell.thickness_factor": ""},
@@ -96,6 +103,7 @@ KEYS = {
     "buckled": {"shell.poisson_ratio": "", "shell.thickness": "mm"},
 }
 EXACT = {
+    "left": 1e-5,
     "sealed": 5e-6,
     "chain": 5e-6,
     "gas": 5e-6,

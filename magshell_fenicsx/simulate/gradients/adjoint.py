@@ -11,6 +11,7 @@ Where a wave phi is neutral that a meridian does not see, Q(phi; u, mu, p) = 0 f
 
 The equations of vibrations and of energy barriers are contracted at several displacements: `Place`. So are those of
 states under a conjugate q that a step holds: it is q = -Pi_mu of the state where the step began, which p changes too.
+So are loads that a step leaves and was not controlled by, as a force at a depth.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
