@@ -1,19 +1,29 @@
 """Imperfections on every shape: places, rims in the mesh, symmetry, and what is refused."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 from conftest import CASES
+from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.source import CaseError, Source
 from magshell_fenicsx.mesh.deviation import Deviated
+from magshell_fenicsx.mesh.mirror import Mirror
 from magshell_fenicsx.mesh.patch import check_orientation
 from magshell_fenicsx.plan.check import describe
+from magshell_fenicsx.plan.imperfections.distance import Angle
+from magshell_fenicsx.plan.imperfections.flaw import Flaw
+from magshell_fenicsx.plan.imperfections.gaussian import Gaussian
+from magshell_fenicsx.plan.imperfections.registered import flaws
+from magshell_fenicsx.plan.imperfections.symmetry import leaves
+from magshell_fenicsx.plan.outline import outline
 from magshell_fenicsx.plan.plan import Plan
 from magshell_fenicsx.plan.planner import make_plan
 
+Array = NDArray[np.float64]
 H = 1 / 90
 PHI_O = 3.2 / np.sqrt(3 * 90)  # nu = 0.5: 12 (1 - nu^2) = 9
 SHAPES: dict[str, tuple[dict[str, Any], str]] = {
@@ -126,6 +136,58 @@ def test_rims_that_overlap_touch_or_nearly_do(polar: float, near: float) -> None
 def test_symmetry_that_is_left(imperfections: list[dict[str, Any]], model: str) -> None:
     plan = make_plan(shaped("hemisphere", *imperfections))
     assert model == ("meridian" if plan.axisymmetric else "half" if plan.half else "full")
+
+
+@pytest.mark.parametrize("kind", ["gaussian", "dimple"])
+def test_symmetry_by_numbers_is_that_by_values(kind: str) -> None:
+    """Pairs across a plane, a depth in two parts, depths that cancel, a width or a depth that differs a little."""
+    drawn = outline(shaped("hemisphere"))
+
+    def answers(*places: tuple[float, float, float, float], formula: bool = False) -> list[bool]:
+        every = [
+            {"kind": kind, "amplitude": depth, "width": width, "at": {"polar": polar, "azimuth": azimuth}}
+            for polar, azimuth, depth, width in places
+        ]
+        every += [{"kind": "formula", "w0": "0*x"}] * formula
+        (left,) = leaves(flaws(shaped("hemisphere", *every), drawn), drawn, each=False)
+        return [left.mirrors(Mirror.upright(np.radians(azimuth))) for azimuth in (30.0, 70.0)]
+
+    one, image = (40.0, 10.0, 0.1, 2.0), (40.0, 50.0, 0.1, 2.0)
+    half, other = (*image[:2], 0.05, 2.0), (60.0, 0.0, 0.1, 2.0)
+    for places, expected in (
+        ([one, image], True),
+        ([one, half, half], True),
+        ([one, image, other, (60.0, 0.0, -0.1, 2.0)], True),
+        ([one, half], False),
+        ([one, (*image[:3], 2.00001)], False),
+        ([one, (40.0, 50.0, 0.1000001, 2.0)], False),
+        ([one, image, other], False),
+    ):
+        found = answers(*places)
+        assert found == [expected, False]
+        assert found == answers(*places, formula=True)  # a formula has no numbers: all are compared at places
+
+
+class Unasked(Angle):
+    """An angle that is not to be computed."""
+
+    def __call__(self, places: Array) -> Array:
+        raise AssertionError(f"computed at {len(places)} places")
+
+
+def test_symmetry_of_many_imperfections_is_found_by_their_numbers() -> None:
+    """400 on a parallel at random, as many planes through pairs of them: none is tried by values all over the shell."""
+    ats = [{"polar": 50.0, "azimuth": float(a)} for a in np.random.default_rng(1).uniform(-180, 180, 400)]
+    case = shaped("hemisphere", *({"kind": "gaussian", "amplitude": 0.1, "width": 2.0, "at": at} for at in ats))
+    drawn, found = outline(case), dict[str, Flaw]()
+    for key, flaw in flaws(case, outline(case)).items():
+        deviation = flaw.deviation
+        assert isinstance(deviation, Gaussian)
+        assert isinstance(deviation.distance, Angle)
+        found[key] = replace(flaw, deviation=replace(deviation, distance=Unasked(deviation.distance.axis)))
+    (left,) = leaves(found, drawn, each=False)
+    assert len(left.azimuths) == 400
+    assert not any(left.mirrors(Mirror.upright(a)) for a in left.azimuths)
 
 
 def test_deviations_add_up_along_the_normal() -> None:

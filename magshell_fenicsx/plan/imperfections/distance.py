@@ -23,7 +23,9 @@ class Angle:
     axis: Array
 
     def __call__(self, places: Array) -> Array:
-        return np.asarray(np.arctan2(np.linalg.norm(np.cross(self.axis, places), axis=1), places @ self.axis))
+        (a, b, c), (x, y, z) = self.axis, places.T
+        across = np.sqrt((b * z - c * y) ** 2 + (c * x - a * z) ** 2 + (a * y - b * x) ** 2)  # np.cross takes thrice
+        return np.asarray(np.arctan2(across, places @ self.axis))
 
 
 @dataclass(frozen=True)
