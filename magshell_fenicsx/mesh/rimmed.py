@@ -34,6 +34,10 @@ class RimmedGrid:
         return float(self.extent.max())
 
     @property
+    def box(self) -> tuple[Array, Array]:
+        return np.array(self.grid.low), np.array(self.grid.high)
+
+    @property
     def glued(self) -> tuple[Glued, ...]:
         return tuple((i, self.grid.low[i], self.grid.high[i]) for i in range(2) if self.grid.glued[i])
 

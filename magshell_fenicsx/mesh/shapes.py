@@ -23,6 +23,10 @@ class Shape(Protocol):
     def reach(self) -> float: ...
 
     @property
+    def box(self) -> tuple[Array, Array]:
+        """Lower and upper bounds of the coordinates of the modelled part: of a disc of radius and angle."""
+
+    @property
     def half(self) -> bool: ...
 
     @property
@@ -69,6 +73,10 @@ class DiscShape:
     def reach(self) -> float:
         return self.radius
 
+    @property
+    def box(self) -> tuple[Array, Array]:
+        return np.zeros(2), np.array([self.radius, pi if self.half else 2 * pi])
+
     def faces(self, occ: Any) -> Faces:
         discs = [(2, occ.addDisk(0, 0, 0, r, r)) for r in (self.radius, *self.circles)]
         discs += within(occ, self.rims, lambda: (2, occ.addDisk(0, 0, 0, self.radius, self.radius)))
@@ -100,6 +108,10 @@ class StripShape:
     @property
     def reach(self) -> float:
         return 1.0
+
+    @property
+    def box(self) -> tuple[Array, Array]:
+        return np.array([0.0, 0.0 if self.half else -self.width / 2]), np.array([1.0, self.width / 2])
 
     def faces(self, occ: Any) -> Faces:
         below = 0 if self.half else -self.width / 2

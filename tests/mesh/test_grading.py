@@ -28,10 +28,37 @@ Array = NDArray[np.float64]
     ],
 )
 def test_estimate_of_cells_is_near_what_gmsh_makes(file: str, setting: str) -> None:
-    """Never far too few, and too many at most by half."""
-    plan = make_plan(Case.load(CASES / file, [setting]))
+    assert 0.9 < estimated(Case.load(CASES / file, [setting])) < 1.2
+
+
+@pytest.mark.parametrize(("count", "width"), [(1, 0.5), (10, 0.5), (10, 3.0), (100, 0.5), (100, 2.0)])
+def test_estimate_of_cells_where_fine_places_overlap(count: int, width: float) -> None:
+    """Gaussians at random on a hemisphere: one, apart, and so many that their sum would be 14 times too large."""
+    rng = np.random.default_rng(1)
+    polar, azimuth = np.degrees(np.arccos(rng.uniform(0.2, 0.98, count))), rng.uniform(-180, 180, count)
+    imperfections = [
+        {"kind": "gaussian", "amplitude": 0.1, "width": width, "at": {"polar": float(p), "azimuth": float(a)}}
+        for p, a in zip(polar, azimuth, strict=True)
+    ]
+    shell = {"geometry": "hemisphere", "radius_to_thickness": 100, "poisson_ratio": 0.5, "imperfections": imperfections}
+    data = {"shell": shell, "boundary": {"equator": "clamped"}, "loading": {"kind": "pressure"}, "symmetry": "none"}
+    assert 0.9 < estimated(Case.from_source(Source("test", {**data, "mesh": {"refinement": 0.25}}))) < 1.2
+
+
+@pytest.mark.parametrize("of_place", ["exp(-3000*((x-0.3)**2 + y**2))", "exp(-2000*(sqrt(x**2+y**2) - 0.5)**2)"])
+def test_estimate_of_cells_where_a_formula_varies(of_place: str) -> None:
+    """At a place, and along a circle."""
+    load = {"kind": "dead", "loads": [{"over": "all", "pressure": f"1e-6*{of_place}"}], "until": "points", "points": [1.0]}
+    shell = {"geometry": "disc", "radius_to_thickness": 100, "poisson_ratio": 0.3}
+    data = {"shell": shell, "boundary": {"rim": "clamped"}, "loading": load, "symmetry": "none"}
+    assert 0.8 < estimated(Case.from_source(Source("test", data))) < 1.25
+
+
+def estimated(case: Case) -> float:
+    """The estimate over the number of cells that gmsh makes."""
+    plan = make_plan(case)
     cells = len(triangulate(plan.shape, plan.size, plan.points, plan.embedding).cells)
-    assert 0.9 < plan.size.cells(plan.shape) / cells < 1.6
+    return plan.size.cells(plan.shape) / cells
 
 
 PLATE = {"geometry": "plate", "length": 1, "width": 1, "thickness": 0.005, "poisson_ratio": 0.3}
