@@ -144,7 +144,7 @@ def squares(places: Callable[[Array], Array], outline: Outline, sizes: "Sizes", 
     low, high = extent(shape)
     side = max(min(COARSEST, *(high - low)), float(np.sqrt(np.prod(high - low) / MOST_FIRST)))
     t = [a + side * (np.arange(ceil((b - a) / side - 1e-9)) + 0.5) for a, b in zip(low, high, strict=True)]
-    centres = np.stack(np.meshgrid(*t, indexing="ij"), axis=-1).reshape(-1, 2)
+    centres: Array = np.stack(np.meshgrid(*t, indexing="ij"), axis=-1).reshape(-1, 2)
     found, largest = list[tuple[Array, float, Array]](), side
     while len(centres) and len(centres) <= MOST_SQUARES:
         chart = centres[:, None] + side * LOCAL
@@ -240,6 +240,7 @@ def of_imperfections(
         if found is None:
             everywhere = min(everywhere, flaw.size)
             continue
+        assert not isinstance(shape, MeshFile)  # it has no squares
         low, high = extent(shape)
         alike = PER_AREA * float(np.prod(high - low)) / found.size**2
         if found.cells(float(np.linalg.norm(high - low)) / 2) < CHEAPER * alike:
@@ -253,9 +254,9 @@ def _smallest(of_place: Callable[[Array], Array]) -> Sizes:
     """Elements that are the smallest which places (n, 3) of a square need; a quarter of the places is looked at."""
 
     def sizes(x: Array, inside: NDArray[np.bool_], side: float) -> Array:
-        x, inside = (v.reshape(len(v), SAMPLES, SAMPLES, *v.shape[2:])[:, ::2, ::2] for v in (x, inside))
-        found = of_place(x.reshape(-1, 3)).reshape(inside.shape)
-        return np.asarray(np.where(inside, found, inf).min(axis=(1, 2)))
+        fewer = x.reshape(-1, SAMPLES, SAMPLES, 3)[:, ::2, ::2]
+        found = of_place(fewer.reshape(-1, 3)).reshape(fewer.shape[:-1])
+        return np.asarray(np.where(inside.reshape(-1, SAMPLES, SAMPLES)[:, ::2, ::2], found, inf).min(axis=(1, 2)))
 
     return sizes
 

@@ -31,7 +31,9 @@ VISIBLE = 0.01  # of what the polynomials leave: a cell that counts
 AT_ONCE = 4096  # parts that are evaluated together
 FIRST = {1: 4, 2: 2, 3: 2}  # divisions of every cell, by its dimension
 RULE = {1: 7, 2: 6, 3: 4}  # degree of the rule on each part
-CHILDREN = {  # corner and scale along each axis of the parts of an interval, a triangle, a body's cell (in its surface)
+CHILDREN: dict[
+    int, list[tuple[tuple[float, ...], tuple[float, ...]]]
+] = {  # corner and scale along each axis of the parts of an interval, a triangle, a body's cell (in its surface)
     1: [((0.0,), (0.5,)), ((0.5,), (0.5,))],
     2: [((x, y), (s, s)) for x, y, s in ((0, 0, 0.5), (0.5, 0, 0.5), (0, 0.5, 0.5), (0.5, 0.5, -0.5))],
     3: [((x, y, 0.0), (0.5, 0.5, 1.0)) for x in (0.0, 0.5) for y in (0.0, 0.5)],
@@ -230,7 +232,7 @@ def _moments(
         return X, w, area * w, values(x, normals)
 
     def integrals(w: Array, f: Array) -> Array:
-        return np.einsum("pq,pqi->pi", w, f)
+        return np.asarray(np.einsum("pq,pqi->pi", w, f))
 
     found = np.zeros((len(chosen), space.dim, components))
     sizes, squares, errors, each = np.zeros(len(chosen)), np.zeros(len(chosen)), 0.0, len(CHILDREN[cells.dimension])
