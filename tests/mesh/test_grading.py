@@ -48,12 +48,7 @@ def test_estimate_of_cells_where_fine_places_overlap(count: int, width: float) -
 @pytest.mark.parametrize("of_place", ["exp(-3000*((x-0.3)**2 + y**2))", "exp(-2000*(sqrt(x**2+y**2) - 0.5)**2)"])
 def test_estimate_of_cells_where_a_formula_varies(of_place: str) -> None:
     """At a place, and along a circle."""
-    load = {
-        "kind": "dead",
-        "loads": [{"over": "all", "pressure": f"1e-6*{of_place}"}],
-        "until": "points",
-        "points": [1.0],
-    }
+    load = {"kind": "dead", "loads": [{"over": "all", "pressure": f"1e-6*{of_place}"}], "factor": 1}
     shell = {"geometry": "disc", "radius_to_thickness": 100, "poisson_ratio": 0.3}
     data = {"shell": shell, "boundary": {"rim": "clamped"}, "loading": load, "symmetry": "none"}
     assert 0.8 < estimated(Case.from_source(Source("test", data))) < 1.25
