@@ -33,7 +33,7 @@ def test_estimate_of_cells_is_near_what_gmsh_makes(file: str, setting: str) -> N
 
 @pytest.mark.parametrize(("count", "width"), [(1, 0.5), (10, 0.5), (10, 3.0), (100, 0.5), (100, 2.0)])
 def test_estimate_of_cells_where_fine_places_overlap(count: int, width: float) -> None:
-    """Gaussians at random on a hemisphere: one, apart, and so many that their sum would be 14 times too large."""
+    """Gaussians at random on a hemisphere: one, some apart, and many that overlap."""
     rng = np.random.default_rng(1)
     polar, azimuth = np.degrees(np.arccos(rng.uniform(0.2, 0.98, count))), rng.uniform(-180, 180, count)
     imperfections = [
