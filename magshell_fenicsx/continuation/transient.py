@@ -136,6 +136,9 @@ class Integrator:
         if self.device:
             u, v, mu = constrained(self.system, self.device, inverse, u, v, mu)
         mu = self._counted(State(u, mu), before.mu if before else mu).mu
+        if self.viscous:
+            self.viscous.memory = before.memory if before else self.viscous.memory
+            self.viscous.begin()
         r = self.system.residual(u, mu) + self.drag * self._times(v)
         if self.ground:
             r = r + self._pulled(self.ground.acceleration(t, False) + self.drag * self.ground.velocity(t, False))
@@ -144,9 +147,6 @@ class Integrator:
         a = -inverse(r)
         if self.device:
             a, mu = held_back(self.system, self.device, inverse, Motion(t, u, v, a, mu))
-        if self.viscous:
-            self.viscous.memory = before.memory if before else self.viscous.memory
-            self.viscous.begin()
         now = Motion(t, u, v, a, mu, work, dissipated, memory=self.viscous and self.viscous.memory)
         if self.averaged and not before:
             self._total = self.kinetic(now) + self.averaged.stored(u, mu)

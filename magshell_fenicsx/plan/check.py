@@ -121,7 +121,7 @@ def _count(case: Case, plan: Plan, patch: PatchMesh | None) -> tuple[int, int]:
     """Cells and unknowns of the mesh, or of the meridian."""
     k = case.degree
     if patch is None:
-        return (count := len(meridian_vertices(plan, case.mesh.refinement)) - 1), 2 * (k * count + 1)
+        return (count := len(meridian_vertices(plan, case)) - 1), 2 * (k * count + 1)
     cells, corners = patch.corners, len(np.unique(patch.corners))
     sides = len(np.unique(np.sort(cells[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0))
     if case.model == "solid":  # three hexahedra a layer above each triangle

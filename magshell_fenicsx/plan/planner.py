@@ -183,7 +183,7 @@ def edge_conditions(boundary: BoundarySection, turn: float) -> dict[str, Conditi
     }
 
 
-def meridian_vertices(plan: Plan, refinement: float) -> Array:
+def meridian_vertices(plan: Plan, case: Case) -> Array:
     """Vertices of the meridian's mesh, in the chart."""
     span = plan.meridian
     assert span
@@ -196,10 +196,11 @@ def meridian_vertices(plan: Plan, refinement: float) -> Array:
         span.length,
         span.circles,
         min([h, *(size / 3 for size, _ in plan.pressed)]),
-        refinement=refinement,
+        refinement=case.mesh.refinement,
         axis=pole,
         largest=min(0.2 * sqrt(h), span.largest),
         pressed=((reach if pole else span.length), PRESSED * sqrt(h)) if reach else None,
+        everywhere=case.mesh.size and case.mesh.size / case.shell.reference,
     )
 
 

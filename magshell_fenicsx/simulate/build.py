@@ -41,7 +41,7 @@ def build_meridian_model(case: Case, plan: Plan) -> MeridianModel:
     span = plan.meridian
     assert span
     points = {name: span.place(x) for name, x in plan.points.items()}
-    vertices = meridian_vertices(plan, case.mesh.refinement)
+    vertices = meridian_vertices(plan, case)
     meridian = make_meridian(span.embedding, vertices, span.names, points, span.curvature)
     model = MeridianModel(
         meridian, plan.material, case.mesh.degree, plan.conditions, plan.loads, case.mesh.penalty, plan.thickness

@@ -12,9 +12,10 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from magshell_fenicsx.mesh.deviation import Deviated, Deviation
-from magshell_fenicsx.mesh.patch import Embedding
+from magshell_fenicsx.mesh.patch import Embedding, MeshError
 
 Array = NDArray[np.float64]
+MOST_CELLS = 1_000_000
 Names = tuple[str | None, str]
 
 
@@ -118,6 +119,7 @@ def graded_vertices(
     axis: bool = True,
     largest: float = inf,
     pressed: tuple[float, float] | None = None,
+    everywhere: float | None = None,
 ) -> Array:
     """Vertices for 1e-7 in k_d at degree 4: cells of a fraction of sqrt(h), finer on the axis, if 0 is there.
 
@@ -133,6 +135,13 @@ def graded_vertices(
         Of the cells, whatever the thickness.
     pressed
         Cells of a size up to a distance from the start, where bodies press.
+    everywhere
+        The size of all cells, over the refinement, in place of all these.
+
+    Raises
+    ------
+    MeshError
+        If there would be more than `MOST_CELLS`.
 
     Notes
     -----
@@ -143,6 +152,8 @@ def graded_vertices(
     largest = min(0.2 * sqrt(h), largest) / refinement
 
     def size(s: Array) -> Array:
+        if everywhere is not None:
+            return np.full_like(s, everywhere / refinement)
         found = np.minimum(smallest + growth * s, largest) if axis else np.full_like(s, largest)
         if pressed:
             found = np.minimum(found, pressed[1] / refinement + growth * np.maximum(0.0, s - pressed[0]))
@@ -157,7 +168,13 @@ def _equidistributed(corners: Sequence[float], size: Callable[[Array], Array]) -
     pieces = []
     for a, b in pairwise(corners):
         s = np.linspace(a, b, 20001)
-        counted = np.concatenate([[0.0], np.cumsum(np.diff(s) / size((s[:-1] + s[1:]) / 2))])
+        with np.errstate(over="ignore", divide="ignore"):
+            counted = np.concatenate([[0.0], np.cumsum(np.diff(s) / size((s[:-1] + s[1:]) / 2))])
+        if not counted[-1] < MOST_CELLS:
+            raise MeshError(
+                f"mesh: the meridian would have {counted[-1]:.2g} cells, allowed {MOST_CELLS:g}: take a larger "
+                "mesh.size, a lower mesh.refinement, or larger bodies"
+            )
         cells = int(np.ceil(counted[-1]))
         piece = np.interp(np.linspace(0, counted[-1], cells + 1), counted, s)
         piece[[0, -1]] = a, b

@@ -32,7 +32,7 @@ from magshell_fenicsx.models.observed import Observed
 from magshell_fenicsx.models.shell import edges
 from magshell_fenicsx.models.shell.driving import field_parameters
 from magshell_fenicsx.models.shell.energy import Density
-from magshell_fenicsx.models.shell.moved import PRESSURE, Support, motions_of, moving, rotation_of
+from magshell_fenicsx.models.shell.moved import PRESSURE, Support, enclosed, motions_of, moving, rotation_of
 from magshell_fenicsx.models.shell.natural import Shape, natural_field
 from magshell_fenicsx.models.shell.parameters import Condition, EdgeMoment, Loads, Material, Potential, default_penalty
 from magshell_fenicsx.models.shell.patterns import cells_of
@@ -115,7 +115,8 @@ class MeridianModel(Observed):
         if loads.magnetic:
             self.energies += factory.magnetic(loads.magnetic, self.u)
         free_ends, self.without_potential = openings(meridian, conditions)
-        volume = factory.swept_volume if loads.pressure or (loads.moves and not free_ends) else factory.volume_change
+        closed = enclosed(loads, free_ends, self.without_potential)
+        volume = factory.swept_volume if loads.pressure or closed else factory.volume_change
         if loads.pressure:
             self.energies.append(factory.pressure(potential=not self.without_potential))
         self.energies += [factory.own(term) for term in loads.own]
@@ -145,7 +146,7 @@ class MeridianModel(Observed):
         if self.growing:
             parameters |= self.growing.parameters(terms, parameters)
             self.growing.renewed += self._renewals
-        moves = moving(self.r0, self.supports, loads, None if free_ends else self._pressed())
+        moves = moving(self.r0, self.supports, loads, self._pressed() if closed else None)
         self.system = FiniteElementSystem(self.u, terms, held, pattern, material.h, parameters=parameters, moving=moves)
         self.system.settings |= dict(known.setting for known, _ in self.contacts.values())
         self._volume = self.kernels.compile("volume energy", 2 * np.pi * volume(jets.revolved(self.u)))

@@ -29,7 +29,7 @@ PART = 5e-8  # of the integral of |f|: a part of a cell that differs by more is 
 DEEPEST, MOST = 9, 400_000  # divisions, parts of all cells
 VISIBLE = 0.01  # of what the polynomials leave: a cell that counts
 AT_ONCE = 4096  # parts that are evaluated together
-FIRST = {1: 4, 2: 2, 3: 2}  # divisions of every cell, by its dimension
+FIRST = {1: 8, 2: 2, 3: 2}  # divisions of every cell, by its dimension
 RULE = {1: 7, 2: 6, 3: 4}  # degree of the rule on each part
 CHILDREN: dict[
     int, list[tuple[tuple[float, ...], tuple[float, ...]]]
@@ -204,7 +204,8 @@ def fitted(values: Values, cells: Cells, nodal: Array, element: Element, degree:
         at_nodes = _bounded(at_nodes, mean, np.matmul(space.tabulate(0, X)[0, :, :, 0], p), f[chosen])
     new = nodal.copy()
     new[chosen] = at_nodes
-    return Fit(new, False, size, missed / size, float(np.sqrt(rest / square)), widest)
+    nothing = np.finfo(float).tiny  # a formula that is zero but on a line
+    return Fit(new, False, size, missed / max(size, nothing), float(np.sqrt(rest / max(square, nothing))), widest)
 
 
 def _moments(
@@ -249,10 +250,11 @@ def _moments(
             errors += float((error[done & (now.cell < cells.owned)] ** 2).sum())
             kept = np.repeat(done, each)
             at, size = number[smaller.cell[kept]], np.linalg.norm(f[kept], axis=-1)
-            phi = space.tabulate(0, X[kept].reshape(-1, X.shape[-1]))[0, :, :, 0].reshape(*size.shape, space.dim)
-            np.add.at(found, at, np.matmul(np.swapaxes(w[kept][..., None] * phi, 1, 2), f[kept]))
-            np.add.at(sizes, at, (area[kept] * size).sum(axis=1))
-            np.add.at(squares, at, (w[kept] * size**2).sum(axis=1))
+            if len(at):  # Basix tabulates no empty set of points
+                phi = space.tabulate(0, X[kept].reshape(-1, X.shape[-1]))[0, :, :, 0].reshape(*size.shape, space.dim)
+                np.add.at(found, at, np.matmul(np.swapaxes(w[kept][..., None] * phi, 1, 2), f[kept]))
+                np.add.at(sizes, at, (area[kept] * size).sum(axis=1))
+                np.add.at(squares, at, (w[kept] * size**2).sum(axis=1))
             rest.append(smaller[~kept])
             left.append(fine[~kept])
         ahead = _Parts.together(rest) if rest else ahead

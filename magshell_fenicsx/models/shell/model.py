@@ -29,7 +29,7 @@ from magshell_fenicsx.models.shell.energy import ShellTerm
 from magshell_fenicsx.models.shell.fast_tangent import FastTangent, make_sites
 from magshell_fenicsx.models.shell.folds import FOLD, largest_fold
 from magshell_fenicsx.models.shell.gradients import PointTerm
-from magshell_fenicsx.models.shell.moved import Support, motions_of, moving, pressed_edges, rotation_of
+from magshell_fenicsx.models.shell.moved import Support, enclosed, motions_of, moving, pressed_edges, rotation_of
 from magshell_fenicsx.models.shell.natural import Shape, natural_field
 from magshell_fenicsx.models.shell.openings import openings
 from magshell_fenicsx.models.shell.parameters import (
@@ -181,7 +181,8 @@ class ShellModel(Observed):
         self.supports |= on_planes
         closing = closing_point(planes)
         free_edges, self.without_potential = openings(self.r0, midsurface.edges, conditions)
-        swept = loads.pressure or (loads.moves and not free_edges)
+        closed = enclosed(loads, free_edges, self.without_potential)
+        swept = loads.pressure or closed
         volume = factory.swept_volume() if swept else factory.volume_change(np.zeros(3) if closing is None else closing)
         if loads.magnetic:
             terms += factory.magnetic(loads.magnetic)
@@ -208,7 +209,7 @@ class ShellModel(Observed):
             terms += [factory.own(load.term, name) for load in dead if isinstance(load, Potential)]
         self._sites = make_sites(self.r0, degree, terms, self.kernels, factory.prestress())
         at_edges = None
-        if loads.moves and not free_edges:
+        if closed:
             in_planes = {name for name, c in conditions.items() if c in ("symmetry", "plane")}
             curves = {
                 name: Curve.of(V, side, triangle_sides())

@@ -59,6 +59,11 @@ def moving(
     return Moving(r0, bodies, pressed) if bodies else None
 
 
+def enclosed(loads: Loads, free_edges: Iterable[str], without_potential: Collection[str]) -> bool:
+    """Whether lids on edges that move close the shell: all edges are held, move, or lie in planes of symmetry."""
+    return bool(loads.moves) and not without_potential and all(motions_of(loads, name) for name in free_edges)
+
+
 def pressed_edges(
     r0: fem.Function,
     curves: Mapping[str, Curve],
@@ -67,7 +72,7 @@ def pressed_edges(
     unit: float,
     closing: NDArray[np.float64] | None,
 ) -> Pressed:
-    """What a live pressure does at the edges that move, of a shell of which no edge is free; collective.
+    """What a live pressure does at the edges that move, of a shell that lids close; collective.
 
     Edges that move alike have one lid, if together they are closed or end on planes of symmetry.
 

@@ -25,7 +25,7 @@ from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes
 from magshell_fenicsx.models.shell.dead_load import assemble_dead_loads
 from magshell_fenicsx.models.shell.driving import field_parameters
 from magshell_fenicsx.models.shell.fast_tangent import FastTangent
-from magshell_fenicsx.models.shell.moved import motions_of, moving, pressed_edges
+from magshell_fenicsx.models.shell.moved import enclosed, motions_of, moving, pressed_edges
 from magshell_fenicsx.models.shell.openings import openings
 from magshell_fenicsx.models.shell.parameters import Condition, EdgeMoment, Loads, Material, Potential
 from magshell_fenicsx.models.shell.supports import closing_point
@@ -102,7 +102,8 @@ class SolidModel(Observed):
         origin = closing_point([mirror, *planes] if self.multiplicity == 2 else planes)
         ends = {name: facets for name, facets in body.faces.items() if name != OUTER}
         free_ends, self.without_potential = openings(self.r0, ends, conditions, in_middle(body, V))
-        swept = loads.pressure or (loads.moves and not free_ends)
+        closed = enclosed(loads, free_ends, self.without_potential)
+        swept = loads.pressure or closed
         self._terms: list[Term] = [self._pattern, factory.compression()]
         if loads.magnetic:
             self._terms += factory.magnetic(loads.magnetic)
@@ -128,7 +129,7 @@ class SolidModel(Observed):
         self.mirror = mirror
         self._sites = make_sites(body, self.r0, self._terms, self.kernels)
         at_edges = None
-        if loads.moves and not free_ends:
+        if closed:
             in_planes = {name for name, c in conditions.items() if c in MIRRORS}
             curves = {
                 name: self._rim(ends[name], MIDDLE if name in hinged else 1.0)

@@ -92,6 +92,18 @@ def test_creep_with_steps_for_a_tolerance(shell: dict[str, Any], fast: float, ti
         assert np.sum(found["iterations"]) < 6000
 
 
+def test_creep_after_a_ramp() -> None:
+    """The history has a corner at its end: w/rest is the integral of the creep under each part of the load."""
+    over, history = 0.1 * TIME, {"pressure": {"kind": "ramp", "to": 5e-5, "over": 0.1 * TIME}}
+    step = {"kind": "time", "duration": TIME, "points": 2, "history": history, "drag": 2 * OMEGA}
+    load = {"kind": "pressure", "control": "load", "until": "target", "pressure": 5e-5, "points": 1}
+    still = Scene(steps_of({}, [load]))
+    rest = columns(still, follow(still))["w_over_h"][-1]
+    scene = Scene(steps_of({"relaxation": [{"modulus": 1.0, "time": TIME / 2}]}, [step]))
+    exact = rest * (1 - 0.5 * np.exp(-1) * np.expm1(over / TIME) * TIME / over)
+    assert columns(scene, follow(scene))["w_over_h"][-1] == pytest.approx(exact, abs=1e-3)
+
+
 def steps_of(shell: dict[str, Any], steps: list[dict[str, Any]]) -> Case:
     strip = {"geometry": "strip", "radius_to_thickness": 50, "poisson_ratio": 0.0, "width": 0.2}
     data = {"shell": strip | shell, "boundary": {"root": "clamped"}, "mesh": {"degree": 3, "size": 0.5}}
