@@ -33,6 +33,12 @@ class Section(BaseModel):
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False, defer_build=True)
 
+    def __setstate__(self, state: dict[Any, Any]) -> None:
+        """Of another rank, where its class may not have been needed yet: without its schema it could not be written."""
+        super().__setstate__(state)
+        if not type(self).__pydantic_complete__:
+            type(self).model_rebuild()
+
 
 def with_unit(unit: str) -> Any:
     """The schema of text with a unit; only pint checks the names of units."""
