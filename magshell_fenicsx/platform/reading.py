@@ -16,7 +16,7 @@ from errno import EFBIG, EINVAL, EISDIR
 from math import prod
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, BinaryIO, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,17 +44,33 @@ def read_whole(file: Path, largest: int = LARGEST) -> bytes:
     OSError
         If it cannot be read, is a folder, a device or a pipe, or has more bytes than `largest`.
     """
+    with open_regular(file) as stream:
+        size = os.fstat(stream.fileno()).st_size
+        if size > largest:
+            raise OSError(EFBIG, f"it is larger than {largest} bytes", str(file))
+        return stream.read(size)
+
+
+def open_regular(file: Path) -> BinaryIO:
+    """A regular file, open for reading.
+
+    Raises
+    ------
+    OSError
+        If it cannot be read, is a folder, a device or a pipe.
+    """
     try:
         _refuse_special(file, file.stat().st_mode)
         number = os.open(file, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)  # never waits for a writer
     except ValueError:
         raise OSError(EINVAL, "its name has a zero byte", str(file)) from None
-    with os.fdopen(number, "rb") as stream:
-        about = os.fstat(number)
-        _refuse_special(file, about.st_mode)
-        if about.st_size > largest:
-            raise OSError(EFBIG, f"it is larger than {largest} bytes", str(file))
-        return stream.read(about.st_size)
+    stream = os.fdopen(number, "rb")
+    try:
+        _refuse_special(file, os.fstat(number).st_mode)
+    except OSError:
+        stream.close()
+        raise
+    return stream
 
 
 def _refuse_special(file: Path, mode: int) -> None:

@@ -2,10 +2,12 @@
 
 import json
 import math
+import os
 import re
 from contextlib import suppress
 from dataclasses import replace
 from datetime import datetime
+from errno import EACCES
 from pathlib import Path
 from typing import Any
 
@@ -20,11 +22,20 @@ from magshell_fenicsx.output.fields.surface import turned
 from magshell_fenicsx.output.fields.vtu import About, FieldSeries, is_whole, point_file
 from magshell_fenicsx.output.report.verdict import read_run
 from magshell_fenicsx.output.store import checkpoint
-from magshell_fenicsx.output.store.durable import Damaged, read_object, sync_folder, write_whole
+from magshell_fenicsx.output.store.durable import Damaged, read_object, read_result, sync_folder, write_whole
 from magshell_fenicsx.output.store.folder import DiskError, by_first, prepare_folder
 from magshell_fenicsx.output.store.known import SUMMARY, read_summary
 from magshell_fenicsx.output.store.table import PathTable, Row
-from magshell_fenicsx.output.store.written import MESH, OF_PATH, note, refuse_unwritten, remove, written
+from magshell_fenicsx.output.store.written import (
+    MESH,
+    NEW,
+    OF_PATH,
+    note,
+    refuse_unwritten,
+    remove,
+    replaced,
+    written,
+)
 from magshell_fenicsx.output.store.written import NAME as LIST
 from magshell_fenicsx.simulate.scene import Scene
 
@@ -59,6 +70,9 @@ def open_folder(out: Path, case: Case, comm: MPI.Comm, resume: bool, overwrite: 
 
     def ready(folder: Path) -> None:
         refuse_unwritten(folder)
+        for part in (folder, folder / "fields"):  # before the first file is removed
+            if part.exists() and not os.access(part, os.W_OK | os.X_OK, effective_ids=True):
+                raise OSError(EACCES, os.strerror(EACCES), str(part))
         if resume:
             _refuse_no_resuming(folder, case)
         elif not overwrite:
@@ -87,6 +101,8 @@ def belongs_to(out: Path, case: Case) -> dict[str, Any]:
     Damaged
         If it cannot be read.
     """
+    if replaced(out):  # what is left of the earlier run is no run
+        return checkpoint.begun_with(out / NEW) or {}
     if begun := checkpoint.begun_with(out / checkpoint.NAME):
         return begun
     summary = read_object(out / SUMMARY) if (out / SUMMARY).exists() else {}
@@ -95,8 +111,10 @@ def belongs_to(out: Path, case: Case) -> dict[str, Any]:
 
 def _refuse_interrupted(out: Path) -> None:
     """A run that has ended, also where its solver could not go on, may be repeated; one that can go on is kept."""
+    if replaced(out):
+        return
     file, table = out / checkpoint.NAME, out / "path.csv"
-    points = max(table.read_bytes().count(b"\n") - 1, 0) if table.exists() else 0
+    points = max(read_result(table).count(b"\n") - 1, 0) if table.exists() else 0
     if not file.exists() or (points < 2 and not (out / MESH).exists()):  # the undeformed shell alone is no loss
         return
     how = "killed, or its machine stopped"
@@ -115,6 +133,11 @@ def _refuse_interrupted(out: Path) -> None:
 def _refuse_no_resuming(out: Path, case: Case) -> None:
     """See that the run can be resumed."""
     file = out / checkpoint.NAME
+    if replaced(out):
+        raise CaseError(
+            f"--resume: {out}: a new run was interrupted while it removed the files of the earlier one; "
+            "start again without --resume, or with --overwrite"
+        )
     if not file.exists() and (out / SUMMARY).exists():
         summary = read_summary(out)
         if summary["stopped"] is None:
@@ -185,7 +208,7 @@ class RunFiles:
     def _make_room(self) -> None:
         """Replace an earlier run by an empty checkpoint; whenever this is killed, what is there is known as a run's."""
         folder, file = self._folder, self._folder / checkpoint.NAME
-        new, earlier = file.with_name(f"{file.name}.new"), written(folder)
+        new, earlier = folder / NEW, written(folder) - {NEW}
         write_whole(new, self._new)  # a full disk stops here
         remove(folder, earlier - {SUMMARY, file.name})
         if self._mesh:

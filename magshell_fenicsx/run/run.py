@@ -19,7 +19,7 @@ from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.output.report.report import write_report
 from magshell_fenicsx.output.store import checkpoint
-from magshell_fenicsx.output.store.durable import Damaged
+from magshell_fenicsx.output.store.durable import Damaged, read_result
 from magshell_fenicsx.output.store.folder import DiskError, by_first, given_folder, held_folder
 from magshell_fenicsx.output.store.table import LOCATED, SOLUTION, Row
 from magshell_fenicsx.output.store.written import MESH
@@ -209,7 +209,7 @@ def _mesh_for_tolerance(case: Case, folder: Path | None, comm: MPI.Comm, say: Sa
     if case.mesh.tolerance is None:
         return None
     file = folder / MESH if folder else None
-    if file and (known := by_first(comm, lambda: file.read_bytes() if file.exists() else b"", "cannot be read")):
+    if file and (known := by_first(comm, lambda: read_result(file) if file.exists() else b"", "cannot be read")):
         try:
             return Adapted.from_json(case, known)
         except (ValueError, KeyError, TypeError, IndexError) as e:

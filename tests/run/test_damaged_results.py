@@ -1,7 +1,9 @@
 """Results that were cut off or changed: one message with the file's name, and no traceback."""
 
+import os
 import shutil
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -33,11 +35,22 @@ def swapped(old: bytes, new: bytes) -> Damage:
     return swap
 
 
+def in_first_row(column: str, text: str) -> Damage:
+    def put(content: bytes) -> bytes:
+        head, row, *rest = (line.split(",") for line in content.decode().split("\r\n"))
+        row[head.index(column)] = text
+        return "\r\n".join(",".join(line) for line in (head, row, *rest)).encode()
+
+    return put
+
+
 BINARY = one_of(bytes(range(256)))
 LONGEST = swapped(b"MSF1", b"MSF1" + (2**62).to_bytes(8, "little"))
 PATH = {
     "binary": BINARY,
     "no table": one_of(b"a\nb\n"),
+    **{text[:4]: swapped(b"step,pressure,0.", f"step,pressure,{text}".encode()) for text in ("1e308", 5000 * "1")},
+    **{text: in_first_row("w_over_h", text) for text in ("nan", "inf")},
     "word": swapped(b"step,pressure,0.", b"step,pressure,abc"),
     "no such load": swapped(b"step,pressure,", b"step,pressurf,"),
     "a count": swapped(b"\r\n1,step", b"\r\n1.5,step"),
@@ -149,3 +162,70 @@ def test_an_interrupted_run_is_not_erased(interrupted: Path, tmp_path: Path, no_
     assert magshell("run", *CASE, "--out", out, "--overwrite").returncode == 0
     assert len(read_path(out)) == 5
     assert magshell("run", *CASE, "--out", out).returncode == 0  # a complete run may be repeated
+
+
+SPECIAL: dict[str, Callable[[Path], object]] = {
+    "pipe": os.mkfifo,
+    "device": lambda file: file.symlink_to("/dev/zero"),
+    "folder": Path.mkdir,
+}
+
+
+@pytest.mark.parametrize("kind", SPECIAL)
+@pytest.mark.parametrize("name", ["path.csv", "summary.json", "checkpoint", "written.txt", "fields/point_0001.vtu"])
+def test_no_regular_file(complete: Path, tmp_path: Path, name: str, kind: str) -> None:
+    """It is named, neither waited for nor read without end, and no file beside it is lost."""
+    out = tmp_path / "out"
+    shutil.copytree(complete, out)
+    (out / name).unlink(missing_ok=True)
+    SPECIAL[kind](out / name)
+    before = sorted(out.rglob("*"))
+    run = ("run", *CASE, "--out", out)
+    for command in (run, (*run, "--resume"), (*run, "--overwrite"), ("plot", out)):
+        refused = magshell(*command)
+        assert (refused.returncode, refused.stderr.count("\n")) == (2, 1), command
+        assert name in refused.stderr, command
+        assert sorted(out.rglob("*")) == before, command
+
+
+def test_linked_fields(complete: Path, tmp_path: Path) -> None:
+    """What is in another folder is neither removed nor written."""
+    out = tmp_path / "out"
+    shutil.copytree(complete, out)
+    (out / "fields").rename(tmp_path / "elsewhere")
+    (out / "fields").symlink_to(tmp_path / "elsewhere")
+    before = {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()}
+    for how in ((), ("--overwrite",), ("--resume",)):
+        refused = magshell("run", *CASE, "--out", out, *how)
+        assert (refused.returncode, "known to have written: fields (a link); move" in refused.stderr) == (2, True)
+    assert {file: file.read_bytes() for file in tmp_path.rglob("*") if file.is_file()} == before
+
+
+@pytest.mark.parametrize("of", ["complete", "interrupted"])
+@pytest.mark.parametrize("removed", [0, 1, 4, 7])
+def test_killed_while_making_room(
+    of: str, removed: int, tmp_path: Path, request: pytest.FixtureRequest, no_pictures: None
+) -> None:
+    """What is left of the earlier run is never said to be complete, and the new run can be started again."""
+    out, unlink, done = tmp_path / "out", Path.unlink, list[Path]()
+    shutil.copytree(request.getfixturevalue(of), out)
+
+    def killed(file: Path, missing_ok: bool = False) -> None:
+        if file.parent in (out, out / "fields") and file.suffix != ".unfinished":
+            done.append(file)
+            if len(done) > removed:
+                raise KeyboardInterrupt
+        unlink(file, missing_ok)
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(Path, "unlink", killed)
+        with suppress(KeyboardInterrupt):
+            magshell("run", *CASE, "--out", out, "--overwrite")
+    assert len(done) == removed + 1
+    (out / "checkpoint.new.unfinished").write_bytes(b"MSF1")  # of one more start, killed earlier
+    resumed = magshell("run", *CASE, "--out", out, "--resume")
+    assert resumed.returncode == 2
+    assert resumed.stderr.startswith(f"--resume: {out}: a new run was interrupted while it removed the files")
+    assert magshell("run", *CASE, "--out", out).returncode == 0
+    assert not list(out.glob("checkpoint*"))
+    assert len(read_path(out)) == 5

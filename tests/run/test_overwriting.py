@@ -135,3 +135,12 @@ def test_no_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         assert refused.stderr.startswith("--out: is empty; give the name of a folder")
     with pytest.raises(ms.CaseError, match="--out: is empty"):
         ms.run(FILE, "")
+
+
+@pytest.mark.parametrize("name", ["n" * 300, "\udcff", "a\0b"])
+def test_no_possible_name(tmp_path: Path, name: str) -> None:
+    """Said before anything is solved: a report in UTF-8 could not name the folder."""
+    refused = magshell("run", FILE, *SMALL, "--out", f"{tmp_path}/{name}")
+    assert (refused.returncode, refused.stderr.count("\n"), refused.stdout) == (2, 1, "")
+    assert refused.stderr.startswith("--out ")
+    assert not list(tmp_path.iterdir())

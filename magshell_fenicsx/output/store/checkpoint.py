@@ -17,7 +17,7 @@ from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.continuation.point import Point
 from magshell_fenicsx.continuation.system import State
-from magshell_fenicsx.output.store.durable import AppendedFile, Damaged
+from magshell_fenicsx.output.store.durable import AppendedFile, Damaged, open_result
 from magshell_fenicsx.output.store.folder import by_first
 from magshell_fenicsx.output.store.framing import framed, read_frame
 from magshell_fenicsx.output.store.ordering import Array, Ordering
@@ -55,7 +55,7 @@ def begun_with(file: Path) -> dict[str, Any] | None:
         If its head cannot be read.
     """
     try:
-        with file.open("rb") as stream:
+        with open_result(file) as stream:
             head = read_frame(stream)
     except FileNotFoundError:
         return None
@@ -146,7 +146,7 @@ class Checkpoint:
 
     def _begin(self) -> Array | None:
         """The positions of the nodes, if the file has them."""
-        self._reading = self._file.open("rb")
+        self._reading = open_result(self._file)
         read_frame(self._reading)
         content = read_frame(self._reading)
         return None if content is None else np.frombuffer(content).reshape(-1, 3)

@@ -2,14 +2,46 @@
 
 import json
 import os
+from contextlib import suppress
+from errno import EFBIG, EINVAL, EISDIR
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from magshell_fenicsx.case.source import CaseError
+from magshell_fenicsx.platform.reading import open_regular, read_whole
 
 
 class Damaged(CaseError):
     """A file of results is not what the program wrote; the message names it and says what is wrong."""
+
+
+def read_result(file: Path) -> bytes:
+    """The content of a file of results; see `open_result`."""
+    try:
+        return read_whole(file)
+    except OSError as e:
+        raise _special(e) from None
+
+
+def open_result(file: Path) -> BinaryIO:
+    """A file of results, open for reading.
+
+    Raises
+    ------
+    Damaged
+        If it is a folder, a device or a pipe.
+    OSError
+        If it is not there, or cannot be read.
+    """
+    try:
+        return open_regular(file)
+    except OSError as e:
+        raise _special(e) from None
+
+
+def _special(e: OSError) -> Exception:
+    """What is raised for a file that no run has written, as a run writes regular files."""
+    return Damaged(f"{e.filename}: is damaged: {e.strerror}") if e.errno in (EFBIG, EINVAL, EISDIR) else e
 
 
 def read_object(file: Path) -> dict[str, Any]:
@@ -21,7 +53,7 @@ def read_object(file: Path) -> dict[str, Any]:
         If there is none.
     """
     try:
-        found = json.loads(file.read_bytes())
+        found = json.loads(read_result(file))
     except (ValueError, RecursionError) as e:
         raise Damaged(f"{file}: is damaged: no JSON: {e}") from None
     if not isinstance(found, dict):
@@ -39,6 +71,7 @@ def write_whole(file: Path, content: bytes) -> None:
     """
     unfinished = file.with_name(file.name + ".unfinished")
     try:
+        unfinished.unlink(missing_ok=True)  # it may be a link to another file
         stream = AppendedFile(unfinished, 0)
         try:
             stream.append(content)
@@ -47,7 +80,8 @@ def write_whole(file: Path, content: bytes) -> None:
         unfinished.replace(file)
         sync_folder(file.parent)
     except OSError as e:
-        unfinished.unlink(missing_ok=True)
+        with suppress(OSError):
+            unfinished.unlink(missing_ok=True)
         raise OSError(e.errno, e.strerror, str(file)) from None
 
 

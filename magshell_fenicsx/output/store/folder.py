@@ -12,6 +12,7 @@ from mpi4py import MPI
 
 from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.platform.first import from_first
+from magshell_fenicsx.platform.reading import read_whole
 
 T = TypeVar("T")
 MOST_NAMED = 6
@@ -28,11 +29,22 @@ def given_folder(out: Path | str) -> Path:
     Raises
     ------
     CaseError
-        If the name is empty, as that of a variable which is not set: the working folder is `.`.
+        If the name is empty, as that of a variable which is not set: the working folder is `.`. If no folder may have
+        it, or none can be looked for there.
     """
     if out == "":
         raise CaseError("--out: is empty; give the name of a folder, . for the working folder")
-    return Path(out)
+    folder = Path(out)
+    try:
+        str(folder).encode()  # reports are in UTF-8
+        if "\0" in str(folder):
+            raise ValueError
+        folder.exists()
+    except ValueError:
+        raise CaseError(f"--out {str(folder)!r}: is no name in UTF-8 without zero bytes; give another") from None
+    except OSError as e:
+        raise CaseError(f"--out {folder}: cannot be written: {e.strerror}") from None
+    return folder
 
 
 def refuse_foreign(folder: Path, names: Iterable[str], what: str) -> None:
@@ -73,20 +85,21 @@ def refuse_others(folder: Path, names: Sequence[str], kept: Collection[str], wha
             raise CaseError(f"--out {folder}: has {what} of {name}, which is kept; give another folder")
     elif not any(_object(file).keys() & OF_POINTS for file in (folder / "points").glob("*.json")):
         # of an interrupted one there would be points
-        refuse_foreign(folder, (name for name in names if _size(folder / name)), what)
+        refuse_foreign(folder, (name for name in names if _is_filled(folder / name)), what)
 
 
 def _object(file: Path) -> dict[str, Any]:
     """The JSON object in a file; empty if there is none."""
     try:
-        known = json.loads(file.read_bytes())
+        known = json.loads(read_whole(file))
     except (OSError, ValueError, RecursionError):
         return {}
     return known if isinstance(known, dict) else {}
 
 
-def _size(file: Path) -> int:
-    return file.stat().st_size if file.exists() else 0
+def _is_filled(file: Path) -> bool:
+    """Whether there is something that is no empty file."""
+    return file.exists() and (not file.is_file() or file.stat().st_size > 0)
 
 
 def prepare_folder(out: Path, comm: MPI.Comm, make: Callable[[Path], None]) -> Path:

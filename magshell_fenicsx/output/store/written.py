@@ -1,6 +1,7 @@
 """Which files of a folder a run has written: another run removes and replaces these alone."""
 
 import re
+import stat
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from pathlib import Path
@@ -8,7 +9,7 @@ from typing import Any
 
 from magshell_fenicsx.output.pictures.picture import PICTURES
 from magshell_fenicsx.output.store import checkpoint
-from magshell_fenicsx.output.store.durable import Damaged, read_object, write_whole
+from magshell_fenicsx.output.store.durable import Damaged, read_object, read_result, write_whole
 from magshell_fenicsx.output.store.folder import refuse_foreign
 from magshell_fenicsx.output.store.table import is_path
 
@@ -16,20 +17,29 @@ NAME = "written.txt"
 FIRST = "# files that magshell_fenicsx has written here: another run replaces these alone\n"
 MESH = "mesh.json"  # the mesh chosen for a tolerance
 OF_PATH = (checkpoint.NAME, "path.csv", MESH)
+NEW = f"{checkpoint.NAME}.new"  # there while a run replaces an earlier one
 DRAWN = (*PICTURES, "curve", "instabilities", "modes", "frequencies", "solutions", "gradients")
-# every name that a run, or `plot` after it, may write
+# every name that a run, or `plot` after it, may write, also while it writes
 NAMES = re.compile(
-    r"checkpoint|(path|stability|frequencies)\.csv|(mesh|summary)\.json|report\.html|animation\.gif|written\.txt"
+    r"(checkpoint(\.new)?|(path|stability|frequencies)\.csv|(mesh|summary)\.json|report\.html|animation\.gif|written\.txt"
     rf"|({'|'.join(DRAWN)})(_\d{{4,}})?\.(png|svg|pdf)"
-    r"|fields(/(path\.pvd|outlines(_\d{4,})?\.vtp|(point_\d{4,}|mode_\d{4,}_.+|gradients_.+)\.vtu))?"
+    r"|fields(/(path\.pvd|outlines(_\d{4,})?\.vtp|(point_\d{4,}|mode_\d{4,}_.+|gradients_.+)\.vtu))?)(\.unfinished)?"
 )
 
 
 def of_names(folder: Path) -> set[str]:
-    """The files of a folder under names that a run writes, as `path.csv` and `fields/path.pvd`."""
-    parts = [folder, *([folder / "fields"] if (folder / "fields").is_dir() else [])]
+    """What a folder has under names that a run writes, as `path.csv` and `fields/path.pvd`; no link is followed."""
+    parts = [folder, *([folder / "fields"] if _kind(folder / "fields") == "a folder" else [])]
     there = {file.relative_to(folder).as_posix() for part in parts for file in part.iterdir()}
     return {name for name in there if NAMES.fullmatch(name)} - ({"fields"} if len(parts) > 1 else set())
+
+
+def _kind(file: Path) -> str:
+    """What is there, if it is no regular file as those of a run."""
+    kinds = {stat.S_IFREG: "", stat.S_IFDIR: "a folder", stat.S_IFLNK: "a link"}
+    with suppress(FileNotFoundError):
+        return kinds.get(stat.S_IFMT(file.lstat().st_mode), "a device or a pipe")
+    return ""
 
 
 def written(folder: Path) -> set[str]:
@@ -37,18 +47,27 @@ def written(folder: Path) -> set[str]:
 
     They are listed in written.txt at the end of a run. Without it they are all, if summary.json is a run's, as of
     earlier versions. The files of a path are, if checkpoint is, also after a kill, or without the list path.csv.
+    What is no regular file is none of theirs.
     """
-    there, found = of_names(folder), set[str]()
-    text = (folder / NAME).read_text(encoding="utf-8", errors="replace") if (folder / NAME).is_file() else ""
+    there = {name for name in of_names(folder) if not _kind(folder / name)}
+    found = {name for name in there if name.endswith(".unfinished")}  # left by a kill
+    text = read_result(folder / NAME).decode(errors="replace") if NAME in there else ""
+    if replaced(folder):
+        found.add(NEW)
     if text.startswith(FIRST):
-        found = there & {NAME, *text.splitlines()}
+        found |= there & {NAME, *text.splitlines()}
     elif _is_of_run(lambda: read_object(folder / "summary.json")):
         return there
     if _is_of_run(lambda: checkpoint.begun_with(folder / checkpoint.NAME)) or (
-        not found and is_path(folder / "path.csv")
+        NAME not in found and is_path(folder / "path.csv")
     ):
         found |= {name for name in there if name in OF_PATH or name.startswith("fields/")}
     return found
+
+
+def replaced(folder: Path) -> bool:
+    """Whether a new run was killed while it removed the files of an earlier one."""
+    return _is_of_run(lambda: checkpoint.begun_with(folder / NEW))
 
 
 def _is_of_run(read: Callable[[], dict[str, Any] | None]) -> bool:
@@ -67,7 +86,8 @@ def refuse_unwritten(folder: Path) -> None:
     CaseError
         With the names of these files.
     """
-    refuse_foreign(folder, of_names(folder) - written(folder), "a run")
+    kinds = {name: _kind(folder / name) for name in of_names(folder) - written(folder)}
+    refuse_foreign(folder, (f"{name} ({kind})" if kind else name for name, kind in kinds.items()), "a run")
 
 
 def note(folder: Path, more: Iterable[str] = ()) -> None:
@@ -77,8 +97,8 @@ def note(folder: Path, more: Iterable[str] = ()) -> None:
 
 
 def remove(folder: Path, names: Iterable[str]) -> None:
-    """Delete files that a run has written, the list of them first; and fields/ if it is empty then."""
-    for name in sorted(names, key=lambda name: name != NAME):
+    """Delete files that a run has written, the list of them last; and fields/ if it is empty then."""
+    for name in sorted(names, key=lambda name: name == NAME):
         (folder / name).unlink(missing_ok=True)
     with suppress(OSError):  # it is not there, or has files of others
         (folder / "fields").rmdir()
