@@ -29,6 +29,8 @@ class FileKeys(Section):
     def _a_name(cls, name: str | None) -> str | None:
         if name is not None and "\0" in name:
             raise ValueError(f"{name!r}: a file's name has no zero byte")
+        if name == "":
+            raise ValueError("the name is empty; give that of a file")
         return name
 
     @property

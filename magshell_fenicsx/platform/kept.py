@@ -70,7 +70,10 @@ def keep(name: str, content: bytes) -> None:
 def _usual() -> Path:
     from dolfinx.jit import get_options  # takes long to import
 
-    return Path(get_options()["cache_dir"]).absolute()
+    usual, base = Path(get_options()["cache_dir"]), os.environ.get("XDG_CACHE_HOME")
+    if base is not None and not Path(base).is_absolute() and usual == Path(base) / "fenics":
+        return Path.home() / ".cache" / "fenics"  # its specification: what is empty or relative is ignored
+    return usual.absolute()
 
 
 @cache

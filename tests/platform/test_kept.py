@@ -109,3 +109,11 @@ def test_no_private_folder_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert done.returncode == 2
     assert done.stderr.startswith(f"kernel cache {shared}/fenics: others may write to it or own it, ")
     assert done.stderr.endswith("set XDG_CACHE_HOME to a folder that you own and nobody else may write (chmod go-w)\n")
+
+
+@pytest.mark.parametrize("base", ["", "relative"])
+def test_relative_base(base: str, home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """XDG base directories: what is empty or relative is ignored."""
+    monkeypatch.setenv("XDG_CACHE_HOME", base)
+    monkeypatch.setattr("dolfinx.jit.get_options", lambda: {"cache_dir": Path(base) / "fenics"})
+    assert kept._usual() == home / ".cache/fenics"

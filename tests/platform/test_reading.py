@@ -118,6 +118,8 @@ REFUSED = [
     ("data", r"a\0b", "a file's name has no zero byte"),
     ("grid", r"a\0b", "a file's name has no zero byte"),
     ("mesh", r"a\0b", "a file's name has no zero byte"),
+    ("data", "", ".file: '': the name is empty; give that of a file"),
+    ("grid", "", ".file: '': the name is empty; give that of a file"),
 ]
 
 
