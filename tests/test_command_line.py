@@ -224,7 +224,9 @@ def test_standard_output_on_a_full_disk(tmp_path: Path) -> None:
 
 def test_closed_descriptors(tmp_path: Path) -> None:
     """No file of the run takes their numbers."""
-    words = CLOSED.format(python=sys.executable, case=shlex.join(map(str, SMALL)), out=shlex.quote(str(tmp_path / "out")))
+    words = CLOSED.format(
+        python=sys.executable, case=shlex.join(map(str, SMALL)), out=shlex.quote(str(tmp_path / "out"))
+    )
     assert subprocess.run(["sh", "-c", words], check=False).returncode == 0
     assert len(read_path(tmp_path / "out")) == 5
 
