@@ -180,6 +180,17 @@ def test_frequencies_where_a_body_touches() -> None:
     assert adjoint(ran[tuple(apart)], "omega2_1").value > 0
 
 
+@pytest.mark.slow
+def test_a_conjugate_held_beside_a_body() -> None:
+    """The volume is held from the first contact on, which is not the state before the step."""
+    pressed = "{kind: pressure, control: load, until: target, pressure: 20 Pa, points: 1}"
+    steps = f"[{pressed}, {{kind: contact, approach: 0.3 mm, points: 1, hold: {{pressure: conjugate}}}}]"
+    of_volume = adjoint(run(Scene(case_of("pressed", [f"loading={steps}"]))), "A_uz")
+    with pytest.raises(CaseError, match=r"shell\.poisson_ratio: has no derivative where a conjugate is held beside"):
+        derivative(of_volume, "shell.poisson_ratio")
+    assert derivative(of_volume, "bodies.ball.radius") != 0
+
+
 def test_modes_of_the_perfect_shell_change() -> None:
     """They are found again in every run."""
     case = case_of("buckled", ["shell.imperfections=[{kind: modes, amplitudes: [0.1]}]"])

@@ -29,6 +29,10 @@ def by_number(adjoint: Adjoint, key: str) -> float:
     value = number_of(scene.case, key)
     if (adjoint.gas or any(place.gas for place in adjoint.places)) and key.startswith("shell."):
         raise CaseError(f"{key}: has no derivative while a gas is held, whose law depends on it")
+    if scene.model.contacts and any(place.follows for place in adjoint.places) and key.startswith("shell."):
+        raise CaseError(
+            f"{key}: has no derivative where a conjugate is held beside a body: the first contact shifts it"
+        )
 
     def contracted(p: float) -> float:
         other, first, total = scene_with(scene, key, p), adjoint.places[0], 0.0
