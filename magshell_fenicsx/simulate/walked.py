@@ -46,10 +46,8 @@ def followed(stage: Stage, path: Path, start: Point, goal: Goal, branches: PathS
     Stopped
         If the path is lost.
     """
-    records, counted = (
-        Walked(_followed(stage, _walk(stage, path, start, goal), branches)),
-        stage.scene.model.system.counted,
-    )
+    records = Walked(_followed(stage, _walk(stage, path, start, goal), branches))
+    counted = stage.scene.model.system.counted
     past = start.state.mu
     for record in records:
         point = stage.point(record.point)
@@ -67,7 +65,7 @@ def _walk(stage: Stage, path: Path, start: Point, goal: Goal) -> Walk:
             refuse_return(stage, path.name, walk.points, high)
         return stiffer(stage, low, high)
 
-    walk = Walk(path, start, goal, checked)
+    walk = Walk(path, start, goal, checked)  # which `checked` looks at
     return walk
 
 
