@@ -9,7 +9,9 @@ from magshell_fenicsx.case.expressions import formula
 from magshell_fenicsx.mesh.frame import rotation
 from magshell_fenicsx.plan.plan import Span
 
-ANGLES = [2.399963 * i for i in range(90)]  # the golden angle: nothing periodic meets them all
+ANGLES = [
+    2.399963 * i for i in range(720)
+]  # the golden angle: nothing periodic meets them all, nor anything wider than 0.01
 Array = NDArray[np.float64]
 NEAR = 0.1  # over R
 SAME = 1e-9  # of the largest value: differences that are rounding
