@@ -62,11 +62,11 @@ def reference(edge: Edge, R_over_h: float, refinement: float = 1.0) -> float:
     h = 1 / R_over_h
     settings = ["shell.azimuth=null", "boundary={bottom: symmetry, top: clamped}", f"shell.thickness={h}"]
     load = "loading.loads=[{over: all, pressure: 1.0}]"
-    case = Case.load(CASE, [*settings, load])
+    case = Case.load(CASE, [*settings, load, f"mesh={{refinement: {refinement}}}"])
     plan = make_plan(case)
     span, length = plan.meridian, case.shell.reference
     assert span
-    vertices = meridian_vertices(plan, refinement)
+    vertices = meridian_vertices(plan, case)
     if edge == "free":  # no strong layers, and bending is so soft that rounding grows with the number of intervals
         vertices = np.linspace(0.0, span.length, round(INTERVALS * refinement) + 1)
     meridian = make_meridian(span.embedding, vertices, span.names, {}, span.curvature)
