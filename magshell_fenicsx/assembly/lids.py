@@ -15,6 +15,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.motion import Motion, Pair, moved, turned
+from magshell_fenicsx.assembly.shape_tables import CORNERS
 
 Array = NDArray[np.float64]
 Amplitudes = Mapping[str, float]
@@ -78,8 +79,7 @@ class Curve:
 
 def triangle_sides() -> dict[int, Side]:
     """The sides of a triangle, which is on their left."""
-    corners = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
-    return {i: (corners[a], corners[b], (a, b)) for i, (a, b) in enumerate(((1, 2), (2, 0), (0, 1)))}
+    return {i: (CORNERS[a], CORNERS[b], (a, b)) for i, (a, b) in enumerate(((1, 2), (2, 0), (0, 1)))}
 
 
 def level_sides(height: float) -> dict[int, Side]:

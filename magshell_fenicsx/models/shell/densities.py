@@ -153,11 +153,6 @@ def volume(r0: Jet, u: Jet, origin: Expr | None = None) -> Expr:
     return (ufl.dot(x, kin.area_vector(r)) - ufl.dot(x0, kin.area_vector(r0))) / 3
 
 
-def pressure(r0: Jet, u: Jet, unit: Expr, origin: Expr | None = None) -> Expr:
-    """Pi/p of a live pressure in that unit; per area of the coordinates as `volume`."""
-    return unit * volume(r0, u, origin)
-
-
 def swept(r0: Jet, u: Jet, unit: Expr | float = 1.0) -> Expr:
     """The volume that the surface sweeps when its points move straight to r0 + u; per area of the coordinates.
 
