@@ -87,8 +87,8 @@ def test_the_work_of_all_loads_is_the_change_of_the_energy() -> None:
 def unstable_at_constant_volume(scene: Scene, state: State) -> int:
     """Negative eigenvalues of the dense tangent on the displacements that keep the volume."""
     system = scene.model.system
-    K = system.tangent(state.u, state.mu)
-    upper = np.triu(K.convert("dense", PETSc.Mat()).getDenseArray())
+    whole = system.tangent(state.u, state.mu).convert("dense", PETSc.Mat())  # its array lives no longer than it
+    upper = np.triu(whole.getDenseArray())
     dense = upper + np.triu(upper, 1).T
     free = np.array(system.held(np.ones(system.size)), dtype=bool)
     normal = system.load(state.u, state.mu, "pressure")[free]
