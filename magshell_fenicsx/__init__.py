@@ -11,22 +11,20 @@ differentiates what was found by amplitudes, numbers of the case and fields; `co
 whose `Free` parameters are amplitudes too.
 """
 
-import sys
 from importlib import import_module
-from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from magshell_fenicsx.platform.version import __version__
 
 if TYPE_CHECKING:
     from magshell_fenicsx.case.case import Case
-    from magshell_fenicsx.case.source import CaseError
+    from magshell_fenicsx.input.source import CaseError
     from magshell_fenicsx.models.shell import kinematics
     from magshell_fenicsx.models.shell.kinematics import Jet
     from magshell_fenicsx.models.shell.own_term import Free, OwnTerm
-    from magshell_fenicsx.run.notebook import curve, picture, polydata, surface
-    from magshell_fenicsx.run.rows import columns
-    from magshell_fenicsx.run.run import Result, run
+    from magshell_fenicsx.runs.notebook import curve, picture, polydata, surface
+    from magshell_fenicsx.runs.rows import columns
+    from magshell_fenicsx.runs.run import Result, run
     from magshell_fenicsx.simulate.follow import follow
     from magshell_fenicsx.simulate.gradients.gradient import gradient
     from magshell_fenicsx.simulate.record import Record, Stopped
@@ -63,13 +61,13 @@ __all__ = [
 
 _ROOMS = {
     "case.case": "Case",
-    "case.source": "CaseError",
+    "input.source": "CaseError",
     "models.shell": "kinematics",
     "models.shell.kinematics": "Jet",
     "models.shell.own_term": "Free OwnTerm",
-    "run.notebook": "curve picture polydata surface",
-    "run.rows": "columns",
-    "run.run": "Result run",
+    "runs.notebook": "curve picture polydata surface",
+    "runs.rows": "columns",
+    "runs.run": "Result run",
     "simulate.follow": "follow",
     "simulate.gradients.gradient": "gradient",
     "simulate.record": "Record Stopped",
@@ -81,21 +79,13 @@ _ROOMS = {
 _WHERE = {name: f"{__name__}.{room}" for room, names in _ROOMS.items() for name in names.split()}
 
 
-class _Package(ModuleType):
-    """The package, which imports a public name when it is asked for: dolfinx takes long."""
-
-    def __getattr__(self, name: str) -> Any:
-        if name not in _WHERE:
-            raise AttributeError(f"{__name__}.{name}")
-        room = import_module(_WHERE[name])
-        return getattr(room, name, None) or import_module(f"{_WHERE[name]}.{name}")
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        if not (name in _WHERE and isinstance(value, ModuleType)):  # `run` is the function, not the folder
-            super().__setattr__(name, value)
-
-    def __dir__(self) -> list[str]:
-        return sorted({*super().__dir__(), *__all__})
+def __getattr__(name: str) -> Any:
+    """A public name, imported when it is asked for: dolfinx takes long."""
+    if name not in _WHERE:
+        raise AttributeError(f"{__name__}.{name}")
+    room = import_module(_WHERE[name])
+    return getattr(room, name, None) or import_module(f"{_WHERE[name]}.{name}")
 
 
-sys.modules[__name__].__class__ = _Package
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

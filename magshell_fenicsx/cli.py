@@ -94,8 +94,8 @@ def run(
     from magshell_fenicsx.output.report.verdict import sentence_of
     from magshell_fenicsx.output.store.folder import DiskError
     from magshell_fenicsx.platform.terminal import live_line
-    from magshell_fenicsx.run.files import AlreadyComplete
-    from magshell_fenicsx.run.run import run as run_case
+    from magshell_fenicsx.runs.files import AlreadyComplete
+    from magshell_fenicsx.runs.run import run as run_case
 
     folder = _chosen(out, case.stem)
     how: dict[str, Any] = {"resume": resume, "overwrite": overwrite, "time_limit": time_limit, "pictures": pictures}
@@ -275,8 +275,8 @@ def check(case: CaseFile, set_: Settings = None) -> None:
     """Validate a case; print what would be built and what is left out."""
     from magshell_fenicsx.case.case import Case
     from magshell_fenicsx.case.opened import read_together, with_same_files
-    from magshell_fenicsx.case.source import CaseError
-    from magshell_fenicsx.plan.check import describe
+    from magshell_fenicsx.input.source import CaseError
+    from magshell_fenicsx.problem.check import describe
     from magshell_fenicsx.simulate.perfect import with_modes
 
     with exit_codes():

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import Any
 
-from magshell_fenicsx.case.source import CaseError
+from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.platform import terminal
 from magshell_fenicsx.platform.kept import UnsafeCache
 from magshell_fenicsx.platform.plain import typer

@@ -19,7 +19,7 @@ from magshell_fenicsx.mesh.sphere import flat, sphere
 from magshell_fenicsx.mesh.triangulation import triangulate
 from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.shell.parameters import Condition, Loads, MagneticEnergy, Magnetisation, Material
-from magshell_fenicsx.plan.imperfections.dimple import Dimple
+from magshell_fenicsx.parts.imperfections.dimple import Dimple
 
 CASES = Path(__file__).parents[1] / "cases"
 CAP = """
@@ -81,7 +81,7 @@ def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def draw_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(import_module("magshell_fenicsx.run.run"), "_draw", lambda folder: None)
+    monkeypatch.setattr(import_module("magshell_fenicsx.runs.run"), "_draw", lambda folder: None)
 
 
 def random_displacement(model: ShellModel, size: float, seed: int = 0) -> Any:

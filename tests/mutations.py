@@ -10,7 +10,7 @@ from typing import Any
 from conftest import CASES
 from hypothesis import strategies as st
 
-from magshell_fenicsx.case.source import read_source
+from magshell_fenicsx.input.source import read_source
 
 Keys = tuple[str | int, ...]
 

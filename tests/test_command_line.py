@@ -167,7 +167,7 @@ def test_the_package_is_imported_as_it_is_used() -> None:
 import sys
 import magshell_fenicsx as ms
 assert "dolfinx" not in sys.modules
-import magshell_fenicsx.run.status
+import magshell_fenicsx.runs.status
 assert ms.run.__name__ == "run" and "run" in dir(ms)
 from magshell_fenicsx import *
 assert run is ms.run and kinematics.Jet is ms.Jet

@@ -6,8 +6,8 @@ python3 cases/benchmarks/contacts_in_time.py
 from typing import Any
 
 from magshell_fenicsx import Case, Scene
-from magshell_fenicsx.case.source import Source
-from magshell_fenicsx.run.rows import rows
+from magshell_fenicsx.input.source import Source
+from magshell_fenicsx.runs.rows import rows
 from magshell_fenicsx.simulate.follow import follow
 
 Section = dict[str, Any]

@@ -21,7 +21,7 @@ from magshell_fenicsx.models.axisymmetric import jets
 from magshell_fenicsx.models.axisymmetric.meridian import make_meridian
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.shell import kinematics as kin
-from magshell_fenicsx.plan.planner import make_plan, meridian_vertices
+from magshell_fenicsx.problem.planner import make_plan, meridian_vertices
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.scene import Scene
 

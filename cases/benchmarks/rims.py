@@ -9,7 +9,7 @@ from pathlib import Path
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.mesh.shapes import DiscShape
-from magshell_fenicsx.plan.planner import make_plan
+from magshell_fenicsx.problem.planner import make_plan
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.scene import Scene
 

@@ -23,9 +23,9 @@ from magshell_fenicsx.continuation.point import PathStopped
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.mesh.grading import Grading
 from magshell_fenicsx.mesh.shapes import StripShape
-from magshell_fenicsx.plan.planner import make_plan
-from magshell_fenicsx.run.run import run
-from magshell_fenicsx.run.summary import Result
+from magshell_fenicsx.problem.planner import make_plan
+from magshell_fenicsx.runs.run import run
+from magshell_fenicsx.runs.summary import Result
 from magshell_fenicsx.simulate.build import build_model
 
 CASES = Path(__file__).parent

@@ -11,7 +11,7 @@ from pathlib import Path
 from PIL import Image
 
 from magshell_fenicsx.case.examples import CASES, title
-from magshell_fenicsx.case.source import read_source
+from magshell_fenicsx.input.source import read_source
 
 OUT = CASES.parent / "docs" / "gallery"
 WIDTH, STEP = 420, 3  # of a picture: 10 to 50 kB; colours are rounded to such steps, so that files are small

@@ -16,7 +16,7 @@ import magshell_fenicsx as ms
 from magshell_fenicsx.continuation.newton import MOTION
 from magshell_fenicsx.continuation.noise import VARIABLE
 from magshell_fenicsx.continuation.system import max_abs
-from magshell_fenicsx.plan.planner import make_plan
+from magshell_fenicsx.problem.planner import make_plan
 
 LEVELS = 1e-15, 1e-14, 1e-13
 COARSE = ["mesh.degree=3", "mesh.refinement=0.5"], ["mesh.refinement=0.5"], ["mesh.degree=3"]

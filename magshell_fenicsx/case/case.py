@@ -10,46 +10,46 @@ from typing import Annotated, Any, Literal, Self, TypeVar
 import numpy as np
 from pydantic import Field, ModelWrapValidatorHandler, ValidationError, model_validator
 
-from magshell_fenicsx.case.bodies.body import refuse_unfit_bodies, with_units
 from magshell_fenicsx.case.bodies.registered import Bodies
-from magshell_fenicsx.case.boundary import EDGES, BoundarySection, refuse_taken
 from magshell_fenicsx.case.design import DesignSection
 from magshell_fenicsx.case.ensemble import EnsembleSection
-from magshell_fenicsx.case.expressions import is_formula
-from magshell_fenicsx.case.fields import MagneticSection, layer_average
-from magshell_fenicsx.case.file import FileKeys, digests
 from magshell_fenicsx.case.frequencies import FrequenciesSection
 from magshell_fenicsx.case.gradients import GradientsSection
 from magshell_fenicsx.case.imperfections.dimple import DimpleSection
-from magshell_fenicsx.case.imperfections.place import Coordinates, ImperfectionSection, places_with_units
 from magshell_fenicsx.case.imperfections.random import RandomSection
 from magshell_fenicsx.case.loading import Loading, ProgrammeStep, programme
-from magshell_fenicsx.case.loads.contact import ContactSection
-from magshell_fenicsx.case.loads.dead import DeadSection
-from magshell_fenicsx.case.loads.edge import EdgeSection, refuse_unheld
-from magshell_fenicsx.case.loads.growth import GrowthSection
-from magshell_fenicsx.case.loads.imperfection import refuse_unfit_growth
-from magshell_fenicsx.case.loads.indentation import IndentationSection
-from magshell_fenicsx.case.loads.step import Step
 from magshell_fenicsx.case.mesh import SOLID_DEGREE, MeshSection
-from magshell_fenicsx.case.messages import explained
-from magshell_fenicsx.case.natural import NaturalSection, measured
 from magshell_fenicsx.case.output import OutputSection
 from magshell_fenicsx.case.patches import refuse_strange
 from magshell_fenicsx.case.programme import refuse_unfit_steps, refuse_unnamed
-from magshell_fenicsx.case.shell import ShellSection
 from magshell_fenicsx.case.solid import SolidSection
-from magshell_fenicsx.case.source import CaseError, Source, read_source
-from magshell_fenicsx.case.sources.source import SourceSection
 from magshell_fenicsx.case.stability import StabilitySection
-from magshell_fenicsx.case.surfaces import CapSurface, MeshSurface, RevolutionSurface, Surface, SurfaceSection
-from magshell_fenicsx.case.targets import NOTED
-from magshell_fenicsx.case.viscosity import refuse_unfit_viscosity
-from magshell_fenicsx.parts.chosen import Chosen
+from magshell_fenicsx.input.chosen import Chosen
+from magshell_fenicsx.input.expressions import is_formula
+from magshell_fenicsx.input.file import FileKeys, digests
+from magshell_fenicsx.input.messages import explained
+from magshell_fenicsx.input.section import texts
+from magshell_fenicsx.input.source import CaseError, Source, read_source
+from magshell_fenicsx.input.targets import NOTED
+from magshell_fenicsx.parts.bodies.body import refuse_unfit_bodies, with_units
+from magshell_fenicsx.parts.bodies.press import ContactSection
+from magshell_fenicsx.parts.forces.dead import DeadSection
+from magshell_fenicsx.parts.forces.indentation import IndentationSection
+from magshell_fenicsx.parts.imperfections.growth import refuse_unfit_growth
+from magshell_fenicsx.parts.imperfections.place import Coordinates, ImperfectionSection, places_with_units
+from magshell_fenicsx.parts.magnetism.fields import MagneticSection, layer_average
+from magshell_fenicsx.parts.magnetism.sources.source import SourceSection
+from magshell_fenicsx.parts.motion.viscosity import refuse_unfit_viscosity
+from magshell_fenicsx.parts.natural.growth import GrowthSection
+from magshell_fenicsx.parts.natural.section import NaturalSection, measured
 from magshell_fenicsx.parts.own import Origin
 from magshell_fenicsx.parts.part import Part, Scales
 from magshell_fenicsx.parts.registered import PARTS, WithParts
-from magshell_fenicsx.parts.section import texts
+from magshell_fenicsx.parts.step import Step
+from magshell_fenicsx.parts.supports.boundary import EDGES, BoundarySection, refuse_taken
+from magshell_fenicsx.parts.supports.motion import EdgeSection, refuse_unheld
+from magshell_fenicsx.shape.sections import CapSurface, MeshSurface, RevolutionSurface, Surface, SurfaceSection
+from magshell_fenicsx.shape.shell import ShellSection
 
 AnyStep = TypeVar("AnyStep", bound=Step)
 

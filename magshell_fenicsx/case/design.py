@@ -4,8 +4,8 @@ from typing import Annotated, Self
 
 from pydantic import Discriminator, Field, Tag, model_validator
 
-from magshell_fenicsx.case.expressions import Formula
-from magshell_fenicsx.parts.section import Section, in_unit, number_and_unit
+from magshell_fenicsx.input.expressions import Formula
+from magshell_fenicsx.input.section import Section, in_unit, number_and_unit
 
 Point = Annotated[list[float], Field(min_length=3, max_length=3)]
 Bounds = Annotated[list[float], Field(min_length=2, max_length=2)]

@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 
 from magshell_fenicsx.case.chance.distribution import Distribution, Value
 from magshell_fenicsx.case.chance.places import NoRoom, random_places, refuse_no_room
-from magshell_fenicsx.parts.section import Section
+from magshell_fenicsx.input.section import Section
 
 Angle = Annotated[float, Field(ge=0, le=180)]
 

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from magshell_fenicsx.case.source import CaseError, read_source
+from magshell_fenicsx.input.source import CaseError, read_source
 
 PACKAGE = Path(__file__).parents[1]
 INSTALLED = PACKAGE / "examples"  # made by setup.py

@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import Discriminator, Field, Tag
 
-from magshell_fenicsx.parts.section import Section
+from magshell_fenicsx.input.section import Section
 
 At = Annotated[
     Annotated[Literal["ends", "end", "all"], Tag("a word")]

@@ -4,7 +4,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from magshell_fenicsx.parts.section import Section
+from magshell_fenicsx.input.section import Section
 
 FIELDS = ("remanence", "magnitude", "thickness", "curvature", "deviation")
 

@@ -6,18 +6,18 @@ from typing import Annotated, Any, TypeAlias
 
 from pydantic import Discriminator, Field, Tag
 
-from magshell_fenicsx.case.loads.contact import ContactSection
-from magshell_fenicsx.case.loads.dead import DeadSection
-from magshell_fenicsx.case.loads.edge import EdgeSection
-from magshell_fenicsx.case.loads.field import FieldBefore, FieldSection, RotationSection
-from magshell_fenicsx.case.loads.growth import GrowthSection
-from magshell_fenicsx.case.loads.imperfection import ImperfectionStep
-from magshell_fenicsx.case.loads.indentation import IndentationSection
-from magshell_fenicsx.case.loads.pressure import PressureSection
-from magshell_fenicsx.case.loads.source import SourceStep
-from magshell_fenicsx.case.loads.step import PathStep, Step, Until
-from magshell_fenicsx.case.loads.time import TimeSection
-from magshell_fenicsx.parts.chosen import Chosen
+from magshell_fenicsx.input.chosen import Chosen
+from magshell_fenicsx.parts.bodies.press import ContactSection
+from magshell_fenicsx.parts.forces.dead import DeadSection
+from magshell_fenicsx.parts.forces.indentation import IndentationSection
+from magshell_fenicsx.parts.imperfections.growth import ImperfectionStep
+from magshell_fenicsx.parts.magnetism.field_step import FieldBefore, FieldSection, RotationSection
+from magshell_fenicsx.parts.magnetism.source_step import SourceStep
+from magshell_fenicsx.parts.motion.step import TimeSection
+from magshell_fenicsx.parts.natural.growth import GrowthSection
+from magshell_fenicsx.parts.pressure.pressure import PressureSection
+from magshell_fenicsx.parts.step import PathStep, Step, Until
+from magshell_fenicsx.parts.supports.motion import EdgeSection
 
 OneStep: TypeAlias = Annotated[
     PressureSection

@@ -4,7 +4,7 @@ from typing import Annotated, Self
 
 from pydantic import Field, model_validator
 
-from magshell_fenicsx.parts.section import Section, or_number
+from magshell_fenicsx.input.section import Section, or_number
 
 SOLID_DEGREE = 2
 

@@ -6,8 +6,8 @@ from pathlib import Path
 from mpi4py import MPI
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.file import FileKeys
-from magshell_fenicsx.case.source import CaseError, Source, read_source
+from magshell_fenicsx.input.file import FileKeys
+from magshell_fenicsx.input.source import CaseError, Source, read_source
 from magshell_fenicsx.platform.first import from_first
 
 

@@ -5,9 +5,9 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-from magshell_fenicsx.case.messages import explained
 from magshell_fenicsx.case.output import OutputSection
-from magshell_fenicsx.case.source import CaseError, Source
+from magshell_fenicsx.input.messages import explained
+from magshell_fenicsx.input.source import CaseError, Source
 
 
 class _Options(BaseModel):

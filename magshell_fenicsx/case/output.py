@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, field_validator
 
-from magshell_fenicsx.parts.section import Section
+from magshell_fenicsx.input.section import Section
 
 DRAWN = (  # fields with colours
     *("w_over_h", "E_1", "E_2", "M_1", "M_2"),

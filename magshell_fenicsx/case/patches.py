@@ -2,8 +2,8 @@
 
 from collections.abc import Collection, Iterable
 
-from magshell_fenicsx.case.shell import ShellSection
-from magshell_fenicsx.case.surfaces import MeshSurface, Surface
+from magshell_fenicsx.shape.sections import MeshSurface, Surface
+from magshell_fenicsx.shape.shell import ShellSection
 
 REMANENCE = "magnetic.remanent.patches"
 

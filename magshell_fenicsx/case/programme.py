@@ -2,15 +2,15 @@
 
 from collections.abc import Collection, Sequence
 
-from magshell_fenicsx.case.fields import MagneticSection
 from magshell_fenicsx.case.loading import ProgrammeStep
-from magshell_fenicsx.case.loads.dead import DeadSection
-from magshell_fenicsx.case.loads.edge import EdgeSection
-from magshell_fenicsx.case.loads.field import FieldBefore, FieldSection, RotationSection
-from magshell_fenicsx.case.loads.indentation import IndentationSection
-from magshell_fenicsx.case.loads.source import SourceStep, refuse_unknown_source
-from magshell_fenicsx.case.loads.step import LEAST_TARGET, Gas, PathStep, Step
-from magshell_fenicsx.case.loads.time import TimeSection, refuse_unfit_time
+from magshell_fenicsx.parts.forces.dead import DeadSection
+from magshell_fenicsx.parts.forces.indentation import IndentationSection
+from magshell_fenicsx.parts.magnetism.field_step import FieldBefore, FieldSection, RotationSection
+from magshell_fenicsx.parts.magnetism.fields import MagneticSection
+from magshell_fenicsx.parts.magnetism.source_step import SourceStep, refuse_unknown_source
+from magshell_fenicsx.parts.motion.step import TimeSection, refuse_unfit_time
+from magshell_fenicsx.parts.step import LEAST_TARGET, Gas, PathStep, Step
+from magshell_fenicsx.parts.supports.motion import EdgeSection
 
 SAME = 1e-9  # cosine of directions: rounding
 

@@ -8,7 +8,7 @@ from pydantic.json_schema import GenerateJsonSchema
 from pydantic_core import core_schema
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.parts.meanings import meaning
+from magshell_fenicsx.input.meanings import meaning
 from magshell_fenicsx.parts.registered import PARTS
 
 _NOISE = {"title", "discriminator", "gt", "ge", "lt", "le"}  # the last are bounds of quantities, which are text

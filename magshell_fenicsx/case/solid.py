@@ -2,7 +2,7 @@
 
 from pydantic import Field
 
-from magshell_fenicsx.parts.section import Section
+from magshell_fenicsx.input.section import Section
 
 
 class SolidSection(Section):

@@ -4,7 +4,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from magshell_fenicsx.parts.section import Section
+from magshell_fenicsx.input.section import Section
 
 
 class StabilitySection(Section):

@@ -3,8 +3,8 @@
 from collections.abc import Collection
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.fields import MU_0
-from magshell_fenicsx.case.targets import given
+from magshell_fenicsx.input.targets import given
+from magshell_fenicsx.parts.magnetism.fields import MU_0
 from magshell_fenicsx.quantities.units import Sizes, sizes
 
 

@@ -10,12 +10,12 @@ from magshell_fenicsx.assembly.growing import Growing
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.assembly.terms import LinearTerm
 from magshell_fenicsx.continuation.system import Amplitudes, State, Vector
-from magshell_fenicsx.models.shell.applied import AppliedField
-from magshell_fenicsx.models.shell.contact import Pressing, Region
-from magshell_fenicsx.models.shell.dead_load import DeadLoads
-from magshell_fenicsx.models.shell.moved import Support
 from magshell_fenicsx.models.shell.parameters import Loads, Material
-from magshell_fenicsx.models.shell.point_load import point_entries
+from magshell_fenicsx.parts.bodies.contact import Pressing, Region
+from magshell_fenicsx.parts.forces.dead_load import DeadLoads
+from magshell_fenicsx.parts.forces.point_load import point_entries
+from magshell_fenicsx.parts.magnetism.applied import AppliedField
+from magshell_fenicsx.parts.supports.moved import Support
 
 Array = NDArray[np.float64]
 

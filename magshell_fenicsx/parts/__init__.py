@@ -1,1 +1,1 @@
-"""The sections of a case: their base class, and parts that add an energy to the model."""
+"""The abilities, each in a room of its own, and the base of their sections and steps."""

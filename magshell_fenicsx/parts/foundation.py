@@ -6,11 +6,11 @@ import ufl
 from pydantic import Field
 from ufl.core.expr import Expr
 
+from magshell_fenicsx.input.section import or_number
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.kinematics import Jet
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.parts.part import Part, Scales
-from magshell_fenicsx.parts.section import or_number
 from magshell_fenicsx.quantities.quantity import Quantity
 
 Stiffness = Annotated[float, Field(gt=0)]

@@ -8,8 +8,8 @@ from typing import Any, Self
 
 from pydantic import PrivateAttr
 
+from magshell_fenicsx.input.section import Section
 from magshell_fenicsx.models.shell.own_term import OwnTerm
-from magshell_fenicsx.parts.section import Section
 
 
 @dataclass(frozen=True)

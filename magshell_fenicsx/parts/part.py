@@ -6,8 +6,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from magshell_fenicsx.input.section import Section
 from magshell_fenicsx.models.shell.own_term import OwnTerm
-from magshell_fenicsx.parts.section import Section
 from magshell_fenicsx.quantities.quantity import Quantity
 from magshell_fenicsx.quantities.registry import register
 

@@ -13,10 +13,10 @@ from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.shell.thickness import Thickness, refuse_unfit
 from magshell_fenicsx.models.solid.model import SolidModel
-from magshell_fenicsx.plan.body import layers, neo_hookean
-from magshell_fenicsx.plan.plan import Plan
-from magshell_fenicsx.plan.planner import meridian_vertices
 from magshell_fenicsx.platform.first import from_first
+from magshell_fenicsx.problem.body import layers, neo_hookean
+from magshell_fenicsx.problem.planner import meridian_vertices
+from magshell_fenicsx.problem.problem import Plan
 
 Array = NDArray[np.float64]
 

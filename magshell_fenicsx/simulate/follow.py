@@ -4,16 +4,16 @@ import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
-from magshell_fenicsx.case.loads.step import PathStep
 from magshell_fenicsx.continuation.path import NotANumber
 from magshell_fenicsx.continuation.point import Point
 from magshell_fenicsx.continuation.system import State
+from magshell_fenicsx.parts.bodies.touch import refuse_penetration
+from magshell_fenicsx.parts.step import PathStep
 from magshell_fenicsx.quantities.registry import OWN_MODES
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.search import searched
 from magshell_fenicsx.simulate.steps import LOCATED, held_by, records_of
-from magshell_fenicsx.simulate.touch import refuse_penetration
 from magshell_fenicsx.simulate.transient import released
 from magshell_fenicsx.simulate.walked import Walked, amount
 

@@ -4,8 +4,8 @@ from collections.abc import Sequence
 from numbers import Real
 from typing import Any, cast
 
-from magshell_fenicsx.case.targets import UNITS
-from magshell_fenicsx.parts.section import in_units
+from magshell_fenicsx.input.section import in_units
+from magshell_fenicsx.input.targets import UNITS
 from magshell_fenicsx.quantities.registry import amplitude, quantity
 from magshell_fenicsx.simulate.scene import Scene
 

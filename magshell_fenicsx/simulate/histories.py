@@ -4,11 +4,11 @@ from collections.abc import Collection
 from functools import partial
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.history import Curve, Level, Time, curve, marks, times_of
-from magshell_fenicsx.case.loads.time import TimeSection
-from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.continuation.system import State
-from magshell_fenicsx.parts.section import in_units
+from magshell_fenicsx.input.section import in_units
+from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.parts.motion.history import Curve, Level, Time, curve, marks, times_of
+from magshell_fenicsx.parts.motion.step import TimeSection
 
 CLOSE = 1e-5  # of the shortest time of a history: a difference by time
 SAME = 1e-9

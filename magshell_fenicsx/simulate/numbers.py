@@ -16,13 +16,13 @@ from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.gradients import FIELDS
 from magshell_fenicsx.case.imperfections.dimple import DimpleSection
 from magshell_fenicsx.case.imperfections.modes import ModesSection
-from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.continuation.system import State
+from magshell_fenicsx.input.section import number_and_unit, si_size
+from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.shell.model import ShellModel
-from magshell_fenicsx.parts.section import number_and_unit, si_size
-from magshell_fenicsx.plan.plan import Plan
-from magshell_fenicsx.plan.planner import make_plan
+from magshell_fenicsx.problem.planner import make_plan
+from magshell_fenicsx.problem.problem import Plan
 from magshell_fenicsx.simulate.scene import Scene
 
 OF_MATERIAL = ("density", "poisson_ratio", "radius_to_thickness", "thickness", "youngs_modulus", "thickness_factor")

@@ -12,7 +12,7 @@ from typing import Any
 from mpi4py import MPI
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.source import Source
+from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.simulate.scene import Scene
 
 HEMISPHERE = {

@@ -10,14 +10,14 @@ from dolfinx.la import InsertMode
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.continuation.system import State, Vector, dot
+from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.frame import rotation
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
-from magshell_fenicsx.models.reacting import motion_columns
-from magshell_fenicsx.models.reactions import weights
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.model import ShellModel
+from magshell_fenicsx.parts.supports.reacting import motion_columns
+from magshell_fenicsx.parts.supports.reactions import weights
 from magshell_fenicsx.quantities.registry import amplitude, contact_columns, quantity
 from magshell_fenicsx.simulate.scene import Scene
 

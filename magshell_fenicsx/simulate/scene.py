@@ -15,29 +15,30 @@ from magshell_fenicsx.assembly.terms import factor_of
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.imperfections.modes import ModesSection
 from magshell_fenicsx.case.opened import opened
-from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.continuation.journal import Journal, NoJournal
 from magshell_fenicsx.continuation.listener import NoProgress, Progress
 from magshell_fenicsx.continuation.newton import BorderedNewton, NewtonOptions
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.continuation.watch import Watch
+from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.frame import rotation
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
-from magshell_fenicsx.models.reacting import (
+from magshell_fenicsx.models.shell.model import ShellModel
+from magshell_fenicsx.models.shell.own_term import OwnTerm
+from magshell_fenicsx.models.shell.patterns import cells_of
+from magshell_fenicsx.models.solid.model import SolidModel
+from magshell_fenicsx.parts.magnetism.direction import directions, field_angle, field_size
+from magshell_fenicsx.parts.magnetism.remanence import cells_of_body
+from magshell_fenicsx.parts.pressure.openings import no_potential
+from magshell_fenicsx.parts.supports.reacting import (
     motion_columns,
     motion_size,
     observed_reactions,
     source_columns,
     source_size,
 )
-from magshell_fenicsx.models.shell.model import ShellModel
-from magshell_fenicsx.models.shell.openings import no_potential
-from magshell_fenicsx.models.shell.own_term import OwnTerm
-from magshell_fenicsx.models.shell.patterns import cells_of
-from magshell_fenicsx.models.shell.supports import refuse_loose
-from magshell_fenicsx.models.solid.model import SolidModel
-from magshell_fenicsx.models.solid.remanence import cells_of_body
-from magshell_fenicsx.plan.columns import (
+from magshell_fenicsx.parts.supports.supports import refuse_loose
+from magshell_fenicsx.problem.columns import (
     also_displaced,
     extra_columns,
     only_turns,
@@ -45,14 +46,13 @@ from magshell_fenicsx.plan.columns import (
     sizes_in_units,
     support_columns,
 )
-from magshell_fenicsx.plan.formulas import unshown, written
-from magshell_fenicsx.plan.limits import refuse_beyond_memory
-from magshell_fenicsx.plan.plan import Plan
-from magshell_fenicsx.plan.planner import make_plan
+from magshell_fenicsx.problem.formulas import unshown, written
+from magshell_fenicsx.problem.limits import refuse_beyond_memory
+from magshell_fenicsx.problem.planner import make_plan
+from magshell_fenicsx.problem.problem import Plan
 from magshell_fenicsx.quantities.registry import amplitude, contact_columns
 from magshell_fenicsx.quantities.units import Sizes
 from magshell_fenicsx.simulate.build import build_meridian_model, build_model, build_solid_model
-from magshell_fenicsx.simulate.direction import directions, field_angle, field_size
 
 Array = NDArray[np.float64]
 

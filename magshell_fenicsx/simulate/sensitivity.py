@@ -15,11 +15,11 @@ from magshell_fenicsx.continuation.fold import Fold, Guess, find_fold, sensitivi
 from magshell_fenicsx.continuation.system import State, Vector
 from magshell_fenicsx.models.axisymmetric import jets
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
-from magshell_fenicsx.models.shell.applied import AppliedField
 from magshell_fenicsx.models.shell.parameters import Magnetisation
 from magshell_fenicsx.models.shell.patterns import Array, Pattern, WithinRims
 from magshell_fenicsx.models.shell.terms import TermFactory
 from magshell_fenicsx.models.solid.model import SolidModel
+from magshell_fenicsx.parts.magnetism.applied import AppliedField
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.shape_sensitivity import to_imperfections

@@ -18,16 +18,16 @@ from numpy.typing import NDArray
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.imperfections.dimple import DimpleSection
 from magshell_fenicsx.case.imperfections.gaussian import GaussianSection
-from magshell_fenicsx.case.imperfections.place import ImperfectionSection
-from magshell_fenicsx.case.loads.imperfection import grown_by
 from magshell_fenicsx.continuation.fold import Fold, sensitivity
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.mesh.deviation import Deviated, Deviation
 from magshell_fenicsx.mesh.mirror import Mirror
 from magshell_fenicsx.models.shell.model import ShellModel
-from magshell_fenicsx.plan.imperfections.flaw import in_frame
-from magshell_fenicsx.plan.imperfections.registered import flaws
-from magshell_fenicsx.plan.outline import outline
+from magshell_fenicsx.parts.imperfections.flaw import in_frame
+from magshell_fenicsx.parts.imperfections.growth import grown_by
+from magshell_fenicsx.parts.imperfections.place import ImperfectionSection
+from magshell_fenicsx.parts.imperfections.registered import flaws
+from magshell_fenicsx.shape.outline import outline
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.stage import Stage
 from magshell_fenicsx.simulate.transfer import same_mesh, transfer

@@ -7,16 +7,16 @@ from mpi4py import MPI
 
 from magshell_fenicsx.assembly.terms import FormTerm
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.loads.dead import DeadSection
 from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.models.axisymmetric import pattern as of_meridian
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.shell import patterns
 from magshell_fenicsx.models.shell.model import ShellModel
-from magshell_fenicsx.models.shell.natural import natural_field
 from magshell_fenicsx.models.shell.thickness import thickness_field
-from magshell_fenicsx.plan.plan import Plan
-from magshell_fenicsx.plan.planner import make_plan
+from magshell_fenicsx.parts.forces.dead import DeadSection
+from magshell_fenicsx.parts.natural.shape import natural_field
+from magshell_fenicsx.problem.planner import make_plan
+from magshell_fenicsx.problem.problem import Plan
 from magshell_fenicsx.simulate.scene import Scene
 
 FIELDS = {"magnetic": {"remanent"}, "shell": {"thickness_factor"}, "natural": {"curvature"}}

@@ -5,12 +5,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from magshell_fenicsx.assembly.moving import in_space
-from magshell_fenicsx.case.loads.time import PushSection
 from magshell_fenicsx.continuation.system import State, Vector, dot, max_abs
 from magshell_fenicsx.mesh.frame import rotation
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.modes import ShellModes
-from magshell_fenicsx.plan.turning import vectors_of
+from magshell_fenicsx.parts.motion.step import PushSection
+from magshell_fenicsx.shape.turning import vectors_of
 from magshell_fenicsx.simulate.scene import Scene
 
 SMALL = 1e-6  # deflection of a mode of size one that does not give its sign

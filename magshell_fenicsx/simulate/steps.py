@@ -6,21 +6,21 @@ from math import acos
 import numpy as np
 
 from magshell_fenicsx.case.loading import ProgrammeStep
-from magshell_fenicsx.case.loads.contact import ContactSection
-from magshell_fenicsx.case.loads.field import FieldBefore, FieldSection, RotationSection
-from magshell_fenicsx.case.loads.step import Drive, Gas, Now, PathStep
-from magshell_fenicsx.case.loads.time import TimeSection
 from magshell_fenicsx.continuation.device import Conjugate
 from magshell_fenicsx.continuation.path import StepOptions
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.continuation.walk import MOST_STEPS, Goal
-from magshell_fenicsx.plan.sources.field import turn_name
-from magshell_fenicsx.simulate.direction import as_a_whole, circle, components, field_angle, field_at, straight
-from magshell_fenicsx.simulate.gas import gas
+from magshell_fenicsx.parts.bodies.press import ContactSection
+from magshell_fenicsx.parts.bodies.touch import touched
+from magshell_fenicsx.parts.magnetism.direction import as_a_whole, circle, components, field_angle, field_at, straight
+from magshell_fenicsx.parts.magnetism.field_step import FieldBefore, FieldSection, RotationSection
+from magshell_fenicsx.parts.magnetism.sources.field import turn_name
+from magshell_fenicsx.parts.motion.step import TimeSection
+from magshell_fenicsx.parts.pressure.gas import gas
+from magshell_fenicsx.parts.step import Drive, Gas, Now, PathStep
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.stage import Stage, staged
-from magshell_fenicsx.simulate.touch import touched
 from magshell_fenicsx.simulate.transient import motion
 from magshell_fenicsx.simulate.walked import Records, Walked, followed
 

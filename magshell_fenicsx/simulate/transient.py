@@ -6,24 +6,24 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from magshell_fenicsx.assembly.ground import Ground
-from magshell_fenicsx.case.loads.snap import SnapSection
-from magshell_fenicsx.case.loads.time import EventSection, TimeSection
-from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.continuation.advance import TimeSteps
 from magshell_fenicsx.continuation.control import GivenLoad
 from magshell_fenicsx.continuation.device import Held
 from magshell_fenicsx.continuation.motion import Motion
 from magshell_fenicsx.continuation.system import State, Vector, max_abs
 from magshell_fenicsx.continuation.transient import Integrator
+from magshell_fenicsx.input.section import in_units
+from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
-from magshell_fenicsx.models.axisymmetric.viscous import surface_of as of_meridian
-from magshell_fenicsx.models.mass import mass, whole_mass
 from magshell_fenicsx.models.modes import ShellModes
-from magshell_fenicsx.models.shell.contact import Pressings
 from magshell_fenicsx.models.shell.model import ShellModel
-from magshell_fenicsx.models.shell.viscous import surface_of as of_shell
-from magshell_fenicsx.models.viscous import Branch, Viscosity
-from magshell_fenicsx.parts.section import in_units
+from magshell_fenicsx.parts.bodies.contact import Pressings
+from magshell_fenicsx.parts.motion.mass import mass, whole_mass
+from magshell_fenicsx.parts.motion.on_meridian import surface_of as of_meridian
+from magshell_fenicsx.parts.motion.on_surface import surface_of as of_shell
+from magshell_fenicsx.parts.motion.step import EventSection, TimeSection
+from magshell_fenicsx.parts.motion.viscous import Branch, Viscosity
+from magshell_fenicsx.parts.snap import SnapSection
 from magshell_fenicsx.simulate.histories import LoadsInTime, time_of
 from magshell_fenicsx.simulate.intervals import Intervals
 from magshell_fenicsx.simulate.record import Record, Stopped

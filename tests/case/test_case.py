@@ -7,8 +7,8 @@ import pytest
 from conftest import CASES
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.fields import MU_0
-from magshell_fenicsx.case.source import CaseError
+from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.parts.magnetism.fields import MU_0
 
 GOOD = dedent("""\
     shell:

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from magshell_fenicsx import Case
-from magshell_fenicsx.case.source import CaseError, Source
-from magshell_fenicsx.plan.planner import make_plan
+from magshell_fenicsx.input.source import CaseError, Source
+from magshell_fenicsx.problem.planner import make_plan
 
 PUSH = {"supports": ["right"], "translation": [-0.01, 0, 0]}
 TURN = {"axis": [0, 2, 0], "angle": 90, "point": [1, 0, 0]}

@@ -7,7 +7,7 @@ from conftest import CASES
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.examples import examples, title, write_example
-from magshell_fenicsx.case.source import CaseError
+from magshell_fenicsx.input.source import CaseError
 
 FILES = [*CASES.glob("*.yaml"), *CASES.glob("benchmarks/*.yaml")]
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.source import CaseError
+from magshell_fenicsx.input.source import CaseError
 
 CAP = """\
 shell:

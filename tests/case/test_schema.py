@@ -10,7 +10,7 @@ from jsonschema import Draft202012Validator
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.reference import reference
 from magshell_fenicsx.case.schema import schema, schema_text
-from magshell_fenicsx.case.source import CaseError, override, read_source
+from magshell_fenicsx.input.source import CaseError, override, read_source
 
 DOCS = CASES.parent / "docs"
 PLATE = "shell={geometry: plate, length: 1, width: 1, thickness: 0.01, poisson_ratio: 0.3}"

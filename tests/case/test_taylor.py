@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from magshell_fenicsx.case.expressions import FUNCTIONS, formula, with_derivatives
+from magshell_fenicsx.input.expressions import FUNCTIONS, formula, with_derivatives
 
 PLACES = np.random.default_rng(0).uniform(0.2, 1.0, (20, 3))
 FORMULAS = [

@@ -12,7 +12,7 @@ from speed.measure import BenchFailed, measure_item
 from speed.report import compare, derived, table
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.plan.planner import make_plan
+from magshell_fenicsx.problem.planner import make_plan
 from magshell_fenicsx.studies.study.scalar import parse_scalar
 
 

@@ -18,7 +18,7 @@ from magshell_fenicsx.continuation.path import Path
 from magshell_fenicsx.continuation.point import PathStopped, Point
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
-from magshell_fenicsx.run.run import run
+from magshell_fenicsx.runs.run import run
 from magshell_fenicsx.simulate.follow import follow
 
 

@@ -10,7 +10,7 @@ from command import magshell, read_path
 from conftest import CASES
 
 from magshell_fenicsx import Case, Result, Scene
-from magshell_fenicsx.run.run import run
+from magshell_fenicsx.runs.run import run
 from magshell_fenicsx.simulate.follow import follow
 
 Row = dict[str, float]

@@ -6,7 +6,7 @@ from conftest import CASES
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.output.fields.gathering import gatherer
-from magshell_fenicsx.run.run import run
+from magshell_fenicsx.runs.run import run
 from magshell_fenicsx.simulate.scene import Scene
 
 POLAR = 0.326233289  # of the paper's dimple at the pole; an independent solver of the meridian's equations, nine digits

@@ -8,10 +8,10 @@ from conftest import CASES
 from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.source import Source
+from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.mesh.grid import Grid
 from magshell_fenicsx.mesh.triangulation import triangulate
-from magshell_fenicsx.plan.planner import make_plan
+from magshell_fenicsx.problem.planner import make_plan
 
 Array = NDArray[np.float64]
 

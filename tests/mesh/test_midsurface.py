@@ -15,7 +15,7 @@ from magshell_fenicsx.mesh.shapes import DiscShape
 from magshell_fenicsx.mesh.sphere import flat, sphere
 from magshell_fenicsx.mesh.triangulation import triangulate
 from magshell_fenicsx.models.shell import kinematics as kin
-from magshell_fenicsx.plan.imperfections.dimple import Dimple
+from magshell_fenicsx.parts.imperfections.dimple import Dimple
 
 
 def patch(size: float = 0.5) -> PatchMesh:

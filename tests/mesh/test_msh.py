@@ -12,14 +12,14 @@ from conftest import CASES
 from mpi4py import MPI
 
 from magshell_fenicsx import Case, Scene
-from magshell_fenicsx.case.source import CaseError, Source
+from magshell_fenicsx.input.source import CaseError, Source
 from magshell_fenicsx.mesh.msh import MeshFile, read_msh
 from magshell_fenicsx.mesh.patch import MeshError, PatchMesh, check_orientation
 from magshell_fenicsx.models.shell.patterns import ByPatch
-from magshell_fenicsx.plan.check import describe
-from magshell_fenicsx.plan.planner import make_plan
-from magshell_fenicsx.run.files import AlreadyComplete
-from magshell_fenicsx.run.run import run
+from magshell_fenicsx.problem.check import describe
+from magshell_fenicsx.problem.planner import make_plan
+from magshell_fenicsx.runs.files import AlreadyComplete
+from magshell_fenicsx.runs.run import run
 from magshell_fenicsx.studies.sweep.axes import parse_axis
 from magshell_fenicsx.studies.sweep.points import make_points
 from magshell_fenicsx.studies.sweep.sweep import sweep

@@ -10,14 +10,14 @@ from dolfinx import fem
 from mpi4py import MPI
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.source import CaseError, Source
+from magshell_fenicsx.input.source import CaseError, Source
 from magshell_fenicsx.mesh.midsurface import Midsurface
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.shell import kinematics as kin
-from magshell_fenicsx.models.shell.openings import moving
-from magshell_fenicsx.plan.check import describe
-from magshell_fenicsx.plan.limits import refuse_beyond_memory
-from magshell_fenicsx.plan.planner import make_plan
+from magshell_fenicsx.parts.pressure.openings import moving
+from magshell_fenicsx.problem.check import describe
+from magshell_fenicsx.problem.limits import refuse_beyond_memory
+from magshell_fenicsx.problem.planner import make_plan
 from magshell_fenicsx.simulate.build import build_midsurface
 
 COMMON = {"thickness": 0.01, "poisson_ratio": 0.3}

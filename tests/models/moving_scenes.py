@@ -9,7 +9,7 @@ import numpy as np
 from magshell_fenicsx import Case, Scene
 from magshell_fenicsx.assembly.motion import Motion
 from magshell_fenicsx.models.shell.parameters import Move
-from magshell_fenicsx.plan.planner import make_plan
+from magshell_fenicsx.problem.planner import make_plan
 
 NONE = np.zeros(3)
 PLATE = {"geometry": "plate", "length": 1.0, "width": 0.1, "thickness": 0.01, "youngs_modulus": 1.2e8}  # E I = 1

@@ -8,7 +8,7 @@ from models.moving_scenes import move, moving_scene
 
 import magshell_fenicsx as ms
 from magshell_fenicsx import Scene
-from magshell_fenicsx.models.reactions import reactions
+from magshell_fenicsx.parts.supports.reactions import reactions
 
 CAP = {"geometry": "cap", "radius": 1.0, "thickness": 0.05, "polar": 60, "youngs_modulus": 1.0}
 TUBE = {"geometry": "cylinder", "radius": 1.0, "length": 1.0, "thickness": 0.05, "youngs_modulus": 1.0}

@@ -7,8 +7,8 @@ from models.moving_scenes import CLAMPED, NONE, PLATE, RING, move, moving_scene
 import magshell_fenicsx as ms
 from magshell_fenicsx import Scene
 from magshell_fenicsx.continuation.system import State
-from magshell_fenicsx.models.reactions import Reaction, reactions
 from magshell_fenicsx.models.shell.parameters import Move
+from magshell_fenicsx.parts.supports.reactions import Reaction, reactions
 
 SMALL = 1e-5  # displacement over the length: the nonlinear part is of its square over h^2
 ROUNDING = 5e-8  # of strains, 2e-16, over those of such displacements, h^2 SMALL = 1e-9: 2e-7 at a point, less in a sum

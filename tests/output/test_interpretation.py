@@ -11,7 +11,7 @@ from conftest import disc, hemisphere
 from dolfinx import fem
 
 from magshell_fenicsx import Case, Scene
-from magshell_fenicsx.case.source import Source
+from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.shell.parameters import Loads, Magnetisation, Material

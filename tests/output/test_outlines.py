@@ -7,7 +7,7 @@ from conftest import CASES
 
 from magshell_fenicsx import Case
 from magshell_fenicsx.output.fields.outlines import DRIVEN, STILL, outlines, read_outlines, vtp_content
-from magshell_fenicsx.plan.planner import make_plan
+from magshell_fenicsx.problem.planner import make_plan
 
 TURN = "{kind: source, name: roll, turn: {axis: [0, 1, 0], angle: 90}}"
 STEPS = f"loading=[{{kind: field}}, {{kind: source, move: [0, 0, 6 mm]}}, {TURN}]"

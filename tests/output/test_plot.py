@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 import magshell_fenicsx as ms
-from magshell_fenicsx.case.source import CaseError, Source
+from magshell_fenicsx.input.source import CaseError, Source
 from magshell_fenicsx.output.pictures.picture import PICTURES
 from magshell_fenicsx.output.pictures.plot import draw, draw_animation, in_true_time, plot
 from magshell_fenicsx.output.store.table import read_rows

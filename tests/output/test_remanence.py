@@ -5,7 +5,7 @@ import pytest
 
 import magshell_fenicsx as ms
 from magshell_fenicsx.case.output import OutputSection
-from magshell_fenicsx.case.source import Source
+from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.output.fields.gathering import gatherer
 from magshell_fenicsx.output.fields.surface import Surface, completed
 from magshell_fenicsx.output.pictures.picture import figures

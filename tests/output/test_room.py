@@ -18,7 +18,7 @@ from magshell_fenicsx.output.pictures.numbers import write_numbers
 from magshell_fenicsx.output.pictures.picture import far_said, figures
 from magshell_fenicsx.output.pictures.sources import near_outlines
 from magshell_fenicsx.output.pictures.view import Camera, Window
-from magshell_fenicsx.plan.planner import make_plan
+from magshell_fenicsx.problem.planner import make_plan
 
 Array = NDArray[np.float64]
 ABOVE = Camera(np.array([0.0, -1e-6, 1.0]))

@@ -8,7 +8,7 @@ from conftest import CASES, disc
 from numpy.typing import NDArray
 
 from magshell_fenicsx import Case, Scene
-from magshell_fenicsx.case.source import Source
+from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.shell.parameters import Loads, Material
 from magshell_fenicsx.output.fields.gathering import gatherer

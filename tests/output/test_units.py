@@ -13,8 +13,8 @@ from command import magshell, read_path
 from conftest import CASES
 
 from magshell_fenicsx import Case, CaseError
-from magshell_fenicsx.case.source import Source
 from magshell_fenicsx.case.units import sizes_of
+from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.quantities.registry import axes_of
 
 R, H, E, NU = 25.2e-3, 0.32e-3, 1.8e6, 0.5

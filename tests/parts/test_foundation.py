@@ -8,8 +8,8 @@ import pytest
 from conftest import CASES
 
 import magshell_fenicsx as ms
-from magshell_fenicsx.case.source import Source
-from magshell_fenicsx.plan.check import describe
+from magshell_fenicsx.input.source import Source
+from magshell_fenicsx.problem.check import describe
 from magshell_fenicsx.quantities.registry import quantity
 
 DISC = {"geometry": "disc", "radius_to_thickness": 50, "poisson_ratio": 0.3}

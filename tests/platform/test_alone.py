@@ -19,13 +19,13 @@ if MPI.COMM_WORLD.rank == int(rank):
         def refused(file, largest=0):
             raise PermissionError(13, "Permission denied", str(file))
         reading.read_whole = refused
-        import magshell_fenicsx.case.source as source
+        import magshell_fenicsx.input.source as source
         source.read_whole = refused
     if mode == "another":
         words += ["--set", "shell.poisson_ratio=0.31"]
     if mode == "alone":
         import magshell_fenicsx.simulate.scene as scene
-        from magshell_fenicsx.case.source import CaseError
+        from magshell_fenicsx.input.source import CaseError
         def make_plan(*arguments):
             raise CaseError("mesh: only here")
         scene.make_plan = make_plan

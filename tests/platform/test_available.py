@@ -11,8 +11,8 @@ from command import magshell, mpirun
 from conftest import CASES
 
 import magshell_fenicsx as ms
-from magshell_fenicsx.plan.limits import Memory
 from magshell_fenicsx.platform import memory
+from magshell_fenicsx.problem.limits import Memory
 
 DIMPLE, BRACKET = CASES / "dimple_buckling.yaml", CASES / "bracket.yaml"
 FULL = ["--set", "symmetry=none"]

@@ -18,9 +18,9 @@ from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.output.store.checkpoint import Checkpoint
 from magshell_fenicsx.output.store.durable import Damaged
 from magshell_fenicsx.output.store.folder import DiskError, by_first, prepare_folder
-from magshell_fenicsx.plan.plan import Plan
 from magshell_fenicsx.platform.first import from_first
-from magshell_fenicsx.run.files import AlreadyComplete
+from magshell_fenicsx.problem.problem import Plan
+from magshell_fenicsx.runs.files import AlreadyComplete
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.studies.sweep.sweep import sweep
 
@@ -96,7 +96,7 @@ def a_folder(out: Path) -> None:
         ms.run(ms.Case.load(PLATE), out / "run", COMM)
     from_first(COMM, (out / "run" / "mesh.json").mkdir)
     case = ms.Case.load(PLATE, ["mesh={tolerance: 0.01}"])
-    with patch("magshell_fenicsx.run.run.open_folder"), raised(Damaged, "mesh.json: is damaged: Is a directory"):
+    with patch("magshell_fenicsx.runs.run.open_folder"), raised(Damaged, "mesh.json: is damaged: Is a directory"):
         ms.run(case, out / "run", COMM, resume=True)
     with patch("magshell_fenicsx.studies.sweep.sweep.load", failing(KeyError("a bug"))), raised(KeyError, "a bug"):
         sweep(PLATE, ["shell.poisson_ratio=0.3,0.4"], out=out / "sweep", comm=COMM)

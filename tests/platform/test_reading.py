@@ -14,8 +14,8 @@ import pytest
 from command import magshell
 
 import magshell_fenicsx as ms
-from magshell_fenicsx.plan.planner import make_plan
 from magshell_fenicsx.platform.reading import Files, read_whole, text_of
+from magshell_fenicsx.problem.planner import make_plan
 
 DATA = """
 shell: {{geometry: hemisphere, radius_to_thickness: 50, poisson_ratio: 0.3,

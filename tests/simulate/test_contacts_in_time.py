@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from magshell_fenicsx import Case
-from magshell_fenicsx.case.source import Source
-from magshell_fenicsx.models.shell.contact import mean_pressure, penalty
-from magshell_fenicsx.run.rows import imbalances, rows
+from magshell_fenicsx.input.source import Source
+from magshell_fenicsx.parts.bodies.contact import mean_pressure, penalty
+from magshell_fenicsx.runs.rows import imbalances, rows
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.scene import Scene
 

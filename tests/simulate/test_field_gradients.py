@@ -14,9 +14,9 @@ from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.continuation.control import GivenLoad
 from magshell_fenicsx.continuation.fold import Guess, find_fold
 from magshell_fenicsx.continuation.system import State
-from magshell_fenicsx.models.shell.natural import Natural
 from magshell_fenicsx.models.shell.thickness import Thickness
-from magshell_fenicsx.plan.natural import frame
+from magshell_fenicsx.parts.natural.planned import frame
+from magshell_fenicsx.parts.natural.shape import Natural
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.gradients.adjoint import adjoint_of_instability
 from magshell_fenicsx.simulate.gradients.gradient import gradient

@@ -12,9 +12,9 @@ from command import magshell, mpirun
 from conftest import CASES
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.source import Source
 from magshell_fenicsx.continuation.fold import Fold, FoldLost, Guess, find_fold
-from magshell_fenicsx.run.run import run
+from magshell_fenicsx.input.source import Source
+from magshell_fenicsx.runs.run import run
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.transfer import _stretch, same_mesh, transfer
 from magshell_fenicsx.studies.sweep.continuation import Continuation
@@ -172,7 +172,7 @@ SHARED = """
 import json, sys
 from mpi4py import MPI
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.run.run import run
+from magshell_fenicsx.runs.run import run
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.sensitivity import sensitivities
 from magshell_fenicsx.continuation.fold import Guess, find_fold, predict_fold

@@ -13,9 +13,9 @@ import pytest
 from interrupted import check_same_path
 
 import magshell_fenicsx as ms
-from magshell_fenicsx.case.source import CaseError, Source
 from magshell_fenicsx.continuation.fold import Guess, find_fold
 from magshell_fenicsx.continuation.system import State
+from magshell_fenicsx.input.source import CaseError, Source
 from magshell_fenicsx.simulate.sensitivity import fold_at, sensitivities
 
 PRESSED = {"kind": "pressure", "control": "load", "until": "target", "pressure": 0.45, "points": 1}

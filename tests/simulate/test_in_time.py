@@ -9,10 +9,10 @@ import pytest
 from command import magshell
 
 from magshell_fenicsx import Case, Scene
-from magshell_fenicsx.case.source import CaseError, Source
-from magshell_fenicsx.run.rows import columns, rows
-from magshell_fenicsx.run.run import run
-from magshell_fenicsx.run.snaps import snaps
+from magshell_fenicsx.input.source import CaseError, Source
+from magshell_fenicsx.runs.rows import columns, rows
+from magshell_fenicsx.runs.run import run
+from magshell_fenicsx.runs.snaps import snaps
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.trace import trace
 

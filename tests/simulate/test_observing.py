@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.source import Source
+from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.scene import Scene

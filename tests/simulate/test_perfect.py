@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.imperfections.modes import ModesSection
-from magshell_fenicsx.case.source import CaseError, Source
-from magshell_fenicsx.plan.imperfections.modes import Round
-from magshell_fenicsx.plan.imperfections.registered import flaws
-from magshell_fenicsx.plan.outline import outline
-from magshell_fenicsx.run.run import run
+from magshell_fenicsx.input.source import CaseError, Source
+from magshell_fenicsx.parts.imperfections.modes import Round
+from magshell_fenicsx.parts.imperfections.registered import flaws
+from magshell_fenicsx.runs.run import run
+from magshell_fenicsx.shape.outline import outline
 from magshell_fenicsx.simulate.perfect import perfect_modes, with_modes
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.shape_sensitivity import changed

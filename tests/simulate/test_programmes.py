@@ -15,8 +15,8 @@ from petsc4py import PETSc
 
 from magshell_fenicsx import Record, columns, run
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.source import CaseError, Source
 from magshell_fenicsx.continuation.system import State
+from magshell_fenicsx.input.source import CaseError, Source
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.steps import stage_of

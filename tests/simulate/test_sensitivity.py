@@ -12,7 +12,7 @@ from magshell_fenicsx.continuation.fold import Fold, Guess, find_fold
 from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.shell.patterns import WithinRims
-from magshell_fenicsx.run.run import run
+from magshell_fenicsx.runs.run import run
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.sensitivity import sensitivities
 

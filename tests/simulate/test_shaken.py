@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from test_in_time import BEAM, STRIP, case_of, columns_of
 
-from magshell_fenicsx.case.source import CaseError
+from magshell_fenicsx.input.source import CaseError
 
 LIFT = {"kind": "edge", "name": "lift", "moves": [{"supports": ["root"], "translation": [0, 0, 1]}]}
 SHAKEN = STRIP | {"mesh": {"degree": 2, "size": 0.5}, "points": {"tip": [1, 0, 0]}}

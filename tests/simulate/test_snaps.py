@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from magshell_fenicsx import Case, Scene
-from magshell_fenicsx.case.source import CaseError, Source
 from magshell_fenicsx.continuation.point import Point
-from magshell_fenicsx.run.interrupt import Interrupted
-from magshell_fenicsx.run.rows import columns, rows
-from magshell_fenicsx.run.snaps import snaps
+from magshell_fenicsx.input.source import CaseError, Source
+from magshell_fenicsx.runs.interrupt import Interrupted
+from magshell_fenicsx.runs.rows import columns, rows
+from magshell_fenicsx.runs.snaps import snaps
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.trace import trace
 

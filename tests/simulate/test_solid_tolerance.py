@@ -6,7 +6,7 @@ import pytest
 from mpi4py import MPI
 
 from magshell_fenicsx import Case
-from magshell_fenicsx.case.source import Source
+from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.simulate.adapt.choice import Adapted
 from magshell_fenicsx.simulate.adapt.ending import by_path
 from magshell_fenicsx.simulate.adapt.tolerance import adapted

@@ -16,8 +16,8 @@ from conftest import CASES
 from mpi4py import MPI
 
 from magshell_fenicsx import Case, CaseError
-from magshell_fenicsx.case.source import Source
-from magshell_fenicsx.run.run import run
+from magshell_fenicsx.input.source import Source
+from magshell_fenicsx.runs.run import run
 from magshell_fenicsx.simulate.adapt.carry import CellFields, NotCarried, carry
 from magshell_fenicsx.simulate.adapt.choice import Adapted, Choice
 from magshell_fenicsx.simulate.adapt.ending import NoResult, by_path, from_near

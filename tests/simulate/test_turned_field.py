@@ -8,9 +8,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import magshell_fenicsx as ms
-from magshell_fenicsx.case.source import Source
 from magshell_fenicsx.continuation.system import State
-from magshell_fenicsx.simulate.direction import field_at
+from magshell_fenicsx.input.source import Source
+from magshell_fenicsx.parts.magnetism.direction import field_at
 
 G = [[0.3, 0.2, 0.0], [0.2, 0.5, -0.4], [0.0, -0.4, -0.8]]
 DISC = {"geometry": "disc", "radius_to_thickness": 20, "poisson_ratio": 0.3}

@@ -5,9 +5,9 @@ import pytest
 from scipy.interpolate import CubicSpline
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.source import Source
 from magshell_fenicsx.continuation.control import GivenLoad
 from magshell_fenicsx.continuation.system import State
+from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.scene import Scene

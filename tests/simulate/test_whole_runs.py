@@ -8,9 +8,9 @@ import pytest
 import yaml
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.source import CaseError, Source, override
-from magshell_fenicsx.parts.section import si_size
-from magshell_fenicsx.plan.planner import make_plan
+from magshell_fenicsx.input.section import si_size
+from magshell_fenicsx.input.source import CaseError, Source, override
+from magshell_fenicsx.problem.planner import make_plan
 from magshell_fenicsx.simulate.adapt.ending import History
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.gradients.adjoint import Adjoint

@@ -8,7 +8,7 @@ import pytest
 from command import magshell
 from conftest import CASES
 
-from magshell_fenicsx.case.source import CaseError
+from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.studies.compare.compare import compare
 
 CASE = CASES / "solid_buckling.yaml"

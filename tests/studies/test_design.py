@@ -16,10 +16,10 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.controls import read_vectors
-from magshell_fenicsx.case.source import read_source
+from magshell_fenicsx.input.controls import read_vectors
+from magshell_fenicsx.input.source import read_source
 from magshell_fenicsx.models.shell.controls import Controls
-from magshell_fenicsx.run.run import run
+from magshell_fenicsx.runs.run import run
 from magshell_fenicsx.simulate.standing import Standing
 from magshell_fenicsx.studies.design.design import design
 from magshell_fenicsx.studies.design.evaluate import Evaluation, evaluate

@@ -12,9 +12,9 @@ from conftest import CASES
 from interrupted import kill, start, wait_until
 
 from magshell_fenicsx import CaseError
-from magshell_fenicsx.case.source import override, read_source
 from magshell_fenicsx.continuation.fold import FoldLost
-from magshell_fenicsx.run.run import run
+from magshell_fenicsx.input.source import override, read_source
+from magshell_fenicsx.runs.run import run
 from magshell_fenicsx.studies.ensemble import ensemble as module
 from magshell_fenicsx.studies.ensemble import solve as solving
 from magshell_fenicsx.studies.ensemble.known import KnownFolds

@@ -10,7 +10,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.source import read_source
+from magshell_fenicsx.input.source import read_source
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.standing import Standing

@@ -15,14 +15,14 @@ from test_sweep import plate
 
 import magshell_fenicsx
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.source import CaseError
+from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.output.store import checkpoint
 from magshell_fenicsx.output.store.known import GROUPS, PHASES
 from magshell_fenicsx.output.store.table import COLUMNS, TEXTS
 from magshell_fenicsx.output.store.written import MESH
 from magshell_fenicsx.platform import sources
-from magshell_fenicsx.run.files import AlreadyComplete
-from magshell_fenicsx.run.run import run
+from magshell_fenicsx.runs.files import AlreadyComplete
+from magshell_fenicsx.runs.run import run
 from magshell_fenicsx.studies.compare import runs
 from magshell_fenicsx.studies.study import sample
 from magshell_fenicsx.studies.study.measure import Usage

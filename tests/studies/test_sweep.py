@@ -13,9 +13,9 @@ from figures import figures
 from figures.figures import FIGURES
 
 from magshell_fenicsx import CaseError
-from magshell_fenicsx.case.source import read_source
-from magshell_fenicsx.parts.section import number_and_unit
-from magshell_fenicsx.run.run import run
+from magshell_fenicsx.input.section import number_and_unit
+from magshell_fenicsx.input.source import read_source
+from magshell_fenicsx.runs.run import run
 from magshell_fenicsx.studies.sweep import axes as axes_module
 from magshell_fenicsx.studies.sweep import chain, sweep_plot
 from magshell_fenicsx.studies.sweep import sweep as module

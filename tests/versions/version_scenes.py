@@ -15,9 +15,9 @@ from magshell_fenicsx import Case
 from magshell_fenicsx.mesh.msh import MeshFile, read_msh
 from magshell_fenicsx.mesh.patch import PatchMesh
 from magshell_fenicsx.models.modes import ShellModes
-from magshell_fenicsx.plan.plan import Plan
-from magshell_fenicsx.plan.planner import make_plan
 from magshell_fenicsx.platform.environment import versions
+from magshell_fenicsx.problem.planner import make_plan
+from magshell_fenicsx.problem.problem import Plan
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.scene import Scene

@@ -4,7 +4,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from magshell_fenicsx.case.bodies.body import Axis, BodySection, Size
+from magshell_fenicsx.parts.bodies.body import Axis, BodySection, Size
 
 
 class BoxSection(BodySection):

@@ -2,7 +2,7 @@
 
 from typing import Literal
 
-from magshell_fenicsx.case.bodies.body import Axis, BodySection, Size
+from magshell_fenicsx.parts.bodies.body import Axis, BodySection, Size
 
 
 class CylinderSection(BodySection):

@@ -2,7 +2,7 @@
 
 from typing import Literal
 
-from magshell_fenicsx.case.bodies.body import BodySection
+from magshell_fenicsx.parts.bodies.body import BodySection
 
 
 class PlaneSection(BodySection):

@@ -9,7 +9,7 @@ from magshell_fenicsx.case.bodies.cylinder import CylinderSection
 from magshell_fenicsx.case.bodies.plane import PlaneSection
 from magshell_fenicsx.case.bodies.rod import RodSection
 from magshell_fenicsx.case.bodies.sphere import SphereSection
-from magshell_fenicsx.parts.chosen import Chosen
+from magshell_fenicsx.input.chosen import Chosen
 
 Body = Annotated[PlaneSection | SphereSection | CylinderSection | RodSection | BoxSection, Chosen("kind")]
 Bodies = Annotated[dict[str, Body], Field(max_length=100)]

@@ -4,7 +4,7 @@ from typing import Literal, Self
 
 from pydantic import model_validator
 
-from magshell_fenicsx.case.bodies.body import BodySection, Size
+from magshell_fenicsx.parts.bodies.body import BodySection, Size
 
 
 class RodSection(BodySection):

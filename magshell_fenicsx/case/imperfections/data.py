@@ -4,9 +4,9 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from magshell_fenicsx.case.file import FileKeys
-from magshell_fenicsx.case.imperfections.place import ImperfectionSection
-from magshell_fenicsx.case.imperfections.sized import over
+from magshell_fenicsx.input.file import FileKeys
+from magshell_fenicsx.parts.imperfections.place import ImperfectionSection
+from magshell_fenicsx.parts.imperfections.sized import over
 
 
 class DataSection(FileKeys, ImperfectionSection):

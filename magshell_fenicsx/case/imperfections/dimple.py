@@ -3,7 +3,7 @@
 from math import pi, sqrt
 from typing import Literal
 
-from magshell_fenicsx.case.imperfections.place import LocalSection
+from magshell_fenicsx.parts.imperfections.place import LocalSection
 
 
 class DimpleSection(LocalSection):

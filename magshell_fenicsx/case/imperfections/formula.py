@@ -4,8 +4,8 @@ from typing import Literal
 
 from pydantic import Field
 
-from magshell_fenicsx.case.expressions import Formula
-from magshell_fenicsx.case.imperfections.place import ImperfectionSection
+from magshell_fenicsx.input.expressions import Formula
+from magshell_fenicsx.parts.imperfections.place import ImperfectionSection
 
 
 class FormulaSection(ImperfectionSection):

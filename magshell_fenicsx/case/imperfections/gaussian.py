@@ -4,7 +4,7 @@ from math import exp, sqrt
 from typing import Literal
 
 from magshell_fenicsx.case.imperfections.dimple import refuse_steep
-from magshell_fenicsx.case.imperfections.place import LocalSection
+from magshell_fenicsx.parts.imperfections.place import LocalSection
 
 
 class GaussianSection(LocalSection):

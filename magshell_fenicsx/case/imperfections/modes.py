@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, PrivateAttr, model_validator
 
-from magshell_fenicsx.case.file import FileKeys
-from magshell_fenicsx.case.imperfections.place import ImperfectionSection
-from magshell_fenicsx.case.imperfections.sized import over
+from magshell_fenicsx.input.file import FileKeys
+from magshell_fenicsx.parts.imperfections.place import ImperfectionSection
+from magshell_fenicsx.parts.imperfections.sized import over
 
 Shape = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 

@@ -9,8 +9,8 @@ from pydantic import Field, PrivateAttr, ValidationError, ValidationInfo, model_
 from magshell_fenicsx.case.ensemble import DefectsSection, generator
 from magshell_fenicsx.case.imperfections.dimple import DimpleSection
 from magshell_fenicsx.case.imperfections.gaussian import GaussianSection
-from magshell_fenicsx.case.imperfections.place import ImperfectionSection
-from magshell_fenicsx.case.imperfections.sized import half_width, over, sizes_noted
+from magshell_fenicsx.parts.imperfections.place import ImperfectionSection
+from magshell_fenicsx.parts.imperfections.sized import half_width, over, sizes_noted
 
 
 class RandomSection(ImperfectionSection):

@@ -10,7 +10,7 @@ from magshell_fenicsx.case.imperfections.formula import FormulaSection
 from magshell_fenicsx.case.imperfections.gaussian import GaussianSection
 from magshell_fenicsx.case.imperfections.modes import ModesSection
 from magshell_fenicsx.case.imperfections.random import RandomSection
-from magshell_fenicsx.parts.chosen import Chosen
+from magshell_fenicsx.input.chosen import Chosen
 
 Imperfection = Annotated[
     DimpleSection | GaussianSection | FormulaSection | DataSection | ModesSection | RandomSection,

@@ -4,7 +4,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from magshell_fenicsx.case.sources.source import Current, Position, Size, SourceSection
+from magshell_fenicsx.parts.magnetism.sources.source import Current, Position, Size, SourceSection
 
 
 class CoilSection(SourceSection):

@@ -4,7 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from magshell_fenicsx.case.sources.source import MagnetSection, Size
+from magshell_fenicsx.parts.magnetism.sources.source import MagnetSection, Size
 
 
 class CuboidSection(MagnetSection):

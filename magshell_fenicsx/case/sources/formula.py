@@ -4,9 +4,9 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from magshell_fenicsx.case.expressions import Formula
-from magshell_fenicsx.case.sources.source import SourceSection
-from magshell_fenicsx.parts.section import FluxDensity
+from magshell_fenicsx.input.expressions import Formula
+from magshell_fenicsx.input.section import FluxDensity
+from magshell_fenicsx.parts.magnetism.sources.source import SourceSection
 
 
 class FormulaSource(SourceSection):

@@ -2,8 +2,8 @@
 
 from typing import Literal
 
-from magshell_fenicsx.case.file import FileKeys
-from magshell_fenicsx.case.sources.source import SourceSection
+from magshell_fenicsx.input.file import FileKeys
+from magshell_fenicsx.parts.magnetism.sources.source import SourceSection
 
 
 class GridSection(FileKeys, SourceSection):

@@ -11,7 +11,7 @@ from magshell_fenicsx.case.sources.formula import FormulaSource
 from magshell_fenicsx.case.sources.grid import GridSection
 from magshell_fenicsx.case.sources.ring import RingSection
 from magshell_fenicsx.case.sources.sphere import SphereSection
-from magshell_fenicsx.parts.chosen import Chosen
+from magshell_fenicsx.input.chosen import Chosen
 
 Source = Annotated[
     CylinderSection | CuboidSection | SphereSection | RingSection | CoilSection | GridSection | FormulaSource,

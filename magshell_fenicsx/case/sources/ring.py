@@ -4,7 +4,7 @@ from typing import Literal, Self
 
 from pydantic import model_validator
 
-from magshell_fenicsx.case.sources.source import MagnetSection, Size
+from magshell_fenicsx.parts.magnetism.sources.source import MagnetSection, Size
 
 
 class RingSection(MagnetSection):

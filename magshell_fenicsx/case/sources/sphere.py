@@ -2,7 +2,7 @@
 
 from typing import Literal
 
-from magshell_fenicsx.case.sources.source import MagnetSection, Size
+from magshell_fenicsx.parts.magnetism.sources.source import MagnetSection, Size
 
 
 class SphereSection(MagnetSection):

@@ -18,16 +18,16 @@ from magshell_fenicsx.models.axisymmetric.meridian import Meridian
 from magshell_fenicsx.models.axisymmetric.pattern import pattern_field
 from magshell_fenicsx.models.shell import densities, edges
 from magshell_fenicsx.models.shell import kinematics as kin
-from magshell_fenicsx.models.shell.applied import AppliedField
-from magshell_fenicsx.models.shell.contact import Contact, Pressing, contact_energy, contact_pressure, pressed_radius
 from magshell_fenicsx.models.shell.densities import MagneticDensity
 from magshell_fenicsx.models.shell.energy import Density
 from magshell_fenicsx.models.shell.free import Constants, constants_of
 from magshell_fenicsx.models.shell.kinematics import Jet
-from magshell_fenicsx.models.shell.laws import FULL, LINEAR, magnetic_densities
-from magshell_fenicsx.models.shell.natural import Forms, Shape
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.parameters import Magnetisation, Material
+from magshell_fenicsx.parts.bodies.contact import Contact, Pressing, contact_energy, contact_pressure, pressed_radius
+from magshell_fenicsx.parts.magnetism.applied import AppliedField
+from magshell_fenicsx.parts.magnetism.laws import FULL, LINEAR, magnetic_densities
+from magshell_fenicsx.parts.natural.shape import Forms, Shape
 
 INTERIOR = "interior edges"
 CONTACT = 6  # degree of the rule of a contact over that of the displacement: points are cheap on a meridian

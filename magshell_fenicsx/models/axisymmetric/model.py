@@ -20,24 +20,24 @@ from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.assembly.terms import Counted, FormTerm
 from magshell_fenicsx.continuation.system import Vector
 from magshell_fenicsx.models.axisymmetric import jets
-from magshell_fenicsx.models.axisymmetric.dead_load import dead_loads, pole_force
 from magshell_fenicsx.models.axisymmetric.energies import INTERIOR, Energy, EnergyFactory
 from magshell_fenicsx.models.axisymmetric.instability import ExcludedWaves
 from magshell_fenicsx.models.axisymmetric.meridian import Meridian
 from magshell_fenicsx.models.axisymmetric.pattern import thickness_field
 from magshell_fenicsx.models.axisymmetric.probe import Array, Probe
-from magshell_fenicsx.models.axisymmetric.supports import openings, supports
 from magshell_fenicsx.models.axisymmetric.waves import Waves
 from magshell_fenicsx.models.observed import Observed
 from magshell_fenicsx.models.shell import edges
-from magshell_fenicsx.models.shell.driving import field_parameters
 from magshell_fenicsx.models.shell.energy import Density
-from magshell_fenicsx.models.shell.moved import PRESSURE, Support, enclosed, motions_of, moving, rotation_of
-from magshell_fenicsx.models.shell.natural import Shape, natural_field
 from magshell_fenicsx.models.shell.parameters import Condition, EdgeMoment, Loads, Material, Potential, default_penalty
 from magshell_fenicsx.models.shell.patterns import cells_of
-from magshell_fenicsx.models.shell.supports import held_on
 from magshell_fenicsx.models.shell.thickness import Thickness
+from magshell_fenicsx.parts.forces.on_meridian import dead_loads, pole_force
+from magshell_fenicsx.parts.magnetism.driving import field_parameters
+from magshell_fenicsx.parts.natural.shape import Shape, natural_field
+from magshell_fenicsx.parts.supports.moved import PRESSURE, Support, enclosed, motions_of, moving, rotation_of
+from magshell_fenicsx.parts.supports.on_meridian import openings, supports
+from magshell_fenicsx.parts.supports.supports import held_on
 
 
 class MeridianModel(Observed):

@@ -28,7 +28,7 @@ from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.models.axisymmetric import jets
 from magshell_fenicsx.models.axisymmetric.energies import INTERIOR, Energy
 from magshell_fenicsx.models.axisymmetric.meridian import Meridian
-from magshell_fenicsx.models.axisymmetric.supports import Supports
+from magshell_fenicsx.parts.supports.on_meridian import Supports
 from magshell_fenicsx.platform import compat
 
 DEGREE = 4  # of the matrix of a wave as a polynomial in m

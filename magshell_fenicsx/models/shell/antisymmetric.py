@@ -19,7 +19,7 @@ from magshell_fenicsx.models.shell import densities
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.edges import edge_density
 from magshell_fenicsx.models.shell.kinematics import Jet
-from magshell_fenicsx.models.shell.natural import Forms
+from magshell_fenicsx.parts.natural.shape import Forms
 
 
 def antisymmetric_edge(

@@ -10,9 +10,9 @@ import ufl
 from ufl.core.expr import Expr
 
 from magshell_fenicsx.models.shell import kinematics as kin
-from magshell_fenicsx.models.shell.applied import around
 from magshell_fenicsx.models.shell.kinematics import Jet
-from magshell_fenicsx.models.shell.natural import Forms
+from magshell_fenicsx.parts.magnetism.applied import around
+from magshell_fenicsx.parts.natural.shape import Forms
 
 MagneticDensity = Callable[[Jet, Jet, Expr, Expr], Expr]  # of (r0, u, Br, Ba)
 

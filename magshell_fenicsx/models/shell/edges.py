@@ -17,7 +17,7 @@ from ufl.core.expr import Expr
 from magshell_fenicsx.models.shell import densities
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.kinematics import Jet
-from magshell_fenicsx.models.shell.natural import Forms
+from magshell_fenicsx.parts.natural.shape import Forms
 
 Sides = tuple[Jet, Jet]
 Shapes = tuple[Forms, Forms]

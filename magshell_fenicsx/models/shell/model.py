@@ -23,15 +23,10 @@ from magshell_fenicsx.mesh.midsurface import Midsurface
 from magshell_fenicsx.mesh.mirror import Y0, Mirror
 from magshell_fenicsx.models.observed import Observed
 from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes
-from magshell_fenicsx.models.shell.dead_load import SurfaceMeasures, assemble_dead_loads
-from magshell_fenicsx.models.shell.driving import field_parameters
 from magshell_fenicsx.models.shell.energy import ShellTerm
 from magshell_fenicsx.models.shell.fast_tangent import FastTangent, make_sites
 from magshell_fenicsx.models.shell.folds import FOLD, largest_fold
 from magshell_fenicsx.models.shell.gradients import PointTerm
-from magshell_fenicsx.models.shell.moved import Support, enclosed, motions_of, moving, pressed_edges, rotation_of
-from magshell_fenicsx.models.shell.natural import Shape, natural_field
-from magshell_fenicsx.models.shell.openings import openings
 from magshell_fenicsx.models.shell.parameters import (
     Condition,
     EdgeMoment,
@@ -43,11 +38,18 @@ from magshell_fenicsx.models.shell.parameters import (
     default_penalty,
 )
 from magshell_fenicsx.models.shell.patterns import by_patch, cells_of
-from magshell_fenicsx.models.shell.point_load import patch_entries, point_entries, vertex_normal
 from magshell_fenicsx.models.shell.residual import FastResidual, renew
 from magshell_fenicsx.models.shell.sites import Site
 from magshell_fenicsx.models.shell.slopes import point_parameters
-from magshell_fenicsx.models.shell.supports import (
+from magshell_fenicsx.models.shell.terms import TermFactory
+from magshell_fenicsx.models.shell.thickness import Thickness, thickness_field
+from magshell_fenicsx.parts.forces.dead_load import SurfaceMeasures, assemble_dead_loads
+from magshell_fenicsx.parts.forces.point_load import patch_entries, point_entries, vertex_normal
+from magshell_fenicsx.parts.magnetism.driving import field_parameters
+from magshell_fenicsx.parts.natural.shape import Shape, natural_field
+from magshell_fenicsx.parts.pressure.openings import openings
+from magshell_fenicsx.parts.supports.moved import Support, enclosed, motions_of, moving, pressed_edges, rotation_of
+from magshell_fenicsx.parts.supports.supports import (
     closing_point,
     held_at_vertex,
     held_on,
@@ -55,8 +57,6 @@ from magshell_fenicsx.models.shell.supports import (
     put_in_plane,
     refuse_unknown,
 )
-from magshell_fenicsx.models.shell.terms import TermFactory
-from magshell_fenicsx.models.shell.thickness import Thickness, thickness_field
 
 
 class ShellModel(Observed):

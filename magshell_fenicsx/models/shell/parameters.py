@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.motion import Motion
 from magshell_fenicsx.mesh.deviation import Deviation
-from magshell_fenicsx.models.shell.contact import Contact
-from magshell_fenicsx.models.shell.driven import Driven, FieldInSpace
-from magshell_fenicsx.models.shell.natural import Natural
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.patterns import Pattern
+from magshell_fenicsx.parts.bodies.contact import Contact
+from magshell_fenicsx.parts.magnetism.driven import Driven, FieldInSpace
+from magshell_fenicsx.parts.natural.shape import Natural
 
 
 @dataclass(frozen=True)

@@ -13,15 +13,6 @@ from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.models.shell import densities, edges
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.antisymmetric import antisymmetric_edge
-from magshell_fenicsx.models.shell.applied import AppliedField
-from magshell_fenicsx.models.shell.contact import (
-    Contact,
-    Pressing,
-    contact_energy,
-    contact_pressure,
-    contact_quadrature,
-    pressed_radius,
-)
 from magshell_fenicsx.models.shell.energy import (
     Density,
     HessianTerm,
@@ -34,12 +25,21 @@ from magshell_fenicsx.models.shell.energy import (
 )
 from magshell_fenicsx.models.shell.free import Constants, constants_of
 from magshell_fenicsx.models.shell.kinematics import CURVED, MOVED, SECOND, Jet
-from magshell_fenicsx.models.shell.laws import FULL, LINEAR, magnetic_densities
-from magshell_fenicsx.models.shell.natural import Shape, grown
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.parameters import ACROSS, Magnetisation, Material
 from magshell_fenicsx.models.shell.patterns import pattern_field
 from magshell_fenicsx.models.shell.thickness import thick
+from magshell_fenicsx.parts.bodies.contact import (
+    Contact,
+    Pressing,
+    contact_energy,
+    contact_pressure,
+    contact_quadrature,
+    pressed_radius,
+)
+from magshell_fenicsx.parts.magnetism.applied import AppliedField
+from magshell_fenicsx.parts.magnetism.laws import FULL, LINEAR, magnetic_densities
+from magshell_fenicsx.parts.natural.shape import Shape, grown
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ the undeformed outward normal of the mid-surface and t the edge's tangent, which
 import ufl
 from ufl.core.expr import Expr
 
-from magshell_fenicsx.models.shell.applied import around
+from magshell_fenicsx.parts.magnetism.applied import around
 
 
 def distortion(X: Expr, u: Expr, H: Expr, shear: Expr, h: Expr, growth: Expr | None = None) -> Expr:

@@ -22,20 +22,20 @@ from magshell_fenicsx.mesh.hexahedra import MIDDLE, OUTER, Body, quadratic
 from magshell_fenicsx.mesh.mirror import Y0, Mirror
 from magshell_fenicsx.models.observed import Observed
 from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes
-from magshell_fenicsx.models.shell.dead_load import assemble_dead_loads
-from magshell_fenicsx.models.shell.driving import field_parameters
 from magshell_fenicsx.models.shell.fast_tangent import FastTangent
-from magshell_fenicsx.models.shell.moved import enclosed, motions_of, moving, pressed_edges
-from magshell_fenicsx.models.shell.openings import openings
 from magshell_fenicsx.models.shell.parameters import Condition, EdgeMoment, Loads, Material, Potential
-from magshell_fenicsx.models.shell.supports import closing_point
-from magshell_fenicsx.models.solid.loads import BodyMeasures, outer_patch
 from magshell_fenicsx.models.solid.material import NeoHookean
-from magshell_fenicsx.models.solid.natural import body_shape, grown
-from magshell_fenicsx.models.solid.remanence import in_cells
 from magshell_fenicsx.models.solid.sites import make_sites
-from magshell_fenicsx.models.solid.supports import ROUNDING, in_middle, supports
 from magshell_fenicsx.models.solid.terms import Density, TermFactory
+from magshell_fenicsx.parts.forces.dead_load import assemble_dead_loads
+from magshell_fenicsx.parts.forces.on_body import BodyMeasures, outer_patch
+from magshell_fenicsx.parts.magnetism.driving import field_parameters
+from magshell_fenicsx.parts.magnetism.remanence import in_cells
+from magshell_fenicsx.parts.natural.on_body import body_shape, grown
+from magshell_fenicsx.parts.pressure.openings import openings
+from magshell_fenicsx.parts.supports.moved import enclosed, motions_of, moving, pressed_edges
+from magshell_fenicsx.parts.supports.on_body import ROUNDING, in_middle, supports
+from magshell_fenicsx.parts.supports.supports import closing_point
 
 Array = NDArray[np.float64]
 MIRRORS = ("symmetry", "plane")

@@ -14,15 +14,16 @@ from ufl.core.expr import Expr
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.terms import Counted, DensityTerm
 from magshell_fenicsx.mesh.hexahedra import MIDDLE, OUTER, Body
-from magshell_fenicsx.models.shell.applied import AppliedField
 from magshell_fenicsx.models.shell.energy import per_area
 from magshell_fenicsx.models.shell.free import Constants, constants_of
 from magshell_fenicsx.models.shell.kinematics import SECOND, Jet
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.parameters import ACROSS, Magnetisation
-from magshell_fenicsx.models.solid import densities, rotation_law
+from magshell_fenicsx.models.solid import densities
 from magshell_fenicsx.models.solid.material import NeoHookean
-from magshell_fenicsx.models.solid.remanence import remanence_field
+from magshell_fenicsx.parts.magnetism import rotation_on_body as rotation_law
+from magshell_fenicsx.parts.magnetism.applied import AppliedField
+from magshell_fenicsx.parts.magnetism.remanence import remanence_field
 
 WHOLE, REDUCED = 5, 3  # quadrature degrees: three and two points in each direction
 VALUE, GRADIENT, ON_FACE = (0,), (1, 2, 3), (0, 1, 2)  # parts of a displacement's jet: value, reference derivatives

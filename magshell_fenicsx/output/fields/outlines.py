@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.models.shell.driven import carried
 from magshell_fenicsx.models.shell.parameters import Loads
 from magshell_fenicsx.output.store.durable import Damaged
+from magshell_fenicsx.parts.magnetism.driven import carried
 
 Array = NDArray[np.float64]
 ARRAY = re.compile(r'Name="(\w+)" [^>]*>([^<]*)</DataArray>')  # in the files of `vtp_content`

@@ -5,11 +5,11 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.models.shell.contact import Contact
 from magshell_fenicsx.models.shell.parameters import ACROSS, Magnetisation, Material
 from magshell_fenicsx.models.shell.patterns import inside
 from magshell_fenicsx.models.shell.strains import TangentFrame
 from magshell_fenicsx.output.fields.interpretation import SurfaceGeometry, Torque, magnetic_loads
+from magshell_fenicsx.parts.bodies.contact import Contact
 
 Array = NDArray[np.float64]
 

@@ -5,9 +5,9 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.models.shell.natural import CURVATURE, STRETCH, Natural
 from magshell_fenicsx.models.shell.parameters import Material
 from magshell_fenicsx.models.shell.strains import NaturalFrame, TangentFrame, bending_moment, principal
+from magshell_fenicsx.parts.natural.shape import CURVATURE, STRETCH, Natural
 
 Array = NDArray[np.float64]
 

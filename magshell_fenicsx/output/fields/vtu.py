@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.case.source import CaseError
+from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.output.fields.outlines import vtp_content
 from magshell_fenicsx.output.fields.surface import LAGRANGE_HEXAHEDRON, LAGRANGE_TRIANGLE, TRIANGLE, Surface
 from magshell_fenicsx.output.store.durable import Damaged, write_whole

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from magshell_fenicsx.case.source import CaseError
+from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.output.fields.frequencies import read_frequencies
 from magshell_fenicsx.output.fields.gradients import gradient_files
 from magshell_fenicsx.output.fields.point_file import read_point

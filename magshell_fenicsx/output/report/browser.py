@@ -3,7 +3,7 @@
 import webbrowser
 from pathlib import Path
 
-from magshell_fenicsx.case.source import CaseError
+from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.output.report.report import NAME, write_report
 
 

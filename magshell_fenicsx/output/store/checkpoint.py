@@ -14,9 +14,9 @@ from dolfinx import fem
 from mpi4py import MPI
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.continuation.point import Point
 from magshell_fenicsx.continuation.system import State
+from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.output.store.durable import AppendedFile, Damaged, open_result
 from magshell_fenicsx.output.store.folder import by_first
 from magshell_fenicsx.output.store.framing import framed, read_frame

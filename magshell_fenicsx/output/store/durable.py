@@ -7,7 +7,7 @@ from errno import EFBIG, EINVAL, EISDIR
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from magshell_fenicsx.case.source import CaseError
+from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.platform.reading import open_regular, read_whole
 
 

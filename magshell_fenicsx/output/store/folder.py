@@ -10,7 +10,7 @@ from typing import Any, Literal, TypeVar
 
 from mpi4py import MPI
 
-from magshell_fenicsx.case.source import CaseError
+from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.platform.first import from_first
 from magshell_fenicsx.platform.reading import read_whole
 

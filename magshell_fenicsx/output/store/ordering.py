@@ -6,8 +6,8 @@ from dolfinx import fem
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.continuation.system import Vector
+from magshell_fenicsx.input.source import CaseError
 
 Array = NDArray[np.float64]
 CLOSE = 1e-9  # nodes at a smaller distance, over the mesh's size, are equal

@@ -9,8 +9,8 @@ from mpi4py import MPI
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.solid import SolidSection
-from magshell_fenicsx.plan.plan import Plan
-from magshell_fenicsx.plan.planner import make_plan
+from magshell_fenicsx.problem.planner import make_plan
+from magshell_fenicsx.problem.problem import Plan
 from magshell_fenicsx.simulate.adapt.size import Sampled
 from magshell_fenicsx.simulate.scene import Scene
 

@@ -17,9 +17,9 @@ import numpy as np
 from mpi4py import MPI
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.source import CaseError
+from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.grid import Grid
-from magshell_fenicsx.plan.limits import refuse_beyond_memory
+from magshell_fenicsx.problem.limits import refuse_beyond_memory
 from magshell_fenicsx.simulate.adapt.choice import Adapted, Choice, Round
 from magshell_fenicsx.simulate.adapt.ending import Ending, NoResult, by_path, from_near
 from magshell_fenicsx.simulate.adapt.indicator import indicators

@@ -10,7 +10,7 @@ with the conjugates q_i that the probing holds: they are those of its begin, whe
 import numpy as np
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.source import CaseError
+from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.simulate.barrier import barrier
 from magshell_fenicsx.simulate.gradients.adjoint import NONE, Adjoint, Begins, Place, held_at, solved, with_begins
 from magshell_fenicsx.simulate.record import Record

@@ -5,11 +5,11 @@ from types import SimpleNamespace
 import numpy as np
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.surfaces import MeshSurface
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.models.shell.parameters import ACROSS, EdgeMoment, Potential
-from magshell_fenicsx.plan.plan import Plan
-from magshell_fenicsx.plan.planner import make_plan
+from magshell_fenicsx.problem.planner import make_plan
+from magshell_fenicsx.problem.problem import Plan
+from magshell_fenicsx.shape.sections import MeshSurface
 from magshell_fenicsx.simulate.gradients.mass import MASS
 from magshell_fenicsx.simulate.gradients.results import refuse_no_result
 from magshell_fenicsx.simulate.numbers import refuse_unknown_parameters

@@ -17,20 +17,20 @@ from numpy.typing import NDArray
 from magshell_fenicsx.assembly.field_derivative import FieldGradient, Share
 from magshell_fenicsx.assembly.field_derivative import by_field as summed
 from magshell_fenicsx.assembly.terms import FormTerm, Term, factor_of
-from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.continuation.system import State
+from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.deviation import Deviated
 from magshell_fenicsx.models.axisymmetric import pattern as of_meridian
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.shell import patterns
 from magshell_fenicsx.models.shell.model import ShellModel
-from magshell_fenicsx.models.shell.natural import Natural
 from magshell_fenicsx.models.shell.patterns import Uniform
 from magshell_fenicsx.models.shell.slopes import Slope
 from magshell_fenicsx.models.shell.thickness import Thickness
-from magshell_fenicsx.models.solid import remanence as of_body
 from magshell_fenicsx.models.solid.model import SolidModel
-from magshell_fenicsx.plan.natural import frame
+from magshell_fenicsx.parts.magnetism import remanence as of_body
+from magshell_fenicsx.parts.natural.planned import frame
+from magshell_fenicsx.parts.natural.shape import Natural
 from magshell_fenicsx.simulate.gradients.adjoint import Adjoint, Place, along
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.sensitivity import magnetic_terms

@@ -5,8 +5,8 @@ from dataclasses import replace
 from typing import TypeAlias
 
 from magshell_fenicsx.assembly.field_derivative import FieldGradient
-from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.continuation.fold import Fold
+from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.simulate.adapt.ending import History
 from magshell_fenicsx.simulate.gradients.adjoint import Adjoint, adjoint_of_instability
 from magshell_fenicsx.simulate.gradients.fields import FIELDS, by_field

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import replace
 
-from magshell_fenicsx.case.source import CaseError
+from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.quantities import registry as quantities
 from magshell_fenicsx.simulate.gradients.adjoint import NONE, Adjoint, Begins, adjoint_of_instability
 from magshell_fenicsx.simulate.record import Record

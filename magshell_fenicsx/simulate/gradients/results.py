@@ -2,7 +2,8 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 
-from magshell_fenicsx.case.source import CaseError
+from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.parts.bodies.touch import rigid
 from magshell_fenicsx.simulate.adapt.ending import History
 from magshell_fenicsx.simulate.gradients.adjoint import Adjoint, adjoint
 from magshell_fenicsx.simulate.gradients.barriers import BARRIER, adjoint_of_barrier, refuse_no_barrier
@@ -17,7 +18,6 @@ from magshell_fenicsx.simulate.gradients.vibration import (
 )
 from magshell_fenicsx.simulate.results import Target, differentiable
 from magshell_fenicsx.simulate.scene import Scene
-from magshell_fenicsx.simulate.touch import rigid
 
 
 def refuse_no_result(scene: Scene, results: Iterable[str], key: str, *, more: Sequence[str] = ()) -> None:

@@ -3,9 +3,9 @@
 from collections.abc import Callable
 
 from magshell_fenicsx.assembly.terms import factor_of
-from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.case.units import sizes_of
 from magshell_fenicsx.continuation.system import State, dot
+from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.simulate.gradients.adjoint import Adjoint, Place, along, by_load
 from magshell_fenicsx.simulate.numbers import carried, goals, number_of, scene_with, with_number
 from magshell_fenicsx.simulate.scene import Scene

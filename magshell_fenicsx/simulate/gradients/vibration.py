@@ -22,11 +22,12 @@ import numpy as np
 
 from magshell_fenicsx.assembly.problem import CENTRAL
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.source import CaseError
 from magshell_fenicsx.continuation.modes import ModesNotFound
 from magshell_fenicsx.continuation.system import State, dot, symmetric_part
+from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.modes import TORSION, ShellMode, ShellModes
+from magshell_fenicsx.parts.bodies.touch import rigid, touching
 from magshell_fenicsx.simulate.gradients.adjoint import (
     NONE,
     WAVE,
@@ -45,7 +46,6 @@ from magshell_fenicsx.simulate.gradients.instabilities import Lost
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.results import Functional
 from magshell_fenicsx.simulate.scene import Scene
-from magshell_fenicsx.simulate.touch import rigid, touching
 
 FIRST = ("omega2_1", "hertz_1")
 NAMES = re.compile(r"(omega2|hertz)_([1-9]\d?)")

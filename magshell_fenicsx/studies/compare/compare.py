@@ -10,11 +10,11 @@ from typing import Any
 from mpi4py import MPI
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.loads.field import FieldBefore, RotationSection
-from magshell_fenicsx.case.loads.time import TimeSection
-from magshell_fenicsx.case.source import CaseError
+from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.output.store.durable import write_whole
 from magshell_fenicsx.output.store.folder import by_first, given_folder, held_folder, refuse_others
+from magshell_fenicsx.parts.magnetism.field_step import FieldBefore, RotationSection
+from magshell_fenicsx.parts.motion.step import TimeSection
 from magshell_fenicsx.studies.compare.curves import Difference, amplitude_of, differences, judged, places, time_at
 from magshell_fenicsx.studies.compare.picture import draw_comparison
 from magshell_fenicsx.studies.compare.runs import MODELS, ModelName, ModelRun, NothingLeft, run_model

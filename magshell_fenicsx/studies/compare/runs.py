@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from magshell_fenicsx.case.source import CaseError
+from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.output.store.checkpoint import FILE, NAME, begun_with
 from magshell_fenicsx.output.store.durable import Damaged, read_object, write_whole
 from magshell_fenicsx.output.store.known import read_summary

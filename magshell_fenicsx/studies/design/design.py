@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.opened import read_together, with_same_files
-from magshell_fenicsx.case.source import CaseError
+from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.output.store.durable import write_whole
 from magshell_fenicsx.output.store.folder import by_first, given_folder, held_folder, refuse_others
 from magshell_fenicsx.platform import sources

@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.design import DesignSection
-from magshell_fenicsx.case.source import CaseError, Source
-from magshell_fenicsx.parts.section import in_unit
+from magshell_fenicsx.input.section import in_unit
+from magshell_fenicsx.input.source import CaseError, Source
 from magshell_fenicsx.simulate.numbers import number_of
 
 Array = NDArray[np.float64]

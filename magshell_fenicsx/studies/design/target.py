@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.design import ShapeSection
-from magshell_fenicsx.case.expressions import formula
-from magshell_fenicsx.case.source import CaseError
+from magshell_fenicsx.input.expressions import formula
+from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.simulate.results import Target
 
 Array = NDArray[np.float64]

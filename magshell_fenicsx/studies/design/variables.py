@@ -17,16 +17,16 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.field_derivative import FieldGradient
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.controls import read_vectors, write_vectors
 from magshell_fenicsx.case.design import DesignSection
-from magshell_fenicsx.case.source import CaseError, Source
+from magshell_fenicsx.input.controls import read_vectors, write_vectors
+from magshell_fenicsx.input.section import si_size
+from magshell_fenicsx.input.source import CaseError, Source
 from magshell_fenicsx.models.shell.controls import ByControls, Controls
 from magshell_fenicsx.models.shell.thickness import Thickness
-from magshell_fenicsx.parts.section import si_size
-from magshell_fenicsx.plan.magnetisation import magnetisation
-from magshell_fenicsx.plan.outline import outline
-from magshell_fenicsx.plan.plan import Plan
-from magshell_fenicsx.plan.planner import make_plan
+from magshell_fenicsx.parts.magnetism.magnetisation import magnetisation
+from magshell_fenicsx.problem.planner import make_plan
+from magshell_fenicsx.problem.problem import Plan
+from magshell_fenicsx.shape.outline import outline
 from magshell_fenicsx.simulate.numbers import number_of
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.studies.design.between import Between

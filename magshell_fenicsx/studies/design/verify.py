@@ -8,9 +8,9 @@ from mpi4py import MPI
 
 from magshell_fenicsx.case.design import DesignSection
 from magshell_fenicsx.case.opened import opened
-from magshell_fenicsx.case.surfaces import MeshSurface
-from magshell_fenicsx.run.run import run
-from magshell_fenicsx.run.summary import Result
+from magshell_fenicsx.runs.run import run
+from magshell_fenicsx.runs.summary import Result
+from magshell_fenicsx.shape.sections import MeshSurface
 from magshell_fenicsx.simulate.gradients.barriers import BARRIER
 from magshell_fenicsx.simulate.gradients.instabilities import FOLDS, SCALES, Lost
 from magshell_fenicsx.simulate.gradients.mass import MASS, mass

@@ -8,8 +8,8 @@ from pydantic import ValidationError
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.ensemble import EnsembleSection
-from magshell_fenicsx.case.messages import explained
-from magshell_fenicsx.case.source import CaseError, Source, override
+from magshell_fenicsx.input.messages import explained
+from magshell_fenicsx.input.source import CaseError, Source, override
 
 # errors of pydantic about keys, which no value drawn can mend
 OF_KEYS = ("extra_forbidden", "model_type", "model_attributes_type", "list_type", "dict_type")

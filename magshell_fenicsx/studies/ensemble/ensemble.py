@@ -8,7 +8,7 @@ from typing import Any
 
 from mpi4py import MPI
 
-from magshell_fenicsx.case.source import CaseError, read_source
+from magshell_fenicsx.input.source import CaseError, read_source
 from magshell_fenicsx.output.store.durable import write_whole
 from magshell_fenicsx.output.store.folder import by_first, given_folder, prepare_folder, refuse_others
 from magshell_fenicsx.platform import sources

@@ -7,8 +7,8 @@ from typing import Any
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.chance.places import NoRoom
-from magshell_fenicsx.case.source import CaseError, Source, override
-from magshell_fenicsx.plan.planner import make_plan
+from magshell_fenicsx.input.source import CaseError, Source, override
+from magshell_fenicsx.problem.planner import make_plan
 from magshell_fenicsx.studies.ensemble.door import in_the_file, refuse_unknown_keys
 from magshell_fenicsx.studies.sweep.points import identity
 

@@ -15,9 +15,9 @@ from magshell_fenicsx.continuation.ahead import fold_ahead
 from magshell_fenicsx.continuation.fold import Fold, FoldLost, Guess
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.output.store.table import COLUMNS
-from magshell_fenicsx.run.rows import RowMaker
-from magshell_fenicsx.run.run import run
-from magshell_fenicsx.run.summary import Result
+from magshell_fenicsx.runs.rows import RowMaker
+from magshell_fenicsx.runs.run import run
+from magshell_fenicsx.runs.summary import Result
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.perfect import with_modes
 from magshell_fenicsx.simulate.record import Stopped

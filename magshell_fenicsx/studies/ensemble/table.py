@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from magshell_fenicsx.parts.section import number_and_unit
+from magshell_fenicsx.input.section import number_and_unit
 from magshell_fenicsx.studies.ensemble.samples import Sample
 from magshell_fenicsx.studies.ensemble.solve import FAILED
 from magshell_fenicsx.studies.study.scalar import Scalar

@@ -9,7 +9,7 @@ from typing import Any
 
 from scipy.interpolate import barycentric_interpolate
 
-from magshell_fenicsx.case.source import CaseError
+from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.output.store.table import COLUMNS, TEXTS
 from magshell_fenicsx.quantities.registry import IN_TIME, OWN_MODES, quantity
 

@@ -12,9 +12,9 @@ from typing import Any
 from mpi4py import MPI
 
 from magshell_fenicsx.case.opened import opened
-from magshell_fenicsx.run.rows import RowMaker
-from magshell_fenicsx.run.snaps import snaps
-from magshell_fenicsx.run.summary import Result
+from magshell_fenicsx.runs.rows import RowMaker
+from magshell_fenicsx.runs.snaps import snaps
+from magshell_fenicsx.runs.summary import Result
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.perfect import with_modes
 from magshell_fenicsx.simulate.record import Stopped

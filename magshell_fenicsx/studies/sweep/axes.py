@@ -8,8 +8,8 @@ from functools import cached_property
 
 import numpy as np
 
-from magshell_fenicsx.case.source import CaseError
-from magshell_fenicsx.parts.section import in_unit, number_and_unit
+from magshell_fenicsx.input.section import in_unit, number_and_unit
+from magshell_fenicsx.input.source import CaseError
 
 MOST_POINTS = 10_000
 FORMS = "write it as key.path=start:stop:count or key.path=value,value,..."

@@ -12,13 +12,13 @@ from typing import Literal
 from mpi4py import MPI
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.loads.pressure import PressureSection
-from magshell_fenicsx.case.surfaces import MeshSurface
 from magshell_fenicsx.continuation.fold import Fold, FoldLost
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.output.store.table import Row
-from magshell_fenicsx.plan.planner import make_plan
-from magshell_fenicsx.run.run import Result, run
+from magshell_fenicsx.parts.pressure.pressure import PressureSection
+from magshell_fenicsx.problem.planner import make_plan
+from magshell_fenicsx.runs.run import Result, run
+from magshell_fenicsx.shape.sections import MeshSurface
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.studies.sweep.axes import Axis, along
 from magshell_fenicsx.studies.sweep.continuation import Continuation

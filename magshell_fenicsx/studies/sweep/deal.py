@@ -8,7 +8,7 @@ from contextlib import contextmanager
 import numpy as np
 from mpi4py import MPI
 
-from magshell_fenicsx.case.source import CaseError
+from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.output.store.folder import DiskError
 
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from magshell_fenicsx.case.source import CaseError, Source
+from magshell_fenicsx.input.source import CaseError, Source
 from magshell_fenicsx.output.store.durable import Damaged, read_object, write_whole
 from magshell_fenicsx.studies.sweep.axes import MOST_POINTS, Axis
 from magshell_fenicsx.studies.sweep.points import SweepPoint, make_point

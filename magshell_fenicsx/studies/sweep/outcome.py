@@ -9,8 +9,8 @@ from uuid import uuid4
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.output.store.table import Row
 from magshell_fenicsx.platform import sources
-from magshell_fenicsx.run.run import Result
-from magshell_fenicsx.run.summary import in_units
+from magshell_fenicsx.runs.run import Result
+from magshell_fenicsx.runs.summary import in_units
 
 CURVE = (
     "label",

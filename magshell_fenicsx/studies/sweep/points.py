@@ -10,9 +10,9 @@ from math import prod
 from pathlib import Path
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.source import CaseError, Source, override, read_source
-from magshell_fenicsx.plan.limits import refuse_beyond_memory
-from magshell_fenicsx.plan.planner import make_plan
+from magshell_fenicsx.input.source import CaseError, Source, override, read_source
+from magshell_fenicsx.problem.limits import refuse_beyond_memory
+from magshell_fenicsx.problem.planner import make_plan
 from magshell_fenicsx.studies.sweep.axes import MOST_POINTS, Axis
 
 

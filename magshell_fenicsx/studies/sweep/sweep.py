@@ -6,7 +6,7 @@ from pathlib import Path
 
 from mpi4py import MPI
 
-from magshell_fenicsx.case.source import CaseError
+from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.output.store.folder import by_first, given_folder, prepare_folder, refuse_others
 from magshell_fenicsx.platform.first import from_first
 from magshell_fenicsx.platform.terminal import print_line

@@ -13,7 +13,7 @@ from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.models.axisymmetric.meridian import graded_vertices, make_meridian
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.shell.parameters import Condition, Force, Loads, Magnetisation, Material
-from magshell_fenicsx.plan.imperfections.dimple import Dimple
+from magshell_fenicsx.parts.imperfections.dimple import Dimple
 
 E3 = np.array([0.0, 0.0, 1.0])
 ALONG_AXIS = Magnetisation(E3, E3)

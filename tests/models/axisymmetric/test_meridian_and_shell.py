@@ -9,8 +9,8 @@ from magshell_fenicsx.models.axisymmetric.revolution import Revolution
 from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.shell.parameters import Loads, Magnetisation, Material
 from magshell_fenicsx.models.shell.patterns import WithinRims, tangential
-from magshell_fenicsx.plan.imperfections.dimple import AT_POLE, Dimple
-from magshell_fenicsx.plan.imperfections.flaw import Flaw
+from magshell_fenicsx.parts.imperfections.dimple import AT_POLE, Dimple
+from magshell_fenicsx.parts.imperfections.flaw import Flaw
 
 Array = np.ndarray
 DIMPLE = Dimple(0.05, 0.5)

@@ -15,7 +15,7 @@ from magshell_fenicsx.mesh.sphere import flat
 from magshell_fenicsx.models.axisymmetric.meridian import graded_vertices, make_meridian
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.shell.parameters import Force, Loads, Material
-from magshell_fenicsx.plan.planner import make_plan, meridian_vertices
+from magshell_fenicsx.problem.planner import make_plan, meridian_vertices
 
 
 @pytest.mark.parametrize(

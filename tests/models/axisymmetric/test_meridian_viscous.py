@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from magshell_fenicsx import Case, Scene, follow
-from magshell_fenicsx.case.source import Source
-from magshell_fenicsx.run.rows import columns
+from magshell_fenicsx.input.source import Source
+from magshell_fenicsx.runs.rows import columns
 
 OMEGA = 10.2158 * np.sqrt(1 / 12) / 50  # of a clamped disc (Leissa 1969), R/h = 50, nu = 0
 DISC = {"geometry": "disc", "radius_to_thickness": 50, "poisson_ratio": 0.0}

@@ -6,8 +6,8 @@ from typing import Any
 import pytest
 
 import magshell_fenicsx as ms
-from magshell_fenicsx.case.source import Source
 from magshell_fenicsx.continuation.path import Path, StepOptions
+from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.mesh.patch import MeshError
 
 MATERIAL = {"thickness": 0.02, "youngs_modulus": 1.0, "poisson_ratio": 0.3}

@@ -5,12 +5,12 @@ import pytest
 from conftest import hemisphere
 
 from magshell_fenicsx import Case, Scene
-from magshell_fenicsx.case.source import Source
 from magshell_fenicsx.continuation.events import critical_mode
 from magshell_fenicsx.continuation.system import State
+from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.shell.parameters import Loads, Material
-from magshell_fenicsx.plan.imperfections.dimple import Dimple
+from magshell_fenicsx.parts.imperfections.dimple import Dimple
 from magshell_fenicsx.simulate.follow import follow
 
 

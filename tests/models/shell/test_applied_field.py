@@ -10,13 +10,13 @@ from conftest import disc, hemisphere, random_displacement
 from test_derivatives import alone, check
 from test_fast_residual import difference as residual_difference
 
-from magshell_fenicsx.case.expressions import with_derivatives
+from magshell_fenicsx.input.expressions import with_derivatives
+from magshell_fenicsx.input.formulas_in_space import FormulasInSpace
 from magshell_fenicsx.mesh.frame import rotation
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.shell.parameters import Loads, Magnetisation, Material, RemanenceLaw
 from magshell_fenicsx.models.shell.patterns import tangential
-from magshell_fenicsx.plan.formulas_in_space import FormulasInSpace
 
 MATERIAL, MU, LAWS = Material(0.3, 0.05), {"lambda_m": 0.4}, ["deformation", "rotation"]
 BR, BA = np.array([0.6, 0.0, 0.8]), np.array([0.0, 0.28, 0.96])

@@ -139,7 +139,7 @@ RANKS = f"""
 import numpy as np
 from mpi4py import MPI
 from magshell_fenicsx import Case, Scene
-from magshell_fenicsx.case.source import Source
+from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.continuation.system import dot, max_abs
 

@@ -17,8 +17,8 @@ from magshell_fenicsx import Case, Scene
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.assembly.terms import FormTerm
-from magshell_fenicsx.case.source import Source
 from magshell_fenicsx.continuation.system import followed
+from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.models.shell import densities, kinematics
 from magshell_fenicsx.models.shell.energy import cell_quadrature
 from magshell_fenicsx.models.shell.fast_tangent import FastTangent, make_sites
@@ -162,7 +162,7 @@ import numpy as np
 from along import along
 from mpi4py import MPI
 from magshell_fenicsx import Case, Scene
-from magshell_fenicsx.case.source import Source
+from magshell_fenicsx.input.source import Source
 
 scene = Scene(Case.from_source(Source("half", {HALF_SHELL!r})))
 model, mu = scene.model, dict(pressure=0.3, lambda_m=0.4)

@@ -6,8 +6,8 @@ import pytest
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.models.shell.fitted import fitted
 from magshell_fenicsx.models.shell.patterns import cells_of
-from magshell_fenicsx.plan.check import describe
-from magshell_fenicsx.plan.planner import make_plan
+from magshell_fenicsx.problem.check import describe
+from magshell_fenicsx.problem.planner import make_plan
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.scene import Scene
 

@@ -8,7 +8,7 @@ from conftest import hemisphere
 
 from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.shell.parameters import Loads, Magnetisation, Material
-from magshell_fenicsx.plan.imperfections.dimple import Dimple
+from magshell_fenicsx.parts.imperfections.dimple import Dimple
 
 Shells = Callable[..., ShellModel]
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import magshell_fenicsx as ms
-from magshell_fenicsx.case.source import Source
-from magshell_fenicsx.plan.planner import make_plan
+from magshell_fenicsx.input.source import Source
+from magshell_fenicsx.problem.planner import make_plan
 
 PLATE = {"geometry": "plate", "length": 2, "width": 1, "thickness": 0.02, "youngs_modulus": 3.0, "poisson_ratio": 0.3}
 CAP = {"geometry": "cap", "polar": 60, "radius": 2, "thickness": 0.04, "youngs_modulus": 3.0, "poisson_ratio": 0.3}

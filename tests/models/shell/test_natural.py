@@ -12,12 +12,12 @@ from along import difference
 import magshell_fenicsx as ms
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.assembly.terms import FormTerm
-from magshell_fenicsx.case.source import Source
 from magshell_fenicsx.continuation.system import State, dot
-from magshell_fenicsx.models.shell.natural import Natural
+from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.models.shell.parameters import Material
 from magshell_fenicsx.output.fields.stresses import Stresses, principal_fields
-from magshell_fenicsx.plan.planner import make_plan
+from magshell_fenicsx.parts.natural.shape import Natural
+from magshell_fenicsx.problem.planner import make_plan
 
 CAP = {"geometry": "cap", "polar": 40, "radius": 1, "thickness": 0.02, "poisson_ratio": 0.3}
 STRIP = {"geometry": "strip", "radius_to_thickness": 50, "width": 0.1, "poisson_ratio": 0}

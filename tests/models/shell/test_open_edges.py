@@ -12,8 +12,8 @@ from petsc4py import PETSc
 from scipy.integrate import solve_bvp
 
 import magshell_fenicsx as ms
-from magshell_fenicsx.case.source import Source
 from magshell_fenicsx.continuation.system import Skewed, Tangent
+from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.mesh.hexahedra import OUTER
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.solid.model import SolidModel

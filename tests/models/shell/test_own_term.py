@@ -11,14 +11,14 @@ from test_fast_residual import difference as residual_difference
 from ufl.core.expr import Expr
 
 from magshell_fenicsx import Case, CaseError, Jet, OwnTerm, Scene
-from magshell_fenicsx.case.source import Source
 from magshell_fenicsx.continuation.system import dot
+from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.mesh.mirror import Y0
 from magshell_fenicsx.models.shell import densities
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.shell.parameters import AreaForce, Loads, Material
-from magshell_fenicsx.plan.planner import make_plan
+from magshell_fenicsx.problem.planner import make_plan
 from magshell_fenicsx.simulate.follow import follow
 
 E1, E2, E3 = np.eye(3)

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from conftest import hemisphere
 
-from magshell_fenicsx.case.expressions import formula
-from magshell_fenicsx.case.fields import Layer, layer_average
+from magshell_fenicsx.input.expressions import formula
 from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.shell.parameters import Loads, Magnetisation, Material
 from magshell_fenicsx.models.shell.patterns import Components, Pattern, WithinRims, radial, tangential
-from magshell_fenicsx.plan.imperfections.dimple import AT_POLE, Dimple
-from magshell_fenicsx.plan.imperfections.flaw import Flaw
+from magshell_fenicsx.parts.imperfections.dimple import AT_POLE, Dimple
+from magshell_fenicsx.parts.imperfections.flaw import Flaw
+from magshell_fenicsx.parts.magnetism.fields import Layer, layer_average
 
 UP = np.array([0.0, 0, 1])
 SIZE = 0.02

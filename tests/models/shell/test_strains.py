@@ -7,7 +7,7 @@ import pytest
 from conftest import disc, hemisphere
 
 from magshell_fenicsx import Case, Scene, surface
-from magshell_fenicsx.case.source import Source
+from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.shell.parameters import Loads, Magnetisation, Material
 from magshell_fenicsx.models.shell.strains import TangentFrame, bending_moment, principal

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 from magshell_fenicsx import Case, Scene, follow
-from magshell_fenicsx.case.source import Source
+from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.mesh.patch import MeshError
 
 THIN = {"thickness": 0.02, "poisson_ratio": 0.3}

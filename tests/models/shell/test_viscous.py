@@ -9,11 +9,11 @@ from along import csr
 from scipy.spatial.transform import Rotation
 
 from magshell_fenicsx import Case, Scene, follow
-from magshell_fenicsx.case.source import CaseError, Source
-from magshell_fenicsx.models.mass import mass
-from magshell_fenicsx.models.shell.viscous import surface_of
-from magshell_fenicsx.models.viscous import Viscosity
-from magshell_fenicsx.run.rows import columns
+from magshell_fenicsx.input.source import CaseError, Source
+from magshell_fenicsx.parts.motion.mass import mass
+from magshell_fenicsx.parts.motion.on_surface import surface_of
+from magshell_fenicsx.parts.motion.viscous import Viscosity
+from magshell_fenicsx.runs.rows import columns
 
 OMEGA = 3.5160 * np.sqrt(1 / 12) / 50  # of a cantilever, R/h = 50, nu = 0
 

@@ -7,13 +7,13 @@ from conftest import spherical
 from mpi4py import MPI
 
 from magshell_fenicsx import Case
-from magshell_fenicsx.case.source import Source
+from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.mesh.hexahedra import Body, sweep
 from magshell_fenicsx.mesh.shapes import DiscShape
 from magshell_fenicsx.mesh.sphere import flat
 from magshell_fenicsx.mesh.triangulation import triangulate
-from magshell_fenicsx.plan.imperfections.dimple import Dimple
-from magshell_fenicsx.plan.planner import make_plan
+from magshell_fenicsx.parts.imperfections.dimple import Dimple
+from magshell_fenicsx.problem.planner import make_plan
 
 
 def hemisphere(size: float, h: float, *, layers: int = 1, half: bool = False, dimple: Dimple | None = None) -> Body:

@@ -8,13 +8,13 @@ import pyvista
 from conftest import CASES
 
 from magshell_fenicsx import Case, Scene
-from magshell_fenicsx.case.source import CaseError
+from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.models.modes import ShellModes
 from magshell_fenicsx.models.solid.model import SolidModel
 from magshell_fenicsx.output.fields.gathering import gatherer
 from magshell_fenicsx.output.fields.vtu import unstructured_grid
-from magshell_fenicsx.plan.check import describe
-from magshell_fenicsx.plan.planner import make_plan
+from magshell_fenicsx.problem.check import describe
+from magshell_fenicsx.problem.planner import make_plan
 
 BUCKLING, INDENTATION = CASES / "solid_buckling.yaml", CASES / "solid_indentation.yaml"
 

@@ -15,7 +15,7 @@ from magshell_fenicsx.models.shell.patterns import radial
 from magshell_fenicsx.models.solid.material import NeoHookean
 from magshell_fenicsx.models.solid.model import SolidModel
 from magshell_fenicsx.models.solid.terms import face_measure
-from magshell_fenicsx.plan.imperfections.dimple import Dimple
+from magshell_fenicsx.parts.imperfections.dimple import Dimple
 
 MU = {"pressure": 0.3, "lambda_m": 0.4, "lambda_across": -0.7, "load": 0.2}
 EVERYWHERE = {"distortion", "compression", "magnetic", "magnetic across", "magnetic gradient", "pressure"}

@@ -10,12 +10,12 @@ from bodies import hemisphere, plate
 from test_solid_derivatives import FIELD, MU, displacement
 
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
-from magshell_fenicsx.case.expressions import with_derivatives
+from magshell_fenicsx.input.expressions import with_derivatives
+from magshell_fenicsx.input.formulas_in_space import FormulasInSpace
 from magshell_fenicsx.models.shell.parameters import Loads, Magnetisation, Material, RemanenceLaw
 from magshell_fenicsx.models.shell.patterns import radial
 from magshell_fenicsx.models.solid.material import NeoHookean
 from magshell_fenicsx.models.solid.model import SolidModel
-from magshell_fenicsx.plan.formulas_in_space import FormulasInSpace
 
 H = 0.1
 G = FIELD.gradient

@@ -10,10 +10,10 @@ from conftest import CASES
 from dolfinx import fem
 
 import magshell_fenicsx as ms
-from magshell_fenicsx.case.source import CaseError, Source
 from magshell_fenicsx.continuation.factor import Factorisation
 from magshell_fenicsx.continuation.fold import Guess, find_fold
 from magshell_fenicsx.continuation.system import State
+from magshell_fenicsx.input.source import CaseError, Source
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.shell.parameters import (
     AreaForce,

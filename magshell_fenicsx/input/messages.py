@@ -1,0 +1,162 @@
+"""What the user reads when a case is wrong: file, line, key, value, what is allowed."""
+
+import difflib
+import re
+from collections.abc import Sequence
+from typing import Any, get_args, get_origin
+
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+
+from magshell_fenicsx.input.meanings import meaning
+from magshell_fenicsx.input.source import Location, Source, dotted
+
+NO_KEYS = ("a word", "a gas")  # tags of a union that has no sections to choose from
+NO_CONTAINER = ("list_type", "dict_type")
+
+
+def explained(errors: Sequence[Any], source: Source, case: type[BaseModel]) -> str:
+    """One line for each mistake.
+
+    Pydantic tries all members of a union, and each has an error: what is a list or a mapping counts as one, and what is
+    neither as a value.
+    """
+    found = [(_without_tag(error["loc"], source.data, case), error) for error in errors]
+    places = [location for location, _ in found]
+
+    def beside(location: Location, kind: str) -> bool:
+        within = any(len(other) > len(location) and other[: len(location)] == location for other in places)
+        return within or (kind in NO_CONTAINER and places.count(location) > 1)
+
+    told = [explain(error, location, source, case) for location, error in found if not beside(location, error["type"])]
+    return "\n".join(dict.fromkeys(told))
+
+
+def explain(error: Any, location: Location, source: Source, case: type[BaseModel]) -> str:
+    """One line for one of pydantic's errors, at the location of its key."""
+    value, kind = error["input"], error["type"]
+    said = error["msg"].removeprefix("Value error, ").replace("Input should be", "must be")
+    said = re.sub(r"^\w+ should have (at \w+ \d+) items? after validation, not", r"must have \1 items, not", said)
+    if about := re.match(r"(\w+(\.[^.:]+)+): ", said):  # a rule between sections names its own key
+        keys = about[1].split(".")
+        location, said = tuple(int(key) if key.isdecimal() else key for key in keys), said[about.end() :]
+    place, key = source.place(location), dotted(location) or "case"
+    if kind == "extra_forbidden":
+        allowed = _allowed_keys(location[:-1], source.data, case)
+        near = difflib.get_close_matches(str(location[-1]), allowed, n=1)
+        hint = f"did you mean {near[0]}? " if near else ""
+        return f"{place}: {key}: unknown key; {hint}allowed here: {', '.join(sorted(allowed))}"
+    if kind == "missing":
+        return f"{place}: {key}: is missing{_meaning(location, source.data, case)}"
+    if kind.startswith("union_tag"):
+        keys = location[:-1] if isinstance(location[-1], int) else location
+        field = _found(keys, source.data, case)[1] or case.model_fields[str(location[0])]
+        models = [m for m in _models(field.annotation) if _tag_key([m])]
+        tag, tags = error["ctx"].get("tag"), dict.fromkeys(tag for m in models for tag in _tags(m))
+        said = "is missing" if tag is None else shown(tag)
+        return f"{place}: {key}.{_tag_key(models)}: {said}; allowed: {', '.join(tags)}"
+    if kind in ("model_type", "model_attributes_type"):
+        return f"{place}: {key}: {shown(value)}: must be a section, with keys below it"
+    if isinstance(value, dict | BaseModel):
+        return f"{place}: {key}: {said}"
+    if said.startswith(shown(value)):
+        return f"{place}: {key}: {said}"
+    says_all = kind in ("value_error", "literal_error")
+    meaning = "" if says_all else _meaning(location, source.data, case)
+    written = _at(source.data, location, str) if isinstance(value, float) else ""
+    text = f"{shown(written)} is {value:.6g}" if written else shown(value)  # its limits are those of the number
+    return f"{place}: {key}: {text}: {said}{meaning}"
+
+
+def shown(value: Any) -> str:
+    """The value as it was written, on one line of bearable length."""
+    try:
+        text = repr(value)
+    except ValueError:  # Python prints no integers of thousands of digits
+        return "a number of thousands of digits"
+    return text if len(text) <= 80 else f"{text[:77]}..."
+
+
+def _without_tag(loc: Location, data: Any, case: type[BaseModel]) -> Location:
+    """Pydantic puts what distinguishes the members of a union after their key: take it out."""
+    models, kept, named = [case], list[str | int](), False
+    for key in loc:
+        if key in NO_KEYS:
+            continue
+        if not models and not named and isinstance(key, str) and key not in _at(data, kept, dict):
+            continue  # of a union of values
+        if named:
+            kept.append(key)
+            named = False
+            continue
+        if len(models) > 1 and not isinstance(key, int):
+            models = [m for m in models if _tag_key([m]) and key in _tags(m)][:1] or models
+            continue
+        kept.append(key)
+        if isinstance(key, str) and models:
+            field = models[0].model_fields.get(key)
+            models = _models(field.annotation) if field else []
+            named = _has_names(field)
+    return tuple(kept)
+
+
+def _at(data: Any, location: Sequence[str | int], kind: type) -> Any:
+    """The part of plain data at a location; an empty one if it is of another kind."""
+    for key in location:
+        there = isinstance(data, dict) or (isinstance(data, list) and isinstance(key, int) and key < len(data))
+        data = data.get(key) if isinstance(data, dict) else data[key] if there else None
+    return data if isinstance(data, kind) else kind()
+
+
+def _allowed_keys(location: Location, data: Any, case: type[BaseModel]) -> list[str]:
+    """Keys of the section at a location."""
+    return list(_found(location, data, case)[0].model_fields)
+
+
+def _meaning(location: Location, data: Any, case: type[BaseModel]) -> str:
+    """The first words on a key, in brackets, with its unit."""
+    section, field = _found(location, data, case)
+    description = meaning(section, str(location[-1])) if field else ""
+    words, unit = re.split(r"[;:.,] | \[", description)[0], re.search(r"\[([^\[\]]+)\]$", description)
+    return f" ({' '.join(words.split())}{f', in {unit[1]}' if unit else ''})" if words else ""
+
+
+def _found(location: Location, data: Any, case: type[BaseModel]) -> tuple[type[BaseModel], FieldInfo | None]:
+    """The innermost section at a location; and the last key, if it is one of a section."""
+    model, field, models, named = case, None, list[type[BaseModel]](), False
+    for key in location:
+        if isinstance(data, dict):
+            data = data.get(key)
+        else:
+            data = data[key] if isinstance(data, list) and isinstance(key, int) else None
+        # None: of a list or mapping of sections, or a part of a union
+        field = None if named else model.model_fields.get(str(key))
+        if field or not (named or isinstance(key, int)):
+            models = _models(field.annotation) if field else []
+        named = _has_names(field)
+        if models and not named:
+            tag = data.get(_tag_key(models)) if len(models) > 1 and isinstance(data, dict) else None
+            model = next((m for m in models if tag is not None and tag in _tags(m)), models[0])
+    return model, field
+
+
+def _has_names(field: FieldInfo | None) -> bool:
+    """Whether the keys below a key are names that the user gives to sections."""
+    return field is not None and get_origin(field.annotation) is dict and bool(_models(field.annotation))
+
+
+def _models(annotation: Any) -> list[type[BaseModel]]:
+    """Every section class within an annotation."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [model for part in get_args(annotation) for model in _models(part)]
+
+
+def _tag_key(models: list[type[BaseModel]]) -> str:
+    """The key that selects one of several section classes; empty without one."""
+    return next((key for key in ("kind", "geometry") if all(key in m.model_fields for m in models)), "")
+
+
+def _tags(model: type[BaseModel]) -> list[str]:
+    """The values of that key that select a section class."""
+    return [str(tag) for tag in get_args(model.model_fields[_tag_key([model])].annotation)]

@@ -1,0 +1,1 @@
+"""Rigid bodies that press on the shell, or stand in its way."""

@@ -1,0 +1,1 @@
+"""Forces, dead loads and moments."""

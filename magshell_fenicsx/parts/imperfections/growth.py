@@ -1,0 +1,76 @@
+"""An imperfection as a load: its depth grows while other loads are held."""
+
+from collections.abc import Collection, Iterable
+from typing import Any, ClassVar, Literal, Protocol
+
+from pydantic import Field
+
+from magshell_fenicsx.parts.step import PathStep, Step, Target, Until
+
+
+class ImperfectionStep(PathStep):
+    """An imperfection grows: the factor of its w0, from 0 (the shell without it) to 1 (as given) and beyond.
+
+    Displacements are measured from the shape without stress, which grows too; volumes from the shape as drawn.
+    Directions and areas of dead loads, thickness and remanence by formula are those of the drawn shape. `until: target`
+    ends at a factor.
+    """
+
+    amplitude: ClassVar[str] = "imperfection"
+    targets: ClassVar[dict[str, Target]] = {"factor": Target("load", "imperfection")}
+    kind: Literal["imperfection"]
+    control: Literal["load", "arc"] = "arc"
+    """What is prescribed step by step: the factor, or arc length, which passes its folds"""
+    until: Until = "target"
+    item: int | None = Field(default=None, ge=0)
+    """Number of the imperfection in shell.imperfections, from 0; all of them together by default"""
+    factor: float | None = Field(default=None, ge=-1e3, le=1e3)
+    """Target of the factor"""
+
+    @property
+    def place(self) -> Any:
+        return self.item
+
+
+class NamedStep(Protocol):
+    """A step with the name of its amplitude and its key in the case file."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def key(self) -> str: ...
+    @property
+    def load(self) -> Step: ...
+
+
+def grown_by(steps: Iterable[NamedStep], keys: Collection[str]) -> dict[str, list[str]]:
+    """Amplitude of a step -> the keys below `shell`, among those given, of the imperfections that it multiplies."""
+    items = {step.name: step.load.item for step in steps if isinstance(step.load, ImperfectionStep)}
+
+    def grows(key: str, item: int | None) -> bool:
+        return item is None or f"{key}.".startswith(f"imperfections.{item}.")
+
+    return {name: [key for key in keys if grows(key, item)] for name, item in items.items()}
+
+
+def refuse_unfit_growth(steps: Iterable[NamedStep], keys: Collection[str], *, solid: bool) -> None:
+    """See that steps of this kind have imperfections to grow.
+
+    Raises
+    ------
+    ValueError
+        With the key and what is allowed.
+    """
+    steps = [step for step in steps if isinstance(step.load, ImperfectionStep)]
+    items = {step.name: getattr(step.load, "item", None) for step in steps}
+    for step in steps:
+        if solid:
+            raise ValueError(f"{step.key}.kind: imperfection: is of a shell, not of a solid")
+        if not keys:
+            raise ValueError(f"{step.key}.kind: imperfection: the case has none; give shell.imperfections")
+        if not grown_by([step], keys)[step.name]:
+            raise ValueError(
+                f"{step.key}.item: {items[step.name]}: shell.imperfections has no such item, counted from 0"
+            )
+        if items[step.name] is None and len(items) > 1:
+            raise ValueError(f"{step.key}.item: give it: another step grows another item of shell.imperfections")

@@ -1,0 +1,1 @@
+"""Remanence, applied field and its sources, and the energies of both."""

@@ -1,0 +1,163 @@
+"""An applied flux density that is known by its values: its Taylor polynomial at the present place of each point.
+
+The polynomial of second order has the first and second derivatives of the field itself, and so have the energies that
+take it: the forms and kernels are the same for every field.
+"""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import ufl
+from dolfinx import fem
+from numpy.typing import NDArray
+from ufl.core.expr import Expr
+
+from magshell_fenicsx.assembly.point_field import PointField, at_quadrature
+from magshell_fenicsx.models.shell.crossing import crossing
+from magshell_fenicsx.models.shell.patterns import refuse_unbounded
+from magshell_fenicsx.parts.magnetism.driven import Driven, FieldInSpace, Here, carried
+
+Array = NDArray[np.float64]
+PAIRS = np.triu_indices(3)
+SIZE = 3 + 3 + 3 + 9 + 18  # u*, B at r0, B*, G*, H* by pairs j <= k
+
+
+def around(P: Expr, u: Expr) -> tuple[Expr, Expr]:
+    """B at the displacement u from the polynomial P (`SIZE`,), and less what it is at u = 0."""
+    d = u - ufl.as_vector([P[i] for i in range(3)])
+
+    def component(i: int) -> Expr:
+        linear = sum(P[9 + 3 * i + j] * d[j] for j in range(3))
+        pairs = enumerate(zip(*PAIRS, strict=True))
+        return P[6 + i] + linear + sum(P[18 + 6 * i + n] * d[int(j)] * d[int(k)] for n, (j, k) in pairs)
+
+    B = ufl.as_vector([component(i) for i in range(3)])
+    return B, B - ufl.as_vector([P[3 + i] for i in range(3)])
+
+
+class AppliedField:
+    """The polynomials of a field at the quadrature points of a shell, a meridian or a body.
+
+    Parameters
+    ----------
+    of
+        The field that no amplitude drives.
+    r0, u
+        Placement and displacement in one space; on a meridian along e_rho and e_z.
+    degree
+        Of the quadrature.
+    driven
+        The fields that amplitudes drive, which are added.
+
+    Raises
+    ------
+    MeshError
+        On every rank, if the field has no finite value or derivative on the undeformed surface.
+
+    Attributes
+    ----------
+    polynomial
+        The parameter of the densities.
+    mu
+        The amplitudes of the driven fields, to be set before `follow`.
+    lost
+        Where the field was not finite, since a walk began and emptied this.
+    """
+
+    def __init__(
+        self, of: FieldInSpace, r0: fem.Function, u: fem.Function, degree: int, driven: Sequence[Driven] = ()
+    ) -> None:
+        V = u.function_space
+        self._degree = degree
+        self.polynomial = PointField(V.mesh, degree, SIZE)
+        self._of, self._driven, self._u = of, driven, u
+        self.mu = {name: 0.0 for each in driven for name in each.names}
+        self.lost = ""
+        self._here: list[Here] = []
+        self._known: tuple[Array, dict[str, float]] = np.empty(0), {}
+        self._still: tuple[Array, Array, Array] | None = None
+        self._placement = r0
+        self._r0 = at_quadrature(r0, self.polynomial.points)
+        B, G, H = self._values(self._r0.reshape(-1, 3))
+        known = np.isfinite(G).all(axis=(1, 2)) & np.isfinite(H).all(axis=(1, 2, 3))
+        self._B0 = np.where(np.reshape(known, (-1, 1)), B, np.nan).reshape(self._r0.shape)
+        refuse_unbounded(self._B0, self._r0, V.mesh.comm, "magnetic.applied")
+        self.follow()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The amplitudes of the driven fields."""
+        return tuple(self.mu)
+
+    def follow(self) -> None:
+        """Renew the polynomials where the displacement or a driven field has changed."""
+        if np.array_equal(self._u.x.array, self._known[0]):
+            if self.mu == self._known[1]:
+                return
+        else:
+            self._still = None
+        self._known = np.array(self._u.x.array), dict(self.mu)
+        u = at_quadrature(self._u, self.polynomial.points)
+        x = self._r0 + u
+        B, G, H = self._values(x.reshape(-1, 3))
+        bad = ~np.isfinite(B).all(axis=1)
+        self.lost = self._where(x.reshape(-1, 3)[bad][0]) if bad.any() else self.lost
+        second = H[:, :, *PAIRS] * np.where(PAIRS[0] == PAIRS[1], 0.5, 1.0)
+        flat = [a.reshape(*u.shape[:2], -1) for a in (u, self._B0, B, G, second)]
+        self.polynomial.renew(np.concatenate(flat, axis=-1))
+
+    def renew_place(self) -> None:
+        """Take the placement anew."""
+        self._r0 = at_quadrature(self._placement, self.polynomial.points)
+        self._known, self._still = (np.empty(0), {}), None
+
+    def slope(self, name: str) -> PointField:
+        """A field for the derivatives by a driven amplitude, to be filled by `renew`."""
+        assert name in self.mu
+        return PointField(self._u.function_space.mesh, self._degree, SIZE)
+
+    def renew(self, field: PointField, name: str, other: str = "") -> None:
+        """Fill a field with the polynomials of dB/dmu, or with the values of d2B/dmu_i dmu_j, at the present place."""
+        values = np.zeros_like(field.values)
+        values[..., :3] = self.polynomial.values[..., :3]
+        shape = values.shape[:2]
+        for here in self._here:
+            if name in here.driven.names and (not other or other in here.driven.names):
+                B, G = (here.twice(name, other), None) if other else here.by(name)
+                values[..., 6:9] += B.reshape(*shape, 3)
+                if G is not None:
+                    values[..., 9:18] += G.reshape(*shape, 9)
+        field.renew(values)
+
+    @property
+    def places(self) -> Array:
+        """The present places (n, 3) of the quadrature points."""
+        return (self._r0 + at_quadrature(self._u, self.polynomial.points)).reshape(-1, 3)
+
+    def passed(self, before: tuple[Array, Mapping[str, float]], after: tuple[Array, Mapping[str, float]]) -> str:
+        """Through what a point has moved between two states, from their places and amplitudes; "" if through none."""
+        still: list[tuple[FieldInSpace, Driven]] = [(part, Driven(part)) for part in getattr(self._of, "parts", [])]
+        for of, driven in [*still, *((each.of, each) for each in self._driven)]:
+            if distance := getattr(of, "distance", None):
+                ways = [(x - t) @ Q for x, (Q, t) in ((x, carried(driven.motions, mu)) for x, mu in (before, after))]
+                if crossing(distance, *ways) is not None:
+                    said = getattr(of, "nowhere", "is inside a source")
+                    return f"a point of the shell {said} between two points of the path"
+        return ""
+
+    def _values(self, x: Array) -> tuple[Array, Array, Array]:
+        if self._still is None:
+            self._still = self._of(x)
+        self._here = [each.at(x, self.mu) for each in self._driven]
+        parts = [self._still, *(here.value for here in self._here)]
+        B, G, H = (np.sum(part, axis=0) for part in zip(*parts, strict=True))
+        return B, G, H
+
+    def _where(self, x: Array) -> str:
+        """What a place (3,) without a finite field is."""
+        still = [(part, part(x[None])[0]) for part in getattr(self._of, "parts", [self._of])]
+        for of, B in [*still, *((each.of, each.at(x[None], self.mu).B) for each in self._driven)]:
+            if not np.isfinite(B).all():
+                said = getattr(of, "nowhere", "is where magnetic.applied has no finite value")
+                return f"the shell's point (x, y, z)/R = ({x[0]:.3g}, {x[1]:.3g}, {x[2]:.3g}) {said}"
+        return ""

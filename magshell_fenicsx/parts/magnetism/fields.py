@@ -1,0 +1,179 @@
+"""The magnetisation and the applied field."""
+
+from math import pi
+from typing import Annotated, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from magshell_fenicsx.case.sources.registered import Sources
+from magshell_fenicsx.input.direction import Direction
+from magshell_fenicsx.input.expressions import Formula
+from magshell_fenicsx.input.file import FileKeys
+from magshell_fenicsx.input.section import FluxDensity, Section
+
+MU_0 = 4e-7 * pi  # T m/A
+
+
+class Layer(Direction):
+    """A layer of the thickness, magnetised in one direction."""
+
+    fraction: float = Field(gt=0, le=1)
+    """Of the thickness; all add up to one [h]"""
+
+
+class RemanentSection(FileKeys, Direction):
+    """The remanent flux density B^r; `polar` and `azimuth` belong to the uniform one.
+
+    radial: along the normal. tangential: along the meridians, away from e3. expression: components as
+    formulas of the undeformed position x, y, z over R. patches: a direction per named patch, "dimple"
+    (within its rim) of a hemisphere, those of a mesh, and "rest". layers: from the inner face outwards; a shell takes
+    their average. points: vectors at points, of which each place has the mean, weighted by exp(-(distance/filter)²).
+    """
+
+    kind: Literal["uniform", "radial", "tangential", "expression", "patches", "layers", "points"] = "uniform"
+    """How it varies in space"""
+    flux_density: FluxDensity | None = Field(default=None, ge=-1e3, le=1e3)
+    """|B^r|, at most 1000 T; with that of `applied` in place of lambda_m; negative: the remanence is reversed"""
+    components: list[Formula] | None = Field(default=None, min_length=3, max_length=3)
+    """Of kind: expression: arithmetic of x, y, z, pi and sin, cos, tan, exp, log, sqrt, abs, sign, arctan2 [|B^r|]"""
+    patches: dict[str, Direction] | None = None
+    """Of kind: patches: name -> direction"""
+    layers: list[Layer] | None = Field(default=None, min_length=1)
+    """Of kind: layers: those through the thickness"""
+    file: str | None = None
+    """Of kind: points: CSV with the columns x, y, z, bx, by, bz, or rho, z, b_rho, b_z of a field that turns about e3;
+    undeformed places over R, vectors over |B^r|, the path from the folder of the case"""
+    filter: float | None = Field(default=None, gt=0, le=10)
+    """Of kind: points: distance over which the points are averaged [R]"""
+
+    @model_validator(mode="after")
+    def _keys_of_the_kind(self) -> Self:
+        belongs = {"components": "expression", "patches": "patches", "layers": "layers"}
+        belongs |= {"file": "points", "filter": "points"}
+        for key, kind in belongs.items():
+            if (getattr(self, key) is not None) != (self.kind == kind):
+                raise ValueError(f"{key} belongs to kind: {kind}, and must be given there; the kind is {self.kind}")
+        if self.kind != "uniform" and {"polar", "azimuth"} & self.model_fields_set:
+            raise ValueError(f"polar and azimuth belong to kind: uniform; the kind is {self.kind}")
+        if self.layers and abs(sum(layer.fraction for layer in self.layers) - 1) > 1e-6:
+            raise ValueError("the fractions of the layers must add up to 1")
+        return self
+
+    def directions(self) -> list[Direction]:
+        """All directions that a mirror plane must hold; radial and tangential patterns allow every plane."""
+        if self.kind == "uniform":
+            return [self]
+        return [*(self.patches or {}).values(), *(self.layers or [])]
+
+
+def layer_average(layers: list[Layer], turn: float = 0.0) -> NDArray[np.float64]:
+    """Average (3,) of the layers' unit vectors over the thickness: all that B0 keeps of them."""
+    return np.asarray(np.sum([layer.fraction * layer.vector(turn) for layer in layers], axis=0))
+
+
+class AppliedSection(Direction):
+    """The applied flux density, uniform or linear in space: |B^a| (uniform b + gradient · r/R); or by formula.
+
+    The unit vector b has the direction of polar and azimuth, r is the deformed place. The fields of sources are added.
+    """
+
+    flux_density: FluxDensity | None = Field(default=None, ge=-1e3, le=1e3)
+    """|B^a|, at most 1000 T; with that of `remanent` in place of lambda_m; negative: the field is reversed"""
+    uniform: float = Field(default=1.0, ge=-1e3, le=1e3)
+    """Factor of the uniform part [|B^a|]"""
+    gradient: list[list[Annotated[float, Field(ge=-1e3, le=1e3)]]] | None = Field(
+        default=None, min_length=3, max_length=3
+    )
+    """Three rows of three numbers; energy: full alone has it [|B^a|/R]"""
+    components: list[Formula] | None = Field(default=None, min_length=3, max_length=3)
+    """Formulas of the deformed position x, y, z over R, in place of the other keys. On a shell the position is that of
+    the mid-surface. They are written as those of `remanent`, must be twice differentiable, and need energy: full
+    [|B^a|]"""
+    sources: Sources | None = None
+    """Magnets, coils, and fields on grids or by formulas, in tesla; without `flux_density` they are the whole field,
+    |B^a| is 1 T, and λ_m is in proportion. They need lengths with units and energy: full"""
+
+    @model_validator(mode="after")
+    def _beside_sources(self) -> Self:
+        others = {"polar", "azimuth", "uniform", "gradient", "components"} & self.model_fields_set
+        if self.sources and self.flux_density is None and others:
+            raise ValueError(f"{', '.join(sorted(others))}: of a field beside the sources: give its flux_density too")
+        names = [source.name for source in self.sources or [] if source.name is not None]
+        if twice := next((name for name in names if names.count(name) > 1), None):
+            raise ValueError(f"sources: {twice}: two of them have this name")
+        return self
+
+    @model_validator(mode="after")
+    def _square(self) -> Self:
+        if self.components and (others := {"polar", "azimuth", "uniform", "gradient"} & self.model_fields_set):
+            raise ValueError(f"components are the whole field: leave out {', '.join(sorted(others))}")
+        if self.gradient and any(len(row) != 3 for row in self.gradient):
+            raise ValueError("gradient is three rows of three numbers")
+        if self.uniform == 0 and not self.gradient:
+            raise ValueError("uniform: 0 needs a gradient")
+        return self
+
+    @property
+    def is_uniform(self) -> bool:
+        """Whether it is the same everywhere."""
+        return not (self.gradient or self.components or self.sources)
+
+    @property
+    def reference(self) -> float | None:
+        """|B^a| in T, with its sign; 1 T where sources are the whole field."""
+        return (self.flux_density or 1.0) if self.sources else self.flux_density
+
+    @property
+    def beside(self) -> bool:
+        """Whether there is a field beside that of the sources."""
+        return bool(self.flux_density) if self.sources else True
+
+
+class MagneticSection(Section):
+    """lambda_m, or both flux densities (and shell.youngs_modulus).
+
+    Energies: full, exact; first, torque and second are the paper's expansions in the displacement;
+    second_consistent has the couple too that they leave out. See docs/theory.md.
+    """
+
+    energy: Literal["full", "first", "torque", "second", "second_consistent"] = "full"
+    """The full magnetic energy, or an expansion"""
+    remanence: Literal["deformation", "rotation"] = "deformation"
+    """How B^r moves with the material: by F, which stretches it too (the paper's law), or by the rotation of F alone"""
+    lambda_m: float | None = Field(default=None, ge=-10, le=10)
+    """λ_m = |B^r||B^a|/(μ0 E); negative: the field is reversed; 0: no magnetic term"""
+    remanent: RemanentSection = RemanentSection.model_construct()
+    """What is magnetised"""
+    applied: AppliedSection = AppliedSection.model_construct()
+    """The field"""
+
+    @model_validator(mode="after")
+    def _one_amplitude(self) -> Self:
+        densities = [self.remanent.flux_density, self.applied.reference]
+        if self.lambda_m is not None and self.applied.sources:
+            raise ValueError("sources are in tesla: give remanent.flux_density in place of lambda_m")
+        if self.lambda_m is not None and densities != [None, None]:
+            raise ValueError("give lambda_m, or the flux densities of remanent and applied, not both")
+        if self.model_fields_set == {"remanence"}:
+            raise ValueError("remanence: is a law of a field, and there is none: give lambda_m or flux densities too")
+        if self.lambda_m is None and None in densities:
+            raise ValueError("give lambda_m, or remanent.flux_density and applied.flux_density")
+        if self.remanent.flux_density == 0:
+            raise ValueError("a remanence of length zero is no magnetisation: leave the section out")
+        if not self.applied.is_uniform and self.energy != "full":
+            raise ValueError(
+                "the approximate energies are of uniform fields; gradient, components and sources need energy: full"
+            )
+        return self
+
+    def amplitude(self, youngs_modulus: float | None) -> float:
+        """lambda_m = |Br||Ba|/(mu_0 E)."""
+        if self.lambda_m is not None:
+            return self.lambda_m
+        Br, Ba = self.remanent.flux_density, self.applied.reference
+        assert Br is not None
+        assert Ba is not None
+        assert youngs_modulus
+        return Br * Ba / (MU_0 * youngs_modulus)

@@ -1,0 +1,1 @@
+"""Sources of the applied field: one file for each kind."""

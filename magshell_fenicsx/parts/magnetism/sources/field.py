@@ -1,0 +1,142 @@
+"""The whole applied field where it is known by its values: formulas, sources, and what is uniform beside these."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from math import acos, radians
+
+import numpy as np
+
+from magshell_fenicsx.assembly.motion import Motion, moved
+from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.loading import ProgrammeStep
+from magshell_fenicsx.input.expressions import with_derivatives
+from magshell_fenicsx.input.formulas_in_space import FormulasInSpace
+from magshell_fenicsx.mesh.frame import rotation
+from magshell_fenicsx.parts.magnetism.driven import Driven, FieldInSpace
+from magshell_fenicsx.parts.magnetism.field_step import RotationSection
+from magshell_fenicsx.parts.magnetism.source_step import SourceStep
+from magshell_fenicsx.parts.magnetism.sources.known import Array, Placed
+from magshell_fenicsx.parts.magnetism.sources.registered import placed
+
+HALFWAY = 0.371  # of a motion: no symmetric place
+
+
+@dataclass(frozen=True)
+class Linear:
+    """A field b + G x."""
+
+    b: Array
+    G: Array
+
+    def __call__(self, x: Array) -> tuple[Array, Array, Array]:
+        n = len(x)
+        return self.b + x @ self.G.T, np.broadcast_to(self.G, (n, 3, 3)), np.zeros((n, 3, 3, 3))
+
+
+@dataclass(frozen=True)
+class Sum:
+    """The sum of some fields, perhaps of none."""
+
+    parts: Sequence[FieldInSpace]
+
+    def __call__(self, x: Array) -> tuple[Array, Array, Array]:
+        n = len(x)
+        B, G, H = np.zeros((n, 3)), np.zeros((n, 3, 3)), np.zeros((n, 3, 3, 3))
+        for part in self.parts:
+            for whole, own in zip((B, G, H), part(x), strict=True):
+                whole += own
+        return B, G, H
+
+
+def turn_name(step: ProgrammeStep) -> str:
+    """The amplitude by which a step of kind: rotation turns a field in space; no user's name has a space."""
+    return f"{step.name} {step.number}"
+
+
+def turns(case: Case, turn: float = 0.0) -> tuple[Motion, ...]:
+    """The rotations of all of the field about the origin, of a field that is known by values, or has a gradient."""
+    applied = case.magnetic.applied if case.magnetic else None
+    if applied is None or not (applied.components or applied.sources or applied.gradient):
+        return ()
+    found, before, zero = list[Motion](), applied.vector(turn), np.zeros(3)
+    for step in case.programme:
+        if isinstance(step.load, RotationSection):
+            after = step.load.to.vector(turn)
+            axis = np.cross(before, after)
+            angle = acos(float(before @ after))
+            found.append(Motion(turn_name(step), zero, angle * axis / np.linalg.norm(axis), zero))
+            before = after
+    return tuple(found)
+
+
+def in_space(case: Case, turn: float = 0.0) -> tuple[FieldInSpace | None, tuple[Driven, ...]]:
+    """The field that stays, None if it is built in, and the fields that steps drive, in a frame turned about e3 (rad).
+
+    Raises
+    ------
+    CaseError
+        If a source cannot be built.
+    """
+    if case.magnetic is None:
+        return None, ()
+    applied, Q = case.magnetic.applied, rotation(turn)
+    formulas = [with_derivatives(text) for text in applied.components or []]
+    by_formula = FormulasInSpace(formulas, Q) if formulas else None
+    rotations = turns(case, turn)
+    if not case.sources and not rotations:
+        return by_formula, ()
+    parts = list[FieldInSpace]()
+    if applied.beside:
+        G = Q @ np.array(applied.gradient or np.zeros((3, 3))) @ Q.T
+        parts.append(by_formula or Linear(applied.uniform * applied.vector(turn), G))
+    driven = list[Driven]()
+    for number, source in enumerate(placed(case, turn)):
+        one = _driven(case, number, source, rotations, Q)
+        if one.names:
+            driven.append(one)
+        else:
+            parts.append(source)
+    if rotations:
+        driven += [Driven(part, rotations) for part in parts]
+        parts = []
+    return Sum(parts), tuple(driven)
+
+
+def _driven(case: Case, number: int, source: Placed, rotations: Sequence[Motion], Q: Array) -> Driven:
+    """A source with the amplitudes of its steps; turns about its own position come before all other motions."""
+    spins, moves, factors, zero = list[Motion](), list[Motion](), dict[str, float](), np.zeros(3)
+    of_all = {motion.name: motion for motion in rotations}
+    steps = {step.name: step.load for step in case.programme if isinstance(step.load, SourceStep)}
+    own = {name for name, load in steps.items() if load.number(case.sources) == number}
+    for step in case.programme:
+        if isinstance(step.load, RotationSection):
+            moves.append(of_all[turn_name(step)])
+        if step.name not in own:
+            continue
+        own.remove(step.name)
+        load, name = steps[step.name], step.name
+        if load.turn:
+            axis = np.array(load.turn.axis) / np.linalg.norm(load.turn.axis)
+            spins.append(Motion(name, zero, radians(load.turn.angle) * (Q @ axis), source.position))
+        elif load.strength is not None:
+            factors[name] = load.strength - 1
+        else:
+            end = np.array(load.move or load.to) / source.length
+            here = moved(moves, dict.fromkeys((m.name for m in moves), 1.0), source.position[None]).x[0]
+            moves.append(Motion(name, Q @ end - (here if load.to else zero), zero, zero))
+    return Driven(source, [*spins, *moves], factors)
+
+
+def values(case: Case) -> list[Callable[[Array], Array]]:
+    """B over |B^a| at places (n, 3) as the sources are at first, and where each amplitude of them has changed."""
+    still, driven = in_space(case)
+    if still is None:
+        return []
+    names = [name for each in driven for name in each.names]
+    mus = [dict.fromkeys(names, 0.0)]
+    mus += [{**mus[0], name: mu} for name in names for mu in (HALFWAY, 1.0)]
+
+    def at(mu: dict[str, float]) -> Callable[[Array], Array]:
+        return lambda x: np.asarray(still(x)[0] + sum((each.at(x, mu).value[0] for each in driven), np.zeros(3)))
+
+    return [at(mu) for mu in mus]

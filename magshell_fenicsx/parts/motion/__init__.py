@@ -1,0 +1,1 @@
+"""Mass, viscosity and steps in time."""

@@ -1,0 +1,145 @@
+"""A load as a function of time: ramp, step, triangle, sine, a table, or a formula."""
+
+import re
+from collections.abc import Callable
+from typing import Annotated, Any, Literal, TypeAlias
+
+import numpy as np
+from pydantic import AfterValidator, Discriminator, Field, Tag
+
+from magshell_fenicsx.input.expressions import formula
+from magshell_fenicsx.input.section import Section, in_units, with_unit
+
+
+def measured(unit: str) -> Any:
+    """A number, or text with a unit, which stays text: what a number means depends on the case."""
+
+    def check(value: float | str) -> float | str:
+        in_units(unit)(value)
+        return value
+
+    return Annotated[float | with_unit(unit), AfterValidator(check)]
+
+
+Time: TypeAlias = measured("second")  # type: ignore[valid-type]
+Level: TypeAlias = measured("tesla")  # type: ignore[valid-type]
+Value = Callable[[Any], float]  # a time or a level as a plain number
+Curve = Callable[[float, bool], float]  # of the time since the step began, at a jump before or after it
+
+
+class RampHistory(Section):
+    """From where the load is to a value, and constant after that."""
+
+    kind: Literal["ramp"]
+    to: Level
+    """Value at its end: of the field a flux density or a part of that in `magnetic`, otherwise as the load's target"""
+    over: Time
+    """Time that it takes"""
+
+
+class StepHistory(Section):
+    """A jump."""
+
+    kind: Literal["step"]
+    to: Level
+    """Value after it"""
+    at: Time = 0.0
+    """Time of the jump"""
+
+
+class WaveHistory(Section):
+    """Up and down around a mean value, which it has at first."""
+
+    kind: Literal["triangle", "sine"]
+    """With corners, or without"""
+    size: Level
+    """Largest distance from the mean"""
+    period: Time
+    """Time of a full wave"""
+    mean: Level = 0.0
+    """Mean value"""
+
+
+def _formula(text: str) -> str:
+    try:
+        if re.search(r"\b[xyz]\b", text):
+            raise ValueError(text)
+        formula(re.sub(r"\bt\b", "x", text))
+    except ValueError:
+        raise ValueError(f"{text!r} is not a formula of the time t, such as 0.5*sin(2*pi*t)") from None
+    return text
+
+
+Row = Annotated[tuple[Time, Level], Field(strict=False)]
+History: TypeAlias = Annotated[
+    Annotated[RampHistory, Tag("ramp")]
+    | Annotated[StepHistory, Tag("step")]
+    | Annotated[WaveHistory, Tag("wave")]
+    | Annotated[str, AfterValidator(_formula), Tag("formula")]
+    | Annotated[list[Row], Field(min_length=2, max_length=100000), Tag("table")],
+    Discriminator(lambda data: _tag(data)),
+]
+
+
+def _tag(data: Any) -> str | None:
+    if isinstance(data, str | list):
+        return "formula" if isinstance(data, str) else "table"
+    kind = data.get("kind") if isinstance(data, dict) else getattr(data, "kind", None)
+    return {"ramp": "ramp", "step": "step", "triangle": "wave", "sine": "wave"}.get(str(kind))
+
+
+def curve(history: History, time: Value, level: Value, here: float) -> Curve:
+    """The value over the time since the begin; `here` is the value before."""
+    if isinstance(history, str):
+        of = formula(re.sub(r"\bt\b", "x", history))
+        return lambda t, before: float(of(*np.array([t, 0.0, 0.0]).reshape(3, 1))[0])
+    if isinstance(history, RampHistory):
+        over, to = time(history.over), level(history.to)
+        return lambda t, before: float(here + (to - here) * min(t / over, 1.0))
+    if isinstance(history, StepHistory):
+        at, to = time(history.at), level(history.to)
+        return lambda t, before: to if t > at or (t == at and not before) else here
+    if isinstance(history, WaveHistory):
+        size, period, mean = level(history.size), time(history.period), level(history.mean)
+        if history.kind == "sine":
+            return lambda t, before: float(mean + size * np.sin(2 * np.pi * t / period))
+        return lambda t, before: float(mean + size * (2 / np.pi) * np.arcsin(np.sin(2 * np.pi * t / period)))
+    times, values = [time(t) for t, _ in history], [level(v) for _, v in history]
+
+    def interpolated(t: float, before: bool) -> float:
+        after = int(np.searchsorted(times, t, side="left" if before else "right"))
+        if after in (0, len(times)):
+            return values[min(after, len(values) - 1)]
+        t0, t1 = times[after - 1 : after + 1]
+        return values[after - 1] + (values[after] - values[after - 1]) * (t - t0) / (t1 - t0)
+
+    return interpolated
+
+
+def marks(history: History, time: Value, end: float) -> list[float]:
+    """Times within (0, end) at which it jumps or has a kink."""
+    found: list[float] = []
+    if isinstance(history, RampHistory):
+        found = [time(history.over)]
+    elif isinstance(history, StepHistory):
+        found = [time(history.at)]
+    elif isinstance(history, WaveHistory) and history.kind == "triangle":
+        quarter = time(history.period) / 4
+        found = [quarter * i for i in range(1, int(end / quarter) + 1, 2)]
+    elif isinstance(history, list):
+        found = [time(t) for t, _ in history]
+    return [t for t in found if 0 < t < end]
+
+
+def times_of(history: History) -> list[float | str]:
+    """All its times."""
+    if isinstance(history, list):
+        return [t for t, _ in history]
+    return [getattr(history, key) for key in ("over", "at", "period") if hasattr(history, key)]
+
+
+def levels_of(history: History) -> list[float | str]:
+    """All its values."""
+    if isinstance(history, list):
+        return [level for _, level in history]
+    return [getattr(history, key) for key in ("to", "size", "mean") if hasattr(history, key)]

@@ -1,0 +1,151 @@
+"""A step in time: the shell moves, with inertia, under loads that are functions of time."""
+
+from collections.abc import Iterator
+from typing import Annotated, Any, ClassVar, Literal, Self, TypeAlias
+
+from pydantic import Field, model_validator
+
+from magshell_fenicsx.input.expressions import Formula
+from magshell_fenicsx.input.section import Section, in_units
+from magshell_fenicsx.parts.motion.history import History, Time, levels_of, measured, times_of
+from magshell_fenicsx.parts.step import Step
+
+Rate: TypeAlias = measured("1/second")  # type: ignore[valid-type]
+
+
+class PushSection(Section):
+    """The shell leaves its state along a natural mode of the model's own symmetry, with a largest component of one."""
+
+    mode: int = Field(default=1, ge=1, le=50)
+    """Number of the mode, from the lowest frequency"""
+    displacement: float = Field(default=0.0, ge=-1e3, le=1e3)
+    """Displacement, inward at the pole or the first named point [h]"""
+    velocity: float = Field(default=0.0, ge=-1e9, le=1e9)
+    """Velocity, likewise, per unit of time [h]"""
+
+
+class EventSection(Section):
+    """A column of path.csv that comes to a value."""
+
+    column: str
+    """Its name, such as w_over_h or middle_uz"""
+    value: float
+    """In the column's unit"""
+
+
+class TimeSection(Step):
+    """The shell moves for a time, from the state before; loads follow their `history`, all others are constant.
+
+    Times are text with a unit, or numbers: with `shell.density` in the unit of time of the case (seconds), else over
+    R √(ρ/E). Generalised alpha, second order, with steps for `tolerance`.
+    """
+
+    amplitude: ClassVar[str] = "time"
+    kind: Literal["time"]
+    duration: Time
+    """How long"""
+    points: Annotated[int, Field(ge=1, le=100000)] = 100
+    """Equal parts of the duration, each a row"""
+    history: dict[str, History] = Field(default_factory=dict)
+    """Load -> its values over the time of the step: `field` (over that of `magnetic`, or as a flux density), `pressure`
+    (over p_c), or the amplitude of another step: a ramp, step, triangle or sine, a table [[time, value], ...] with
+    straight lines and jumps, or a formula of the time t"""
+    rho_inf: float = Field(default=0.8, ge=0, le=1)
+    """Factor by which the highest frequencies fade at each step; 1 conserves energy"""
+    step: Time | None = None
+    """Fixed time step; by default steps follow from `tolerance`"""
+    tolerance: float = Field(default=1e-3, ge=1e-9, le=1)
+    """Largest estimated error of a time step [h]"""
+    balance: float = Field(default=1e-2, ge=1e-9, le=1)
+    """Largest error of the balance of energy (column imbalance), over kinetic + stored + dissipated + work; beside a
+    body a time step with more than its share is repeated with a smaller one, unless `step` is given; a run warns where
+    it is larger"""
+    drag: Rate = 0.0
+    """Force over mass and velocity; free vibrations fade at half of it [per unit of time; 20 Hz is 20 per second]"""
+    push: PushSection | None = None
+    """How it begins to move"""
+    velocity: Annotated[list[Formula], Field(min_length=3, max_length=3)] | None = None
+    """Initial velocity, added: formulas of the undeformed place x, y, z [length of the shell; over R if without unit]
+    along e1, e2, e3 [the same per unit of time]"""
+    until: Literal["duration", "rest", "event", "instability"] = "duration"
+    """At the end of the duration; as soon as the shell rests: then its equilibrium is the last row; at the `event`; or
+    at the first row at which the shell has an unstable direction"""
+    event: EventSection | None = None
+    """What ends the step with `until: event`"""
+
+    @model_validator(mode="after")
+    def _loads_are_held(self) -> Self:
+        for name, how in self.hold.items():
+            if how != "load" and name in self.drives:
+                raise ValueError(f"hold.{name}: it follows its history: only load is allowed")
+        if (self.event is None) == (self.until == "event"):
+            raise ValueError("event: goes with until: event, which needs one")
+        if self.search:
+            raise ValueError("search: is for steps that end in equilibrium")
+        for key, value in (("duration", self.duration), ("step", self.step), ("drag", self.drag)):
+            size = in_units("1/second" if key == "drag" else "second")(value) if value is not None else 1.0
+            if size < 0 or (size == 0 and key != "drag"):
+                raise ValueError(f"{key}: {value}: must be positive")
+        for name, history in self.history.items():
+            times = [float(in_units("second")(t)) for t in times_of(history)]
+            if isinstance(history, list) and (times[0] < 0 or times != sorted(times)):
+                raise ValueError(f"history.{name}: the times of a table must not fall, nor be negative")
+            if not isinstance(history, list) and min(times, default=1.0) < (
+                0 if history_may_begin(history) else 1e-300
+            ):
+                raise ValueError(f"history.{name}: times must be positive")
+        return self
+
+    @property
+    def drives(self) -> tuple[str, ...]:
+        """The amplitudes that follow histories."""
+        return tuple("lambda_m" if name == "field" else name for name in self.history)
+
+    def with_units(self) -> Iterator[tuple[str, str]]:
+        """Key and text of each time with a unit."""
+        given: dict[str, Any] = {"duration": self.duration, "step": self.step, "drag": self.drag}
+        for name, history in self.history.items():
+            given |= {f"history.{name} {i}": t for i, t in enumerate(times_of(history))}
+        yield from ((key.split(" ")[0], value) for key, value in given.items() if isinstance(value, str))
+
+
+def history_may_begin(history: History) -> bool:
+    """Whether a time of it may be zero: that of a jump."""
+    return getattr(history, "kind", "") == "step"
+
+
+def refuse_unfit_time(
+    key: str, load: TimeSection, amplitudes: set[str], motions: set[str], *, density: bool, measured: bool
+) -> None:
+    """See that its loads are there, and that its units have a meaning.
+
+    Parameters
+    ----------
+    amplitudes
+        Of other steps.
+    motions
+        Those of supports.
+    density, measured
+        Whether the shell has a density, and the field a flux density.
+
+    Raises
+    ------
+    ValueError
+        With the key and what is allowed.
+    """
+    for where, text in load.with_units():
+        if not density:
+            raise ValueError(
+                f"{key}.{where}: {text}: a time with a unit needs shell.density, youngs_modulus and lengths"
+            )
+    allowed = {"field", "pressure", *amplitudes} - {"lambda_m", "angle", "time"}
+    for name, history in load.history.items():
+        if name not in allowed:
+            raise ValueError(f"{key}.history.{name}: no such load; allowed: {', '.join(sorted(allowed))}")
+        times = [t for t, _ in history] if isinstance(history, list) else []
+        if name in motions and (getattr(history, "kind", "") == "step" or len(set(times)) < len(times)):
+            raise ValueError(f"{key}.history.{name}: a support cannot jump")
+        for level in levels_of(history):
+            if isinstance(level, str) and not (name == "field" and measured):
+                why = "needs magnetic.applied.flux_density" if name == "field" else "is a flux density: give a number"
+                raise ValueError(f"{key}.history.{name}: {level}: {why}")

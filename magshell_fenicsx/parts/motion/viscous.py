@@ -1,0 +1,319 @@
+"""Viscosity of a shell: stresses that follow the rates of its strains, in the elastic law's form.
+
+Kelvin and Voigt: the stress of tau dE/dt and tau dK/dt. A branch of Maxwell, a spring g in series with a dashpot: the
+stress of g q with dq/dt = dE/dt - q/tau, q of the membrane strain and of the curvature. Rates are those of the exact
+strains, so that rigid motions are not damped. Strains are known at the nodes of each cell and interpolated.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import ufl
+from dolfinx import fem
+from numpy.typing import NDArray
+from ufl.core.expr import Expr
+
+from magshell_fenicsx.continuation.system import Amplitudes, Tangent, Vector, max_abs
+from magshell_fenicsx.models.axisymmetric.model import MeridianModel
+from magshell_fenicsx.models.shell import densities, edges
+from magshell_fenicsx.models.shell import kinematics as kin
+from magshell_fenicsx.models.shell.kinematics import Jet
+from magshell_fenicsx.models.shell.model import ShellModel
+from magshell_fenicsx.models.shell.strains import TangentFrame
+from magshell_fenicsx.parts.natural.shape import covariant
+
+Array = NDArray[np.float64]
+SIZE = 12  # numbers of a strain and a change of curvature, symmetric tensors in space
+STEP = 1e-3  # part of the thickness by which a velocity moves the shell for its rate of strain
+
+
+@dataclass(frozen=True)
+class Branch:
+    """A branch of Maxwell: its modulus over Young's, and its relaxation time."""
+
+    modulus: float
+    time: float
+
+
+@dataclass(frozen=True)
+class Memory:
+    """What a step leaves.
+
+    Attributes
+    ----------
+    strains
+        q of each branch, (cells, places, 12).
+    rate, dt
+        Mean rate of the strain along the step and its length; None where the motion begins or turns a corner.
+    """
+
+    strains: list[Array]
+    rate: Array | None = None
+    dt: float = 0.0
+
+
+@dataclass(frozen=True)
+class Edge:
+    """Edges that hold the normal, or lie on a mirror plane.
+
+    Attributes
+    ----------
+    jump
+        Of the deformed jet, by how much the edge is open; of a mirrored edge half of what is between both sides.
+    sides
+        2 for mirrored edges.
+    along
+        Measure of these edges.
+    """
+
+    jump: Callable[[Jet], Expr]
+    sides: int
+    along: ufl.Measure
+
+
+@dataclass(frozen=True)
+class Surface:
+    """What viscous forces need to know of a model, of a shell or of its meridian.
+
+    Attributes
+    ----------
+    stresses
+        Space of what is known of strains, whose nodes are the places.
+    tables
+        From nodal displacements, with ghosts, to jets (6, cells, places, 3).
+    jet, r0, thickness
+        The jet of a field; that of the placement; what multiplies h, None for 1.
+    over
+        Measures of the cells and of the edges between them; energies are multiplied by `whole`.
+    m, widths
+        Covector of an edge, see `kinematics.conormal`; h_e between cells and at ends, see `edges.two_sided`.
+    """
+
+    stresses: fem.FunctionSpace
+    tables: Callable[[Array], Array]
+    jet: Callable[[Expr], Jet]
+    r0: Jet
+    thickness: fem.Function | None
+    over: tuple[ufl.Measure, ufl.Measure]
+    m: Expr
+    widths: tuple[Expr, Expr]
+    ends: Sequence[Edge]
+    folded: bool = False
+    whole: float = 1.0
+
+
+class Viscosity:
+    """The viscous forces of a shell in motion; a `continuation.transient.Viscous`. Compiles kernels.
+
+    Parameters
+    ----------
+    model, surface
+        A shell or a meridian, and what `surface_of` finds of it.
+    mu
+        Amplitudes with the places of supports, which do not move.
+    kelvin
+        Time tau of Kelvin and Voigt; zero without.
+
+    Attributes
+    ----------
+    memory
+        Of the steps so far.
+    slowness
+        `kelvin`.
+    """
+
+    def __init__(
+        self,
+        model: ShellModel | MeridianModel,
+        surface: Surface,
+        mu: Amplitudes,
+        kelvin: float,
+        branches: Sequence[Branch],
+    ) -> None:
+        self._model, self._mu, self._branches, self.slowness = model, dict(mu), branches, kelvin
+        V, Q, self._jets = model.V, surface.stresses, surface.tables
+        self._frame = TangentFrame.of(self._jets(model.r0.x.array))
+        self._field, self._places = fem.Function(Q, name="viscous"), Q.dofmap.list
+        self._given = _Given(self._field, fem.Function(V), fem.Function(V), fem.Constant(V.mesh, 0.0))
+        works = _works(model, surface, self._given)
+        gradients = [ufl.derivative(surface.whole * work, model.u, ufl.TestFunction(V)) for work in works]
+        self._forms = [model.kernels.compile(f"viscous residual {i}", form) for i, form in enumerate(gradients)]
+        names = (term.name for term in model.system.terms)
+        self._strained = [name for name in names if name in ("membrane", "bending") or name.endswith(" edges")]
+        self.memory = Memory([np.zeros((*self._places.shape, SIZE)) for _ in branches])
+        self._first: tuple[Vector, Array] = np.empty(0), np.empty(0)  # displacements and their strains
+        self._last: tuple[Vector, Array] = self._first
+        self._force = np.zeros(model.system.size)
+
+    def force(self, u0: Vector, u1: Vector, v: Vector, part: float, dt: float) -> Vector:
+        """The forces at a part of the step from u0 to u1, with the velocity v there."""
+        at = u0 + part * (u1 - u0)
+        stress = self.slowness * self._rate(at, v) if self.slowness else np.zeros((*self._places.shape, SIZE))
+        if self._branches:
+            for branch, q, end in zip(self._branches, self.memory.strains, self._evolved(u0, u1, dt), strict=True):
+                stress += branch.modulus * (part * end + (1 - part) * q)
+        self._force = self._forces(stress, u0, at, self.stiffness(dt, 2 / dt) if dt else 0.0)
+        return self._force
+
+    def tangent(self, u: Vector, mu: Amplitudes, dt: float, rate: float) -> Tangent:
+        """The system's tangent with that of these forces, which stiffen the shell, but no body that it touches."""
+        stiffer = 1 + self.stiffness(dt, rate)
+        return self._model.system.tangent(u, mu, times=dict.fromkeys(self._strained, stiffer))
+
+    def stiffness(self, dt: float, rate: float) -> float:
+        """What a step adds to the elastic tangent, in parts of it; `rate` is dv/du at its end."""
+        return self.slowness * rate + sum(b.modulus * (_share(b, dt) + self._bend(b, dt) / dt) for b in self._branches)
+
+    def begin(self) -> None:
+        """A motion begins or turns a corner: the rate of strain before it says nothing about the next step."""
+        self.memory = Memory(self.memory.strains)
+
+    def accept(self, u0: Vector, u1: Vector, dt: float) -> Vector:
+        """Go on from u1; the force that the step was solved with."""
+        if self._branches:
+            self.memory = Memory(self._evolved(u0, u1, dt), np.asarray(self._change(u0, u1) / dt), dt)
+        return self._force
+
+    def doubt(self, u0: Vector, u1: Vector, dt: float) -> Vector | None:
+        """The force at the end by which the curvature of the strain in time counts; None if nothing does."""
+        rate = self.memory.rate
+        if rate is None:
+            return None
+        bend = self._change(u0, u1) / dt - rate
+        return self._forces(sum(b.modulus * self._bend(b, dt) for b in self._branches) * bend, u1, u1, 0.0)
+
+    def _forces(self, stress: Array, u0: Vector, u1: Vector, stiffness: float) -> Vector:
+        """Of a stress at nodes, and of edges that open from u0 to u1."""
+        given, system = self._given, self._model.system
+        self._field.x.array.reshape(-1, SIZE)[self._places] = stress
+        given.stiffness.value = stiffness
+        for field, displacement in ((given.before, u0), (given.after, u1)):
+            field.x.array[:] = system.with_ghosts(displacement, self._mu)
+        return system.gradient_of(u1, self._mu, self._forms)
+
+    def _evolved(self, u0: Vector, u1: Vector, dt: float) -> list[Array]:
+        """q at the end of a step; the strain is quadratic in time through its ends and the begin of the step before."""
+        change, rate = self._change(u0, u1), self.memory.rate
+        bend = 0.0 if rate is None else change / dt - rate
+        return [
+            np.asarray(np.exp(-dt / b.time) * q + _share(b, dt) * change + self._bend(b, dt) * bend)
+            for b, q in zip(self._branches, self.memory.strains, strict=True)
+        ]
+
+    def _bend(self, branch: Branch, dt: float) -> float:
+        """What a change of the mean rate from the step before to this one leaves in the spring."""
+        return 0.0 if self.memory.rate is None else _bent(dt / branch.time) * dt * 2 * dt / (dt + self.memory.dt)
+
+    def _change(self, u0: Vector, u1: Vector) -> Array:
+        if self._first[0] is not u0:
+            self._first = self._last if self._last[0] is u0 else (u0, self._strain(u0))
+        if self._last[0] is not u1:
+            self._last = u1, self._strain(u1)
+        return self._last[1] - self._first[1]
+
+    def _rate(self, u: Vector, v: Vector) -> Array:
+        size = max_abs(self._model.system.comm, v)
+        if size == 0:
+            return np.zeros((*self._places.shape, SIZE))
+        step = STEP * self._model.material.h / size
+        return np.asarray((self._strain(u + step * v) - self._strain(u - step * v)) / (2 * step))
+
+    def _strain(self, u: Vector) -> Array:
+        """(cells, places, 12): E and K as tensors in space."""
+        jets = self._jets(self._model.system.with_ghosts(u, self._mu))
+        tensors = [
+            self._frame.tensor(S) for S in (self._frame.membrane_strain(jets), self._frame.curvature_change(jets))
+        ]
+        return np.concatenate([S[..., [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]] for S in tensors], axis=-1)
+
+
+def _share(branch: Branch, dt: float) -> float:
+    """The part of a strain that grows evenly in a step and that is left in the spring at its end."""
+    return float(-np.expm1(-dt / branch.time) * branch.time / dt) if dt else 1.0
+
+
+def _bent(z: float) -> float:
+    """The integral of exp(-z (1 - s)) (s - 1/2) over a step, 0 to 1."""
+    if z < 1e-2:
+        return z / 12 - z**2 / 24 + z**3 / 80
+    return float((1 + np.exp(-z)) / (2 * z) + np.expm1(-z) / z**2)
+
+
+@dataclass(frozen=True)
+class _Given:
+    """What viscous forces depend on: stresses at nodes, and two displacements between which edges open, how stiffly."""
+
+    field: fem.Function
+    before: fem.Function
+    after: fem.Function
+    stiffness: fem.Constant
+
+    def opened(self, surface: Surface, jump: Callable[[Jet], Expr]) -> Expr:
+        """The stiffness times the change of an edge's jump, a given number."""
+        after, before = (jump(surface.r0 + surface.jet(field)) for field in (self.after, self.before))
+        return self.stiffness * (after - before)
+
+
+def mirrored_jump(r0: Jet, m: Expr, normal: Expr) -> Callable[[Jet], Expr]:
+    """Half of the jump across a plane with that normal."""
+    nu1, nu2, _ = kin.conormal(r0, m)
+    return lambda r: ufl.dot(kin.normal(r), normal) * ufl.dot(normal, r.r1 * nu1 + r.r2 * nu2)
+
+
+def held_jump(r0: Jet, m: Expr, n0: Expr) -> Callable[[Jet], Expr]:
+    """The jump to the normal that an edge holds."""
+    nu1, nu2, _ = kin.conormal(r0, m)
+    return lambda r: -ufl.dot(n0 - kin.normal(r), r.r1 * nu1 + r.r2 * nu2)
+
+
+def _works(model: ShellModel | MeridianModel, surface: Surface, given: _Given) -> list[ufl.Form]:
+    """The work of given stresses on the strains of u, and on edges as in C0 interior penalty; its gradient are forces.
+
+    Smooth surfaces have no jumps, so that these need no memory: each step closes the edges that it opens.
+    """
+    field, r0, u, t, m = given.field, surface.r0, surface.jet(model.u), surface.thickness, surface.m
+    nu, h, sigma = model.material.nu, model.material.h, model.sigma
+    D = densities.bending_stiffness(h, nu)
+    up = kin.inverse_metric(r0)
+
+    def thick(side: str = "") -> Expr | float:
+        return 1.0 if t is None else (t(side) if side else t)[0]
+
+    def product(S: Expr, T: Expr) -> Expr:
+        a, b = kin.mixed(S, up), kin.mixed(T, up)
+        return (1 - nu) * ufl.tr(ufl.dot(a, b)) + nu * ufl.tr(a) * ufl.tr(b)
+
+    membrane = thick() * product(covariant(r0, field, 0), kin.membrane_strain(r0, u)) / (1 - nu**2)
+    bending = thick() ** 3 * D * product(covariant(r0, field, 6), kin.curvature_change(r0, u))
+    work = (membrane + bending) * kin.area_ratio(r0) * surface.over[0]
+
+    sides = ("+", "-")
+    r0s, us = ([j.side(s) for s in sides] for j in (r0, u))
+    conormals = [kin.conormal(j, m(s)) for j, s in zip(r0s, sides, strict=True)]
+
+    def across(r: Jet) -> Expr:
+        plus, minus = (r.side(s) for s in sides)
+        if surface.folded:
+            return ufl.atan2(*edges.fold_angle(plus, minus, m("+")))
+        return edges.fold_jump(plus, minus, conormals[0][:2], conormals[1][:2])
+
+    def moments(of: Callable[[Jet, str], Expr]) -> Expr:
+        each = zip(r0s, sides, conormals, strict=True)
+        return sum(thick(s) ** 3 * D * densities.moment_of(of(j, s), j, a, b, nu) for j, s, (a, b, _) in each) / 2
+
+    between, at_ends = surface.widths
+    S_J, J = given.opened(surface, across), across(r0 + u)
+    bent = moments(lambda j, s: kin.curvature_change(j, us[sides.index(s)]))
+    stiff = (thick("+") ** 3 + thick("-") ** 3) / 2 * sigma * D / between
+    edge = moments(lambda j, s: covariant(j, field(s), 6)) * J + S_J * (bent + stiff * J)
+    works = [work + edge * (conormals[0][2] + conormals[1][2]) / 2 * surface.over[1]]
+    nu1, nu2, stretch = kin.conormal(r0, m)
+    for end in surface.ends:
+        S_J, J = given.opened(surface, end.jump), end.jump(r0 + u)
+        M, bent = (
+            densities.moment_of(K, r0, nu1, nu2, nu) for K in (covariant(r0, field, 6), kin.curvature_change(r0, u))
+        )
+        edge = M * J + S_J * (bent + end.sides * sigma / at_ends * J)
+        works.append(thick() ** 3 * D * edge * stretch * end.along)
+    return works

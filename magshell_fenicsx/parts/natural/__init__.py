@@ -1,0 +1,1 @@
+"""The curvature and the size that the shell would have without stress."""

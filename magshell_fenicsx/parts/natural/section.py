@@ -1,0 +1,104 @@
+"""The natural shape: the curvature and the size that the shell would have without stress."""
+
+import re
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import BeforeValidator, Field, model_validator
+
+from magshell_fenicsx.input.expressions import Formula, formula
+from magshell_fenicsx.input.section import _NUMBER, Section, in_units
+
+_PER_LENGTH = re.compile(
+    rf"\s*(?P<number>{_NUMBER})[\s*]*(?:1?\s*/\s*(?P<below>[^\W\d]+)|(?P<power>[^\W\d]+)\s*(?:\*\*|\^)\s*-1)\s*"
+)
+PLACE = ("x", "y", "z", "pi")
+
+
+def per_length(value: Any) -> Any:
+    """Text such as "5/m" or "5 m^-1" as a number in 1/m; all else, formulas too, as it is."""
+    found = _PER_LENGTH.fullmatch(value) if isinstance(value, str) else None
+    unit = found and (found["below"] or found["power"])
+    if not found or unit in PLACE:
+        return value
+    return in_units("1/metre")(f"{found['number']} {unit}**-1")
+
+
+def _components(numbers: int, least: float, most: float, *, lengths: bool = False) -> BeforeValidator:
+    """One value, a list of this many, or a mapping of patches to either; a value is a number or a formula."""
+
+    def one(value: Any) -> Any:
+        value = per_length(value) if lengths else value
+        if isinstance(value, str):
+            formula(value)
+        elif isinstance(value, bool) or not isinstance(value, int | float) or not least <= value <= most:
+            raise ValueError(f"{value!r}: allowed are numbers from {least:g} to {most:g}, and formulas of x, y, z")
+        return value
+
+    def some(value: Any) -> Any:
+        if isinstance(value, list) and len(value) != numbers:
+            raise ValueError(f"a list has {numbers} values, this has {len(value)}")
+        return [one(v) for v in value] if isinstance(value, list) else one(value)
+
+    def read(value: Any) -> Any:
+        if not isinstance(value, dict):
+            return value if value is None else some(value)
+        if not value:
+            raise ValueError("a mapping names at least one patch")
+        for name, each in value.items():
+            if any(isinstance(v, str) and per_length(v) is v for v in (each if isinstance(each, list) else [each])):
+                raise ValueError(f"{name}: of a patch numbers, no formulas")
+        return {name: some(each) for name, each in value.items()}
+
+    kind = Number | Annotated[list[Number], Field(min_length=numbers, max_length=numbers)]
+    return BeforeValidator(read, json_schema_input_type=kind | dict[str, kind] | None)
+
+
+Number = float | str
+Component = Annotated[float | Formula, Field(union_mode="left_to_right")]  # a number stays one
+Values = Number | list[Number] | dict[str, Number | list[Number]] | None
+
+
+class NaturalSection(Section):
+    """The curvature and the size that the shell would have without stress: growth, swelling, pre-stretch.
+
+    Both grow with amplitudes of their own, natural_curvature and natural_stretch, from 0 (the shell as drawn) to 1
+    (what is given here) and beyond. A step of kind: natural drives one; before a single load of another kind both grow
+    to 1. Formulas are of the undeformed place x, y, z in the shell's length. A mapping has a value for each patch of a
+    mesh, for the dimple, and for the rest.
+    """
+
+    curvature: Annotated[Values, _components(3, -1e9, 1e9, lengths=True)] = None
+    """In addition to the drawn one, per natural length, positive where the surface bends towards its normal: one number
+    for all directions (a sphere), or k11, k22, k12 in the frame of `along` [1/length]"""
+    stretch: Annotated[Values, _components(2, 0.05, 20)] = None
+    """Natural over drawn length: one number for all directions, the thickness too, or two along t1 and t2 of `along`,
+    with the thickness as drawn"""
+    along: Literal["meridian"] | Annotated[list[Component], Field(min_length=3, max_length=3)] | None = None
+    """t1 of the frame t1, t2 = n x t1: away from the pole on the meridians of e3, or the part in the surface of a
+    vector; by default [1, 0, 0] of a strip, a plate and a mesh, meridian of all else"""
+
+    @model_validator(mode="after")
+    def _something_grows(self) -> Self:
+        if self.curvature is None and self.stretch is None:
+            raise ValueError("give curvature, stretch, or both")
+        return self
+
+    @property
+    def formulas(self) -> list[str]:
+        """Those of the curvature and the stretch."""
+        return [text for value in (self.curvature, self.stretch) for text in components(value) if isinstance(text, str)]
+
+
+def components(value: Any) -> list[float | str]:
+    """The numbers and formulas of a curvature or stretch, none of patches."""
+    return value if isinstance(value, list) else [] if value is None or isinstance(value, dict) else [value]
+
+
+def measured(data: Any) -> list[str]:
+    """The keys of plain data whose curvature has a unit."""
+
+    def units(value: Any) -> bool:
+        values = value.values() if isinstance(value, dict) else value if isinstance(value, list) else [value]
+        return any(units(v) if isinstance(v, list) else per_length(v) is not v for v in values)
+
+    return ["natural.curvature"] if isinstance(data, dict) and units(data.get("curvature")) else []

@@ -1,0 +1,1 @@
+"""Live pressure, enclosed gas, and the lids of openings."""

@@ -1,0 +1,36 @@
+"""A live pressure."""
+
+from math import copysign
+from typing import Annotated, ClassVar, Literal
+
+from pydantic import Field
+
+from magshell_fenicsx.input.targets import over
+from magshell_fenicsx.parts.step import Now, PathStep, Target, Until
+
+
+class PressureSection(PathStep):
+    """Live pressure, which follows the surface; p > 0 from outside."""
+
+    amplitude: ClassVar[str] = "pressure"
+    conjugate: ClassVar[str] = "volume"
+    conjugate_control: ClassVar[str] = "volume"
+    targets: ClassVar[dict[str, Target]] = {
+        "pressure": Target("load", "p_over_pc"),
+        "volume_change": Target("conjugate", "volume_change"),
+    }
+    kind: Literal["pressure"]
+    control: Literal["volume", "load", "arc"] = "volume"
+    """What is prescribed step by step: ΔV, p, or arc length, which passes every fold. The default is load with a target
+    `pressure`; and arc beside a free edge, where no ΔV is conjugate to p"""
+    until: Until = "limit"
+    pressure: Annotated[float, over("p_c")] | None = Field(default=None, ge=-1e3, le=1e3)
+    """Target p; with control: load or arc [p_c]"""
+    volume_change: Annotated[float, over("R³")] | None = Field(default=None, ge=-5, le=5)
+    """Target ΔV; with control: volume or arc [R³]"""
+
+    def begin(self, here: float) -> float:
+        return here
+
+    def first(self, change: float, now: Now, *, by_load: bool) -> float:
+        return copysign(0.1, change)

@@ -1,0 +1,277 @@
+"""The base of the steps of a programme: what a step drives, how, and how far."""
+
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self
+
+import numpy as np
+from pydantic import Discriminator, Field, Tag, model_validator
+
+from magshell_fenicsx.input.section import Pressure, Section
+from magshell_fenicsx.parts.search import SearchSection
+from magshell_fenicsx.parts.snap import SnapSection
+
+Until = Annotated[
+    Literal["limit", "bifurcation", "target", "points", "zero"],
+    Field(
+        description="Where the path ends: at the first instability (limit; past one that a half or a meridian excludes "
+        "it goes on to the model's own, up to twice the load), at the first bifurcation, through folds, at the target, "
+        "after `points` steps by arc length, or where the load has risen and fallen back to zero: the top of an energy "
+        "barrier, whose height is `barrier` in summary.json (zero)"
+    ),
+]
+Count = Annotated[int, Field(ge=1, le=10000, description="Equal parts to the target, each a row; or steps")]
+LEAST_TARGET = 1e-9
+Prescribed = Literal["load", "conjugate"]
+Control = Literal["load", "conjugate", "arc"]
+
+
+class GasSection(Section):
+    """An ideal gas at constant temperature under the shell: its pressure times its volume is constant."""
+
+    ambient: Pressure | None = Field(default=None, gt=0, le=1e12)
+    """Pressure outside, with a unit"""
+    ambient_over_pc: float | None = Field(default=None, gt=0, le=1e12)
+    """The same without one [p_c]"""
+    volume: float | None = Field(default=None, gt=0, le=1e6)
+    """Volume of the gas under the undeformed shell; by default the volume under the shell itself [R³]"""
+
+    @model_validator(mode="after")
+    def _one_ambient(self) -> Self:
+        if (self.ambient is None) == (self.ambient_over_pc is None):
+            raise ValueError("give ambient or ambient_over_pc")
+        return self
+
+
+class Gas(Section):
+    """The pressure follows from a gas under the shell."""
+
+    gas: GasSection
+    """The gas"""
+
+
+Hold = Annotated[
+    Annotated[Literal["load", "conjugate"], Tag("a word")] | Annotated[Gas, Tag("a gas")],
+    Discriminator(lambda data: "a gas" if isinstance(data, dict | Gas) else "a word"),
+]
+
+
+class Target(NamedTuple):
+    """What the value of a key prescribes: the amplitude or its conjugate, and the column of path.csv with it."""
+
+    quantity: Prescribed
+    column: str
+
+
+@dataclass(frozen=True)
+class Now:
+    """The amplitude of a step where the step begins.
+
+    Attributes
+    ----------
+    value, conjugate
+        mu, and -dPi/dmu.
+    unit
+        -dPi/dmu of one unit of the key that prescribes it.
+    driven
+        Whether an earlier step has driven the amplitude.
+    size
+        Of the amplitude of a full field, lambda_m; 1 for other loads.
+    """
+
+    value: float
+    conjugate: float
+    unit: float
+    driven: bool
+    size: float
+
+
+@dataclass(frozen=True)
+class Drive:
+    """How a step drives its amplitude.
+
+    Attributes
+    ----------
+    quantity, end
+        What has a target, mu or -dPi/dmu, and the target; None without.
+    targets
+        Requested values on the way, the last of them `end`.
+    first
+        Change of the amplitude in the first step.
+    scale
+        See `continuation.path.Path`.
+    step
+        The first step of a prescribed conjugate; None: it follows from `first`.
+    """
+
+    control: Control
+    quantity: Prescribed
+    end: float | None
+    targets: list[float]
+    first: float
+    scale: float = 1.0
+    step: float | None = None
+
+
+class Step(Section):
+    """What every step has in common.
+
+    Attributes
+    ----------
+    amplitude
+        Name of the amplitude that it drives.
+    conjugate
+        The displacement that `hold: conjugate` holds, in words; empty if it cannot be held.
+    """
+
+    amplitude: ClassVar[str]
+    conjugate: ClassVar[str] = ""
+    points: int
+    hold: dict[str, Hold] = Field(default_factory=dict)
+    """Amplitude of another step, or pressure -> what is constant in this step: the load itself (default), its
+    conjugate displacement (of the pressure the volume, of a force the displacement), or a gas under the shell. With
+    `until: limit` also this step's own amplitude: `conjugate` finds the instability at held volume or displacement"""
+    search: SearchSection | None = None
+    """Search for further solutions at the end of the step"""
+
+    @property
+    def place(self) -> Any:
+        """What distinguishes two loads of the same kind."""
+        return None
+
+    @property
+    def target(self) -> tuple[Target, float] | None:
+        """The target and its value, in the unit of its key; None without."""
+        return None
+
+
+class PathStep(Step):
+    """What every load that is followed along a path has in common.
+
+    Attributes
+    ----------
+    targets
+        The keys of targets.
+    conjugate_control
+        Name of the control that prescribes the conjugate displacement.
+    """
+
+    targets: ClassVar[dict[str, Target]] = {}
+    conjugate_control: ClassVar[str] = "displacement"
+    control: str
+    until: Until
+    points: Count = 10
+    then: Literal["snap"] | None = None
+    """What follows the fold that ends the step with `until: limit`: `snap` releases the shell, which moves under its
+    loads and what else is held, lightly damped, until it rests on the branch that it snaps to; the next step goes on
+    from there"""
+    snap: SnapSection = SnapSection.model_construct()
+    """How it is released"""
+    branches: bool = False
+    """Follow both directions of the branch at the first bifurcation too, to the target or for `points` steps"""
+    sensitivities: bool = False
+    """Derive the load at the fold that ends the path by all other amplitudes, the defect and each patch's remanence"""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _control_of_the_target(cls, data: Any) -> Any:
+        """A target that is a load is reached by load control, where the default prescribes its conjugate."""
+        default = cls.model_fields["control"].default
+        if not isinstance(data, dict) or "control" in data or default != cls.conjugate_control:
+            return data
+        quantities = {each.quantity for key, each in cls.targets.items() if data.get(key) is not None}
+        return {**data, "control": "load"} if quantities == {"load"} else data
+
+    @model_validator(mode="after")
+    def _target_fits_control(self) -> Self:
+        """One target that fits the control with `until: target`, none elsewhere."""
+        given, by = self._given, self.prescribed
+        fitting = [key for key, (quantity, _) in self.targets.items() if by in ("arc", quantity)]
+        for key, value in given.items():
+            if 0 < abs(value) < LEAST_TARGET:
+                raise ValueError(f"{key} is a target and must be zero, or at least {LEAST_TARGET:g} in size")
+        if self.until == "target" and (len(given) > 1 or not set(given) <= set(fitting) or not (given or self._end)):
+            names = " or ".join(fitting) or "another control"
+            raise ValueError(
+                f"until: target with control: {self.control} needs {names} (and nothing else) as target; control: arc "
+                f"takes {' or '.join(self.targets)}"
+            )
+        if self.until in ("limit", "bifurcation", "zero") and given:
+            raise ValueError(f"{next(iter(given))} is a target: it goes with until: target")
+        if self.until in ("points", "zero") and by != "arc":
+            why = "counts steps by arc length" if self.until == "points" else "passes the largest load"
+            raise ValueError(f"until: {self.until} {why}: it goes with control: arc")
+        if self.then and self.until != "limit":
+            raise ValueError("then: snap: goes with until: limit")
+        if self.snap != SnapSection() and not self.then:
+            raise ValueError("snap: goes with then: snap")
+        return self
+
+    @property
+    def _given(self) -> dict[str, float]:
+        return {key: value for key in self.targets if (value := getattr(self, key)) is not None}
+
+    @property
+    def _end(self) -> float | None:
+        """The target if no key gives one."""
+        return None
+
+    @property
+    def prescribed(self) -> Control:
+        """What is prescribed step by step, in the words of the solver."""
+        if self.control == self.conjugate_control:
+            return "conjugate"
+        return "load" if self.control == "load" else "arc"
+
+    @property
+    def target(self) -> tuple[Target, float] | None:
+        for key, value in self._given.items():
+            return self.targets[key], value
+        if self._end is None or self.until != "target":
+            return None
+        return next(iter(self.targets.values())), self._end
+
+    def first(self, change: float, now: Now, *, by_load: bool) -> float:
+        """Change of the amplitude in the first step, by default one of equal parts; its sign is that of `change`.
+
+        Parameters
+        ----------
+        change
+            From here to the target; without one 1.
+        by_load
+            Whether it is a change of the amplitude.
+        """
+        return change / self.points
+
+    def step(self, change: float | None, now: Now) -> float | None:
+        """The first step of a prescribed conjugate; None: it follows from `first`."""
+        return None
+
+    def drive(self, now: Now) -> Drive:
+        """How the step drives its amplitude from here.
+
+        Targets are equal parts of the way: from zero if the amplitude is driven for the first time, without those
+        that earlier steps have passed.
+        """
+        goal = self.target
+        quantity: Prescribed = goal[0].quantity if goal else "load"
+        by_load = quantity == "load"
+        here = now.value if by_load else now.conjugate
+        end = None if goal is None else goal[1] * (now.size if by_load else now.unit)
+        change = now.size if end is None else end - here
+        found: list[float] = []
+        if end is not None and self.until == "target":
+            begin = here if now.driven else self.begin(here)
+            found = [float(t) for t in np.linspace(begin, end, self.points + 1)[1:]]
+            found = [t for t in found if (t - here) * change > 0]
+        if self.until == "zero":
+            found = [0.0]
+        first, step = self.first(change, now, by_load=by_load), self.step(None if goal is None else change, now)
+        return Drive(self.prescribed, quantity, end, found, first, self.scale(now), step)
+
+    def begin(self, here: float) -> float:
+        """Where the equal parts of the first way to a target begin."""
+        return 0.0
+
+    def scale(self, now: Now) -> float:
+        """An amplitude that counts as of order one in the arc length."""
+        return 1.0

@@ -1,0 +1,1 @@
+"""What is held, what moves there, and its reactions."""

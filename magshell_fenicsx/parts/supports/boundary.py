@@ -1,0 +1,64 @@
+"""Conditions on the named edges and points of a geometry."""
+
+import re
+from collections.abc import Iterable
+from typing import Annotated, Any, Literal, get_args
+
+from pydantic import BeforeValidator, Field, ValidationError
+
+from magshell_fenicsx.input.section import Section
+
+EDGES = {"hemisphere": ("equator",), "disc": ("rim",), "strip": ("root", "tip", "sides")}
+Axis = Literal["x", "y", "z"]
+EdgeCondition = Literal["clamped", "simply supported", "hinged", "symmetry", "free"]
+
+
+class HeldSection(Section):
+    """Some components of the displacement are zero; rotations are free."""
+
+    held: Annotated[list[Axis], Field(min_length=1, max_length=3)]
+    """The components that are zero"""
+
+    @property
+    def components(self) -> tuple[int, ...]:
+        return tuple(sorted({"xyz".index(axis) for axis in self.held}))
+
+
+def _condition(value: Any) -> Any:
+    """One message for a union."""
+    if isinstance(value, HeldSection) or (isinstance(value, str) and value in get_args(EdgeCondition)):
+        return value
+    if isinstance(value, dict) and set(value) == {"held"}:
+        try:
+            return HeldSection.model_validate(value)
+        except ValidationError:
+            pass
+    raise ValueError(f"must be {', '.join(get_args(EdgeCondition))}, or {{held: [x, y, z]}} with some of these")
+
+
+class BoundarySection(Section):
+    """Edge, point or patch of a mesh -> condition; edges that are not named are free.
+
+    clamped: neither displacement nor rotation. hinged, or simply supported: no displacement. symmetry: the edge
+    lies in a mirror plane of a shape of which this is a part (of a whole shape take `symmetry: half`). held:
+    some components of the displacement; a point of `points` can be held too. A patch of a mesh file can be
+    clamped or held, all of it, if no edge has its name.
+    """
+
+    model_config = Section.model_config | {"extra": "allow"}
+    __pydantic_extra__: dict[
+        str, Annotated[Any, BeforeValidator(_condition, json_schema_input_type=EdgeCondition | HeldSection)]
+    ]
+
+    def conditions(self) -> dict[str, EdgeCondition | HeldSection]:
+        """Name -> condition."""
+        return dict(self.__pydantic_extra__ or {})
+
+
+def refuse_taken(points: Iterable[str]) -> None:
+    """Refuse names of points that the program gives itself."""
+    for point in points:
+        if point == "pole":
+            raise ValueError("points.pole: is taken, by the point that w_pole_over_h is of; choose another name")
+        if re.fullmatch(r"load(_\d+)?", point):
+            raise ValueError(f"points.{point}: is taken, by the point that is indented; choose another name")

@@ -1,0 +1,133 @@
+"""Motions of supports: edges, points and patches that are held and move as rigid bodies."""
+
+from collections.abc import Mapping
+from math import copysign
+from typing import Annotated, Any, ClassVar, Literal, Self
+
+from pydantic import Field, model_validator
+
+from magshell_fenicsx.input.section import Section, or_number
+from magshell_fenicsx.parts.step import Count, Now, PathStep, Target, Until
+from magshell_fenicsx.quantities.registry import QUANTITIES, TAKEN
+
+Finite = Annotated[float, Field(ge=-1e9, le=1e9)]
+Lengths = Annotated[list[Annotated[float, or_number("metre", Finite), Field(ge=-1e9, le=1e9)]], Field(
+    min_length=3, max_length=3
+)]  # fmt: skip
+Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$", max_length=40)]
+UNHELD = ("free", "symmetry")
+
+
+class TurnSection(Section):
+    """A rotation about an axis through a point."""
+
+    axis: Annotated[list[Finite], Field(min_length=3, max_length=3)]
+    """Along it, of any length"""
+    angle: float = Field(ge=-36000, le=36000)
+    """By the right-hand rule [degrees]"""
+    point: Lengths
+    """On the axis, where the shell is undeformed [the shell's length; over R if that has no unit]"""
+
+    @model_validator(mode="after")
+    def _there_is_one(self) -> Self:
+        if not any(self.axis) or not self.angle:
+            raise ValueError("axis and angle must not be zero")
+        return self
+
+
+class MoveSection(Section):
+    """A rigid motion of supports: first a rotation, then a translation, for a factor of one.
+
+    A clamped edge turns with its normal. The angle, and the translation, are proportional to the factor.
+    """
+
+    supports: list[str] = Field(min_length=1, max_length=1000)
+    """Names of `boundary` that hold displacements: edges, points or patches"""
+    translation: Lengths | None = None
+    """[the shell's length; over R if that has no unit]"""
+    rotation: TurnSection | None = None
+    """About a fixed axis"""
+
+    @model_validator(mode="after")
+    def _it_moves(self) -> Self:
+        if self.rotation is None and not any(self.translation or []):
+            raise ValueError("give a translation that is not zero, a rotation, or both")
+        return self
+
+
+class EdgeSection(PathStep):
+    """Supports that move, all in proportion to one factor.
+
+    Its conjugate is the reaction: the forces of the supports along their translations (their work over the sum of the
+    lengths of these), without translations the moments about the axes; with a pressure, that on the rigid lids
+    which close such edges counts. Later steps may move the same supports again,
+    from where they are then.
+    """
+
+    conjugate: ClassVar[str] = "reaction"
+    conjugate_control: ClassVar[str] = "reaction"
+    targets: ClassVar[dict[str, Target]] = {
+        "factor": Target("load", "motion"),
+        "reaction": Target("conjugate", "reaction"),
+    }
+    kind: Literal["edge"]
+    name: Name = "motion"
+    """Name of the factor, which is its column in path.csv"""
+    moves: list[MoveSection] = Field(min_length=1, max_length=100)
+    """Motions of supports"""
+    control: Literal["load", "reaction", "arc"] = "arc"
+    """What is prescribed step by step: the factor, the reaction, or arc length, which passes every fold"""
+    until: Until = "target"
+    factor: float | None = Field(default=None, ge=-1e9, le=1e9)
+    """Target of the factor, 1 by default; with control: load or arc"""
+    reaction: Annotated[float, or_number("newton"), Field(ge=-1e30, le=1e30)] | None = None
+    """Target of the reaction; with control: reaction or arc [force; of rotations alone force times length]"""
+    points: Count = 10
+
+    @model_validator(mode="after")
+    def _each_once(self) -> Self:
+        if self.name in ({*TAKEN, *QUANTITIES} - {"motion"}):
+            raise ValueError(f"name: {self.name}: is taken; choose another name for the factor of the motion")
+        named = [name for move in self.moves for name in move.supports]
+        if twice := next((name for name in named if named.count(name) > 1), None):
+            raise ValueError(f"moves: {twice}: moves twice in one step; let a later step move it again")
+        return self
+
+    @property
+    def amplitude(self) -> str:  # type: ignore[override]  # each motion has a name of its own
+        return self.name
+
+    @property
+    def place(self) -> Any:
+        return self.moves
+
+    @property
+    def _end(self) -> float | None:
+        return 1.0 if self.reaction is None and self.control != "reaction" else None
+
+    def first(self, change: float, now: Now, *, by_load: bool) -> float:
+        return change / self.points if by_load else copysign(1e-3 * self.scale(now), -change)
+
+    def step(self, change: float | None, now: Now) -> float | None:
+        return abs(change) / self.points if self.control == "reaction" and change else None
+
+    def scale(self, now: Now) -> float:
+        return abs(self.factor or 1.0)
+
+
+def refuse_unheld(key: str, load: EdgeSection, conditions: Mapping[str, Any]) -> None:
+    """See that a step moves nothing but supports.
+
+    Raises
+    ------
+    ValueError
+        With the name and what is allowed.
+    """
+    held = sorted(name for name, condition in conditions.items() if condition not in UNHELD)
+    for i, move in enumerate(load.moves):
+        for name in move.supports:
+            if name not in held:
+                raise ValueError(
+                    f"{key}.moves.{i}.supports: {name}: only what boundary holds (clamped, hinged or held) can move: "
+                    f"{', '.join(held) or 'nothing'}"
+                )

@@ -1,0 +1,120 @@
+"""What holds a meridian: displacements that are zero at its ends, and whether it is held against rigid motions."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from dolfinx import fem
+from numpy.typing import NDArray
+
+from magshell_fenicsx.mesh.patch import MeshError
+from magshell_fenicsx.models.axisymmetric.meridian import Meridian
+from magshell_fenicsx.models.shell.parameters import Condition, Held
+from magshell_fenicsx.parts.pressure.openings import ring_openings
+from magshell_fenicsx.parts.supports.supports import RIGHT, STRAIGHT, no_mirror
+
+Facets = NDArray[np.int32]
+HORIZONTAL, AXIAL = {0, 1}, 2  # components of the displacement
+
+
+@dataclass(frozen=True)
+class Supports:
+    """Facets of the meridian by what is held there.
+
+    Attributes
+    ----------
+    axis
+        The point on the axis, which no axisymmetric displacement moves off it.
+    horizontal, axial
+        Where the displacements normal to e3 and along e3 are zero.
+    mirror
+        Where a plane normal to e3 mirrors the shell.
+    named
+        Name of an end, or of a point on the axis -> facets, and the components of (U, W) that are held there.
+    """
+
+    axis: Facets
+    horizontal: Facets
+    axial: Facets
+    mirror: Facets
+    named: Mapping[str, tuple[Facets, tuple[int, ...]]]
+
+    def held(self, V: fem.FunctionSpace) -> list[fem.DirichletBC]:
+        """Of the axisymmetric displacement (U, W)."""
+        return [_zero(V, self.axis, 0), _zero(V, self.horizontal, 0), _zero(V, self.axial, 1)]
+
+    def held_waves(self, V: fem.FunctionSpace, m: int) -> list[fem.DirichletBC]:
+        """Of the coefficients (U + V, V, W): a wave m = 1 may move the axis across itself."""
+        at_axis = [_zero(V, self.axis, i) for i in ((0, 2) if m == 1 else (0, 1, 2))]
+        return [*at_axis, *(_zero(V, self.horizontal, i) for i in range(2)), _zero(V, self.axial, 2)]
+
+    def refuse_loose(self, r0: fem.Function) -> None:
+        """See that no rigid motion is left free; nothing but supports holds an unloaded shell.
+
+        Raises
+        ------
+        MeshError
+            With the motion.
+        """
+
+        def places(facets: Facets) -> NDArray[np.float64]:
+            dofs = fem.locate_dofs_topological(r0.function_space, 0, facets)
+            return np.asarray(r0.x.array.reshape(-1, 2)[dofs])
+
+        if not len(self.axial):
+            raise MeshError("boundary: the shell is not held: it is free to move along (0, 0, 1)")
+        # moved by a along e1 and turned by b about e2 it moves by a + b z along e1, at most by b rho along e3
+        rows = [[1.0, z] for _, z in places(self.horizontal)] + [[0.0, rho] for rho, _ in places(self.axial)]
+        stopped = np.linalg.matrix_rank(np.array(rows), tol=1e-9)
+        if stopped < 2:
+            motion = "turn" if len(self.horizontal) else "move along (1, 0, 0)"
+            raise MeshError(f"boundary: the shell is not held: it is free to {motion}")
+
+
+def supports(meridian: Meridian, conditions: Mapping[str, Condition]) -> Supports:
+    """The supports that conditions of named ends make, and those of a named point on the axis.
+
+    Raises
+    ------
+    MeshError
+        If an end lies in no plane of symmetry.
+    """
+    horizontal, axial, mirror = found = [list[Facets]() for _ in range(3)]
+    named: dict[str, tuple[Facets, tuple[int, ...]]] = {}
+    for name, condition in conditions.items():
+        here = meridian.ends.get(name, meridian.axis)
+        held = set(condition.components) if isinstance(condition, Held) else set()
+        if condition in ("clamped", "simply supported"):
+            held = {*HORIZONTAL, AXIAL}
+        if condition == "plane":
+            _refuse_slanting(meridian, name)
+            mirror.append(here)
+            held = {AXIAL}
+        if held >= HORIZONTAL:
+            horizontal.append(here)
+        if AXIAL in held:
+            axial.append(here)
+        both = tuple(i for i, part in enumerate((HORIZONTAL, {AXIAL})) if held >= part)
+        if both:
+            named[name] = here, both
+    parts = [np.unique(np.concatenate([np.empty(0, np.int32), *f])) for f in found]
+    return Supports(meridian.axis, parts[0], parts[1], parts[2], named)
+
+
+def openings(meridian: Meridian, conditions: Mapping[str, Condition]) -> tuple[list[str], tuple[str, ...]]:
+    """The ends that are not held, and those of them where a live pressure has no potential."""
+    places = {name: meridian.section(np.array([meridian.parameter(name)]))[0] for name in meridian.ends}
+    return ring_openings(places, conditions)
+
+
+def _refuse_slanting(meridian: Meridian, name: str) -> None:
+    """See that the surface crosses the plane of an end at right angles."""
+    s = meridian.parameter(name)
+    (rho, z), (rho_near, z_near) = meridian.section(np.array([s, s + (STRAIGHT if s == 0 else -STRAIGHT)]))
+    if abs(z_near - z) < RIGHT * np.hypot(rho_near - rho, z_near - z):
+        raise MeshError(no_mirror(name))
+
+
+def _zero(V: fem.FunctionSpace, facets: Facets, component: int) -> fem.DirichletBC:
+    part = V.sub(component)
+    return fem.dirichletbc(0.0, fem.locate_dofs_topological(part, 0, facets), part)

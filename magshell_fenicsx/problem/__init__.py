@@ -1,0 +1,1 @@
+"""The parts added up, without any mesh: symmetry, sizes, names, limits, columns, check."""

@@ -1,0 +1,102 @@
+"""What a model has and what is left out, in words."""
+
+from collections import Counter
+from math import degrees
+
+from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.mesh.mirror import Mirror, plane_text
+from magshell_fenicsx.models.shell.parameters import Loads
+from magshell_fenicsx.parts.imperfections.growth import grown_by
+from magshell_fenicsx.parts.imperfections.rims import MOST_RIMS
+from magshell_fenicsx.parts.registered import PARTS
+from magshell_fenicsx.problem.body import layers, neo_hookean
+from magshell_fenicsx.shape.sections import MeshSurface
+
+SHOWN = 6  # of many imperfections
+
+
+def account(case: Case, loads: Loads, model: str, mirror: Mirror | None, rims: int) -> tuple[list[str], list[str]]:
+    """What is included and what is left out.
+
+    Parameters
+    ----------
+    model
+        "meridian", "half shell", ...
+    mirror
+        Plane of a half.
+    rims
+        Number of different rims beside the pole.
+    """
+    included = [model, "membrane and bending energy" if case.model == "shell" else _elastic(case)]
+    left_out = []
+    if loads.magnetic:
+        law = "" if loads.magnetic.law == "deformation" else ", remanence that turns and does not stretch"
+        included.append(f"magnetic energy ({loads.magnetic.energy}){law}, lambda_m = {case.lambda_m:g}")
+        included += [f"source {source.name or i}: {source.words()}" for i, source in enumerate(case.sources)]
+    else:
+        left_out.append("magnetic energy: " + ("lambda_m is zero" if case.magnetic else "no magnetic section"))
+    if loads.natural:
+        names = " and ".join(name.removeprefix("natural_") for name in loads.natural.amplitudes)
+        included.append(f"natural {names}: strains are measured from there")
+    else:
+        left_out.append("natural shape: as drawn")
+    if loads.pressure:
+        included.append("live pressure" if case.model == "shell" else "live pressure on the outer face")
+    else:
+        left_out.append("pressure: not loaded by it (the volume is only reported)")
+    for force in loads.forces.values():
+        patch = force.patch * case.shell.R_over_h
+        included.append(f"force on a patch of radius {patch:g} h" if patch else "force at a point")
+    if not loads.forces:
+        left_out.append("force: none")
+    if dead := loads.all_dead:
+        included.append(f"{len(dead)} dead load{'s' * (len(dead) > 1)}")
+    if loads.moves:
+        moved = dict.fromkeys(name for move in loads.moves for name in move.names)
+        included.append(f"supports that move: {', '.join(moved)}")
+    for contact in loads.contacts:
+        k, kind = f"{contact.stiffness:.4g}", str(case.bodies[contact.body].kind)
+        if radius := getattr(case.bodies[contact.body], "radius", None):
+            kind += f" of radius {1e3 * radius:g} mm" if case.shell.with_units else f" of radius {radius:g}"
+        included.append(f"body {contact.body}: {kind} without friction, stiffness k R²/(E h) = {k}")
+    if case.imperfections:
+        included.append(_imperfections(case, rims))
+    for name, keys in grown_by(case.programme, case.imperfections).items():
+        included.append(f"{name} grows: {', '.join(keys)}")
+    for key, part in PARTS.items():
+        if key in case.parts:
+            included.append(case.parts[key].account(case.scales))
+        else:
+            left_out.append(part.absent)
+    if model == "meridian":
+        left_out.append("waves around the axis (they are looked for at each point)")
+    if mirror:
+        plane = (
+            f"through e3 at azimuth {degrees(mirror.azimuth) + 0.0:g} degrees"
+            if mirror.through_e3
+            else plane_text(mirror)
+        )
+        left_out.append(
+            f"the other half: mirror plane {plane} (modes antisymmetric to it are looked for along the path)"
+        )
+    return included, left_out
+
+
+def _imperfections(case: Case, rims: int) -> str:
+    """All of a few; of many how many there are of each kind."""
+    found = [section.account() for section in case.imperfections.values()]
+    if len(found) > SHOWN:
+        kinds = Counter(section.kind for section in case.imperfections.values())
+        found = [f"{count} of kind {kind}" for kind, count in kinds.items()]
+    beside = ""
+    if case.dimples and (isinstance(case.shell, MeshSurface) or rims > MOST_RIMS):
+        why = "of a mesh file" if isinstance(case.shell, MeshSurface) else f"of more than {MOST_RIMS}"
+        beside = f"; elements lie across the rims of dimples, {why}: k_d is then less exact"
+    return f"imperfections: {', '.join(found)}{beside}"
+
+
+def _elastic(case: Case) -> str:
+    material, count = neo_hookean(case), len(layers(case)) - 1
+    ratio = material.bulk / material.shear
+    small_strains = f"E = {material.youngs_modulus:.5g}, nu = {material.nu:.5g} for small strains"
+    return f"neo-Hookean energy, kappa/mu = {ratio:.5g} ({small_strains}), {count} layer{'s' * (count > 1)}"

@@ -1,0 +1,296 @@
+"""The formulas of a case in the undeformed place: that they have sensible values, and where elements must be small."""
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from math import ceil, inf, sqrt
+
+import basix
+import numpy as np
+from mpi4py import MPI
+from numpy.typing import NDArray
+
+from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.input.by_formula import function
+from magshell_fenicsx.input.messages import shown
+from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.mesh.frame import rotation
+from magshell_fenicsx.mesh.grading import PER_AREA, Squares
+from magshell_fenicsx.mesh.grid import Grid
+from magshell_fenicsx.mesh.msh import MeshFile
+from magshell_fenicsx.mesh.patch import PatchMesh
+from magshell_fenicsx.mesh.shapes import DiscShape, Shape, StripShape
+from magshell_fenicsx.models.shell.fitted import Cells, fitted
+from magshell_fenicsx.models.shell.patterns import LARGEST as LARGEST_VECTOR
+from magshell_fenicsx.models.shell.thickness import LEAST_FACTOR, MOST_FACTOR
+from magshell_fenicsx.parts.forces.dead import DeadSection
+from magshell_fenicsx.parts.imperfections.flaw import Flaw
+from magshell_fenicsx.parts.natural.shape import LARGEST, SMALLEST
+from magshell_fenicsx.shape.outline import ANY, Outline
+
+Array = NDArray[np.float64]
+SAMPLES = 20  # along each side of a square of the chart
+COARSEST, MOST_FIRST, MOST_SQUARES = 0.2, 800, 3000  # side of the first squares over R, how many, and how many later
+DEGREE = 4  # of the polynomials that are compared
+SHOWN, SMALLEST_SQUARE = 0.25, 0.1  # of sqrt(Rh) and of h: elements of this size show loads, and all else
+SMALLEST_FLAW = 0.25  # of h
+TOTAL, SQUARE = 1e-3, 0.02  # of the integrals of a formula's size and of its square, which cells may miss
+CHEAPER = 0.5  # of as many elements as small ones everywhere are: a graded mesh is worth while
+MISSED = 0.003  # of the variance of a formula: what polynomials on squares may miss of it
+CURVATURE = 1e6  # of a natural shape, over 1/R
+LOCAL = (np.stack(np.meshgrid(*[np.arange(SAMPLES)] * 2, indexing="ij"), axis=-1).reshape(-1, 2) + 0.5) / SAMPLES - 0.5
+_POWERS = [(i, j) for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i)]
+BASIS = np.linalg.qr(np.stack([(2 * LOCAL[:, 0]) ** i * (2 * LOCAL[:, 1]) ** j for i, j in _POWERS], axis=-1))[0]
+
+
+@dataclass(frozen=True)
+class Written:
+    """A key of the case with formulas of the undeformed place.
+
+    Attributes
+    ----------
+    of_place
+        Places (n, 3) over R in the frame of the case -> each formula's values (n, formulas), in the case's unit.
+    least, most
+        Allowed values.
+    load
+        Whether it is a load: what is shorter than about sqrt(Rh) bends no shell then, and its moments are exact on
+        elements of any size. Strains follow all else down to its last detail.
+    """
+
+    key: str
+    texts: tuple[str, ...]
+    of_place: Callable[[Array], Array]
+    least: float
+    most: float
+    load: bool = False
+
+
+def written(case: Case) -> list[Written]:
+    """Those of thickness, remanence, dead loads and natural shape."""
+    return list(_written(case))
+
+
+def _written(case: Case) -> Iterator[Written]:
+    R = case.shell.reference
+
+    def one(
+        key: str, values: Iterable[float | str], least: float, most: float, length: float = R, *, load: bool = False
+    ) -> Iterator[Written]:
+        texts = tuple(v for v in values if isinstance(v, str))
+        functions = [function(text) for text in texts]
+
+        def of_place(x: Array) -> Array:
+            return np.stack([f(*(length * x).T) for f in functions], axis=-1)
+
+        if texts:
+            yield Written(key, texts, of_place, least, most, load)
+
+    if isinstance(case.thickness_factor, str):
+        yield from one("shell.thickness_factor", [case.thickness_factor], LEAST_FACTOR, MOST_FACTOR, 1.0)
+    if case.magnetic and case.magnetic.remanent.components:
+        key = "magnetic.remanent.components"
+        yield from one(key, case.magnetic.remanent.components, -LARGEST_VECTOR, LARGEST_VECTOR, 1.0)
+    for step in case.programme:
+        if isinstance(step.load, DeadSection):
+            for i, load in enumerate(step.load.loads):
+                for name in ("per_length", "per_area", "pressure"):
+                    value = getattr(load, name)
+                    unit = case.scales.E * case.scales.h / (R if name != "per_length" else 1.0)
+                    most = LARGEST_VECTOR * unit
+                    values = value if isinstance(value, list) else [value]
+                    yield from one(f"{step.key}.loads.{i}.{name}", values, -most, most, load=True)
+    for name, least, most in (("stretch", SMALLEST, LARGEST), ("curvature", -CURVATURE / R, CURVATURE / R)):
+        value = getattr(case.natural, name, None)
+        values = value if isinstance(value, list) else [] if isinstance(value, dict) else [value]
+        yield from one(f"natural.{name}", values, least, most)
+
+
+def refuse_unfit_formulas(formulas: Sequence[Written], x: Array) -> None:
+    """Look at the values at places (n, 3) over R of the undeformed shell.
+
+    Raises
+    ------
+    CaseError
+        With the first place where one is not finite or out of bounds.
+    """
+    for each in formulas:
+        values = each.of_place(x)
+        bad = ~((values >= each.least) & (values <= each.most))
+        if bad.any():
+            row, i = np.argwhere(bad)[0]
+            place = ", ".join(f"{c:.3g}" for c in x[row])
+            bounds = f"{each.least:.4g} to {each.most:.4g}"
+            raise CaseError(
+                f"{each.key}: {shown(each.texts[i])}: is {values[row, i]:.4g} at (x, y, z)/R = ({place}): "
+                f"allowed {bounds}"
+            )
+
+
+def squares(places: Callable[[Array], Array], outline: Outline, sizes: "Sizes", finest: float) -> Squares | None:
+    """Squares of the chart in which elements must be small; None if there are none, or the chart is a mesh file's.
+
+    Squares are divided until the elements that they need are no smaller than they, or as small as `finest`.
+
+    Parameters
+    ----------
+    places
+        Chart (n, 2) -> places (n, 3) over R in the frame of the case.
+    sizes
+        Places (squares, n, 3), which of them are inside, and the side of the squares -> size of elements of each.
+    """
+    shape = outline.chart(None, ANY)
+    if isinstance(shape, MeshFile):
+        return None
+    low, high = extent(shape)
+    side = max(min(COARSEST, *(high - low)), float(np.sqrt(np.prod(high - low) / MOST_FIRST)))
+    t = [a + side * (np.arange(ceil((b - a) / side - 1e-9)) + 0.5) for a, b in zip(low, high, strict=True)]
+    centres: Array = np.stack(np.meshgrid(*t, indexing="ij"), axis=-1).reshape(-1, 2)
+    found, largest = list[tuple[Array, float, Array]](), side
+    while len(centres) and len(centres) <= MOST_SQUARES:
+        chart = centres[:, None] + side * LOCAL
+        inside = within(shape, chart)
+        kept = inside.any(axis=1)
+        centres, chart, inside = centres[kept], chart[kept], inside[kept]
+        size = sizes(places(chart.reshape(-1, 2)).reshape(*chart.shape[:2], 3), inside, side)
+        small = (size < side) & (side > finest)
+        leaves = ~small & (np.maximum(size, finest) < largest)
+        found.append((centres[leaves], side, np.maximum(size[leaves], finest)))
+        side /= 2
+        offsets = side / 2 * np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])
+        centres = (centres[small][:, None] + offsets).reshape(-1, 2)
+    if len(centres):  # so many that they are all alike: as small as can be paid for
+        found.append((centres, side, np.full(len(centres), max(side, finest))))
+    if not sum(len(each) for each, _, _ in found):
+        return None
+    sides = np.concatenate([np.full(len(each), s) for each, s, _ in found])
+    return Squares(np.concatenate([c for c, _, _ in found]), sides / 2, np.concatenate([s for _, _, s in found]))
+
+
+Sizes = Callable[[Array, NDArray[np.bool_], float], Array]
+
+
+def extent(shape: Shape | Grid) -> tuple[Array, Array]:
+    """Lower and upper corner of a chart."""
+    if isinstance(shape, Grid):
+        return np.array(shape.low), np.array(shape.high)
+    if isinstance(shape, StripShape):
+        return np.array([0.0, -shape.width / 2]), np.array([1.0, shape.width / 2])
+    return np.full(2, -shape.reach), np.full(2, shape.reach)
+
+
+def within(shape: Shape | Grid, chart: Array) -> NDArray[np.bool_]:
+    """Whether points (..., 2) belong to a chart."""
+    if isinstance(shape, DiscShape):
+        return np.asarray(np.hypot(chart[..., 0], chart[..., 1]) <= shape.reach)
+    low, high = extent(shape)
+    return np.asarray(((chart >= low) & (chart <= high)).all(axis=-1))
+
+
+def shown_by_polynomials(values: Callable[[Array], Array]) -> Sizes:
+    """Elements that show a formula of places (n, 3): smaller than the squares where polynomials miss most of it."""
+    whole: float = 0.0
+    mean: Array | None = None
+
+    def sizes(x: Array, inside: NDArray[np.bool_], side: float) -> Array:
+        nonlocal whole, mean
+        f = values(x.reshape(-1, 3)).reshape(*x.shape[:2], -1)
+        good = inside & np.isfinite(f).all(axis=-1)
+        mean = f[good].mean(axis=0) if mean is None else mean
+        f = np.where(good[..., None], f - mean, 0.0)
+        missed = f - BASIS @ (BASIS.T @ f)
+        for i in np.flatnonzero(~good.all(axis=1)):
+            Q = np.linalg.qr(BASIS[good[i]])[0]
+            missed[i], g = 0.0, f[i][good[i]]
+            missed[i][good[i]] = g - Q @ (Q.T @ g)
+        area = (side / SAMPLES) ** 2
+        whole = max(whole, area * float((f**2).sum()))
+        squared = area * (missed**2).sum(axis=(1, 2))
+        order = np.argsort(squared)
+        fine = np.empty(len(f), dtype=bool)
+        fine[order] = np.cumsum(squared[order]) <= MISSED * whole
+        return np.where(fine, side, side / 2)
+
+    return sizes
+
+
+def refinements(case: Case, formulas: Sequence[Written], drawn: Outline, turn: float, h: float) -> list[Squares]:
+    """Where formulas need small elements, in the chart of a frame that is turned about e3 (rad)."""
+    Q = rotation(turn)
+
+    def places(chart: Array) -> Array:
+        return drawn.embedding(chart) @ Q
+
+    finest = {True: SHOWN * sqrt(h), False: SMALLEST_SQUARE * h}
+    found = (squares(places, drawn, shown_by_polynomials(each.of_place), finest[each.load]) for each in formulas)
+    return [each.finer(case.mesh.refinement) for each in found if each]
+
+
+def of_imperfections(
+    flaws: Iterable[Flaw], perfect: Outline, turn: float, case: Case, h: float
+) -> tuple[list[Squares], float]:
+    """Where imperfections without a centre need small elements, and the size that shows the others everywhere."""
+    Q, everywhere, local = rotation(turn), inf, list[Squares]()
+    shape = perfect.chart(None, ANY)
+
+    def places(chart: Array) -> Array:
+        return perfect.perfect(chart) @ Q
+
+    for flaw in flaws:
+        found = flaw.sizes and squares(places, perfect, _smallest(flaw.sizes), SMALLEST_FLAW * h)
+        if found is None:
+            everywhere = min(everywhere, flaw.size)
+            continue
+        assert not isinstance(shape, MeshFile)  # it has no squares
+        low, high = extent(shape)
+        alike = PER_AREA * float(np.prod(high - low)) / found.size**2
+        if found.cells(float(np.linalg.norm(high - low)) / 2) < CHEAPER * alike:
+            local.append(found.finer(case.mesh.refinement))
+        else:
+            everywhere = min(everywhere, found.size)
+    return local, everywhere
+
+
+def _smallest(of_place: Callable[[Array], Array]) -> Sizes:
+    """Elements that are the smallest which places (n, 3) of a square need; a quarter of the places is looked at."""
+
+    def sizes(x: Array, inside: NDArray[np.bool_], side: float) -> Array:
+        fewer = x.reshape(-1, SAMPLES, SAMPLES, 3)[:, ::2, ::2]
+        found = of_place(fewer.reshape(-1, 3)).reshape(fewer.shape[:-1])
+        return np.asarray(np.where(inside.reshape(-1, SAMPLES, SAMPLES)[:, ::2, ::2], found, inf).min(axis=(1, 2)))
+
+    return sizes
+
+
+def unshown(formulas: Sequence[Written], cells: Cells, turn: float, h: float) -> list[str]:
+    """What the cells miss of formulas, in words; collective."""
+    Q, element, said = rotation(turn), cells.element, list[str]()
+    for each in formulas:
+
+        def values(x: Array, n: Array, each: Written = each) -> Array:
+            return each.of_place(x.reshape(-1, 3) @ Q).reshape(*x.shape[:-1], -1)
+
+        x, normals, _ = cells.at(element.points)
+        fit = fitted(values, cells, values(x, normals), element, element.degree)
+        missed = fit.rest**2
+        if fit.missed > TOTAL:
+            wrong = f"{100 * fit.missed:.2g} %"
+            said.append(f"{each.key}: its integral over the mesh may be wrong by {wrong}: it varies too much")
+        elif missed > SQUARE and not (each.load and fit.widest < 4 * SHOWN * sqrt(h)):
+            said.append(
+                f"{each.key}: varies within elements of up to {fit.widest:.2g} R: its integral is right, but "
+                f"{100 * missed:.2g} % of that of its square is not shown; take a smaller mesh.size or a larger "
+                "mesh.refinement"
+            )
+    return said
+
+
+def cells_of_patch(patch: PatchMesh, degree: int) -> Cells:
+    """The cells of a triangulation, with the places of a model of that degree."""
+    element = basix.create_element(
+        basix.ElementFamily.P, basix.CellType.triangle, degree, basix.LagrangeVariant.gll_warped
+    )
+    corners = patch.nodes[patch.cells[:, :3]]
+    X = element.points
+    chart = corners[:, :1] + np.einsum("qk,ckd->cqd", X, corners[:, 1:] - corners[:, :1])
+    places = patch.embedding(chart.reshape(-1, chart.shape[-1])).reshape(*chart.shape[:2], 3)
+    return Cells(element, places, len(places), MPI.COMM_SELF)

@@ -1,0 +1,295 @@
+"""From a case to what must be built for it, without building anything: the parts added up."""
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
+from math import inf, radians, sqrt
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.input.expressions import formula
+from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.mesh.frame import rotation
+from magshell_fenicsx.mesh.grading import Grading, Squares
+from magshell_fenicsx.mesh.grid import Grid
+from magshell_fenicsx.mesh.mirror import CUT, Y0, Mirror
+from magshell_fenicsx.mesh.msh import MeshFile, cell_count
+from magshell_fenicsx.mesh.rimmed import RimmedGrid
+from magshell_fenicsx.mesh.shapes import DiscShape, StripShape
+from magshell_fenicsx.models.axisymmetric.meridian import graded_vertices
+from magshell_fenicsx.models.shell.own_term import OwnTerm
+from magshell_fenicsx.models.shell.parameters import Condition, Held, Material
+from magshell_fenicsx.models.shell.thickness import Thickness
+from magshell_fenicsx.parts.bodies.registered import body_leaves, contacts, pressed
+from magshell_fenicsx.parts.forces.dead import DeadSection
+from magshell_fenicsx.parts.forces.indentation import IndentationSection
+from magshell_fenicsx.parts.forces.loads import indented, loads, potentials, refuse_wide_patch
+from magshell_fenicsx.parts.imperfections.flaw import Flaw, in_frame
+from magshell_fenicsx.parts.imperfections.growth import grown_by
+from magshell_fenicsx.parts.imperfections.registered import flaws
+from magshell_fenicsx.parts.imperfections.rims import MOST_RIMS, Spot, different, spots
+from magshell_fenicsx.parts.imperfections.symmetry import leaves
+from magshell_fenicsx.parts.magnetism.magnetisation import magnetisation
+from magshell_fenicsx.parts.supports.boundary import BoundarySection, EdgeCondition, HeldSection
+from magshell_fenicsx.problem.account import account
+from magshell_fenicsx.problem.columns import refuse_twice
+from magshell_fenicsx.problem.formulas import of_imperfections, refinements, refuse_unfit_formulas, written
+from magshell_fenicsx.problem.limits import refuse_unbounded_fields, sources_beside, unknowns_of
+from magshell_fenicsx.problem.names import refuse_unfit_ends
+from magshell_fenicsx.problem.own_terms import surface_terms
+from magshell_fenicsx.problem.problem import Plan
+from magshell_fenicsx.problem.sizes import Loaded, grading, travel
+from magshell_fenicsx.shape.outline import Chart, Outline, outline, refuse_beside
+from magshell_fenicsx.shape.sections import MeshSurface
+from magshell_fenicsx.shape.symmetry import Leaves, askew, field_fits, left, mirror, unmirrored
+
+Array = NDArray[np.float64]
+Points = dict[str, Array]
+PRESSED = 0.08  # of sqrt(Rh): cells of a meridian that show the ring of a contact
+FAR_FROM_ONE = 50.0  # times the radius, or a part of it: a surface as long as that hints at another unit
+
+
+def make_plan(case: Case, terms: Sequence[OwnTerm] = ()) -> Plan:
+    """Plan a case, with its user-defined energies and `terms`.
+
+    Raises
+    ------
+    CaseError
+        If the symmetry that is asked for is not there, or what is asked for cannot be built.
+    MeshError
+        If the meridian has no such edge or point.
+    """
+    material = Material(case.shell.poisson_ratio, 1 / case.shell.R_over_h)
+    perfect = outline(case)
+    found = flaws(case, perfect)
+    growing = {
+        name: {key: found[key] for key in keys} for name, keys in grown_by(case.programme, case.imperfections).items()
+    }
+    still = {*found} - {key for keys in growing.values() for key in keys}
+    drawn = imperfect(perfect, found, 0.0, still)
+    places = indented(case, drawn)
+    sample = np.zeros((0, 3)) if isinstance(case.shell, MeshSurface) else drawn.sample()
+    refuse_unbounded_fields(case, sample)
+    formulas = written(case)
+    refuse_unfit_formulas(formulas, sample if len(sample) or not formulas else drawn.sample())
+    terms = (*case.own_terms, *terms)
+    energies = surface_terms(case, terms)
+    parts = left(case, drawn, places, (*energies, *potentials(case)))
+    parts += leaves(found, perfect, each=bool(case.patches))
+    parts += [body_leaves(contact) for contact in contacts(case, perfect, drawn, 0.0)]
+    axisymmetric, plane = _symmetry(case, drawn, parts)
+    half = plane is not None
+    turn, beyond = 0.0, plane
+    if plane and drawn.round and plane.through_e3:  # the frame is turned into the plane
+        turn, beyond = plane.azimuth, Y0
+    points = _named_points(case, drawn, turn, half)
+    under = dict[str, str]()
+    for name, place in places.items():
+        load = _place(case, drawn, name, place, turn, half)
+        candidates = (point for point in ("pole", *under.values()) if point in points)
+        same = (point for point in candidates if np.array_equal(points[point], load))
+        under[name] = next(same, name.replace("force", "load"))
+        points[under[name]] = load
+    refuse_wide_patch(case, drawn, {name: points[point] for name, point in under.items()})
+    loaded: list[Loaded] = [
+        (points[load.at], []) for step in case.loads_of(DeadSection) for load in step.loads if load.at
+    ]
+    for point in dict.fromkeys(under.values()):
+        there = (step.load for step in case.programme if under.get(step.name) == point)
+        loaded.append((points[point], [load for load in there if isinstance(load, IndentationSection)]))
+    local = [] if isinstance(case.shell, MeshSurface) else spots(found.items(), perfect, turn)
+    wide = [flaw for flaw in found.values() if flaw.centre is None]
+    everywhere, varying = min((flaw.size for flaw in wide), default=inf), list[Squares]()
+    bodies = contacts(case, perfect, drawn, turn)
+    touched = [(drawn.inverse(c.front), travel(material.h, pressed(case, c.body), c.size), c.size) for c in bodies]
+    if not (axisymmetric or case.mesh.size):
+        varying, everywhere = of_imperfections(wide, perfect, turn, case, material.h)
+        varying += refinements(case, formulas, drawn, turn, material.h)
+    size = grading(case, drawn, material.h, local, everywhere, loaded, touched, varying)
+    drawn = imperfect(perfect, found, turn, still)
+    shape = drawn.chart(beyond, size)
+    if isinstance(shape, Grid) and beyond:  # what a point needs, its image needs too
+        images = [drawn.inverse(beyond.image(drawn.embedding(x[None])[0])) for x in points.values()]
+        x, y = ((*shape.through[i], *(float(image[i]) for image in images)) for i in range(2))
+        shape = replace(shape, through=(x, y))
+    rims = different(local)
+    shape = _matched(shape, local, rims if len(rims) <= MOST_RIMS else ())
+    span = drawn.span if axisymmetric else None
+    conditions = edge_conditions(case.boundary, turn)
+    supports = tuple(name for name, condition in conditions.items() if condition != "free")
+    if beyond:
+        conditions = {name: c for name, c in conditions.items() if name not in beyond.lost} | {CUT: "symmetry"}
+    within = {name: in_frame(found[key].inside, turn) for name, key in case.dimples.items()}
+    grown = {name: tuple(in_frame(f.deviation, turn) for f in each.values()) for name, each in growing.items()}
+    all_loads = replace(loads(case, under, turn, beyond, energies, within), contacts=bodies, growing=grown)
+    magnetic = case.magnetic
+    if magnetic and not all_loads.magnetic and field_fits(case, drawn, plane, axisymmetric=axisymmetric):
+        all_loads = replace(all_loads, remanence=magnetisation(magnetic, case, turn, within))
+    if span:
+        refuse_unfit_ends([name for name in span.names if name], points, conditions, all_loads)
+    model = "meridian" if axisymmetric else f"{'half' if half else 'full'} {case.model}"
+    included, left_out = account(case, all_loads, model, plane, len(rims))
+    included += [f"{key}: {flaw.account}" for key, flaw in found.items() if flaw.account]
+    sample = sample if len(sample) else drawn.sample()
+    plan = Plan(
+        material=material,
+        loads=all_loads,
+        conditions=conditions,
+        meridian=span,
+        mirror=beyond,
+        azimuth=turn,
+        shape=shape,
+        embedding=drawn.embedding,
+        points=points,
+        size=size,
+        included=[*included, *(f"own energy: {term.name}" for term in terms)],
+        left_out=left_out,
+        thickness=_thickness(case, turn),
+        length=case.shell.reference,
+        own=tuple(terms),
+        within=within,
+        supports=supports,
+        reactions=bool(all_loads.moves) if case.reactions is None else case.reactions,
+        pressed=tuple((size, reach) for _, reach, size in touched),
+        warning=sources_beside(case, sample) or _wrong_unit(case, sample),
+        unknowns=0.0 if span else unknowns_of(case, _cells(shape, size, half=half)),
+    )
+    refuse_twice(case, plan)
+    return plan
+
+
+def _wrong_unit(case: Case, places: Array) -> str | None:
+    """What hints at another unit of a mesh file's coordinates, in words; None without."""
+    extent = float(np.ptp(places, axis=0).max())
+    if not isinstance(case.shell, MeshSurface) or 1 / FAR_FROM_ONE <= extent <= FAR_FROM_ONE:
+        return None
+    key = "unit" if case.shell.with_units else "radius"
+    return f"the surface of the mesh file is {extent:.4g} times as long as shell.radius: is shell.{key} right?"
+
+
+def edge_conditions(boundary: BoundarySection, turn: float) -> dict[str, Condition]:
+    """The conditions of a case in the model's terms, in a frame turned about e3 (rad)."""
+    terms: dict[EdgeCondition, Condition] = {
+        "hinged": "simply supported",
+        "symmetry": "plane",
+        "clamped": "clamped",
+        "simply supported": "simply supported",
+        "free": "free",
+    }
+    return {
+        name: Held(tuple(_turned(c.components, turn))) if isinstance(c, HeldSection) else terms[c]
+        for name, c in boundary.conditions().items()
+    }
+
+
+def meridian_vertices(plan: Plan, case: Case) -> Array:
+    """Vertices of the meridian's mesh, in the chart."""
+    span = plan.meridian
+    assert span
+    if span.vertices is not None:
+        return span.vertices
+    pole = span.names[0] is None
+    h = plan.material.h / span.curvature
+    reach = max((one[1] for one in plan.pressed), default=0.0)
+    return graded_vertices(
+        span.length,
+        span.circles,
+        min([h, *(size / 3 for size, _ in plan.pressed)]),
+        refinement=case.mesh.refinement,
+        axis=pole,
+        largest=min(0.2 * sqrt(h), span.largest),
+        pressed=((reach if pole else span.length), PRESSED * sqrt(h)) if reach else None,
+        everywhere=case.mesh.size and case.mesh.size / case.shell.reference,
+    )
+
+
+def imperfect(perfect: Outline, found: Mapping[str, Flaw], turn: float, still: Collection[str]) -> Outline:
+    """The shell with the imperfections that do not grow, in a frame turned about e3 (rad); all have their cells."""
+    if not found:
+        return perfect
+    circles = tuple(flaw.reach for flaw in found.values() if flaw.rim) if perfect.disc else ()
+    shown = min((flaw.size for flaw in found.values()), default=inf)
+    return perfect.deviated(
+        tuple(in_frame(found[key].deviation, turn) for key in found if key in still), circles, shown
+    )
+
+
+def _matched(shape: Chart, local: Sequence[Spot], rims: tuple[Array, ...]) -> Chart | RimmedGrid:
+    """The shape with element edges along the rims."""
+    circles = tuple(dict.fromkeys(spot.radius for spot in local if spot.circle and spot.jumps))
+    if isinstance(shape, Grid):
+        return RimmedGrid(shape, rims) if rims else shape
+    if isinstance(shape, DiscShape):
+        return replace(shape, circles=tuple(r for r in circles if r < shape.radius), rims=rims)
+    return replace(shape, rims=rims) if isinstance(shape, StripShape) else shape
+
+
+def _symmetry(case: Case, drawn: Outline, parts: list[Leaves]) -> tuple[bool, Mirror | None]:
+    """Whether to model the meridian, and else the mirror plane of a half, None for a full model."""
+    reason = askew(parts)
+    if reason and case.symmetry == "axisymmetric":
+        raise CaseError(f"symmetry: axisymmetric: {reason}")
+    if reason is None and case.symmetry in ("auto", "axisymmetric") and case.model == "shell":
+        return True, None
+    if case.symmetry not in ("auto", "half"):
+        return False, None
+    plane = mirror(parts, drawn, loosely=case.symmetry == "half")
+    if case.symmetry == "half" and plane is None:
+        if name := unmirrored(parts, drawn):
+            raise CaseError(f"symmetry: half: the energy {name} does not share it")
+        made = "; edges of a mesh file must lie in it: mesh a half, mirror the nodes and triangles, join them"
+        hint = made if isinstance(case.shell, MeshSurface) else ""
+        raise CaseError(f"symmetry: half: shell, supports, fields and load have no common mirror plane{hint}")
+    return False, plane
+
+
+def _named_points(case: Case, drawn: Outline, turn: float, half: bool) -> Points:
+    """Named vertices in the chart, "pole" among them."""
+    Q, R = rotation(turn), case.shell.reference
+
+    def chart(name: str, x: Array) -> Array:
+        refuse_beside(f"points.{name}", x, drawn, case.shell)
+        found = drawn.inverse(Q @ x)
+        return drawn.on_half(found) if half else found
+
+    points = {name: chart(name, np.array(x) / R) for name, x in case.points.items()}
+    if points:
+        points["pole"] = next(iter(points.values()))
+    elif drawn.highest is not None:
+        points["pole"] = drawn.highest
+    return points
+
+
+def _place(case: Case, drawn: Outline, name: str, place: Array, turn: float, half: bool) -> Array:
+    """The place of an indentation in the chart."""
+    load = next(step.load for step in case.programme if step.name == name)
+    assert isinstance(load, IndentationSection)
+    if load.at.point is None and drawn.sphere:
+        polar, theta = radians(load.at.polar), radians(load.at.azimuth) - turn
+        return polar * np.array([np.cos(theta), 0.0 if half else np.sin(theta)]) if polar else np.zeros(2)
+    found = drawn.inverse(rotation(turn) @ place)
+    return drawn.on_half(found) if half else found
+
+
+def _cells(shape: Chart | RimmedGrid, size: Grading, *, half: bool) -> float:
+    """About how many triangles there will be."""
+    if isinstance(shape, MeshFile):
+        return cell_count(shape) * (0.5 if half else 1.0)
+    return shape.cells * (0.5 if half else 1.0) if isinstance(shape, Grid) else size.cells(shape)
+
+
+def _turned(components: tuple[int, ...], turn: float) -> list[int]:
+    """The components in a frame into which they turn as a whole."""
+    held = np.eye(3)[list(components)] @ rotation(turn).T
+    return [i for i in range(3) if held[:, i] @ held[:, i] > 0.5]
+
+
+def _thickness(case: Case, turn: float) -> Thickness | None:
+    factor = case.thickness_factor
+    if isinstance(factor, dict):
+        return Thickness(patches=factor)
+    if not factor:
+        return None
+    told, Q = formula(factor), rotation(turn)
+    return Thickness(lambda x, y, z: told(*np.tensordot(Q.T, np.stack([x, y, z]), 1)) if turn else told(x, y, z))

@@ -1,0 +1,156 @@
+"""What a scene is built from."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from math import inf
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magshell_fenicsx.mesh.grading import Size
+from magshell_fenicsx.mesh.grid import Grid, grid_mesh
+from magshell_fenicsx.mesh.mirror import Mirror, cut
+from magshell_fenicsx.mesh.msh import MeshFile, read_msh
+from magshell_fenicsx.mesh.patch import Embedding, PatchMesh
+from magshell_fenicsx.mesh.rimmed import RimmedGrid
+from magshell_fenicsx.mesh.shapes import Shape
+from magshell_fenicsx.mesh.triangulation import triangulate
+from magshell_fenicsx.models.shell.own_term import OwnTerm
+from magshell_fenicsx.models.shell.parameters import Condition, Loads, Material
+from magshell_fenicsx.models.shell.patterns import Inside
+from magshell_fenicsx.models.shell.thickness import Thickness
+from magshell_fenicsx.problem.names import refuse_unfit
+
+
+@dataclass(frozen=True)
+class Span:
+    """A meridian, walked from the pole or one edge to the other.
+
+    Attributes
+    ----------
+    length
+        Of its chart, which starts at 0.
+    circles
+        Where the curvature jumps.
+    names
+        Of its ends; None for the pole.
+    embedding, normal
+        Chart (n, 2), its second coordinate 0 -> the plane of e1 and e3, and the normal of the perfect surface there.
+    place
+        Chart (2,) of the surface -> parameter of this one and azimuth (rad).
+    curvature
+        The largest of the meridian over 1/R, at least 1.
+    largest
+        Size of cells that shows the imperfections.
+    vertices
+        Those of its mesh, if that is given.
+    """
+
+    length: float
+    circles: tuple[float, ...]
+    names: tuple[str | None, str]
+    embedding: Embedding
+    normal: Embedding
+    place: Callable[[NDArray[np.float64]], tuple[float, float]]
+    curvature: float = 1.0
+    largest: float = inf
+    vertices: NDArray[np.float64] | None = None
+
+    def sample(self) -> NDArray[np.float64]:
+        """Places (n, 3) along it, its ends among them."""
+        s = np.linspace(0.0, self.length, 401)
+        return self.embedding(np.column_stack([s, 0 * s]))
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Everything that a scene is built from, dimensionless (lengths in R).
+
+    Attributes
+    ----------
+    meridian
+        What is modelled instead of the surface; None if that is modelled.
+    mirror
+        Plane of the half that is modelled; None for all.
+    azimuth
+        The model's frame is turned about e3 by it (rad).
+    shape, size, points, embedding
+        What is triangulated, and how it is put into space. The point "pole" is the one whose
+        displacement is reported: the pole, the disc's centre, the strip's tip.
+    included, left_out
+        What the model has and lacks, for people.
+    thickness
+        What multiplies the thickness; None for 1.
+    length
+        R in the unit that results are told in.
+    own
+        One's own energies; `loads` has them too, after those of the case's parts.
+    pressed
+        Size of each body, and how far from its first contact it presses; over R.
+    warning
+        What is unphysical, if anything.
+    within
+        Name of the patch of each dimple -> whether places (n, 3) are within its rim.
+    unknowns
+        About how many there will be, if the meridian is not modelled.
+    """
+
+    material: Material
+    loads: Loads
+    conditions: dict[str, Condition]
+    meridian: Span | None
+    mirror: Mirror | None
+    azimuth: float
+    shape: Shape | Grid | MeshFile | PatchMesh
+    embedding: Embedding
+    points: dict[str, NDArray[np.float64]]
+    size: Size
+    included: list[str]
+    left_out: list[str]
+    thickness: Thickness | None = None
+    length: float = 1.0
+    own: tuple[OwnTerm, ...] = ()
+    pressed: tuple[tuple[float, float], ...] = ()
+    supports: tuple[str, ...] = ()
+    reactions: bool = False
+    warning: str | None = None
+    within: Mapping[str, Inside] = field(default_factory=dict)
+    unknowns: float = 0.0
+
+    @property
+    def axisymmetric(self) -> bool:
+        """Whether the meridian is modelled."""
+        return self.meridian is not None
+
+    @property
+    def half(self) -> bool:
+        return self.mirror is not None
+
+    @property
+    def fixed(self) -> bool:
+        """Whether something is clamped, so that there is no rigid motion."""
+        return "clamped" in self.conditions.values()
+
+    def triangulated(self) -> PatchMesh:
+        """The triangulation; call it on one rank only.
+
+        Raises
+        ------
+        MeshError
+            If there is none, it cannot carry a shell, or it has not what the plan names.
+        """
+        patch = self._made()
+        refuse_unfit(patch, self.conditions, self.loads, self.thickness)
+        return patch
+
+    def _made(self) -> PatchMesh:
+        if isinstance(self.shape, MeshFile):
+            return replace(read_msh(self.shape, self.points, self.mirror), embedding=self.embedding)
+        if isinstance(self.shape, PatchMesh):
+            return replace(self.shape, embedding=self.embedding)
+        if isinstance(self.shape, Grid):
+            patch = grid_mesh(self.shape, self.points, self.embedding)
+        else:
+            patch = triangulate(self.shape, self.size, self.points, self.embedding)
+        whole = isinstance(self.shape, Grid | RimmedGrid)  # other shapes are made as halves
+        return cut(patch, self.mirror) if self.mirror and whole else patch

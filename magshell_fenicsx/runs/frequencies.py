@@ -1,0 +1,112 @@
+"""After a run: natural frequencies at points of its path."""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from math import isnan, nan
+from pathlib import Path
+
+from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.continuation.modes import ModesNotFound
+from magshell_fenicsx.continuation.system import State
+from magshell_fenicsx.models.axisymmetric.model import MeridianModel
+from magshell_fenicsx.models.modes import ShellMode, ShellModes
+from magshell_fenicsx.output.fields.frequencies import NAME, frequency_table, hertz, wave_of
+from magshell_fenicsx.output.fields.gathering import gatherer
+from magshell_fenicsx.output.fields.modes import mode_file
+from magshell_fenicsx.output.store.durable import write_whole
+from magshell_fenicsx.output.store.folder import by_first
+from magshell_fenicsx.parts.bodies.touch import hardened, rigid, touching
+from magshell_fenicsx.runs.modes import write_mode_of
+from magshell_fenicsx.runs.summary import Result
+from magshell_fenicsx.simulate.scene import Scene
+
+Say = Callable[[str], None]
+SAME = 1e-3  # relative change of omega^2 by stiffer bodies that needs no warning
+
+
+def wanted(case: Case, point: int) -> bool:
+    """Whether the state of a point must be kept for its frequencies; the start and the end are known anyway."""
+    at = case.frequencies.at if case.frequencies else ()
+    return at == "all" or (isinstance(at, list) and point in at)
+
+
+def own_wave(scene: Scene) -> str:
+    """The wave of the model's own modes."""
+    if isinstance(scene.model, MeridianModel):
+        return "0"
+    return "symmetric" if scene.model.multiplicity == 2 else ""
+
+
+def contact_changes(scene: Scene, state: State, modes: Sequence[ShellMode]) -> list[float]:
+    """How much omega^2 of each mode changes, relative, if the bodies that touch are four times as stiff; collective.
+
+    It is compared with the nearest one of the same label: a mode that is not there any more changes too. nan, if the
+    shell finds no such equilibrium near.
+    """
+    bodies = touching(scene, state)
+    if not bodies:
+        return [0.0] * len(modes)
+    harder = hardened(scene, state, bodies)
+    if harder is None:
+        return [nan] * len(modes)
+    others = ShellModes(scene.model).vibrations(harder, len(modes) + 2)
+    return [
+        min((abs(o.eigenvalue / mode.eigenvalue - 1) for o in others if o.label == mode.label), default=1.0)
+        for mode in modes
+    ]
+
+
+def _soft(point: int, n: int, mode: ShellMode, change: float) -> str:
+    """The warning for a mode that depends on the penalty of a contact."""
+    by = "no equilibrium near to compare with" if isnan(change) else f"omega2 changes by {change:.2g} of it"
+    return (
+        f"warning: frequency {n} of point {point} (omega2 {mode.eigenvalue:.6g}) depends on the stiffness of the "
+        f"bodies: four times as stiff, {by}"
+    )
+
+
+def frequencies_after(result: Result, folder: Path, say: Say) -> None:
+    """Write frequencies.csv, and fields/mode_*_f*.vtu of the first and the last of the points; keep the modes.
+
+    Collective; rank 0 writes. Call it after the run, because it overwrites the model's tangent.
+
+    Raises
+    ------
+    DiskError
+        On every rank, if something cannot be written.
+    """
+    scene, section = result.scene, result.scene.case.frequencies
+    if section is None:
+        return
+    if scene.model.without_potential and scene.plan.loads.pressure:
+        say("warning: a pressure at a free edge has no potential: frequencies are those of the symmetric tangent")
+    states = dict(sorted(result.kept.items()))
+    if section.at in ("ends", "end"):
+        start = {0: scene.unloaded()} if section.at == "ends" else {}
+        states = {**start, result.end: result.last}
+    elif isinstance(section.at, list) and (strange := sorted(set(section.at) - set(states))):
+        say(f"warning: frequencies.at: the path has no point {', '.join(map(str, strange))}")
+    shell, own, unit = ShellModes(scene.model), own_wave(scene), scene.case.time_unit
+    for number, state in states.items():
+        state = rigid(scene, state)
+        try:
+            result.frequencies[number] = modes = shell.vibrations(state, section.count)
+            if scene.model.contacts:
+                result.contact_changes[number] = changes = contact_changes(scene, state, modes)
+                for n, (mode, change) in enumerate(zip(modes, changes, strict=True), 1):
+                    if not change <= SAME:
+                        say(_soft(number, n, mode, change))
+        except ModesNotFound as e:
+            say(f"warning: no frequencies of point {number}: {e}")
+            continue
+        first = modes[0]
+        f, wave = hertz(first.eigenvalue, unit), wave_of(first.label, own)
+        in_hertz = "" if f is None else f", {f:.6g} Hz"
+        say(f"lowest frequency at point {number}: omega2 {first.eigenvalue:.6g}{in_hertz}  {wave}".rstrip())
+    content = frequency_table(result.frequencies, own, unit, result.contact_changes)
+    by_first(scene.comm, partial(write_whole, folder / NAME, content))
+    gathering = gatherer(scene.model, scene.comm)
+    for number in {*list(states)[:1], *list(states)[-1:]} & set(result.frequencies):
+        for n, mode in enumerate(result.frequencies[number][: section.count], 1):
+            file = mode_file(folder, number, f"f{n}", mode.label)
+            write_mode_of(scene, gathering, file, states[number].u, mode.label, mode.vector)

@@ -1,0 +1,103 @@
+"""A scene in a notebook: the deformed surface as arrays and for pyvista, and pictures without files.
+
+All functions are collective. Results that only rank 0 has are None on other ranks.
+"""
+
+from collections.abc import Sequence
+from functools import partial
+from typing import TYPE_CHECKING, Literal
+
+from magshell_fenicsx.output.fields.gathering import gatherer
+from magshell_fenicsx.output.fields.surface import Surface, completed, turned
+from magshell_fenicsx.output.fields.vtu import unstructured_grid
+from magshell_fenicsx.output.pictures.camera import run_camera
+from magshell_fenicsx.output.pictures.curve import curve_figure
+from magshell_fenicsx.output.pictures.layout import png
+from magshell_fenicsx.output.pictures.picture import PICTURES, figures
+from magshell_fenicsx.output.store.known import pole_of
+from magshell_fenicsx.quantities.registry import axes_of
+from magshell_fenicsx.runs.rows import rows
+from magshell_fenicsx.simulate.record import Record
+from magshell_fenicsx.simulate.scene import Scene
+
+if TYPE_CHECKING:  # take long to import
+    import pyvista
+    from matplotlib.figure import Figure
+
+
+def surface(scene: Scene, record: Record) -> Surface | None:
+    """The whole deformed mid-surface as NumPy arrays, lengths in R: `r0`, `u`, `n0`, `w`, `cells` and `fields`.
+
+    The fields are membrane strains `E` and bending moments over D/R `M`, their principal values `E_1`, `E_2`, `M_1`,
+    `M_2`, and those of the magnetic field: `Br`, `Ba`, `p_mag`, `f_mag`, `k`, `tau`; see `Surface`.
+    """
+    plan, state = scene.plan, record.point.state
+    scene.refuse_foreign(state)
+    found = gatherer(scene.model, scene.comm).gather(state.u, state.mu)
+    return turned(completed(found, plan.mirror.plane) if plan.mirror else found, plan.azimuth) if found else None
+
+
+def polydata(scene: Scene, record: Record) -> "pyvista.PolyData | None":
+    """The deformed mid-surface in flat triangles, for pyvista, with w_over_h, u_over_h, ... at its points.
+
+    `points` (n, 3) and `regular_faces` (m, 3) are the nodes in R and the triangles as NumPy arrays;
+    `plot(scalars="w_over_h")` shows it.
+    """
+    found = surface(scene, record)
+    return _smooth(found, scene.plan.material.h) if found else None
+
+
+def picture(
+    scene: Scene,
+    record: Record,
+    of: Literal["shell", "strains", "moments", "fields", "magnetic_loads"] = "shell",
+) -> "Figure | None":
+    """One picture of a run, as in shell.png, strains.png, ...; None also if the scene has no such fields."""
+    if of not in PICTURES:
+        raise ValueError(f"picture: {of}: allowed are {', '.join(PICTURES)}")
+    found = surface(scene, record)
+    if found is None:
+        return None
+    style = scene.case.output
+    drawn = figures(found, scene.plan.material.h, style, run_camera(found, style), [of])
+    return _in_line(drawn[of]) if drawn else None
+
+
+def curve(scene: Scene, records: Sequence[Record], amplitude: str | None = None) -> "Figure":
+    """The curve of the path, as in curve.png; by default for the amplitude that varied last.
+
+    Raises
+    ------
+    ValueError
+        If nothing has varied, or the scene has no such amplitude.
+    """
+    records = list(records)
+    varied = amplitude or (records[-1].amplitude if records else "")
+    if not varied:
+        raise ValueError("curve: nothing has varied in these records: give those of follow or trace, all of them")
+    found, place = rows(scene, records), pole_of({"shell": scene.case.shell.model_dump(mode="json")})
+    axes = axes_of(varied, found[0])
+    if not all(axis.name in found[0] for axis in axes):
+        there = ", ".join(dict.fromkeys(record.amplitude for record in records if record.amplitude))
+        raise ValueError(f"curve: {varied}: the scene has no such amplitude; these records vary {there or 'none'}")
+    return _in_line(curve_figure(found, varied, scene.case.output, place))
+
+
+def _smooth(surface: Surface, h: float) -> "pyvista.PolyData":
+    """Flat triangles with normals; curved triangles are divided."""
+    import pyvista
+    from vtkmodules.vtkFiltersGeometry import vtkDataSetSurfaceFilter
+
+    divided = vtkDataSetSurfaceFilter()
+    divided.SetInputData(unstructured_grid(surface, h))
+    divided.SetNonlinearSubdivisionLevel(2)
+    divided.Update()
+    smooth = pyvista.PolyData(divided.GetOutput())
+    body = surface.is_body  # its edges stay sharp
+    return smooth.compute_normals(cell_normals=False, split_vertices=body, feature_angle=60.0, consistent_normals=False)
+
+
+def _in_line(figure: "Figure") -> "Figure":
+    """The same figure, which a notebook then shows without pyplot."""
+    figure._repr_png_ = partial(png, figure)  # type: ignore[attr-defined]
+    return figure

@@ -1,0 +1,98 @@
+"""Records of a history as rows of path.csv, and as columns."""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magshell_fenicsx.case.loading import ProgrammeStep
+from magshell_fenicsx.continuation.transient import FLOOR
+from magshell_fenicsx.output.store.table import COLUMNS, Row
+from magshell_fenicsx.parts.motion.step import TimeSection
+from magshell_fenicsx.simulate.record import Record
+from magshell_fenicsx.simulate.scene import Scene
+
+CLOCK = ("time", "dissipated", "work")
+
+
+class RowMaker:
+    """Makes the rows of one history, in the order of its records."""
+
+    def __init__(self, scene: Scene) -> None:
+        self._scene, self._count, self._field_end = scene, 0, 0.0
+        self._clock, self._begun, self._step = dict.fromkeys(CLOCK, 0.0), dict.fromkeys(CLOCK, 0.0), 0
+        self._listed = isinstance(scene.case.loading, list)  # alone, a field as the load is no field before it
+
+    def row(self, record: Record, wall_s: float) -> Row:
+        """The next row; `wall_s` is in seconds since the start of the history. Collective."""
+        values, point = self._scene.observe(record.point.state), record.point
+        if record.label in ("start", "field") or (self._listed and record.amplitude in ("lambda_m", "angle")):
+            self._field_end = values["w_over_h"]
+        self._count += 1
+        row: Row = {
+            "point": self._count - 1,
+            "label": record.label,
+            "amplitude": record.amplitude,
+            **values,
+            "w_from_field_over_h": values["w_over_h"] - self._field_end,
+            "negative_pivots": point.negative_pivots,
+            "negative_pivots_held": point.negative_pivots_held,
+            "iterations": point.iterations,
+            "factorisations": point.factorisations,
+            "wall_s": round(wall_s, 3),
+            "mode": record.mode,
+            "branch": record.branch,
+            "error_over_h": point.error,
+            "load_error": point.load_error,
+            "excluded_pivots": record.excluded_pivots,
+            "step": record.step,
+            **self._in_time(record, values),
+        }
+        return {**row, **self._scene.sizes.values(row)}
+
+    def _in_time(self, record: Record, values: Mapping[str, float]) -> dict[str, float]:
+        """The columns of a motion: time and sums go on from earlier steps."""
+        if "time" not in self._scene.extra_columns:
+            return {}
+        if record.step != self._step:
+            self._begun, self._step = dict(self._clock), record.step
+        since = {name: record.clock.get(name, 0.0) for name in CLOCK}
+        self._clock = {name: self._begun[name] + since[name] for name in CLOCK}
+        stored = self._scene.stored(record.point.state, values["energy"])
+        own = {name: record.clock.get(name, 0.0) for name in ("kinetic", "imbalance")}
+        return {**self._clock, **own, "stored": stored}
+
+
+def imbalances(programme: Iterable[ProgrammeStep], found: Sequence[Row], length: float) -> Iterator[str]:
+    """What steps in time gain or lose beyond `balance`, in words; `length` is the system's."""
+    for step in programme:
+        over = getattr(step.load, "balance", TimeSection.model_fields["balance"].default)
+        parts = [_imbalance(row, length) for row in found if row["step"] == step.number and row.get("imbalance")]
+        if parts and abs(worst := max(parts, key=abs)) > over:
+            yield (
+                f"step {step.number}: its steps in time {'gain' if worst > 0 else 'lose'} {abs(worst):.2g} of the "
+                f"energies, more than balance: {over:g}; take a smaller step, tolerance or balance, or rho_inf: 1, "
+                "which loses none"
+            )
+
+
+def _imbalance(row: Row, length: float) -> float:
+    """That of a row over its energies."""
+    energies = sum(abs(float(row[name])) for name in ("kinetic", "stored", "dissipated", "work"))
+    return float(row["imbalance"]) / (energies + (FLOOR * length) ** 2)
+
+
+def rows(scene: Scene, records: Iterable[Record]) -> list[Row]:
+    """The rows of some records, with the times nan."""
+    maker = RowMaker(scene)
+    return [maker.row(record, np.nan) for record in records]
+
+
+def columns(scene: Scene, records: Iterable[Record]) -> dict[str, NDArray[np.generic]]:
+    """The columns of path.csv except the time, each (records,), for instance for `pandas.DataFrame`.
+
+    Collective.
+    """
+    found = rows(scene, records)
+    names = [name for name in (*COLUMNS, *scene.extra_columns) if name != "wall_s"]
+    return {name: np.array([row[name] for row in found]) for name in names}

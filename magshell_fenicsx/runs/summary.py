@@ -1,0 +1,264 @@
+"""The result of a run, and summary.json."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from magshell_fenicsx.assembly.terms import factor_of
+from magshell_fenicsx.continuation.system import State, dot
+from magshell_fenicsx.continuation.timing import Stopwatch
+from magshell_fenicsx.models.modes import ShellMode
+from magshell_fenicsx.output.fields.frequencies import hertz
+from magshell_fenicsx.output.report.verdict import place_in_units
+from magshell_fenicsx.output.store.checkpoint import FILE
+from magshell_fenicsx.output.store.table import LOCATED, Row
+from magshell_fenicsx.platform import sources
+from magshell_fenicsx.platform.environment import fast_blas, versions
+from magshell_fenicsx.quantities.registry import amplitude
+from magshell_fenicsx.runs.snaps import snaps
+from magshell_fenicsx.shape.sections import Surface
+from magshell_fenicsx.shape.shell import ShellSection
+from magshell_fenicsx.simulate.adapt.choice import Adapted
+from magshell_fenicsx.simulate.adapt.ending import History, NoResult
+from magshell_fenicsx.simulate.scene import Scene
+
+
+@dataclass
+class Result:
+    """The result of a run.
+
+    Attributes
+    ----------
+    rows
+        One mapping per accepted point, with the columns of path.csv.
+    last
+        Displacement and amplitudes at the last point of the path.
+    singular
+        The same at the located instabilities, by row number.
+    stopped
+        Why the run ended before its target; None if it reached it.
+    remarks
+        What the result must not be read without: why the path stopped beyond its first instability with
+        `until: limit`, or that a snap starts from a shell that has buckled before.
+    replayed
+        Number of solves taken from a checkpoint.
+    sensitivities
+        Sensitivities of the amplitude at the final fold, if the case requests them; see `simulate.sensitivity`.
+    adapted
+        The mesh and its error estimate, if the case has a tolerance.
+    history
+        The records that `value` is taken from.
+    end
+        Number of the row of `last`.
+    kept
+        States at the points whose frequencies are requested, by row number; not of the start and the end.
+    frequencies
+        The natural modes, by row number.
+    contact_changes
+        Beside bodies how much their omega^2 depend on the bodies' stiffness; see `frequencies.contact_changes`.
+    found
+        The states of the solutions that searches have found, by row number.
+    barrier
+        The energy barrier over E h R^2 of a last step with `until: zero`; None without.
+    gradients
+        By result, as in summary.json.
+    largest
+        By row number of an instability the undeformed place where its mode moves most along the normal, in the shell's
+        length; on rank 0, and not of a meridian, whose modes have rings.
+    """
+
+    scene: Scene
+    last: State
+    rows: list[Row] = field(default_factory=list)
+    singular: dict[int, State] = field(default_factory=dict)
+    stopped: str | None = None
+    remarks: list[str] = field(default_factory=list)
+    replayed: int = 0
+    sensitivities: dict[str, float] = field(default_factory=dict)
+    output: Stopwatch = field(default_factory=Stopwatch)
+    adapted: Adapted | None = None
+    history: History = field(default_factory=History)
+    barrier: float | None = None
+    end: int = 0
+    found: dict[int, State] = field(default_factory=dict)
+    kept: dict[int, State] = field(default_factory=dict)
+    frequencies: dict[int, list[ShellMode]] = field(default_factory=dict)
+    contact_changes: dict[int, list[float]] = field(default_factory=dict)
+    gradients: dict[str, dict[str, Any]] = field(default_factory=dict)
+    largest: dict[int, list[float]] = field(default_factory=dict)
+
+    @property
+    def limit_points(self) -> list[dict[str, Any]]:
+        """The located instabilities."""
+        return [
+            {
+                **self.scene.sizes.values({key: row[key] for key in _told(row)}),
+                "amplitude": row["amplitude"],
+                "value": row[amplitude(str(row["amplitude"])).column],
+                "p_over_pc": row["p_over_pc"],
+                "w_pole_over_h": row["w_pole_over_h"],
+                "kind": row["label"],
+                "mode": row["mode"],
+                "branch": row["branch"],
+                "load_error": row["load_error"],
+                **self._mode_at(number),
+            }
+            for number, row in enumerate(self.rows)
+            if row["label"] in LOCATED
+        ]
+
+    def _mode_at(self, number: int) -> dict[str, list[float]]:
+        """Where a mode is largest, over R or in m, and in the unit of the report."""
+        if number not in self.largest:
+            return {}
+        place, shell = self.largest[number], self.scene.case.shell
+        shown = place_in_units(place, shell.geometry, in_metres=shell.with_units)
+        return {"mode_at": place, **{f"mode_at_{unit}": numbers for unit, numbers in shown.items() if unit}}
+
+    @property
+    def knockdown(self) -> float | None:
+        """k_d: p/p_c at the first instability under pressure; None if there is none, or at held volume."""
+        at_volume = {step.number for step in self.scene.case.programme if step.name in step.load.hold}
+        points = (row for row in self.rows if row["label"] in LOCATED and row["amplitude"] == "pressure")
+        return next((float(p["p_over_pc"]) for p in points if not p["branch"] and p.get("step") not in at_volume), None)
+
+    @property
+    def critical_field(self) -> float | None:
+        """λ_m at the first instability under the field; None if there is none."""
+        points = (row for row in self.rows if row["label"] in LOCATED and row["amplitude"] == "lambda_m")
+        return next((float(row["lambda_m"]) for row in points if not row["branch"]), None)
+
+    @property
+    def value(self) -> float | None:
+        """The scalar result that mesh.tolerance refers to; None if the run has none."""
+        try:
+            return self.history.ending(self.scene, self.stopped).value
+        except NoResult:
+            return None
+
+
+def summary(result: Result, total_s: float) -> dict[str, Any]:
+    """The content of summary.json."""
+    scene = result.scene
+    material, model, newton = scene.plan.material, scene.model, scene.newton
+    R_over_h, time_unit = 1 / material.h, scene.case.time_unit
+    return {
+        "case": (result.adapted.asked if result.adapted else scene.case).model_dump(mode="json", exclude_none=True),
+        FILE: scene.case.file_name,
+        **scene.case.outside,
+        "sources": sources.ours(),
+        "dimensionless": {
+            "radius_to_thickness": R_over_h,
+            "poisson_ratio": material.nu,
+            "lambda_m": scene.case.lambda_m,
+            "Lambda_m": scene.case.lambda_m * R_over_h,
+            "pc_over_E": material.classical_pressure,
+            "energy_unit": "E h R^2",
+        },
+        "dimensions": _dimensions(scene.case.shell),
+        "in_units": in_units(result),
+        "model": {
+            "included": scene.plan.included,
+            "left_out": scene.left_out,
+            **({"not_shown": scene.unshown} if scene.unshown else {}),
+            "kernels": model.kernels.names,
+            "forms": len(model.kernels.names),
+            "penalty": model.sigma,
+        },
+        "stopped": result.stopped,
+        "remarks": result.remarks,
+        "limit_points": result.limit_points,
+        "sensitivities": result.sensitivities,
+        "gradients": result.gradients,
+        "knockdown": result.knockdown,
+        "critical_field": result.critical_field,
+        "barrier": result.barrier,
+        "snaps": snaps(result.rows),
+        "frequencies": [
+            {
+                "point": number,
+                "omega2": [mode.eigenvalue for mode in modes],
+                **({"hertz": [hertz(mode.eigenvalue, time_unit) for mode in modes]} if time_unit else {}),
+                **({"contact_change": result.contact_changes[number]} if number in result.contact_changes else {}),
+            }
+            for number, modes in result.frequencies.items()
+        ],
+        "solutions": solutions(result),
+        "most_excluded_pivots": max((int(row["excluded_pivots"]) for row in result.rows), default=0),
+        "points": len(result.rows),
+        "mesh": {"cells": scene.cells, "dofs": model.system.dofs, "degree": model.degree},
+        **({"tolerance": result.adapted.account(result.value)} if result.adapted else {}),
+        "timing": {
+            "jit_s": model.kernels.seconds,
+            "setup_s": scene.setup_s,
+            "assembly_s": model.system.assembly.seconds,
+            "factor_s": newton.factorisation.stopwatch.seconds,
+            "output_s": result.output.seconds,
+            "solve_s": newton.factorisation.solving.seconds,
+            "total_s": total_s,
+        },
+        "replayed": result.replayed,
+        "factorisations": newton.factorisation.count,
+        "iterations": newton.iterations,
+        "ranks": scene.comm.size,
+        "blas": fast_blas() or "reference",
+        "versions": versions(),
+    }
+
+
+def solutions(result: Result) -> list[dict[str, Any]]:
+    """What searches have found; the residual is over the sum of the sizes of all terms' forces. Collective."""
+    system, found = result.scene.model.system, []
+    for number, state in result.found.items():
+        row = result.rows[number]
+        residual = system.residual(state.u, state.mu)
+        forces = (factor_of(t.amplitude, state.mu) * system.forces(state.u, state.mu, t.name) for t in system.terms)
+        sizes = [np.sqrt(dot(system.comm, v, v)) for v in (residual, *forces)]
+        keys = ("p_over_pc", "w_over_h", "w_pole_over_h", "volume_change", "energy", "negative_pivots")
+        found.append(
+            {
+                "point": number,
+                "step": row["step"],
+                "solution": row["branch"],
+                "stable": not int(row["negative_pivots"]) + int(row["excluded_pivots"]),
+                **{key: row[key] for key in (*keys, "excluded_pivots", "error_over_h")},
+                **result.scene.sizes.values({key: row[key] for key in keys}),
+                "residual": sizes[0] / sum(sizes[1:]),
+            }
+        )
+    return found
+
+
+def _told(row: Row) -> set[str]:
+    """The columns of a limit point that may have units."""
+    return {amplitude(str(row["amplitude"])).column, "p_over_pc", "w_pole_over_h"}
+
+
+def in_units(result: Result) -> dict[str, float]:
+    """The numbers of a case with units, with these in their names; none of a case without."""
+    of, case = result.scene.sizes.of, result.scene.case
+    found = {}
+    if "p_c" in of:
+        found["classical_pressure_Pa"] = of["p_c"]
+        if result.knockdown is not None:
+            found["buckling_pressure_Pa"] = result.knockdown * of["p_c"]
+    if "λ_m" in of and result.critical_field is not None:
+        ending = "percent" if result.scene.sizes.field == "%" else "mT"
+        found[f"critical_field_{ending}"] = result.critical_field * of["λ_m"]
+    if "2πD/R" in of:
+        found["unit_force_N"] = of["2πD/R"]
+        found["bending_stiffness_N_m"] = of["2πD/R"] * case.shell.reference / (2 * np.pi)
+        found["unit_energy_mJ"] = of["E h R²"]
+        if result.barrier is not None:
+            found["barrier_mJ"] = result.barrier * of["E h R²"]
+    return found
+
+
+def _dimensions(shell: ShellSection | Surface) -> dict[str, Any]:
+    """The dimensions of the shell that the case gives, in SI or in the case's own units."""
+    if isinstance(shell, ShellSection):
+        lengths, in_si = {"radius": shell.radius, "thickness": shell.thickness}, True
+    else:
+        lengths, in_si = {"radius": shell.reference, "thickness": shell.thickness}, shell.with_units
+    return {**lengths, "youngs_modulus": shell.youngs_modulus, "units": "SI" if in_si else "the case's own"}

@@ -1,0 +1,1 @@
+"""Outlines of mid-surfaces, their mirrors, and what is axisymmetric on them."""

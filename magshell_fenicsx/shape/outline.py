@@ -1,0 +1,321 @@
+"""The chart of each geometry, over the reference length R: what is meshed, and how it is put into space."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from math import inf, pi, radians
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.mesh.deviation import Deviated, Deviation
+from magshell_fenicsx.mesh.grading import Grading
+from magshell_fenicsx.mesh.grid import Grid
+from magshell_fenicsx.mesh.mirror import Y0, Mirror
+from magshell_fenicsx.mesh.msh import MeshFile, in_space, normals, read_msh
+from magshell_fenicsx.mesh.patch import Embedding, MeshError
+from magshell_fenicsx.mesh.revolved import Arc, Capped, Profile, Revolved, Segment, Spline
+from magshell_fenicsx.mesh.shapes import DiscShape, Shape, StripShape
+from magshell_fenicsx.mesh.sphere import flat, sphere, upwards
+from magshell_fenicsx.problem.problem import Span
+from magshell_fenicsx.shape.mirrors import grid_mirrors, lines_on, mesh_mirrors
+from magshell_fenicsx.shape.sections import (
+    AnnulusSurface,
+    CapSurface,
+    CylinderSurface,
+    MeshSurface,
+    PlateSurface,
+    RevolutionSurface,
+    RoundSection,
+    Surface,
+    TorusSurface,
+)
+from magshell_fenicsx.shape.shell import ShellSection
+
+Array = NDArray[np.float64]
+Chart = Shape | Grid | MeshFile
+ANY = Grading([], 1.0)
+ROUNDING = 1e-9
+ON_SURFACE = 1e-6  # of R, within which a named point lies on the surface
+
+
+@dataclass(frozen=True)
+class Outline:
+    """A geometry as a chart with its map to space.
+
+    Attributes
+    ----------
+    chart
+        What is meshed, for a mirror plane in the model's frame or None, and element sizes (of grids).
+    normal
+        Chart -> outward unit normals.
+    inverse
+        Chart (2,) of a place (3,); of a mesh file the place itself.
+    highest
+        Chart of the point whose displacement is reported where the case names none: a pole, a tip; None: the
+        reader of the mesh file takes the highest.
+    edge
+        Distance of the outer edge from the chart's origin; infinite where the chart is no disc.
+    sphere
+        Whether chart distances from the origin are polar angles.
+    round
+        Whether it is closed around e3.
+    mirrors
+        Its planes, but for those through e3 of what is `round`; of a mesh file for vectors that a plane should
+        hold, and whether its edges suffice (see `mesh_mirrors`).
+    from_pole
+        Places -> length of the meridian from the pole; None but for a pole of a surface of revolution.
+    span
+        The meridian; None if it is closed, or the surface is none of revolution.
+    """
+
+    chart: Callable[[Mirror | None, Grading], Chart]
+    embedding: Embedding
+    normal: Embedding
+    inverse: Callable[[Array], Array]
+    highest: Array | None
+    edge: float = inf
+    sphere: bool = False
+    round: bool = False
+    mirrors: Callable[[Sequence[Array], bool], Sequence[Mirror]] = lambda vectors, loosely: []
+    from_pole: Callable[[Array], Array] | None = None
+    span: Span | None = None
+
+    def on_half(self, chart: Array) -> Array:
+        """A place of the chart on its half, from which rounding may have moved it; grids and meshes are cut."""
+        if self.grid or isinstance(self.chart(None, ANY), MeshFile):
+            return chart
+        return np.array([chart[0], chart[1] if chart[1] > ROUNDING else 0.0])
+
+    @property
+    def grid(self) -> Grid | None:
+        """What is meshed, if that is a grid."""
+        shape = self.chart(None, ANY)
+        return shape if isinstance(shape, Grid) else None
+
+    def sample(self) -> Array:
+        """Places (n, 3) all over the surface, with its centre, edges and axes among them."""
+        chart = self.charts()
+        if chart is None:
+            return in_space(read_msh(self.chart(None, ANY), {}).nodes)  # type: ignore[arg-type]
+        return self.embedding(chart)
+
+    def charts(self) -> Array | None:
+        """Their charts (n, 2); None for a mesh file."""
+        shape = self.chart(None, ANY)
+        if isinstance(shape, MeshFile):
+            return None
+        t = np.linspace(0, 1, 41)
+        if isinstance(shape, DiscShape):
+            rho, theta = np.meshgrid(shape.reach * t, 2 * np.pi * t)
+            x, y = rho * np.cos(theta), rho * np.sin(theta)
+        elif isinstance(shape, StripShape):
+            x, y = np.meshgrid(t, (t - 0.5) * shape.width)
+        else:
+            assert isinstance(shape, Grid)
+            x, y = np.meshgrid(*(a + t * (b - a) for a, b in zip(shape.low, shape.high, strict=True)))
+        return np.column_stack([x.ravel(), y.ravel()])
+
+    def within(self, chart: Array) -> Array:
+        """The nearest place of the chart (2,) to one that may be beside it."""
+        shape = self.chart(None, ANY)
+        if isinstance(shape, DiscShape):
+            return np.asarray(chart / max(float(np.hypot(*chart)) / self.edge, 1.0))
+        if isinstance(shape, StripShape):
+            return np.clip(chart, [0, -shape.width / 2], [1, shape.width / 2])
+        assert isinstance(shape, Grid)
+        return np.clip(chart, shape.low, shape.high)
+
+    @property
+    def perfect(self) -> Embedding:
+        """Chart -> the surface without its imperfections."""
+        return self.embedding.perfect if isinstance(self.embedding, Deviated) else self.embedding
+
+    def deviated(self, deviations: tuple[Deviation, ...], circles: tuple[float, ...], largest: float) -> "Outline":
+        """The outline with imperfections; the curvature jumps on circles around the pole, `largest` cells show them."""
+        span = self.span and replace(
+            self.span,
+            embedding=Deviated(self.span.embedding, self.span.normal, deviations),
+            circles=circles,
+            largest=largest / 2,
+        )
+        return replace(self, embedding=Deviated(self.embedding, self.normal, deviations), span=span)
+
+    @property
+    def disc(self) -> bool:
+        """Whether it is of revolution about e3, up to its pole."""
+        return self.edge < inf
+
+
+def outline(case: Case) -> Outline:
+    """The outline of a case's perfect shell."""
+    shell = case.shell
+    if isinstance(shell, MeshSurface):
+        file = MeshFile(shell.path, (shell.unit or 1.0) / shell.reference, bool(shell.imperfections), shell.files)
+
+        def planes(vectors: Sequence[Array], loosely: bool) -> list[Mirror]:
+            try:
+                bare = replace(file, normals=False)
+                return _either_half(mesh_mirrors(read_msh(bare, {}), vectors, loosely=loosely))
+            except MeshError:  # for whoever builds it to report
+                return []
+
+        return Outline(lambda mirror, size: file, in_space, normals, lambda x: x, None, mirrors=planes)
+    if isinstance(shell, ShellSection) and shell.width is not None:
+        width = shell.width
+        tip, corner = np.array([1.0, 0.0]), np.array([0.0, -width / 2])
+
+        def within(x: Array) -> Array:
+            return np.clip(_plane(x), corner, -corner + tip)
+
+        return Outline(
+            lambda m, size: StripShape(width, m is not None), flat, upwards, within, tip, mirrors=lambda *_: [Y0]
+        )
+    if isinstance(shell, ShellSection) and shell.geometry == "disc":
+        return _disc(1.0, "rim", flat, upwards, _plane)
+    if isinstance(shell, ShellSection) or (isinstance(shell, CapSurface) and shell.hole is None):
+        hemisphere = isinstance(shell, ShellSection)
+        edge, name = (pi / 2, "equator") if hemisphere else (radians(shell.polar), "rim")  # type: ignore[union-attr]
+        return _disc(edge, name, sphere, sphere, _of_sphere, sphere=True)
+    if isinstance(shell, PlateSurface):
+        high = np.array([1.0, shell.width / shell.reference])
+        grid = Grid((0.0, 0.0), (1.0, float(high[1])), 1.0)
+        return _grid(grid, flat, upwards, lambda x: np.clip(x[:2], 0.0, high), high)
+    profile, names = _profile(shell)
+    if names[1] is None:
+        capped, bent = Capped(profile), _curvature(profile)
+        drawn = _disc(profile.length, names[0], capped, capped.normal, capped.inverse, curvature=bent)
+        return replace(drawn, from_pole=capped.from_pole)
+    return _ring(shell, profile, (names[0], names[1]))
+
+
+def refuse_beside(key: str, x: Array, outline: Outline, shell: Surface | ShellSection) -> None:
+    """See that the place (3,) at a key, over R, is on the surface.
+
+    Raises
+    ------
+    CaseError
+        With a place near it that is.
+    """
+    found = outline.inverse(x)
+    there = x if len(found) == 3 else outline.embedding(found[None])[0]
+    perfect = outline.perfect(found[None])[0] if len(found) == 2 else x
+    if min(float(np.linalg.norm(place - x)) for place in (there, perfect)) > ON_SURFACE:
+        size, unit = (1e3 * shell.reference, " mm") if shell.with_units else (shell.reference, "")
+        near = ", ".join(f"{c * size + 0.0:.8g}{unit}" for c in np.round(there, 12))
+        bare = "; a number without a unit is in metres here" if shell.with_units else ""
+        raise CaseError(f"{key}: is not on the surface; a place near it that is: [{near}]{bare}")
+
+
+def _disc(
+    edge: float,
+    name: str,
+    embedding: Embedding,
+    normal: Embedding,
+    inverse: Callable[[Array], Array],
+    *,
+    sphere: bool = False,
+    curvature: float = 1.0,
+) -> Outline:
+    def chart(mirror: Mirror | None, size: Grading) -> Chart:
+        return DiscShape(edge, mirror is not None, edge=name)
+
+    def within(x: Array) -> Array:
+        found = inverse(x)
+        beyond = np.hypot(*found) / edge
+        return np.asarray(found / max(beyond, 1.0))
+
+    def place(chart: Array) -> tuple[float, float]:
+        return float(np.hypot(*chart)), float(np.arctan2(chart[1], chart[0]))
+
+    span = Span(edge, (), (None, name), embedding, normal, place, curvature)
+    return Outline(chart, embedding, normal, within, np.zeros(2), edge, sphere, round=True, span=span)
+
+
+def _ring(shell: Surface, profile: Profile, names: tuple[str, str]) -> Outline:
+    assert isinstance(shell, RoundSection | RevolutionSurface)
+    first, last = shell.turn
+    along = np.linspace(0, profile.length, 101, dtype=np.float64)
+    rho = float(profile(along)[:, 0].max())
+    glued = shell.azimuth is None, isinstance(shell, TorusSurface) and shell.tube is None
+    low, high = (first * rho, 0.0), (last * rho, profile.length)
+    embedding = Revolved(profile, rho)
+
+    def inverse(x: Array) -> Array:
+        return np.clip(embedding.inverse(x, first), low, high)
+
+    def section(chart: Array) -> Array:
+        r, z = profile(profile.length - chart[:, 0]).T  # from its end: the normal points outwards
+        return np.column_stack([r, 0 * r, z])
+
+    def normal(chart: Array) -> Array:
+        along_r, along_z = profile.tangent(profile.length - chart[:, 0]).T
+        return np.column_stack([along_z, 0 * along_z, -along_r])
+
+    def place(chart: Array) -> tuple[float, float]:
+        return profile.length - float(chart[1]), float(chart[0]) / rho
+
+    span = None
+    if glued == (True, False):
+        span = Span(profile.length, (), (names[1], names[0]), section, normal, place, _curvature(profile))
+    grid = Grid(low, high, 1.0, ("left", "right", *names), glued)
+    return _grid(grid, embedding, embedding.normal, inverse, np.array(low if any(glued) else high), span)
+
+
+def _curvature(profile: Profile) -> float:
+    """The largest, at least 1; to a thousandth, not to rounding."""
+    s = np.linspace(0, profile.length, 1001, dtype=np.float64)
+    turned = np.linalg.norm(np.diff(profile.tangent(s), axis=0), axis=1)
+    return max(1.0, round(float(turned.max() / s[1]), 3))
+
+
+def _grid(
+    grid: Grid,
+    embedding: Embedding,
+    normal: Embedding,
+    inverse: Callable[[Array], Array],
+    highest: Array,
+    span: Span | None = None,
+) -> Outline:
+    def chart(mirror: Mirror | None, size: Grading) -> Chart:
+        through = lines_on(mirror, grid, embedding) if mirror else grid.through
+        return replace(grid, size=size.across if size.features else size.largest, through=through)
+
+    def planes(vectors: Sequence[Array], loosely: bool) -> list[Mirror]:
+        return _either_half(grid_mirrors(grid, embedding))
+
+    return Outline(chart, embedding, normal, inverse, highest, round=grid.glued[0], mirrors=planes, span=span)
+
+
+def _either_half(planes: Sequence[Mirror]) -> list[Mirror]:
+    return [half for plane in planes for half in (plane, plane.reversed)]
+
+
+def _profile(shell: Surface) -> tuple[Profile, tuple[str, str | None]]:
+    """The curve that is turned about e3, over R, and the names of its ends; no second one for the pole."""
+    if isinstance(shell, CapSurface):
+        assert shell.hole is not None
+        return Arc(1.0, pi / 2 - radians(shell.polar), pi / 2 - radians(shell.hole)), ("rim", "hole")
+    if isinstance(shell, CylinderSurface):
+        return Segment((1.0, 0.0), (1.0, shell.length / shell.radius)), ("bottom", "top")
+    if isinstance(shell, AnnulusSurface):
+        return Segment((1.0, 0.0), (shell.inner_radius / shell.radius, 0.0)), ("outer", "inner")
+    if isinstance(shell, TorusSurface):
+        first, last = shell.tube or (0.0, 360.0)
+        return Arc(shell.tube_radius / shell.radius, radians(first), radians(last), 1.0), ("bottom", "top")
+    assert isinstance(shell, RevolutionSurface)
+    curve = shell.profile.curve / shell.reference
+    straight = len(curve) == 2
+    ends = tuple(map(float, curve[0])), tuple(map(float, curve[1]))
+    profile: Profile = Segment(*ends) if straight else Spline(curve)  # type: ignore[arg-type]
+    return profile, ("bottom", None if curve[-1, 0] == 0 else "top")
+
+
+def _plane(x: Array) -> Array:
+    return x[:2]
+
+
+def _of_sphere(x: Array) -> Array:
+    across = np.hypot(x[0], x[1])
+    return np.asarray(np.arctan2(across, x[2]) * x[:2] / across) if across > 0 else np.zeros(2)

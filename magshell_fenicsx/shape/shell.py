@@ -1,0 +1,102 @@
+"""The shell: geometry, thickness, material, defect."""
+
+from typing import Any, Literal, Self
+
+from pydantic import Field, ModelWrapValidatorHandler, ValidationInfo, model_validator
+
+from magshell_fenicsx.case.imperfections.dimple import DimpleSection
+from magshell_fenicsx.case.imperfections.registered import Imperfections
+from magshell_fenicsx.input.expressions import Formula
+from magshell_fenicsx.input.section import Density, Length, Pressure, Section
+from magshell_fenicsx.parts.imperfections.sized import note_sizes
+from magshell_fenicsx.parts.motion.history import Time
+from magshell_fenicsx.parts.motion.viscosity import Branches
+
+
+class ShellSection(Section):
+    """Either radius_to_thickness, or radius and thickness with units; a strip's radius is its length.
+
+    Without units lengths are over R, forces over E R².
+
+    Edges: equator (hemisphere), rim (disc), root (x = 0), tip and sides (strip).
+    """
+
+    geometry: Literal["hemisphere", "disc", "strip"]
+    """A hemisphere around e3, a flat disc or a flat strip along e1"""
+    radius_to_thickness: float | None = Field(default=None, ge=10, le=1e5)
+    """R/h, in place of radius and thickness"""
+    radius: Length | None = Field(default=None, gt=0)
+    """Radius R, between 10 and 1e5 thicknesses"""
+    thickness: Length | None = Field(default=None, gt=0)
+    """Thickness h"""
+    youngs_modulus: Pressure | None = Field(default=None, ge=1, le=1e13)
+    """Young's modulus E, 1 Pa to 1e13 Pa; only flux densities need it"""
+    poisson_ratio: float = Field(gt=-1, le=0.5)
+    """Poisson's ratio ν"""
+    density: Density | None = Field(default=None, gt=0)
+    """Density ρ; with it frequencies are in hertz"""
+    viscosity: Time | None = None
+    """Of Kelvin and Voigt in steps of kind: time: viscosity over Young's modulus"""
+    relaxation: Branches = Field(default=[])
+    """Branches of Maxwell in steps of kind: time, relaxed before each of these"""
+    thickness_factor: Formula | None = None
+    """Multiplies h: a formula of x, y, z over R"""
+    defect: DimpleSection | None = None
+    """One dimple of a hemisphere; for more, or elsewhere, see imperfections"""
+    imperfections: Imperfections = Field(default=[])
+    """Deviations of the mid-surface along its normal, added up"""
+    width: float | None = Field(default=None, gt=0, le=10)
+    """Of a strip, which must have one [length of the strip]"""
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _imperfections_with_units(
+        cls, data: Any, handler: ModelWrapValidatorHandler[Self], info: ValidationInfo
+    ) -> Self:
+        note_sizes(data, handler, info, with_units=isinstance(data, dict) and data.get("thickness") is not None)
+        return handler(data)
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        lengths = [self.radius, self.thickness]
+        if self.radius_to_thickness is not None:
+            if lengths != [None, None]:
+                raise ValueError("give radius_to_thickness, or radius and thickness, not both")
+        elif None in lengths:
+            raise ValueError("give radius_to_thickness, or both radius and thickness")
+        elif not 10 <= self.R_over_h <= 1e5:
+            raise ValueError(f"radius/thickness is {self.R_over_h:.4g}; a thin shell needs 10 to 1e5")
+        if (self.width is None) == (self.geometry == "strip"):
+            raise ValueError("width (over the length) belongs to geometry: strip, and only to it")
+        if self.density is not None and (self.youngs_modulus is None or self.radius is None):
+            raise ValueError("density turns frequencies into hertz: that needs youngs_modulus, radius and thickness")
+        if self.defect and self.geometry != "hemisphere":
+            raise ValueError("a defect needs geometry: hemisphere; elsewhere give imperfections")
+        if self.width is not None and self.width * self.R_over_h < 1:
+            raise ValueError(
+                f"the strip is narrower than its thickness; width must be at least {1 / self.R_over_h:.4g}"
+            )
+        return self
+
+    @property
+    def R_over_h(self) -> float:
+        if self.radius_to_thickness is not None:
+            return self.radius_to_thickness
+        assert self.radius
+        assert self.thickness
+        return self.radius / self.thickness
+
+    @property
+    def reference(self) -> float:
+        """R, or 1 where the case has no lengths: those of points are then over R."""
+        return self.radius or 1.0
+
+    @property
+    def with_units(self) -> bool:
+        """Whether lengths have units, and are in metres."""
+        return self.radius is not None
+
+    @property
+    def modulus(self) -> float | None:
+        """E that dead loads are over: of a case without lengths 1, so that forces are over E R²."""
+        return self.youngs_modulus if self.with_units else 1.0

@@ -1,0 +1,70 @@
+"""Whether a formula of x, y, z is the same along every meridian."""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magshell_fenicsx.input.expressions import formula
+from magshell_fenicsx.mesh.frame import rotation
+from magshell_fenicsx.problem.problem import Span
+
+ANGLES = [
+    2.399963 * i for i in range(720)
+]  # the golden angle: nothing periodic meets them all, nor anything wider than 0.01
+Array = NDArray[np.float64]
+NEAR = 0.1  # over R
+SAME = 1e-9  # of the largest value: differences that are rounding
+
+
+def scalar_turns(text: str, span: Span, length: float = 1.0) -> bool:
+    """Whether a formula has the same value all around; its unit of length is R over `length`."""
+    f, places = formula(text), length * _places(span)
+    return _same([f(*(places @ rotation(angle)).T)[:, None] for angle in ANGLES])
+
+
+def vector_turns(components: Sequence[str], span: Span, length: float = 1.0, *, in_space: bool = False) -> bool:
+    """Whether the vector with these components turns with the meridian and has none across it.
+
+    On the surface, and with `in_space` beside it, where it may move to.
+
+    Parameters
+    ----------
+    length
+        R in the unit of the formulas' places.
+    """
+    vectors, places = vectors_of(components), _places(span)
+    if in_space:
+        places = beside(places) * [1.0, 0.0, 1.0]
+    return _turns(lambda x: vectors(length * x), places)
+
+
+def field_turns(field: Callable[[Array], Array], span: Span) -> bool:
+    """Whether the smooth field of sources turns with the meridian and has no component across it, on the surface."""
+    return _turns(field, _places(span)[::20], ANGLES[:12])
+
+
+def _turns(field: Callable[[Array], Array], places: Array, angles: Sequence[float] = ANGLES) -> bool:
+    found = [field(places @ Q) @ Q.T for Q in map(rotation, angles)]
+    return _same([*found, found[0] * [1.0, 0.0, 1.0]])
+
+
+def vectors_of(components: Sequence[str]) -> Callable[[Array], Array]:
+    """The vectors (n, 3) with these components at places (n, 3)."""
+    fs = [formula(text) for text in components]
+    return lambda x: np.stack([f(*x.T) for f in fs], axis=-1)
+
+
+def beside(x: Array) -> Array:
+    """Places (n, 3), and others near them."""
+    return np.vstack([x, x + NEAR * np.random.default_rng(2026).uniform(-1, 1, x.shape)])
+
+
+def _places(span: Span) -> Array:
+    """Along a meridian, without its ends: a formula may divide by zero on the axis."""
+    return span.sample()[1:-1]
+
+
+def _same(values: Sequence[Array]) -> bool:
+    first = values[0]
+    return all(bool((np.abs(v - first) <= SAME * np.abs(first).max()).all()) for v in values)
