@@ -12,6 +12,7 @@ from magshell_fenicsx.models.shell.kinematics import Jet
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.parts.part import Part, Scales
 from magshell_fenicsx.quantities.quantity import Quantity
+from magshell_fenicsx.quantities.units import POINT_FORCE, STIFFNESS
 
 Stiffness = Annotated[float, Field(gt=0)]
 
@@ -26,15 +27,14 @@ class Foundation(Part):
     """k, a force per area and displacement [E/R; force/length³]"""
 
     quantities = (
-        Quantity("foundation", "stiffness", "Stiffness k of the foundation.", "load", "k R²/(E h)", "E h/R²", "N/m³"),
+        Quantity("foundation", "stiffness", "Stiffness k of the foundation.", "load", "k R²/(E h)", (STIFFNESS,)),
         Quantity(
             "foundation_force",
             "reaction",
             "Reaction of the foundation, ∫ k w dA, positive outwards.",
             "load",
             "F_k R/(2πD)",
-            "2πD/R",
-            "N",
+            (POINT_FORCE,),
         ),
     )
     absent = "foundation: none"

@@ -7,8 +7,7 @@ from magshell_fenicsx.models.shell.parameters import Loads
 from magshell_fenicsx.parts.motion.step import TimeSection
 from magshell_fenicsx.parts.supports.reacting import columns, motion_columns, source_columns
 from magshell_fenicsx.problem.problem import Plan
-from magshell_fenicsx.quantities.registry import IN_TIME, OF_EVERY_RUN, amplitude, contact_columns
-from magshell_fenicsx.quantities.units import Sizes
+from magshell_fenicsx.quantities.registry import IN_TIME, OF_EVERY_RUN, Sizes, amplitude, contact_columns
 
 
 def sizes_in_units(case: Case, plan: Plan) -> Sizes:

@@ -1,32 +1,44 @@
 """A quantity observed along a path, an amplitude that varies, and the spelling of their symbols."""
 
 import re
+import unicodedata
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
 
-Kind = Literal["load", "displacement", "energy", "error", "time", "place", "reaction", "moment", "count", "text"]
-PLAIN = str.maketrans({"λ": "lambda", "π": "pi", "Δ": "d", "τ": "tau", "²": "^2", "³": "^3"})
-LATEX = str.maketrans({"λ": r"\lambda ", "π": r"\pi ", "Δ": r"\Delta ", "τ": r"\tau ", "²": "^2", "³": "^3"})
+from magshell_fenicsx.quantities.units import Unit
 
-IN_UNITS = {  # the unit as a formula, or the kind of what is in the case's units -> ending of the name and unit
-    "p_c": (("Pa", "Pa"),),
-    "λ_m": (("mT", "mT"), ("percent", "%")),
-    "2πD/R": (("N", "N"),),
-    "h": (("mm", "mm"),),
-    "R³": (("mm3", "mm³"),),
-    "E h R²": (("mJ", "mJ"),),
-    "E h/R²": (("N_per_m3", "N/m³"),),
-    "place": (("mm", "mm"),),
-    "reaction": (("N", "N"), ("N_m", "N m")),
-    "force": (("N", "N"),),
-    "work": (("J", "J"),),
-    "moment": (("N_m", "N m"),),
-    "t": (("s", "s"),),
-}
-ENDINGS = tuple(dict.fromkeys(ending for endings in IN_UNITS.values() for ending, _ in endings))
-RENAMED = {"p_over_pc": "pressure", "lambda_m": "applied"}
-FIELDS = {"mT": ("applied field", "B_a"), "%": ("strength of the sources", "")}
+Kind = Literal["load", "displacement", "energy", "error", "time", "place", "reaction", "moment", "count", "text"]
+SUPERSCRIPTS = str.maketrans("²³⁴", "234")
+
+
+def _letter(greek: str) -> str:
+    """The name of a Greek letter, as TeX spells it.
+
+    Examples
+    --------
+    >>> _letter("λ"), _letter("Δ"), _letter("ω")
+    ('lambda', 'Delta', 'omega')
+    """
+    name = unicodedata.name(greek).split()[-1].replace("LAMDA", "LAMBDA")
+    return name.capitalize() if greek.isupper() else name.lower()
+
+
+def plain_text(text: str) -> str:
+    """Text with Greek letters and powers, for a terminal.
+
+    Examples
+    --------
+    >>> plain_text("λ Δw² ρ")
+    'lambda dw^2 rho'
+    """
+    text = re.sub("[\u0391-\u03c9]", lambda greek: "d" if greek[0] == "Δ" else _letter(greek[0]), text)
+    return re.sub("[²³⁴]", lambda power: f"^{power[0].translate(SUPERSCRIPTS)}", text)
+
+
+def _tex(text: str) -> str:
+    text = re.sub("[\u0391-\u03c9]", lambda greek: rf"\{_letter(greek[0])} ", text)
+    return re.sub("[²³⁴]", lambda power: f"^{power[0].translate(SUPERSCRIPTS)}", text)
 
 
 def spelled(value: float, form: str) -> str:
@@ -55,12 +67,14 @@ class Quantity:
         Definition in one sentence.
     symbol
         For example "λ_m": Greek letters and powers in Unicode, an index after "_"; empty if there is no symbol.
-    unit, si
-        The unit as a formula such as "E h R²", and that unit in SI; empty for a pure number.
+    units
+        What one of the number is, the first of them unless the case shows another; empty for a pure number.
     note
         Distinguishes quantities with the same symbol; follows the words or the symbol.
     sign
         Sign of its value on an axis.
+    stem
+        Its name without a unit, before the endings of columns in units; by default the name without "_over_h".
     """
 
     name: str
@@ -68,10 +82,20 @@ class Quantity:
     meaning: str
     kind: Kind
     symbol: str = ""
-    unit: str = ""
-    si: str = ""
+    units: tuple[Unit, ...] = ()
     note: str = ""
     sign: float = 1.0
+    stem: str = ""
+
+    @property
+    def unit(self) -> str:
+        """The unit as a formula such as "E h R²"; empty for a pure number."""
+        return self.units[0].written if self.units else ""
+
+    @property
+    def si(self) -> str:
+        """That unit in SI."""
+        return self.units[0].si if self.units else ""
 
     @property
     def plain(self) -> str:
@@ -82,7 +106,7 @@ class Quantity:
         >>> [Quantity("", "", "", "load", symbol).plain for symbol in ("p/p_c", "λ_m", "ΔV/R³")]
         ['p/pc', 'lambda_m', 'dV/R^3']
         """
-        return re.sub(r"(?<=[A-Za-z])_", "", self.symbol).translate(PLAIN) or self.words
+        return plain_text(re.sub(r"(?<=[A-Za-z])_", "", self.symbol)) or self.words
 
     @property
     def latex(self) -> str:
@@ -93,7 +117,7 @@ class Quantity:
         >>> [Quantity("", "", "", "load", symbol).latex for symbol in ("p/p_c", "λ_m", "F R/(2πD)")]
         ['$p/p_\\\\mathrm{c}$', '$\\\\lambda_\\\\mathrm{m}$', '$F R/(2\\\\pi D)$']
         """
-        spelled = re.sub(r" ?_(\w+)", r"_\\mathrm{\1}", self.symbol.translate(LATEX))
+        spelled = re.sub(r" ?_(\w+)", r"_\\mathrm{\1}", _tex(self.symbol))
         return f"${spelled}$" if self.symbol else self.words
 
     @property
@@ -127,12 +151,16 @@ class Quantity:
 
     @property
     def scale(self) -> str:
-        """Its unit as a formula, a key of `IN_UNITS`; of what path.csv has in the case's units the kind."""
-        if self.symbol in ("λ_m", "t"):
-            return self.symbol
-        if self.kind == "reaction" and self.si:
-            return {"N": "force", "N m": "moment", "J": "work"}[self.si]
-        return self.unit or self.kind
+        """The key of its unit; of a number without one the kind."""
+        return self.units[0].key if self.units else self.kind
+
+    def in_unit(self, unit: Unit) -> "Quantity":
+        """The column in the unit that is shown for one of its units."""
+        stem, symbol = self.stem or self.name.replace("_over_h", ""), re.split("[ /]", self.symbol)[0]
+        words = self.words if unit.words is None else unit.words
+        symbol = symbol if unit.symbol is None else unit.symbol
+        shown = Unit(unit.shown, unit.shown)
+        return replace(self, name=f"{stem}_{unit.ending}", words=words, symbol=symbol, units=(shown,))
 
     @property
     def in_units(self) -> tuple["Quantity", ...]:
@@ -140,15 +168,11 @@ class Quantity:
 
         Examples
         --------
-        >>> [q.name for q in Quantity("w_over_h", "", "", "displacement", "w/h", "h").in_units]
+        >>> from magshell_fenicsx.quantities.units import THICKNESS
+        >>> [q.name for q in Quantity("w_over_h", "", "", "displacement", "w/h", (THICKNESS,)).in_units]
         ['w_mm']
         """
-        stem, symbol = RENAMED.get(self.name, self.name.replace("_over_h", "")), re.split("[ /]", self.symbol)[0]
-        found = []
-        for ending, unit in IN_UNITS.get(self.scale, ()):
-            words, sign = FIELDS[unit] if self.scale == "λ_m" else (self.words, symbol)
-            found.append(replace(self, name=f"{stem}_{ending}", words=words, symbol=sign, unit=unit, si=unit))
-        return tuple(found)
+        return tuple(self.in_unit(unit) for unit in self.units if unit.ending)
 
 
 @dataclass(frozen=True)

@@ -1,20 +1,42 @@
-"""Every amplitude and every column of path.csv, in the order of the file."""
+"""Every amplitude and every column of path.csv, in the order of the file, and those columns in a case's units."""
 
 import re
-from collections.abc import Collection, Iterable
-from dataclasses import replace
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from math import isnan, nan
 
 from magshell_fenicsx.quantities.quantity import Amplitude, Kind, Quantity
+from magshell_fenicsx.quantities.units import (
+    DEGREES,
+    ENERGY,
+    FIELD,
+    FORCE,
+    MOMENT,
+    PLACE,
+    POINT_FORCE,
+    PRESSURE,
+    REACTION,
+    SECONDS,
+    STRENGTH,
+    THICKNESS,
+    TIME,
+    TORQUE,
+    VOLUME,
+    WORK,
+    Given,
+    Unit,
+)
 
 OWN_MODES = ("", "symmetric", "asymmetric")  # in the column of modes: those of the model itself; it excludes all others
 
 
 def _energy(name: str, words: str, meaning: str, symbol: str = "") -> Quantity:
-    return Quantity(name, words, meaning, "energy", symbol, "E h R²", "J")
+    return Quantity(name, words, meaning, "energy", symbol, (ENERGY,))
 
 
 def _w(name: str, note: str, meaning: str) -> Quantity:
-    return Quantity(name, "displacement", meaning, "displacement", "w/h", "h", "m", note=note)
+    return Quantity(name, "displacement", meaning, "displacement", "w/h", (THICKNESS,), note=note)
 
 
 OF_EVERY_RUN = (
@@ -27,8 +49,8 @@ OF_EVERY_RUN = (
         "Live pressure, positive from outside, over p_c = 2E/√(3(1 - ν²)) (h/R)².",
         "load",
         "p/p_c",
-        "p_c",
-        "Pa",
+        (PRESSURE,),
+        stem="pressure",
     ),
     Quantity(
         "lambda_m",
@@ -36,9 +58,10 @@ OF_EVERY_RUN = (
         "|Br||Ba|/(μ0 E), with the sign of the case; in SI the applied flux density.",
         "load",
         "λ_m",
-        si="mT",
+        (FIELD, STRENGTH),
+        stem="applied",
     ),
-    Quantity("force", "force", "Dead force of an indentation, positive inwards.", "load", "F R/(2πD)", "2πD/R", "N"),
+    Quantity("force", "force", "Dead force of an indentation, positive inwards.", "load", "F R/(2πD)", (POINT_FORCE,)),
     _w(
         "w_over_h",
         "",
@@ -56,8 +79,7 @@ OF_EVERY_RUN = (
         "Change of the volume under the shell, with rigid lids on closed edges that move; negative where it shrinks.",
         "displacement",
         "ΔV/R³",
-        "R³",
-        "m³",
+        (VOLUME,),
         sign=-1.0,
     ),
     _energy("energy", "energy", "Π, the sum of all terms."),
@@ -72,7 +94,7 @@ OF_EVERY_RUN = (
     ),
     Quantity("iterations", "iterations", "Iterations of Newton's method.", "count"),
     Quantity("factorisations", "factorisations", "Factorisations of the tangent.", "count"),
-    Quantity("wall_s", "time", "Time since the start of the run.", "time", unit="s", si="s"),
+    Quantity("wall_s", "time", "Time since the start of the run.", "time", units=(SECONDS,)),
     _energy("stretching", "stretching", "Membrane energy; not of a solid."),
     _energy("bending", "bending", "Bending energy, including the edges; not of a solid."),
     _energy("magnetic", "magnetic", "Magnetic energy."),
@@ -85,9 +107,7 @@ OF_EVERY_RUN = (
         "U_τ",
     ),
     Quantity("mode", "mode", "Mode of an instability: symmetric, asymmetric, m = 2, antisymmetric, ...", "text"),
-    Quantity(
-        "field_angle", "field angle", "Angle by which the field has turned.", "load", unit="degrees", si="degrees"
-    ),
+    Quantity("field_angle", "field angle", "Angle by which the field has turned.", "load", units=(DEGREES,)),
     Quantity(
         "branch",
         "branch",
@@ -96,7 +116,12 @@ OF_EVERY_RUN = (
     ),
     _w("w_point_over_h", "of the loaded point", "Inward displacement of the loaded point itself."),
     Quantity(
-        "error_over_h", "error of u", "Estimate of the algebraic error: the next Newton step.", "error", "", "h", "m"
+        "error_over_h",
+        "error of u",
+        "Estimate of the algebraic error: the next Newton step.",
+        "error",
+        "",
+        (THICKNESS,),
     ),
     Quantity("load_error", "error of the load", "Estimate of the error of the amplitude at a located point.", "error"),
     Quantity(
@@ -119,6 +144,7 @@ OF_SOME_RUNS = (
         "Reaction of the supports that move, along their motion; of several motions reaction_NAME. In the case's unit "
         "of force (N with units), of rotations alone in that of a moment.",
         "reaction",
+        units=(REACTION, MOMENT),
     ),
     Quantity("source", "source", "Factor of a source's motion or strength; the step may give it another name.", "load"),
     Quantity(
@@ -126,11 +152,17 @@ OF_SOME_RUNS = (
         "force on the source",
         "Force of the shell on a source that is driven, along its motion; of several source_force_NAME.",
         "reaction",
-        si="N",
+        units=(FORCE,),
     ),
-    Quantity("source_torque", "torque on the source", "The same about the axis of its turn.", "reaction", si="N m"),
     Quantity(
-        "source_work", "work of the source", "The same of its strength: -dΠ/d(factor of the field).", "reaction", si="J"
+        "source_torque", "torque on the source", "The same about the axis of its turn.", "reaction", units=(TORQUE,)
+    ),
+    Quantity(
+        "source_work",
+        "work of the source",
+        "The same of its strength: -dΠ/d(factor of the field).",
+        "reaction",
+        units=(WORK,),
     ),
 )
 OF_CONTACTS = (
@@ -141,8 +173,7 @@ OF_CONTACTS = (
         "`force` is then the force on the body.",
         "load",
         "a/h",
-        "h",
-        "m",
+        (THICKNESS,),
     ),
     Quantity(
         "penetration_over_h",
@@ -150,17 +181,21 @@ OF_CONTACTS = (
         "Largest penetration of a body into the shell's face, an error of the penalty; negative: minus the least gap.",
         "error",
         "",
-        "h",
-        "m",
+        (THICKNESS,),
     ),
     Quantity(
         "contact_radius",
         "contact radius",
         "Mean distance of the pressure from the body's axis, in the shell's length; over R if that has no unit.",
         "place",
+        units=(PLACE,),
     ),
-    Quantity("contact_inner", "contact from", "Least distance of the pressure from the body's axis.", "place"),
-    Quantity("contact_outer", "contact to", "Largest distance of the pressure from the body's axis.", "place"),
+    Quantity(
+        "contact_inner", "contact from", "Least distance of the pressure from the body's axis.", "place", units=(PLACE,)
+    ),
+    Quantity(
+        "contact_outer", "contact to", "Largest distance of the pressure from the body's axis.", "place", units=(PLACE,)
+    ),
     Quantity(
         "contact_stiffness",
         "stiffness of the contact",
@@ -179,7 +214,12 @@ CONTACT = (
 )
 IN_TIME = (  # of runs with a step of kind: time
     Quantity(
-        "time", "time", "Time of the motion; in seconds, or the case's own unit, with shell.density.", "time", "t"
+        "time",
+        "time",
+        "Time of the motion; in seconds, or the case's own unit, with shell.density.",
+        "time",
+        "t",
+        (TIME,),
     ),
     _energy("kinetic", "kinetic", "Kinetic energy."),
     _energy("stored", "stored", "Energy of the shell itself: all terms but the potentials of loads."),
@@ -219,6 +259,17 @@ def register(quantities: Iterable[Quantity]) -> None:
     QUANTITIES.update({q.name: q for q in quantities})
 
 
+def units_in_use() -> tuple[Unit, ...]:
+    """The units of all columns, those of supports and points too."""
+    columns = (*QUANTITIES.values(), *map(quantity, ("_ux", "_fx", "_mx")))
+    return tuple(dict.fromkeys(unit for q in columns for unit in q.units))
+
+
+def endings() -> dict[str, str]:
+    """Ending of a column in units -> the unit in words."""
+    return {unit.ending: unit.shown for unit in units_in_use() if unit.ending}
+
+
 def quantity(name: str) -> Quantity:
     """The quantity of a column; a named point's displacement or a user-defined amplitude has its own name."""
     if name in QUANTITIES:
@@ -234,9 +285,10 @@ def quantity(name: str) -> Quantity:
     for column in ("reaction", *OF_SOURCES):
         if name.startswith(f"{column}_"):
             return replace(QUANTITIES[column], name=name, words=name.replace("_", " "))
-    kinds: dict[str, Kind] = {"u": "place", "f": "reaction", "m": "moment"}
+    kinds: dict[str, tuple[Kind, Unit]] = {"u": ("place", PLACE), "f": ("reaction", REACTION), "m": ("moment", MOMENT)}
     ending = re.search(r"_([ufm])[xyz]$", name)
-    return Quantity(name, name.replace("_", " "), "", kinds[ending[1]] if ending else "load")
+    kind, units = (kinds[ending[1]][0], kinds[ending[1]][1:]) if ending else ("load", ())
+    return Quantity(name, name.replace("_", " "), "", kind, units=units)
 
 
 def shown(name: str, columns: Collection[str]) -> Quantity:
@@ -282,3 +334,54 @@ def axes_of(name: str, row: Collection[str] = ()) -> tuple[Quantity, Quantity]:
         over = replace(over, note=varied.place)
     sideways = name in ("angle", "time") or varied.column.startswith("approach_over_h")
     return (drawn, over) if sideways else (over, drawn)
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """What one of a dimensionless number, or of a number in SI, is in the units that are shown.
+
+    Attributes
+    ----------
+    given
+        What the case gives with units; None for nothing.
+    moments
+        Columns of reactions that are moments.
+    """
+
+    given: Given | None = None
+    moments: Collection[str] = ()
+
+    @cached_property
+    def of(self) -> Mapping[str, float]:
+        """Key of a unit -> its size, without those that the case lacks."""
+        return {unit.key: size for unit in units_in_use() if (size := self._size(unit)) is not None}
+
+    @property
+    def field(self) -> str:
+        """The unit of the field: mT, or % of the sources."""
+        return (STRENGTH if self._size(STRENGTH) else FIELD).shown
+
+    def _size(self, unit: Unit) -> float | None:
+        size = unit.size(self.given) if self.given and unit.ending else nan
+        return None if isnan(size) else size
+
+    def unit(self, name: str) -> Unit | None:
+        """The unit in which a column is shown; None if it has none in this case."""
+        there = [unit for unit in quantity(name).units if self._size(unit) is not None]
+        if name in self.moments:
+            there = [unit for unit in there if unit is MOMENT]
+        return next(iter(there), None)
+
+    def column(self, name: str) -> Quantity | None:
+        """The column in units for a dimensionless one; None if there is none."""
+        unit = self.unit(name)
+        return quantity(name).in_unit(unit) if unit else None
+
+    def columns(self, names: Iterable[str]) -> tuple[str, ...]:
+        """The columns in units for some columns."""
+        return tuple(shown.name for name in names if (shown := self.column(name)))
+
+    def values(self, row: Mapping[str, float | int | str]) -> dict[str, float]:
+        """The values of a row in units."""
+        units = ((name, unit) for name in row if (unit := self.unit(name)))
+        return {quantity(name).in_unit(unit).name: float(row[name]) * self.of[unit.key] + 0.0 for name, unit in units}

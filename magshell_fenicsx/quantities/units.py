@@ -1,87 +1,105 @@
-"""The sizes of a case's units, and the columns that a case with units has beside the dimensionless ones."""
+"""Units as data: what one of a dimensionless number is, as a function of the shell's sizes."""
 
-from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass, field
-from math import pi, sqrt
-
-from magshell_fenicsx.quantities.quantity import Quantity
-from magshell_fenicsx.quantities.registry import quantity
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import nan, pi, sqrt
 
 
 @dataclass(frozen=True)
-class Sizes:
-    """What one of a dimensionless number, or of a number in SI, is in the units that are shown.
+class Given:
+    """What a case gives with units; nan for what it gives without.
 
     Attributes
     ----------
-    of
-        Scale (`Quantity.scale`) -> size; without an entry a quantity has no unit.
-    field
-        Unit of the field: mT, or % of the sources.
-    moments
-        Columns of reactions that are moments.
-    """
-
-    of: Mapping[str, float] = field(default_factory=dict)
-    field: str = "mT"
-    moments: Collection[str] = ()
-
-    def column(self, name: str) -> Quantity | None:
-        """The column in units for a dimensionless one; None if there is none."""
-        known = quantity(name)
-        if known.scale not in self.of or known.kind == "text":
-            return None
-        choice = {"λ_m": self.field, "reaction": "N m" if name in self.moments else "N"}
-        unit = choice.get(known.scale)
-        return next(each for each in known.in_units if unit in (None, each.unit))
-
-    def columns(self, names: Iterable[str]) -> tuple[str, ...]:
-        """The columns in units for some columns."""
-        return tuple(found.name for name in names if (found := self.column(name)))
-
-    def values(self, row: Mapping[str, float | int | str]) -> dict[str, float]:
-        """The values of a row in units."""
-        found = ((name, self.column(name)) for name in row)
-        return {to.name: float(row[name]) * self.of[quantity(name).scale] + 0.0 for name, to in found if to}
-
-
-def sizes(
-    nu: float,
-    R_over_h: float,
-    *,
-    R: float | None = None,
-    E: float | None = None,
-    per_lambda: float | None = None,
-    in_seconds: bool = False,
-) -> dict[str, float]:
-    """Scale -> size in the units shown.
-
-    Parameters
-    ----------
-    R, E
-        Radius (m) and Young's modulus (Pa) of a case with units.
-    per_lambda
+    R, E, rho
+        Radius (m), Young's modulus (Pa) and density (kg/m³).
+    applied, strength
         Applied flux density (mT), or strength of the sources (%), of lambda_m = 1.
-    in_seconds
-        Whether times are in seconds.
-
-    Examples
-    --------
-    >>> found = sizes(0.5, 90, R=0.0252, E=1.8e6)
-    >>> f"{found['p_c']:.4f} Pa, {found['h']:.3f} mm, {found['2πD/R']:.5f} N"
-    '296.2963 Pa, 0.280 mm, 0.00109 N'
+    second
+        The unit of time (s).
     """
-    found = {}
-    if E is not None:
-        found["p_c"] = 2 * E / sqrt(3 * (1 - nu**2)) / R_over_h**2
-    if R is not None:
-        found |= {"h": 1e3 * R / R_over_h, "R³": 1e9 * R**3, "place": 1e3}
-    if R is not None and E is not None:
-        h = R / R_over_h
-        found |= {"2πD/R": pi * E * h**3 / (6 * (1 - nu**2) * R), "E h R²": 1e3 * E * h * R**2}
-        found |= {"E h/R²": E * h / R**2, **dict.fromkeys(("reaction", "moment", "force", "work"), 1.0)}
-    if per_lambda is not None:
-        found["λ_m"] = per_lambda
-    if in_seconds:
-        found["t"] = 1.0
-    return found
+
+    nu: float
+    R_over_h: float
+    R: float = nan
+    E: float = nan
+    rho: float = nan
+    applied: float = nan
+    strength: float = nan
+    second: float = nan
+
+    @property
+    def h(self) -> float:
+        """The thickness (m)."""
+        return self.R / self.R_over_h
+
+    @property
+    def force(self) -> float:
+        """2πD/R (N)."""
+        return pi * self.E * self.h**3 / (6 * (1 - self.nu**2) * self.R)
+
+    @property
+    def any(self) -> float:
+        """1 in a case whose lengths and modulus have units, else nan."""
+        return 1.0 + 0.0 * self.R * self.E
+
+
+@dataclass(frozen=True)
+class Unit:
+    """The unit of a number in path.csv.
+
+    Attributes
+    ----------
+    key
+        Its name, and the unit as a formula such as "E h R²" unless `formula` says another.
+    si
+        The unit in SI.
+    ending, shown
+        The unit in which a case with units has a column of its own: the ending of its name, and the unit in words.
+    size
+        What one of the number is in that unit; nan if the case lacks what it needs.
+    text
+        The unit into which a text with a unit is converted for it, for pint; empty if no text is.
+    words, symbol
+        Of the column in that unit, if they are not those of the quantity.
+    """
+
+    key: str
+    si: str = ""
+    ending: str = ""
+    shown: str = ""
+    size: Callable[[Given], float] = lambda given: nan
+    text: str = ""
+    formula: str | None = None
+    words: str | None = None
+    symbol: str | None = None
+
+    @property
+    def written(self) -> str:
+        """The unit as a formula."""
+        return self.key if self.formula is None else self.formula
+
+
+def _one(given: Given) -> float:
+    return given.any
+
+
+PRESSURE = Unit("p_c", "Pa", "Pa", "Pa", lambda g: 2 * g.E / sqrt(3 * (1 - g.nu**2)) / g.R_over_h**2, text="pascal")
+THICKNESS = Unit("h", "m", "mm", "mm", lambda g: 1e3 * g.h, text="millimetre")
+VOLUME = Unit("R³", "m³", "mm3", "mm³", lambda g: 1e9 * g.R**3, text="millimetre**3")
+POINT_FORCE = Unit("2πD/R", "N", "N", "N", lambda g: g.force, text="newton")
+ENERGY = Unit("E h R²", "J", "mJ", "mJ", lambda g: 1e3 * g.E * g.h * g.R**2)
+STIFFNESS = Unit("E h/R²", "N/m³", "N_per_m3", "N/m³", lambda g: g.E * g.h / g.R**2)
+FIELD = Unit(
+    "λ_m", "mT", "mT", "mT", lambda g: g.applied, text="millitesla", formula="", words="applied field", symbol="B_a"
+)
+STRENGTH = Unit("λ_m", "", "percent", "%", lambda g: g.strength, formula="", words="strength of the sources", symbol="")
+PLACE = Unit("place", "", "mm", "mm", lambda g: 1e3 * g.R / g.R, formula="")
+REACTION = Unit("reaction", "", "N", "N", _one, formula="")
+MOMENT = Unit("moment", "", "N_m", "N m", _one, formula="")
+FORCE = Unit("force", "N", "N", "N", _one, formula="")
+TORQUE = Unit("torque", "N m", "N_m", "N m", _one, formula="")
+WORK = Unit("work", "J", "J", "J", _one, formula="")
+TIME = Unit("t", "", "s", "s", lambda g: g.second, formula="")
+SECONDS = Unit("s", "s")
+DEGREES = Unit("degrees", "degrees")

@@ -16,8 +16,7 @@ from magshell_fenicsx.parts.motion.step import TimeSection
 from magshell_fenicsx.parts.step import PathStep
 from magshell_fenicsx.parts.supports.reacting import motion_columns
 from magshell_fenicsx.quantities.quantity import spelled
-from magshell_fenicsx.quantities.registry import amplitude, quantity, shown
-from magshell_fenicsx.quantities.units import Sizes
+from magshell_fenicsx.quantities.registry import Sizes, amplitude, quantity, shown
 from magshell_fenicsx.simulate.scene import Scene
 
 WORDS = {"limit": "the first instability", "bifurcation": "the first bifurcation"}

@@ -5,7 +5,6 @@ from numbers import Real
 from typing import Any, cast
 
 from magshell_fenicsx.input.section import in_units
-from magshell_fenicsx.input.targets import UNITS
 from magshell_fenicsx.quantities.registry import amplitude, quantity
 from magshell_fenicsx.simulate.scene import Scene
 
@@ -38,17 +37,18 @@ def _number(scene: Scene, name: str, where: str, amount: Any, of_load: bool) -> 
     if not isinstance(amount, str):
         raise ValueError(f'{where}: must be a number, or text with a unit such as "100 Pa"')
     known = amplitude(name)
-    scale = quantity(known.column if of_load else known.conjugate).scale
+    column = known.column if of_load else known.conjugate
+    unit, scale = scene.sizes.unit(column), quantity(column).scale
     sized = of_load or name == "pressure" or name in (*scene.model.loads.forces, *scene.model.contacts)
-    unit = (UNITS | {"λ_m": "millitesla"}).get(scale)
-    if unit is None or not sized or (scale == "λ_m" and scene.sizes.field != "mT"):
+    text = unit.text if unit else next((each.text for each in quantity(column).units), "")
+    if not (text and sized):
         of = name if of_load else f"the conjugate of {name}"
         raise ValueError(f"{where}: {of} has no unit here: give a number")
-    if scale not in scene.sizes.of:
+    if unit is None:
         needed = "youngs_modulus and lengths of the shell with units"
         raise ValueError(f"{where}: has a unit: that needs {needed}; a number is in {scale}")
     try:
-        number = in_units(unit)(amount) / scene.sizes.of[scale]
+        number = in_units(text)(amount) / scene.sizes.of[unit.key]
     except ValueError as e:
         raise ValueError(f"{where}: {e}") from None
     return number if of_load else number * scene.conjugate_unit(name)

@@ -50,8 +50,7 @@ from magshell_fenicsx.problem.formulas import unshown, written
 from magshell_fenicsx.problem.limits import refuse_beyond_memory
 from magshell_fenicsx.problem.planner import make_plan
 from magshell_fenicsx.problem.problem import Plan
-from magshell_fenicsx.quantities.registry import amplitude, contact_columns
-from magshell_fenicsx.quantities.units import Sizes
+from magshell_fenicsx.quantities.registry import Sizes, amplitude, contact_columns
 from magshell_fenicsx.simulate.build import build_meridian_model, build_model, build_solid_model
 
 Array = NDArray[np.float64]

@@ -21,7 +21,7 @@ from conftest import CASES
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.platform.terminal import LAUNCHERS, live_line
-from magshell_fenicsx.quantities.units import Sizes
+from magshell_fenicsx.quantities.registry import Sizes
 from magshell_fenicsx.runs.status import Aim, RunProgress, time_left
 
 QUICK = (CASES / "pole_indentation.yaml", "--set=mesh.degree=3", "--set=mesh.refinement=0.5")

@@ -14,7 +14,7 @@ from magshell_fenicsx.output.report.report_path import Line, head, symbol
 from magshell_fenicsx.output.store.durable import Damaged
 from magshell_fenicsx.output.store.known import pole_of, read_summary
 from magshell_fenicsx.output.store.table import LOCATED, pole_name, read_lines
-from magshell_fenicsx.quantities.quantity import PLAIN, Quantity
+from magshell_fenicsx.quantities.quantity import Quantity, plain_text
 from magshell_fenicsx.quantities.registry import OWN_MODES, amplitude, axes_of, shown
 
 Summary = Mapping[str, Any]
@@ -91,7 +91,7 @@ def plain(sentence: Markup) -> str:
     'lambda_m = -1.84e-5 (1e2 Pa) < 1'
     """
     text = str(sentence).replace(" · 10<sup>", "e").replace("10<sup>", "1e").replace("−", "-")
-    return unescape(re.sub(r"</?su[bp]>", "", text.replace("<sub>", "_"))).translate(PLAIN)
+    return plain_text(unescape(re.sub(r"</?su[bp]>", "", text.replace("<sub>", "_"))))
 
 
 def sentence_of(folder: Path) -> str:

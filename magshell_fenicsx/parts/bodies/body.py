@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 
 from magshell_fenicsx.input.section import Section, or_number
 from magshell_fenicsx.parts.imperfections.place import At, Coordinates
-from magshell_fenicsx.quantities.quantity import ENDINGS
+from magshell_fenicsx.quantities.registry import endings
 
 Axis = Annotated[list[Annotated[float, Field(ge=-1e9, le=1e9)]], Field(min_length=3, max_length=3)]
 Size = Annotated[float, or_number("metre"), Field(gt=0, le=1e9)]
@@ -64,7 +64,7 @@ def refuse_unfit_bodies(bodies: Mapping[str, BodySection], moved: Mapping[str, s
     for name in bodies:
         if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,39}", name):
             raise ValueError(f"bodies.{name}: a name is a letter, then letters, digits and _; at most 40")
-        if name in ENDINGS:
+        if name in endings():
             raise ValueError(f"bodies.{name}: is taken, by columns in this unit; choose another name")
     if bodies and solid:
         raise ValueError("bodies: press on a shell; of a solid give a force on a patch (kind: indentation, patch)")

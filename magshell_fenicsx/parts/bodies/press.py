@@ -8,6 +8,7 @@ from pydantic import Field
 from magshell_fenicsx.input.targets import over
 from magshell_fenicsx.parts.step import Control, Count, Now, PathStep, Target, Until
 from magshell_fenicsx.parts.supports.motion import Name
+from magshell_fenicsx.quantities.units import POINT_FORCE, THICKNESS
 
 FIRST = 0.1  # of h: the first step of the approach towards a force
 
@@ -30,9 +31,9 @@ class ContactSection(PathStep):
     control: Literal["approach", "force", "arc"] = "arc"
     """What is prescribed step by step: the approach, the force, or arc length, which passes every fold"""
     until: Until = "target"
-    approach: Annotated[float, over("h")] | None = Field(default=None, ge=-1e6, le=1e6)
+    approach: Annotated[float, over(THICKNESS)] | None = Field(default=None, ge=-1e6, le=1e6)
     """Target of the approach, from where the body is at first; with control: approach or arc [h]"""
-    force: Annotated[float, over("2πD/R")] | None = Field(default=None, ge=-1e6, le=1e6)
+    force: Annotated[float, over(POINT_FORCE)] | None = Field(default=None, ge=-1e6, le=1e6)
     """Target of the force on the body; with control: force or arc [2πD/R]"""
     points: Count = 20
 

@@ -8,6 +8,7 @@ from pydantic import Field, model_validator
 from magshell_fenicsx.input.direction import Direction
 from magshell_fenicsx.input.targets import over
 from magshell_fenicsx.parts.step import Count, Now, PathStep, Target, Until
+from magshell_fenicsx.quantities.units import POINT_FORCE, THICKNESS
 
 LEAST_HUMP = 0.01  # F of the first step towards the top of an energy barrier
 
@@ -44,12 +45,12 @@ class IndentationSection(PathStep):
     """What is prescribed step by step: w, F, or arc length, which passes every fold; the default is load with a target
     `force`"""
     until: Until = "target"
-    depth: Annotated[float, over("h")] | None = Field(default=None, ge=-1e4, le=1e4)
+    depth: Annotated[float, over(THICKNESS)] | None = Field(default=None, ge=-1e4, le=1e4)
     """Target w under the load; with control: displacement or arc [h]"""
-    force: Annotated[float, over("2πD/R")] | None = Field(default=None, ge=-1e6, le=1e6)
+    force: Annotated[float, over(POINT_FORCE)] | None = Field(default=None, ge=-1e6, le=1e6)
     """Target F; with control: load or arc [2πD/R]"""
     points: Count = 20
-    patch: Annotated[float, over("h")] = Field(default=0.0, ge=0, le=1000)
+    patch: Annotated[float, over(THICKNESS)] = Field(default=0.0, ge=0, le=1000)
     """Radius of the patch that the force is spread over, from 0.3; 0 is a point [h]"""
 
     @property

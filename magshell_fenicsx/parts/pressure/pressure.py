@@ -7,6 +7,7 @@ from pydantic import Field
 
 from magshell_fenicsx.input.targets import over
 from magshell_fenicsx.parts.step import Now, PathStep, Target, Until
+from magshell_fenicsx.quantities.units import PRESSURE, VOLUME
 
 
 class PressureSection(PathStep):
@@ -24,9 +25,9 @@ class PressureSection(PathStep):
     """What is prescribed step by step: ΔV, p, or arc length, which passes every fold. The default is load with a target
     `pressure`; and arc beside a free edge, where no ΔV is conjugate to p"""
     until: Until = "limit"
-    pressure: Annotated[float, over("p_c")] | None = Field(default=None, ge=-1e3, le=1e3)
+    pressure: Annotated[float, over(PRESSURE)] | None = Field(default=None, ge=-1e3, le=1e3)
     """Target p; with control: load or arc [p_c]"""
-    volume_change: Annotated[float, over("R³")] | None = Field(default=None, ge=-5, le=5)
+    volume_change: Annotated[float, over(VOLUME)] | None = Field(default=None, ge=-5, le=5)
     """Target ΔV; with control: volume or arc [R³]"""
 
     def begin(self, here: float) -> float:

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.quantities.quantity import IN_UNITS
-from magshell_fenicsx.quantities.registry import quantity
+from magshell_fenicsx.quantities.registry import endings, quantity
 from magshell_fenicsx.studies.design.between import Between
 from magshell_fenicsx.studies.design.variables import Variables
 
@@ -19,7 +18,6 @@ TITLES = {
     "curvature": r"natural curvature $\kappa R$",
     "deviation": "deviation $w_0/h$",
 }
-SHOWN = {"Hz", *(unit for endings in IN_UNITS.values() for _, unit in endings)}  # on axes
 MARGINS = (-0.03, 0.03)  # beyond the bounds
 
 
@@ -67,7 +65,7 @@ def _draw_history(axes: Any, rows: Sequence[dict[str, Any]], results: Sequence[s
         axes.plot(number[best], values[best], "o", markersize=3, color=line.get_color())
         if result == "shape":
             axes.set_yscale("log")
-    shown = unit if unit in SHOWN else ""
+    shown = unit if unit in {"Hz", *endings().values()} else ""
     axes.set_ylabel(_name(results[0]) + (f"  ({shown})" if shown else "") if len(results) == 1 else shown)
     if len(results) > 1:
         axes.legend(frameon=False, fontsize=8)
@@ -91,10 +89,10 @@ def _unit(result: str) -> str:
 
 def _in_units(result: str) -> tuple[str, str] | None:
     """The name of a result in a unit without its ending, and the unit; the longest ending first: N_m before m."""
-    endings = {ending: unit for each in IN_UNITS.values() for ending, unit in each}
-    for ending in sorted(endings, key=len, reverse=True):
+    units = endings()
+    for ending in sorted(units, key=len, reverse=True):
         if result.endswith(f"_{ending}"):
-            return result.removesuffix(f"_{ending}"), endings[ending]
+            return result.removesuffix(f"_{ending}"), units[ending]
     return None
 
 

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from magshell_fenicsx.quantities.quantity import ENDINGS
+from magshell_fenicsx.quantities.registry import endings
 from magshell_fenicsx.studies.sweep.axes import Axis
 from magshell_fenicsx.studies.sweep.outcome import CURVE, Outcome
 from magshell_fenicsx.studies.sweep.points import SweepPoint
@@ -48,7 +48,7 @@ def _in_units(outcome: Outcome) -> dict[str, Any]:
     """The columns in units of its limit point, and the numbers of the case."""
     limit = outcome.limit or {}
     return {
-        key: v for key, v in limit.items() if key.endswith(tuple(f"_{each}" for each in ENDINGS))
+        key: v for key, v in limit.items() if key.endswith(tuple(f"_{each}" for each in endings()))
     } | outcome.in_units
 
 
