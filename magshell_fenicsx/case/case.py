@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from copy import deepcopy
+from dataclasses import replace
 from functools import cached_property
 from math import pi, radians
 from pathlib import Path
@@ -17,11 +18,10 @@ from magshell_fenicsx.case.frequencies import FrequenciesSection
 from magshell_fenicsx.case.gradients import GradientsSection
 from magshell_fenicsx.case.imperfections.dimple import DimpleSection
 from magshell_fenicsx.case.imperfections.random import RandomSection
-from magshell_fenicsx.case.loading import Loading, ProgrammeStep, programme
+from magshell_fenicsx.case.loading import Loading, listed, programme, refuse_unfit_steps
 from magshell_fenicsx.case.mesh import SOLID_DEGREE, MeshSection
 from magshell_fenicsx.case.output import OutputSection
 from magshell_fenicsx.case.patches import refuse_strange
-from magshell_fenicsx.case.programme import refuse_unfit_steps, refuse_unnamed
 from magshell_fenicsx.case.solid import SolidSection
 from magshell_fenicsx.case.stability import StabilitySection
 from magshell_fenicsx.input.chosen import Chosen
@@ -32,22 +32,17 @@ from magshell_fenicsx.input.section import texts
 from magshell_fenicsx.input.source import CaseError, Source, read_source
 from magshell_fenicsx.input.targets import NOTED
 from magshell_fenicsx.parts.bodies.body import refuse_unfit_bodies, with_units
-from magshell_fenicsx.parts.bodies.press import ContactSection
-from magshell_fenicsx.parts.forces.dead import DeadSection
-from magshell_fenicsx.parts.forces.indentation import IndentationSection
-from magshell_fenicsx.parts.imperfections.growth import refuse_unfit_growth
+from magshell_fenicsx.parts.bodies.press import approaches
 from magshell_fenicsx.parts.imperfections.place import Coordinates, ImperfectionSection, places_with_units
-from magshell_fenicsx.parts.magnetism.fields import MagneticSection, layer_average
+from magshell_fenicsx.parts.magnetism.fields import MagneticSection, layer_average, strength
 from magshell_fenicsx.parts.magnetism.sources.source import SourceSection
 from magshell_fenicsx.parts.motion.viscosity import refuse_unfit_viscosity
-from magshell_fenicsx.parts.natural.growth import GrowthSection
 from magshell_fenicsx.parts.natural.section import NaturalSection, measured
 from magshell_fenicsx.parts.own import Origin
-from magshell_fenicsx.parts.part import Part, Scales
+from magshell_fenicsx.parts.part import Part, Scales, Setting
 from magshell_fenicsx.parts.registered import PARTS, WithParts
-from magshell_fenicsx.parts.step import Step
+from magshell_fenicsx.parts.step import ProgrammeStep, Step
 from magshell_fenicsx.parts.supports.boundary import EDGES, BoundarySection, refuse_taken
-from magshell_fenicsx.parts.supports.motion import EdgeSection, refuse_unheld
 from magshell_fenicsx.shape.sections import CapSurface, MeshSurface, RevolutionSurface, Surface, SurfaceSection
 from magshell_fenicsx.shape.shell import ShellSection
 
@@ -103,10 +98,10 @@ class Case(WithParts):
         section = handler(data)
         if isinstance(data, dict) and not section.shell.with_units:
             parts = {key: data.get(key) for key in ("points", "mesh", *PARTS)}
-            sources = written if isinstance(written := data.get("loading"), list) else [written]
-            for step, source in zip(programme(section.loading, field=False), sources, strict=False):
-                if isinstance(step.load, DeadSection | EdgeSection) and isinstance(source, dict):
-                    parts[step.key] = {key: value for key, value in source.items() if key != "hold"}
+            written = listed(data.get("loading"))
+            for key, load in listed(section.loading).items():
+                if load.measured and isinstance(written[key], dict):
+                    parts[key] = {name: value for name, value in written[key].items() if name != "hold"}
             for key in (
                 *texts(parts, is_formula),
                 *measured(data.get("natural")),
@@ -130,9 +125,6 @@ class Case(WithParts):
                 "magnetic.remanent.layers: the layers cancel: their average is a remanence of length zero, and a shell "
                 "knows no more of them"
             )
-        for load in self.loads_of(GrowthSection):
-            if getattr(self.natural, load.key, None) is None:
-                raise ValueError(f"loading.{load.key}: is a factor of natural.{load.key}: give that too")
         return self
 
     @model_validator(mode="after")
@@ -154,14 +146,8 @@ class Case(WithParts):
     def _named_parts_are_there(self) -> Self:
         shell = self.shell
         refuse_taken(self.points)
-        dead = self.loads_of(DeadSection)
-        for key in (*(["loads of kind: dead"] if dead else []), *self.parts):
-            if shell.modulus is None:
-                raise ValueError(f"shell.youngs_modulus is needed for {key}")
-        for step in self.programme:
-            if isinstance(step.load, IndentationSection):
-                self._on_shell(step.key, step.load.at.polar)
-        refuse_unnamed(self.programme, self.points)
+        for key in self.parts:
+            self.setting.has_modulus(key)
         if isinstance(shell, ShellSection):
             edges = EDGES[shell.geometry]
             for name in self.boundary.conditions():
@@ -170,13 +156,6 @@ class Case(WithParts):
         for key, patches in self.patches.items():
             refuse_strange(key, patches, shell, self.dimples)
         return self
-
-    def _on_shell(self, key: str, polar: float) -> None:
-        """A degree from the edge of a sphere at least."""
-        shell = self.shell
-        edge = shell.polar if isinstance(shell, CapSurface) else 90.0
-        if shell.geometry in ("hemisphere", "cap") and not 0 <= polar < edge - 1:
-            raise ValueError(f"{key}.at.polar: {polar:g} is not on the shell: allowed 0 to {edge - 1:g}")
 
     @property
     def patches(self) -> dict[str, Iterable[str]]:
@@ -214,8 +193,6 @@ class Case(WithParts):
         self.mesh.refuse_unfit_solid(read=isinstance(self.shell, MeshSurface))
         if self.symmetry == "axisymmetric":
             raise ValueError("symmetry: axisymmetric: a solid is whole or half")
-        for load in self.loads_of(IndentationSection):
-            load.refuse_point_of_solid()
         if self.solid:
             self.solid.refuse_unfit(self.shell.poisson_ratio)
         return self
@@ -223,39 +200,40 @@ class Case(WithParts):
     @model_validator(mode="after")
     def _bodies_fit(self) -> Self:
         for name, body in self.bodies.items():
-            self._on_shell(f"bodies.{name}", 0.0 if body.at.point else body.at.polar)
-        moved = {step.key: step.load.body for step in self.programme if isinstance(step.load, ContactSection)}
-        refuse_unfit_bodies(self.bodies, moved, solid=self.model == "solid")
+            self.setting.on_shell(f"bodies.{name}", 0.0 if body.at.point else body.at.polar)
+        refuse_unfit_bodies(self.bodies, solid=self.model == "solid")
         return self
 
     @model_validator(mode="after")
     def _programme_fits(self) -> Self:
-        for step in self.programme:
-            if isinstance(step.load, EdgeSection):
-                refuse_unheld(step.key, step.load, self.boundary.conditions())
-        refuse_unfit_growth(self.programme, self.imperfections, solid=self.model == "solid")
-        density, whole = self.time_unit is not None and self.shell.with_units, isinstance(self.loading, list)
+        density = self.time_unit is not None and self.shell.with_units
         refuse_unfit_viscosity(self.shell, self.natural, density=density, solid=self.model == "solid")
-        refuse_unfit_steps(self.programme, self.magnetic, self.lambda_m, whole=whole, density=density)
+        refuse_unfit_steps(self.setting)
         return self
 
     @cached_property
+    def setting(self) -> Setting:
+        """What its parts know of it."""
+        sections = {key: getattr(self, key) for key in type(self).model_fields}
+        sections["imperfections"] = self.imperfections
+        whole, solid = isinstance(self.loading, list), self.model == "solid"
+        around = Setting(self.shell, self.points, sections, whole=whole, solid=solid)
+        return replace(around, steps=programme(self.loading, around))
+
+    @property
     def programme(self) -> tuple[ProgrammeStep, ...]:
         """Its steps; before a single load the natural shape grows, then the field."""
-        grows = [key for key in ("stretch", "curvature") if getattr(self.natural, key, None) is not None]
-        return programme(self.loading, field=bool(self.lambda_m), natural=grows, approaches=self.approaches)
+        return tuple(self.setting.steps)
 
     @property
     def approaches(self) -> dict[str, str]:
-        """Body -> name of its approach, the amplitude; a single one needs no name beside it."""
-        steps: list[Step | None] = [*self.loading] if isinstance(self.loading, list) else [self.loading]
-        alone = len(self.bodies) == 1 and not any(isinstance(step, IndentationSection) for step in steps)
-        return {name: "approach" if alone else f"approach_{name}" for name in self.bodies}
+        """Body -> name of its approach, the amplitude."""
+        return approaches(self.bodies, list(listed(self.loading).values()))
 
     def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
-        """A copy with some sections changed, which makes its programme anew."""
+        """A copy with some sections changed, whose parts know it and not this one."""
         copied = super().model_copy(update=update, deep=deep)
-        copied.__dict__.pop("programme", None)
+        copied.__dict__.pop("setting", None)
         return copied
 
     def loads_of(self, kind: type[AnyStep]) -> list[AnyStep]:
@@ -311,7 +289,7 @@ class Case(WithParts):
     @property
     def lambda_m(self) -> float:
         """|Br||Ba|/(mu_0 E); 0 without a field."""
-        return self.magnetic.amplitude(self.shell.youngs_modulus) if self.magnetic else 0.0
+        return strength(self.setting)
 
     @property
     def sources(self) -> Sequence[SourceSection]:
@@ -320,9 +298,8 @@ class Case(WithParts):
 
     @property
     def time_unit(self) -> float | None:
-        """R √(ρ/E), that times are over: in seconds where the case has units; None without a density."""
-        density, modulus = self.shell.density, self.shell.youngs_modulus
-        return float(self.shell.reference * np.sqrt(density / modulus)) if density and modulus else None
+        """See `Setting.time_unit`."""
+        return self.setting.time_unit
 
     @property
     def outside(self) -> dict[str, str | None]:

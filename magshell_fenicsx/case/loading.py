@@ -1,38 +1,19 @@
-"""The kinds of steps, and the programme of a case: its steps with their numbers and amplitudes."""
+"""The programme of a case: its steps with their numbers and amplitudes, and what all must have in common."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Annotated, Any, TypeAlias
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias, Union
 
 from pydantic import Discriminator, Field, Tag
 
 from magshell_fenicsx.input.chosen import Chosen
-from magshell_fenicsx.parts.bodies.press import ContactSection
-from magshell_fenicsx.parts.forces.dead import DeadSection
-from magshell_fenicsx.parts.forces.indentation import IndentationSection
-from magshell_fenicsx.parts.imperfections.growth import ImperfectionStep
-from magshell_fenicsx.parts.magnetism.field_step import FieldBefore, FieldSection, RotationSection
-from magshell_fenicsx.parts.magnetism.source_step import SourceStep
-from magshell_fenicsx.parts.motion.step import TimeSection
-from magshell_fenicsx.parts.natural.growth import GrowthSection
-from magshell_fenicsx.parts.pressure.pressure import PressureSection
-from magshell_fenicsx.parts.step import PathStep, Step, Until
-from magshell_fenicsx.parts.supports.motion import EdgeSection
+from magshell_fenicsx.parts.part import Setting
+from magshell_fenicsx.parts.registered import FIRST, STEPS
+from magshell_fenicsx.parts.step import LEAST_TARGET, Gas, ProgrammeStep, Step
 
-OneStep: TypeAlias = Annotated[
-    PressureSection
-    | IndentationSection
-    | FieldSection
-    | RotationSection
-    | GrowthSection
-    | ImperfectionStep
-    | DeadSection
-    | EdgeSection
-    | ContactSection
-    | SourceStep
-    | TimeSection,
-    Chosen("kind"),
-]
+if TYPE_CHECKING:
+    OneStep: TypeAlias = Step
+else:
+    OneStep = Annotated[Union[tuple(STEPS.values())], Chosen("kind")]  # noqa: UP007
 PROGRAMME = "programme"  # tag of a list of steps
 Loading: TypeAlias = Annotated[
     Annotated[OneStep, Tag("one")] | Annotated[list[OneStep], Tag(PROGRAMME), Field(min_length=1, max_length=1000)],
@@ -40,74 +21,73 @@ Loading: TypeAlias = Annotated[
 ]
 
 
-@dataclass(frozen=True)
-class ProgrammeStep:
-    """A step of a programme.
-
-    Attributes
-    ----------
-    number
-        From 1.
-    name
-        Name of its amplitude; a second force or list of dead loads has a number, such as "force_2".
-    key
-        Where it is in the case file.
-    """
-
-    number: int
-    name: str
-    key: str
-    load: Step
-
-    @property
-    def kind(self) -> str:
-        return str(getattr(self.load, "kind", ""))
-
-    @property
-    def until(self) -> Until:
-        return self.load.until if isinstance(self.load, PathStep) else "target"
-
-
-def programme(
-    loading: Step | Sequence[Step] | None,
-    *,
-    field: bool,
-    natural: Sequence[str] = (),
-    approaches: Mapping[str, str] | None = None,
-) -> tuple[ProgrammeStep, ...]:
-    """The steps of a case: those of a list, or the natural shape, the field and then one load.
-
-    Parameters
-    ----------
-    field
-        Whether the case has a field.
-    natural
-        What of its natural shape grows, stretch before curvature.
-    approaches
-        Body -> name of its approach.
-    """
+def listed(loading: Any) -> dict[str, Any]:
+    """Key -> load, or its plain data: of the one load of a case or of a list of steps."""
     if isinstance(loading, Sequence):
-        return _numbered(loading, [f"loading.{i}" for i in range(len(loading))], approaches or {})
-    grown = [] if isinstance(loading, GrowthSection) else [{"kind": "natural", key: 1.0} for key in natural]
-    growth = [GrowthSection.model_validate(each) for each in grown]
-    drives = isinstance(loading, FieldSection) or (isinstance(loading, TimeSection) and "field" in loading.history)
-    first = [FieldBefore(kind="field")] if field and not drives else []
-    given = [loading] if loading else []
-    keys = [*("natural" for _ in growth), *("magnetic" for _ in first), *("loading" for _ in given)]
-    return _numbered([*growth, *first, *given], keys, approaches or {})
+        return {f"loading.{i}": load for i, load in enumerate(loading)}
+    return {"loading": loading} if loading else {}
 
 
-def _numbered(loads: Sequence[Step], keys: Sequence[str], approaches: Mapping[str, str]) -> tuple[ProgrammeStep, ...]:
-    known: dict[str, list[Any]] = {}
+def programme(loading: Step | Sequence[Step] | None, setting: Setting) -> tuple[ProgrammeStep, ...]:
+    """The steps of a case: those of a list, or what comes before one load, and then that."""
+    before: list[tuple[str, Step]] = []
+    if not isinstance(loading, Sequence):
+        before = [pair for kind in FIRST for pair in STEPS[kind].before(setting, loading)]
+    keyed = [*before, *listed(loading).items()]
+    loads, known = [load for _, load in keyed], dict[str, list[Any]]()
     steps = []
-    for number, (load, key) in enumerate(zip(loads, keys, strict=True), 1):
-        if isinstance(load, ContactSection):
-            body = str(load.body or next(iter(approaches), ""))
-            steps.append(ProgrammeStep(number, approaches.get(body, load.amplitude), key, load))
-            continue
-        places = known.setdefault(load.amplitude, [])
-        if load.place not in places:
-            places.append(load.place)
-        which = places.index(load.place) + 1
-        steps.append(ProgrammeStep(number, load.amplitude + (f"_{which}" if which > 1 else ""), key, load))
+    for number, (key, load) in enumerate(keyed, 1):
+        name = load.name_in(setting, loads)
+        if name is None:
+            places = known.setdefault(load.amplitude, [])
+            if load.place not in places:
+                places.append(load.place)
+            which = places.index(load.place) + 1
+            name = load.amplitude + (f"_{which}" if which > 1 else "")
+        steps.append(ProgrammeStep(number, name, key, load))
     return tuple(steps)
+
+
+def refuse_unfit_steps(setting: Setting) -> None:
+    """See that each step has what it needs, a way to go, and known amplitudes to hold.
+
+    Raises
+    ------
+    ValueError
+        With the key and what is allowed.
+    """
+    for step in setting.steps:
+        load, key = step.load, step.key
+        load.refuse_unfit(step, setting)
+        if step.name not in setting.driven_before(step.number) and load.target and load.target[1] == 0:
+            raise ValueError(
+                f"{key}: the target must not be zero (at least {LEAST_TARGET:g} in size): the first step of a load "
+                "begins there"
+            )
+        before = setting.before(step.number)
+        if before and not before[-1].load.rests and not load.in_time:
+            kind = before[-1].kind
+            raise ValueError(f"{key}: begins in equilibrium: the step of kind: {kind} before it needs until: rest")
+        _refuse_unfit_hold(step, setting.steps)
+
+
+def _refuse_unfit_hold(step: ProgrammeStep, steps: Sequence[ProgrammeStep]) -> None:
+    held = {other.name: other.load for other in steps if other.load.holdable}
+    loads: dict[str, Step | None] = {"pressure": None, **held}
+    if step.load.in_time:
+        loads.pop(step.name)
+    limit = step.until == "limit"
+    allowed = sorted(set(loads) - (set() if limit else {step.name}))
+    for name, how in step.load.hold.items():
+        key = f"{step.key}.hold.{name}"
+        if name == step.name and not (limit and how == "conjugate"):
+            raise ValueError(f"{key}: this step drives {name}; allowed: {', '.join(allowed) or 'none'}")
+        if name not in loads:
+            raise ValueError(f"{key}: the programme has no such amplitude; allowed: {', '.join(allowed) or 'none'}")
+        load = loads[name]
+        if isinstance(how, Gas) and name != "pressure":
+            raise ValueError(f"{key}: a gas holds the pressure, not {name}; allowed: load, conjugate")
+        if how == "conjugate" and load is not None and not load.held_conjugate:
+            raise ValueError(f"{key}: conjugate: nothing that can be held is conjugate to it; allowed: load")
+        if how == "conjugate" and load is not None and load.released and (step.load.in_time or step.load.released_by):
+            raise ValueError(f"{key}: conjugate: {load.released}")

@@ -1,8 +1,8 @@
 """The base of parts: sections of a case that add energies."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import numpy as np
 
@@ -10,6 +10,14 @@ from magshell_fenicsx.input.section import Section
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.quantities.quantity import Quantity
 from magshell_fenicsx.quantities.registry import register
+
+if TYPE_CHECKING:
+    from magshell_fenicsx.parts.step import ProgrammeStep, Step
+    from magshell_fenicsx.shape.sections import Surface
+    from magshell_fenicsx.shape.shell import ShellSection
+
+Kind = TypeVar("Kind")
+AnyStep = TypeVar("AnyStep", bound="Step")
 
 
 @dataclass(frozen=True)
@@ -25,6 +33,89 @@ class Scales:
     def force(self) -> float:
         """2πD/R over E h R."""
         return float(np.pi * (self.h / self.R) ** 2 / (6 * (1 - self.nu**2)))
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What is around a part in its case: it takes from this what it needs, and each room knows its own section.
+
+    Attributes
+    ----------
+    points
+        Name -> place (3,) in the shell's length.
+    sections
+        Key of the case -> what stands there.
+    steps
+        The programme.
+    whole
+        Whether the programme is a list of the case file, so that no step comes before it.
+    solid
+        Whether the body is modelled in three dimensions.
+    """
+
+    shell: "ShellSection | Surface"
+    points: Mapping[str, list[float]]
+    sections: Mapping[str, Any]
+    steps: "Sequence[ProgrammeStep]" = field(default=())
+    whole: bool = True
+    solid: bool = False
+
+    def of(self, kind: type[Kind]) -> Kind | None:
+        """The section of a class; None without one."""
+        return next((section for section in self.sections.values() if isinstance(section, kind)), None)
+
+    def loads(self, kind: "type[AnyStep]") -> "dict[str, AnyStep]":
+        """Amplitude -> its last step, of the steps of a kind."""
+        return {step.name: step.load for step in self.steps if isinstance(step.load, kind)}
+
+    def before(self, number: int) -> "Sequence[ProgrammeStep]":
+        """The steps before one of the programme."""
+        return self.steps[: number - 1]
+
+    def driven_before(self, number: int) -> set[str]:
+        """The amplitudes that steps before one have driven."""
+        return {name for step in self.before(number) for name in (step.name, *step.load.drives)}
+
+    def has_modulus(self, what: str) -> None:
+        """See that there is a modulus, which something needs.
+
+        Raises
+        ------
+        ValueError
+            If there is none.
+        """
+        if self.shell.modulus is None:
+            raise ValueError(f"shell.youngs_modulus is needed for {what}")
+
+    def has_point(self, key: str, name: str | None) -> None:
+        """See that a point has a place.
+
+        Raises
+        ------
+        ValueError
+            With the key and the points that there are.
+        """
+        if name is not None and name not in self.points:
+            known = ", ".join(self.points) or "none"
+            raise ValueError(f"{key}: {name}: name it in points, with its place; there are {known}")
+
+    def on_shell(self, key: str, polar: float) -> None:
+        """See that a direction from the centre of a sphere is a degree from its edge at least.
+
+        Raises
+        ------
+        ValueError
+            With what is allowed.
+        """
+        edge = self.shell.edge_polar
+        if edge is not None and not 0 <= polar < edge - 1:
+            raise ValueError(f"{key}.at.polar: {polar:g} is not on the shell: allowed 0 to {edge - 1:g}")
+
+    @property
+    def time_unit(self) -> float | None:
+        """R √(ρ/E), that times are over: in seconds where the case has units; None without a density."""
+        density, modulus = self.shell.density, self.shell.youngs_modulus
+        return float(self.shell.reference * np.sqrt(density / modulus)) if density and modulus else None
 
 
 class Part(Section):

@@ -1,4 +1,4 @@
-"""The list of all parts."""
+"""The list of all parts, and of all kinds of steps."""
 
 from importlib import import_module
 from inspect import cleandoc
@@ -8,6 +8,7 @@ from pydantic import Field, create_model
 
 from magshell_fenicsx.parts.own import WithOwnTerms
 from magshell_fenicsx.parts.part import Part
+from magshell_fenicsx.parts.step import Step
 
 REGISTERED: dict[str, str] = {
     # key of the case file, and name of the file here -> the class in it
@@ -16,6 +17,31 @@ REGISTERED: dict[str, str] = {
 PARTS: dict[str, type[Part]] = {
     key: getattr(import_module(f"{__package__}.{key}"), name) for key, name in REGISTERED.items()
 }
+
+KINDS_OF_STEPS: dict[str, str] = {
+    # kind -> module here and class in it
+    "pressure": "pressure.pressure.PressureSection",
+    "indentation": "forces.indentation.IndentationSection",
+    "field": "magnetism.field_step.FieldSection",
+    "rotation": "magnetism.field_step.RotationSection",
+    "natural": "natural.growth.GrowthSection",
+    "imperfection": "imperfections.growth.ImperfectionStep",
+    "dead": "forces.dead.DeadSection",
+    "edge": "supports.motion.EdgeSection",
+    "contact": "bodies.press.ContactSection",
+    "source": "magnetism.source_step.SourceStep",
+    "time": "motion.step.TimeSection",
+}
+FIRST = ("natural", "field")  # the kinds of which steps may come before the one load of a case, in their order
+
+
+def _step(path: str) -> type[Step]:
+    module, _, name = path.rpartition(".")
+    found: type[Step] = getattr(import_module(f"{__package__}.{module}"), name)
+    return found
+
+
+STEPS: dict[str, type[Step]] = {kind: _step(path) for kind, path in KINDS_OF_STEPS.items()}
 
 
 def _meaning(part: type[Part]) -> str:

@@ -1,5 +1,6 @@
 """The base of the steps of a programme: what a step drives, how, and how far."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self
 
@@ -7,8 +8,7 @@ import numpy as np
 from pydantic import Discriminator, Field, Tag, model_validator
 
 from magshell_fenicsx.input.section import Pressure, Section
-from magshell_fenicsx.parts.search import SearchSection
-from magshell_fenicsx.parts.snap import SnapSection
+from magshell_fenicsx.parts.part import Setting
 
 Until = Annotated[
     Literal["limit", "bifurcation", "target", "points", "zero"],
@@ -53,6 +53,34 @@ Hold = Annotated[
     Annotated[Literal["load", "conjugate"], Tag("a word")] | Annotated[Gas, Tag("a gas")],
     Discriminator(lambda data: "a gas" if isinstance(data, dict | Gas) else "a word"),
 ]
+
+
+class SearchSection(Section):
+    """Other equilibria at the last point of a step, such as snapped shapes, by deflation: no path leads to them.
+
+    Everything that the step holds stays held. What is found depends on the guesses: there may be more.
+    """
+
+    solutions: Annotated[int, Field(ge=1, le=100)] = 3
+    """Ends after so many, each a point with the label solution"""
+    guesses: Annotated[int, Field(ge=1, le=1000)] = 12
+    """Guesses tried at most: the shell with dents, then both directions of the softest mode of each solution"""
+    stable: bool = False
+    """Whether each guess goes down in energy until it rests at a stable solution, which takes minutes on surfaces; only
+    stable ones count. A half or a meridian knows no motions beside its symmetry: take symmetry: none"""
+    seconds: Annotated[float, Field(gt=0)] | None = None
+    """No guess is tried after so long; by default there is no limit [s]"""
+
+
+class SnapSection(Section):
+    """Of `then: snap`."""
+
+    push: float = Field(default=0.05, gt=0, le=10)
+    """How far it leaves the fold, along the path's direction there [h]"""
+    damping: float = Field(default=0.1, gt=0, le=10)
+    """Part of the critical drag of the lowest mode of vibration that is not neutral at the fold"""
+    tolerance: float = Field(default=1e-3, ge=1e-9, le=1)
+    """Largest estimated error of a time step [h]"""
 
 
 class Target(NamedTuple):
@@ -121,10 +149,25 @@ class Step(Section):
         Name of the amplitude that it drives.
     conjugate
         The displacement that `hold: conjugate` holds, in words; empty if it cannot be held.
+    released
+        Why the conjugate cannot be held while the shell moves; empty if it can.
+    measured
+        Whether its numbers have units where the shell's lengths have.
+    holdable
+        Whether other steps may say what they hold of its amplitude.
+    jumps
+        Whether its amplitude may jump in time.
+    in_time
+        Whether it is a motion, which need not begin in equilibrium.
     """
 
     amplitude: ClassVar[str]
     conjugate: ClassVar[str] = ""
+    released: ClassVar[str] = ""
+    measured: ClassVar[bool] = False
+    holdable: ClassVar[bool] = True
+    jumps: ClassVar[bool] = True
+    in_time: ClassVar[bool] = False
     points: int
     hold: dict[str, Hold] = Field(default_factory=dict)
     """Amplitude of another step, or pressure -> what is constant in this step: the load itself (default), its
@@ -142,6 +185,77 @@ class Step(Section):
     def target(self) -> tuple[Target, float] | None:
         """The target and its value, in the unit of its key; None without."""
         return None
+
+    @property
+    def ends(self) -> Until:
+        """Where it ends, in the words of a path."""
+        return "target"
+
+    @property
+    def rests(self) -> bool:
+        """Whether it ends in equilibrium."""
+        return True
+
+    @property
+    def drives(self) -> tuple[str, ...]:
+        """Amplitudes of other steps that it drives too."""
+        return ()
+
+    @property
+    def held_conjugate(self) -> bool:
+        """Whether other steps may hold its conjugate."""
+        return bool(self.conjugate)
+
+    @property
+    def released_by(self) -> SnapSection | None:
+        """How the shell is released at its end; None if it is not."""
+        return None
+
+    @classmethod
+    def before(cls, setting: Setting, loading: "Step | None") -> list[tuple[str, "Step"]]:
+        """The steps of this kind that come before the only load of a case, each with the key that asks for it."""
+        return []
+
+    def name_in(self, setting: Setting, loads: Sequence["Step"]) -> str | None:
+        """The name of its amplitude beside all loads of a case; None: `amplitude`, with a number from the second on."""
+        return None
+
+    def refuse_unfit(self, step: "ProgrammeStep", setting: Setting) -> None:
+        """See that the case has what the step needs.
+
+        Raises
+        ------
+        ValueError
+            With the key and what is allowed.
+        """
+
+
+@dataclass(frozen=True)
+class ProgrammeStep:
+    """A step of a programme.
+
+    Attributes
+    ----------
+    number
+        From 1.
+    name
+        Name of its amplitude; a second force or list of dead loads has a number, such as "force_2".
+    key
+        Where it is in the case file.
+    """
+
+    number: int
+    name: str
+    key: str
+    load: Step
+
+    @property
+    def kind(self) -> str:
+        return str(getattr(self.load, "kind", ""))
+
+    @property
+    def until(self) -> Until:
+        return self.load.ends
 
 
 class PathStep(Step):
@@ -205,6 +319,14 @@ class PathStep(Step):
         if self.snap != SnapSection() and not self.then:
             raise ValueError("snap: goes with then: snap")
         return self
+
+    @property
+    def ends(self) -> Until:
+        return self.until
+
+    @property
+    def released_by(self) -> SnapSection | None:
+        return self.snap if self.then else None
 
     @property
     def _given(self) -> dict[str, float]:

@@ -5,10 +5,10 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.case.loading import ProgrammeStep
 from magshell_fenicsx.continuation.transient import FLOOR
 from magshell_fenicsx.output.store.table import COLUMNS, Row
 from magshell_fenicsx.parts.motion.step import TimeSection
+from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.scene import Scene
 

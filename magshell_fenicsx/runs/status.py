@@ -7,13 +7,12 @@ from math import acos, degrees
 
 import numpy as np
 
-from magshell_fenicsx.case.loading import ProgrammeStep
 from magshell_fenicsx.continuation.point import Point
 from magshell_fenicsx.output.store.table import SOLUTION, Row
 from magshell_fenicsx.parts.forces.dead import DeadSection
 from magshell_fenicsx.parts.magnetism.field_step import RotationSection
 from magshell_fenicsx.parts.motion.step import TimeSection
-from magshell_fenicsx.parts.step import PathStep
+from magshell_fenicsx.parts.step import PathStep, ProgrammeStep
 from magshell_fenicsx.parts.supports.reacting import motion_columns
 from magshell_fenicsx.quantities.quantity import spelled
 from magshell_fenicsx.quantities.registry import Sizes, amplitude, quantity, shown

@@ -85,6 +85,11 @@ class SurfaceSection(Section):
         return self
 
     @property
+    def edge_polar(self) -> float | None:
+        """Of a part of a sphere the angle of its edge from e3 (degrees); None of other geometries."""
+        return None
+
+    @property
     def with_units(self) -> bool:
         """Whether lengths and Young's modulus were given units, and are in SI."""
         return self._with_units
@@ -154,6 +159,10 @@ class CapSurface(RoundSection):
         if self.hole is None and self.azimuth is not None:
             raise ValueError("azimuth: a part of a cap needs a hole around the pole")
         return self
+
+    @property
+    def edge_polar(self) -> float | None:
+        return self.polar
 
 
 class CylinderSurface(RoundSection):

@@ -87,6 +87,11 @@ class ShellSection(Section):
         return self.radius / self.thickness
 
     @property
+    def edge_polar(self) -> float | None:
+        """Of a part of a sphere the angle of its edge from e3 (degrees); None of other geometries."""
+        return 90.0 if self.geometry == "hemisphere" else None
+
+    @property
     def reference(self) -> float:
         """R, or 1 where the case has no lengths: those of points are then over R."""
         return self.radius or 1.0

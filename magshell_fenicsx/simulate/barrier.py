@@ -2,8 +2,8 @@
 
 import scipy
 
-from magshell_fenicsx.case.loading import ProgrammeStep
 from magshell_fenicsx.continuation.system import State
+from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.steps import held_by
 

@@ -5,13 +5,12 @@ from collections.abc import Iterator
 from dataclasses import replace
 from functools import cached_property, partial
 
-from magshell_fenicsx.case.loading import ProgrammeStep
 from magshell_fenicsx.continuation.control import GivenLoad
 from magshell_fenicsx.continuation.path import StepOptions
 from magshell_fenicsx.continuation.search import Limits, further
 from magshell_fenicsx.continuation.settling import Settling
 from magshell_fenicsx.continuation.system import State
-from magshell_fenicsx.parts.search import SearchSection
+from magshell_fenicsx.parts.step import ProgrammeStep, SearchSection
 from magshell_fenicsx.simulate.guesses import dented
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene

@@ -5,7 +5,6 @@ from math import acos
 
 import numpy as np
 
-from magshell_fenicsx.case.loading import ProgrammeStep
 from magshell_fenicsx.continuation.device import Conjugate
 from magshell_fenicsx.continuation.path import StepOptions
 from magshell_fenicsx.continuation.system import State
@@ -17,7 +16,7 @@ from magshell_fenicsx.parts.magnetism.field_step import FieldBefore, FieldSectio
 from magshell_fenicsx.parts.magnetism.sources.field import turn_name
 from magshell_fenicsx.parts.motion.step import TimeSection
 from magshell_fenicsx.parts.pressure.gas import gas
-from magshell_fenicsx.parts.step import Drive, Gas, Now, PathStep
+from magshell_fenicsx.parts.step import Drive, Gas, Now, PathStep, ProgrammeStep
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.stage import Stage, staged

@@ -23,7 +23,7 @@ from magshell_fenicsx.parts.motion.on_meridian import surface_of as of_meridian
 from magshell_fenicsx.parts.motion.on_surface import surface_of as of_shell
 from magshell_fenicsx.parts.motion.step import EventSection, TimeSection
 from magshell_fenicsx.parts.motion.viscous import Branch, Viscosity
-from magshell_fenicsx.parts.snap import SnapSection
+from magshell_fenicsx.parts.step import SnapSection
 from magshell_fenicsx.simulate.histories import LoadsInTime, time_of
 from magshell_fenicsx.simulate.intervals import Intervals
 from magshell_fenicsx.simulate.record import Record, Stopped

@@ -59,8 +59,8 @@ class BodySection(Section):
         return self
 
 
-def refuse_unfit_bodies(bodies: Mapping[str, BodySection], moved: Mapping[str, str | None], *, solid: bool) -> None:
-    """Refuse names, and steps that move a body which is none; `moved` are keys of steps -> body that they name."""
+def refuse_unfit_bodies(bodies: Mapping[str, BodySection], *, solid: bool) -> None:
+    """Refuse names, and bodies beside a solid."""
     for name in bodies:
         if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,39}", name):
             raise ValueError(f"bodies.{name}: a name is a letter, then letters, digits and _; at most 40")
@@ -68,10 +68,6 @@ def refuse_unfit_bodies(bodies: Mapping[str, BodySection], moved: Mapping[str, s
             raise ValueError(f"bodies.{name}: is taken, by columns in this unit; choose another name")
     if bodies and solid:
         raise ValueError("bodies: press on a shell; of a solid give a force on a patch (kind: indentation, patch)")
-    known = ", ".join(bodies) or "none: give it in bodies"
-    for key, body in moved.items():
-        if (body is None and len(bodies) != 1) or (body is not None and body not in bodies):
-            raise ValueError(f"{key}.body: {body or 'is missing'}; allowed: {known}")
 
 
 def with_units(bodies: Mapping[str, Any] | None) -> Iterator[str]:

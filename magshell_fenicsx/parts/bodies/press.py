@@ -1,12 +1,14 @@
 """A rigid body that presses on the shell."""
 
+from collections.abc import Collection, Mapping, Sequence
 from math import copysign
 from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field
 
 from magshell_fenicsx.input.targets import over
-from magshell_fenicsx.parts.step import Control, Count, Now, PathStep, Target, Until
+from magshell_fenicsx.parts.part import Setting
+from magshell_fenicsx.parts.step import Control, Count, Now, PathStep, ProgrammeStep, Step, Target, Until
 from magshell_fenicsx.parts.supports.motion import Name
 from magshell_fenicsx.quantities.units import POINT_FORCE, THICKNESS
 
@@ -45,9 +47,26 @@ class ContactSection(PathStep):
     def place(self) -> Any:
         return self.body
 
+    def name_in(self, setting: Setting, loads: Sequence[Step]) -> str:
+        names = approaches(setting.sections["bodies"], loads)
+        body = str(self.body or next(iter(names), ""))
+        return names.get(body, self.amplitude)
+
+    def refuse_unfit(self, step: ProgrammeStep, setting: Setting) -> None:
+        bodies: Mapping[str, object] = setting.sections["bodies"]
+        if (self.body is None and len(bodies) != 1) or (self.body is not None and self.body not in bodies):
+            known = ", ".join(bodies) or "none: give it in bodies"
+            raise ValueError(f"{step.key}.body: {self.body or 'is missing'}; allowed: {known}")
+
     @property
     def prescribed(self) -> Control:
         return "load" if self.control == "approach" else super().prescribed
 
     def first(self, change: float, now: Now, *, by_load: bool) -> float:
         return change / self.points if by_load else copysign(FIRST, -change)
+
+
+def approaches(bodies: Collection[str], loads: Sequence[Step]) -> dict[str, str]:
+    """Body -> name of its approach, the amplitude; a single one needs no name beside it, unless a load is `force`."""
+    alone = len(bodies) == 1 and not any(load.amplitude == "force" for load in loads)
+    return {name: "approach" if alone else f"approach_{name}" for name in bodies}

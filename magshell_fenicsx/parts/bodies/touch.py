@@ -7,12 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline
 
-from magshell_fenicsx.case.loading import ProgrammeStep
 from magshell_fenicsx.continuation.control import GivenLoad
 from magshell_fenicsx.continuation.point import PathStopped, Point
 from magshell_fenicsx.continuation.system import State, max_abs
 from magshell_fenicsx.parts.bodies.contact import Contact
 from magshell_fenicsx.parts.bodies.press import ContactSection
+from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.simulate.record import Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.stage import Stage

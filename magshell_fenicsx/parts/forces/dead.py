@@ -7,7 +7,8 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from magshell_fenicsx.input.expressions import Formula, is_formula
 from magshell_fenicsx.input.section import Section, in_units, or_number
-from magshell_fenicsx.parts.step import Count, Now, PathStep, Target, Until
+from magshell_fenicsx.parts.part import Setting
+from magshell_fenicsx.parts.step import Count, Now, PathStep, ProgrammeStep, Target, Until
 
 Finite = Annotated[float, Field(ge=-1e30, le=1e30)]
 Moment = Annotated[float, or_number("newton", Finite), Field(ge=-1e30, le=1e30)]
@@ -108,6 +109,7 @@ class DeadSection(PathStep):
 
     amplitude: ClassVar[str] = "load"
     conjugate: ClassVar[str] = "displacement along the loads"
+    measured: ClassVar[bool] = True
     targets: ClassVar[dict[str, Target]] = {
         "factor": Target("load", "load_factor"),
         "displacement": Target("conjugate", "w_over_h"),
@@ -147,6 +149,15 @@ class DeadSection(PathStep):
     @property
     def place(self) -> Any:
         return self.loads
+
+    @property
+    def held_conjugate(self) -> bool:
+        return not (self.turns or self.by_place)
+
+    def refuse_unfit(self, step: ProgrammeStep, setting: Setting) -> None:
+        setting.has_modulus("loads of kind: dead")
+        for i, load in enumerate(self.loads):
+            setting.has_point(f"{step.key}.loads.{i}.at", load.at)
 
     def first(self, change: float, now: Now, *, by_load: bool) -> float:
         return change / self.points if by_load else copysign(1e-3, change)

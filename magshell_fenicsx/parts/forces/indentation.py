@@ -7,7 +7,8 @@ from pydantic import Field, model_validator
 
 from magshell_fenicsx.input.direction import Direction
 from magshell_fenicsx.input.targets import over
-from magshell_fenicsx.parts.step import Count, Now, PathStep, Target, Until
+from magshell_fenicsx.parts.part import Setting
+from magshell_fenicsx.parts.step import Count, Now, PathStep, ProgrammeStep, Target, Until
 from magshell_fenicsx.quantities.units import POINT_FORCE, THICKNESS
 
 LEAST_HUMP = 0.01  # F of the first step towards the top of an energy barrier
@@ -57,9 +58,10 @@ class IndentationSection(PathStep):
     def place(self) -> Any:
         return self.at, self.patch
 
-    def refuse_point_of_solid(self) -> None:
-        """Refuse a point force, which a solid cannot have."""
-        if not self.patch:
+    def refuse_unfit(self, step: ProgrammeStep, setting: Setting) -> None:
+        setting.on_shell(step.key, self.at.polar)
+        setting.has_point(f"{step.key}.at.point", self.at.point)
+        if setting.solid and not self.patch:
             raise ValueError(
                 "loading.patch: 0: a point force sinks into a solid without limit; give the patch its radius over h "
                 "(of the paper's indenter, 0.2 mm at R = 25.2 mm, with R/h = 90: 0.714)"

@@ -1,11 +1,12 @@
 """An imperfection as a load: its depth grows while other loads are held."""
 
-from collections.abc import Collection, Iterable
-from typing import Any, ClassVar, Literal, Protocol
+from collections.abc import Collection, Iterable, Mapping
+from typing import Any, ClassVar, Literal
 
 from pydantic import Field
 
-from magshell_fenicsx.parts.step import PathStep, Step, Target, Until
+from magshell_fenicsx.parts.part import Setting
+from magshell_fenicsx.parts.step import PathStep, ProgrammeStep, Target, Until
 
 
 class ImperfectionStep(PathStep):
@@ -31,19 +32,20 @@ class ImperfectionStep(PathStep):
     def place(self) -> Any:
         return self.item
 
+    def refuse_unfit(self, step: ProgrammeStep, setting: Setting) -> None:
+        keys: Mapping[str, object] = setting.sections["imperfections"]
+        names = setting.loads(ImperfectionStep)
+        if setting.solid:
+            raise ValueError(f"{step.key}.kind: imperfection: is of a shell, not of a solid")
+        if not keys:
+            raise ValueError(f"{step.key}.kind: imperfection: the case has none; give shell.imperfections")
+        if not grown_by([step], keys)[step.name]:
+            raise ValueError(f"{step.key}.item: {self.item}: shell.imperfections has no such item, counted from 0")
+        if names[step.name].item is None and len(names) > 1:
+            raise ValueError(f"{step.key}.item: give it: another step grows another item of shell.imperfections")
 
-class NamedStep(Protocol):
-    """A step with the name of its amplitude and its key in the case file."""
 
-    @property
-    def name(self) -> str: ...
-    @property
-    def key(self) -> str: ...
-    @property
-    def load(self) -> Step: ...
-
-
-def grown_by(steps: Iterable[NamedStep], keys: Collection[str]) -> dict[str, list[str]]:
+def grown_by(steps: Iterable[ProgrammeStep], keys: Collection[str]) -> dict[str, list[str]]:
     """Amplitude of a step -> the keys below `shell`, among those given, of the imperfections that it multiplies."""
     items = {step.name: step.load.item for step in steps if isinstance(step.load, ImperfectionStep)}
 
@@ -51,26 +53,3 @@ def grown_by(steps: Iterable[NamedStep], keys: Collection[str]) -> dict[str, lis
         return item is None or f"{key}.".startswith(f"imperfections.{item}.")
 
     return {name: [key for key in keys if grows(key, item)] for name, item in items.items()}
-
-
-def refuse_unfit_growth(steps: Iterable[NamedStep], keys: Collection[str], *, solid: bool) -> None:
-    """See that steps of this kind have imperfections to grow.
-
-    Raises
-    ------
-    ValueError
-        With the key and what is allowed.
-    """
-    steps = [step for step in steps if isinstance(step.load, ImperfectionStep)]
-    items = {step.name: getattr(step.load, "item", None) for step in steps}
-    for step in steps:
-        if solid:
-            raise ValueError(f"{step.key}.kind: imperfection: is of a shell, not of a solid")
-        if not keys:
-            raise ValueError(f"{step.key}.kind: imperfection: the case has none; give shell.imperfections")
-        if not grown_by([step], keys)[step.name]:
-            raise ValueError(
-                f"{step.key}.item: {items[step.name]}: shell.imperfections has no such item, counted from 0"
-            )
-        if items[step.name] is None and len(items) > 1:
-            raise ValueError(f"{step.key}.item: give it: another step grows another item of shell.imperfections")

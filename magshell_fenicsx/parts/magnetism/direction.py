@@ -6,12 +6,12 @@ from math import atan2, copysign, cos, degrees, hypot, sin
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.case.loading import ProgrammeStep
 from magshell_fenicsx.continuation.along import Curve
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.models.shell.parameters import ACROSS, Magnetisation
 from magshell_fenicsx.parts.magnetism.driven import carried
 from magshell_fenicsx.parts.magnetism.field_step import RotationSection
+from magshell_fenicsx.parts.step import ProgrammeStep
 
 Array = NDArray[np.float64]
 FIELD = ("lambda_m", *ACROSS)  # amplitudes of the field's components

@@ -2,10 +2,16 @@
 
 from typing import Annotated, ClassVar, Literal
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from magshell_fenicsx.input.direction import Direction
-from magshell_fenicsx.parts.step import Drive, Now, PathStep, Step, Target, Until
+from magshell_fenicsx.parts.magnetism.fields import MagneticSection, strength
+from magshell_fenicsx.parts.part import Setting
+from magshell_fenicsx.parts.step import Drive, Now, PathStep, ProgrammeStep, Step, Target, Until
+
+SAME = 1e-9  # cosine of directions: rounding
 
 
 class FieldSection(PathStep):
@@ -31,6 +37,15 @@ class FieldSection(PathStep):
     def scale(self, now: Now) -> float:
         return now.size
 
+    @classmethod
+    def before(cls, setting: Setting, loading: Step | None) -> list[tuple[str, Step]]:
+        driven = loading is not None and cls.amplitude in (loading.amplitude, *loading.drives)
+        return [] if driven or not strength(setting) else [("magnetic", FieldBefore(kind="field"))]
+
+    def refuse_unfit(self, step: ProgrammeStep, setting: Setting) -> None:
+        if not strength(setting):
+            raise ValueError(f"{step.key}.kind: field needs magnetic.lambda_m, not zero, for its target or direction")
+
 
 class FieldBefore(FieldSection):
     """The field that is applied before the one load of a case; it ends at the first instability."""
@@ -47,8 +62,29 @@ class RotationSection(Step):
     """
 
     amplitude: ClassVar[str] = "angle"
+    holdable: ClassVar[bool] = False
     kind: Literal["rotation"]
     to: Direction
     """Its last direction"""
     points: Annotated[int, Field(ge=1, le=10000)] = 12
     """Equal angles to it"""
+
+    def refuse_unfit(self, step: ProgrammeStep, setting: Setting) -> None:
+        before = direction_before(step.number, setting)
+        if before is None or not strength(setting):
+            raise ValueError(f"{step.key}.kind: rotation needs a field: magnetic.lambda_m, not zero")
+        driven = setting.driven_before(step.number)
+        if setting.whole and FieldSection.amplitude not in driven:
+            raise ValueError(f"{step.key}.kind: rotation needs a field: a step of kind: field before it")
+        if abs(before @ self.to.vector()) > 1 - SAME:
+            where = "the field at its beginning" if self.amplitude in driven else "magnetic.applied"
+            raise ValueError(f"{step.key}.to: must be neither parallel nor opposite to {where}")
+
+
+def direction_before(number: int, setting: Setting) -> NDArray[np.float64] | None:
+    """The unit vector (3,) of the field where a step begins; None without a field."""
+    turned = [step.load.to for step in setting.before(number) if isinstance(step.load, RotationSection)]
+    if turned:
+        return turned[-1].vector()
+    magnetic = setting.of(MagneticSection)
+    return magnetic.applied.vector() if magnetic else None

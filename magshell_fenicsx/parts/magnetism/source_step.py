@@ -6,8 +6,11 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 from pydantic import Field, model_validator
 
 from magshell_fenicsx.input.section import Section
+from magshell_fenicsx.parts.magnetism.field_step import FieldSection
+from magshell_fenicsx.parts.magnetism.fields import MagneticSection
 from magshell_fenicsx.parts.magnetism.sources.source import SourceSection
-from magshell_fenicsx.parts.step import Count, Now, PathStep, Target, Until
+from magshell_fenicsx.parts.part import Setting
+from magshell_fenicsx.parts.step import Count, Now, PathStep, ProgrammeStep, Target, Until
 from magshell_fenicsx.parts.supports.motion import Finite, Lengths, Name
 from magshell_fenicsx.quantities.registry import QUANTITIES, TAKEN
 
@@ -89,18 +92,19 @@ class SourceStep(PathStep):
             return self.source if 0 <= self.source < len(sources) else None
         return next((i for i, one in enumerate(sources) if one.name == self.source), None)
 
-
-def refuse_unknown_source(key: str, load: SourceStep, sources: Sequence[SourceSection]) -> None:
-    """See that a step has its source.
-
-    Raises
-    ------
-    ValueError
-        With what is allowed.
-    """
-    if load.number(sources) is None:
-        names = [one.name or str(i) for i, one in enumerate(sources)]
-        raise ValueError(
-            f"{key}.source: {load.source}: magnetic.applied.sources has no such source; allowed: "
-            f"{', '.join(names) or 'none'}"
-        )
+    def refuse_unfit(self, step: ProgrammeStep, setting: Setting) -> None:
+        magnetic, key = setting.of(MagneticSection), step.key
+        sources = (magnetic.applied.sources if magnetic else None) or []
+        if self.number(sources) is None:
+            names = [one.name or str(i) for i, one in enumerate(sources)]
+            raise ValueError(
+                f"{key}.source: {self.source}: magnetic.applied.sources has no such source; allowed: "
+                f"{', '.join(names) or 'none'}"
+            )
+        if setting.whole and FieldSection.amplitude not in setting.driven_before(step.number):
+            raise ValueError(f"{key}.kind: source needs the field of its source: a step of kind: field before it")
+        loads = (each for each in setting.steps if each.name != step.name)
+        others = [each.load for each in loads if isinstance(each.load, SourceStep)]
+        same = (other for other in others if other.number(sources) == self.number(sources))
+        if self.to and any(other.move or other.to for other in same):
+            raise ValueError(f"{key}.to: another step moves the same source: give move")

@@ -7,8 +7,11 @@ from pydantic import Field, model_validator
 
 from magshell_fenicsx.input.expressions import Formula
 from magshell_fenicsx.input.section import Section, in_units
+from magshell_fenicsx.parts.magnetism.field_step import RotationSection
+from magshell_fenicsx.parts.magnetism.fields import MagneticSection, strength
 from magshell_fenicsx.parts.motion.history import History, Time, levels_of, measured, times_of
-from magshell_fenicsx.parts.step import Step
+from magshell_fenicsx.parts.part import Setting
+from magshell_fenicsx.parts.step import ProgrammeStep, Step
 
 Rate: TypeAlias = measured("1/second")  # type: ignore[valid-type]
 
@@ -41,6 +44,7 @@ class TimeSection(Step):
     """
 
     amplitude: ClassVar[str] = "time"
+    in_time: ClassVar[bool] = True
     kind: Literal["time"]
     duration: Time
     """How long"""
@@ -101,6 +105,38 @@ class TimeSection(Step):
         """The amplitudes that follow histories."""
         return tuple("lambda_m" if name == "field" else name for name in self.history)
 
+    @property
+    def rests(self) -> bool:
+        return self.until == "rest"
+
+    def refuse_unfit(self, step: ProgrammeStep, setting: Setting) -> None:
+        key, driven = step.key, setting.driven_before(step.number)
+        field = strength(setting)
+        if "field" in self.history and (not field or RotationSection.amplitude in driven):
+            why = "not after kind: rotation" if field else "needs magnetic.lambda_m, not zero"
+            raise ValueError(f"{key}.history.field: {why}")
+        for where, text in self.with_units():
+            if setting.time_unit is None or not setting.shell.with_units:
+                raise ValueError(
+                    f"{key}.{where}: {text}: a time with a unit needs shell.density, youngs_modulus and lengths"
+                )
+        loads, magnetic = {each.name: each.load for each in setting.steps}, setting.of(MagneticSection)
+        allowed = {"field", "pressure", *loads} - {"lambda_m", "angle", "time"}
+        measured = magnetic is not None and magnetic.applied.flux_density not in (None, 0.0)
+        for name, history in self.history.items():
+            if name not in allowed:
+                raise ValueError(f"{key}.history.{name}: no such load; allowed: {', '.join(sorted(allowed))}")
+            times = [t for t, _ in history] if isinstance(history, list) else []
+            jumps = getattr(history, "kind", "") == "step" or len(set(times)) < len(times)
+            if jumps and name in loads and not loads[name].jumps:
+                raise ValueError(f"{key}.history.{name}: a support cannot jump")
+            for level in levels_of(history):
+                if isinstance(level, str) and not (name == "field" and measured):
+                    why = (
+                        "needs magnetic.applied.flux_density" if name == "field" else "is a flux density: give a number"
+                    )
+                    raise ValueError(f"{key}.history.{name}: {level}: {why}")
+
     def with_units(self) -> Iterator[tuple[str, str]]:
         """Key and text of each time with a unit."""
         given: dict[str, Any] = {"duration": self.duration, "step": self.step, "drag": self.drag}
@@ -112,40 +148,3 @@ class TimeSection(Step):
 def history_may_begin(history: History) -> bool:
     """Whether a time of it may be zero: that of a jump."""
     return getattr(history, "kind", "") == "step"
-
-
-def refuse_unfit_time(
-    key: str, load: TimeSection, amplitudes: set[str], motions: set[str], *, density: bool, measured: bool
-) -> None:
-    """See that its loads are there, and that its units have a meaning.
-
-    Parameters
-    ----------
-    amplitudes
-        Of other steps.
-    motions
-        Those of supports.
-    density, measured
-        Whether the shell has a density, and the field a flux density.
-
-    Raises
-    ------
-    ValueError
-        With the key and what is allowed.
-    """
-    for where, text in load.with_units():
-        if not density:
-            raise ValueError(
-                f"{key}.{where}: {text}: a time with a unit needs shell.density, youngs_modulus and lengths"
-            )
-    allowed = {"field", "pressure", *amplitudes} - {"lambda_m", "angle", "time"}
-    for name, history in load.history.items():
-        if name not in allowed:
-            raise ValueError(f"{key}.history.{name}: no such load; allowed: {', '.join(sorted(allowed))}")
-        times = [t for t, _ in history] if isinstance(history, list) else []
-        if name in motions and (getattr(history, "kind", "") == "step" or len(set(times)) < len(times)):
-            raise ValueError(f"{key}.history.{name}: a support cannot jump")
-        for level in levels_of(history):
-            if isinstance(level, str) and not (name == "field" and measured):
-                why = "needs magnetic.applied.flux_density" if name == "field" else "is a flux density: give a number"
-                raise ValueError(f"{key}.history.{name}: {level}: {why}")

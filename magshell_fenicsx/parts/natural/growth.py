@@ -4,7 +4,9 @@ from typing import ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
-from magshell_fenicsx.parts.step import PathStep, Target, Until
+from magshell_fenicsx.parts.natural.section import NaturalSection
+from magshell_fenicsx.parts.part import Setting
+from magshell_fenicsx.parts.step import PathStep, ProgrammeStep, Step, Target, Until
 
 
 class GrowthSection(PathStep):
@@ -43,3 +45,15 @@ class GrowthSection(PathStep):
     @property
     def amplitude(self) -> str:  # type: ignore[override]
         return f"natural_{self.key}"
+
+    @classmethod
+    def before(cls, setting: Setting, loading: Step | None) -> list[tuple[str, Step]]:
+        natural = setting.of(NaturalSection)
+        if isinstance(loading, cls) or natural is None:
+            return []
+        keys = [key for key in ("stretch", "curvature") if getattr(natural, key) is not None]
+        return [("natural", cls.model_validate({"kind": "natural", key: 1.0})) for key in keys]
+
+    def refuse_unfit(self, step: ProgrammeStep, setting: Setting) -> None:
+        if getattr(setting.of(NaturalSection), self.key, None) is None:
+            raise ValueError(f"loading.{self.key}: is a factor of natural.{self.key}: give that too")

@@ -1,13 +1,14 @@
 """Motions of supports: edges, points and patches that are held and move as rigid bodies."""
 
-from collections.abc import Mapping
 from math import copysign
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
 from magshell_fenicsx.input.section import Section, or_number
-from magshell_fenicsx.parts.step import Count, Now, PathStep, Target, Until
+from magshell_fenicsx.parts.part import Setting
+from magshell_fenicsx.parts.step import Count, Now, PathStep, ProgrammeStep, Target, Until
+from magshell_fenicsx.parts.supports.boundary import BoundarySection
 from magshell_fenicsx.quantities.registry import QUANTITIES, TAKEN
 
 Finite = Annotated[float, Field(ge=-1e9, le=1e9)]
@@ -65,6 +66,9 @@ class EdgeSection(PathStep):
     """
 
     conjugate: ClassVar[str] = "reaction"
+    released: ClassVar[str] = "a support that is free to move has a mass, which is not known"
+    measured: ClassVar[bool] = True
+    jumps: ClassVar[bool] = False
     conjugate_control: ClassVar[str] = "reaction"
     targets: ClassVar[dict[str, Target]] = {
         "factor": Target("load", "motion"),
@@ -114,20 +118,14 @@ class EdgeSection(PathStep):
     def scale(self, now: Now) -> float:
         return abs(self.factor or 1.0)
 
-
-def refuse_unheld(key: str, load: EdgeSection, conditions: Mapping[str, Any]) -> None:
-    """See that a step moves nothing but supports.
-
-    Raises
-    ------
-    ValueError
-        With the name and what is allowed.
-    """
-    held = sorted(name for name, condition in conditions.items() if condition not in UNHELD)
-    for i, move in enumerate(load.moves):
-        for name in move.supports:
-            if name not in held:
-                raise ValueError(
-                    f"{key}.moves.{i}.supports: {name}: only what boundary holds (clamped, hinged or held) can move: "
-                    f"{', '.join(held) or 'nothing'}"
-                )
+    def refuse_unfit(self, step: ProgrammeStep, setting: Setting) -> None:
+        boundary = setting.of(BoundarySection)
+        conditions = boundary.conditions() if boundary else {}
+        held = sorted(name for name, condition in conditions.items() if condition not in UNHELD)
+        for i, move in enumerate(self.moves):
+            for name in move.supports:
+                if name not in held:
+                    raise ValueError(
+                        f"{step.key}.moves.{i}.supports: {name}: only what boundary holds (clamped, hinged or held) "
+                        f"can move: {', '.join(held) or 'nothing'}"
+                    )

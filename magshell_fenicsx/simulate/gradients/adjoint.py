@@ -22,7 +22,6 @@ from typing import TypeAlias
 import numpy as np
 
 from magshell_fenicsx.assembly.terms import FormTerm, factor_of
-from magshell_fenicsx.case.loading import ProgrammeStep
 from magshell_fenicsx.continuation.device import Conjugate, Device
 from magshell_fenicsx.continuation.fold import Fold
 from magshell_fenicsx.continuation.inverse import nearest_to_zero
@@ -32,7 +31,7 @@ from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.parts.magnetism.field_step import RotationSection
 from magshell_fenicsx.parts.motion.mass import mass_along
 from magshell_fenicsx.parts.pressure.gas import gas_by_begin
-from magshell_fenicsx.parts.step import Gas, PathStep
+from magshell_fenicsx.parts.step import Gas, PathStep, ProgrammeStep
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.results import Functional, Target, force_unit, functional, in_units
 from magshell_fenicsx.simulate.scene import Scene

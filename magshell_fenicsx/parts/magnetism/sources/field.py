@@ -8,7 +8,6 @@ import numpy as np
 
 from magshell_fenicsx.assembly.motion import Motion, moved
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.loading import ProgrammeStep
 from magshell_fenicsx.input.expressions import with_derivatives
 from magshell_fenicsx.input.formulas_in_space import FormulasInSpace
 from magshell_fenicsx.mesh.frame import rotation
@@ -17,6 +16,7 @@ from magshell_fenicsx.parts.magnetism.field_step import RotationSection
 from magshell_fenicsx.parts.magnetism.source_step import SourceStep
 from magshell_fenicsx.parts.magnetism.sources.known import Array, Placed
 from magshell_fenicsx.parts.magnetism.sources.registered import placed
+from magshell_fenicsx.parts.step import ProgrammeStep
 
 HALFWAY = 0.371  # of a motion: no symmetric place
 
