@@ -5,7 +5,7 @@ The algebra, done once, takes longer than a small run. A file beside the kernels
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import ufl
@@ -32,22 +32,26 @@ class _Found(ufl.Form):  # type: ignore[misc]
         return self._found[2]
 
 
-def at_zero(form: ufl.Form, v: fem.Function) -> ufl.Form:
-    """The form at v = 0, to be compiled and for nothing else; derivatives by v are taken before."""
+def at_zero(form: ufl.Form, v: fem.Function, compiled: Callable[[ufl.Form], fem.Form]) -> fem.Form:
+    """The form at v = 0, compiled; derivatives by v are taken before.
+
+    What is left is kept once its kernel is there: a kernel of the whole form under its signature would be another's.
+    """
     number = form.coefficients().index(v)
     key = hashlib.sha256(f"{ufl.__version__} {form.signature()} {number}".encode()).hexdigest()[:40]
     name = f"at_zero_{key}.json"
     if known := recall(name):
-        return _Found(form, **json.loads(known))
-    found = ufl.replace(form, {v: ufl.zero(v.ufl_shape)})
-    if not found.empty():
+        return compiled(_Found(form, **json.loads(known)))
+    rest = ufl.replace(form, {v: ufl.zero(v.ufl_shape)})
+    kernel = compiled(rest)
+    if not rest.empty():
         left = {
-            "signature": found.signature(),
-            "coefficients": _numbers(form.coefficients(), found.coefficients()),
-            "constants": _numbers(form.constants(), found.constants()),
+            "signature": rest.signature(),
+            "coefficients": _numbers(form.coefficients(), rest.coefficients()),
+            "constants": _numbers(form.constants(), rest.constants()),
         }
         keep(name, json.dumps(left).encode())
-    return found
+    return kernel
 
 
 def _numbers(all_: Sequence[Any], some: Sequence[Any]) -> list[int]:

@@ -13,7 +13,7 @@ from magshell_fenicsx.continuation.modes import ModesNotFound
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
-from magshell_fenicsx.models.axisymmetric.pattern import nodal_normals
+from magshell_fenicsx.models.axisymmetric.revolution import nodal_normals
 from magshell_fenicsx.models.modes import ShellMode, ShellModes
 from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.parts.imperfections.flaw import in_frame

@@ -14,7 +14,6 @@ from magshell_fenicsx.continuation.system import State, Vector, dot
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.frame import rotation
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
-from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.parts.supports.reacting import motion_columns
 from magshell_fenicsx.parts.supports.reactions import weights
@@ -168,11 +167,10 @@ def offset(scene: Scene, target: Target) -> fem.Function:
 def over_area(scene: Scene) -> Callable[[ufl.core.expr.Expr], ufl.Form]:
     """The integral over the undeformed area of the modelled part; of a solid over its volume."""
     model = scene.model
-    if isinstance(model, MeridianModel):
-        return lambda f: 2 * np.pi * model.factory.area()(f)
-    if isinstance(model, ShellModel):
-        ratio, dx = kin.area_ratio(model.factory.jets()[0]), model.factory.dx()
-        return lambda f: f * ratio * dx
+    if isinstance(model, ShellModel | MeridianModel):
+        carrier = model.factory.carrier
+        over = carrier.over_area()
+        return lambda f: carrier.whole * over(f)
     return lambda f: f * ufl.dx(domain=model.V.mesh)
 
 

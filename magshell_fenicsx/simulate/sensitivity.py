@@ -13,12 +13,9 @@ from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.terms import FormTerm
 from magshell_fenicsx.continuation.fold import Fold, Guess, find_fold, sensitivity
 from magshell_fenicsx.continuation.system import State, Vector
-from magshell_fenicsx.models.axisymmetric import jets
-from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.shell.parameters import Magnetisation
 from magshell_fenicsx.models.shell.patterns import Array, Pattern, WithinRims
-from magshell_fenicsx.models.shell.terms import TermFactory
-from magshell_fenicsx.models.solid.model import SolidModel
+from magshell_fenicsx.models.shell.terms import EnergyFactory
 from magshell_fenicsx.parts.magnetism.applied import AppliedField
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.scene import Scene
@@ -155,13 +152,7 @@ def magnetic_terms(scene: Scene, state: State, field: Magnetisation) -> Sequence
 
 def _made(scene: Scene, field: Magnetisation) -> tuple[Sequence[FormTerm], Sequence[AppliedField]]:
     model, log, fields = scene.model, KernelLog(), list[AppliedField]()
-    if isinstance(model, MeridianModel):
-        u = jets.revolved(model.u)
-        return [
-            FormTerm(e.name, 2 * np.pi * e.of(u), model.u, log, e.amplitude, linear=e.linear, follow=e.follow)
-            for e in replace(model.factory, fields=fields).magnetic(field, model.u)
-        ], fields
-    if isinstance(model, SolidModel):
-        return replace(model.factory, log=log, fields=fields).magnetic(field), fields
-    made = TermFactory(model.r0, model.u, model.material, model.sigma, model.degree, log, model.thickness)
-    return made.magnetic(field), made.fields
+    factory = replace(model.factory, log=log, fields=fields)
+    if isinstance(factory, EnergyFactory):
+        return [factory.term(energy) for energy in factory.magnetic(field)], fields
+    return factory.magnetic(field), fields

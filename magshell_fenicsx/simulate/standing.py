@@ -8,7 +8,6 @@ from mpi4py import MPI
 from magshell_fenicsx.assembly.terms import FormTerm
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.continuation.newton import BorderedNewton
-from magshell_fenicsx.models.axisymmetric import pattern as of_meridian
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.shell import patterns
 from magshell_fenicsx.models.shell.model import ShellModel
@@ -88,17 +87,12 @@ def _patches(plan: Plan) -> bool:
 
 def _put(model: ShellModel | MeridianModel, plan: Plan) -> None:
     magnetic, natural, r0 = plan.loads.magnetic, plan.loads.natural, model.r0
-    meridian = isinstance(model, MeridianModel)
     there = {c.name: c for t in model.system.terms if isinstance(t, FormTerm) for c in t.form.coefficients()}
     if magnetic and callable(magnetic.remanent):
-        field = of_meridian.pattern_field if meridian else patterns.pattern_field
-        there["Br"].x.array[:] = field(magnetic.remanent, r0)[0].x.array
+        there["Br"].x.array[:] = patterns.pattern_field(magnetic.remanent, r0)[0].x.array
     if plan.thickness and model.thickness:
-        if isinstance(model, MeridianModel):
-            factor = of_meridian.thickness_field(plan.thickness, r0)
-        else:
-            factor = thickness_field(plan.thickness, r0, model.midsurface)
-        model.thickness.x.array[:] = factor.x.array
+        patches = model.midsurface.patches if isinstance(model, ShellModel) else {}
+        model.thickness.x.array[:] = thickness_field(plan.thickness, r0, patches).x.array
     if natural:
         there["natural"].x.array[:] = natural_field(natural, patterns.cells_of(r0), model.V).x.array
     if isinstance(model, ShellModel):

@@ -24,15 +24,24 @@ def test_is_the_form_of_the_algebra(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     gradient = ufl.derivative(energy, v, ufl.TestFunction(V))
     hessian = ufl.derivative(gradient, v, ufl.TrialFunction(V))
 
-    def matrix(form: ufl.Form) -> np.ndarray:
-        return fem.assemble_matrix(fem.form(form, jit_options=JIT_OPTIONS)).to_dense()
+    def compiled(form: ufl.Form) -> fem.Form:
+        return fem.form(form, jit_options=JIT_OPTIONS)
 
-    expected = matrix(ufl.replace(hessian, {v: ufl.zero()}))
+    def matrix() -> np.ndarray:
+        return fem.assemble_matrix(at_zero(hessian, v, compiled)).to_dense()
+
+    def interrupted(form: ufl.Form) -> fem.Form:
+        raise KeyboardInterrupt
+
+    expected = fem.assemble_matrix(compiled(ufl.replace(hessian, {v: ufl.zero()}))).to_dense()
     monkeypatch.setattr(kept, "kernel_cache", lambda: tmp_path)
-    assert (matrix(at_zero(hessian, v)) == expected).all()
+    with pytest.raises(KeyboardInterrupt):
+        at_zero(hessian, v, interrupted)
+    assert list(tmp_path.iterdir()) == []
+    assert (matrix() == expected).all()
     monkeypatch.setattr(ufl, "replace", None)  # from here on the file must do
-    assert (matrix(at_zero(hessian, v)) == expected).all()
+    assert (matrix() == expected).all()
     found.value = 6.0
-    assert (matrix(at_zero(hessian, v)) == 2 * expected).all()
+    assert (matrix() == 2 * expected).all()
     left.x.array[:] *= 2
-    assert (matrix(at_zero(hessian, v)) == 4 * expected).all()
+    assert (matrix() == 4 * expected).all()

@@ -5,11 +5,9 @@ Lengths in R, energies in E h R^2, of the whole shell. Amplitudes as in `ShellMo
 """
 
 from collections.abc import Mapping
-from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
-import ufl
 from dolfinx import fem
 
 from magshell_fenicsx.assembly.growing import Growing
@@ -17,22 +15,18 @@ from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.lids import Lid, Pressed
 from magshell_fenicsx.assembly.parameter import FreeParameter, make_parameters
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
-from magshell_fenicsx.assembly.terms import Counted, FormTerm
 from magshell_fenicsx.continuation.system import Vector
-from magshell_fenicsx.models.axisymmetric import jets
-from magshell_fenicsx.models.axisymmetric.energies import INTERIOR, Energy, EnergyFactory
 from magshell_fenicsx.models.axisymmetric.instability import ExcludedWaves
 from magshell_fenicsx.models.axisymmetric.meridian import Meridian
-from magshell_fenicsx.models.axisymmetric.pattern import thickness_field
 from magshell_fenicsx.models.axisymmetric.probe import Array, Probe
 from magshell_fenicsx.models.axisymmetric.waves import Waves
+from magshell_fenicsx.models.carriers import on_meridian
 from magshell_fenicsx.models.observed import Observed
-from magshell_fenicsx.models.shell import edges
-from magshell_fenicsx.models.shell.energy import Density
 from magshell_fenicsx.models.shell.parameters import Condition, EdgeMoment, Loads, Material, Potential, default_penalty
 from magshell_fenicsx.models.shell.patterns import cells_of
-from magshell_fenicsx.models.shell.thickness import Thickness
-from magshell_fenicsx.parts.forces.on_meridian import dead_loads, pole_force
+from magshell_fenicsx.models.shell.terms import INTERIOR, EnergyFactory
+from magshell_fenicsx.models.shell.thickness import Thickness, thickness_field
+from magshell_fenicsx.parts.forces.on_meridian import Around, dead_loads, pole_force
 from magshell_fenicsx.parts.magnetism.driving import field_parameters
 from magshell_fenicsx.parts.natural.shape import Shape, natural_field
 from magshell_fenicsx.parts.supports.moved import PRESSURE, Support, enclosed, motions_of, moving, rotation_of
@@ -98,8 +92,10 @@ class MeridianModel(Observed):
         free, shape = dict[str, fem.Constant](), None
         if loads.natural:
             shape = Shape.of(natural_field(loads.natural, cells_of(self.r0), V), loads.natural, free)
-        factory = EnergyFactory(meridian, self.r0, material, self.sigma, degree, self.thickness, shape, free)
-        self.factory = factory = replace(factory, drawn=self.growing and self.growing.drawn)
+        carrier = on_meridian(self.r0, self.growing and self.growing.drawn)
+        of_shell = material, self.sigma, self.kernels, self.thickness, shape, free
+        self.factory = factory = EnergyFactory(carrier, self.u, *of_shell)
+        around = Around(meridian, carrier)
         self.held = supports(meridian, conditions)
         self.energies = [factory.membrane(), factory.bending(), factory.interior_edges()]
         self.supports = {}
@@ -111,34 +107,36 @@ class MeridianModel(Observed):
                 self.energies.append(factory.clamped_edges(edge, facets, turn))
             self.supports[name] = Support.of(held_on(V, 0, facets, components), edge, turn)
         if len(self.held.mirror):
-            self.energies.append(factory.mirror_edges(self.held.mirror))
+            self.energies.append(factory.mirror_edges(self.held.mirror, np.array([0.0, 0.0, 1.0])))
         if loads.magnetic:
-            self.energies += factory.magnetic(loads.magnetic, self.u)
+            self.energies += factory.magnetic(loads.magnetic)
         free_ends, self.without_potential = openings(meridian, conditions)
         closed = enclosed(loads, free_ends, self.without_potential)
-        volume = factory.swept_volume if loads.pressure or closed else factory.volume_change
+        swept = loads.pressure or closed
+        volume = factory.swept_volume() if swept else factory.volume_change(np.zeros(3))
         if loads.pressure:
             self.energies.append(factory.pressure(potential=not self.without_potential))
         self.energies += [factory.own(term) for term in loads.own]
-        u = jets.revolved(self.u)
-        self.observed = self.kernels.compile_all(factory.observed(term, u) for term in loads.own)
+        self.observed = self.kernels.compile_all(factory.observed(term) for term in loads.own)
         self.contacts = {}
         for contact in loads.contacts:
-            pressed, known, integrals = factory.contact(contact, self.u)
+            pressed, known, integrals = factory.contact(contact)
             self.energies.append(pressed)
             self.contacts[contact.amplitude] = known, self.kernels.compile_all([integrals])
         for name, force in loads.forces.items():
-            self.energies.append(pole_force(name, force.patch, self.force_unit, factory, self.kernels))
+            self.energies.append(pole_force(name, force.patch, self.force_unit, around, self.kernels))
         self.load_size = {}
         for name, dead in loads.dead.items():
             self.energies += [factory.own(load.term, name) for load in dead if isinstance(load, Potential)]
             if not all(isinstance(load, EdgeMoment | Potential) for load in dead):
-                energy, self.load_size[name] = dead_loads(name, dead, factory, self.kernels)
+                energy, self.load_size[name] = dead_loads(name, dead, around, self.kernels)
                 self.energies.append(energy)
-        terms = [self._term(e) for e in self.energies]
-        for name, dead in loads.dead.items():
             moments = [load for load in dead if isinstance(load, EdgeMoment)]
-            terms += [self._moment(f"{name} moment {load.edge} {i}", load, name) for i, load in enumerate(moments)]
+            self.energies += [
+                factory.edge_moment(f"{name} moment {load.edge} {i}", meridian.ends[load.edge], load.moment, name)
+                for i, load in enumerate(moments)
+            ]
+        terms = [factory.term(energy) for energy in self.energies]
         pattern, held = next(term for term in terms if term.name == INTERIOR), self.held.held(V)
         parameters: dict[str, FreeParameter] = {**make_parameters(factory.free, terms, self.u, self.kernels)}
         parameters |= field_parameters(factory.fields, terms, self.u, self.kernels)
@@ -149,7 +147,7 @@ class MeridianModel(Observed):
         moves = moving(self.r0, self.supports, loads, self._pressed() if closed else None)
         self.system = FiniteElementSystem(self.u, terms, held, pattern, material.h, parameters=parameters, moving=moves)
         self.system.settings |= dict(known.setting for known, _ in self.contacts.values())
-        self._volume = self.kernels.compile("volume energy", 2 * np.pi * volume(jets.revolved(self.u)))
+        self._volume = self.kernels.compile("volume energy", volume)
         self._seen = {name: Probe.at(*place, self.r0) for name, place in meridian.points.items()}
         self.normals = {name: probe.normal for name, probe in self._seen.items()}
 
@@ -166,11 +164,6 @@ class MeridianModel(Observed):
         """See `Observed`."""
         return self._seen[point].rows(self.system.size)
 
-    def _term(self, e: Energy) -> FormTerm:
-        u, v = jets.revolved(self.u), jets.revolved(ufl.TestFunction(self.V))
-        work, energy = 2 * np.pi * e.work(u, v) if e.work else None, 2 * np.pi * e.of(u)
-        return FormTerm(e.name, energy, self.u, self.kernels, e.amplitude, linear=e.linear, work=work, follow=e.follow)
-
     def _pressed(self) -> Pressed:
         """What a live pressure does at the ends that move, along e3: on each is a lid."""
         ends = {name: self.meridian.parameter(name) for name in self.meridian.ends}
@@ -181,14 +174,3 @@ class MeridianModel(Observed):
             if (motions := motions_of(self.loads, name))
         ]
         return Pressed(PRESSURE, self.material.classical_pressure / self.material.h, lids)
-
-    def _moment(self, name: str, load: EdgeMoment, amplitude: str) -> Counted:
-        facets, constant = self.meridian.ends[load.edge], self.factory.constant
-        past = constant(np.array([1.0, 0.0]))
-        density = Density(edges.turning, (constant(load.moment), past), facets=facets)
-        e = self.factory.moment(name, facets, density, amplitude)
-        self.energies.append(e)
-        length = 2 * np.pi * self.meridian.section(np.array([self.meridian.parameter(load.edge)]))[0, 0]
-        term = Counted(name, 2 * np.pi * e.of(jets.revolved(self.u)), self.u, self.kernels, amplitude)
-        term.count_from(past, load.moment * length)
-        return term

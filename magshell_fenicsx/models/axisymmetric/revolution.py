@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.system import Vector
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
-from magshell_fenicsx.models.axisymmetric.pattern import nodal_normals
+from magshell_fenicsx.models.shell.patterns import places
 
 Array = NDArray[np.float64]
 OFF_POLE = 1e-3  # of the first cell
@@ -141,3 +141,10 @@ def _revolved(values: Array) -> Array:
     o = np.zeros_like(U)
     jet = [(U, o, W), (Us, o, Ws), (o, U, o), (Uss, o, Wss), (o, Us, o), (-U, o, o)]
     return np.stack([np.stack(v, axis=-1) for v in jet])
+
+
+def nodal_normals(r0: fem.Function) -> Array:
+    """Unit normals (nodes, 3) at the azimuth 0, averaged over the cells that meet."""
+    normals = np.zeros((len(r0.x.array) // 2, 3))
+    np.add.at(normals, r0.function_space.dofmap.list, places(r0)[1])
+    return np.asarray(normals / np.linalg.norm(normals, axis=1)[:, None])

@@ -6,7 +6,7 @@ cosine's and of the sine's coefficients: one form on the meridian with m as a nu
 """
 
 from collections.abc import Iterator, Sequence
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
 from math import ceil, comb, sqrt
 
 import numpy as np
@@ -26,8 +26,9 @@ from magshell_fenicsx.continuation.factor import Factorisation
 from magshell_fenicsx.continuation.inverse import nearest_to_zero
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.models.axisymmetric import jets
-from magshell_fenicsx.models.axisymmetric.energies import INTERIOR, Energy
 from magshell_fenicsx.models.axisymmetric.meridian import Meridian
+from magshell_fenicsx.models.carriers import Energy
+from magshell_fenicsx.models.shell.terms import INTERIOR
 from magshell_fenicsx.parts.supports.on_meridian import Supports
 from magshell_fenicsx.platform import compat
 
@@ -72,7 +73,7 @@ class Waves:
         self._m = fem.Constant(V.mesh, 1.0)
         self._factor = fem.Constant(V.mesh, 1.0)
         self._kept = kept = [e for e in energies if not e.linear]
-        self._forms = [(e.amplitude, log.compile(f"{e.name} waves", self._second(e))) for e in kept]
+        self._forms = [(e.amplitude, self._second(e, log)) for e in kept]
         self._phi, self._energies, self._log = fem.Function(V, name="phi"), list[FormTerm](), log
         self._held_once, self._held = supports.held_waves(V, 1), supports.held_waves(V, 2)
         pattern = next(form for e, (_, form) in zip(kept, self._forms, strict=True) if e.name == INTERIOR)
@@ -214,11 +215,11 @@ class Waves:
             if self._factor.value:
                 yield form
 
-    def _second(self, e: Energy) -> ufl.Form:
+    def _second(self, e: Energy, log: KernelLog) -> fem.Form:
         energy, v = self._of_wave(e)
         gradient = ufl.derivative(energy, v, ufl.TestFunction(self.V))
         hessian = ufl.derivative(gradient, v, ufl.TrialFunction(self.V))
-        return at_zero(self._factor * hessian, v)  # where most of it vanishes
+        return at_zero(self._factor * hessian, v, partial(log.compile, f"{e.name} waves"))  # most of it vanishes
 
     def _of_wave(self, e: Energy) -> tuple[ufl.Form, fem.Function]:
         v, u = fem.Function(self.V), jets.revolved(self._system.u)

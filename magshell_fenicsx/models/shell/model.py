@@ -21,6 +21,7 @@ from magshell_fenicsx.assembly.sliding import Constraint, held_along
 from magshell_fenicsx.assembly.terms import LinearTerm, Term
 from magshell_fenicsx.mesh.midsurface import Midsurface
 from magshell_fenicsx.mesh.mirror import Y0, Mirror
+from magshell_fenicsx.models.carriers import on_surface
 from magshell_fenicsx.models.observed import Observed
 from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes
 from magshell_fenicsx.models.shell.energy import ShellTerm
@@ -41,7 +42,7 @@ from magshell_fenicsx.models.shell.patterns import by_patch, cells_of
 from magshell_fenicsx.models.shell.residual import FastResidual, renew
 from magshell_fenicsx.models.shell.sites import Site
 from magshell_fenicsx.models.shell.slopes import point_parameters
-from magshell_fenicsx.models.shell.terms import TermFactory
+from magshell_fenicsx.models.shell.terms import EnergyFactory
 from magshell_fenicsx.models.shell.thickness import Thickness, thickness_field
 from magshell_fenicsx.parts.forces.dead_load import SurfaceMeasures, assemble_dead_loads
 from magshell_fenicsx.parts.forces.point_load import patch_entries, point_entries, vertex_normal
@@ -124,7 +125,7 @@ class ShellModel(Observed):
             put_in_plane(self.r0, midsurface.edges[name])
         shapes = {name: midsurface.growth(V, deviations) for name, deviations in loads.growing.items()}
         self.growing = Growing(self.r0, shapes, material.h) if shapes else None
-        self.thickness = factor = thickness_field(thickness, self.r0, midsurface) if thickness else None
+        self.thickness = factor = thickness_field(thickness, self.r0, midsurface.patches) if thickness else None
         free, shape = dict[str, fem.Constant](), None
         if loads.natural:
             cells = midsurface.mesh.topology.index_map(2)
@@ -132,10 +133,11 @@ class ShellModel(Observed):
             loads = self.loads = replace(loads, natural=grown)
             shape = Shape.of(natural_field(grown, cells_of(self.r0), self.V), grown, free)
         folded = midsurface.read and largest_fold(self.r0, degree) > FOLD
-        of_shell = material, self.sigma, degree, self.kernels, factor, shape, free, folded
-        self.factory = factory = TermFactory(self.r0, self.u, *of_shell, drawn=self.growing and self.growing.drawn)
-        interior = factory.interior_edges()
-        terms: list[Term] = [factory.membrane(), factory.bending(), interior]
+        carrier = on_surface(self.r0, self.growing and self.growing.drawn)
+        of_shell = material, self.sigma, self.kernels, factor, shape, free, folded
+        self.factory = factory = EnergyFactory(carrier, self.u, *of_shell)
+        interior = factory.term(factory.interior_edges())
+        terms: list[Term] = [factory.term(factory.membrane()), factory.term(factory.bending()), interior]
         held: list[Constraint] = []
         mirrored: list[Constraint] = []
         planes: list[Mirror] = []
@@ -148,7 +150,7 @@ class ShellModel(Observed):
 
         if "symmetry" in conditions.values():
             planes.append(mirror)
-            terms.append(factory.mirror_edges(facets("symmetry"), mirror.normal))
+            terms.append(factory.term(factory.mirror_edges(facets("symmetry"), mirror.normal)))
             mirrored.append(held_along(V, 1, facets("symmetry"), mirror.normal))
         clamped = [name for name, c in conditions.items() if c == "clamped" and name in midsurface.edges]
         self.supports: dict[str, Support] = {}
@@ -159,7 +161,8 @@ class ShellModel(Observed):
                 continue
             if condition == "plane":
                 planes.append(plane := plane_of(self.r0, midsurface.edges[name], name))
-                terms.append(factory.mirror_edges(midsurface.edges[name], plane.normal, f"{name} mirror edges"))
+                mirrored_edges = factory.mirror_edges(midsurface.edges[name], plane.normal, f"{name} mirror edges")
+                terms.append(factory.term(mirrored_edges))
                 held.append(held_along(V, 1, midsurface.edges[name], plane.normal))
                 on_planes[name] = Support.of(held_on(V, 1, midsurface.edges[name], components), f"{name} mirror edges")
                 continue
@@ -169,7 +172,7 @@ class ShellModel(Observed):
                     f"{name} clamped edges" if len(clamped) > 1 else "clamped edges",
                     rotation_of(loads, name, V),
                 )
-                terms.append(factory.clamped_edges(edge, midsurface.edges[name], turn))
+                terms.append(factory.term(factory.clamped_edges(edge, midsurface.edges[name], turn)))
             if name in midsurface.edges:
                 here = held_on(V, 1, midsurface.edges[name], components)
             elif name in midsurface.patches:
@@ -185,15 +188,15 @@ class ShellModel(Observed):
         swept = loads.pressure or closed
         volume = factory.swept_volume() if swept else factory.volume_change(np.zeros(3) if closing is None else closing)
         if loads.magnetic:
-            terms += factory.magnetic(loads.magnetic)
+            terms += [factory.term(energy) for energy in factory.magnetic(loads.magnetic)]
         if loads.pressure:
-            terms.append(factory.pressure(potential=not self.without_potential))
-        terms += [factory.own(term) for term in loads.own]
+            terms.append(factory.term(factory.pressure(potential=not self.without_potential)))
+        terms += [factory.term(factory.own(term)) for term in loads.own]
         self.observed = self.kernels.compile_all(factory.observed(term) for term in loads.own)
         self.contacts = {}
         for contact in loads.contacts:
             pressed, known, integrals = factory.contact(contact)
-            terms.append(pressed)
+            terms.append(factory.term(pressed))
             self.contacts[contact.amplitude] = known, self.kernels.compile_all([integrals])
         self.normals = {name: vertex_normal(self.r0, x) for name, x in midsurface.points.items()}
         terms += [self._force(name, force) for name, force in loads.forces.items()]
@@ -202,11 +205,11 @@ class ShellModel(Observed):
             assert on
             terms.append(self.load_with(name, assemble_dead_loads(dead, V, on, self.kernels)))
             moments = [load for load in dead if isinstance(load, EdgeMoment)]
-            terms += [
-                factory.edge_moment(f"{name} moment {load.edge} {i}", midsurface.edges[load.edge], load.moment, name)
-                for i, load in enumerate(moments)
-            ]
-            terms += [factory.own(load.term, name) for load in dead if isinstance(load, Potential)]
+            for i, load in enumerate(moments):
+                facets_of_load = midsurface.edges[load.edge]
+                moment = factory.edge_moment(f"{name} moment {load.edge} {i}", facets_of_load, load.moment, name)
+                terms.append(factory.term(moment))
+            terms += [factory.term(factory.own(load.term, name)) for load in dead if isinstance(load, Potential)]
         self._sites = make_sites(self.r0, degree, terms, self.kernels, factory.prestress())
         at_edges = None
         if closed:

@@ -139,7 +139,8 @@ def pattern_field(pattern: Pattern, r0: fem.Function, finer: int = 0) -> tuple[f
     refuse_unbounded(pattern(nodes, n0), nodes, V.mesh.comm, "loading.loads" if finer else "magnetic.remanent")
     fit = shown(pattern, cells_of(r0), pattern(inside(nodes), n0), Q.element.basix_element)
     field.x.array.reshape(-1, 3)[Q.dofmap.list] = fit.nodal
-    return field, None if fit.smooth else fit.size
+    around = 2 * np.pi if V.dofmap.index_map_bs == 2 else 1.0
+    return field, None if fit.smooth else around * fit.size
 
 
 def pattern_on_edge(
@@ -207,11 +208,19 @@ def inside(nodes: Array) -> Array:
 
 
 def places(r0: fem.Function, at: Array | None = None) -> tuple[Array, Array]:
-    """The nodes of every cell, or other reference points (n, 2), and the cell's normals there: (cells, n, 3) each."""
+    """The nodes of every cell, or other reference points (n, 2), and the cell's normals there: (cells, n, 3) each.
+
+    On a meridian, whose placement is along e_rho and e_z, along (e_rho, e_theta, e_z).
+    """
     V = r0.function_space
-    element = V.element.basix_element
+    element, size = V.element.basix_element, V.dofmap.index_map_bs
     table = element.tabulate(1, element.points if at is None else at)[..., 0]
-    x, a1, a2 = np.einsum("dvk,cki->dcvi", table, r0.x.array.reshape(-1, 3)[V.dofmap.list])
+    jets = np.einsum("dvk,cki->dcvi", table, r0.x.array.reshape(-1, size)[V.dofmap.list])
+    if size == 2:
+        (rho, z), (rho_s, z_s) = np.moveaxis(jets, -1, 1)
+        normals = np.stack([-z_s, 0 * z_s, rho_s], axis=-1) / np.hypot(rho_s, z_s)[..., None]
+        return np.stack([rho, 0 * rho, z], axis=-1), np.asarray(normals)
+    x, a1, a2 = jets
     m = np.cross(a1, a2)
     return x, np.asarray(m / np.linalg.norm(m, axis=-1, keepdims=True))
 

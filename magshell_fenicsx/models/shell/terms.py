@@ -1,17 +1,19 @@
-"""The densities as terms: each compiled once, and only when a scene calls for it."""
+"""The energies of a shell on its carrier: each a density, made only when a scene calls for it."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import TypeVar
 
 import numpy as np
 import ufl
-from dolfinx import fem, mesh
+from dolfinx import fem
 from numpy.typing import NDArray
 from ufl.core.expr import Expr
 
 from magshell_fenicsx.assembly.kernels import KernelLog
+from magshell_fenicsx.assembly.terms import FormTerm
+from magshell_fenicsx.models.carriers import Carrier, Energy, Facets
 from magshell_fenicsx.models.shell import densities, edges
-from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.antisymmetric import antisymmetric_edge
 from magshell_fenicsx.models.shell.energy import (
     Density,
@@ -19,12 +21,10 @@ from magshell_fenicsx.models.shell.energy import (
     MomentTerm,
     Parameter,
     ShellTerm,
-    cell_quadrature,
-    edge_quadrature,
     per_area,
 )
 from magshell_fenicsx.models.shell.free import Constants, constants_of
-from magshell_fenicsx.models.shell.kinematics import CURVED, MOVED, SECOND, Jet
+from magshell_fenicsx.models.shell.kinematics import CURVED, MOVED, SECOND
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.parameters import ACROSS, Magnetisation, Material
 from magshell_fenicsx.models.shell.patterns import pattern_field
@@ -34,104 +34,130 @@ from magshell_fenicsx.parts.bodies.contact import (
     Pressing,
     contact_energy,
     contact_pressure,
-    contact_quadrature,
     pressed_radius,
 )
 from magshell_fenicsx.parts.magnetism.applied import AppliedField
 from magshell_fenicsx.parts.magnetism.laws import FULL, LINEAR, magnetic_densities
 from magshell_fenicsx.parts.natural.shape import Shape, grown
 
+Array = NDArray[np.float64]
+AnyTerm = TypeVar("AnyTerm", bound=FormTerm)
+INTERIOR = "interior edges"
+
 
 @dataclass(frozen=True)
-class TermFactory:
-    """Makes the terms of one shell; all share the fields r0 and u."""
+class EnergyFactory:
+    """Makes the energies of one shell, and terms of them.
 
-    r0: fem.Function
+    Attributes
+    ----------
+    thickness
+        What multiplies h, (1,); None for 1.
+    natural
+        The natural shape; None if it is the drawn one.
+    free
+        Constants of the parameters that enter freely.
+    folded
+        Whether cells meet at angles that are not small.
+    fields
+        The applied fields known by values that were made.
+    """
+
+    carrier: Carrier
     u: fem.Function
     material: Material
     sigma: float
-    degree: int
     log: KernelLog
     thickness: fem.Function | None = None
     natural: Shape | None = None
-    free: Constants = field(default_factory=dict)  # of parameters that enter freely
-    folded: bool = False  # whether cells meet at angles that are not small
-    fields: list[AppliedField] = field(default_factory=list)  # those made
-    drawn: fem.Function | None = None  # the placement that volumes count from; None for r0
+    free: Constants = field(default_factory=dict)
+    folded: bool = False
+    fields: list[AppliedField] = field(default_factory=list)
 
-    def membrane(self) -> ShellTerm:
+    def term(self, energy: Energy) -> FormTerm:
+        """An energy as a term of the model's displacement."""
+        whole, u = self.carrier.whole, self.carrier.jet(self.u)
+        form, work = whole * energy.of(u), None
+        if energy.work:
+            work = whole * energy.work(u, self.carrier.jet(ufl.TestFunction(self.u.function_space)))
+
+        def make(kind: Callable[..., AnyTerm], *density: Density) -> AnyTerm:
+            given = energy.name, *density, form, self.u, self.log, energy.amplitude
+            return kind(*given, linear=energy.linear, work=work, follow=energy.follow)
+
+        if energy.density is None:
+            return make(FormTerm)
+        if energy.counted is None:
+            return make(ShellTerm, energy.density)
+        moment = make(MomentTerm, energy.density)
+        moment.count_from(*energy.counted)
+        return moment
+
+    def membrane(self) -> Energy:
         density = Density(per_area(densities.membrane), (self._constant(self.material.nu),))
-        return self._cells("membrane", self._thick(self._grown(density), None))
+        return self.carrier.energy("membrane", self._thick(self._grown(density), None))
 
     def prestress(self) -> Density:
         """The part of the tangent that membrane stress makes; its last parameter but the thickness is the strain."""
-        strain = fem.Function(fem.functionspace(self._domain, ("DG", 0, (3,))))
+        strain = fem.Function(fem.functionspace(self.carrier.mesh, ("DG", 0, (3,))))
         density = Density(per_area(densities.prestress), (self._constant(self.material.nu), strain))
         return self._thick(self._grown(density), None)
 
-    def bending(self) -> ShellTerm:
+    def bending(self) -> Energy:
         density = Density(per_area(densities.bending), self._nu_h(), parts=CURVED)
-        return self._cells("bending", self._thick(self._grown(density), 1))
+        return self.carrier.energy("bending", self._thick(self._grown(density), 1))
 
-    def interior_edges(self) -> ShellTerm:
+    def interior_edges(self) -> Energy:
         parameters = self._penalised() if self.thickness is None else (*self._penalised(), self.thickness)
         of = edges.folded if self.folded else edges.interior
-        density = self._grown(Density(of, parameters, CURVED, SECOND, sides=2))
-        r0, u = ((j.side("+"), j.side("-")) for j in self.jets())
-        m = kin.facet_covector(self._domain)
-        width = ufl.avg(ufl.CellVolume(self._domain)) / ufl.avg(ufl.FacetArea(self._domain))
-        sided = [(p("+"), p("-")) if isinstance(p, fem.Function) else p for p in density.parameters]
-        energy = density.of(r0, u, (m("+"), m("-")), width, *sided)
-        return ShellTerm("interior edges", density, energy * self.interior_measure(), self.u, self.log)
+        return self.carrier.energy(INTERIOR, self._grown(Density(of, parameters, CURVED, SECOND, sides=2)))
 
-    def clamped_edges(self, name: str, facets: NDArray[np.int32], turn: fem.Constant | None = None) -> ShellTerm:
+    def clamped_edges(self, name: str, facets: Facets, turn: fem.Constant | None = None) -> Energy:
         """`turn` is the rotation of an edge that moves."""
         parameters = (*self._penalised(), *([] if turn is None else [turn]))
         density = Density(edges.clamped, parameters, CURVED, SECOND, facets)
-        return self._edges(name, self._thick(self._grown(density), 1))
+        return self.carrier.energy(name, self._thick(self._grown(density), 1))
 
-    def mirror_edges(
-        self, facets: NDArray[np.int32], normal: NDArray[np.float64], name: str = "mirror edges"
-    ) -> ShellTerm:
+    def mirror_edges(self, facets: Facets, normal: Array, name: str = "mirror edges") -> Energy:
+        """Edges on a mirror plane with that normal."""
         parameters = (*self._penalised(), self._constant(normal))
         density = Density(edges.symmetric, parameters, CURVED, SECOND, facets)
-        return self._edges(name, self._thick(self._grown(density), 1))
+        return self.carrier.energy(name, self._thick(self._grown(density), 1))
 
-    def edge_moment(self, name: str, facets: NDArray[np.int32], intensity: float, amplitude: str) -> MomentTerm:
+    def edge_moment(self, name: str, facets: Facets, intensity: float, amplitude: str) -> Energy:
         """A moment per length about the edge's first tangent; in E h R."""
         past = self._constant(np.array([1.0, 0.0]))
         density = Density(edges.turning, (self._constant(intensity), past), facets=facets)
-        energy = density.of(*self.jets(), *self.edge_geometry(), *density.parameters) * self.ds(facets)
-        along = kin.conormal(self.jets()[0], self.edge_geometry()[0])[2]
-        length = self.log.compile(f"{name} length", along * self.ds(facets))
-        total = self._domain.comm.allreduce(fem.assemble_scalar(length))
-        term = MomentTerm(name, density, energy, self.u, self.log, amplitude)
-        term.count_from(past, intensity * total)
-        return term
+        length = fem.assemble_scalar(self.log.compile(f"{name} length", self.carrier.length(facets)))
+        total = self.carrier.whole * self._over_ranks(length)
+        return self.carrier.energy(name, density, amplitude, counted=(past, intensity * total))
 
-    def antisymmetric_edges(self, facets: NDArray[np.int32], normal: NDArray[np.float64]) -> HessianTerm:
+    def antisymmetric_edges(self, facets: Facets, normal: Array) -> HessianTerm:
         """The mirror plane's edges under antisymmetric displacements."""
-        parameters = (*self._penalised(), self._constant(normal))
+        carrier, parameters = self.carrier, (*self._penalised(), self._constant(normal))
         density = self._grown(Density(antisymmetric_edge, parameters, CURVED, facets=facets))
         v = fem.Function(self.u.function_space)
-        jets = (*self.jets(), kin.jet(v, self._domain))
-        energy = density.of(*jets, *self.edge_geometry(), *density.parameters) * self.ds(facets)
+        jets = carrier.j0, carrier.jet(self.u), carrier.jet(v)
+        energy = density.of(*jets, carrier.covector, carrier.widths[1], *density.parameters) * carrier.ds(facets)
         return HessianTerm("antisymmetric edges", density, energy, v, self.log)
 
-    def magnetic(self, field: Magnetisation) -> list[ShellTerm]:
-        """The terms of the chosen energy, linear in the applied field, with the amplitude lambda_m."""
-        pattern = field.remanent
-        Br = pattern_field(pattern, self.r0)[0] if callable(pattern) else self._constant(pattern)
+    def magnetic(self, field: Magnetisation) -> list[Energy]:
+        """The terms of the chosen energy, linear in the applied field, with the amplitude lambda_m.
+
+        A field in space is known at the displacement u.
+        """
+        pattern, carrier = field.remanent, self.carrier
+        Br = pattern_field(pattern, carrier.r0)[0] if callable(pattern) else self._constant(pattern)
         if field.in_space:
-            known = AppliedField(field.in_space, self.r0, self.u, cell_quadrature(self.degree), field.driven)
+            known = AppliedField(field.in_space, carrier.r0, self.u, carrier.rule, field.driven)
             self.fields.append(known)
             of = densities.in_space(FULL[field.law])
             density = self._thick(Density(per_area(of), (Br, known.polynomial), parts=MOVED), None)
-            return [self._cells("magnetic", density, "lambda_m", follow=known.follow)]
+            return [carrier.energy("magnetic", density, "lambda_m", follow=known.follow)]
         directions = [("lambda_m", "", field.applied)]
         directions += [(name, name.replace("lambda_", " "), Ba) for name, Ba in zip(ACROSS, field.across, strict=False)]
         terms = [
-            self._cells(
+            carrier.energy(
                 name + suffix,
                 self._thick(Density(per_area(of), (Br, self._constant(Ba))), None),
                 amplitude,
@@ -143,69 +169,64 @@ class TermFactory:
         if field.gradient is not None:
             parameters = (Br, self._constant(field.gradient))
             density = Density(per_area(densities.in_gradient(FULL[field.law])), parameters, parts=MOVED)
-            terms.append(self._cells("magnetic gradient", self._thick(density, None), "lambda_m"))
+            terms.append(carrier.energy("magnetic gradient", self._thick(density, None), "lambda_m"))
         return terms
 
-    def pressure(self, *, potential: bool) -> ShellTerm:
+    def pressure(self, *, potential: bool) -> Energy:
         """Amplitude p/p_c of a live pressure: the potential p Delta V, or its virtual work where it has none."""
         unit = self._constant(self.material.classical_pressure / self.material.h)
         work = None if potential else densities.following
-        return self._cells(
-            "pressure", Density(densities.swept, (unit,), parts=MOVED, work=work), "pressure", drawn=True
-        )
+        density = Density(densities.swept, (unit,), parts=MOVED, work=work)
+        return self.carrier.energy("pressure", density, "pressure", drawn=True)
 
     def swept_volume(self) -> ufl.Form:
         """Delta V/R^3 of the modelled part when its points move straight to their places."""
-        return densities.swept(*self._jets_from_drawn()) * self.dx()
+        return self._volume(densities.swept)
 
-    def own(self, term: OwnTerm, amplitude: str | None = None) -> ShellTerm:
+    def volume_change(self, origin: Array) -> ufl.Form:
+        """Delta V/R^3 of the modelled part, between it and a point of all its symmetry planes."""
+        return self._volume(densities.volume, *([self._constant(origin)] if origin.any() else []))
+
+    def _volume(self, of: Callable[..., Expr], *parameters: Expr) -> ufl.Form:
+        jets = self.carrier.from_drawn(self.carrier.jet(self.u))
+        return self.carrier.whole * of(*jets, *parameters) * self.carrier.dx()
+
+    def own(self, term: OwnTerm, amplitude: str | None = None) -> Energy:
         """The energy of a part or one's own, with the amplitude of its name or another."""
         still = tuple(part for part in term.placed_parts if part not in term.parts)  # asked for of r0 alone
-        parameters = self._parameters(term)
-        density = Density(per_area(term.density), parameters, parts=(*term.parts, *still), linear=still)
-        return self._cells(term.name, density, amplitude or term.name, linear=term.linear)
+        density = Density(per_area(term.density), self._parameters(term), parts=(*term.parts, *still), linear=still)
+        return self.carrier.energy(term.name, density, amplitude or term.name, linear=term.linear)
 
     def observed(self, term: OwnTerm) -> dict[str, ufl.Form]:
-        """What it observes."""
-        arguments = (*self.jets(), *self._parameters(term))
-        return {column: per_area(of)(*arguments) * self.dx() for column, of in term.observed.items()}
+        """What it observes of the modelled part."""
+        parameters = self._parameters(term)
+        return {column: self._over_area(of, parameters) for column, of in term.observed.items()}
 
-    def contact(self, contact: Contact) -> tuple[ShellTerm, Pressing, dict[str, fem.Form]]:
+    def contact(self, contact: Contact) -> tuple[Energy, Pressing, dict[str, ufl.Form]]:
         """The energy of a body, what it knows of it, and the integrals of its pressure and of that times its radius."""
-        rule, approach = contact_quadrature(self.degree), self.free.setdefault(contact.amplitude, self._constant(0.0))
-        known = Pressing(contact, self.material.h, self.r0, self.u, approach, rule, self.thickness)
-        parameters = known.parameters
-        density = Density(per_area(contact_energy), parameters, ("r",), quadrature=rule)
-        term = self._cells(f"contact {contact.body}", density, follow=known.follow)
-        arguments, dx = (*self.jets(), *parameters), self.dx(rule)
+        carrier, approach = self.carrier, self.free.setdefault(contact.amplitude, self._constant(0.0))
+        rule = carrier.contact_rule
+        known = Pressing(contact, self.material.h, carrier.r0, self.u, approach, rule, self.thickness)
+        density = Density(per_area(contact_energy), known.parameters, ("r",), quadrature=rule)
         of_radius = pressed_radius(self._constant(contact.front), self._constant(contact.direction))
         seen: dict[str, Callable[..., Expr]] = {"pressure": contact_pressure, "radius": of_radius}
-        return term, known, {name: per_area(of)(*arguments) * dx for name, of in seen.items()}
+        integrals = {name: self._over_area(of, known.parameters, rule) for name, of in seen.items()}
+        return carrier.energy(f"contact {contact.body}", density, follow=known.follow), known, integrals
+
+    def _over_area(
+        self, of: Callable[..., Expr], parameters: tuple[Parameter, ...], rule: int | None = None
+    ) -> ufl.Form:
+        density = Density(per_area(of), parameters, quadrature=rule)
+        return self.carrier.whole * self.carrier.integral(density, self.carrier.jet(self.u))
 
     def _parameters(self, term: OwnTerm) -> tuple[fem.Constant, ...]:
-        return constants_of(term, self._domain, self.free)
+        return constants_of(term, self.carrier.mesh, self.free)
 
-    def volume_change(self, origin: NDArray[np.float64]) -> ufl.Form:
-        """Delta V/R^3 of the modelled part, between it and a point of all its symmetry planes."""
-        return (
-            densities.volume(*self._jets_from_drawn(), *([self._constant(origin)] if origin.any() else [])) * self.dx()
-        )
+    def _constant(self, value: float | Array) -> fem.Constant:
+        return self.carrier.constant(value)
 
-    @property
-    def _domain(self) -> mesh.Mesh:
-        return self.u.function_space.mesh
-
-    def jets(self) -> tuple[Jet, Jet]:
-        return kin.jet(self.r0, self._domain), kin.jet(self.u, self._domain)
-
-    def _jets_from_drawn(self) -> tuple[Jet, Jet]:
-        """Those of the drawn placement and of the displacement from there."""
-        r0, u = self.jets()
-        drawn = kin.jet(self.drawn, self._domain) if self.drawn else r0
-        return (drawn, r0 + u - drawn) if self.drawn else (r0, u)
-
-    def _constant(self, value: float | NDArray[np.float64]) -> fem.Constant:
-        return fem.Constant(self._domain, value)
+    def _over_ranks(self, value: float) -> float:
+        return float(self.carrier.mesh.comm.allreduce(value))
 
     def _thick(self, density: Density, h_at: int | None) -> Density:
         """The density with the thickness as it varies, if it does; `h_at` as of `thickness.thick`."""
@@ -220,43 +241,3 @@ class TermFactory:
 
     def _penalised(self) -> tuple[Parameter, ...]:
         return *self._nu_h(), self._constant(self.sigma)
-
-    def dx(self, rule: int | None = None) -> ufl.Measure:
-        metadata = {"quadrature_degree": rule or cell_quadrature(self.degree)}
-        return ufl.Measure("dx", domain=self._domain, metadata=metadata)
-
-    def _edge_rule(self) -> dict[str, int]:
-        return {"quadrature_degree": edge_quadrature(self.degree)}
-
-    def interior_measure(self) -> ufl.Measure:
-        return ufl.dS(domain=self._domain, metadata=self._edge_rule())
-
-    def ds(self, facets: NDArray[np.int32]) -> ufl.Measure:
-        tags = mesh.meshtags(self._domain, 1, facets, np.ones_like(facets))
-        return ufl.Measure("ds", domain=self._domain, subdomain_data=tags, metadata=self._edge_rule())(1)
-
-    def edge_geometry(self) -> tuple[Expr, Expr]:
-        """Covector and width of a boundary edge."""
-        return kin.facet_covector(self._domain), ufl.CellVolume(self._domain) / ufl.FacetArea(self._domain)
-
-    def _cells(
-        self,
-        name: str,
-        density: Density,
-        amplitude: str | None = None,
-        *,
-        linear: bool = False,
-        follow: Callable[[], None] | None = None,
-        drawn: bool = False,
-    ) -> ShellTerm:
-        jets, work = self._jets_from_drawn() if drawn else self.jets(), None
-        energy = density.of(*jets, *density.parameters) * self.dx(density.quadrature)
-        if density.work:
-            v = kin.jet(ufl.TestFunction(self.u.function_space), self._domain)
-            work = density.work(*self.jets(), v, *density.parameters) * self.dx()
-        return ShellTerm(name, density, energy, self.u, self.log, amplitude, linear=linear, work=work, follow=follow)
-
-    def _edges(self, name: str, density: Density) -> ShellTerm:
-        assert density.facets is not None
-        energy = density.of(*self.jets(), *self.edge_geometry(), *density.parameters) * self.ds(density.facets)
-        return ShellTerm(name, density, energy, self.u, self.log)

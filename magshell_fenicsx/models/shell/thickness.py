@@ -9,11 +9,10 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 from ufl.core.expr import Expr
 
-from magshell_fenicsx.mesh.midsurface import Midsurface
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.shell.energy import Density
 from magshell_fenicsx.models.shell.fitted import Cells, fitted
-from magshell_fenicsx.models.shell.patterns import cells_of
+from magshell_fenicsx.models.shell.patterns import cells_of, places
 
 Array = NDArray[np.float64]
 LEAST_FACTOR, MOST_FACTOR = 1e-3, 1e3
@@ -56,7 +55,9 @@ def refuse_unfit(factors: Array, x: Array, comm: MPI.Comm) -> None:
         )
 
 
-def thickness_field(thickness: Thickness, r0: fem.Function, midsurface: Midsurface) -> fem.Function:
+def thickness_field(
+    thickness: Thickness, r0: fem.Function, patches: Mapping[str, NDArray[np.bool_]] | None = None
+) -> fem.Function:
     """h(x)/h at the nodes of every cell, free to jump from cell to cell; shape (1,).
 
     Raises
@@ -65,12 +66,12 @@ def thickness_field(thickness: Thickness, r0: fem.Function, midsurface: Midsurfa
         On every rank, if it is not positive somewhere, or a patch is unknown.
     """
     V = r0.function_space
-    nodes = r0.x.array.reshape(-1, 3)[V.dofmap.list]
+    nodes, _ = places(r0)
     values = thickness.at(nodes)
     refuse_unfit(values, nodes, V.mesh.comm)
     values = thickness.shown(cells_of(r0), values)
     for name, factor in (thickness.patches or {}).items():
-        values[patch_of(midsurface.patches, name, "shell.thickness_factor")] = factor
+        values[patch_of(patches or {}, name, "shell.thickness_factor")] = factor
     return nodal_thickness(values, nodes, V)
 
 

@@ -1,6 +1,7 @@
 """Loads that keep their direction and leave the rotation, as energies on the meridian that are linear in u."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import ufl
@@ -8,15 +9,40 @@ from dolfinx import fem
 from ufl.core.expr import Expr
 
 from magshell_fenicsx.assembly.kernels import KernelLog
-from magshell_fenicsx.models.axisymmetric.energies import Energy, EnergyFactory, Integral
-from magshell_fenicsx.models.axisymmetric.pattern import pattern_field
+from magshell_fenicsx.models.axisymmetric.meridian import Meridian
+from magshell_fenicsx.models.carriers import Carrier, Energy
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.kinematics import Jet
 from magshell_fenicsx.models.shell.parameters import AreaForce, DeadLoad, EdgeForce, EdgeMoment, PointForce, Potential
-from magshell_fenicsx.models.shell.patterns import FINER
+from magshell_fenicsx.models.shell.patterns import FINER, pattern_field
+
+Integral = Callable[[Expr], ufl.Form]
 
 
-def dead_loads(name: str, loads: Sequence[DeadLoad], factory: EnergyFactory, log: KernelLog) -> tuple[Energy, float]:
+@dataclass(frozen=True)
+class Around:
+    """Integrals over parts of a surface of revolution, per radian as those of its carrier."""
+
+    meridian: Meridian
+    carrier: Carrier
+
+    def end(self, name: str) -> Integral:
+        """Along the undeformed circle of an end."""
+        return lambda f: f * self.carrier.r0[0] * self.carrier.ds(self.meridian.ends[name])
+
+    def pole(self) -> Integral:
+        """The value on the axis, over 2 pi."""
+        return lambda f: f / (2 * np.pi) * self.carrier.ds(self.meridian.axis)
+
+    def patch(self, radius: float) -> Integral:
+        """Of f (1 - d^2/radius^2)^2, d the distance in space from the pole."""
+        a, pole = self.carrier.constant(radius), self.carrier.constant(self.meridian.section(np.zeros(1))[0])
+        inside = 1 - ufl.dot(self.carrier.r0 - pole, self.carrier.r0 - pole) / a**2
+        weight, over = ufl.conditional(ufl.gt(inside, 0), inside**2, 0), self.carrier.over_area()
+        return lambda f: over(weight * f)
+
+
+def dead_loads(name: str, loads: Sequence[DeadLoad], on: Around, log: KernelLog) -> tuple[Energy, float]:
     """All except the moments, with an amplitude's name, and the sum of their sizes over E h R.
 
     Vectors are along e3, and points are on the axis.
@@ -26,23 +52,23 @@ def dead_loads(name: str, loads: Sequence[DeadLoad], factory: EnergyFactory, log
         if isinstance(load, EdgeMoment | Potential):
             continue
         if isinstance(load, PointForce):
-            over = factory.at_pole()
+            over = on.pole()
         elif isinstance(load, EdgeForce):
-            over = factory.around(factory.meridian.ends[load.edge])
+            over = on.end(load.edge)
         else:
-            over = factory.area()
+            over = on.carrier.over_area()
         if not isinstance(load, PointForce) and callable(load.force):
-            along, whole = pattern_field(load.force, factory.r0, FINER)
+            along, whole = pattern_field(load.force, on.carrier.r0, FINER)
             parts.append((along, over))
             fitted = whole is not None and isinstance(load, AreaForce)
             size += whole if fitted and whole is not None else _integral(ufl.sqrt(ufl.dot(along, along)), over, log)
             continue
-        whole = _whole(over, factory, log)
+        whole = _whole(over, on, log)
         if isinstance(load, AreaForce) and isinstance(load.force, float):
-            along, strength = -kin.normal(factory.j0) * factory.constant(load.force), abs(load.force)
+            along, strength = -kin.normal(on.carrier.j0) * on.carrier.constant(load.force), abs(load.force)
         else:
             vector = np.asarray(load.force) / (whole if isinstance(load, EdgeForce) and load.total else 1.0)
-            along, strength = factory.constant(vector), float(np.linalg.norm(vector))
+            along, strength = on.carrier.constant(vector), float(np.linalg.norm(vector))
         parts.append((along, over))
         size += strength * whole
 
@@ -52,16 +78,16 @@ def dead_loads(name: str, loads: Sequence[DeadLoad], factory: EnergyFactory, log
     return Energy(name, energy, name, linear=True), size
 
 
-def pole_force(name: str, patch: float, unit: float, factory: EnergyFactory, log: KernelLog) -> Energy:
+def pole_force(name: str, patch: float, unit: float, on: Around, log: KernelLog) -> Energy:
     """A force against e3 at the pole, or spread over a patch of that radius."""
-    over = factory.patch(patch) if patch else factory.at_pole()
-    share = factory.constant(unit / _whole(over, factory, log))
+    over = on.patch(patch) if patch else on.pole()
+    share = on.carrier.constant(unit / _whole(over, on, log))
     return Energy(name, lambda u: over(share * u.r[2]), name, linear=True)
 
 
-def _whole(over: Integral, factory: EnergyFactory, log: KernelLog) -> float:
+def _whole(over: Integral, on: Around, log: KernelLog) -> float:
     """The integral of 1, all around."""
-    return _integral(factory.constant(1.0), over, log)
+    return _integral(on.carrier.constant(1.0), over, log)
 
 
 def _integral(f: Expr, over: Integral, log: KernelLog) -> float:

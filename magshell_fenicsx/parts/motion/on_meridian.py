@@ -3,11 +3,9 @@
 import basix
 import basix.ufl
 import numpy as np
-import ufl
 from dolfinx import fem
 from numpy.typing import NDArray
 
-from magshell_fenicsx.models.axisymmetric import jets
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.parts.motion.viscous import SIZE, Edge, Surface, held_jump, mirrored_jump
@@ -17,27 +15,28 @@ Array = NDArray[np.float64]
 
 def surface_of(model: MeridianModel) -> Surface:
     """Strains are known inside the cells: on the axis the coordinates are singular."""
-    mesh, factory, j0 = model.V.mesh, model.factory, model.factory.j0
+    mesh, carrier = model.V.mesh, model.factory.carrier
+    j0, m = carrier.j0, carrier.covector
     inside = basix.ufl.element(
         "DG", "interval", model.degree, lagrange_variant=basix.LagrangeVariant.gl_isaac, shape=(SIZE,)
     )
-    stresses, m, width = fem.functionspace(mesh, inside), factory.covector(), factory.width()
+    stresses = fem.functionspace(mesh, inside)
     clamped = [facets for name, (facets, _) in model.held.named.items() if model.conditions[name] == "clamped"]
-    ends = [Edge(held_jump(j0, m, kin.normal(j0)), 1, factory.ds(facets)) for facets in clamped]
+    ends = [Edge(held_jump(j0, m, kin.normal(j0)), 1, carrier.ds(facets)) for facets in clamped]
     if len(model.held.mirror):
-        up = factory.constant(np.array([0.0, 0.0, 1.0]))
-        ends.append(Edge(mirrored_jump(j0, m, up), 2, factory.ds(model.held.mirror)))
+        up = carrier.constant(np.array([0.0, 0.0, 1.0]))
+        ends.append(Edge(mirrored_jump(j0, m, up), 2, carrier.ds(model.held.mirror)))
     return Surface(
         stresses,
         _Tables(model.V, stresses.element.basix_element.points),
-        jets.revolved,
+        carrier.jet,
         j0,
-        factory.thickness,
-        (factory.dx(), ufl.Measure("dS", domain=mesh)),
+        model.thickness,
+        (carrier.dx(), carrier.dS()),
         m,
-        (ufl.avg(width), width),
+        carrier.widths,
         ends,
-        whole=2 * np.pi,
+        whole=carrier.whole,
     )
 
 

@@ -17,19 +17,18 @@ from magshell_fenicsx.parts.motion.viscous import SIZE, Edge, Surface, held_jump
 
 def surface_of(model: ShellModel) -> Surface:
     """Strains are known at the nodes of each cell."""
-    V, factory = model.V, model.factory
+    V, factory, carrier = model.V, model.factory, model.factory.carrier
     element, nodes = V.element.basix_element, V.dofmap.list
-    table, (r0, _) = Table.tabulate(element, element.points), factory.jets()
-    m = kin.facet_covector(V.mesh)
+    table, r0, m = Table.tabulate(element, element.points), carrier.j0, carrier.covector
     return Surface(
         fem.functionspace(V.mesh, ("DG", model.degree, (SIZE,))),
         lambda nodal: np.asarray(np.moveaxis(table.jets(nodal.reshape(-1, 3)[nodes]), 2, 0)),
-        lambda f: kin.jet(f, V.mesh),
+        carrier.jet,
         r0,
         factory.thickness,
-        (factory.dx(), factory.interior_measure()),
+        (carrier.dx(), carrier.dS()),
         m,
-        (ufl.avg(ufl.CellVolume(V.mesh)) / ufl.avg(ufl.FacetArea(V.mesh)), factory.edge_geometry()[1]),
+        carrier.widths,
         list(_ends(model, r0, m)),
         factory.folded,
     )
@@ -39,7 +38,7 @@ def _ends(model: ShellModel, r0: Jet, m: Expr) -> Iterator[Edge]:
     for term in model.system.terms:
         if not isinstance(term, ShellTerm) or term.density.facets is None or not term.name.endswith(" edges"):
             continue
-        rest, along = term.density.parameters[3:], model.factory.ds(term.density.facets)
+        rest, along = term.density.parameters[3:], model.factory.carrier.ds(term.density.facets)
         if "mirror" in term.name:
             yield Edge(mirrored_jump(r0, m, rest[0]), 2, along)
             continue

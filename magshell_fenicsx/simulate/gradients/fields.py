@@ -20,7 +20,6 @@ from magshell_fenicsx.assembly.terms import FormTerm, Term, factor_of
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.deviation import Deviated
-from magshell_fenicsx.models.axisymmetric import pattern as of_meridian
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.shell import patterns
 from magshell_fenicsx.models.shell.model import ShellModel
@@ -127,8 +126,8 @@ def _of_parameters(scene: Scene, place: Place, name: str) -> list[Share]:
 def _as_form(scene: Scene, slope: Slope) -> FormTerm:
     """A derivative at points as a form."""
     assert isinstance(scene.model, ShellModel)
-    factory, density = scene.model.factory, slope.density
-    energy = density.of(*factory.jets(), *density.parameters) * factory.dx(density.quadrature)
+    carrier = scene.model.factory.carrier
+    energy = carrier.integral(slope.density, carrier.jet(scene.model.u))
     return FormTerm(slope.name, energy, scene.model.u, scene.model.kernels, slope.amplitude)
 
 
@@ -217,12 +216,7 @@ def _terms(scene: Scene, state: State, name: str) -> list[FormTerm]:
 def places_of(scene: Scene, f: fem.Function) -> tuple[Array, Array]:
     """Nodes of every cell of a field and normals there, as the field's pattern is given them."""
     model, nodes = scene.model, f.function_space.element.basix_element.points
-    if isinstance(model, MeridianModel):
-        places, normals = of_meridian.places(model.r0, nodes)
-    elif isinstance(model, ShellModel):
-        places, normals = patterns.places(model.r0, nodes)
-    else:
-        places, normals = of_body.places(model.V)
+    places, normals = of_body.places(model.V) if isinstance(model, SolidModel) else patterns.places(model.r0, nodes)
     return patterns.inside(places), normals
 
 

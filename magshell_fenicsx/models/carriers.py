@@ -1,0 +1,198 @@
+"""Where the densities of a shell are integrated: its mid-surface, or the meridian of what is closed around e3.
+
+A carrier gives the jets of fields, the measures of cells, of the edges between them and of the boundary's edges, and
+how wide the cells are there. Whoever writes an energy writes its density alone.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import ufl
+from dolfinx import fem, mesh
+from numpy.typing import NDArray
+from ufl.core.expr import Expr
+
+from magshell_fenicsx.models.axisymmetric import jets
+from magshell_fenicsx.models.shell import kinematics as kin
+from magshell_fenicsx.models.shell.energy import Density, cell_quadrature, edge_quadrature
+from magshell_fenicsx.models.shell.kinematics import Jet
+
+Facets = NDArray[np.int32]
+
+
+@dataclass(frozen=True)
+class Energy:
+    """An energy as a function of the displacement's jet, so that waves may be added to a displacement; see `Term`.
+
+    Attributes
+    ----------
+    of
+        Of the jet of u: the energy on the carrier, of which `Carrier.whole` times as much is modelled.
+    work
+        Of the jets of u and v: the virtual work of a load without potential, quadratic in u.
+    density
+        What is integrated; None for a load that is known by its vector.
+    follow
+        Renews its coefficients.
+    counted
+        Of a moment: the turn that its angle is counted from, and -Pi of one radian.
+    """
+
+    name: str
+    of: Callable[[Jet], ufl.Form]
+    amplitude: str | None = None
+    linear: bool = False
+    work: Callable[[Jet, Jet], ufl.Form] | None = None
+    density: Density | None = None
+    follow: Callable[[], None] | None = None
+    counted: tuple[fem.Constant, float] | None = None
+
+    def added(self, u: Jet, v: Jet) -> ufl.Form:
+        """A form with the Hessian in v, at v = 0, of the energy of u + v; a work gives its symmetric part."""
+        if self.work is None:
+            return self.of(u + v)
+        return 0.25 * (self.work(u + v, v) - self.work(u - v, v))
+
+
+@dataclass(frozen=True)
+class Carrier:
+    """The mid-surface, or its meridian, with the placement r0 on it.
+
+    Attributes
+    ----------
+    jet
+        From a field of the placement's space to its value and derivatives.
+    covector
+        Of an edge, see `kinematics.conormal`.
+    widths
+        h_e of edges between cells and at the boundary, see `edges.two_sided`.
+    rule, edge_rule, contact_rule
+        Degrees of the quadrature on cells, along edges (None where these are points) and under contact.
+    whole
+        What integrals are multiplied by: 2 pi on a meridian, where they are per radian.
+    drawn
+        The placement that volumes count from; None for r0.
+    """
+
+    r0: fem.Function
+    jet: Callable[[Expr], Jet]
+    covector: Expr
+    widths: tuple[Expr, Expr]
+    rule: int
+    edge_rule: int | None
+    contact_rule: int
+    whole: float = 1.0
+    drawn: fem.Function | None = None
+
+    @property
+    def mesh(self) -> mesh.Mesh:
+        return self.r0.function_space.mesh
+
+    @property
+    def j0(self) -> Jet:
+        """Of the placement."""
+        return self.jet(self.r0)
+
+    def constant(self, value: float | NDArray[np.float64]) -> fem.Constant:
+        """A number or a vector in a form."""
+        return fem.Constant(self.mesh, value)
+
+    def dx(self, rule: int | None = None) -> ufl.Measure:
+        """Of the cells, in the surface's coordinates."""
+        return ufl.Measure("dx", domain=self.mesh, metadata={"quadrature_degree": rule or self.rule})
+
+    def dS(self) -> ufl.Measure:
+        """Of the edges between cells."""
+        return ufl.Measure("dS", domain=self.mesh, metadata=self._along_edges)
+
+    def ds(self, facets: Facets) -> ufl.Measure:
+        """Of some edges of the boundary."""
+        dimension = self.mesh.topology.dim - 1
+        tags = mesh.meshtags(self.mesh, dimension, facets, np.ones_like(facets))
+        return ufl.Measure("ds", domain=self.mesh, subdomain_data=tags, metadata=self._along_edges)(1)
+
+    @property
+    def _along_edges(self) -> dict[str, int]:
+        return {} if self.edge_rule is None else {"quadrature_degree": self.edge_rule}
+
+    def over_area(self) -> Callable[[Expr], ufl.Form]:
+        """The integral over the undeformed area."""
+        ratio = kin.area_ratio(self.j0)
+        return lambda f: f * ratio * self.dx()
+
+    def length(self, facets: Facets) -> ufl.Form:
+        """The undeformed length of some edges."""
+        return kin.conormal(self.j0, self.covector)[2] * self.ds(facets)
+
+    def from_drawn(self, u: Jet) -> tuple[Jet, Jet]:
+        """The jets of the drawn placement and of the displacement from there."""
+        if self.drawn is None:
+            return self.j0, u
+        drawn = self.jet(self.drawn)
+        return drawn, self.j0 + u - drawn
+
+    def measure(self, density: Density) -> ufl.Measure:
+        """Of the cells or edges where a density lives; a form takes a single one for the same edges."""
+        if density.sides == 2:
+            return self.dS()
+        return self.dx(density.quadrature) if density.facets is None else self.ds(density.facets)
+
+    def value(self, density: Density, u: Jet, *, drawn: bool = False) -> Expr:
+        """Of a density; `drawn`: of what counts from the drawn placement."""
+        r0 = self.j0
+        if density.sides == 2:
+            pairs = ((j.side("+"), j.side("-")) for j in (r0, u))
+            m = self.covector("+"), self.covector("-")
+            sided = [(p("+"), p("-")) if isinstance(p, fem.Function) else p for p in density.parameters]
+            return density.of(*pairs, m, self.widths[0], *sided)
+        if density.facets is not None:
+            return density.of(r0, u, self.covector, self.widths[1], *density.parameters)
+        return density.of(*(self.from_drawn(u) if drawn else (r0, u)), *density.parameters)
+
+    def integral(self, density: Density, u: Jet) -> ufl.Form:
+        """Of a density."""
+        return self.value(density, u) * self.measure(density)
+
+    def energy(self, name: str, density: Density, amplitude: str | None = None, **others: Any) -> Energy:
+        """That of a density; `others` are attributes of `Energy`, and `drawn` as of `value`."""
+        drawn, work, over = others.pop("drawn", False), None, self.measure(density)
+        if virtual := density.work:
+            work = lambda u, v: virtual(self.j0, u, v, *density.parameters) * over  # noqa: E731
+        of = lambda u: self.value(density, u, drawn=drawn) * over  # noqa: E731
+        return Energy(name, of, amplitude, work=work, density=density, **others)
+
+
+def on_surface(r0: fem.Function, drawn: fem.Function | None = None) -> Carrier:
+    """The mid-surface, a mesh of triangles."""
+    domain, degree = r0.function_space.mesh, r0.function_space.element.basix_element.degree
+    between = ufl.avg(ufl.CellVolume(domain)) / ufl.avg(ufl.FacetArea(domain))
+    return Carrier(
+        r0,
+        lambda f: kin.jet(f, domain),
+        kin.facet_covector(domain),
+        (between, ufl.CellVolume(domain) / ufl.FacetArea(domain)),
+        rule=cell_quadrature(degree),
+        edge_rule=edge_quadrature(degree),
+        contact_rule=3 * degree,  # the pressure at the rim of a contact is narrower than an element
+        drawn=drawn,
+    )
+
+
+def on_meridian(r0: fem.Function, drawn: fem.Function | None = None) -> Carrier:
+    """The meridian, a mesh of intervals."""
+    domain, degree = r0.function_space.mesh, r0.function_space.element.basix_element.degree
+    along = jets.revolved(r0).r1
+    width = ufl.CellVolume(domain) / 2 * ufl.sqrt(ufl.dot(along, along))  # triangles have half their height
+    return Carrier(
+        r0,
+        jets.revolved,
+        ufl.as_vector([ufl.FacetNormal(domain)[0], 0]),  # the length of an edge is then that per radian
+        (ufl.avg(width), width),
+        rule=2 * degree + 2,  # one point more than the surface's: on the axis the densities are rational
+        edge_rule=None,
+        contact_rule=6 * degree,  # points are cheap here
+        whole=2 * np.pi,
+        drawn=drawn,
+    )
