@@ -1,6 +1,7 @@
 """The command line: a thin layer over the Python API. Each command imports only what it needs."""
 
 import gc
+import os
 import signal
 import sys
 import traceback
@@ -8,7 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from magshell_fenicsx.cli_pictures import plot, view
-from magshell_fenicsx.ending import STOPPED, exit_codes, failure, print_line, refuse_lost, world
+from magshell_fenicsx.ending import INVALID, STOPPED, exit_codes, failure, print_line, refuse_lost, world
 from magshell_fenicsx.platform.completion import case_files, left_to_the_shell
 from magshell_fenicsx.platform.plain import typer
 from magshell_fenicsx.platform.terminal import open_standard_streams
@@ -31,6 +32,8 @@ Result = Annotated[
     str, typer.Option(metavar="NAME", help="knockdown, critical_field, force@w_over_h=10, energy@end, ...")
 ]
 
+PETSC = ("-snes_", "-ksp_", "-mat_", "-magshell_", "-log_", "-options_")  # how its options begin
+
 
 def _folder(default: str) -> Any:
     return typer.Option(help=f"output folder; default {default}", autocompletion=left_to_the_shell)
@@ -44,9 +47,21 @@ def _chosen(out: str | None, default: str) -> Path:
         return Path("results") / default if out is None else given_folder(out)
 
 
+def _hand_over_to_petsc(words: list[str]) -> None:
+    """Take PETSc's options, which come last, off the words of a command; PETSc reads them when it is imported."""
+    first = next((i for i, word in enumerate(words) if word.startswith(PETSC)), len(words))
+    for word in words[first:]:
+        if word.startswith("--") or word.endswith((".yaml", ".yml")):
+            sys.exit(failure(f"{word} comes after {words[first]}: options of PETSc come last", INVALID).exit_code)
+    if words[first:]:
+        os.environ["PETSC_OPTIONS"] = " ".join([os.environ.get("PETSC_OPTIONS", ""), *words[first:]])
+    del words[first:]
+
+
 def main() -> None:
     """Run the program."""
     open_standard_streams()
+    _hand_over_to_petsc(sys.argv)
     gc.set_threshold(100_000, 5, 5)  # Python's own would look for garbage two hundred times in a small run
     signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # sent by `magshell ... | head`; PETSc would report a crash
     try:

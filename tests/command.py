@@ -40,7 +40,7 @@ def started(*arguments: str | Path | float, ranks: int = 0, pictures: bool = Tru
     """Run `magshell ...` in processes of its own, under mpirun if `ranks` is given."""
     launcher, words = mpirun(ranks) if ranks else [], [str(word) for word in arguments]
     undrawn = ["--no-pictures"] if words[:1] == ["run"] and not pictures else []
-    command = [*launcher, sys.executable, "-m", "magshell_fenicsx", *words, *undrawn]
+    command = [*launcher, sys.executable, "-m", "magshell_fenicsx", *words[:1], *undrawn, *words[1:]]
     return subprocess.run(command, capture_output=True, text=True, check=False)
 
 

@@ -259,3 +259,17 @@ def test_no_numbers(tmp_path: Path, words: tuple[str | Path, ...]) -> None:
     assert done.returncode == 2
     assert str(words[-1]) in done.stderr
     assert not (tmp_path / "out").exists()
+
+
+def test_options_of_petsc(tmp_path: Path) -> None:
+    done = started("run", *SMALL, "--out", tmp_path / "out", "-snes_monitor", "-snes_max_it", 30, pictures=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "0 SNES Function norm" in done.stdout
+
+
+def test_options_of_petsc_come_last(tmp_path: Path) -> None:
+    """Else PETSc would take a case file for the file into which it writes."""
+    done = started("run", "-snes_monitor", *SMALL, "--out", tmp_path / "out", pictures=False)
+    assert done.returncode == 2
+    assert "options of PETSc come last" in done.stderr
+    assert not (tmp_path / "out").exists()
