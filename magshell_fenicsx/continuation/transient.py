@@ -17,7 +17,7 @@ from magshell_fenicsx.continuation.device import Device
 from magshell_fenicsx.continuation.edge import join, split
 from magshell_fenicsx.continuation.factor import Factorisation
 from magshell_fenicsx.continuation.motion import Averaged, Ground, Motion, Viscous, constrained, held_back
-from magshell_fenicsx.continuation.newton import MOTION
+from magshell_fenicsx.continuation.snes import MOTION
 from magshell_fenicsx.continuation.system import Amplitudes, Edged, Skewed, State, System, Vector, dot, max_abs
 
 TOLERANCE = 1e-10  # of u in a step, over the system's length or, where that is longer, a tenth of the displacement

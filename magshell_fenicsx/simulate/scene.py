@@ -17,7 +17,8 @@ from magshell_fenicsx.case.imperfections.modes import ModesSection
 from magshell_fenicsx.case.opened import opened
 from magshell_fenicsx.continuation.journal import Journal, NoJournal
 from magshell_fenicsx.continuation.listener import NoProgress, Progress
-from magshell_fenicsx.continuation.newton import BorderedNewton, NewtonOptions
+from magshell_fenicsx.continuation.newton import BorderedNewton
+from magshell_fenicsx.continuation.snes import NewtonOptions
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.continuation.watch import Watch
 from magshell_fenicsx.input.source import CaseError
