@@ -39,7 +39,7 @@ from magshell_fenicsx.parts.magnetism.sources.source import SourceSection
 from magshell_fenicsx.parts.motion.viscosity import refuse_unfit_viscosity
 from magshell_fenicsx.parts.natural.section import NaturalSection, measured
 from magshell_fenicsx.parts.own import Origin
-from magshell_fenicsx.parts.part import Part, Scales, Setting
+from magshell_fenicsx.parts.part import Context, Part, Scales
 from magshell_fenicsx.parts.registered import PARTS, WithParts
 from magshell_fenicsx.parts.step import ProgrammeStep, Step
 from magshell_fenicsx.parts.supports.boundary import EDGES, BoundarySection, refuse_taken
@@ -147,7 +147,7 @@ class Case(WithParts):
         shell = self.shell
         refuse_taken(self.points)
         for key in self.parts:
-            self.setting.has_modulus(key)
+            self.context.has_modulus(key)
         if isinstance(shell, ShellSection):
             edges = EDGES[shell.geometry]
             for name in self.boundary.conditions():
@@ -200,7 +200,7 @@ class Case(WithParts):
     @model_validator(mode="after")
     def _bodies_fit(self) -> Self:
         for name, body in self.bodies.items():
-            self.setting.on_shell(f"bodies.{name}", 0.0 if body.at.point else body.at.polar)
+            self.context.on_shell(f"bodies.{name}", 0.0 if body.at.point else body.at.polar)
         refuse_unfit_bodies(self.bodies, solid=self.model == "solid")
         return self
 
@@ -208,22 +208,22 @@ class Case(WithParts):
     def _programme_fits(self) -> Self:
         density = self.time_unit is not None and self.shell.with_units
         refuse_unfit_viscosity(self.shell, self.natural, density=density, solid=self.model == "solid")
-        refuse_unfit_steps(self.setting)
+        refuse_unfit_steps(self.context)
         return self
 
     @cached_property
-    def setting(self) -> Setting:
+    def context(self) -> Context:
         """What its parts know of it."""
         sections = {key: getattr(self, key) for key in type(self).model_fields}
         sections["imperfections"] = self.imperfections
         whole, solid = isinstance(self.loading, list), self.model == "solid"
-        around = Setting(self.shell, self.points, sections, whole=whole, solid=solid)
+        around = Context(self.shell, self.points, sections, whole=whole, solid=solid)
         return replace(around, steps=programme(self.loading, around))
 
     @property
     def programme(self) -> tuple[ProgrammeStep, ...]:
         """Its steps; before a single load the natural shape grows, then the field."""
-        return tuple(self.setting.steps)
+        return tuple(self.context.steps)
 
     @property
     def approaches(self) -> dict[str, str]:
@@ -233,7 +233,7 @@ class Case(WithParts):
     def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
         """A copy with some sections changed, whose parts know it and not this one."""
         copied = super().model_copy(update=update, deep=deep)
-        copied.__dict__.pop("setting", None)
+        copied.__dict__.pop("context", None)
         return copied
 
     def loads_of(self, kind: type[AnyStep]) -> list[AnyStep]:
@@ -247,10 +247,8 @@ class Case(WithParts):
 
     @property
     def scales(self) -> Scales:
-        """What forces and stiffnesses are over; there is a modulus where something needs it."""
-        shell = self.shell
-        assert shell.modulus is not None
-        return Scales(shell.reference, shell.reference / shell.R_over_h, shell.modulus, shell.poisson_ratio)
+        """See `Context.scales`."""
+        return self.context.scales
 
     @property
     def degree(self) -> int:
@@ -289,7 +287,7 @@ class Case(WithParts):
     @property
     def lambda_m(self) -> float:
         """|Br||Ba|/(mu_0 E); 0 without a field."""
-        return strength(self.setting)
+        return strength(self.context)
 
     @property
     def sources(self) -> Sequence[SourceSection]:
@@ -298,8 +296,8 @@ class Case(WithParts):
 
     @property
     def time_unit(self) -> float | None:
-        """See `Setting.time_unit`."""
-        return self.setting.time_unit
+        """See `Context.time_unit`."""
+        return self.context.time_unit
 
     @property
     def outside(self) -> dict[str, str | None]:

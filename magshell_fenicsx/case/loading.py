@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeAlias, Union
 from pydantic import Discriminator, Field, Tag
 
 from magshell_fenicsx.input.chosen import Chosen
-from magshell_fenicsx.parts.part import Setting
+from magshell_fenicsx.parts.part import Context
 from magshell_fenicsx.parts.registered import FIRST, STEPS
 from magshell_fenicsx.parts.step import LEAST_TARGET, Gas, ProgrammeStep, Step
 
@@ -28,16 +28,16 @@ def listed(loading: Any) -> dict[str, Any]:
     return {"loading": loading} if loading else {}
 
 
-def programme(loading: Step | Sequence[Step] | None, setting: Setting) -> tuple[ProgrammeStep, ...]:
+def programme(loading: Step | Sequence[Step] | None, context: Context) -> tuple[ProgrammeStep, ...]:
     """The steps of a case: those of a list, or what comes before one load, and then that."""
     before: list[tuple[str, Step]] = []
     if not isinstance(loading, Sequence):
-        before = [pair for kind in FIRST for pair in STEPS[kind].before(setting, loading)]
+        before = [pair for kind in FIRST for pair in STEPS[kind].before(context, loading)]
     keyed = [*before, *listed(loading).items()]
     loads, known = [load for _, load in keyed], dict[str, list[Any]]()
     steps = []
     for number, (key, load) in enumerate(keyed, 1):
-        name = load.name_in(setting, loads)
+        name = load.name_in(context, loads)
         if name is None:
             places = known.setdefault(load.amplitude, [])
             if load.place not in places:
@@ -48,7 +48,7 @@ def programme(loading: Step | Sequence[Step] | None, setting: Setting) -> tuple[
     return tuple(steps)
 
 
-def refuse_unfit_steps(setting: Setting) -> None:
+def refuse_unfit_steps(context: Context) -> None:
     """See that each step has what it needs, a way to go, and known amplitudes to hold.
 
     Raises
@@ -56,19 +56,19 @@ def refuse_unfit_steps(setting: Setting) -> None:
     ValueError
         With the key and what is allowed.
     """
-    for step in setting.steps:
+    for step in context.steps:
         load, key = step.load, step.key
-        load.refuse_unfit(step, setting)
-        if step.name not in setting.driven_before(step.number) and load.target and load.target[1] == 0:
+        load.refuse_unfit(step, context)
+        if step.name not in context.driven_before(step.number) and load.target and load.target[1] == 0:
             raise ValueError(
                 f"{key}: the target must not be zero (at least {LEAST_TARGET:g} in size): the first step of a load "
                 "begins there"
             )
-        before = setting.before(step.number)
+        before = context.before(step.number)
         if before and not before[-1].load.rests and not load.in_time:
             kind = before[-1].kind
             raise ValueError(f"{key}: begins in equilibrium: the step of kind: {kind} before it needs until: rest")
-        _refuse_unfit_hold(step, setting.steps)
+        _refuse_unfit_hold(step, context.steps)
 
 
 def _refuse_unfit_hold(step: ProgrammeStep, steps: Sequence[ProgrammeStep]) -> None:

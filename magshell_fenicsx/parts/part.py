@@ -5,17 +5,23 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from magshell_fenicsx.input.section import Section
+from magshell_fenicsx.mesh.mirror import Mirror
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.quantities.quantity import Quantity
 from magshell_fenicsx.quantities.registry import register
+from magshell_fenicsx.shape.symmetry import Leaves
 
 if TYPE_CHECKING:
+    from magshell_fenicsx.models.shell.patterns import Inside
     from magshell_fenicsx.parts.step import ProgrammeStep, Step
+    from magshell_fenicsx.shape.outline import Outline
     from magshell_fenicsx.shape.sections import Surface
     from magshell_fenicsx.shape.shell import ShellSection
 
+Array = NDArray[np.float64]
 Kind = TypeVar("Kind")
 AnyStep = TypeVar("AnyStep", bound="Step")
 
@@ -36,7 +42,7 @@ class Scales:
 
 
 @dataclass(frozen=True)
-class Setting:
+class Context:
     """What is around a part in its case: it takes from this what it needs, and each room knows its own section.
 
     Attributes
@@ -112,13 +118,58 @@ class Setting:
             raise ValueError(f"{key}.at.polar: {polar:g} is not on the shell: allowed 0 to {edge - 1:g}")
 
     @property
+    def scales(self) -> Scales:
+        """What forces and stiffnesses are over; there is a modulus where something needs it."""
+        shell = self.shell
+        assert shell.modulus is not None
+        return Scales(shell.reference, shell.reference / shell.R_over_h, shell.modulus, shell.poisson_ratio)
+
+    @property
     def time_unit(self) -> float | None:
         """R √(ρ/E), that times are over: in seconds where the case has units; None without a density."""
         density, modulus = self.shell.density, self.shell.youngs_modulus
         return float(self.shell.reference * np.sqrt(density / modulus)) if density and modulus else None
 
 
-class Part(Section):
+@dataclass(frozen=True)
+class Modelled:
+    """The part of a shell that is modelled.
+
+    Attributes
+    ----------
+    outline
+        Of the shell with the imperfections that do not grow.
+    turn
+        Azimuth of the model's frame (rad).
+    mirror
+        Plane, in the model's frame, of the half that is modelled; None for all. A force on the plane, or on an edge
+        across it, is shared by the halves; the loads of an edge of the other half are left out.
+    vertices
+        Amplitude of a load at one place -> name of the vertex there.
+    within
+        Name of the patch of each dimple -> whether places (n, 3) are within its rim.
+    """
+
+    outline: "Outline"
+    turn: float
+    mirror: Mirror | None
+    vertices: Mapping[str, str]
+    within: "Mapping[str, Inside]"
+
+
+class Ability(Section):
+    """A section of the case file that adds something to a problem; by default nothing."""
+
+    def leaves(self, context: Context, outline: "Outline") -> list[Leaves]:
+        """The symmetry that it leaves of a shell."""
+        return []
+
+    def adds(self, context: Context, modelled: Modelled) -> dict[str, Any]:
+        """Fields of the model's `Loads`, to which those of other parts are added."""
+        return {}
+
+
+class Part(Ability):
     """A section of the case file whose energies are integrals over the mid-surface.
 
     A subclass needs one file and one line in `registered.py`. Its docstring and those of its keys appear in

@@ -1,14 +1,21 @@
 """The base of the steps of a programme: what a step drives, how, and how far."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Discriminator, Field, Tag, model_validator
 
 from magshell_fenicsx.input.section import Pressure, Section
-from magshell_fenicsx.parts.part import Setting
+from magshell_fenicsx.mesh.frame import rotation
+from magshell_fenicsx.mesh.grading import Feature
+from magshell_fenicsx.parts.part import Context, Modelled
+from magshell_fenicsx.shape.symmetry import Leaves
+
+if TYPE_CHECKING:
+    from magshell_fenicsx.shape.outline import Outline
 
 Until = Annotated[
     Literal["limit", "bifurcation", "target", "points", "zero"],
@@ -21,6 +28,7 @@ Until = Annotated[
 ]
 Count = Annotated[int, Field(ge=1, le=10000, description="Equal parts to the target, each a row; or steps")]
 LEAST_TARGET = 1e-9
+Array = NDArray[np.float64]
 Prescribed = Literal["load", "conjugate"]
 Control = Literal["load", "conjugate", "arc"]
 
@@ -212,15 +220,15 @@ class Step(Section):
         return None
 
     @classmethod
-    def before(cls, setting: Setting, loading: "Step | None") -> list[tuple[str, "Step"]]:
+    def before(cls, context: Context, loading: "Step | None") -> list[tuple[str, "Step"]]:
         """The steps of this kind that come before the only load of a case, each with the key that asks for it."""
         return []
 
-    def name_in(self, setting: Setting, loads: Sequence["Step"]) -> str | None:
+    def name_in(self, context: Context, loads: Sequence["Step"]) -> str | None:
         """The name of its amplitude beside all loads of a case; None: `amplitude`, with a number from the second on."""
         return None
 
-    def refuse_unfit(self, step: "ProgrammeStep", setting: Setting) -> None:
+    def refuse_unfit(self, step: "ProgrammeStep", context: Context) -> None:
         """See that the case has what the step needs.
 
         Raises
@@ -228,6 +236,90 @@ class Step(Section):
         ValueError
             With the key and what is allowed.
         """
+
+    def leaves(self, step: "ProgrammeStep", context: Context, outline: "Outline") -> list[Leaves]:
+        """The symmetry that it leaves of a shell."""
+        return []
+
+    def place_on(self, step: "ProgrammeStep", context: Context, outline: "Outline") -> Array | None:
+        """The one place (3,) over R where it is, in the frame of the case; None if it is not at one.
+
+        Raises
+        ------
+        CaseError
+            If it does not say where it is on this geometry.
+        """
+        return None
+
+    def chart_of(self, place: Array, outline: "Outline", turn: float, *, half: bool) -> Array:
+        """That place in the chart of a frame turned about e3 (rad)."""
+        chart = outline.inverse(rotation(turn) @ place)
+        return outline.on_half(chart) if half else chart
+
+    def refuse_unfit_place(self, step: "ProgrammeStep", context: Context, outline: "Outline", at: Array) -> None:
+        """See that there is room for it around its place in the chart.
+
+        Raises
+        ------
+        CaseError
+            With what is allowed.
+        """
+
+    def named_points(self) -> list[str]:
+        """The named points at which it is concentrated."""
+        return []
+
+    @classmethod
+    def around(cls, loads: Sequence[Self], place: Array, fit: "Fit") -> list[Feature]:
+        """Small elements around a place in the chart with these loads of the kind."""
+        return []
+
+    def growth(self, fit: "Fit") -> float:
+        """How fast elements may grow away from small ones."""
+        return 0.4
+
+    def rim(self, fit: "Fit") -> float:
+        """Size of elements along the edge of a curved surface, over sqrt(Rh)."""
+        return 1.4
+
+    def largest(self, fit: "Fit") -> float | None:
+        """Largest size of elements on a curved disc, over R; None: as without it."""
+        return None
+
+    def formulas(self, key: str, context: Context) -> Iterable[tuple[str, Any, float]]:
+        """Key and value of what may be formulas of the undeformed place in the shell's length, and their unit."""
+        return []
+
+    @classmethod
+    def implied(cls) -> dict[str, Any]:
+        """The same, where another step holds the amplitude of this kind or drives it in time."""
+        return {}
+
+    def adds(self, step: "ProgrammeStep", context: Context, modelled: Modelled) -> dict[str, Any]:
+        """Fields of the model's `Loads`, to which those of other parts are added."""
+        return {}
+
+
+@dataclass(frozen=True)
+class Fit:
+    """What element sizes depend on.
+
+    Attributes
+    ----------
+    h
+        Over R.
+    refinement
+        By which sizes are divided.
+    solid
+        Whether the body is modelled in three dimensions.
+    local
+        Whether the shell has a local imperfection.
+    """
+
+    h: float
+    refinement: float
+    solid: bool
+    local: bool
 
 
 @dataclass(frozen=True)

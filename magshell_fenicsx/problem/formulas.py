@@ -22,7 +22,6 @@ from magshell_fenicsx.mesh.shapes import DiscShape, Shape, StripShape
 from magshell_fenicsx.models.shell.fitted import Cells, fitted
 from magshell_fenicsx.models.shell.patterns import LARGEST as LARGEST_VECTOR
 from magshell_fenicsx.models.shell.thickness import LEAST_FACTOR, MOST_FACTOR
-from magshell_fenicsx.parts.forces.dead import DeadSection
 from magshell_fenicsx.parts.imperfections.flaw import Flaw
 from magshell_fenicsx.parts.natural.shape import LARGEST, SMALLEST
 from magshell_fenicsx.shape.outline import ANY, Outline
@@ -91,14 +90,9 @@ def _written(case: Case) -> Iterator[Written]:
         key = "magnetic.remanent.components"
         yield from one(key, case.magnetic.remanent.components, -LARGEST_VECTOR, LARGEST_VECTOR, 1.0)
     for step in case.programme:
-        if isinstance(step.load, DeadSection):
-            for i, load in enumerate(step.load.loads):
-                for name in ("per_length", "per_area", "pressure"):
-                    value = getattr(load, name)
-                    unit = case.scales.E * case.scales.h / (R if name != "per_length" else 1.0)
-                    most = LARGEST_VECTOR * unit
-                    values = value if isinstance(value, list) else [value]
-                    yield from one(f"{step.key}.loads.{i}.{name}", values, -most, most, load=True)
+        for key, value, unit in step.load.formulas(step.key, case.context):
+            most, values = LARGEST_VECTOR * unit, value if isinstance(value, list) else [value]
+            yield from one(key, values, -most, most, load=True)
     for name, least, most in (("stretch", SMALLEST, LARGEST), ("curvature", -CURVATURE / R, CURVATURE / R)):
         value = getattr(case.natural, name, None)
         values = value if isinstance(value, list) else [] if isinstance(value, dict) else [value]

@@ -2,7 +2,8 @@
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
-from math import inf, radians, sqrt
+from math import inf, sqrt
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,18 +20,18 @@ from magshell_fenicsx.mesh.rimmed import RimmedGrid
 from magshell_fenicsx.mesh.shapes import DiscShape, StripShape
 from magshell_fenicsx.models.axisymmetric.meridian import graded_vertices
 from magshell_fenicsx.models.shell.own_term import OwnTerm
-from magshell_fenicsx.models.shell.parameters import Condition, Held, Material
+from magshell_fenicsx.models.shell.parameters import Condition, Held, Loads, Material
 from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.parts.bodies.registered import body_leaves, contacts, pressed
-from magshell_fenicsx.parts.forces.dead import DeadSection
-from magshell_fenicsx.parts.forces.indentation import IndentationSection
-from magshell_fenicsx.parts.forces.loads import indented, loads, potentials, refuse_wide_patch
 from magshell_fenicsx.parts.imperfections.flaw import Flaw, in_frame
 from magshell_fenicsx.parts.imperfections.growth import grown_by
 from magshell_fenicsx.parts.imperfections.registered import flaws
 from magshell_fenicsx.parts.imperfections.rims import MOST_RIMS, Spot, different, spots
 from magshell_fenicsx.parts.imperfections.symmetry import leaves
-from magshell_fenicsx.parts.magnetism.magnetisation import magnetisation
+from magshell_fenicsx.parts.magnetism.magnetisation import applied, field_fits, magnetisation
+from magshell_fenicsx.parts.magnetism.magnetisation import leaves as leaves_of_field
+from magshell_fenicsx.parts.part import Ability, Modelled
+from magshell_fenicsx.parts.registered import STEPS
 from magshell_fenicsx.parts.supports.boundary import BoundarySection, EdgeCondition, HeldSection
 from magshell_fenicsx.problem.account import account
 from magshell_fenicsx.problem.columns import refuse_twice
@@ -42,7 +43,7 @@ from magshell_fenicsx.problem.problem import Plan
 from magshell_fenicsx.problem.sizes import Loaded, grading, travel
 from magshell_fenicsx.shape.outline import Chart, Outline, outline, refuse_beside
 from magshell_fenicsx.shape.sections import MeshSurface
-from magshell_fenicsx.shape.symmetry import Leaves, askew, field_fits, left, mirror, unmirrored
+from magshell_fenicsx.shape.symmetry import Leaves, askew, mirror, of_energy, of_points, of_shape, unmirrored
 
 Array = NDArray[np.float64]
 Points = dict[str, Array]
@@ -68,14 +69,16 @@ def make_plan(case: Case, terms: Sequence[OwnTerm] = ()) -> Plan:
     }
     still = {*found} - {key for keys in growing.values() for key in keys}
     drawn = imperfect(perfect, found, 0.0, still)
-    places = indented(case, drawn)
+    context, last = case.context, {step.name: step for step in case.programme}
+    at_place = {name: (step, step.load.place_on(step, context, drawn)) for name, step in last.items()}
+    places = {name: (step, place) for name, (step, place) in at_place.items() if place is not None}
     sample = np.zeros((0, 3)) if isinstance(case.shell, MeshSurface) else drawn.sample()
     refuse_unbounded_fields(case, sample)
     formulas = written(case)
     refuse_unfit_formulas(formulas, sample if len(sample) or not formulas else drawn.sample())
     terms = (*case.own_terms, *terms)
     energies = surface_terms(case, terms)
-    parts = left(case, drawn, places, (*energies, *potentials(case)))
+    parts = _left(case, drawn, energies)
     parts += leaves(found, perfect, each=bool(case.patches))
     parts += [body_leaves(contact) for contact in contacts(case, perfect, drawn, 0.0)]
     axisymmetric, plane = _symmetry(case, drawn, parts)
@@ -85,19 +88,18 @@ def make_plan(case: Case, terms: Sequence[OwnTerm] = ()) -> Plan:
         turn, beyond = plane.azimuth, Y0
     points = _named_points(case, drawn, turn, half)
     under = dict[str, str]()
-    for name, place in places.items():
-        load = _place(case, drawn, name, place, turn, half)
+    for name, (step, place) in places.items():
+        chart = step.load.chart_of(place, drawn, turn, half=half)
         candidates = (point for point in ("pole", *under.values()) if point in points)
-        same = (point for point in candidates if np.array_equal(points[point], load))
+        same = (point for point in candidates if np.array_equal(points[point], chart))
         under[name] = next(same, name.replace("force", "load"))
-        points[under[name]] = load
-    refuse_wide_patch(case, drawn, {name: points[point] for name, point in under.items()})
-    loaded: list[Loaded] = [
-        (points[load.at], []) for step in case.loads_of(DeadSection) for load in step.loads if load.at
-    ]
+        points[under[name]] = chart
+    for step in case.programme:
+        if step.name in under:
+            step.load.refuse_unfit_place(step, context, drawn, points[under[step.name]])
+    loaded: list[Loaded] = [(points[at], [step.load]) for step in case.programme for at in step.load.named_points()]
     for point in dict.fromkeys(under.values()):
-        there = (step.load for step in case.programme if under.get(step.name) == point)
-        loaded.append((points[point], [load for load in there if isinstance(load, IndentationSection)]))
+        loaded.append((points[point], [step.load for step in case.programme if under.get(step.name) == point]))
     local = [] if isinstance(case.shell, MeshSurface) else spots(found.items(), perfect, turn)
     wide = [flaw for flaw in found.values() if flaw.centre is None]
     everywhere, varying = min((flaw.size for flaw in wide), default=inf), list[Squares]()
@@ -122,7 +124,8 @@ def make_plan(case: Case, terms: Sequence[OwnTerm] = ()) -> Plan:
         conditions = {name: c for name, c in conditions.items() if name not in beyond.lost} | {CUT: "symmetry"}
     within = {name: in_frame(found[key].inside, turn) for name, key in case.dimples.items()}
     grown = {name: tuple(in_frame(f.deviation, turn) for f in each.values()) for name, each in growing.items()}
-    all_loads = replace(loads(case, under, turn, beyond, energies, within), contacts=bodies, growing=grown)
+    all_loads = _loads(case, Modelled(drawn, turn, beyond, under, within))
+    all_loads = replace(all_loads, magnetic=applied(case, turn, within), own=energies, contacts=bodies, growing=grown)
     magnetic = case.magnetic
     if magnetic and not all_loads.magnetic and field_fits(case, drawn, plane, axisymmetric=axisymmetric):
         all_loads = replace(all_loads, remanence=magnetisation(magnetic, case, turn, within))
@@ -157,6 +160,40 @@ def make_plan(case: Case, terms: Sequence[OwnTerm] = ()) -> Plan:
     )
     refuse_twice(case, plan)
     return plan
+
+
+def _left(case: Case, drawn: Outline, energies: Sequence[OwnTerm]) -> list[Leaves]:
+    """What each part of a case leaves of its symmetry."""
+    context = case.context
+    sections = [section for section in context.sections.values() if isinstance(section, Ability)]
+    return [
+        of_shape(case.shell, drawn),
+        *(leaves_of_field(case, drawn) if case.magnetic and case.lambda_m else []),
+        *(leaves for section in sections for leaves in section.leaves(context, drawn)),
+        *(leaves for step in case.programme for leaves in step.load.leaves(step, context, drawn)),
+        of_points(case.points.values(), case.shell.reference, drawn),
+        *(of_energy(term, drawn) for term in energies),
+    ]
+
+
+def _loads(case: Case, modelled: Modelled) -> Loads:
+    """What the parts of a case add to the loads of its model."""
+    context, last = case.context, {step.name: step for step in case.programme}
+    named = {*last, *(name for step in case.programme for name in (*step.load.drives, *step.load.hold))}
+    sections = [section for section in context.sections.values() if isinstance(section, Ability)]
+    fields: dict[str, Any] = {}
+    for added in (
+        *(kind.implied() for kind in STEPS.values() if getattr(kind, "amplitude", None) in named),
+        *(step.load.adds(step, context, modelled) for step in last.values()),
+        *(section.adds(context, modelled) for section in sections),
+    ):
+        for name, value in added.items():
+            before = fields.get(name)
+            if isinstance(value, dict):
+                fields[name] = {**(before or {}), **value}
+            else:
+                fields[name] = (*(before or ()), *value) if isinstance(value, tuple) else before or value
+    return Loads(**fields)
 
 
 def _wrong_unit(case: Case, places: Array) -> str | None:
@@ -259,17 +296,6 @@ def _named_points(case: Case, drawn: Outline, turn: float, half: bool) -> Points
     elif drawn.highest is not None:
         points["pole"] = drawn.highest
     return points
-
-
-def _place(case: Case, drawn: Outline, name: str, place: Array, turn: float, half: bool) -> Array:
-    """The place of an indentation in the chart."""
-    load = next(step.load for step in case.programme if step.name == name)
-    assert isinstance(load, IndentationSection)
-    if load.at.point is None and drawn.sphere:
-        polar, theta = radians(load.at.polar), radians(load.at.azimuth) - turn
-        return polar * np.array([np.cos(theta), 0.0 if half else np.sin(theta)]) if polar else np.zeros(2)
-    found = drawn.inverse(rotation(turn) @ place)
-    return drawn.on_half(found) if half else found
 
 
 def _cells(shape: Chart | RimmedGrid, size: Grading, *, half: bool) -> float:

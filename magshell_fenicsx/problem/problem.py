@@ -1,8 +1,7 @@
 """What a scene is built from."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from math import inf
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,46 +19,7 @@ from magshell_fenicsx.models.shell.parameters import Condition, Loads, Material
 from magshell_fenicsx.models.shell.patterns import Inside
 from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.problem.names import refuse_unfit
-
-
-@dataclass(frozen=True)
-class Span:
-    """A meridian, walked from the pole or one edge to the other.
-
-    Attributes
-    ----------
-    length
-        Of its chart, which starts at 0.
-    circles
-        Where the curvature jumps.
-    names
-        Of its ends; None for the pole.
-    embedding, normal
-        Chart (n, 2), its second coordinate 0 -> the plane of e1 and e3, and the normal of the perfect surface there.
-    place
-        Chart (2,) of the surface -> parameter of this one and azimuth (rad).
-    curvature
-        The largest of the meridian over 1/R, at least 1.
-    largest
-        Size of cells that shows the imperfections.
-    vertices
-        Those of its mesh, if that is given.
-    """
-
-    length: float
-    circles: tuple[float, ...]
-    names: tuple[str | None, str]
-    embedding: Embedding
-    normal: Embedding
-    place: Callable[[NDArray[np.float64]], tuple[float, float]]
-    curvature: float = 1.0
-    largest: float = inf
-    vertices: NDArray[np.float64] | None = None
-
-    def sample(self) -> NDArray[np.float64]:
-        """Places (n, 3) along it, its ends among them."""
-        s = np.linspace(0.0, self.length, 401)
-        return self.embedding(np.column_stack([s, 0 * s]))
+from magshell_fenicsx.shape.turning import Span
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,6 @@ from magshell_fenicsx.mesh.patch import Embedding, MeshError
 from magshell_fenicsx.mesh.revolved import Arc, Capped, Profile, Revolved, Segment, Spline
 from magshell_fenicsx.mesh.shapes import DiscShape, Shape, StripShape
 from magshell_fenicsx.mesh.sphere import flat, sphere, upwards
-from magshell_fenicsx.problem.problem import Span
 from magshell_fenicsx.shape.mirrors import grid_mirrors, lines_on, mesh_mirrors
 from magshell_fenicsx.shape.sections import (
     AnnulusSurface,
@@ -32,6 +31,7 @@ from magshell_fenicsx.shape.sections import (
     TorusSurface,
 )
 from magshell_fenicsx.shape.shell import ShellSection
+from magshell_fenicsx.shape.turning import Span
 
 Array = NDArray[np.float64]
 Chart = Shape | Grid | MeshFile

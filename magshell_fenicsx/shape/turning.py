@@ -1,13 +1,15 @@
-"""Whether a formula of x, y, z is the same along every meridian."""
+"""A meridian, and whether a formula of x, y, z is the same along every one."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from math import inf
 
 import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.input.expressions import formula
 from magshell_fenicsx.mesh.frame import rotation
-from magshell_fenicsx.problem.problem import Span
+from magshell_fenicsx.mesh.patch import Embedding
 
 ANGLES = [
     2.399963 * i for i in range(720)
@@ -15,6 +17,46 @@ ANGLES = [
 Array = NDArray[np.float64]
 NEAR = 0.1  # over R
 SAME = 1e-9  # of the largest value: differences that are rounding
+
+
+@dataclass(frozen=True)
+class Span:
+    """A meridian, walked from the pole or one edge to the other.
+
+    Attributes
+    ----------
+    length
+        Of its chart, which starts at 0.
+    circles
+        Where the curvature jumps.
+    names
+        Of its ends; None for the pole.
+    embedding, normal
+        Chart (n, 2), its second coordinate 0 -> the plane of e1 and e3, and the normal of the perfect surface there.
+    place
+        Chart (2,) of the surface -> parameter of this one and azimuth (rad).
+    curvature
+        The largest of the meridian over 1/R, at least 1.
+    largest
+        Size of cells that shows the imperfections.
+    vertices
+        Those of its mesh, if that is given.
+    """
+
+    length: float
+    circles: tuple[float, ...]
+    names: tuple[str | None, str]
+    embedding: Embedding
+    normal: Embedding
+    place: Callable[[NDArray[np.float64]], tuple[float, float]]
+    curvature: float = 1.0
+    largest: float = inf
+    vertices: NDArray[np.float64] | None = None
+
+    def sample(self) -> NDArray[np.float64]:
+        """Places (n, 3) along it, its ends among them."""
+        s = np.linspace(0.0, self.length, 401)
+        return self.embedding(np.column_stack([s, 0 * s]))
 
 
 def scalar_turns(text: str, span: Span, length: float = 1.0) -> bool:

@@ -68,7 +68,7 @@ def changed(scene: Scene, name: str, along: Direction, c: float) -> Scene:
     if name == "thickness":
         one = Thickness(lambda x, y, z: 1 + c * along(np.stack([x, y, z], axis=-1)))
         return Scene(scene.case, scene.comm, replace(plan, thickness=one))
-    natural = plan.loads.natural or Natural(np.zeros(3), None, frame(scene.case, plan.azimuth))
+    natural = plan.loads.natural or Natural(np.zeros(3), None, frame(scene.case.context, plan.azimuth))
     drawn = natural.curvature
 
     def curvature(r0: Array, n0: Array) -> Array:

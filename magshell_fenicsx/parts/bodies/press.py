@@ -7,7 +7,7 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import Field
 
 from magshell_fenicsx.input.targets import over
-from magshell_fenicsx.parts.part import Setting
+from magshell_fenicsx.parts.part import Context
 from magshell_fenicsx.parts.step import Control, Count, Now, PathStep, ProgrammeStep, Step, Target, Until
 from magshell_fenicsx.parts.supports.motion import Name
 from magshell_fenicsx.quantities.units import POINT_FORCE, THICKNESS
@@ -47,13 +47,13 @@ class ContactSection(PathStep):
     def place(self) -> Any:
         return self.body
 
-    def name_in(self, setting: Setting, loads: Sequence[Step]) -> str:
-        names = approaches(setting.sections["bodies"], loads)
+    def name_in(self, context: Context, loads: Sequence[Step]) -> str:
+        names = approaches(context.sections["bodies"], loads)
         body = str(self.body or next(iter(names), ""))
         return names.get(body, self.amplitude)
 
-    def refuse_unfit(self, step: ProgrammeStep, setting: Setting) -> None:
-        bodies: Mapping[str, object] = setting.sections["bodies"]
+    def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
+        bodies: Mapping[str, object] = context.sections["bodies"]
         if (self.body is None and len(bodies) != 1) or (self.body is not None and self.body not in bodies):
             known = ", ".join(bodies) or "none: give it in bodies"
             raise ValueError(f"{step.key}.body: {self.body or 'is missing'}; allowed: {known}")

@@ -1,15 +1,33 @@
 """Dead loads, which keep their direction."""
 
-from math import copysign
-from typing import Annotated, Any, ClassVar, Literal, Self
+from collections.abc import Iterable, Sequence
+from math import copysign, sqrt
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
+import numpy as np
+import ufl
+from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field, model_validator
+from ufl.core.expr import Expr
 
-from magshell_fenicsx.input.expressions import Formula, is_formula
+from magshell_fenicsx.input.by_formula import function
+from magshell_fenicsx.input.expressions import Formula, is_formula, symbolic
 from magshell_fenicsx.input.section import Section, in_units, or_number
-from magshell_fenicsx.parts.part import Setting
-from magshell_fenicsx.parts.step import Count, Now, PathStep, ProgrammeStep, Target, Until
+from magshell_fenicsx.mesh.grading import Disc, Feature
+from magshell_fenicsx.mesh.mirror import ROUNDING, Mirror
+from magshell_fenicsx.models.shell.kinematics import Jet
+from magshell_fenicsx.models.shell.own_term import OwnTerm
+from magshell_fenicsx.parts.part import Context, Modelled, Scales
+from magshell_fenicsx.parts.step import Count, Fit, Now, PathStep, ProgrammeStep, Target, Until
+from magshell_fenicsx.shape.symmetry import Leaves, alike, of_energy, tilted, unit
+from magshell_fenicsx.shape.turning import Span, scalar_turns, vector_turns
 
+if TYPE_CHECKING:
+    from magshell_fenicsx.shape.outline import Outline
+
+Array = NDArray[np.float64]
+SYMBOLIC = {name: getattr(ufl, name) for name in ("sin", "cos", "tan", "exp", "sqrt", "sign")}
+SYMBOLIC |= {"log": ufl.ln, "abs": abs, "arctan2": ufl.atan2}
 Finite = Annotated[float, Field(ge=-1e30, le=1e30)]
 Moment = Annotated[float, or_number("newton", Finite), Field(ge=-1e30, le=1e30)]
 Three = Field(min_length=3, max_length=3)
@@ -154,13 +172,115 @@ class DeadSection(PathStep):
     def held_conjugate(self) -> bool:
         return not (self.turns or self.by_place)
 
-    def refuse_unfit(self, step: ProgrammeStep, setting: Setting) -> None:
-        setting.has_modulus("loads of kind: dead")
+    def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
+        context.has_modulus("loads of kind: dead")
         for i, load in enumerate(self.loads):
-            setting.has_point(f"{step.key}.loads.{i}.at", load.at)
+            context.has_point(f"{step.key}.loads.{i}.at", load.at)
 
     def first(self, change: float, now: Now, *, by_load: bool) -> float:
         return change / self.points if by_load else copysign(1e-3, change)
 
     def step(self, change: float | None, now: Now) -> float | None:
         return abs(change) / self.points if self.control == "displacement" and change else None
+
+    def leaves(self, step: ProgrammeStep, context: Context, outline: "Outline") -> list[Leaves]:
+        R, span = context.shell.reference, outline.span
+        fixed = [load for load in self.loads if not load.varies]
+        forces = [np.array(v) for load in fixed for v in (load.force, load.per_length, load.per_area) if v]
+        places = [np.array(context.points[load.at]) / R for load in self.loads if load.at]
+        vectors = [unit(v) for v in (*forces, *places)]
+        x = outline.sample() if len(fixed) < len(self.loads) else np.zeros((0, 3))
+        patches = any(load.over not in (None, "all") for load in self.loads)
+
+        def mirrors(mirror: Mirror) -> bool:
+            on_plane = all(abs(float(mirror.beyond(place))) < ROUNDING for place in places)
+            return on_plane and all(any(is_image(a, b, mirror, x, R) for b in self.loads) for a in self.loads)
+
+        why = "a patch is loaded" if patches else None
+        if any(tilted(v) for v in vectors):
+            why = "a load is not along e3, or off the axis"
+        if span and not all(load_turns(load, span, R) for load in self.loads if load.varies):
+            why = why or "a load differs around e3"
+        potentials = [load.potential for load in self.loads if load.potential]
+        energies = [potential(f"potential_{i}", text, np.eye(3), context.scales) for i, text in enumerate(potentials)]
+        return [Leaves(why, vectors, mirrors), *(of_energy(energy, outline) for energy in energies)]
+
+    def named_points(self) -> list[str]:
+        return [load.at for load in self.loads if load.at]
+
+    @classmethod
+    def around(cls, loads: Sequence[Self], place: Array, fit: Fit) -> list[Feature]:
+        x, y = map(float, place)
+        return [Disc((x, y), 0.0, fit.h, loads[0].growth(fit))]
+
+    def largest(self, fit: Fit) -> float | None:
+        size = 2 * sqrt(fit.h)
+        return size if size < 0.35 else None
+
+    def formulas(self, key: str, context: Context) -> Iterable[tuple[str, Any, float]]:
+        scales = context.scales
+        for i, load in enumerate(self.loads):
+            for name in ("per_length", "per_area", "pressure"):
+                unit = scales.E * scales.h / (scales.R if name != "per_length" else 1.0)
+                yield f"{key}.loads.{i}.{name}", getattr(load, name), unit
+
+    def adds(self, step: ProgrammeStep, context: Context, modelled: Modelled) -> dict[str, Any]:
+        from magshell_fenicsx.parts.forces.loads import dead_load  # the solver takes long to import
+
+        mirror = modelled.mirror
+        here = (load for load in self.loads if not mirror or load.edge not in mirror.lost)
+        made = (dead_load(load, f"{step.name}_potential_{i}", context, modelled) for i, load in enumerate(here))
+        return {"dead": {step.name: tuple(made)}}
+
+
+def load_turns(load: DeadLoadSection, span: Span, R: float) -> bool:
+    """Whether a load by formula is the same all around e3."""
+    if load.vector is None:
+        return scalar_turns(str(load.pressure), span, R)
+    return vector_turns([str(v) for v in load.vector], span, R)
+
+
+def is_image(load: DeadLoadSection, other: DeadLoadSection, mirror: Mirror, x: Array, R: float) -> bool:
+    """Whether the plane mirrors one load to the other; x are places (n, 3) for formulas."""
+    if load.varies or other.varies:
+        return _mirrored_formula(load, other, mirror, R * x, R * mirror.image(x))
+    edge = load.edge and mirror.other(load.edge)
+    if (edge, load.at, load.over, load.moment, load.pressure, load.potential is None) != (
+        other.edge,
+        other.at,
+        other.over,
+        other.moment,
+        other.pressure,
+        other.potential is None,
+    ):
+        return False
+    for here, there in ((getattr(x, key) for x in (load, other)) for key in ("force", "per_length", "per_area")):
+        if (here is None) != (there is None):
+            return False
+        if here and np.abs(mirror.reflection @ here - there).max() > 1e-10 * np.linalg.norm(here):
+            return False
+    return True
+
+
+def _mirrored_formula(load: DeadLoadSection, other: DeadLoadSection, mirror: Mirror, x: Array, image: Array) -> bool:
+    edge = load.edge and mirror.other(load.edge)
+    if (edge, load.over, load.vector is None) != (other.edge, other.over, other.vector is None):
+        return False
+    values, images = (
+        np.stack([function(v)(*places.T) for v in (each.vector or [each.pressure or 0.0])], axis=-1)
+        for each, places in ((load, x), (other, image))
+    )
+    return alike(values if load.vector is None else values @ mirror.reflection, images)
+
+
+def potential(name: str, text: str, Q: Array, scales: Scales) -> OwnTerm:
+    """The energy of a load that depends on the deformed place, zero where nothing has moved."""
+
+    def at(r: Expr, scale: Expr, size: Expr) -> Expr:
+        x = [scale * sum(float(Q[j, i]) * r[j] for j in range(3) if Q[j, i]) for i in range(3)]
+        return size * symbolic(text, SYMBOLIC, *x)
+
+    def density(r0: Jet, u: Jet, scale: Expr, size: Expr) -> Expr:
+        return at(r0.r + u.r, scale, size) - at(r0.r, scale, size)
+
+    return OwnTerm(name, density, (scales.R, 1 / (scales.E * scales.h)))

@@ -1,15 +1,27 @@
 """A force that pushes on one place."""
 
-from math import copysign
-from typing import Annotated, Any, ClassVar, Literal, Self
+from collections.abc import Sequence
+from math import copysign, radians, sqrt
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from magshell_fenicsx.input.direction import Direction
+from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.input.targets import over
-from magshell_fenicsx.parts.part import Setting
-from magshell_fenicsx.parts.step import Count, Now, PathStep, ProgrammeStep, Target, Until
+from magshell_fenicsx.mesh.grading import Disc, Feature
+from magshell_fenicsx.mesh.mirror import ROUNDING
+from magshell_fenicsx.parts.part import Context, Modelled
+from magshell_fenicsx.parts.step import Count, Fit, Now, PathStep, ProgrammeStep, Target, Until
 from magshell_fenicsx.quantities.units import POINT_FORCE, THICKNESS
+from magshell_fenicsx.shape.symmetry import Leaves, tilted
+
+if TYPE_CHECKING:
+    from magshell_fenicsx.shape.outline import Outline
+
+Array = NDArray[np.float64]
 
 LEAST_HUMP = 0.01  # F of the first step towards the top of an energy barrier
 
@@ -58,14 +70,78 @@ class IndentationSection(PathStep):
     def place(self) -> Any:
         return self.at, self.patch
 
-    def refuse_unfit(self, step: ProgrammeStep, setting: Setting) -> None:
-        setting.on_shell(step.key, self.at.polar)
-        setting.has_point(f"{step.key}.at.point", self.at.point)
-        if setting.solid and not self.patch:
+    def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
+        context.on_shell(step.key, self.at.polar)
+        context.has_point(f"{step.key}.at.point", self.at.point)
+        if context.solid and not self.patch:
             raise ValueError(
                 "loading.patch: 0: a point force sinks into a solid without limit; give the patch its radius over h "
                 "(of the paper's indenter, 0.2 mm at R = 25.2 mm, with R/h = 90: 0.714)"
             )
+
+    def leaves(self, step: ProgrammeStep, context: Context, outline: "Outline") -> list[Leaves]:
+        place = self.place_on(step, context, outline)
+        reason = "the force is not at the pole" if tilted(place) else None
+        return [Leaves(reason, [place], lambda mirror: bool(abs(mirror.beyond(place)) < ROUNDING))]
+
+    def place_on(self, step: ProgrammeStep, context: Context, outline: "Outline") -> Array:
+        at, geometry, key = self.at, context.shell.geometry, step.key
+        if at.point is not None:
+            return np.asarray(np.array(context.points[at.point]) / context.shell.reference)
+        polar = radians(at.polar)
+        if not outline.sphere and polar:
+            where = "at its centre or tip, polar: 0, or at a point of points"
+            raise CaseError(f"{key}.at.polar: {at.polar:g}: a {geometry} is loaded {where}")
+        if outline.highest is None or not (outline.disc or geometry == "strip"):
+            raise CaseError(f"{key}.at: a {geometry} has no pole: give {{point: NAME}}, of points")
+        if not outline.sphere:
+            return np.asarray(outline.embedding(outline.highest[None])[0])
+        if 0 < polar < 1 / context.shell.R_over_h:
+            raise CaseError(f"{key}.at.polar: {at.polar:g}: 0, or more than a thickness from the pole")
+        chart = polar * at.vector()[:2] / max(np.hypot(*at.vector()[:2]), 1e-300)
+        return np.asarray(outline.embedding(chart[None])[0])
+
+    def chart_of(self, place: Array, outline: "Outline", turn: float, *, half: bool) -> Array:
+        if self.at.point is not None or not outline.sphere:
+            return super().chart_of(place, outline, turn, half=half)
+        polar, theta = radians(self.at.polar), radians(self.at.azimuth) - turn
+        return polar * np.array([np.cos(theta), 0.0 if half else np.sin(theta)]) if polar else np.zeros(2)
+
+    def refuse_unfit_place(self, step: ProgrammeStep, context: Context, outline: "Outline", at: Array) -> None:
+        width = getattr(context.shell, "width", None) if context.shell.geometry == "strip" else None
+        room = outline.edge - float(np.hypot(*at[:2])) if outline.sphere else min(1.0, width or 1.0)
+        most = room * context.shell.R_over_h
+        if self.patch and not 0.3 <= self.patch <= most:
+            raise CaseError(
+                f"{step.key}.patch: {self.patch:g}: allowed are 0 for a point, or 0.3 to {most:.4g}, where it "
+                "reaches the edge"
+            )
+
+    @classmethod
+    def around(cls, loads: Sequence[Self], place: Array, fit: Fit) -> list[Feature]:
+        """The dent too: by mirror buckling the radius of its ridge is about sqrt(2 R w)."""
+        h, (x, y) = fit.h, map(float, place)
+        patch = min(load.patch for load in loads)
+        depth = max(abs(load.depth) if load.depth else 10.0 for load in loads)
+        dent = (1.0 if fit.solid else 0.85) * sqrt(2 * depth * h) + 0.5 * sqrt(h)
+        growth = loads[0].growth(fit)
+        # finer than h the point force's logarithmic stretch would be resolved, which has no limit
+        return [
+            Disc((x, y), dent, sqrt(h) / fit.refinement, growth),
+            Disc((x, y), patch * h, max(patch * h / 2, h), growth),
+        ]
+
+    def growth(self, fit: Fit) -> float:
+        return 0.5 if fit.solid else 0.6  # far from the ridge degree 2 needs more than degree 4
+
+    def rim(self, fit: Fit) -> float:
+        """Of a hemisphere the edge is far from a dent."""
+        return 2.0 if fit.solid else 2.8
+
+    def adds(self, step: ProgrammeStep, context: Context, modelled: Modelled) -> dict[str, Any]:
+        from magshell_fenicsx.models.shell.parameters import Force  # the solver takes long to import
+
+        return {"forces": {step.name: Force(modelled.vertices[step.name], self.patch / context.shell.R_over_h)}}
 
     def first(self, change: float, now: Now, *, by_load: bool) -> float:
         if self.until == "zero":

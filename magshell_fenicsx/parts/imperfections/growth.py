@@ -5,7 +5,7 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import Field
 
-from magshell_fenicsx.parts.part import Setting
+from magshell_fenicsx.parts.part import Context
 from magshell_fenicsx.parts.step import PathStep, ProgrammeStep, Target, Until
 
 
@@ -32,10 +32,10 @@ class ImperfectionStep(PathStep):
     def place(self) -> Any:
         return self.item
 
-    def refuse_unfit(self, step: ProgrammeStep, setting: Setting) -> None:
-        keys: Mapping[str, object] = setting.sections["imperfections"]
-        names = setting.loads(ImperfectionStep)
-        if setting.solid:
+    def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
+        keys: Mapping[str, object] = context.sections["imperfections"]
+        names = context.loads(ImperfectionStep)
+        if context.solid:
             raise ValueError(f"{step.key}.kind: imperfection: is of a shell, not of a solid")
         if not keys:
             raise ValueError(f"{step.key}.kind: imperfection: the case has none; give shell.imperfections")

@@ -1,6 +1,6 @@
 """The applied field as a load: its strength and its direction."""
 
-from typing import Annotated, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,8 +8,12 @@ from pydantic import Field
 
 from magshell_fenicsx.input.direction import Direction
 from magshell_fenicsx.parts.magnetism.fields import MagneticSection, strength
-from magshell_fenicsx.parts.part import Setting
+from magshell_fenicsx.parts.part import Context
 from magshell_fenicsx.parts.step import Drive, Now, PathStep, ProgrammeStep, Step, Target, Until
+from magshell_fenicsx.shape.symmetry import Leaves
+
+if TYPE_CHECKING:
+    from magshell_fenicsx.shape.outline import Outline
 
 SAME = 1e-9  # cosine of directions: rounding
 
@@ -38,12 +42,12 @@ class FieldSection(PathStep):
         return now.size
 
     @classmethod
-    def before(cls, setting: Setting, loading: Step | None) -> list[tuple[str, Step]]:
+    def before(cls, context: Context, loading: Step | None) -> list[tuple[str, Step]]:
         driven = loading is not None and cls.amplitude in (loading.amplitude, *loading.drives)
-        return [] if driven or not strength(setting) else [("magnetic", FieldBefore(kind="field"))]
+        return [] if driven or not strength(context) else [("magnetic", FieldBefore(kind="field"))]
 
-    def refuse_unfit(self, step: ProgrammeStep, setting: Setting) -> None:
-        if not strength(setting):
+    def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
+        if not strength(context):
             raise ValueError(f"{step.key}.kind: field needs magnetic.lambda_m, not zero, for its target or direction")
 
 
@@ -69,22 +73,25 @@ class RotationSection(Step):
     points: Annotated[int, Field(ge=1, le=10000)] = 12
     """Equal angles to it"""
 
-    def refuse_unfit(self, step: ProgrammeStep, setting: Setting) -> None:
-        before = direction_before(step.number, setting)
-        if before is None or not strength(setting):
+    def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
+        before = direction_before(step.number, context)
+        if before is None or not strength(context):
             raise ValueError(f"{step.key}.kind: rotation needs a field: magnetic.lambda_m, not zero")
-        driven = setting.driven_before(step.number)
-        if setting.whole and FieldSection.amplitude not in driven:
+        driven = context.driven_before(step.number)
+        if context.whole and FieldSection.amplitude not in driven:
             raise ValueError(f"{step.key}.kind: rotation needs a field: a step of kind: field before it")
         if abs(before @ self.to.vector()) > 1 - SAME:
             where = "the field at its beginning" if self.amplitude in driven else "magnetic.applied"
             raise ValueError(f"{step.key}.to: must be neither parallel nor opposite to {where}")
 
+    def leaves(self, step: ProgrammeStep, context: Context, outline: "Outline") -> list[Leaves]:
+        return [Leaves("the field turns", [self.to.vector()])]
 
-def direction_before(number: int, setting: Setting) -> NDArray[np.float64] | None:
+
+def direction_before(number: int, context: Context) -> NDArray[np.float64] | None:
     """The unit vector (3,) of the field where a step begins; None without a field."""
-    turned = [step.load.to for step in setting.before(number) if isinstance(step.load, RotationSection)]
+    turned = [step.load.to for step in context.before(number) if isinstance(step.load, RotationSection)]
     if turned:
         return turned[-1].vector()
-    magnetic = setting.of(MagneticSection)
+    magnetic = context.of(MagneticSection)
     return magnetic.applied.vector() if magnetic else None

@@ -12,7 +12,7 @@ from magshell_fenicsx.input.direction import Direction
 from magshell_fenicsx.input.expressions import Formula
 from magshell_fenicsx.input.file import FileKeys
 from magshell_fenicsx.input.section import FluxDensity, Section
-from magshell_fenicsx.parts.part import Setting
+from magshell_fenicsx.parts.part import Context
 
 MU_0 = 4e-7 * pi  # T m/A
 
@@ -180,7 +180,7 @@ class MagneticSection(Section):
         return Br * Ba / (MU_0 * youngs_modulus)
 
 
-def strength(setting: Setting) -> float:
+def strength(context: Context) -> float:
     """lambda_m of a case; 0 without a field."""
-    magnetic = setting.of(MagneticSection)
-    return magnetic.amplitude(setting.shell.youngs_modulus) if magnetic else 0.0
+    magnetic = context.of(MagneticSection)
+    return magnetic.amplitude(context.shell.youngs_modulus) if magnetic else 0.0

@@ -1,6 +1,6 @@
 """The field section in the model's frame."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,12 +10,17 @@ from magshell_fenicsx.input.controls import read_vectors
 from magshell_fenicsx.input.direction import Direction
 from magshell_fenicsx.input.expressions import formula
 from magshell_fenicsx.mesh.frame import rotation
+from magshell_fenicsx.mesh.mirror import Mirror
 from magshell_fenicsx.models.shell.controls import ByControls, Controls
 from magshell_fenicsx.models.shell.parameters import Magnetisation
 from magshell_fenicsx.models.shell.patterns import Components, Inside, Pattern, WithinRims, radial, tangential
+from magshell_fenicsx.parts.magnetism.field_step import FieldSection, RotationSection
 from magshell_fenicsx.parts.magnetism.fields import MagneticSection, RemanentSection, layer_average
-from magshell_fenicsx.parts.magnetism.sources.field import in_space, turns
+from magshell_fenicsx.parts.magnetism.sources.field import in_space, turns, values
+from magshell_fenicsx.shape.outline import Outline
 from magshell_fenicsx.shape.sections import MeshSurface
+from magshell_fenicsx.shape.symmetry import PARALLEL, Leaves, alike, tilted
+from magshell_fenicsx.shape.turning import beside, field_turns, vector_turns, vectors_of
 
 Array = NDArray[np.float64]
 SAME = 1e-9  # part of a direction outside a plane: rounding
@@ -92,3 +97,71 @@ def magnetisation(
         driven,
         turns(case, turn),
     )
+
+
+def leaves(case: Case, outline: Outline) -> list[Leaves]:
+    """Remanence and applied field must both be symmetric to a plane, or both antisymmetric."""
+    magnetic = case.magnetic
+    assert magnetic
+    known = magnetic.applied.components if magnetic.applied.beside else None
+    alone = known or not magnetic.applied.beside
+    vectors = [d.vector() for d in (*magnetic.remanent.directions(), *([] if alone else [magnetic.applied]))]
+    whole = turns(case)  # then the rotation is a part of the field at each place
+    turning = [] if whole else [load.to.vector() for load in case.loads_of(RotationSection)]
+    remanent, G = magnetic.remanent, np.array(magnetic.applied.gradient or np.zeros((3, 3)))
+    fields: list[Callable[[Array], Array]] = [lambda x: np.asarray(x @ G.T)] if G.any() else []
+    fields += [vectors_of(texts) for texts in (remanent.components, known) if texts]
+    askew = ["a field is not along e3"] if any(tilted(v) for v in vectors) else []
+    if remanent.file:
+        by_place = by_points(remanent)
+        fields.append(lambda x: by_place(x, x))
+        askew += [] if by_place.controls.around else ["the remanence is given at points in space"]
+    if remanent.components and not (outline.span and vector_turns(remanent.components, outline.span)):
+        askew.append("the formula of the remanence differs around e3")
+    if known and not (outline.span and vector_turns(known, outline.span, in_space=True)):
+        askew.append("the formula of the applied field differs around e3")
+    sources = values(case) if case.sources or whole else []
+    if sources and not (outline.span and all(field_turns(field, outline.span) for field in sources)):
+        askew.append("the field of a source differs around e3")
+    if np.abs(G - np.diag([G[0, 0], G[0, 0], G[2, 2]])).max() > PARALLEL:
+        askew.append("the gradient of the applied field is not diag(a, a, b)")
+
+    def mirrors(mirror: Mirror) -> bool:
+        S, x = mirror.reflection, outline.sample() if fields or sources else np.zeros((0, 3))
+        x = beside(x) if known else x
+
+        def images(sign: float) -> bool:
+            uniform = all(np.abs(S @ v - sign * v).max() <= 1e-10 for v in (*vectors, *turning))
+            few = x[:: len(x) // 50 + 1]  # the field of a source is smooth
+            varying = all(
+                alike(sign * np.einsum("ni,ij->nj", field(places), S), field(mirror.image(places)))
+                for field, places in (*((field, x) for field in fields), *((field, few) for field in sources))
+            )
+            kinds = {"radial": 1.0, "tangential": float(S[2, 2])}
+            return uniform and varying and kinds.get(remanent.kind, sign) == sign
+
+        return images(1.0) or images(-1.0)
+
+    return [Leaves(next(iter(askew), None), [*vectors, *_of_sources(case)], mirrors)]
+
+
+def _of_sources(case: Case) -> list[Array]:
+    """What a mirror plane through e3 may hold: the places of sources, or the axes of those on e3."""
+    places = [np.array(source.position) / case.shell.reference for source in case.sources]
+    axes = [source.axes[:, 2] for source in case.sources]
+    return [place if tilted(place) else axis for place, axis in zip(places, axes, strict=True)]
+
+
+def field_fits(case: Case, outline: Outline, plane: Mirror | None, *, axisymmetric: bool) -> bool:
+    """Whether a reduced model shows the remanence as it is, where without a field it does not reduce the model."""
+    (part,) = leaves(case, outline)
+    return (part.askew is None or not axisymmetric) and (plane is None or part.mirrors(plane))
+
+
+def applied(case: Case, turn: float, within: Mapping[str, Inside]) -> Magnetisation | None:
+    """What is magnetised where a step drives the field; None without."""
+    driven = {name for step in case.programme for name in (step.name, *step.load.drives)}
+    if case.magnetic is None or FieldSection.amplitude not in driven:
+        return None
+    turned = [step.load.to for step in case.programme if isinstance(step.load, RotationSection)]
+    return magnetisation(case.magnetic, case, turn, within, turned)

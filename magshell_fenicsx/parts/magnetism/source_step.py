@@ -9,7 +9,7 @@ from magshell_fenicsx.input.section import Section
 from magshell_fenicsx.parts.magnetism.field_step import FieldSection
 from magshell_fenicsx.parts.magnetism.fields import MagneticSection
 from magshell_fenicsx.parts.magnetism.sources.source import SourceSection
-from magshell_fenicsx.parts.part import Setting
+from magshell_fenicsx.parts.part import Context
 from magshell_fenicsx.parts.step import Count, Now, PathStep, ProgrammeStep, Target, Until
 from magshell_fenicsx.parts.supports.motion import Finite, Lengths, Name
 from magshell_fenicsx.quantities.registry import QUANTITIES, TAKEN
@@ -92,8 +92,8 @@ class SourceStep(PathStep):
             return self.source if 0 <= self.source < len(sources) else None
         return next((i for i, one in enumerate(sources) if one.name == self.source), None)
 
-    def refuse_unfit(self, step: ProgrammeStep, setting: Setting) -> None:
-        magnetic, key = setting.of(MagneticSection), step.key
+    def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
+        magnetic, key = context.of(MagneticSection), step.key
         sources = (magnetic.applied.sources if magnetic else None) or []
         if self.number(sources) is None:
             names = [one.name or str(i) for i, one in enumerate(sources)]
@@ -101,9 +101,9 @@ class SourceStep(PathStep):
                 f"{key}.source: {self.source}: magnetic.applied.sources has no such source; allowed: "
                 f"{', '.join(names) or 'none'}"
             )
-        if setting.whole and FieldSection.amplitude not in setting.driven_before(step.number):
+        if context.whole and FieldSection.amplitude not in context.driven_before(step.number):
             raise ValueError(f"{key}.kind: source needs the field of its source: a step of kind: field before it")
-        loads = (each for each in setting.steps if each.name != step.name)
+        loads = (each for each in context.steps if each.name != step.name)
         others = [each.load for each in loads if isinstance(each.load, SourceStep)]
         same = (other for other in others if other.number(sources) == self.number(sources))
         if self.to and any(other.move or other.to for other in same):

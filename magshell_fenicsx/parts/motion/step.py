@@ -1,17 +1,23 @@
 """A step in time: the shell moves, with inertia, under loads that are functions of time."""
 
 from collections.abc import Iterator
-from typing import Annotated, Any, ClassVar, Literal, Self, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, TypeAlias
 
 from pydantic import Field, model_validator
 
 from magshell_fenicsx.input.expressions import Formula
 from magshell_fenicsx.input.section import Section, in_units
+from magshell_fenicsx.mesh.mirror import Mirror
 from magshell_fenicsx.parts.magnetism.field_step import RotationSection
 from magshell_fenicsx.parts.magnetism.fields import MagneticSection, strength
 from magshell_fenicsx.parts.motion.history import History, Time, levels_of, measured, times_of
-from magshell_fenicsx.parts.part import Setting
+from magshell_fenicsx.parts.part import Context
 from magshell_fenicsx.parts.step import ProgrammeStep, Step
+from magshell_fenicsx.shape.symmetry import Leaves, alike
+from magshell_fenicsx.shape.turning import vector_turns, vectors_of
+
+if TYPE_CHECKING:
+    from magshell_fenicsx.shape.outline import Outline
 
 Rate: TypeAlias = measured("1/second")  # type: ignore[valid-type]
 
@@ -109,18 +115,18 @@ class TimeSection(Step):
     def rests(self) -> bool:
         return self.until == "rest"
 
-    def refuse_unfit(self, step: ProgrammeStep, setting: Setting) -> None:
-        key, driven = step.key, setting.driven_before(step.number)
-        field = strength(setting)
+    def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
+        key, driven = step.key, context.driven_before(step.number)
+        field = strength(context)
         if "field" in self.history and (not field or RotationSection.amplitude in driven):
             why = "not after kind: rotation" if field else "needs magnetic.lambda_m, not zero"
             raise ValueError(f"{key}.history.field: {why}")
         for where, text in self.with_units():
-            if setting.time_unit is None or not setting.shell.with_units:
+            if context.time_unit is None or not context.shell.with_units:
                 raise ValueError(
                     f"{key}.{where}: {text}: a time with a unit needs shell.density, youngs_modulus and lengths"
                 )
-        loads, magnetic = {each.name: each.load for each in setting.steps}, setting.of(MagneticSection)
+        loads, magnetic = {each.name: each.load for each in context.steps}, context.of(MagneticSection)
         allowed = {"field", "pressure", *loads} - {"lambda_m", "angle", "time"}
         measured = magnetic is not None and magnetic.applied.flux_density not in (None, 0.0)
         for name, history in self.history.items():
@@ -136,6 +142,18 @@ class TimeSection(Step):
                         "needs magnetic.applied.flux_density" if name == "field" else "is a flux density: give a number"
                     )
                     raise ValueError(f"{key}.history.{name}: {level}: {why}")
+
+    def leaves(self, step: ProgrammeStep, context: Context, outline: "Outline") -> list[Leaves]:
+        if not self.velocity:
+            return []
+        given, R = vectors_of(self.velocity), context.shell.reference
+
+        def keeps(mirror: Mirror) -> bool:
+            S, x = mirror.reflection, outline.sample()
+            return alike(given(R * x) @ S, given(R * mirror.image(x)))
+
+        turns = outline.span and vector_turns(self.velocity, outline.span, R)
+        return [Leaves(None if turns else "the initial velocity differs around e3", (), keeps)]
 
     def with_units(self) -> Iterator[tuple[str, str]]:
         """Key and text of each time with a unit."""

@@ -5,7 +5,7 @@ from typing import ClassVar, Literal, Self
 from pydantic import Field, model_validator
 
 from magshell_fenicsx.parts.natural.section import NaturalSection
-from magshell_fenicsx.parts.part import Setting
+from magshell_fenicsx.parts.part import Context
 from magshell_fenicsx.parts.step import PathStep, ProgrammeStep, Step, Target, Until
 
 
@@ -47,13 +47,13 @@ class GrowthSection(PathStep):
         return f"natural_{self.key}"
 
     @classmethod
-    def before(cls, setting: Setting, loading: Step | None) -> list[tuple[str, Step]]:
-        natural = setting.of(NaturalSection)
+    def before(cls, context: Context, loading: Step | None) -> list[tuple[str, Step]]:
+        natural = context.of(NaturalSection)
         if isinstance(loading, cls) or natural is None:
             return []
         keys = [key for key in ("stretch", "curvature") if getattr(natural, key) is not None]
         return [("natural", cls.model_validate({"kind": "natural", key: 1.0})) for key in keys]
 
-    def refuse_unfit(self, step: ProgrammeStep, setting: Setting) -> None:
-        if getattr(setting.of(NaturalSection), self.key, None) is None:
+    def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
+        if getattr(context.of(NaturalSection), self.key, None) is None:
             raise ValueError(f"loading.{self.key}: is a factor of natural.{self.key}: give that too")

@@ -1,12 +1,17 @@
 """The natural shape: the curvature and the size that the shell would have without stress."""
 
 import re
-from typing import Annotated, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import BeforeValidator, Field, model_validator
 
 from magshell_fenicsx.input.expressions import Formula, formula
-from magshell_fenicsx.input.section import _NUMBER, Section, in_units
+from magshell_fenicsx.input.section import _NUMBER, in_units
+from magshell_fenicsx.parts.part import Ability, Context, Modelled
+from magshell_fenicsx.shape.symmetry import Leaves
+
+if TYPE_CHECKING:
+    from magshell_fenicsx.shape.outline import Outline
 
 _PER_LENGTH = re.compile(
     rf"\s*(?P<number>{_NUMBER})[\s*]*(?:1?\s*/\s*(?P<below>[^\W\d]+)|(?P<power>[^\W\d]+)\s*(?:\*\*|\^)\s*-1)\s*"
@@ -58,7 +63,7 @@ Component = Annotated[float | Formula, Field(union_mode="left_to_right")]  # a n
 Values = Number | list[Number] | dict[str, Number | list[Number]] | None
 
 
-class NaturalSection(Section):
+class NaturalSection(Ability):
     """The curvature and the size that the shell would have without stress: growth, swelling, pre-stretch.
 
     Both grow with amplitudes of their own, natural_curvature and natural_stretch, from 0 (the shell as drawn) to 1
@@ -87,6 +92,16 @@ class NaturalSection(Section):
     def formulas(self) -> list[str]:
         """Those of the curvature and the stretch."""
         return [text for value in (self.curvature, self.stretch) for text in components(value) if isinstance(text, str)]
+
+    def leaves(self, context: Context, outline: "Outline") -> list[Leaves]:
+        from magshell_fenicsx.parts.natural.planned import leaves  # the solver takes long to import
+
+        return leaves(context, outline)
+
+    def adds(self, context: Context, modelled: Modelled) -> dict[str, Any]:
+        from magshell_fenicsx.parts.natural.planned import natural  # the solver takes long to import
+
+        return {"natural": natural(context, modelled.turn, modelled.within)}
 
 
 def components(value: Any) -> list[float | str]:

@@ -1,12 +1,12 @@
 """A live pressure."""
 
-from math import copysign
-from typing import Annotated, ClassVar, Literal
+from math import copysign, sqrt
+from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field
 
 from magshell_fenicsx.input.targets import over
-from magshell_fenicsx.parts.step import Now, PathStep, Target, Until
+from magshell_fenicsx.parts.step import Fit, Now, PathStep, Target, Until
 from magshell_fenicsx.quantities.units import PRESSURE, VOLUME
 
 
@@ -29,6 +29,14 @@ class PressureSection(PathStep):
     """Target p; with control: load or arc [p_c]"""
     volume_change: Annotated[float, over(VOLUME)] | None = Field(default=None, ge=-5, le=5)
     """Target ΔV; with control: volume or arc [R³]"""
+
+    @classmethod
+    def implied(cls) -> dict[str, Any]:
+        return {"pressure": True}
+
+    def largest(self, fit: Fit) -> float | None:
+        """Without a local imperfection a sphere buckles anywhere, in waves of about 3.6 sqrt(Rh)."""
+        return None if fit.local else 1.2 * sqrt(fit.h)
 
     def begin(self, here: float) -> float:
         return here

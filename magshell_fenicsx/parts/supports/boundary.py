@@ -2,11 +2,19 @@
 
 import re
 from collections.abc import Iterable
-from typing import Annotated, Any, Literal, get_args
+from functools import partial
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
+import numpy as np
 from pydantic import BeforeValidator, Field, ValidationError
 
 from magshell_fenicsx.input.section import Section
+from magshell_fenicsx.mesh.mirror import ROUNDING, Mirror
+from magshell_fenicsx.parts.part import Ability, Context
+from magshell_fenicsx.shape.symmetry import PARALLEL, Leaves, nothing, tilted
+
+if TYPE_CHECKING:
+    from magshell_fenicsx.shape.outline import Outline
 
 EDGES = {"hemisphere": ("equator",), "disc": ("rim",), "strip": ("root", "tip", "sides")}
 Axis = Literal["x", "y", "z"]
@@ -36,7 +44,7 @@ def _condition(value: Any) -> Any:
     raise ValueError(f"must be {', '.join(get_args(EdgeCondition))}, or {{held: [x, y, z]}} with some of these")
 
 
-class BoundarySection(Section):
+class BoundarySection(Ability):
     """Edge, point or patch of a mesh -> condition; edges that are not named are free.
 
     clamped: neither displacement nor rotation. hinged, or simply supported: no displacement. symmetry: the edge
@@ -53,6 +61,35 @@ class BoundarySection(Section):
     def conditions(self) -> dict[str, EdgeCondition | HeldSection]:
         """Name -> condition."""
         return dict(self.__pydantic_extra__ or {})
+
+    def leaves(self, context: Context, outline: "Outline") -> list[Leaves]:
+        """A half does not see rigid motions across its plane: it needs a support against all."""
+        parts, fixed = list[Leaves](), False
+        for name, condition in self.conditions().items():
+            fixed = fixed or condition in ("clamped", "simply supported", "hinged")
+            reason = None
+            if isinstance(condition, HeldSection):
+                fixed = fixed or len(condition.components) == 3
+                one_sided = len({0, 1} & set(condition.components)) == 1
+                off = tilted(np.array(context.points.get(name, [0.0, 0.0, 1.0])))
+                why = "is held along x or y alone" if one_sided else "is held off the axis" if off else None
+                reason = why and f"boundary.{name}: {why}"
+            parts.append(Leaves(reason, mirrors=partial(self._mirrored, context, name)))
+        if not fixed:  # a meridian asks for itself whether it is held
+            parts.append(Leaves(mirrors=nothing))
+        return parts
+
+    def _mirrored(self, context: Context, name: str, mirror: Mirror) -> bool:
+        """The other half is held in the same way, and a point that is held is on the plane."""
+        conditions = self.conditions()
+        condition, other = conditions[name], conditions.get(mirror.other(name), "free")
+        if isinstance(condition, HeldSection):
+            held, S = np.diag([float(i in condition.components) for i in range(3)]), mirror.reflection
+            if np.abs(S @ held @ S - held).max() > PARALLEL:
+                return False
+        place = context.points.get(name)
+        off = 0.0 if place is None else float(mirror.beyond(np.array(place) / context.shell.reference))
+        return abs(off) < ROUNDING and condition == other
 
 
 def refuse_taken(points: Iterable[str]) -> None:

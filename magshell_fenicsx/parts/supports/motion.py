@@ -1,16 +1,26 @@
 """Motions of supports: edges, points and patches that are held and move as rigid bodies."""
 
-from math import copysign
-from typing import Annotated, Any, ClassVar, Literal, Self
+from math import copysign, radians
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from magshell_fenicsx.assembly.motion import Motion
 from magshell_fenicsx.input.section import Section, or_number
-from magshell_fenicsx.parts.part import Setting
+from magshell_fenicsx.mesh.frame import rotation
+from magshell_fenicsx.mesh.mirror import ROUNDING, Mirror
+from magshell_fenicsx.parts.part import Context, Modelled
 from magshell_fenicsx.parts.step import Count, Now, PathStep, ProgrammeStep, Target, Until
 from magshell_fenicsx.parts.supports.boundary import BoundarySection
 from magshell_fenicsx.quantities.registry import QUANTITIES, TAKEN
+from magshell_fenicsx.shape.symmetry import Leaves
 
+if TYPE_CHECKING:
+    from magshell_fenicsx.shape.outline import Outline
+
+Array = NDArray[np.float64]
 Finite = Annotated[float, Field(ge=-1e9, le=1e9)]
 Lengths = Annotated[list[Annotated[float, or_number("metre", Finite), Field(ge=-1e9, le=1e9)]], Field(
     min_length=3, max_length=3
@@ -118,8 +128,8 @@ class EdgeSection(PathStep):
     def scale(self, now: Now) -> float:
         return abs(self.factor or 1.0)
 
-    def refuse_unfit(self, step: ProgrammeStep, setting: Setting) -> None:
-        boundary = setting.of(BoundarySection)
+    def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
+        boundary = context.of(BoundarySection)
         conditions = boundary.conditions() if boundary else {}
         held = sorted(name for name, condition in conditions.items() if condition not in UNHELD)
         for i, move in enumerate(self.moves):
@@ -129,3 +139,59 @@ class EdgeSection(PathStep):
                         f"{step.key}.moves.{i}.supports: {name}: only what boundary holds (clamped, hinged or held) "
                         f"can move: {', '.join(held) or 'nothing'}"
                     )
+
+    def leaves(self, step: ProgrammeStep, context: Context, outline: "Outline") -> list[Leaves]:
+        R = context.shell.reference
+        return [Leaves(sideways(self), held_vectors(self), lambda mirror: mirrored(self, R, mirror))]
+
+    def adds(self, step: ProgrammeStep, context: Context, modelled: Modelled) -> dict[str, Any]:
+        from magshell_fenicsx.models.shell.parameters import Move  # the solver takes long to import
+
+        R, turn = context.shell.reference, modelled.turn
+        return {"moves": tuple(Move(tuple(one.supports), motion(one, step.name, R, turn)) for one in self.moves)}
+
+
+def motion(move: MoveSection, name: str, R: float, turn: float = 0.0) -> Motion:
+    """A motion with the amplitude `name`, over the length R."""
+    Q, about, zero = rotation(turn), move.rotation, np.zeros(3)
+    shift = Q @ (np.array(move.translation) / R) if move.translation else zero
+    if about is None:
+        return Motion(name, shift, zero, zero)
+    axis = np.array(about.axis) / np.linalg.norm(about.axis)
+    return Motion(name, shift, radians(about.angle) * (Q @ axis), Q @ (np.array(about.point) / R))
+
+
+def sideways(load: EdgeSection) -> str | None:
+    """Why a motion is not axisymmetric; None if it is."""
+    for one in load.moves:
+        if one.rotation or (one.translation and any(one.translation[:2])):
+            return f"the motion of {one.supports[0]} is not along e3"
+    return None
+
+
+def held_vectors(load: EdgeSection) -> list[Array]:
+    """Unit vectors (3,) that a mirror plane through e3 must hold: translations, and normals of axes of rotation."""
+    found = [np.array(one.translation) for one in load.moves if one.translation]
+    found += [np.cross([0.0, 0.0, 1.0], one.rotation.axis) for one in load.moves if one.rotation]
+    return [v / np.linalg.norm(v) for v in found if v.any()]
+
+
+def mirrored(load: EdgeSection, R: float, mirror: Mirror) -> bool:
+    """Whether a plane maps the motions onto themselves."""
+    motions = {name: motion(one, "", R) for one in load.moves for name in one.supports}
+    return all(
+        mirror.other(name) in motions and _is_image(one, motions[mirror.other(name)], mirror)
+        for name, one in motions.items()
+    )
+
+
+def _is_image(one: Motion, other: Motion, mirror: Mirror) -> bool:
+    """A mirrored rotation runs the other way about the mirrored axis."""
+    S, along = mirror.reflection, other.turn / (np.linalg.norm(other.turn) or 1.0)
+    apart = mirror.image(one.centre) - other.centre
+    size = max(np.abs([one.shift, one.turn]).max(), ROUNDING)
+    return bool(
+        np.abs(S @ one.shift - other.shift).max() < ROUNDING * size
+        and np.abs(S @ one.turn + other.turn).max() < ROUNDING * size
+        and (not other.turns or np.abs(apart - (apart @ along) * along).max() < ROUNDING)
+    )
