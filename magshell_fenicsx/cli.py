@@ -58,6 +58,20 @@ def _hand_over_to_petsc(words: list[str]) -> None:
     del words[first:]
 
 
+def _made(source: Any) -> Any:
+    """The case of a source."""
+    from magshell_fenicsx.case.case import Case
+
+    return Case.from_source(source)
+
+
+def _shared(source: Any) -> Any:
+    """The same on all ranks, which share its files; collective."""
+    from magshell_fenicsx.case.opened import with_same_files
+
+    return with_same_files(_made(source), world())
+
+
 def main() -> None:
     """Run the program."""
     open_standard_streams()
@@ -150,11 +164,11 @@ def sweep(
 ) -> None:
     """Run a case over ranges of its keys; keep the points that are already in the folder."""
     from magshell_fenicsx.output.store.folder import DiskError
-    from magshell_fenicsx.studies.sweep.sweep import sweep as run_sweep
+    from magshell_fenicsx.studies.sweep import sweep as run_sweep
 
     folder = _chosen(out, f"{case.stem}_sweep")
     with exit_codes(stopped=(DiskError,)):
-        done = run_sweep(case, over, set_ or [], folder, full_paths=full_paths, part=part)
+        done = run_sweep(case, over, set_ or [], folder, made=_made, full_paths=full_paths, part=part)
     print_line(f"results in {folder}/")
     if done.stopped:
         raise failure(f"{done.stopped} of {len(done.points)} points stopped early; sweep.csv says why", STOPPED)
@@ -173,14 +187,21 @@ def study(
 ) -> None:
     """Measure error against run time over meshes, degrees, models and ranks; keep the runs in the folder."""
     from magshell_fenicsx.output.store.folder import DiskError
-    from magshell_fenicsx.studies.study.study import parse_ranks
-    from magshell_fenicsx.studies.study.study import study as run_study
+    from magshell_fenicsx.studies.study import parse_ranks
+    from magshell_fenicsx.studies.study import study as run_study
 
     folder = _chosen(out, f"{case.stem}_study")
     with exit_codes(stopped=(DiskError,)):
-        numbers, settings = parse_ranks(ranks), set_ or []
         done = run_study(
-            case, over, settings, result=result, reference=reference, ranks=numbers, repeat=repeat, out=folder
+            case,
+            over,
+            set_ or [],
+            result=result,
+            made=_made,
+            reference=reference,
+            ranks=parse_ranks(ranks),
+            repeat=repeat,
+            out=folder,
         )
     print_line(f"results in {folder}/")
     if done.without_result:
@@ -209,7 +230,7 @@ def ensemble(
 ) -> None:
     """Run random samples of a case (its section `ensemble`) and fit their statistics; keep finished samples."""
     from magshell_fenicsx.output.store.folder import DiskError
-    from magshell_fenicsx.studies.ensemble.ensemble import ensemble as run_ensemble
+    from magshell_fenicsx.studies.ensemble import ensemble as run_ensemble
 
     folder = _chosen(out, f"{case.stem}_ensemble")
     with exit_codes(stopped=(DiskError,)):
@@ -218,6 +239,7 @@ def ensemble(
             set_ or [],
             samples=samples,
             seed=seed,
+            made=_made,
             result=result,
             out=folder,
             part=part,
@@ -244,12 +266,12 @@ def design(
     """Vary a case for a result (its section `design`); write the best case, its table and picture, and verify it."""
     from magshell_fenicsx.mesh.patch import MeshError
     from magshell_fenicsx.output.store.folder import DiskError
-    from magshell_fenicsx.studies.design.design import Missed
-    from magshell_fenicsx.studies.design.design import design as run_design
+    from magshell_fenicsx.studies.design import Missed
+    from magshell_fenicsx.studies.design import design as run_design
 
     folder = _chosen(out, f"{case.stem}_design")
     with exit_codes(MeshError, stopped=(DiskError, Missed)):
-        run_design(case, set_ or [], folder, resume=resume, say=print_line)
+        run_design(case, set_ or [], folder, made=_shared, resume=resume, say=print_line)
     print_line(f"results in {folder}/")
 
 
@@ -267,14 +289,13 @@ def compare(
 ) -> None:
     """Run a case as a shell and as a solid; compare their curves and run times."""
     from magshell_fenicsx.output.store.folder import DiskError
-    from magshell_fenicsx.studies.compare.compare import compare as run_comparison
-    from magshell_fenicsx.studies.compare.compare import parse_refinements
-    from magshell_fenicsx.studies.compare.runs import NothingLeft
+    from magshell_fenicsx.studies.compare import NothingLeft, parse_refinements
+    from magshell_fenicsx.studies.compare import compare as run_comparison
 
     folder = _chosen(out, f"{case.stem}_compare")
     with exit_codes(stopped=(DiskError, NothingLeft)):
         refinements = parse_refinements(shell, solid)
-        done = run_comparison(case, set_ or [], refinements=refinements, out=folder, say=print_line)
+        done = run_comparison(case, set_ or [], refinements=refinements, out=folder, made=_made, say=print_line)
     difference = done.content["difference"]
     if difference is not None:
         print_line(f"{done.content['result']}: the solid differs from the shell by {100 * difference:+.3f} %")
@@ -306,11 +327,11 @@ def check(case: CaseFile, set_: Settings = None) -> None:
             except CaseError as e:
                 raise CaseError(read.placed(str(e))) from None
         if read.ensemble:
-            from magshell_fenicsx.studies.ensemble.door import refuse_unknown_keys
+            from magshell_fenicsx.studies.samples import refuse_unknown_keys
 
-            refuse_unknown_keys(source, read.ensemble)
+            refuse_unknown_keys(source, read.ensemble, _made)
         if read.design:
-            from magshell_fenicsx.studies.design.numbers import refuse_unfit_numbers
+            from magshell_fenicsx.studies.design_variables import refuse_unfit_numbers
 
             try:
                 refuse_unfit_numbers(source, read, read.design)

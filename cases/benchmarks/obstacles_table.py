@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.output.pictures.curve import smooth
-from magshell_fenicsx.studies.sweep.table import write_csv
+from magshell_fenicsx.output.store.table import write_csv
 
 Array = NDArray[np.float64]
 HEAD = (

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from magshell_fenicsx.studies.sweep.table import write_csv
+from magshell_fenicsx.output.store.table import write_csv
 
 INTRO = """# Extremes
 

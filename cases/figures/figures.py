@@ -11,10 +11,11 @@ from typing import Any
 
 from mpi4py import MPI
 
+from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.output.store.folder import by_first
-from magshell_fenicsx.studies.sweep.sweep import Sweep, sweep
-from magshell_fenicsx.studies.sweep.sweep_plot import loaded
-from magshell_fenicsx.studies.sweep.table import sweep_row, write_csv
+from magshell_fenicsx.output.store.table import write_csv
+from magshell_fenicsx.studies.sweep import Sweep, sweep, sweep_row
+from magshell_fenicsx.studies.sweep_picture import loaded
 
 CASES = Path(__file__).parent
 OUT = Path("results") / "figures"
@@ -98,7 +99,7 @@ FIGURES = {
 def make(name: str, out: Path = OUT) -> Sweep:
     """Compute a figure's sweep, then write its numbers and its picture; collective."""
     figure = FIGURES[name]
-    done = sweep(CASES / figure.case, figure.over, out=out / name)
+    done = sweep(CASES / figure.case, figure.over, out=out / name, made=Case.from_source)
 
     def write() -> None:
         rows, y = (knockdowns(done), "delta_k_d") if figure.along else (curves(done), "force")

@@ -16,7 +16,7 @@ from speed.measure import BenchFailed, measure_item
 from speed.report import compare, derived, table
 
 from magshell_fenicsx.output.store.durable import write_whole
-from magshell_fenicsx.studies.study.machine import fingerprint
+from magshell_fenicsx.platform.environment import fingerprint
 
 OUT = Path("results") / "bench.json"
 

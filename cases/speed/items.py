@@ -1,11 +1,13 @@
 """What the benchmark consists of."""
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
 CASES = Path(__file__).parents[1]
+WITH_CAMPAIGNS = {"PYTHONPATH": os.pathsep.join([str(CASES), os.environ.get("PYTHONPATH", "")])}  # of a process
 
 # F R/(2 pi D) at w/h, lambda_m = +0.00184: our own of degree 5, refinement 1.9 (1.4 is within 2e-5 of it);
 # hybridised Hellan-Herrmann-Johnson elements, two meshes within 1.8e-4, have 3.0565, 8.2762, 15.1470, 21.603, 27.528
@@ -30,7 +32,7 @@ class Item:
     Attributes
     ----------
     kind
-        "run": all of `magshell run`; else a piece of it without files, see `study.workload`.
+        "run": all of `magshell run`; else a piece of it without files, see `speed.workload`.
     references
         Name of a result -> its value from elsewhere; the largest relative error is noted.
     cold

@@ -5,9 +5,9 @@ from contextlib import nullcontext
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from speed.items import CASES, Item
+from speed.items import CASES, WITH_CAMPAIGNS, Item
 
-from magshell_fenicsx.studies.study.measure import Usage, measure
+from magshell_fenicsx.platform.processes import Usage, measure
 
 Numbers = dict[str, list[float]]
 
@@ -35,14 +35,14 @@ def measure_item(item: Item) -> Numbers:
 
 
 def _run(item: Item, cache: str | None) -> dict[str, Any]:
-    case, environment = str(CASES / f"{item.case}.yaml"), {"XDG_CACHE_HOME": cache} if cache else None
+    case, environment = str(CASES / f"{item.case}.yaml"), {"XDG_CACHE_HOME": cache} if cache else {}
     if item.kind == "run":
         settings = [word for setting in item.settings for word in ("--set", setting)]
         with TemporaryDirectory() as out:
             used = _checked(measure("magshell_fenicsx", ["run", case, *settings, "--out", out], item.ranks))
         return _process(used)
     arguments = [item.kind, case, json.dumps(item.settings), json.dumps(list(item.references))]
-    used = _checked(measure("magshell_fenicsx.studies.study.workload", arguments, item.ranks, environment))
+    used = _checked(measure("speed.workload", arguments, item.ranks, WITH_CAMPAIGNS | environment))
     report = json.loads(next(line for line in used.output.splitlines() if line.startswith("{")))  # MPI may say more
     values, stopped = report.pop("values", {}), report.pop("stopped", None)
     if stopped or None in values.values():

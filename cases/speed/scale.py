@@ -9,9 +9,10 @@ import sys
 from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
+from speed.items import WITH_CAMPAIGNS
 
-from magshell_fenicsx.studies.study.machine import described, fingerprint
-from magshell_fenicsx.studies.study.measure import measure
+from magshell_fenicsx.platform.environment import described, fingerprint
+from magshell_fenicsx.platform.processes import measure
 
 PIECES = ("tangent", "factor", "back_solves", "residual")
 DEFAULT = (1.0, 2.0, 4.0)  # 1.1e4, 3.0e4 and 9.7e4 unknowns at degree 4; 7.5 and 14 make 3e5 and 1e6
@@ -30,8 +31,8 @@ def row(refinement: float, degree: int, ranks: int, repeats: int) -> Row:
     ScaleFailed
         If they do not end well.
     """
-    arguments = [str(repeats), str(degree), str(refinement)]
-    used = measure("magshell_fenicsx.studies.study.iteration", arguments, ranks)
+    arguments = ["scale", str(repeats), str(degree), str(refinement)]
+    used = measure("speed.workload", arguments, ranks, WITH_CAMPAIGNS)
     if used.code:
         raise ScaleFailed(f"refinement {refinement:g} on {ranks} ranks: exit code {used.code}: {used.errors.strip()}")
     found = json.loads(next(line for line in used.output.splitlines() if line.startswith("{")))  # MPI may say more

@@ -12,8 +12,6 @@ import numpy as np
 from pydantic import Field, ModelWrapValidatorHandler, ValidationError, model_validator
 
 from magshell_fenicsx.case.bodies.registered import Bodies
-from magshell_fenicsx.case.design import DesignSection
-from magshell_fenicsx.case.ensemble import EnsembleSection
 from magshell_fenicsx.case.frequencies import FrequenciesSection
 from magshell_fenicsx.case.gradients import GradientsSection
 from magshell_fenicsx.case.imperfections.dimple import DimpleSection
@@ -27,9 +25,9 @@ from magshell_fenicsx.case.stability import StabilitySection
 from magshell_fenicsx.input.chosen import Chosen
 from magshell_fenicsx.input.expressions import is_formula
 from magshell_fenicsx.input.file import FileKeys, digests
-from magshell_fenicsx.input.messages import explained
+from magshell_fenicsx.input.messages import InvalidCase
 from magshell_fenicsx.input.section import texts
-from magshell_fenicsx.input.source import CaseError, Source, read_source
+from magshell_fenicsx.input.source import Source, read_source
 from magshell_fenicsx.input.targets import NOTED
 from magshell_fenicsx.parts.bodies.body import refuse_unfit_bodies, with_units
 from magshell_fenicsx.parts.bodies.press import approaches
@@ -45,6 +43,7 @@ from magshell_fenicsx.parts.step import ProgrammeStep, Step
 from magshell_fenicsx.parts.supports.boundary import EDGES, BoundarySection, refuse_taken
 from magshell_fenicsx.shape.sections import CapSurface, MeshSurface, RevolutionSurface, Surface, SurfaceSection
 from magshell_fenicsx.shape.shell import ShellSection
+from magshell_fenicsx.studies.sections import DesignSection, EnsembleSection
 
 AnyStep = TypeVar("AnyStep", bound=Step)
 
@@ -334,4 +333,4 @@ class Case(WithParts):
             case = cls.model_validate(source.data, context=context)
             return case.written_as(Origin(source.place, deepcopy(source.data), context))
         except ValidationError as e:
-            raise CaseError(explained(e.errors(), source, cls)) from None
+            raise InvalidCase(e.errors(), source, cls) from None

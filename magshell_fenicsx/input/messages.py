@@ -9,10 +9,26 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from magshell_fenicsx.input.meanings import meaning
-from magshell_fenicsx.input.source import Location, Source, dotted
+from magshell_fenicsx.input.source import CaseError, Location, Source, dotted
 
 NO_KEYS = ("a word", "a gas")  # tags of a union that has no sections to choose from
 NO_CONTAINER = ("list_type", "dict_type")
+
+
+class InvalidCase(CaseError):
+    """A case that its sections refuse: one line for each mistake."""
+
+    def __init__(self, errors: Sequence[Any], source: Source, case: type[BaseModel]) -> None:
+        super().__init__(explained(errors, source, case))
+        self._errors, self._source, self._case = errors, source, case
+
+    def of(self, *kinds: str) -> list[str]:
+        """The lines of pydantic's errors of some kinds."""
+        errors = [error for error in self._errors if error["type"] in kinds]
+        return [explained(errors, self._source, self._case)] if errors else []
+
+    def __reduce__(self) -> tuple[type[CaseError], tuple[str]]:
+        return CaseError, (str(self),)  # for other ranks the message is enough
 
 
 def explained(errors: Sequence[Any], source: Source, case: type[BaseModel]) -> str:

@@ -13,9 +13,8 @@ from scipy import stats
 
 from magshell_fenicsx import CaseError
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.chance.distribution import DistributionSection
-from magshell_fenicsx.case.chance.places import NoRoom, random_places
-from magshell_fenicsx.case.ensemble import EnsembleSection, generator
+from magshell_fenicsx.input.chance import DistributionSection, NoRoom, generator, random_places
+from magshell_fenicsx.studies.sections import EnsembleSection
 
 SPREAD = np.sqrt(np.log(1 + 0.5**2))  # of the logarithm of a lognormal number with mean 1 and deviation 0.5
 LAWS = [

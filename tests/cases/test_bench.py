@@ -13,7 +13,7 @@ from speed.report import compare, derived, table
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.problem.planner import make_plan
-from magshell_fenicsx.studies.study.scalar import parse_scalar
+from magshell_fenicsx.studies.results import parse_scalar
 
 
 def file(machine: str = "a", **numbers: float) -> dict[str, Any]:

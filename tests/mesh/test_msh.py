@@ -9,6 +9,7 @@ import gmsh
 import numpy as np
 import pytest
 from conftest import CASES
+from many import make_points, sweep
 from mpi4py import MPI
 
 from magshell_fenicsx import Case, Scene
@@ -20,9 +21,7 @@ from magshell_fenicsx.problem.check import describe
 from magshell_fenicsx.problem.planner import make_plan
 from magshell_fenicsx.runs.files import AlreadyComplete
 from magshell_fenicsx.runs.run import run
-from magshell_fenicsx.studies.sweep.axes import parse_axis
-from magshell_fenicsx.studies.sweep.points import make_points
-from magshell_fenicsx.studies.sweep.sweep import sweep
+from magshell_fenicsx.studies.points import parse_axis
 
 Script = Callable[[], None]
 

@@ -11,6 +11,7 @@ from unittest.mock import patch
 
 import pytest
 from conftest import CASES
+from many import sweep
 from mpi4py import MPI
 
 import magshell_fenicsx as ms
@@ -22,7 +23,6 @@ from magshell_fenicsx.platform.first import from_first
 from magshell_fenicsx.problem.problem import Plan
 from magshell_fenicsx.runs.files import AlreadyComplete
 from magshell_fenicsx.simulate.scene import Scene
-from magshell_fenicsx.studies.sweep.sweep import sweep
 
 COMM = MPI.COMM_WORLD
 PLATE = CASES / "clamped_plate.yaml"
@@ -98,7 +98,7 @@ def a_folder(out: Path) -> None:
     case = ms.Case.load(PLATE, ["mesh={tolerance: 0.01}"])
     with patch("magshell_fenicsx.runs.run.open_folder"), raised(Damaged, "mesh.json: is damaged: Is a directory"):
         ms.run(case, out / "run", COMM, resume=True)
-    with patch("magshell_fenicsx.studies.sweep.sweep.load", failing(KeyError("a bug"))), raised(KeyError, "a bug"):
+    with patch("magshell_fenicsx.studies.sweep.kept_outcome", failing(KeyError("a bug"))), raised(KeyError, "a bug"):
         sweep(PLATE, ["shell.poisson_ratio=0.3,0.4"], out=out / "sweep", comm=COMM)
 
 

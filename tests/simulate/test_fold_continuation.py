@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from command import magshell, mpirun
 from conftest import CASES
+from many import sweep
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.continuation.fold import Fold, FoldLost, Guess, find_fold
@@ -17,9 +18,8 @@ from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.runs.run import run
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.transfer import _stretch, same_mesh, transfer
-from magshell_fenicsx.studies.sweep.continuation import Continuation
-from magshell_fenicsx.studies.sweep.outcome import Outcome
-from magshell_fenicsx.studies.sweep.sweep import sweep
+from magshell_fenicsx.studies.folds import Continuation
+from magshell_fenicsx.studies.runner import Outcome
 
 DIMPLE, COPLANAR = CASES / "dimple_buckling.yaml", CASES / "figures" / "coplanar.yaml"
 COARSE = ["mesh.degree=3", "mesh.refinement=0.4"]

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 from command import magshell
 from conftest import CASES
+from many import compare
 
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.studies.compare.compare import compare
 
 CASE = CASES / "solid_buckling.yaml"
 THICK = ["shell.radius_to_thickness=20", "symmetry=half"]

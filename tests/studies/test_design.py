@@ -12,6 +12,7 @@ import scipy
 from command import magshell
 from conftest import CAP, CASES, draw_nothing
 from interrupted import kill, start, wait_until
+from many import design, variables
 from mpi4py import MPI
 from numpy.typing import NDArray
 
@@ -21,9 +22,7 @@ from magshell_fenicsx.input.source import read_source
 from magshell_fenicsx.models.shell.controls import Controls
 from magshell_fenicsx.runs.run import run
 from magshell_fenicsx.simulate.standing import Standing
-from magshell_fenicsx.studies.design.design import design
-from magshell_fenicsx.studies.design.evaluate import Evaluation, evaluate
-from magshell_fenicsx.studies.design.variables import variables
+from magshell_fenicsx.studies.design_evaluation import Evaluation, evaluate
 
 Array = NDArray[np.float64]
 STRIP = """
@@ -61,7 +60,7 @@ def test_reach_interrupt_and_resume(
     strip: Callable[[str], Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """An interrupted design ends as one that was not; its best case runs as it is, to the same number."""
-    case, room = strip(TURN), import_module("magshell_fenicsx.studies.design.design")
+    case, room = strip(TURN), import_module("magshell_fenicsx.studies.design")
     evaluate, count = room.evaluate, [0]
 
     def stopping(*arguments: object) -> object:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from magshell_fenicsx.studies.design.picture import draw_design
+from magshell_fenicsx.studies.design_picture import draw_design
 
 MANY = ["buckling_pressure_Pa", "mass", "tip_uz_mm", "w_mm", "knockdown", "tip_fz_N", "hertz_1", "hertz_2"]
 

@@ -10,18 +10,18 @@ import pytest
 from command import magshell
 from conftest import CASES
 from interrupted import kill, start, wait_until
+from many import ensemble, make_samples
 
 from magshell_fenicsx import CaseError
 from magshell_fenicsx.continuation.fold import FoldLost
 from magshell_fenicsx.input.source import override, read_source
 from magshell_fenicsx.runs.run import run
-from magshell_fenicsx.studies.ensemble import ensemble as module
-from magshell_fenicsx.studies.ensemble import solve as solving
-from magshell_fenicsx.studies.ensemble.known import KnownFolds
-from magshell_fenicsx.studies.ensemble.samples import Sample, make_samples
-from magshell_fenicsx.studies.ensemble.table import make_row
-from magshell_fenicsx.studies.study.scalar import parse_scalar
-from magshell_fenicsx.studies.sweep.outcome import Outcome
+from magshell_fenicsx.studies import ensemble as solving
+from magshell_fenicsx.studies.folds import KnownFolds
+from magshell_fenicsx.studies.results import parse_scalar
+from magshell_fenicsx.studies.runner import Outcome
+from magshell_fenicsx.studies.samples import Sample
+from magshell_fenicsx.studies.statistics import make_row
 
 DIMPLE = CASES / "dimple_buckling.yaml"
 RANDOM = (
@@ -42,7 +42,7 @@ def drawn(*settings: str, numbers: range = range(4), deleted: int = 0) -> list[S
     source = read_source(DIMPLE)
     for setting in (RANDOM, *settings):
         override(source, setting)
-    return make_samples(source, 1, numbers, deleted)
+    return make_samples(source, 1, numbers, deleted=deleted)
 
 
 def read(file: Path) -> list[dict[str, str]]:
@@ -78,7 +78,7 @@ def analytic(monkeypatch: pytest.MonkeyPatch) -> list[int]:
         amplitude = sample.values["shell.defect.amplitude"]
         return Outcome(1 / (1 + amplitude), None, None, 100, 0.1, [{"label": "fold"}], "fold", 3, None, 0.1)
 
-    monkeypatch.setattr(module, "solve", solve)
+    monkeypatch.setattr(solving, "solve", solve)
     return done
 
 
@@ -139,11 +139,11 @@ def test_defects_with_and_without_units_are_compared() -> None:
 
 def test_interrupted_and_resumed(tmp_path: Path, analytic: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(KeyboardInterrupt):
-        module.ensemble(DIMPLE, [RANDOM], samples=10, seed=1, out=tmp_path)
+        ensemble(DIMPLE, [RANDOM], samples=10, seed=1, out=tmp_path)
     assert len(list((tmp_path / "points").iterdir())) == 7
     with pytest.raises(CaseError, match="has no sample of this ensemble"):
-        module.ensemble(DIMPLE, [RANDOM], samples=7, seed=2, out=tmp_path, resume=True)
-    short = module.ensemble(DIMPLE, [RANDOM], samples=7, seed=1, out=tmp_path, resume=True)
+        ensemble(DIMPLE, [RANDOM], samples=7, seed=2, out=tmp_path, resume=True)
+    short = ensemble(DIMPLE, [RANDOM], samples=7, seed=1, out=tmp_path, resume=True)
     assert analytic == list(range(8))
     assert [row["sample"] for row in short.rows] == list(range(7))
     amplitudes = np.array([float(row["shell.defect.amplitude"]) for row in read(tmp_path / "samples.csv")])
@@ -155,15 +155,15 @@ def test_interrupted_and_resumed(tmp_path: Path, analytic: list[int], monkeypatc
 def test_parts_make_the_whole(tmp_path: Path, analytic: list[int]) -> None:
     folders = [tmp_path / str(i) for i in (1, 2)]
     for i, folder in enumerate(folders, 1):
-        part = module.ensemble(DIMPLE, [RANDOM], samples=7, seed=1, out=folder, part=f"{i}/2")
+        part = ensemble(DIMPLE, [RANDOM], samples=7, seed=1, out=folder, part=f"{i}/2")
         assert [row["sample"] for row in part.rows] == list(range(i - 1, 7, 2))
         assert (folder / f"samples_{i}_of_2.csv").exists()
-    whole = module.ensemble(DIMPLE, [RANDOM], samples=7, seed=1, out=tmp_path / "whole")
+    whole = ensemble(DIMPLE, [RANDOM], samples=7, seed=1, out=tmp_path / "whole")
     del analytic[:]
-    merged = module.ensemble(DIMPLE, [RANDOM], samples=7, seed=1, out=tmp_path / "merged", merge=folders)
+    merged = ensemble(DIMPLE, [RANDOM], samples=7, seed=1, out=tmp_path / "merged", merge=folders)
     assert analytic == []
     assert merged.rows == whole.rows
-    half = module.ensemble(DIMPLE, [RANDOM], samples=7, seed=1, out=tmp_path / "half", merge=folders[:1])
+    half = ensemble(DIMPLE, [RANDOM], samples=7, seed=1, out=tmp_path / "half", merge=folders[:1])
     assert half.content["counts"] == {"samples": 7, "found": 4, "missing": 3}
     assert half.without_result == 3
 
@@ -197,7 +197,7 @@ def test_failed_samples_are_counted_and_listed(tmp_path: Path, monkeypatch: pyte
     assert summary["weibull"] is None
     assert "| 1 | failed | failed: RuntimeError: out of luck |" in (tmp_path / "report.md").read_text(encoding="utf-8")
     monkeypatch.undo()
-    again = module.ensemble(DIMPLE, [RANDOM, *COARSE], samples=1, seed=1, out=tmp_path, result="energy@end")
+    again = ensemble(DIMPLE, [RANDOM, *COARSE], samples=1, seed=1, out=tmp_path, result="energy@end")
     assert again.rows[0]["status"] == "found"
 
 
@@ -236,7 +236,7 @@ def test_ranks_give_the_table_of_one(tmp_path: Path, alone: list[dict[str, str]]
 )
 def test_bad_input(settings: list[str], options: dict[str, Any], message: str, tmp_path: Path) -> None:
     with pytest.raises(CaseError) as e:
-        module.ensemble(DIMPLE, settings, **{"samples": 4, "seed": 1, "out": tmp_path / "out", **options})
+        ensemble(DIMPLE, settings, **{"samples": 4, "seed": 1, "out": tmp_path / "out", **options})
     assert message in str(e.value)
     assert not (tmp_path / "out").exists()
 

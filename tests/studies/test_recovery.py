@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import scipy
+from many import variables
 from mpi4py import MPI
 from numpy.typing import NDArray
 
@@ -14,8 +15,7 @@ from magshell_fenicsx.input.source import read_source
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.standing import Standing
-from magshell_fenicsx.studies.design.evaluate import evaluate
-from magshell_fenicsx.studies.design.variables import variables
+from magshell_fenicsx.studies.design_evaluation import evaluate
 
 Array = NDArray[np.float64]
 STRIP = """

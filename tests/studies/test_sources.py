@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 from benchmarks import obstacles
 from conftest import CASES
+from many import study, sweep
 from test_sweep import plate
 
 import magshell_fenicsx
@@ -21,14 +22,12 @@ from magshell_fenicsx.output.store.known import GROUPS, PHASES
 from magshell_fenicsx.output.store.table import COLUMNS, TEXTS
 from magshell_fenicsx.output.store.written import MESH
 from magshell_fenicsx.platform import sources
+from magshell_fenicsx.platform.processes import Usage
 from magshell_fenicsx.runs.files import AlreadyComplete
 from magshell_fenicsx.runs.run import run
-from magshell_fenicsx.studies.compare import runs
-from magshell_fenicsx.studies.study import sample
-from magshell_fenicsx.studies.study.measure import Usage
-from magshell_fenicsx.studies.study.study import study
-from magshell_fenicsx.studies.sweep import chain
-from magshell_fenicsx.studies.sweep.sweep import sweep
+from magshell_fenicsx.studies import compare as runs
+from magshell_fenicsx.studies import measured as sample
+from magshell_fenicsx.studies import sweep as chain
 
 PACKAGE, BUCKLING = Path(magshell_fenicsx.__file__).parent, CASES / "dimple_buckling.yaml"
 QUICK = ["mesh.degree=3", "mesh.refinement=0.3"]

@@ -9,17 +9,16 @@ from typing import Any
 
 import pytest
 from conftest import CASES
+from many import make_points, study
 
 from magshell_fenicsx import CaseError
-from magshell_fenicsx.studies.study import sample
-from magshell_fenicsx.studies.study.measure import Usage, measure
-from magshell_fenicsx.studies.study.reference import extrapolated
-from magshell_fenicsx.studies.study.rows import Run, make_rows
-from magshell_fenicsx.studies.study.sample import TIMES, Measured
-from magshell_fenicsx.studies.study.scalar import Scalar, parse_scalar
-from magshell_fenicsx.studies.study.study import parse_ranks, study
-from magshell_fenicsx.studies.sweep.axes import parse_axes
-from magshell_fenicsx.studies.sweep.points import make_points
+from magshell_fenicsx.platform.processes import Usage, measure
+from magshell_fenicsx.studies import measured as sample
+from magshell_fenicsx.studies.measured import TIMES, Measured
+from magshell_fenicsx.studies.points import parse_axes
+from magshell_fenicsx.studies.results import Scalar, parse_scalar
+from magshell_fenicsx.studies.study import parse_ranks
+from magshell_fenicsx.studies.study_report import Run, estimated_error, make_rows
 
 DIMPLE, PLATE = CASES / "dimple_buckling.yaml", CASES / "clamped_plate.yaml"
 K_D = 0.326233289  # axisymmetric solver, nine digits
@@ -95,17 +94,17 @@ def test_result_must_be_one(text: str, said: str) -> None:
 def test_richardson_with_unequal_refinements() -> None:
     """v = 2 + 0.3 h^3.5 is extrapolated exactly from any three sizes."""
     h = [1.0, 0.7, 0.4]
-    error, order = extrapolated(h, [2 + 0.3 * x**3.5 for x in h])
+    error, order = estimated_error(h, [2 + 0.3 * x**3.5 for x in h])
     assert order == pytest.approx(3.5, rel=1e-9)
     assert error == pytest.approx(0.3 * 0.4**3.5, rel=1e-8)
 
 
 def test_no_order_where_there_is_none() -> None:
     """Two meshes, or values that go to and fro: the last difference; one mesh: nothing is known."""
-    assert extrapolated([2, 1], [1.2, 1.1]) == (pytest.approx(0.1), None)
-    assert extrapolated([4, 2, 1], [1.2, 1.0, 1.1]) == (pytest.approx(0.1), None)
-    assert extrapolated([4, 2, 1], [1.0, 1.1, 1.3]) == (pytest.approx(0.2), None)  # diverges
-    assert extrapolated([1], [1.2]) == (None, None)
+    assert estimated_error([2, 1], [1.2, 1.1]) == (pytest.approx(0.1), None)
+    assert estimated_error([4, 2, 1], [1.2, 1.0, 1.1]) == (pytest.approx(0.1), None)
+    assert estimated_error([4, 2, 1], [1.0, 1.1, 1.3]) == (pytest.approx(0.2), None)  # diverges
+    assert estimated_error([1], [1.2]) == (None, None)
 
 
 def made(*measured: tuple[float | None, int, float]) -> tuple[list[Run], list[Measured]]:

@@ -11,17 +11,16 @@ from command import magshell
 from conftest import CASES
 from figures import figures
 from figures.figures import FIGURES
+from many import make_points, sweep, with_earlier
 
 from magshell_fenicsx import CaseError
 from magshell_fenicsx.input.section import number_and_unit
 from magshell_fenicsx.input.source import read_source
 from magshell_fenicsx.runs.run import run
-from magshell_fenicsx.studies.sweep import axes as axes_module
-from magshell_fenicsx.studies.sweep import chain, sweep_plot
-from magshell_fenicsx.studies.sweep import sweep as module
-from magshell_fenicsx.studies.sweep.axes import parse_axes
-from magshell_fenicsx.studies.sweep.earlier import with_earlier
-from magshell_fenicsx.studies.sweep.points import SweepPoint, make_points
+from magshell_fenicsx.studies import points as axes_module
+from magshell_fenicsx.studies import sweep as module
+from magshell_fenicsx.studies import sweep_picture as sweep_plot
+from magshell_fenicsx.studies.points import SweepPoint, parse_axes
 
 PLATE, DIMPLE, POLE = (CASES / f"{name}.yaml" for name in ("clamped_plate", "dimple_buckling", "pole_indentation"))
 COARSE = ["mesh.degree=3", "mesh.refinement=0.5"]
@@ -46,12 +45,12 @@ def computed(monkeypatch: pytest.MonkeyPatch) -> list[float]:
         done.append(case.loading.pressure)
         return run(case, comm=comm)
 
-    monkeypatch.setattr(chain, "run", counted)
+    monkeypatch.setattr(module, "run", counted)
     return done
 
 
 def plate(out: Path, *over: str, settings: tuple[str, ...] = (), say: Callable[[str], None] = print) -> module.Sweep:
-    return module.sweep(PLATE, over or [PRESSURES], [*COARSE, *settings], out, say=say)
+    return sweep(PLATE, over or [PRESSURES], [*COARSE, *settings], out, say=say)
 
 
 def test_product_and_ties() -> None:
@@ -187,14 +186,14 @@ def test_a_large_sweep_reads_each_value_a_few_times(tmp_path: Path, monkeypatch:
 def test_parts_of_several_jobs_make_one_table(tmp_path: Path, computed: list[float]) -> None:
     """Each computes its share into one folder; the whole sweep then computes nothing."""
     over = "loading.pressure=1e-5:3e-5:3"
-    first = module.sweep(PLATE, [over], COARSE, tmp_path, part="1/2")
+    first = sweep(PLATE, [over], COARSE, tmp_path, part="1/2")
     assert (computed, len(first.points)) == ([1e-5], 1)
     assert len(read(tmp_path / "sweep.csv")) == 1
-    module.sweep(PLATE, [over], COARSE, tmp_path, part="2/2")
+    sweep(PLATE, [over], COARSE, tmp_path, part="2/2")
     assert len(plate(tmp_path, over).points) == len(read(tmp_path / "sweep.csv")) == 3
     assert computed == [1e-5, 2e-5, 3e-5]
     with pytest.raises(CaseError, match="--part 3/2: write it as i/n with 1 <= i <= n"):
-        module.sweep(PLATE, [over], COARSE, tmp_path, part="3/2")
+        sweep(PLATE, [over], COARSE, tmp_path, part="3/2")
 
 
 def test_values_with_units_are_numbers(tmp_path: Path) -> None:
@@ -208,7 +207,7 @@ def test_values_with_units_are_numbers(tmp_path: Path) -> None:
         "loading: {kind: pressure, until: limit}\nmesh: {degree: 3, refinement: 0.5}\n",
         encoding="utf-8",
     )
-    done = module.sweep(file, ["magnetic.applied.flux_density=-20mT:0.02T:3"], out=tmp_path / "out")
+    done = sweep(file, ["magnetic.applied.flux_density=-20mT:0.02T:3"], out=tmp_path / "out")
     assert [outcome.found for outcome in done.outcomes] == ["path", "fold", "fold"]
     rows = read(tmp_path / "out" / "sweep.csv")
     assert [row["magnetic.applied.flux_density"] for row in rows] == ["-20 mT", "0 mT", "20 mT"]

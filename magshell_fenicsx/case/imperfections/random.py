@@ -6,9 +6,9 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, PrivateAttr, ValidationError, ValidationInfo, model_validator
 
-from magshell_fenicsx.case.ensemble import DefectsSection, generator
 from magshell_fenicsx.case.imperfections.dimple import DimpleSection
 from magshell_fenicsx.case.imperfections.gaussian import GaussianSection
+from magshell_fenicsx.input.chance import DefectsSection, generator
 from magshell_fenicsx.parts.imperfections.place import ImperfectionSection
 from magshell_fenicsx.parts.imperfections.sized import half_width, over, sizes_noted
 

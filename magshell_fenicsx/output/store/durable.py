@@ -2,6 +2,7 @@
 
 import json
 import os
+from collections.abc import Mapping
 from contextlib import suppress
 from errno import EFBIG, EINVAL, EISDIR
 from pathlib import Path
@@ -59,6 +60,11 @@ def read_object(file: Path) -> dict[str, Any]:
     if not isinstance(found, dict):
         raise Damaged(f"{file}: is damaged: no JSON object")
     return found
+
+
+def write_object(file: Path, content: Mapping[str, Any], indent: int = 1) -> None:
+    """Write a JSON object; see `write_whole`."""
+    write_whole(file, (json.dumps(content, indent=indent) + "\n").encode())
 
 
 def write_whole(file: Path, content: bytes) -> None:

@@ -89,6 +89,14 @@ def _line(values: Iterable[Any]) -> str:
     return stream.getvalue()
 
 
+def write_csv(rows: Iterable[Mapping[str, Any]], columns: Sequence[str], file: Path) -> None:
+    """Write rows with numbers in full precision."""
+    with file.open("w", newline="", encoding="utf-8") as stream:
+        writer = csv.DictWriter(stream, columns, extrasaction="ignore")
+        writer.writeheader()
+        writer.writerows({k: repr(v) if isinstance(v, float) else v for k, v in row.items()} for row in rows)
+
+
 def is_path(file: Path) -> bool:
     """Whether a file begins as a path.csv does."""
     try:

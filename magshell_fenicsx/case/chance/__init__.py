@@ -1,1 +1,0 @@
-"""Random quantities of a case file: distributions of numbers, and random places."""

@@ -1,0 +1,249 @@
+"""Random quantities of a case file: distributions of numbers, random places, and defects there."""
+
+import zlib
+from math import cos, degrees, inf, log, nextafter, pi, radians, sqrt
+from statistics import NormalDist
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BeforeValidator, Field, model_validator
+
+from magshell_fenicsx.input.section import Section
+
+Array = NDArray[np.float64]
+
+NEEDED = {
+    "normal": ("mean", "deviation"),
+    "lognormal": ("mean", "deviation"),
+    "uniform": ("above", "below"),
+    "choice": ("values",),
+}
+OPTIONAL = {"normal": ("above", "below"), "lognormal": ("above", "below"), "choice": ("weights",)}
+LEAST_PART = 1e-9  # probability between the bounds of a truncated distribution
+
+Value = float | int | str
+
+
+class DistributionSection(Section):
+    """A random number, or a word chosen at random.
+
+    normal and lognormal: mean and deviation are those of the number itself, before bounds cut the distribution off.
+    uniform: between above and below. choice: one of values. In place of the section a number is that number always.
+    """
+
+    kind: Literal["normal", "lognormal", "uniform", "choice"]
+    """Its law"""
+    mean: float | None = None
+    """Mean; of a lognormal number positive"""
+    deviation: float | None = Field(default=None, gt=0)
+    """Standard deviation"""
+    above: float | None = None
+    """Least value"""
+    below: float | None = None
+    """Largest value"""
+    values: Annotated[list[float | int | str], Field(min_length=1)] | None = None
+    """What is chosen from"""
+    weights: list[Annotated[float, Field(ge=0)]] | None = None
+    """Of each of the values; by default all are equally probable"""
+    unit: str | None = Field(default=None, examples=["mm"])
+    """Unit of the numbers, of a key with units"""
+
+    @model_validator(mode="after")
+    def _keys_belong_to_the_kind(self) -> Self:
+        needed, given = NEEDED[self.kind], self.model_fields_set - {"kind", "unit"}
+        if missing := [key for key in needed if key not in given]:
+            raise ValueError(f"kind: {self.kind} needs {' and '.join(missing)}")
+        if strange := sorted(given - {*needed, *OPTIONAL.get(self.kind, ())}):
+            raise ValueError(f"{strange[0]} does not belong to kind: {self.kind}")
+        low, high = self._bounds
+        if low >= high:
+            raise ValueError(f"above must be less than below, here {low:g} and {high:g}")
+        if self.kind == "lognormal" and not self._mean > 0:
+            raise ValueError(f"a lognormal number is positive: its mean must be too, here {self._mean:g}")
+        if self.kind in ("normal", "lognormal") and np.diff(self._probabilities)[0] < LEAST_PART:
+            raise ValueError(
+                f"almost no number lies between above and below, here {low:g} and {high:g}: choose bounds closer to "
+                f"the mean, {self._mean:g}"
+            )
+        if self.weights is not None and (len(self.weights) != len(self.values or []) or not sum(self.weights)):
+            raise ValueError("weights: one for each of the values, not all zero")
+        return self
+
+    def draw(self, rng: np.random.Generator) -> Value:
+        """A value; takes one number of the generator, whatever the kind."""
+        return self.at(float(rng.random()))
+
+    def at(self, part: float) -> Value:
+        """The quantile of a probability: the inverse of the distribution function."""
+        if self.kind == "choice":
+            assert self.values
+            weights = np.array(self.weights or [1.0] * len(self.values))
+            steps = np.cumsum(weights) / weights.sum()
+            return self._with_unit(self.values[int(np.searchsorted(steps, part, side="right"))])
+        low, high = self._bounds
+        if self.kind == "uniform":
+            return self._with_unit(low + part * (high - low))
+        first, last = self._probabilities
+        centre, width = self._normal
+        inner = min(max(first + part * (last - first), nextafter(0, 1)), nextafter(1, 0))
+        x = NormalDist(centre, width).inv_cdf(inner)
+        return self._with_unit(float(np.clip(np.exp(x) if self.kind == "lognormal" else x, low, high)))
+
+    @property
+    def _mean(self) -> float:
+        assert self.mean is not None
+        return self.mean
+
+    @property
+    def _bounds(self) -> tuple[float, float]:
+        return -inf if self.above is None else self.above, inf if self.below is None else self.below
+
+    @property
+    def _normal(self) -> tuple[float, float]:
+        """Mean and deviation of the number, or of the logarithm of a lognormal one."""
+        assert self.deviation is not None
+        if self.kind == "normal":
+            return self._mean, self.deviation
+        spread = log(1 + (self.deviation / self._mean) ** 2)
+        return log(self._mean) - spread / 2, sqrt(spread)
+
+    @property
+    def _probabilities(self) -> tuple[float, float]:
+        """The probabilities of smaller numbers than above and below."""
+        centre, width = self._normal
+        ends = np.array(self._bounds)
+        with np.errstate(divide="ignore"):
+            ends = np.log(np.maximum(ends, 0.0)) if self.kind == "lognormal" else ends
+        first, last = (NormalDist(centre, width).cdf(end) for end in ends)
+        return first, last
+
+    def _with_unit(self, value: Value) -> Value:
+        return value if self.unit is None else f"{value!r} {self.unit}"
+
+
+def _certain(value: Any) -> Any:
+    """A number, as the choice of one."""
+    if isinstance(value, float | int) and not isinstance(value, bool):
+        return {"kind": "choice", "values": [value]}
+    return value
+
+
+Distribution = Annotated[
+    DistributionSection, BeforeValidator(_certain, json_schema_input_type=float | DistributionSection)
+]
+
+
+MOST_TRIES, MOST_STARTS = 300, 30  # for one place; with all places anew
+DENSEST = pi / 12**0.5  # part of the plane that equal discs can cover
+
+
+class NoRoom(ValueError):
+    """The places do not fit at their least distance; the message has the numbers."""
+
+
+def random_places(rng: np.random.Generator, count: int, polar: tuple[float, float], distance: float) -> Array:
+    """Polar angles and azimuths (count, 2) in degrees, uniform in area between two polar angles.
+
+    A place at less than `distance` from an earlier one is drawn again (random sequential addition).
+
+    Parameters
+    ----------
+    polar, distance
+        In degrees; the distance is the angle between two places, seen from the centre.
+
+    Raises
+    ------
+    NoRoom
+        If not even a dense packing has room, or none was found.
+    """
+    refuse_no_room(count, polar, distance)
+    low, high, least = cos(radians(polar[1])), cos(radians(polar[0])), cos(radians(distance))
+    for _ in range(MOST_STARTS):
+        found = np.empty((0, 3))
+        for _ in range(count):
+            for _ in range(MOST_TRIES):
+                z, azimuth = rng.uniform(low, high), rng.uniform(0.0, 2 * pi)
+                new = np.array([np.sqrt(1 - z * z) * np.cos(azimuth), np.sqrt(1 - z * z) * np.sin(azimuth), z])
+                if (found @ new <= least).all():
+                    found = np.vstack([found, new])
+                    break
+            else:
+                break
+        if len(found) == count:
+            angles = np.degrees([np.arccos(found[:, 2]), np.arctan2(found[:, 1], found[:, 0]) % (2 * pi)])
+            return np.asarray(angles.T)
+    raise NoRoom(f"no room was found for {count} places at least {distance:g} degrees apart: fewer, or closer ones")
+
+
+def refuse_no_room(count: int, polar: tuple[float, float], distance: float) -> None:
+    """Compare the area of discs around the places with the area that they may lie in.
+
+    Raises
+    ------
+    NoRoom
+        If the discs are too large or too many even for a hexagonal packing.
+    """
+    half = radians(distance) / 2
+    low, high = max(radians(polar[0]) - half, 0.0), min(radians(polar[1]) + half, pi)
+    most = max(DENSEST * (cos(low) - cos(high)) / (1 - cos(half)), 1.0) if half else np.inf
+    if count > most:
+        raise NoRoom(
+            f"{count} places at least {distance:g} degrees apart do not fit between the polar angles {polar[0]:g} and "
+            f"{degrees(radians(polar[1])):g}: there is room for less than {int(most) + 1}"
+        )
+
+
+Angle = Annotated[float, Field(ge=0, le=180)]
+
+
+class DefectsSection(Section):
+    """Random defects in place of `shell.imperfections`, at random places of a sphere, uniform in area."""
+
+    kind: Literal["gaussian", "dimple"] = "gaussian"
+    """The kind of all of them, as in `shell.imperfections`"""
+    count: Distribution
+    """Their number; a distribution of whole numbers, or a number"""
+    amplitude: Distribution
+    """The amplitude of each [h]"""
+    width: Distribution
+    """The width of each, as in `shell.imperfections`"""
+    polar: Annotated[list[Angle], Field(min_length=2, max_length=2)]
+    """Least and largest polar angle of their centres [degrees]"""
+    distance: Angle = 0.0
+    """Least angle between two centres [degrees]"""
+
+    @model_validator(mode="after")
+    def _there_is_room(self) -> Self:
+        if self.polar[0] >= self.polar[1]:
+            raise ValueError(f"polar: the first angle must be less than the second, here {self.polar}")
+        numbers = [self.count.at(part) for part in np.linspace(0, 1 - 1e-9, 101)]
+        if any(not float(n).is_integer() or not 0 <= float(n) <= 500 for n in numbers if not isinstance(n, str)):
+            raise ValueError("count: must be whole numbers from 0 to 500")
+        refuse_no_room(max(int(n) for n in numbers), (self.polar[0], self.polar[1]), self.distance)
+        return self
+
+    def draw(self, rng: np.random.Generator) -> list[dict[str, Any]]:
+        """Defects as in `shell.imperfections`.
+
+        Raises
+        ------
+        NoRoom
+            If no places were found for them.
+        """
+        count = int(self.count.draw(rng))
+        places = random_places(rng, count, (self.polar[0], self.polar[1]), self.distance)
+        return [
+            {
+                "kind": self.kind,
+                "amplitude": self.amplitude.draw(rng),
+                "width": self.width.draw(rng),
+                "at": {"polar": float(polar), "azimuth": float(azimuth)},
+            }
+            for polar, azimuth in places
+        ]
+
+
+def generator(seed: int, number: int, name: str) -> np.random.Generator:
+    """The random numbers of a sample for one name."""
+    return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(number, zlib.crc32(name.encode()))))

@@ -1,0 +1,102 @@
+"""Wall time, CPU time and peak memory of a command in a separate process.
+
+`python3 -m magshell_fenicsx.platform.processes FOLDER MODULE ARGUMENT...` runs a module as `python3 -m` does, and
+writes the peak memory of this rank to a folder. The peak is the kernel's VmHWM. getrusage is no substitute: a process
+inherits the peak of its parent, and the parent of several ranks gets only the largest.
+"""
+
+import os
+import re
+import runpy
+import subprocess
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+
+@dataclass(frozen=True)
+class Usage:
+    """The resources that a process used.
+
+    Attributes
+    ----------
+    code
+        Exit code.
+    wall_s, cpu_s
+        Times of the whole process; CPU seconds are summed over ranks and their child processes.
+    peak_mb
+        Peak resident memory (2^20 bytes), summed over the ranks; None if a rank died.
+    output, errors
+        Standard output and standard error.
+    """
+
+    code: int
+    wall_s: float
+    cpu_s: float
+    peak_mb: float | None
+    output: str
+    errors: str
+
+
+def measure(
+    module: str, arguments: Sequence[str], ranks: int = 1, environment: Mapping[str, str] | None = None
+) -> Usage:
+    """Run `python3 -m MODULE ARGUMENT...` and wait for it; one thread per rank.
+
+    Parameters
+    ----------
+    ranks
+        Number of ranks; mpirun starts more than one.
+    environment
+        Additional environment variables.
+    """
+    launcher = ["mpirun", "--map-by", ":OVERSUBSCRIBE", "-n", str(ranks)] if ranks > 1 else []
+    with TemporaryDirectory() as scratch:
+        command = [*launcher, sys.executable, "-m", "magshell_fenicsx.platform.processes", scratch, module, *arguments]
+        output, errors = Path(scratch) / "output", Path(scratch) / "errors"
+        with output.open("wb") as stdout, errors.open("wb") as stderr:
+            start = time.perf_counter()
+            process = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=stdout,
+                stderr=stderr,
+                env={**os.environ, "OMP_NUM_THREADS": "1", **(environment or {})},
+            )
+            try:
+                _, status, usage = os.wait4(process.pid, 0)
+            except BaseException:
+                process.terminate()
+                process.wait()
+                raise
+            wall_s = time.perf_counter() - start
+        # wait4 has reaped the process, so Popen must not wait for it
+        process.returncode = os.waitstatus_to_exitcode(status)
+        peaks = [int(file.read_text(encoding="utf-8")) for file in Path(scratch).glob("peak.*")]
+        return Usage(
+            code=process.returncode,
+            wall_s=wall_s,
+            cpu_s=usage.ru_utime + usage.ru_stime,
+            peak_mb=sum(peaks) / 1024 if len(peaks) == ranks else None,
+            output=output.read_text(encoding="utf-8", errors="replace"),
+            errors=errors.read_text(encoding="utf-8", errors="replace"),
+        )
+
+
+def main() -> None:
+    folder, module, *arguments = sys.argv[1:]
+    sys.argv = [module, *arguments]
+    try:
+        runpy.run_module(module, run_name="__main__", alter_sys=True)
+    finally:
+        status = Path("/proc/self/status").read_text(encoding="utf-8")
+        peak = re.search(r"^VmHWM:\s*(\d+) kB$", status, re.MULTILINE)
+        if peak:
+            (Path(folder) / f"peak.{os.getpid()}").write_text(peak[1], encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

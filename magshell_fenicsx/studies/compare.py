@@ -1,0 +1,412 @@
+"""Comparison of a case as a shell and as a solid: curve against curve, error against run time."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass, fields
+from math import copysign
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from mpi4py import MPI
+from pydantic import TypeAdapter
+
+from magshell_fenicsx.input.source import CaseError, read_source
+from magshell_fenicsx.output.store.checkpoint import FILE, NAME, begun_with
+from magshell_fenicsx.output.store.durable import Damaged, read_object, write_object
+from magshell_fenicsx.output.store.folder import by_first, given_folder
+from magshell_fenicsx.output.store.known import read_summary
+from magshell_fenicsx.output.store.table import read_lines, write_csv
+from magshell_fenicsx.platform import sources
+from magshell_fenicsx.platform.processes import measure
+from magshell_fenicsx.quantities.registry import amplitude, quantity
+from magshell_fenicsx.studies.results import Scalar
+from magshell_fenicsx.studies.runner import Folder, Made, Say, compute, keep, kept
+from magshell_fenicsx.studies.study_report import estimated_error
+
+Errors = Mapping[str, Sequence[tuple[float, float]]]
+ModelName = Literal["shell", "solid"]
+MODELS: tuple[ModelName, ...] = ("shell", "solid")
+WITHOUT: dict[ModelName, list[str]] = {"shell": ["solid=null"], "solid": []}  # settings of a model alone
+UNCOMPARED = ("angle", "time")  # amplitudes over which curves are not compared
+FOLDER = Folder("a comparison", ("compare.json", "compare.csv", "compare.png"), ("difference", "runs"), points="")
+
+
+@dataclass(frozen=True)
+class ModelRun:
+    """The results of a run.
+
+    Attributes
+    ----------
+    refinement
+        The value of mesh.refinement.
+    summary, rows
+        The content of summary.json and of path.csv.
+    cpu_s, wall_s
+        Times of the process without the compilation of kernels.
+    """
+
+    model: ModelName
+    refinement: float
+    summary: dict[str, Any]
+    rows: list[dict[str, str]]
+    cpu_s: float
+    wall_s: float
+
+    @property
+    def dofs(self) -> int:
+        return int(self.summary["mesh"]["dofs"])
+
+
+class NothingLeft(RuntimeError):
+    """A run left no results; the message has the reason."""
+
+
+@dataclass(frozen=True)
+class Used:
+    """What usage.json says of a run: what was asked for, and the times of the process."""
+
+    asked: dict[str, Any]
+    cpu_s: float
+    wall_s: float
+
+
+def run_model(
+    case: Path, settings: Sequence[str], model: ModelName, refinement: float, folder: Path, say: Say = print
+) -> ModelRun:
+    """Run a case with one of the models, unless the folder has that run by the same sources.
+
+    Raises
+    ------
+    NothingLeft
+        If there is nothing to compare.
+    """
+    chosen = [*settings, f"model={model}", f"mesh.refinement={refinement:g}", *WITHOUT[model]]
+    asked = {"case": case.read_text(encoding="utf-8"), "settings": chosen, "sources": sources.ours()}
+    used, results, why = kept(folder / "usage.json", TypeAdapter(Used)), None, ""
+    if used and used.asked == asked:
+        try:
+            results = read_summary(folder), read_lines(folder / "path.csv")
+        except (OSError, Damaged) as e:
+            why = str(e)
+    elif used and used.asked | {"sources": asked["sources"]} == asked:
+        why = "the folder has results of other sources of magshell_fenicsx"
+    if why:
+        say(f"{model} at refinement {refinement:g}: computed again, {why}")
+    if not (used and results):
+        name = _case_in(folder)
+        if name and Path(name).stem != case.stem:
+            raise CaseError(f"--out {folder.parent}: has a comparison of {name}, which is kept; give another folder")
+        sets = [part for setting in chosen for part in ("--set", setting)]
+        measured = measure("magshell_fenicsx", ["run", str(case), *sets, "--out", str(folder), "--overwrite"])
+        if not (folder / "summary.json").exists() or measured.code not in (0, 3):
+            errors = measured.errors.strip().splitlines()
+            raise NothingLeft(f"model: {model}: {errors[-1] if errors else f'exit code {measured.code}'}")
+        results = read_summary(folder), read_lines(folder / "path.csv")
+        used = Used({**asked, "sources": results[0]["sources"]}, measured.cpu_s, measured.wall_s)
+        keep(folder / "usage.json", asdict(used))
+    summary, rows = results
+    compiling = float(summary["timing"]["jit_s"])
+    return ModelRun(model, refinement, summary, rows, used.cpu_s - compiling, used.wall_s - compiling)
+
+
+def _case_in(folder: Path) -> str:
+    """The name of the case file whose run is in a folder; empty without."""
+    with suppress(OSError, Damaged):
+        return str((begun_with(folder / NAME) or read_object(folder / "summary.json")).get(FILE, ""))
+    return ""
+
+
+W = "w"  # displacement of the mid-surface since the end of the field
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Loads of both models at the same displacement."""
+
+    w_over_h: float
+    shell: float
+    solid: float
+
+    @property
+    def relative(self) -> float:
+        """Relative difference of the solid from the shell."""
+        return self.solid / self.shell - 1
+
+
+def amplitude_of(run: ModelRun) -> str:
+    """The amplitude that varied last."""
+    return run.rows[-1]["amplitude"]
+
+
+def curve(run: ModelRun) -> tuple[list[float], list[float]]:
+    """Displacements and loads of the last part of the path, without branches."""
+    y = amplitude(amplitude_of(run)).column
+    return [float(row[W]) for row in loaded(run)], [float(row[y]) for row in loaded(run)]
+
+
+def loaded(run: ModelRun) -> list[dict[str, str]]:
+    """The rows of the last part of the path and the row before it, with the displacement since that row.
+
+    The field displaces the mid-surface of a solid by nu lambda_m R/h more (of w/h), since it also stretches the
+    thickness. The displacement since the end of the field excludes this.
+    """
+    varied = amplitude_of(run)
+    x = "w_point_over_h" if varied == "force" else "w_pole_over_h"  # the same point in both models
+    first = next(i for i, row in enumerate(run.rows) if row["amplitude"] == varied)
+    before = run.rows[max(first - 1, 0)]
+    part = [before, *(row for row in run.rows[first:] if row["amplitude"] == varied and row["branch"] == "0")]
+    return [{**row, W: repr(float(row[x]) - float(before[x]))} for row in part]
+
+
+def places(runs: Sequence[ModelRun]) -> list[float]:
+    """The displacements 1, 2, ... that all runs reach, or their last common one if it is below 1.
+
+    Empty if a run has no targets: its steps are too long to interpolate between them.
+    """
+    if not all(any(row["label"] == "target" for row in loaded(run)) for run in runs):
+        return []
+    end = min(max(curve(run)[0]) for run in runs)
+    return [float(w) for w in range(1, int(end + 1e-6) + 1)] or [end]
+
+
+def differences(shell: ModelRun, solid: ModelRun) -> list[Difference]:
+    """The differences at the displacements that both runs reach."""
+    found = []
+    for place in places([shell, solid]):
+        loads = [load_at(run, place) for run in (shell, solid)]
+        if loads[0] is not None and loads[1] is not None:
+            found.append(Difference(place, loads[0], loads[1]))
+    return found
+
+
+def load_at(run: ModelRun, w: float) -> float | None:
+    """The load at a displacement; None if the run does not reach it."""
+    return Scalar("", amplitude(amplitude_of(run)).column, W, w).of(run.summary, loaded(run))
+
+
+def judged(runs: Sequence[ModelRun], at: float | None) -> tuple[str, list[float | None]]:
+    """The name and the values of the compared number: k_d if all runs have it, else the load at a displacement."""
+    if all(run.summary["knockdown"] is not None for run in runs):
+        return "knockdown", [float(run.summary["knockdown"]) for run in runs]
+    if at is None:
+        return "nothing", [None for _ in runs]
+    return f"{amplitude(amplitude_of(runs[0])).column} at w/h = {at:g}", [load_at(run, at) for run in runs]
+
+
+def time_at(error: float, runs: Sequence[tuple[float, float]]) -> float | None:
+    """Run time in seconds for an error, interpolated between runs (error, seconds); None outside their range.
+
+    Examples
+    --------
+    >>> round(time_at(0.01, [(0.1, 1.0), (0.001, 100.0)]), 9)
+    10.0
+    """
+    ordered = sorted((e, s) for e, s in runs if e > 0)
+    if not ordered or not ordered[0][0] <= error <= ordered[-1][0]:
+        return None
+    e, s = np.log(np.array(ordered)).T
+    return float(np.exp(np.interp(np.log(error), e, s)))
+
+
+ONE_PERCENT = 0.01
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """The result of a comparison.
+
+    Attributes
+    ----------
+    differences
+        Differences between the curves of the finest runs.
+    content
+        The content of compare.json.
+    """
+
+    differences: list[Difference]
+    content: dict[str, Any]
+
+
+def compare(
+    file: Path | str,
+    settings: Sequence[str] = (),
+    *,
+    refinements: Mapping[ModelName, Sequence[float]],
+    out: Path | str,
+    made: Made,
+    say: Say = print,
+) -> Comparison:
+    """Run a case with both models; write compare.csv, compare.json and compare.png, and a folder for each run.
+
+    Every run is a separate process. Runs of the same case and sources that are in the folder are kept.
+
+    Parameters
+    ----------
+    refinements
+        Mesh refinements of each model. The finest runs are compared. Errors are relative to the limit that the
+        three finest runs extrapolate to.
+    made
+        Makes a case of its source.
+
+    Raises
+    ------
+    CaseError
+        If the case is not valid for one of the models.
+    NothingLeft
+        If a run left no results.
+    """
+    file, folder = Path(file), given_folder(out)
+    for model in MODELS:
+        case = made(read_source(file, [*settings, f"model={model}", *WITHOUT[model]]))
+    varied = case.programme[-1].name if case.programme else ""
+    if not varied or varied in UNCOMPARED or (varied == "lambda_m" and case.loading is None):
+        raise CaseError("compare: needs a load whose curve can be compared: pressure, indentation or field")
+    runs: dict[ModelName, list[ModelRun]] = {model: [] for model in MODELS}
+
+    def computed(task: tuple[ModelName, float]) -> Iterator[str]:
+        model, refinement = task
+        done = run_model(file, settings, model, refinement, folder / f"{model}_{refinement:g}", say)
+        runs[model].append(done)
+        yield f"{model} at refinement {refinement:g}: {done.dofs} unknowns, {done.cpu_s:.1f} s CPU"
+        if not amplitude_of(done):
+            raise NothingLeft(f"the {model} did not leave its undeformed state: {done.summary['stopped']}")
+
+    with FOLDER.held(folder, MPI.COMM_SELF, file.name):
+        tasks = [(model, refinement) for model in MODELS for refinement in sorted(set(refinements[model]))]
+        compute(tasks, computed, MPI.COMM_SELF, say)
+        shell, solid = (runs[model][-1] for model in MODELS)
+        if amplitude_of(shell) != amplitude_of(solid):
+            ends = [amplitude_of(run) for run in (shell, solid)]
+            raise CaseError(f"compare: the shell ended while {ends[0]} varied, the solid while {ends[1]} did")
+        found = differences(shell, solid)
+        at = max(places([run for model in MODELS for run in runs[model]]), default=None)
+        content = {"case": file.name, **_content(runs, at, found)}
+        by_first(MPI.COMM_SELF, lambda: _write(content, found, folder))
+        errors: Errors = {
+            model: [(run["error"], run["cpu_s"]) for run in content["runs"][model] if run["error"]] for model in MODELS
+        }
+        title = f"{file.name} {' '.join(settings)}".strip()
+        draw_comparison(shell, solid, found, errors, title, folder / "compare.png")
+    return Comparison(found, content)
+
+
+def _write(content: Mapping[str, Any], found: Sequence[Difference], folder: Path) -> None:
+    rows = [{**asdict(d), "relative": d.relative} for d in found]
+    write_csv(rows, (*(f.name for f in fields(Difference)), "relative"), folder / "compare.csv")
+    write_object(folder / "compare.json", content, indent=2)
+
+
+def parse_refinements(shell: str, solid: str) -> dict[ModelName, list[float]]:
+    """Read the options.
+
+    Raises
+    ------
+    CaseError
+        If one is not a list of numbers from 0.1 to 20.
+
+    Examples
+    --------
+    >>> parse_refinements("1", "0.5,1")
+    {'shell': [1.0], 'solid': [0.5, 1.0]}
+    """
+    found: dict[ModelName, list[float]] = {}
+    for model, text in zip(MODELS, (shell, solid), strict=True):
+        try:
+            found[model] = [float(part) for part in text.split(",")]
+        except ValueError:
+            found[model] = []
+        if not found[model] or not all(0.1 <= r <= 20 for r in found[model]):
+            raise CaseError(f"--{model} {text}: write refinements from 0.1 to 20, for example 0.5,0.7,1")
+    return found
+
+
+def _content(runs: dict[ModelName, list[ModelRun]], at: float | None, found: Sequence[Difference]) -> dict[str, Any]:
+    accounts: dict[ModelName, list[dict[str, Any]]] = {}
+    limits: dict[str, float | None] = {}
+    seconds: dict[str, float | None] = {}
+    name, judgements = judged([run for series in runs.values() for run in series], at)
+    for model, series in runs.items():
+        values, judgements = judgements[: len(series)], judgements[len(series) :]
+        limit = extrapolated(values, [run.refinement for run in series])
+        errors = [abs(v / limit - 1) if v is not None and limit else None for v in values]
+        accounts[model] = [
+            {
+                "refinement": run.refinement,
+                "dofs": run.dofs,
+                "value": value,
+                "error": error,
+                "cpu_s": run.cpu_s,
+                "wall_s": run.wall_s,
+                "factorisations": run.summary["factorisations"],
+                "stopped": run.summary["stopped"],
+            }
+            for run, value, error in zip(series, values, errors, strict=True)
+        ]
+        limits[model] = limit
+        measured = [(e, run.cpu_s) for e, run in zip(errors, series, strict=True) if e is not None]
+        seconds[model] = time_at(ONE_PERCENT, measured)
+    both = [accounts[model][-1]["value"] for model in MODELS]
+    times = [seconds[model] for model in MODELS]
+    return {
+        "result": name,
+        "difference": both[1] / both[0] - 1 if None not in both else None,
+        "largest_difference_of_the_curves": max((abs(d.relative) for d in found), default=None),
+        "limits": limits,
+        "seconds_to_one_percent": seconds,
+        "ratio_at_one_percent": times[1] / times[0] if times[0] and times[1] else None,
+        "runs": accounts,
+    }
+
+
+def extrapolated(values: Sequence[float | None], refinements: Sequence[float]) -> float | None:
+    """The limit of the last three values by Richardson extrapolation; None for fewer values.
+
+    It is the last value if no order of convergence is observed.
+
+    Examples
+    --------
+    >>> round(extrapolated([2.0, 1.25, 1.0625], [1.0, 2.0, 4.0]), 12)
+    1.0
+    """
+    last = [v for v in values[-3:] if v is not None]
+    if len(last) < 3:
+        return None
+    error, order = estimated_error([1 / r for r in refinements[-3:]], last)
+    return last[2] if error is None or order is None else last[2] + copysign(error, last[2] - last[1])
+
+
+def draw_comparison(
+    shell: ModelRun, solid: ModelRun, found: Sequence[Difference], errors: Errors, title: str, file: Path
+) -> None:
+    """Write the picture.
+
+    Parameters
+    ----------
+    errors
+        Model -> (relative error, CPU seconds) of its coarser runs; without any the panel is left out.
+    """
+    from matplotlib.figure import Figure
+
+    panels = 1 + bool(found) + any(errors.values())
+    figure = Figure(figsize=(4.4 * panels, 3.7), dpi=160, layout="constrained")
+    varied = amplitude(amplitude_of(shell))
+    x_label, y_label = f"{quantity('w_over_h').latex} {varied.place} since the field", quantity(varied.column).label
+    first, *others = figure.subplots(1, panels, squeeze=False)[0]
+    first.plot(*curve(shell), ".-", color="C0", markersize=4, linewidth=1, label=f"shell, {shell.dofs} unknowns")
+    first.plot(*curve(solid), "o", color="C3", markersize=4, fillstyle="none", label=f"solid, {solid.dofs} unknowns")
+    first.set(xlabel=x_label, ylabel=y_label)
+    first.legend(frameon=False, fontsize=8)
+    if found:
+        others[0].plot([d.w_over_h for d in found], [100 * d.relative for d in found], ".-", color="C3")
+        others[0].axhline(0, color="0.8", linewidth=0.8, zorder=0)
+        others[0].set(xlabel=x_label, ylabel="solid over shell, difference (%)")
+    if any(errors.values()):
+        for (model, points), color in zip(errors.items(), ("C0", "C3"), strict=True):
+            if ordered := sorted((s, e) for e, s in points):
+                others[-1].loglog(*zip(*ordered, strict=True), "o-", color=color, label=model)
+        others[-1].set(xlabel="CPU time of the process (s)", ylabel="relative error, of each model's own limit")
+        others[-1].grid(which="both", color="0.92")
+        others[-1].legend(frameon=False, fontsize=8)
+    figure.suptitle(title, fontsize=9)
+    figure.savefig(file)

@@ -1,1 +1,0 @@
-"""Comparison of the shell and the solid model of a case."""

@@ -1,0 +1,340 @@
+"""A design: an optimiser of SciPy over the cases of its variables; every evaluation is kept, the best is verified.
+
+Evaluations are known by their variables: a design that is started again takes those in its folder, walks the same way,
+and goes on where it was interrupted.
+"""
+
+import hashlib
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from mpi4py import MPI
+from numpy.typing import NDArray
+from pydantic import TypeAdapter
+
+from magshell_fenicsx.input.source import CaseError, read_source
+from magshell_fenicsx.output.store.durable import write_object, write_whole
+from magshell_fenicsx.output.store.folder import by_first, given_folder
+from magshell_fenicsx.output.store.table import write_csv
+from magshell_fenicsx.platform import sources
+from magshell_fenicsx.platform.first import from_first
+from magshell_fenicsx.platform.terminal import print_line
+from magshell_fenicsx.runs.run import run
+from magshell_fenicsx.runs.summary import Result
+from magshell_fenicsx.simulate.gradients.barriers import BARRIER
+from magshell_fenicsx.simulate.gradients.instabilities import FOLDS, SCALES, Lost
+from magshell_fenicsx.simulate.gradients.mass import MASS, mass
+from magshell_fenicsx.simulate.gradients.results import vibration_at_end
+from magshell_fenicsx.simulate.results import Target, distances
+from magshell_fenicsx.simulate.standing import Standing
+from magshell_fenicsx.studies.design_evaluation import DISTANCE, Evaluation, evaluate
+from magshell_fenicsx.studies.design_picture import draw_design
+from magshell_fenicsx.studies.design_variables import Variables, variables
+from magshell_fenicsx.studies.design_wanted import Wanted, searched, wanted_of
+from magshell_fenicsx.studies.points import identity
+from magshell_fenicsx.studies.runner import Case, Folder, Made, Say, keep, kept
+
+Array = NDArray[np.float64]
+FOLDER = Folder(
+    "a design", ("summary.json", "design.csv", "best.yaml", "best.csv", "design.png"), ("objective", "best")
+)
+WAY = 4  # stages before the last have this part of the iterations
+NOTHING = 1e-10  # change of a result, relative, over the whole range of a variable
+FAR = 0.3  # relative difference of a result that is another result
+ROUNDING = 1e-12  # a smaller one is none
+
+
+class Missed(RuntimeError):
+    """The design is not what was asked for; the message says by how much."""
+
+
+@dataclass
+class Design:
+    """A design in its folder.
+
+    Attributes
+    ----------
+    rows
+        Of design.csv: one per evaluation.
+    tried
+        The variables and the evaluations, in the same order; those of the present stage.
+    stage
+        Number of the wanted shape; 0 of the last.
+    """
+
+    variables: Variables
+    wanted: Wanted
+    folder: Path
+    comm: MPI.Comm
+    say: Say
+    rows: list[dict[str, Any]] = field(default_factory=list)
+    tried: list[tuple[Array, Evaluation]] = field(default_factory=list)
+    stage: int = 0
+    _scene: Standing = field(default_factory=Standing)
+
+    def __call__(self, x: Array) -> Evaluation:
+        """The evaluation of a vector, known or new; collective."""
+        x = np.array(self.comm.bcast(x))
+        for tried, known in reversed(self.tried):
+            if np.array_equal(tried, x):
+                return known
+        stage = f"{self.stage}".encode() if self.stage else b""
+        name = hashlib.sha256(x.tobytes() + stage).hexdigest()[:16]
+        file, vectors = (self.folder / "points" / f"{name}.{ending}" for ending in ("json", "csv"))
+        evaluation = from_first(self.comm, lambda: kept(file, TypeAdapter(Evaluation), "evaluation", **self._mine))
+        if evaluation is None:
+            evaluation = self._new(x, vectors)
+            content = {**self._mine, "evaluation": asdict(evaluation)}
+            from_first(self.comm, lambda: keep(file, content))
+        self._add(x, evaluation, name)
+        return evaluation
+
+    def begin(self, stage: int, targets: Sequence[Mapping[str, Target]]) -> None:
+        """Want the next of several shapes."""
+        self.stage = (stage + 1) % len(targets)
+        self.wanted.targets = targets[stage]
+        self.tried.clear()
+
+    def _new(self, x: Array, vectors: Path) -> Evaluation:
+        by_first(self.comm, lambda: self.variables.write(x, vectors))
+        case, wanted = self.variables.case_of(x, vectors), self.wanted
+        evaluation = evaluate(case, x, self.variables, wanted.results, wanted.targets, self.comm, self._scene)
+        return Evaluation(**self.comm.bcast(asdict(evaluation)))
+
+    @cached_property
+    def _mine(self) -> dict[str, str]:
+        """What the evaluations of this design have in their files: a hash of what is designed, and the sources."""
+        asked = self.wanted.section.model_dump_json(exclude={"iterations", "verify"})
+        designed = hashlib.sha256((identity(self.variables.case) + asked).encode()).hexdigest()[:16]
+        return {"design": designed, "sources": sources.ours()}
+
+    def _add(self, x: Array, evaluation: Evaluation, name: str) -> None:
+        self.tried.append((x, evaluation))
+        best, there = self.best, bool(evaluation.values)
+        row = {
+            "evaluation": len(self.rows) + 1,
+            **{result: evaluation.values.get(result) for result in self.wanted.results},
+            **evaluation.seen,
+            "objective": self.wanted.objective(evaluation) if there else None,
+            "violation": self.wanted.violation(evaluation) if there else None,
+            "best": bool(best and best[0] is x),
+            **self.variables.numbers(x),
+            **({"stage": self.stage or "last"} if self.wanted.stages else {}),
+            "note": evaluation.note,
+            "point": name,
+        }
+        self.rows.append(row)
+        by_first(self.comm, self._write)
+        values = ", ".join(f"{key} = {value:.9g}" for key, value in (evaluation.values | evaluation.seen).items())
+        note = f" ({evaluation.note})" if values and evaluation.note else evaluation.note
+        self.say(f"{row['evaluation']:5d}  {values}{note}{'  best' if row['best'] else ''}")
+
+    def _write(self) -> None:
+        if not any(evaluation.values for _, evaluation in self.tried) and (self.folder / "design.csv").exists():
+            return  # one that cannot start replaces nothing
+        columns = list(dict.fromkeys(key for row in self.rows for key in row))
+        write_csv(self.rows, columns, self.folder / "design.csv")
+
+    @property
+    def best(self) -> tuple[Array, Evaluation] | None:
+        """The evaluation with the least objective of those that keep the constraints best."""
+        there = [each for each in self.tried if each[1].values]
+        return min(there, key=lambda each: self.wanted.merit(each[1])) if there else None
+
+
+def design(
+    file: Path | str,
+    settings: Sequence[str] = (),
+    out: Path | str = "results/design",
+    *,
+    made: Made,
+    resume: bool = False,
+    comm: MPI.Intracomm = MPI.COMM_WORLD,
+    say: Say = print_line,
+) -> dict[str, Any]:
+    """Vary a case for a result; collective. Returns the content of summary.json.
+
+    Parameters
+    ----------
+    out
+        Folder of design.csv (all evaluations), best.yaml with best.csv (the best case and its remanence), design.png,
+        summary.json, verified/ (the run of the best case on a finer mesh) and points/.
+    made
+        Makes a case of its source, the same on all ranks.
+    resume
+        See that the folder has evaluations of this design.
+
+    Raises
+    ------
+    CaseError
+        If the case has no design, or a variable or a result is none.
+    Missed
+        After everything is written: if a target is not reached, a constraint not kept, or no optimum found.
+    """
+    source = from_first(comm, lambda: read_source(Path(file), settings))
+    case, folder = made(source), given_folder(out)
+    if case.design is None:
+        raise CaseError(f"{file}: design: is missing: it says what varies and what is wanted")
+    try:
+        vary, wanted = variables(source, case, case.design, made), wanted_of(case, case.design)
+        with FOLDER.held(folder, comm, Path(file).name):
+            if resume and not by_first(comm, lambda: any((folder / "points").glob("*.json"))):
+                raise CaseError(f"{folder}: has no evaluation to resume")
+            return _designed(Design(vary, wanted, folder, comm, say), Path(file), comm)
+    except CaseError as e:
+        raise CaseError(case.placed(str(e))) from None
+
+
+def _designed(made: Design, file: Path, comm: MPI.Intracomm) -> dict[str, Any]:
+    vary, wanted, section, folder = made.variables, made.wanted, made.wanted.section, made.folder
+    first, best, x, ended = _optimised(made)
+    steps = section.remanence.steps if section.remanence else None
+    if steps:
+        x = vary.rounded(x, steps)
+        before, best = best, made(x)
+        if not best.values:
+            raise Missed(f"with angles in {steps} steps of a turn there is no result: {best.note}")
+        made.say(f"angles rounded to {steps} steps of a turn: {wanted.words(before)} -> {wanted.words(best)}")
+    by_first(comm, partial(_write_best, made, x, file))
+    content: dict[str, Any] = {
+        "case": file.name,
+        "objective": section.objective.model_dump(exclude_none=True),
+        "start": first.values | first.seen,
+        "best": best.values | best.seen,
+        "numbers": vary.numbers(x),
+        "ended": ended,
+        "without_influence": _without_influence(vary, first),
+        "evaluations": len(made.rows),
+        "note": best.note,
+        "violation": wanted.violation(best),
+        "sources": sources.ours(),
+    }
+    by_first(comm, lambda: draw_design(made.rows, wanted.results, vary, x, folder / "design.png"))
+    by_first(comm, lambda: write_object(folder / "summary.json", content))
+    content["verified"] = verified(made, best, comm)
+    by_first(comm, lambda: write_object(folder / "summary.json", content))
+    if missed := wanted.missed(best):
+        raise Missed(f"{missed}; the best case is {folder / 'best.yaml'}")
+    return content
+
+
+def _optimised(made: Design) -> tuple[Evaluation, Evaluation, Array, str]:
+    """The first evaluation, the best one with its variables, and why the optimiser ended."""
+    vary, wanted, iterations = made.variables, made.wanted, made.wanted.section.iterations
+    targets = [*wanted.stages, wanted.targets]
+    made.begin(0, targets)
+    first, x = made(vary.first), vary.first
+    if not first.values:
+        raise Missed(f"the case itself has no result to start from: {first.note}")
+    wanted.begin(first)
+    idle = _without_influence(vary, first)
+    for name in idle:
+        made.say(f"warning: {name} has no influence on {', '.join(wanted.results)} where the design starts")
+    if len(idle) == len(vary.blocks):
+        raise Missed(f"no variable has an influence on {', '.join(wanted.results)} where the design starts")
+    for stage in range(len(targets)):
+        if stage:
+            made.begin(stage, targets)
+            wanted.begin(made(x))
+        last = stage == len(targets) - 1
+        ended = searched(made, wanted, vary, x, iterations if last else -(-iterations // WAY))
+        assert made.best
+        x, best = made.best
+    return first, best, x, ended
+
+
+def _without_influence(vary: Variables, first: Evaluation) -> list[str]:
+    """The variables that change no result."""
+    slopes = np.array([first.gradients[result] for result in first.values])
+    size = np.array([abs(value) or 1.0 for value in first.values.values()])
+    strongest = (np.abs(slopes) / size[:, None]).max(axis=0)
+    return [name for name, part in vary.blocks.items() if strongest[part].max() < NOTHING]
+
+
+def _write_best(made: Design, x: Array, file: Path) -> None:
+    """The best case as a file that `magshell run` takes, and its remanence beside it."""
+    folder, data = made.folder, made.variables.data(x, "best.csv")
+    made.variables.write(x, folder / "best.csv")
+    _from_here(data, file.parent.absolute(), folder.absolute())
+    text = f"# The best case of a design: {file.name}\n" + yaml.safe_dump(data, sort_keys=False)
+    write_whole(folder / "best.yaml", text.encode())
+
+
+def _from_here(part: Any, old: Path, new: Path) -> None:
+    """Let the files that a case names be found from another folder."""
+    for key, value in part.items() if isinstance(part, dict) else enumerate(part if isinstance(part, list) else []):
+        if key == "file" and isinstance(value, str) and value != "best.csv":
+            part[key] = os.path.relpath(old / value, new)
+        _from_here(value, old, new)
+
+
+def verified(made: Design, best: Evaluation, comm: MPI.Intracomm) -> dict[str, Any]:
+    """The results of best.yaml by `run` into verified/, and what its excluded modes say; collective."""
+    wanted, say, file, settings = made.wanted, made.say, made.folder / "best.yaml", list[str]()
+
+    def best_case() -> Case:
+        return made.variables.made(from_first(comm, lambda: read_source(file, settings)))
+
+    case = best_case()
+    if case.shell.geometry != "mesh":
+        settings = [f"mesh.refinement={case.mesh.refinement * wanted.section.verify:.6g}"]
+        case = best_case()
+    how = ", ".join(settings) or "on the mesh of the file"
+    result = run(case, made.folder / "verified", comm, overwrite=True)  # the folder is the design's
+    values = {name: _value(result, name) for name in wanted.results if name not in wanted.targets}
+    seen = dict[str, float]()
+    for target in wanted.targets.values():
+        seen["rms_distance"], seen[DISTANCE] = distances(result.scene, result.last, target)
+    for name, value in (values | seen).items():
+        here = best.values.get(name, best.seen.get(name))
+        if value is None:
+            say(f"verified ({how}): no {name}{f': {result.stopped}' if result.stopped else ''}")
+        elif here is not None:
+            away = value / here - 1
+            say(f"verified ({how}): {name} = {value:.9g}, {_beside(away)} the design's {here:.9g}")
+            if abs(away) > FAR:
+                say(f"warning: {name} is another one there: the mesh is too coarse, or there are several equilibria")
+    modes = [f"{p['kind']} {p['mode']}".strip() for p in result.limit_points if p["mode"]]
+    if modes and not any(name in FOLDS for name in wanted.results):
+        say(f"warning: the run sees modes that the design did not: {', '.join(modes)}")
+    excluded = int(result.rows[-1]["excluded_pivots"]) if result.rows else 0
+    return {"settings": settings, **values, **seen, "excluded_modes": modes, "excluded_pivots": excluded}
+
+
+def _value(result: Result, name: str) -> float | None:
+    """A result of a run: the first instability of a fold's amplitude, excluded modes too."""
+    if name == MASS:
+        return mass(result.scene)[0]
+    if name in FOLDS:
+        found = (p for p in result.limit_points if p["amplitude"] == FOLDS[name] and not p["branch"])
+        size = result.scene.sizes.of[SCALES[name]] if name in SCALES else 1.0
+        return next((size * float(p["value"]) for p in found), None)
+    if name == BARRIER:
+        return result.barrier
+    if not result.rows:
+        return None
+    row = result.rows[-1]
+    try:
+        omega2 = vibration_at_end(result.scene, result.history, name)
+    except Lost:
+        return None
+    return float((row | result.scene.sizes.values(row))[name]) if omega2 is None else omega2
+
+
+def _beside(away: float) -> str:
+    """A relative difference in words.
+
+    Examples
+    --------
+    >>> _beside(-3.19e-8), _beside(1.62e-2), _beside(-8.9e-15)
+    ('3.2e-06 % below', '1.6 % above', 'equal to')
+    """
+    if abs(away) < ROUNDING:
+        return "equal to"
+    return f"{100 * abs(away):.2g} % {'above' if away > 0 else 'below'}"

@@ -1,0 +1,344 @@
+"""What a design wants: an objective that is least, constraints that are not negative; and SciPy's optimisers."""
+
+import itertools
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from magshell_fenicsx.input.expressions import formula
+from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.simulate.gradients.instabilities import BESIDE, MOST
+from magshell_fenicsx.simulate.results import Target
+from magshell_fenicsx.studies.design_evaluation import LOWEST, Evaluation
+from magshell_fenicsx.studies.design_variables import Variables
+from magshell_fenicsx.studies.runner import Case
+from magshell_fenicsx.studies.sections import DesignSection, LimitSection, ShapeSection
+
+Array = NDArray[np.float64]
+
+EQUAL = 1e-3  # relative difference of results that are to be the same
+
+
+@dataclass(frozen=True)
+class Limit:
+    """A result above (sign 1) or below (sign -1) a bound, or another result but for a margin."""
+
+    of: str
+    sign: float
+    bound: float = 0.0
+    other: str = ""
+    margin: float = 0.0
+
+    def left(self, values: Mapping[str, float]) -> float:
+        """How far it is from being broken."""
+        against = values[self.other] if self.other else self.bound
+        return self.sign * (values[self.of] - against) + self.margin
+
+    def slope(self, gradients: Mapping[str, Sequence[float]]) -> Array:
+        """The gradient of `left`."""
+        against = np.array(gradients[self.other]) if self.other else 0.0
+        return np.asarray(self.sign * (np.array(gradients[self.of]) - against))
+
+    @property
+    def words(self) -> str:
+        if self.other:
+            return f"{self.of} the same as {self.other}"
+        return f"{self.of} {'at least' if self.sign > 0 else 'at most'} {self.bound:g}"
+
+
+def limits_of(section: LimitSection, scale: Mapping[str, float]) -> list[Limit]:
+    """Those of a section of a case; `scale` has the sizes of results at the start."""
+    sides = ((section.least, 1.0), (section.most, -1.0))
+    found = [Limit(section.of, sign, bound) for bound, sign in sides if bound is not None]
+    if section.same_as:
+        margin = EQUAL * max(scale.get(of, 0.0) for of in (section.of, section.same_as))
+        found += [Limit(section.of, sign, other=section.same_as, margin=margin) for sign in (1.0, -1.0)]
+    return found
+
+
+FINE = 4001  # points by which the length of a spline is measured
+AT_ROOT = 1e-6
+
+
+def target_of(section: ShapeSection, case: Case, bent: float = 1.0) -> Target:
+    """Undeformed places (n, 3) over R -> wanted places; of a curve with a part of its curvature.
+
+    Raises
+    ------
+    CaseError
+        If a curve is wanted of another shell than a strip, or begins elsewhere than at its root.
+    """
+    if section.components:
+        along = [formula(text) for text in section.components]
+        return lambda x: np.stack([f(*x.T) for f in along], axis=-1)
+    if case.shell.geometry != "strip":
+        raise CaseError("design.objective.shape.curve: is of a strip; give components")
+    points = np.array(section.curve)
+    if np.abs(points[0]).max() > AT_ROOT:
+        raise CaseError(
+            f"design.objective.shape.curve: begins at {points[0].tolist()}, but the strip's root is at 0, 0, 0"
+        )
+    return Curve(points, bent)
+
+
+class Curve:
+    """The spline through points, of length one; the strip's places keep their distance to its middle line along y."""
+
+    def __init__(self, points: Array, bent: float = 1.0) -> None:
+        chord = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+        spline = scipy.interpolate.CubicSpline(chord, points)
+        fine = spline(np.linspace(0.0, chord[-1], FINE))
+        fine = fine if bent == 1.0 else _bent(fine, bent)
+        length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(fine, axis=0), axis=1))])
+        self._at = scipy.interpolate.CubicSpline(length / length[-1], fine / length[-1])
+
+    def __call__(self, x: Array) -> Array:
+        return np.asarray(self._at(x[:, 0])) + x[:, 1:2] * [0.0, 1.0, 0.0]
+
+
+def _bent(points: Array, part: float) -> Array:
+    """The curve with the same first tangent and lengths, and a part of its curvature, in a frame without twist."""
+    steps = np.diff(points, axis=0)
+    length = np.linalg.norm(steps, axis=1, keepdims=True)
+    tangents = steps / length
+    found, turned = [tangents[0]], np.eye(3)  # from the frame of the curve to that of the bent one
+    for before, after in itertools.pairwise(tangents):
+        turn = np.cross(before, after)
+        angle = np.arctan2(np.linalg.norm(turn), before @ after)
+        axis = turn * (angle / max(float(np.linalg.norm(turn)), 1e-300))
+        back = scipy.spatial.transform.Rotation.from_rotvec(-axis).as_matrix()
+        turned = turned @ scipy.spatial.transform.Rotation.from_rotvec(part * axis).as_matrix() @ back
+        found.append(turned @ after)
+    return np.vstack([points[:1], points[0] + np.cumsum(length * np.array(found), axis=0)])
+
+
+KEPT = 1e-6  # a constraint counts as kept to this part of its bound
+REACHED = 1e-3  # a value counts as reached to this part of it
+
+
+@dataclass
+class Wanted:
+    """What is wanted; results are scaled with their values at the start.
+
+    Attributes
+    ----------
+    results
+        That of the objective first.
+    targets
+        Of the wanted shape.
+    stages
+        Those that come before it.
+    """
+
+    section: DesignSection
+    targets: Mapping[str, Target]
+    stages: Sequence[Mapping[str, Target]] = ()
+    scale: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def results(self) -> list[str]:
+        return self.section.results
+
+    def begin(self, first: Evaluation) -> None:
+        """Take the scales."""
+        self.scale = {result: abs(value) or 1.0 for result, value in first.values.items()}
+
+    def objective(self, found: Evaluation) -> float:
+        """Least is best."""
+        return self._objective(found)[0]
+
+    def slope(self, found: Evaluation) -> Array:
+        """Its gradient."""
+        return self._objective(found)[1] * np.array(found.gradients[self.section.objective.result])
+
+    def _objective(self, found: Evaluation) -> tuple[float, float]:
+        wanted = self.section.objective
+        value = min(found.values[result] for result in wanted.results)
+        scale = self._scale or abs(value) or 1.0
+        if wanted.value is not None:
+            scale = abs(wanted.value) or scale
+            return ((value - wanted.value) / scale) ** 2, 2 * (value - wanted.value) / scale**2
+        sign = -1.0 if wanted.maximise else 1.0
+        return sign * value / scale, sign / scale
+
+    @property
+    def _scale(self) -> float:
+        """The largest of the objective's results at the start."""
+        return max((self.scale.get(result, 0.0) for result in self.section.objective.results), default=0.0)
+
+    @property
+    def lowest(self) -> bool:
+        """Whether the lowest of several values is to be raised: of results, instabilities or frequencies."""
+        wanted = self.section.objective
+        return wanted.maximise is not None and (len(wanted.results) > 1 or wanted.result in LOWEST)
+
+    def lowest_values(self, found: Evaluation) -> Array:
+        """All of them over the scale, always as many: where fewer are near, what is surely above."""
+        every = [_several(found.values[of], found.beside.get(of)) for of in self.section.objective.results]
+        return np.asarray(np.concatenate([[value for value, _ in several] for several in every]) / self._scale)
+
+    def lowest_slopes(self, found: Evaluation) -> Array:
+        """(values, variables)."""
+        results = self.section.objective.results
+        every = [_several(found.values[of], found.beside.get(of), found.gradients[of]) for of in results]
+        return np.asarray(np.concatenate([[slope for _, slope in several] for several in every]) / self._scale)
+
+    def constraints(self, found: Evaluation) -> Array:
+        """Not negative where all are kept."""
+        return np.array([limit.left(found.values) / self._size(limit) for limit in self._limits])
+
+    def constraint_slopes(self, found: Evaluation) -> Array:
+        """(constraints, variables)."""
+        return np.array([limit.slope(found.gradients) / self._size(limit) for limit in self._limits])
+
+    @property
+    def _limits(self) -> list[Limit]:
+        """Of all constraints."""
+        return [each for section in self.section.constraints for each in limits_of(section, self.scale)]
+
+    def _size(self, limit: Limit) -> float:
+        return abs(limit.bound) or max(self.scale.get(of, 0.0) for of in (limit.of, limit.other)) or 1.0
+
+    def violation(self, found: Evaluation) -> float:
+        """By how much the constraints are not kept, relative."""
+        return float(max([0.0, *(-self.constraints(found))]))
+
+    def merit(self, found: Evaluation) -> tuple[float, float]:
+        """By what evaluations are compared: least is best."""
+        violation = self.violation(found)
+        return (violation if violation > KEPT else 0.0, self.objective(found))
+
+    def words(self, found: Evaluation) -> str:
+        """The results of an evaluation."""
+        return ", ".join(f"{key} = {value:.6g}" for key, value in (found.values | found.seen).items())
+
+    def missed(self, found: Evaluation) -> str:
+        """What is not as wanted; empty if all is."""
+        wanted, said = self.section.objective, list[str]()
+        if wanted.value is not None and wanted.reach:
+            value = found.values[wanted.reach]
+            if abs(value - wanted.value) > REACHED * (abs(wanted.value) or 1.0):
+                asked = f"{wanted.reach} = {wanted.value:g} is not reached within the bounds"
+                said.append(f"{asked}: the nearest found is {value:.6g}")
+        for limit in self._limits:
+            if limit.left(found.values) < -KEPT * self._size(limit):
+                said.append(f"{limit.words} is not kept: the nearest found is {found.values[limit.of]:.6g}")
+        return "; ".join(said)
+
+
+def _several(
+    value: float, beside: Sequence[tuple[float, list[float]]] | None, slope: Sequence[float] = ()
+) -> list[tuple[float, Sequence[float]]]:
+    """A result and those beside it with their slopes: MOST of what may cross others, else one."""
+    if beside is None:
+        return [(value, slope)]
+    above = (BESIDE * value, [BESIDE * v for v in slope])
+    return [(value, slope), *beside, *[above] * MOST][:MOST]
+
+
+def wanted_of(case: Case, section: DesignSection) -> Wanted:
+    """What the section of a case wants."""
+    shape = section.objective.shape
+    if shape is None:
+        return Wanted(section, {})
+    parts = [(i + 1) / shape.stages for i in range(shape.stages)]
+    *stages, last = [{"shape": target_of(shape, case, part)} for part in parts]
+    return Wanted(section, last, stages)
+
+
+WORSE = 1.0  # a lost path counts as this much worse than the worst found
+
+
+def searched(
+    evaluated: Callable[[Array], Evaluation], goal: Wanted, vary: Variables, first: Array, iterations: int
+) -> str:
+    """Look for the best variables from the first on; why the optimiser ended."""
+    if goal.lowest:
+        return _raised(evaluated, goal, vary, first, iterations)
+    known: list[tuple[Array, float]] = []
+
+    def objective(x: Array) -> tuple[float, Array]:
+        found = evaluated(x)
+        if not found.values:
+            away = x - min(known, key=lambda each: each[1])[0]
+            uphill = np.asarray(away / max(float(np.linalg.norm(away)), 1e-300))
+            return max(value for _, value in known) + WORSE, uphill
+        value = goal.objective(found)
+        known.append((np.array(x), value))
+        return value, goal.slope(found)
+
+    options: dict[str, Any] = {"maxiter": iterations, "ftol": 1e-15, "gtol": 1e-9}
+    method, constraints = "L-BFGS-B", dict[str, Any]()
+    if goal.section.constraints:
+        method, options = "SLSQP", {"maxiter": iterations, "ftol": 1e-9}
+        constraints = _kept(evaluated, goal.constraints, goal.constraint_slopes)
+    found = scipy.optimize.minimize(
+        objective,
+        first,
+        jac=True,
+        method=method,
+        bounds=vary.limits,
+        constraints=constraints or (),
+        options=options,
+    )
+    return str(found.message)
+
+
+def _raised(
+    evaluated: Callable[[Array], Evaluation], goal: Wanted, vary: Variables, first: Array, iterations: int
+) -> str:
+    """Raise the lowest of several instabilities: the largest t with all of them above t, for (x, t).
+
+    Where two of them cross, their minimum has a corner, and this problem has none.
+    """
+
+    def above(found: Evaluation, t: float) -> Array:
+        return np.concatenate([goal.lowest_values(found) - t, goal.constraints(found)])
+
+    def slopes(found: Evaluation) -> Array:
+        lowest, others = goal.lowest_slopes(found), goal.constraint_slopes(found)
+        with_t = [np.column_stack([lowest, -np.ones(len(lowest))])]
+        return np.vstack([*with_t, *([np.column_stack([others, np.zeros(len(others))])] if len(others) else [])])
+
+    last: list[Evaluation] = []
+
+    def at(z: Array) -> tuple[Array, Array]:
+        found = evaluated(z[:-1])
+        if found.values:
+            last[:] = [found]
+        values = above(last[0], z[-1])
+        return (values if found.values else values * 0 - WORSE), slopes(last[0])
+
+    start = np.append(first, goal.lowest_values(evaluated(first)).min())
+    down = np.append(0 * first, -1.0)
+    found = scipy.optimize.minimize(
+        lambda z: (-z[-1], down),
+        start,
+        jac=True,
+        method="SLSQP",
+        bounds=[*vary.limits, (None, None)],
+        constraints={"type": "ineq", "fun": lambda z: at(z)[0], "jac": lambda z: at(z)[1]},
+        options={"maxiter": iterations, "ftol": 1e-7},
+    )
+    return str(found.message)
+
+
+def _kept(
+    evaluated: Callable[[Array], Evaluation],
+    values: Callable[[Evaluation], Array],
+    slopes: Callable[[Evaluation], Array],
+) -> dict[str, Any]:
+    """Constraints for SciPy; a lost path has those of the last one that is known."""
+    last: list[Evaluation] = []
+
+    def at(x: Array) -> Evaluation:
+        found = evaluated(x)
+        if found.values:
+            last[:] = [found]
+        return last[0]
+
+    return {"type": "ineq", "fun": lambda x: values(at(x)), "jac": lambda x: slopes(at(x))}

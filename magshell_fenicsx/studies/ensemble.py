@@ -1,0 +1,269 @@
+"""Random samples of a case; the ranks share them, existing ones are kept.
+
+A sample takes the cheapest way that leads to its result. A knockdown is the fold of the nearest known sample on the
+same mesh, continued; else the fold that Newton's method finds from one of the first points of the path; else the fold
+at its end. Each ends in Newton's method for the fold, so that a knockdown is the same to 1e-9 by all ways. Every other
+result needs the path.
+"""
+
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from mpi4py import MPI
+
+from magshell_fenicsx.continuation.ahead import fold_ahead
+from magshell_fenicsx.continuation.fold import Fold, FoldLost, Guess
+from magshell_fenicsx.input.source import CaseError, read_source
+from magshell_fenicsx.mesh.patch import MeshError
+from magshell_fenicsx.output.store.durable import write_object, write_whole
+from magshell_fenicsx.output.store.folder import by_first, given_folder
+from magshell_fenicsx.platform import sources
+from magshell_fenicsx.platform.first import from_first
+from magshell_fenicsx.platform.terminal import print_line
+from magshell_fenicsx.runs.rows import RowMaker
+from magshell_fenicsx.runs.run import run
+from magshell_fenicsx.runs.summary import Result
+from magshell_fenicsx.simulate.follow import follow
+from magshell_fenicsx.simulate.perfect import with_modes
+from magshell_fenicsx.simulate.record import Stopped
+from magshell_fenicsx.simulate.scene import Scene
+from magshell_fenicsx.studies.ensemble_report import draw_ensemble, report
+from magshell_fenicsx.studies.folds import KnownFolds, fold_row, has_knockdown
+from magshell_fenicsx.studies.results import Scalar, parse_scalar
+from magshell_fenicsx.studies.runner import (
+    FAILED,
+    Folder,
+    Made,
+    Outcome,
+    Say,
+    compute,
+    keep_outcome,
+    kept_outcome,
+    outcome_of,
+    part_of,
+)
+from magshell_fenicsx.studies.samples import Sample, make_samples
+from magshell_fenicsx.studies.statistics import WITHOUT, Row, make_row, statistics, write_samples
+
+MOST_SAMPLES = 100_000
+MOST_TRIES = 2  # points of the path from which the fold ahead is tried
+
+
+@dataclass(frozen=True)
+class Ensemble:
+    """A finished ensemble: the rows of samples.csv, and the content of summary.json."""
+
+    rows: list[Row]
+    content: dict[str, Any]
+
+    @property
+    def without_result(self) -> int:
+        """Number of samples without the requested result."""
+        return sum(row["status"] != "found" for row in self.rows)
+
+
+def ensemble(
+    file: Path | str,
+    settings: Sequence[str] = (),
+    *,
+    samples: int,
+    seed: int,
+    made: Made,
+    result: str = "knockdown",
+    out: Path | str = "results/ensemble",
+    part: str | None = None,
+    merge: Sequence[Path | str] = (),
+    delete_weakest: int = 0,
+    resume: bool = False,
+    comm: MPI.Intracomm = MPI.COMM_WORLD,
+    say: Say = print_line,
+) -> Ensemble:
+    """Compute random samples of a case; collective, and every rank computes samples of its own.
+
+    Parameters
+    ----------
+    made
+        Makes a case of its source.
+    result
+        As of `magshell study`: knockdown, barrier, critical_field, COLUMN@COLUMN=VALUE or COLUMN@end.
+    out
+        Folder of samples.csv, summary.json, ensemble.png, report.md and points/; samples that are there are kept
+        if these sources computed them.
+    part
+        "i/n": compute only every n-th sample, from the i-th; the files are then samples_i_of_n.csv and so on.
+    merge
+        Folders of parts: take their samples, compute none.
+    delete_weakest
+        Also compute each sample without so many of its defects, those with the least amplitudes.
+    resume
+        See that the folder has samples of this ensemble.
+    say
+        Called with one line per finished sample, on the rank that finished it.
+
+    Raises
+    ------
+    CaseError
+        Before the first sample: if one is no valid case, an argument is wrong, or `out` cannot be written.
+    DiskError
+        If the tables cannot be written.
+    """
+    scalar, numbers = parse_scalar(result), _numbers(samples, seed, part)
+    ending = f"_{part.replace('/', '_of_')}" if part else ""
+
+    def drawn() -> list[list[Sample]]:
+        source = read_source(Path(file), settings)
+        return [make_samples(source, seed, numbers, made, less) for less in sorted({0, delete_weakest})]
+
+    variants = from_first(comm, drawn)
+    every = {sample.key: sample for variant in variants for sample in variant}
+    folder, name = given_folder(out), Path(file).name
+    parts = [Path(place) for place in merge]
+    if resume or merge:
+        by_first(comm, lambda: _refuse_strange(parts or [folder], every))
+    tables = (f"summary{ending}.json", f"samples{ending}.csv", f"ensemble{ending}.png", f"report{ending}.md")
+    Folder("an ensemble", tables, ("seed", "samples")).prepare(folder, comm, name)
+    if merge:
+        by_first(comm, lambda: _copy(every, parts, folder))
+    missing = [] if merge else by_first(comm, lambda: [key for key in every if not _is_known(folder, key, scalar)])
+    if comm.rank == 0:
+        ranks = f"{comm.size} rank{'s' if comm.size > 1 else ''}"
+        say(f"{len(every)} samples, {len(missing)} to compute on {ranks}")
+    known = KnownFolds()
+
+    def sample_computed(key: str) -> Iterator[str]:
+        sample = every[key]
+        outcome = solve(sample, scalar, known)
+        keep_outcome(outcome, sample.case, _file(folder, key))
+        value = outcome.value(scalar)
+        said = f"no {scalar.name}" if value is None else f"{scalar.name} = {value:.9g} ({outcome.found})"
+        why = f", {outcome.stopped}" if outcome.stopped else ""
+        place = f"{missing.index(key) + 1:5d}/{len(missing)}"
+        yield f"{place}  sample {sample.number}: {said}{why}, {outcome.cpu_s:.1f} s"
+
+    compute(missing, sample_computed, comm, say)
+    rows = [_row(each, folder, scalar) for each in zip(*variants, strict=True)]
+    content = {
+        "case": name,
+        "settings": list(settings),
+        "seed": seed,
+        "samples": samples,
+        "part": part,
+        "result": result,
+        "deleted": delete_weakest,
+        "sources": sources.ours(),
+        **by_first(comm, lambda: statistics(rows, seed)),
+    }
+    by_first(comm, lambda: _write(rows, content, folder, ending))
+    return Ensemble(rows, content)
+
+
+def _numbers(samples: int, seed: int, part: str | None) -> range:
+    """The numbers of the samples to compute."""
+    if not 1 <= samples <= MOST_SAMPLES:
+        raise CaseError(f"--samples {samples}: must be 1 to {MOST_SAMPLES}")
+    if seed < 0:
+        raise CaseError(f"--seed {seed}: must not be negative")
+    i, n = part_of(part, samples, "samples")
+    return range(i - 1, samples, n)
+
+
+def _file(folder: Path, key: str) -> Path:
+    return folder / "points" / f"{key}.json"
+
+
+def _is_known(folder: Path, key: str, scalar: Scalar) -> bool:
+    """Whether the folder has a usable outcome; an error may have been of the machine, and is tried again."""
+    outcome = kept_outcome(_file(folder, key))
+    return bool(outcome and outcome.serves(scalar) and not (outcome.stopped or "").startswith(FAILED))
+
+
+def _refuse_strange(places: Sequence[Path], keys: Mapping[str, Sample]) -> None:
+    for place in places:
+        if not any(kept_outcome(_file(place, key)) for key in keys):
+            raise CaseError(
+                f"{place}: has no sample of this ensemble that these sources computed: look at case, --seed and --set"
+            )
+
+
+def _copy(keys: Mapping[str, Sample], places: Sequence[Path], folder: Path) -> None:
+    for key in keys:
+        source = next((file for place in places if kept_outcome(file := _file(place, key))), None)
+        if source and source.resolve() != _file(folder, key).resolve():
+            write_whole(_file(folder, key), source.read_bytes())
+
+
+def _row(variants: Sequence[Sample], folder: Path, scalar: Scalar) -> Row:
+    """The row of a sample; with a second variant, the one without its weakest defects, also the result of that."""
+    rows = [make_row(sample, kept_outcome(_file(folder, sample.key)), scalar) for sample in variants]
+    row = rows[0]
+    if len(rows) > 1:
+        row[WITHOUT] = rows[1]["result"]
+        if row["status"] == "found" and row[WITHOUT] is None:
+            row |= {"status": rows[1]["status"], "why": f"without the weakest defects: {rows[1]['why']}"}
+    return row
+
+
+def _write(rows: Sequence[Row], content: Mapping[str, Any], folder: Path, ending: str) -> None:
+    write_samples(rows, folder / f"samples{ending}.csv")
+    write_object(folder / f"summary{ending}.json", content)
+    draw_ensemble(rows, content["result"], folder / f"ensemble{ending}.png")
+    write_whole(folder / f"report{ending}.md", report(content, rows, ending).encode())
+
+
+def solve(sample: Sample, scalar: Scalar, known: KnownFolds) -> Outcome:
+    """Compute a sample on this rank; an error ends the sample, not the ensemble."""
+    start, cpu = time.perf_counter(), time.process_time()
+    try:
+        outcome = _solved(sample, scalar, known)
+    except Exception as e:  # whatever it is, the other samples go on, and the table names it
+        why = f"{FAILED}{'' if isinstance(e, MeshError) else f'{type(e).__name__}: '}{e}"
+        outcome = Outcome.failed(" ".join(why.split()))
+    wall_s, cpu_s = time.perf_counter() - start, time.process_time() - cpu
+    return replace(outcome, wall_s=round(wall_s, 3), cpu_s=round(cpu_s, 3))
+
+
+def _solved(sample: Sample, scalar: Scalar, known: KnownFolds) -> Outcome:
+    with_modes(sample.case, MPI.COMM_SELF)
+    if scalar.name != "knockdown" or not has_knockdown(sample.case):
+        return _outcome(run(sample.case, comm=MPI.COMM_SELF))
+    scene = Scene(sample.case, MPI.COMM_SELF)
+    try:
+        return _of_fold(scene, known.follow(sample.values, scene))
+    except FoldLost:
+        return _along_path(sample, scene, known)
+
+
+def _along_path(sample: Sample, scene: Scene, known: KnownFolds) -> Outcome:
+    """The fold from the first point of the path that leads to it, or the end of the path."""
+    result, made, tries = Result(scene, scene.unloaded()), RowMaker(scene), MOST_TRIES
+    try:
+        for record in follow(scene, remark=result.remarks.append):
+            result.rows.append(made.row(record, 0.0))
+            if record.amplitude != "pressure" or record.mode or record.label == "bifurcation":
+                continue
+            guess = Guess(record.point.state, record.point.du) if record.label == "fold" else None
+            if record.label == "step" and tries and not record.point.negative_pivots:
+                guess = fold_ahead(scene.newton, record.point, "pressure")
+                tries -= guess is not None
+            if guess is None:
+                continue
+            try:
+                fold = known.polished(sample.values, scene, guess)
+            except FoldLost:
+                continue
+            if record.label == "fold" or fold.value > record.point.state.mu["pressure"]:
+                return _of_fold(scene, fold)
+    except Stopped as e:
+        result.stopped = str(e)
+    return _outcome(result)
+
+
+def _of_fold(scene: Scene, fold: Fold) -> Outcome:
+    return outcome_of(Result(scene, fold.state, [fold_row(scene, fold)]), "fold", scene.newton.factorisation.count)
+
+
+def _outcome(result: Result) -> Outcome:
+    return outcome_of(result, "path", result.scene.newton.factorisation.count)

@@ -1,1 +1,0 @@
-"""Random samples of a case, and their statistics."""

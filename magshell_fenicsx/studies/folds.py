@@ -1,0 +1,226 @@
+"""Folds of the pressure, followed from case to case: along a parameter, or from the nearest case that is known."""
+
+import json
+from copy import copy
+from dataclasses import dataclass, replace
+
+import numpy as np
+from mpi4py import MPI
+from numpy.typing import NDArray
+
+from magshell_fenicsx.continuation.fold import Fold, FoldLost, Guess, find_fold, predict_fold
+from magshell_fenicsx.continuation.system import State, Vector, dot
+from magshell_fenicsx.output.store.table import Row
+from magshell_fenicsx.simulate.perfect import with_modes
+from magshell_fenicsx.simulate.scene import Scene
+from magshell_fenicsx.simulate.transfer import chart, matching, same_mesh, transfer
+from magshell_fenicsx.studies.runner import Case
+from magshell_fenicsx.studies.samples import Values
+
+Array = NDArray[np.float64]
+KEPT = 3  # folds of one continuation, for a quadratic extrapolation
+MOST_FOLDS = 20  # that are kept of earlier samples
+MOST_UNKNOWNS = 200_000  # of all kept scenes: 1 GB with their factors
+LEAST_COSINE = 0.5  # between successive null vectors; a smaller value means a jump to another fold
+
+
+def has_knockdown(case: Case) -> bool:
+    """Whether its result is a fold of the pressure that can be followed to another case."""
+    loading = case.loading
+    # with a tolerance each point has its own mesh; a mesh file has no chart in which states are transferred
+    by_one_mesh = case.mesh.tolerance is None and case.shell.geometry != "mesh"
+    return (
+        by_one_mesh and getattr(loading, "kind", "") == "pressure" and loading.until == "limit" and not loading.branches
+    )
+
+
+def fold_row(scene: Scene, fold: Fold) -> Row:
+    """A fold as a row of path.csv."""
+    row: Row = {"label": "fold", "amplitude": fold.name, **scene.observe(fold.state)}
+    row |= {"mode": "", "branch": 0, "load_error": 0.0}
+    return {**row, **scene.sizes.values(row)}
+
+
+def refuse_later(scene: Scene, fold: Fold, expected: Vector) -> None:
+    """Reject a fold that is not the first instability under growing pressure, as far as this state shows.
+
+    Parameters
+    ----------
+    expected
+        The null vector of the fold that it was continued from.
+
+    Raises
+    ------
+    FoldLost
+        If its null vector is another, it is no maximum, or the shell is unstable there in another direction.
+    """
+    comm, a, b = scene.newton.system.comm, fold.phi, expected
+    if dot(comm, a, b) < LEAST_COSINE * np.sqrt(dot(comm, a, a) * dot(comm, b, b)):
+        raise FoldLost("another fold was found")
+    if fold.value <= 0 or fold.curvature >= 0:
+        raise FoldLost("the fold is not a maximum of the pressure")
+    modes = scene.model.excluded_modes
+    if fold.unstable or (modes and modes.is_unstable(fold.state)):
+        raise FoldLost("another instability comes before the fold")
+
+
+def _held(scene: Scene) -> dict[str, float]:
+    """The amplitudes beside the pressure, the field in full."""
+    held = dict(scene.unloaded().mu)
+    return held | ({"lambda_m": scene.case.lambda_m} if "lambda_m" in held else {})
+
+
+class Continuation:
+    """Follows a fold of the pressure through a parameter p of the case.
+
+    All scenes have the same kind of model. The known folds are stored in the unknowns of the last scene.
+
+    Parameters
+    ----------
+    p, scene, state
+        The first fold, located by a path; Newton's method refines it.
+
+    Raises
+    ------
+    FoldLost
+        If there is no fold, or if it is not the first instability.
+    """
+
+    def __init__(self, p: float, scene: Scene, state: State) -> None:
+        fold = find_fold(scene.newton, Guess(state), "pressure")
+        refuse_later(scene, fold, fold.phi)
+        self._known, self._scene = [(p, fold)], scene
+
+    def follow(self, p: float, scene: Scene) -> Fold:
+        """The fold at another value of the parameter.
+
+        Raises
+        ------
+        FoldLost
+            If none is found, or if there is evidence that it is not the first instability.
+        """
+        known = [(q, self._moved(fold, scene)) for q, fold in self._known]
+        guess = predict_fold(scene.newton.system, known, p, _held(scene))
+        fold = find_fold(scene.newton, guess, "pressure")
+        refuse_later(scene, fold, known[-1][1].phi)
+        self._known, self._scene = [*known, (p, fold)][-KEPT:], scene
+        return fold
+
+    def from_here(self) -> "Continuation":
+        """A continuation that knows the last fold only, in which another parameter may vary."""
+        continued = copy(self)
+        continued._known = self._known[-1:]
+        return continued
+
+    def has_mesh_of(self, scene: Scene) -> bool:
+        """Whether a scene has the mesh of the last one."""
+        alike = type(scene.model) is type(self._scene.model) and scene.plan.half == self._scene.plan.half
+        return alike and same_mesh(self._scene, scene)
+
+    def _moved(self, fold: Fold, scene: Scene) -> Fold:
+        u, phi = (transfer(self._scene, scene, v) for v in (fold.state.u, fold.phi))
+        return replace(fold, state=State(u, fold.state.mu), phi=phi)
+
+
+@dataclass(frozen=True)
+class _Known:
+    """A fold without its scene: the drawn values, the nodes in the chart, displacement, pressure and null vector."""
+
+    values: Values
+    nodes: Array
+    u: Vector
+    pressure: float
+    phi: Vector
+
+
+class KnownFolds:
+    """Folds of the pressure of earlier samples on this rank, from which those of others on the same mesh are found."""
+
+    def __init__(self) -> None:
+        self._known: list[_Known] = []
+
+    def polished(self, values: Values, scene: Scene, guess: Guess, expected: Vector | None = None) -> Fold:
+        """The fold near a guess, to 1e-9; it is kept.
+
+        A guess from another sample has the null vector that the fold must resemble. One from the path of this sample
+        has a soft mode, which may be a mixture of the modes of several defects: there the inertia decides.
+
+        Raises
+        ------
+        FoldLost
+            If none is found, or it is not seen to be the first instability.
+        """
+        fold = find_fold(scene.newton, guess, "pressure")
+        refuse_later(scene, fold, fold.phi if expected is None else expected)
+        self._known = [*self._known, _Known(values, chart(scene), fold.state.u, fold.value, fold.phi)][-MOST_FOLDS:]
+        return fold
+
+    def follow(self, values: Values, scene: Scene) -> Fold:
+        """The fold of a sample, from the nearest known one on its mesh.
+
+        Raises
+        ------
+        FoldLost
+            If no known fold is on this mesh; and see `polished`.
+        """
+        held = _held(scene)
+        if held.keys() - {"pressure", "lambda_m"}:
+            raise FoldLost("other amplitudes are driven before the pressure")
+        nodes = chart(scene)
+        for known in sorted(self._known, key=lambda known: self._distance(values, known.values)):
+            order = matching(known.nodes, nodes) if known.nodes.shape == nodes.shape else None
+            if order is None:
+                continue
+            u, phi = (v.reshape(len(nodes), -1)[order].ravel() for v in (known.u, known.phi))
+            return self.polished(values, scene, Guess(State(u, held | {"pressure": known.pressure}), phi), phi)
+        raise FoldLost("no fold is known on this mesh")
+
+    def _distance(self, a: Values, b: Values) -> float:
+        """The distance of two samples, each number over its scatter; with other words infinite."""
+        total = 0.0
+        for key in a.keys() | b.keys():
+            x, y = a.get(key), b.get(key)
+            if x == y:
+                continue
+            if not isinstance(x, float | int) or not isinstance(y, float | int):
+                return np.inf
+            numbers = [v for known in self._known if isinstance(v := known.values.get(key), float | int)]
+            total += ((x - y) / (float(np.std([*numbers, x])) or 1.0)) ** 2
+        return total
+
+
+class Scenes:
+    """The scenes of a rank; cases that differ by the strength of the field alone share one.
+
+    Those that were used last are kept.
+    """
+
+    def __init__(self) -> None:
+        self._kept: dict[str, Scene] = {}
+
+    def of(self, case: Case) -> Scene:
+        """The scene of a case, made anew if none is kept.
+
+        Raises
+        ------
+        MeshError
+            If it cannot be meshed.
+        """
+        key = _apart_from_strength(case)
+        known = self._kept.pop(key, None)
+        scene = known.retuned(case) if known else Scene(with_modes(case, MPI.COMM_SELF), MPI.COMM_SELF)
+        self._kept[key] = scene
+        while sum(each.newton.system.size for each in self._kept.values()) > MOST_UNKNOWNS and len(self._kept) > 1:
+            self._kept.pop(next(iter(self._kept)))
+        return scene
+
+
+def _apart_from_strength(case: Case) -> str:
+    """What determines all of a scene but the size of lambda_m, which is an amplitude."""
+    data = case.model_dump(mode="json") | case.outside
+    if magnetic := data.get("magnetic"):
+        magnetic.pop("lambda_m", None)
+        magnetic["remanent"].pop("flux_density", None)
+        if not case.sources:  # otherwise it is that of the field beside them
+            magnetic["applied"].pop("flux_density", None)
+    return json.dumps([data, bool(case.lambda_m)], sort_keys=True)

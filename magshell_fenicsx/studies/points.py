@@ -1,0 +1,224 @@
+"""The points of a study: axes of `--over`, their product, each a valid case."""
+
+import copy
+import hashlib
+import json
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import product
+from math import prod
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from magshell_fenicsx.input.section import in_unit, number_and_unit
+from magshell_fenicsx.input.source import CaseError, Source, override, read_source
+from magshell_fenicsx.problem.limits import refuse_beyond_memory
+from magshell_fenicsx.problem.planner import make_plan
+from magshell_fenicsx.studies.runner import Case, Made
+
+MOST_POINTS = 10_000
+FORMS = "write it as key.path=start:stop:count or key.path=value,value,..."
+
+
+@dataclass(frozen=True)
+class Axis:
+    """One direction of a sweep.
+
+    Attributes
+    ----------
+    keys
+        Keys that take the same value; several keys are tied.
+    values
+        Values as in the case file.
+    """
+
+    keys: tuple[str, ...]
+    values: tuple[str, ...]
+
+    @property
+    def name(self) -> str:
+        """The keys as in `--over`."""
+        return "+".join(self.keys)
+
+    @cached_property
+    def unit(self) -> str:
+        """The unit of its values, that of the first which has one."""
+        return next(filter(None, (number_and_unit(value)[1] for value in self.values)), "")
+
+    @cached_property
+    def numbers(self) -> list[float] | None:
+        """The values as numbers, in its unit; None if one of them is a word."""
+        try:
+            return [self.number(value) for value in self.values]
+        except ValueError:
+            return None
+
+    def number(self, value: str) -> float:
+        """A value in its unit."""
+        return in_unit(value, self.unit)
+
+
+def along(axes: Sequence[Axis]) -> Axis | None:
+    """The last axis with numbers; curves are drawn and folds are followed along it."""
+    return next((axis for axis in reversed(axes) if axis.numbers), None)
+
+
+def parse_axes(texts: Sequence[str]) -> list[Axis]:
+    """Read all `--over` of a command line.
+
+    Raises
+    ------
+    CaseError
+        If one has another form, or a key is swept twice.
+    """
+    axes = [parse_axis(text) for text in texts]
+    keys = [key for axis in axes for key in axis.keys]
+    for key in keys:
+        if keys.count(key) > 1:
+            raise CaseError(f"--over: {key} is swept twice; keys that vary together are tied with +")
+    return axes
+
+
+def parse_axis(text: str) -> Axis:
+    """Read one `--over`.
+
+    Examples
+    --------
+    >>> parse_axis("a.x+a.y=0:90:3")
+    Axis(keys=('a.x', 'a.y'), values=('0', '45', '90'))
+    >>> parse_axis("magnetic.energy=full,first").values
+    ('full', 'first')
+    >>> parse_axis("magnetic.applied.flux_density=-40mT:0.04T:3").values
+    ('-40 mT', '0 mT', '40 mT')
+    """
+    path, equals, values = text.partition("=")
+    keys = tuple(key.strip() for key in path.split("+"))
+    if not equals or not all(re.fullmatch(r"\w+(\.\w+)*", key) for key in keys):
+        raise CaseError(f"--over {text}: {FORMS}; keys that vary together are tied with +")
+    return Axis(keys, _range(text, values) if ":" in values else _list(text, values))
+
+
+def _range(text: str, values: str) -> tuple[str, ...]:
+    """start:stop:count, equidistant with both ends; the values are in the unit of the first end that has one."""
+    try:
+        first, last, number = values.split(":")
+        unit = number_and_unit(first)[1] or number_and_unit(last)[1]
+        ends = [in_unit(end, unit) if unit else float(end) for end in (first, last)]
+        start, stop, count = *ends, int(number)
+    except ValueError:
+        raise CaseError(
+            f"--over {text}: {values} is not start:stop:count (two numbers of one unit and a whole number)"
+        ) from None
+    if not (math.isfinite(start) and math.isfinite(stop)):
+        raise CaseError(f"--over {text}: start and stop must be finite")
+    if not 2 <= count <= MOST_POINTS:
+        raise CaseError(f"--over {text}: count is {count}; allowed 2 to {MOST_POINTS}")
+    return tuple(f"{value + 0.0:.12g} {unit}".rstrip() for value in np.linspace(start, stop, count))
+
+
+def _list(text: str, values: str) -> tuple[str, ...]:
+    items = tuple(value.strip() for value in values.split(","))
+    if not all(items):
+        raise CaseError(f"--over {text}: a value is missing; {FORMS}")
+    if re.search(r"[\[\]{}]", values):
+        raise CaseError(f"--over {text}: only numbers and words can be swept, not sections or lists")
+    return items
+
+
+@dataclass(frozen=True)
+class SweepPoint:
+    """One point.
+
+    Attributes
+    ----------
+    values
+        Swept key -> its value at this point, as text.
+    key
+        Hash of the problem; equal problems have equal keys in any sweep and version.
+    """
+
+    values: dict[str, str]
+    case: Case
+    key: str
+
+    @property
+    def label(self) -> str:
+        """For example `energy=full, remanent.polar=45`."""
+        return ", ".join(f"{short(key)}={value}" for key, value in self.values.items())
+
+
+def make_points(source: Source, axes: Sequence[Axis], made: Made) -> list[SweepPoint]:
+    """All points, in the order of the product, the last axis fastest.
+
+    Raises
+    ------
+    CaseError
+        If any point is not a valid case; nothing has been computed then.
+    """
+    count = prod(len(axis.values) for axis in axes)
+    if count > MOST_POINTS:
+        raise CaseError(f"--over: {count} points; allowed at most {MOST_POINTS}")
+    return [make_point(source, axes, values, made) for values in product(*(axis.values for axis in axes))]
+
+
+def swept_source(file: Path, axes: Sequence[Axis], settings: Sequence[str]) -> Source:
+    """The case that is swept, with the settings.
+
+    Raises
+    ------
+    CaseError
+        If it cannot be read, or a setting is of a swept key.
+    """
+    source = read_source(file)
+    for setting in settings:
+        if setting.partition("=")[0].strip() in {key for axis in axes for key in axis.keys}:
+            raise CaseError(f"--set {setting}: this key is swept by --over")
+        override(source, setting)
+    return source
+
+
+def make_point(source: Source, axes: Sequence[Axis], values: Sequence[str], made: Made) -> SweepPoint:
+    """The point with one value for each axis."""
+    varied = copy.deepcopy(source)
+    chosen = {key: value for axis, value in zip(axes, values, strict=True) for key in axis.keys}
+    assignments = [f"{key}={value}" for key, value in chosen.items()]
+    try:
+        for assignment in assignments:
+            override(varied, assignment)
+        case = made(varied)
+        refuse_beyond_memory(case, make_plan(case))  # raises the errors of the plan, such as a missing mirror plane
+    except CaseError as e:
+        message = str(e)
+        for assignment in assignments:
+            message = message.replace(f"--set {assignment}", f"--over {assignment}")
+        raise CaseError(f"{message}\nin the point {', '.join(assignments)}") from None
+    return SweepPoint(chosen, case, identity(case))
+
+
+def identity(case: Case) -> str:
+    """Hash of the problem: the resolved case, without a zero field, and its mesh file."""
+    data = case.model_dump(mode="json") | case.outside
+    if not case.lambda_m:
+        del data["magnetic"]
+    return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def short(key: str) -> str:
+    """The short name of a key: `energy`, `remanent.polar`."""
+    words = key.split(".")
+    return ".".join(words[-2:] if words[-1] in ("polar", "azimuth") else words[-1:])
+
+
+def value_at(data: Any, path: Sequence[str]) -> Any:
+    """What plain data of a case has at a key's words; None if it has no such key."""
+    for name in path:
+        try:
+            data = data[int(name)] if isinstance(data, list) else data[name]
+        except (LookupError, ValueError, TypeError):
+            return None
+    return data

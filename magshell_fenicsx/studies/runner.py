@@ -1,0 +1,291 @@
+"""One runner for many runs: cases in, outcomes and a table out.
+
+A study says which runs there are. The runner opens its folder, keeps every outcome in a file as soon as it is there,
+deals the missing runs to the ranks, and says how far it is. What these sources have kept is not computed again.
+"""
+
+import json
+import sys
+import time
+import traceback
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+from uuid import uuid4
+
+import numpy as np
+from mpi4py import MPI
+from pydantic import TypeAdapter
+
+from magshell_fenicsx.input.source import CaseError, Source
+from magshell_fenicsx.output.store.durable import write_object
+from magshell_fenicsx.output.store.folder import DiskError, held_folder, prepare_folder, refuse_others
+from magshell_fenicsx.output.store.table import COLUMNS, Row
+from magshell_fenicsx.platform import sources
+from magshell_fenicsx.runs.summary import Result, in_units
+from magshell_fenicsx.studies.results import Scalar
+
+Case = Any  # what the front end makes of a source, and `run` and `Scene` take: a study does not know its class
+Made = Callable[[Source], Case]
+Say = Callable[[str], None]
+Kept = TypeVar("Kept")
+Task = TypeVar("Task")
+Found = Literal["path", "fold"]
+FAILED = "failed: "  # what `stopped` begins with if an error ended the run
+LEAST_LEFT = 10.0  # s; a shorter rest is not said
+
+
+@dataclass(frozen=True)
+class Folder:
+    """The files of a kind of study in its folder.
+
+    Attributes
+    ----------
+    what
+        Its name in messages: "an ensemble".
+    tables
+        The files that it writes; the first is a JSON object.
+    keys
+        What that object has.
+    points
+        The folder within, of the outcomes.
+    """
+
+    what: str
+    tables: tuple[str, ...]
+    keys: tuple[str, ...]
+    points: str = "points"
+
+    def prepare(self, out: Path, comm: MPI.Comm, case: str = "") -> Path:
+        """Make it, unless it has files of others, or tables of another case file; several jobs may. Collective."""
+
+        def make(folder: Path) -> None:
+            refuse_others(folder, self.tables, self.keys, self.what, case)
+            (folder / self.points).mkdir(parents=True, exist_ok=True)
+
+        return prepare_folder(out, comm, make)
+
+    @contextmanager
+    def held(self, out: Path, comm: MPI.Comm, case: str) -> Iterator[None]:
+        """The same for one job alone, which holds it inside `with`; collective."""
+        with held_folder(out, comm, make=True):
+            self.prepare(out, comm, case)
+            yield
+
+
+def keep(file: Path, content: Mapping[str, Any]) -> None:
+    """Write an outcome; a killed study leaves the complete file or none, and two may write the same one.
+
+    Raises
+    ------
+    DiskError
+        For instance if the disk is full; earlier files are kept.
+    """
+    unfinished = file.with_suffix(f".{uuid4().hex}")
+    try:
+        write_object(unfinished, content)
+        unfinished.replace(file)
+    except OSError as e:
+        raise DiskError(f"{file} cannot be written: {e.strerror}") from e
+
+
+def kept(file: Path, kind: TypeAdapter[Kept], key: str = "", **same: Any) -> Kept | None:
+    """The outcome in a file.
+
+    None if there is none, it is damaged, or the file has other values than `same`.
+    """
+    try:
+        content = json.loads(file.read_text(encoding="utf-8"))
+        if any(content[name] != value for name, value in same.items()):
+            return None
+        return kind.validate_python(content[key] if key else content)
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+def part_of(part: str | None, count: int, of: str) -> tuple[int, int]:
+    """The numbers i and n of a part "i/n", one of n jobs.
+
+    Examples
+    --------
+    >>> part_of("2/3", 5, "points"), part_of(None, 5, "points")
+    ((2, 3), (1, 1))
+    """
+    first, slash, number = (part or "1/1").partition("/")
+    if not (slash and first.isdecimal() and number.isdecimal() and 1 <= int(first) <= int(number) <= count):
+        raise CaseError(f"--part {part}: write it as i/n with 1 <= i <= n, and n at most the number of {of}")
+    return int(first), int(number)
+
+
+def compute(
+    tasks: Sequence[Task], do: Callable[[Task], Iterable[str]], comm: MPI.Intracomm, say: Say = lambda line: None
+) -> None:
+    """Deal tasks to the ranks; collective.
+
+    Parameters
+    ----------
+    do
+        Computes a task, keeps the outcome of each of its runs, and yields a line of text for it.
+    """
+    begun = time.perf_counter()
+    with _together(comm):
+        for i in deal(len(tasks), comm):
+            for line in do(tasks[i]):
+                say(line + _rest(time.perf_counter() - begun, i + 1, len(tasks)))
+
+
+def _rest(seconds: float, done: int, count: int) -> str:
+    """How long the others take if they go on as those before.
+
+    Examples
+    --------
+    >>> _rest(60.0, 1, 11), _rest(60.0, 10, 11), _rest(90.0, 4, 5)
+    (', about 10 min left', '', ', about 22 s left')
+    """
+    left = seconds * (count / done - 1)
+    if left < LEAST_LEFT:
+        return ""
+    size, unit = next((size, unit) for size, unit in ((3600, "h"), (60, "min"), (1, "s")) if left >= 1.5 * size)
+    return f", about {left / size:.0f} {unit} left"
+
+
+def deal(count: int, comm: MPI.Intracomm) -> Iterator[int]:
+    """Distribute the numbers 0 to count - 1; the next free rank gets the next number. Collective.
+
+    All ranks increase a counter in the memory of rank 0, which works like the others.
+    """
+    if comm.size == 1:
+        yield from range(count)
+        return
+    counter = np.zeros(1, dtype=np.int64)
+    window = MPI.Win.Allocate(counter.nbytes if comm.rank == 0 else 0, counter.itemsize, comm=comm)
+    if comm.rank == 0:
+        window.tomemory()[:] = counter.tobytes()
+    comm.Barrier()
+    one, number = np.ones(1, dtype=np.int64), np.zeros(1, dtype=np.int64)
+    while True:
+        window.Lock(0)
+        window.Fetch_and_op(one, number, 0)
+        window.Unlock(0)
+        if number[0] >= count:
+            break
+        yield int(number[0])
+    window.Free()
+
+
+@contextmanager
+def _together(comm: MPI.Intracomm) -> Iterator[None]:
+    """Wait at the end for all ranks; an error on one of several ends all, which would wait for it for ever."""
+    try:
+        yield
+    except BaseException as e:
+        if comm.size == 1:
+            raise
+        code = 2 if isinstance(e, CaseError) else 3 if isinstance(e, DiskError) else 1
+        print(f"rank {comm.rank}: {e if code > 1 else traceback.format_exc()}", file=sys.stderr, flush=True)
+        comm.Abort(code)
+    comm.Barrier()
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The outcome of a run.
+
+    Attributes
+    ----------
+    knockdown
+        k_d; None if there is no instability under pressure.
+    barrier
+        The energy barrier over E h R²; None if the case does not ask for one.
+    limit
+        The first limit point (the one of k_d) as in summary.json, or the event that ends a motion; None without.
+    stopped
+        Why the run ended before its target; None if it reached it.
+    curve
+        Every accepted point, with the columns of path.csv.
+    found
+        "path": the full path was computed; "fold": the fold of another run was followed, and the curve has only this
+        point.
+    factorisations
+        Factorisations of the model's tangent, including failed attempts; without those for excluded modes.
+    cpu_s
+        CPU time of a sample of an ensemble.
+    in_units
+        Numbers of a case with units, as in summary.json.
+    """
+
+    knockdown: float | None
+    limit: dict[str, Any] | None
+    stopped: str | None
+    dofs: int | None
+    wall_s: float
+    curve: list[Row]
+    found: Found
+    factorisations: int
+    barrier: float | None = None
+    cpu_s: float = 0.0
+    in_units: dict[str, float] = field(default_factory=dict)
+
+    @classmethod
+    def failed(cls, why: str, wall_s: float = 0.0, factorisations: int = 0) -> "Outcome":
+        """That of a run without a result."""
+        return cls(None, None, why, None, wall_s, [], "path", factorisations)
+
+    def value(self, scalar: Scalar) -> float | None:
+        """A named number of the run; None if it does not have it."""
+        if not self.curve:
+            return None
+        limits = [self.limit] if self.limit else []
+        summary = {"knockdown": self.knockdown, "barrier": self.barrier, "limit_points": limits}
+        return scalar.of(summary, [{key: str(v) for key, v in row.items()} for row in self.curve])
+
+    def serves(self, scalar: Scalar) -> bool:
+        """Whether it has what a number needs: of a fold alone only the knockdown is known."""
+        return self.found == "path" or scalar.name == "knockdown"
+
+
+OUTCOME = TypeAdapter(Outcome)
+
+
+def outcome_of(result: Result, found: Found, factorisations: int, wall_s: float = 0.0) -> Outcome:
+    """The outcome of a run, or of a fold in the form of a run."""
+    limits = sorted(result.limit_points, key=lambda p: p["amplitude"] != "pressure" or p["value"] != result.knockdown)
+    columns = dict.fromkeys((*COLUMNS, *result.scene.extra_columns))
+    return Outcome(
+        knockdown=result.knockdown,
+        limit=next(iter(limits), None) or _event(result),
+        stopped=result.stopped,
+        dofs=result.scene.model.system.dofs,
+        wall_s=round(wall_s, 3),
+        curve=[
+            {key: v if isinstance(v := row[key], str | int) else float(v) for key in columns if key in row}
+            for row in result.rows
+        ],
+        found=found,
+        factorisations=factorisations,
+        barrier=result.barrier,
+        in_units=in_units(result),
+    )
+
+
+def _event(result: Result) -> dict[str, Any] | None:
+    """The point at which a motion has ended by an event or an instability, in the form of a limit point."""
+    last, steps = result.rows[-1], result.scene.case.programme
+    until = getattr(steps[-1].load, "until", "") if steps else ""
+    if result.stopped or last["amplitude"] != "time" or until not in ("event", "instability"):
+        return None
+    known = {key: last[key] for key in ("p_over_pc", "w_pole_over_h", "amplitude")}
+    return {**known, "kind": until, "mode": "", "value": last["time"]}
+
+
+def keep_outcome(outcome: Outcome, case: Case, file: Path) -> None:
+    """Write the outcome of a case."""
+    known = {"case": case.model_dump(mode="json", exclude_none=True), **case.outside, "sources": sources.ours()}
+    keep(file, {**known, "outcome": asdict(outcome)})
+
+
+def kept_outcome(file: Path) -> Outcome | None:
+    """The outcome of a case in a file, if these sources have computed it; see `kept`."""
+    return kept(file, OUTCOME, "outcome", sources=sources.ours())

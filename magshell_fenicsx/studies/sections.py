@@ -1,0 +1,259 @@
+"""The sections of studies in a case: what a design varies and wants, and what is random in an ensemble."""
+
+import json
+from typing import Annotated, Any, Self
+
+from pydantic import Discriminator, Field, Tag, model_validator
+
+from magshell_fenicsx.input.chance import DefectsSection, Distribution, Value, generator
+from magshell_fenicsx.input.expressions import Formula
+from magshell_fenicsx.input.section import Section, in_unit, number_and_unit
+
+Point = Annotated[list[float], Field(min_length=3, max_length=3)]
+Bounds = Annotated[list[float], Field(min_length=2, max_length=2)]
+Measured = Annotated[str, Field(pattern=r"^\s*[-+]?\.?[0-9]", examples=["20 mT"])]
+Amounts = Annotated[list[float | Measured], Field(min_length=2, max_length=2)]
+
+
+class ShapeSection(Section):
+    """Where each place should be at the end of the path: the mean square distance over the area is least there."""
+
+    components: Annotated[list[Formula], Field(min_length=3, max_length=3)] | None = None
+    """The wanted place as formulas of the undeformed x, y, z over R [R]"""
+    curve: Annotated[list[Point], Field(min_length=3)] | None = None
+    """Of a strip: points of the curve of its middle line from the root on, which a spline joins; it is scaled to the
+    strip's length [any length]"""
+    stages: Annotated[int, Field(ge=1, le=50)] = 1
+    """Of a curve: it is first wanted with 1/stages of its curvature, then with 2/stages, and so on. All but the last
+    have a quarter of the iterations"""
+
+    @model_validator(mode="after")
+    def _one_of_them(self) -> Self:
+        if (self.components is None) == (self.curve is None):
+            raise ValueError("give components or curve")
+        if self.stages > 1 and self.curve is None:
+            raise ValueError("stages: belong to a curve")
+        return self
+
+
+WANTED = ("maximise", "minimise", "reach", "shape")
+Results = Annotated[
+    Annotated[str, Tag("one")] | Annotated[list[str], Tag("several"), Field(min_length=1)],
+    Discriminator(lambda data: "several" if isinstance(data, list) else "one"),
+]
+
+
+class ObjectiveSection(Section):
+    """One of its keys; the results are knockdown, critical_field (in units buckling_pressure_Pa, critical_field_mT),
+    mass (over that of the thickness h everywhere), barrier, natural frequencies (omega2_1, omega2_2, ... as in
+    frequencies.csv, or hertz_1, ...), or a column of path.csv where the path ends, such as force_N or a force of a
+    support."""
+
+    maximise: Results | None = None
+    """A result; of several the least, so that they end equal where nothing else stops them"""
+    minimise: str | None = None
+    """A result"""
+    reach: str | None = None
+    """A result that should have `value`"""
+    value: float | None = None
+    """Of `reach`"""
+    shape: ShapeSection | None = None
+    """A shape"""
+
+    @model_validator(mode="after")
+    def _one_of_them(self) -> Self:
+        given = [key for key in WANTED if getattr(self, key) is not None]
+        if len(given) != 1:
+            raise ValueError(f"give one of maximise, minimise, reach and shape, here {', '.join(given) or 'none'}")
+        if (self.reach is None) != (self.value is None):
+            raise ValueError("reach and value belong together")
+        return self
+
+    @property
+    def result(self) -> str:
+        """Its name; "shape" of a shape."""
+        return self.results[0]
+
+    @property
+    def results(self) -> list[str]:
+        """All names of `maximise`, or the one."""
+        if isinstance(self.maximise, list):
+            return self.maximise
+        return [self.maximise or self.minimise or self.reach or "shape"]
+
+
+class LimitSection(Section):
+    """A result within bounds."""
+
+    of: str
+    """A result, as in the objective"""
+    least: float | None = None
+    """Its least value"""
+    most: float | None = None
+    """Its largest value"""
+    same_as: str | None = None
+    """Another result that it is equal to, to 1e-3"""
+
+    @model_validator(mode="after")
+    def _bounds(self) -> Self:
+        if self.least is None and self.most is None and self.same_as is None:
+            raise ValueError(f"of: {self.of}: give least, most, both, or same_as")
+        return self
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The results that it limits."""
+        return (self.of, self.same_as) if self.same_as else (self.of,)
+
+
+class RemanenceVariables(Section):
+    """The vectors of the remanence at points, of which each place has a mean; see `kind: points` of the remanence.
+
+    Their directions are free. On a meridian the points lie along it; on a strip along its middle, and vectors stay in
+    the plane of x and z; elsewhere they are spread over the surface, and all of it is modelled.
+    """
+
+    points: Annotated[int, Field(ge=2, le=20_000)] | None = None
+    """How many; without it those of `magnetic.remanent`, kind: points"""
+    filter: float | None = Field(default=None, gt=0, le=10)
+    """Nothing varies over less than this; by default the distance of the points [R]"""
+    magnitude: Bounds | None = None
+    """Least and largest length of a vector; by default lengths stay as they are [|B^r|]"""
+    steps: Annotated[int, Field(ge=2, le=360)] | None = None
+    """At the end polar angles (and azimuths) are rounded to the nearest of so many steps of a turn"""
+
+    @model_validator(mode="after")
+    def _magnitudes(self) -> Self:
+        if self.magnitude and not 0 < self.magnitude[0] < self.magnitude[1] <= 1:
+            raise ValueError(f"magnitude: needs 0 < least < largest <= 1, here {self.magnitude}")
+        return self
+
+
+class FieldVariables(Section):
+    """The values of a field at points, of which each place has the mean, weighted by exp(-(distance/filter)²).
+
+    In the best case the field is a formula of x, y, z.
+    """
+
+    points: Annotated[int, Field(ge=2, le=300)]
+    """How many, spread as those of the remanence"""
+    values: Bounds
+    """Least and largest value"""
+    filter: float | None = Field(default=None, gt=0, le=10)
+    """Nothing varies over less than this; by default the distance of the points [R]"""
+
+    @model_validator(mode="after")
+    def _bounds(self) -> Self:
+        if not self.values[0] < self.values[1]:
+            raise ValueError(f"values: the first must be less than the second, here {self.values}")
+        return self
+
+
+class DesignSection(Section):
+    """What `magshell design` varies, and for what; every other command takes the case without it."""
+
+    objective: ObjectiveSection
+    """What is wanted"""
+    numbers: dict[str, Amounts] = Field(default_factory=dict)
+    """Key of the case with a number (`magnetic.remanent.polar`, `shell.poisson_ratio`) -> least and largest value, with
+    units where the key has one: `magnetic.applied.flux_density: [-20 mT, 20 mT]`"""
+    remanence: RemanenceVariables | None = None
+    """Vectors of the remanence that vary"""
+    thickness: FieldVariables | None = None
+    """Factor of the thickness, which varies: `shell.thickness_factor` [h]"""
+    curvature: FieldVariables | None = None
+    """Natural curvatures 11 and 22, which vary: `natural.curvature` [1/R]"""
+    deviation: FieldVariables | None = None
+    """Deviation w0 of the shape outwards, which varies from zero on: one more of `shell.imperfections` [h]"""
+    constraints: list[LimitSection] = Field(default_factory=list)
+    """Results that must stay within bounds"""
+    iterations: int = Field(default=60, ge=1, le=10_000)
+    """At most so many steps of the optimiser"""
+    verify: float = Field(default=1.5, ge=1, le=10)
+    """The result is run again with `mesh.refinement` times this number"""
+
+    @model_validator(mode="after")
+    def _something_varies(self) -> Self:
+        if not self.numbers and self.remanence is None and not self.fields:
+            raise ValueError("needs numbers, remanence, thickness, curvature or deviation: otherwise nothing varies")
+        if self.thickness and self.thickness.values[0] <= 0:
+            raise ValueError("thickness: values: must be positive")
+        for key, written in self.numbers.items():
+            try:
+                least, most, _ = self.bounds(key)
+            except ValueError as e:
+                raise ValueError(f"numbers: {key}: {e}") from None
+            if not least < most:
+                here = ", ".join(map(str, written))
+                raise ValueError(f"numbers: {key}: the first bound must be less than the second, here {here}")
+        return self
+
+    def bounds(self, key: str) -> tuple[float, float, str]:
+        """The bounds of a number and their unit, that of the first one with a unit.
+
+        Raises
+        ------
+        ValueError
+            If one bound is not in that unit.
+        """
+        least, most = map(str, self.numbers[key])
+        unit = number_and_unit(least)[1] or number_and_unit(most)[1]
+        for bound in (least, most) if unit else ():
+            if not number_and_unit(bound)[1] and bound not in ("0", "0.0"):
+                raise ValueError(f"{bound.removesuffix('.0')} has no unit: give both bounds one")
+        return in_unit(least, unit), in_unit(most, unit), unit
+
+    @property
+    def fields(self) -> dict[str, FieldVariables]:
+        """The scalar fields that vary."""
+        found = {"thickness": self.thickness, "curvature": self.curvature, "deviation": self.deviation}
+        return {name: section for name, section in found.items() if section}
+
+    def key_of(self, result: str) -> str:
+        """The first key below `design` that names a result."""
+        if result in self.objective.results:
+            return next(f"objective.{key}" for key in WANTED if getattr(self.objective, key) is not None)
+        named = ((f"constraints.{i}", limit) for i, limit in enumerate(self.constraints))
+        return next(
+            f"{key}.{'of' if limit.of == result else 'same_as'}" for key, limit in named if result in limit.names
+        )
+
+    @property
+    def results(self) -> list[str]:
+        """All that are computed: that of the objective first."""
+        limited = (name for limit in self.constraints for name in limit.names)
+        return list(dict.fromkeys([*self.objective.results, *limited]))
+
+
+class EnsembleSection(Section):
+    """What is random in the samples of `magshell ensemble`; every other command takes the case without it."""
+
+    keys: dict[str, Distribution] = Field(default_factory=dict)
+    """Key of the case, with dots (`magnetic.lambda_m`, `shell.imperfections.0.amplitude`) -> its distribution"""
+    defects: DefectsSection | None = None
+    """Random defects of a sphere"""
+
+    @model_validator(mode="after")
+    def _something_is_random(self) -> Self:
+        if not self.keys and self.defects is None:
+            raise ValueError("needs keys or defects: otherwise nothing is random")
+        if self.defects and (key := next((key for key in self.keys if key.startswith("shell.imperfections")), None)):
+            raise ValueError(f"keys: {key}: defects take the place of shell.imperfections")
+        return self
+
+    def settings(self, seed: int, number: int) -> dict[str, str]:
+        """The keys of a sample and their values, as in `--set`; they depend on seed and number alone.
+
+        Every key has random numbers of its own: another key more does not change the others.
+
+        Raises
+        ------
+        NoRoom
+            If no places were found for the defects.
+        """
+        drawn: dict[str, Value | list[Any]] = {
+            key: distribution.draw(generator(seed, number, key)) for key, distribution in self.keys.items()
+        }
+        if self.defects:
+            drawn["shell.imperfections"] = self.defects.draw(generator(seed, number, "shell.imperfections"))
+        return {key: json.dumps(value) for key, value in drawn.items()}

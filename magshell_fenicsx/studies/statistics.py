@@ -1,0 +1,296 @@
+"""The rows of samples.csv and their statistics: moments, correlations and the three-parameter Weibull distribution.
+
+P(x) = 1 - exp(-((x - location)/scale)^shape) for x > location, fitted by maximum likelihood. At a given location the
+shape is the root of one equation and the scale follows from it, so that the likelihood is maximised over the location
+alone (profile likelihood). It has no maximum where the shape is below one: such shapes are left out.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import weibull_min
+
+from magshell_fenicsx.input.section import number_and_unit
+from magshell_fenicsx.output.store.table import write_csv
+from magshell_fenicsx.studies.results import Scalar
+from magshell_fenicsx.studies.runner import FAILED, Outcome
+from magshell_fenicsx.studies.samples import Sample
+
+Array = NDArray[np.float64]
+
+Row = dict[str, Any]
+RESULT, WITHOUT = "result", "result_without_weakest"
+SEVEREST = "severest."
+FIRST = ("sample", "status", RESULT)
+LAST = ("found", "factorisations", "dofs", "cpu_s", "wall_s", "why", "point")
+STATUS = {
+    "found": "with a result",
+    "stopped": "stopped early",
+    "none": "without an instability",
+    "failed": "failed",
+    "missing": "not computed",
+}
+RESAMPLED = 300
+LEAST = 3  # samples for a correlation
+LEAST_DIFFERENT = 8  # different values for three parameters
+SPANS = 1e-3, 1e2  # distances of the location below the least value, in standard deviations
+GRID, ROUNDS = 9, 9  # locations that are tried at once, and how often the grid is refined around the best
+SHAPES = 1.0, 1e3
+STEPS = 5  # of Newton's method, which begins close
+LEVEL = 0.95
+
+
+def make_row(sample: Sample, outcome: Outcome | None, scalar: Scalar) -> Row:
+    """The row of a sample; None as outcome: it has not been computed."""
+    result = outcome.value(scalar) if outcome else None
+    status, why = _status(outcome, result)
+    computed = ("found", "factorisations", "dofs", "cpu_s", "wall_s")
+    return {
+        "sample": sample.number,
+        "status": status,
+        RESULT: result,
+        **_columns(sample.values),
+        **_columns({f"{SEVEREST}{key}": number for key, number in sample.severest.items()}),
+        **{name: getattr(outcome, name, None) for name in computed},
+        "why": f"no {scalar.name}" if status == "none" else why,
+        "point": sample.key,
+    }
+
+
+def _status(outcome: Outcome | None, result: float | None) -> tuple[str, str | None]:
+    """A key of `STATUS`, and why there is no result."""
+    if outcome is None:
+        return "missing", "not computed"
+    why = outcome.stopped
+    if result is not None:
+        return "found", why
+    return "none" if why is None else "failed" if why.startswith(FAILED) else "stopped", why
+
+
+def _columns(values: Mapping[str, Any]) -> Row:
+    """Values by the names of their columns; one with a unit is a number, and its name has the unit.
+
+    Examples
+    --------
+    >>> _columns({"shell.thickness": "0.25 mm", "shell.poisson_ratio": 0.5})
+    {'shell.thickness_mm': 0.25, 'shell.poisson_ratio': 0.5}
+    """
+    found = {}
+    for key, value in values.items():
+        number, unit = number_and_unit(value) if isinstance(value, str) else ("", "")
+        found[f"{key}_{unit}" if unit else key] = float(number) if unit else value
+    return found
+
+
+def severest_keys(rows: Sequence[Row]) -> list[str]:
+    """The columns of the most severe defect."""
+    return list(dict.fromkeys(key for row in rows for key in row if key.startswith(SEVEREST)))
+
+
+def drawn_keys(rows: Sequence[Row]) -> list[str]:
+    """The columns of drawn values, in the order of the rows."""
+    others = {*FIRST, *LAST, *severest_keys(rows), WITHOUT}
+    return list(dict.fromkeys(key for row in rows for key in row if key not in others))
+
+
+def write_samples(rows: Sequence[Row], file: Path) -> None:
+    """Write samples.csv."""
+    more = [WITHOUT] if any(WITHOUT in row for row in rows) else []
+    write_csv(rows, (*FIRST, *more, *severest_keys(rows), *drawn_keys(rows), *LAST), file)
+
+
+def results(rows: Sequence[Row], column: str = RESULT) -> Array:
+    """The results of the samples that have one."""
+    return np.array([row[column] for row in rows if row.get(column) is not None], dtype=float)
+
+
+def statistics(rows: Sequence[Row], seed: int) -> dict[str, Any]:
+    """Numbers of samples, moments, the Weibull fit, correlations, and the change without the weakest defects.
+
+    Parameters
+    ----------
+    seed
+        Of the resampling for intervals.
+    """
+    values = results(rows)
+    return {
+        "counts": counts(rows),
+        **moments(values),
+        "weibull": _weibull(values),
+        "level": LEVEL,
+        "intervals": intervals(values, seed, RESAMPLED) if len(values) >= LEAST else {},
+        "correlations": correlations(rows),
+        "without_weakest": _without(rows),
+        "cpu_s_per_sample": float(np.mean([row["cpu_s"] for row in rows if row["cpu_s"] is not None] or [np.nan])),
+    }
+
+
+def counts(rows: Sequence[Row]) -> dict[str, int]:
+    """The number of samples, and of those with each status."""
+    statuses = [row["status"] for row in rows]
+    return {"samples": len(rows), **{status: statuses.count(status) for status in sorted(set(statuses))}}
+
+
+def moments(values: Array) -> dict[str, Any]:
+    """Mean, standard deviation and quartiles; None where there are too few values."""
+    if not len(values):
+        return dict.fromkeys(("mean", "deviation", "least", "median", "largest"))
+    return {
+        "mean": float(values.mean()),
+        "deviation": float(values.std(ddof=1)) if len(values) > 1 else None,
+        "least": float(values.min()),
+        "median": float(np.median(values)),
+        "largest": float(values.max()),
+    }
+
+
+def _weibull(values: Array) -> dict[str, Any] | None:
+    found = fit(values) if len(values) else None
+    if found is None:
+        return None
+    return {**asdict(found), "quantile_1_percent": found.quantile(0.01), "distance": distance(values, found)}
+
+
+def correlations(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
+    """The correlation of the result with the most severe defect and with every key: Pearson's and Spearman's."""
+    from scipy.stats import pearsonr, spearmanr
+
+    found = {}
+    drawn = [key for key in drawn_keys(rows) if not key.startswith("shell.imperfections.")]
+    for key in (*severest_keys(rows), *drawn):
+        pairs = np.array([(x, y) for row in rows if _is_number(x := row.get(key)) and (y := row[RESULT]) is not None])
+        if len(pairs) < LEAST or not np.ptp(pairs, axis=0).all():
+            continue
+        x, y = pairs.T
+        found[key] = {"pearson": float(pearsonr(x, y)[0]), "spearman": float(spearmanr(x, y)[0])}
+    return found
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, float | int)
+
+
+def _without(rows: Sequence[Row]) -> dict[str, Any] | None:
+    """The change of the result by deleting the weakest defects, over the samples that have both."""
+    both = [(row[RESULT], row[WITHOUT]) for row in rows if row[RESULT] is not None and row.get(WITHOUT) is not None]
+    if not both:
+        return None
+    whole, less = np.array(both).T
+    change = less / whole - 1
+    return {
+        "samples": len(both),
+        "mean": float(less.mean()),
+        "change_of_mean": float(less.mean() / whole.mean() - 1),
+        "largest_change": float(change[np.argmax(np.abs(change))]),
+    }
+
+
+@dataclass(frozen=True)
+class Weibull:
+    """A fitted distribution.
+
+    Attributes
+    ----------
+    bounded
+        Whether the best location is one of the bounds of the search, so that the sample does not determine it.
+    """
+
+    shape: float
+    location: float
+    scale: float
+    bounded: bool
+
+    def below(self, x: Array) -> Array:
+        """The probability of a smaller value."""
+        return np.asarray(weibull_min.cdf(x, self.shape, self.location, self.scale))
+
+    def density(self, x: Array) -> Array:
+        return np.asarray(weibull_min.pdf(x, self.shape, self.location, self.scale))
+
+    def quantile(self, part: float) -> float:
+        """The value that is larger with the probability 1 - part."""
+        return float(weibull_min.ppf(part, self.shape, self.location, self.scale))
+
+
+def fit(values: Sequence[float] | Array) -> Weibull | None:
+    """The most likely distribution; None with fewer than `LEAST_DIFFERENT` different values.
+
+    Parameters
+    ----------
+    values
+        The sample (n,).
+    """
+    x = np.sort(np.asarray(values, dtype=float))
+    if len(np.unique(x)) < LEAST_DIFFERENT:
+        return None
+    spread = float(x.std())
+    low, high = np.log(SPANS)
+    ends, best = (low, high), 0.0
+    for _ in range(ROUNDS):
+        tried = np.linspace(low, high, GRID)
+        best = float(tried[np.argmax(_likelihoods(x, x[0] - spread * np.exp(tried)))])
+        step = tried[1] - tried[0]
+        low, high = max(best - step, ends[0]), min(best + step, ends[1])
+    location = x[0] - spread * float(np.exp(best))
+    shape, scale = (float(v[0]) for v in _at(x, np.array([location])))
+    return Weibull(shape, float(location), scale, best in ends or shape <= SHAPES[0])
+
+
+def distance(values: Array, fitted: Weibull) -> float:
+    """The largest difference between the empirical and the fitted distribution function (Kolmogorov and Smirnov)."""
+    below, n = fitted.below(np.sort(values)), len(values)
+    return float(np.max([np.arange(1, n + 1) / n - below, below - np.arange(n) / n]))
+
+
+def _likelihoods(x: Array, locations: Array) -> Array:
+    """Mean logarithm of the density, at the best shape and scale of each location."""
+    shapes, scales = _at(x, locations)
+    logs = np.log((x - locations[:, None]) / scales[:, None])
+    powers = np.exp(shapes[:, None] * logs)
+    return np.asarray(np.log(shapes / scales) + np.mean((shapes[:, None] - 1) * logs - powers, axis=1))
+
+
+def _at(x: Array, locations: Array) -> tuple[Array, Array]:
+    """The best shape (m,) and scale (m,) for locations (m,).
+
+    The shape k solves 1/k = sum(y^k log y)/sum(y^k) - mean(log y) with y = x - location, by Newton's method for log k.
+    """
+    y = np.log(x - locations[:, None])
+    y, middle = y - y.mean(axis=1, keepdims=True), y.mean(axis=1)  # mean(log y) = 0 then
+    k = 1.2 / np.maximum(y.std(axis=1), 1e-12)
+    for _ in range(STEPS):
+        top = np.max(k[:, None] * y, axis=1, keepdims=True)
+        w = np.exp(k[:, None] * y - top)
+        s0, s1, s2 = w.sum(axis=1), (w * y).sum(axis=1), (w * y**2).sum(axis=1)
+        value, slope = s1 / s0 - 1 / k, s2 / s0 - (s1 / s0) ** 2 + 1 / k**2
+        k = k * np.exp(np.clip(-value / (slope * k), -1.0, 1.0))
+    k = np.clip(k, *SHAPES)
+    top = np.max(k[:, None] * y, axis=1, keepdims=True)
+    mean = np.log(np.mean(np.exp(k[:, None] * y - top), axis=1)) + top[:, 0]
+    return np.asarray(k), np.asarray(np.exp(middle + mean / k))
+
+
+def intervals(values: Sequence[float] | Array, seed: int, count: int = 400) -> dict[str, tuple[float, float]]:
+    """Percentile intervals of the parameters, of the mean and of the 1 % quantile, from resampled values.
+
+    Parameters
+    ----------
+    seed, count
+        Of the resampling, and its number.
+    """
+    x, rng = np.asarray(values, dtype=float), np.random.default_rng(seed)
+    found: dict[str, list[float]] = {}
+    for _ in range(count):
+        again = rng.choice(x, len(x))
+        numbers = {"mean": float(again.mean()), "deviation": float(again.std(ddof=1))}
+        if one := fit(again):
+            numbers |= {"shape": one.shape, "location": one.location, "scale": one.scale}
+            numbers["quantile_1_percent"] = one.quantile(0.01)
+        for name, value in numbers.items():
+            found.setdefault(name, []).append(value)
+    ends = (0.5 - LEVEL / 2, 0.5 + LEVEL / 2)
+    return {name: tuple(map(float, np.quantile(many, ends))) for name, many in found.items()}  # type: ignore[misc]

@@ -1,0 +1,178 @@
+"""Error against run time of a case over meshes, degrees, models and ranks; every run is a separate process."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from math import isfinite
+from pathlib import Path
+from shutil import which
+from typing import Any
+
+from mpi4py import MPI
+
+from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.output.store.durable import write_object
+from magshell_fenicsx.output.store.folder import by_first, given_folder
+from magshell_fenicsx.output.store.table import write_csv
+from magshell_fenicsx.platform import sources
+from magshell_fenicsx.platform.environment import fingerprint
+from magshell_fenicsx.platform.terminal import print_line
+from magshell_fenicsx.studies.measured import Measured, complete, load, of_others
+from magshell_fenicsx.studies.points import make_points, parse_axes, swept_source
+from magshell_fenicsx.studies.results import Scalar, parse_scalar
+from magshell_fenicsx.studies.runner import Folder, Made, Say, compute
+from magshell_fenicsx.studies.study_report import (
+    COLUMNS,
+    Reference,
+    Row,
+    Run,
+    draw_study,
+    make_rows,
+    reference_sentence,
+    repeated,
+    write_table,
+)
+
+FOLDER = Folder("a study", ("study.json", "study.csv", "study.md", "study.png"), ("machine", "result"))
+
+
+@dataclass(frozen=True)
+class Study:
+    """A finished study.
+
+    Attributes
+    ----------
+    rows
+        As in study.csv, the points in product order, the ranks fastest.
+    reference
+        None if no run gave the result.
+    """
+
+    rows: list[Row]
+    reference: Reference | None
+
+    @property
+    def without_result(self) -> int:
+        """Number of runs without the requested result."""
+        return sum(row["result"] is None for row in self.rows)
+
+
+def study(
+    file: Path | str,
+    over: Sequence[str],
+    settings: Sequence[str] = (),
+    *,
+    result: str,
+    made: Made,
+    reference: float | None = None,
+    ranks: Sequence[int] = (1,),
+    repeat: int = 3,
+    out: Path | str = "results/study",
+    say: Say = print_line,
+) -> Study:
+    """Measure error and run time at all points of a product; write study.csv, .json, .md and .png.
+
+    Runs are separate processes, one at a time: each point runs once to compile its kernels, then `repeat` times. Runs
+    in the folder are kept if this machine measured them with these sources.
+
+    Parameters
+    ----------
+    over
+        `key.path=start:stop:count` or `key.path=value,value`; keys tied with `+`.
+    result
+        `knockdown`, `critical_field`, `COLUMN@COLUMN=VALUE` or `COLUMN@end`; see `Scalar`.
+    made
+        Makes a case of its source.
+    reference
+        The exact value for the errors; None takes the finest run and estimates its own error.
+    ranks
+        Numbers of MPI ranks for every point.
+    say
+        Called with one line per run.
+
+    Raises
+    ------
+    CaseError
+        Before the first run: if a point is not a valid case, the result has no such name, or `out` cannot be
+        written.
+    DiskError
+        If the disk is full; finished runs are kept.
+    """
+    scalar, axes = parse_scalar(result), parse_axes(over)
+    _check(reference, ranks, repeat)
+    points = make_points(swept_source(Path(file), axes, settings), axes, made)
+    folder, machine = given_folder(out), fingerprint()
+    with FOLDER.held(folder, MPI.COMM_WORLD, Path(file).name):
+        counts = sorted(set(ranks))
+        origins = [{"sources": sources.ours(), **point.case.outside} for point in points]
+        files = {(i, n): folder / "points" / f"{points[i].key}-{n}.json" for i in range(len(points)) for n in counts}
+        if again := sum(of_others(file, origins[i]) for (i, _), file in files.items()):
+            say(f"{again} of {len(files)} computed again: the folder has results of other sources of magshell_fenicsx")
+        runs = {(i, n): Run(points[i], n, load(kept_in, machine, origins[i])) for (i, n), kept_in in files.items()}
+
+        def point_measured(key: tuple[int, int]) -> Iterator[str]:
+            (i, n), run = key, runs[key]
+            chosen = [*settings, *(f"{name}={value}" for name, value in run.point.values.items())]
+            arguments = [str(file), *(word for setting in chosen for word in ("--set", setting))]
+            complete(run.measured, arguments, n, repeat, files[key], origins[i])
+            yield f"{i + 1:4d}/{len(points)}  {run.label}: {_outcome(run.measured, scalar)}"
+
+        compute([*runs], point_measured, MPI.COMM_SELF, say)
+        rows, against = make_rows([*runs.values()], scalar, reference)
+        content = {
+            "case": Path(file).name,
+            "settings": list(settings),
+            "over": list(over),
+            "result": result,
+            "reference": asdict(against) if against else None,
+            "reference_said": reference_sentence(against),
+            "repeat": repeat,
+            "machine": machine,
+        }
+        done = Study(rows, against)
+        by_first(MPI.COMM_WORLD, lambda: _write(done, tuple(points[0].values), content, folder))
+    say(reference_sentence(against))
+    return done
+
+
+def parse_ranks(text: str) -> list[int]:
+    """Read `--ranks`.
+
+    Examples
+    --------
+    >>> parse_ranks("1,2")
+    [1, 2]
+    """
+    try:
+        return [int(word) for word in text.split(",")]
+    except ValueError:
+        raise CaseError(f"--ranks {text}: write whole numbers with commas, for example 1,2") from None
+
+
+def _check(reference: float | None, ranks: Sequence[int], repeat: int) -> None:
+    if MPI.COMM_WORLD.size > 1:
+        raise CaseError("a study starts its ranks itself: use --ranks instead of mpirun")
+    if repeat < 1 or not ranks or min(ranks) < 1:
+        raise CaseError("--repeat and --ranks must be at least 1")
+    if max(ranks) > 1 and not which("mpirun"):
+        raise CaseError("--ranks: there is no mpirun to start more than one")
+    if reference is not None and not isfinite(reference):
+        raise CaseError(f"--reference {reference}: must be a finite number")
+
+
+def _write(done: Study, keys: Sequence[str], content: dict[str, Any], folder: Path) -> None:
+    write_object(folder / "study.json", content)
+    write_csv(done.rows, (*keys, *COLUMNS), folder / "study.csv")
+    write_table(done.rows, keys, content, folder / "study.md")
+    repeats = repeated(content["repeat"]).lower()
+    title = f"{content['result']} of {content['case']}\n{content['machine']['cpu']}, kernels compiled, {repeats}"
+    own_error = done.reference.error if done.reference else None
+    draw_study(done.rows, keys, title, own_error, folder / "study.png")
+
+
+def _outcome(measured: Measured, scalar: Scalar) -> str:
+    if measured.summary is None:
+        return f"stopped early: {measured.failure}"
+    value = scalar.of(measured.summary, measured.rows)
+    found = f"{scalar.name} = {value:.9g}" if value is not None else f"no {scalar.name}"
+    stopped = measured.summary["stopped"]
+    return f"{found}, {measured.typical('wall_s'):.2f} s" + (f", stopped early: {stopped}" if stopped else "")

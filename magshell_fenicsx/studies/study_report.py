@@ -1,0 +1,345 @@
+"""The rows of a study with their errors, its table and its picture."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import cycle
+from pathlib import Path
+from typing import Any
+
+from scipy.optimize import brentq
+
+from magshell_fenicsx.platform.environment import described
+from magshell_fenicsx.studies.measured import TIMES, Measured
+from magshell_fenicsx.studies.points import SweepPoint, short
+from magshell_fenicsx.studies.results import Scalar
+
+ORDERS = 0.05, 30.0  # range of credible observed orders
+
+
+@dataclass(frozen=True)
+class Reference:
+    """A value with its own error.
+
+    Attributes
+    ----------
+    error
+        Relative error; None if unknown.
+    order
+        Observed order of convergence for that error; None if there is none.
+    source
+        Description of the reference.
+    """
+
+    value: float
+    error: float | None
+    order: float | None
+    source: str
+
+    def error_of(self, value: float) -> float:
+        """Relative error of another value; absolute if the reference is zero."""
+        return abs(value - self.value) / (abs(self.value) or 1.0)
+
+
+def estimated_error(h: Sequence[float], values: Sequence[float]) -> tuple[float | None, float | None]:
+    """Error of the last value, and the order p, from v(h) = v + C h^p (Richardson).
+
+    Parameters
+    ----------
+    h
+        Mesh sizes, decreasing.
+    values
+        At least three values give the order. With two, or without monotonic convergence, the error is the last
+        difference and there is no order.
+
+    Returns
+    -------
+    tuple
+        Absolute error, None for a single value; order, or None.
+
+    Examples
+    --------
+    >>> error, order = estimated_error([4, 2, 1], [1 + 16e-3, 1 + 4e-3, 1 + 1e-3])
+    >>> round(error, 9), round(order, 9)
+    (0.001, 2.0)
+    """
+    if len(values) < 2:
+        return None, None
+    last = abs(values[-1] - values[-2])
+    p = observed_order(h[-3:], values[-3:]) if len(values) > 2 else None
+    if p is None:
+        return last, None
+    return last * h[-1] ** p / (h[-2] ** p - h[-1] ** p), p
+
+
+def observed_order(h: Sequence[float], values: Sequence[float]) -> float | None:
+    """p with (v1 - v2)/(v2 - v3) = (h1^p - h2^p)/(h2^p - h3^p); None if there is none between `ORDERS`."""
+    (a, b, c), (v1, v2, v3) = h, values
+    if (v1 - v2) * (v2 - v3) <= 0:
+        return None
+
+    def mismatch(p: float) -> float:
+        return float((v1 - v2) * (b**p - c**p) - (v2 - v3) * (a**p - b**p))
+
+    low, high = ORDERS
+    return float(brentq(mismatch, low, high)) if mismatch(low) * mismatch(high) < 0 else None
+
+
+REFINEMENT = "mesh.refinement"
+COLUMNS = (
+    *("ranks", "cells", "dofs", "degree", "result", "error"),
+    *("wall_s", "cpu_s", "jit_first_s", "jit_s", "setup_s", "assembly_s", "factor_s", "solve_s", "output_s", "total_s"),
+    *("peak_mb", "factorisations", "iterations", "stopped", "pareto"),
+)
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Run:
+    """The measurements of a point on a number of ranks."""
+
+    point: SweepPoint
+    ranks: int
+    measured: Measured
+
+    @property
+    def label(self) -> str:
+        return f"{self.point.label}, {self.ranks} rank{'s' if self.ranks > 1 else ''}"
+
+
+def make_rows(runs: Sequence[Run], scalar: Scalar, given: float | None) -> tuple[list[Row], Reference | None]:
+    """All rows, in the order of the runs, and the reference of their errors.
+
+    Parameters
+    ----------
+    given
+        The reference; None takes the finest run, with an estimate of its error.
+    """
+    rows = [_row(run, scalar) for run in runs]
+    reference, finest = None, None
+    if given is not None:
+        reference = Reference(given, None, None, "given")
+    elif any(row["result"] is not None for row in rows):
+        finest = max((row for row in rows if row["result"] is not None), key=lambda r: (r["degree"], r["dofs"]))
+        reference = _estimated(finest, runs, rows)
+    for row in rows:
+        if reference and row["result"] is not None:
+            row["error"] = reference.error if row is finest else reference.error_of(row["result"])
+    spent = clock(rows)
+    comparable = [row for row in rows if row["error"] is not None and row[spent] is not None]
+    for row in rows:
+        row["pareto"] = row in comparable and not any(_beats(other, row, spent) for other in comparable)
+    return rows, reference
+
+
+def _row(run: Run, scalar: Scalar) -> Row:
+    measured, summary = run.measured, run.measured.summary
+    row: Row = {**run.point.values, **dict.fromkeys(COLUMNS), "ranks": run.ranks, "stopped": measured.failure}
+    if summary is None:
+        return row
+    return row | {
+        **summary["mesh"],
+        "result": scalar.of(summary, measured.rows),
+        **{key: measured.typical(key) for key in TIMES},
+        "jit_first_s": measured.first["jit_s"] if measured.first else None,
+        "factorisations": summary["factorisations"],
+        "iterations": summary["iterations"],
+        "stopped": summary["stopped"],
+    }
+
+
+def _estimated(finest: Row, runs: Sequence[Run], rows: Sequence[Row]) -> Reference:
+    """The finest run as reference; its error comes from runs that differ only in the refinement."""
+    same = [key for key in runs[0].point.values if key != REFINEMENT] + ["ranks"]
+    series = {
+        run.point.case.mesh.refinement: row["result"]
+        for run, row in zip(runs, rows, strict=True)
+        if row["result"] is not None and row["dofs"] <= finest["dofs"] and all(row[k] == finest[k] for k in same)
+    }
+    refinements = sorted(series)
+    error, order = estimated_error([1 / r for r in refinements], [series[r] for r in refinements])
+    value = finest["result"]
+    relative = None if error is None else error / (abs(value) or 1.0)
+    return Reference(value, relative, order, f"finest run: degree {finest['degree']}, {finest['dofs']} dofs")
+
+
+def clock(rows: Sequence[Row]) -> str:
+    """The time that compares runs: CPU time for one rank, because other processes affect it less; else wall time."""
+    alone = all(row["ranks"] == 1 for row in rows) and any(row["cpu_s"] is not None for row in rows)
+    return "cpu_s" if alone else "wall_s"
+
+
+def _beats(a: Row, b: Row, spent: str) -> bool:
+    """Whether a is at least as good as b in both time and error, and better in one."""
+    here, there = (a[spent], a["error"]), (b[spent], b["error"])
+    return here != there and here[0] <= there[0] and here[1] <= there[1]
+
+
+FORMS = {
+    "result": ".9g",
+    "error": ".1e",
+    "peak_mb": ".0f",
+    **dict.fromkeys(("wall_s", "cpu_s", "jit_s", "setup_s", "assembly_s", "factor_s", "solve_s", "output_s"), ".3g"),
+}
+SHOWN = (
+    *("cells", "dofs", "result", "error", "wall_s", "cpu_s", "jit_s", "setup_s", "assembly_s", "factor_s", "solve_s"),
+    *("output_s", "peak_mb", "factorisations", "iterations", "stopped"),
+)
+LEGEND = """Wall and CPU seconds are for the whole process with its files, kernels compiled; the phases are as in
+summary.json; the peak is the resident memory of all ranks. **Bold**: no other run is both faster and more accurate.
+"""
+
+
+def write_table(rows: Sequence[Row], keys: Sequence[str], content: dict[str, Any], file: Path) -> None:
+    """Write study.md.
+
+    Parameters
+    ----------
+    keys
+        The swept keys.
+    content
+        The content of study.json.
+    """
+    head = [*map(short, keys), "ranks", *(name.replace("_s", " (s)").replace("_mb", " (MB)") for name in SHOWN)]
+    lines = [head, ["---"] * len(head)]
+    for row in rows:
+        cells = [_cell(row, key) for key in (*keys, "ranks", *SHOWN)]
+        lines.append([f"**{cell}**" if row["pareto"] and cell else cell for cell in cells])
+    table = "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    file.write_text(
+        f"# {content['result']} of {content['case']}: error against run time\n\n"
+        f"{content['reference_said']} {repeated(content['repeat'])} on {described(content['machine'])}.\n"
+        f"{LEGEND}\n![](study.png)\n\n{table}\n",
+        encoding="utf-8",
+    )
+
+
+def repeated(repeat: int) -> str:
+    """How often each point was run.
+
+    Examples
+    --------
+    >>> repeated(1), repeated(3)
+    ('One run each', 'Medians of 3 runs')
+    """
+    return f"Medians of {repeat} runs" if repeat > 1 else "One run each"
+
+
+def reference_sentence(reference: Reference | None) -> str:
+    """The reference of the errors, as a sentence."""
+    if reference is None:
+        return "No run gave the result."
+    value = f"Errors are relative to {reference.value:.10g} ({reference.source}"
+    if reference.source == "given":
+        return f"{value})."
+    if reference.error is None:
+        return f"{value}; its own error is not known: it has no coarser mesh to compare with)."
+    how = f"observed order {reference.order:.2g}" if reference.order else "the last difference: no order was observed"
+    return f"{value}; its own error is estimated at {reference.error:.1e}, {how}): smaller errors mean nothing."
+
+
+def _cell(row: Row, key: str) -> str:
+    value = row[key]
+    if value is None:
+        return ""
+    return format(value, FORMS[key]) if key in FORMS else str(value).replace("|", "/").replace("\n", " ")
+
+
+CLOCKS = {"wall_s": "wall time of the process (s)", "cpu_s": "CPU time of the process (s)"}
+AGAINST = {"dofs": "unknowns", "peak_mb": "peak memory, all ranks (MB)"}
+PARTS = {
+    "jit_s": "kernels (warm)",
+    "setup_s": "set-up",
+    "assembly_s": "assembly",
+    "factor_s": "factorisation",
+    "solve_s": "back-solve",
+    "output_s": "output",
+}
+MARKERS = "osD^vP*X"
+LEAST_SPREAD = 3.0  # least factor between the middle and the ends of an axis, so that noise shows no trend
+
+
+def draw_study(rows: Sequence[Row], keys: Sequence[str], title: str, own_error: float | None, file: Path) -> None:
+    """Write study.png; runs without an error are left out.
+
+    Parameters
+    ----------
+    keys
+        The swept keys; the runs of a series differ only in the refinement.
+    own_error
+        Error of the reference, drawn as a line; smaller errors are meaningless.
+    """
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    spent = clock(rows)
+    series = _series([row for row in rows if row["error"] and row[spent]], keys)
+    figure, panels = plt.subplots(2, 2, figsize=(9.6, 7.2), layout="constrained")
+    for axes, (quantity, label) in zip(panels.flat, {spent: CLOCKS[spent], **AGAINST}.items(), strict=False):
+        _errors(axes, series, quantity, own_error)
+        axes.set(xlabel=label, ylabel="relative error")
+    _parts(panels[1, 1], series)
+    figure.suptitle(title, fontsize=10)
+    for axes, place in ((panels[0, 0], "upper"), (panels[1, 1], "lower")):
+        handles, labels = axes.get_legend_handles_labels()
+        if handles:
+            figure.legend(handles, labels, loc=f"outside right {place}", fontsize=8, frameon=False)
+    figure.savefig(file, dpi=160)
+    plt.close(figure)
+
+
+def _series(rows: Sequence[Row], keys: Sequence[str]) -> dict[str, list[Row]]:
+    """Series of rows that differ only in the mesh size, by a label of their common values."""
+    names = [*(key for key in keys if key != REFINEMENT), "ranks"]
+    shown = [name for name in names if len({row[name] for row in rows}) > 1]
+    found: dict[str, list[Row]] = {}
+    for row in sorted(rows, key=lambda r: r["dofs"]):
+        found.setdefault(", ".join(f"{short(name)} {row[name]}" for name in shown) or "runs", []).append(row)
+    return found
+
+
+def _errors(axes: Any, series: dict[str, list[Row]], quantity: str, own_error: float | None) -> None:
+    from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
+
+    for (label, rows), marker in zip(series.items(), cycle(MARKERS), strict=False):
+        x, error = ([row[key] for row in rows] for key in (quantity, "error"))
+        axes.plot(x, error, marker=marker, markersize=4, linewidth=1, label=label)
+    best = sorted((row[quantity], row["error"]) for rows in series.values() for row in rows if row["pareto"])
+    if quantity in CLOCKS and best:
+        x, error = map(list, zip(*best, strict=True))
+        axes.step(x, error, where="post", color="0.6", linewidth=5, alpha=0.5, zorder=0, label="Pareto front")
+        axes.plot(x, error, "o", markersize=9, fillstyle="none", color="0.3")
+    if own_error:
+        axes.axhline(own_error, color="C3", linewidth=0.8, linestyle=":", label="error of the reference itself")
+    axes.set(xscale="log", yscale="log")
+    if values := [row[quantity] for rows in series.values() for row in rows]:
+        middle = (min(values) * max(values)) ** 0.5
+        spread = max(LEAST_SPREAD, 1.1 * (max(values) / min(values)) ** 0.5)
+        axes.set_xlim(middle / spread, middle * spread)
+    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.grid(which="both", color="0.92", linewidth=0.6)
+
+
+def _parts(axes: Any, series: dict[str, list[Row]]) -> None:
+    """Draw the shares of the phases in the wall time, for the runs on the Pareto front."""
+    rows = sorted((r for rows in series.values() for r in rows if r["pareto"]), key=lambda r: -r["error"])
+    bottom = [0.0] * len(rows)
+    places = range(len(rows))
+    for i, (key, label) in enumerate(PARTS.items()):
+        if all(row[key] is None for row in rows):
+            continue
+        heights = [(row[key] or 0.0) / row["wall_s"] for row in rows]
+        axes.bar(places, heights, bottom=bottom, color=f"C{i}", label=label)
+        bottom = [b + h for b, h in zip(bottom, heights, strict=True)]
+    for end, colour, label in (
+        ("total_s", "0.6", "the rest of the run"),
+        ("wall_s", "0.85", "start and end of the process"),
+    ):
+        rest = [max((row[end] or 0.0) / row["wall_s"] - b, 0.0) for row, b in zip(rows, bottom, strict=True)]
+        axes.bar(places, rest, bottom=bottom, color=colour, label=label)
+        bottom = [b + h for b, h in zip(bottom, rest, strict=True)]
+    axes.set_xticks(places, [f"{row['error']:.0e}\n{row['dofs']}" for row in rows], fontsize=7)
+    axes.set(xlabel="error and unknowns of the Pareto front's runs", ylabel="share of the wall time", ylim=(0, 1))

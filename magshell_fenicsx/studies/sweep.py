@@ -1,0 +1,409 @@
+"""A case over ranges of its keys; the ranks share the points, and existing points are kept.
+
+The points along one axis are a chain. If the result is a knockdown, the fold of one point of a chain is followed to
+the next; the first point, and every point where this fails, computes the full path.
+"""
+
+import copy
+import hashlib
+import json
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from mpi4py import MPI
+
+from magshell_fenicsx.continuation.fold import FoldLost
+from magshell_fenicsx.input.source import CaseError, Source
+from magshell_fenicsx.mesh.patch import MeshError
+from magshell_fenicsx.output.store.durable import Damaged, read_object, write_object
+from magshell_fenicsx.output.store.folder import by_first, given_folder
+from magshell_fenicsx.output.store.table import COLUMNS, write_csv
+from magshell_fenicsx.platform.first import from_first
+from magshell_fenicsx.platform.terminal import print_line
+from magshell_fenicsx.problem.planner import make_plan
+from magshell_fenicsx.quantities.registry import endings
+from magshell_fenicsx.runs.run import Result, run
+from magshell_fenicsx.studies.folds import Continuation, Scenes, fold_row, has_knockdown
+from magshell_fenicsx.studies.points import (
+    MOST_POINTS,
+    Axis,
+    SweepPoint,
+    along,
+    make_point,
+    make_points,
+    parse_axes,
+    swept_source,
+    value_at,
+)
+from magshell_fenicsx.studies.runner import (
+    Case,
+    Folder,
+    Made,
+    Outcome,
+    Say,
+    compute,
+    keep_outcome,
+    kept_outcome,
+    outcome_of,
+    part_of,
+)
+from magshell_fenicsx.studies.sweep_picture import draw_sweep
+
+NAME, TABLE, CURVES, PICTURE = "sweep.json", "sweep.csv", "curves.csv", "sweep.png"
+FOLDER = Folder("a sweep", (NAME, TABLE, CURVES, PICTURE), ("keys", "base", "points"))
+SYMMETRIES = ("none", "half", "axisymmetric")  # a model with an earlier symmetry covers the later ones
+OF_LIMIT = ("p_over_pc", "w_pole_over_h", "kind", "mode", "amplitude", "value")
+CURVE = (
+    *("label", "amplitude", "p_over_pc", "lambda_m", "field_angle", "force", "load_factor", "w_over_h"),
+    *("w_pole_over_h", "volume_change", "mode", "branch"),
+)
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """A finished sweep: its points in product order, and their outcomes."""
+
+    axes: list[Axis]
+    points: list[SweepPoint]
+    outcomes: list[Outcome]
+
+    @property
+    def stopped(self) -> int:
+        """Number of points that ended before their target."""
+        return sum(outcome.stopped is not None for outcome in self.outcomes)
+
+
+def sweep(
+    file: Path | str,
+    over: Sequence[str],
+    settings: Sequence[str] = (),
+    out: Path | str = "results/sweep",
+    comm: MPI.Intracomm = MPI.COMM_WORLD,
+    say: Say = print_line,
+    *,
+    made: Made,
+    full_paths: bool = False,
+    part: str | None = None,
+) -> Sweep:
+    """Run a case at all points of a product; collective, and every rank works.
+
+    If the result is a knockdown (`loading: {kind: pressure, until: limit}`), one path is computed up to its fold, and
+    then the fold is followed along the last axis with numbers; see `Continuation`.
+
+    Parameters
+    ----------
+    over
+        `key.path=start:stop:count` or `key.path=value,value`; keys tied with `+`.
+    out
+        Folder of sweep.csv, sweep.png and points/; existing points are kept if these sources computed them. Tables and
+        picture have the points of earlier sweeps over the same keys too.
+    say
+        Called with one line per finished point, on the rank that finished it.
+    made
+        Makes a case of its source.
+    full_paths
+        Compute the full path at every point.
+    part
+        "i/n": compute only the i-th of n equal shares of the points; several jobs may share one folder.
+
+    Raises
+    ------
+    CaseError
+        Before the first point, if a point is not a valid case, or `out` cannot be written or has another sweep.
+    DiskError
+        If the tables cannot be written.
+    """
+    axes = parse_axes(over)
+    source = from_first(comm, lambda: swept_source(Path(file), axes, settings))
+    asked = from_first(comm, lambda: make_points(source, axes, made))
+    share = share_of(part, len(asked))
+    folder = FOLDER.prepare(given_folder(out), comm)
+    points = by_first(comm, lambda: with_earlier(folder, source, axes, asked, made))
+    before = len(points) - len(asked)
+    files = [folder / "points" / f"{point.key}.json" for point in points]
+    first = {point.key: number for number, point in reversed(list(enumerate(points)))}  # equal points are one
+    missing = by_first(comm, lambda: sorted(n for n in first.values() if kept_outcome(files[n]) is None))
+    if part:
+        missing = [number for number in missing if number - before in share]
+    if comm.rank == 0:
+        also = f" and {before} there" if before else ""
+        say(f"{len(asked)} points{also}, {len(missing)} to compute on {comm.size} rank{'s' * (comm.size > 1)}")
+        if again := sum(files[number].exists() for number in missing):
+            say(f"{again} of these computed again: their files are of other sources of magshell_fenicsx, or damaged")
+    shared = Known()
+
+    def chain_computed(chain: Chain) -> Iterator[str]:
+        for number, outcome in run_chain(chain, shared):
+            keep_outcome(outcome, points[number].case, files[number])
+            place = f"{missing.index(number) + 1:4d}/{len(missing)}"
+            yield f"{place}  {points[number].label}: {_result(outcome)}, {outcome.wall_s:.1f} s"
+
+    compute(make_chains(axes, points, missing, full_paths=full_paths), chain_computed, comm, say)
+    done = [(point, outcome) for point, file in zip(points, files, strict=True) if (outcome := kept_outcome(file))]
+    assert part or len(done) == len(points)
+    if comm.rank == 0 and len(done) < len(points):
+        say(f"{len(points) - len(done)} of {len(points)} points are left to other parts")
+    if done:
+        by_first(comm, lambda: _write(axes, [point for point, _ in done], [outcome for _, outcome in done], folder))
+    mine = {id(point) for i, point in enumerate(asked) if not part or i in share}
+    own = [(point, outcome) for point, outcome in done if id(point) in mine]
+    return Sweep(axes, [point for point, _ in own], [outcome for _, outcome in own])
+
+
+def share_of(part: str | None, count: int) -> range:
+    """The numbers of the points of a part "i/n": neighbours, whose folds can be followed.
+
+    Examples
+    --------
+    >>> share_of("1/2", 5), share_of("2/2", 5)
+    (range(0, 2), range(2, 5))
+    """
+    i, n = part_of(part, count, "points")
+    return range((i - 1) * count // n, i * count // n)
+
+
+def _result(outcome: Outcome) -> str:
+    reached = "no limit point"
+    if outcome.knockdown is not None:
+        pascals = outcome.in_units.get("buckling_pressure_Pa")
+        reached = f"k_d = {outcome.knockdown:.6f}{f', {pascals:.6g} Pa' if pascals else ''} ({outcome.found})"
+    elif outcome.barrier is not None:
+        reached = f"barrier = {outcome.barrier:.6g} E h R^2"
+    elif outcome.limit:
+        reached = f"{outcome.limit['kind']} at {outcome.limit['amplitude']} = {outcome.limit['value']:.6g}"
+    return f"{reached}, stopped early: {outcome.stopped}" if outcome.stopped else reached
+
+
+@dataclass(frozen=True)
+class Link:
+    """A point of a chain: its number in the sweep, its value on the axis, and its case."""
+
+    number: int
+    at: float
+    case: Case
+
+
+Chain = list[Link]
+
+
+def make_chains(
+    axes: Sequence[Axis], points: Sequence[SweepPoint], missing: Sequence[int], *, full_paths: bool
+) -> list[Chain]:
+    """Put the missing points into chains.
+
+    Parameters
+    ----------
+    missing
+        Numbers of the points to compute.
+    full_paths
+        Put each point into a separate chain, as also happens if folds cannot be followed.
+    """
+    axis = along(axes)
+    if full_paths or axis is None:
+        return [[Link(number, 0.0, points[number].case)] for number in missing]
+    lines: dict[tuple[str, ...], list[int]] = {}
+    for number, point in enumerate(points):
+        lines.setdefault(tuple(v for key, v in point.values.items() if key not in axis.keys), []).append(number)
+    return [chain for line in lines.values() for chain in _chains_of(line, axis, points, set(missing))]
+
+
+def _chains_of(line: list[int], axis: Axis, points: Sequence[SweepPoint], missing: set[int]) -> list[Chain]:
+    """The missing points along the axis, as one chain if their folds can be followed."""
+    key = axis.keys[0]
+    wanted = [Link(n, axis.number(points[n].values[key]), points[n].case) for n in line if n in missing]
+    one_mesh = key.startswith("magnetic.")  # a solid's state cannot be transferred to another mesh
+    followed = all(has_knockdown(link.case) and (one_mesh or link.case.model == "shell") for link in wanted)
+    if len(wanted) < 2 or not followed:
+        return [[link] for link in wanted]
+    common = min((_symmetry(points[number].case) for number in line), key=SYMMETRIES.index)
+    chain = [replace(link, case=link.case.model_copy(update={"symmetry": common})) for link in wanted]
+    return [sorted(chain, key=lambda link: link.at)]
+
+
+def _symmetry(case: Case) -> str:
+    plan = make_plan(case)
+    return "axisymmetric" if plan.axisymmetric else "half" if plan.half else "none"
+
+
+@dataclass
+class Known:
+    """What the chains of one rank share.
+
+    Attributes
+    ----------
+    first
+        The first fold of the last chain, from which that of the next one is followed if it has the same mesh.
+    """
+
+    scenes: Scenes = field(default_factory=Scenes)
+    first: Continuation | None = None
+
+
+def run_chain(chain: Chain, known: Known) -> Iterator[tuple[int, Outcome]]:
+    """Compute a chain on this rank; number and outcome of each point."""
+    continuation = known.first if len(chain) > 1 else None
+    for link in chain:
+        begun = link is chain[0]
+        start, spent, outcome = time.perf_counter(), 0, None
+        if continuation:
+            outcome, spent = _by_fold(continuation, link, known.scenes, start, same_mesh=begun)
+        if not outcome:
+            outcome, continuation = _by_path(link, spent, start, go_on=link is not chain[-1])
+        if begun:
+            known.first = continuation = continuation and continuation.from_here()
+        yield link.number, outcome
+
+
+def _by_fold(
+    continuation: Continuation, link: Link, scenes: Scenes, start: float, *, same_mesh: bool
+) -> tuple[Outcome | None, int]:
+    """The outcome, or None if the fold cannot be followed; and the number of factorisations."""
+    try:
+        scene = scenes.of(link.case)
+    except MeshError:
+        return None, 0
+    if same_mesh and not continuation.has_mesh_of(scene):
+        return None, 0
+    factorisation = scene.newton.factorisation
+    before = factorisation.count
+    try:
+        fold = continuation.follow(link.at, scene)
+    except FoldLost:
+        return None, factorisation.count - before
+    result, work = Result(scene, fold.state, [fold_row(scene, fold)]), factorisation.count - before
+    return outcome_of(result, "fold", work, time.perf_counter() - start), work
+
+
+def _by_path(link: Link, spent: int, start: float, *, go_on: bool) -> tuple[Outcome, Continuation | None]:
+    """The outcome of a full path, and the continuation from its fold if there is one."""
+    try:
+        result = run(link.case, comm=MPI.COMM_SELF)
+    except MeshError as e:
+        return Outcome.failed(str(e), time.perf_counter() - start, spent), None
+    continuation = _begun(link.at, result) if go_on else None
+    work = spent + result.scene.newton.factorisation.count
+    return outcome_of(result, "path", work, time.perf_counter() - start), continuation
+
+
+def _begun(at: float, result: Result) -> Continuation | None:
+    last = result.rows[result.end]
+    if last["label"] != "fold" or last["amplitude"] != "pressure" or last["p_over_pc"] != result.knockdown:
+        return None
+    try:
+        return Continuation(at, result.scene, result.last)
+    except FoldLost:
+        return None
+
+
+def with_earlier(
+    folder: Path, source: Source, axes: Sequence[Axis], points: Sequence[SweepPoint], made: Made
+) -> list[SweepPoint]:
+    """The points of the folder's sweep and the new ones among `points`; writes down all.
+
+    Raises
+    ------
+    CaseError
+        If the folder has a sweep over other keys, or of another case.
+    """
+    keys, base = [list(axis.keys) for axis in axes], _base(source, axes)
+    earlier = _earlier(folder, keys, base)
+    asked = [[point.values[axis.keys[0]] for axis in axes] for point in points]
+    merged = [Axis(axis.keys, tuple(v[i] for v in (*asked, *earlier))) for i, axis in enumerate(axes)]
+    places = {_place(values, merged) for values in asked}
+    left = [values for values in earlier if _place(values, merged) not in places]
+    if (count := len(left) + len(asked)) > MOST_POINTS:
+        raise CaseError(f"--out {folder}: {count} points with those there; allowed at most {MOST_POINTS}")
+    write_object(folder / NAME, {"keys": keys, "base": base, "points": [*left, *asked]})
+    return [*(make_point(source, axes, values, made) for values in left), *points]
+
+
+def _place(values: Sequence[str], axes: Sequence[Axis]) -> tuple[str, ...]:
+    """The same text for equal numbers, whatever their unit."""
+    pairs = zip(values, axes, strict=True)
+    return tuple(f"{axis.number(value):.10g}" if axis.numbers else value for value, axis in pairs)
+
+
+def _earlier(folder: Path, keys: list[list[str]], base: str) -> list[list[str]]:
+    """The values of the points of the folder's sweep."""
+    file = folder / NAME
+    if not file.exists():
+        if (folder / TABLE).exists() and (folder / TABLE).stat().st_size:
+            raise CaseError(f"--out {folder}: has a sweep.csv of an earlier version; give another folder")
+        return []
+    known = read_object(file)
+    over, points = known.get("keys"), known.get("points")
+    if not (isinstance(known.get("base"), str) and _are_words(over) and _are_words(points, of=len(over or ""))):
+        raise Damaged(f"{file}: is damaged: no keys, base and points of a sweep")
+    if over != keys:
+        said = " and ".join("+".join(each) for each in known["keys"])
+        raise CaseError(f"--out {folder}: has a sweep over {said}, which is kept; give another folder for other keys")
+    if known["base"] != base:
+        raise CaseError(
+            f"--out {folder}: has a sweep of another case or other --set, which is kept; give another folder"
+        )
+    return list(known["points"])
+
+
+def _are_words(lists: object, of: int | None = None) -> bool:
+    """Whether it is a list of lists of text, each with so many items."""
+    return isinstance(lists, list) and all(
+        isinstance(each, list) and of in (None, len(each)) and all(isinstance(v, str) for v in each) for each in lists
+    )
+
+
+def _base(source: Source, axes: Sequence[Axis]) -> str:
+    """Hash of the case as it is written, without the swept keys."""
+    data = copy.deepcopy(source.data)
+    for key in (key for axis in axes for key in axis.keys):
+        *sections, last = key.split(".")
+        part = value_at(data, sections)
+        if isinstance(part, dict):
+            part.pop(last, None)
+        elif isinstance(part, list) and last.isdecimal() and int(last) < len(part):
+            part[int(last)] = None
+    return hashlib.sha256(json.dumps(data, sort_keys=True, default=str).encode()).hexdigest()[:16]
+
+
+def _write(axes: Sequence[Axis], points: Sequence[SweepPoint], outcomes: Sequence[Outcome], folder: Path) -> None:
+    """Write the tables and the picture.
+
+    In sweep.csv values with units are columns of numbers too, and so are the results of a case with units.
+    """
+    swept, both = tuple(points[0].values), list(zip(points, outcomes, strict=True))
+    rows = [
+        {**point.values, **sweep_row(outcome), "point": point.key, **_numbers(axes, point), **_in_units(outcome)}
+        for point, outcome in both
+    ]
+    first = (*swept, "k_d", *OF_LIMIT, "stopped", "found", "factorisations", "dofs", "wall_s", "point", "barrier")
+    write_csv(rows, tuple(dict.fromkeys((*first, *(key for row in rows for key in row)))), folder / TABLE)
+    lines = [{**point.values, **row} for point, outcome in both for row in outcome.curve]
+    there = [key for key in CURVE if any(key in line for line in lines)]
+    own = [key for line in lines for key in line if key not in COLUMNS]
+    write_csv(lines, tuple(dict.fromkeys((*swept, *there, *own))), folder / CURVES)
+    draw_sweep(axes, points, outcomes, folder / PICTURE)
+
+
+def _numbers(axes: Sequence[Axis], point: SweepPoint) -> dict[str, float]:
+    """Key_unit -> number, of the values with units."""
+    swept = [(axis, key) for axis in axes if axis.unit and axis.numbers for key in axis.keys]
+    return {f"{key}_{axis.unit}": axis.number(point.values[key]) for axis, key in swept}
+
+
+def _in_units(outcome: Outcome) -> dict[str, Any]:
+    """The columns in units of its limit point, and the numbers of the case."""
+    units, limit = tuple(f"_{each}" for each in endings()), outcome.limit or {}
+    return {key: v for key, v in limit.items() if key.endswith(units)} | outcome.in_units
+
+
+def sweep_row(outcome: Outcome) -> Mapping[str, Any]:
+    """The row of sweep.csv for an outcome; missing values are None."""
+    limit = outcome.limit or {}
+    names = ("stopped", "found", "factorisations", "dofs", "wall_s", "barrier")
+    return {
+        "k_d": outcome.knockdown,
+        **{key: limit.get(key) for key in OF_LIMIT},
+        **{name: getattr(outcome, name) for name in names},
+    }

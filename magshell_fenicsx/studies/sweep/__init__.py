@@ -1,1 +1,0 @@
-"""A case over ranges of its keys."""

@@ -1,0 +1,199 @@
+"""The picture of a sweep: a result over one swept number or as a map over two, or all curves."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import cycle
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from magshell_fenicsx.quantities.registry import OWN_MODES, axes_of
+from magshell_fenicsx.studies.points import Axis, SweepPoint, along, short
+from magshell_fenicsx.studies.runner import Outcome
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from magshell_fenicsx.output.store.table import Row
+
+LEGEND_ROWS = 16
+STYLES = ("-", "--", ":", "-.")
+UNITS = {"polar": "degrees", "azimuth": "degrees"}
+NAMES = {  # words and symbol of keys
+    "lambda_m": ("field", r"$\lambda_\mathrm{m}$"),
+    "poisson_ratio": ("Poisson's ratio", r"$\nu$"),
+    "radius_to_thickness": ("radius over thickness", "$R/h$"),
+    "amplitude": ("amplitude over $h$", ""),
+}
+MAPPED = 3  # least different values of both axes of a map
+KNOCKDOWN, BARRIER = r"knockdown factor  $k_\mathrm{d}$", r"energy barrier  ($E h R^2$)"
+
+
+@dataclass(frozen=True)
+class Results:
+    """One number of each point, and what it is.
+
+    Attributes
+    ----------
+    size, measured
+        A second scale in the case's units: its factor, and its label; 0 if there is none for all points.
+    """
+
+    values: Sequence[float | None]
+    label: str
+    size: float = 0.0
+    measured: str = ""
+
+
+def draw_sweep(axes: Sequence[Axis], points: Sequence[SweepPoint], outcomes: Sequence[Outcome], file: Path) -> None:
+    """Draw one line for each combination of the values that are not on the horizontal axis, or a map."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    axes = [Axis(axis.keys, tuple(dict.fromkeys(p.values[axis.keys[0]] for p in points))) for axis in axes]
+    figure, plot = plt.subplots(figsize=(7.2, 4.2), layout="constrained")
+    results, mapped = _results(outcomes), _is_map(axes)
+    if mapped:
+        _map(plot, axes, points, results or _ends(outcomes))
+    elif results:
+        _values(plot, axes, points, results)
+    else:
+        _curves(plot, points, outcomes)
+    labels = plot.get_legend_handles_labels()[1]
+    if labels and any(labels):
+        columns = -(-len(labels) // LEGEND_ROWS)
+        figure.legend(loc="outside right upper", fontsize=8, frameon=False, ncols=columns)
+    figure.savefig(file, dpi=200)
+    plt.close(figure)
+
+
+def _is_map(axes: Sequence[Axis]) -> bool:
+    """Whether two numbers are swept, both over enough values."""
+    return len(axes) == 2 and all(len(set(axis.numbers or ())) >= MAPPED for axis in axes)
+
+
+def _results(outcomes: Sequence[Outcome]) -> Results | None:
+    """The energy barriers or knockdown factors, with their second scale; None without any."""
+    barriers, knockdowns = [o.barrier for o in outcomes], [o.knockdown for o in outcomes]
+    if any(value is not None for value in barriers):
+        return Results(barriers, BARRIER, _common(outcomes, "unit_energy_mJ"), "energy barrier  (mJ)")
+    if any(value is not None for value in knockdowns):
+        size = _common(outcomes, "classical_pressure_Pa")
+        return Results(knockdowns, KNOCKDOWN, size, "buckling pressure  (Pa)")
+    return None
+
+
+def _common(outcomes: Sequence[Outcome], name: str) -> float:
+    """A number in units that all points share; 0 if they do not."""
+    sizes = [outcome.in_units.get(name, 0.0) for outcome in outcomes]
+    return sizes[0] if np.allclose(sizes, sizes[0], rtol=1e-9, atol=0) else 0.0
+
+
+def _ends(outcomes: Sequence[Outcome]) -> Results:
+    """What the last point of each curve has: its load, or its displacement where all loads are the same."""
+    last = [outcome.curve[-1] if outcome.curve else {} for outcome in outcomes]
+    shown = next((row for row in last if row), {})
+    x, y = axes_of(str(shown.get("amplitude", "")) or "force", shown)
+    drawn = y if np.ptp([y.on_axis(row) for row in last if y.name in row]) > 0 else x
+    return Results([drawn.on_axis(row) if drawn.name in row else None for row in last], f"{drawn.label} at the end")
+
+
+def _map(plot: Any, axes: Sequence[Axis], points: Sequence[SweepPoint], results: Results) -> None:
+    """Colours and contours over both swept numbers; points without a result are crosses in a hole."""
+    rows, columns = axes
+    x, y = (sorted(set(axis.numbers or ())) for axis in (columns, rows))
+    grid = np.full((len(y), len(x)), np.nan)
+    for point, value in zip(points, results.values, strict=True):
+        i, j = y.index(rows.number(point.values[rows.keys[0]])), x.index(columns.number(point.values[columns.keys[0]]))
+        grid[i, j] = np.nan if value is None else value
+    hole = np.isnan(grid)
+    filled = plot.contourf(x, y, grid, 20, cmap="viridis")
+    lines = plot.contour(x, y, grid, 8, colors="white", linewidths=0.8)
+    plot.clabel(lines, fontsize=8)
+    places = np.stack(np.meshgrid(x, y), axis=-1)
+    for hidden, style in ((False, {"marker": ".", "color": "0.15"}), (True, {"marker": "x", "color": "0.5"})):
+        plot.plot(*places[hole == hidden].T, linestyle="", markersize=4, clip_on=False, zorder=5, **style)
+    bar = plot.figure.colorbar(filled, ax=plot, label=results.label)
+    if results.size:
+        second = bar.ax.secondary_yaxis("left", functions=_scales(results.size))
+        second.set_ylabel(results.measured)
+    plot.set(xlabel=_axis_label(columns), ylabel=_axis_label(rows))
+
+
+def _values(plot: Any, axes: Sequence[Axis], points: Sequence[SweepPoint], results: Results) -> None:
+    """Draw a number of each point over the last axis with numbers; points without it are left out."""
+    axis = along(axes) or axes[-1]
+    lines: dict[str, list[tuple[float | str, float]]] = {}
+    for point, value in zip(points, results.values, strict=True):
+        line = lines.setdefault(_label(point, axis), [])
+        if value is not None:
+            x = point.values[axis.keys[0]]
+            line.append((axis.number(x) if axis.numbers else x, value))
+    for (name, line), style in zip(lines.items(), cycle(STYLES), strict=False):
+        drawn = sorted(line) if axis.numbers else line
+        plot.plot(*zip(*drawn, strict=True), style, marker=".", label=name) if drawn else None
+    if axis.numbers:
+        plot.locator_params(axis="x", nbins=5)  # long numbers would overlap
+    plot.set_xlabel(_axis_label(axis))
+    plot.set_ylabel(results.label)
+    if results.size:
+        plot.secondary_yaxis("right", functions=_scales(results.size)).set_ylabel(results.measured)
+
+
+def _scales(size: float) -> tuple[Any, Any]:
+    return lambda v: v * size, lambda v: v / size
+
+
+def _axis_label(axis: Axis) -> str:
+    unit = axis.unit or UNITS.get(axis.keys[0].split(".")[-1])
+    return " = ".join(_words(key) for key in axis.keys) + (f"  ({unit})" if unit else "")
+
+
+def _words(key: str) -> str:
+    """The name of a key on an axis: that of the field says whose it is.
+
+    Examples
+    --------
+    >>> _words("magnetic.applied.flux_density"), _words("shell.radius_to_thickness")
+    ('applied flux density', 'radius over thickness  $R/h$')
+    """
+    if short(key) in NAMES:
+        return "  ".join(part for part in NAMES[short(key)] if part)
+    words = " ".join(key.split(".")[-2:]) if key.endswith(".flux_density") else short(key)
+    return words.replace("_", " ")
+
+
+def _curves(plot: "Axes", points: Sequence[SweepPoint], outcomes: Sequence[Outcome]) -> None:
+    """Draw the last varied load over its displacement, for every point."""
+    amplitude = next((str(o.curve[-1]["amplitude"]) for o in outcomes if len(o.curve) > 1), "force")
+    x, y = axes_of(amplitude, next((o.curve[-1] for o in outcomes if o.curve), ()))
+    for point, outcome, style in zip(points, outcomes, cycle(STYLES), strict=False):
+        part = loaded(outcome.curve, amplitude)
+        places = ([each.on_axis(row) for row in part] for each in (x, y))
+        plot.plot(*places, style, marker=".", label=_label(point, None))
+    plot.axhline(0, color="0.8", linewidth=0.8, zorder=0)
+    plot.set(xlabel=x.label, ylabel=y.label)
+
+
+def loaded(curve: Sequence["Row"], amplitude: str) -> list["Row"]:
+    """The part of a curve in which an amplitude varied, and the point before it.
+
+    Branches are left out, and so are instabilities of excluded modes, whose rows are not in the order of the path.
+    """
+    first = next((i for i, row in enumerate(curve) if row["amplitude"] == amplitude), len(curve))
+    part = curve[max(first - 1, 0) :] if first < len(curve) else []
+    return [row for row in part if row["mode"] in OWN_MODES and not row["branch"]]
+
+
+def _label(point: SweepPoint, without: Axis | None) -> str:
+    hidden = without.keys if without else ()
+    return ", ".join(f"{_symbol(key)}{value}" for key, value in point.values.items() if key not in hidden)
+
+
+def _symbol(key: str) -> str:
+    """A key before its value: its symbol with a sign of equality, or its words."""
+    words, symbol = NAMES.get(short(key), (short(key).replace("_", " "), ""))
+    return f"{symbol} = " if symbol else f"{words} "

@@ -1,0 +1,27 @@
+"""The studies of many runs, with cases as a file says them."""
+
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+
+from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.studies import compare as comparisons
+from magshell_fenicsx.studies import design as designs
+from magshell_fenicsx.studies import design_variables, points, samples
+from magshell_fenicsx.studies import ensemble as ensembles
+from magshell_fenicsx.studies import study as studies
+from magshell_fenicsx.studies import sweep as sweeps
+
+sweep = partial(sweeps.sweep, made=Case.from_source)
+ensemble = partial(ensembles.ensemble, made=Case.from_source)
+study = partial(studies.study, made=Case.from_source)
+compare = partial(comparisons.compare, made=Case.from_source)
+design = partial(designs.design, made=Case.from_source)
+variables = partial(design_variables.variables, made=Case.from_source)
+make_samples = partial(samples.make_samples, made=Case.from_source)
+with_earlier = partial(sweeps.with_earlier, made=Case.from_source)
+
+
+def make_points(file: Path, axes: Sequence[points.Axis], settings: Sequence[str] = ()) -> list[points.SweepPoint]:
+    """All points of a sweep of a case's file."""
+    return points.make_points(points.swept_source(file, axes, settings), axes, Case.from_source)
