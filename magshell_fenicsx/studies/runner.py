@@ -51,19 +51,25 @@ class Folder:
         What that object has.
     points
         The folder within, of the outcomes.
+    first
+        A table that is there from the start, empty, so that a folder which cannot be written is refused.
     """
 
     what: str
     tables: tuple[str, ...]
     keys: tuple[str, ...]
     points: str = "points"
+    first: str = ""
 
     def prepare(self, out: Path, comm: MPI.Comm, case: str = "") -> Path:
         """Make it, unless it has files of others, or tables of another case file; several jobs may. Collective."""
 
         def make(folder: Path) -> None:
             refuse_others(folder, self.tables, self.keys, self.what, case)
-            (folder / self.points).mkdir(parents=True, exist_ok=True)
+            for made in (folder, folder / self.points):
+                made.mkdir(parents=True, exist_ok=True)
+            if self.first:
+                (folder / self.first).touch()
 
         return prepare_folder(out, comm, make)
 
@@ -249,10 +255,12 @@ class Outcome:
 OUTCOME = TypeAdapter(Outcome)
 
 
-def outcome_of(result: Result, found: Found, factorisations: int, wall_s: float = 0.0) -> Outcome:
-    """The outcome of a run, or of a fold in the form of a run."""
+def outcome_of(
+    result: Result, found: Found, factorisations: int, wall_s: float = 0.0, columns: Sequence[str] = COLUMNS
+) -> Outcome:
+    """The outcome of a run, or of a fold in the form of a run; its curve has some columns of every run, and its own."""
     limits = sorted(result.limit_points, key=lambda p: p["amplitude"] != "pressure" or p["value"] != result.knockdown)
-    columns = dict.fromkeys((*COLUMNS, *result.scene.extra_columns))
+    chosen = dict.fromkeys((*columns, *result.scene.extra_columns))
     return Outcome(
         knockdown=result.knockdown,
         limit=next(iter(limits), None) or _event(result),
@@ -260,7 +268,7 @@ def outcome_of(result: Result, found: Found, factorisations: int, wall_s: float 
         dofs=result.scene.model.system.dofs,
         wall_s=round(wall_s, 3),
         curve=[
-            {key: v if isinstance(v := row[key], str | int) else float(v) for key in columns if key in row}
+            {key: v if isinstance(v := row[key], str | int) else float(v) for key in chosen if key in row}
             for row in result.rows
         ],
         found=found,

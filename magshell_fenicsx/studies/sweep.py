@@ -53,7 +53,7 @@ from magshell_fenicsx.studies.runner import (
 from magshell_fenicsx.studies.sweep_picture import draw_sweep
 
 NAME, TABLE, CURVES, PICTURE = "sweep.json", "sweep.csv", "curves.csv", "sweep.png"
-FOLDER = Folder("a sweep", (NAME, TABLE, CURVES, PICTURE), ("keys", "base", "points"))
+FOLDER = Folder("a sweep", (NAME, TABLE, CURVES, PICTURE), ("keys", "base", "points"), first=TABLE)
 SYMMETRIES = ("none", "half", "axisymmetric")  # a model with an earlier symmetry covers the later ones
 OF_LIMIT = ("p_over_pc", "w_pole_over_h", "kind", "mode", "amplitude", "value")
 CURVE = (
@@ -274,7 +274,7 @@ def _by_fold(
     except FoldLost:
         return None, factorisation.count - before
     result, work = Result(scene, fold.state, [fold_row(scene, fold)]), factorisation.count - before
-    return outcome_of(result, "fold", work, time.perf_counter() - start), work
+    return outcome_of(result, "fold", work, time.perf_counter() - start, CURVE), work
 
 
 def _by_path(link: Link, spent: int, start: float, *, go_on: bool) -> tuple[Outcome, Continuation | None]:
@@ -285,7 +285,7 @@ def _by_path(link: Link, spent: int, start: float, *, go_on: bool) -> tuple[Outc
         return Outcome.failed(str(e), time.perf_counter() - start, spent), None
     continuation = _begun(link.at, result) if go_on else None
     work = spent + result.scene.newton.factorisation.count
-    return outcome_of(result, "path", work, time.perf_counter() - start), continuation
+    return outcome_of(result, "path", work, time.perf_counter() - start, CURVE), continuation
 
 
 def _begun(at: float, result: Result) -> Continuation | None:
