@@ -14,7 +14,7 @@ from petsc4py import PETSc
 from magshell_fenicsx.assembly.kernels import JIT_OPTIONS
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.assembly.terms import FormTerm
-from magshell_fenicsx.continuation.system import Skewed
+from magshell_fenicsx.continuation.system import Skewed, State
 from magshell_fenicsx.models.shell.energy import HessianTerm
 
 Direction = tuple[fem.Function, fem.Form]
@@ -41,17 +41,22 @@ def _compiled(term: FormTerm | HessianTerm) -> Direction:
 
 def along(system: FiniteElementSystem, u: np.ndarray, mu: Mapping[str, float], v: np.ndarray) -> np.ndarray:
     """d2Pi/du2 . v without supports."""
-    system.at(u, dict(mu))
-    total = np.zeros_like(system.u.x.array)
-    for term in system.terms:
-        if isinstance(term, FormTerm | HessianTerm) and not term.linear:
-            direction, form = _compiled(term)
-            direction.x.array[: system.size] = v
-            direction.x.scatter_forward()
-            part = np.zeros_like(total)
-            fem.assemble_vector(part, form)
-            total += (mu[term.amplitude] if term.amplitude else 1.0) * part
-    return np.asarray(system._summed(total, held=False))
+
+    def total() -> np.ndarray:
+        total = np.zeros_like(system.u.x.array)
+        for term in system.terms:
+            if isinstance(term, FormTerm | HessianTerm) and not term.linear:
+                direction, form = _compiled(term)
+                direction.x.array[: system.size] = v
+                direction.x.scatter_forward()
+                if isinstance(term, FormTerm):
+                    term.renew()
+                part = np.zeros_like(total)
+                fem.assemble_vector(part, form)
+                total += (mu[term.amplitude] if term.amplitude else 1.0) * part
+        return total
+
+    return np.asarray(system._summed(system.at(State(u, dict(mu))).of(total), held=False))
 
 
 def difference(system: FiniteElementSystem, u: np.ndarray, mu: Mapping[str, float]) -> float:

@@ -82,6 +82,7 @@ def by_field(shares: Iterable[Share], f: fem.Function, u: fem.Function, w: fem.F
             taken = ufl.derivative(energy, u, w) if order else energy
             weight = fem.Constant(domain, float(factor))
             form = log.compile(f"{share.term.name} by {f.name} {order}", weight * ufl.derivative(taken, f, v))
+            share.term.renew()
             fem.assemble_vector(found.x.array, form)
     found.x.scatter_reverse(InsertMode.add)
     cells = domain.topology.index_map(domain.topology.dim).size_local

@@ -39,8 +39,6 @@ class Growing:
     ----------
     drawn
         A copy of the drawn placement.
-    renewed
-        What takes values of the placement anew when it changes.
     """
 
     def __init__(self, r0: fem.Function, shapes: Mapping[str, fem.Function], length: float) -> None:
@@ -49,7 +47,6 @@ class Growing:
         comm = r0.function_space.mesh.comm
         largest = {name: comm.allreduce(np.abs(d).max(initial=0.0), MPI.MAX) for name, d in self._shapes.items()}
         self.steps = {name: STEP * length / size if size else 1.0 for name, size in largest.items()}
-        self.renewed: list[Callable[[], None]] = []
 
     def value(self, name: str) -> float:
         """The amplitude of the present placement."""
@@ -62,8 +59,6 @@ class Growing:
         self._values[name] = value
         grown = sum(v * self._shapes[each] for each, v in self._values.items())
         self._r0.x.array[:] = self.drawn.x.array + grown
-        for renew in self.renewed:
-            renew()
 
     def by(self, name: str, of: Callable[[float], float]) -> float:
         """The sum over neighbouring placements of a function of the weight: a derivative of what is linear in it."""
@@ -109,12 +104,7 @@ class GrowingValue:
 
     def slope_of(self, energy: Callable[[], float]) -> float:
         """The derivative of an energy."""
-        return self.growing.by(self.name, lambda weight: weight * self._followed(energy))
-
-    def _followed(self, energy: Callable[[], float]) -> float:
-        for term in self.terms:
-            term.follow()
-        return energy()
+        return self.growing.by(self.name, lambda weight: weight * energy())
 
 
 @dataclass(frozen=True)
@@ -155,8 +145,6 @@ class _Slope:
         names = [name for one in self.of if (name := getattr(one, "name", "")) in served]
 
         def add(weight: float) -> float:
-            for term in self.by.terms:
-                term.follow()
             if self.gradients:
                 self.gradients.add(b, dict.fromkeys(names, weight * factor))
             for one in self.of:

@@ -69,11 +69,15 @@ class Moving:
         self.cells = still[V.dofmap.list].any(axis=1)  # local cells with a node that moves
 
     def put(self, u: Array, mu: Amplitudes) -> None:
-        """Write E(mu) into a displacement, and the rotations into the terms of the edges."""
+        """Write E(mu) into a displacement."""
         for body, places in zip(self._bodies, self._places, strict=True):
             u[body.dofs] = self._components(body, moved(body.motions, mu, places).x - places)
+
+    def turn(self, mu: Amplitudes) -> None:
+        """Write the rotations into the terms of the edges; amplitudes that are not given are zero."""
+        for body in self._bodies:
             if body.turn is not None:
-                body.turn.value[:] = turned(body.motions, mu).x.T
+                body.turn.value[:] = turned(body.motions, dict.fromkeys(body.names, 0.0) | dict(mu)).x.T
 
     def rate(self, mu: Amplitudes, name: str) -> Array:
         """dE/dmu."""

@@ -1,7 +1,12 @@
-"""The sum of terms on a finite-element space, as a system for the solvers."""
+"""The sum of terms on a finite-element space, as a system for the solvers.
+
+A state is evaluated, never visited: what `FiniteElementSystem.at` gives is a function of the state alone. What a state
+has from its history stands in it, and goes on by `FiniteElementSystem.advance` when a path accepts it.
+"""
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import TypeAlias, TypeVar
 
 import numpy as np
 from dolfinx import fem
@@ -23,6 +28,9 @@ from magshell_fenicsx.platform import compat
 
 ASIDE = 1e-3  # the largest displacement of a difference, over h
 CENTRAL = {1.0: 2 / 3, -1.0: -2 / 3, 2.0: -1 / 12, -2.0: 1 / 12}  # multiple of a step -> weight over it of a slope
+
+Given = TypeVar("Given")
+Setting: TypeAlias = tuple[Settable, float]  # a number of the terms, and its value in a state that has none
 
 
 class FiniteElementSystem:
@@ -47,6 +55,15 @@ class FiniteElementSystem:
     moving
         Nodes among the held ones whose displacement E(mu) is prescribed. Increments of u are zero there, and
         whatever u holds there is replaced by E(mu).
+    history
+        Numbers that states have beside their amplitudes, by name, with their values where a state has none.
+
+    Attributes
+    ----------
+    u
+        The displacement in the terms' forms: that of whatever was evaluated last.
+    history
+        The given ones, and the turns of edges under moments.
     """
 
     def __init__(
@@ -60,6 +77,7 @@ class FiniteElementSystem:
         gradients: ResidualAssembler | None = None,
         parameters: Mapping[str, FreeParameter] | None = None,
         moving: Moving | None = None,
+        history: Mapping[str, Setting] | None = None,
     ) -> None:
         V = u.function_space
         self.u, self.terms, self.length = u, terms, length
@@ -69,8 +87,9 @@ class FiniteElementSystem:
         self.parameters = parameters or {}
         self.moving, self._pressed = moving, moving.pressed if moving else None
         self._counted = [t for t in terms if isinstance(t, Counted)]
-        # numbers that a state's amplitudes may have besides their own, and their values without
-        self.settings: dict[str, tuple[Settable, float]] = {t.setting: (t, 0.0) for t in self._counted}
+        self.history: dict[str, Setting] = {**(history or {}), **{t.turn: (t, 0.0) for t in self._counted}}
+        free = {name: parameter.constant for name, parameter in self.parameters.items()}
+        self._numbers = {name: (number, float(number.value)) for name, number in free.items()} | self.history
         self.coordinates = frozenset(self.parameters) | (moving.names if moving else frozenset())
         self.comm = V.mesh.comm
         self.size = V.dofmap.index_map.size_local * V.dofmap.index_map_bs
@@ -92,43 +111,66 @@ class FiniteElementSystem:
             self._K.setOption(PETSc.Mat.Option.SYMMETRIC, True)
             self._unheld = fem_petsc.create_matrix(pattern.tangent_form) if moving else None
 
-    def set(self, u: Vector) -> None:
-        """Copy a displacement into the Function of the terms, which follow it."""
-        self._copy(u)
-        for term in self.terms:
-            term.follow()
+    def at(self, state: State) -> "Evaluated":
+        """A state, to be asked for what it has."""
+        return Evaluated(self, state.u, state.mu)
 
-    def _copy(self, u: Vector) -> None:
-        self.u.x.array[: self.size] = u
-        self.u.x.scatter_forward()
+    def advance(self, state: State, before: Amplitudes) -> State:
+        """An accepted state with its history, from that of the state before on a path.
+
+        The turns of edges under moments are less than half a turn from those before.
+        """
+        if not self._counted:
+            return state
+        past = {t.turn: before.get(t.turn, 0.0) for t in self._counted}
+        angles = self.at(State(state.u, state.mu | past)).of(lambda: {t.turn: t.angle() for t in self._counted})
+        return State(state.u, state.mu | angles)
 
     def placed(self, state: State) -> State:
         """The state with the displacement of the nodes that move."""
-        if self.moving is None:
-            return state
-        self.at(state.u, state.mu)
-        return State(np.array(self.u.x.array[: self.size]), state.mu)
+        return State(self.with_ghosts(state.u, state.mu)[: self.size], state.mu) if self.moving else state
 
-    def at(self, u: Vector, mu: Amplitudes) -> None:
-        """Set the displacement and the free parameters of the terms."""
-        self._copy(u)
-        self.place(mu)
-        for term in self.terms:
-            term.follow()
+    def with_ghosts(self, u: Vector, mu: Amplitudes | None = None) -> NDArray[np.float64]:
+        """The displacement of all nodes on this rank, of those that move too."""
+        self._b.x.array[: self.size] = u
+        self._b.x.scatter_forward()
+        whole = np.array(self._b.x.array)
+        if self.moving and mu is not None:
+            self.moving.put(whole, mu)
+        return whole
 
-    def gradient_of(self, u: Vector, mu: Amplitudes, forms: Sequence[fem.Form]) -> Vector:
-        """The sum of compiled linear forms at a displacement over all ranks, zero at supports."""
-        self.at(u, mu)
-        part: NDArray[np.float64] = np.zeros_like(self.u.x.array)
-        for form in forms:
-            fem.assemble_vector(part, form)
-        return self._summed(part)
+    def residual(self, u: Vector, mu: Amplitudes) -> Vector:
+        return Evaluated(self, u, mu).residual()
 
-    def with_ghosts(self, u: Vector, mu: Amplitudes) -> NDArray[np.float64]:
-        """All nodes' displacement on this rank, of those that move too."""
-        self._copy(u)
-        self.place(mu)
-        return np.array(self.u.x.array)
+    def forces(self, u: Vector, mu: Amplitudes, name: str = "") -> Vector:
+        """See `Evaluated.forces`."""
+        return Evaluated(self, u, mu).forces(name)
+
+    def load(self, u: Vector, mu: Amplitudes, name: str, *, held: bool = True) -> Vector:
+        """d2Pi/du dmu, zero at supports if `held`."""
+        return Evaluated(self, u, mu).load(name, held=held)
+
+    def potential(self, u: Vector, mu: Amplitudes, name: str) -> float:
+        return Evaluated(self, u, mu).potential(name)
+
+    def curvature(self, u: Vector, mu: Amplitudes, name: str, other: str) -> float:
+        if not {name, other} & self.coordinates:
+            return 0.0  # amplitudes that multiply their terms
+        return Evaluated(self, u, mu).curvature(name, other)
+
+    def energies(self, u: Vector, mu: Amplitudes | None = None) -> dict[str, float]:
+        """See `Evaluated.energies`; of supports that do not move if no amplitudes are given."""
+        return Evaluated(self, u, mu or {}).energies()
+
+    def stored(self, u: Vector, mu: Amplitudes) -> float:
+        """See `Evaluated.stored`."""
+        return Evaluated(self, u, mu).stored()
+
+    def tangent(
+        self, u: Vector, mu: Amplitudes, stress: Sequence[Weighted] = (), times: Mapping[str, float] | None = None
+    ) -> PETSc.Mat | Skewed:
+        """See `System`; `times` multiplies the tangents of some terms, by name."""
+        return Evaluated(self, u, mu).tangent(stress, times)
 
     def held(self, u: Vector) -> Vector:
         """The displacement with zeros at the supports."""
@@ -141,83 +183,32 @@ class FiniteElementSystem:
         if self.projection:
             self.projection.project(u)
 
-    def place(self, mu: Amplitudes) -> None:
-        """Set the free parameters of the terms, and move the nodes that move."""
-        for name, parameter in self.parameters.items():
-            parameter.constant.value = mu[name]
-        for name, (constant, value) in self.settings.items():
-            constant.value = mu.get(name, value)
+    def _put(self, u: Vector, mu: Amplitudes) -> None:
+        """Set the displacement, the numbers and the nodes that move."""
+        for name, (number, value) in self._numbers.items():
+            number.value = mu.get(name, value)
+        self.u.x.array[: self.size] = u
+        self.u.x.scatter_forward()
         if self.moving:
-            self.moving.put(self.u.x.array, mu)
+            self.moving.turn(mu)
+            if self.moving.names <= mu.keys():
+                self.moving.put(self.u.x.array, mu)
 
-    def residual(self, u: Vector, mu: Amplitudes) -> Vector:
-        self.at(u, mu)
-        factors = self._factors(mu)
-        if self.noise is None:
-            found = self._summed(self._gradient(factors))
-            if not self._finite(found.sum()):
-                self.strange = self._not_numbers(factors)
-            return found
-        first = self.u.function_space.dofmap.index_map.local_range[0] * self.u.function_space.dofmap.index_map_bs
-        parts = [self._summed(self._gradient({name: factor})) for name, factor in factors.items()]
-        return np.asarray(np.sum([self.noise.on_vector(part, first) for part in parts], axis=0))
+    def _renew(self) -> None:
+        """Renew what forms of others take of the terms as it is."""
+        for term in self.terms:
+            if isinstance(term, FormTerm):
+                term.renew()
 
     def _finite(self, value: float) -> bool:
         """Whether a number is one on all ranks."""
         here = bool(np.isfinite(value))
         return here if self.comm.size == 1 else bool(self.comm.allreduce(here, MPI.LAND))
 
-    def _not_numbers(self, factors: Mapping[str, float]) -> list[str]:
-        """The terms whose energy or gradient at the present u is not a number; collective."""
-        used = [t for t in self.terms if factors[t.name]]
-        sizes = {t.name: t.energy() + self._gradient({t.name: 1.0}).sum() for t in used}
-        return [name for name, size in sizes.items() if not self._finite(size)] or ["the sum of all terms"]
-
-    def forces(self, u: Vector, mu: Amplitudes, name: str = "") -> Vector:
-        """dPi/du at all nodes, of all terms or of one: of all at supports the forces of these on the shell."""
-        self.at(u, mu)
-        part = self._gradient({name: 1.0} if name else self._factors(mu))
-        if self.moving and self._pressed and not name:
-            part += mu.get(self._pressed.load, 0.0) * self.moving.on_edges(self.u.x.array)
-        return self._summed(part, held=False)
-
     def step_along(self, v: Vector, part: float) -> float:
         """What v is multiplied by so that its largest entry is a part of the system's length; collective."""
         largest = self.comm.allreduce(float(np.abs(v).max(initial=0.0)), MPI.MAX)
         return float(part * self.length / (largest or 1.0))
-
-    def stiffness_along(self, u: Vector, mu: Amplitudes, v: Vector) -> Vector:
-        """K v of all terms with the rows and columns of supports, by differences of fourth order."""
-        step, found = self.step_along(v, ASIDE), np.zeros(self.size)
-        for way, weight in CENTRAL.items():
-            self.at(u, mu)
-            self.u.x.array[: self.size] += way * step * v
-            self.u.x.scatter_forward()
-            for term in self.terms:
-                term.follow()
-            found += weight / step * self._summed(self._gradient(self._factors(mu)), held=False)
-        return found
-
-    def load(self, u: Vector, mu: Amplitudes, name: str, *, held: bool = True) -> Vector:
-        """d2Pi/du dmu, zero at supports if `held`."""
-        self.at(u, mu)
-        part = self._column(mu, name)
-        if self.moving and self._pressed and name == self._pressed.load and not held:
-            part += self.moving.on_edges(self.u.x.array)
-        return self._summed(part, held=held)
-
-    def potential(self, u: Vector, mu: Amplitudes, name: str) -> float:
-        self.at(u, mu)
-        if self.moving and name in self.moving.names:
-            here = float(self._gradient(self._factors(mu)) @ self.moving.rate(mu, name))
-            for edge, A in self.moving.turning(mu, name):
-                here += float(self._gradient({edge: 1.0}) @ self.moving.along(A, self.u.x.array))
-        elif name in self.parameters:
-            slopes = self.parameters[name].slopes
-            here = sum(factor_of(slope.amplitude, mu) * slope.energy() for slope in slopes)
-        else:
-            here = sum(t.energy() for t in self.terms if t.amplitude == name)
-        return float(self.comm.allreduce(here)) + self._of_lids(mu, name)
 
     def _of_lids(self, mu: Amplitudes, *names: str) -> float:
         """The derivative of p V, V what the lids sweep, by one or two amplitudes."""
@@ -230,23 +221,6 @@ class FiniteElementSystem:
         factor = unit if len(motions) < len(names) else unit * mu.get(load, 0.0)
         derivative = (self._pressed.swept, self._pressed.slope, self._pressed.bend)[len(motions)]
         return factor * derivative(mu, *motions)
-
-    def curvature(self, u: Vector, mu: Amplitudes, name: str, other: str) -> float:
-        if not {name, other} & self.coordinates:
-            return 0.0  # amplitudes that multiply their terms
-        self.at(u, mu)
-        if self.moving and {name, other} & self.moving.names:
-            here = self._motion_curvature(self.moving, mu, *sorted((name, other), key=self.moving.names.__contains__))
-            return float(self.comm.allreduce(here)) + self._of_lids(mu, name, other)
-        if name not in self.parameters:
-            name, other = other, name
-        parameter = self.parameters[name]
-        if other in self.parameters:
-            bends = parameter.bends(self.parameters[other].constant)
-            here = sum(factor_of(bend.amplitude, mu) * bend.energy() for bend in bends)
-        else:
-            here = sum(slope.energy() for slope in parameter.slopes if slope.amplitude == other)
-        return float(self.comm.allreduce(here))
 
     def _motion_curvature(self, moving: Moving, mu: Amplitudes, other: str, name: str) -> float:
         """This rank's part of d2Pi/dmu_i dmu_j, the second amplitude that of a motion."""
@@ -295,54 +269,20 @@ class FiniteElementSystem:
         found[: self.size] = (K * given).array
         return found
 
-    def counted(self, state: State, before: Amplitudes) -> State:
-        """The state with the turns of its edges under moments, less than half a turn from those of `before`."""
-        if not self._counted:
-            return state
-        past = {t.setting: before.get(t.setting, 0.0) for t in self._counted}
-        self.at(state.u, state.mu | past)
-        return State(state.u, state.mu | {t.setting: t.angle() for t in self._counted})
-
-    def energies(self, u: Vector, mu: Amplitudes | None = None) -> dict[str, float]:
-        """Each term's potential, without its amplitude; of supports that do not move if none are given."""
-        self.set(u) if mu is None else self.at(u, mu)
-        potentials = {t.name: float(self.comm.allreduce(t.energy())) for t in self.terms}
-        if mu and self._pressed and self._pressed.load in potentials:
-            potentials[self._pressed.load] += self._of_lids(mu, self._pressed.load)
-        return potentials
-
-    def stored(self, u: Vector, mu: Amplitudes) -> float:
-        """The energy without the potentials of loads."""
-        self.at(u, mu)
-        own = (t for t in self.terms if t.amplitude is None or t.amplitude in self.coordinates)
-        return float(self.comm.allreduce(sum(factor_of(t.amplitude, mu) * t.energy() for t in own)))
-
-    def integral(self, u: Vector, form: fem.Form) -> float:
-        """The value of a compiled form at a displacement, summed over all ranks."""
-        self.set(u)
-        return float(self.comm.allreduce(fem.assemble_scalar(form)))
-
-    def tangent(
-        self, u: Vector, mu: Amplitudes, stress: Sequence[Weighted] = (), times: Mapping[str, float] | None = None
+    def _tangent(
+        self, factors: Mapping[str, float], stress: Sequence[tuple[float, NDArray[np.float64]]]
     ) -> PETSc.Mat | Skewed:
-        """See `System`; `times` multiplies the tangents of some terms, by name."""
-        with self.assembly:
-            whole = [(weight, self.with_ghosts(v, mu)) for weight, v in stress]
-            self.at(u, mu)
-            factors = self._factors(mu)
-            for name, size in (times or {}).items():
-                factors[name] *= size
-            K = (
-                self._assembler.tangent(factors, whole)
-                if self._assembler
-                else self._of_forms(self._K, factors, self.clamped)
-            )
-            if self.projection:
-                K = self.projection.tangent(K)
-            if self.noise:
-                self.noise.on_matrix(K)
-            N = self._skew(factors)
-            return Skewed(K, N) if N else K
+        """That of the terms with these factors; `stress` has ghosts."""
+        if self._assembler:
+            K = self._assembler.tangent(factors, stress)
+        else:
+            K = self._of_forms(self._K, factors, self.clamped)
+        if self.projection:
+            K = self.projection.tangent(K)
+        if self.noise:
+            self.noise.on_matrix(K)
+        N = self._skew(factors)
+        return Skewed(K, N) if N else K
 
     def _skew(self, factors: Mapping[str, float]) -> PETSc.Mat | None:
         """The skew part of the tangent, of loads without potential; None without."""
@@ -392,3 +332,145 @@ class FiniteElementSystem:
             if held:
                 self._hold(b)
             return np.array(b[: self.size])
+
+
+class Evaluated:
+    """A state of a system: its energies, forces and tangent.
+
+    What is asked of it is a function of the state alone, whatever was evaluated before, and changes nothing that
+    another evaluation sees. What terms find from displacement and amplitudes is shared by all that is asked of a state;
+    see `following.Follows`.
+    """
+
+    def __init__(self, system: FiniteElementSystem, u: Vector, mu: Amplitudes) -> None:
+        self._system, self._u, self._mu = system, u, mu
+
+    def of(self, function: Callable[[], Given]) -> Given:
+        """What a function of the system's u, and of the placement and the numbers in forms, gives at the state."""
+        self._system._put(self._u, self._mu)
+        return function()
+
+    def energies(self) -> dict[str, float]:
+        """Each term's potential, without its amplitude."""
+        system, mu = self._present, self._mu
+        potentials = {t.name: float(system.comm.allreduce(t.energy())) for t in system.terms}
+        if mu and system._pressed and system._pressed.load in potentials:
+            potentials[system._pressed.load] += system._of_lids(mu, system._pressed.load)
+        return potentials
+
+    def stored(self) -> float:
+        """The energy without the potentials of loads."""
+        system, mu = self._present, self._mu
+        own = (t for t in system.terms if t.amplitude is None or t.amplitude in system.coordinates)
+        return float(system.comm.allreduce(sum(factor_of(t.amplitude, mu) * t.energy() for t in own)))
+
+    def integral(self, form: fem.Form) -> float:
+        """The value of a compiled form, summed over all ranks."""
+        system = self._present
+        system._renew()
+        return float(system.comm.allreduce(fem.assemble_scalar(form)))
+
+    def gradient(self, forms: Sequence[fem.Form]) -> Vector:
+        """The sum of compiled linear forms over all ranks, zero at supports."""
+        system = self._present
+        system._renew()
+        part: NDArray[np.float64] = np.zeros_like(system.u.x.array)
+        for form in forms:
+            fem.assemble_vector(part, form)
+        return system._summed(part)
+
+    def residual(self) -> Vector:
+        """dPi/du; the terms that are not numbers are noted in the system's `strange`."""
+        system = self._present
+        factors = system._factors(self._mu)
+        if system.noise is None:
+            whole = system._summed(system._gradient(factors))
+            if not system._finite(whole.sum()):
+                system.strange = self._not_numbers(factors)
+            return whole
+        V = system.u.function_space.dofmap
+        parts = [system._summed(system._gradient({name: factor})) for name, factor in factors.items()]
+        noisy = [system.noise.on_vector(part, V.index_map.local_range[0] * V.index_map_bs) for part in parts]
+        return np.asarray(np.sum(noisy, axis=0))
+
+    def _not_numbers(self, factors: Mapping[str, float]) -> list[str]:
+        """The terms whose energy or gradient is not a number; collective."""
+        system = self._system
+        used = [t for t in system.terms if factors[t.name]]
+        sizes = {t.name: t.energy() + system._gradient({t.name: 1.0}).sum() for t in used}
+        return [name for name, size in sizes.items() if not system._finite(size)] or ["the sum of all terms"]
+
+    def forces(self, name: str = "") -> Vector:
+        """dPi/du at all nodes, of all terms or of one: of all at supports the forces of these on the shell."""
+        system, mu = self._present, self._mu
+        part = system._gradient({name: 1.0} if name else system._factors(mu))
+        if system.moving and system._pressed and not name:
+            part += mu.get(system._pressed.load, 0.0) * system.moving.on_edges(system.u.x.array)
+        return system._summed(part, held=False)
+
+    def stiffness_along(self, v: Vector) -> Vector:
+        """K v of all terms with the rows and columns of supports, by differences of fourth order."""
+        system = self._system
+        step, along = system.step_along(v, ASIDE), np.zeros(system.size)
+        for way, weight in CENTRAL.items():
+            system._put(self._u, self._mu)
+            system.u.x.array[: system.size] += way * step * v
+            system.u.x.scatter_forward()
+            along += weight / step * system._summed(system._gradient(system._factors(self._mu)), held=False)
+        return along
+
+    def load(self, name: str, *, held: bool = True) -> Vector:
+        """d2Pi/du dmu, zero at supports if `held`."""
+        system = self._present
+        part = system._column(self._mu, name)
+        if system.moving and system._pressed and name == system._pressed.load and not held:
+            part += system.moving.on_edges(system.u.x.array)
+        return system._summed(part, held=held)
+
+    def potential(self, name: str) -> float:
+        """dPi/dmu, on every rank."""
+        system, mu = self._present, self._mu
+        if system.moving and name in system.moving.names:
+            own = float(system._gradient(system._factors(mu)) @ system.moving.rate(mu, name))
+            for edge, A in system.moving.turning(mu, name):
+                own += float(system._gradient({edge: 1.0}) @ system.moving.along(A, system.u.x.array))
+        elif name in system.parameters:
+            slopes = system.parameters[name].slopes
+            own = sum(factor_of(slope.amplitude, mu) * slope.energy() for slope in slopes)
+        else:
+            own = sum(t.energy() for t in system.terms if t.amplitude == name)
+        return float(system.comm.allreduce(own)) + system._of_lids(mu, name)
+
+    def curvature(self, name: str, other: str) -> float:
+        """d2Pi/dmu_i dmu_j of amplitudes of which one is a coordinate, on every rank."""
+        system, mu = self._present, self._mu
+        moving = system.moving
+        if moving and {name, other} & moving.names:
+            own = system._motion_curvature(moving, mu, *sorted((name, other), key=moving.names.__contains__))
+            return float(system.comm.allreduce(own)) + system._of_lids(mu, name, other)
+        if name not in system.parameters:
+            name, other = other, name
+        parameter = system.parameters[name]
+        if other in system.parameters:
+            bends = parameter.bends(system.parameters[other].constant)
+            own = sum(factor_of(bend.amplitude, mu) * bend.energy() for bend in bends)
+        else:
+            own = sum(slope.energy() for slope in parameter.slopes if slope.amplitude == other)
+        return float(system.comm.allreduce(own))
+
+    def tangent(self, stress: Sequence[Weighted] = (), times: Mapping[str, float] | None = None) -> PETSc.Mat | Skewed:
+        """d2Pi/du2, see `System`; `times` multiplies the tangents of some terms, by name."""
+        system = self._system
+        with system.assembly:
+            whole = [(weight, system.with_ghosts(v, self._mu)) for weight, v in stress]
+            system._put(self._u, self._mu)
+            factors = system._factors(self._mu)
+            for name, size in (times or {}).items():
+                factors[name] *= size
+            return system._tangent(factors, whole)
+
+    @property
+    def _present(self) -> FiniteElementSystem:
+        """The system with the state's displacement and numbers in its forms."""
+        self._system._put(self._u, self._mu)
+        return self._system

@@ -1,6 +1,6 @@
 """A potential Pi(u) with its amplitude: energy, residual and tangent."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import cached_property
 from typing import Generic, Protocol, TypeVar
 
@@ -10,6 +10,7 @@ from dolfinx import fem
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
+from magshell_fenicsx.assembly.following import PointField
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.platform import compat
 
@@ -27,9 +28,6 @@ class Term(Protocol):
 
     def energy(self) -> float:
         """Pi(u) on this rank's part."""
-
-    def follow(self) -> None:
-        """Renew what the energy knows of the present u."""
 
     def compile_residual(self) -> None:
         """Compile the forms of `energy` and `add_residual`."""
@@ -52,7 +50,7 @@ def factor_of(amplitude: str | None, mu: Mapping[str, float]) -> float:
 class FormTerm:
     """A potential given by its UFL energy; both derivatives are automatic.
 
-    `linear` says that the energy is linear in u, so that it has no tangent; `follow` renews its coefficients.
+    `linear` says that the energy is linear in u, so that it has no tangent.
 
     A load may have no potential. Then `work`, its virtual work, takes the place of the energy's gradient, and the
     energy is only reported. The derivative of the work is no symmetric form.
@@ -77,9 +75,8 @@ class FormTerm:
         *,
         linear: bool = False,
         work: ufl.Form | None = None,
-        follow: Callable[[], None] | None = None,
     ) -> None:
-        self.name, self.amplitude, self.linear, self._follow = name, amplitude, linear, follow
+        self.name, self.amplitude, self.linear = name, amplitude, linear
         self.has_potential = work is None
         self._factor = fem.Constant(u.function_space.mesh, 1.0)
         self._u, self._log = u, log
@@ -119,18 +116,25 @@ class FormTerm:
     def _hessian(self) -> ufl.Form:
         return ufl.derivative(self._gradient, self._u, ufl.TrialFunction(self._u.function_space))
 
-    def energy(self) -> float:
-        return float(fem.assemble_scalar(self.energy_form))
+    @cached_property
+    def _fields(self) -> list[PointField]:
+        """Coefficients that follow the displacement."""
+        return [field for field in self.form.coefficients() if isinstance(field, PointField)]
 
-    def follow(self) -> None:
-        """Renew coefficients that depend on u."""
-        if self._follow:
-            self._follow()
+    def renew(self) -> None:
+        """Renew the coefficients of the forms, which assembly takes as they are."""
+        for field in self._fields:
+            field.renew()
+
+    def energy(self) -> float:
+        self.renew()
+        return float(fem.assemble_scalar(self.energy_form))
 
     def compile_residual(self) -> None:
         _ = self.energy_form, self.residual_form
 
     def add_residual(self, b: NDArray[np.float64], factor: float) -> None:
+        self.renew()
         self._factor.value = factor
         fem.assemble_vector(b, self.residual_form)
 
@@ -139,11 +143,13 @@ class FormTerm:
 
     def add_tangent(self, K: PETSc.Mat, factor: float, clamped: list[fem.DirichletBC]) -> None:
         if self.tangent_form is not None:
+            self.renew()
             self._factor.value = factor
             compat.add_matrix(K, self.tangent_form, clamped)
 
     def add_skew(self, N: PETSc.Mat, factor: float, clamped: list[fem.DirichletBC]) -> None:
         """Add factor times the skew part of the derivative of the work, of a load without potential."""
+        self.renew()
         self._factor.value = factor
         compat.add_matrix(N, self.skew_form, clamped)
 
@@ -151,8 +157,8 @@ class FormTerm:
 class Counted(FormTerm):
     """-Pi = intensity times the angle of an edge, integrated; the angle goes on beyond half a turn.
 
-    Derivatives know no turns. The energy is that of the angle nearest to `value`, an angle that the state has among its
-    amplitudes, so that it is a function of the state.
+    Derivatives know no turns. The energy is that of the angle nearest to `value`, an angle that stands in the state, so
+    that it is a function of the state.
     """
 
     def count_from(self, past: fem.Constant, whole: float) -> None:
@@ -169,8 +175,8 @@ class Counted(FormTerm):
         self._turned = 0.0
 
     @property
-    def setting(self) -> str:
-        """Name of `value` among the amplitudes of a state; no user's name has a space."""
+    def turn(self) -> str:
+        """Name of `value` in a state; no user's name has a space."""
         return f"turn of {self.name}"
 
     @property
@@ -205,9 +211,8 @@ class DensityTerm(FormTerm, Generic[Density]):
         *,
         linear: bool = False,
         work: ufl.Form | None = None,
-        follow: Callable[[], None] | None = None,
     ) -> None:
-        super().__init__(name, energy, u, log, amplitude, linear=linear, work=work, follow=follow)
+        super().__init__(name, energy, u, log, amplitude, linear=linear, work=work)
         self.density = density
 
 
@@ -222,9 +227,6 @@ class LinearTerm:
 
     def energy(self) -> float:
         return -float(self._entries @ self._u.x.array[self._dofs])
-
-    def follow(self) -> None:
-        """It depends on nothing else."""
 
     def compile_residual(self) -> None:
         """A sum of entries."""

@@ -34,8 +34,6 @@ class Energy:
         Of the jets of u and v: the virtual work of a load without potential, quadratic in u.
     density
         What is integrated; None for a load that is known by its vector.
-    follow
-        Renews its coefficients.
     counted
         Of a moment: the turn that its angle is counted from, and -Pi of one radian.
     """
@@ -46,7 +44,6 @@ class Energy:
     linear: bool = False
     work: Callable[[Jet, Jet], ufl.Form] | None = None
     density: Density | None = None
-    follow: Callable[[], None] | None = None
     counted: tuple[fem.Constant, float] | None = None
 
     def added(self, u: Jet, v: Jet) -> ufl.Form:

@@ -1,6 +1,6 @@
 """What is read off the displacement of a model with named points, shell or solid."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from dolfinx import fem
@@ -84,7 +84,7 @@ class Observed:
         """Delta V/R^3 of the whole shell, whose supports move by these amplitudes."""
         moving = self.system.moving
         lids = moving.pressed.swept(mu) if mu and moving and moving.pressed else 0.0
-        return self.multiplicity * (self.system.integral(u, self._volume) + lids)
+        return self.multiplicity * (self.system.at(State(u, dict(mu or {}))).integral(self._volume) + lids)
 
     def deflection(self, u: Vector, point: str) -> float:
         """w/R = -u . n0 at a named vertex."""
@@ -104,24 +104,17 @@ class Observed:
 
     def touching(self, state: State, approach: str) -> Region:
         """Where a body touches."""
-        known, forms = self.contacts[approach]
-        self.system.place(state.mu)
-        pressure, moment = (self.system.integral(state.u, forms[name]) for name in ("pressure", "radius"))
-        return known.region(self.system.comm, moment / pressure if pressure else 0.0)
-
-    @property
-    def _renewals(self) -> list[Callable[[], None]]:
-        """What the fields and the bodies take anew where the placement changes."""
-        bodies = [known.renew_place for known, _ in self.contacts.values()]
-        return [*(known.renew_place for known in self.fields), *bodies]
+        pressing, forms = self.contacts[approach]
+        at = self.system.at(state)
+        pressure, moment = (at.integral(forms[name]) for name in ("pressure", "radius"))
+        return at.of(lambda: pressing.region(self.system.comm, moment / pressure if pressure else 0.0))
 
     def cell_pressures(self, state: State) -> Array | None:
         """The pressure of all bodies in each local cell, see `Pressing`; None without bodies."""
         if not self.contacts:
             return None
-        self.system.place(state.mu)
-        self.system.set(state.u)
-        return np.asarray(sum(known.cell_pressures() for known, _ in self.contacts.values()))
+        pressings = [pressing for pressing, _ in self.contacts.values()]
+        return self.system.at(state).of(lambda: np.asarray(sum(each.cell_pressures() for each in pressings)))
 
     def loaded_deflection(self, u: Vector, name: str) -> float:
         """w/R conjugate to a force: at its point, or averaged over its patch; of dead loads along themselves.
@@ -131,9 +124,9 @@ class Observed:
         size = self.load_size.get(name, 0.0) if name in self.loads.dead else self.force_unit
         if not size:
             return self.deflection(u, "pole")
-        self.system.set(u)
         load = next(term for term in self.system.terms if term.name == name)
-        return -float(self.system.comm.allreduce(load.energy())) / size
+        energy = self.system.at(State(u, {})).of(load.energy)
+        return -float(self.system.comm.allreduce(energy)) / size
 
     @property
     def force_unit(self) -> float:

@@ -109,4 +109,4 @@ def frequencies_after(result: Result, folder: Path, say: Say) -> None:
     for number in {*list(states)[:1], *list(states)[-1:]} & set(result.frequencies):
         for n, mode in enumerate(result.frequencies[number][: section.count], 1):
             file = mode_file(folder, number, f"f{n}", mode.label)
-            write_mode_of(scene, gathering, file, states[number].u, mode.label, mode.vector)
+            write_mode_of(scene, gathering, file, states[number], mode.label, mode.vector)

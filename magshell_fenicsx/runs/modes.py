@@ -89,14 +89,14 @@ class _Writer:
 
     def _write(self, number: int, name: str, state: State, label: str, vector: Vector) -> Surface | None:
         file = mode_file(self.folder, number, name, label)
-        return write_mode_of(self.result.scene, self.gatherer, file, state.u, label, vector)
+        return write_mode_of(self.result.scene, self.gatherer, file, state, label, vector)
 
 
 def write_mode_of(
-    scene: Scene, gatherer: Gatherer, file: Path, u: Vector, label: str, vector: Vector
+    scene: Scene, gatherer: Gatherer, file: Path, state: State, label: str, vector: Vector
 ) -> Surface | None:
-    """Write a mode at a displacement, and return it on rank 0; collective."""
-    surface = mode_surface(scene.model, gatherer, u, label, vector, scene.plan.azimuth)
+    """Write a mode at a state, and return it on rank 0; collective."""
+    surface = mode_surface(scene.model, gatherer, state.u, label, vector, scene.plan.azimuth, state.mu)
 
     def write() -> None:
         assert surface is not None

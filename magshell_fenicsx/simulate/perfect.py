@@ -146,11 +146,10 @@ def _wave(model: MeridianModel, mode: ShellMode) -> Shape:
 def _at_nodes(scene: Scene, model: ShellModel, mode: ShellMode) -> tuple[Array, Array]:
     """All nodes (n, 3) and the inward displacements (n,) there, on every rank."""
     V, comm = model.V, scene.comm
-    model.system.set(mode.vector)
     dofs = V.dofmap.list[: V.mesh.topology.index_map(2).size_local]
     numbers = V.dofmap.index_map.local_to_global(dofs.ravel().astype(np.int32))
     table = V.element.basix_element.tabulate(1, compat.interpolation_points(V))[:, :, :, 0]
-    r0, v = (f.x.array.reshape(-1, 3)[dofs] for f in (model.r0, model.u))
+    r0, v = (x.reshape(-1, 3)[dofs] for x in (model.r0.x.array, model.system.with_ghosts(mode.vector)))
     _, r_1, r_2 = np.matmul(table[:, None], r0)
     parts = comm.allgather((numbers, *(a.reshape(-1, 3) for a in (r0, v, np.cross(r_1, r_2)))))
     where, x, v, n = (np.concatenate(part) for part in zip(*parts, strict=True))

@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 import numpy as np
 import ufl
 from dolfinx import fem
-from dolfinx.la import InsertMode
 from mpi4py import MPI
 from numpy.typing import NDArray
 
@@ -88,7 +87,7 @@ def functional(scene: Scene, state: State, of: str | Target) -> Functional:
 def differentiable(scene: Scene, state: State) -> list[str]:
     """The columns of path.csv that `functional` takes, and those of them in units."""
     at_pole = AT_POLE if "pole" in scene.model.normals else ()
-    amplitudes = (amplitude(name).column for name in state.mu if name not in scene.model.system.settings)
+    amplitudes = (amplitude(name).column for name in state.mu if name not in scene.model.system.history)
     found = dict.fromkeys(
         ("energy", *_conjugates(scene), *_displacements(scene), *_forces(scene), *at_pole, *amplitudes)
     )
@@ -127,7 +126,7 @@ def _reaction(scene: Scene, state: State, name: str, axis: int, of: str) -> Func
     way = rotation(plan.azimuth)[:, axis]
     e = force_unit(scene) * weights(scene.model, name, way, plan.mirror)
     value = dot(system.comm, e, system.forces(state.u, state.mu))
-    return Functional(value, system.held(system.stiffness_along(state.u, state.mu, e)), reaction=e)
+    return Functional(value, system.held(system.at(state).stiffness_along(e)), reaction=e)
 
 
 def _conjugates(scene: Scene) -> dict[str, tuple[str, float]]:
@@ -177,8 +176,8 @@ def over_area(scene: Scene) -> Callable[[ufl.core.expr.Expr], ufl.Form]:
 def distances(scene: Scene, state: State, target: Target) -> tuple[float, float]:
     """Root mean square and largest distance to a target at the nodes, over R; collective."""
     system, away = scene.model.system, offset(scene, target)
-    system.set(state.u)
-    gaps = np.linalg.norm((system.u.x.array - away.x.array).reshape(-1, scene.model.V.dofmap.bs), axis=1)
+    u = system.with_ghosts(state.u, state.mu)
+    gaps = np.linalg.norm((u - away.x.array).reshape(-1, scene.model.V.dofmap.bs), axis=1)
     largest = system.comm.allreduce(float(gaps.max(initial=0.0)), MPI.MAX)
     return float(np.sqrt(_misfit(scene, state, target).value)), largest
 
@@ -189,11 +188,7 @@ def _misfit(scene: Scene, state: State, target: Target) -> Functional:
     gap, log = system.u - away, model.kernels
     one = fem.Constant(model.V.mesh, 1.0)
     square = log.compile("misfit", over(ufl.dot(gap, gap)))
-    area = system.integral(state.u, log.compile("area", over(one)))
+    at = system.at(state)
+    area = at.integral(log.compile("area", over(one)))
     slope = log.compile("misfit slope", over(2 * ufl.dot(gap, ufl.TestFunction(model.V))))
-    system.set(state.u)
-    vector = fem.Function(model.V)
-    fem.assemble_vector(vector.x.array, slope)
-    vector.x.scatter_reverse(InsertMode.add)
-    by_u = system.held(np.array(vector.x.array[: system.size]))
-    return Functional(system.integral(state.u, square) / area, np.asarray(by_u / area))
+    return Functional(at.integral(square) / area, np.asarray(at.gradient([slope]) / area))

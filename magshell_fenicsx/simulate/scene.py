@@ -181,7 +181,7 @@ class Scene:
                 f"this state is of another scene: it has {state.u.size} unknowns on this rank, this scene has "
                 f"{own.u.size}; take records of follow or trace of the same scene"
             )
-        others = state.mu.keys() - own.mu.keys() - {*self.model.system.settings}
+        others = state.mu.keys() - own.mu.keys() - {*self.model.system.history}
         if own.mu.keys() - state.mu.keys() or (others and not more):
             there, here = (", ".join(sorted(mu)) or "none" for mu in (state.mu, own.mu))
             raise ValueError(f"this state is of another scene: its amplitudes are {there}, those of this scene {here}")
@@ -220,7 +220,7 @@ class Scene:
             **{
                 column: state.mu[term.name]
                 * model.multiplicity
-                * model.system.integral(state.u, model.observed[column])
+                * model.system.at(state).integral(model.observed[column])
                 for term in self.plan.loads.own
                 for column in term.observed
             },

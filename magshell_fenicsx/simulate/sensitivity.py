@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from dolfinx import fem
 from dolfinx.la import InsertMode
 
 from magshell_fenicsx.assembly.kernels import KernelLog
@@ -67,8 +68,8 @@ def sensitivities(scene: Scene, fold: Fold, record: Record | None = None) -> dic
       the derivative in lambda_m.
     """
     stage = stage_at(scene, record) if record else plain(scene)
-    system, state, settings = stage.newton.system, fold.state, scene.model.system.settings
-    columns = {name: system.load(state.u, state.mu, name) for name in state.mu if name not in (fold.name, *settings)}
+    system, state, history = stage.newton.system, fold.state, scene.model.system.history
+    columns = {name: system.load(state.u, state.mu, name) for name in state.mu if name not in (fold.name, *history)}
     by_patch = _remanence_columns(scene, replace(fold, state=stage.leave(state)))
     columns |= {name: stage.padded(column) for name, column in (by_patch | _field_column(scene, state)).items()}
     found = {name: sensitivity(system, fold, column) for name, column in columns.items()}
@@ -128,12 +129,14 @@ def _remanence_columns(scene: Scene, fold: Fold) -> dict[str, Vector]:
 
 def _magnetic_column(scene: Scene, fold: Fold, field: Magnetisation) -> Vector:
     model, system = scene.model, scene.model.system
-    system.set(fold.state.u)
-    column = system.u.copy()
-    column.x.array[:] = 0
-    for term in magnetic_terms(scene, fold.state, field):
-        assert term.amplitude
-        term.add_residual(column.x.array, fold.state.mu[term.amplitude])
+    column, terms = fem.Function(model.V), magnetic_terms(scene, fold.state, field)
+
+    def add() -> None:
+        for term in terms:
+            assert term.amplitude
+            term.add_residual(column.x.array, fold.state.mu[term.amplitude])
+
+    system.at(fold.state).of(add)
     column.x.scatter_reverse(InsertMode.add)
     for held in system.clamped:
         held.set(column.x.array)
@@ -141,12 +144,10 @@ def _magnetic_column(scene: Scene, fold: Fold, field: Magnetisation) -> Vector:
 
 
 def magnetic_terms(scene: Scene, state: State, field: Magnetisation) -> Sequence[FormTerm]:
-    """The model's magnetic terms with another remanence, at a state whose displacement is set."""
+    """The model's magnetic terms with another remanence, in the fields of a state."""
     terms, fields = _made(scene, field)
     for known in fields:
         known.mu.update({name: state.mu[name] for name in known.names})
-    for term in terms:
-        term.follow()
     return terms
 
 

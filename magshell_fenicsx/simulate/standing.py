@@ -95,5 +95,3 @@ def _put(model: ShellModel | MeridianModel, plan: Plan) -> None:
         model.thickness.x.array[:] = thickness_field(plan.thickness, r0, patches).x.array
     if natural:
         there["natural"].x.array[:] = natural_field(natural, patterns.cells_of(r0), model.V).x.array
-    if isinstance(model, ShellModel):
-        model.retake()

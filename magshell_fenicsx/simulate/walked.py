@@ -47,13 +47,13 @@ def followed(stage: Stage, path: Path, start: Point, goal: Goal, branches: PathS
         If the path is lost.
     """
     records = Walked(_followed(stage, _walk(stage, path, start, goal), branches))
-    counted = stage.scene.model.system.counted
+    advance = stage.scene.model.system.advance
     past = start.state.mu
     for record in records:
         point = stage.point(record.point)
-        past = (state := counted(point.state, past)).mu
+        past = (state := advance(point.state, past)).mu
         yield replace(record, point=replace(point, state=state))
-    return counted(stage.leave(records.end), past)
+    return advance(stage.leave(records.end), past)
 
 
 def _walk(stage: Stage, path: Path, start: Point, goal: Goal) -> Walk:

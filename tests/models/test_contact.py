@@ -72,8 +72,7 @@ def test_derivatives(kind: str) -> None:
             assert (forces[1] - forces[0]) / 1e-5 == pytest.approx(bend, rel=1e-6)
             energies = []
             for at in (down, up):
-                system.place(at)
-                energies.append(sum(system.energies(u).values()))
+                energies.append(sum(system.energies(u, at).values()))
             assert (energies[1] - energies[0]) / 1e-5 == pytest.approx(force, rel=1e-5)
             found += [column, np.array([force, bend])]
         changed.append(found)

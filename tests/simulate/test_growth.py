@@ -58,8 +58,7 @@ def test_derivatives_and_the_shell_that_has_it_from_the_start(symmetry: str) -> 
         return (ahead[0] - 8 * ahead[1] + 8 * ahead[2] - ahead[3]) / (12 * size)
 
     def total(at: dict[str, float]) -> float:
-        system.place(at)
-        energies = system.energies(u)
+        energies = system.energies(u, at)
         return float(sum((at[t.amplitude] if t.amplitude else 1) * energies[t.name] for t in system.terms))
 
     for name in (first, second):
@@ -79,7 +78,7 @@ def test_derivatives_and_the_shell_that_has_it_from_the_start(symmetry: str) -> 
         return (ahead[0] - 8 * ahead[1] + 8 * ahead[2] - ahead[3]) / 12e-4
 
     def energy(w: Any) -> float:
-        found = system.energies(w)
+        found = system.energies(w, mu)
         return float(sum((mu[t.amplitude] if t.amplitude else 1) * found[t.name] for t in system.terms))
 
     residual = system.residual(u, mu)

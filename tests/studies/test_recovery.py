@@ -43,9 +43,9 @@ def test_from_its_own_shape(tmp_path: Path) -> None:
 
     scene = Scene(made(known))
     *_, last = follow(scene)
-    scene.model.system.set(last.point.state.u)
+    u = scene.model.system.with_ghosts(last.point.state.u)
     places = scene.model.r0.x.array.reshape(-1, 3)  # type: ignore[union-attr]
-    there, tree = places + scene.model.u.x.array.reshape(-1, 3), scipy.spatial.cKDTree(places)
+    there, tree = places + u.reshape(-1, 3), scipy.spatial.cKDTree(places)
     misfits, standing = list[float](), Standing()
 
     def misfit(x: Array) -> tuple[float, Array]:

@@ -143,10 +143,11 @@ class MeridianModel(Observed):
         self.fields = factory.fields
         if self.growing:
             parameters |= self.growing.parameters(terms, parameters)
-            self.growing.renewed += self._renewals
         moves = moving(self.r0, self.supports, loads, self._pressed() if closed else None)
-        self.system = FiniteElementSystem(self.u, terms, held, pattern, material.h, parameters=parameters, moving=moves)
-        self.system.settings |= dict(known.setting for known, _ in self.contacts.values())
+        stiffnesses = dict(known.history for known, _ in self.contacts.values())
+        self.system = FiniteElementSystem(
+            self.u, terms, held, pattern, material.h, parameters=parameters, moving=moves, history=stiffnesses
+        )
         self._volume = self.kernels.compile("volume energy", volume)
         self._seen = {name: Probe.at(*place, self.r0) for name, place in meridian.points.items()}
         self.normals = {name: probe.normal for name, probe in self._seen.items()}

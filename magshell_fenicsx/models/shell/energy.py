@@ -154,9 +154,6 @@ class HessianTerm:
     def energy(self) -> float:
         return 0.0
 
-    def follow(self) -> None:
-        """It depends on nothing else."""
-
     def compile_residual(self) -> None:
         """There is none."""
 

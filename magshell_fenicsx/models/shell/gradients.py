@@ -6,6 +6,7 @@ first: the metric of a sliver is then as well conditioned as in a form.
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Protocol
 
@@ -18,8 +19,8 @@ from ufl.algorithms import extract_coefficients
 from ufl.constantvalue import Zero
 from ufl.core.expr import Expr
 
+from magshell_fenicsx.assembly.following import Follows, values_of
 from magshell_fenicsx.assembly.kernels import KernelLog
-from magshell_fenicsx.assembly.point_field import PointField
 from magshell_fenicsx.assembly.point_kernels import Points
 from magshell_fenicsx.models.shell.energy import Density
 from magshell_fenicsx.models.shell.kinematics import Jet
@@ -54,8 +55,8 @@ class PointGradient:
         All on cells, or all on edges with as many sides.
     parts
         Which parts of the jets the points have.
-    each
-        Points of an entity; a chunk has whole entities.
+    each, count
+        Points of an entity, and of all; a chunk has whole entities.
     r0
         (points, sides * parts * 3) in the cells' own coordinates.
     geometry
@@ -66,10 +67,6 @@ class PointGradient:
     comm
         All its ranks compile together.
 
-    Attributes
-    ----------
-    chunks
-        The points that are treated together.
     """
 
     def __init__(
@@ -77,33 +74,28 @@ class PointGradient:
         terms: Sequence[PointTerm],
         parts: Sequence[str],
         each: int,
-        r0: Array,
+        count: int,
+        r0: Follows[Array],
         geometry: Array,
         values: Callable[[fem.Function], Array],
         log: KernelLog,
         comm: MPI.Comm,
     ) -> None:
-        count, self._size = r0.shape
+        self._size = terms[0].density.sides * len(parts) * 3
         chunk = max(CHUNK // each, 1) * each
-        self.chunks = [slice(first, min(first + chunk, count)) for first in range(0, count, chunk)]
+        self._chunks = [slice(first, min(first + chunk, count)) for first in range(0, count, chunk)]
         points = self._points = Points(max(min(count, chunk), 1))
         self._u, placement, place = (points.field(size) for size in (self._size, self._size, geometry.shape[1]))
-        self._known = [(placement, r0), (place, geometry)]
-        self._following: list[tuple[fem.Function, Array]] = []
-        self._taken, self._values = dict[int, fem.Function](), values
+        self._given = [_Given(placement, r0), _Given(place, Follows(lambda: geometry, tuple))]
         self._names, self._log, self._comm = [term.name for term in terms], log, comm
         self._W, self._work, self._v = list[Expr](), list[Expr](), points.field(self._size)
         for term in terms:
             parameters, varying = parameters_at(points, term.density.parameters, term.density.sides)
-            for here, field in varying:
-                self._taken[len(self._known)] = field
-                self._known.append((here, values(field)))
-            self._following += [(here, values(field)) for here, field in varying if isinstance(field, PointField)]
+            self._given += [_Given(here, _following(field, values)) for here, field in varying]
             self._W.append(_energy(term.density, [placement, self._u], place, parts, parameters))
             if term.density.work:
                 self._work.append(_energy(term.density, [placement, self._u, self._v], place, parts, parameters))
         self._conservative = [W for W, term in zip(self._W, terms, strict=True) if not term.density.work]
-        self._loaded: slice | None = None
         self._energies: dict[str, fem.Expression | None] = {}
 
     @cached_property
@@ -125,17 +117,11 @@ class PointGradient:
             self._energies[name] = None if none else self._log.compile_expression(f"{name} energy", W, self._comm)
         return self._energies[name]
 
-    def place(self, r0: Array) -> None:
-        """Take another placement."""
-        self._known[0] = self._known[0][0], r0
-        self._loaded = None
-
-    def retake(self) -> None:
-        """Take the fields of the densities anew, but for those that are followed."""
-        for number, field in self._taken.items():
-            if not isinstance(field, PointField):
-                self._known[number] = self._known[number][0], self._values(field)
-        self._loaded = None
+    def chunks(self) -> list[slice]:
+        """The points that are treated together, to be evaluated one after the other with what is given now."""
+        for given in self._given:
+            given.values.renew()
+        return self._chunks
 
     def room(self, chunk: slice) -> Array:
         """For the derivatives of u in reference coordinates, to be filled: (points, sides * parts * 3)."""
@@ -144,10 +130,38 @@ class PointGradient:
 
     def evaluate(self, chunk: slice, kernel: fem.Expression) -> Array:
         """`gradient` by what was filled in, in the same order, or `energy`; the array is reused by the next call."""
-        for field, values in self._known if self._loaded != chunk else self._following:
-            fill(field, values[chunk])
-        self._loaded = chunk
+        for given in self._given:
+            given.fill(chunk)
         return self._points.evaluate(kernel, chunk.stop - chunk.start)
+
+
+@dataclass
+class _Given:
+    """What a kernel takes besides u.
+
+    Attributes
+    ----------
+    room
+        Of the points of a chunk.
+    values
+        At all points.
+    filled
+        The chunk whose values the room has, and their version.
+    """
+
+    room: fem.Function
+    values: Follows[Array]
+    filled: tuple[slice, int] | None = None
+
+    def fill(self, chunk: slice) -> None:
+        """Have the latest values of a chunk in the room."""
+        if self.filled != (chunk, self.values.version):
+            fill(self.room, self.values.latest[chunk])
+            self.filled = chunk, self.values.version
+
+
+def _following(field: fem.Function, values: Callable[[fem.Function], Array]) -> Follows[Array]:
+    return Follows(lambda: values(field), lambda: (values_of(field),))
 
 
 def in_own_coordinates(jet: Jet, frame: Sequence[Expr | Array]) -> Jet:

@@ -39,8 +39,7 @@ from magshell_fenicsx.models.shell.parameters import (
     default_penalty,
 )
 from magshell_fenicsx.models.shell.patterns import by_patch, cells_of
-from magshell_fenicsx.models.shell.residual import FastResidual, renew
-from magshell_fenicsx.models.shell.sites import Site
+from magshell_fenicsx.models.shell.residual import FastResidual
 from magshell_fenicsx.models.shell.slopes import point_parameters
 from magshell_fenicsx.models.shell.terms import EnergyFactory
 from magshell_fenicsx.models.shell.thickness import Thickness, thickness_field
@@ -222,17 +221,14 @@ class ShellModel(Observed):
             unit = material.classical_pressure / material.h
             at_edges = pressed_edges(self.r0, curves, in_planes, loads, unit, closing)
         self.moving = moving(self.r0, self.supports, loads, at_edges)
-        self._near, self._beside = None, list[Site]()
+        near = None
         if self.moving:
-            near = make_sites(self.r0, degree, terms, self.kernels, chosen=self.moving.cells)
-            self._near = self.moving.cells, near
-        fast = FastTangent(self.u, self._sites, held + mirrored, self._near)
+            near = self.moving.cells, make_sites(self.r0, degree, terms, self.kernels, chosen=self.moving.cells)
+        fast = FastTangent(self.u, self._sites, held + mirrored, near)
         dense = [term for term in terms if isinstance(term, ShellTerm)]
-        served = list[FastResidual]()
 
         def serve(terms: Sequence[PointTerm], *, apart: bool = False) -> FastResidual:
-            served.append(FastResidual(self.r0, self.u, degree, terms, self.kernels, apart=apart))
-            return served[-1]
+            return FastResidual(self.r0, self.u, degree, terms, self.kernels, apart=apart)
 
         gradients = serve(dense)
         gradients.compile()
@@ -246,14 +242,10 @@ class ShellModel(Observed):
         self.fields = factory.fields
         if self.growing:
             parameters |= self.growing.parameters(terms, parameters, gradients)
-            sites = [*self._sites, *(self._near[1] if self._near else [])]
-            self.growing.renewed += [each.renew for each in sites] + self._renewals
-            self.growing.renewed.append(lambda: renew(served))  # some come later
+        stiffnesses = dict(known.history for known, _ in self.contacts.values())
         self.system = FiniteElementSystem(
-            self.u, terms, held + mirrored, interior, material.h, fast, gradients, parameters, self.moving
+            self.u, terms, held + mirrored, interior, material.h, fast, gradients, parameters, self.moving, stiffnesses
         )
-        self.system.settings |= dict(known.setting for known, _ in self.contacts.values())
-        self._served = served
         self._interior, self._held, self.mirror = interior, held, mirror
         self._on_mirror = facets("symmetry")
         self.observe(self.kernels.compile("volume energy", volume), midsurface.points)
@@ -265,10 +257,7 @@ class ShellModel(Observed):
             return None
         edges = self.factory.antisymmetric_edges(self._on_mirror, self.mirror.normal)
         held = self._held + [held_along(self.V, 1, self._on_mirror, along) for along in self.mirror.in_plane]
-        self._beside = make_sites(self.r0, self.degree, [edges], self.kernels)
-        sites = self._sites + self._beside
-        if self.growing:
-            self.growing.renewed += [site.renew for site in self._beside]
+        sites = self._sites + make_sites(self.r0, self.degree, [edges], self.kernels)
         fast = FastTangent(self.u, sites, held)
         terms = [edges if t.name == "mirror edges" else t for t in self.system.terms]
         system = self.system
@@ -283,16 +272,9 @@ class ShellModel(Observed):
                 system.gradients,
                 system.parameters,
                 self.moving,
+                system.history,
             )
         )
-
-    def retake(self) -> None:
-        """Take the values of remanence, thickness and natural shape anew, after they have changed."""
-        near = self._near[1] if self._near else []
-        for site in (*self._sites, *near, *self._beside):
-            site.retake()
-        for residual in self._served:
-            residual.retake()
 
     def _force(self, name: str, force: Force) -> LinearTerm:
         x, inward = self.midsurface.points[force.point], -self.normals[force.point]

@@ -1,6 +1,7 @@
 """Energies and residuals without compiled forms, from the terms' own densities and their gradients at points."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from typing import Protocol
 
 import numpy as np
@@ -9,6 +10,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.batches import boundary_edges, edge_width, interior_edges
 from magshell_fenicsx.assembly.cell_frames import cell_frames
+from magshell_fenicsx.assembly.following import Follows
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.shape_tables import Table, cell_rule, edge_covector, edge_rule
 from magshell_fenicsx.assembly.sheets import Sheet
@@ -25,12 +27,6 @@ class _Site(Protocol):
 
     def energy(self, nodal: Array, name: str) -> float:
         """That of a term on this rank's part."""
-
-    def place(self, r0: fem.Function) -> None:
-        """Take another placement."""
-
-    def retake(self) -> None:
-        """Take the fields anew."""
 
     def compile(self) -> None:
         """Compile the kernels of `add`; collective."""
@@ -83,20 +79,10 @@ class FastResidual:
             sites.append(_Cells(r0, this[0] or cell_quadrature(degree), together, log))
         if on_edges:
             sites.append(_Edges(r0, edge_quadrature(degree), on_edges, log))
-        self._sites, self._r0 = sites, r0
+        self._sites = sites
         self.names = frozenset(term.name for term in terms)
         self._u, self._nodes = u, u.function_space.dofmap.list
         self._dofs = (3 * self._nodes[:, :, None] + np.arange(3)).ravel()
-
-    def renew(self) -> None:
-        """Take the placement anew."""
-        for site in self._sites:
-            site.place(self._r0)
-
-    def retake(self) -> None:
-        """Take the fields of the densities anew."""
-        for site in self._sites:
-            site.retake()
 
     def compile(self) -> None:
         """Compile the kernels of the residual; collective."""
@@ -121,12 +107,6 @@ class FastResidual:
         return np.asarray(nodal.reshape(-1, 3 * self._nodes.shape[1]))
 
 
-def renew(residuals: Iterable[FastResidual]) -> None:
-    """Let all take the placement anew."""
-    for each in residuals:
-        each.renew()
-
-
 class _Cells:
     """Terms with one amplitude on the owned cells."""
 
@@ -137,24 +117,16 @@ class _Cells:
         table, each = Table.tabulate(V.element.basix_element, X), len(X)
         parts = [name for name in NAMES if name in FIRST or any(name in term.density.parts for term in terms)]
         self._sheet = Sheet(table, self._weights, [NAMES.index(part) for part in parts])
-        cells = self._owned = np.arange(V.mesh.topology.index_map(2).size_local, dtype=np.int32)
-        frames = self._frames = cell_frames(V.mesh)
-        self._table, self._parts = table, parts
-        known = self._known(r0)
-        geometry = np.repeat(frames[cells], each, axis=0)
+        cells, frames = np.arange(V.mesh.topology.index_map(2).size_local, dtype=np.int32), cell_frames(V.mesh)
+        geometry, count = np.repeat(frames[cells], each, axis=0), len(cells) * each
+
+        def placement() -> Array:
+            return _placement(r0, table, frames, parts)[cells].reshape(count, 3 * len(parts))
+
+        placed = Follows(placement, lambda: (r0.x.array,))
         self._points = PointGradient(
-            terms, parts, each, known, geometry, lambda field: at_points(field, X, cells), log, V.mesh.comm
+            terms, parts, each, count, placed, geometry, lambda field: at_points(field, X, cells), log, V.mesh.comm
         )
-
-    def _known(self, r0: fem.Function) -> Array:
-        known = _placement(r0, self._table, self._frames, self._parts)[self._owned]
-        return known.reshape(len(known) * len(self._weights), 3 * len(self._parts))
-
-    def place(self, r0: fem.Function) -> None:
-        self._points.place(self._known(r0))
-
-    def retake(self) -> None:
-        self._points.retake()
 
     def compile(self) -> None:
         _ = self._points.gradient
@@ -174,7 +146,7 @@ class _Cells:
     def _filled(self, nodal: Array) -> Iterator[tuple[slice, slice]]:
         """Each chunk, with the derivatives of u filled in, and its cells."""
         each = len(self._weights)
-        for chunk in self._points.chunks:
+        for chunk in self._points.chunks():
             cells = slice(chunk.start // each, chunk.stop // each)
             self._sheet.at_points(nodal[cells], self._points.room(chunk))
             yield chunk, cells
@@ -193,30 +165,31 @@ class _Edges:
         table = Table.tabulate(V.element.basix_element, X)
         self._sheet = Sheet(table, w, [NAMES.index(part) for part in CURVED])
         frames, cells = cell_frames(V.mesh), np.arange(len(V.dofmap.list), dtype=np.int32)
-        self._table, self._frames = table, frames
-        placement = self._placed(r0)
-        self._there, self._back = np.empty_like(placement), np.empty_like(placement)
+        self._there, self._back = (np.empty((len(cells) * len(X), 3 * len(CURVED))) for _ in range(2))
         self._on = dict[str, tuple[NDArray[np.intp], PointGradient]]()
+
+        def placements() -> dict[str, Array]:
+            all_cells = _placement(r0, table, frames, CURVED).reshape(-1, 3 * len(CURVED))
+            return {
+                name: all_cells[rows].reshape(len(rows), rows.shape[1] * 3 * len(CURVED))
+                for name, (rows, _) in on_terms.items()
+            }
+
+        on_terms = {term.name: _where(V, term.density, frames, each) for term in terms}
+        placed = Follows(placements, lambda: (r0.x.array,))
+
+        def placed_on(name: str) -> Array:
+            return placed.renew()[name]
+
         for term in terms:
-            rows, geometry = _where(V, term.density, frames, each)
-            known = placement[rows].reshape(len(rows), rows.shape[1] * placement.shape[1])
+            rows, geometry = on_terms[term.name]
 
             def values(field: fem.Function, rows: NDArray[np.intp] = rows) -> Array:
                 return at_points(field, X, cells)[rows].reshape(len(rows), rows.shape[1] * field.ufl_shape[0])
 
-            self._on[term.name] = rows, PointGradient([term], CURVED, each, known, geometry, values, log, V.mesh.comm)
-
-    def _placed(self, r0: fem.Function) -> Array:
-        return _placement(r0, self._table, self._frames, CURVED).reshape(-1, 3 * len(CURVED))
-
-    def place(self, r0: fem.Function) -> None:
-        placement = self._placed(r0)
-        for rows, points in self._on.values():
-            points.place(placement[rows].reshape(len(rows), rows.shape[1] * placement.shape[1]))
-
-    def retake(self) -> None:
-        for _, points in self._on.values():
-            points.retake()
+            here = Follows(partial(placed_on, term.name), lambda: (r0.x.array,))
+            points = PointGradient([term], CURVED, each, len(rows), here, geometry, values, log, V.mesh.comm)
+            self._on[term.name] = rows, points
 
     def compile(self) -> None:
         for _, points in self._on.values():
@@ -243,7 +216,7 @@ class _Edges:
     def _evaluated(self, name: str, kernel: fem.Expression | None) -> Iterator[tuple[NDArray[np.intp], Array]]:
         """A kernel's values in each chunk, at the points of these numbers among those of all cells' edges."""
         rows, points = self._on[name]
-        for chunk in points.chunks if kernel else []:
+        for chunk in points.chunks() if kernel else []:
             here = rows[chunk].ravel()
             np.take(self._there, here, axis=0, out=points.room(chunk).reshape(len(here), -1), mode="clip")
             yield here, points.evaluate(chunk, kernel)

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.batches import Batch
 from magshell_fenicsx.assembly.contraction import Blocks, Contraction
+from magshell_fenicsx.assembly.following import Follows, PointField, values_of
 from magshell_fenicsx.assembly.kernels import KernelLog
-from magshell_fenicsx.assembly.point_field import PointField
 from magshell_fenicsx.assembly.point_kernels import Pair, Pairs, Points, point_hessian
 from magshell_fenicsx.assembly.shape_tables import PARTS
 from magshell_fenicsx.models.shell.energy import Density, HessianTerm, Parameter, ShellTerm
@@ -56,8 +56,7 @@ class Site:
         self._points = Points(max([1, *(batch.size for batch in batches)]))
         self._u, self._r0 = (self._points.field(3 * PARTS * sides) for _ in range(2))
         self._geometry = self._points.field(2 * sides + 1)
-        self._placement = r0
-        self.renew()
+        self._placements = Follows(lambda: [self._jets(batch, r0.x.array) for batch in batches], lambda: (r0.x.array,))
         self._kernels = {
             t.name: Kernel(
                 t.name, t.density, self._points, batches, of_v=isinstance(t, HessianTerm) or bool(t.density.work)
@@ -89,9 +88,12 @@ class Site:
             Takes the number of each batch of interior edges and what couples the cells there.
         """
         kernels = [(kernel, factors[name]) for name, kernel in self._kernels.items() if factors.get(name)]
+        placements = self._placements.renew()
+        for kernel, _ in kernels:
+            kernel.renew()
         for number, batch in enumerate(self.batches):
             fill(self._u, self._jets(batch, u))
-            fill(self._r0, self._placements[number])
+            fill(self._r0, placements[number])
             fill(self._geometry, np.repeat(batch.geometry, len(batch.rule.weights), axis=0))
             contraction, blocks = self._contractions[batch.rule], Blocks(batch, self._coupled)
             for kernel, factor in kernels:
@@ -104,15 +106,6 @@ class Site:
                 couple(number, contraction.cross(blocks))
         self._replaced = False
 
-    def retake(self) -> None:
-        """Take the fields of the densities anew."""
-        for kernel in [*self._kernels.values(), *([self._prestress] if self._prestress else [])]:
-            kernel.retake()
-
-    def renew(self) -> None:
-        """Take the placement anew."""
-        self._placements = [self._jets(batch, self._placement.x.array) for batch in self.batches]
-
     def replace_strain(
         self, u: Array, by: Sequence[tuple[float, Array]], besides: NDArray[np.bool_] | None = None
     ) -> None:
@@ -122,12 +115,13 @@ class Site:
         """
         if self._prestress is None:
             return
-        for number, (batch, r0) in enumerate(zip(self.batches, self._placements, strict=True)):
+        for number, (batch, r0) in enumerate(zip(self.batches, self._placements.renew(), strict=True)):
             strains = [w * _strain(r0, self._jets(batch, v)) for w, v in (*by, (-1.0, u))]
             strain = np.sum(strains, axis=0)
             if besides is not None:
                 strain[np.repeat(besides[batch.cells[0]], len(batch.rule.weights))] = 0.0
             self._prestress.vary(number, strain)
+        self._prestress.renew()
         self._replaced = True
 
     def _jets(self, batch: Batch, field: Array) -> Array:
@@ -144,16 +138,7 @@ class Kernel:
         self._name, self._density, self._of_v = name, density, of_v
         self._points, self._batches = points, batches
         self._parameters, varying = parameters_at(points, density.parameters, density.sides)
-        self._fields = [field for _, field in varying]
-        self._varying = [(here, self._taken(field)) for here, field in varying]
-
-    def _taken(self, field: fem.Function) -> list[Array]:
-        return [_on_sides(field, batch, range(self._density.sides)) for batch in self._batches]
-
-    def retake(self) -> None:
-        """Take the fields of the density anew."""
-        for field, (_, values) in zip(self._fields, self._varying, strict=True):
-            values[:] = self._taken(field)
+        self._varying = [(here, on_batches(field, batches, density.sides)) for here, field in varying]
 
     def compile(
         self, u: fem.Function, r0: fem.Function, geometry: fem.Function, sides: int, log: KernelLog, comm: MPI.Comm
@@ -171,12 +156,17 @@ class Kernel:
 
     def vary(self, number: int, values: Array) -> None:
         """Give the first parameter that varies its values at the points of a batch."""
-        self._varying[0][1][number] = values
+        self._varying[0][1].renew()[number] = values
+
+    def renew(self) -> None:
+        """Renew the values of fields at the points of all batches."""
+        for _, values in self._varying:
+            values.renew()
 
     def evaluate(self, number: int) -> Array:
         """The Hessian's parts at the points of a batch."""
         for here, values in self._varying:
-            fill(here, values[number])
+            fill(here, values.latest[number])
         return self._points.evaluate(self._hessian, self._batches[number].size)
 
 
@@ -237,6 +227,11 @@ def at_points(field: fem.Function, X: Array, cells: NDArray[np.int32]) -> Array:
     values = Q.element.basix_element.tabulate(0, X)[0, :, :, 0]
     nodal = field.x.array.reshape(-1, size)[Q.dofmap.list[cells]]
     return np.asarray(np.matmul(values, nodal)).reshape(-1, size)
+
+
+def on_batches(field: fem.Function, batches: Sequence[Batch], sides: int = 1) -> Follows[list[Array]]:
+    """The values of a field that varies over the cells, at the points of each batch."""
+    return Follows(lambda: [_on_sides(field, batch, range(sides)) for batch in batches], lambda: (values_of(field),))
 
 
 def _on_sides(field: fem.Function, batch: Batch, sides: range) -> Array:

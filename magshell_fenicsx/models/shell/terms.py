@@ -83,7 +83,7 @@ class EnergyFactory:
 
         def make(kind: Callable[..., AnyTerm], *density: Density) -> AnyTerm:
             given = energy.name, *density, form, self.u, self.log, energy.amplitude
-            return kind(*given, linear=energy.linear, work=work, follow=energy.follow)
+            return kind(*given, linear=energy.linear, work=work)
 
         if energy.density is None:
             return make(FormTerm)
@@ -153,7 +153,7 @@ class EnergyFactory:
             self.fields.append(known)
             of = densities.in_space(FULL[field.law])
             density = self._thick(Density(per_area(of), (Br, known.polynomial), parts=MOVED), None)
-            return [carrier.energy("magnetic", density, "lambda_m", follow=known.follow)]
+            return [carrier.energy("magnetic", density, "lambda_m")]
         directions = [("lambda_m", "", field.applied)]
         directions += [(name, name.replace("lambda_", " "), Ba) for name, Ba in zip(ACROSS, field.across, strict=False)]
         terms = [
@@ -211,7 +211,7 @@ class EnergyFactory:
         of_radius = pressed_radius(self._constant(contact.front), self._constant(contact.direction))
         seen: dict[str, Callable[..., Expr]] = {"pressure": contact_pressure, "radius": of_radius}
         integrals = {name: self._over_area(of, known.parameters, rule) for name, of in seen.items()}
-        return carrier.energy(f"contact {contact.body}", density, follow=known.follow), known, integrals
+        return carrier.energy(f"contact {contact.body}", density), known, integrals
 
     def _over_area(
         self, of: Callable[..., Expr], parameters: tuple[Parameter, ...], rule: int | None = None

@@ -16,12 +16,13 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.batches import POINTS, Batch, Rule
 from magshell_fenicsx.assembly.contraction import Blocks, Contraction
+from magshell_fenicsx.assembly.following import Follows
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.point_kernels import Pairs, Points, point_hessian
 from magshell_fenicsx.assembly.shape_tables import Table
 from magshell_fenicsx.assembly.terms import Term
 from magshell_fenicsx.mesh.hexahedra import Body
-from magshell_fenicsx.models.shell.sites import at_points, fill, parameters_at
+from magshell_fenicsx.models.shell.sites import fill, on_batches, parameters_at
 from magshell_fenicsx.models.solid.terms import SolidTerm
 
 Array = NDArray[np.float64]
@@ -68,7 +69,7 @@ class Site:
         self._g, self._u = self._points.field(SIZES[where]), self._points.field(3 * PARTS)
         self._hessians = {}
         self._pairs: dict[str, Pairs] = {}
-        self._varying: dict[str, list[tuple[fem.Function, list[Array]]]] = {}
+        self._varying: dict[str, list[tuple[fem.Function, Follows[list[Array]]]]] = {}
         for term in terms:
             pairs = Pairs(tuple(combinations_with_replacement(term.density.parts, 2)))
             z = self._points.field(3 * PARTS) if term.density.work else self._u
@@ -84,13 +85,16 @@ class Site:
     def add(self, u: Array, factors: Mapping[str, float], same: Array, couple: Callable[[int, Array], None]) -> None:
         """Add the terms' element matrices to `same`; see `shell.sites.Site.add`."""
         names = [name for name in self._hessians if factors.get(name)]
+        for name in names:
+            for _, values in self._varying[name]:
+                values.renew()
         for number, (batch, geometry) in enumerate(zip(self._batches, self._geometry, strict=True)):
             fill(self._u, self._jets(batch, u))
             fill(self._g, geometry)
             blocks = Blocks(batch, self._coupled)
             for name in names:
                 for here, values in self._varying[name]:
-                    fill(here, values[number])
+                    fill(here, values.latest[number])
                 blocks.add(self._points.evaluate(self._hessians[name], batch.size), factors[name], self._pairs[name])
             same[batch.cells[0]] += self._contraction.same(blocks, 0)
 
@@ -103,10 +107,7 @@ class Site:
         density, g, z = term.density, self._g, self._u
         here, varying = parameters_at(self._points, density.parameters, 1)
         of = density.work or density.of
-        self._varying[term.name] = [
-            (here, [at_points(field, batch.rule.points[0], batch.cells[0]) for batch in self._batches])
-            for here, field in varying
-        ]
+        self._varying[term.name] = [(here, on_batches(field, self._batches)) for here, field in varying]
 
         def vector(f: fem.Function, part: int) -> Any:
             return ufl.as_vector([f[3 * part + c] for c in range(3)])

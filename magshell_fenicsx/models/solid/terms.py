@@ -117,7 +117,7 @@ class TermFactory:
             known = AppliedField(of.in_space, X, self.u, WHOLE, of.driven)
             self.fields.append(known)
             density = Density(law.magnetic_in_space, (Br, known.polynomial, *self._constants(self.h)), VALUE + GRADIENT)
-            return [self._bulk("magnetic", density, "lambda_m", follow=known.follow)]
+            return [self._bulk("magnetic", density, "lambda_m")]
         directions = [("lambda_m", "", of.applied)]
         directions += [(name, name.replace("lambda_", " "), Ba) for name, Ba in zip(ACROSS, of.across, strict=False)]
         terms = []
@@ -209,12 +209,11 @@ class TermFactory:
         amplitude: str | None = None,
         *,
         linear: bool = False,
-        follow: Callable[[], None] | None = None,
     ) -> SolidTerm:
         domain, u = self.body.mesh, self.u
         dx = ufl.Measure("dx", domain=domain, metadata={"quadrature_degree": density.degree})
         energy = density.of(ufl.SpatialCoordinate(domain), u, ufl.grad(u), *density.parameters) * dx
-        return SolidTerm(name, density, energy, self.u, self.log, amplitude, linear=linear, follow=follow)
+        return SolidTerm(name, density, energy, self.u, self.log, amplitude, linear=linear)
 
     def _on_faces(self, found: Sequence[Density], v: Expr | None = None) -> ufl.Form:
         """The sum of energies, or of virtual works of v."""

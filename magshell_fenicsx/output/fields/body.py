@@ -33,8 +33,7 @@ class BodyGatherer:
 
     def gather(self, u: Vector, mu: Mapping[str, float] | None = None) -> Surface | None:
         """The displaced body on rank 0; None on other ranks."""
-        self._model.system.set(u)
-        nodes = self._nodes(self._model.u)
+        nodes = self._on_first(self._model.system.with_ghosts(u)[: self._model.system.size].reshape(-1, 3))
         return Surface(self._r0, nodes, self._n0, self._cells, self._fields) if self.comm.rank == 0 else None
 
     def _nodes(self, f: fem.Function) -> Array:

@@ -49,6 +49,7 @@ def mode_surface(
     label: str,
     vector: Vector,
     azimuth: float = 0.0,
+    mu: Mapping[str, float] | None = None,
 ) -> Surface | None:
     """The whole shell displaced by u, with a mode as its fields; collective.
 
@@ -59,6 +60,8 @@ def mode_surface(
         half is the mirror image with the opposite sign; any other label: the mode has the model's own symmetry.
     azimuth
         Azimuth of the model's frame, rad.
+    mu
+        The amplitudes, where imperfections grow.
 
     Returns
     -------
@@ -70,7 +73,7 @@ def mode_surface(
             return None
         m = 0 if label == TORSION else int(label.removeprefix(WAVES))
         return _with_mode(*_revolved_wave(model, u, m, vector))
-    base, mode = gatherer.gather(u), gatherer.gather(vector)
+    base, mode = gatherer.gather(u, mu), gatherer.gather(vector)
     if base is None or mode is None:
         return None
     surface = _with_mode(base, mode.u)

@@ -69,21 +69,24 @@ class RevolvedGatherer:
         """The displaced surface with its fields at the amplitudes mu, on rank 0; None on other ranks."""
         if self.comm.rank:
             return None
-        if self._model.growing and mu:
-            self._model.system.place(mu)
-            self._take_placement(mu)
-        self._model.system.set(u)
+        state = State(u, dict(mu or {}))
+        return self._model.system.at(state).of(lambda: self._drawn(state))
+
+    def _drawn(self, state: State) -> Surface:
+        """The surface at the displacement and the placement that are set."""
+        if self._model.growing:
+            self._take_placement(state.mu)
         swept = self._swept
-        stresses = self._stresses.of(swept.inner_jets(self._model.u, self._inner), mu or {})
+        stresses = self._stresses.of(swept.inner_jets(self._model.u, self._inner), state.mu)
         components, jumps = self._recovered.components(stresses)
         tensors = {name: self._at_ends.tensor(S) for name, S in components.items()}
-        values = tensors | principal_fields(components) | self._fields.of(swept.jets(self._model.u), mu or {})
-        pressure = self._model.cell_pressures(State(u, dict(mu))) if mu else None
+        values = tensors | principal_fields(components) | self._fields.of(swept.jets(self._model.u), state.mu)
+        pressure = self._model.cell_pressures(state) if state.mu else None
         if pressure is not None:
             values[PRESSURE] = np.repeat(pressure[swept.order, None], 2, axis=1)
         found = self._around(values)
         fields = self._constant | found
-        shape = swept.r0, swept.displacement(u), swept.n0, swept.cells
+        shape = swept.r0, swept.displacement(state.u), swept.n0, swept.cells
         return Surface(*shape, fields, (), jumps["M"], jumps["E"])
 
     def _around(self, fields: Mapping[str, Array]) -> dict[str, Array]:

@@ -101,7 +101,8 @@ class SurfaceGatherer:
         local = V.dofmap.list[: self._owned]
         numbers = V.dofmap.index_map.local_to_global(local.ravel().astype(np.int32)).reshape(local.shape)
         self._recovered: RecoveredShell | None = None
-        self._take_placement({}, self._gathered(numbers))
+        undeformed = model.system.at(State(model.zero(), {}))
+        undeformed.of(lambda: self._take_placement({}, self._gathered(numbers)))
 
     def _take_placement(self, mu: Mapping[str, float], numbers: NDArray[np.int64] | None = None) -> None:
         """What depends on the placement, at amplitudes of imperfections that grow; at first given the nodes."""
@@ -142,18 +143,21 @@ class SurfaceGatherer:
 
     def gather(self, u: Vector, mu: Mapping[str, float] | None = None) -> Surface | None:
         """The displaced surface with its fields at the amplitudes mu, on rank 0; None on other ranks."""
-        if self._model.growing and mu:
-            self._model.system.place(mu)
-            self._take_placement(mu)
-        self._model.system.set(u)
+        state = State(u, dict(mu or {}))
+        return self._model.system.at(state).of(lambda: self._drawn(state))
+
+    def _drawn(self, state: State) -> Surface | None:
+        """The surface at the displacement and the placement that are set."""
+        if self._model.growing:
+            self._take_placement(state.mu)
         jet = self._jet(self._model.u, self._places, 1)
-        values = self._fields.of(jet, mu or {})
-        pressure = self._model.cell_pressures(State(u, dict(mu))) if mu else None
+        values = self._fields.of(jet, state.mu)
+        pressure = self._model.cell_pressures(state) if state.mu else None
         if pressure is not None:
             values[PRESSURE] = np.repeat(pressure[: self._owned, None], len(self._places), axis=1)
         found = {name: self._averaged(each) for name, each in values.items()}
         nodes = self._averaged(jet[0])
-        stresses = self._stresses.of(self._jet(self._model.u, self._inner), mu or {})
+        stresses = self._stresses.of(self._jet(self._model.u, self._inner), state.mu)
         tensors = {name: self._gathered(np.einsum("...ia,...a->...i", self._six, S)) for name, S in stresses.items()}
         if not self._recovered:
             return None

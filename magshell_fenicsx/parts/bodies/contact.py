@@ -17,7 +17,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 from ufl.core.expr import Expr
 
-from magshell_fenicsx.assembly.point_field import PointField, at_quadrature
+from magshell_fenicsx.assembly.following import Follows, PointField, at_quadrature
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.continuation.system import Amplitudes, State, Vector
 from magshell_fenicsx.models.shell.kinematics import Jet
@@ -169,6 +169,29 @@ class Region:
     outer: float
 
 
+@dataclass(frozen=True)
+class _Expanded:
+    """The penalty of the points that are pressed: which they are, psi and its derivatives by the depth, normals."""
+
+    pressed: NDArray[np.bool_]
+    value: Array
+    first: Array
+    second: Array
+    n: Array
+    N: Array
+
+    def penalty(self) -> tuple[NDArray[np.bool_], Array]:
+        """These points, and psi with its gradient and half its Hessian there."""
+        H = self.second[..., None] * self.n[:, :, None] * self.n[:, None, :] - self.first[..., None] * self.N
+        return self.pressed, _flat(self.value, -self.first * self.n, H)
+
+
+def _flat(value: Array, gradient: Array, H: Array) -> Array:
+    """The polynomial of a function without its place."""
+    pairs = H[:, *PAIRS] * np.where(PAIRS[0] == PAIRS[1], 0.5, 1.0)
+    return np.concatenate([value, gradient, pairs], axis=1)
+
+
 class Pressing:
     """The polynomials of a contact at the quadrature points of a shell or a meridian.
 
@@ -192,7 +215,7 @@ class Pressing:
     polynomial
         The first of them.
     stiffness
-        That of the present state.
+        In the penalty.
     """
 
     def __init__(
@@ -209,23 +232,36 @@ class Pressing:
         self.contact, self._h, self._u, self._approach = contact, h, u, approach
         self.polynomial = PointField(V.mesh, degree, SIZE)
         self._points, self._degree = self.polynomial.points, degree
-        self._placement, self._r0 = r0, at_quadrature(r0, self._points)
-        self._factor = 1.0 if thickness is None else at_quadrature(thickness, self._points)[..., 0].ravel()
+        self._r0 = Follows(lambda: at_quadrature(r0, self._points), lambda: (r0.x.array,))
+        thick = [] if thickness is None else [thickness.x.array]
+
+        def factor() -> float | Array:
+            return 1.0 if thickness is None else at_quadrature(thickness, self._points)[..., 0].ravel()
+
+        self._factor = Follows(factor, lambda: (*thick,))
         self._face = None if thickness is None else PointField(V.mesh, degree, FACE)
         motion = fem.Constant(V.mesh, h * contact.direction)
         self.parameters = (self.polynomial, motion, approach, *(() if self._face is None else (thickness, self._face)))
         self._owned = V.mesh.topology.index_map(V.mesh.topology.dim).size_local
-        self._known: Array = np.empty(0)
         self.stiffness = fem.Constant(V.mesh, contact.stiffness)
-        self._seen: tuple[Array, float, float] = np.empty(0), 0.0, 0.0  # displacement, approach and stiffness
-        self._mean: tuple[Array, Array] | None = None  # gradient and Hessian of a step, in place of the present ones
-        self.gap: Array = np.empty(0)
-        self._about: Array | None = None
-        self.follow()
+        self._mean: tuple[Array, ...] = ()  # gradient and Hessian of a step, in place of the present ones
+        self._about: tuple[Array, ...] = ()  # the gap about which the penalty is expanded
+
+        def places() -> tuple[Array, ...]:
+            return r0.x.array, u.x.array, approach.value, *thick
+
+        def forces() -> tuple[Array, ...]:
+            return *places(), self.stiffness.value, *self._mean, *self._about
+
+        self._gaps = Follows(lambda: self._gap_at(self.place), places)
+        self._pressed = Follows(self._expanded, forces)
+        self.polynomial.follow(self._polynomials, forces)
+        if self._face is not None:
+            self._face.follow(self._by_thickness, forces)
 
     @property
-    def setting(self) -> tuple[str, tuple[fem.Constant, float]]:
-        """Its stiffness, see `FiniteElementSystem.settings`."""
+    def history(self) -> tuple[str, tuple[fem.Constant, float]]:
+        """Its stiffness, see `FiniteElementSystem`."""
         return self.contact.setting, (self.stiffness, self.contact.stiffness)
 
     @property
@@ -233,46 +269,54 @@ class Pressing:
         """The displacement (3,) of the body for an approach of one."""
         return self._h * self.contact.direction
 
-    def follow(self) -> None:
-        """Renew the polynomials where displacement or approach have changed."""
-        u, approach, k = self._u.x.array, float(self._approach.value), float(self.stiffness.value)
-        if (approach, k) == self._seen[1:] and np.array_equal(u, self._seen[0]):
-            return
-        self._seen = u.copy(), approach, k
-        self._known = y = self.place
-        if self._mean:
-            self._renew(y, np.ones(len(self._mean[0]), dtype=bool), np.zeros((len(self._mean[0]), 1)), *self._mean)
-            return
-        self.gap, n, N = self.contact.gap((self._r0 + y).reshape(-1, 3), 0.0, self._h / 2 * self._factor)
-        about = self.gap if self._about is None else self._about
-        pressed = about < 0  # few of the points
-        value, first, second = (a[:, None] for a in penalty(-about[pressed], k, SOFT * self._h))
-        if self._about is not None:
-            more = (about - self.gap)[pressed, None]
-            value, first = value + more * (first + more / 2 * second), first + more * second
-        n, N = n[pressed], N[pressed]
-        H = second[..., None] * n[:, :, None] * n[:, None, :] - first[..., None] * N
-        self._renew(y, pressed, value, -first * n, H)
-        if self._face is not None:
-            by_t = np.zeros((len(self.gap), FACE))
-            by_t[:, 0] = self._factor
-            by_t[pressed, 1:] = self._h / 2 * np.concatenate([first, -second * n], axis=1)
-            self._face.renew(by_t.reshape(*y.shape[:2], FACE))
+    @property
+    def gap(self) -> Array:
+        """At all points, over R."""
+        return self._gaps.renew()[0]
 
-    def _renew(self, y: Array, pressed: NDArray[np.bool_], value: Array, gradient: Array, H: Array) -> None:
-        """Of the pressed points psi, its gradient and its Hessian are given."""
-        pairs = H[:, *PAIRS] * np.where(PAIRS[0] == PAIRS[1], 0.5, 1.0)
+    def _gap_at(self, y: Array) -> tuple[Array, Array, Array]:
+        """The gap and its derivatives at places `place`."""
+        return self.contact.gap((self._r0.renew() + y).reshape(-1, 3), 0.0, self._h / 2 * self._factor.renew())
+
+    def _expanded(self) -> "_Expanded":
+        """The penalty where points are pressed, few of all."""
+        gap, n, N = self._gaps.renew()
+        about = self._about[0] if self._about else gap
+        pressed = about < 0
+        k = float(self.stiffness.value)
+        value, first, second = (a[:, None] for a in penalty(-about[pressed], k, SOFT * self._h))
+        if self._about:
+            more = (about - gap)[pressed, None]
+            value, first = value + more * (first + more / 2 * second), first + more * second
+        return _Expanded(pressed, value, first, second, n[pressed], N[pressed])
+
+    def _polynomials(self) -> Array:
+        """psi, its gradient and its Hessian at the places of the points."""
+        y = self.place
         flat = np.zeros((*y.shape[:2], SIZE))
         flat[..., :3] = y
-        flat.reshape(-1, SIZE)[pressed, 3:] = np.concatenate([value, gradient, pairs], axis=1)
-        self.polynomial.renew(flat)
+        pressed, psi = self._step_mean() if self._mean else self._pressed.renew().penalty()
+        flat.reshape(-1, SIZE)[pressed, 3:] = psi
+        return flat
 
-    def expand_about(self, other: "Pressing") -> None:
-        """Take in place of the penalty its Taylor polynomial about the present gap of the same contact elsewhere.
+    def _step_mean(self) -> tuple[NDArray[np.bool_], Array]:
+        gradient, H = self._mean
+        return np.ones(len(gradient), dtype=bool), _flat(np.zeros((len(gradient), 1)), gradient, H)
+
+    def _by_thickness(self) -> Array:
+        """The factor of the thickness, and what psi changes by with it."""
+        at = self._pressed.renew()
+        by_t = np.zeros((len(at.pressed), FACE))
+        by_t[:, 0] = self._factor.renew()
+        by_t[at.pressed, 1:] = self._h / 2 * np.concatenate([at.first, -at.second * at.n], axis=1)
+        return by_t.reshape(*self.polynomial.values.shape[:2], FACE)
+
+    def expand_about(self, gap: Array) -> None:
+        """Take in place of the penalty its Taylor polynomial about a gap, of the same contact elsewhere.
 
         For differences by a number of the case: a body that is hard closes or opens within a far smaller way.
         """
-        self._about, self._seen = other.gap, (np.empty(0), 0.0, 0.0)
+        self._about = (gap,)
 
     @property
     def place(self) -> Array:
@@ -293,8 +337,7 @@ class Pressing:
             Of the step at which the system has its forces.
         """
         k, soft, places = float(self.stiffness.value), SOFT * self._h, (begin, (begin + end) / 2, end)
-        half = self._h / 2 * self._factor
-        gaps, n, N = zip(*(self.contact.gap((self._r0 + y).reshape(-1, 3), 0.0, half) for y in places), strict=True)
+        gaps, n, N = zip(*(self._gap_at(y) for y in places), strict=True)
         s0, _, s1 = (-gap for gap in gaps)
         mean, slope = mean_pressure(s0, s1, k, soft)
         normal, bend = (n[0] + 4 * n[1] + n[2]) / 6, (2 * N[1] + N[2]) / 6
@@ -309,27 +352,24 @@ class Pressing:
         late = part - 0.5
         gradient = -times(mean, normal) - late * (times(p1, n[2]) - times(p0, n[0]))
         H = times(slope, outer(normal)) - times(mean, bend) + late * (times(stiff, outer(n[2])) - times(p1, N[2]))
-        self._mean, self._seen = (gradient, np.asarray(H / part)), (np.empty(0), 0.0, 0.0)
+        self._mean = gradient, np.asarray(H / part)
 
     def present(self) -> None:
         """Take the present forces again."""
-        self._mean, self._seen = None, (np.empty(0), 0.0, 0.0)
-
-    def renew_place(self) -> None:
-        """Take the placement anew."""
-        self._r0, self._known = at_quadrature(self._placement, self._points), np.empty(0)
+        self._mean = ()
 
     def cell_pressures(self) -> Array:
         """The mean pressure in each local cell, over E h/R: the ring of a contact is narrower than that of nodes."""
         V = self._u.function_space
         weights = basix.make_quadrature(V.mesh.basix_cell(), self._degree)[1]
+        self.polynomial.renew()
         size = np.linalg.norm(self.polynomial.values[..., 4:7], axis=-1)
         return np.asarray(size @ weights / weights.sum())
 
     def region(self, comm: MPI.Comm, radius: float) -> Region:
         """Where the body touches; `radius` is the mean one."""
         owned = slice(0, self._owned * len(self._points))
-        gap, x = self.gap[owned], (self._r0 + self._known).reshape(-1, 3)[owned] - self.contact.front
+        gap, x = self.gap[owned], (self._r0.renew() + self.place).reshape(-1, 3)[owned] - self.contact.front
         pressure, d = penalty(-gap, float(self.stiffness.value), SOFT * self._h)[1], self.contact.direction
         most = comm.allreduce(float(pressure.max(initial=0.0)), MPI.MAX)
         from_axis = np.linalg.norm(x - (x @ d)[:, None] * d, axis=1)[pressure > PRESSED * most]
@@ -365,8 +405,7 @@ class Pressings:
             pressing.present()
 
     def _places(self, state: State) -> list[Array]:
-        self._system.with_ghosts(state.u, state.mu)
-        return [pressing.place for pressing in self._pressings]
+        return self._system.at(state).of(lambda: [pressing.place for pressing in self._pressings])
 
     def stored(self, u: Vector, mu: Amplitudes) -> float:
         """The energy of the shell itself with that of the contacts."""

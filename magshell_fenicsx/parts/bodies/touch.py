@@ -1,6 +1,7 @@
 """Contact of bodies: the first one, a free flight that arc length could not measure, and how stiff bodies must be."""
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -83,8 +84,7 @@ def refuse_crossing(stage: Stage, low: Point, high: Point) -> None:
     for known in model.fields:
         ends = list[tuple[NDArray[np.float64], Mapping[str, float]]]()
         for state in states:
-            model.system.with_ghosts(state.u, state.mu)
-            ends.append((known.places, state.mu))
+            ends.append((model.system.at(state).of(partial(getattr, known, "places")), state.mu))
         if said := [each for each in model.system.comm.allgather(known.passed(*ends)) if each]:
             raise PathStopped(said[0], low, final=True)
 

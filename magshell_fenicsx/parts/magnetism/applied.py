@@ -12,7 +12,7 @@ from dolfinx import fem
 from numpy.typing import NDArray
 from ufl.core.expr import Expr
 
-from magshell_fenicsx.assembly.point_field import PointField, at_quadrature
+from magshell_fenicsx.assembly.following import Follows, PointField, at_quadrature
 from magshell_fenicsx.models.shell.crossing import crossing
 from magshell_fenicsx.models.shell.patterns import refuse_unbounded
 from magshell_fenicsx.parts.magnetism.driven import Driven, FieldInSpace, Here, carried
@@ -59,7 +59,7 @@ class AppliedField:
     polynomial
         The parameter of the densities.
     mu
-        The amplitudes of the driven fields, to be set before `follow`.
+        The amplitudes of the driven fields.
     lost
         Where the field was not finite, since a walk began and emptied this.
     """
@@ -74,51 +74,39 @@ class AppliedField:
         self.mu = {name: 0.0 for each in driven for name in each.names}
         self.lost = ""
         self._here: list[Here] = []
-        self._known: tuple[Array, dict[str, float]] = np.empty(0), {}
-        self._still: tuple[Array, Array, Array] | None = None
-        self._placement = r0
-        self._r0 = at_quadrature(r0, self.polynomial.points)
-        B, G, H = self._values(self._r0.reshape(-1, 3))
+        points = self.polynomial.points
+        self._r0 = Follows(lambda: at_quadrature(r0, points), lambda: (r0.x.array,))
+        self._moved = Follows(lambda: at_quadrature(u, points), lambda: (u.x.array,))
+        self._still = Follows(lambda: of(self.places), lambda: (r0.x.array, u.x.array))
+        places = self._r0.renew()
+        B, G, H = self._sum(of(places.reshape(-1, 3)), places.reshape(-1, 3))
         known = np.isfinite(G).all(axis=(1, 2)) & np.isfinite(H).all(axis=(1, 2, 3))
-        self._B0 = np.where(np.reshape(known, (-1, 1)), B, np.nan).reshape(self._r0.shape)
-        refuse_unbounded(self._B0, self._r0, V.mesh.comm, "magnetic.applied")
-        self.follow()
+        self._B0 = np.where(np.reshape(known, (-1, 1)), B, np.nan).reshape(places.shape)
+        refuse_unbounded(self._B0, places, V.mesh.comm, "magnetic.applied")
+        self.polynomial.follow(self._polynomials, lambda: (r0.x.array, u.x.array, *self.mu.values()))
 
     @property
     def names(self) -> tuple[str, ...]:
         """The amplitudes of the driven fields."""
         return tuple(self.mu)
 
-    def follow(self) -> None:
-        """Renew the polynomials where the displacement or a driven field has changed."""
-        if np.array_equal(self._u.x.array, self._known[0]):
-            if self.mu == self._known[1]:
-                return
-        else:
-            self._still = None
-        self._known = np.array(self._u.x.array), dict(self.mu)
-        u = at_quadrature(self._u, self.polynomial.points)
-        x = self._r0 + u
-        B, G, H = self._values(x.reshape(-1, 3))
+    def _polynomials(self) -> Array:
+        u, x = self._moved.renew(), self.places
+        B, G, H = self._sum(self._still.renew(), x)
         bad = ~np.isfinite(B).all(axis=1)
-        self.lost = self._where(x.reshape(-1, 3)[bad][0]) if bad.any() else self.lost
+        self.lost = self._where(x[bad][0]) if bad.any() else self.lost
         second = H[:, :, *PAIRS] * np.where(PAIRS[0] == PAIRS[1], 0.5, 1.0)
         flat = [a.reshape(*u.shape[:2], -1) for a in (u, self._B0, B, G, second)]
-        self.polynomial.renew(np.concatenate(flat, axis=-1))
+        return np.concatenate(flat, axis=-1)
 
-    def renew_place(self) -> None:
-        """Take the placement anew."""
-        self._r0 = at_quadrature(self._placement, self.polynomial.points)
-        self._known, self._still = (np.empty(0), {}), None
+    def slope(self, name: str, other: str = "") -> PointField:
+        """The polynomials of dB/dmu, or the values of d2B/dmu_i dmu_j, by driven amplitudes."""
+        field = PointField(self._u.function_space.mesh, self._degree, SIZE)
+        field.follow(lambda: self._slopes(name, other), lambda: (self.polynomial.renew(),))
+        return field
 
-    def slope(self, name: str) -> PointField:
-        """A field for the derivatives by a driven amplitude, to be filled by `renew`."""
-        assert name in self.mu
-        return PointField(self._u.function_space.mesh, self._degree, SIZE)
-
-    def renew(self, field: PointField, name: str, other: str = "") -> None:
-        """Fill a field with the polynomials of dB/dmu, or with the values of d2B/dmu_i dmu_j, at the present place."""
-        values = np.zeros_like(field.values)
+    def _slopes(self, name: str, other: str) -> Array:
+        values = np.zeros_like(self.polynomial.values)
         values[..., :3] = self.polynomial.values[..., :3]
         shape = values.shape[:2]
         for here in self._here:
@@ -127,12 +115,12 @@ class AppliedField:
                 values[..., 6:9] += B.reshape(*shape, 3)
                 if G is not None:
                     values[..., 9:18] += G.reshape(*shape, 9)
-        field.renew(values)
+        return values
 
     @property
     def places(self) -> Array:
         """The present places (n, 3) of the quadrature points."""
-        return (self._r0 + at_quadrature(self._u, self.polynomial.points)).reshape(-1, 3)
+        return (self._r0.renew() + self._moved.renew()).reshape(-1, 3)
 
     def passed(self, before: tuple[Array, Mapping[str, float]], after: tuple[Array, Mapping[str, float]]) -> str:
         """Through what a point has moved between two states, from their places and amplitudes; "" if through none."""
@@ -145,11 +133,10 @@ class AppliedField:
                     return f"a point of the shell {said} between two points of the path"
         return ""
 
-    def _values(self, x: Array) -> tuple[Array, Array, Array]:
-        if self._still is None:
-            self._still = self._of(x)
+    def _sum(self, still: tuple[Array, Array, Array], x: Array) -> tuple[Array, Array, Array]:
+        """B, G and H of the field that no amplitude drives and of those that are driven, at places."""
         self._here = [each.at(x, self.mu) for each in self._driven]
-        parts = [self._still, *(here.value for here in self._here)]
+        parts = [still, *(here.value for here in self._here)]
         B, G, H = (np.sum(part, axis=0) for part in zip(*parts, strict=True))
         return B, G, H
 

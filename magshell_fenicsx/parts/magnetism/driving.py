@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 import ufl
 from dolfinx import fem
 
+from magshell_fenicsx.assembly.following import PointField
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.parameter import Derivative, bends_of
-from magshell_fenicsx.assembly.point_field import PointField
 from magshell_fenicsx.assembly.terms import FormTerm, Term
 from magshell_fenicsx.parts.magnetism.applied import AppliedField
 
@@ -35,20 +35,18 @@ class FieldParameter:
 
     The energy is linear in the field: of dB/dmu it is dPi/dmu. So the forms are those of the terms, with the
     polynomials of the derivatives.
+
+    Attributes
+    ----------
+    slopes
+        dPi_i/dmu as terms.
     """
 
     constant: Amplitude
     terms: Sequence[FormTerm]
     log: KernelLog
-    _slope: PointField
-    _slopes: Sequence[FormTerm]
-    _bends: dict[str, tuple[PointField, list[FormTerm]]] = field(default_factory=dict)
-
-    @property
-    def slopes(self) -> Sequence[FormTerm]:
-        """dPi_i/dmu as terms, at the present displacement and amplitudes."""
-        self.constant.known.renew(self._slope, self.constant.name)
-        return self._slopes
+    slopes: Sequence[FormTerm]
+    _bends: dict[str, list[FormTerm]] = field(default_factory=dict)
 
     def bends(self, q: object) -> Sequence[Derivative]:
         """d2Pi_i/dmu dq with the amplitudes that multiply them."""
@@ -56,12 +54,11 @@ class FieldParameter:
         if not isinstance(q, Amplitude) or q.known is not known:
             return bends_of(q, self.constant)
         if q.name not in self._bends:
-            bend = known.slope(q.name)
-            terms = [FormTerm(t.name, _with(t.form, known, bend), t._u, self.log, t.amplitude) for t in self.terms]
-            self._bends[q.name] = bend, terms
-        bend, terms = self._bends[q.name]
-        known.renew(bend, self.constant.name, q.name)
-        return terms
+            bend = known.slope(self.constant.name, q.name)
+            self._bends[q.name] = [
+                FormTerm(t.name, _with(t.form, known, bend), t._u, self.log, t.amplitude) for t in self.terms
+            ]
+        return self._bends[q.name]
 
 
 def field_parameters(
@@ -76,7 +73,7 @@ def field_parameters(
             slopes = [FormTerm(t.name, _with(t.form, known, slope), u, log, t.amplitude) for t in own]
             for each in slopes:
                 each.compile_residual()
-            found[name] = FieldParameter(Amplitude(known, name), own, log, slope, slopes)
+            found[name] = FieldParameter(Amplitude(known, name), own, log, slopes)
     return found
 
 

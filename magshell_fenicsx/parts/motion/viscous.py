@@ -14,7 +14,7 @@ from dolfinx import fem
 from numpy.typing import NDArray
 from ufl.core.expr import Expr
 
-from magshell_fenicsx.continuation.system import Amplitudes, Tangent, Vector, max_abs
+from magshell_fenicsx.continuation.system import Amplitudes, State, Tangent, Vector, max_abs
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.shell import densities, edges
 from magshell_fenicsx.models.shell import kinematics as kin
@@ -190,7 +190,7 @@ class Viscosity:
         given.stiffness.value = stiffness
         for field, displacement in ((given.before, u0), (given.after, u1)):
             field.x.array[:] = system.with_ghosts(displacement, self._mu)
-        return system.gradient_of(u1, self._mu, self._forms)
+        return system.at(State(u1, self._mu)).gradient(self._forms)
 
     def _evolved(self, u0: Vector, u1: Vector, dt: float) -> list[Array]:
         """q at the end of a step; the strain is quadratic in time through its ends and the begin of the step before."""

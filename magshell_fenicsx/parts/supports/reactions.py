@@ -50,7 +50,7 @@ def reactions(model: Observed, state: State, mirror: Mirror | None = None) -> di
     system, comm = model.system, model.system.comm
     R, taken = system.forces(state.u, state.mu), np.zeros(system.size, dtype=bool)
     axes = system.u.function_space.dofmap.index_map_bs
-    r = in_space(model.r0.x.array[: system.size] + system.u.x.array[: system.size], axes)
+    r = in_space(model.r0.x.array[: system.size] + system.with_ghosts(state.u, state.mu)[: system.size], axes)
     found: dict[str, Reaction] = {}
     for name, support in model.supports.items():
         dofs = support.dofs[support.dofs < system.size]

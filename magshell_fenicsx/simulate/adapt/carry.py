@@ -48,10 +48,9 @@ def carry(source: Scene, target: Scene, u: Vector) -> Vector:
 def gathered(scene: Scene, u: Vector) -> Array:
     """Values (cells, nodes, components) of a displacement on the cells of all ranks, on every rank; collective."""
     system, V = scene.model.system, scene.model.V
-    system.set(u)
     topology = V.mesh.topology
     here = V.dofmap.list[: topology.index_map(topology.dim).size_local]
-    return np.concatenate(system.comm.allgather(system.u.x.array.reshape(-1, V.dofmap.bs)[here]))
+    return np.concatenate(system.comm.allgather(system.with_ghosts(u).reshape(-1, V.dofmap.bs)[here]))
 
 
 class CellFields:

@@ -204,13 +204,16 @@ def _of_wave(scene: Scene, record: Record) -> Adjoint:
 def variation(model: MeridianModel, state: State, phi: Vector, m: int, names: Iterable[str]) -> Functional:
     """Q_m(phi) of a wave, with its derivatives by u and by some amplitudes."""
     terms, system, mu = model.excluded_modes.waves.along(phi, m), model.system, state.mu
-    system.at(state.u, mu)
-    by_u = np.zeros(system.size)
-    for term in terms:
-        term.add_residual(by_u, factor_of(term.amplitude, mu))
-    value = sum((factor_of(term.amplitude, mu) * term.energy() for term in terms), 0.0)
-    by_mu = {name: sum((term.energy() for term in terms if term.amplitude == name), 0.0) for name in names}
-    return Functional(value, system.held(by_u), by_mu)
+
+    def present() -> Functional:
+        by_u = np.zeros(system.size)
+        for term in terms:
+            term.add_residual(by_u, factor_of(term.amplitude, mu))
+        value = sum((factor_of(term.amplitude, mu) * term.energy() for term in terms), 0.0)
+        by_mu = {name: sum((term.energy() for term in terms if term.amplitude == name), 0.0) for name in names}
+        return Functional(value, system.held(by_u), by_mu)
+
+    return system.at(state).of(present)
 
 
 def adjoint(
@@ -324,8 +327,8 @@ def by_load(adjoint: Adjoint, name: str) -> float:
         found += place.energy and place.energy * system.potential(u, mu, name)
         found += sum(c * system.curvature(u, mu, i, name) for i, c in place.conjugates.items())
     if adjoint.directions:
-        system.at(adjoint.state.u, adjoint.state.mu)
-        own = sum(c * term.energy() for term, c in along(scene, adjoint) if term.amplitude == name)
+        terms = [(term, c) for term, c in along(scene, adjoint) if term.amplitude == name]
+        own = system.at(adjoint.state).of(lambda: sum(c * term.energy() for term, c in terms))
         found += system.comm.allreduce(own)
     return float(found)
 
@@ -391,7 +394,7 @@ def _by_conjugate(load: PathStep, record: Record) -> bool:
 
 
 def along(scene: Scene, adjoint: Adjoint) -> list[tuple[FormTerm, float]]:
-    """The energies of the directions, at the displacement that is set, and their factors."""
+    """The energies of the directions, and their factors."""
     model, found = scene.model, list[tuple[FormTerm, float]]()
     for d in adjoint.directions:
         phi = d.phi if d.wave is not None else transfer(adjoint.scene, scene, d.phi)

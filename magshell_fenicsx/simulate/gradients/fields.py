@@ -8,6 +8,7 @@ with it, and the triangulation stays.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import basix
 import numpy as np
@@ -70,9 +71,9 @@ def by_field(adjoint: Adjoint, name: str) -> FieldGradient:
     model, kind = scene.model, FIELDS[name]
     if name == "deviation" and (model.contacts or getattr(scene.plan.loads.magnetic, "in_space", None)):
         raise CaseError("deviation: no gradient beside bodies, or in a field that is known at points of space")
-    parts = list[Array]()
-    for number, place in enumerate(adjoint.places):
-        model.system.at(place.state.u, place.state.mu)
+
+    def part(number: int, place: Place) -> tuple[fem.Function, list[Array]]:
+        """The field, and what a place gives, whose state is set."""
         terms = _terms(scene, place.state, name)
         f = next((c for t in terms for c in t.form.coefficients() if c.name == kind.coefficient), None)
         if f is None or (isinstance(model, SolidModel) and kind.coefficient != "Br"):
@@ -84,11 +85,16 @@ def by_field(adjoint: Adjoint, name: str) -> FieldGradient:
         if not number:
             shares += [Share(t, c * factor_of(t.amplitude, place.state.mu), 0.0) for t, c in along(scene, adjoint)]
         w = _contracted(scene, place)
-        parts.append(summed(shares, f, model.u, w, model.kernels))
+        forces = [summed(shares, f, model.u, w, model.kernels)]
         if name == "thickness" and scene.plan.loads.contacts:
-            parts.append(_of_starts(scene, shares, f, w))
-    assert f
-    forces = np.sum(parts, axis=0)
+            forces.append(_of_starts(scene, shares, f, w))
+        return f, forces
+
+    parts = [
+        model.system.at(place.state).of(partial(part, number, place)) for number, place in enumerate(adjoint.places)
+    ]
+    f = parts[-1][0]
+    forces = np.sum([each for _, of_place in parts for each in of_place], axis=0)
     places, normals = (v[: len(forces)] for v in places_of(scene, f))
     if name == "deviation":
         places = _perfect(scene, places, normals)

@@ -1,6 +1,7 @@
 """Derivatives by single numbers: an amplitude, or a key of the case."""
 
 from collections.abc import Callable
+from functools import partial
 
 from magshell_fenicsx.assembly.terms import factor_of
 from magshell_fenicsx.case.units import sizes_of
@@ -46,8 +47,8 @@ def by_number(adjoint: Adjoint, key: str) -> float:
             )
         if adjoint.by_itself:
             total += adjoint.by_itself(other, state)
-        other.model.system.at(state.u, state.mu)
-        energies = sum(c * factor_of(t.amplitude, state.mu) * t.energy() for t, c in along(other, adjoint))
+        terms = [(c * factor_of(t.amplitude, state.mu), t) for t, c in along(other, adjoint)]
+        energies = other.model.system.at(state).of(lambda: sum(c * t.energy() for c, t in terms))
         return float(total + other.model.system.comm.allreduce(energies))
 
     return _slope(contracted, value, BESIDE if scene.model.contacts else STEP)
@@ -79,10 +80,9 @@ def size_by_number(adjoint: Adjoint, key: str) -> float:
 
 def _expand(scene: Scene, other: Scene, state: State) -> None:
     """Take the penalties of bodies in another scene on the same mesh as polynomials about a state of the first one."""
-    if scene.model.contacts:
-        scene.model.system.at(state.u, state.mu)
+    at = scene.model.system.at(state)
     for name, (pressing, _) in scene.model.contacts.items():
-        other.model.contacts[name][0].expand_about(pressing)
+        other.model.contacts[name][0].expand_about(at.of(partial(getattr, pressing, "gap")))
 
 
 def _moved(scene: Scene, other: Scene, state: State) -> State:

@@ -58,7 +58,7 @@ def test_term_alone(shell: Shells, name: str, degree: int) -> None:
     """To 1e-12 at random nodal values, nothing held; added to what is there. So is the energy."""
     model = shell(degree, half=name == "mirror edges", energy=TERMS[name])
     term = next(t for t in model.system.terms if t.name == name)
-    model.system.set(random_displacement(model, 1e-3))
+    model.u.x.array[:] = random_displacement(model, 1e-3)
     reference, found = np.zeros_like(model.u.x.array), np.ones_like(model.u.x.array)
     term.add_residual(reference, -0.7)
     residual = FastResidual(model.r0, model.u, degree, [term], KernelLog())
@@ -112,7 +112,7 @@ def test_slivers(aspect: float) -> None:
     )
     model.V.mesh.geometry.x[:, 1] /= aspect
     model.r0.x.array.reshape(-1, 3)[:, 1] /= aspect
-    model.system.set(random_displacement(model, 1e-3) * np.tile([1, 1 / aspect, 1], model.system.size // 3))
+    model.u.x.array[:] = random_displacement(model, 1e-3) * np.tile([1, 1 / aspect, 1], model.system.size // 3)
     for term in model.system.terms:
         residual = FastResidual(model.r0, model.u, 4, [term], KernelLog())
         reference, found = np.zeros_like(model.u.x.array), np.zeros_like(model.u.x.array)

@@ -151,8 +151,7 @@ def test_derivatives(model: str, symmetry: str, shell: dict[str, Any], size: flo
     mu = dict(BOTH)
 
     def energy(x: np.ndarray, at: dict[str, float]) -> float:
-        system.place(at)
-        return sum(system.energies(x).values())
+        return sum(system.energies(x, at).values())
 
     def moved(name: str, step: float) -> dict[str, float]:
         return {**mu, name: mu[name] + step}

@@ -130,7 +130,7 @@ def test_small_folds_are_smooth_edges() -> None:
     """Where cells meet smoothly the two forms of the jump agree to the square of its angle."""
     model = ShellModel(panel(0.25), MATERIAL, 3, {}, Loads())
     factory = TermFactory(model.r0, model.u, MATERIAL, model.sigma, 3, KernelLog())
-    model.system.set(random_displacement(model, 1e-5))
+    model.u.x.array[:] = random_displacement(model, 1e-5)
     smooth, folded = (replace(factory, folded=f).interior_edges().energy() for f in (False, True))
     assert folded == pytest.approx(smooth, rel=1e-3)
 
@@ -144,7 +144,7 @@ def test_moment_counts_turns() -> None:
         Q = np.array([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]])
         # the right edge runs along -e3 with the surface on its left... the sign is that of the outward normal
         u = (x @ Q.T - x).ravel()
-        state = model.system.counted(State(u, {"load": 1.0}), state.mu)
+        state = model.system.advance(State(u, {"load": 1.0}), state.mu)
         found = -model.system.potential(u, state.mu, "load")
         assert abs(found) == pytest.approx(0.01 * a, rel=1e-9)
         assert -model.system.potential(u, state.mu, "load") == found  # asking changes nothing

@@ -57,7 +57,7 @@ def times(tangent: Tangent, v: Array) -> Array:
 def work(of: ms.Scene, u: Array, v: Array) -> float:
     """p int n . v da of p/p_c = 1 by Nanson's formula, with a rule of another degree; of a solid on its outer face."""
     model = of.model
-    model.system.set(u)
+    model.u.x.array[:] = u
     w = fem.Function(model.V)
     w.x.array[: len(v)] = v
     unit = model.material.classical_pressure / model.material.h

@@ -30,7 +30,7 @@ def solve(size: float, degree: int, w0_over_h: float = 1e-4) -> tuple[float, flo
     assert found.converged
     u = found.state.u
     w0 = model.deflection(u, "pole")
-    model.system.set(u)
+    model.u.x.array[:] = u
     jets = kin.jet(model.r0, model.V.mesh), kin.jet(model.u, model.V.mesh)
     r, c = jets[0].r, -p / (64 * D)
     H = c * (8 * ufl.outer(r, r) - 4 * (1 - ufl.dot(r, r)) * ufl.Identity(3))  # Hessian of c (1 - r^2)^2
