@@ -194,12 +194,6 @@ class FiniteElementSystem:
             if self.moving.names <= mu.keys():
                 self.moving.put(self.u.x.array, mu)
 
-    def _renew(self) -> None:
-        """Renew what forms of others take of the terms as it is."""
-        for term in self.terms:
-            if isinstance(term, FormTerm):
-                term.renew()
-
     def _finite(self, value: float) -> bool:
         """Whether a number is one on all ranks."""
         here = bool(np.isfinite(value))
@@ -350,6 +344,14 @@ class Evaluated:
         self._system._put(self._u, self._mu)
         return function()
 
+    def assembled(self, function: Callable[[], Given]) -> Given:
+        """The same of a function that assembles compiled forms, which take the terms' fields as they are."""
+        system = self._present
+        for term in system.terms:
+            if isinstance(term, FormTerm):
+                term.renew()
+        return function()
+
     def energies(self) -> dict[str, float]:
         """Each term's potential, without its amplitude."""
         system, mu = self._present, self._mu
@@ -366,18 +368,18 @@ class Evaluated:
 
     def integral(self, form: fem.Form) -> float:
         """The value of a compiled form, summed over all ranks."""
-        system = self._present
-        system._renew()
-        return float(system.comm.allreduce(fem.assemble_scalar(form)))
+        return float(self._system.comm.allreduce(self.assembled(lambda: fem.assemble_scalar(form))))
 
     def gradient(self, forms: Sequence[fem.Form]) -> Vector:
         """The sum of compiled linear forms over all ranks, zero at supports."""
-        system = self._present
-        system._renew()
-        part: NDArray[np.float64] = np.zeros_like(system.u.x.array)
-        for form in forms:
-            fem.assemble_vector(part, form)
-        return system._summed(part)
+        part: NDArray[np.float64] = np.zeros_like(self._system.u.x.array)
+
+        def add() -> None:
+            for form in forms:
+                fem.assemble_vector(part, form)
+
+        self.assembled(add)
+        return self._system._summed(part)
 
     def residual(self) -> Vector:
         """dPi/du; the terms that are not numbers are noted in the system's `strange`."""

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.continuation.system import Skewed, State
 from magshell_fenicsx.input.source import Source
+from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.scene import Scene
@@ -148,6 +149,8 @@ def all_of(scene: Scene, state: State) -> list[Array]:
     tangent = system.tangent(u, mu)
     parts = (tangent.K, tangent.N) if isinstance(tangent, Skewed) else (tangent,)
     values = [np.array(part.getValuesCSR()[2]) for part in parts]
+    if isinstance(scene.model, MeridianModel):
+        values.append(np.array(scene.model.excluded_modes.waves.tangent(state, 2).getValuesCSR()[2]))
     return [shown, np.array(numbers), system.residual(u, mu), system.forces(u, mu), *columns, *values]
 
 

@@ -89,7 +89,7 @@ class Waves:
 
     def tangent(self, state: State, m: int) -> PETSc.Mat:
         """The matrix of Q_m at an axisymmetric state; it is reused by the next call."""
-        self._system.at(state).of(lambda: self._assemble(self._K, state, m, self.held(m)))
+        self._system.at(state).assembled(lambda: self._assemble(self._K, state, m, self.held(m)))
         return self._K
 
     def along(self, phi: NDArray[np.float64], m: int) -> list[FormTerm]:
@@ -119,7 +119,7 @@ class Waves:
         between five, of m = 0, +-a and +-b. Q_-m is Q_m of the mirrored wave (U, -V, W), and so three are
         assembled. Only those that are not positive definite are factored for their inertia.
         """
-        values = self._system.at(state).of(lambda: [self._entries(state, m) for m in self._nodes[:3]])
+        values = self._system.at(state).assembled(lambda: [self._entries(state, m) for m in self._nodes[:3]])
         values += [_mirrored(v) for v in values[1:]]
         if not self._bands:
             self._bands = [Banded(*self._sparsity, self._rows(m)) for m in (1, 2)]
