@@ -116,8 +116,8 @@ class Integrator:
         self._K: PETSc.Mat | None = None
         self.factored: Factored | None = None
         self._x, self._y = mass.createVecs()
-        # the turns of edges under moments, whose work is counted on
-        self._counted: Callable[[State, Amplitudes], State] = getattr(system, "counted", lambda state, before: state)
+        # what a state has from its history: turns of edges under moments, whose work is counted on
+        self._advance: Callable[[State, Amplitudes], State] = getattr(system, "advance", lambda state, before: state)
 
     def begin(self, t: float, u: Vector, v: Vector, before: Motion | None = None) -> Motion:
         """A motion with the acceleration that the loads after t give it; sums go on from those of `before`.
@@ -135,7 +135,7 @@ class Integrator:
             work += self._kinetic(v, t, False)
         if self.device:
             u, v, mu = constrained(self.system, self.device, inverse, u, v, mu)
-        mu = self._counted(State(u, mu), before.mu if before else mu).mu
+        mu = self._advance(State(u, mu), before.mu if before else mu).mu
         if self.viscous:
             self.viscous.memory = before.memory if before else self.viscous.memory
             self.viscous.begin()
@@ -335,7 +335,7 @@ class Integrator:
     def _accepted(self, now: Motion, u: Vector, y: Array, dt: float) -> Motion:
         comm, rule, t = self.system.comm, self.rule, now.t + dt
         a, v = self._rates(now, u, dt)
-        mu = self._counted(State(u, self._at(now, y, 1.0, dt)), now.mu).mu
+        mu = self._advance(State(u, self._at(now, y, 1.0, dt)), now.mu).mu
         after, mean = Motion(t, u, v, a, mu), dict[str, float]()
         if self.averaged and self._driven & self.averaged.names:
             part = 1 - rule.alpha_f
