@@ -1,21 +1,18 @@
 """The whole case: its sections and what they must have in common."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import replace
 from functools import cached_property
-from math import pi, radians
+from math import radians
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, TypeVar
 
 import numpy as np
 from pydantic import Field, ModelWrapValidatorHandler, ValidationError, model_validator
 
-from magshell_fenicsx.case.bodies.registered import Bodies
 from magshell_fenicsx.case.frequencies import FrequenciesSection
 from magshell_fenicsx.case.gradients import GradientsSection
-from magshell_fenicsx.case.imperfections.dimple import DimpleSection
-from magshell_fenicsx.case.imperfections.random import RandomSection
 from magshell_fenicsx.case.loading import Loading, listed, programme, refuse_unfit_steps
 from magshell_fenicsx.case.mesh import SOLID_DEGREE, MeshSection
 from magshell_fenicsx.case.output import OutputSection
@@ -26,12 +23,13 @@ from magshell_fenicsx.input.chosen import Chosen
 from magshell_fenicsx.input.expressions import is_formula
 from magshell_fenicsx.input.file import FileKeys, digests
 from magshell_fenicsx.input.messages import InvalidCase
-from magshell_fenicsx.input.section import texts
+from magshell_fenicsx.input.section import lengths_with_units, texts
 from magshell_fenicsx.input.source import Source, read_source
 from magshell_fenicsx.input.targets import NOTED
 from magshell_fenicsx.parts.bodies.body import refuse_unfit_bodies, with_units
 from magshell_fenicsx.parts.bodies.press import approaches
-from magshell_fenicsx.parts.imperfections.place import Coordinates, ImperfectionSection, places_with_units
+from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionSection
+from magshell_fenicsx.parts.kinds import Bodies
 from magshell_fenicsx.parts.magnetism.fields import MagneticSection, layer_average, strength
 from magshell_fenicsx.parts.magnetism.sources.source import SourceSection
 from magshell_fenicsx.parts.motion.viscosity import refuse_unfit_viscosity
@@ -41,6 +39,7 @@ from magshell_fenicsx.parts.part import Context, Part, Scales
 from magshell_fenicsx.parts.registered import PARTS, WithParts
 from magshell_fenicsx.parts.step import ProgrammeStep, Step
 from magshell_fenicsx.parts.supports.boundary import EDGES, BoundarySection, refuse_taken
+from magshell_fenicsx.shape.ground import Coordinates
 from magshell_fenicsx.shape.sections import CapSurface, MeshSurface, RevolutionSurface, Surface, SurfaceSection
 from magshell_fenicsx.shape.shell import ShellSection
 from magshell_fenicsx.studies.sections import DesignSection, EnsembleSection
@@ -104,8 +103,8 @@ class Case(WithParts):
             for key in (
                 *texts(parts, is_formula),
                 *measured(data.get("natural")),
-                *places_with_units(data["shell"]),
-                *with_units(data.get("bodies")),
+                *_imperfections_with_units(section, data["shell"]),
+                *with_units(section.bodies, data.get("bodies")),
             ):
                 raise ValueError(f"{key}: has a unit, but the shell's lengths have none: give all of them one, or none")
         return section
@@ -131,12 +130,10 @@ class Case(WithParts):
         shell = self.shell
         if getattr(shell, "defect", None) and shell.imperfections:
             raise ValueError("shell.imperfections: give these or defect; a dimple of the list is the same as defect")
+        edge = None if shell.edge_polar is None else radians(shell.edge_polar)
         for key, section in self.imperfections.items():
             try:
-                section.refuse_unfit(shell.R_over_h, shell.poisson_ratio)
-                if isinstance(section, DimpleSection) and shell.geometry in ("hemisphere", "cap"):
-                    edge = radians(shell.polar) if isinstance(shell, CapSurface) else pi / 2
-                    section.refuse_wide(shell.R_over_h, shell.poisson_ratio, edge)
+                section.refuse_unfit(shell.R_over_h, shell.poisson_ratio, edge)
             except ValueError as e:
                 raise ValueError(f"shell.{key}: {e}") from None
         return self
@@ -261,16 +258,13 @@ class Case(WithParts):
         defect = shell.defect if isinstance(shell, ShellSection | CapSurface | RevolutionSurface) else None
         listed = dict[str, ImperfectionSection]()
         for i, section in enumerate(shell.imperfections):
-            if isinstance(section, RandomSection) and section.dimples:
-                listed |= {f"imperfections.{i}.{key}": dimple for key, dimple in section.drawn.items()}
-            else:
-                listed[f"imperfections.{i}"] = section
+            listed |= {f"imperfections.{i}{key}": each for key, each in section.listed().items()}
         return {"defect": defect} if defect else listed
 
     @property
     def dimples(self) -> dict[str, str]:
         """Names of the patches within the rims of dimples -> keys of `imperfections`."""
-        keys = [key for key, section in self.imperfections.items() if isinstance(section, DimpleSection)]
+        keys = [key for key, section in self.imperfections.items() if section.patch]
         return {"dimple" if i == 0 else f"dimple_{i + 1}": key for i, key in enumerate(keys)}
 
     @property
@@ -334,3 +328,15 @@ class Case(WithParts):
             return case.written_as(Origin(source.place, deepcopy(source.data), context))
         except ValidationError as e:
             raise InvalidCase(e.errors(), source, cls) from None
+
+
+def _imperfections_with_units(case: Case, shell: dict[str, Any]) -> Iterator[str]:
+    """The keys of imperfections that are lengths with a unit in plain data of a shell."""
+    written = {f"imperfections.{i}": item for i, item in enumerate(shell.get("imperfections") or [])}
+    sections: dict[str, object] = {f"imperfections.{i}": each for i, each in enumerate(case.shell.imperfections)}
+    if shell.get("defect"):
+        written["defect"], sections["defect"] = shell["defect"], case.imperfections["defect"]
+    for key, item in written.items():
+        section = sections[key]
+        assert isinstance(section, ImperfectionSection)
+        yield from lengths_with_units(type(section), item, f"shell.{key}.")

@@ -1,9 +1,10 @@
 """The base of all sections of a case: strict types, no unknown keys, numbers with units."""
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from functools import cache
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
@@ -125,9 +126,43 @@ def in_units(unit: str, *, bare: bool = False) -> Callable[[Any], float]:
     return convert
 
 
-def or_number(unit: str, number: Any = float) -> BeforeValidator:
+@dataclass(frozen=True, slots=True)
+class Measured(BeforeValidator):
+    """The validator of a number that may have a unit."""
+
+    unit: str = ""
+
+
+def or_number(unit: str, number: Any = float) -> Measured:
     """A validator: a number unchanged, or text converted to `unit`; `number` is its type in the schema."""
-    return BeforeValidator(in_units(unit), json_schema_input_type=number | with_unit(unit))
+    return Measured(in_units(unit), json_schema_input_type=number | with_unit(unit), unit=unit)
+
+
+def lengths_with_units(section: type[BaseModel], data: Mapping[str, Any], path: str = "") -> Iterator[str]:
+    """The keys of plain data of a section that are lengths by the types of its fields, and are text with a unit."""
+    for key, field in section.model_fields.items():
+        value = data.get(key)
+        if isinstance(value, dict):
+            for inner in _sections(field.annotation):
+                yield from lengths_with_units(inner, value, f"{path}{key}.")
+        elif any(isinstance(x, str) for x in (value if isinstance(value, list) else [value])) and _is_length(
+            field.annotation, field.metadata
+        ):
+            yield f"{path}{key}"
+
+
+def _is_length(annotation: Any, metadata: Iterable[Any] = ()) -> bool:
+    if any(isinstance(each, Measured) and each.unit == "metre" for each in metadata):
+        return True
+    return any(_is_length(part, getattr(part, "__metadata__", ())) for part in get_args(annotation))
+
+
+def _sections(annotation: Any) -> Iterator[type[BaseModel]]:
+    """The section classes within an annotation."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+    for part in get_args(annotation):
+        yield from _sections(part)
 
 
 NAMES = {

@@ -8,7 +8,7 @@ from magshell_fenicsx.case.units import sizes_of
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.msh import MeshFile
 from magshell_fenicsx.mesh.patch import MeshError, PatchMesh
-from magshell_fenicsx.parts.magnetism.sources.registered import placed
+from magshell_fenicsx.parts.magnetism.sources.field import placed
 from magshell_fenicsx.parts.pressure.openings import no_potential, ring_openings
 from magshell_fenicsx.problem.body import layers
 from magshell_fenicsx.problem.formulas import cells_of_patch, unshown, written
@@ -81,11 +81,11 @@ def _in_units(case: Case) -> list[str]:
 
 def _of_sources(case: Case) -> list[str]:
     """How strong magnets and coils are on the shell: too weak, and a place was meant in another unit."""
-    sources = placed(case)
+    sources = placed(case.context)
     if not sources:
         return []
     assert case.magnetic
-    places, unit = outline(case).sample(), case.magnetic.applied.reference or 1.0
+    places, unit = outline(case.shell).sample(), case.magnetic.applied.reference or 1.0
     sizes = 1e3 * abs(unit) * np.linalg.norm(np.sum([source(places)[0] for source in sources], axis=0), axis=1)
     return [f"field of the sources on the undeformed shell: {sizes.min():.4g} to {sizes.max():.4g} mT"]
 

@@ -22,7 +22,7 @@ from magshell_fenicsx.mesh.shapes import DiscShape, Shape, StripShape
 from magshell_fenicsx.models.shell.fitted import Cells, fitted
 from magshell_fenicsx.models.shell.patterns import LARGEST as LARGEST_VECTOR
 from magshell_fenicsx.models.shell.thickness import LEAST_FACTOR, MOST_FACTOR
-from magshell_fenicsx.parts.imperfections.flaw import Flaw
+from magshell_fenicsx.parts.imperfections.imperfection import Flaw
 from magshell_fenicsx.parts.natural.shape import LARGEST, SMALLEST
 from magshell_fenicsx.shape.outline import ANY, Outline
 

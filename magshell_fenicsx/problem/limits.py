@@ -10,7 +10,7 @@ from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.input.expressions import formula, with_derivatives
 from magshell_fenicsx.input.messages import shown
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.parts.magnetism.sources.registered import placed
+from magshell_fenicsx.parts.magnetism.sources.field import placed
 from magshell_fenicsx.platform.memory import available
 from magshell_fenicsx.problem.body import layers
 from magshell_fenicsx.problem.problem import Plan
@@ -114,7 +114,7 @@ def refuse_unbounded_fields(case: Case, r0: Array) -> None:
         )
     if not case.magnetic:
         return
-    for source in placed(case):
+    for source in placed(case.context):
         B = source(r0)[0]
         if len(strong := r0[np.isfinite(B).all(axis=1) & (np.abs(B) > LARGEST_RATIO).any(axis=1)]):
             x, y, z = strong[0]

@@ -22,10 +22,9 @@ from magshell_fenicsx.models.axisymmetric.meridian import graded_vertices
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.parameters import Condition, Held, Loads, Material
 from magshell_fenicsx.models.shell.thickness import Thickness
-from magshell_fenicsx.parts.bodies.registered import body_leaves, contacts, pressed
-from magshell_fenicsx.parts.imperfections.flaw import Flaw, in_frame
+from magshell_fenicsx.parts.bodies.standing import body_leaves, contacts, pressed
 from magshell_fenicsx.parts.imperfections.growth import grown_by
-from magshell_fenicsx.parts.imperfections.registered import flaws
+from magshell_fenicsx.parts.imperfections.imperfection import Flaw, flaws, in_frame
 from magshell_fenicsx.parts.imperfections.rims import MOST_RIMS, Spot, different, spots
 from magshell_fenicsx.parts.imperfections.symmetry import leaves
 from magshell_fenicsx.parts.magnetism.magnetisation import applied, field_fits, magnetisation
@@ -41,7 +40,8 @@ from magshell_fenicsx.problem.names import refuse_unfit_ends
 from magshell_fenicsx.problem.own_terms import surface_terms
 from magshell_fenicsx.problem.problem import Plan
 from magshell_fenicsx.problem.sizes import Loaded, grading, travel
-from magshell_fenicsx.shape.outline import Chart, Outline, outline, refuse_beside
+from magshell_fenicsx.shape.ground import refuse_beside
+from magshell_fenicsx.shape.outline import Chart, Outline, ground_of
 from magshell_fenicsx.shape.sections import MeshSurface
 from magshell_fenicsx.shape.symmetry import Leaves, askew, mirror, of_energy, of_points, of_shape, unmirrored
 
@@ -62,13 +62,16 @@ def make_plan(case: Case, terms: Sequence[OwnTerm] = ()) -> Plan:
         If the meridian has no such edge or point.
     """
     material = Material(case.shell.poisson_ratio, 1 / case.shell.R_over_h)
-    perfect = outline(case)
-    found = flaws(case, perfect)
+    ground = ground_of(case.shell)
+    perfect = ground.perfect
+    found = flaws(case.imperfections, ground)
     growing = {
         name: {key: found[key] for key in keys} for name, keys in grown_by(case.programme, case.imperfections).items()
     }
     still = {*found} - {key for keys in growing.values() for key in keys}
     drawn = imperfect(perfect, found, 0.0, still)
+    ground = replace(ground, drawn=drawn)
+    standing = case.bodies, case.approaches, {step.name for step in case.programme}
     context, last = case.context, {step.name: step for step in case.programme}
     at_place = {name: (step, step.load.place_on(step, context, drawn)) for name, step in last.items()}
     places = {name: (step, place) for name, (step, place) in at_place.items() if place is not None}
@@ -80,7 +83,7 @@ def make_plan(case: Case, terms: Sequence[OwnTerm] = ()) -> Plan:
     energies = surface_terms(case, terms)
     parts = _left(case, drawn, energies)
     parts += leaves(found, perfect, each=bool(case.patches))
-    parts += [body_leaves(contact) for contact in contacts(case, perfect, drawn, 0.0)]
+    parts += [body_leaves(contact) for contact in contacts(*standing, ground)]
     axisymmetric, plane = _symmetry(case, drawn, parts)
     half = plane is not None
     turn, beyond = 0.0, plane
@@ -103,8 +106,9 @@ def make_plan(case: Case, terms: Sequence[OwnTerm] = ()) -> Plan:
     local = [] if isinstance(case.shell, MeshSurface) else spots(found.items(), perfect, turn)
     wide = [flaw for flaw in found.values() if flaw.centre is None]
     everywhere, varying = min((flaw.size for flaw in wide), default=inf), list[Squares]()
-    bodies = contacts(case, perfect, drawn, turn)
-    touched = [(drawn.inverse(c.front), travel(material.h, pressed(case, c.body), c.size), c.size) for c in bodies]
+    bodies = contacts(*standing, replace(ground, turn=turn))
+    approached = {c.body: pressed(step.load for step in case.programme if step.name == c.amplitude) for c in bodies}
+    touched = [(drawn.inverse(c.front), travel(material.h, approached[c.body], c.size), c.size) for c in bodies]
     if not (axisymmetric or case.mesh.size):
         varying, everywhere = of_imperfections(wide, perfect, turn, case, material.h)
         varying += refinements(case, formulas, drawn, turn, material.h)
@@ -286,7 +290,7 @@ def _named_points(case: Case, drawn: Outline, turn: float, half: bool) -> Points
     Q, R = rotation(turn), case.shell.reference
 
     def chart(name: str, x: Array) -> Array:
-        refuse_beside(f"points.{name}", x, drawn, case.shell)
+        refuse_beside(f"points.{name}", x, drawn, R, with_units=case.shell.with_units)
         found = drawn.inverse(Q @ x)
         return drawn.on_half(found) if half else found
 

@@ -7,8 +7,6 @@ from math import inf, pi, radians
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.deviation import Deviated, Deviation
 from magshell_fenicsx.mesh.grading import Grading
 from magshell_fenicsx.mesh.grid import Grid
@@ -18,6 +16,7 @@ from magshell_fenicsx.mesh.patch import Embedding, MeshError
 from magshell_fenicsx.mesh.revolved import Arc, Capped, Profile, Revolved, Segment, Spline
 from magshell_fenicsx.mesh.shapes import DiscShape, Shape, StripShape
 from magshell_fenicsx.mesh.sphere import flat, sphere, upwards
+from magshell_fenicsx.shape.ground import Ground
 from magshell_fenicsx.shape.mirrors import grid_mirrors, lines_on, mesh_mirrors
 from magshell_fenicsx.shape.sections import (
     AnnulusSurface,
@@ -37,7 +36,6 @@ Array = NDArray[np.float64]
 Chart = Shape | Grid | MeshFile
 ANY = Grading([], 1.0)
 ROUNDING = 1e-9
-ON_SURFACE = 1e-6  # of R, within which a named point lies on the surface
 
 
 @dataclass(frozen=True)
@@ -96,10 +94,17 @@ class Outline:
 
     def sample(self) -> Array:
         """Places (n, 3) all over the surface, with its centre, edges and axes among them."""
-        chart = self.charts()
+        chart, nodes = self.charts(), self.nodes
         if chart is None:
-            return in_space(read_msh(self.chart(None, ANY), {}).nodes)  # type: ignore[arg-type]
+            assert nodes is not None
+            return in_space(nodes)
         return self.embedding(chart)
+
+    @property
+    def nodes(self) -> Array | None:
+        """Those of a mesh file, places with normals (n, 6) or alone (n, 3); None without a file."""
+        shape = self.chart(None, ANY)
+        return read_msh(shape, {}).nodes if isinstance(shape, MeshFile) else None
 
     def charts(self) -> Array | None:
         """Their charts (n, 2); None for a mesh file."""
@@ -148,9 +153,26 @@ class Outline:
         return self.edge < inf
 
 
-def outline(case: Case) -> Outline:
-    """The outline of a case's perfect shell."""
-    shell = case.shell
+def ground_of(shell: Surface | ShellSection) -> Ground:
+    """What imperfections, bodies and sources need of a shell, which has none as yet."""
+    perfect = outline(shell)
+    factor = shell.thickness_factor
+    return Ground(
+        shell.geometry,
+        perfect,
+        perfect,
+        shell.reference,
+        shell.R_over_h,
+        shell.poisson_ratio,
+        shell.with_units,
+        shell.edge_polar,
+        factor if isinstance(factor, str) else None,
+        (shell.model_dump_json(exclude={"imperfections"}), shell.digest if isinstance(shell, MeshSurface) else None),
+    )
+
+
+def outline(shell: Surface | ShellSection) -> Outline:
+    """The outline of a perfect shell."""
     if isinstance(shell, MeshSurface):
         file = MeshFile(shell.path, (shell.unit or 1.0) / shell.reference, bool(shell.imperfections), shell.files)
 
@@ -190,24 +212,6 @@ def outline(case: Case) -> Outline:
     return _ring(shell, profile, (names[0], names[1]))
 
 
-def refuse_beside(key: str, x: Array, outline: Outline, shell: Surface | ShellSection) -> None:
-    """See that the place (3,) at a key, over R, is on the surface.
-
-    Raises
-    ------
-    CaseError
-        With a place near it that is.
-    """
-    found = outline.inverse(x)
-    there = x if len(found) == 3 else outline.embedding(found[None])[0]
-    perfect = outline.perfect(found[None])[0] if len(found) == 2 else x
-    if min(float(np.linalg.norm(place - x)) for place in (there, perfect)) > ON_SURFACE:
-        size, unit = (1e3 * shell.reference, " mm") if shell.with_units else (shell.reference, "")
-        near = ", ".join(f"{c * size + 0.0:.8g}{unit}" for c in np.round(there, 12))
-        bare = "; a number without a unit is in metres here" if shell.with_units else ""
-        raise CaseError(f"{key}: is not on the surface; a place near it that is: [{near}]{bare}")
-
-
 def _disc(
     edge: float,
     name: str,
@@ -222,9 +226,9 @@ def _disc(
         return DiscShape(edge, mirror is not None, edge=name)
 
     def within(x: Array) -> Array:
-        found = inverse(x)
-        beyond = np.hypot(*found) / edge
-        return np.asarray(found / max(beyond, 1.0))
+        chart = inverse(x)
+        beyond = np.hypot(*chart) / edge
+        return np.asarray(chart / max(beyond, 1.0))
 
     def place(chart: Array) -> tuple[float, float]:
         return float(np.hypot(*chart)), float(np.arctan2(chart[1], chart[0]))

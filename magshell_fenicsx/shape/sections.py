@@ -10,12 +10,12 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import BeforeValidator, Field, ModelWrapValidatorHandler, PrivateAttr, ValidationInfo, model_validator
 
-from magshell_fenicsx.case.imperfections.dimple import DimpleSection
-from magshell_fenicsx.case.imperfections.registered import Imperfections
 from magshell_fenicsx.input.expressions import Formula, formula
 from magshell_fenicsx.input.file import FileKeys
 from magshell_fenicsx.input.section import Section, in_units, or_number, texts
-from magshell_fenicsx.parts.imperfections.sized import note_sizes
+from magshell_fenicsx.parts.imperfections.dimple import DimpleSection
+from magshell_fenicsx.parts.imperfections.imperfection import note_sizes
+from magshell_fenicsx.parts.kinds import Imperfections
 from magshell_fenicsx.parts.motion.history import Time
 from magshell_fenicsx.parts.motion.viscosity import Branches
 

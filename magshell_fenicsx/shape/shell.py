@@ -4,11 +4,11 @@ from typing import Any, Literal, Self
 
 from pydantic import Field, ModelWrapValidatorHandler, ValidationInfo, model_validator
 
-from magshell_fenicsx.case.imperfections.dimple import DimpleSection
-from magshell_fenicsx.case.imperfections.registered import Imperfections
 from magshell_fenicsx.input.expressions import Formula
 from magshell_fenicsx.input.section import Density, Length, Pressure, Section
-from magshell_fenicsx.parts.imperfections.sized import note_sizes
+from magshell_fenicsx.parts.imperfections.dimple import DimpleSection
+from magshell_fenicsx.parts.imperfections.imperfection import note_sizes
+from magshell_fenicsx.parts.kinds import Imperfections
 from magshell_fenicsx.parts.motion.history import Time
 from magshell_fenicsx.parts.motion.viscosity import Branches
 

@@ -14,13 +14,13 @@ from pydantic import ValidationError
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.gradients import FIELDS
-from magshell_fenicsx.case.imperfections.dimple import DimpleSection
-from magshell_fenicsx.case.imperfections.modes import ModesSection
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.section import number_and_unit, si_size
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.shell.model import ShellModel
+from magshell_fenicsx.parts.imperfections.dimple import DimpleSection
+from magshell_fenicsx.parts.imperfections.modes import ModesSection
 from magshell_fenicsx.problem.planner import make_plan
 from magshell_fenicsx.problem.problem import Plan
 from magshell_fenicsx.simulate.scene import Scene

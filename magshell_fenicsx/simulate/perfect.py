@@ -7,7 +7,6 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.imperfections.modes import ModesSection, Shape
 from magshell_fenicsx.case.mesh import MeshSection
 from magshell_fenicsx.continuation.modes import ModesNotFound
 from magshell_fenicsx.continuation.system import State
@@ -16,9 +15,9 @@ from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.axisymmetric.revolution import nodal_normals
 from magshell_fenicsx.models.modes import ShellMode, ShellModes
 from magshell_fenicsx.models.shell.model import ShellModel
-from magshell_fenicsx.parts.imperfections.flaw import in_frame
 from magshell_fenicsx.parts.imperfections.growth import ImperfectionStep
-from magshell_fenicsx.parts.imperfections.modes import Mirrored, on_meridian, on_surface
+from magshell_fenicsx.parts.imperfections.imperfection import in_frame
+from magshell_fenicsx.parts.imperfections.modes import Mirrored, ModesSection, Shape, on_meridian, on_surface
 from magshell_fenicsx.parts.pressure.pressure import PressureSection
 from magshell_fenicsx.platform import compat
 from magshell_fenicsx.simulate.follow import follow

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.terms import factor_of
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.imperfections.modes import ModesSection
 from magshell_fenicsx.case.opened import opened
 from magshell_fenicsx.continuation.journal import Journal, NoJournal
 from magshell_fenicsx.continuation.listener import NoProgress, Progress
@@ -28,6 +27,7 @@ from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.patterns import cells_of
 from magshell_fenicsx.models.solid.model import SolidModel
+from magshell_fenicsx.parts.imperfections.modes import ModesSection
 from magshell_fenicsx.parts.magnetism.direction import directions, field_angle, field_size
 from magshell_fenicsx.parts.magnetism.remanence import cells_of_body
 from magshell_fenicsx.parts.pressure.openings import no_potential

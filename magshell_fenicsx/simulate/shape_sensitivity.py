@@ -16,18 +16,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.imperfections.dimple import DimpleSection
-from magshell_fenicsx.case.imperfections.gaussian import GaussianSection
 from magshell_fenicsx.continuation.fold import Fold, sensitivity
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.mesh.deviation import Deviated, Deviation
 from magshell_fenicsx.mesh.mirror import Mirror
 from magshell_fenicsx.models.shell.model import ShellModel
-from magshell_fenicsx.parts.imperfections.flaw import in_frame
+from magshell_fenicsx.parts.imperfections.dimple import DimpleSection
+from magshell_fenicsx.parts.imperfections.gaussian import GaussianSection
 from magshell_fenicsx.parts.imperfections.growth import grown_by
-from magshell_fenicsx.parts.imperfections.place import ImperfectionSection
-from magshell_fenicsx.parts.imperfections.registered import flaws
-from magshell_fenicsx.shape.outline import outline
+from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionSection, flaws, in_frame
+from magshell_fenicsx.shape.outline import ground_of
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.stage import Stage
 from magshell_fenicsx.simulate.transfer import same_mesh, transfer
@@ -140,8 +138,8 @@ class _Mirrored:
 def _deviation(scene: Scene, case: Case, key: str) -> Deviation:
     """The deviation of an imperfection of another case, in the frame of the scene's model."""
     plan, number = scene.plan, list(scene.case.imperfections).index(key)
-    found = list(flaws(case, outline(case)).values())[number]  # the other case has random dimples one by one
-    turned = in_frame(found.deviation, plan.azimuth)
+    flaw = list(flaws(case.imperfections, ground_of(case.shell)).values())[number]  # that has random dimples one by one
+    turned = in_frame(flaw.deviation, plan.azimuth)
     return _Mirrored(turned, plan.mirror) if plan.mirror else turned
 
 

@@ -11,9 +11,9 @@ import scipy
 from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.field_derivative import FieldGradient
-from magshell_fenicsx.input.controls import read_vectors, write_vectors
 from magshell_fenicsx.input.section import in_unit, si_size
 from magshell_fenicsx.input.source import CaseError, Source
+from magshell_fenicsx.input.tables import read_vectors, write_vectors
 from magshell_fenicsx.mesh.frame import rotation
 from magshell_fenicsx.models.shell.controls import ByControls, Controls
 from magshell_fenicsx.models.shell.thickness import Thickness
@@ -398,7 +398,7 @@ def _places(case: Case, plan: Plan, count: int) -> Array:
     if case.shell.geometry == "strip":
         along = np.linspace(0.0, 1.0, count)
         return np.column_stack([along, 0 * along, 0 * along])
-    sample = outline(case).sample()
+    sample = outline(case.shell).sample()
     chosen, away = [0], np.full(len(sample), np.inf)
     while len(chosen) < min(count, len(sample)):
         away = np.minimum(away, np.linalg.norm(sample - sample[chosen[-1]], axis=1))

@@ -6,7 +6,7 @@ import pytest
 from conftest import CASES
 
 import magshell_fenicsx as ms
-from magshell_fenicsx.parts.imperfections.place import ImperfectionSection
+from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionSection
 
 R, H, NU = 25.2, 0.28, 0.5
 WIDTH = R / sqrt(sqrt(12 * (1 - NU**2)) * R / H)  # mm: the width 1

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from magshell_fenicsx.assembly.field_derivative import FieldGradient
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.continuation.fold import Guess, find_fold
-from magshell_fenicsx.input.controls import write_vectors
 from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.input.tables import write_vectors
 from magshell_fenicsx.models.shell.controls import ByControls
 from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.simulate.follow import follow

@@ -10,12 +10,11 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.imperfections.modes import ModesSection
 from magshell_fenicsx.input.source import CaseError, Source
-from magshell_fenicsx.parts.imperfections.modes import Round
-from magshell_fenicsx.parts.imperfections.registered import flaws
+from magshell_fenicsx.parts.imperfections.imperfection import flaws
+from magshell_fenicsx.parts.imperfections.modes import ModesSection, Round
 from magshell_fenicsx.runs.run import run
-from magshell_fenicsx.shape.outline import outline
+from magshell_fenicsx.shape.outline import ground_of, outline
 from magshell_fenicsx.simulate.perfect import perfect_modes, with_modes
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.shape_sensitivity import changed
@@ -58,9 +57,11 @@ def test_a_mode_computed_and_from_the_file_of_a_run(tmp_path: Path) -> None:
     (shape,) = computed.shell.imperfections[0].shapes  # type: ignore[union-attr]
     assert isinstance(shape, Round)
     assert shape.m == 4
-    x = outline(read).sample()
+    x = outline(read.shell).sample()
     x = x[x[:, 2] > 0.05]
-    one, other = (next(iter(flaws(c, outline(c)).values())).deviation(x) * 12 for c in (read, computed))
+    one, other = (
+        next(iter(flaws(c.imperfections, ground_of(c.shell)).values())).deviation(x) * 12 for c in (read, computed)
+    )
     assert np.abs(other).max() == pytest.approx(0.1, rel=0.05)
     assert alike(one, other, 1e-3)
     assert read.outside["imperfections.0.file"]
@@ -73,7 +74,7 @@ def test_modes_of_half_and_full_shells() -> None:
     load = {"kind": "pressure", "control": "load", "until": "target", "pressure": 0.05}
     data = {"shell": {**shell, "poisson_ratio": 0.3}, "boundary": edges, "loading": load, "mesh": {"degree": 3}}
     panel = Case.from_source(Source("panel.yaml", data))
-    x = outline(panel).sample()
+    x = outline(panel.shell).sample()
     whole = perfect_modes(panel.model_copy(update={"symmetry": "none"}), 2, MPI.COMM_SELF)
     halves = perfect_modes(panel, 2, MPI.COMM_SELF)
     for one, other in zip(whole, halves, strict=True):
@@ -101,4 +102,4 @@ def test_what_is_refused(tmp_path: Path) -> None:
     for name in ("mode.vtu", "other.vtu"):
         read = case(0.1, file=name, folder=tmp_path)
         with pytest.raises(CaseError, match=rf"shell\.imperfections\.0\.file: {name}: is no mode file"):
-            flaws(read, outline(read))
+            flaws(read.imperfections, ground_of(read.shell))

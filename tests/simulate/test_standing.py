@@ -7,7 +7,7 @@ import pytest
 from conftest import CASES
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.input.controls import write_vectors
+from magshell_fenicsx.input.tables import write_vectors
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.standing import Standing, refilled

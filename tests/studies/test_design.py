@@ -17,8 +17,8 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.input.controls import read_vectors
 from magshell_fenicsx.input.source import read_source
+from magshell_fenicsx.input.tables import read_vectors
 from magshell_fenicsx.models.shell.controls import Controls
 from magshell_fenicsx.runs.run import run
 from magshell_fenicsx.simulate.standing import Standing

@@ -1,19 +1,93 @@
-"""What all rigid bodies have in common."""
+"""What all rigid bodies have in common: their sections, where they stand, and their signed distance."""
 
 import re
-from collections.abc import Iterator, Mapping
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from math import inf
 from typing import Annotated, Any, Literal, Self
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from magshell_fenicsx.input.section import Section, or_number
-from magshell_fenicsx.parts.imperfections.place import At, Coordinates
+from magshell_fenicsx.input.section import Section, lengths_with_units, or_number
+from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.quantities.registry import endings
+from magshell_fenicsx.shape.ground import At, Coordinates
 
+Array = NDArray[np.float64]
 Axis = Annotated[list[Annotated[float, Field(ge=-1e9, le=1e9)]], Field(min_length=3, max_length=3)]
 Size = Annotated[float, or_number("metre"), Field(gt=0, le=1e9)]
-LENGTHS = ("position", "radius", "edge", "size")
+ALONG = 1e-6  # part of an axis across the approach that counts as none
+
+
+class Distance(ABC):
+    """The signed distance of a body at approach zero, positive outside, with its outline; all over R."""
+
+    @abstractmethod
+    def __call__(self, x: Array) -> tuple[Array, Array, Array]:
+        """Places (n, 3) -> the distance (n,), its gradient (n, 3) and its Hessian (n, 3, 3)."""
+
+    @property
+    @abstractmethod
+    def lines(self) -> list[Array]:
+        """Its outline: places (n, 3) along lines."""
+
+    @property
+    def held(self) -> Sequence[Array]:
+        """Vectors (3,) that a mirror plane through e3 must hold, of a body that is round about them."""
+        return ()
+
+    @property
+    def across(self) -> Sequence[Array]:
+        """Vectors (3,) of which each may lie in a mirror plane through e3, of a body with several planes."""
+        return ()
+
+
+@dataclass(frozen=True)
+class Placed:
+    """A body's place, dimensionless and in the model's frame.
+
+    Attributes
+    ----------
+    key
+        Of the case file, for messages.
+    front, centre
+        The place (3,) of its surface that goes ahead, and its reference point behind that.
+    direction
+        Unit vector (3,) of the approach.
+    Q
+        Turns vectors of the case into the model's frame.
+    R
+        The length that lengths are over.
+    """
+
+    key: str
+    front: Array
+    centre: Array
+    direction: Array
+    Q: Array
+    R: float
+
+    def across(self, axis: list[float]) -> Array:
+        """The unit vector along the part of an axis that is across the approach.
+
+        Raises
+        ------
+        CaseError
+            If there is none.
+        """
+        v = self.Q @ np.array(axis, dtype=float)
+        v = v - (v @ self.direction) * self.direction
+        if (size := float(np.linalg.norm(v))) < ALONG * np.linalg.norm(axis):
+            raise CaseError(f"{self.key}.axis: is along the approach; give an axis across it")
+        return np.asarray(v / size)
+
+    def axes(self, axis: list[float]) -> Array:
+        """Unit vectors as rows (3, 3): along an axis, across it and the approach, and along the approach."""
+        first = self.across(axis)
+        return np.stack([first, np.cross(self.direction, first), self.direction])
 
 
 class BodySection(Section):
@@ -50,6 +124,16 @@ class BodySection(Section):
         """Radius of what touches, in the case's unit; infinite for a plane."""
         return float(getattr(self, "radius", inf))
 
+    def distance(self, placed: Placed) -> Distance:
+        """Its distance where it stands.
+
+        Raises
+        ------
+        CaseError
+            If its axis is along the approach.
+        """
+        raise NotImplementedError
+
     @model_validator(mode="after")
     def _directions(self) -> Self:
         for key in ("direction", "axis"):
@@ -57,6 +141,26 @@ class BodySection(Section):
             if given is not None and not any(given):
                 raise ValueError(f"{key}: must not be zero")
         return self
+
+
+def place_body(section: BodySection, key: str, place: Array, normal: Array, half: float, Q: Array, R: float) -> Placed:
+    """Where a body is.
+
+    Parameters
+    ----------
+    place, normal
+        Of the undeformed mid-surface where it touches first, in the case's frame over R.
+    half
+        Half the thickness over R.
+    """
+    out = normal if section.side == "outside" else -normal
+    d = -out if section.direction is None else np.array(section.direction, dtype=float)
+    d = d / np.linalg.norm(d)
+    d, ahead = Q @ d, section.ahead / R
+    front = Q @ (place + half * out)
+    if section.position is not None:
+        front = Q @ (np.array(section.position) / R) + ahead * d
+    return Placed(key, front, front - ahead * d, d, Q, R)
 
 
 def refuse_unfit_bodies(bodies: Mapping[str, BodySection], *, solid: bool) -> None:
@@ -70,10 +174,27 @@ def refuse_unfit_bodies(bodies: Mapping[str, BodySection], *, solid: bool) -> No
         raise ValueError("bodies: press on a shell; of a solid give a force on a patch (kind: indentation, patch)")
 
 
-def with_units(bodies: Mapping[str, Any] | None) -> Iterator[str]:
-    """The keys of plain data of bodies that are text with a unit."""
-    for name, body in (bodies or {}).items():
-        data = {key: body.get(key) for key in LENGTHS} | {"at.point": (body.get("at") or {}).get("point")}
-        for key, value in data.items():
-            if any(isinstance(x, str) for x in (value if isinstance(value, list) else [value])):
-                yield f"bodies.{name}.{key}"
+def with_units(bodies: Mapping[str, BodySection], written: Mapping[str, Any] | None) -> Iterator[str]:
+    """The keys of bodies that are text with a unit in plain data."""
+    for name, body in (written or {}).items():
+        yield from lengths_with_units(type(bodies[name]), body, f"bodies.{name}.")
+
+
+def rounded(q: Array, edge: float) -> tuple[Array, Array, Array]:
+    """The signed distance from a convex corner in two or three coordinates, less a radius, with derivatives by q.
+
+    Parameters
+    ----------
+    q
+        (n, m) coordinates from the corner of the core, which is where all are negative.
+    edge
+        Radius that rounds the core.
+    """
+    m = np.maximum(q, 0.0)
+    far = np.linalg.norm(m, axis=1)
+    outside = far > 0
+    nearest = np.eye(q.shape[1])[q.argmax(axis=1)]
+    n = np.where(outside[:, None], m / np.maximum(far, 1e-300)[:, None], nearest)
+    active = (m > 0)[:, :, None] * np.eye(q.shape[1])
+    H = (active - n[:, :, None] * n[:, None, :]) / np.maximum(far, 1e-300)[:, None, None]
+    return np.where(outside, far, q.max(axis=1)) - edge, n, np.where(outside[:, None, None], H, 0.0)

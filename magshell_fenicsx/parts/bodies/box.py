@@ -1,21 +1,53 @@
-"""The distance from a box with rounded edges."""
+"""A box with rounded edges."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field, model_validator
 
-from magshell_fenicsx.case.bodies.box import BoxSection
-from magshell_fenicsx.parts.bodies.placed import Placed
-from magshell_fenicsx.parts.bodies.rounded import rounded
+from magshell_fenicsx.parts.bodies.body import Axis, BodySection, Distance, Placed, Size, rounded
 from magshell_fenicsx.shape.lines import edges
 
 Array = NDArray[np.float64]
 
 
+class BoxSection(BodySection):
+    """A box with rounded edges and corners."""
+
+    kind: Literal["box"]
+    size: Annotated[list[Size], Field(min_length=3, max_length=3)]
+    """Along `axis`, across it and the approach, and along the approach [the shell's length; over R if that has no
+    unit]"""
+    edge: Size
+    """Radius of the rounding, at most half of the smallest size [the shell's length; over R if that has no unit]"""
+    axis: Axis
+    """Along the first size, of any length; its part across the approach counts, and there must be one"""
+
+    @property
+    def ahead(self) -> float:
+        return self.size[2] / 2
+
+    @property
+    def blunt(self) -> float:
+        return min(self.size[:2]) / 2
+
+    @model_validator(mode="after")
+    def _edge_fits(self) -> Self:
+        if 2 * self.edge > min(self.size):
+            raise ValueError("edge: a rounding is at most half of the smallest size")
+        return self
+
+    def distance(self, placed: Placed) -> Distance:
+        half = np.array(self.size) / placed.R / 2
+        return Box(placed.centre, placed.axes(self.axis), half, self.edge / placed.R)
+
+
 @dataclass(frozen=True)
-class Box:
-    """A `Distance`: `axes` (3, 3) are its unit vectors as rows, `half` its half sizes along them."""
+class Box(Distance):
+    """`axes` (3, 3) are its unit vectors as rows, `half` its half sizes along them."""
 
     centre: Array
     axes: Array
@@ -30,13 +62,8 @@ class Box:
 
     @property
     def lines(self) -> list[Array]:
-        """Its outline: places (n, 3) along lines, over R."""
         return [self.centre + line @ self.axes for line in edges(-self.half, self.half)]
 
-
-def box(section: BoxSection, placed: Placed) -> Box:
-    """See `Placed`."""
-    half, d = np.array(section.size) / placed.R / 2, placed.direction
-    first = placed.across(section.axis)
-    axes = np.stack([first, np.cross(d, first), d])
-    return Box(placed.centre, axes, half, section.edge / placed.R)
+    @property
+    def across(self) -> Sequence[Array]:
+        return [*self.axes]

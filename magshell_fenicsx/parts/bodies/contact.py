@@ -21,11 +21,9 @@ from magshell_fenicsx.assembly.following import Follows, PointField, at_quadratu
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.continuation.system import Amplitudes, State, Vector
 from magshell_fenicsx.models.shell.kinematics import Jet
+from magshell_fenicsx.parts.bodies.body import Distance
 
 Array = NDArray[np.float64]
-# places (n, 3) over R -> g (n,), dg (n, 3), d2g (n, 3, 3); a body that is its own mirror image in several planes has
-# `axes`, unit vectors in them, and one with a single such plane through e3 at most has `axis`, which that plane holds
-Distance = Callable[[Array], tuple[Array, Array, Array]]
 SOFT = 1e-3  # of h: the penalty's stiffness grows from zero over this penetration
 PAIRS = np.triu_indices(3)
 SIZE = 3 + 1 + 3 + 6  # y*, psi*, its gradient, its Hessian by pairs i <= j
@@ -45,7 +43,7 @@ class Contact:
     amplitude
         Name of its approach, over h.
     distance
-        Signed distance at approach zero, positive outside.
+        At approach zero.
     direction
         Unit vector (3,) of the approach.
     front

@@ -1,21 +1,39 @@
-"""The distance from the round side of a cylinder."""
+"""A cylinder that touches with its round side."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.case.bodies.cylinder import CylinderSection
-from magshell_fenicsx.parts.bodies.placed import Placed
+from magshell_fenicsx.parts.bodies.body import Axis, BodySection, Distance, Placed, Size
 from magshell_fenicsx.parts.bodies.sphere import Sphere
 from magshell_fenicsx.shape.lines import SEEN, frame, upright
 
 Array = NDArray[np.float64]
 
 
+class CylinderSection(BodySection):
+    """A cylinder without ends, its axis across the approach."""
+
+    kind: Literal["cylinder"]
+    radius: Size
+    """Its radius [the shell's length; over R if that has no unit]"""
+    axis: Axis
+    """Along the cylinder, of any length, not along the approach"""
+
+    @property
+    def ahead(self) -> float:
+        return self.radius
+
+    def distance(self, placed: Placed) -> Distance:
+        return Cylinder(placed.centre, placed.across(self.axis), self.radius / placed.R)
+
+
 @dataclass(frozen=True)
-class Cylinder:
-    """A `Distance`: that of a sphere, of places without their part along the unit vector `axis`."""
+class Cylinder(Distance):
+    """That of a sphere, of places without their part along the unit vector `axis`."""
 
     centre: Array
     axis: Array
@@ -28,10 +46,8 @@ class Cylinder:
 
     @property
     def lines(self) -> list[Array]:
-        """Its outline: places (n, 3) along lines, over R."""
         return [self.centre + line @ frame(self.axis).T for line in upright(self.radius, 2 * SEEN)]
 
-
-def cylinder(section: CylinderSection, placed: Placed) -> Cylinder:
-    """See `Placed`."""
-    return Cylinder(placed.centre, placed.across(section.axis), section.radius / placed.R)
+    @property
+    def held(self) -> Sequence[Array]:
+        return [self.axis]

@@ -1,20 +1,29 @@
-"""The distance from a plane."""
+"""A plane."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.case.bodies.plane import PlaneSection
-from magshell_fenicsx.parts.bodies.placed import Placed
+from magshell_fenicsx.parts.bodies.body import BodySection, Distance, Placed
 from magshell_fenicsx.shape.lines import SEEN, frame
 
 Array = NDArray[np.float64]
 
 
+class PlaneSection(BodySection):
+    """A half-space; its face is normal to the direction of the approach."""
+
+    kind: Literal["plane"]
+
+    def distance(self, placed: Placed) -> Distance:
+        return Plane(placed.front, placed.direction)
+
+
 @dataclass(frozen=True)
-class Plane:
-    """A `Distance`: the body is behind `front`, seen along the unit vector `along`."""
+class Plane(Distance):
+    """The body is behind `front`, seen along the unit vector `along`."""
 
     front: Array
     along: Array
@@ -25,11 +34,5 @@ class Plane:
 
     @property
     def lines(self) -> list[Array]:
-        """Its outline: places (n, 3) along lines, over R."""
         square = np.array([[1, 1, 0], [-1, 1, 0], [-1, -1, 0], [1, -1, 0], [1, 1, 0]])
         return [self.front + SEEN * square @ frame(self.along).T]
-
-
-def plane(section: PlaneSection, placed: Placed) -> Plane:
-    """See `Placed`."""
-    return Plane(placed.front, placed.direction)

@@ -1,21 +1,40 @@
-"""The distance from the flat end of a cylinder, its edge rounded."""
+"""A cylinder that touches with its flat end, whose edge is rounded."""
 
 from dataclasses import dataclass
+from typing import Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import model_validator
 
-from magshell_fenicsx.case.bodies.rod import RodSection
-from magshell_fenicsx.parts.bodies.placed import Placed
-from magshell_fenicsx.parts.bodies.rounded import rounded
+from magshell_fenicsx.parts.bodies.body import BodySection, Distance, Placed, Size, rounded
 from magshell_fenicsx.shape.lines import SEEN, frame, upright
 
 Array = NDArray[np.float64]
 
 
+class RodSection(BodySection):
+    """A cylinder along the approach with a flat end, whose edge is rounded."""
+
+    kind: Literal["rod"]
+    radius: Size
+    """Its radius [the shell's length; over R if that has no unit]"""
+    edge: Size
+    """Radius of the edge's rounding, at most `radius` [the shell's length; over R if that has no unit]"""
+
+    @model_validator(mode="after")
+    def _edge_fits(self) -> Self:
+        if self.edge > self.radius:
+            raise ValueError("edge: a rounding is no larger than the radius")
+        return self
+
+    def distance(self, placed: Placed) -> Distance:
+        return Rod(placed.front, placed.direction, self.radius / placed.R, self.edge / placed.R)
+
+
 @dataclass(frozen=True)
-class Rod:
-    """A `Distance`: the body is behind the middle `end` of its end, seen along the unit vector `along`."""
+class Rod(Distance):
+    """The body is behind the middle `end` of its end, seen along the unit vector `along`."""
 
     end: Array
     along: Array
@@ -37,11 +56,5 @@ class Rod:
 
     @property
     def lines(self) -> list[Array]:
-        """Its outline: places (n, 3) along lines, over R."""
         middle = self.end - SEEN * self.along
         return [middle + line @ frame(self.along).T for line in upright(self.radius, 2 * SEEN)]
-
-
-def rod(section: RodSection, placed: Placed) -> Rod:
-    """See `Placed`."""
-    return Rod(placed.front, placed.direction, section.radius / placed.R, section.edge / placed.R)

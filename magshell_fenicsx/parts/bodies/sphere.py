@@ -1,20 +1,35 @@
-"""The distance from a sphere."""
+"""A sphere."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.case.bodies.sphere import SphereSection
-from magshell_fenicsx.parts.bodies.placed import Placed
+from magshell_fenicsx.parts.bodies.body import BodySection, Distance, Placed, Size
 from magshell_fenicsx.shape.lines import ball
 
 Array = NDArray[np.float64]
 
 
+class SphereSection(BodySection):
+    """A ball."""
+
+    kind: Literal["sphere"]
+    radius: Size
+    """Its radius [the shell's length; over R if that has no unit]"""
+
+    @property
+    def ahead(self) -> float:
+        return self.radius
+
+    def distance(self, placed: Placed) -> Distance:
+        return Sphere(placed.centre, self.radius / placed.R)
+
+
 @dataclass(frozen=True)
-class Sphere:
-    """A `Distance`."""
+class Sphere(Distance):
+    """From the centre, less the radius."""
 
     centre: Array
     radius: float
@@ -27,10 +42,4 @@ class Sphere:
 
     @property
     def lines(self) -> list[Array]:
-        """Its outline: places (n, 3) along lines, over R."""
         return [self.centre + line for line in ball(self.radius)]
-
-
-def sphere(section: SphereSection, placed: Placed) -> Sphere:
-    """See `Placed`."""
-    return Sphere(placed.centre, section.radius / placed.R)

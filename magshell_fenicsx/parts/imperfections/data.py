@@ -1,38 +1,87 @@
-"""A measured imperfection: a smooth function through its values."""
+"""A measured imperfection: places and heights from a file, their feet on the perfect surface, a smooth function."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import inf, sqrt
+from pathlib import Path
+from textwrap import shorten
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
+from pydantic import Field
 
-from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.imperfections.data import DataSection
+from magshell_fenicsx.input.file import FileKeys
 from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.input.tables import TableError, column_size, read_table
 from magshell_fenicsx.mesh.patch import place_text
-from magshell_fenicsx.mesh.scattered import Scattered, scattered
-from magshell_fenicsx.parts.imperfections.feet import feet
-from magshell_fenicsx.parts.imperfections.flaw import Flaw
-from magshell_fenicsx.parts.imperfections.scan import Lengths, Scan, ScanError, read_scan
-from magshell_fenicsx.shape.outline import Outline
+from magshell_fenicsx.parts.imperfections.imperfection import Flaw, ImperfectionSection, over
+from magshell_fenicsx.platform.reading import Files
+from magshell_fenicsx.shape.ground import Ground
+
+if TYPE_CHECKING:  # SciPy and the solver take their time, and a case alone does not need them
+    from magshell_fenicsx.mesh.scattered import Scattered
+    from magshell_fenicsx.shape.outline import Outline
 
 Array = NDArray[np.float64]
-MOST_H, MOST_R, FAR = (
-    50.0,
-    0.5,
-    0.5,
-)  # largest |w0| over h and over R; distance over R beyond which a place is not of this shell
+PLACES = (("x", "y", "z"), ("polar", "azimuth"), ("azimuth", "z"))
+ANGLES = ("polar", "azimuth")
+MOST_ROWS = 300_000
+MOST_H, MOST_R = 50.0, 0.5  # largest |w0| over h and over R
+FAR = 0.5  # distance over R beyond which a place is not of this shell
 SAME = 0.2  # of the typical distance of neighbours, below which values are averaged
 HOLE, GAPS = 3.0, 4.0  # largest hole: radius over sqrt(R h), or over the typical distance of neighbours
 SMALLEST, SHOWN = 0.45, 2.0  # element size over sqrt(R h), and over the length of the sharpest bend
+STEPS, STEP = 30, 1e-5  # of Newton's method, and of differences in the chart
+AROUND = 12  # nodes of a mesh file that a quadric goes through
+_fits: dict[tuple[str | None, ...], "_Fit"] = {}  # a run plans its case several times
+
+
+class DataSection(FileKeys, ImperfectionSection):
+    """w0 measured at places of the surface, scattered or on a grid, with noise and holes; a smooth function fits it.
+
+    Columns of the file: x, y, z, w0; or polar, azimuth, w0 (spheres); or azimuth, z, w0 (cylinders), angles in
+    degrees; or x, y, z of the real surface. A header such as x [mm], w0 [um] has units; without one, places are in
+    the shell's length and w0 is over h.
+    """
+
+    kind: Literal["data"]
+    file: str
+    """CSV with a header or .npz, its path from the folder of the case"""
+    amplitude: float = Field(default=1.0, ge=-1e3, le=1e3)
+    """Factor of w0"""
+    noise: Annotated[float, over("h")] | None = Field(default=None, ge=0, le=50)
+    """Standard deviation of the noise in w0; 0: w0 is exact; estimated by default [h]"""
+
+    def account(self) -> str:
+        return f"data of {self.file}"
+
+    def flaw(self, ground: Ground, key: str) -> Flaw:
+        """See `ImperfectionSection`.
+
+        Raises
+        ------
+        CaseError
+            If the file cannot be read, or its values are not of this shell.
+        """
+        this = (self.digest, str(self.path), str(self.noise), *ground.identity)
+        if this not in _fits:
+            if len(_fits) > 3:
+                _fits.clear()
+            lengths = Lengths(ground.h, ground.R, ground.with_units)
+            try:
+                _fits[this] = _fitted(self.noise, read_scan(self.path, lengths, self.files), ground)
+            except TableError as e:
+                raise CaseError(f"{key}.file: {self.file}: {e}") from None
+        fit = _fits[this]
+        return Flaw(Factored(fit.function, self.amplitude), fit.size, account=f"{self.file}: {fit.account}")
 
 
 @dataclass(frozen=True)
 class Factored:
     """A function of place times a factor; both over R."""
 
-    function: Scattered
+    function: "Scattered"
     factor: float
 
     def __call__(self, places: Array) -> Array:
@@ -40,61 +89,128 @@ class Factored:
 
 
 @dataclass(frozen=True)
+class Lengths:
+    """The units of a case.
+
+    Attributes
+    ----------
+    h
+        Thickness over R.
+    R
+        Reference length in the case's length.
+    si
+        Whether that is a metre.
+    """
+
+    h: float
+    R: float
+    si: bool
+
+    def over_R(self, unit: str | None, name: str) -> float:
+        """The size of a column's unit over R; without one, w0 is over h and a place in the case's length."""
+        if unit in ("h", "R"):
+            return self.h if unit == "h" else 1.0
+        if unit is None:
+            return self.h if name == "w0" else 1 / self.R
+        if not self.si:
+            raise TableError(
+                f"column {name}: has the unit {unit}, but the shell's lengths have none; h and R are allowed"
+            )
+        return column_size(name, unit, "metre") / self.R
+
+
+@dataclass(frozen=True)
+class Scan:
+    """Columns of finite numbers, lengths over R and angles in rad; `lost` rows had others."""
+
+    columns: dict[str, Array]
+    lost: int
+
+    @property
+    def w0(self) -> Array | None:
+        return self.columns.get("w0")
+
+
+def read_scan(file: Path, lengths: Lengths, files: Files | None = None) -> Scan:
+    """Measured places and deviations of a file: CSV with a header, or .npz.
+
+    Raises
+    ------
+    TableError
+        If it cannot be read, or has not the columns.
+    """
+    columns, units = read_table(file, files or Files())
+    wanted = next(
+        (names for names in PLACES if set(names) <= columns.keys() and ("w0" in columns or len(names) == 3)), None
+    )
+    if wanted is None:
+        raise TableError(
+            f"has the columns {shorten(', '.join(map(repr, columns)), 200)}; needed are x, y, z, w0, or x, y, z of the "
+            "real surface, or polar, azimuth, w0 of a sphere, or azimuth, z, w0 of a cylinder"
+        )
+    names = [*wanted, *(["w0"] if "w0" in columns else [])]
+    if "w0" in units and units["w0"] is None and any(units[name] for name in wanted if name not in ANGLES):
+        raise TableError("column w0: has no unit, but the places have one: write w0 [h] or a length, such as w0 [um]")
+    return _finite_rows(names, [columns[name] * _factor(units[name], name, lengths) for name in names])
+
+
+def _factor(unit: str | None, name: str, lengths: Lengths) -> float:
+    if name not in ANGLES:
+        return lengths.over_R(unit, name)
+    if unit not in (None, "deg", "degree", "degrees", "°", "rad"):
+        raise TableError(f"column {name}: its unit {unit} is no angle: degree or rad")
+    return 1.0 if unit == "rad" else np.pi / 180
+
+
+def _finite_rows(names: Sequence[str], columns: Sequence[Array]) -> Scan:
+    try:
+        rows = np.column_stack([np.ravel(column) for column in np.broadcast_arrays(*columns)])
+    except ValueError:
+        raise TableError("its arrays have different lengths") from None
+    if len(rows) > MOST_ROWS:
+        raise TableError(f"has {len(rows)} rows; allowed at most {MOST_ROWS}: leave out rows, or average neighbours")
+    good = np.isfinite(rows).all(axis=1)
+    if good.sum() < max(20, len(rows) // 2):
+        raise TableError(f"has {good.sum()} rows of finite numbers in {len(rows)}; needed are 20, and half of the rows")
+    return Scan(dict(zip(names, rows[good].T, strict=True)), int((~good).sum()))
+
+
+@dataclass(frozen=True)
 class _Fit:
-    function: Scattered
+    function: "Scattered"
     size: float
     account: str
 
 
-_known: dict[tuple[str | None, ...], _Fit] = {}  # a run plans its case several times
+def _fitted(standard: float | None, scan: Scan, ground: Ground) -> _Fit:
+    """The smooth function; `standard` is the standard deviation of the noise over h, None to estimate it."""
+    import scipy
 
+    from magshell_fenicsx.mesh.scattered import scattered
 
-def data(section: DataSection, case: Case, drawn: Outline, key: str) -> Flaw:
-    """See `Flaw`.
-
-    Raises
-    ------
-    CaseError
-        If the file cannot be read, or its values are not of this shell.
-    """
-    shell = case.shell.model_dump_json(exclude={"imperfections"})
-    mesh = case.outside.get("mesh_file")
-    this = (section.digest, str(section.path), str(section.noise), shell, mesh)
-    if this not in _known:
-        if len(_known) > 3:
-            _known.clear()
-        lengths = Lengths(1 / case.shell.R_over_h, case.shell.reference, case.shell.with_units)
-        try:
-            scan = read_scan(section.path, lengths, section.files)
-            _known[this] = _fitted(section, scan, case.shell.geometry, drawn, lengths)
-        except ScanError as e:
-            raise CaseError(f"shell.{key}.file: {section.file}: {e}") from None
-    fit = _known[this]
-    return Flaw(Factored(fit.function, section.amplitude), fit.size, account=f"{section.file}: {fit.account}")
-
-
-def _fitted(section: DataSection, scan: Scan, geometry: str, drawn: Outline, lengths: Lengths) -> _Fit:
-    h, surface = lengths.h, drawn.sample()
-    places, w0 = _on_surface(scan, geometry, drawn, surface)
+    h, surface = ground.h, ground.perfect.sample()
+    places, w0 = _on_surface(scan, ground, surface)
     if not np.abs(w0).max() <= min(MOST_H * h, MOST_R):
         unit = (
             "; without a unit in the header, w0 is over h"
             if scan.w0 is not None
             else ": are they in the shell's frame?"
         )
-        raise ScanError(f"w0 reaches {np.abs(w0).max() / h:.4g} h; allowed at most {min(MOST_H, MOST_R / h):.4g}{unit}")
+        raise TableError(
+            f"w0 reaches {np.abs(w0).max() / h:.4g} h; allowed at most {min(MOST_H, MOST_R / h):.4g}{unit}"
+        )
     given = len(w0)
     tree = scipy.spatial.cKDTree(places)
     spacing = float(np.median(tree.query(places, [9])[0])) / 1.7
     gaps = tree.query(surface)[0]
     if gaps.max() > max(HOLE * sqrt(h), GAPS * spacing):
         where = place_text(surface[np.argmax(gaps)])
-        raise ScanError(
+        raise TableError(
             f"no value lies within {gaps.max():.3g} R of the place {where} over R, where the hole is too large to "
             "guess; give values there, w0 = 0 where the shell is perfect"
         )
     places, w0 = _merged(places, w0, SAME * spacing)
-    noise = None if section.noise is None else section.noise * h
+    noise = None if standard is None else standard * h
     function = scattered(places, w0, surface, noise=noise)
     estimated = "estimated" if noise is None else "given"
     account = (
@@ -106,31 +222,33 @@ def _fitted(section: DataSection, scan: Scan, geometry: str, drawn: Outline, len
     return _Fit(function, max(SHOWN * _bend(function, surface, sqrt(h)), SMALLEST * sqrt(h)), account + lost)
 
 
-def _on_surface(scan: Scan, geometry: str, drawn: Outline, surface: Array) -> tuple[Array, Array]:
+def _on_surface(scan: Scan, ground: Ground, surface: Array) -> tuple[Array, Array]:
     """Places (n, 3) of the perfect surface and w0 (n,), over R."""
+    import scipy
+
     columns, w0 = scan.columns, scan.w0
     if "x" not in columns:
         assert w0 is not None
         polar = columns.get("polar")
-        if geometry not in (("cylinder",) if polar is None else ("hemisphere", "cap")):
+        if ground.geometry not in (("cylinder",) if polar is None else ("hemisphere", "cap")):
             angles = "azimuth and z are of a cylinder" if polar is None else "polar and azimuth are of a sphere"
-            raise ScanError(f"{angles}; on geometry: {geometry} give x, y, z")
+            raise TableError(f"{angles}; on geometry: {ground.geometry} give x, y, z")
         rho, z = (1.0, columns["z"]) if polar is None else (np.sin(polar), np.cos(polar))
         return np.column_stack([rho * np.cos(columns["azimuth"]), rho * np.sin(columns["azimuth"]), z]), w0
     x = np.column_stack([columns[name] for name in "xyz"])
     away = scipy.spatial.cKDTree(surface).query(x)[0]
     if away.max() > FAR:
         row = int(np.argmax(away))
-        raise ScanError(
+        raise TableError(
             f"the place {place_text(x[row])} over R is {away[row]:.3g} R from the shell: give the columns their unit, "
             "such as x [mm], or turn and move them to the shell's frame"
         )
-    places, heights = feet(drawn, x)
+    places, heights = feet(ground.perfect, x)
     if w0 is None:
         return places, heights
     if np.abs(heights).max() > 0.02 + 2 * np.abs(w0).max():
         row = int(np.argmax(np.abs(heights)))
-        raise ScanError(
+        raise TableError(
             f"the place {place_text(x[row])} over R is {abs(heights[row]):.3g} R from the shell, but w0 there "
             f"is {w0[row]:.3g} R: the unit of one of them is wrong, or it is the place of another shell"
         )
@@ -145,10 +263,61 @@ def _merged(places: Array, w0: Array, distance: float) -> tuple[Array, Array]:
     return np.column_stack([np.bincount(cell, c) / count for c in places.T]), np.bincount(cell, w0) / count
 
 
-def _bend(function: Scattered, x: Array, length: float) -> float:
+def _bend(function: "Scattered", x: Array, length: float) -> float:
     """1/k of the shortest wave sin(k x) that a function resembles, from its second differences over a length over R."""
     x = x[:: max(1, len(x) // 2000)]
     w, d = function(x), 0.7 * length
     bent = sum(np.abs(function(x + d * e) - 2 * w + function(x - d * e)) for e in np.eye(3)) / d**2
     largest = float(np.nanmax(bent))
     return float(np.sqrt(np.ptp(w) / 2 / largest)) if largest > 0 else inf
+
+
+def feet(perfect: "Outline", x: Array) -> tuple[Array, Array]:
+    """Feet (n, 3) of the normals through places x (n, 3), all over R, and the heights (n,) of these above the surface.
+
+    Of a mesh file, on quadrics through its nodes.
+    """
+    import scipy
+
+    if (nodes := perfect.nodes) is not None:
+        return _on_quadrics(nodes, x)
+    if perfect.sphere:
+        r = np.linalg.norm(x, axis=1)
+        return x / r[:, None], r - 1
+    sample = perfect.sample()
+    nearest, again = np.unique(scipy.spatial.cKDTree(sample).query(x)[1], return_inverse=True)
+    chart = np.array([perfect.inverse(place) for place in sample[nearest]])[again]
+    for _ in range(STEPS):  # Gauss and Newton's, which converges as fast as w0 is small against the radius of curvature
+        along = [(perfect.perfect(chart + e) - perfect.perfect(chart - e)) / (2 * STEP) for e in STEP * np.eye(2)]
+        J = np.stack(along, axis=-1)
+        off = np.einsum("nij,ni->nj", J, x - perfect.perfect(chart))
+        step = np.linalg.solve(np.einsum("nij,nik->njk", J, J), off[..., None])[..., 0]
+        chart = chart + np.clip(step, -0.2, 0.2)
+        if np.abs(step).max() < 1e-12:
+            break
+    places = perfect.perfect(chart)
+    return places, np.einsum("ij,ij->i", x - places, perfect.normal(chart))
+
+
+def _on_quadrics(nodes: Array, x: Array) -> tuple[Array, Array]:
+    """The same from nodes (m, 6): places and normals."""
+    import scipy
+
+    nodes = np.unique(nodes.round(14), axis=0)
+    tree = scipy.spatial.cKDTree(nodes[:, :3])
+    near = tree.query(x, AROUND)[1]
+    centre, normal = nodes[near[:, 0], :3], nodes[near[:, 0], 3:]
+    normal = normal / np.linalg.norm(normal, axis=1)[:, None]
+    first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal), axis=1)])
+    first /= np.linalg.norm(first, axis=1)[:, None]
+    frame = np.stack([first, np.cross(normal, first), normal], axis=1)
+    s, t, z = np.moveaxis(np.einsum("nkj,nij->nki", nodes[near, :3] - centre[:, None], frame), -1, 0)
+    quadric = np.linalg.pinv(np.stack([0 * s + 1, s, t, s * s, s * t, t * t], axis=-1)) @ z[..., None]
+    a, b, c, d, e, f = quadric[..., 0].T
+    p, q, height = np.einsum("nj,nij->ni", x - centre, frame).T
+    slope_s, slope_t = b + 2 * d * p + e * q, c + e * p + 2 * f * q
+    gap = height - (a + b * p + c * q + d * p * p + e * p * q + f * q * q)
+    upwards = np.stack([-slope_s, -slope_t, 0 * p + 1], axis=-1)
+    upwards /= np.linalg.norm(upwards, axis=1)[:, None]
+    w0 = gap * upwards[:, 2]
+    return x - w0[:, None] * np.einsum("ni,nij->nj", upwards, frame), w0

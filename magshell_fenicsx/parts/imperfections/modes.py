@@ -1,25 +1,87 @@
 """Modes of the perfect shell as imperfections."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from math import sqrt
+from typing import TYPE_CHECKING, Annotated, Literal, Self
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
+from pydantic import Field, PrivateAttr, model_validator
 
-from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.imperfections.modes import ModesSection, Shape
+from magshell_fenicsx.input.file import FileKeys
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.mirror import Mirror
-from magshell_fenicsx.mesh.scattered import Scattered, scattered
-from magshell_fenicsx.parts.imperfections.flaw import Flaw
+from magshell_fenicsx.parts.imperfections.imperfection import Flaw, ImperfectionSection, over
 from magshell_fenicsx.platform.reading import vtk_data
-from magshell_fenicsx.shape.outline import Outline
+from magshell_fenicsx.shape.ground import ON_AXIS, Ground
+
+if TYPE_CHECKING:  # SciPy takes its time, and a case alone does not need it
+    from magshell_fenicsx.mesh.scattered import Scattered
 
 Array = NDArray[np.float64]
+Shape = Callable[[Array], Array]
 EQUAL = 1e-4  # part of the largest value within which crests and troughs are equally large
-ON_AXIS = 1e-9  # over R
 BESIDE = 0.3  # over R, largest distance of a place of the shell from the nodes of a mode
+SHOWN = 1.2  # of sqrt(R h): elements that show a mode
+
+
+class ModesSection(FileKeys, ImperfectionSection):
+    """The lowest modes of the perfect shell where it first becomes unstable under the case's loads.
+
+    A pressure goes on to there, whatever its target; under other loads without an instability they are those at the
+    end. Of each its displacement along the normal, inwards positive, over the largest one.
+    """
+
+    kind: Literal["modes"]
+    amplitudes: Annotated[list[Annotated[float, over("h"), Field(ge=-50, le=50)]], Field(min_length=1, max_length=20)]
+    """Largest w0 of each mode, the lowest mode first; positive: inwards where the mode is largest [h]"""
+    file: str | None = None
+    """A mode file of a run (fields/mode_*.vtu), its path from the folder of the case, in place of computed modes"""
+
+    _shapes: tuple[Shape, ...] | None = PrivateAttr(default=None)
+
+    @model_validator(mode="after")
+    def _one_mode_in_a_file(self) -> Self:
+        if self.file is not None and len(self.amplitudes) > 1:
+            raise ValueError(
+                "amplitudes: a file has one mode: give one amplitude, and an item of the list for each file"
+            )
+        return self
+
+    def account(self) -> str:
+        return f"modes of {', '.join(f'{a:g}' for a in self.amplitudes)} h"
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        return tuple(f"amplitudes.{i}" for i in range(len(self.amplitudes)))
+
+    @property
+    def shapes(self) -> tuple[Shape, ...] | None:
+        """The modes as functions of places over R, 1 where inwards largest; None until they are computed."""
+        return self._shapes
+
+    def become(self, shapes: tuple[Shape, ...]) -> None:
+        """Take the modes of the perfect shell."""
+        self._shapes = shapes[: len(self.amplitudes)]
+
+    def flaw(self, ground: Ground, key: str) -> Flaw:
+        """See `ImperfectionSection`; modes that are not yet computed are zero.
+
+        Raises
+        ------
+        CaseError
+            If the file of a mode cannot be used.
+        """
+        h = ground.h
+        if self.file is not None and self.shapes is None:
+            self.become((_read(self, ground.perfect.sample(), f"{key}.file: {self.file}"),))
+        shapes = self.shapes or ()
+        amplitudes = tuple(a * h for a in self.amplitudes[: len(shapes)])
+        names = [f"mode {i}{f' (m = {s.m})' if isinstance(s, Round) else ''}" for i, s in enumerate(shapes, 1)]
+        words = [f"{a:g} h of {self.file or name}" for a, name in zip(self.amplitudes, names, strict=False)]
+        account = ", ".join(words) or "modes that the run computes"
+        return Flaw(Modes(shapes, amplitudes), SHOWN * sqrt(h), account=account)
 
 
 @dataclass(frozen=True)
@@ -38,7 +100,7 @@ class Modes:
 class Round:
     """f(rho, z) cos(m theta), f through its values at places (rho, 0, z) of the meridian."""
 
-    f: Scattered
+    f: "Scattered"
     m: int
 
     def __call__(self, places: Array) -> Array:
@@ -56,18 +118,22 @@ class Mirrored:
     sign: float
 
     def __call__(self, places: Array) -> Array:
-        other = self.mirror.beyond(places) < 0
-        here = np.where(other[:, None], self.mirror.image(places), places)
-        return np.asarray(self.shape(here) * np.where(other, self.sign, 1.0))
+        beyond = self.mirror.beyond(places) < 0
+        on_this_side = np.where(beyond[:, None], self.mirror.image(places), places)
+        return np.asarray(self.shape(on_this_side) * np.where(beyond, self.sign, 1.0))
 
 
-def on_surface(places: Array, w: Array, cover: Array) -> Scattered:
+def on_surface(places: Array, w: Array, cover: Array) -> "Scattered":
     """A mode from its inward displacements (n,) at places (n, 3), scaled to 1."""
+    from magshell_fenicsx.mesh.scattered import scattered
+
     return scattered(places, np.asarray(w / _largest(places, w)), cover, noise=0)
 
 
 def on_meridian(rho: Array, z: Array, w: Array, m: int) -> Round:
     """A wave around e3 from its inward displacements (n,) along the meridian, with its parity across the axis."""
+    from magshell_fenicsx.mesh.scattered import scattered
+
     places = np.column_stack([rho, 0 * z, z])
     f = np.asarray(w / _largest(places, w))
     if rho.min() < ON_AXIS:
@@ -75,34 +141,17 @@ def on_meridian(rho: Array, z: Array, w: Array, m: int) -> Round:
     return Round(scattered(places, f, places, noise=0), m)
 
 
-def modes(section: ModesSection, case: Case, drawn: Outline, key: str) -> Flaw:
-    """See `Flaw`; modes that are not yet computed are zero.
+def _read(section: ModesSection, sample: Array, key: str) -> "Scattered":
+    import scipy
 
-    Raises
-    ------
-    CaseError
-        If the file of a mode cannot be used.
-    """
-    h = 1 / case.shell.R_over_h
-    if section.file is not None and section.shapes is None:
-        section.become((_read(section, drawn, f"shell.{key}.file: {section.file}"),))
-    shapes = section.shapes or ()
-    amplitudes = tuple(a * h for a in section.amplitudes[: len(shapes)])
-    names = [f"mode {i}{f' (m = {s.m})' if isinstance(s, Round) else ''}" for i, s in enumerate(shapes, 1)]
-    words = [f"{a:g} h of {section.file or name}" for a, name in zip(section.amplitudes, names, strict=False)]
-    return Flaw(Modes(shapes, amplitudes), 1.2 * sqrt(h), account=", ".join(words) or "modes that the run computes")
-
-
-def _read(section: ModesSection, drawn: Outline, key: str) -> Scattered:
     try:
-        found = vtk_data(section.files.content(section.path), section.path.suffix).point_data
-        r0, w = (np.asarray(found[name], dtype=float) for name in ("r0", "mode_w"))
+        fields = vtk_data(section.files.content(section.path), section.path.suffix).point_data
+        r0, w = (np.asarray(fields[name], dtype=float) for name in ("r0", "mode_w"))
     except Exception as e:  # VTK and pyvista raise many types
         said = getattr(e, "strerror", None) or e
         raise CaseError(f"{key}: is no mode file that a run writes (fields/mode_*.vtu): {said}") from None
     if r0.shape != (len(w), 3) or not (np.isfinite(r0).all() and np.isfinite(w).all() and np.abs(w).max() > 0):
         raise CaseError(f"{key}: the mode has no finite displacement")
-    sample = drawn.sample()
     if scipy.spatial.cKDTree(r0).query(sample)[0].max() > BESIDE:
         raise CaseError(f"{key}: is the mode of another shell: it does not reach all places of this one")
     return on_surface(r0, w, sample)

@@ -1,21 +1,86 @@
-"""A Gaussian random field: a sum of plane waves in space, evaluated on the surface."""
+"""Random imperfections from a seed: a smooth field, or dimples at random places."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from math import sqrt
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
+from pydantic import Field, PrivateAttr, ValidationError, ValidationInfo, model_validator
 
-from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.imperfections.random import RandomSection
-from magshell_fenicsx.parts.imperfections.flaw import Flaw
-from magshell_fenicsx.shape.outline import Outline
+from magshell_fenicsx.input.chance import DefectsSection, generator
+from magshell_fenicsx.parts.imperfections.dimple import DimpleSection
+from magshell_fenicsx.parts.imperfections.gaussian import GaussianSection
+from magshell_fenicsx.parts.imperfections.imperfection import (
+    Flaw,
+    ImperfectionSection,
+    half_width,
+    over,
+    sizes_noted,
+)
+from magshell_fenicsx.shape.ground import Ground
 
 Array = NDArray[np.float64]
 WAVES = 512
 AT_ONCE = 4096  # places
+
+
+class RandomSection(ImperfectionSection):
+    """A Gaussian random field of a given size and length of correlation, or random dimples.
+
+    The field has the covariance δ² exp(-d²/(2 ℓ²)) of two places at the straight distance d. It and the dimples
+    depend on the seed alone, not on mesh, machine or ranks.
+    """
+
+    kind: Literal["random"]
+    seed: int = Field(ge=0, le=2**63 - 1)
+    """Chooses one of the random shapes"""
+    amplitude: Annotated[float, over("h")] | None = Field(default=None, ge=-50, le=50)
+    """Standard deviation δ of the field [h]"""
+    length: Annotated[float, over("width")] | None = Field(default=None, ge=0.05, le=1e3)
+    """Length of correlation ℓ of the field, in the unit of a dimple's width"""
+    dimples: DefectsSection | None = None
+    """Random dimples, in place of amplitude and length; on spheres"""
+
+    _sizes: Mapping[str, Any] = PrivateAttr(default={})
+
+    @model_validator(mode="after")
+    def _one_way(self, info: ValidationInfo) -> Self:
+        if (self.amplitude is None) != (self.length is None) or (self.amplitude is None) == (self.dimples is None):
+            raise ValueError("give amplitude and length of a random field, or dimples")
+        if self.dimples:
+            self._sizes = sizes_noted(info)
+            _ = self.drawn  # refuses what has no room
+        return self
+
+    def account(self) -> str:
+        return f"random field of {self.amplitude:g} h, seed {self.seed}"
+
+    def listed(self) -> Mapping[str, ImperfectionSection]:
+        return {f".{key}": dimple for key, dimple in self.drawn.items()} if self.dimples else {"": self}
+
+    @cached_property
+    def drawn(self) -> Mapping[str, DimpleSection | GaussianSection]:
+        """The random dimples by their keys below the section."""
+        if self.dimples is None:
+            return {}
+        items = self.dimples.draw(generator(self.seed, 0, "shell.imperfections"))
+        kind = DimpleSection if self.dimples.kind == "dimple" else GaussianSection
+        try:
+            sections = [kind.model_validate(item, context=dict(self._sizes)) for item in items]
+        except ValidationError as e:
+            first = e.errors()[0]
+            raise ValueError(f"dimples: {first['loc'][-1]}: {first['msg'].removeprefix('Value error, ')}") from None
+        return {f"dimples.{i}": each for i, each in enumerate(sections)}
+
+    def flaw(self, ground: Ground, key: str) -> Flaw:
+        """See `ImperfectionSection`; of the field, which the length of correlation shows."""
+        assert self.amplitude is not None
+        assert self.length
+        length = half_width(self.length, ground.R_over_h, ground.nu)
+        return Flaw(Waves(self.amplitude / ground.R_over_h, length, self.seed), length)
 
 
 @dataclass(frozen=True)
@@ -33,6 +98,8 @@ class Waves:
     @cached_property
     def _waves(self) -> Array:
         """(4, N): the components of k and the phase."""
+        import scipy
+
         bits = np.random.PCG64(self.seed).random_raw(4 * WAVES).reshape(4, WAVES)
         uniform = ((bits >> np.uint64(11)) + 0.5) / 2.0**53
         return np.vstack([scipy.special.ndtri(uniform[:3]) / self.length, 2 * np.pi * uniform[3:]])
@@ -44,11 +111,3 @@ class Waves:
             angles = self._waves[3] + sum(x[:, j : j + 1] * self._waves[j] for j in range(3))
             w0[i : i + AT_ONCE] = np.cos(angles).sum(axis=1)
         return self.delta * sqrt(2 / WAVES) * w0
-
-
-def random_field(section: RandomSection, case: Case, drawn: Outline, key: str) -> Flaw:
-    """See `Flaw`."""
-    assert section.amplitude is not None
-    shell = case.shell
-    length = section.correlation_length(shell.R_over_h, shell.poisson_ratio)
-    return Flaw(Waves(section.amplitude / shell.R_over_h, length, section.seed), length)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.frame import rotation
-from magshell_fenicsx.parts.imperfections.flaw import Flaw
+from magshell_fenicsx.parts.imperfections.imperfection import Flaw
 from magshell_fenicsx.shape.outline import Outline
 
 Array = NDArray[np.float64]

@@ -13,10 +13,10 @@ from magshell_fenicsx.mesh.deviation import Deviation
 from magshell_fenicsx.mesh.frame import rotation
 from magshell_fenicsx.mesh.mirror import Mirror
 from magshell_fenicsx.parts.imperfections.dimple import Dimple
-from magshell_fenicsx.parts.imperfections.distance import Angle, Straight
-from magshell_fenicsx.parts.imperfections.flaw import Flaw
 from magshell_fenicsx.parts.imperfections.gaussian import Gaussian
+from magshell_fenicsx.parts.imperfections.imperfection import Flaw
 from magshell_fenicsx.parts.imperfections.rims import AXIS, contour
+from magshell_fenicsx.shape.ground import Angle, Straight
 from magshell_fenicsx.shape.outline import Outline
 from magshell_fenicsx.shape.symmetry import Leaves, common_azimuth
 from magshell_fenicsx.shape.turning import ANGLES

@@ -7,11 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from magshell_fenicsx.case.sources.registered import Sources
 from magshell_fenicsx.input.direction import Direction
 from magshell_fenicsx.input.expressions import Formula
 from magshell_fenicsx.input.file import FileKeys
 from magshell_fenicsx.input.section import FluxDensity, Section
+from magshell_fenicsx.parts.kinds import Sources
 from magshell_fenicsx.parts.part import Context
 
 MU_0 = 4e-7 * pi  # T m/A

@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.input.controls import read_vectors
 from magshell_fenicsx.input.direction import Direction
 from magshell_fenicsx.input.expressions import formula
+from magshell_fenicsx.input.tables import read_vectors
 from magshell_fenicsx.mesh.frame import rotation
 from magshell_fenicsx.mesh.mirror import Mirror
 from magshell_fenicsx.models.shell.controls import ByControls, Controls
@@ -70,7 +70,7 @@ def magnetisation(
         remanent = WithinRims(rims, rest) if vectors else rest
     else:
         remanent = section.vector(turn)
-    known, driven = in_space(case, turn)
+    known, driven = in_space(case.context, turn)
     basis = [magnetic.applied.vector(turn)]
     for direction in () if known else to:
         away = direction.vector(turn) - np.sum([(direction.vector(turn) @ e) * e for e in basis], axis=0)
@@ -95,7 +95,7 @@ def magnetisation(
         known,
         tuple(basis),
         driven,
-        turns(case, turn),
+        turns(case.context, turn),
     )
 
 
@@ -106,7 +106,7 @@ def leaves(case: Case, outline: Outline) -> list[Leaves]:
     known = magnetic.applied.components if magnetic.applied.beside else None
     alone = known or not magnetic.applied.beside
     vectors = [d.vector() for d in (*magnetic.remanent.directions(), *([] if alone else [magnetic.applied]))]
-    whole = turns(case)  # then the rotation is a part of the field at each place
+    whole = turns(case.context)  # then the rotation is a part of the field at each place
     turning = [] if whole else [load.to.vector() for load in case.loads_of(RotationSection)]
     remanent, G = magnetic.remanent, np.array(magnetic.applied.gradient or np.zeros((3, 3)))
     fields: list[Callable[[Array], Array]] = [lambda x: np.asarray(x @ G.T)] if G.any() else []
@@ -120,7 +120,7 @@ def leaves(case: Case, outline: Outline) -> list[Leaves]:
         askew.append("the formula of the remanence differs around e3")
     if known and not (outline.span and vector_turns(known, outline.span, in_space=True)):
         askew.append("the formula of the applied field differs around e3")
-    sources = values(case) if case.sources or whole else []
+    sources = values(case.context) if case.sources or whole else []
     if sources and not (outline.span and all(field_turns(field, outline.span) for field in sources)):
         askew.append("the field of a source differs around e3")
     if np.abs(G - np.diag([G[0, 0], G[0, 0], G[2, 2]])).max() > PARALLEL:

@@ -10,7 +10,7 @@ from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.shell.parameters import Loads, Magnetisation, Material
 from magshell_fenicsx.models.shell.patterns import WithinRims, tangential
 from magshell_fenicsx.parts.imperfections.dimple import AT_POLE, Dimple
-from magshell_fenicsx.parts.imperfections.flaw import Flaw
+from magshell_fenicsx.parts.imperfections.imperfection import Flaw
 
 Array = np.ndarray
 DIMPLE = Dimple(0.05, 0.5)

@@ -9,7 +9,7 @@ from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.shell.parameters import Loads, Magnetisation, Material
 from magshell_fenicsx.models.shell.patterns import Components, Pattern, WithinRims, radial, tangential
 from magshell_fenicsx.parts.imperfections.dimple import AT_POLE, Dimple
-from magshell_fenicsx.parts.imperfections.flaw import Flaw
+from magshell_fenicsx.parts.imperfections.imperfection import Flaw
 from magshell_fenicsx.parts.magnetism.fields import Layer, layer_average
 
 UP = np.array([0.0, 0, 1])

@@ -1,38 +1,67 @@
-"""A current in a thin wire as a field."""
+"""Currents in thin wires."""
+
+from typing import Annotated, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field, model_validator
 
-from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.sources.coil import CoilSection
-from magshell_fenicsx.parts.magnetism.sources.harmonic import Harmonic
-from magshell_fenicsx.parts.magnetism.sources.known import Known, magpylib
+from magshell_fenicsx.parts.magnetism.sources.source import (
+    Current,
+    Harmonic,
+    OwnField,
+    Position,
+    Size,
+    SourceSection,
+    magpylib,
+)
 from magshell_fenicsx.shape.lines import circle
 
 Array = NDArray[np.float64]
+NOWHERE = "on the wire of"
 
 
-def coil(section: CoilSection, case: Case, key: str) -> Known:
-    """See `Known`."""
-    current, made = section.turns * section.current, magpylib(key).current
-    if section.vertices is not None:
-        corners = np.array(section.vertices)
-        wire = made.Polyline(current=current, vertices=corners)
-        return Known(Harmonic(wire.getB, lambda x: to_polygon(x, corners)), [corners], "on the wire of")
-    assert section.diameter
-    r = section.diameter / 2
-    loop = made.Circle(current=current, diameter=2 * r)
+class CoilSection(SourceSection):
+    """A current in a thin wire: a circle around its own z axis, or a polygon."""
 
-    def distance(x: Array) -> Array:
-        return np.hypot(np.hypot(x[:, 0], x[:, 1]) - r, x[:, 2])
+    kind: Literal["coil"]
+    diameter: Size | None = None
+    """Of a circle [m]"""
+    vertices: Annotated[list[Position], Field(min_length=2, max_length=100_000)] | None = None
+    """Corners of a polygon in its own axes, in place of diameter; the first again at the end closes it [m]"""
+    current: Current
+    """By the right-hand rule about its own z axis, or along the polygon [A]"""
+    turns: int = Field(default=1, ge=1, le=1_000_000)
+    """Turns of the wire"""
 
-    return Known(Harmonic(loop.getB, distance), [circle(r)], "on the wire of")
+    @model_validator(mode="after")
+    def _one_shape(self) -> Self:
+        if (self.diameter is None) == (self.vertices is None):
+            raise ValueError("give diameter or vertices")
+        if self.vertices and any(a == b for a, b in zip(self.vertices, self.vertices[1:], strict=False)):
+            raise ValueError("vertices: two of them in a row are the same place")
+        return self
+
+    def field(self, key: str, R: float) -> OwnField:
+        current, currents = self.turns * self.current, magpylib(key).current
+        if self.vertices is not None:
+            corners = np.array(self.vertices)
+            wire = currents.Polyline(current=current, vertices=corners)
+            return OwnField(Harmonic(wire.getB, lambda x: to_polygon(x, corners)), [corners], NOWHERE)
+        assert self.diameter
+        r = self.diameter / 2
+        loop = currents.Circle(current=current, diameter=2 * r)
+
+        def distance(x: Array) -> Array:
+            return np.hypot(np.hypot(x[:, 0], x[:, 1]) - r, x[:, 2])
+
+        return OwnField(Harmonic(loop.getB, distance), [circle(r)], NOWHERE)
 
 
 def to_polygon(x: Array, corners: Array) -> Array:
     """The distance (n,) of places (n, 3) from the nearest of the lines between corners (m, 3)."""
-    found = np.full(len(x), np.inf)
+    least = np.full(len(x), np.inf)
     for a, way in zip(corners, np.diff(corners, axis=0), strict=False):
         along = np.clip((x - a) @ way / np.sum(way**2), 0.0, 1.0)
-        found = np.minimum(found, np.linalg.norm(x - a - along[:, None] * way, axis=1))
-    return found
+        least = np.minimum(least, np.linalg.norm(x - a - along[:, None] * way, axis=1))
+    return least

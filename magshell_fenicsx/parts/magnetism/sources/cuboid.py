@@ -1,20 +1,36 @@
-"""A cuboid magnet as a field."""
+"""A cuboid magnet."""
+
+from types import ModuleType
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
-from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.sources.cuboid import CuboidSection
-from magshell_fenicsx.parts.magnetism.sources.cylinder import to_box
-from magshell_fenicsx.parts.magnetism.sources.harmonic import Harmonic
-from magshell_fenicsx.parts.magnetism.sources.known import Known, magpylib
+from magshell_fenicsx.parts.magnetism.sources.source import MagnetSection, Size, Values, to_box
 from magshell_fenicsx.shape.lines import edges
 
 Array = NDArray[np.float64]
 
 
-def cuboid(section: CuboidSection, case: Case, key: str) -> Known:
-    """See `Known`."""
-    half = np.array(section.dimension) / 2
-    magnet = magpylib(key).magnet.Cuboid(dimension=2 * half, polarization=section.vector)
-    return Known(Harmonic(magnet.getB, lambda x: to_box(np.abs(x) - half)), edges(-half, half), "inside")
+class CuboidSection(MagnetSection):
+    """A cuboid along its own axes, uniformly magnetised."""
+
+    kind: Literal["cuboid"]
+    dimension: Annotated[list[Size], Field(min_length=3, max_length=3)]
+    """Edges along its own axes [m]"""
+
+    @property
+    def half(self) -> Array:
+        """Half its edges (3,) in m."""
+        return np.array(self.dimension) / 2
+
+    def values(self, magnets: ModuleType) -> Values:
+        magnet = magnets.Cuboid(dimension=2 * self.half, polarization=self.vector)
+        return magnet.getB  # type: ignore[no-any-return]
+
+    def distance(self, x: Array) -> Array:
+        return to_box(np.abs(x) - self.half)
+
+    def lines(self) -> list[Array]:
+        return edges(-self.half, self.half)

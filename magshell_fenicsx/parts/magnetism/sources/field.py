@@ -7,15 +7,15 @@ from math import acos, radians
 import numpy as np
 
 from magshell_fenicsx.assembly.motion import Motion, moved
-from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.input.expressions import with_derivatives
 from magshell_fenicsx.input.formulas_in_space import FormulasInSpace
 from magshell_fenicsx.mesh.frame import rotation
 from magshell_fenicsx.parts.magnetism.driven import Driven, FieldInSpace
 from magshell_fenicsx.parts.magnetism.field_step import RotationSection
+from magshell_fenicsx.parts.magnetism.fields import AppliedSection, MagneticSection
 from magshell_fenicsx.parts.magnetism.source_step import SourceStep
-from magshell_fenicsx.parts.magnetism.sources.known import Array, Placed
-from magshell_fenicsx.parts.magnetism.sources.registered import placed
+from magshell_fenicsx.parts.magnetism.sources.source import Array, Placed
+from magshell_fenicsx.parts.part import Context
 from magshell_fenicsx.parts.step import ProgrammeStep
 
 HALFWAY = 0.371  # of a motion: no symmetric place
@@ -53,23 +53,50 @@ def turn_name(step: ProgrammeStep) -> str:
     return f"{step.name} {step.number}"
 
 
-def turns(case: Case, turn: float = 0.0) -> tuple[Motion, ...]:
+def placed(context: Context, turn: float = 0.0) -> list[Placed]:
+    """The sources of a case, in a frame turned about e3 (rad).
+
+    Raises
+    ------
+    CaseError
+        If magpylib is missing, or a file is no grid.
+    """
+    applied = _applied(context)
+    if applied is None or not applied.sources:
+        return []
+    R, unit, Q = context.shell.reference, applied.reference, rotation(turn)
+    assert unit
+    sources = list[Placed]()
+    for i, section in enumerate(applied.sources):
+        key = f"magnetic.applied.sources.{i}"
+        position = [x / R for x in section.position]
+        own = section.field(key, R)
+        sources.append(Placed(own, Q @ position, Q @ section.axes, R, section.strength / unit, key))
+    return sources
+
+
+def _applied(context: Context) -> AppliedSection | None:
+    magnetic = context.of(MagneticSection)
+    return magnetic.applied if magnetic else None
+
+
+def turns(context: Context, turn: float = 0.0) -> tuple[Motion, ...]:
     """The rotations of all of the field about the origin, of a field that is known by values, or has a gradient."""
-    applied = case.magnetic.applied if case.magnetic else None
+    applied = _applied(context)
     if applied is None or not (applied.components or applied.sources or applied.gradient):
         return ()
-    found, before, zero = list[Motion](), applied.vector(turn), np.zeros(3)
-    for step in case.programme:
+    rotations, before, zero = list[Motion](), applied.vector(turn), np.zeros(3)
+    for step in context.steps:
         if isinstance(step.load, RotationSection):
             after = step.load.to.vector(turn)
             axis = np.cross(before, after)
             angle = acos(float(before @ after))
-            found.append(Motion(turn_name(step), zero, angle * axis / np.linalg.norm(axis), zero))
+            rotations.append(Motion(turn_name(step), zero, angle * axis / np.linalg.norm(axis), zero))
             before = after
-    return tuple(found)
+    return tuple(rotations)
 
 
-def in_space(case: Case, turn: float = 0.0) -> tuple[FieldInSpace | None, tuple[Driven, ...]]:
+def in_space(context: Context, turn: float = 0.0) -> tuple[FieldInSpace | None, tuple[Driven, ...]]:
     """The field that stays, None if it is built in, and the fields that steps drive, in a frame turned about e3 (rad).
 
     Raises
@@ -77,21 +104,21 @@ def in_space(case: Case, turn: float = 0.0) -> tuple[FieldInSpace | None, tuple[
     CaseError
         If a source cannot be built.
     """
-    if case.magnetic is None:
+    applied, Q = _applied(context), rotation(turn)
+    if applied is None:
         return None, ()
-    applied, Q = case.magnetic.applied, rotation(turn)
     formulas = [with_derivatives(text) for text in applied.components or []]
     by_formula = FormulasInSpace(formulas, Q) if formulas else None
-    rotations = turns(case, turn)
-    if not case.sources and not rotations:
+    rotations = turns(context, turn)
+    if not applied.sources and not rotations:
         return by_formula, ()
     parts = list[FieldInSpace]()
     if applied.beside:
         G = Q @ np.array(applied.gradient or np.zeros((3, 3))) @ Q.T
         parts.append(by_formula or Linear(applied.uniform * applied.vector(turn), G))
     driven = list[Driven]()
-    for number, source in enumerate(placed(case, turn)):
-        one = _driven(case, number, source, rotations, Q)
+    for number, source in enumerate(placed(context, turn)):
+        one = _driven(applied, context.steps, number, source, rotations, Q)
         if one.names:
             driven.append(one)
         else:
@@ -102,19 +129,26 @@ def in_space(case: Case, turn: float = 0.0) -> tuple[FieldInSpace | None, tuple[
     return Sum(parts), tuple(driven)
 
 
-def _driven(case: Case, number: int, source: Placed, rotations: Sequence[Motion], Q: Array) -> Driven:
+def _driven(
+    applied: AppliedSection,
+    steps: Sequence[ProgrammeStep],
+    number: int,
+    source: Placed,
+    rotations: Sequence[Motion],
+    Q: Array,
+) -> Driven:
     """A source with the amplitudes of its steps; turns about its own position come before all other motions."""
     spins, moves, factors, zero = list[Motion](), list[Motion](), dict[str, float](), np.zeros(3)
     of_all = {motion.name: motion for motion in rotations}
-    steps = {step.name: step.load for step in case.programme if isinstance(step.load, SourceStep)}
-    own = {name for name, load in steps.items() if load.number(case.sources) == number}
-    for step in case.programme:
+    loads = {step.name: step.load for step in steps if isinstance(step.load, SourceStep)}
+    own = {name for name, load in loads.items() if load.number(applied.sources or []) == number}
+    for step in steps:
         if isinstance(step.load, RotationSection):
             moves.append(of_all[turn_name(step)])
         if step.name not in own:
             continue
         own.remove(step.name)
-        load, name = steps[step.name], step.name
+        load, name = loads[step.name], step.name
         if load.turn:
             axis = np.array(load.turn.axis) / np.linalg.norm(load.turn.axis)
             spins.append(Motion(name, zero, radians(load.turn.angle) * (Q @ axis), source.position))
@@ -122,14 +156,14 @@ def _driven(case: Case, number: int, source: Placed, rotations: Sequence[Motion]
             factors[name] = load.strength - 1
         else:
             end = np.array(load.move or load.to) / source.length
-            here = moved(moves, dict.fromkeys((m.name for m in moves), 1.0), source.position[None]).x[0]
-            moves.append(Motion(name, Q @ end - (here if load.to else zero), zero, zero))
+            begin = moved(moves, dict.fromkeys((m.name for m in moves), 1.0), source.position[None]).x[0]
+            moves.append(Motion(name, Q @ end - (begin if load.to else zero), zero, zero))
     return Driven(source, [*spins, *moves], factors)
 
 
-def values(case: Case) -> list[Callable[[Array], Array]]:
+def values(context: Context) -> list[Callable[[Array], Array]]:
     """B over |B^a| at places (n, 3) as the sources are at first, and where each amplitude of them has changed."""
-    still, driven = in_space(case)
+    still, driven = in_space(context)
     if still is None:
         return []
     names = [name for each in driven for name in each.names]

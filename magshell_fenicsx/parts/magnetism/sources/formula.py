@@ -1,20 +1,33 @@
-"""A field by formulas."""
+"""A field by formulas, in tesla."""
+
+from typing import Annotated, Literal
 
 import numpy as np
+from pydantic import Field
 
-from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.sources.formula import FormulaSource
-from magshell_fenicsx.input.expressions import with_derivatives
+from magshell_fenicsx.input.expressions import Formula, with_derivatives
 from magshell_fenicsx.input.formulas_in_space import FormulasInSpace
-from magshell_fenicsx.parts.magnetism.sources.known import Array, Known
+from magshell_fenicsx.input.section import FluxDensity
+from magshell_fenicsx.parts.magnetism.sources.source import Array, OwnField, SourceSection
 
 
-def by_formula(section: FormulaSource, case: Case, key: str) -> Known:
-    """See `Known`."""
-    R, formulas = case.shell.reference, FormulasInSpace([with_derivatives(t) for t in section.components], np.eye(3))
+class FormulaSource(SourceSection):
+    """A flux density by formulas of the deformed position; they must be twice differentiable."""
 
-    def field(x: Array) -> tuple[Array, Array, Array]:
-        B, G, H = formulas(np.asarray(x / R))
-        return section.flux_density * B, section.flux_density / R * G, section.flux_density / R**2 * H
+    kind: Literal["formula"]
+    components: Annotated[list[Formula], Field(min_length=3, max_length=3)]
+    """Of x, y, z over R along its own axes, from its position [flux_density]"""
+    flux_density: Annotated[FluxDensity, Field(ge=-1e3, le=1e3)] = 1.0
+    """What the components are over; 1 T by default"""
 
-    return Known(field, [], "where there is no finite value or derivative of")
+    def words(self) -> str:
+        return f"formulas ({', '.join(self.components)})"
+
+    def field(self, key: str, R: float) -> OwnField:
+        formulas = FormulasInSpace([with_derivatives(text) for text in self.components], np.eye(3))
+
+        def values(x: Array) -> tuple[Array, Array, Array]:
+            B, G, H = formulas(np.asarray(x / R))
+            return self.flux_density * B, self.flux_density / R * G, self.flux_density / R**2 * H
+
+        return OwnField(values, [], "where there is no finite value or derivative of")

@@ -1,26 +1,48 @@
-"""A ring magnet as a field."""
+"""A ring magnet."""
+
+from types import ModuleType
+from typing import Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import model_validator
 
-from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.sources.ring import RingSection
-from magshell_fenicsx.parts.magnetism.sources.cylinder import to_box
-from magshell_fenicsx.parts.magnetism.sources.harmonic import Harmonic
-from magshell_fenicsx.parts.magnetism.sources.known import Known, magpylib
+from magshell_fenicsx.parts.magnetism.sources.source import MagnetSection, Size, Values, to_box
 from magshell_fenicsx.shape.lines import upright
 
 Array = NDArray[np.float64]
 
 
-def ring(section: RingSection, case: Case, key: str) -> Known:
-    """See `Known`."""
-    inner, outer, h = section.inner_diameter / 2, section.diameter / 2, section.height
-    made = magpylib(key).magnet.CylinderSegment
-    magnet = made(dimension=(inner, outer, h, 0, 360), polarization=section.vector)
+class RingSection(MagnetSection):
+    """A hollow cylinder around its own z axis, uniformly magnetised."""
 
-    def distance(x: Array) -> Array:
+    kind: Literal["ring"]
+    diameter: Size
+    """Outer diameter [m]"""
+    inner_diameter: Size
+    """Of the hole [m]"""
+    height: Size
+    """Along its own z axis [m]"""
+
+    @model_validator(mode="after")
+    def _hollow(self) -> Self:
+        if self.inner_diameter >= self.diameter:
+            raise ValueError("inner_diameter must be smaller than diameter")
+        return self
+
+    @property
+    def radii(self) -> tuple[float, float]:
+        """Of the hole, and of the ring, in m."""
+        return self.inner_diameter / 2, self.diameter / 2
+
+    def values(self, magnets: ModuleType) -> Values:
+        magnet = magnets.CylinderSegment(dimension=(*self.radii, self.height, 0, 360), polarization=self.vector)
+        return magnet.getB  # type: ignore[no-any-return]
+
+    def distance(self, x: Array) -> Array:
+        inner, outer = self.radii
         off_middle = np.abs(np.hypot(x[:, 0], x[:, 1]) - (inner + outer) / 2)
-        return to_box(np.column_stack([off_middle - (outer - inner) / 2, np.abs(x[:, 2]) - h / 2]))
+        return to_box(np.column_stack([off_middle - (outer - inner) / 2, np.abs(x[:, 2]) - self.height / 2]))
 
-    return Known(Harmonic(magnet.getB, distance), [*upright(inner, h), *upright(outer, h)], "inside")
+    def lines(self) -> list[Array]:
+        return [line for radius in self.radii for line in upright(radius, self.height)]

@@ -1,5 +1,11 @@
-"""What all sources of the applied field have in common."""
+"""What all sources of the applied field have in common: their sections, and their fields at their places."""
 
+from abc import abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cache
+from itertools import product
+from types import ModuleType
 from typing import Annotated
 
 import numpy as np
@@ -8,7 +14,11 @@ from pydantic import Field
 
 from magshell_fenicsx.input.direction import Direction
 from magshell_fenicsx.input.section import FluxDensity, Section, or_number
+from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.parts.magnetism.driven import FieldInSpace
 
+Array = NDArray[np.float64]
+Values = Callable[[Array], Array]
 Metres = Annotated[float, or_number("metre"), Field(ge=-1e6, le=1e6)]
 Size = Annotated[float, or_number("metre"), Field(gt=0, le=1e6)]
 Position = Annotated[list[Metres], Field(min_length=3, max_length=3)]
@@ -18,6 +28,26 @@ Polarization = (
 )
 Current = Annotated[float, or_number("ampere"), Field(ge=-1e9, le=1e9)]
 SourceName = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$", max_length=40)]
+STEP, DEGREE = 0.005, 5  # see `Harmonic`
+
+
+@dataclass(frozen=True)
+class OwnField:
+    """The field of a source in its own axes.
+
+    Attributes
+    ----------
+    values
+        Places (n, 3) in m -> B in T with its first and second derivatives; not finite where there is none.
+    lines
+        Its outline: places (n, 3) along lines, in m.
+    nowhere
+        What a place without a field is.
+    """
+
+    values: FieldInSpace
+    lines: Sequence[Array]
+    nowhere: str
 
 
 class SourceSection(Section):
@@ -36,7 +66,7 @@ class SourceSection(Section):
     """Factor of its field"""
 
     @property
-    def axes(self) -> NDArray[np.float64]:
+    def axes(self) -> Array:
         """Its own axes as columns (3, 3)."""
         (sp, cp), (sa, ca), (ss, cs) = (
             (np.sin(t), np.cos(t)) for t in np.radians([self.axis.polar, self.axis.azimuth, self.spin])
@@ -49,6 +79,16 @@ class SourceSection(Section):
         """Its words in the account of what is built."""
         return f"{self.kind} at ({', '.join(f'{1e3 * x:g}' for x in self.position)}) mm"
 
+    def field(self, key: str, R: float) -> OwnField:
+        """Its field; `key` is its own, and R (m) what formulas of the place are over.
+
+        Raises
+        ------
+        CaseError
+            If magpylib is missing, or a file is no grid.
+        """
+        raise NotImplementedError
+
 
 class MagnetSection(SourceSection):
     """Base of all magnets."""
@@ -59,7 +99,157 @@ class MagnetSection(SourceSection):
     """Along its own z axis, or three components along its own axes: its remanence, μ0 times its magnetisation"""
 
     @property
-    def vector(self) -> NDArray[np.float64]:
+    def vector(self) -> Array:
         """The polarization (3,) in its own axes, in T."""
         J = self.polarization
         return np.array(J if isinstance(J, list) else [0.0, 0.0, J])
+
+    @abstractmethod
+    def values(self, magnets: ModuleType) -> Values:
+        """B at places in m, by the magnet of magpylib."""
+
+    @abstractmethod
+    def distance(self, x: Array) -> Array:
+        """How far places (n, 3) in m are from it; negative inside."""
+
+    @abstractmethod
+    def lines(self) -> list[Array]:
+        """Its outline: places (n, 3) along lines, in m."""
+
+    def field(self, key: str, R: float) -> OwnField:
+        return OwnField(Harmonic(self.values(magpylib(key).magnet), self.distance), self.lines(), "inside")
+
+
+def to_box(beyond: Array) -> Array:
+    """The distance (n,) from how far places are beyond the faces in each direction (n, m); negative inside."""
+    return np.asarray(np.linalg.norm(np.maximum(beyond, 0.0), axis=1) + np.minimum(beyond.max(axis=1), 0.0))
+
+
+@dataclass(frozen=True)
+class Placed:
+    """A source at its place as a `FieldInSpace`: lengths over R, B over |B^a|.
+
+    Attributes
+    ----------
+    own
+        Its field in its own axes.
+    position
+        (3,) over R, in the model's frame.
+    axes
+        (3, 3) the source's own axes as columns, in the same frame.
+    length, factor
+        R in m; what multiplies B in T.
+    key
+        Of the case file.
+    """
+
+    own: OwnField
+    position: Array
+    axes: Array
+    length: float
+    factor: float
+    key: str
+
+    def __call__(self, x: Array) -> tuple[Array, Array, Array]:
+        Q, R = self.axes, self.length
+        B, G, H = self.own.values(R * (x - self.position) @ Q)
+        return (
+            self.factor * B @ Q.T,
+            np.einsum("ai,bj,nij->nab", Q, Q, G, optimize=True) * (self.factor * R),
+            np.einsum("ai,bj,ck,nijk->nabc", Q, Q, Q, H, optimize=True) * (self.factor * R**2),
+        )
+
+    def distance(self, x: Array) -> Array:
+        """From places (n, 3) to its body, over R, negative inside; infinite if it has none."""
+        of = getattr(self.own.values, "distance", None)
+        return (
+            np.full(len(x), np.inf) if of is None else of(self.length * (x - self.position) @ self.axes) / self.length
+        )
+
+    @property
+    def nowhere(self) -> str:
+        """What a place without a field is, in words."""
+        return f"is {self.own.nowhere} {self.key}"
+
+    @property
+    def lines(self) -> list[Array]:
+        """Its outline: places (n, 3) along lines, over R."""
+        return [self.position + line / self.length @ self.axes.T for line in self.own.lines]
+
+
+def magpylib(key: str) -> ModuleType:
+    """The package, imported where a case has a source that needs it.
+
+    Raises
+    ------
+    CaseError
+        With the command that installs it.
+    """
+    try:
+        import magpylib
+    except ImportError:
+        raise CaseError(
+            f"{key}: magnets and coils need the package magpylib: python3 -m pip install --no-deps magpylib"
+        ) from None
+    return magpylib  # type: ignore[no-any-return]
+
+
+@dataclass(frozen=True)
+class Harmonic:
+    """A field outside its sources with its derivatives, of its values alone.
+
+    There B has neither a divergence nor a curl, so around any place it is the gradient of a series of harmonic
+    polynomials. The values at the place itself, at six points on the axes and at eight on the diagonals of a cube, all
+    at the distance a, determine the first and second derivatives exactly if the series ends at degree 5. What is left
+    out is of order (a/d)^4, with the distance d from the nearest source; rounding is of order (d/a)^2. With
+    a = 0.005 d both are 1e-9 of the derivatives of a cylinder magnet, measured against 27 points at 0.03 d.
+
+    Attributes
+    ----------
+    values
+        Places (n, 3) -> B (n, 3).
+    distance
+        Places (n, 3) -> distance (n,) from the nearest source, negative inside a magnet, where the field is nan.
+    """
+
+    values: Values
+    distance: Values
+
+    def __call__(self, x: Array) -> tuple[Array, Array, Array]:
+        d = self.distance(x)
+        outside = np.isfinite(d) & (d > 0)
+        B, G, H = (np.full((len(x), *shape), np.nan) for shape in ((3,), (3, 3), (3, 3, 3)))
+        if not outside.any():
+            return B, G, H
+        points, first, second = stencil()
+        step = STEP * d[outside]
+        around = self.values((x[outside, None] + step[:, None, None] * points).reshape(-1, 3))
+        flat = np.reshape(around, (len(step), 3 * len(points)))
+        B[outside] = flat[:, :3]
+        G[outside] = (flat @ first / step[:, None]).reshape(-1, 3, 3)
+        H[outside] = (flat @ second / step[:, None] ** 2).reshape(-1, 3, 3, 3)
+        return B, G, H
+
+
+@cache
+def stencil() -> tuple[Array, Array, Array]:
+    """Points (m, 3) at the distance 0 or 1, and what makes derivatives of the values there: (3 m, 9) and (3 m, 27).
+
+    The gradients of the powers (a . x)^l of null vectors a are those of all harmonic polynomials of degree l.
+    """
+    axes, diagonals = np.vstack([np.eye(3), -np.eye(3)]), np.array([*product((-1.0, 1.0), repeat=3)]) / np.sqrt(3)
+    points = np.vstack([np.zeros((1, 3)), axes, diagonals])
+    values, first, second = list[Array](), list[Array](), list[Array]()
+    for degree in range(1, DEGREE + 1):
+        for t in 2 * np.pi * np.arange(2 * degree + 1) / (2 * degree + 1):
+            a = np.array([np.cos(t), np.sin(t), 1j])
+            power = np.ones(len(points)) if degree == 1 else (points @ a) ** (degree - 1)
+            by_x = 2.0 * (degree == 2) * np.outer(a, a).ravel()
+            by_x_twice = 6.0 * (degree == 3) * np.einsum("i,j,k->ijk", a, a, a).ravel()
+            for part in (np.real, np.imag):
+                values.append(part(degree * np.outer(power, a).ravel()))
+                first.append(part(by_x))
+                second.append(part(by_x_twice))
+    inverse = np.linalg.pinv(np.array(values), rcond=1e-10)
+    first_weights, second_weights = (np.asarray(inverse @ np.array(rows), dtype=float) for rows in (first, second))
+    return points, first_weights, second_weights

@@ -1,23 +1,30 @@
-"""A sphere magnet as a field."""
+"""A sphere magnet."""
+
+from types import ModuleType
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.sources.sphere import SphereSection
-from magshell_fenicsx.parts.magnetism.sources.harmonic import Harmonic
-from magshell_fenicsx.parts.magnetism.sources.known import Known, magpylib
+from magshell_fenicsx.parts.magnetism.sources.source import MagnetSection, Size, Values
 from magshell_fenicsx.shape.lines import ball
 
 Array = NDArray[np.float64]
 
 
-def sphere(section: SphereSection, case: Case, key: str) -> Known:
-    """See `Known`."""
-    r = section.diameter / 2
-    magnet = magpylib(key).magnet.Sphere(diameter=2 * r, polarization=section.vector)
+class SphereSection(MagnetSection):
+    """A sphere, uniformly magnetised: outside it the field of a dipole."""
 
-    def distance(x: Array) -> Array:
-        return np.asarray(np.linalg.norm(x, axis=1) - r)
+    kind: Literal["sphere"]
+    diameter: Size
+    """Diameter [m]"""
 
-    return Known(Harmonic(magnet.getB, distance), ball(r), "inside")
+    def values(self, magnets: ModuleType) -> Values:
+        magnet = magnets.Sphere(diameter=self.diameter, polarization=self.vector)
+        return magnet.getB  # type: ignore[no-any-return]
+
+    def distance(self, x: Array) -> Array:
+        return np.asarray(np.linalg.norm(x, axis=1) - self.diameter / 2)
+
+    def lines(self) -> list[Array]:
+        return ball(self.diameter / 2)

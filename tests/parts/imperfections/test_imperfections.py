@@ -13,15 +13,14 @@ from magshell_fenicsx.input.source import CaseError, Source
 from magshell_fenicsx.mesh.deviation import Deviated
 from magshell_fenicsx.mesh.mirror import Mirror
 from magshell_fenicsx.mesh.patch import check_orientation
-from magshell_fenicsx.parts.imperfections.distance import Angle
-from magshell_fenicsx.parts.imperfections.flaw import Flaw
 from magshell_fenicsx.parts.imperfections.gaussian import Gaussian
-from magshell_fenicsx.parts.imperfections.registered import flaws
+from magshell_fenicsx.parts.imperfections.imperfection import Flaw, flaws
 from magshell_fenicsx.parts.imperfections.symmetry import leaves
 from magshell_fenicsx.problem.check import describe
 from magshell_fenicsx.problem.planner import make_plan
 from magshell_fenicsx.problem.problem import Plan
-from magshell_fenicsx.shape.outline import outline
+from magshell_fenicsx.shape.ground import Angle
+from magshell_fenicsx.shape.outline import ground_of, outline
 
 Array = NDArray[np.float64]
 H = 1 / 90
@@ -141,7 +140,8 @@ def test_symmetry_that_is_left(imperfections: list[dict[str, Any]], model: str) 
 @pytest.mark.parametrize("kind", ["gaussian", "dimple"])
 def test_symmetry_by_numbers_is_that_by_values(kind: str) -> None:
     """Pairs across a plane, a depth in two parts, depths that cancel, a width or a depth that differs a little."""
-    drawn = outline(shaped("hemisphere"))
+    ground = ground_of(shaped("hemisphere").shell)
+    drawn = ground.perfect
 
     def answers(*places: tuple[float, float, float, float], formula: bool = False) -> list[bool]:
         every = [
@@ -149,7 +149,7 @@ def test_symmetry_by_numbers_is_that_by_values(kind: str) -> None:
             for polar, azimuth, depth, width in places
         ]
         every += [{"kind": "formula", "w0": "0*x"}] * formula
-        (left,) = leaves(flaws(shaped("hemisphere", *every), drawn), drawn, each=False)
+        (left,) = leaves(flaws(shaped("hemisphere", *every).imperfections, ground), drawn, each=False)
         return [left.mirrors(Mirror.upright(np.radians(azimuth))) for azimuth in (30.0, 70.0)]
 
     one, image = (40.0, 10.0, 0.1, 2.0), (40.0, 50.0, 0.1, 2.0)
@@ -179,8 +179,8 @@ def test_symmetry_of_many_imperfections_is_found_by_their_numbers() -> None:
     """400 on a parallel at random, as many planes through pairs of them: none is tried by values all over the shell."""
     ats = [{"polar": 50.0, "azimuth": float(a)} for a in np.random.default_rng(1).uniform(-180, 180, 400)]
     case = shaped("hemisphere", *({"kind": "gaussian", "amplitude": 0.1, "width": 2.0, "at": at} for at in ats))
-    drawn, found = outline(case), dict[str, Flaw]()
-    for key, flaw in flaws(case, outline(case)).items():
+    drawn, found = outline(case.shell), dict[str, Flaw]()
+    for key, flaw in flaws(case.imperfections, ground_of(case.shell)).items():
         deviation = flaw.deviation
         assert isinstance(deviation, Gaussian)
         assert isinstance(deviation.distance, Angle)

@@ -9,10 +9,9 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.input.source import CaseError, Source
-from magshell_fenicsx.parts.imperfections.data import data
-from magshell_fenicsx.parts.imperfections.feet import _on_quadrics, feet
-from magshell_fenicsx.parts.imperfections.flaw import Flaw
-from magshell_fenicsx.shape.outline import Outline, outline
+from magshell_fenicsx.parts.imperfections.data import _on_quadrics, feet
+from magshell_fenicsx.parts.imperfections.imperfection import Flaw
+from magshell_fenicsx.shape.outline import Outline, ground_of, outline
 
 Array = NDArray[np.float64]
 RNG = np.random.default_rng(16)
@@ -34,7 +33,7 @@ def made(shell: dict[str, Any], folder: Path = Path(), **item: Any) -> Case:
 
 
 def read(case: Case) -> Flaw:
-    return data(case.shell.imperfections[0], case, outline(case), "imperfections.0")  # type: ignore[arg-type]
+    return case.shell.imperfections[0].flaw(ground_of(case.shell), "shell.imperfections.0")
 
 
 def places(drawn: Outline, count: int) -> tuple[Array, Array]:
@@ -51,7 +50,7 @@ def write(folder: Path, header: str, *columns: Array) -> None:
 @pytest.mark.parametrize("shell", SHAPES, ids=lambda shell: shell["geometry"])
 def test_feet(shell: dict[str, Any]) -> None:
     """Places beside a surface, at known heights along its normal."""
-    drawn = outline(made(shell))
+    drawn = outline(made(shell).shell)
     x, n = places(drawn, 60)
     w0 = 0.02 * RNG.standard_normal(60)
     found, heights = feet(drawn, x + w0[:, None] * n)
@@ -80,7 +79,7 @@ def test_one_map_in_four_files(tmp_path: Path, way: str) -> None:
     """Places and w0, the same with units, places of the real surface, azimuth and z."""
     lengths = {"thickness": "0.5 mm", "radius": "25 mm", "length": "37.5 mm"} if way == "lengths" else {}
     case = made({**CYLINDER, **lengths}, tmp_path)
-    drawn = outline(case)
+    drawn = outline(case.shell)
     x, n = places(drawn, 600)
     w = wave(x)
     theta, z = np.degrees(np.arctan2(x[:, 1], x[:, 0])), x[:, 2]
@@ -99,7 +98,7 @@ def test_one_map_in_four_files(tmp_path: Path, way: str) -> None:
 
 def test_factor_and_noise(tmp_path: Path) -> None:
     case = made(CYLINDER, tmp_path, amplitude=2.0)
-    x, _ = places(outline(case), 700)
+    x, _ = places(outline(case.shell), 700)
     write(tmp_path, "x,y,z,w0", x, wave(x) + 0.05 * RNG.standard_normal(len(x)))
     flaw, again = read(case), read(made(CYLINDER, tmp_path, noise=0.05))
     for found, factor in ((flaw, 2), (again, 1)):
@@ -110,7 +109,7 @@ def test_factor_and_noise(tmp_path: Path) -> None:
 
 def test_what_is_refused(tmp_path: Path) -> None:
     case = made(CYLINDER, tmp_path)
-    x, n = places(outline(case), 600)
+    x, n = places(outline(case.shell), 600)
     w = wave(x)
     hole = np.linalg.norm(x - [1, 0, 0.75], axis=1) > 0.5
     for header, columns, words in (

@@ -5,7 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from magshell_fenicsx.parts.imperfections.scan import Lengths, ScanError, read_scan
+from magshell_fenicsx.input.tables import TableError
+from magshell_fenicsx.parts.imperfections.data import Lengths, read_scan
 
 MM = Lengths(h=0.01, R=0.025, si=True)
 BARE = Lengths(h=0.01, R=1.0, si=False)
@@ -62,7 +63,7 @@ def test_angles_grids_and_rows_without_numbers(tmp_path: Path) -> None:
     ],
 )
 def test_what_is_refused(tmp_path: Path, header: str, rows: np.ndarray, words: str) -> None:
-    with pytest.raises(ScanError, match=words):
+    with pytest.raises(TableError, match=words):
         read_scan(written(tmp_path, header, rows), MM)
 
 
@@ -71,7 +72,7 @@ def test_files_that_are_none(tmp_path: Path) -> None:
     (tmp_path / "b.csv").write_text("x,y,z,w0\n1,2\n3\n")
     (tmp_path / "c.csv").write_text("")
     for name, words in (("a.npz", "no .npz"), ("b.csv", "lengths"), ("c.csv", "no rows"), ("d.csv", "No such file")):
-        with pytest.raises(ScanError, match=words):
+        with pytest.raises(TableError, match=words):
             read_scan(tmp_path / name, BARE)
-    with pytest.raises(ScanError, match="has the unit mm, but the shell's lengths have none"):
+    with pytest.raises(TableError, match="has the unit mm, but the shell's lengths have none"):
         read_scan(written(tmp_path, "x [mm],y [mm],z [mm],w0 [h]"), BARE)

@@ -18,8 +18,7 @@ from magshell_fenicsx.input.expressions import with_derivatives
 from magshell_fenicsx.input.formulas_in_space import FormulasInSpace
 from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.models.shell.crossing import crossing
-from magshell_fenicsx.parts.magnetism.sources.field import in_space
-from magshell_fenicsx.parts.magnetism.sources.registered import placed
+from magshell_fenicsx.parts.magnetism.sources.field import in_space, placed
 from magshell_fenicsx.problem.check import describe
 from magshell_fenicsx.problem.planner import make_plan
 from magshell_fenicsx.simulate.follow import follow
@@ -64,7 +63,7 @@ def case(sources: list[dict[str, Any]], folder: Path | None = None, **sections: 
 def test_values_and_derivatives(kind: str) -> None:
     """Values are magpylib's at the place and angle; derivatives those of central differences of it, to 1e-7."""
     keys, own = KINDS[kind]
-    still, _ = in_space(case([{"kind": "coil" if kind == "wire" else kind, **OWN, **keys}]))
+    still, _ = in_space(case([{"kind": "coil" if kind == "wire" else kind, **OWN, **keys}]).context)
     assert still
     B, G, H = still(RANDOM)
     np.testing.assert_allclose(B, own.getB(L * RANDOM), rtol=1e-9, atol=1e-12 * np.abs(B).max())
@@ -88,7 +87,7 @@ def test_sphere_is_a_dipole() -> None:
     texts = [f"(z - ({z0}))*x/{s}**2.5", f"(z - ({z0}))*y/{s}**2.5", f"(z - ({z0}))**2/{s}**2.5 - {s}**-1.5/3"]
     exact = FormulasInSpace([with_derivatives(text) for text in texts], np.eye(3))
     magnet = {"kind": "sphere", "diameter": "20 mm", "polarization": "1.3 T", "position": [0, 0, z0 * L]}
-    still, _ = in_space(case([magnet]))
+    still, _ = in_space(case([magnet]).context)
     assert still
     for found, known in zip(still(RANDOM), exact(RANDOM), strict=True):
         np.testing.assert_allclose(found, 1.3 * r**3 * known, atol=1e-8 * np.abs(1.3 * r**3 * known).max())
@@ -151,7 +150,7 @@ def test_sum(tmp_path: Path) -> None:
     for key in ("radius", "thickness"):
         data["shell"][key] = f"{data['shell'][key]} m"
     data["shell"]["youngs_modulus"] = "1 MPa"
-    still, driven = in_space(Case.from_source(Source("test", data, folder=tmp_path)))
+    still, driven = in_space(Case.from_source(Source("test", data, folder=tmp_path)).context)
     assert still
     assert not driven
     x = RANDOM * [0.9, 0.8, 0.9]
@@ -255,7 +254,7 @@ def test_shell_leaves_the_grid(tmp_path: Path) -> None:
 
 def test_thin_magnet_in_the_way() -> None:
     """It is passed through in one step: the distance of the ends of a way says nothing about its middle."""
-    (plate,) = placed(case([{"kind": "cylinder", **ALONG, "height": "0.02 mm", "position": [0, 0, 0]}]))
+    (plate,) = placed(case([{"kind": "cylinder", **ALONG, "height": "0.02 mm", "position": [0, 0, 0]}]).context)
     x = np.array([[0.01, 0.02, 0.3], [5.0, 0, 0.3]])
     found = crossing(plate.distance, x, x - [0, 0, 0.7])
     assert found is not None

@@ -1,1 +1,0 @@
-"""The sources of the applied field: one section for each kind."""

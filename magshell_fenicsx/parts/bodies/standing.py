@@ -1,0 +1,154 @@
+"""The rigid bodies of a case in the model's terms: where they stand, how stiff they are, and what they leave."""
+
+from collections.abc import Callable, Collection, Iterable, Mapping
+from math import atan2, inf
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.mesh.frame import rotation
+from magshell_fenicsx.mesh.mirror import Mirror
+from magshell_fenicsx.parts.bodies.body import BodySection, place_body
+from magshell_fenicsx.parts.bodies.contact import Contact
+from magshell_fenicsx.parts.bodies.press import ContactSection
+from magshell_fenicsx.parts.step import Step
+from magshell_fenicsx.shape.ground import Ground, located
+from magshell_fenicsx.shape.symmetry import Leaves
+
+Array = NDArray[np.float64]
+NATURAL = 1e6  # default stiffness over D/(R h)^2: plate and ball then penetrate less than 1e-3 h
+POINTED = 15.0  # times as stiff is the penalty of a body that touches in a spot, times 1 + R/its radius
+WITHIN = 1e-6  # penetration over h that is rounding
+ROUNDS, FINER = 6, 0.2  # refinements of a search, and how much smaller its range is each time
+AROUND = 1.5  # half the side, over R, of the cube in which bodies may overlap
+ALIKE = 1e-10  # distances and directions of images: rounding
+
+
+def contacts(
+    bodies: Mapping[str, BodySection], approaches: Mapping[str, str], driven: Collection[str], ground: Ground
+) -> tuple[Contact, ...]:
+    """What bodies bring to the model.
+
+    Parameters
+    ----------
+    approaches
+        Body -> name of its approach, the amplitude.
+    driven
+        The amplitudes that steps drive.
+
+    Raises
+    ------
+    CaseError
+        If a body penetrates the undeformed shell, or one that moves overlaps another.
+    """
+    standing = [_contact(name, body, approaches[name], ground) for name, body in bodies.items()]
+    for i, one in enumerate(standing):
+        for other in standing[i + 1 :]:
+            if not {one.amplitude, other.amplitude} & {*driven}:
+                continue
+            if (depth := overlap(one, other)) > 0:
+                raise CaseError(
+                    f"bodies.{other.body}.position: overlaps bodies.{one.body} by {depth:.3g} R at approach 0; bodies "
+                    "that move must be apart"
+                )
+    return tuple(standing)
+
+
+def _contact(name: str, section: BodySection, approach: str, ground: Ground) -> Contact:
+    key, h, Q = f"bodies.{name}", ground.h, ground.Q
+    place, _ = located(section.at, ground, key)
+    chart = ground.perfect.inverse(place)
+    normal = ground.perfect.normal(chart[None])[0]
+    start = place if len(chart) == 3 else ground.drawn.embedding(chart[None])[0]
+    half = float(ground.half_thickness(start[None])[0])
+    placed = place_body(section, key, start, normal / np.linalg.norm(normal), half, Q, ground.R)
+    D, size = h**2 / (12 * (1 - ground.nu**2)), section.blunt / placed.R
+    k = section.stiffness or NATURAL * D / h**2 * (1.0 if size == inf else POINTED * (1 + 1 / size))
+    contact = Contact(
+        name,
+        approach,
+        section.distance(placed),
+        placed.direction,
+        placed.front,
+        k,
+        section.penetration,
+        size,
+        section.stiffness is not None,
+        *((Q @ start, placed.front - Q @ start) if section.position is None else ()),
+    )
+    depth = -least_gap(contact, ground)
+    if depth > WITHIN * h:
+        at, hint = "position", "move it back"
+        if section.position is None:
+            at, hint = "at", "give a place `at` that it reaches first, or its `position`"
+        raise CaseError(
+            f"{key}.{at}: the body penetrates the undeformed shell by {depth / h:.4g} h at approach 0; {hint}"
+        )
+    return contact
+
+
+def pressed(loads: Iterable[Step]) -> float:
+    """The largest approach over h that a target of steps asks for; 0 without."""
+    return max((abs(load.approach or 0.0) for load in loads if isinstance(load, ContactSection)), default=0.0)
+
+
+def body_leaves(contact: Contact) -> Leaves:
+    """The symmetry that a body leaves, found at random places."""
+    x = np.random.default_rng(17).uniform(-2, 2, (40, 3))
+    g, d = contact.distance(x)[0], contact.direction
+
+    def alike(S: Array, image: Array) -> bool:
+        other = contact.distance(image)[0]
+        return bool(np.abs(S @ d - d).max() < ALIKE and np.abs(other - g).max() < ALIKE * (1 + np.abs(g).max()))
+
+    turns = all(alike(Q, x @ Q.T) for Q in (rotation(1.0), rotation(2.5)))
+    tilted = [contact.front, d, *contact.distance.held]
+    between = tuple(atan2(v[1], v[0]) for v in contact.distance.across if np.hypot(*v[:2]) > ALIKE)
+
+    def mirrors(mirror: Mirror) -> bool:
+        return alike(mirror.reflection, mirror.image(x))
+
+    return Leaves(None if turns else f"bodies.{contact.body} is not turned about e3", tilted, mirrors, azimuths=between)
+
+
+def least_gap(contact: Contact, ground: Ground) -> float:
+    """The least gap over R between a body and the face of the undeformed shell."""
+    drawn = ground.drawn
+
+    def gap(x: Array) -> Array:
+        return contact.gap(x @ ground.Q.T, 0.0, ground.half_thickness(x))[0]
+
+    chart = drawn.charts()
+    if chart is None:
+        return float(gap(drawn.sample()).min())
+    reach = np.full(2, 0.1 * float(np.ptp(chart, axis=0).max()))
+
+    def on_chart(x: Array) -> Array:
+        return gap(drawn.embedding(np.array([drawn.within(p) for p in x])))
+
+    values = gap(drawn.embedding(chart))
+    return _refined(on_chart, chart[values.argmin()], float(values.min()), reach)
+
+
+def overlap(one: Contact, other: Contact) -> float:
+    """How deep two bodies overlap near the shell at approach zero, over R; negative if they are apart."""
+
+    def farther(x: Array) -> Array:
+        return np.maximum(one.distance(x)[0], other.distance(x)[0])
+
+    x = np.concatenate([np.random.default_rng(3).uniform(-AROUND, AROUND, (4000, 3)), [one.front, other.front]])
+    values = farther(x)
+    return -_refined(farther, x[values.argmin()], float(values.min()), np.full(3, 0.5))
+
+
+def _refined(f: Callable[[Array], Array], best: Array, least: float, reach: Array) -> float:
+    """The minimum near a place, by random places in a box that shrinks around the best one."""
+    rng = np.random.default_rng(5)
+    for _ in range(ROUNDS):
+        x = best + reach * rng.uniform(-1, 1, (200, len(best)))
+        values = f(x)
+        if values.min() < least:
+            best, least = x[values.argmin()], float(values.min())
+        reach = FINER * reach
+    return least

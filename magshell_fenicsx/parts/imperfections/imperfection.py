@@ -1,0 +1,228 @@
+"""What all imperfections have in common: their sections, sizes with units, and what they bring to a plan."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from math import inf, sqrt
+from typing import Annotated, Any, ClassVar, Generic, Literal, Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BeforeValidator, Field, ModelWrapValidatorHandler, ValidationError, ValidationInfo
+
+from magshell_fenicsx.input.section import Section, in_units, with_unit
+from magshell_fenicsx.mesh.deviation import Deviation
+from magshell_fenicsx.mesh.frame import rotation
+from magshell_fenicsx.shape.ground import At, Distance, Ground
+
+Array = NDArray[np.float64]
+Values = TypeVar("Values")
+KEYS = ("imperfections", "defect")
+CONTEXT = "of imperfections"  # key of the context of a validation: scale -> size in m, none without units
+UNITS = {"h": "h", "width": "the unit of a dimple's width"}
+SHOWN = 0.45  # of sqrt(R h): elements that show a dimple
+
+
+@dataclass(frozen=True)
+class Flaw:
+    """What one imperfection brings to a plan; places, lengths and w0 are over R, in the frame of the case.
+
+    Attributes
+    ----------
+    deviation
+        Places (n, 3) of the perfect surface -> w0 (n,).
+    size
+        Largest element size that shows it, within `reach` of its centre.
+    centre
+        Its place (3,) on the perfect surface; None if it is everywhere.
+    distance
+        From its centre.
+    reach
+        How far it reaches from its centre, in the measure of `distance`.
+    rim
+        Whether the curvature jumps there.
+    account
+        What it was made from, for people.
+    sizes
+        Places (n, 3) -> element sizes (n,) that show it there, of one without a centre that varies more in some
+        places; None where they are alike.
+    """
+
+    deviation: Deviation
+    size: float = inf
+    centre: Array | None = None
+    distance: Distance | None = None
+    reach: float = inf
+    rim: bool = False
+    account: str = ""
+    sizes: Callable[[Array], Array] | None = None
+
+    def inside(self, places: Array) -> NDArray[np.bool_]:
+        """Whether places (n, 3) are within its rim."""
+        assert self.distance
+        return np.asarray(self.distance(places) < self.reach)
+
+
+@dataclass(frozen=True)
+class Turned(Generic[Values]):
+    """A function of places (n, 3) in a frame whose axes are the rows of `axes`."""
+
+    of_place: Callable[[Array], Values]
+    axes: Array
+
+    def __call__(self, places: Array) -> Values:
+        return self.of_place(places @ self.axes)
+
+
+def in_frame(of_place: Callable[[Array], Values], turn: float) -> Callable[[Array], Values]:
+    """A function of places in a frame turned about e3 (rad)."""
+    return Turned(of_place, rotation(turn)) if turn else of_place
+
+
+class Shell(Protocol):
+    """A shell with or without units."""
+
+    @property
+    def R_over_h(self) -> float: ...
+    @property
+    def reference(self) -> float: ...
+    @property
+    def poisson_ratio(self) -> float: ...
+
+
+def half_width(width: float, R_over_h: float, nu: float) -> float:
+    """Width of an imperfection over R (rad), from the width over (h R)^(1/2)/(12 (1 - nu^2))^(1/4)."""
+    return width / sqrt(sqrt(12 * (1 - nu**2)) * R_over_h)
+
+
+def over(scale: Literal["h", "width"]) -> BeforeValidator:
+    """A validator: a length with a unit -> a number over h, or in the unit of a dimple's width; or a number."""
+
+    def convert(value: Any, info: ValidationInfo) -> Any:
+        if not isinstance(value, str):
+            return value
+        exact = in_units("metre")(value)
+        if info.context and CONTEXT not in info.context:
+            return 1.0  # the shell is wrong: any number will do
+        sizes = (info.context or {}).get(CONTEXT)
+        if not sizes:
+            raise ValueError(f"has a unit: that needs lengths of the shell with units; a number is in {UNITS[scale]}")
+        return exact / sizes[scale]
+
+    return BeforeValidator(convert, json_schema_input_type=float | with_unit("millimetre"))
+
+
+def note_sizes(data: Any, handler: ModelWrapValidatorHandler[Any], info: ValidationInfo, *, with_units: bool) -> None:
+    """Note what the imperfections in plain data of a shell are over: the shell without them has these sizes.
+
+    A wrong shell has none: its own message says what is wrong.
+    """
+    if (
+        not isinstance(info.context, dict)
+        or not isinstance(data, dict)
+        or not any(map(_has_text, _imperfections(data)))
+    ):
+        return
+    info.context.pop(CONTEXT, None)
+    try:
+        shell: Shell = handler({key: value for key, value in data.items() if key not in KEYS})
+    except ValidationError:
+        return
+    R, R_over_h = shell.reference, shell.R_over_h
+    sizes = {"h": R / R_over_h, "width": R * half_width(1.0, R_over_h, shell.poisson_ratio)}
+    info.context[CONTEXT] = sizes if with_units else {}
+
+
+def sizes_noted(info: ValidationInfo) -> Mapping[str, Any]:
+    """The part of the context of a validation with the sizes, for what is validated later."""
+    return {CONTEXT: (info.context or {}).get(CONTEXT, {})}
+
+
+def _imperfections(data: dict[str, Any]) -> list[Any]:
+    listed = data.get("imperfections")
+    return [*(listed if isinstance(listed, list) else []), data.get("defect")]
+
+
+def _has_text(part: Any) -> bool:
+    """Whether a part of plain data has text that begins with a number, or the unit of random numbers."""
+    if isinstance(part, dict):
+        return any(key == "unit" or _has_text(value) for key, value in part.items())
+    if isinstance(part, list):
+        return any(map(_has_text, part))
+    return isinstance(part, str) and part.strip()[:1] in {*"+-.0123456789"}
+
+
+class ImperfectionSection(Section):
+    """Base of all kinds: w0 along the outward normal of the perfect surface.
+
+    Attributes
+    ----------
+    patch
+        Whether the part within its rim is a patch with a name.
+    """
+
+    patch: ClassVar[bool] = False
+    kind: str
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Numbers that a knockdown factor is differentiated by, as paths of keys below the section."""
+        return ("amplitude",)
+
+    def account(self) -> str:
+        """Its words in the account of what is built."""
+        return self.kind
+
+    def listed(self) -> "Mapping[str, ImperfectionSection]":
+        """What is built of it: itself, or others by their keys below its own, which begin with a dot."""
+        return {"": self}
+
+    def refuse_unfit(self, R_over_h: float, nu: float, edge: float | None) -> None:
+        """See that a shell can have it; raises ValueError otherwise.
+
+        Parameters
+        ----------
+        edge
+            Polar angle of the edge of a sphere (rad); None of other shells.
+        """
+
+    def flaw(self, ground: Ground, key: str) -> Flaw:
+        """What it brings to a plan; `key` is its own, with dots.
+
+        Raises
+        ------
+        CaseError
+            If the perfect surface has no such imperfection.
+        """
+        raise NotImplementedError
+
+
+class LocalSection(ImperfectionSection):
+    """Base of those around a place."""
+
+    amplitude: Annotated[float, over("h")] = Field(ge=-50, le=50)
+    """Depth δ, inwards; a bump is negative [h]"""
+    width: Annotated[float, over("width")] = Field(ge=0.05, le=50)
+    """Half-width φo of a dimple, φg of a Gaussian one, times (√(12(1 - ν²)) R/h)^(1/2); with a unit R φo, R φg"""
+    at: At = At.model_construct()
+    """Its centre"""
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        return ("amplitude", "width", "at.polar", "at.azimuth")
+
+    def half_width(self, R_over_h: float, nu: float) -> float:
+        """Over R (rad)."""
+        return half_width(self.width, R_over_h, nu)
+
+
+def refuse_steep(depth: float, slope: float) -> None:
+    """Refuse a local imperfection by its depth over R and its steepest slope."""
+    if depth > 0.5:
+        raise ValueError(f"the dimple is {depth:.2g} radii deep; it must stay below half a radius")
+    if slope > 2:
+        raise ValueError(f"the dimple's steepest slope is {slope:.3g}: too steep for a shell, at most 2")
+
+
+def flaws(imperfections: Mapping[str, ImperfectionSection], ground: Ground) -> dict[str, Flaw]:
+    """Key of each imperfection below `shell` -> what it brings."""
+    return {key: section.flaw(ground, f"shell.{key}") for key, section in imperfections.items()}

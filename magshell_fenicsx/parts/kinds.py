@@ -1,0 +1,48 @@
+"""The kinds of bodies, imperfections and sources: each is a file of its room, with its section and what that makes.
+
+A new kind is such a file, named after it, and its name here.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Annotated, Any, Union, get_args
+
+from pydantic import Field
+
+from magshell_fenicsx.input.chosen import Chosen
+from magshell_fenicsx.input.section import Section
+from magshell_fenicsx.parts.bodies.body import BodySection
+from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionSection
+from magshell_fenicsx.parts.magnetism.sources.source import SourceSection
+
+REGISTERED: dict[str, tuple[str, ...]] = {
+    # room -> kinds in the order of the documentation
+    "bodies": ("plane", "sphere", "cylinder", "rod", "box"),
+    "imperfections": ("dimple", "gaussian", "formula", "data", "modes", "random"),
+    "magnetism.sources": ("cylinder", "cuboid", "sphere", "ring", "coil", "grid", "formula"),
+}
+
+
+def section_of(room: str, kind: str) -> type[Section]:
+    """The section of a kind: the one class in its file with this value of the key `kind`."""
+    module = import_module(f"{__package__}.{room}.{kind}")
+    own = (each for each in vars(module).values() if getattr(each, "__module__", "") == module.__name__)
+    sections = [each for each in own if isinstance(each, type) and issubclass(each, Section)]
+    (section,) = (each for each in sections if kind in get_args(each.model_fields["kind"].annotation))
+    return section
+
+
+def _any_of(room: str) -> Any:
+    sections = tuple(section_of(room, kind) for kind in REGISTERED[room])
+    return Annotated[Union[sections], Chosen("kind")]  # noqa: UP007
+
+
+if TYPE_CHECKING:
+    Body = BodySection
+    Imperfection = ImperfectionSection
+    Source = SourceSection
+else:
+    Body, Imperfection, Source = map(_any_of, REGISTERED)
+
+Bodies = Annotated[dict[str, Body], Field(max_length=100)]
+Imperfections = Annotated[list[Imperfection], Field(max_length=1000)]
+Sources = Annotated[list[Source], Field(min_length=1, max_length=1000)]

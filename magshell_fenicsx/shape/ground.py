@@ -1,0 +1,175 @@
+"""What the kinds of a part need of the shell that they are on: its outline, its scales, and places of it."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Annotated, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from magshell_fenicsx.input.direction import Direction
+from magshell_fenicsx.input.expressions import formula
+from magshell_fenicsx.input.section import or_number
+from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.mesh.frame import rotation
+
+if TYPE_CHECKING:  # it reads meshes, and needs the solver for that
+    from magshell_fenicsx.shape.outline import Outline
+
+Array = NDArray[np.float64]
+Distance = Callable[[Array], Array]  # places (n, 3) over R -> distances (n,) over R, from one place
+Coordinates = Annotated[list[Annotated[float, or_number("metre")]], Field(min_length=3, max_length=3)]
+ON_SURFACE = 1e-6  # of R, within which a named point lies on the surface
+ON_AXIS = 1e-9  # over R
+
+
+class At(Direction):
+    """A direction from the centre of a sphere, `polar: 0` of a pole or a centre; or a place of the perfect surface."""
+
+    point: Coordinates | None = None
+    """Place on the perfect surface, on any shape [the shell's length; over R if that has no unit]"""
+
+    @model_validator(mode="after")
+    def _one_way(self) -> Self:
+        if self.point is not None and {"polar", "azimuth"} & self.model_fields_set:
+            raise ValueError("give a point, or polar and azimuth")
+        return self
+
+    def words(self) -> str:
+        """Where it is."""
+        if self.point is not None:
+            return f"at ({', '.join(f'{x:g}' for x in self.point)})"
+        return f"at polar {self.polar:g}, azimuth {self.azimuth:g}" if self.polar else "at the pole"
+
+
+@dataclass(frozen=True)
+class Ground:
+    """The shell that imperfections, bodies and sources are on; places are over R, in the frame of the case.
+
+    Attributes
+    ----------
+    geometry
+        Its word in the case.
+    perfect, drawn
+        The outline without imperfections, and with those that do not grow.
+    R
+        What lengths of the case are over, in the case's unit.
+    R_over_h, nu
+        R over the thickness, and Poisson's ratio.
+    with_units
+        Whether lengths of the case are in metres.
+    edge_polar
+        Of a part of a sphere the angle of its edge from e3 (degree); None of other geometries.
+    thickness_factor
+        A formula that multiplies the thickness.
+    identity
+        What tells its perfect surface from others.
+    turn
+        The model's frame is turned about e3 by it (rad).
+    """
+
+    geometry: str
+    perfect: "Outline"
+    drawn: "Outline"
+    R: float
+    R_over_h: float
+    nu: float
+    with_units: bool = False
+    edge_polar: float | None = None
+    thickness_factor: str | None = None
+    identity: tuple[str | None, ...] = ()
+    turn: float = 0.0
+
+    @property
+    def h(self) -> float:
+        """The thickness over R."""
+        return 1 / self.R_over_h
+
+    @cached_property
+    def Q(self) -> Array:
+        """Turns vectors of the case into the model's frame."""
+        return rotation(self.turn)
+
+    @property
+    def spherical(self) -> bool:
+        """Whether distances on it are angles."""
+        return self.edge_polar is not None
+
+    @cached_property
+    def _thickness(self) -> Callable[..., Array] | None:
+        return formula(self.thickness_factor) if self.thickness_factor else None
+
+    def half_thickness(self, x: Array) -> Array:
+        """Half the thickness over R at places (n, 3)."""
+        return np.broadcast_to(self.h / 2 * (self._thickness(*x.T) if self._thickness else 1.0), len(x))
+
+
+@dataclass(frozen=True)
+class Angle:
+    """The angle (rad) from a unit vector (3,)."""
+
+    axis: Array
+
+    def __call__(self, places: Array) -> Array:
+        (a, b, c), (x, y, z) = self.axis, places.T
+        across = np.sqrt((b * z - c * y) ** 2 + (c * x - a * z) ** 2 + (a * y - b * x) ** 2)  # np.cross takes thrice
+        return np.asarray(np.arctan2(across, places @ self.axis))
+
+
+@dataclass(frozen=True)
+class Straight:
+    """The distance in space from a place (3,)."""
+
+    place: Array
+
+    def __call__(self, places: Array) -> Array:
+        return np.asarray(np.linalg.norm(places - self.place, axis=1))
+
+
+def located(at: At, ground: Ground, key: str) -> tuple[Array, Distance]:
+    """A place (3,) over R of the perfect surface, and the distance from there: an angle, or the length of the
+    meridian from a pole, or straight.
+
+    Raises
+    ------
+    CaseError
+        If it does not lie on the surface, or a direction does not say where it is.
+    """
+    perfect = ground.perfect
+    if at.point is not None:
+        place = np.array(at.point) / ground.R
+        if ground.geometry != "mesh":
+            refuse_beside(f"{key}.at.point", place, perfect, ground.R, with_units=ground.with_units)
+    elif ground.spherical:
+        place = at.vector()
+        if not 0 <= at.polar <= 180 or np.linalg.norm(perfect.perfect(perfect.inverse(place)[None])[0] - place) > 1e-6:
+            raise CaseError(f"{key}.at.polar: {at.polar:g}: is not on the shell: allowed 0 to {ground.edge_polar:g}")
+    elif at.polar or perfect.highest is None or not (perfect.disc or ground.geometry == "strip"):
+        raise CaseError(f"{key}.at: on a {ground.geometry} give its place, at: {{point: [x, y, z]}}")
+    else:
+        place = perfect.perfect(perfect.highest[None])[0]
+    if ground.spherical:
+        return place, Angle(place / np.linalg.norm(place))
+    if perfect.from_pole and np.hypot(*place[:2]) < ON_AXIS:
+        return place, perfect.from_pole
+    return place, Straight(place)
+
+
+def refuse_beside(key: str, x: Array, outline: "Outline", R: float, *, with_units: bool) -> None:
+    """See that the place (3,) at a key, over R, is on the surface.
+
+    Raises
+    ------
+    CaseError
+        With a place near it that is.
+    """
+    chart = outline.inverse(x)
+    nearest = x if len(chart) == 3 else outline.embedding(chart[None])[0]
+    perfect = outline.perfect(chart[None])[0] if len(chart) == 2 else x
+    if min(float(np.linalg.norm(place - x)) for place in (nearest, perfect)) > ON_SURFACE:
+        size, unit = (1e3 * R, " mm") if with_units else (R, "")
+        near = ", ".join(f"{c * size + 0.0:.8g}{unit}" for c in np.round(nearest, 12))
+        bare = "; a number without a unit is in metres here" if with_units else ""
+        raise CaseError(f"{key}: is not on the surface; a place near it that is: [{near}]{bare}")
