@@ -11,6 +11,7 @@ from magshell_fenicsx.continuation.transient import Integrator
 ATONCE = 0.1  # part of what the balance may lack that one step may make
 SPENT = 0.3  # of its share: a step after one that leaks more is not longer
 SMALLEST = 1e-6  # of the first step
+FINEST = 1e-9  # tolerance of a step
 
 
 @dataclass(frozen=True)
@@ -29,12 +30,20 @@ class TimeSteps:
         First step without `fixed`.
     balance
         Beside a body: what the balance of energy may lack, over its turnover.
+    longest, fastest
+        The longest step for the tolerance up to a time, as a rule that at which a motion is fastest.
     """
 
     fixed: float | None
     tolerance: float
     first: float
     balance: float = 1e-2
+    longest: float = np.inf
+    fastest: float = -np.inf
+
+    def refined(self, part: float) -> "TimeSteps":
+        """Steps that are shorter by this factor; below `FINEST` estimated errors are of the iterations."""
+        return replace(self, tolerance=max(part**3 * self.tolerance, FINEST), longest=part * self.longest)
 
     def share(self, now: Motion) -> float:
         """What the last step may have added to the imbalance."""
@@ -75,7 +84,7 @@ def advance(
     while end - now.t > 1e-9 * (end - begin):
         between()
         way = end - now.t
-        dt = min(dt, steps.fixed or dt)
+        dt = min(dt, steps.fixed or dt, steps.longest if now.t < steps.fastest else dt)
         length = way / np.ceil(way / dt * (1 - 1e-9))
         found = integrator.step(now, length)
         if isinstance(found, str):

@@ -80,6 +80,9 @@ class SearchSection(Section):
     """No guess is tried after so long; by default there is no limit [s]"""
 
 
+Errors: TypeAlias = Literal["step", "motion"]
+
+
 class SnapSection(Section):
     """Of `then: snap`."""
 
@@ -88,7 +91,10 @@ class SnapSection(Section):
     damping: float = Field(default=0.1, gt=0, le=10)
     """Part of the critical drag of the lowest mode of vibration that is not neutral at the fold"""
     tolerance: float = Field(default=1e-3, ge=1e-9, le=1)
-    """Largest estimated error of a time step [h]"""
+    """Largest estimated error [h] of what `errors` says"""
+    errors: Errors = "motion"
+    """Of each time step, or of the motion at all rows (column error_over_h): then it is rehearsed with longer steps,
+    which takes several times as long; a snap magnifies the errors of steps"""
 
 
 class Target(NamedTuple):

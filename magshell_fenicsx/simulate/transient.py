@@ -25,7 +25,7 @@ from magshell_fenicsx.parts.motion.step import EventSection, TimeSection
 from magshell_fenicsx.parts.motion.viscous import Branch, Viscosity
 from magshell_fenicsx.parts.step import SnapSection
 from magshell_fenicsx.simulate.histories import LoadsInTime, time_of
-from magshell_fenicsx.simulate.intervals import Intervals
+from magshell_fenicsx.simulate.intervals import Intervals, Rehearsed
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.stage import staged
@@ -62,34 +62,51 @@ def motion(scene: Scene, load: TimeSection, state: State, held: Mapping[str, Hel
     case, system = scene.case, scene.model.system
     loads = LoadsInTime(case, load, state, scene.motions)
     drag = float(in_units("1/second")(load.drag)) * (case.time_unit or 1.0)
-    viscous, device, ground = viscosity(scene, state), staged(scene, state, held).device, None
-    if moving := scene.motions & set(load.drives):
-        if viscous:
-            raise CaseError(f"history.{next(iter(moving))}: a viscous shell needs supports that are at rest")
-        carried = state.ground if isinstance(state, Moving) else None
-        ground = Ground(system, whole_mass(scene.model), lambda t, b: (loads(t, b), loads.rates(t, b, moving)), carried)
-    pressings = {name: known for name, (known, _) in scene.model.contacts.items()}
-    touching = Pressings(system, pressings) if pressings else None
-    integrator = Integrator(
-        system, mass(scene.model), loads, load.rho_inf, drag, viscous, load.drives, device, ground, touching
-    )
     u, v = state.u, state.v if isinstance(state, Moving) else 0.0 * state.u
     if load.push:
         u, v = pushed(scene, load.push, state, v)
     if load.velocity:
         v = v + by_formula(scene, load.velocity)
-    now, duration = integrator.begin(0.0, u, v), time_of(case, load.duration)
+
+    def begin() -> tuple[Integrator, Motion]:
+        viscous, device, ground = viscosity(scene, state), staged(scene, state, held).device, None
+        if moving := scene.motions & set(load.drives):
+            if viscous:
+                raise CaseError(f"history.{next(iter(moving))}: a viscous shell needs supports that are at rest")
+            carried = state.ground if isinstance(state, Moving) else None
+            ground = Ground(
+                system, whole_mass(scene.model), lambda t, b: (loads(t, b), loads.rates(t, b, moving)), carried
+            )
+        pressings = {name: known for name, (known, _) in scene.model.contacts.items()}
+        touching = Pressings(system, pressings) if pressings else None
+        integrator = Integrator(
+            system, mass(scene.model), loads, load.rho_inf, drag, viscous, load.drives, device, ground, touching
+        )
+        return integrator, integrator.begin(0.0, u, v)
+
+    integrator, now = begin()
+    ground, duration = integrator.ground, time_of(case, load.duration)
     fixed = None if load.step is None else time_of(case, load.step)
     steps = TimeSteps(fixed, load.tolerance, fixed or duration / load.points / 10, load.balance)
     dt, most = steps.first, integrator.kinetic(now)
     total = most + system.stored(now.u, now.mu)
     outputs = [duration * i / load.points for i in range(1, load.points + 1)]
-    walk, watched = Intervals(scene, integrator, held, steps, loads.marks), _watched(scene, load.event, state)
-    ended = ""
+    watched, ended = _watched(scene, load.event, state), ""
+
+    def crossed(before: Motion, now: Motion) -> bool:
+        return bool(watched and watched(before) * watched(now) <= 0 and watched(now) != watched(before))
+
+    def over(before: Motion, now: Motion, most: float) -> bool:
+        quiet = load.until == "rest" and max(integrator.kinetic(before), integrator.kinetic(now)) <= QUIET * most
+        return quiet or crossed(before, now)
+
+    whole = load.errors == "motion" and fixed is None
+    rehearse = Rehearsed(scene, held, loads.marks, begin, outputs, over) if whole else None
+    walk = Intervals(scene, integrator, held, steps, loads.marks, rehearse)
     for end in outputs:
         before, first = now, dt
         now, dt, point = walk.journalled(before, first, end)
-        if watched and watched(before) * watched(now) <= 0 and watched(now) != watched(before):
+        if watched and crossed(before, now):
             now, dt, point = walk.journalled(before, first, walk.crossing(before, first, now, watched))
             ended = "event"
         kinetic = integrator.kinetic(now)
@@ -175,6 +192,7 @@ def released(scene: Scene, snap: SnapSection, fold: Record, held: Mapping[str, H
         points=MOST,
         drag=2 * snap.damping * omega / unit,
         tolerance=snap.tolerance,
+        errors=snap.errors,
         until="rest",
     )
     away = scene.model.system.held(fold.point.du)
