@@ -76,6 +76,28 @@ def imbalances(programme: Iterable[ProgrammeStep], found: Sequence[Row], length:
             )
 
 
+def departures(programme: Iterable[ProgrammeStep], found: Sequence[Row]) -> Iterator[str]:
+    """Which motions have, or may have, a larger error than their tolerance, in words."""
+    for step in programme:
+        load = step.load
+        how = load if isinstance(load, TimeSection) else getattr(load, "snap", None)
+        rows = [row for row in found if row["step"] == step.number and row["amplitude"] == "time"]
+        if how is None or not rows:
+            continue
+        error = max(float(row["error_over_h"]) for row in rows)
+        if how.errors == "motion" and error > how.tolerance:
+            yield (
+                f"step {step.number}: the estimated error of its motion is {error:.2g} h, more than tolerance: "
+                f"{how.tolerance:g}; even the shortest steps leave it"
+            )
+        adapted = isinstance(load, TimeSection) and load.step is None and load.until != "instability"
+        if adapted and how.errors == "step" and any(int(row["negative_pivots"]) for row in rows):
+            yield (
+                f"step {step.number}: it passes unstable states, which magnify the errors of its steps in time; "
+                "errors: motion keeps those of the motion below tolerance"
+            )
+
+
 def _imbalance(row: Row, length: float) -> float:
     """That of a row over its energies."""
     energies = sum(abs(float(row[name])) for name in ("kinetic", "stored", "dissipated", "work"))

@@ -31,7 +31,7 @@ from magshell_fenicsx.runs.frequencies import frequencies_after, wanted
 from magshell_fenicsx.runs.gradients import gradients_after, refuse_unknown
 from magshell_fenicsx.runs.interrupt import Interrupted, Stoppable, Watch
 from magshell_fenicsx.runs.modes import modes_after
-from magshell_fenicsx.runs.rows import RowMaker, imbalances
+from magshell_fenicsx.runs.rows import RowMaker, departures, imbalances
 from magshell_fenicsx.runs.status import RunProgress, waiting
 from magshell_fenicsx.runs.summary import Result, summary
 from magshell_fenicsx.simulate.adapt.choice import Adapted
@@ -165,7 +165,8 @@ def _run(
             for step in scene.case.programme:
                 if step.load.search and not any(int(result.rows[i]["step"]) == step.number for i in result.found):
                     say(f"warning: the search at the end of step {step.number} has found no further solution")
-            for said in imbalances(scene.case.programme, result.rows, scene.model.system.length):
+            steps = scene.case.programme
+            for said in (*imbalances(steps, result.rows, scene.model.system.length), *departures(steps, result.rows)):
                 say(f"warning: {said}")
             result.sensitivities = _sensitivities(result)
             result.barrier = _barrier(result)

@@ -1,8 +1,8 @@
 """The rows of a motion: its states at given times, from the journal where it has them, and their errors.
 
 Departures from unstable states magnify the errors of steps, by a factor that the end of the motion alone shows. So a
-motion whose error at the rows is asked for is rehearsed with longer steps. The first rehearsal shows when it is fastest;
-until then no step is longer than there. Two more show the error, which goes as the square of the steps.
+motion whose error at the rows is asked for is rehearsed with longer steps. The first rehearsal shows when it is
+fastest: until then no step is longer than there. Two more show the error, which goes as the square of the steps.
 """
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -205,7 +205,8 @@ class Intervals:
         stage = staged(scene, state, self.held)
         pivots = stage.newton.factor_at(stage.enter(state)).negative_pivots
         still = 0.0 * now.a
-        point = Point(state, now.t, now.v, dt, pivots, pivots, *spent, error=error, habit=scene.newton.factorisation.habit)
+        habit = scene.newton.factorisation.habit
+        point = Point(state, now.t, now.v, dt, pivots, pivots, *spent, error=error, habit=habit)
         rest = Point(State(now.a, now.potentials), now.work, still, now.dissipated, 0, 0, error=now.error)
         made = integrator.factored or Factored(still, {}, 0.0, integrator.factorisation.habit)
         factors = Point(State(made.u, made.mu), made.dt, still, 0.0, 0, 0, habit=made.habit)
