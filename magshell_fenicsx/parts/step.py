@@ -89,9 +89,9 @@ class SnapSection(Section):
     push: float = Field(default=0.05, gt=0, le=10)
     """How far it leaves the fold, along the path's direction there [h]"""
     damping: float = Field(default=0.1, gt=0, le=10)
-    """Part of the critical drag of the lowest mode of vibration that is not neutral at the fold"""
+    """Part of the critical drag of the third mode of vibration at the fold, where the first one is neutral"""
     tolerance: float = Field(default=1e-3, ge=1e-9, le=1)
-    """Largest estimated error [h] of what `errors` says"""
+    """Largest estimated error of what `errors` names [h]"""
     errors: Errors = "motion"
     """Of each time step, or of the motion at all rows (column error_over_h): then it is rehearsed with longer steps,
     which takes several times as long; a snap magnifies the errors of steps"""

@@ -118,7 +118,7 @@ OF_EVERY_RUN = (
     Quantity(
         "error_over_h",
         "error of u",
-        "Estimate of the algebraic error: the next Newton step; in time, with errors: motion, that of the steps in time.",
+        "Estimate of the algebraic error: the next Newton step; with errors: motion, that of steps in time.",
         "error",
         "",
         (THICKNESS,),

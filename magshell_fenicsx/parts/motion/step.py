@@ -65,7 +65,7 @@ class TimeSection(Step):
     step: Time | None = None
     """Fixed time step; by default steps follow from `tolerance`"""
     tolerance: float = Field(default=1e-3, ge=1e-9, le=1)
-    """Largest estimated error [h] of what `errors` says"""
+    """Largest estimated error of what `errors` names [h]"""
     errors: Errors = "step"
     """Of each time step, or of the motion at all rows (column error_over_h): then it is rehearsed with longer steps,
     which takes several times as long; a snap magnifies the errors of steps"""
