@@ -173,7 +173,7 @@ def released(scene: Scene, snap: SnapSection, fold: Record, held: Mapping[str, H
 
     Loads are constant, except those whose conjugates are `held`.
 
-    The shell leaves the fold along the path's direction there. Its drag is in proportion to the frequency of its second
+    The shell leaves the fold along the path's direction there. Its drag is in proportion to the frequency of its third
     mode of vibration: the first one has none at a fold.
 
     Raises
