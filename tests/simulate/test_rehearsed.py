@@ -8,17 +8,17 @@ from typing import Any
 
 import numpy as np
 import pytest
-from magshell_fenicsx.case.source import Source
-from magshell_fenicsx.models.mass import mass
-from magshell_fenicsx.run.rows import departures
-from magshell_fenicsx.run.rows import rows as table_of
 from numpy.typing import NDArray
 
 from magshell_fenicsx import Case, Scene
 from magshell_fenicsx.continuation.advance import TimeSteps, advance
 from magshell_fenicsx.continuation.system import Vector
 from magshell_fenicsx.continuation.transient import Integrator
+from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.models.modes import ShellModes
+from magshell_fenicsx.parts.motion.mass import mass
+from magshell_fenicsx.runs.rows import departures
+from magshell_fenicsx.runs.rows import rows as table_of
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.record import Record
 
