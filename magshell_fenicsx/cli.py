@@ -28,9 +28,15 @@ Over = Annotated[
     list[str],
     typer.Option(metavar="KEY.PATH=START:STOP:COUNT", help="or =VALUE,VALUE; repeat for a product, tie keys with +"),
 ]
-Result = Annotated[
-    str, typer.Option(metavar="NAME", help="knockdown, critical_field, force@w_over_h=10, energy@end, ...")
-]
+
+
+def _result(before: str = "") -> Any:
+    return typer.Option(
+        "--result", metavar="NAME", help=f"{before}knockdown, critical_field, force@w_over_h=10, energy@end, ..."
+    )
+
+
+Result = Annotated[str, _result()]
 
 PETSC = ("-snes_", "-ksp_", "-mat_", "-magshell_", "-log_", "-options_")  # how its options begin
 
@@ -155,6 +161,7 @@ def sweep(
     over: Over,
     set_: Settings = None,
     out: Annotated[str | None, _folder("results/<case name>_sweep/")] = None,
+    result: Annotated[str | None, _result("beside k_d, barrier and limit points: ")] = None,
     full_paths: Annotated[
         bool, typer.Option("--full-paths", help="compute the full path at every point; follow no fold")
     ] = False,
@@ -168,10 +175,12 @@ def sweep(
 
     folder = _chosen(out, f"{case.stem}_sweep")
     with exit_codes(stopped=(DiskError,)):
-        done = run_sweep(case, over, set_ or [], folder, made=_made, full_paths=full_paths, part=part)
+        done = run_sweep(case, over, set_ or [], folder, made=_made, result=result, full_paths=full_paths, part=part)
     print_line(f"results in {folder}/")
     if done.stopped:
         raise failure(f"{done.stopped} of {len(done.points)} points stopped early; sweep.csv says why", STOPPED)
+    if without := done.results.count(None):
+        raise failure(f"{without} of {len(done.points)} points gave no {result}; sweep.csv says why", STOPPED)
 
 
 @app.command()
@@ -285,6 +294,7 @@ def compare(
     solid: Annotated[
         str, typer.Option(metavar="R,R", help="refinements of the solid's mesh; three give error against run time")
     ] = "1",
+    result: Annotated[str | None, _result("what is compared; default k_d, or the load: ")] = None,
     out: Annotated[str | None, _folder("results/<case name>_compare/")] = None,
 ) -> None:
     """Run a case as a shell and as a solid; compare their curves and run times."""
@@ -295,7 +305,9 @@ def compare(
     folder = _chosen(out, f"{case.stem}_compare")
     with exit_codes(stopped=(DiskError, NothingLeft)):
         refinements = parse_refinements(shell, solid)
-        done = run_comparison(case, set_ or [], refinements=refinements, out=folder, made=_made, say=print_line)
+        done = run_comparison(
+            case, set_ or [], refinements=refinements, out=folder, made=_made, result=result, say=print_line
+        )
     difference = done.content["difference"]
     if difference is not None:
         print_line(f"{done.content['result']}: the solid differs from the shell by {100 * difference:+.3f} %")

@@ -20,7 +20,7 @@ from magshell_fenicsx.output.store.table import read_lines, write_csv
 from magshell_fenicsx.platform import sources
 from magshell_fenicsx.platform.processes import measure
 from magshell_fenicsx.quantities.registry import amplitude, quantity
-from magshell_fenicsx.studies.results import Scalar
+from magshell_fenicsx.studies.results import Scalar, parse_scalar
 from magshell_fenicsx.studies.runner import Folder, Made, Say, compute, keep, kept
 from magshell_fenicsx.studies.study_report import estimated_error
 
@@ -185,8 +185,13 @@ def load_at(run: ModelRun, w: float) -> float | None:
     return Scalar("", amplitude(amplitude_of(run)).column, W, w).of(run.summary, loaded(run))
 
 
-def judged(runs: Sequence[ModelRun], at: float | None) -> tuple[str, list[float | None]]:
-    """The name and the values of the compared number: k_d if all runs have it, else the load at a displacement."""
+def judged(runs: Sequence[ModelRun], at: float | None, scalar: Scalar | None = None) -> tuple[str, list[float | None]]:
+    """The name and the values of the compared number.
+
+    That is what is asked for; else k_d if all runs have it, else the load at a displacement.
+    """
+    if scalar:
+        return scalar.name, [scalar.of(run.summary, run.rows) for run in runs]
     if all(run.summary["knockdown"] is not None for run in runs):
         return "knockdown", [float(run.summary["knockdown"]) for run in runs]
     if at is None:
@@ -235,6 +240,7 @@ def compare(
     refinements: Mapping[ModelName, Sequence[float]],
     out: Path | str,
     made: Made,
+    result: str | None = None,
     say: Say = print,
 ) -> Comparison:
     """Run a case with both models; write compare.csv, compare.json and compare.png, and a folder for each run.
@@ -248,6 +254,8 @@ def compare(
         three finest runs extrapolate to.
     made
         Makes a case of its source.
+    result
+        The number that is compared, as of `magshell study`; by default k_d, or the load at a displacement.
 
     Raises
     ------
@@ -256,7 +264,7 @@ def compare(
     NothingLeft
         If a run left no results.
     """
-    file, folder = Path(file), given_folder(out)
+    file, folder, scalar = Path(file), given_folder(out), parse_scalar(result) if result else None
     for model in MODELS:
         case = made(read_source(file, [*settings, f"model={model}", *WITHOUT[model]]))
     varied = case.programme[-1].name if case.programme else ""
@@ -281,7 +289,7 @@ def compare(
             raise CaseError(f"compare: the shell ended while {ends[0]} varied, the solid while {ends[1]} did")
         found = differences(shell, solid)
         at = max(places([run for model in MODELS for run in runs[model]]), default=None)
-        content = {"case": file.name, **_content(runs, at, found)}
+        content = {"case": file.name, **_content(runs, at, found, scalar)}
         by_first(MPI.COMM_SELF, lambda: _write(content, found, folder))
         errors: Errors = {
             model: [(run["error"], run["cpu_s"]) for run in content["runs"][model] if run["error"]] for model in MODELS
@@ -321,11 +329,13 @@ def parse_refinements(shell: str, solid: str) -> dict[ModelName, list[float]]:
     return found
 
 
-def _content(runs: dict[ModelName, list[ModelRun]], at: float | None, found: Sequence[Difference]) -> dict[str, Any]:
+def _content(
+    runs: dict[ModelName, list[ModelRun]], at: float | None, found: Sequence[Difference], scalar: Scalar | None
+) -> dict[str, Any]:
     accounts: dict[ModelName, list[dict[str, Any]]] = {}
     limits: dict[str, float | None] = {}
     seconds: dict[str, float | None] = {}
-    name, judgements = judged([run for series in runs.values() for run in series], at)
+    name, judgements = judged([run for series in runs.values() for run in series], at, scalar)
     for model, series in runs.items():
         values, judgements = judgements[: len(series)], judgements[len(series) :]
         limit = extrapolated(values, [run.refinement for run in series])

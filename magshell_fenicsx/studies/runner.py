@@ -249,7 +249,9 @@ class Outcome:
 
     def serves(self, scalar: Scalar) -> bool:
         """Whether it has what a number needs: of a fold alone only the knockdown is known."""
-        return self.found == "path" or scalar.name == "knockdown"
+        needed = {scalar.column, scalar.at} & set(COLUMNS)
+        whole = self.found == "path" and (not self.curve or needed <= self.curve[0].keys())
+        return whole or scalar.name == "knockdown"
 
 
 OUTCOME = TypeAdapter(Outcome)

@@ -38,6 +38,7 @@ from magshell_fenicsx.studies.points import (
     swept_source,
     value_at,
 )
+from magshell_fenicsx.studies.results import Scalar, parse_scalar
 from magshell_fenicsx.studies.runner import (
     Case,
     Folder,
@@ -64,11 +65,12 @@ CURVE = (
 
 @dataclass(frozen=True)
 class Sweep:
-    """A finished sweep: its points in product order, and their outcomes."""
+    """A finished sweep: its points in product order, their outcomes, and their results where one was asked for."""
 
     axes: list[Axis]
     points: list[SweepPoint]
     outcomes: list[Outcome]
+    results: list[float | None]
 
     @property
     def stopped(self) -> int:
@@ -85,6 +87,7 @@ def sweep(
     say: Say = print_line,
     *,
     made: Made,
+    result: str | None = None,
     full_paths: bool = False,
     part: str | None = None,
 ) -> Sweep:
@@ -104,6 +107,8 @@ def sweep(
         Called with one line per finished point, on the rank that finished it.
     made
         Makes a case of its source.
+    result
+        A number of each point as of `magshell study`, beside those that every sweep has; see `parse_scalar`.
     full_paths
         Compute the full path at every point.
     part
@@ -116,7 +121,8 @@ def sweep(
     DiskError
         If the tables cannot be written.
     """
-    axes = parse_axes(over)
+    axes, scalar = parse_axes(over), parse_scalar(result) if result else None
+    full_paths = full_paths or not (scalar is None or scalar.name == "knockdown")
     source = from_first(comm, lambda: swept_source(Path(file), axes, settings))
     asked = from_first(comm, lambda: make_points(source, axes, made))
     share = share_of(part, len(asked))
@@ -125,7 +131,7 @@ def sweep(
     before = len(points) - len(asked)
     files = [folder / "points" / f"{point.key}.json" for point in points]
     first = {point.key: number for number, point in reversed(list(enumerate(points)))}  # equal points are one
-    missing = by_first(comm, lambda: sorted(n for n in first.values() if kept_outcome(files[n]) is None))
+    missing = by_first(comm, lambda: sorted(n for n in first.values() if not _is_known(files[n], scalar)))
     if part:
         missing = [number for number in missing if number - before in share]
     if comm.rank == 0:
@@ -133,13 +139,13 @@ def sweep(
         say(f"{len(asked)} points{also}, {len(missing)} to compute on {comm.size} rank{'s' * (comm.size > 1)}")
         if again := sum(files[number].exists() for number in missing):
             say(f"{again} of these computed again: their files are of other sources of magshell_fenicsx, or damaged")
-    shared = Known()
+    shared = Known(columns=COLUMNS if scalar else CURVE)
 
     def chain_computed(chain: Chain) -> Iterator[str]:
         for number, outcome in run_chain(chain, shared):
             keep_outcome(outcome, points[number].case, files[number])
             place = f"{missing.index(number) + 1:4d}/{len(missing)}"
-            yield f"{place}  {points[number].label}: {_result(outcome)}, {outcome.wall_s:.1f} s"
+            yield f"{place}  {points[number].label}: {_words(outcome, scalar)}, {outcome.wall_s:.1f} s"
 
     compute(make_chains(axes, points, missing, full_paths=full_paths), chain_computed, comm, say)
     done = [(point, outcome) for point, file in zip(points, files, strict=True) if (outcome := kept_outcome(file))]
@@ -147,10 +153,11 @@ def sweep(
     if comm.rank == 0 and len(done) < len(points):
         say(f"{len(points) - len(done)} of {len(points)} points are left to other parts")
     if done:
-        by_first(comm, lambda: _write(axes, [point for point, _ in done], [outcome for _, outcome in done], folder))
+        by_first(comm, lambda: _write(axes, done, scalar, folder))
     mine = {id(point) for i, point in enumerate(asked) if not part or i in share}
     own = [(point, outcome) for point, outcome in done if id(point) in mine]
-    return Sweep(axes, [point for point, _ in own], [outcome for _, outcome in own])
+    values = [outcome.value(scalar) for _, outcome in own] if scalar else []
+    return Sweep(axes, [point for point, _ in own], [outcome for _, outcome in own], values)
 
 
 def share_of(part: str | None, count: int) -> range:
@@ -165,9 +172,18 @@ def share_of(part: str | None, count: int) -> range:
     return range((i - 1) * count // n, i * count // n)
 
 
-def _result(outcome: Outcome) -> str:
+def _is_known(file: Path, scalar: Scalar | None) -> bool:
+    outcome = kept_outcome(file)
+    return outcome is not None and (scalar is None or outcome.serves(scalar))
+
+
+def _words(outcome: Outcome, scalar: Scalar | None) -> str:
+    """What a point has reached."""
     reached = "no limit point"
-    if outcome.knockdown is not None:
+    if scalar and scalar.name != "knockdown":
+        value = outcome.value(scalar)
+        reached = f"no {scalar.name}" if value is None else f"{scalar.name} = {value:.9g}"
+    elif outcome.knockdown is not None:
         pascals = outcome.in_units.get("buckling_pressure_Pa")
         reached = f"k_d = {outcome.knockdown:.6f}{f', {pascals:.6g} Pa' if pascals else ''} ({outcome.found})"
     elif outcome.barrier is not None:
@@ -234,10 +250,13 @@ class Known:
 
     Attributes
     ----------
+    columns
+        Those of every run that outcomes keep.
     first
         The first fold of the last chain, from which that of the next one is followed if it has the same mesh.
     """
 
+    columns: Sequence[str] = CURVE
     scenes: Scenes = field(default_factory=Scenes)
     first: Continuation | None = None
 
@@ -249,20 +268,20 @@ def run_chain(chain: Chain, known: Known) -> Iterator[tuple[int, Outcome]]:
         begun = link is chain[0]
         start, spent, outcome = time.perf_counter(), 0, None
         if continuation:
-            outcome, spent = _by_fold(continuation, link, known.scenes, start, same_mesh=begun)
+            outcome, spent = _by_fold(continuation, link, known, start, same_mesh=begun)
         if not outcome:
-            outcome, continuation = _by_path(link, spent, start, go_on=link is not chain[-1])
+            outcome, continuation = _by_path(link, known.columns, spent, start, go_on=link is not chain[-1])
         if begun:
             known.first = continuation = continuation and continuation.from_here()
         yield link.number, outcome
 
 
 def _by_fold(
-    continuation: Continuation, link: Link, scenes: Scenes, start: float, *, same_mesh: bool
+    continuation: Continuation, link: Link, known: Known, start: float, *, same_mesh: bool
 ) -> tuple[Outcome | None, int]:
     """The outcome, or None if the fold cannot be followed; and the number of factorisations."""
     try:
-        scene = scenes.of(link.case)
+        scene = known.scenes.of(link.case)
     except MeshError:
         return None, 0
     if same_mesh and not continuation.has_mesh_of(scene):
@@ -274,10 +293,12 @@ def _by_fold(
     except FoldLost:
         return None, factorisation.count - before
     result, work = Result(scene, fold.state, [fold_row(scene, fold)]), factorisation.count - before
-    return outcome_of(result, "fold", work, time.perf_counter() - start, CURVE), work
+    return outcome_of(result, "fold", work, time.perf_counter() - start, known.columns), work
 
 
-def _by_path(link: Link, spent: int, start: float, *, go_on: bool) -> tuple[Outcome, Continuation | None]:
+def _by_path(
+    link: Link, columns: Sequence[str], spent: int, start: float, *, go_on: bool
+) -> tuple[Outcome, Continuation | None]:
     """The outcome of a full path, and the continuation from its fold if there is one."""
     try:
         result = run(link.case, comm=MPI.COMM_SELF)
@@ -285,7 +306,7 @@ def _by_path(link: Link, spent: int, start: float, *, go_on: bool) -> tuple[Outc
         return Outcome.failed(str(e), time.perf_counter() - start, spent), None
     continuation = _begun(link.at, result) if go_on else None
     work = spent + result.scene.newton.factorisation.count
-    return outcome_of(result, "path", work, time.perf_counter() - start, CURVE), continuation
+    return outcome_of(result, "path", work, time.perf_counter() - start, columns), continuation
 
 
 def _begun(at: float, result: Result) -> Continuation | None:
@@ -367,23 +388,28 @@ def _base(source: Source, axes: Sequence[Axis]) -> str:
     return hashlib.sha256(json.dumps(data, sort_keys=True, default=str).encode()).hexdigest()[:16]
 
 
-def _write(axes: Sequence[Axis], points: Sequence[SweepPoint], outcomes: Sequence[Outcome], folder: Path) -> None:
+def _write(
+    axes: Sequence[Axis], done: Sequence[tuple[SweepPoint, Outcome]], scalar: Scalar | None, folder: Path
+) -> None:
     """Write the tables and the picture.
 
     In sweep.csv values with units are columns of numbers too, and so are the results of a case with units.
     """
-    swept, both = tuple(points[0].values), list(zip(points, outcomes, strict=True))
+    points, outcomes = [point for point, _ in done], [outcome for _, outcome in done]
+    swept = tuple(points[0].values)
     rows = [
         {**point.values, **sweep_row(outcome), "point": point.key, **_numbers(axes, point), **_in_units(outcome)}
-        for point, outcome in both
+        for point, outcome in done
     ]
+    results = [outcome.value(scalar) for outcome in outcomes] if scalar else None
+    rows = [row | {"result": value} for row, value in zip(rows, results, strict=True)] if results else rows
     first = (*swept, "k_d", *OF_LIMIT, "stopped", "found", "factorisations", "dofs", "wall_s", "point", "barrier")
     write_csv(rows, tuple(dict.fromkeys((*first, *(key for row in rows for key in row)))), folder / TABLE)
-    lines = [{**point.values, **row} for point, outcome in both for row in outcome.curve]
+    lines = [{**point.values, **row} for point, outcome in done for row in outcome.curve]
     there = [key for key in CURVE if any(key in line for line in lines)]
     own = [key for line in lines for key in line if key not in COLUMNS]
     write_csv(lines, tuple(dict.fromkeys((*swept, *there, *own))), folder / CURVES)
-    draw_sweep(axes, points, outcomes, folder / PICTURE)
+    draw_sweep(axes, points, outcomes, folder / PICTURE, (scalar.name, results) if scalar and results else None)
 
 
 def _numbers(axes: Sequence[Axis], point: SweepPoint) -> dict[str, float]:

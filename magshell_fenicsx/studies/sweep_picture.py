@@ -46,8 +46,20 @@ class Results:
     measured: str = ""
 
 
-def draw_sweep(axes: Sequence[Axis], points: Sequence[SweepPoint], outcomes: Sequence[Outcome], file: Path) -> None:
-    """Draw one line for each combination of the values that are not on the horizontal axis, or a map."""
+def draw_sweep(
+    axes: Sequence[Axis],
+    points: Sequence[SweepPoint],
+    outcomes: Sequence[Outcome],
+    file: Path,
+    asked: tuple[str, Sequence[float | None]] | None = None,
+) -> None:
+    """Draw one line for each combination of the values that are not on the horizontal axis, or a map.
+
+    Parameters
+    ----------
+    asked
+        The name of a result and its value at each point; None draws energy barriers, knockdown factors or curves.
+    """
     import matplotlib
 
     matplotlib.use("Agg")
@@ -55,7 +67,7 @@ def draw_sweep(axes: Sequence[Axis], points: Sequence[SweepPoint], outcomes: Seq
 
     axes = [Axis(axis.keys, tuple(dict.fromkeys(p.values[axis.keys[0]] for p in points))) for axis in axes]
     figure, plot = plt.subplots(figsize=(7.2, 4.2), layout="constrained")
-    results, mapped = _results(outcomes), _is_map(axes)
+    results, mapped = _results(outcomes, asked), _is_map(axes)
     if mapped:
         _map(plot, axes, points, results or _ends(outcomes))
     elif results:
@@ -75,8 +87,10 @@ def _is_map(axes: Sequence[Axis]) -> bool:
     return len(axes) == 2 and all(len(set(axis.numbers or ())) >= MAPPED for axis in axes)
 
 
-def _results(outcomes: Sequence[Outcome]) -> Results | None:
-    """The energy barriers or knockdown factors, with their second scale; None without any."""
+def _results(outcomes: Sequence[Outcome], asked: tuple[str, Sequence[float | None]] | None) -> Results | None:
+    """The result that is asked for; else energy barriers or knockdown factors, with a second scale; None without."""
+    if asked and asked[0] not in ("knockdown", "barrier"):
+        return Results(asked[1], asked[0])
     barriers, knockdowns = [o.barrier for o in outcomes], [o.knockdown for o in outcomes]
     if any(value is not None for value in barriers):
         return Results(barriers, BARRIER, _common(outcomes, "unit_energy_mJ"), "energy barrier  (mJ)")

@@ -33,6 +33,9 @@ def test_the_two_models_differ_by_a_multiple_of_the_thickness(tmp_path: Path) ->
     again = compare(CASE, THICK, refinements=refinements, out=tmp_path, say=said.append)  # type: ignore[arg-type]
     assert again.content == done.content
     assert (tmp_path / "solid_0.4" / "usage.json").stat().st_mtime_ns == kept
+    asked = compare(CASE, THICK, refinements=refinements, out=tmp_path, result="p_over_pc@end", say=said.append)  # type: ignore[arg-type]
+    assert asked.content["result"] == "p_over_pc@end"
+    assert asked.content["difference"] == pytest.approx(done.content["difference"], rel=1e-6)
 
 
 @pytest.mark.slow

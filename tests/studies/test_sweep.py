@@ -183,6 +183,31 @@ def test_a_large_sweep_reads_each_value_a_few_times(tmp_path: Path, monkeypatch:
     assert len(asked) < 10 * 60
 
 
+def test_a_named_result_of_each_point(tmp_path: Path, computed: list[float]) -> None:
+    """A clamped plate, w = p R^4/(64 D) at its centre (Timoshenko): a column, and a line for each point.
+
+    Points that an earlier sweep has kept without that column are computed again, then they are kept.
+    """
+    plate(tmp_path)
+    said: list[str] = []
+    done = sweep(PLATE, [PRESSURES], COARSE, tmp_path, say=said.append, result="w_from_field_over_h@end")
+    assert computed == 2 * [1e-5, 3e-5]
+    rows = read(tmp_path / "sweep.csv")
+    assert [float(row["result"]) for row in rows] == done.results
+    p_over_E = 1e-5 * 2 / (3 * (1 - 0.3**2)) ** 0.5 / 50**2
+    w_over_h = p_over_E * 50**4 * 12 * (1 - 0.3**2) / 64
+    assert done.results == pytest.approx([w_over_h, 3 * w_over_h], rel=2e-3)
+    assert [
+        f"w_from_field_over_h@end = {value:.9g}" in line for value, line in zip(done.results, said[-2:], strict=True)
+    ]
+    sweep(PLATE, [PRESSURES], COARSE, tmp_path, result="w_from_field_over_h@end")
+    assert len(computed) == 4
+    over = ["--over", PRESSURES, *(f"--set={setting}" for setting in COARSE)]
+    none = magshell("sweep", PLATE, *over, "--out", tmp_path, "--result", "critical_field")
+    assert none.returncode == 3
+    assert "2 of 2 points gave no critical_field; sweep.csv says why" in none.stderr
+
+
 def test_parts_of_several_jobs_make_one_table(tmp_path: Path, computed: list[float]) -> None:
     """Each computes its share into one folder; the whole sweep then computes nothing."""
     over = "loading.pressure=1e-5:3e-5:3"
