@@ -44,7 +44,7 @@ def plot(
 
 def view(folder: Run) -> None:
     """Open the report of a run in the web browser: the shell to turn, the path to walk along; else print its path."""
-    from magshell_fenicsx.output.report.browser import opened, report_of
+    from magshell_fenicsx.output.report.report import opened, report_of
 
     if world().rank:
         return

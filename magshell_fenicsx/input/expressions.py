@@ -1,18 +1,105 @@
-"""Formulas of position in a case file: checked at the door, evaluated with NumPy, no other code reached."""
+"""Formulas of a case: read, checked and evaluated, with their derivatives by Taylor's arithmetic."""
 
 import ast
 import operator
 import sys
-from collections.abc import Callable, Mapping
-from typing import Annotated, Any
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
+from numpy.lib.mixins import NDArrayOperatorsMixin
 from numpy.typing import NDArray
 from pydantic import AfterValidator, BeforeValidator, Field
 
-from magshell_fenicsx.input.taylor import Taylor
-
 Array = NDArray[np.float64]
+Partials = tuple[
+    list[Any], dict[tuple[int, int], Any]
+]  # first derivatives by each argument, second ones by pairs i <= j
+
+
+@dataclass(frozen=True)
+class Taylor(NDArrayOperatorsMixin):
+    """What NumPy's functions of it return too.
+
+    Attributes
+    ----------
+    value, gradient, hessian
+        (n,), (3, n) and (3, 3, n).
+    """
+
+    value: Array
+    gradient: Array
+    hessian: Array
+
+    @classmethod
+    def coordinates(cls, x: Array) -> list[Self]:
+        """x, y and z at places (n, 3)."""
+        one, none = np.ones(len(x)), np.zeros((3, 3, len(x)))
+        return [cls(x[:, i], np.eye(3)[i, :, None] * one, none) for i in range(3)]
+
+    def __array_ufunc__(self, ufunc: np.ufunc, method: str, *arguments: Any, **options: Any) -> Any:
+        """A function of this and of numbers, by the chain rule."""
+        if method != "__call__" or options or ufunc not in PARTIALS:
+            return NotImplemented
+        values = [a.value if isinstance(a, Taylor) else a for a in arguments]
+        varying = [i for i, a in enumerate(arguments) if isinstance(a, Taylor)]
+        first, second = PARTIALS[ufunc](*values)
+        gradient, hessian = np.zeros_like(self.gradient), np.zeros_like(self.hessian)
+        for i in varying:
+            gradient = gradient + first[i] * arguments[i].gradient
+            hessian = hessian + first[i] * arguments[i].hessian
+        for (i, j), partial in second.items():
+            if i in varying and j in varying:
+                product = arguments[i].gradient[:, None] * arguments[j].gradient
+                hessian = hessian + partial * (product if i == j else product + product.swapaxes(0, 1))
+        return Taylor(ufunc(*values), gradient, hessian)
+
+
+def _power(x: Any, p: Any) -> Partials:
+    def term(factor: Any, exponent: Any) -> Any:
+        return np.where(factor == 0, 0.0, factor * np.power(x, exponent))  # not 0/0, of x**1 at 0 for instance
+
+    value, log = np.power(x, p), np.log(x)
+    mixed = np.power(x, p - 1) * (1 + p * log)
+    return [term(p, p - 1), value * log], {
+        (0, 0): term(p * (p - 1), p - 2),
+        (0, 1): mixed,
+        (1, 1): value * log**2,
+    }
+
+
+def _arctan2(y: Any, x: Any) -> Partials:
+    r2 = x**2 + y**2
+    across = 2 * x * y / r2**2
+    return [x / r2, -y / r2], {(0, 0): -across, (0, 1): (y**2 - x**2) / r2**2, (1, 1): across}
+
+
+def _tan(x: Any) -> Partials:
+    t = np.tan(x)
+    return [1 + t**2], {(0, 0): 2 * t * (1 + t**2)}
+
+
+PARTIALS: dict[np.ufunc, Callable[..., Partials]] = {
+    np.add: lambda x, y: ([1.0, 1.0], {}),
+    np.subtract: lambda x, y: ([1.0, -1.0], {}),
+    np.multiply: lambda x, y: ([y, x], {(0, 1): 1.0}),
+    np.divide: lambda x, y: ([1 / y, -x / y**2], {(0, 1): -1 / y**2, (1, 1): 2 * x / y**3}),
+    np.power: _power,
+    np.positive: lambda x: ([1.0], {}),
+    np.negative: lambda x: ([-1.0], {}),
+    np.sin: lambda x: ([np.cos(x)], {(0, 0): -np.sin(x)}),
+    np.cos: lambda x: ([-np.sin(x)], {(0, 0): -np.cos(x)}),
+    np.tan: _tan,
+    np.exp: lambda x: ([np.exp(x)], {(0, 0): np.exp(x)}),
+    np.log: lambda x: ([1 / x], {(0, 0): -1 / x**2}),
+    np.sqrt: lambda x: ([0.5 / np.sqrt(x)], {(0, 0): -0.25 / (x * np.sqrt(x))}),
+    np.abs: lambda x: ([np.sign(x)], {}),
+    np.sign: lambda x: ([0.0], {}),
+    np.arctan2: _arctan2,
+}
+
+
 FUNCTIONS = {name: getattr(np, name) for name in ("sin", "cos", "tan", "exp", "log", "sqrt", "abs", "sign", "arctan2")}
 NAMES = ("x", "y", "z", "pi")
 _OPERATORS: dict[type[ast.AST], Callable[..., Any]] = {
@@ -157,3 +244,55 @@ def _steps(tree: ast.Expression) -> list[_Step]:
             assert isinstance(node.value, int | float)
             steps.append(np.float64(min(node.value, sys.float_info.max)))
     return steps[::-1]
+
+
+@dataclass(frozen=True)
+class ByFormula:
+    """Vectors of numbers and formulas of the undeformed place, in a frame and a unit of length of their own."""
+
+    by_formula: ClassVar[bool] = True
+    of_position: Sequence[Callable[[Array, Array, Array], Array]]
+    frame: Array
+    length: float
+    factor: float = 1.0
+    vectors: bool = False
+
+    def __call__(self, r0: Array, n0: Array) -> Array:
+        x = np.moveaxis(self.length * r0 @ self.frame, -1, 0)
+        found = self.factor * np.stack([f(*x) for f in self.of_position], axis=-1)
+        return found @ self.frame.T if self.vectors else found
+
+
+@dataclass(frozen=True)
+class Inwards:
+    """A pressure by formula, which is against the normal."""
+
+    by_formula: ClassVar[bool] = True
+    pressure: ByFormula
+
+    def __call__(self, r0: Array, n0: Array) -> Array:
+        return -self.pressure(r0, n0) * n0
+
+
+def function(value: float | str) -> Callable[[Array, Array, Array], Array]:
+    """A formula of x, y, z, or a number that is the same everywhere."""
+    if isinstance(value, str):
+        return formula(value)
+    return lambda x, y, z: np.full_like(x, value)
+
+
+@dataclass(frozen=True)
+class FormulasInSpace:
+    """Three formulas of the deformed place as a `FieldInSpace`, in a frame whose axes are the rows of `axes`."""
+
+    components: list[Callable[[Array], Taylor]]
+    axes: Array
+
+    def __call__(self, x: Array) -> tuple[Array, Array, Array]:
+        found, Q = [component(x @ self.axes) for component in self.components], self.axes
+        B, G, H = (np.stack([getattr(f, d) for f in found]) for d in ("value", "gradient", "hessian"))
+        return (
+            np.einsum("ai,in->na", Q, B),
+            np.einsum("ai,bj,ijn->nab", Q, Q, G, optimize=True),
+            np.einsum("ai,bj,ck,ijkn->nabc", Q, Q, Q, H, optimize=True),
+        )

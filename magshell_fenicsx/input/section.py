@@ -10,6 +10,8 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 if TYPE_CHECKING:
     import pint
+import numpy as np
+from numpy.typing import NDArray
 
 # one number, then units; pint alone would evaluate any formula, even 9**9**9
 _NUMBER = r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?"
@@ -210,3 +212,17 @@ Length = Annotated[float, _quantity("metre")]
 Pressure = Annotated[float, _quantity("pascal")]
 FluxDensity = Annotated[float, _quantity("tesla")]
 Density = Annotated[float, _quantity("kilogram/metre**3")]
+
+
+class Direction(Section):
+    """Angles in degrees: polar from e3, azimuth from e1 about e3."""
+
+    polar: float = 0.0
+    """Angle from e3 [degree]"""
+    azimuth: float = 0.0
+    """Angle from e1 about e3 [degree]"""
+
+    def vector(self, turn: float = 0.0) -> NDArray[np.float64]:
+        """The unit vector (3,) in a frame that is turned by `turn` (rad) about e3."""
+        polar, azimuth = np.radians(self.polar), np.radians(self.azimuth) - turn
+        return np.array([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)])

@@ -5,7 +5,7 @@ The shape itself is the vector field r0. It is interpolated at the nodes of the 
 rigid motions are exact.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -18,10 +18,62 @@ from dolfinx.cpp.io import perm_gmsh
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from magshell_fenicsx.mesh.deviation import Deviated, Deviation
-from magshell_fenicsx.mesh.nodal_normals import ORDERS
 from magshell_fenicsx.mesh.patch import Embedding, PatchMesh, as_set, check_orientation
 from magshell_fenicsx.platform import compat
+
+Array = NDArray[np.float64]
+ORDERS = {3: 1, 6: 2, 10: 3}  # nodes of a triangle -> its order
+
+
+def nodal_normals(nodes: Array, cells: NDArray[np.int64]) -> Array:
+    """Unit normals (n, 3): means over the triangles (m, 3 | 6 | 10) around each node, with their angles as weights."""
+    count = cells.shape[1]
+    element = basix.create_element(
+        basix.ElementFamily.P, basix.CellType.triangle, ORDERS[count], basix.LagrangeVariant.equispaced
+    )
+    ordered = cells[:, perm_gmsh(mesh.CellType.triangle, count)]
+    a1, a2 = np.einsum("dqk,ckx->dcqx", element.tabulate(1, element.points)[1:, :, :, 0], nodes[ordered])
+    angles = np.full(ordered.shape, np.pi)
+    for corner, (e, f) in enumerate(((a1, a2), (a2 - a1, -a1), (-a2, a1 - a2))):  # vertices come first
+        cosine = np.sum(_unit(e[:, corner]) * _unit(f[:, corner]), axis=1)
+        angles[:, corner] = np.arccos(np.clip(cosine, -1, 1))
+    total = np.zeros_like(nodes)
+    np.add.at(total, ordered, angles[..., None] * _unit(np.cross(a1, a2)))
+    return _unit(total)
+
+
+def _unit(v: Array) -> Array:
+    return np.asarray(v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-300))
+
+
+Deviation = Callable[[Array], Array]  # places (n, 3) of the perfect surface -> w0 (n,), both over R
+
+
+@dataclass(frozen=True)
+class Deviated:
+    """Chart -> r0 = x + w0(x) n(x), with the sum w0 of all deviations.
+
+    Attributes
+    ----------
+    perfect, normal
+        Chart -> places x (n, 3) and outward unit normals (n, 3) of the perfect surface.
+    """
+
+    perfect: Embedding
+    normal: Embedding
+    deviations: tuple[Deviation, ...]
+
+    def __call__(self, chart: Array) -> Array:
+        return np.asarray(self.perfect(chart) + self.w0(chart)[:, None] * self.normal(chart))
+
+    def along_normal(self, chart: Array, deviations: Sequence[Deviation]) -> Array:
+        """The displacement (n, 3) that other deviations add."""
+        return replace(self, deviations=tuple(deviations)).w0(chart)[:, None] * self.normal(chart)
+
+    def w0(self, chart: Array) -> Array:
+        """w0 over R at places of the chart, (n,)."""
+        places = self.perfect(chart)
+        return np.asarray(sum((deviation(places) for deviation in self.deviations), np.zeros(len(places))))
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""A mirror plane, and the half of a triangulation on one side of it."""
+"""Mirror planes, the meshes cut by them, and turned frames."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -6,8 +6,14 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.mesh.frame import rotation
 from magshell_fenicsx.mesh.patch import MeshError, PatchMesh, as_set, border_pairs, directed_sides, on_border
+
+
+def rotation(azimuth: float) -> NDArray[np.float64]:
+    """Q (3, 3) of a frame turned by an azimuth (rad): Q v are the components of v in it, and w Q turns rows w back."""
+    c, s = np.cos(azimuth), np.sin(azimuth)
+    return np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+
 
 Array = NDArray[np.float64]
 CUT = "symmetry"  # name of the edge on the plane

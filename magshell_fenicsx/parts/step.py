@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from pydantic import Discriminator, Field, Tag, model_validator
 
 from magshell_fenicsx.input.section import Pressure, Section
-from magshell_fenicsx.mesh.frame import rotation
 from magshell_fenicsx.mesh.grading import Feature
+from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.parts.part import Context, Modelled
 from magshell_fenicsx.shape.symmetry import Leaves
 

@@ -10,12 +10,12 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.input.by_formula import function
+from magshell_fenicsx.input.expressions import function
 from magshell_fenicsx.input.messages import shown
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.mesh.frame import rotation
 from magshell_fenicsx.mesh.grading import PER_AREA, Squares
 from magshell_fenicsx.mesh.grid import Grid
+from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.mesh.msh import MeshFile
 from magshell_fenicsx.mesh.patch import PatchMesh
 from magshell_fenicsx.mesh.shapes import DiscShape, Shape, StripShape

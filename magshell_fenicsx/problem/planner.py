@@ -11,12 +11,10 @@ from numpy.typing import NDArray
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.input.expressions import formula
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.mesh.frame import rotation
 from magshell_fenicsx.mesh.grading import Grading, Squares
-from magshell_fenicsx.mesh.grid import Grid
-from magshell_fenicsx.mesh.mirror import CUT, Y0, Mirror
+from magshell_fenicsx.mesh.grid import Grid, RimmedGrid
+from magshell_fenicsx.mesh.mirror import CUT, Y0, Mirror, rotation
 from magshell_fenicsx.mesh.msh import MeshFile, cell_count
-from magshell_fenicsx.mesh.rimmed import RimmedGrid
 from magshell_fenicsx.mesh.shapes import DiscShape, StripShape
 from magshell_fenicsx.models.axisymmetric.meridian import graded_vertices
 from magshell_fenicsx.models.shell.own_term import OwnTerm

@@ -7,11 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.mesh.grading import Size
-from magshell_fenicsx.mesh.grid import Grid, grid_mesh
+from magshell_fenicsx.mesh.grid import Grid, RimmedGrid, grid_mesh
 from magshell_fenicsx.mesh.mirror import Mirror, cut
 from magshell_fenicsx.mesh.msh import MeshFile, read_msh
 from magshell_fenicsx.mesh.patch import Embedding, PatchMesh
-from magshell_fenicsx.mesh.rimmed import RimmedGrid
 from magshell_fenicsx.mesh.shapes import Shape
 from magshell_fenicsx.mesh.triangulation import triangulate
 from magshell_fenicsx.models.shell.own_term import OwnTerm

@@ -17,9 +17,8 @@ from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.output.fields.gathering import gatherer
-from magshell_fenicsx.output.fields.outlines import DRIVEN, STILL, outlines
 from magshell_fenicsx.output.fields.surface import turned
-from magshell_fenicsx.output.fields.vtu import About, FieldSeries, is_whole, point_file
+from magshell_fenicsx.output.fields.vtu import DRIVEN, STILL, About, FieldSeries, is_whole, outlines, point_file
 from magshell_fenicsx.output.report.verdict import read_run
 from magshell_fenicsx.output.store import checkpoint
 from magshell_fenicsx.output.store.durable import Damaged, read_object, read_result, sync_folder, write_whole

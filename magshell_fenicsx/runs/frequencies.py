@@ -10,9 +10,8 @@ from magshell_fenicsx.continuation.modes import ModesNotFound
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.modes import ShellMode, ShellModes
-from magshell_fenicsx.output.fields.frequencies import NAME, frequency_table, hertz, wave_of
 from magshell_fenicsx.output.fields.gathering import gatherer
-from magshell_fenicsx.output.fields.modes import mode_file
+from magshell_fenicsx.output.fields.modes import NAME, frequency_table, hertz, mode_file, wave_of
 from magshell_fenicsx.output.store.durable import write_whole
 from magshell_fenicsx.output.store.folder import by_first
 from magshell_fenicsx.parts.bodies.touch import hardened, rigid, touching

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from magshell_fenicsx.assembly.field_derivative import FieldGradient
 from magshell_fenicsx.continuation.fold import FoldLost
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.mesh.frame import rotation
+from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.output.fields.gathering import Gatherer, gatherer
-from magshell_fenicsx.output.fields.gradients import columns_of, gradient_file
+from magshell_fenicsx.output.fields.modes import columns_of, gradient_file
 from magshell_fenicsx.output.fields.surface import Surface, completed, turned
 from magshell_fenicsx.output.fields.vtu import About, vtu_content
 from magshell_fenicsx.output.store.durable import write_whole

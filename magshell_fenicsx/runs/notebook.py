@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Literal
 from magshell_fenicsx.output.fields.gathering import gatherer
 from magshell_fenicsx.output.fields.surface import Surface, completed, turned
 from magshell_fenicsx.output.fields.vtu import unstructured_grid
-from magshell_fenicsx.output.pictures.camera import run_camera
 from magshell_fenicsx.output.pictures.curve import curve_figure
 from magshell_fenicsx.output.pictures.layout import png
 from magshell_fenicsx.output.pictures.picture import PICTURES, figures
+from magshell_fenicsx.output.pictures.view import run_camera
 from magshell_fenicsx.output.store.known import pole_of
 from magshell_fenicsx.quantities.registry import axes_of
 from magshell_fenicsx.runs.rows import rows

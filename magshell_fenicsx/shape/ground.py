@@ -9,11 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from magshell_fenicsx.input.direction import Direction
 from magshell_fenicsx.input.expressions import formula
-from magshell_fenicsx.input.section import or_number
+from magshell_fenicsx.input.section import Direction, or_number
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.mesh.frame import rotation
+from magshell_fenicsx.mesh.mirror import rotation
 
 if TYPE_CHECKING:  # it reads meshes, and needs the solver for that
     from magshell_fenicsx.shape.outline import Outline

@@ -7,9 +7,9 @@ from math import inf, pi, radians
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.mesh.deviation import Deviated, Deviation
 from magshell_fenicsx.mesh.grading import Grading
 from magshell_fenicsx.mesh.grid import Grid
+from magshell_fenicsx.mesh.midsurface import Deviated, Deviation
 from magshell_fenicsx.mesh.mirror import Y0, Mirror
 from magshell_fenicsx.mesh.msh import MeshFile, in_space, normals, read_msh
 from magshell_fenicsx.mesh.patch import Embedding, MeshError

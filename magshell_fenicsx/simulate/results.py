@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.system import State, Vector, dot
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.mesh.frame import rotation
+from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.parts.supports.reacting import motion_columns

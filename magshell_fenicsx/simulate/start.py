@@ -6,7 +6,7 @@ import numpy as np
 
 from magshell_fenicsx.assembly.moving import in_space
 from magshell_fenicsx.continuation.system import State, Vector, dot, max_abs
-from magshell_fenicsx.mesh.frame import rotation
+from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.modes import ShellModes
 from magshell_fenicsx.parts.motion.step import PushSection

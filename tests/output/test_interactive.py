@@ -15,14 +15,12 @@ from PIL import Image
 
 import magshell_fenicsx as ms
 from magshell_fenicsx.input.source import CaseError, Source
-from magshell_fenicsx.output.fields.point_file import read_point
 from magshell_fenicsx.output.fields.surface import Surface
+from magshell_fenicsx.output.fields.vtu import read_point
 from magshell_fenicsx.output.pictures.colours import couple
 from magshell_fenicsx.output.pictures.plot import plot
-from magshell_fenicsx.output.pictures.thinned import thinned
-from magshell_fenicsx.output.report.browser import opened, report_of
-from magshell_fenicsx.output.report.interactive import chosen_frames, plotly
-from magshell_fenicsx.output.report.report import write_report
+from magshell_fenicsx.output.report.interactive import chosen_frames, plotly, thinned
+from magshell_fenicsx.output.report.report import opened, report_of, write_report
 from magshell_fenicsx.output.store.checkpoint import identity, refuse_other
 
 needs_plotly = pytest.mark.skipif(plotly() is None, reason="Plotly is not installed")

@@ -6,7 +6,7 @@ import numpy as np
 from conftest import CASES
 
 from magshell_fenicsx import Case
-from magshell_fenicsx.output.fields.outlines import DRIVEN, STILL, outlines, read_outlines, vtp_content
+from magshell_fenicsx.output.fields.vtu import DRIVEN, STILL, outlines, read_outlines, vtp_content
 from magshell_fenicsx.problem.planner import make_plan
 
 TURN = "{kind: source, name: roll, turn: {axis: [0, 1, 0], angle: 90}}"

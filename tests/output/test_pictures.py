@@ -19,16 +19,12 @@ from numpy.typing import NDArray
 from magshell_fenicsx.case.output import OutputSection
 from magshell_fenicsx.output.fields.surface import Surface, completed
 from magshell_fenicsx.output.fields.vtu import About, FieldSeries, point_file, read_vtu
-from magshell_fenicsx.output.pictures.arrows import drawn_arrows, spread
-from magshell_fenicsx.output.pictures.bars import SIGNED, colour_map
-from magshell_fenicsx.output.pictures.camera import towards
 from magshell_fenicsx.output.pictures.captions import caption
 from magshell_fenicsx.output.pictures.colours import loads, strains
 from magshell_fenicsx.output.pictures.curve import curve_figure
-from magshell_fenicsx.output.pictures.layout import png, written
-from magshell_fenicsx.output.pictures.picture import PICTURES, figures
-from magshell_fenicsx.output.pictures.tessellation import tessellated
-from magshell_fenicsx.output.pictures.view import Camera, Seen, Window, axes_on_screen
+from magshell_fenicsx.output.pictures.layout import SIGNED, colour_map, png, written
+from magshell_fenicsx.output.pictures.picture import PICTURES, drawn_arrows, figures, spread
+from magshell_fenicsx.output.pictures.view import Camera, Seen, Window, axes_on_screen, tessellated, towards
 from magshell_fenicsx.output.store.known import pole_of
 from magshell_fenicsx.output.store.table import Row
 

@@ -13,8 +13,7 @@ from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.shell.parameters import Loads, Material
 from magshell_fenicsx.output.fields.gathering import gatherer
 from magshell_fenicsx.output.fields.point_fields import PointFields
-from magshell_fenicsx.output.fields.recovery import Recovery
-from magshell_fenicsx.output.fields.smooth_parts import smooth_parts, split
+from magshell_fenicsx.output.fields.recovery import Recovery, smooth_parts, split
 from magshell_fenicsx.output.fields.surface import SurfaceGatherer
 from magshell_fenicsx.simulate.follow import follow
 

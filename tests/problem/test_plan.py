@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.input.direction import Direction
+from magshell_fenicsx.input.section import Direction
 from magshell_fenicsx.input.source import CaseError, Source
 from magshell_fenicsx.problem.planner import make_plan
 from magshell_fenicsx.shape.symmetry import common_azimuth

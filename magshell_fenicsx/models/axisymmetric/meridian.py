@@ -11,7 +11,7 @@ from dolfinx import fem, mesh
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from magshell_fenicsx.mesh.deviation import Deviated, Deviation
+from magshell_fenicsx.mesh.midsurface import Deviated, Deviation
 from magshell_fenicsx.mesh.patch import Embedding, MeshError
 
 Array = NDArray[np.float64]

@@ -7,7 +7,8 @@ evaluated around the axis.
 import csv
 import io
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from math import pi, sqrt
 from pathlib import Path
 from typing import Protocol
 
@@ -23,7 +24,7 @@ from magshell_fenicsx.models.solid.model import SolidModel
 from magshell_fenicsx.output.fields.gathering import Gatherer
 from magshell_fenicsx.output.fields.surface import Surface, completed, turned
 from magshell_fenicsx.output.fields.vtu import About, vtu_content
-from magshell_fenicsx.output.store.durable import write_whole
+from magshell_fenicsx.output.store.durable import Damaged, write_whole
 
 Array = NDArray[np.float64]
 WAVES = "m = "
@@ -189,3 +190,91 @@ def wave_number(surface: Surface) -> int | None:
         left.append(float(np.sum((w[ring] - basis @ np.linalg.lstsq(basis, w[ring])[0]) ** 2)))
     best = int(np.argmin(left))
     return best if best >= 2 and left[best] < 0.1 * float(np.sum(w[ring] ** 2)) else None
+
+
+PREFIX = "gradients_"
+CURVATURES = ("curvature_11", "curvature_22", "curvature_12")
+
+
+def columns_of(by: str) -> tuple[str, ...]:
+    """The names in the file of a field's gradient; that of the remanence is a vector."""
+    return CURVATURES if by == "curvature" else (by,)
+
+
+def gradient_file(folder: Path, of: str) -> Path:
+    """The file of a result's gradients.
+
+    Examples
+    --------
+    >>> gradient_file(Path("out"), "knockdown").as_posix()
+    'out/fields/gradients_knockdown.vtu'
+    """
+    return folder / "fields" / f"{PREFIX}{of}.vtu"
+
+
+def gradient_files(folder: Path) -> dict[str, Path]:
+    """Result -> file of those in a folder."""
+    return {file.stem.removeprefix(PREFIX): file for file in sorted((folder / "fields").glob(f"{PREFIX}*.vtu"))}
+
+
+NAME = "frequencies.csv"
+NUMBERS = ("point", "wave", "omega2", "hertz")
+CONTACT_CHANGE = "contact_change"  # of omega2, relative, if the bodies that touch are four times as stiff
+
+
+@dataclass(frozen=True)
+class Frequency:
+    """A row: omega2 is ω² ρ R²/E; hertz is nan without a density, and of an unstable mode, which does not vibrate."""
+
+    point: int
+    wave: str
+    omega2: float
+    hertz: float
+
+
+def wave_of(label: str, own: str) -> str:
+    """The circumferential number or the symmetry of a mode; `own` is that of the model's own modes.
+
+    Examples
+    --------
+    >>> wave_of("m = 7", "0"), wave_of("", "0"), wave_of("antisymmetric", "symmetric")
+    ('7', '0', 'antisymmetric')
+    """
+    return label.removeprefix(WAVES) if label else own
+
+
+def hertz(omega2: float, time_unit: float | None) -> float | None:
+    """The frequency, with `time_unit` R √(ρ/E); None without it, and of an unstable mode."""
+    return sqrt(omega2) / (2 * pi * time_unit) if time_unit and omega2 >= 0 else None
+
+
+def frequency_table(
+    found: Mapping[int, Sequence[Mode]],
+    own: str,
+    time_unit: float | None,
+    contact_changes: Mapping[int, Sequence[float]],
+) -> bytes:
+    """The file: modes of each point, ascending; `contact_changes` is a column where there are bodies."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow((*NUMBERS, CONTACT_CHANGE) if contact_changes else NUMBERS)
+    for point, modes in found.items():
+        for n, mode in enumerate(modes):
+            f = hertz(mode.eigenvalue, time_unit)
+            row = (point, wave_of(mode.label, own), repr(mode.eigenvalue), "" if f is None else repr(f))
+            writer.writerow((*row, repr(contact_changes[point][n])) if contact_changes else row)
+    return text.getvalue().encode()
+
+
+def read_frequencies(folder: Path) -> list[Frequency]:
+    """The rows of a run's folder; none without the file."""
+    if not (folder / NAME).exists():
+        return []
+    try:
+        with (folder / NAME).open(encoding="utf-8", newline="") as stream:
+            return [
+                Frequency(int(line["point"]), line["wave"], float(line["omega2"]), float(line["hertz"] or "nan"))
+                for line in csv.DictReader(stream)
+            ]
+    except (KeyError, ValueError, TypeError, csv.Error) as e:
+        raise Damaged(f"{folder / NAME}: is damaged: {type(e).__name__}: {e}") from None

@@ -1,17 +1,174 @@
-"""Fields at a shell's points besides displacement, strains and moments: magnetic fields and loads, gaps."""
+"""Fields at the points of a surface: strains, stresses, densities of energy, and what interprets them."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.models.shell.parameters import ACROSS, Magnetisation, Material
 from magshell_fenicsx.models.shell.patterns import inside
-from magshell_fenicsx.models.shell.strains import TangentFrame
-from magshell_fenicsx.output.fields.interpretation import SurfaceGeometry, Torque, magnetic_loads
+from magshell_fenicsx.models.shell.strains import NaturalFrame, TangentFrame, bending_moment, principal
 from magshell_fenicsx.parts.bodies.contact import Contact
+from magshell_fenicsx.parts.natural.shape import CURVATURE, STRETCH, Natural
 
 Array = NDArray[np.float64]
+
+
+def magnetic_loads(
+    g: "SurfaceGeometry", field: Magnetisation, r0: Array, h: float | Array
+) -> tuple[dict[str, Array], "Torque"]:
+    """The loads p_mag and k at points r0 (..., 3), and the torque as a function of u.
+
+    f_mag is added if the remanence and the thickness are uniform.
+
+    Parameters
+    ----------
+    h
+        Thickness over R; an array (...) if it varies.
+    """
+    pattern = field.remanent
+    Br = pattern(r0, g.n0) if callable(pattern) else np.broadcast_to(pattern, r0.shape)
+    Ba = field.applied
+    rotates = field.law == "rotation"
+    loads = {"p_mag": magnetic_pressure(g, Br, Ba, h), "k": spring_stiffness(g, Br, Ba)}
+    if rotates:
+        loads = {"p_mag": 0 * loads["p_mag"], "k": loads["k"] - (Br @ Ba + loads["k"]) / 2}
+    if not callable(pattern) and isinstance(h, float):  # the formula of f_mag assumes uniform vectors and thickness
+        loads["f_mag"] = in_plane_force(g, Br, Ba, h)
+        if rotates:
+            loads["f_mag"] = (loads["f_mag"] - in_plane_force(g, Ba, pattern, h)) / 2
+    return loads, torque(g, Br, Ba, rotates=rotates)
+
+
+@dataclass(frozen=True)
+class SurfaceGeometry:
+    """Undeformed bases and curvature at points: a1, a2 (..., 2, 3), n0 (..., 3), b0_ij (..., 2, 2)."""
+
+    a: Array
+    n0: Array
+    b0: Array
+
+    @property
+    def dual(self) -> Array:
+        """a0^1, a0^2, (..., 2, 3)."""
+        metric = np.einsum("...ai,...bi->...ab", self.a, self.a)
+        return np.asarray(np.einsum("...ab,...bi->...ai", np.linalg.inv(metric), self.a))
+
+
+def magnetic_pressure(g: SurfaceGeometry, Br: Array, Ba: Array, h: float | Array) -> Array:
+    """p_mag = h b0:B0 with B0 = -Br (x) Ba, (...)."""
+    b = np.einsum("...ab,...ai,...bj->...ij", g.b0, g.dual, g.dual)
+    return np.asarray(-h * np.einsum("...ij,...i,j->...", b, Br, Ba))
+
+
+def in_plane_force(g: SurfaceGeometry, Br: Array, Ba: Array, h: float) -> Array:
+    """f_mag (..., 3) for uniform Br and Ba.
+
+    f_c is -h times the surface divergence of -(a_c . Ba)(a^a . Br). For constant vectors this equals
+    h [b_ca (n . Ba)(a^a . Br) + tr b (n . Br)(a_c . Ba)].
+    """
+    dual = g.dual
+    along, normal_Ba = np.einsum("...ai,...i->...a", dual, Br), np.einsum("...i,i->...", g.n0, Ba)
+    trace = np.einsum("...ab,...ai,...bi->...", g.b0, dual, dual)
+    covariant = np.einsum("...ca,...a->...c", g.b0, along) * normal_Ba[..., None]
+    covariant += (trace * np.einsum("...i,...i->...", g.n0, Br))[..., None] * np.einsum("...ci,i->...c", g.a, Ba)
+    return np.asarray(h * np.einsum("...c,...ci->...i", covariant, dual))
+
+
+def spring_stiffness(g: SurfaceGeometry, Br: Array, Ba: Array) -> Array:
+    """k = (n0 (x) n0):B0, (...)."""
+    return np.asarray(-np.einsum("...i,...i->...", g.n0, Br) * np.einsum("...i,i->...", g.n0, Ba))
+
+
+@dataclass(frozen=True)
+class Torque:
+    """The torque tau at points with normals n0 (..., 3); `along` is -(n0 . Br)(a0^a . Ba), (..., 2).
+
+    For a remanence that does not stretch, that and half of (n0 . Ba)(a0^a . Br); `dual` and `transposed` are then the
+    dual basis (..., 2, 3) and half of (n0 . Ba) Br, (..., 3).
+    """
+
+    n0: Array
+    along: Array
+    dual: Array | None = None
+    transposed: Array | None = None
+
+    def __call__(self, du: Array) -> Array:
+        """tau_c = B0^ij (a0^a . e_j)(n0 . e_i) (u,_a . a0_c) as a vector (..., 3), from u,_1 and u,_2 (..., 2, 3)."""
+        turned = np.matmul(self.along[..., None, :], du)[..., 0, :]
+        found = turned - np.sum(turned * self.n0, axis=-1, keepdims=True) * self.n0
+        if self.dual is not None and self.transposed is not None:
+            found = found + np.einsum("...ac,...c,...ai->...i", du, self.transposed, self.dual)
+        return np.asarray(found)
+
+
+def torque(g: SurfaceGeometry, Br: Array, Ba: Array, *, rotates: bool = False) -> Torque:
+    """The torque as a function of the displacement's derivatives, of a remanence that `rotates` or is convected."""
+    along = -np.einsum("...i,...i->...", g.n0, Br)[..., None] * np.einsum("...ai,i->...a", g.dual, Ba)
+    if not rotates:
+        return Torque(g.n0, along)
+    in_surface = Br - np.einsum("...i,...i->...", g.n0, Br)[..., None] * g.n0
+    half = (g.n0 @ Ba / 2)[..., None]
+    along = along + half * np.einsum("...ai,...i->...a", g.dual, Br)
+    return Torque(g.n0, along, g.dual, half * in_surface)
+
+
+class Stresses:
+    """Strains and moments at points (cells, points per cell).
+
+    Parameters
+    ----------
+    r0
+        (6, cells, points, 3) jet of the placement; see `strains.TangentFrame`.
+    thickness
+        (cells, points) factor of h; None for 1.
+    """
+
+    def __init__(self, r0: Array, material: Material, thickness: Array | None, natural: Natural | None = None) -> None:
+        self.frame, self._nu, self._thickness = TangentFrame.of(r0), material.nu, thickness
+        self._natural = natural and natural.at(r0[0], self.frame.n0)
+
+    def of(self, u: Array, mu: Mapping[str, float]) -> dict[str, Array]:
+        """Those of a displacement with the jet u (6, cells, points, 3) over R, at the amplitudes mu.
+
+        Returns
+        -------
+        E, M
+            (..., 3) components 11, 12 and 22 of membrane strain and bending moment over D/R, with D of the thickness
+            h; the strain from the natural shape, if there is one.
+        E_total
+            The strain from the drawn shape, if there is a natural one.
+        """
+        frame, total = self.frame, {}
+        E, K = frame.membrane_strain(u), frame.curvature_change(u)
+        M = bending_moment(K, self._nu)
+        if self._natural:
+            total["E_total"] = E
+            shape = NaturalFrame.of(frame, *self._natural, mu.get(CURVATURE, 0.0), mu.get(STRETCH, 0.0))
+            E, M = shape.elastic(E), shape.moment(K, self._nu)
+        if self._thickness is not None:
+            M *= self._thickness[..., None] ** 3
+        return {"E": E, "M": M, **total}
+
+
+def principal_fields(components: Mapping[str, Array]) -> dict[str, Array]:
+    """E_1, E_2, M_1, M_2 (...): the principal values of E and M (..., 3), the larger first."""
+    return {
+        f"{name}_{number}": values
+        for name in ("E", "M")
+        for number, values in enumerate(principal(components[name]), 1)
+    }
+
+
+def in_space(S: Array, t: Array) -> Array:
+    """Components (..., 3) in frames t (..., 2, 3) as tensors (..., 3, 3)."""
+    return np.asarray(np.swapaxes(t, -1, -2) @ S[..., [[0, 1], [1, 2]]] @ t)
+
+
+def in_frame(S: Array, t: Array) -> Array:
+    """Components (..., 3) in frames t (..., 2, 3) of symmetric tensors (..., 3, 3)."""
+    return np.asarray((t @ S @ np.swapaxes(t, -1, -2))[..., [0, 0, 1], [0, 1, 1]])
 
 
 class PointFields:

@@ -1,10 +1,44 @@
-"""Smooth fields from fields that jump between cells: superconvergent patch recovery."""
+"""Strains, moments and stresses recovered at nodes, and the parts of a surface within which they are smooth."""
+
+from collections.abc import Mapping
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from magshell_fenicsx.models.shell.strains import TangentFrame
+from magshell_fenicsx.output.fields.point_fields import in_frame, in_space, principal_fields
+
 Array = NDArray[np.float64]
+ROUNDING = {"E": 1e-13, "M": 1e-8}  # smaller strains and moments are zero, up to rounding
+
+
+def relative_jump(values: Array, continuous: Array, weight: Array, zero: float = 0.0) -> float:
+    """The weighted rms of the difference between the cells' values and continuous ones, over the rms of the values.
+
+    Parameters
+    ----------
+    values, continuous
+        (cells, points, ...)
+    weight
+        (cells, points)
+    zero
+        Of values no larger than this there is none.
+
+    Examples
+    --------
+    >>> round(relative_jump(np.array([[3.0, 5.0], [3.0, 5.0]]), np.full((2, 2), 4.0), np.ones((2, 2))), 3)
+    0.243
+    """
+
+    def mean_square(f: Array) -> float:
+        squared = (f**2).reshape(*weight.shape, -1).sum(axis=-1)
+        return float((weight * squared).sum() / weight.sum())
+
+    size = np.sqrt(mean_square(values))
+    return float(np.sqrt(mean_square(values - continuous)) / size) if size > zero else 0.0
+
+
 Numbers = NDArray[np.int64]
 SECOND = 0.03  # weight of the second ring of cells around a vertex at an edge, where the first has few
 ENOUGH = 1.2  # samples over coefficients of a polynomial, at least
@@ -118,3 +152,140 @@ def _monomials(y: Array, degree: int) -> Array:
         ],
         axis=-1,
     )
+
+
+UPPER = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])  # the components of a symmetric tensor
+WHOLE = [[0, 1, 2], [1, 3, 4], [2, 4, 5]]
+TWICE = np.sqrt([1.0, 2, 2, 1, 2, 1])  # so that the sum of squares is that of all nine
+
+
+class RecoveredShell:
+    """Takes tensors from samples to nodes.
+
+    Parameters
+    ----------
+    numbers
+        (m, s) nodes of all cells, corners first; smooth parts share none.
+    reference
+        (s, 2) their places in the reference cell.
+    nodes, normals
+        (m, s, 3) places and undeformed normals there.
+    samples, weight
+        (m, q, 3) places and (m, q) weights.
+    table
+        (q, s) values of the nodes' shape functions at the samples.
+    degree
+        Of the displacement, and of the polynomials that are fitted.
+    """
+
+    def __init__(
+        self,
+        numbers: NDArray[np.int64],
+        reference: Array,
+        nodes: Array,
+        normals: Array,
+        samples: Array,
+        weight: Array,
+        table: Array,
+        degree: int,
+    ) -> None:
+        vertices, corners = np.unique(numbers[:, :3], return_inverse=True)
+        corners = corners.reshape(-1, 3)
+        place, normal = np.zeros((2, len(vertices), 3))
+        place[corners] = nodes[:, :3]
+        np.add.at(normal, corners, normals[:, :3])
+        self._recovery = Recovery(corners, samples, weight, place, frames(normal), degree)
+        _, first = np.unique(numbers, return_index=True)
+        cell, node = np.divmod(first, numbers.shape[1])
+        barycentric = np.column_stack([1 - reference.sum(axis=1), reference])[node]
+        self._to_nodes = self._recovery.at(cell, nodes[cell, node], barycentric)
+        self._numbers, self._weight, self._table = numbers, weight, table
+
+    def fields(self, tensors: Mapping[str, Array], n0: Array) -> tuple[dict[str, Array], dict[str, float]]:
+        """E, M, ... at the nodes with normals n0 (n, 3), their principal values, by how much samples differ.
+
+        Parameters
+        ----------
+        tensors
+            Name -> (m, q, 6) at the samples, see `six`.
+        """
+        fit = self._recovery.coefficients(np.concatenate(list(tensors.values()), axis=-1))
+        found = dict(zip(tensors, np.split(self._to_nodes @ fit, len(tensors), axis=-1), strict=True))
+        jumps = {
+            name: relative_jump(tensors[name], self._table @ found[name][self._numbers], self._weight, zero)
+            for name, zero in ROUNDING.items()
+        }
+        t = frames(n0)
+        components = {name: in_frame((values / TWICE)[..., WHOLE], t) for name, values in found.items()}
+        smooth = {name: in_space(S, t) for name, S in components.items()}
+        return smooth | principal_fields(components), jumps
+
+
+def six(frame: TangentFrame) -> Array:
+    """(..., 6, 3) from S_11, S_12, S_22 in a frame to the components of a tensor in space, times `TWICE`."""
+    return np.asarray(frame.in_space[..., *UPPER, :] * TWICE[:, None])
+
+
+def frames(normals: Array) -> Array:
+    """Two unit vectors (n, 2, 3) across each of some vectors (n, 3)."""
+    n = normals / np.linalg.norm(normals, axis=-1, keepdims=True)
+    t1 = np.cross(n, np.where(np.abs(n[:, :1]) < 0.8, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]]))
+    t1 /= np.linalg.norm(t1, axis=-1, keepdims=True)
+    return np.stack([t1, np.cross(n, t1)], axis=1)
+
+
+JUMP = 1e-3  # of a given field over its largest value
+KINK = 0.5  # jump of the normal, some 30 degrees: less is a facet
+
+
+def smooth_parts(corners: Numbers, sides: Numbers, given: list[Array], normals: Array) -> Numbers:
+    """The number of the part to which each cell belongs.
+
+    Parameters
+    ----------
+    corners
+        (m, s) numbers of the nodes of the cells.
+    sides
+        (e, j) which of these nodes are on each side.
+    given
+        (m, s, ...) fields at the nodes.
+    normals
+        (m, s, 3)
+    """
+    count = len(corners)
+    on = corners[:, sides].reshape(-1, sides.shape[1])  # nodes of all sides, cell after cell
+    order = np.argsort(on, axis=1)
+    key = np.take_along_axis(on, order, axis=1)
+    _, first, which, times = np.unique(key, axis=0, return_index=True, return_inverse=True, return_counts=True)
+    which = which.ravel()
+    twins = np.flatnonzero((times[which] == 2) & (first[which] != np.arange(len(on))))
+    pair = np.column_stack([first[which[twins]], twins])
+
+    def jumps(field: Array) -> Array:
+        """The largest jump of a field at the nodes of each shared side."""
+        values = field.reshape(count, corners.shape[1], -1)[:, sides].reshape(*on.shape, -1)
+        one, other = np.take_along_axis(values, order[..., None], axis=1)[pair.T]
+        return np.asarray(np.abs(one - other).max(axis=(1, 2)))
+
+    kink = jumps(normals)
+    apart = kink > KINK
+    for field in given:
+        largest = np.abs(field).max() or 1.0
+        apart |= jumps(field) > largest * (JUMP + 2 * kink)  # a field along the normal turns with facets
+    a, b = (pair[~apart] // len(sides)).T
+    together = scipy.sparse.coo_matrix((np.ones(len(a)), (a, b)), (count, count))
+    return np.asarray(scipy.sparse.csgraph.connected_components(together, directed=False)[1], np.int64)
+
+
+def split(numbers: Numbers, parts: Numbers) -> Numbers:
+    """The nodes (m, s) of cells, renumbered so that each part has its own.
+
+    Examples
+    --------
+    >>> split(np.array([[0, 1], [1, 2]]), np.array([0, 1])).tolist()
+    [[0, 1], [2, 3]]
+    """
+    if not parts.any():
+        return numbers
+    key = np.column_stack([np.repeat(parts, numbers.shape[1]), numbers.ravel()])
+    return np.unique(key, axis=0, return_inverse=True)[1].reshape(numbers.shape).astype(np.int64)

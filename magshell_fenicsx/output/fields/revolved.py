@@ -9,15 +9,12 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.system import State, Vector
-from magshell_fenicsx.mesh.deviation import Deviated
+from magshell_fenicsx.mesh.midsurface import Deviated
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.axisymmetric.revolution import ENDS, Revolution
 from magshell_fenicsx.models.shell.patterns import inside
-from magshell_fenicsx.output.fields.jump import ROUNDING, relative_jump
-from magshell_fenicsx.output.fields.point_fields import PointFields
-from magshell_fenicsx.output.fields.recovery import Recovery
-from magshell_fenicsx.output.fields.smooth_parts import smooth_parts
-from magshell_fenicsx.output.fields.stresses import Stresses, principal_fields
+from magshell_fenicsx.output.fields.point_fields import PointFields, Stresses, principal_fields
+from magshell_fenicsx.output.fields.recovery import ROUNDING, Recovery, relative_jump, smooth_parts
 from magshell_fenicsx.output.fields.surface import PRESSURE, W0, Surface, grown
 
 Array = NDArray[np.float64]

@@ -13,14 +13,12 @@ from dolfinx.cpp.io import perm_vtk
 from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.system import State, Vector
-from magshell_fenicsx.mesh.deviation import Deviation
-from magshell_fenicsx.mesh.frame import rotation
+from magshell_fenicsx.mesh.midsurface import Deviation
+from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.shell.patterns import inside
-from magshell_fenicsx.output.fields.point_fields import PointFields
-from magshell_fenicsx.output.fields.recovered_shell import RecoveredShell, six
-from magshell_fenicsx.output.fields.smooth_parts import smooth_parts, split
-from magshell_fenicsx.output.fields.stresses import Stresses
+from magshell_fenicsx.output.fields.point_fields import PointFields, Stresses
+from magshell_fenicsx.output.fields.recovery import RecoveredShell, six, smooth_parts, split
 
 TRIANGLE, LAGRANGE_TRIANGLE, LAGRANGE_HEXAHEDRON = 5, 69, 72  # VTK's numbers of cell types
 HEXAHEDRON_NODES = 27

@@ -10,13 +10,11 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.case.output import OutputSection
 from magshell_fenicsx.output.fields.surface import Surface
-from magshell_fenicsx.output.pictures.bars import SIGNED, colour_bar
 from magshell_fenicsx.output.pictures.colours import Coloured
 from magshell_fenicsx.output.pictures.curve import Part, drawn_parts, place, plot_curve
-from magshell_fenicsx.output.pictures.layout import Boxes, Panel, directions, drawing
+from magshell_fenicsx.output.pictures.layout import SIGNED, Boxes, Panel, colour_bar, directions, drawing
 from magshell_fenicsx.output.pictures.picture import Background
-from magshell_fenicsx.output.pictures.sources import near_outlines
-from magshell_fenicsx.output.pictures.view import Camera, Image, Window
+from magshell_fenicsx.output.pictures.view import Camera, Image, Window, near_outlines
 from magshell_fenicsx.output.store.table import POLE, Row
 
 if TYPE_CHECKING:

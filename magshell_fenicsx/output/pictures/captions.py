@@ -1,10 +1,76 @@
-"""Titles of pictures, in matplotlib's mathematics."""
+"""Numbers and captions under pictures."""
 
 from collections.abc import Sequence
+from functools import partial
+from typing import TYPE_CHECKING
 
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:  # takes long to import
+    from matplotlib.axes import Axes
 from magshell_fenicsx.output.store.table import Row
 from magshell_fenicsx.quantities.quantity import spelled
 from magshell_fenicsx.quantities.registry import amplitude, shown
+
+Array = NDArray[np.float64]
+WIDE, TALL, APART = (
+    0.6,
+    0.95,
+    5.0,
+)  # of a figure, over the font's size; from a mark to the middle of its number, in points
+AWAY = [(-1, 1), (1, 1), (-1, -1), (1, -1), (0, 1.3), (0, -1.3), (-1.3, 0), (1.3, 0)]  # the preferred first
+MARK = 3.0  # half the size of a mark, in points
+
+
+def write_numbers(axes: "Axes", marks: Sequence[tuple[tuple[float, float], str]], curves: Sequence[Array]) -> None:
+    """Write texts beside marks at places of the data; those that would cover others, or other marks, are left out.
+
+    Parameters
+    ----------
+    curves
+        Places (2, n) that a number had better not cover.
+    """
+    from matplotlib import rcParams
+
+    if not marks:
+        return
+    box, figure = axes.get_position(), axes.get_figure(root=True)
+    assert figure
+    wide, tall = 72 * figure.get_size_inches()
+    size, (left, right), (low, high) = rcParams["font.size"], axes.get_xlim(), axes.get_ylim()
+    reach = np.array([box.width * wide, box.height * tall])  # of the axes, in points
+
+    def in_points(places: Array) -> Array:
+        return np.asarray((places - [left, low]) / [right - left, high - low] * reach)
+
+    at = in_points(np.array([place for place, _ in marks], float))
+    line = np.concatenate([in_points(curve.T) for curve in curves]) if curves else np.zeros((0, 2))
+    taken = [(place, np.full(2, MARK)) for place in at]
+    for i, (_, text) in enumerate(marks):
+        place: Array = at[i]
+        half = np.array([WIDE * len(text), TALL]) * size / 2
+        middles = [place + np.array(away) * (half + APART - 1) for away in AWAY]
+        free = [m for m in middles if _inside(m, half, reach) and not any(_meet(m, half, *other) for other in taken)]
+        if not free:
+            continue
+        best = min(free, key=partial(_fault, place, half, at, line))
+        taken.append((best, half))
+        axes.text(best[0] / reach[0], best[1] / reach[1], text, transform=axes.transAxes, ha="center", va="center")
+
+
+def _fault(place: Array, half: Array, marks: Array, line: Array, middle: Array) -> tuple[int, int]:
+    """How many marks a text is nearer to than to its own, and how many points of curves it covers."""
+    nearer = np.linalg.norm(marks - middle, axis=1) < np.linalg.norm(place - middle) - 1e-9
+    return int(nearer.sum()), int((np.abs(line - middle) < half).all(axis=1).sum())
+
+
+def _inside(middle: Array, half: Array, reach: Array) -> bool:
+    return bool(((middle - half > 0) & (middle + half < reach)).all())
+
+
+def _meet(middle: Array, half: Array, other: Array, its_half: Array) -> bool:
+    return bool((np.abs(middle - other) < half + its_half).all())
 
 
 def shell_caption(h: float, nu: float, row: Row) -> str:

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.output.fields.surface import Surface
-from magshell_fenicsx.output.pictures.bars import SIGNED
+from magshell_fenicsx.output.pictures.layout import SIGNED
 
 Array = NDArray[np.float64]
 MAGNITUDE = "viridis"

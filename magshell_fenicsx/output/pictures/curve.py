@@ -10,15 +10,20 @@ import scipy
 from numpy.typing import NDArray
 
 from magshell_fenicsx.case.output import OutputSection
-from magshell_fenicsx.output.pictures.bars import number_format
-from magshell_fenicsx.output.pictures.layout import INCH, ONE, SEVERAL, drawing
-from magshell_fenicsx.output.pictures.numbers import write_numbers
+from magshell_fenicsx.output.pictures.captions import write_numbers
+from magshell_fenicsx.output.pictures.layout import INCH, ONE, SEVERAL, drawing, number_format
 from magshell_fenicsx.output.store.table import LOCATED, POLE, SOLUTION, Row, pole_name
 from magshell_fenicsx.quantities.registry import OWN_MODES, axes_of, quantity, shown
 from magshell_fenicsx.quantities.registry import amplitude as registered
 
 if TYPE_CHECKING:  # takes long to import
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+from collections import defaultdict
+
+from magshell_fenicsx.output.fields.modes import Frequency
+
+if TYPE_CHECKING:  # takes long to import
     from matplotlib.figure import Figure
 
 FINE = 16  # drawn segments between two points
@@ -182,3 +187,31 @@ def _line(rows: Sequence[Row], amplitude: str) -> list[Row]:
 def _once(axes: "Axes", name: str) -> str:
     """A label of the legend; matplotlib leaves out "_"."""
     return "_" if name in axes.get_legend_handles_labels()[1] else name
+
+
+NAMED = 12  # most waves in the legend
+
+
+def frequencies_figure(found: Sequence[Frequency], rows: Sequence[Row], style: OutputSection) -> "Figure":
+    """ω² ρ R²/E over the amplitude that varied last; the n-th lowest of each wave is one line."""
+    from matplotlib.figure import Figure
+
+    varied = next((str(row["amplitude"]) for row in reversed(rows) if row["amplitude"]), "")
+    column = shown(registered(varied).column, rows[0]) if varied else None
+    places = {int(row["point"]): float(row[column.name]) if column else 0.0 for row in rows}
+    lines = defaultdict[tuple[str, int], list[tuple[float, float]]](list)
+    count = defaultdict[tuple[int, str], int](int)
+    for it in (it for it in found if it.point in places):
+        lines[it.wave, count[it.point, it.wave]].append((places[it.point], it.omega2))
+        count[it.point, it.wave] += 1
+    width = (style.width or ONE) / INCH
+    figure = Figure(figsize=(width, 0.75 * width), dpi=style.dpi, layout="constrained")
+    axes, waves = figure.subplots(), list(dict.fromkeys(wave for wave, _ in lines))
+    for (wave, number), points in sorted(lines.items()):
+        named = wave if number == 0 and waves.index(wave) < NAMED else None
+        axes.plot(*zip(*points, strict=True), ".-", color=f"C{waves.index(wave) % 10}", label=named, lw=1, ms=4)
+    axes.axhline(0, color="0.6", lw=0.6)
+    axes.set(xlabel=column.label if column else "", ylabel=r"$\omega^2 \rho R^2/E$")
+    if waves != [""]:
+        axes.legend(title="wave", frameon=False)
+    return figure

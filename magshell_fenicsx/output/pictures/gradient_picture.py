@@ -9,11 +9,9 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.case.output import OutputSection
 from magshell_fenicsx.output.fields.surface import Surface
-from magshell_fenicsx.output.pictures.arrows import spread
-from magshell_fenicsx.output.pictures.bars import SIGNED
 from magshell_fenicsx.output.pictures.colours import Coloured
-from magshell_fenicsx.output.pictures.layout import Arrow, Panel, columns, drawing, panel_width, panels_figure
-from magshell_fenicsx.output.pictures.picture import Background
+from magshell_fenicsx.output.pictures.layout import SIGNED, Arrow, Panel, columns, drawing, panel_width, panels_figure
+from magshell_fenicsx.output.pictures.picture import Background, spread
 from magshell_fenicsx.output.pictures.view import Camera
 
 if TYPE_CHECKING:  # takes long to import

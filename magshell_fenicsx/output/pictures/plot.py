@@ -8,22 +8,17 @@ from typing import Any
 import numpy as np
 
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.output.fields.frequencies import read_frequencies
-from magshell_fenicsx.output.fields.gradients import gradient_files
-from magshell_fenicsx.output.fields.point_file import read_point
+from magshell_fenicsx.output.fields.modes import gradient_files, read_frequencies
 from magshell_fenicsx.output.fields.surface import Surface
-from magshell_fenicsx.output.fields.vtu import About, point_file, read_vtu
+from magshell_fenicsx.output.fields.vtu import About, point_file, read_point, read_vtu
 from magshell_fenicsx.output.pictures.animation import animated
-from magshell_fenicsx.output.pictures.camera import run_camera
 from magshell_fenicsx.output.pictures.captions import caption
-from magshell_fenicsx.output.pictures.curve import curve_figure, drawn_parts
-from magshell_fenicsx.output.pictures.frequencies import frequencies_figure
+from magshell_fenicsx.output.pictures.curve import curve_figure, drawn_parts, frequencies_figure
 from magshell_fenicsx.output.pictures.gradient_picture import gradients_figure
 from magshell_fenicsx.output.pictures.layout import drawing, written
+from magshell_fenicsx.output.pictures.modes import mode_figures, searched, solutions_figure
 from magshell_fenicsx.output.pictures.picture import figures
-from magshell_fenicsx.output.pictures.run_modes import mode_figures
-from magshell_fenicsx.output.pictures.solutions import searched, solutions_figure
-from magshell_fenicsx.output.pictures.view import Camera
+from magshell_fenicsx.output.pictures.view import Camera, run_camera
 from magshell_fenicsx.output.report.report import write_report
 from magshell_fenicsx.output.store.durable import write_whole
 from magshell_fenicsx.output.store.known import case_in, headline, pole_of, style_of

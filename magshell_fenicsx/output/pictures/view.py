@@ -5,18 +5,130 @@ from functools import cache, cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import basix
 import numpy as np
+from dolfinx.cpp.io import perm_vtk
+from dolfinx.mesh import CellType
 from mpi4py import MPI
 from numpy.typing import NDArray
 
 from magshell_fenicsx.output.fields.surface import Surface
-from magshell_fenicsx.output.pictures.tessellation import Tessellation, tessellated
 from magshell_fenicsx.platform.native import native
 
 if TYPE_CHECKING:  # takes long to import
     from matplotlib.colors import Colormap
+from collections.abc import Sequence
+
+from magshell_fenicsx.case.output import OutputSection
 
 Array = NDArray[np.float64]
+Numbers = NDArray[np.int64]
+EQUAL = basix.LagrangeVariant.equispaced
+
+
+@dataclass(frozen=True)
+class Tessellation:
+    """Flat triangles in the pieces of a surface; its points are the same for every displacement.
+
+    Attributes
+    ----------
+    nodes
+        (m, k) nodes of each piece.
+    table
+        (q, k) values of its shape functions at its q points.
+    slopes
+        (2, q, k) their derivatives at its points.
+    triangles
+        (t, 3) numbers of points, of all pieces.
+    flat
+        Whether the pieces are flat triangles, whose normals are averaged at nodes.
+    """
+
+    nodes: Numbers
+    table: Array
+    slopes: Array
+    triangles: NDArray[np.int32]
+    flat: bool
+
+    def at(self, values: Array) -> Array:
+        """Values (n, ...) of nodes at the points (m q, ...)."""
+        flat = values[self.nodes].reshape(*self.nodes.shape, -1)
+        return np.asarray(np.matmul(self.table, flat).reshape(-1, *values.shape[1:]))
+
+    def normals(self, r: Array) -> Array:
+        """Unit normals (m q, 3) of the surface with nodes at r (n, 3); of either sign."""
+        along = np.matmul(self.slopes[:, None], r[self.nodes])
+        found = np.cross(*along).reshape(-1, 3)
+        if self.flat:
+            where, n = self.nodes.ravel(), len(r)
+            found = np.column_stack([np.bincount(where, found[:, i], n) for i in range(3)])[where]
+        return np.asarray(found / np.maximum(np.linalg.norm(found, axis=1), 1e-300)[:, None])
+
+
+def tessellated(surface: Surface, most: int = 40_000) -> Tessellation:
+    """The flat triangles of a surface, at most about so many, but never fewer than its cells give."""
+    if surface.is_body:
+        faces = _outer_faces(surface.cells)
+        division = _division(2 * len(faces), 4, most)
+        element = basix.create_element(basix.ElementFamily.P, basix.CellType.quadrilateral, 2, EQUAL)
+        return _divided(faces, element, np.arange(9), _squares(division))
+    count = surface.cells.shape[1]
+    degree = round((np.sqrt(8 * count + 1) - 3) / 2)
+    element = basix.create_element(basix.ElementFamily.P, basix.CellType.triangle, degree, EQUAL)
+    order = np.argsort(perm_vtk(CellType.triangle, count))
+    division = 1 if degree == 1 else _division(len(surface.cells), 2 * degree, most)
+    return _divided(surface.cells, element, order, _triangle(division))
+
+
+def _division(pieces: int, wanted: int, most: int) -> int:
+    return int(np.clip(np.sqrt(most / max(pieces, 1)), 1, wanted))
+
+
+def _divided(
+    nodes: Numbers, element: "basix.finite_element.FiniteElement", order: Numbers, fine: tuple[Array, Numbers]
+) -> Tessellation:
+    points, triangles = fine
+    table, *slopes = element.tabulate(1, points)[:, :, :, 0][:, :, order]
+    numbers = np.arange(len(nodes))[:, None, None] * len(points) + triangles
+    return Tessellation(nodes, table, np.array(slopes), numbers.reshape(-1, 3).astype(np.int32), nodes.shape[1] == 3)
+
+
+def _triangle(n: int) -> tuple[Array, Numbers]:
+    """Points of the reference triangle in a grid, and its n² triangles."""
+    places = [(i, j) for j in range(n + 1) for i in range(n + 1 - j)]
+    number = {place: k for k, place in enumerate(places)}
+    up = [(number[i, j], number[i + 1, j], number[i, j + 1]) for i, j in places if i + j < n]
+    down = [(number[i + 1, j], number[i + 1, j + 1], number[i, j + 1]) for i, j in places if i + j < n - 1]
+    return np.array(places) / n, np.array(up + down)
+
+
+def _squares(n: int) -> tuple[Array, Numbers]:
+    """The same of the reference square; 2 n² triangles."""
+    x, y = np.meshgrid(np.arange(n + 1), np.arange(n + 1))
+    low = (np.arange(n)[:, None] * (n + 1) + np.arange(n)).ravel()
+    right, above = low + 1, low + n + 1
+    triangles = np.concatenate([np.column_stack([low, right, above]), np.column_stack([right, above + 1, above])])
+    return np.column_stack([x.ravel(), y.ravel()]) / n, triangles
+
+
+def _outer_faces(cells: Numbers) -> Numbers:
+    """The nine nodes of each face that belongs to one hexahedron only, in Basix's order of a square."""
+    body = basix.create_element(basix.ElementFamily.P, basix.CellType.hexahedron, 2, EQUAL)
+    square = basix.create_element(basix.ElementFamily.P, basix.CellType.quadrilateral, 2, EQUAL)
+    ours = cells[:, np.argsort(np.argsort(perm_vtk(CellType.hexahedron, cells.shape[1])))]  # in Basix's order
+    faces = []
+    for axis in range(3):
+        others = [i for i in range(3) if i != axis]
+        for side in (0.0, 1.0):
+            on = np.flatnonzero(np.isclose(body.points[:, axis], side))
+            at = {tuple(np.round(2 * body.points[i, others]).astype(int)): i for i in on}
+            faces.append(ours[:, [at[tuple(np.round(2 * p).astype(int))] for p in square.points]])
+    found = np.concatenate(faces)
+    corners = np.sort(found[:, :4], axis=1)
+    _, first, count = np.unique(corners, axis=0, return_index=True, return_counts=True)
+    return np.asarray(found[np.sort(first[count == 1])])
+
+
 Image = NDArray[np.uint8]
 FUNCTIONS = """
     void rasterise(const double *, const int32_t *, int64_t, int32_t, int32_t, int32_t *, float *);
@@ -155,3 +267,74 @@ def _pointers(*arrays: NDArray[Any]) -> list[Any]:
 def axes_on_screen(direction: Array) -> Array:
     """The components (3, 2) of e1, e2, e3 to the right and up on the screen, seen from a direction."""
     return Camera(direction).axes[:2].T
+
+
+ASIDE = (-0.8, -1.1, 0.8, 1.1)  # turns from a place that still leave it visible
+LARGER = 1.15  # the shell must fill so much more of the picture
+
+
+def run_camera(surface: Surface, style: OutputSection) -> Camera:
+    """The camera of all pictures of a run, from the shell at the point that the run is about."""
+    if style.camera is None:
+        return _best(surface, deflected_place(surface))
+    polar, azimuth = np.radians([style.camera.polar, style.camera.azimuth])
+    return Camera(np.array([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)]))
+
+
+def _best(surface: Surface, place: Array) -> Camera:
+    """The camera from which a place is visible; beside sources or bodies turned to where the shell fills more."""
+    usual, near = Camera(towards(place)), near_outlines(surface)
+    if not near:
+        return usual
+    pieces, r = tessellated(surface), surface.r0 + surface.u
+    corners, everything = pieces.at(r)[pieces.triangles], np.concatenate([surface.r0, r, *near])
+
+    def size(camera: Camera) -> float:
+        """The part of the picture that the shell covers."""
+        (a, b, c), box = np.moveaxis(camera(corners)[..., :2], 1, 0), Window.around(camera(everything), 1).box
+        x, y = np.moveaxis(np.stack([b - a, c - a]), -1, 0)
+        return float(np.abs(x[0] * y[1] - x[1] * y[0]).sum() / 2 / ((box[1] - box[0]) * (box[3] - box[2])))
+
+    best = max((Camera(towards(place, aside)) for aside in ASIDE), key=size)
+    return best if size(best) > LARGER * size(usual) else usual
+
+
+def towards(place: Array, aside: float = -0.5) -> Array:
+    """A camera direction (3,) from which a point (3,) of a shell is visible: from above and from the side."""
+    heading = (np.arctan2(place[1], place[0]) if np.hypot(*place[:2]) > 0.1 else -0.5) + aside
+    return np.array([4.2 * np.cos(heading), 4.2 * np.sin(heading), 2.75])
+
+
+def deflected_place(surface: Surface) -> Array:
+    """The point (3,) of the largest normal displacement."""
+    return np.asarray(surface.r0[np.argmax(np.abs(surface.w))])
+
+
+FAR = 2.5  # of the shell's extent, from its middle: sources farther away are not drawn
+SAME = 1e-3  # of that reach: lines as near as this meet
+
+
+def near_outlines(surface: Surface) -> tuple[Array, ...]:
+    """The outlines of sources and bodies that leave the shell large enough to be seen."""
+    r = surface.r0 + surface.u
+    middle, reach = r.mean(axis=0), FAR * float(np.ptp(r, axis=0).max())
+    whole = _joined(surface.outlines, SAME * reach)
+    far = {number for line, number in zip(surface.outlines, whole, strict=True) if _farthest(line, middle) > reach}
+    return tuple(line for line, number in zip(surface.outlines, whole, strict=True) if number not in far)
+
+
+def _farthest(line: Array, middle: Array) -> float:
+    return float(np.linalg.norm(line - middle, axis=1).max())
+
+
+def _joined(lines: Sequence[Array], within: float) -> list[int]:
+    """A number for each line, the same of lines that meet: they are of one source or body."""
+    numbers = list(range(len(lines)))
+    for i, line in enumerate(lines):
+        for k, other in enumerate(lines[:i]):
+            ends = np.concatenate([line[[0, -1]], other[[0, -1]]])
+            apart = np.linalg.norm(ends[:, None] - np.concatenate([other, line])[None], axis=2)
+            apart[:2, len(other) :] = apart[2:, : len(other)] = np.inf  # of a line from itself
+            if apart.min() < within:
+                numbers = [numbers[k] if n == numbers[i] else n for n in numbers]
+    return numbers

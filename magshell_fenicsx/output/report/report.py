@@ -1,6 +1,8 @@
 """report.html: a run in one file, made from the files of its folder."""
 
 import base64
+import io
+import webbrowser
 from collections.abc import Iterator, Sequence
 from math import isnan
 from pathlib import Path
@@ -9,11 +11,10 @@ from typing import Any
 import yaml
 from markupsafe import Markup
 
-from magshell_fenicsx.output.fields.frequencies import Frequency, read_frequencies
-from magshell_fenicsx.output.report.html_numbers import number
+from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.output.fields.modes import Frequency, read_frequencies
 from magshell_fenicsx.output.report.interactive import interactive
-from magshell_fenicsx.output.report.light import light
-from magshell_fenicsx.output.report.report_path import Line, head, path_table, pole_head, symbol
+from magshell_fenicsx.output.report.report_path import Line, head, number, path_table, pole_head, symbol
 from magshell_fenicsx.output.report.verdict import Summary, amount, located, read_run, value, verdict
 from magshell_fenicsx.output.store.durable import write_whole
 from magshell_fenicsx.output.store.known import headline, pole_of
@@ -224,3 +225,46 @@ def _how_to_estimate(case: dict[str, Any]) -> str:
         return "give the case mesh: {tolerance: 1e-3} in place of degree and refinement"
     finer = "mesh.degree one higher" if case["shell"]["geometry"] == "mesh" else "mesh.refinement twice as large"
     return f"run it again with {finer} and compare (mesh.tolerance is not offered for this geometry or model)"
+
+
+def report_of(folder: Path) -> Path:
+    """The report of a run's folder, written if it is not there.
+
+    Raises
+    ------
+    CaseError
+        If the folder holds no run with a summary.
+    """
+    if not (folder / NAME).exists():
+        if not (folder / "summary.json").exists():
+            raise CaseError(f"{folder} holds no report.html, and no summary.json to make one of")
+        write_report(folder)
+    return (folder / NAME).resolve()
+
+
+def opened(file: Path) -> bool:
+    """Whether a web browser could be asked to show a file."""
+    try:
+        return webbrowser.open(file.as_uri())
+    except webbrowser.Error:
+        return False
+
+
+LARGE = 250_000  # bytes
+WIDEST, COLOURS = 1100, 256  # pixels: the width of the page
+
+
+def light(content: bytes) -> bytes:
+    """A PNG file as it is, or if it is large with the page's width and a palette; other files as they are."""
+    if len(content) < LARGE or not content.startswith(b"\x89PNG"):
+        return content
+    from PIL import Image
+
+    with Image.open(io.BytesIO(content)) as image:
+        size = min(WIDEST, image.width), round(image.height * min(WIDEST / image.width, 1))
+        smaller = image.convert("RGB").resize(size, Image.Resampling.BOX, reducing_gap=2.0)
+    reduced = io.BytesIO()
+    smaller.quantize(COLOURS, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE).save(
+        reduced, "PNG", compress_level=6
+    )
+    return min(content, reduced.getvalue(), key=len)

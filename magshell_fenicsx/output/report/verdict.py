@@ -9,8 +9,7 @@ from typing import Any
 
 from markupsafe import Markup
 
-from magshell_fenicsx.output.report.html_numbers import above_rounding, number
-from magshell_fenicsx.output.report.report_path import Line, head, symbol
+from magshell_fenicsx.output.report.report_path import Line, above_rounding, head, number, symbol
 from magshell_fenicsx.output.store.durable import Damaged
 from magshell_fenicsx.output.store.known import pole_of, read_summary
 from magshell_fenicsx.output.store.table import LOCATED, pole_name, read_lines

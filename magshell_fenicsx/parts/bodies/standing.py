@@ -7,8 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.mesh.frame import rotation
-from magshell_fenicsx.mesh.mirror import Mirror
+from magshell_fenicsx.mesh.mirror import Mirror, rotation
 from magshell_fenicsx.parts.bodies.body import BodySection, place_body
 from magshell_fenicsx.parts.bodies.contact import Contact
 from magshell_fenicsx.parts.bodies.press import ContactSection

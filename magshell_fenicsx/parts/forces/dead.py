@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field, model_validator
 from ufl.core.expr import Expr
 
-from magshell_fenicsx.input.by_formula import function
-from magshell_fenicsx.input.expressions import Formula, is_formula, symbolic
+from magshell_fenicsx.input.expressions import Formula, function, is_formula, symbolic
 from magshell_fenicsx.input.section import Section, in_units, or_number
 from magshell_fenicsx.mesh.grading import Disc, Feature
 from magshell_fenicsx.mesh.mirror import ROUNDING, Mirror

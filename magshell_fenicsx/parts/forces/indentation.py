@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from magshell_fenicsx.input.direction import Direction
+from magshell_fenicsx.input.section import Direction
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.input.targets import over
 from magshell_fenicsx.mesh.grading import Disc, Feature

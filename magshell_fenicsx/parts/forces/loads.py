@@ -3,8 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.input.by_formula import ByFormula, Inwards, function
-from magshell_fenicsx.mesh.frame import rotation
+from magshell_fenicsx.input.expressions import ByFormula, Inwards, function
+from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.models.shell.parameters import AreaForce, DeadLoad, EdgeForce, EdgeMoment, PointForce, Potential
 from magshell_fenicsx.models.shell.patterns import Pattern
 from magshell_fenicsx.parts.forces.dead import DeadLoadSection, potential

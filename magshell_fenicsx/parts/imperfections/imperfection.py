@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field, ModelWrapValidatorHandler, ValidationError, ValidationInfo
 
 from magshell_fenicsx.input.section import Section, in_units, with_unit
-from magshell_fenicsx.mesh.deviation import Deviation
-from magshell_fenicsx.mesh.frame import rotation
+from magshell_fenicsx.mesh.midsurface import Deviation
+from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.shape.ground import At, Distance, Ground
 
 Array = NDArray[np.float64]

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.mesh.frame import rotation
+from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.parts.imperfections.imperfection import Flaw
 from magshell_fenicsx.shape.outline import Outline
 

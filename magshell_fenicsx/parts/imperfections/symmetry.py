@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from magshell_fenicsx.mesh.deviation import Deviation
-from magshell_fenicsx.mesh.frame import rotation
-from magshell_fenicsx.mesh.mirror import Mirror
+from magshell_fenicsx.mesh.midsurface import Deviation
+from magshell_fenicsx.mesh.mirror import Mirror, rotation
 from magshell_fenicsx.parts.imperfections.dimple import Dimple
 from magshell_fenicsx.parts.imperfections.gaussian import Gaussian
 from magshell_fenicsx.parts.imperfections.imperfection import Flaw

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from magshell_fenicsx.input.direction import Direction
+from magshell_fenicsx.input.section import Direction
 from magshell_fenicsx.parts.magnetism.fields import MagneticSection, strength
 from magshell_fenicsx.parts.part import Context
 from magshell_fenicsx.parts.step import Drive, Now, PathStep, ProgrammeStep, Step, Target, Until

@@ -7,10 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from magshell_fenicsx.input.direction import Direction
 from magshell_fenicsx.input.expressions import Formula
 from magshell_fenicsx.input.file import FileKeys
-from magshell_fenicsx.input.section import FluxDensity, Section
+from magshell_fenicsx.input.section import Direction, FluxDensity, Section
 from magshell_fenicsx.parts.kinds import Sources
 from magshell_fenicsx.parts.part import Context
 

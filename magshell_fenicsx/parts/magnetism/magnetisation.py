@@ -6,11 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.input.direction import Direction
 from magshell_fenicsx.input.expressions import formula
+from magshell_fenicsx.input.section import Direction
 from magshell_fenicsx.input.tables import read_vectors
-from magshell_fenicsx.mesh.frame import rotation
-from magshell_fenicsx.mesh.mirror import Mirror
+from magshell_fenicsx.mesh.mirror import Mirror, rotation
 from magshell_fenicsx.models.shell.controls import ByControls, Controls
 from magshell_fenicsx.models.shell.parameters import Magnetisation
 from magshell_fenicsx.models.shell.patterns import Components, Inside, Pattern, WithinRims, radial, tangential

@@ -5,9 +5,8 @@ from collections.abc import Callable, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.input.by_formula import ByFormula, function
-from magshell_fenicsx.mesh.frame import rotation
-from magshell_fenicsx.mesh.mirror import Mirror
+from magshell_fenicsx.input.expressions import ByFormula, function
+from magshell_fenicsx.mesh.mirror import Mirror, rotation
 from magshell_fenicsx.models.shell.patterns import Inside, Pattern, WithinRims
 from magshell_fenicsx.parts.natural.section import NaturalSection, components
 from magshell_fenicsx.parts.natural.shape import Natural, Varying, meridians

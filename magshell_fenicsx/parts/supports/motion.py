@@ -9,8 +9,7 @@ from pydantic import Field, model_validator
 
 from magshell_fenicsx.assembly.motion import Motion
 from magshell_fenicsx.input.section import Section, or_number
-from magshell_fenicsx.mesh.frame import rotation
-from magshell_fenicsx.mesh.mirror import ROUNDING, Mirror
+from magshell_fenicsx.mesh.mirror import ROUNDING, Mirror, rotation
 from magshell_fenicsx.parts.part import Context, Modelled
 from magshell_fenicsx.parts.step import Count, Now, PathStep, ProgrammeStep, Target, Until
 from magshell_fenicsx.parts.supports.boundary import BoundarySection

@@ -9,8 +9,7 @@ from meridian_scenes import E3, hemisphere
 from petsc4py import PETSc
 
 from magshell_fenicsx.continuation.system import State
-from magshell_fenicsx.input.expressions import with_derivatives
-from magshell_fenicsx.input.formulas_in_space import FormulasInSpace
+from magshell_fenicsx.input.expressions import FormulasInSpace, with_derivatives
 from magshell_fenicsx.models.shell.parameters import Loads, Magnetisation, RemanenceLaw
 from magshell_fenicsx.models.shell.patterns import tangential
 

@@ -10,9 +10,8 @@ from conftest import disc, hemisphere, random_displacement
 from test_derivatives import alone, check
 from test_fast_residual import difference as residual_difference
 
-from magshell_fenicsx.input.expressions import with_derivatives
-from magshell_fenicsx.input.formulas_in_space import FormulasInSpace
-from magshell_fenicsx.mesh.frame import rotation
+from magshell_fenicsx.input.expressions import FormulasInSpace, with_derivatives
+from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.shell.parameters import Loads, Magnetisation, Material, RemanenceLaw

@@ -15,7 +15,7 @@ from magshell_fenicsx.assembly.terms import FormTerm
 from magshell_fenicsx.continuation.system import State, dot
 from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.models.shell.parameters import Material
-from magshell_fenicsx.output.fields.stresses import Stresses, principal_fields
+from magshell_fenicsx.output.fields.point_fields import Stresses, principal_fields
 from magshell_fenicsx.parts.natural.shape import Natural
 from magshell_fenicsx.problem.planner import make_plan
 

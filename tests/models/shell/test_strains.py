@@ -11,7 +11,7 @@ from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.shell.parameters import Loads, Magnetisation, Material
 from magshell_fenicsx.models.shell.strains import TangentFrame, bending_moment, principal
-from magshell_fenicsx.output.fields.stresses import Stresses, principal_fields
+from magshell_fenicsx.output.fields.point_fields import Stresses, principal_fields
 from magshell_fenicsx.output.fields.surface import Surface, SurfaceGatherer
 from magshell_fenicsx.simulate.follow import follow
 

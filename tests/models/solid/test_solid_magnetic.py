@@ -10,8 +10,7 @@ from bodies import hemisphere, plate
 from test_solid_derivatives import FIELD, MU, displacement
 
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
-from magshell_fenicsx.input.expressions import with_derivatives
-from magshell_fenicsx.input.formulas_in_space import FormulasInSpace
+from magshell_fenicsx.input.expressions import FormulasInSpace, with_derivatives
 from magshell_fenicsx.models.shell.parameters import Loads, Magnetisation, Material, RemanenceLaw
 from magshell_fenicsx.models.shell.patterns import radial
 from magshell_fenicsx.models.solid.material import NeoHookean

@@ -14,8 +14,7 @@ from conftest import CASES
 from scipy.spatial.transform import Rotation
 
 from magshell_fenicsx import Case, CaseError, Scene
-from magshell_fenicsx.input.expressions import with_derivatives
-from magshell_fenicsx.input.formulas_in_space import FormulasInSpace
+from magshell_fenicsx.input.expressions import FormulasInSpace, with_derivatives
 from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.models.shell.crossing import crossing
 from magshell_fenicsx.parts.magnetism.sources.field import in_space, placed

@@ -7,9 +7,8 @@ from math import acos, radians
 import numpy as np
 
 from magshell_fenicsx.assembly.motion import Motion, moved
-from magshell_fenicsx.input.expressions import with_derivatives
-from magshell_fenicsx.input.formulas_in_space import FormulasInSpace
-from magshell_fenicsx.mesh.frame import rotation
+from magshell_fenicsx.input.expressions import FormulasInSpace, with_derivatives
+from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.parts.magnetism.driven import Driven, FieldInSpace
 from magshell_fenicsx.parts.magnetism.field_step import RotationSection
 from magshell_fenicsx.parts.magnetism.fields import AppliedSection, MagneticSection

@@ -5,8 +5,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field
 
-from magshell_fenicsx.input.expressions import Formula, with_derivatives
-from magshell_fenicsx.input.formulas_in_space import FormulasInSpace
+from magshell_fenicsx.input.expressions import Formula, FormulasInSpace, with_derivatives
 from magshell_fenicsx.input.section import FluxDensity
 from magshell_fenicsx.parts.magnetism.sources.source import Array, OwnField, SourceSection
 

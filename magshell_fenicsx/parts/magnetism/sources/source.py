@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from magshell_fenicsx.input.direction import Direction
-from magshell_fenicsx.input.section import FluxDensity, Section, or_number
+from magshell_fenicsx.input.section import Direction, FluxDensity, Section, or_number
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.parts.magnetism.driven import FieldInSpace
 

@@ -1,0 +1,186 @@
+"""Pictures of modes and of further solutions: small panels beside each other."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from magshell_fenicsx.case.output import OutputSection
+from magshell_fenicsx.output.fields.surface import Surface
+from magshell_fenicsx.output.pictures.colours import Coloured
+from magshell_fenicsx.output.pictures.layout import (
+    GAP,
+    INCH,
+    LINE,
+    ONE,
+    SEVERAL,
+    Boxes,
+    colour_bar,
+    directions,
+    draw_panel,
+)
+from magshell_fenicsx.output.pictures.picture import Background
+from magshell_fenicsx.output.pictures.view import Camera, Window
+
+if TYPE_CHECKING:  # takes long to import
+    from matplotlib.figure import Figure
+import csv
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from magshell_fenicsx.output.fields.modes import mode_caption, mode_file, wave_number
+from magshell_fenicsx.output.fields.vtu import read_vtu
+from magshell_fenicsx.output.pictures.captions import named_value
+from magshell_fenicsx.output.pictures.curve import numbered
+from magshell_fenicsx.output.pictures.layout import SIGNED, drawing
+from magshell_fenicsx.output.store.durable import Damaged
+from magshell_fenicsx.output.store.table import LOCATED, SOLUTION, Row, stability
+from magshell_fenicsx.quantities.registry import OWN_MODES, amplitude
+
+
+def small_panels(
+    surfaces: Sequence[Surface],
+    layers: Sequence[Coloured],
+    captions: Sequence[str],
+    style: OutputSection,
+    camera: Camera,
+) -> "Figure":
+    """All in one window, with captions above them; the layers have the same limits."""
+    from matplotlib.figure import Figure
+
+    number, line, gap = len(surfaces), LINE * style.font_size, GAP / INCH
+    across = number if number < 4 else 2 if number == 4 else 3 if number < 10 else 4
+    width = (style.width or (ONE if number == 1 else SEVERAL)) / INCH
+    wide = width / across
+    drawn = np.concatenate([camera(np.concatenate([s.r0, s.r0 + s.u])) for s in surfaces])
+    window = Window.around(drawn, max(int((wide - gap) * style.dpi), 50))
+    tall = window.shape[0] / style.dpi
+    lines = max(caption.count("\n") + 1 for caption in captions)
+    each, below = tall + lines * line + gap / 2, 4.4 * line
+    height = -(-number // across) * each + below
+    figure = Figure(figsize=(width, height), dpi=style.dpi)
+    boxes = Boxes(figure)
+    for i, (surface, layer, caption) in enumerate(zip(surfaces, layers, captions, strict=True)):
+        panel = Background(surface, camera, 0, window).panel(layer, style)
+        left, low = i % across * wide, height - (i // across + 1) * each
+        draw_panel(boxes.axes(left + gap / 2, low, wide - gap, tall), panel, style)
+        figure.text(*boxes.place(left + wide / 2, low + tall + lines * line / 2), caption, ha="center", va="center")
+    reach = min(width - gap - 8 * line, 4.0)
+    box = boxes.axes((width - reach) / 2, 1.7 * line, reach, 0.65 * line)
+    colour_bar(figure, box, panel.scale)
+    directions(boxes.axes(gap / 2, 0.4 * line, 3.4 * line, 3.4 * line), camera, style)
+    return figure
+
+
+def searched(rows: Sequence[Row]) -> list[Row]:
+    """The rows of all solutions, and before those of a step the last point of its path."""
+    found: list[Row] = []
+    for i, row in enumerate(rows):
+        if row["label"] == SOLUTION:
+            first = rows[i - 1]["label"] != SOLUTION or rows[i - 1]["step"] != row["step"]
+            before = [rows[max(j for j in range(i) if rows[j]["branch"] == 0)]] if first else []
+            found += [*before, row]
+    return found
+
+
+def solutions_figure(
+    surfaces: Sequence[Surface], rows: Sequence[Row], h: float, style: OutputSection, camera: Camera
+) -> "Figure":
+    """Draw the deformed shells of some rows with the same colours."""
+    largest = max(float(np.abs(surface.w).max()) for surface in surfaces) / h or 1.0
+    limits = (-largest, largest)
+    layers = [
+        Coloured("w_over_h", np.asarray(s.w / h), limits, SIGNED, "inward normal displacement $w/h$") for s in surfaces
+    ]
+    captions = [f"{_name(row)}: {stability(row).split()[0]}" for row in rows]
+    with drawing(style):
+        return small_panels(surfaces, layers, captions, style, camera)
+
+
+def _name(row: Row) -> str:
+    return f"solution {row['branch']}" if row["label"] == SOLUTION else "end of the path"
+
+
+SHOWN = 0.08  # drawn size of a mode's largest displacement, over R
+CAPTION = "$w$ of the mode over its largest"
+
+
+def modes_figure(
+    surfaces: Sequence[Surface], captions: Sequence[str], style: OutputSection, camera: Camera
+) -> "Figure":
+    """Draw one small panel per mode: the deformed shell plus the mode, coloured by the mode's normal displacement.
+
+    Parameters
+    ----------
+    surfaces
+        With the fields "mode" and "mode_w"; see `fields.modes`.
+    captions
+        Of the panels, in matplotlib's mathematics.
+    """
+    moved = [replace(surface, u=surface.u + SHOWN * surface.fields["mode"]) for surface in surfaces]
+    layers = []
+    for surface in surfaces:
+        w = surface.fields["mode_w"]
+        layers.append(Coloured("mode_w", w / (np.abs(w).max() or 1.0), (-1.0, 1.0), SIGNED, CAPTION))
+    with drawing(style):
+        return small_panels(moved, layers, captions, style, camera)
+
+
+MOST_PANELS = 12
+
+
+@dataclass(frozen=True)
+class Mode:
+    """A mode of stability.csv."""
+
+    label: str
+    eigenvalue: float
+
+
+def mode_figures(
+    folder: Path, rows: Sequence[Row], style: OutputSection, camera: Camera
+) -> Iterator[tuple[str, "Figure"]]:
+    """`instabilities` of the null vectors, and `modes_NNNN` of the modes in stability.csv."""
+    numbers = numbered(rows)
+    singular = [row for row in rows if row["label"] in LOCATED]
+    if panels := [panel for row in singular if (panel := _null_vector(folder, row, numbers))]:
+        yield "instabilities", _figure(panels, style, camera)
+    table = folder / "stability.csv"
+    if not table.exists():
+        return
+    try:
+        with table.open(encoding="utf-8", newline="") as stream:
+            listed = [
+                (int(line["point"]), Mode(line["mode"], float(line["eigenvalue"]))) for line in csv.DictReader(stream)
+            ]
+    except (KeyError, ValueError, TypeError, csv.Error) as e:
+        raise Damaged(f"{table}: is damaged: {type(e).__name__}: {e}") from None
+    for row in rows:
+        point = int(row["point"])
+        modes = [mode for number, mode in listed if number == point]
+        files = [(mode_file(folder, point, str(n), mode.label), n, mode) for n, mode in enumerate(modes, 1)]
+        if panels := [(read_vtu(file)[0], mode_caption(n, mode)) for file, n, mode in files if file.exists()]:
+            yield f"modes_{point:04d}", _figure(panels, style, camera)
+
+
+def _figure(panels: Sequence[tuple[Surface, str]], style: OutputSection, camera: Camera) -> "Figure":
+    surfaces, captions = zip(*panels[:MOST_PANELS], strict=True)
+    return modes_figure(surfaces, captions, style, camera)
+
+
+def _null_vector(folder: Path, row: Row, numbers: dict[int, int]) -> tuple[Surface, str] | None:
+    """The surface with a null vector, and its caption: number, kind, where on the path."""
+    label = "" if row["mode"] in OWN_MODES else str(row["mode"])
+    file = mode_file(folder, int(row["point"]), str(row["label"]), label)
+    if not file.exists():
+        return None
+    surface, _ = read_vtu(file)
+    details = [str(row["mode"])] if row["mode"] else []
+    if not label and (m := wave_number(surface)):
+        details.append(f"m = {m}")
+    details = [detail.replace("m = ", "$m$ = ") for detail in details]
+    kind = f" ({', '.join(details)})" if details else ""
+    column = amplitude(str(row["amplitude"])).column
+    where = f"\n{named_value(column, row, 5)}" if row["amplitude"] else ""
+    return surface, f"{numbers[int(row['point'])]}: {row['label']}{kind}{where}"
