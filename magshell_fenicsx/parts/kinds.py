@@ -16,7 +16,7 @@ from magshell_fenicsx.parts.magnetism.sources.source import SourceSection
 
 REGISTERED: dict[str, tuple[str, ...]] = {
     # room -> kinds in the order of the documentation
-    "bodies": ("plane", "sphere", "cylinder", "rod", "box"),
+    "bodies": ("plane", "sphere", "cylinder", "rod", "box", "ellipsoid"),
     "imperfections": ("dimple", "gaussian", "formula", "data", "modes", "random"),
     "magnetism.sources": ("cylinder", "cuboid", "sphere", "ring", "coil", "grid", "formula"),
 }

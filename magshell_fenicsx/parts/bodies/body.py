@@ -105,8 +105,8 @@ class BodySection(Section):
     direction: Axis | None = None
     """Of the approach; by default along the shell's normal at `at`, towards the shell"""
     position: Coordinates | None = None
-    """Where it is at approach 0: a point of a plane, the centre of a sphere, cylinder or box, the middle of a rod's
-    end [the shell's length; over R if that has no unit]"""
+    """Where it is at approach 0: a point of a plane, the middle of a rod's end, the centre of another body [the shell's
+    length; over R if that has no unit]"""
     stiffness: float | None = Field(default=None, gt=0, le=1e12)
     """k of the penalty k s²/2 per area of a penetration s; by default 1e6 D/(R² h²) of a plane, of another body of
     radius r 15 (1 + R/r) times as much, and four times as much each time that the penetration would exceed its bound

@@ -1,0 +1,91 @@
+"""An ellipsoid."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from magshell_fenicsx.parts.bodies.body import Axis, BodySection, Distance, Placed, Size
+from magshell_fenicsx.shape.lines import ball
+
+Array = NDArray[np.float64]
+STEPS = 60  # of Newton's method, which takes about six
+CENTRAL = 1e-12  # of a semi-axis: places nearer to a plane of symmetry are moved there, where the nearest place is one
+SOLVED = 1e-15  # change of the parameter, over the largest semi-axis squared
+FLAT = 1e-9  # least 1 + distance times curvature: beyond a centre of curvature another place is nearest
+
+
+class EllipsoidSection(BodySection):
+    """An ellipsoid, one of its axes along the approach."""
+
+    kind: Literal["ellipsoid"]
+    semi_axes: Annotated[list[Size], Field(min_length=3, max_length=3)]
+    """Along `axis`, across it and the approach, and along the approach; half of its lengths [the shell's length; over R
+    if that has no unit]"""
+    axis: Axis
+    """Along the first semi-axis, of any length; its part across the approach counts, and there must be one"""
+
+    @property
+    def ahead(self) -> float:
+        return self.semi_axes[2]
+
+    @property
+    def blunt(self) -> float:
+        """The smaller radius of curvature of its front, in the case's unit."""
+        return min(self.semi_axes[:2]) ** 2 / self.semi_axes[2]
+
+    def distance(self, placed: Placed) -> Distance:
+        return Ellipsoid(placed.centre, placed.axes(self.axis), np.array(self.semi_axes) / placed.R)
+
+
+@dataclass(frozen=True)
+class Ellipsoid(Distance):
+    """`axes` (3, 3) are its unit vectors as rows, `semi` its semi-axes a_i along them.
+
+    The nearest place of the surface to y has the coordinates a_i² y_i/(t + a_i²), with the largest root t of
+    F(t) = sum (a_i y_i/(t + a_i²))² - 1. F falls and is convex there, so Newton's method from a place with
+    0 <= F <= 2 goes up to the root and never past it.
+    """
+
+    centre: Array
+    axes: Array
+    semi: Array
+
+    def __call__(self, x: Array) -> tuple[Array, Array, Array]:
+        y = (x - self.centre) @ self.axes.T
+        foot = self.nearest(y)
+        normal = foot / self.semi**2
+        steep = np.linalg.norm(normal, axis=1)
+        n = normal / steep[:, None]
+        g = np.einsum("ni,ni->n", y - foot, n)
+        tangent = np.eye(3) - n[:, :, None] * n[:, None, :]
+        S = tangent @ (np.eye(3) / self.semi**2 / steep[:, None, None]) @ tangent  # the curvatures of the surface
+        curvatures, directions = np.linalg.eigh(S)
+        there = curvatures / np.maximum(1 + g[:, None] * curvatures, FLAT)  # and of its parallel one
+        N = np.einsum("nia,na,nja->nij", directions, there, directions)
+        return g, n @ self.axes, np.einsum("ai,nab,bj->nij", self.axes, N, self.axes, optimize=True)
+
+    def nearest(self, y: Array) -> Array:
+        """The nearest places (n, 3) of its surface to places (n, 3), along its axes."""
+        a = self.semi
+        size = np.maximum(np.abs(y), CENTRAL * a)
+        t = (a * size - a**2).max(axis=1)
+        for _ in range(STEPS):
+            ratio = a * size / (t[:, None] + a**2)
+            F, slope = (ratio**2).sum(axis=1) - 1, -2 * (ratio**2 / (t[:, None] + a**2)).sum(axis=1)
+            step = -F / slope
+            t = t + step
+            if np.abs(step).max(initial=0.0) <= SOLVED * a.max() ** 2:
+                break
+        return np.asarray(np.where(y < 0, -1.0, 1.0) * a**2 * size / (t[:, None] + a**2))
+
+    @property
+    def lines(self) -> list[Array]:
+        return [self.centre + self.semi * line @ self.axes for line in ball(1.0)]
+
+    @property
+    def across(self) -> Sequence[Array]:
+        return [*self.axes]
