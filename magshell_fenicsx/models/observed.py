@@ -6,7 +6,7 @@ import numpy as np
 from dolfinx import fem
 from numpy.typing import NDArray
 
-from magshell_fenicsx.assembly.growing import Growing
+from magshell_fenicsx.assembly.parameters import Growing
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.assembly.terms import LinearTerm
 from magshell_fenicsx.continuation.system import Amplitudes, State, Vector

@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from magshell_fenicsx.assembly.ground import Ground
 from magshell_fenicsx.continuation.advance import TimeSteps
 from magshell_fenicsx.continuation.control import GivenLoad
 from magshell_fenicsx.continuation.device import Held
@@ -18,6 +17,7 @@ from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.modes import ShellModes
 from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.parts.bodies.contact import Pressings
+from magshell_fenicsx.parts.motion.ground import Ground
 from magshell_fenicsx.parts.motion.mass import mass, whole_mass
 from magshell_fenicsx.parts.motion.on_meridian import surface_of as of_meridian
 from magshell_fenicsx.parts.motion.on_surface import surface_of as of_shell

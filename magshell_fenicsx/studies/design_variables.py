@@ -10,7 +10,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from magshell_fenicsx.assembly.field_derivative import FieldGradient
+from magshell_fenicsx.assembly.forms import FieldGradient
 from magshell_fenicsx.input.section import in_unit, si_size
 from magshell_fenicsx.input.source import CaseError, Source
 from magshell_fenicsx.input.tables import read_vectors, write_vectors

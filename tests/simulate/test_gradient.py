@@ -9,7 +9,7 @@ import pytest
 from conftest import CASES
 from numpy.typing import NDArray
 
-from magshell_fenicsx.assembly.field_derivative import FieldGradient
+from magshell_fenicsx.assembly.forms import FieldGradient
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.continuation.fold import Guess, find_fold
 from magshell_fenicsx.input.source import CaseError

@@ -10,10 +10,9 @@ from functools import cached_property
 import numpy as np
 from dolfinx import fem
 
-from magshell_fenicsx.assembly.growing import Growing
 from magshell_fenicsx.assembly.kernels import KernelLog
-from magshell_fenicsx.assembly.lids import Lid, Pressed
-from magshell_fenicsx.assembly.parameter import FreeParameter, make_parameters
+from magshell_fenicsx.assembly.moving import Lid, Pressed
+from magshell_fenicsx.assembly.parameters import FreeParameter, Growing, make_parameters
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.continuation.system import Vector
 from magshell_fenicsx.models.axisymmetric.instability import ExcludedWaves

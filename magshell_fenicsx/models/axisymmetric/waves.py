@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 from scipy.sparse import coo_array
 
-from magshell_fenicsx.assembly.at_zero import at_zero
+from magshell_fenicsx.assembly.forms import at_zero
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.assembly.terms import FormTerm

@@ -12,10 +12,9 @@ import numpy as np
 from dolfinx import fem
 from numpy.typing import NDArray
 
-from magshell_fenicsx.assembly.growing import Growing
 from magshell_fenicsx.assembly.kernels import KernelLog
-from magshell_fenicsx.assembly.lids import Curve, triangle_sides
-from magshell_fenicsx.assembly.parameter import FreeParameter
+from magshell_fenicsx.assembly.moving import Curve, triangle_sides
+from magshell_fenicsx.assembly.parameters import FreeParameter, Growing
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.assembly.sliding import Constraint, held_along
 from magshell_fenicsx.assembly.terms import LinearTerm, Term

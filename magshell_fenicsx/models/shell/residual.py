@@ -9,11 +9,9 @@ from dolfinx import fem
 from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.batches import boundary_edges, edge_width, interior_edges
-from magshell_fenicsx.assembly.cell_frames import cell_frames
 from magshell_fenicsx.assembly.following import Follows
 from magshell_fenicsx.assembly.kernels import KernelLog
-from magshell_fenicsx.assembly.shape_tables import Table, cell_rule, edge_covector, edge_rule
-from magshell_fenicsx.assembly.sheets import Sheet
+from magshell_fenicsx.assembly.shape_tables import Sheet, Table, cell_frames, cell_rule, edge_covector, edge_rule
 from magshell_fenicsx.models.shell.energy import Density, cell_quadrature, edge_quadrature
 from magshell_fenicsx.models.shell.gradients import FRAME, PointGradient, PointTerm, in_own_coordinates
 from magshell_fenicsx.models.shell.kinematics import CURVED, FIRST, Jet

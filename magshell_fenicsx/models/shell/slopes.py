@@ -10,7 +10,7 @@ from dolfinx import fem
 from numpy.typing import NDArray
 from ufl.core.expr import Expr
 
-from magshell_fenicsx.assembly.parameter import Derivative, bends_of
+from magshell_fenicsx.assembly.parameters import Derivative, bends_of
 from magshell_fenicsx.models.shell.energy import Density, ShellTerm
 from magshell_fenicsx.models.shell.gradients import PointTerm
 from magshell_fenicsx.models.shell.residual import FastResidual
@@ -38,7 +38,7 @@ class Slope:
 
 @dataclass(frozen=True)
 class PointParameter:
-    """A free parameter of a shell, as `assembly.parameter.Parameter`."""
+    """A free parameter of a shell, as `assembly.parameters.Parameter`."""
 
     constant: fem.Constant
     slopes: Sequence[Slope]

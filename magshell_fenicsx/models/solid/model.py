@@ -13,8 +13,8 @@ from dolfinx import fem
 from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.kernels import KernelLog
-from magshell_fenicsx.assembly.lids import Curve, level_sides
-from magshell_fenicsx.assembly.parameter import FreeParameter, make_parameters
+from magshell_fenicsx.assembly.moving import Curve, level_sides
+from magshell_fenicsx.assembly.parameters import FreeParameter, make_parameters
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.assembly.sliding import Constraint, held_along
 from magshell_fenicsx.assembly.terms import LinearTerm, Term

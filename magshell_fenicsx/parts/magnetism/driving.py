@@ -8,7 +8,7 @@ from dolfinx import fem
 
 from magshell_fenicsx.assembly.following import PointField
 from magshell_fenicsx.assembly.kernels import KernelLog
-from magshell_fenicsx.assembly.parameter import Derivative, bends_of
+from magshell_fenicsx.assembly.parameters import Derivative, bends_of
 from magshell_fenicsx.assembly.terms import FormTerm, Term
 from magshell_fenicsx.parts.magnetism.applied import AppliedField
 
@@ -31,7 +31,7 @@ class Amplitude:
 
 @dataclass(frozen=True)
 class FieldParameter:
-    """An amplitude of a driven field, as `assembly.parameter.Parameter`.
+    """An amplitude of a driven field, as `assembly.parameters.Parameter`.
 
     The energy is linear in the field: of dB/dmu it is dPi/dmu. So the forms are those of the terms, with the
     polynomials of the derivatives.

@@ -7,9 +7,8 @@ import numpy as np
 from dolfinx import fem
 from numpy.typing import NDArray
 
-from magshell_fenicsx.assembly.lids import Curve, Lid, Pressed, ends
 from magshell_fenicsx.assembly.motion import Motion
-from magshell_fenicsx.assembly.moving import Body, Moving
+from magshell_fenicsx.assembly.moving import Body, Curve, Lid, Moving, Pressed, ends
 from magshell_fenicsx.models.shell.parameters import Loads
 
 PRESSURE = "pressure"  # its amplitude

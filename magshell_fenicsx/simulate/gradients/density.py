@@ -14,7 +14,7 @@ from dolfinx import fem
 from dolfinx.la import InsertMode
 from numpy.typing import NDArray
 
-from magshell_fenicsx.assembly.field_derivative import FieldGradient
+from magshell_fenicsx.assembly.forms import FieldGradient
 from magshell_fenicsx.simulate.results import over_area
 from magshell_fenicsx.simulate.scene import Scene
 

@@ -15,8 +15,8 @@ import numpy as np
 from dolfinx import fem
 from numpy.typing import NDArray
 
-from magshell_fenicsx.assembly.field_derivative import FieldGradient, Share
-from magshell_fenicsx.assembly.field_derivative import by_field as summed
+from magshell_fenicsx.assembly.forms import FieldGradient, Share
+from magshell_fenicsx.assembly.forms import by_field as summed
 from magshell_fenicsx.assembly.terms import FormTerm, Term, factor_of
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TypeAlias
 
-from magshell_fenicsx.assembly.field_derivative import FieldGradient
+from magshell_fenicsx.assembly.forms import FieldGradient
 from magshell_fenicsx.continuation.fold import Fold
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.simulate.adapt.ending import History

@@ -5,7 +5,7 @@ import ufl
 from dolfinx import fem
 from dolfinx.la import InsertMode
 
-from magshell_fenicsx.assembly.field_derivative import FieldGradient
+from magshell_fenicsx.assembly.forms import FieldGradient
 from magshell_fenicsx.models.solid.model import SolidModel
 from magshell_fenicsx.simulate.gradients.fields import places_of
 from magshell_fenicsx.simulate.results import over_area

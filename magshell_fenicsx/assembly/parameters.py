@@ -1,22 +1,121 @@
-"""The undeformed placement as a function of amplitudes: shapes that are added to it grow.
+"""Free parameters of terms, and the derivatives of energies by them.
+
+A parameter is a constant in forms, or an amplitude of the undeformed placement, to which shapes are added that grow:
 
     r0 = r0_drawn + sum_i mu_i d_i
 
-Displacements are measured from r0, the shape without stress. All terms follow it; their derivatives by an amplitude are
-differences of fourth order over steps of h/200, exact to about 1e-9.
+Displacements are measured from r0, the shape without stress. All terms follow it; their derivatives by such an
+amplitude are differences of fourth order over steps of h/200, exact to about 1e-9.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any, Protocol
 
 import numpy as np
+import ufl
 from dolfinx import fem
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from magshell_fenicsx.assembly.assemblers import ResidualAssembler
-from magshell_fenicsx.assembly.parameter import Derivative, FreeParameter
-from magshell_fenicsx.assembly.terms import Term
+from magshell_fenicsx.assembly.kernels import KernelLog
+from magshell_fenicsx.assembly.terms import FormTerm, ResidualAssembler, Term
+
+
+class Settable(Protocol):
+    """A number that terms depend on."""
+
+    value: Any
+
+
+class Derivative(Protocol):
+    """An energy's derivative by parameters, with the amplitude of its term."""
+
+    @property
+    def amplitude(self) -> str | None: ...
+
+    def energy(self) -> float: ...
+
+    def add_residual(self, b: NDArray[np.float64], factor: float) -> None: ...
+
+
+class FreeParameter(Protocol):
+    """What a system needs of a parameter, see `Parameter`."""
+
+    @property
+    def constant(self) -> Settable: ...
+
+    @property
+    def slopes(self) -> Sequence[Derivative]: ...
+
+    def bends(self, q: Any) -> Sequence[Derivative]: ...
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A free parameter p of a system with the terms mu_i Pi_i(u; p), in which p is a constant.
+
+    Attributes
+    ----------
+    constant
+        p in the terms.
+    slopes
+        dPi_i/dp as terms with the amplitudes mu_i.
+    log
+        Of the kernels that are compiled on first use.
+    """
+
+    constant: fem.Constant
+    slopes: Sequence[FormTerm]
+    log: KernelLog
+    _bends: dict[fem.Constant, list[FormTerm]] = field(default_factory=dict)
+
+    def bends(self, q: Any) -> Sequence[Derivative]:
+        """d2Pi_i/dp dq with the amplitudes mu_i; q may be p."""
+        if not isinstance(q, fem.Constant):
+            return bends_of(q, self.constant)
+        if q not in self._bends:
+            self._bends[q] = [
+                FormTerm(f"{t.name} twice", derived(t.form, q), t._u, self.log, t.amplitude)
+                for t in self.slopes
+                if q in t.form.constants()
+            ]
+        return self._bends[q]
+
+
+def bends_of(q: Any, p: Any) -> Sequence[Derivative]:
+    """The mixed derivatives by q, which is no constant in a form, as q has them; else none."""
+    return list(q.bends(p)) if hasattr(q, "bends") else []
+
+
+def make_parameters(
+    constants: Mapping[str, fem.Constant], terms: Sequence[Term], u: fem.Function, log: KernelLog
+) -> dict[str, Parameter]:
+    """The free parameters of a model, by name; collective.
+
+    Parameters
+    ----------
+    constants
+        The parameters as they stand in the forms of the terms.
+    """
+    found, forms = {}, [term for term in terms if isinstance(term, FormTerm)]
+    for name, p in constants.items():
+        slopes = [
+            FormTerm(f"{term.name} by {name}", derived(term.form, p), u, log, term.amplitude)
+            for term in forms
+            if p in term.form.constants()
+        ]
+        for slope in slopes:
+            slope.compile_residual()
+        found[name] = Parameter(p, slopes, log)
+    return found
+
+
+def derived(energy: ufl.Form, p: fem.Constant) -> ufl.Form:
+    """The derivative of a form by a constant in it."""
+    variable = ufl.variable(p)
+    return ufl.diff(ufl.replace(energy, {p: variable}), variable)
+
 
 Array = NDArray[np.float64]
 STEP = 5e-3  # of the length, that the largest displacement of a difference has
@@ -109,7 +208,7 @@ class GrowingValue:
 
 @dataclass(frozen=True)
 class GrowingParameter:
-    """An amplitude of the placement, as `assembly.parameter.Parameter`."""
+    """An amplitude of the placement, as `assembly.parameters.Parameter`."""
 
     constant: GrowingValue
     gradients: ResidualAssembler | None

@@ -8,7 +8,7 @@ import ufl
 from dolfinx import fem, mesh
 from mpi4py import MPI
 
-from magshell_fenicsx.assembly.at_zero import at_zero
+from magshell_fenicsx.assembly.forms import at_zero
 from magshell_fenicsx.assembly.kernels import JIT_OPTIONS
 from magshell_fenicsx.platform import kept
 
