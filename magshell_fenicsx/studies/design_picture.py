@@ -36,11 +36,11 @@ def draw_design(rows: Sequence[dict[str, Any]], results: Sequence[str], vary: Va
         above.tick_params(labelbottom=i == len(units) - 1)
     above.set_xlabel("evaluation (dots: the best so far)")
     others = [figure.add_subplot(grid[:, i]) for i in range(1, panels)]
-    if vary.controls is not None:
+    if vary.controls and vary.remanence:
         places, vectors = vary.controls.places, vary.vectors(x)
         names = (r"\rho", "z") if vary.controls.around else ("x", "y", "z")
         widest = np.argsort(-np.ptp(places, axis=0), kind="stable")[:2]
-        first, second = (0, len(names) - 1) if vary.planar else sorted(int(i) for i in widest)
+        first, second = (0, len(names) - 1) if vary.remanence.planar else sorted(int(i) for i in widest)
         others[0].plot(places[:, first], places[:, second], ".", color="0.6", markersize=3)
         others[0].quiver(
             places[:, first], places[:, second], vectors[:, first], vectors[:, second], color="C3", width=0.006

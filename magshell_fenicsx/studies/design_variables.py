@@ -1,7 +1,7 @@
 """The variables of a design as one vector, and the case that a vector stands for."""
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,81 +25,182 @@ from magshell_fenicsx.simulate.numbers import number_of
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.studies.points import value_at
 from magshell_fenicsx.studies.runner import Case, Made
-from magshell_fenicsx.studies.sections import DesignSection
+from magshell_fenicsx.studies.sections import DesignSection, RemanenceVariables
 
 Array = NDArray[np.float64]
 
 
-def refuse_unfit_numbers(source: Source, case: Case, design: DesignSection) -> tuple[Array, tuple[str, ...]]:
-    """The bounds (numbers, 2) of the numbers of a design, and their units.
-
-    Raises
-    ------
-    CaseError
-        If a key has no number, another unit, or starts beyond its bounds.
-    """
-    found, units = [], []
-    for key in design.numbers:
-        low, high, unit = design.bounds(key)
-        try:
-            value, written = number_of(case, key), value_at(source.data, key.split("."))
-        except CaseError as e:
-            raise CaseError(f"design.numbers: {e}") from None
-        if isinstance(written, str):
-            try:
-                value = in_unit(written, unit)
-            except ValueError:
-                raise CaseError(
-                    f"design.numbers: {key}: the case gives {written}: its bounds need such a unit"
-                ) from None
-        elif unit:
-            raise CaseError(f"design.numbers: {key}: is a number without a unit in the case: so are its bounds")
-        if not low <= value <= high:
-            raise CaseError(f"design.numbers: {key}: the case starts at {value:g}, beyond {low:g} to {high:g}")
-        found.append((low, high))
-        units.append(unit)
-    return np.array(found, dtype=float).reshape(-1, 2), tuple(units)
+Limits = tuple[float | None, float | None]
+Found = Mapping[str, Any]  # the gradients of a result, numbers and those by fields
 
 
 @dataclass(frozen=True)
-class Between:
-    """The values of one field; as variables they run from 0 to 1 between their bounds.
+class Bounded:
+    """Values whose variables run from 0 to 1 between their bounds.
 
     Attributes
     ----------
+    name
+        The key of the case, or the field.
     start
-        (n, components): factors of h, curvatures 11 and 22 over 1/R, or deviations over h.
-    length
-        R in the unit of the case's formulas, of a curvature.
+        The values of the case itself.
     """
 
     name: str
-    controls: Controls
     start: Array
     bounds: tuple[float, float]
-    length: float = 1.0
 
     @property
     def first(self) -> Array:
         """The variables at the start."""
         return np.asarray((self.start - self.bounds[0]) / (self.bounds[1] - self.bounds[0])).ravel()
 
+    @property
+    def limits(self) -> list[Limits]:
+        """Their bounds."""
+        return [(0.0, 1.0)] * self.start.size
+
     def values(self, x: Array) -> Array:
-        """(n, components) of variables."""
+        """The values of variables, in the shape of `start`."""
         low, high = self.bounds
         return np.asarray(low + x * (high - low)).reshape(self.start.shape)
 
-    def gradient(self, scene: Scene, found: FieldGradient) -> Array:
-        """By the variables; collective."""
-        places = found.places.reshape(-1, 3) @ rotation(scene.plan.azimuth)
-        forces = found.forces.reshape(len(places), -1)[:, : self.start.shape[1]]
-        comm = found.field.function_space.mesh.comm
+
+@dataclass(frozen=True)
+class Number(Bounded):
+    """A number of the case, in a unit."""
+
+    unit: str
+
+    @property
+    def label(self) -> str:
+        """The key with its unit, if it has one."""
+        return f"{self.name} [{self.unit}]" if self.unit else self.name
+
+    def gradient(self, x: Array, scene: Scene, found: Found) -> Array:
+        slope = found.get(self.name, 0.0)
+        return np.array([slope * si_size(self.unit) * (self.bounds[1] - self.bounds[0])])
+
+    def put(self, data: dict[str, Any], x: Array) -> None:
+        section: Any = data
+        *names, last = self.name.split(".")
+        for name in names:
+            section = section[int(name)] if isinstance(section, list) else section.setdefault(name, {})
+        value = float(self.values(x)[0])
+        section[int(last) if isinstance(section, list) else last] = f"{value:.15g} {self.unit}" if self.unit else value
+
+
+@dataclass(frozen=True)
+class Vectors:
+    """The remanence at points, of which each place has the mean.
+
+    Each vector has a polar angle, an azimuth where it is not kept in a plane, and its length where that varies, from 0
+    to 1 between its bounds.
+
+    Attributes
+    ----------
+    start
+        (n, 3), or (n, 2) on a meridian.
+    lengths
+        Least and largest length; None: they stay as they are.
+    """
+
+    controls: Controls
+    start: Array
+    lengths: tuple[float, float] | None
+    name: str = "remanence"
+
+    @property
+    def planar(self) -> bool:
+        """Whether the vectors stay in a plane."""
+        return self.controls.around or not self.controls.places[:, 1].any()
+
+    @property
+    def angles(self) -> int:
+        """How many of its variables are angles; they come first."""
+        return len(self.start) * (1 if self.planar else 2)
+
+    @property
+    def first(self) -> Array:
+        across = self.start[:, 0] if self.planar else np.hypot(*self.start[:, :2].T)
+        parts = [np.arctan2(across, self.start[:, -1])]
+        if not self.planar:
+            parts.append(np.arctan2(self.start[:, 1], self.start[:, 0]))
+        if self.lengths:
+            size = np.linalg.norm(self.start, axis=1)
+            parts.append((size - self.lengths[0]) / (self.lengths[1] - self.lengths[0]))
+        return np.concatenate(parts)
+
+    @property
+    def limits(self) -> list[Limits]:
+        return [(None, None)] * self.angles + [(0.0, 1.0)] * (len(self.start) if self.lengths else 0)
+
+    def vectors(self, x: Array) -> Array:
+        """At the points, (n, 3) or (n, 2)."""
+        return self._polar(x)[0]
+
+    def gradient(self, x: Array, scene: Scene, found: Found) -> Array:
+        if not isinstance(by := found.get(self.name), FieldGradient):
+            return np.zeros(len(x))
+        magnetic = scene.plan.loads.magnetic
+        assert magnetic
+        assert isinstance(magnetic.remanent, ByControls)
+        comm = by.field.function_space.mesh.comm
+        forces = comm.allreduce(magnetic.remanent.pulled(by.places, by.forces))
+        return np.concatenate([np.sum(forces * way, axis=1) for way in self._polar(x)[1]])
+
+    def _polar(self, x: Array) -> tuple[Array, list[Array]]:
+        """Vectors, and their derivatives by each of their variables."""
+        polar, *more = x.reshape(-1, len(self.start))
+        s, c = np.sin(polar), np.cos(polar)
+        size, grows = np.linalg.norm(self.start, axis=1), 0.0
+        if self.lengths:
+            grows = self.lengths[1] - self.lengths[0]
+            size = self.lengths[0] + more[-1] * grows
+        one = size[:, None]
+        if self.planar:
+            still = [] if self.controls.around else [0 * s]
+            unit, turned = (np.stack(v, axis=1) for v in ([s, *still, c], [c, *still, -s]))
+            ways = [one * turned]
+        else:
+            a, b = np.cos(more[0]), np.sin(more[0])
+            unit = np.stack([s * a, s * b, c], axis=1)
+            ways = [one * np.stack([c * a, c * b, -s], axis=1), one * np.stack([-s * b, s * a, 0 * s], axis=1)]
+        return one * unit, [*ways, *([grows * unit] if self.lengths else [])]
+
+    def put(self, data: dict[str, Any], x: Array) -> None:
+        known = data["magnetic"].get("remanent", {})
+        kept = {"flux_density": known["flux_density"]} if "flux_density" in known else {}
+        data["magnetic"]["remanent"] = {"kind": "points", "file": "", "filter": self.controls.width, **kept}
+
+
+@dataclass(frozen=True)
+class Between(Bounded):
+    """The values (n, components) of a scalar field at points, of which each place has the mean.
+
+    They are factors of h, curvatures 11 and 22 over 1/R, or deviations over h. In the case such a field is a formula,
+    with the weights of `models.shell.controls`: it needs no file, and its symmetry is recognised by its values.
+
+    Attributes
+    ----------
+    length
+        R in the unit of the case's formulas, of a curvature.
+    """
+
+    controls: Controls
+    length: float = 1.0
+
+    def gradient(self, x: Array, scene: Scene, found: Found) -> Array:
+        if not isinstance(by := found.get(self.name), FieldGradient):
+            return np.zeros(len(x))
+        places = by.places.reshape(-1, 3) @ rotation(scene.plan.azimuth)
+        forces = by.forces.reshape(len(places), -1)[:, : self.start.shape[1]]
+        comm = by.field.function_space.mesh.comm
         pulled = comm.allreduce(np.asarray(self.controls.weights(places).T @ forces))
         unit = scene.plan.material.h if self.name == "deviation" else 1.0
         return np.asarray(pulled * unit * (self.bounds[1] - self.bounds[0])).ravel()
 
     def put(self, data: dict[str, Any], x: Array) -> None:
-        """Give plain data of the case the field of variables."""
         texts = [self._formula(values) for values in self.values(x).T]
         if self.name == "thickness":
             data["shell"]["thickness_factor"] = texts[0]
@@ -108,8 +209,7 @@ class Between:
             defect = [shell.pop("defect")] if shell.get("defect") else []
             shell["imperfections"] = [*defect, *(shell.get("imperfections") or ()), {"kind": "formula", "w0": texts[0]}]
         else:
-            known = data.get("natural") or {}
-            data["natural"] = {**known, "curvature": [*texts, 0]}
+            data["natural"] = {**(data.get("natural") or {}), "curvature": [*texts, 0]}
 
     def _formula(self, values: Array) -> str:
         R = self.length if self.name == "curvature" else 1.0  # other formulas are of places over R
@@ -127,7 +227,10 @@ class Between:
 
 @dataclass(frozen=True)
 class Variables:
-    """What varies.
+    """What varies, as one vector: numbers, then the remanence, then scalar fields.
+
+    Every part has a name, its variables at the start (`first`) and their bounds (`limits`); it takes its gradient from
+    those of `simulate.gradients` (`gradient`) and gives plain data of the case what variables stand for (`put`).
 
     Attributes
     ----------
@@ -135,161 +238,82 @@ class Variables:
         At the start.
     made
         Makes a case of its source.
-    keys, bounds, units
-        Of the numbers; (numbers, 2), in these units.
-    controls, start
-        Of the remanence, None without; its vectors at the start.
-    lengths
-        Least and largest length of a vector; None: they stay as they are.
-    fields
-        Scalar fields, in this order after all else.
+    remanence
+        None if it stays as it is.
     """
 
     source: Source
     case: Case
     made: Made
-    keys: tuple[str, ...]
-    bounds: Array
-    units: tuple[str, ...]
-    controls: Controls | None
-    start: Array
-    lengths: tuple[float, float] | None
+    scalars: tuple[Number, ...]
+    remanence: Vectors | None = None
     fields: tuple[Between, ...] = ()
+
+    @property
+    def parts(self) -> Sequence[Number | Vectors | Between]:
+        return [*self.scalars, *([self.remanence] if self.remanence else []), *self.fields]
 
     @property
     def blocks(self) -> dict[str, slice]:
         """What varies -> its variables."""
-        found, at = {key: slice(i, i + 1) for i, key in enumerate(self.keys)}, len(self.keys)
-        sizes = {"remanence": len(self._angles) + (len(self.start) if self.lengths else 0)} if self.controls else {}
-        for name, size in (sizes | {field.name: field.start.size for field in self.fields}).items():
-            found[name] = slice(at, at + size)
-            at += size
-        return found
+        ends = np.cumsum([0, *(part.first.size for part in self.parts)])
+        return {part.name: slice(*ends[i : i + 2]) for i, part in enumerate(self.parts)}
 
     @property
     def names(self) -> tuple[str, ...]:
         """What results are differentiated by."""
-        return tuple(self.blocks)
+        return tuple(part.name for part in self.parts)
 
     @property
-    def _angles(self) -> range:
-        """Of the vectors, after the numbers."""
-        return range(0 if self.controls is None else len(self.start) * (1 if self.planar else 2))
-
-    @property
-    def planar(self) -> bool:
-        """Whether the vectors stay in a plane."""
-        return self.controls is not None and (self.controls.around or not self.controls.places[:, 1].any())
+    def controls(self) -> Controls | None:
+        """Of the remanence, if that varies."""
+        return self.remanence.controls if self.remanence else None
 
     @property
     def first(self) -> Array:
         """The vector of the case itself."""
-        numbers = np.array([number_of(self.case, key) for key in self.keys]) / self._sizes
-        parts = [(numbers - self.bounds[:, 0]) / np.ptp(self.bounds, axis=1)]
-        if self.controls is not None:
-            size = np.linalg.norm(self.start, axis=1)
-            across = self.start[:, 0] if self.planar else np.hypot(*self.start[:, :2].T)
-            parts.append(np.arctan2(across, self.start[:, -1]))
-            if not self.planar:
-                parts.append(np.arctan2(self.start[:, 1], self.start[:, 0]))
-            if self.lengths:
-                parts.append((size - self.lengths[0]) / (self.lengths[1] - self.lengths[0]))
-        return np.concatenate([*parts, *(field.first for field in self.fields)])
+        return np.concatenate([part.first for part in self.parts])
 
     @property
-    def limits(self) -> list[tuple[float | None, float | None]]:
+    def limits(self) -> list[Limits]:
         """Bounds of the vector."""
-        free: list[tuple[float | None, float | None]] = [(None, None)] * len(self._angles)
-        between = (len(self.start) if self.lengths else 0) + sum(field.start.size for field in self.fields)
-        return [*[(0.0, 1.0)] * len(self.keys), *free, *[(0.0, 1.0)] * between]
-
-    @property
-    def _sizes(self) -> Array:
-        """Of the numbers' units in SI."""
-        return np.array([si_size(unit) for unit in self.units])
+        return [limit for part in self.parts for limit in part.limits]
 
     def numbers(self, x: Array) -> dict[str, float]:
         """Key, with its unit if it has one -> value."""
-        named = (f"{key} [{unit}]" if unit else key for key, unit in zip(self.keys, self.units, strict=True))
-        return dict(zip(named, self._numbers(x).values(), strict=True))
-
-    def _numbers(self, x: Array) -> dict[str, float]:
-        """Key -> value in its unit."""
-        low, high = self.bounds.T
-        values = low + x[: len(self.keys)] * (high - low)
-        return dict(zip(self.keys, map(float, values), strict=True))
+        return {part.label: float(part.values(x[i : i + 1])[0]) for i, part in enumerate(self.scalars)}
 
     def vectors(self, x: Array) -> Array:
         """The remanence at its points, (n, 3) or (n, 2)."""
-        return self._polar(x)[0]
+        assert self.remanence
+        return self.remanence.vectors(x[self.blocks["remanence"]])
 
-    def gradient(self, x: Array, scene: Scene, found: Mapping[str, float | FieldGradient]) -> Array:
+    def gradient(self, x: Array, scene: Scene, found: Found) -> Array:
         """A gradient by the vector from those of `simulate.gradients`; by what is not among them it is zero."""
-        total = np.zeros(len(x))
-        slopes = np.array([found.get(key, 0.0) for key in self.keys])
-        total[: len(self.keys)] = slopes * self._sizes * np.ptp(self.bounds, axis=1)
-        for field in self.fields:
-            if isinstance(by := found.get(field.name), FieldGradient):
-                total[self.blocks[field.name]] = field.gradient(scene, by)
-        if self.controls is not None and isinstance(by := found.get("remanence"), FieldGradient):
-            magnetic = scene.plan.loads.magnetic
-            assert magnetic
-            assert isinstance(magnetic.remanent, ByControls)
-            comm = by.field.function_space.mesh.comm
-            forces = comm.allreduce(magnetic.remanent.pulled(by.places, by.forces))
-            ways = [np.sum(forces * way, axis=1) for way in self._polar(x)[1]]
-            total[self.blocks["remanence"]] = np.concatenate(ways)
-        return total
-
-    def _polar(self, x: Array) -> tuple[Array, list[Array]]:
-        """Vectors, and their derivatives by each of their variables."""
-        n, rest = len(self.start), x[self.blocks["remanence"]]
-        polar, *more = rest.reshape(-1, n)
-        s, c = np.sin(polar), np.cos(polar)
-        size, grows = np.linalg.norm(self.start, axis=1), 0.0
-        if self.lengths:
-            grows = self.lengths[1] - self.lengths[0]
-            size = self.lengths[0] + more[-1] * grows
-        one = size[:, None]
-        if self.planar:
-            still = [] if self.controls and self.controls.around else [0 * s]
-            unit, turned = (np.stack(v, axis=1) for v in ([s, *still, c], [c, *still, -s]))
-            ways = [one * turned]
-        else:
-            a, b = np.cos(more[0]), np.sin(more[0])
-            unit = np.stack([s * a, s * b, c], axis=1)
-            ways = [one * np.stack([c * a, c * b, -s], axis=1), one * np.stack([-s * b, s * a, 0 * s], axis=1)]
-        return one * unit, [*ways, *([grows * unit] if self.lengths else [])]
+        blocks = self.blocks
+        return np.concatenate([part.gradient(x[blocks[part.name]], scene, found) for part in self.parts])
 
     def rounded(self, x: Array, steps: int) -> Array:
-        """The vector with angles at the nearest of so many steps of a turn."""
-        x = np.array(x)
-        angles = slice(len(self.keys), len(self.keys) + len(self._angles))
+        """The vector with angles of the remanence at the nearest of so many steps of a turn."""
+        assert self.remanence
+        x, begin = np.array(x), len(self.scalars)
+        angles = slice(begin, begin + self.remanence.angles)
         x[angles] = np.round(x[angles] * steps / (2 * np.pi)) * 2 * np.pi / steps
         return x
 
     def write(self, x: Array, file: Path) -> None:
-        """Write the vectors."""
-        if self.controls is not None:
-            write_vectors(file, self.controls.places, self.vectors(x))
+        """Write the vectors of the remanence."""
+        if self.remanence:
+            write_vectors(file, self.remanence.controls.places, self.vectors(x))
 
     def data(self, x: Array, vectors: str) -> dict[str, Any]:
         """The case of a vector as plain data; `vectors` is the file of the remanence."""
-        data = copy.deepcopy(self.source.data)
+        data, blocks = copy.deepcopy(self.source.data), self.blocks
         data.pop("design", None)
-        for (key, value), unit in zip(self._numbers(x).items(), self.units, strict=True):
-            section, names = data, key.split(".")
-            for name in names[:-1]:
-                section = section[int(name)] if isinstance(section, list) else section.setdefault(name, {})
-            section[int(names[-1]) if isinstance(section, list) else names[-1]] = (
-                f"{value:.15g} {unit}" if unit else value
-            )
-        if self.controls is not None:
-            known = data["magnetic"].get("remanent", {})
-            kept = {"flux_density": known["flux_density"]} if "flux_density" in known else {}
-            data["magnetic"]["remanent"] = {"kind": "points", "file": vectors, "filter": self.controls.width, **kept}
-        for field in self.fields:
-            field.put(data, x[self.blocks[field.name]])
+        for part in self.parts:
+            part.put(data, x[blocks[part.name]])
+        if self.remanence:
+            data["magnetic"]["remanent"]["file"] = vectors
         return data
 
     def case_of(self, x: Array, vectors: Path) -> Case:
@@ -306,29 +330,49 @@ def variables(source: Source, case: Case, design: DesignSection, made: Made) -> 
     CaseError
         If a key has no number or starts beyond its bounds, or there is no remanence to vary.
     """
-    bounds, units = refuse_unfit_numbers(source, case, design)
-    controls, start = None, np.asarray(np.zeros((0, 3)))
+    scalars, remanence = refuse_unfit_numbers(source, case, design), None
     if design.remanence:
-        controls, start = _controls(case, design)
-        if not (case.shell.geometry == "strip" or controls.around):
+        remanence = _remanence(case, design.remanence)
+        if not (case.shell.geometry == "strip" or remanence.controls.around):
             source = copy.deepcopy(source)
             source.data["symmetry"] = "none"
             case = made(source)
-    lengths = design.remanence and design.remanence.magnitude
-    sizes = np.linalg.norm(start, axis=1)
-    if lengths and not (lengths[0] - 1e-9 <= sizes.min() and sizes.max() <= lengths[1] + 1e-9):
-        raise CaseError(
-            f"design.remanence.magnitude: the vectors start with lengths {sizes.min():g} to {sizes.max():g}, beyond "
-            f"{lengths[0]:g} to {lengths[1]:g}"
-        )
-    between = (lengths[0], lengths[1]) if lengths else None
-    fields = _fields(case, design)
-    return Variables(source, case, made, tuple(design.numbers), bounds, units, controls, start, between, fields)
+    return Variables(source, case, made, scalars, remanence, _fields(case, design))
+
+
+def refuse_unfit_numbers(source: Source, case: Case, design: DesignSection) -> tuple[Number, ...]:
+    """The numbers of a design.
+
+    Raises
+    ------
+    CaseError
+        If a key has no number, another unit, or starts beyond its bounds.
+    """
+    numbers = []
+    for key in design.numbers:
+        low, high, unit = design.bounds(key)
+        try:
+            value, written = number_of(case, key), value_at(source.data, key.split("."))
+        except CaseError as e:
+            raise CaseError(f"design.numbers: {e}") from None
+        start = value / si_size(unit)
+        if isinstance(written, str):
+            try:
+                value = in_unit(written, unit)
+            except ValueError:
+                said = f"design.numbers: {key}: the case gives {written}: its bounds need such a unit"
+                raise CaseError(said) from None
+        elif unit:
+            raise CaseError(f"design.numbers: {key}: is a number without a unit in the case: so are its bounds")
+        if not low <= value <= high:
+            raise CaseError(f"design.numbers: {key}: the case starts at {value:g}, beyond {low:g} to {high:g}")
+        numbers.append(Number(key, np.array([start]), (low, high), unit))
+    return tuple(numbers)
 
 
 def _fields(case: Case, design: DesignSection) -> tuple[Between, ...]:
     """The scalar fields with their points and values at the start."""
-    found, plan = [], make_plan(case)
+    fields, plan = [], make_plan(case)
     for name, section in design.fields.items():
         places, width = _spread(case, plan, section.points, section.filter)
         if name == "thickness":
@@ -344,8 +388,8 @@ def _fields(case: Case, design: DesignSection) -> tuple[Between, ...]:
                 f"{high:g}"
             )
         at = places[:, [0, 2]] if plan.meridian else places
-        found.append(Between(name, Controls(at, width), np.asarray(start), (low, high), case.shell.reference))
-    return tuple(found)
+        fields.append(Between(name, np.asarray(start), (low, high), Controls(at, width), case.shell.reference))
+    return tuple(fields)
 
 
 def _curvatures(plan: Plan, places: Array) -> Array:
@@ -364,10 +408,24 @@ def _spread(case: Case, plan: Plan, count: int, width: float | None) -> tuple[Ar
     return places, width or float(np.median(scipy.spatial.cKDTree(places).query(places, [2])[0]))
 
 
-def _controls(case: Case, design: DesignSection) -> tuple[Controls, Array]:
+def _remanence(case: Case, section: RemanenceVariables) -> Vectors:
+    """The vectors of the remanence that vary."""
+    controls, start = _controls(case, section)
+    sizes, lengths = np.linalg.norm(start, axis=1), section.magnitude
+    if lengths is None:
+        return Vectors(controls, start, None)
+    low, high = lengths
+    if not (low - 1e-9 <= sizes.min() and sizes.max() <= high + 1e-9):
+        raise CaseError(
+            f"design.remanence.magnitude: the vectors start with lengths {sizes.min():g} to {sizes.max():g}, beyond "
+            f"{low:g} to {high:g}"
+        )
+    return Vectors(controls, start, (low, high))
+
+
+def _controls(case: Case, section: RemanenceVariables) -> tuple[Controls, Array]:
     """The points of the remanence, and its vectors there at the start."""
-    assert design.remanence
-    magnetic, count, width = case.magnetic, design.remanence.points, design.remanence.filter
+    magnetic, count, width = case.magnetic, section.points, section.filter
     if magnetic is None or not case.lambda_m:
         raise CaseError("design.remanence: the case has no field, so no result depends on the remanence")
     if count is None:

@@ -21,6 +21,11 @@ from magshell_fenicsx.studies.sections import DesignSection, LimitSection, Shape
 Array = NDArray[np.float64]
 
 EQUAL = 1e-3  # relative difference of results that are to be the same
+KEPT = 1e-6  # a constraint counts as kept to this part of its bound
+REACHED = 1e-3  # a value counts as reached to this part of it
+WORSE = 1.0  # a lost path counts as this much worse than the worst known
+FINE = 4001  # points by which the length of a spline is measured
+AT_ROOT = 1e-6
 
 
 @dataclass(frozen=True)
@@ -58,10 +63,6 @@ def limits_of(section: LimitSection, scale: Mapping[str, float]) -> list[Limit]:
         margin = EQUAL * max(scale.get(of, 0.0) for of in (section.of, section.same_as))
         found += [Limit(section.of, sign, other=section.same_as, margin=margin) for sign in (1.0, -1.0)]
     return found
-
-
-FINE = 4001  # points by which the length of a spline is measured
-AT_ROOT = 1e-6
 
 
 def target_of(section: ShapeSection, case: Case, bent: float = 1.0) -> Target:
@@ -116,10 +117,6 @@ def _bent(points: Array, part: float) -> Array:
     return np.vstack([points[:1], points[0] + np.cumsum(length * np.array(found), axis=0)])
 
 
-KEPT = 1e-6  # a constraint counts as kept to this part of its bound
-REACHED = 1e-3  # a value counts as reached to this part of it
-
-
 @dataclass
 class Wanted:
     """What is wanted; results are scaled with their values at the start.
@@ -147,17 +144,17 @@ class Wanted:
         """Take the scales."""
         self.scale = {result: abs(value) or 1.0 for result, value in first.values.items()}
 
-    def objective(self, found: Evaluation) -> float:
+    def objective(self, evaluation: Evaluation) -> float:
         """Least is best."""
-        return self._objective(found)[0]
+        return self._objective(evaluation)[0]
 
-    def slope(self, found: Evaluation) -> Array:
+    def slope(self, evaluation: Evaluation) -> Array:
         """Its gradient."""
-        return self._objective(found)[1] * np.array(found.gradients[self.section.objective.result])
+        return self._objective(evaluation)[1] * np.array(evaluation.gradients[self.section.objective.result])
 
-    def _objective(self, found: Evaluation) -> tuple[float, float]:
+    def _objective(self, evaluation: Evaluation) -> tuple[float, float]:
         wanted = self.section.objective
-        value = min(found.values[result] for result in wanted.results)
+        value = min(evaluation.values[result] for result in wanted.results)
         scale = self._scale or abs(value) or 1.0
         if wanted.value is not None:
             scale = abs(wanted.value) or scale
@@ -176,24 +173,24 @@ class Wanted:
         wanted = self.section.objective
         return wanted.maximise is not None and (len(wanted.results) > 1 or wanted.result in LOWEST)
 
-    def lowest_values(self, found: Evaluation) -> Array:
+    def lowest_values(self, evaluation: Evaluation) -> Array:
         """All of them over the scale, always as many: where fewer are near, what is surely above."""
-        every = [_several(found.values[of], found.beside.get(of)) for of in self.section.objective.results]
+        every = [_several(evaluation.values[of], evaluation.beside.get(of)) for of in self.section.objective.results]
         return np.asarray(np.concatenate([[value for value, _ in several] for several in every]) / self._scale)
 
-    def lowest_slopes(self, found: Evaluation) -> Array:
+    def lowest_slopes(self, evaluation: Evaluation) -> Array:
         """(values, variables)."""
         results = self.section.objective.results
-        every = [_several(found.values[of], found.beside.get(of), found.gradients[of]) for of in results]
+        every = [_several(evaluation.values[of], evaluation.beside.get(of), evaluation.gradients[of]) for of in results]
         return np.asarray(np.concatenate([[slope for _, slope in several] for several in every]) / self._scale)
 
-    def constraints(self, found: Evaluation) -> Array:
+    def constraints(self, evaluation: Evaluation) -> Array:
         """Not negative where all are kept."""
-        return np.array([limit.left(found.values) / self._size(limit) for limit in self._limits])
+        return np.array([limit.left(evaluation.values) / self._size(limit) for limit in self._limits])
 
-    def constraint_slopes(self, found: Evaluation) -> Array:
+    def constraint_slopes(self, evaluation: Evaluation) -> Array:
         """(constraints, variables)."""
-        return np.array([limit.slope(found.gradients) / self._size(limit) for limit in self._limits])
+        return np.array([limit.slope(evaluation.gradients) / self._size(limit) for limit in self._limits])
 
     @property
     def _limits(self) -> list[Limit]:
@@ -203,30 +200,30 @@ class Wanted:
     def _size(self, limit: Limit) -> float:
         return abs(limit.bound) or max(self.scale.get(of, 0.0) for of in (limit.of, limit.other)) or 1.0
 
-    def violation(self, found: Evaluation) -> float:
+    def violation(self, evaluation: Evaluation) -> float:
         """By how much the constraints are not kept, relative."""
-        return float(max([0.0, *(-self.constraints(found))]))
+        return float(max([0.0, *(-self.constraints(evaluation))]))
 
-    def merit(self, found: Evaluation) -> tuple[float, float]:
+    def merit(self, evaluation: Evaluation) -> tuple[float, float]:
         """By what evaluations are compared: least is best."""
-        violation = self.violation(found)
-        return (violation if violation > KEPT else 0.0, self.objective(found))
+        violation = self.violation(evaluation)
+        return (violation if violation > KEPT else 0.0, self.objective(evaluation))
 
-    def words(self, found: Evaluation) -> str:
+    def words(self, evaluation: Evaluation) -> str:
         """The results of an evaluation."""
-        return ", ".join(f"{key} = {value:.6g}" for key, value in (found.values | found.seen).items())
+        return ", ".join(f"{key} = {value:.6g}" for key, value in (evaluation.values | evaluation.seen).items())
 
-    def missed(self, found: Evaluation) -> str:
+    def missed(self, evaluation: Evaluation) -> str:
         """What is not as wanted; empty if all is."""
         wanted, said = self.section.objective, list[str]()
         if wanted.value is not None and wanted.reach:
-            value = found.values[wanted.reach]
+            value = evaluation.values[wanted.reach]
             if abs(value - wanted.value) > REACHED * (abs(wanted.value) or 1.0):
                 asked = f"{wanted.reach} = {wanted.value:g} is not reached within the bounds"
                 said.append(f"{asked}: the nearest found is {value:.6g}")
         for limit in self._limits:
-            if limit.left(found.values) < -KEPT * self._size(limit):
-                said.append(f"{limit.words} is not kept: the nearest found is {found.values[limit.of]:.6g}")
+            if limit.left(evaluation.values) < -KEPT * self._size(limit):
+                said.append(f"{limit.words} is not kept: the nearest found is {evaluation.values[limit.of]:.6g}")
         return "; ".join(said)
 
 
@@ -250,42 +247,37 @@ def wanted_of(case: Case, section: DesignSection) -> Wanted:
     return Wanted(section, last, stages)
 
 
-WORSE = 1.0  # a lost path counts as this much worse than the worst found
-
-
 def searched(
     evaluated: Callable[[Array], Evaluation], goal: Wanted, vary: Variables, first: Array, iterations: int
 ) -> str:
     """Look for the best variables from the first on; why the optimiser ended."""
     if goal.lowest:
         return _raised(evaluated, goal, vary, first, iterations)
-    known: list[tuple[Array, float]] = []
+    tried: list[tuple[Array, float]] = []
 
     def objective(x: Array) -> tuple[float, Array]:
-        found = evaluated(x)
-        if not found.values:
-            away = x - min(known, key=lambda each: each[1])[0]
+        evaluation = evaluated(x)
+        if not evaluation.values:
+            away = x - min(tried, key=lambda each: each[1])[0]
             uphill = np.asarray(away / max(float(np.linalg.norm(away)), 1e-300))
-            return max(value for _, value in known) + WORSE, uphill
-        value = goal.objective(found)
-        known.append((np.array(x), value))
-        return value, goal.slope(found)
+            return max(value for _, value in tried) + WORSE, uphill
+        value = goal.objective(evaluation)
+        tried.append((np.array(x), value))
+        return value, goal.slope(evaluation)
 
-    options: dict[str, Any] = {"maxiter": iterations, "ftol": 1e-15, "gtol": 1e-9}
-    method, constraints = "L-BFGS-B", dict[str, Any]()
+    def kept(x: Array) -> Array:
+        return goal.constraints(last(x)[0])
+
+    def kept_slopes(x: Array) -> Array:
+        return goal.constraint_slopes(last(x)[0])
+
+    last, how = _last_known(evaluated), dict[str, Any]()
     if goal.section.constraints:
-        method, options = "SLSQP", {"maxiter": iterations, "ftol": 1e-9}
-        constraints = _kept(evaluated, goal.constraints, goal.constraint_slopes)
-    found = scipy.optimize.minimize(
-        objective,
-        first,
-        jac=True,
-        method=method,
-        bounds=vary.limits,
-        constraints=constraints or (),
-        options=options,
-    )
-    return str(found.message)
+        how = {"method": "SLSQP", "constraints": {"type": "ineq", "fun": kept, "jac": kept_slopes}}
+    options = {"maxiter": iterations, "ftol": 1e-9} if how else {"maxiter": iterations, "ftol": 1e-15, "gtol": 1e-9}
+    how = how or {"method": "L-BFGS-B"}
+    ended = scipy.optimize.minimize(objective, first, jac=True, bounds=vary.limits, options=options, **how)
+    return str(ended.message)
 
 
 def _raised(
@@ -295,50 +287,40 @@ def _raised(
 
     Where two of them cross, their minimum has a corner, and this problem has none.
     """
+    last = _last_known(evaluated)
 
-    def above(found: Evaluation, t: float) -> Array:
-        return np.concatenate([goal.lowest_values(found) - t, goal.constraints(found)])
+    def above(z: Array) -> Array:
+        evaluation, found = last(z[:-1])
+        values: Array = np.concatenate([goal.lowest_values(evaluation) - z[-1], goal.constraints(evaluation)])
+        return values if found else np.full_like(values, -WORSE)
 
-    def slopes(found: Evaluation) -> Array:
-        lowest, others = goal.lowest_slopes(found), goal.constraint_slopes(found)
-        with_t = [np.column_stack([lowest, -np.ones(len(lowest))])]
-        return np.vstack([*with_t, *([np.column_stack([others, np.zeros(len(others))])] if len(others) else [])])
-
-    last: list[Evaluation] = []
-
-    def at(z: Array) -> tuple[Array, Array]:
-        found = evaluated(z[:-1])
-        if found.values:
-            last[:] = [found]
-        values = above(last[0], z[-1])
-        return (values if found.values else values * 0 - WORSE), slopes(last[0])
+    def slopes(z: Array) -> Array:
+        evaluation, _ = last(z[:-1])
+        parts = ((goal.lowest_slopes(evaluation), -1.0), (goal.constraint_slopes(evaluation), 0.0))
+        return np.vstack([np.column_stack([part, np.full(len(part), by_t)]) for part, by_t in parts if len(part)])
 
     start = np.append(first, goal.lowest_values(evaluated(first)).min())
     down = np.append(0 * first, -1.0)
-    found = scipy.optimize.minimize(
+    ended = scipy.optimize.minimize(
         lambda z: (-z[-1], down),
         start,
         jac=True,
         method="SLSQP",
         bounds=[*vary.limits, (None, None)],
-        constraints={"type": "ineq", "fun": lambda z: at(z)[0], "jac": lambda z: at(z)[1]},
+        constraints={"type": "ineq", "fun": above, "jac": slopes},
         options={"maxiter": iterations, "ftol": 1e-7},
     )
-    return str(found.message)
+    return str(ended.message)
 
 
-def _kept(
-    evaluated: Callable[[Array], Evaluation],
-    values: Callable[[Evaluation], Array],
-    slopes: Callable[[Evaluation], Array],
-) -> dict[str, Any]:
-    """Constraints for SciPy; a lost path has those of the last one that is known."""
+def _last_known(evaluated: Callable[[Array], Evaluation]) -> Callable[[Array], tuple[Evaluation, bool]]:
+    """What evaluates a vector; of a lost path the last one that is known, and False."""
     last: list[Evaluation] = []
 
-    def at(x: Array) -> Evaluation:
-        found = evaluated(x)
-        if found.values:
-            last[:] = [found]
-        return last[0]
+    def at(x: Array) -> tuple[Evaluation, bool]:
+        evaluation = evaluated(x)
+        if evaluation.values:
+            last[:] = [evaluation]
+        return last[0], bool(evaluation.values)
 
-    return {"type": "ineq", "fun": lambda x: values(at(x)), "jac": lambda x: slopes(at(x))}
+    return at

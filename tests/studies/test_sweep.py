@@ -197,9 +197,8 @@ def test_a_named_result_of_each_point(tmp_path: Path, computed: list[float]) -> 
     p_over_E = 1e-5 * 2 / (3 * (1 - 0.3**2)) ** 0.5 / 50**2
     w_over_h = p_over_E * 50**4 * 12 * (1 - 0.3**2) / 64
     assert done.results == pytest.approx([w_over_h, 3 * w_over_h], rel=2e-3)
-    assert [
-        f"w_from_field_over_h@end = {value:.9g}" in line for value, line in zip(done.results, said[-2:], strict=True)
-    ]
+    for w, line in zip(done.results, said[-2:], strict=True):
+        assert f"w_from_field_over_h@end = {w:.9g}" in line
     sweep(PLATE, [PRESSURES], COARSE, tmp_path, result="w_from_field_over_h@end")
     assert len(computed) == 4
     over = ["--over", PRESSURES, *(f"--set={setting}" for setting in COARSE)]

@@ -33,7 +33,7 @@ class Expected(Scene):
             contacts=dict.fromkeys(contact.amplitude for contact in loads.contacts),
             load_size=size,
             force_unit=1.0,
-            system=SimpleNamespace(settings={}),
+            system=SimpleNamespace(history={}),
         )
         vars(self).update(case=case, plan=plan, model=model)
 
