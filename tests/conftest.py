@@ -41,7 +41,7 @@ TILTED = Magnetisation(np.array([0.6, 0.0, 0.8]), np.array([0.0, 0.28, 0.96]))
 def hemisphere(size: float = 0.5, *, half: bool = False, dimple: Dimple | None = None) -> Midsurface:
     """A coarse hemisphere; the size holds everywhere."""
     points = {"pole": np.zeros(2), "load": np.array([np.pi / 4, 0.0])}
-    shape = DiscShape(np.pi / 2, half, (dimple.phi_o,) if dimple else ())
+    shape = DiscShape(np.pi / 2, half, (dimple.width,) if dimple else ())
     return distribute(triangulate(shape, lambda x: size, points, spherical(dimple)), MPI.COMM_SELF)
 
 

@@ -55,10 +55,8 @@ def account(case: Case, loads: Loads, model: str, mirror: Mirror | None, rims: i
         moved = dict.fromkeys(name for move in loads.moves for name in move.names)
         included.append(f"supports that move: {', '.join(moved)}")
     for contact in loads.contacts:
-        k, kind = f"{contact.stiffness:.4g}", str(case.bodies[contact.body].kind)
-        if radius := getattr(case.bodies[contact.body], "radius", None):
-            kind += f" of radius {1e3 * radius:g} mm" if case.shell.with_units else f" of radius {radius:g}"
-        included.append(f"body {contact.body}: {kind} without friction, stiffness k R²/(E h) = {k}")
+        k, body = f"{contact.stiffness:.4g}", case.bodies[contact.body].words(with_units=case.shell.with_units)
+        included.append(f"body {contact.body}: {body} without friction, stiffness k R²/(E h) = {k}")
     if case.imperfections:
         included.append(_imperfections(case, rims))
     for name, keys in grown_by(case.programme, case.imperfections).items():

@@ -19,8 +19,7 @@ from magshell_fenicsx.input.section import number_and_unit, si_size
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.shell.model import ShellModel
-from magshell_fenicsx.parts.imperfections.dimple import DimpleSection
-from magshell_fenicsx.parts.imperfections.modes import ModesSection
+from magshell_fenicsx.parts.imperfections.imperfection import LocalSection
 from magshell_fenicsx.problem.planner import make_plan
 from magshell_fenicsx.problem.problem import Plan
 from magshell_fenicsx.simulate.scene import Scene
@@ -58,7 +57,7 @@ def number_of(case: Case, key: str) -> float:
             f"{key}: a number of the mesh, of the shape or of a target has no gradient here; those of imperfections at "
             "a fold are in sensitivities"
         )
-    if any(isinstance(each, ModesSection) and not each.file for each in case.imperfections.values()):
+    if any(section.of_perfect_shell for section in case.imperfections.values()):
         raise CaseError(
             f"{key}: the modes of the perfect shell, which the case has as imperfections, change with it: give their "
             "file (kind: modes, file)"
@@ -148,8 +147,8 @@ def scene_with(scene: Scene, key: str, value: float) -> Scene:
 
 
 def _rims(case: Case) -> list[float]:
-    shell, dimples = case.shell, case.imperfections.values()
-    return [d.half_width(shell.R_over_h, shell.poisson_ratio) for d in dimples if isinstance(d, DimpleSection)]
+    shell, local = case.shell, [each for each in case.imperfections.values() if isinstance(each, LocalSection)]
+    return [each.half_width(shell.R_over_h, shell.poisson_ratio) for each in local if each.patch]
 
 
 def on_mesh_of(scene: Scene, new: Plan) -> Plan:

@@ -38,9 +38,7 @@ def with_modes(case: Case, comm: MPI.Comm) -> Case:
         If the perfect shell cannot be built, or its modes are not found.
     """
     wanted = [
-        section
-        for section in case.imperfections.values()
-        if isinstance(section, ModesSection) and section.file is None and section.shapes is None
+        section for section in case.imperfections.values() if isinstance(section, ModesSection) and section.awaited
     ]
     if wanted:
         if case.dimples and case.patches:

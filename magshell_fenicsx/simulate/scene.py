@@ -27,7 +27,6 @@ from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.patterns import cells_of
 from magshell_fenicsx.models.solid.model import SolidModel
-from magshell_fenicsx.parts.imperfections.modes import ModesSection
 from magshell_fenicsx.parts.magnetism.direction import directions, field_angle, field_size
 from magshell_fenicsx.parts.magnetism.remanence import cells_of_body
 from magshell_fenicsx.parts.pressure.openings import no_potential
@@ -92,7 +91,7 @@ class Scene:
     ) -> None:
         start = time.perf_counter()
         case = opened(case, comm)
-        if any(isinstance(s, ModesSection) and not (s.file or s.shapes) for s in case.imperfections.values()):
+        if any(section.awaited for section in case.imperfections.values()):
             raise CaseError(
                 "shell.imperfections: kind: modes: compute them first, by simulate.perfect.with_modes(case, comm)"
             )

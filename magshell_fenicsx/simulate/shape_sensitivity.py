@@ -21,10 +21,8 @@ from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.mesh.midsurface import Deviated, Deviation
 from magshell_fenicsx.mesh.mirror import Mirror
 from magshell_fenicsx.models.shell.model import ShellModel
-from magshell_fenicsx.parts.imperfections.dimple import DimpleSection
-from magshell_fenicsx.parts.imperfections.gaussian import GaussianSection
 from magshell_fenicsx.parts.imperfections.growth import grown_by
-from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionSection, flaws, in_frame
+from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionSection, LocalSection, flaws, in_frame
 from magshell_fenicsx.shape.outline import ground_of
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.stage import Stage
@@ -50,11 +48,11 @@ def to_imperfections(stage: Stage, fold: Fold) -> dict[str, float]:
 
 
 def _varies(case: Case, section: ImperfectionSection, name: str) -> bool:
-    if isinstance(section, DimpleSection) and case.patches and name != "amplitude":
+    if section.patch and case.patches and name != "amplitude":
         return False
     if not name.startswith("at."):
         return True
-    assert isinstance(section, DimpleSection | GaussianSection)
+    assert isinstance(section, LocalSection)
     spherical = case.shell.geometry in ("hemisphere", "cap") and section.at.point is None
     return spherical and section.at.polar != 0
 
@@ -88,7 +86,7 @@ def _unit(case: Case, key: str, name: str) -> float:
     if name == "width":
         return float(getattr(section, name))
     if name.startswith("at."):
-        assert isinstance(section, DimpleSection | GaussianSection)
+        assert isinstance(section, LocalSection)
         return degrees(section.half_width(case.shell.R_over_h, case.shell.poisson_ratio))
     return 1.0
 

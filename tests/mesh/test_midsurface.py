@@ -51,7 +51,7 @@ def test_edges_follow_the_rim_of_the_dimple() -> None:
     dimple = Dimple(0.05, 0.5)
     mesh = triangulate(DiscShape(np.pi / 2, False, (0.5,)), lambda x: 0.3, {"pole": np.zeros(2)}, flat)
     phi = np.hypot(*mesh.nodes.T)[mesh.cells[:, :9]]
-    inside, outside = phi < dimple.phi_o - 1e-9, phi > dimple.phi_o + 1e-9
+    inside, outside = phi < dimple.width - 1e-9, phi > dimple.width + 1e-9
     assert not (inside.any(axis=1) & outside.any(axis=1)).any()
     assert inside.any()
     assert outside.any()

@@ -124,6 +124,13 @@ class BodySection(Section):
         """Radius of what touches, in the case's unit; infinite for a plane."""
         return float(getattr(self, "radius", inf))
 
+    def words(self, *, with_units: bool) -> str:
+        """What it is, in the account of what is built."""
+        radius = getattr(self, "radius", None)
+        if radius is None:
+            return self.kind
+        return f"{self.kind} of radius " + (f"{1e3 * radius:g} mm" if with_units else f"{radius:g}")
+
     def distance(self, placed: Placed) -> Distance:
         """Its distance where it stands.
 

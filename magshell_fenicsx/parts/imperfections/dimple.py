@@ -7,7 +7,7 @@ from typing import ClassVar, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.parts.imperfections.imperfection import SHOWN, Flaw, LocalSection, refuse_steep
+from magshell_fenicsx.parts.imperfections.imperfection import SHOWN, Flaw, Local, LocalSection, refuse_steep
 from magshell_fenicsx.shape.ground import Angle, Distance, Ground, located
 
 Array = NDArray[np.float64]
@@ -44,26 +44,14 @@ class DimpleSection(LocalSection):
 
 
 @dataclass(frozen=True)
-class Dimple:
-    """A deviation.
+class Dimple(Local):
+    """Its deviation."""
 
-    Attributes
-    ----------
-    delta
-        Depth over R.
-    phi_o
-        Half-width over R (rad).
-    distance
-        From its centre.
-    """
-
-    delta: float
-    phi_o: float
     distance: Distance = AT_POLE
 
-    def __call__(self, places: Array) -> Array:
-        phi = self.distance(places)
-        return np.where(phi < self.phi_o, -self.delta * (1 - (phi / self.phi_o) ** 2) ** 2, 0.0)
+    @staticmethod
+    def profile(squared: Array) -> Array:
+        return np.where(squared < 1, (1 - squared) ** 2, 0.0)
 
 
 def _too_wide(phi_o: float, most: float) -> str:

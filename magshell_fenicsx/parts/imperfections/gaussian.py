@@ -1,14 +1,13 @@
 """A Gaussian dimple, w0 = -delta exp(-(phi/phi_g)^2)."""
 
-from dataclasses import dataclass
 from math import exp, sqrt
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.parts.imperfections.imperfection import SHOWN, Flaw, LocalSection, refuse_steep
-from magshell_fenicsx.shape.ground import Distance, Ground, located
+from magshell_fenicsx.parts.imperfections.imperfection import SHOWN, Flaw, Local, LocalSection, refuse_steep
+from magshell_fenicsx.shape.ground import Ground, located
 
 Array = NDArray[np.float64]
 REACH = 2.0  # widths, where 2 % of the depth is left
@@ -35,13 +34,9 @@ class GaussianSection(LocalSection):
         return Flaw(deviation, size, place, distance, REACH * phi_g)
 
 
-@dataclass(frozen=True)
-class Gaussian:
-    """A deviation; see `Dimple`."""
+class Gaussian(Local):
+    """Its deviation."""
 
-    delta: float
-    phi_g: float
-    distance: Distance
-
-    def __call__(self, places: Array) -> Array:
-        return np.asarray(-self.delta * np.exp(-((self.distance(places) / self.phi_g) ** 2)))
+    @staticmethod
+    def profile(squared: Array) -> Array:
+        return np.asarray(np.exp(-squared))

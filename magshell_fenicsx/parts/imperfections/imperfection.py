@@ -3,16 +3,18 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from math import inf, sqrt
-from typing import Annotated, Any, ClassVar, Generic, Literal, Protocol, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Generic, Literal, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field, ModelWrapValidatorHandler, ValidationError, ValidationInfo
 
 from magshell_fenicsx.input.section import Section, in_units, with_unit
-from magshell_fenicsx.mesh.midsurface import Deviation
 from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.shape.ground import At, Distance, Ground
+
+if TYPE_CHECKING:  # it needs the solver, and a case alone does not
+    from magshell_fenicsx.mesh.midsurface import Deviation
 
 Array = NDArray[np.float64]
 Values = TypeVar("Values")
@@ -47,7 +49,7 @@ class Flaw:
         places; None where they are alike.
     """
 
-    deviation: Deviation
+    deviation: "Deviation"
     size: float = inf
     centre: Array | None = None
     distance: Distance | None = None
@@ -60,6 +62,32 @@ class Flaw:
         """Whether places (n, 3) are within its rim."""
         assert self.distance
         return np.asarray(self.distance(places) < self.reach)
+
+
+@dataclass(frozen=True)
+class Local:
+    """The deviation -depth f((distance/width)²) around a place, with a profile f that is 1 there.
+
+    Attributes
+    ----------
+    depth, width
+        Over R; the width in the measure of `distance`, so on spheres in rad.
+    distance
+        From its centre.
+    """
+
+    depth: float
+    width: float
+    distance: Distance
+
+    @staticmethod
+    def profile(squared: Array) -> Array:
+        """f."""
+        raise NotImplementedError
+
+    def __call__(self, places: Array) -> Array:
+        squared = np.asarray((self.distance(places) / self.width) ** 2, dtype=np.float64)
+        return np.asarray(-self.depth * self.profile(squared))
 
 
 @dataclass(frozen=True)
@@ -171,6 +199,16 @@ class ImperfectionSection(Section):
     def account(self) -> str:
         """Its words in the account of what is built."""
         return self.kind
+
+    @property
+    def awaited(self) -> int:
+        """How many modes of the perfect shell it needs that are not yet computed."""
+        return 0
+
+    @property
+    def of_perfect_shell(self) -> bool:
+        """Whether it is computed from the perfect shell, with whose numbers it changes."""
+        return False
 
     def listed(self) -> "Mapping[str, ImperfectionSection]":
         """What is built of it: itself, or others by their keys below its own, which begin with a dot."""

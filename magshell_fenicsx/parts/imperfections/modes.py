@@ -61,6 +61,14 @@ class ModesSection(FileKeys, ImperfectionSection):
         """The modes as functions of places over R, 1 where inwards largest; None until they are computed."""
         return self._shapes
 
+    @property
+    def awaited(self) -> int:
+        return len(self.amplitudes) if self.file is None and self.shapes is None else 0
+
+    @property
+    def of_perfect_shell(self) -> bool:
+        return self.file is None
+
     def become(self, shapes: tuple[Shape, ...]) -> None:
         """Take the modes of the perfect shell."""
         self._shapes = shapes[: len(self.amplitudes)]

@@ -45,7 +45,7 @@ class Spot:
     rim: Array | None = None
 
 
-def spots(found: Iterable[tuple[str, Flaw]], drawn: Outline, turn: float) -> list[Spot]:
+def spots(flaws: Iterable[tuple[str, Flaw]], drawn: Outline, turn: float) -> list[Spot]:
     """The local imperfections of a case in the chart of a frame that is turned about e3 (rad).
 
     Parameters
@@ -59,7 +59,7 @@ def spots(found: Iterable[tuple[str, Flaw]], drawn: Outline, turn: float) -> lis
         If one reaches around the shell.
     """
     placed = []
-    for key, flaw in found:
+    for key, flaw in flaws:
         if flaw.centre is None:
             continue
         if drawn.disc and np.hypot(*flaw.centre[:2]) < AXIS:
@@ -105,10 +105,10 @@ def contour(key: str, flaw: Flaw, drawn: Outline, turn: float, centre: Array, pa
     low, below, above = high - tried[0], beyond(high - tried[0]), beyond(high)
     for _ in range(ROUNDS):  # of the rule of false position, where the end that stays counts half
         middle = high - above * (high - low) / (above - below)
-        found = beyond(middle)
-        crossed = found * above < 0
+        between = beyond(middle)
+        crossed = between * above < 0
         low, below = np.where(crossed, high, low), np.where(crossed, above, below / 2)
-        high, above = middle, np.where(found == 0, 1e-300, found)
+        high, above = middle, np.where(between == 0, 1e-300, between)
     return np.asarray(centre + high[:, None] * rays)
 
 

@@ -1,6 +1,6 @@
 """The symmetry that the imperfections of a case leave, by their values."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from math import atan2
@@ -11,9 +11,7 @@ from scipy.spatial import cKDTree
 
 from magshell_fenicsx.mesh.midsurface import Deviation
 from magshell_fenicsx.mesh.mirror import Mirror, rotation
-from magshell_fenicsx.parts.imperfections.dimple import Dimple
-from magshell_fenicsx.parts.imperfections.gaussian import Gaussian
-from magshell_fenicsx.parts.imperfections.imperfection import Flaw
+from magshell_fenicsx.parts.imperfections.imperfection import Flaw, Local
 from magshell_fenicsx.parts.imperfections.rims import AXIS, contour
 from magshell_fenicsx.shape.ground import Angle, Straight
 from magshell_fenicsx.shape.outline import Outline
@@ -29,21 +27,24 @@ FIRST = 3  # imperfections without an image that are looked at before all places
 
 @dataclass(frozen=True)
 class _Numbers:
-    """Gaussians and dimples, those that differ in their depth alone added up.
+    """Local deviations, those that differ in their depth alone added up.
 
     Attributes
     ----------
     rows
-        Centres, widths, and 1 of a Gaussian or 0 of a dimple, (n, 5).
+        Centres, widths, and the numbers of the profiles, (n, 5).
     depths
         (n,).
     angles
         Whether distances are angles.
+    profiles
+        See `Local`.
     """
 
     rows: Array
     depths: Array
     angles: bool
+    profiles: Sequence[Callable[[Array], Array]]
 
     @cached_property
     def tree(self) -> cKDTree:
@@ -51,12 +52,16 @@ class _Numbers:
 
     def __call__(self, x: Array) -> Array:
         """Their sum at a few places (m, 3)."""
-        centres, widths, gaussian = self.rows[:, :3], self.rows[:, 3], self.rows[:, 4] > 0
+        centres, widths = self.rows[:, :3], self.rows[:, 3]
         distance = np.linalg.norm(x[:, None] - centres, axis=-1)
         if self.angles:
             distance = 2 * np.arctan2(distance, np.linalg.norm(x[:, None] + centres, axis=-1))
         squared = (distance / widths) ** 2
-        return np.asarray(-np.where(gaussian, np.exp(-squared), np.maximum(1 - squared, 0.0) ** 2) @ self.depths)
+        w0 = np.zeros(len(x))
+        for number, profile in enumerate(self.profiles):
+            of_it = np.round(self.rows[:, 4]) == number
+            w0 -= profile(squared[:, of_it]) @ self.depths[of_it]
+        return w0
 
 
 @dataclass(frozen=True)
@@ -70,35 +75,37 @@ class _Sum:
 
     @cached_property
     def numbers(self) -> _Numbers | None:
-        """What it is made of, if that is Gaussians and dimples alone: there may be thousands."""
-        local = [d for d in self.deviations if isinstance(d, Gaussian | Dimple)]
+        """What it is made of, if that is local deviations alone: there may be thousands."""
+        local = [d for d in self.deviations if isinstance(d, Local)]
+        kinds = list(dict.fromkeys(type(d) for d in local))
         angles = [d.distance.axis for d in local if isinstance(d.distance, Angle)]
         places = angles or [d.distance.place for d in local if isinstance(d.distance, Straight)]
         if not places or len(places) < len(self.deviations):
             return None
-        shapes = [(d.phi_g, 1.0) if isinstance(d, Gaussian) else (d.phi_o, 0.0) for d in local]
+        shapes = [(d.width, kinds.index(type(d))) for d in local]
         rows = np.round(np.column_stack([places, shapes]) / IMAGE) * IMAGE
         rows, number = np.unique(rows, axis=0, return_inverse=True)
-        depths = np.bincount(number.ravel(), [d.delta for d in local])
+        depths = np.bincount(number.ravel(), [d.depth for d in local])
         kept = np.abs(depths) > IMAGE * np.abs(depths).max()
-        return _Numbers(rows[kept], depths[kept], bool(angles)) if kept.any() else None
+        profiles = [kind.profile for kind in kinds]
+        return _Numbers(rows[kept], depths[kept], bool(angles), profiles) if kept.any() else None
 
     def mirrored(self, mirror: Mirror) -> bool | None:
         """Whether it is its own image, by its numbers; None if they do not say."""
-        made = self.numbers
-        if made is None or (made.angles and mirror.offset):
+        numbers = self.numbers
+        if numbers is None or (numbers.angles and mirror.offset):
             return None
-        rows, depths = made.rows, made.depths
-        away, image = made.tree.query(np.column_stack([mirror.image(rows[:, :3]), rows[:, 3:]]))
+        rows, depths = numbers.rows, numbers.depths
+        away, image = numbers.tree.query(np.column_stack([mirror.image(rows[:, :3]), rows[:, 3:]]))
         alone = (away > 4 * IMAGE) | (np.abs(depths[image] - depths) > IMAGE * np.abs(depths).max())
         if not alone.any():
             return True if len(np.unique(image)) == len(image) else None
-        there = rows[np.flatnonzero(alone)[:FIRST], :3]
-        differs = np.abs(made(there) - made(mirror.image(there))).max()
+        centres = rows[np.flatnonzero(alone)[:FIRST], :3]
+        differs = np.abs(numbers(centres) - numbers(mirror.image(centres))).max()
         return False if differs > 2 * SAME * np.abs(depths).sum() else None
 
 
-def leaves(found: Mapping[str, Flaw], drawn: Outline, *, each: bool) -> list[Leaves]:
+def leaves(flaws: Mapping[str, Flaw], drawn: Outline, *, each: bool) -> list[Leaves]:
     """What imperfections leave.
 
     Parameters
@@ -108,12 +115,12 @@ def leaves(found: Mapping[str, Flaw], drawn: Outline, *, each: bool) -> list[Lea
     each
         Whether each must be its own image, as patches with names are.
     """
-    if not found:
+    if not flaws:
         return []
-    grouped = [[flaw] for flaw in found.values()] if each else [list(found.values())]
+    grouped = [[flaw] for flaw in flaws.values()] if each else [list(flaws.values())]
     groups = [_Sum([flaw.deviation for flaw in group]) for group in grouped]
 
-    sample = cache(lambda: _sample(found, drawn))
+    sample = cache(lambda: _sample(flaws, drawn))
 
     def mirrors(mirror: Mirror) -> bool:
         unsure = []
@@ -124,7 +131,7 @@ def leaves(found: Mapping[str, Flaw], drawn: Outline, *, each: bool) -> list[Lea
                 unsure.append(group)
         return all(_same(group(sample()), group(mirror.image(sample()))) for group in unsure)
 
-    centres = [flaw.centre for flaw in found.values() if flaw.centre is not None]
+    centres = [flaw.centre for flaw in flaws.values() if flaw.centre is not None]
     off = [centre for centre in centres if np.hypot(*centre[:2]) > AXIS]
     reason = None
     if off and drawn.round:
@@ -148,10 +155,10 @@ def _between(centres: Sequence[Array]) -> tuple[float, ...]:
     return tuple((atan2(x[1], x[0]) + atan2(first[1], first[0])) / 2 for x in (first, *alike))
 
 
-def _sample(found: Mapping[str, Flaw], drawn: Outline) -> Array:
+def _sample(flaws: Mapping[str, Flaw], drawn: Outline) -> Array:
     """Places (n, 3) all over the shell, and around each local imperfection."""
     places = [drawn.sample()]
-    for key, flaw in found.items():
+    for key, flaw in flaws.items():
         if flaw.centre is None:
             continue
         places.append(flaw.centre[None])
@@ -161,5 +168,5 @@ def _sample(found: Mapping[str, Flaw], drawn: Outline) -> Array:
     return np.concatenate(places)
 
 
-def _same(here: Array, there: Array) -> bool:
-    return bool((np.abs(here - there) <= SAME * max(np.abs(here).max(), np.abs(there).max())).all())
+def _same(w0: Array, image: Array) -> bool:
+    return bool((np.abs(w0 - image) <= SAME * max(np.abs(w0).max(), np.abs(image).max())).all())

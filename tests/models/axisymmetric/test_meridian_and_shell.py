@@ -14,7 +14,7 @@ from magshell_fenicsx.parts.imperfections.imperfection import Flaw
 
 Array = np.ndarray
 DIMPLE = Dimple(0.05, 0.5)
-REACH = Flaw(DIMPLE, distance=AT_POLE, reach=DIMPLE.phi_o)
+REACH = Flaw(DIMPLE, distance=AT_POLE, reach=DIMPLE.width)
 
 
 def displacement(phi: Array) -> tuple[Array, Array]:
@@ -33,8 +33,8 @@ def displacement(phi: Array) -> tuple[Array, Array]:
 )
 def test_energies_and_volume(field: Magnetisation) -> None:
     loads, R_over_h, nu = Loads(pressure=True, magnetic=field), 20, 0.3
-    width = DIMPLE.phi_o * np.sqrt(R_over_h) * (12 * (1 - nu**2)) ** 0.25
-    line = hemisphere(R_over_h, nu, loads, dimple=(DIMPLE.delta * R_over_h, width))
+    width = DIMPLE.width * np.sqrt(R_over_h) * (12 * (1 - nu**2)) ** 0.25
+    line = hemisphere(R_over_h, nu, loads, dimple=(DIMPLE.depth * R_over_h, width))
     phi = line.V.tabulate_dof_coordinates()[:, 0]
     on_line = np.column_stack(displacement(phi)).ravel()
 

@@ -18,7 +18,7 @@ from magshell_fenicsx.problem.planner import make_plan
 
 def hemisphere(size: float, h: float, *, layers: int = 1, half: bool = False, dimple: Dimple | None = None) -> Body:
     """A body around the hemisphere of radius 1; the triangles' size holds everywhere."""
-    shape = DiscShape(np.pi / 2, half, (dimple.phi_o,) if dimple else ())
+    shape = DiscShape(np.pi / 2, half, (dimple.width,) if dimple else ())
     points = {"pole": np.zeros(2)}
     return sweep(triangulate(shape, lambda x: size, points, spherical(dimple)), h, layers, MPI.COMM_SELF)
 
