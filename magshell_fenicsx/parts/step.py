@@ -1,6 +1,6 @@
 """The base of the steps of a programme: what a step drives, how, and how far."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple, Self, TypeAlias
 
@@ -15,6 +15,9 @@ from magshell_fenicsx.parts.part import Context, Modelled
 from magshell_fenicsx.shape.symmetry import Leaves
 
 if TYPE_CHECKING:
+    from magshell_fenicsx.continuation.path import StepOptions
+    from magshell_fenicsx.models.shell.parameters import Loads
+    from magshell_fenicsx.parts.motion.step import TimeSection
     from magshell_fenicsx.shape.outline import Outline
 
 Until = Annotated[
@@ -117,7 +120,9 @@ class Now:
     driven
         Whether an earlier step has driven the amplitude.
     size
-        Of the amplitude of a full field, lambda_m; 1 for other loads.
+        What a target of one is, see `Step.size`.
+    h
+        Thickness over R.
     """
 
     value: float
@@ -125,6 +130,7 @@ class Now:
     unit: float
     driven: bool
     size: float
+    h: float
 
 
 @dataclass(frozen=True)
@@ -154,6 +160,103 @@ class Drive:
     step: float | None = None
 
 
+@dataclass(frozen=True)
+class Here:
+    """Where a step begins, in the model's terms.
+
+    Attributes
+    ----------
+    loads
+        What loads the model.
+    turn
+        Azimuth of its frame (rad).
+    mu
+        The amplitudes.
+    potential
+        Amplitude -> Pi_i(u).
+    unit
+        Amplitude -> -dPi/dmu of one unit of the key that prescribes it.
+    open
+        Whether a live pressure has no potential.
+    """
+
+    step: "ProgrammeStep"
+    context: Context
+    loads: "Loads"
+    turn: float
+    h: float
+    mu: Mapping[str, float]
+    potential: Callable[[str], float]
+    unit: Callable[[str], float]
+    open: bool
+
+    @property
+    def driven(self) -> bool:
+        """Whether an earlier step has driven the amplitude."""
+        return any(self.step.name == other.name for other in self.context.before(self.step.number))
+
+    def now(self) -> Now:
+        """The amplitude of the step."""
+        name = self.step.name
+        size = self.step.load.size(self.context)
+        return Now(self.mu[name], -self.potential(name), self.unit(name), self.driven, size, self.h)
+
+
+Curves = Mapping[str, Callable[[float], tuple[float, float, float]]]  # of several amplitudes, see `Along`
+
+
+@dataclass(frozen=True)
+class Course:
+    """How a step goes on from where it begins.
+
+    Attributes
+    ----------
+    until
+        Of the walk.
+    steps
+        The largest number of steps; None: the walk's own.
+    curves
+        Amplitudes that are functions of the step's own, and its value; None where the model has it itself.
+    finer
+        The lengths of steps of a path, from those that follow from the first one.
+    forbidden
+        What is said of an instability that must not be on the way, by its amplitudes and its name; None if it may.
+    at_once
+        Whether that ends the step, or it goes on to its end first.
+    label
+        Of points that are no instabilities, in place of the walk's own.
+    impossible
+        Why there is no way; empty if there is one.
+    """
+
+    drive: Drive
+    until: Literal["limit", "bifurcation", "target", "points"]
+    steps: int | None = None
+    curves: tuple[Curves, float] | None = None
+    finer: "Callable[[StepOptions], StepOptions] | None" = None
+    forbidden: Callable[[Mapping[str, float], str], str] | None = None
+    at_once: bool = False
+    label: Literal["", "field"] = ""
+    impossible: str = ""
+
+
+@dataclass(frozen=True)
+class Ahead:
+    """The end of a step in words, for those who wait for it.
+
+    Attributes
+    ----------
+    end
+        Value of the column of its amplitude; None if it ends at another event.
+    steps
+        Number of steps after which it ends; None if it ends otherwise.
+    """
+
+    words: str
+    end: float | None = None
+    steps: int | None = None
+
+
 class Step(Section):
     """What every step has in common.
 
@@ -173,6 +276,10 @@ class Step(Section):
         Whether its amplitude may jump in time.
     in_time
         Whether it is a motion, which need not begin in equilibrium.
+    in_lengths
+        Whether a target of its conjugate is in the shell's length.
+    touches
+        Whether it begins where something touches the shell first.
     """
 
     amplitude: ClassVar[str]
@@ -182,6 +289,8 @@ class Step(Section):
     holdable: ClassVar[bool] = True
     jumps: ClassVar[bool] = True
     in_time: ClassVar[bool] = False
+    in_lengths: ClassVar[bool] = False
+    touches: ClassVar[bool] = False
     points: int
     hold: dict[str, Hold] = Field(default_factory=dict)
     """Amplitude of another step, or pressure -> what is constant in this step: the load itself (default), its
@@ -214,6 +323,49 @@ class Step(Section):
     def drives(self) -> tuple[str, ...]:
         """Amplitudes of other steps that it drives too."""
         return ()
+
+    @property
+    def motion(self) -> "TimeSection | None":
+        """The step as a motion; None if it is none."""
+        return None
+
+    @property
+    def branch_points(self) -> int:
+        """How many steps it follows each direction of a branch; 0 if none is followed."""
+        return 0
+
+    @property
+    def wants_sensitivities(self) -> bool:
+        """Whether the load at its fold is derived by what is given."""
+        return False
+
+    def size(self, context: Context) -> float:
+        """What a target of one is of the amplitude."""
+        return 1.0
+
+    def course(self, here: Here) -> Course:
+        """How it goes on."""
+        raise NotImplementedError
+
+    def curves(self, here: Here) -> tuple[Curves, float] | None:
+        """See `Course`, from any state of the step."""
+        return None
+
+    def ahead(self, step: "ProgrammeStep", context: Context, loads: "Loads", turn: float) -> Ahead | None:
+        """Its end, if its target does not say it."""
+        return None
+
+    def changes(self, name: str, mu: Iterable[str]) -> set[str]:
+        """Which of all amplitudes it changes as it is given; `name` is its own."""
+        return {name}
+
+    def by_conjugate(self, *, at_target: bool) -> bool:
+        """Whether the conjugate is prescribed at its points, or at its target."""
+        return False
+
+    def on_perfect(self, *, last: bool) -> "Step | None":
+        """The step on the shell without imperfections, to the first instability if it is the last; None without."""
+        return self
 
     @property
     def held_conjugate(self) -> bool:
@@ -487,6 +639,23 @@ class PathStep(Step):
             found = [0.0]
         first, step = self.first(change, now, by_load=by_load), self.step(None if goal is None else change, now)
         return Drive(self.prescribed, quantity, end, found, first, self.scale(now), step)
+
+    def course(self, here: Here) -> Course:
+        until = "target" if self.until == "zero" else self.until
+        steps = self.points if until == "points" else None
+        return Course(self.drive(here.now()), until, steps, self.curves(here))
+
+    @property
+    def branch_points(self) -> int:
+        return self.points if self.branches else 0
+
+    @property
+    def wants_sensitivities(self) -> bool:
+        return self.sensitivities
+
+    def by_conjugate(self, *, at_target: bool) -> bool:
+        goal = self.target if at_target and self.until == "target" else None
+        return self.control == self.conjugate_control or (goal is not None and goal[0].quantity == "conjugate")
 
     def begin(self, here: float) -> float:
         """Where the equal parts of the first way to a target begin."""

@@ -4,7 +4,6 @@ from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.units import sizes_of
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.models.shell.parameters import Loads
-from magshell_fenicsx.parts.motion.step import TimeSection
 from magshell_fenicsx.parts.supports.reacting import columns, motion_columns, source_columns
 from magshell_fenicsx.problem.problem import Plan
 from magshell_fenicsx.quantities.registry import IN_TIME, OF_EVERY_RUN, Sizes, amplitude, contact_columns
@@ -47,7 +46,7 @@ def extra_columns(case: Case, plan: Plan) -> tuple[str, ...]:
     own = (*own_amplitudes(loads), *(column for term in loads.own for column in term.observed))
     factors = (amplitude(name).column for name in (*loads.forces, *loads.dead) if name != "force")
     displaced = (f"w_{name}_over_h" for name in also_displaced(loads))
-    moves = any(isinstance(s.load, TimeSection) or getattr(s.load, "then", None) for s in case.programme)
+    moves = any(step.load.in_time or step.load.released_by for step in case.programme)
     clock = tuple(q.name for q in IN_TIME) if moves else ()
     sources = source_columns(loads)
     contacts = (column for c in loads.contacts for column in contact_columns(c.amplitude) if column != "force")

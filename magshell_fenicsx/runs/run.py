@@ -22,7 +22,6 @@ from magshell_fenicsx.output.store.durable import Damaged, read_result
 from magshell_fenicsx.output.store.folder import DiskError, by_first, given_folder, held_folder
 from magshell_fenicsx.output.store.table import LOCATED, SOLUTION, Row
 from magshell_fenicsx.output.store.written import MESH
-from magshell_fenicsx.parts.step import PathStep
 from magshell_fenicsx.platform.environment import fast_blas
 from magshell_fenicsx.quantities.quantity import spelled
 from magshell_fenicsx.quantities.registry import amplitude, shown
@@ -226,7 +225,7 @@ def _sensitivities(result: Result) -> dict[str, float]:
     """The sensitivities at the final fold, if the case requests them."""
     scene, last = result.scene, result.rows[result.end]
     step = scene.case.programme[int(last["step"]) - 1] if last["label"] == "fold" else None
-    if step is None or not (isinstance(step.load, PathStep) and step.load.sensitivities):
+    if step is None or not step.load.wants_sensitivities:
         return {}
     assert result.history.located
     record = result.history.located[-1]

@@ -3,16 +3,12 @@
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from math import acos, degrees
 
 import numpy as np
 
 from magshell_fenicsx.continuation.point import Point
 from magshell_fenicsx.output.store.table import SOLUTION, Row
-from magshell_fenicsx.parts.forces.dead import DeadSection
-from magshell_fenicsx.parts.magnetism.field_step import RotationSection
-from magshell_fenicsx.parts.motion.step import TimeSection
-from magshell_fenicsx.parts.step import PathStep, ProgrammeStep
+from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.parts.supports.reacting import motion_columns
 from magshell_fenicsx.quantities.quantity import spelled
 from magshell_fenicsx.quantities.registry import Sizes, amplitude, quantity, shown
@@ -77,26 +73,21 @@ class Aim:
 def aim(scene: Scene, step: ProgrammeStep) -> Aim:
     """The end of a step."""
     load, varied = step.load, amplitude(step.name)
-    if isinstance(load, RotationSection):
-        before, after = scene.directions[step.number - 1 : step.number + 1]
-        first = scene.directions[0]
-        there = degrees(acos(float(np.clip(after @ first, -1, 1))))
-        return Aim(varied.column, there if before @ first > 1 - 1e-9 else None, "its last direction")
-    if isinstance(load, TimeSection):
-        return Aim("time", words="the end", steps=load.points)
+    if ahead := load.ahead(step, scene.case.context, scene.plan.loads, scene.plan.azimuth):
+        return Aim(varied.column, ahead.end, ahead.words, ahead.steps)
     if step.until == "points":
         return Aim(varied.column, words=f"{load.points} steps", steps=load.points)
     if step.until != "target" or load.target is None:
         return Aim(varied.column, words=WORDS.get(step.until, ""))
     target, value = load.target
     if target.quantity == "load":
-        return Aim(varied.column, value * (scene.case.lambda_m if step.name == "lambda_m" else 1.0))
+        return Aim(varied.column, value * load.size(scene.case.context))
     if step.name in scene.model.contacts:
         return Aim(varied.conjugate, value)
     if step.name in scene.motions:
         return Aim(motion_columns(scene.plan.loads)[step.name], value)
     own = f"w_{step.name}_over_h"
-    in_h = scene.plan.length * scene.plan.material.h if isinstance(load, DeadSection) else 1.0
+    in_h = scene.plan.length * scene.plan.material.h if load.in_lengths else 1.0
     return Aim(own if own in scene.extra_columns else target.column, value / in_h)
 
 
@@ -199,4 +190,4 @@ class RunProgress:
         """Whether the case requests branches; their number is not known in advance."""
         steps = self._scene.case.programme
         load = steps[self._step - 1].load if steps else None
-        return isinstance(load, PathStep) and load.branches
+        return load is not None and load.branch_points > 0

@@ -8,7 +8,6 @@ from magshell_fenicsx.continuation.path import NotANumber
 from magshell_fenicsx.continuation.point import Point
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.parts.bodies.touch import refuse_penetration
-from magshell_fenicsx.parts.step import PathStep
 from magshell_fenicsx.quantities.registry import OWN_MODES
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
@@ -66,10 +65,11 @@ def follow(scene: Scene, *, search: bool = True, remark: Callable[[str], None] =
                 refuse_penetration(scene, record.point.state)
                 if last in LOCATED and not (first or record.branch or scene.watch.unlocated):
                     first = record
-            if isinstance(step.load, PathStep) and step.load.then == "snap" and record:
+            release = step.load.released_by
+            if release and record:
                 if record.excluded_pivots:
                     remark(where + _buckled(scene, record, first))
-                walked = Walked(released(scene, step.load.snap, record, held_by(scene, step, record.point.state)))
+                walked = Walked(released(scene, release, record, held_by(scene, step, record.point.state)))
                 for record in walked:
                     last = record.label
                     yield replace(record, step=step.number)
@@ -77,7 +77,7 @@ def follow(scene: Scene, *, search: bool = True, remark: Callable[[str], None] =
         except (Stopped, NotANumber) as e:
             names = scene.model.system.strange
             strange = f"; where it was tried last, {' and '.join(names)} was not a number" if names else ""
-            if not (first and step is steps[-1] and step.until == "limit" and not getattr(step.load, "then", None)):
+            if not (first and step is steps[-1] and step.until == "limit" and not step.load.released_by):
                 raise Stopped(f"{where}{e}{strange}") from None
             remark(f"{BEYOND}{where}{e}{strange}")
             return

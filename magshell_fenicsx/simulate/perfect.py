@@ -15,10 +15,8 @@ from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.axisymmetric.revolution import nodal_normals
 from magshell_fenicsx.models.modes import ShellMode, ShellModes
 from magshell_fenicsx.models.shell.model import ShellModel
-from magshell_fenicsx.parts.imperfections.growth import ImperfectionStep
 from magshell_fenicsx.parts.imperfections.imperfection import in_frame
 from magshell_fenicsx.parts.imperfections.modes import Mirrored, ModesSection, Shape, on_meridian, on_surface
-from magshell_fenicsx.parts.pressure.pressure import PressureSection
 from magshell_fenicsx.platform import compat
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.record import Stopped
@@ -79,18 +77,12 @@ def perfect(case: Case) -> Case:
 
 
 def _to_the_limit(case: Case) -> Any:
-    """The loading, with a pressure at its end that has no target."""
+    """The loading of the perfect shell, to the first instability."""
     loading = case.loading
-
-    def freed(load: Any) -> Any:
-        if not isinstance(load, PressureSection):
-            return load
-        return PressureSection(kind="pressure", control=load.control, hold=load.hold)
-
     if not isinstance(loading, list):
-        return None if isinstance(loading, ImperfectionStep) else freed(loading)
-    loads = [load for load in loading if not isinstance(load, ImperfectionStep)]
-    return [*loads[:-1], *map(freed, loads[-1:])] or None
+        return loading and loading.on_perfect(last=True)
+    loads = [load for each in loading if (load := each.on_perfect(last=False)) is not None]
+    return [*loads[:-1], *(load.on_perfect(last=True) for load in loads[-1:])] or None
 
 
 def perfect_modes(case: Case, count: int, comm: MPI.Comm) -> tuple[Shape, ...]:

@@ -27,7 +27,7 @@ from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.patterns import cells_of
 from magshell_fenicsx.models.solid.model import SolidModel
-from magshell_fenicsx.parts.magnetism.direction import directions, field_angle, field_size
+from magshell_fenicsx.parts.magnetism.direction import field_angle, field_size
 from magshell_fenicsx.parts.magnetism.remanence import cells_of_body
 from magshell_fenicsx.parts.pressure.openings import no_potential
 from magshell_fenicsx.parts.supports.reacting import (
@@ -306,11 +306,6 @@ class Scene:
     @staticmethod
     def _column(name: str) -> str:
         return amplitude(name).column
-
-    @cached_property
-    def directions(self) -> Array:
-        """See `direction.directions`."""
-        return directions(self.case.programme, self.plan.loads.magnetic, self.plan.azimuth)
 
     def conjugate_unit(self, name: str) -> float:
         """-dPi/dmu of one unit of a target: ΔV/R³ of a pressure, w/h of a force, the shell's length of dead loads."""

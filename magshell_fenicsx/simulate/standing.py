@@ -12,7 +12,6 @@ from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.shell import patterns
 from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.shell.thickness import thickness_field
-from magshell_fenicsx.parts.forces.dead import DeadSection
 from magshell_fenicsx.parts.natural.shape import natural_field
 from magshell_fenicsx.problem.planner import make_plan
 from magshell_fenicsx.problem.problem import Plan
@@ -56,7 +55,7 @@ def refilled(scene: Scene, case: Case) -> bool:
     """
     model = scene.model
     same = scene.case.model_dump(exclude=FIELDS) == case.model_dump(exclude=FIELDS)
-    if not same or not isinstance(model, MeridianModel | ShellModel) or model.contacts or case.loads_of(DeadSection):
+    if not same or not isinstance(model, MeridianModel | ShellModel) or model.contacts or scene.plan.loads.dead:
         return False
     plan, old = make_plan(case, scene.plan.own), scene.plan
     if (old.axisymmetric, old.mirror, old.azimuth) != (plan.axisymmetric, plan.mirror, plan.azimuth):

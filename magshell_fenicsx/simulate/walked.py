@@ -13,7 +13,6 @@ from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.continuation.walk import Goal, Walk
 from magshell_fenicsx.continuation.watch import Crossing
 from magshell_fenicsx.parts.bodies.touch import refuse_crossing, refuse_return, stiffer
-from magshell_fenicsx.parts.step import PathStep
 from magshell_fenicsx.quantities.registry import amplitude, quantity
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
@@ -35,8 +34,10 @@ class Walked:
         self.end = yield from self._records
 
 
-def followed(stage: Stage, path: Path, start: Point, goal: Goal, branches: PathStep | None = None) -> Records:
-    """The records of a walk, with instabilities that the reduced model excludes, and of requested branches.
+def followed(stage: Stage, path: Path, start: Point, goal: Goal, branches: int = 0) -> Records:
+    """The records of a walk, with instabilities that the reduced model excludes, and of branches.
+
+    Each direction of the branch at the first bifurcation is followed for that number of steps, or to the target.
 
     With `until: bifurcation` an excluded instability ends the walk. With `until: limit` the walk continues to the first
     instability of the model itself, up to `BEYOND` times the load of the first excluded one.
@@ -69,7 +70,7 @@ def _walk(stage: Stage, path: Path, start: Point, goal: Goal) -> Walk:
     return walk
 
 
-def _followed(stage: Stage, walk: Walk, branches: PathStep | None) -> Records:
+def _followed(stage: Stage, walk: Walk, branches: int) -> Records:
     """The same with the points of the stage's system; the state at the end of the last walk."""
     stage.scene.progress.doing("looking for modes that the model excludes")
     path, start, goal = walk.path, walk.points[0], walk.goal
@@ -128,8 +129,8 @@ def _followed(stage: Stage, walk: Walk, branches: PathStep | None) -> Records:
         lost = f"{lost}; {why}" if lost else why
     if lost:
         raise Stopped(lost)
-    if branches and branches.branches and crossing:
-        yield from _branches(stage, path, crossing, goal, branches.points)
+    if branches and crossing:
+        yield from _branches(stage, path, crossing, goal, branches)
     return walk.points[-1].state
 
 

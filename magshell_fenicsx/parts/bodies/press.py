@@ -1,17 +1,23 @@
 """A rigid body that presses on the shell."""
 
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 from math import copysign
-from typing import Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from pydantic import Field
 
 from magshell_fenicsx.input.targets import over
 from magshell_fenicsx.parts.part import Context
-from magshell_fenicsx.parts.step import Control, Count, Now, PathStep, ProgrammeStep, Step, Target, Until
+from magshell_fenicsx.parts.step import Control, Count, Course, Here, Now, PathStep, ProgrammeStep, Step, Target, Until
 from magshell_fenicsx.parts.supports.motion import Name
 from magshell_fenicsx.quantities.units import POINT_FORCE, THICKNESS
 
+if TYPE_CHECKING:
+    from magshell_fenicsx.continuation.path import StepOptions
+
+SHARP = 1e-9  # least step along a contact: folds are as sharp as the penalty's stiffness changes, over 1e-3 h of gap
+EASY, HARD = 4, 8  # matrices of a step along a contact, whose rim moves from point to point before it settles
 FIRST = 0.1  # of h: the first step of the approach towards a force
 
 
@@ -23,6 +29,7 @@ class ContactSection(PathStep):
 
     conjugate: ClassVar[str] = "force on the body"
     conjugate_control: ClassVar[str] = "force"
+    touches: ClassVar[bool] = True
     targets: ClassVar[dict[str, Target]] = {
         "approach": Target("load", "approach_over_h"),
         "force": Target("conjugate", "force"),
@@ -61,6 +68,12 @@ class ContactSection(PathStep):
     @property
     def prescribed(self) -> Control:
         return "load" if self.control == "approach" else super().prescribed
+
+    def course(self, here: Here) -> Course:
+        def finer(o: "StepOptions") -> "StepOptions":
+            return replace(o, easy=EASY, few=EASY, hard=HARD, smallest=min(o.smallest, SHARP))
+
+        return replace(super().course(here), finer=finer)
 
     def first(self, change: float, now: Now, *, by_load: bool) -> float:
         return change / self.points if by_load else copysign(FIRST, -change)

@@ -127,6 +127,7 @@ class DeadSection(PathStep):
     amplitude: ClassVar[str] = "load"
     conjugate: ClassVar[str] = "displacement along the loads"
     measured: ClassVar[bool] = True
+    in_lengths: ClassVar[bool] = True
     targets: ClassVar[dict[str, Target]] = {
         "factor": Target("load", "load_factor"),
         "displacement": Target("conjugate", "w_over_h"),

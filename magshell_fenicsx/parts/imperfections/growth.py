@@ -32,6 +32,9 @@ class ImperfectionStep(PathStep):
     def place(self) -> Any:
         return self.item
 
+    def on_perfect(self, *, last: bool) -> None:
+        return None
+
     def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
         keys: Mapping[str, object] = context.sections["imperfections"]
         names = context.loads(ImperfectionStep)

@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.along import Curve
-from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.models.shell.parameters import ACROSS, Magnetisation
 from magshell_fenicsx.parts.magnetism.driven import carried
 from magshell_fenicsx.parts.magnetism.field_step import RotationSection
@@ -30,9 +29,9 @@ def components(direction: Array, field: Magnetisation | None) -> Array:
     return np.ones(1) if field is None or field.in_space else np.array(field.axes) @ direction
 
 
-def field_at(state: State) -> Array:
-    """The components of the field."""
-    return np.array([state.mu[name] for name in FIELD if name in state.mu])
+def field_at(mu: Mapping[str, float]) -> Array:
+    """The components of the field, from all amplitudes."""
+    return np.array([mu[name] for name in FIELD if name in mu])
 
 
 def straight(direction: Array) -> dict[str, Curve]:

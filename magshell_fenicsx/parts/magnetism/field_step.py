@@ -1,5 +1,8 @@
 """The applied field as a load: its strength and its direction."""
 
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from math import acos, degrees
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 import numpy as np
@@ -9,12 +12,26 @@ from pydantic import Field
 from magshell_fenicsx.input.section import Direction
 from magshell_fenicsx.parts.magnetism.fields import MagneticSection, strength
 from magshell_fenicsx.parts.part import Context
-from magshell_fenicsx.parts.step import Drive, Now, PathStep, ProgrammeStep, Step, Target, Until
+from magshell_fenicsx.parts.step import (
+    Ahead,
+    Course,
+    Curves,
+    Drive,
+    Here,
+    Now,
+    PathStep,
+    ProgrammeStep,
+    Step,
+    Target,
+    Until,
+)
 from magshell_fenicsx.shape.symmetry import Leaves
 
 if TYPE_CHECKING:
+    from magshell_fenicsx.models.shell.parameters import Loads
     from magshell_fenicsx.shape.outline import Outline
 
+Array = NDArray[np.float64]
 SAME = 1e-9  # cosine of directions: rounding
 
 
@@ -41,6 +58,32 @@ class FieldSection(PathStep):
     def scale(self, now: Now) -> float:
         return now.size
 
+    def size(self, context: Context) -> float:
+        return strength(context)
+
+    def course(self, here: Here) -> Course:
+        until = "target" if self.until == "zero" else self.until
+        steps = self.points if until == "points" else None
+        return Course(self.drive(self._now(here)), until, steps, self.curves(here))
+
+    def curves(self, here: Here) -> tuple[Curves, float] | None:
+        from magshell_fenicsx.parts.magnetism.direction import straight  # the solver takes long to import
+
+        direction, value = self._along(here)
+        return (straight(direction), value) if direction[1:].any() else None
+
+    def _along(self, here: Here) -> tuple[Array, float]:
+        """The direction by the amplitudes of the field's components, and the field along it."""
+        from magshell_fenicsx.parts.magnetism.direction import components, directions, field_at
+
+        field = here.loads.magnetic
+        direction = components(directions(here.context.steps, field, here.turn)[here.step.number - 1], field)
+        return direction, float(direction @ field_at(here.mu))
+
+    def _now(self, here: Here) -> Now:
+        """The field has no conjugate."""
+        return Now(self._along(here)[1], 0.0, 0.0, here.driven, self.size(here.context), here.h)
+
     @classmethod
     def before(cls, context: Context, loading: Step | None) -> list[tuple[str, Step]]:
         driven = loading is not None and cls.amplitude in (loading.amplitude, *loading.drives)
@@ -56,6 +99,17 @@ class FieldBefore(FieldSection):
 
     def drive(self, now: Now) -> Drive:
         return Drive("arc", "load", now.size, [now.size], now.size / 2, now.size)
+
+    def course(self, here: Here) -> Course:
+        course = super().course(here)
+
+        def forbidden(mu: Mapping[str, float], what: str) -> str:
+            return (
+                f"the field alone makes the shell unstable: critical field lambda_m = {mu[self.amplitude]:.9g} of "
+                f"{course.drive.end or 0.0:g} ({what})"
+            )
+
+        return replace(course, until="limit", forbidden=forbidden, label="field")
 
 
 class RotationSection(Step):
@@ -86,6 +140,42 @@ class RotationSection(Step):
 
     def leaves(self, step: ProgrammeStep, context: Context, outline: "Outline") -> list[Leaves]:
         return [Leaves("the field turns", [self.to.vector()])]
+
+    def changes(self, name: str, mu: Iterable[str]) -> set[str]:
+        return {name} | {other for other in mu if other.startswith("lambda_")}
+
+    def course(self, here: Here) -> Course:
+        from magshell_fenicsx.parts.magnetism import direction as of  # the solver takes long to import
+
+        field, number = here.loads.magnetic, here.step.number
+        ends = of.directions(here.context.steps, field, here.turn)[number - 1 : number + 1]
+        before, after = (of.components(end, field) for end in ends)
+        size, total = float(before @ of.field_at(here.mu)), acos(float(ends[0] @ ends[1]))
+        targets = [float(t) for t in np.linspace(0.0, total, self.points + 1)[1:]]
+        drive = Drive("arc", "load", total, targets, total / self.points, total / self.points)
+        if size == 0:
+            return Course(drive, "limit", impossible="the field is zero and cannot turn")
+
+        def forbidden(mu: Mapping[str, float], what: str) -> str:
+            angle = of.field_angle(mu, field) % 360
+            return f"the turning field makes the shell unstable at {angle:.4g} degrees: {what}"
+
+        whole = field and field.turns
+        curves = of.as_a_whole(turn_name(here.step), total) if whole else of.circle(size, before, after)
+        return Course(drive, "limit", curves=(curves, 0.0), forbidden=forbidden, at_once=True)
+
+    def ahead(self, step: ProgrammeStep, context: Context, loads: "Loads", turn: float) -> Ahead:
+        from magshell_fenicsx.parts.magnetism.direction import directions  # the solver takes long to import
+
+        all_directions = directions(context.steps, loads.magnetic, turn)
+        first, before, after = (all_directions[i] for i in (0, step.number - 1, step.number))
+        there = degrees(acos(float(np.clip(after @ first, -1, 1))))
+        return Ahead("its last direction", there if before @ first > 1 - SAME else None)
+
+
+def turn_name(step: ProgrammeStep) -> str:
+    """The amplitude by which a step of kind: rotation turns a field in space; no user's name has a space."""
+    return f"{step.name} {step.number}"
 
 
 def direction_before(number: int, context: Context) -> NDArray[np.float64] | None:

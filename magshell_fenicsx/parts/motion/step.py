@@ -12,11 +12,12 @@ from magshell_fenicsx.parts.magnetism.field_step import RotationSection
 from magshell_fenicsx.parts.magnetism.fields import MagneticSection, strength
 from magshell_fenicsx.parts.motion.history import History, Time, levels_of, measured, times_of
 from magshell_fenicsx.parts.part import Context
-from magshell_fenicsx.parts.step import Errors, ProgrammeStep, Step
+from magshell_fenicsx.parts.step import Ahead, Errors, ProgrammeStep, Step
 from magshell_fenicsx.shape.symmetry import Leaves, alike
 from magshell_fenicsx.shape.turning import vector_turns, vectors_of
 
 if TYPE_CHECKING:
+    from magshell_fenicsx.models.shell.parameters import Loads
     from magshell_fenicsx.shape.outline import Outline
 
 Rate: TypeAlias = measured("1/second")  # type: ignore[valid-type]
@@ -113,6 +114,13 @@ class TimeSection(Step):
     def drives(self) -> tuple[str, ...]:
         """The amplitudes that follow histories."""
         return tuple("lambda_m" if name == "field" else name for name in self.history)
+
+    @property
+    def motion(self) -> "TimeSection":
+        return self
+
+    def ahead(self, step: ProgrammeStep, context: Context, loads: "Loads", turn: float) -> Ahead:
+        return Ahead("the end", steps=self.points)
 
     @property
     def rests(self) -> bool:

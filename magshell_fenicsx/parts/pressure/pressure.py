@@ -1,12 +1,13 @@
 """A live pressure."""
 
+from dataclasses import replace
 from math import copysign, sqrt
 from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field
 
 from magshell_fenicsx.input.targets import over
-from magshell_fenicsx.parts.step import Fit, Now, PathStep, Target, Until
+from magshell_fenicsx.parts.step import Course, Fit, Here, Now, PathStep, Step, Target, Until
 from magshell_fenicsx.quantities.units import PRESSURE, VOLUME
 
 
@@ -29,6 +30,15 @@ class PressureSection(PathStep):
     """Target p; with control: load or arc [p_c]"""
     volume_change: Annotated[float, over(VOLUME)] | None = Field(default=None, ge=-5, le=5)
     """Target ΔV; with control: volume or arc [R³]"""
+
+    def course(self, here: Here) -> Course:
+        course = super().course(here)
+        if here.open and "control" not in self.model_fields_set:
+            return replace(course, drive=replace(course.drive, control="arc"))
+        return course
+
+    def on_perfect(self, *, last: bool) -> Step:
+        return PressureSection(kind="pressure", control=self.control, hold=self.hold) if last else self
 
     @classmethod
     def implied(cls) -> dict[str, Any]:

@@ -28,10 +28,9 @@ from magshell_fenicsx.continuation.inverse import nearest_to_zero
 from magshell_fenicsx.continuation.system import State, System, Vector, dot
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
-from magshell_fenicsx.parts.magnetism.field_step import RotationSection
 from magshell_fenicsx.parts.motion.mass import mass_along
 from magshell_fenicsx.parts.pressure.gas import gas_by_begin
-from magshell_fenicsx.parts.step import Gas, PathStep, ProgrammeStep
+from magshell_fenicsx.parts.step import Gas, ProgrammeStep
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.results import Functional, Target, force_unit, functional, in_units
 from magshell_fenicsx.simulate.scene import Scene
@@ -312,8 +311,7 @@ def with_begins(adjoint: Adjoint, record: Record, begins: Begins) -> Adjoint:
 
 def _driven(step: ProgrammeStep, mu: Mapping[str, float]) -> set[str]:
     """The amplitudes that a step changes as it is given."""
-    fields = isinstance(step.load, RotationSection)
-    return {step.name} | ({name for name in mu if name.startswith("lambda_")} if fields else set())
+    return step.load.changes(step.name, mu)
 
 
 def by_load(adjoint: Adjoint, name: str) -> float:
@@ -376,8 +374,7 @@ def held_at(
     step = scene.case.programme[record.step - 1] if record.step else None
     if hold is None and step:
         held |= held_by(scene, step, state)
-        load = step.load
-        if isinstance(load, PathStep) and _by_conjugate(load, record):
+        if step.load.by_conjugate(at_target=record.label == "target"):
             held[step.name] = -scene.model.system.potential(state.u, state.mu, step.name)
     for name, how in (hold or {}).items():
         if name not in state.mu or how not in ("load", "conjugate"):
@@ -385,12 +382,6 @@ def held_at(
         if how == "conjugate":
             held[name] = -scene.model.system.potential(state.u, state.mu, name)
     return held
-
-
-def _by_conjugate(load: PathStep, record: Record) -> bool:
-    """Whether the conjugate is what is prescribed at a record."""
-    goal = load.target if record.label == "target" and load.until == "target" else None
-    return load.control == load.conjugate_control or (goal is not None and goal[0].quantity == "conjugate")
 
 
 def along(scene: Scene, adjoint: Adjoint) -> list[tuple[FormTerm, float]]:

@@ -10,7 +10,7 @@ from magshell_fenicsx.assembly.motion import Motion, moved
 from magshell_fenicsx.input.expressions import FormulasInSpace, with_derivatives
 from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.parts.magnetism.driven import Driven, FieldInSpace
-from magshell_fenicsx.parts.magnetism.field_step import RotationSection
+from magshell_fenicsx.parts.magnetism.field_step import RotationSection, turn_name
 from magshell_fenicsx.parts.magnetism.fields import AppliedSection, MagneticSection
 from magshell_fenicsx.parts.magnetism.source_step import SourceStep
 from magshell_fenicsx.parts.magnetism.sources.source import Array, Placed
@@ -45,11 +45,6 @@ class Sum:
             for whole, own in zip((B, G, H), part(x), strict=True):
                 whole += own
         return B, G, H
-
-
-def turn_name(step: ProgrammeStep) -> str:
-    """The amplitude by which a step of kind: rotation turns a field in space; no user's name has a space."""
-    return f"{step.name} {step.number}"
 
 
 def placed(context: Context, turn: float = 0.0) -> list[Placed]:
