@@ -173,6 +173,7 @@ NAMES = {
     "over",
     "kind",
     "control",
+    "errors",
     "until",
     "radius",
     "name",
