@@ -81,11 +81,11 @@ def refuse_crossing(stage: Stage, low: Point, high: Point) -> None:
         With the magnet.
     """
     model, states = stage.scene.model, [stage.leave(point.state) for point in (low, high)]
-    for known in model.fields:
+    for field in model.fields:
         ends = list[tuple[NDArray[np.float64], Mapping[str, float]]]()
         for state in states:
-            ends.append((model.system.at(state).of(partial(getattr, known, "places")), state.mu))
-        if said := [each for each in model.system.comm.allgather(known.passed(*ends)) if each]:
+            ends.append((model.system.at(state).of(partial(getattr, field, "places")), state.mu))
+        if said := [each for each in model.system.comm.allgather(field.passed(*ends)) if each]:
             raise PathStopped(said[0], low, final=True)
 
 

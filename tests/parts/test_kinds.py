@@ -1,0 +1,54 @@
+"""The kinds of bodies, imperfections and sources: every file is in the list, and lengths are found by their types."""
+
+from importlib import import_module
+from pathlib import Path
+from pkgutil import iter_modules
+from typing import Any, get_args
+
+import pytest
+
+from magshell_fenicsx import Case
+from magshell_fenicsx.input.section import Section
+from magshell_fenicsx.parts.kinds import REGISTERED, section_of
+
+PARTS = "magshell_fenicsx.parts"
+
+
+def kinds_of(module: str) -> set[str]:
+    """The kinds of the sections that a module defines."""
+    own = [each for each in vars(import_module(module)).values() if getattr(each, "__module__", "") == module]
+    fields = [each.model_fields.get("kind") for each in own if isinstance(each, type) and issubclass(each, Section)]
+    return {kind for field in fields if field for kind in get_args(field.annotation)}
+
+
+@pytest.mark.parametrize("room", REGISTERED)
+def test_every_file_with_a_kind_is_in_the_list(room: str) -> None:
+    """But for steps, which have a list of their own."""
+    (folder,) = import_module(f"{PARTS}.{room}").__path__
+    names = [each.name for each in iter_modules([folder])]
+    files = {name for name in names if name in kinds_of(f"{PARTS}.{room}.{name}")}
+    assert files == set(REGISTERED[room])
+    for kind in REGISTERED[room]:
+        assert Path(str(import_module(section_of(room, kind).__module__).__file__)).stem == kind
+
+
+CAP = {"geometry": "cap", "radius": 1.0, "thickness": 0.02, "poisson_ratio": 0.3}
+DIMPLE = {"kind": "dimple", "amplitude": 1.0, "width": 3.0, "at": {"point": ["0 mm", 0.0, 1.0]}}
+
+
+@pytest.mark.parametrize(
+    ("key", "shell", "body"),
+    [
+        ("bodies.a.radius", {}, {"kind": "sphere", "radius": "2 mm"}),
+        ("bodies.a.edge", {}, {"kind": "rod", "radius": 0.2, "edge": "1 mm"}),
+        ("bodies.a.size", {}, {"kind": "box", "size": [1, 1, "2 m"], "edge": 0.1, "axis": [1, 0, 0]}),
+        ("bodies.a.position", {}, {"kind": "plane", "position": [0, 0, "2 mm"]}),
+        ("bodies.a.at.point", {}, {"kind": "plane", "at": {"point": [0, 0, "1 m"]}}),
+        ("shell.imperfections.0.at.point", {"imperfections": [DIMPLE]}, None),
+        ("shell.defect.at.point", {"defect": DIMPLE}, None),
+    ],
+)
+def test_a_unit_beside_a_shell_without_one(key: str, shell: dict[str, Any], body: dict[str, Any] | None) -> None:
+    bodies = {"a": body} if body else {}
+    with pytest.raises(ValueError, match=rf"{key}: has a unit, but the shell's lengths have none"):
+        Case.model_validate({"shell": CAP | shell, "boundary": {"rim": "clamped"}, "bodies": bodies})
