@@ -1,6 +1,6 @@
 """Comparison of a case as a shell and as a solid: curve against curve, error against run time."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, fields
 from math import copysign
@@ -172,12 +172,8 @@ def places(runs: Sequence[ModelRun]) -> list[float]:
 
 def differences(shell: ModelRun, solid: ModelRun) -> list[Difference]:
     """The differences at the displacements that both runs reach."""
-    found = []
-    for place in places([shell, solid]):
-        loads = [load_at(run, place) for run in (shell, solid)]
-        if loads[0] is not None and loads[1] is not None:
-            found.append(Difference(place, loads[0], loads[1]))
-    return found
+    both = ((place, load_at(shell, place), load_at(solid, place)) for place in places([shell, solid]))
+    return [Difference(place, one, two) for place, one, two in both if one is not None and two is not None]
 
 
 def load_at(run: ModelRun, w: float) -> float | None:
@@ -185,18 +181,20 @@ def load_at(run: ModelRun, w: float) -> float | None:
     return Scalar("", amplitude(amplitude_of(run)).column, W, w).of(run.summary, loaded(run))
 
 
-def judged(runs: Sequence[ModelRun], at: float | None, scalar: Scalar | None = None) -> tuple[str, list[float | None]]:
-    """The name and the values of the compared number.
+def judge(
+    runs: Sequence[ModelRun], at: float | None, scalar: Scalar | None
+) -> tuple[str, Callable[[ModelRun], float | None]]:
+    """The name of the compared number, and what gives it of a run.
 
     That is what is asked for; else k_d if all runs have it, else the load at a displacement.
     """
+    if scalar is None and all(run.summary["knockdown"] is not None for run in runs):
+        scalar = parse_scalar("knockdown")
     if scalar:
-        return scalar.name, [scalar.of(run.summary, run.rows) for run in runs]
-    if all(run.summary["knockdown"] is not None for run in runs):
-        return "knockdown", [float(run.summary["knockdown"]) for run in runs]
+        return scalar.name, lambda run: scalar.of(run.summary, run.rows)
     if at is None:
-        return "nothing", [None for _ in runs]
-    return f"{amplitude(amplitude_of(runs[0])).column} at w/h = {at:g}", [load_at(run, at) for run in runs]
+        return "nothing", lambda run: None
+    return f"{amplitude(amplitude_of(runs[0])).column} at w/h = {at:g}", lambda run: load_at(run, at)
 
 
 def time_at(error: float, runs: Sequence[tuple[float, float]]) -> float | None:
@@ -287,20 +285,20 @@ def compare(
         if amplitude_of(shell) != amplitude_of(solid):
             ends = [amplitude_of(run) for run in (shell, solid)]
             raise CaseError(f"compare: the shell ended while {ends[0]} varied, the solid while {ends[1]} did")
-        found = differences(shell, solid)
+        differing = differences(shell, solid)
         at = max(places([run for model in MODELS for run in runs[model]]), default=None)
-        content = {"case": file.name, **_content(runs, at, found, scalar)}
-        by_first(MPI.COMM_SELF, lambda: _write(content, found, folder))
+        content = {"case": file.name, **_content(runs, at, differing, scalar)}
+        by_first(MPI.COMM_SELF, lambda: _write(content, differing, folder))
         errors: Errors = {
             model: [(run["error"], run["cpu_s"]) for run in content["runs"][model] if run["error"]] for model in MODELS
         }
         title = f"{file.name} {' '.join(settings)}".strip()
-        draw_comparison(shell, solid, found, errors, title, folder / "compare.png")
-    return Comparison(found, content)
+        draw_comparison(shell, solid, differing, errors, title, folder / "compare.png")
+    return Comparison(differing, content)
 
 
-def _write(content: Mapping[str, Any], found: Sequence[Difference], folder: Path) -> None:
-    rows = [{**asdict(d), "relative": d.relative} for d in found]
+def _write(content: Mapping[str, Any], differing: Sequence[Difference], folder: Path) -> None:
+    rows = [{**asdict(d), "relative": d.relative} for d in differing]
     write_csv(rows, (*(f.name for f in fields(Difference)), "relative"), folder / "compare.csv")
     write_object(folder / "compare.json", content, indent=2)
 
@@ -318,26 +316,26 @@ def parse_refinements(shell: str, solid: str) -> dict[ModelName, list[float]]:
     >>> parse_refinements("1", "0.5,1")
     {'shell': [1.0], 'solid': [0.5, 1.0]}
     """
-    found: dict[ModelName, list[float]] = {}
+    refinements: dict[ModelName, list[float]] = {}
     for model, text in zip(MODELS, (shell, solid), strict=True):
         try:
-            found[model] = [float(part) for part in text.split(",")]
+            refinements[model] = [float(part) for part in text.split(",")]
         except ValueError:
-            found[model] = []
-        if not found[model] or not all(0.1 <= r <= 20 for r in found[model]):
+            refinements[model] = []
+        if not refinements[model] or not all(0.1 <= r <= 20 for r in refinements[model]):
             raise CaseError(f"--{model} {text}: write refinements from 0.1 to 20, for example 0.5,0.7,1")
-    return found
+    return refinements
 
 
 def _content(
-    runs: dict[ModelName, list[ModelRun]], at: float | None, found: Sequence[Difference], scalar: Scalar | None
+    runs: dict[ModelName, list[ModelRun]], at: float | None, differing: Sequence[Difference], scalar: Scalar | None
 ) -> dict[str, Any]:
     accounts: dict[ModelName, list[dict[str, Any]]] = {}
     limits: dict[str, float | None] = {}
     seconds: dict[str, float | None] = {}
-    name, judgements = judged([run for series in runs.values() for run in series], at, scalar)
+    name, value_of = judge([run for series in runs.values() for run in series], at, scalar)
     for model, series in runs.items():
-        values, judgements = judgements[: len(series)], judgements[len(series) :]
+        values = [value_of(run) for run in series]
         limit = extrapolated(values, [run.refinement for run in series])
         errors = [abs(v / limit - 1) if v is not None and limit else None for v in values]
         accounts[model] = [
@@ -361,7 +359,7 @@ def _content(
     return {
         "result": name,
         "difference": both[1] / both[0] - 1 if None not in both else None,
-        "largest_difference_of_the_curves": max((abs(d.relative) for d in found), default=None),
+        "largest_difference_of_the_curves": max((abs(d.relative) for d in differing), default=None),
         "limits": limits,
         "seconds_to_one_percent": seconds,
         "ratio_at_one_percent": times[1] / times[0] if times[0] and times[1] else None,
@@ -387,7 +385,7 @@ def extrapolated(values: Sequence[float | None], refinements: Sequence[float]) -
 
 
 def draw_comparison(
-    shell: ModelRun, solid: ModelRun, found: Sequence[Difference], errors: Errors, title: str, file: Path
+    shell: ModelRun, solid: ModelRun, differing: Sequence[Difference], errors: Errors, title: str, file: Path
 ) -> None:
     """Write the picture.
 
@@ -398,7 +396,7 @@ def draw_comparison(
     """
     from matplotlib.figure import Figure
 
-    panels = 1 + bool(found) + any(errors.values())
+    panels = 1 + bool(differing) + any(errors.values())
     figure = Figure(figsize=(4.4 * panels, 3.7), dpi=160, layout="constrained")
     varied = amplitude(amplitude_of(shell))
     x_label, y_label = f"{quantity('w_over_h').latex} {varied.place} since the field", quantity(varied.column).label
@@ -407,8 +405,8 @@ def draw_comparison(
     first.plot(*curve(solid), "o", color="C3", markersize=4, fillstyle="none", label=f"solid, {solid.dofs} unknowns")
     first.set(xlabel=x_label, ylabel=y_label)
     first.legend(frameon=False, fontsize=8)
-    if found:
-        others[0].plot([d.w_over_h for d in found], [100 * d.relative for d in found], ".-", color="C3")
+    if differing:
+        others[0].plot([d.w_over_h for d in differing], [100 * d.relative for d in differing], ".-", color="C3")
         others[0].axhline(0, color="0.8", linewidth=0.8, zorder=0)
         others[0].set(xlabel=x_label, ylabel="solid over shell, difference (%)")
     if any(errors.values()):

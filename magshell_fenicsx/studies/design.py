@@ -292,12 +292,12 @@ def verified(made: Design, best: Evaluation, comm: MPI.Intracomm) -> dict[str, A
     for target in wanted.targets.values():
         seen["rms_distance"], seen[DISTANCE] = distances(result.scene, result.last, target)
     for name, value in (values | seen).items():
-        here = best.values.get(name, best.seen.get(name))
+        designed = best.values.get(name, best.seen.get(name))
         if value is None:
             say(f"verified ({how}): no {name}{f': {result.stopped}' if result.stopped else ''}")
-        elif here is not None:
-            away = value / here - 1
-            say(f"verified ({how}): {name} = {value:.9g}, {_beside(away)} the design's {here:.9g}")
+        elif designed is not None:
+            away = value / designed - 1
+            say(f"verified ({how}): {name} = {value:.9g}, {_beside(away)} the design's {designed:.9g}")
             if abs(away) > FAR:
                 say(f"warning: {name} is another one there: the mesh is too coarse, or there are several equilibria")
     modes = [f"{p['kind']} {p['mode']}".strip() for p in result.limit_points if p["mode"]]
@@ -312,9 +312,9 @@ def _value(result: Result, name: str) -> float | None:
     if name == MASS:
         return mass(result.scene)[0]
     if name in FOLDS:
-        found = (p for p in result.limit_points if p["amplitude"] == FOLDS[name] and not p["branch"])
+        points = (p for p in result.limit_points if p["amplitude"] == FOLDS[name] and not p["branch"])
         size = result.scene.sizes.of[SCALES[name]] if name in SCALES else 1.0
-        return next((size * float(p["value"]) for p in found), None)
+        return next((size * float(p["value"]) for p in points), None)
     if name == BARRIER:
         return result.barrier
     if not result.rows:

@@ -7,6 +7,7 @@ import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
+from magshell_fenicsx.assembly.forms import FieldGradient
 from magshell_fenicsx.continuation.fold import FoldLost
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.simulate.adapt.ending import History
@@ -90,28 +91,27 @@ def evaluate(
         lost = str(e)
     lost = lost or next((text for text in remarks if text.startswith(BEYOND)), "")
     made, notes = Evaluation(), [f"the path is lost: {lost}"] if lost else []
+
+    def slope(by: Mapping[str, float | FieldGradient]) -> list[float]:
+        return [float(v) for v in variables.gradient(x, scene, by)]
+
     try:
         for result in results:
             if result == MASS:
                 made.values[result], by_thickness = mass(scene)
-                slope = variables.gradient(x, scene, {"thickness": by_thickness} if by_thickness else {})
-                made.gradients[result] = [float(v) for v in slope]
+                made.gradients[result] = slope({"thickness": by_thickness} if by_thickness else {})
                 continue
             if lost and result not in FOLDS:
                 return Evaluation(note=notes[0])
             if result in LOWEST:
-                found = _lowest(scene, records, result, history.begins)
-                notes.append("lowest: " + ", ".join(f"{name or 'mode'} at {each.shown:.6g}" for name, each in found))
+                adjoints = _lowest(scene, records, result, history.begins)
+                notes.append("lowest: " + ", ".join(f"{mode or 'mode'} at {each.shown:.6g}" for mode, each in adjoints))
             else:
                 refuse_moving(scene, records[-1], targets.get(result, result))
-                found = [adjoint_at_end(scene, history, targets.get(result, result))]
-                notes += [f"{result}: {kind}" for kind, _ in found if kind]
-            slopes = [
-                variables.gradient(x, scene, {name: derivative(each, name) for name in variables.names})
-                for _, each in found
-            ]
+                adjoints = [adjoint_at_end(scene, history, targets.get(result, result))]
+                notes += [f"{result}: {kind}" for kind, _ in adjoints if kind]
             (made.values[result], made.gradients[result]), *others = [
-                (each.shown, [float(v) for v in slope]) for (_, each), slope in zip(found, slopes, strict=True)
+                (each.shown, slope({name: derivative(each, name) for name in variables.names})) for _, each in adjoints
             ]
             if result in LOWEST:
                 made.beside[result] = others

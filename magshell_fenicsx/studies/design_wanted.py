@@ -58,11 +58,11 @@ class Limit:
 def limits_of(section: LimitSection, scale: Mapping[str, float]) -> list[Limit]:
     """Those of a section of a case; `scale` has the sizes of results at the start."""
     sides = ((section.least, 1.0), (section.most, -1.0))
-    found = [Limit(section.of, sign, bound) for bound, sign in sides if bound is not None]
+    limits = [Limit(section.of, sign, bound) for bound, sign in sides if bound is not None]
     if section.same_as:
         margin = EQUAL * max(scale.get(of, 0.0) for of in (section.of, section.same_as))
-        found += [Limit(section.of, sign, other=section.same_as, margin=margin) for sign in (1.0, -1.0)]
-    return found
+        limits += [Limit(section.of, sign, other=section.same_as, margin=margin) for sign in (1.0, -1.0)]
+    return limits
 
 
 def target_of(section: ShapeSection, case: Case, bent: float = 1.0) -> Target:
@@ -106,15 +106,15 @@ def _bent(points: Array, part: float) -> Array:
     steps = np.diff(points, axis=0)
     length = np.linalg.norm(steps, axis=1, keepdims=True)
     tangents = steps / length
-    found, turned = [tangents[0]], np.eye(3)  # from the frame of the curve to that of the bent one
+    directions, turned = [tangents[0]], np.eye(3)  # from the frame of the curve to that of the bent one
     for before, after in itertools.pairwise(tangents):
         turn = np.cross(before, after)
         angle = np.arctan2(np.linalg.norm(turn), before @ after)
         axis = turn * (angle / max(float(np.linalg.norm(turn)), 1e-300))
         back = scipy.spatial.transform.Rotation.from_rotvec(-axis).as_matrix()
         turned = turned @ scipy.spatial.transform.Rotation.from_rotvec(part * axis).as_matrix() @ back
-        found.append(turned @ after)
-    return np.vstack([points[:1], points[0] + np.cumsum(length * np.array(found), axis=0)])
+        directions.append(turned @ after)
+    return np.vstack([points[:1], points[0] + np.cumsum(length * np.array(directions), axis=0)])
 
 
 @dataclass
@@ -290,9 +290,9 @@ def _raised(
     last = _last_known(evaluated)
 
     def above(z: Array) -> Array:
-        evaluation, found = last(z[:-1])
+        evaluation, known = last(z[:-1])
         values: Array = np.concatenate([goal.lowest_values(evaluation) - z[-1], goal.constraints(evaluation)])
-        return values if found else np.full_like(values, -WORSE)
+        return values if known else np.full_like(values, -WORSE)
 
     def slopes(z: Array) -> Array:
         evaluation, _ = last(z[:-1])

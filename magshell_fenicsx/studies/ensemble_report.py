@@ -23,11 +23,11 @@ def report(content: Mapping[str, Any], rows: Sequence[Row], ending: str = "") ->
     """
     table = f"samples{ending}.csv"
     counts, fit = content["counts"], content["weibull"]
-    told = ", ".join(f"{number} {STATUS[name]}" for name, number in counts.items() if name != "samples")
+    counted = ", ".join(f"{number} {STATUS[name]}" for name, number in counts.items() if name != "samples")
     lines = [
         f"# {content['result']} of {content['case']}: {counts['samples']} random samples",
         "",
-        f"Seed {content['seed']}; {told}. Mean CPU time of a sample: {content['cpu_s_per_sample']:.3g} s.",
+        f"Seed {content['seed']}; {counted}. Mean CPU time of a sample: {content['cpu_s_per_sample']:.3g} s.",
         "Sample k is drawn from the seed and k alone. Intervals are bootstrap intervals of "
         f"{100 * content['level']:.0f} %, by percentiles. [{table}]({table}) has all samples.",
         "",
@@ -93,7 +93,7 @@ def draw_ensemble(rows: Sequence[Row], name: str, file: Path) -> None:
     figure = Figure(figsize=(4.2 * panels, 3.6), dpi=160, layout="constrained")
     histogram, function, *others = figure.subplots(1, panels, squeeze=False)[0]
     if len(values):
-        x, found = np.linspace(values.min(), values.max(), 300), fit(values)
+        x, fitted = np.linspace(values.min(), values.max(), 300), fit(values)
         histogram.hist(values, bins="auto" if np.ptp(values) > 0 else 1, density=True, color="C0", alpha=0.4)
         ordered = np.sort(values)
         part = np.arange(len(values) + 1) / len(values)
@@ -101,9 +101,9 @@ def draw_ensemble(rows: Sequence[Row], name: str, file: Path) -> None:
         if len(less := np.sort(results(rows, WITHOUT))):
             part = np.arange(1, len(less) + 1) / len(less)
             function.step(less, part, where="post", color="C2", linewidth=1, label="without the weakest defects")
-        if found:
-            histogram.plot(x, found.density(x), color="C3")
-            function.plot(x, found.below(x), color="C3", label=f"Weibull, shape {found.shape:.3g}")
+        if fitted:
+            histogram.plot(x, fitted.density(x), color="C3")
+            function.plot(x, fitted.below(x), color="C3", label=f"Weibull, shape {fitted.shape:.3g}")
         function.legend(frameon=False, fontsize=8)
     histogram.set(xlabel=label, ylabel="probability density")
     function.set(xlabel=label, ylabel="probability of a smaller value", ylim=(0, 1))

@@ -24,6 +24,7 @@ from magshell_fenicsx.output.store.durable import write_object
 from magshell_fenicsx.output.store.folder import DiskError, held_folder, prepare_folder, refuse_others
 from magshell_fenicsx.output.store.table import COLUMNS, Row
 from magshell_fenicsx.platform import sources
+from magshell_fenicsx.runs.snaps import snaps
 from magshell_fenicsx.runs.summary import Result, in_units
 from magshell_fenicsx.studies.results import Scalar
 
@@ -220,6 +221,8 @@ class Outcome:
         CPU time of a sample of an ensemble.
     in_units
         Numbers of a case with units, as in summary.json.
+    snaps
+        As in summary.json.
     """
 
     knockdown: float | None
@@ -233,6 +236,7 @@ class Outcome:
     barrier: float | None = None
     cpu_s: float = 0.0
     in_units: dict[str, float] = field(default_factory=dict)
+    snaps: list[dict[str, Any]] = field(default_factory=list)
 
     @classmethod
     def failed(cls, why: str, wall_s: float = 0.0, factorisations: int = 0) -> "Outcome":
@@ -244,7 +248,7 @@ class Outcome:
         if not self.curve:
             return None
         limits = [self.limit] if self.limit else []
-        summary = {"knockdown": self.knockdown, "barrier": self.barrier, "limit_points": limits}
+        summary = {"knockdown": self.knockdown, "barrier": self.barrier, "limit_points": limits, "snaps": self.snaps}
         return scalar.of(summary, [{key: str(v) for key, v in row.items()} for row in self.curve])
 
     def serves(self, scalar: Scalar) -> bool:
@@ -277,6 +281,7 @@ def outcome_of(
         factorisations=factorisations,
         barrier=result.barrier,
         in_units=in_units(result),
+        snaps=snaps(result.rows) if found == "path" else [],
     )
 
 
@@ -286,14 +291,14 @@ def _event(result: Result) -> dict[str, Any] | None:
     until = getattr(steps[-1].load, "until", "") if steps else ""
     if result.stopped or last["amplitude"] != "time" or until not in ("event", "instability"):
         return None
-    known = {key: last[key] for key in ("p_over_pc", "w_pole_over_h", "amplitude")}
-    return {**known, "kind": until, "mode": "", "value": last["time"]}
+    common = {key: last[key] for key in ("p_over_pc", "w_pole_over_h", "amplitude")}
+    return {**common, "kind": until, "mode": "", "value": last["time"]}
 
 
 def keep_outcome(outcome: Outcome, case: Case, file: Path) -> None:
     """Write the outcome of a case."""
-    known = {"case": case.model_dump(mode="json", exclude_none=True), **case.outside, "sources": sources.ours()}
-    keep(file, {**known, "outcome": asdict(outcome)})
+    origin = {"case": case.model_dump(mode="json", exclude_none=True), **case.outside, "sources": sources.ours()}
+    keep(file, {**origin, "outcome": asdict(outcome)})
 
 
 def kept_outcome(file: Path) -> Outcome | None:

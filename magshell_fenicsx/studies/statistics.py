@@ -79,11 +79,11 @@ def _columns(values: Mapping[str, Any]) -> Row:
     >>> _columns({"shell.thickness": "0.25 mm", "shell.poisson_ratio": 0.5})
     {'shell.thickness_mm': 0.25, 'shell.poisson_ratio': 0.5}
     """
-    found = {}
+    columns = {}
     for key, value in values.items():
         number, unit = number_and_unit(value) if isinstance(value, str) else ("", "")
-        found[f"{key}_{unit}" if unit else key] = float(number) if unit else value
-    return found
+        columns[f"{key}_{unit}" if unit else key] = float(number) if unit else value
+    return columns
 
 
 def severest_keys(rows: Sequence[Row]) -> list[str]:
@@ -149,25 +149,25 @@ def moments(values: Array) -> dict[str, Any]:
 
 
 def _weibull(values: Array) -> dict[str, Any] | None:
-    found = fit(values) if len(values) else None
-    if found is None:
+    fitted = fit(values) if len(values) else None
+    if fitted is None:
         return None
-    return {**asdict(found), "quantile_1_percent": found.quantile(0.01), "distance": distance(values, found)}
+    return {**asdict(fitted), "quantile_1_percent": fitted.quantile(0.01), "distance": distance(values, fitted)}
 
 
 def correlations(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
     """The correlation of the result with the most severe defect and with every key: Pearson's and Spearman's."""
     from scipy.stats import pearsonr, spearmanr
 
-    found = {}
+    correlated = {}
     drawn = [key for key in drawn_keys(rows) if not key.startswith("shell.imperfections.")]
     for key in (*severest_keys(rows), *drawn):
         pairs = np.array([(x, y) for row in rows if _is_number(x := row.get(key)) and (y := row[RESULT]) is not None])
         if len(pairs) < LEAST or not np.ptp(pairs, axis=0).all():
             continue
         x, y = pairs.T
-        found[key] = {"pearson": float(pearsonr(x, y)[0]), "spearman": float(spearmanr(x, y)[0])}
-    return found
+        correlated[key] = {"pearson": float(pearsonr(x, y)[0]), "spearman": float(spearmanr(x, y)[0])}
+    return correlated
 
 
 def _is_number(value: Any) -> bool:
@@ -283,7 +283,7 @@ def intervals(values: Sequence[float] | Array, seed: int, count: int = 400) -> d
         Of the resampling, and its number.
     """
     x, rng = np.asarray(values, dtype=float), np.random.default_rng(seed)
-    found: dict[str, list[float]] = {}
+    resampled: dict[str, list[float]] = {}
     for _ in range(count):
         again = rng.choice(x, len(x))
         numbers = {"mean": float(again.mean()), "deviation": float(again.std(ddof=1))}
@@ -291,6 +291,6 @@ def intervals(values: Sequence[float] | Array, seed: int, count: int = 400) -> d
             numbers |= {"shape": one.shape, "location": one.location, "scale": one.scale}
             numbers["quantile_1_percent"] = one.quantile(0.01)
         for name, value in numbers.items():
-            found.setdefault(name, []).append(value)
+            resampled.setdefault(name, []).append(value)
     ends = (0.5 - LEVEL / 2, 0.5 + LEVEL / 2)
-    return {name: tuple(map(float, np.quantile(many, ends))) for name, many in found.items()}  # type: ignore[misc]
+    return {name: tuple(map(float, np.quantile(many, ends))) for name, many in resampled.items()}  # type: ignore[misc]

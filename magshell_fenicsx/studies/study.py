@@ -173,6 +173,6 @@ def _outcome(measured: Measured, scalar: Scalar) -> str:
     if measured.summary is None:
         return f"stopped early: {measured.failure}"
     value = scalar.of(measured.summary, measured.rows)
-    found = f"{scalar.name} = {value:.9g}" if value is not None else f"no {scalar.name}"
+    reached = f"{scalar.name} = {value:.9g}" if value is not None else f"no {scalar.name}"
     stopped = measured.summary["stopped"]
-    return f"{found}, {measured.typical('wall_s'):.2f} s" + (f", stopped early: {stopped}" if stopped else "")
+    return f"{reached}, {measured.typical('wall_s'):.2f} s" + (f", stopped early: {stopped}" if stopped else "")

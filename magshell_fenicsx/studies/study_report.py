@@ -293,10 +293,10 @@ def _series(rows: Sequence[Row], keys: Sequence[str]) -> dict[str, list[Row]]:
     """Series of rows that differ only in the mesh size, by a label of their common values."""
     names = [*(key for key in keys if key != REFINEMENT), "ranks"]
     shown = [name for name in names if len({row[name] for row in rows}) > 1]
-    found: dict[str, list[Row]] = {}
+    series: dict[str, list[Row]] = {}
     for row in sorted(rows, key=lambda r: r["dofs"]):
-        found.setdefault(", ".join(f"{short(name)} {row[name]}" for name in shown) or "runs", []).append(row)
-    return found
+        series.setdefault(", ".join(f"{short(name)} {row[name]}" for name in shown) or "runs", []).append(row)
+    return series
 
 
 def _errors(axes: Any, series: dict[str, list[Row]], quantity: str, own_error: float | None) -> None:

@@ -9,11 +9,12 @@ import hashlib
 import json
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from mpi4py import MPI
+from pydantic import TypeAdapter, ValidationError
 
 from magshell_fenicsx.continuation.fold import FoldLost
 from magshell_fenicsx.input.source import CaseError, Source
@@ -337,7 +338,7 @@ def with_earlier(
     left = [values for values in earlier if _place(values, merged) not in places]
     if (count := len(left) + len(asked)) > MOST_POINTS:
         raise CaseError(f"--out {folder}: {count} points with those there; allowed at most {MOST_POINTS}")
-    write_object(folder / NAME, {"keys": keys, "base": base, "points": [*left, *asked]})
+    write_object(folder / NAME, asdict(Listed(keys, base, [*left, *asked])))
     return [*(make_point(source, axes, values, made) for values in left), *points]
 
 
@@ -347,6 +348,15 @@ def _place(values: Sequence[str], axes: Sequence[Axis]) -> tuple[str, ...]:
     return tuple(f"{axis.number(value):.10g}" if axis.numbers else value for value, axis in pairs)
 
 
+@dataclass(frozen=True)
+class Listed:
+    """What sweep.json says: the swept keys, a hash of the case without them, and the values of all points."""
+
+    keys: list[list[str]]
+    base: str
+    points: list[list[str]]
+
+
 def _earlier(folder: Path, keys: list[list[str]], base: str) -> list[list[str]]:
     """The values of the points of the folder's sweep."""
     file = folder / NAME
@@ -354,25 +364,20 @@ def _earlier(folder: Path, keys: list[list[str]], base: str) -> list[list[str]]:
         if (folder / TABLE).exists() and (folder / TABLE).stat().st_size:
             raise CaseError(f"--out {folder}: has a sweep.csv of an earlier version; give another folder")
         return []
-    known = read_object(file)
-    over, points = known.get("keys"), known.get("points")
-    if not (isinstance(known.get("base"), str) and _are_words(over) and _are_words(points, of=len(over or ""))):
+    try:
+        listed = TypeAdapter(Listed).validate_python(read_object(file))
+    except ValidationError:
+        listed = None
+    if listed is None or any(len(values) != len(listed.keys) for values in listed.points):
         raise Damaged(f"{file}: is damaged: no keys, base and points of a sweep")
-    if over != keys:
-        said = " and ".join("+".join(each) for each in known["keys"])
+    if listed.keys != keys:
+        said = " and ".join("+".join(each) for each in listed.keys)
         raise CaseError(f"--out {folder}: has a sweep over {said}, which is kept; give another folder for other keys")
-    if known["base"] != base:
+    if listed.base != base:
         raise CaseError(
             f"--out {folder}: has a sweep of another case or other --set, which is kept; give another folder"
         )
-    return list(known["points"])
-
-
-def _are_words(lists: object, of: int | None = None) -> bool:
-    """Whether it is a list of lists of text, each with so many items."""
-    return isinstance(lists, list) and all(
-        isinstance(each, list) and of in (None, len(each)) and all(isinstance(v, str) for v in each) for each in lists
-    )
+    return listed.points
 
 
 def _base(source: Source, axes: Sequence[Axis]) -> str:
