@@ -21,6 +21,8 @@ class Sized(Protocol):
     @property
     def poisson_ratio(self) -> float: ...
     @property
+    def density(self) -> float | None: ...
+    @property
     def reference(self) -> float: ...
     @property
     def with_units(self) -> bool: ...
@@ -31,7 +33,8 @@ def given(shell: Sized) -> Given:
     in_pascals = shell.with_units or shell.geometry in ("hemisphere", "disc", "strip")  # whose E always has a unit
     R = shell.reference if shell.with_units else nan
     E = shell.youngs_modulus if in_pascals and shell.youngs_modulus else nan
-    return Given(shell.poisson_ratio, shell.R_over_h, R, E)
+    rho = shell.density if shell.with_units and shell.density else nan
+    return Given(shell.poisson_ratio, shell.R_over_h, R, E, rho)
 
 
 def _note(shell: Any, info: ValidationInfo) -> Any:
@@ -55,8 +58,7 @@ def over(unit: Unit) -> BeforeValidator:
         shell = (info.context or {}).get("given")
         size = unit.size(shell) if shell else nan
         if isnan(size):
-            needed = "youngs_modulus and lengths of the shell with units"
-            raise ValueError(f"has a unit: that needs {needed}; a number is in {unit.key}")
+            raise ValueError(f"has a unit: that needs {unit.needs}; a number is in {unit.key}")
         return exact / size
 
     return BeforeValidator(convert, json_schema_input_type=float | with_unit(unit.text))

@@ -31,6 +31,7 @@ KINDS_OF_STEPS: dict[str, str] = {
     "contact": "bodies.press.ContactSection",
     "source": "magnetism.source_step.SourceStep",
     "time": "motion.step.TimeSection",
+    "spin": "spin.SpinStep",
 }
 FIRST = ("natural", "field")  # the kinds of which steps may come before the one load of a case, in their order
 

@@ -11,7 +11,10 @@ from pydantic import Discriminator, Field, Tag, model_validator
 from magshell_fenicsx.input.section import Pressure, Section
 from magshell_fenicsx.mesh.grading import Feature
 from magshell_fenicsx.mesh.mirror import rotation
+from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.parts.part import Context, Modelled
+from magshell_fenicsx.quantities.quantity import Quantity
+from magshell_fenicsx.quantities.registry import register
 from magshell_fenicsx.shape.symmetry import Leaves
 
 if TYPE_CHECKING:
@@ -262,6 +265,8 @@ class Step(Section):
 
     Attributes
     ----------
+    quantities
+        The columns that it adds to path.csv.
     amplitude
         Name of the amplitude that it drives.
     conjugate
@@ -282,6 +287,7 @@ class Step(Section):
         Whether it begins where something touches the shell first.
     """
 
+    quantities: ClassVar[tuple[Quantity, ...]] = ()
     amplitude: ClassVar[str]
     conjugate: ClassVar[str] = ""
     released: ClassVar[str] = ""
@@ -298,6 +304,10 @@ class Step(Section):
     `until: limit` also this step's own amplitude: `conjugate` finds the instability at held volume or displacement"""
     search: SearchSection | None = None
     """Search for further solutions at the end of the step"""
+
+    @classmethod
+    def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
+        register(cls.quantities)
 
     @property
     def place(self) -> Any:
@@ -394,6 +404,14 @@ class Step(Section):
         ValueError
             With the key and what is allowed.
         """
+
+    def terms(self, step: "ProgrammeStep", context: Context) -> list[OwnTerm]:
+        """Energies with its amplitude, from nothing but their densities; see `OwnTerm`."""
+        return []
+
+    def account(self, step: "ProgrammeStep", context: Context) -> str:
+        """The line of `magshell check`, if nothing else says it."""
+        return ""
 
     def leaves(self, step: "ProgrammeStep", context: Context, outline: "Outline") -> list[Leaves]:
         """The symmetry that it leaves of a shell."""

@@ -61,6 +61,8 @@ def account(case: Case, loads: Loads, model: str, mirror: Mirror | None, rims: i
         included.append(_imperfections(case, rims))
     for name, keys in grown_by(case.programme, case.imperfections).items():
         included.append(f"{name} grows: {', '.join(keys)}")
+    for step in {step.name: step for step in case.programme}.values():
+        included += [said] if (said := step.load.account(step, case.context)) else []
     for key, part in PARTS.items():
         if key in case.parts:
             included.append(case.parts[key].account(case.scales))

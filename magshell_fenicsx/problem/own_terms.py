@@ -12,7 +12,7 @@ LEAST, MOST = 1e-12, 1e9  # of a part's amplitude, in E h/R^2: rounding, and wha
 
 
 def surface_terms(case: Case, own: Sequence[OwnTerm]) -> tuple[OwnTerm, ...]:
-    """The terms of a case's parts, then one's own.
+    """The terms of a case's parts and of its steps, then one's own.
 
     Raises
     ------
@@ -25,6 +25,8 @@ def surface_terms(case: Case, own: Sequence[OwnTerm]) -> tuple[OwnTerm, ...]:
             if not LEAST <= abs(term.value) <= MOST:
                 raise CaseError(f"{key}: {term.name} is {term.value:.4g} E h/R²; allowed are {LEAST:g} to {MOST:g}")
             found.append(term)
+    for step in {step.name: step for step in case.programme}.values():
+        found += step.load.terms(step, case.context)
     found += own
     names = [name for term in found for name in (term.name, *term.observed)]
     names += {p.name for term in found for p in term.free}

@@ -60,6 +60,8 @@ class Unit:
         What one of the number is in that unit; nan if the case lacks what it needs.
     text
         The unit into which a text with a unit is converted for it, for pint; empty if no text is.
+    needs
+        What a case must have for such a text.
     words, symbol
         Of the column in that unit, if they are not those of the quantity.
     """
@@ -70,6 +72,7 @@ class Unit:
     shown: str = ""
     size: Callable[[Given], float] = lambda given: nan
     text: str = ""
+    needs: str = "youngs_modulus and lengths of the shell with units"
     formula: str | None = None
     words: str | None = None
     symbol: str | None = None
@@ -78,6 +81,9 @@ class Unit:
     def written(self) -> str:
         """The unit as a formula."""
         return self.key if self.formula is None else self.formula
+
+
+DENSITY_TOO = "density, youngs_modulus and lengths of the shell with units"
 
 
 def _one(given: Given) -> float:

@@ -60,6 +60,9 @@ class OwnTerm:
     observed
         Column -> density as above; mu times its integral over the whole shell is observed along a path. A model has
         only the symmetries that these leave too.
+    of_volume
+        Whether the densities are those of a volume, over E: the thickness multiplies them where it varies, and a solid
+        has them in all of its body. They depend on the places r0.r and u.r alone.
 
     Raises
     ------
@@ -72,6 +75,7 @@ class OwnTerm:
     parameters: tuple[float | Array | Free, ...] = ()
     value: float = 0.0
     observed: Mapping[str, Callable[..., Expr]] = field(default_factory=dict)
+    of_volume: bool = False
 
     def __post_init__(self) -> None:
         if not self.name.isidentifier():
@@ -90,6 +94,10 @@ class OwnTerm:
                 f"{self.name}: the density depends on {', '.join(f'u.{part}' for part in curved)}; without a term on "
                 "the edges it would miss the rotations between cells. Allowed are u.r, u.r1 and u.r2"
             )
+
+        bent = {*self.parts, *self._found_in(self._symbolic[1])} - {"r"}
+        if self.of_volume and bent:
+            raise ValueError(f"{self.name}: a density of a volume depends on r0.r and u.r alone, not on {min(bent)}")
 
     @cached_property
     def parts(self) -> tuple[str, ...]:
@@ -139,6 +147,7 @@ class OwnTerm:
         values = [self._value(r0, u, self.density) for r0, u in _random_jets()]
         free = [(p.name, p.value) for p in self.free]
         text = f"{self.name} {self.value!r} {free} {sorted(self.observed)} {[f'{v:.9e}' for v in values]}"
+        text += " of a volume" * self.of_volume
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     @cached_property

@@ -195,12 +195,16 @@ class EnergyFactory:
         """The energy of a part or one's own, with the amplitude of its name or another."""
         still = tuple(part for part in term.placed_parts if part not in term.parts)  # asked for of r0 alone
         density = Density(per_area(term.density), self._parameters(term), parts=(*term.parts, *still), linear=still)
+        density = self._thick(density, None) if term.of_volume else density
         return self.carrier.energy(term.name, density, amplitude or term.name, linear=term.linear)
 
     def observed(self, term: OwnTerm) -> dict[str, ufl.Form]:
         """What it observes of the modelled part."""
         parameters = self._parameters(term)
-        return {column: self._over_area(of, parameters) for column, of in term.observed.items()}
+        by_column = {column: Density(per_area(of), parameters) for column, of in term.observed.items()}
+        if term.of_volume:
+            by_column = {column: self._thick(density, None) for column, density in by_column.items()}
+        return {column: self._over_area(density) for column, density in by_column.items()}
 
     def contact(self, contact: Contact) -> tuple[Energy, Pressing, dict[str, ufl.Form]]:
         """The energy of a body, what it knows of it, and the integrals of its pressure and of that times its radius."""
@@ -210,13 +214,11 @@ class EnergyFactory:
         density = Density(per_area(contact_energy), known.parameters, ("r",), quadrature=rule)
         of_radius = pressed_radius(self._constant(contact.front), self._constant(contact.direction))
         seen: dict[str, Callable[..., Expr]] = {"pressure": contact_pressure, "radius": of_radius}
-        integrals = {name: self._over_area(of, known.parameters, rule) for name, of in seen.items()}
+        by_name = {name: Density(per_area(of), known.parameters, quadrature=rule) for name, of in seen.items()}
+        integrals = {name: self._over_area(density) for name, density in by_name.items()}
         return carrier.energy(f"contact {contact.body}", density), known, integrals
 
-    def _over_area(
-        self, of: Callable[..., Expr], parameters: tuple[Parameter, ...], rule: int | None = None
-    ) -> ufl.Form:
-        density = Density(per_area(of), parameters, quadrature=rule)
+    def _over_area(self, density: Density) -> ufl.Form:
         return self.carrier.whole * self.carrier.integral(density, self.carrier.jet(self.u))
 
     def _parameters(self, term: OwnTerm) -> tuple[fem.Constant, ...]:

@@ -16,7 +16,7 @@ from magshell_fenicsx.assembly.terms import Counted, DensityTerm
 from magshell_fenicsx.mesh.hexahedra import MIDDLE, OUTER, Body
 from magshell_fenicsx.models.shell.energy import per_area
 from magshell_fenicsx.models.shell.free import Constants, constants_of
-from magshell_fenicsx.models.shell.kinematics import SECOND, Jet
+from magshell_fenicsx.models.shell.kinematics import CURVED, SECOND, Jet
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.parameters import ACROSS, Magnetisation
 from magshell_fenicsx.models.solid import densities
@@ -146,14 +146,34 @@ class TermFactory:
         ]
 
     def own(self, term: OwnTerm, amplitude: str | None = None) -> SolidTerm:
-        """The energy of a part or one's own on the outer face, with the amplitude of its name or another."""
+        """The energy of a part or one's own on the outer face or of the body, with its own amplitude or another."""
+        if term.of_volume:
+            return self._bulk(term.name, self._inside(term, term.density), amplitude or term.name, linear=term.linear)
         density = self._surface(term, term.density)
         energy = self._on_faces([density])
         return SolidTerm(term.name, density, energy, self.u, self.log, amplitude or term.name, linear=term.linear)
 
     def observed(self, term: OwnTerm) -> dict[str, ufl.Form]:
-        """What it observes on the outer face."""
+        """What it observes on the outer face, or of the body."""
+        if term.of_volume:
+            inside = {column: self._inside(term, of) for column, of in term.observed.items()}
+            return {column: self._over_body(density) for column, density in inside.items()}
         return {column: self._on_faces([self._surface(term, of)]) for column, of in term.observed.items()}
+
+    def _inside(self, term: OwnTerm, of: Callable[..., Expr]) -> Density:
+        """A density of the volume, which depends on places alone."""
+        flat, count = [ufl.zero(3)] * len(CURVED), len(term.parameters)
+
+        def at(X: Expr, u: Expr, H: Expr, *parameters: Expr) -> Expr:
+            return of(Jet(X, *flat), Jet(u, *flat), *parameters[:count]) / parameters[count]
+
+        constants = constants_of(term, self.u.function_space.mesh, self.free)
+        return Density(at, (*constants, *self._constants(self.h)), VALUE)
+
+    def _over_body(self, density: Density) -> ufl.Form:
+        dx = ufl.Measure("dx", domain=self.body.mesh, metadata={"quadrature_degree": density.degree})
+        X, H = ufl.SpatialCoordinate(self.body.mesh), ufl.grad(self.u)
+        return density.of(X, self.u, H, *density.parameters) * dx
 
     def _surface(self, term: OwnTerm, of: Callable[..., Expr]) -> Density:
         """Of the mid-surface's density the same on the outer face, per area of the reference cell."""
@@ -210,9 +230,7 @@ class TermFactory:
         *,
         linear: bool = False,
     ) -> SolidTerm:
-        domain, u = self.body.mesh, self.u
-        dx = ufl.Measure("dx", domain=domain, metadata={"quadrature_degree": density.degree})
-        energy = density.of(ufl.SpatialCoordinate(domain), u, ufl.grad(u), *density.parameters) * dx
+        energy = self._over_body(density)
         return SolidTerm(name, density, energy, self.u, self.log, amplitude, linear=linear)
 
     def _on_faces(self, found: Sequence[Density], v: Expr | None = None) -> ufl.Form:

@@ -1,0 +1,66 @@
+"""The shell spins about e3: centrifugal forces, which grow with the square of its speed."""
+
+from math import sqrt
+from typing import Annotated, Any, ClassVar, Literal
+
+from pydantic import BeforeValidator, Field
+from ufl.core.expr import Expr
+
+from magshell_fenicsx.input.targets import over
+from magshell_fenicsx.models.shell.kinematics import Jet
+from magshell_fenicsx.models.shell.own_term import OwnTerm
+from magshell_fenicsx.parts.part import Context
+from magshell_fenicsx.parts.step import Now, PathStep, ProgrammeStep, Target, Until
+from magshell_fenicsx.quantities.quantity import Quantity
+from magshell_fenicsx.quantities.units import DENSITY_TOO, Unit
+
+SPEED = Unit("√(E/ρ)/R", text="radian/second", size=lambda g: sqrt(g.E / g.rho) / g.R, needs=DENSITY_TOO)
+SQUARED = Unit("E/(ρ R²)", "1/s²", "per_s2", "1/s²", lambda g: g.E / (g.rho * g.R**2))
+
+
+def _of_angles(value: Any) -> Any:
+    """Hertz would be read as radians per second."""
+    if isinstance(value, str) and "z" in value.lower():
+        raise ValueError(f"{value}: give rpm or rad/s, which say what turns")
+    return value
+
+
+class SpinStep(PathStep):
+    """The shell spins about e3 through the origin: the forces ρ ω² r away from the axis, where it has moved to.
+
+    Points are equal parts of ω². Forces of Coriolis are left out: the shell rests beside its axis, and frequencies of
+    such a shell are those without them.
+    """
+
+    amplitude: ClassVar[str] = "spin"
+    targets: ClassVar[dict[str, Target]] = {"speed": Target("load", "spin")}
+    quantities: ClassVar[tuple[Quantity, ...]] = (
+        Quantity("spin", "spin squared", "Centrifugal load ρ ω² R²/E; in SI ω².", "load", "ρ ω² R²/E", (SQUARED,)),
+    )
+    kind: Literal["spin"]
+    control: Literal["load", "arc"] = "arc"
+    """What is prescribed step by step: ω², or arc length, which passes its folds"""
+    until: Until = "target"
+    speed: Annotated[float, over(SPEED), BeforeValidator(_of_angles)] | None = Field(default=None, ge=0, le=1e3)
+    """Target of the angular speed ω, as "3000 rpm" or "300 rad/s" where the shell has a density [√(E/ρ)/R]"""
+
+    @property
+    def _given(self) -> dict[str, float]:
+        return {} if self.speed is None else {"speed": self.speed**2}
+
+    def first(self, change: float, now: Now, *, by_load: bool) -> float:
+        return change / self.points if self.target else now.h**2
+
+    def scale(self, now: Now) -> float:
+        return (self.speed or now.h) ** 2
+
+    def terms(self, step: ProgrammeStep, context: Context) -> list[OwnTerm]:
+        return [OwnTerm(step.name, energy, of_volume=True)]
+
+    def account(self, step: ProgrammeStep, context: Context) -> str:
+        return f"centrifugal forces of a shell that spins about e3, amplitude {step.name} = ρ ω² R²/E"
+
+
+def energy(r0: Jet, u: Jet) -> Expr:
+    """The energy density for ρ ω² R²/E = 1, zero where nothing has moved."""
+    return -sum(u.r[i] * (r0.r[i] + u.r[i] / 2) for i in range(2))
