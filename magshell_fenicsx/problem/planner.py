@@ -127,10 +127,12 @@ def make_plan(case: Case, terms: Sequence[OwnTerm] = ()) -> Plan:
     within = {name: in_frame(found[key].inside, turn) for name, key in case.dimples.items()}
     grown = {name: tuple(in_frame(f.deviation, turn) for f in each.values()) for name, each in growing.items()}
     all_loads = _loads(case, Modelled(drawn, turn, beyond, under, within))
-    all_loads = replace(all_loads, magnetic=applied(case, turn, within), own=energies, contacts=bodies, growing=grown)
+    all_loads = replace(
+        all_loads, magnetic=applied(context, turn, within), own=energies, contacts=bodies, growing=grown
+    )
     magnetic = case.magnetic
-    if magnetic and not all_loads.magnetic and field_fits(case, drawn, plane, axisymmetric=axisymmetric):
-        all_loads = replace(all_loads, remanence=magnetisation(magnetic, case, turn, within))
+    if magnetic and not all_loads.magnetic and field_fits(context, drawn, plane, axisymmetric=axisymmetric):
+        all_loads = replace(all_loads, remanence=magnetisation(magnetic, context, turn, within))
     if span:
         refuse_unfit_ends([name for name in span.names if name], points, conditions, all_loads)
     model = "meridian" if axisymmetric else f"{'half' if half else 'full'} {case.model}"
@@ -170,7 +172,7 @@ def _left(case: Case, drawn: Outline, energies: Sequence[OwnTerm]) -> list[Leave
     sections = [section for section in context.sections.values() if isinstance(section, Ability)]
     return [
         of_shape(case.shell, drawn),
-        *(leaves_of_field(case, drawn) if case.magnetic and case.lambda_m else []),
+        *(leaves_of_field(context, drawn) if case.magnetic and case.lambda_m else []),
         *(leaves for section in sections for leaves in section.leaves(context, drawn)),
         *(leaves for step in case.programme for leaves in step.load.leaves(step, context, drawn)),
         of_points(case.points.values(), case.shell.reference, drawn),

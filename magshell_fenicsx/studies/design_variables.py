@@ -435,7 +435,7 @@ def _controls(case: Case, section: RemanenceVariables) -> tuple[Controls, Array]
         return Controls(places, width or magnetic.remanent.filter or 1.0), vectors
     plan = make_plan(case)
     places, width = _spread(case, plan, count, width)
-    field = magnetisation(magnetic, case, 0.0, plan.within)
+    field = magnetisation(magnetic, case.context, 0.0, plan.within)
     if field.patches is not None:
         raise CaseError("design.remanence.points: the remanence starts by patches of a mesh: start from another kind")
     if callable(field.remanent):

@@ -5,7 +5,6 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.input.expressions import formula
 from magshell_fenicsx.input.section import Direction
 from magshell_fenicsx.input.tables import read_vectors
@@ -16,6 +15,8 @@ from magshell_fenicsx.models.shell.patterns import Components, Inside, Pattern, 
 from magshell_fenicsx.parts.magnetism.field_step import FieldSection, RotationSection
 from magshell_fenicsx.parts.magnetism.fields import MagneticSection, RemanentSection, layer_average
 from magshell_fenicsx.parts.magnetism.sources.field import in_space, turns, values
+from magshell_fenicsx.parts.magnetism.sources.source import SourceSection
+from magshell_fenicsx.parts.part import Context
 from magshell_fenicsx.shape.outline import Outline
 from magshell_fenicsx.shape.sections import MeshSurface
 from magshell_fenicsx.shape.symmetry import PARALLEL, Leaves, alike, tilted
@@ -39,7 +40,7 @@ def by_points(section: RemanentSection, turn: float = 0.0) -> ByControls:
 
 
 def magnetisation(
-    magnetic: MagneticSection, case: Case, turn: float, within: Mapping[str, Inside], to: Sequence[Direction] = ()
+    magnetic: MagneticSection, context: Context, turn: float, within: Mapping[str, Inside], to: Sequence[Direction] = ()
 ) -> Magnetisation:
     """What is magnetised and how it is modelled, in a frame turned about e3 (rad).
 
@@ -62,14 +63,14 @@ def magnetisation(
         remanent = by_points(section, turn)
     elif section.layers:
         remanent = layer_average(section.layers, turn)
-    elif section.patches and not isinstance(case.shell, MeshSurface):
+    elif section.patches and not isinstance(context.shell, MeshSurface):
         vectors = {name: direction.vector(turn) for name, direction in section.patches.items()}
         rest = vectors.pop("rest")
         rims = tuple((inside, vectors.get(name, rest)) for name, inside in within.items())
         remanent = WithinRims(rims, rest) if vectors else rest
     else:
         remanent = section.vector(turn)
-    known, driven = in_space(case.context, turn)
+    known, driven = in_space(context, turn)
     basis = [magnetic.applied.vector(turn)]
     for direction in () if known else to:
         away = direction.vector(turn) - np.sum([(direction.vector(turn) @ e) * e for e in basis], axis=0)
@@ -77,7 +78,7 @@ def magnetisation(
             basis.append(away / np.linalg.norm(away))
     applied, *across = (magnetic.applied.uniform * e for e in basis)
     patches = None
-    if section.patches and isinstance(case.shell, MeshSurface):
+    if section.patches and isinstance(context.shell, MeshSurface):
         patches = {name: direction.vector(turn) for name, direction in section.patches.items()}
     Q = rotation(turn)
     layers = tuple((layer.fraction, layer.vector(turn)) for layer in section.layers or [])
@@ -94,19 +95,19 @@ def magnetisation(
         known,
         tuple(basis),
         driven,
-        turns(case.context, turn),
+        turns(context, turn),
     )
 
 
-def leaves(case: Case, outline: Outline) -> list[Leaves]:
+def leaves(context: Context, outline: Outline) -> list[Leaves]:
     """Remanence and applied field must both be symmetric to a plane, or both antisymmetric."""
-    magnetic = case.magnetic
+    magnetic = context.of(MagneticSection)
     assert magnetic
     known = magnetic.applied.components if magnetic.applied.beside else None
     alone = known or not magnetic.applied.beside
     vectors = [d.vector() for d in (*magnetic.remanent.directions(), *([] if alone else [magnetic.applied]))]
-    whole = turns(case.context)  # then the rotation is a part of the field at each place
-    turning = [] if whole else [load.to.vector() for load in case.loads_of(RotationSection)]
+    whole = turns(context)  # then the rotation is a part of the field at each place
+    turning = [] if whole else [step.to.vector() for step in _rotations(context)]
     remanent, G = magnetic.remanent, np.array(magnetic.applied.gradient or np.zeros((3, 3)))
     fields: list[Callable[[Array], Array]] = [lambda x: np.asarray(x @ G.T)] if G.any() else []
     fields += [vectors_of(texts) for texts in (remanent.components, known) if texts]
@@ -119,7 +120,7 @@ def leaves(case: Case, outline: Outline) -> list[Leaves]:
         askew.append("the formula of the remanence differs around e3")
     if known and not (outline.span and vector_turns(known, outline.span, in_space=True)):
         askew.append("the formula of the applied field differs around e3")
-    sources = values(case.context) if case.sources or whole else []
+    sources = values(context) if magnetic.applied.sources or whole else []
     if sources and not (outline.span and all(field_turns(field, outline.span) for field in sources)):
         askew.append("the field of a source differs around e3")
     if np.abs(G - np.diag([G[0, 0], G[0, 0], G[2, 2]])).max() > PARALLEL:
@@ -141,26 +142,36 @@ def leaves(case: Case, outline: Outline) -> list[Leaves]:
 
         return images(1.0) or images(-1.0)
 
-    return [Leaves(next(iter(askew), None), [*vectors, *_of_sources(case)], mirrors)]
+    return [
+        Leaves(
+            next(iter(askew), None),
+            [*vectors, *_of_sources(magnetic.applied.sources or [], context.shell.reference)],
+            mirrors,
+        )
+    ]
 
 
-def _of_sources(case: Case) -> list[Array]:
+def _of_sources(sources: Sequence[SourceSection], R: float) -> list[Array]:
     """What a mirror plane through e3 may hold: the places of sources, or the axes of those on e3."""
-    places = [np.array(source.position) / case.shell.reference for source in case.sources]
-    axes = [source.axes[:, 2] for source in case.sources]
+    places = [np.array(source.position) / R for source in sources]
+    axes = [source.axes[:, 2] for source in sources]
     return [place if tilted(place) else axis for place, axis in zip(places, axes, strict=True)]
 
 
-def field_fits(case: Case, outline: Outline, plane: Mirror | None, *, axisymmetric: bool) -> bool:
+def field_fits(context: Context, outline: Outline, plane: Mirror | None, *, axisymmetric: bool) -> bool:
     """Whether a reduced model shows the remanence as it is, where without a field it does not reduce the model."""
-    (part,) = leaves(case, outline)
+    (part,) = leaves(context, outline)
     return (part.askew is None or not axisymmetric) and (plane is None or part.mirrors(plane))
 
 
-def applied(case: Case, turn: float, within: Mapping[str, Inside]) -> Magnetisation | None:
+def applied(context: Context, turn: float, within: Mapping[str, Inside]) -> Magnetisation | None:
     """What is magnetised where a step drives the field; None without."""
-    driven = {name for step in case.programme for name in (step.name, *step.load.drives)}
-    if case.magnetic is None or FieldSection.amplitude not in driven:
+    magnetic = context.of(MagneticSection)
+    driven = {name for step in context.steps for name in (step.name, *step.load.drives)}
+    if magnetic is None or FieldSection.amplitude not in driven:
         return None
-    turned = [step.load.to for step in case.programme if isinstance(step.load, RotationSection)]
-    return magnetisation(case.magnetic, case, turn, within, turned)
+    return magnetisation(magnetic, context, turn, within, [step.to for step in _rotations(context)])
+
+
+def _rotations(context: Context) -> list[RotationSection]:
+    return [step.load for step in context.steps if isinstance(step.load, RotationSection)]
