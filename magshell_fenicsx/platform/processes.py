@@ -40,6 +40,11 @@ class Usage:
     output: str
     errors: str
 
+    @property
+    def last_error(self) -> str:
+        """The last line of its errors; empty without."""
+        return (self.errors.strip().splitlines() or [""])[-1]
+
 
 def measure(
     module: str, arguments: Sequence[str], ranks: int = 1, environment: Mapping[str, str] | None = None

@@ -100,8 +100,7 @@ def run_model(
         sets = [part for setting in chosen for part in ("--set", setting)]
         measured = measure("magshell_fenicsx", ["run", str(case), *sets, "--out", str(folder), "--overwrite"])
         if not (folder / "summary.json").exists() or measured.code not in (0, 3):
-            errors = measured.errors.strip().splitlines()
-            raise NothingLeft(f"model: {model}: {errors[-1] if errors else f'exit code {measured.code}'}")
+            raise NothingLeft(f"model: {model}: {measured.last_error or f'exit code {measured.code}'}")
         results = read_summary(folder), read_lines(folder / "path.csv")
         used = Used({**asked, "sources": results[0]["sources"]}, measured.cpu_s, measured.wall_s)
         keep(folder / "usage.json", asdict(used))

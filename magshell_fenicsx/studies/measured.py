@@ -12,7 +12,7 @@ from typing import Any
 from pydantic import TypeAdapter
 
 from magshell_fenicsx.output.store.known import PHASES
-from magshell_fenicsx.platform.processes import Usage, measure
+from magshell_fenicsx.platform.processes import measure
 from magshell_fenicsx.studies.runner import keep, kept
 
 TIMES = ("wall_s", "cpu_s", *PHASES, "peak_mb")
@@ -108,7 +108,8 @@ def _run_once(measured: Measured, arguments: Sequence[str], ranks: int) -> Sampl
             with (out / "path.csv").open(encoding="utf-8", newline="") as stream:
                 measured.rows = list(csv.DictReader(stream))
         except OSError:
-            measured.summary, measured.rows, measured.failure = None, [], _failure(used)
+            measured.summary, measured.rows = None, []
+            measured.failure = f"exit code {used.code}: {used.last_error or 'no message'}"
     timing: dict[str, float] = (measured.summary or {}).get("timing", {})
     return {
         "wall_s": used.wall_s,
@@ -116,8 +117,3 @@ def _run_once(measured: Measured, arguments: Sequence[str], ranks: int) -> Sampl
         "peak_mb": used.peak_mb,
         **{key: timing.get(key) for key in PHASES},
     }
-
-
-def _failure(used: Usage) -> str:
-    errors = used.errors.strip().splitlines()
-    return f"exit code {used.code}: {errors[-1] if errors else 'no message'}"

@@ -162,16 +162,14 @@ def correlations(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
     correlated = {}
     drawn = [key for key in drawn_keys(rows) if not key.startswith("shell.imperfections.")]
     for key in (*severest_keys(rows), *drawn):
-        pairs = np.array([(x, y) for row in rows if _is_number(x := row.get(key)) and (y := row[RESULT]) is not None])
+        pairs = np.array(
+            [(x, y) for row in rows if isinstance(x := row.get(key), float | int) and (y := row[RESULT]) is not None]
+        )
         if len(pairs) < LEAST or not np.ptp(pairs, axis=0).all():
             continue
         x, y = pairs.T
         correlated[key] = {"pearson": float(pearsonr(x, y)[0]), "spearman": float(spearmanr(x, y)[0])}
     return correlated
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, float | int)
 
 
 def _without(rows: Sequence[Row]) -> dict[str, Any] | None:
