@@ -335,7 +335,7 @@ def check(case: CaseFile, set_: Settings = None) -> None:
             from magshell_fenicsx.simulate.gradients.expected import refuse_unknown_results
 
             try:
-                refuse_unknown_results(read)
+                refuse_unknown_results(read, read.design.named if read.design else {})
             except CaseError as e:
                 raise CaseError(read.placed(str(e))) from None
         if read.ensemble:

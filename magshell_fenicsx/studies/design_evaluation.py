@@ -73,13 +73,13 @@ def evaluate(
     known: Standing,
 ) -> Evaluation:
     """Follow the path of a case, and differentiate its results; collective. `known` is of the case before."""
-    lost, section = "", variables.case.design
+    lost, named = "", variables.case.design.named
     records, history, remarks = list[Record](), History(), list[str]()
     try:
         scene = known.of(case, comm)
         for result in results:
             if result != MASS and result not in targets:
-                refuse_no_result(scene, [result], f"design.{section.key_of(result)}", more=[MASS])
+                refuse_no_result(scene, [result], named[result], more=[MASS])
         for record in follow(scene, search=False, remark=remarks.append):
             records.append(record)
             history.add(record)

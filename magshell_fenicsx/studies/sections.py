@@ -219,6 +219,12 @@ class DesignSection(Section):
         )
 
     @property
+    def named(self) -> dict[str, str]:
+        """Results but a wanted shape -> the keys that name them."""
+        shape = ["shape"] if self.objective.shape else []
+        return {result: f"design.{self.key_of(result)}" for result in self.results if result not in shape}
+
+    @property
     def results(self) -> list[str]:
         """All that are computed: that of the objective first."""
         limited = (name for limit in self.constraints for name in limit.names)

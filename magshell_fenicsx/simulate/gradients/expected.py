@@ -1,5 +1,6 @@
 """What results and parameters a case will have, by its plan alone: for `magshell check`, which builds nothing."""
 
+from collections.abc import Mapping
 from types import SimpleNamespace
 
 import numpy as np
@@ -52,22 +53,25 @@ class Expected(Scene):
         return 1.0
 
 
-def refuse_unknown_results(case: Case) -> None:
-    """See that the results and parameters of gradients and design are there, by the names alone.
+def refuse_unknown_results(case: Case, designed: Mapping[str, str]) -> None:
+    """See that the results and parameters of gradients, and the results of a design, are there, by the names alone.
+
+    Parameters
+    ----------
+    designed
+        Results of the design, and the keys that name them.
 
     Raises
     ------
     CaseError
         If one is not.
     """
-    if not (case.gradients or case.design):
+    if not (case.gradients or designed):
         return
     scene = Expected(case, make_plan(case))
     if case.gradients:
         refuse_no_result(scene, case.gradients.of, "gradients.of")
         refuse_unknown_parameters(case, case.gradients.by, scene.unloaded())
-    if case.design:
-        shape = case.design.objective.shape is not None
-        for result in case.design.results:
-            if result != MASS and not (shape and result == "shape"):
-                refuse_no_result(scene, [result], f"design.{case.design.key_of(result)}", more=[MASS])
+    for result, key in designed.items():
+        if result != MASS:
+            refuse_no_result(scene, [result], key, more=[MASS])
