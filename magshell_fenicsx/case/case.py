@@ -6,7 +6,7 @@ from dataclasses import replace
 from functools import cached_property
 from math import radians
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self, TypeVar
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import Field, ModelWrapValidatorHandler, ValidationError, model_validator
@@ -37,14 +37,12 @@ from magshell_fenicsx.parts.natural.section import NaturalSection, measured
 from magshell_fenicsx.parts.own import Origin
 from magshell_fenicsx.parts.part import Context, Part, Scales
 from magshell_fenicsx.parts.registered import PARTS, WithParts
-from magshell_fenicsx.parts.step import ProgrammeStep, Step
+from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.parts.supports.boundary import EDGES, BoundarySection, refuse_taken
 from magshell_fenicsx.shape.ground import Coordinates
 from magshell_fenicsx.shape.sections import CapSurface, MeshSurface, RevolutionSurface, Surface, SurfaceSection
 from magshell_fenicsx.shape.shell import ShellSection
 from magshell_fenicsx.studies.sections import DesignSection, EnsembleSection
-
-AnyStep = TypeVar("AnyStep", bound=Step)
 
 
 class Case(WithParts):
@@ -231,10 +229,6 @@ class Case(WithParts):
         copied = super().model_copy(update=update, deep=deep)
         copied.__dict__.pop("context", None)
         return copied
-
-    def loads_of(self, kind: type[AnyStep]) -> list[AnyStep]:
-        """The loads of a kind among its steps."""
-        return [step.load for step in self.programme if isinstance(step.load, kind)]
 
     @property
     def parts(self) -> dict[str, Part]:

@@ -15,6 +15,7 @@ from magshell_fenicsx.quantities.registry import register
 from magshell_fenicsx.shape.symmetry import Leaves
 
 if TYPE_CHECKING:
+    from magshell_fenicsx.mesh.midsurface import Deviation
     from magshell_fenicsx.models.shell.patterns import Inside
     from magshell_fenicsx.parts.step import ProgrammeStep, Step
     from magshell_fenicsx.shape.outline import Outline
@@ -144,6 +145,12 @@ class Modelled:
     mirror
         Plane, in the model's frame, of the half that is modelled; None for all. A force on the plane, or on an edge
         across it, is shared by the halves; the loads of an edge of the other half are left out.
+    plane
+        The same plane in the frame of the case.
+    axisymmetric
+        Whether the meridian is modelled.
+    deviations
+        Key of each imperfection below `shell` -> its deviation, in the model's frame.
     vertices
         Amplitude of a load at one place -> name of the vertex there.
     within
@@ -153,8 +160,11 @@ class Modelled:
     outline: "Outline"
     turn: float
     mirror: Mirror | None
+    plane: Mirror | None
+    axisymmetric: bool
     vertices: Mapping[str, str]
     within: "Mapping[str, Inside]"
+    deviations: "Mapping[str, Deviation]"
 
 
 class Ability(Section):

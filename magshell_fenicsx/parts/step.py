@@ -34,6 +34,7 @@ Until = Annotated[
 ]
 Count = Annotated[int, Field(ge=1, le=10000, description="Equal parts to the target, each a row; or steps")]
 LEAST_TARGET = 1e-9
+BALANCE = 1e-2  # largest error of the balance of energy in time, over all energies
 Array = NDArray[np.float64]
 Prescribed = Literal["load", "conjugate"]
 Control = Literal["load", "conjugate", "arc"]
@@ -407,6 +408,10 @@ class Step(Section):
 
     def terms(self, step: "ProgrammeStep", context: Context) -> list[OwnTerm]:
         """Energies with its amplitude, from nothing but their densities; see `OwnTerm`."""
+        return []
+
+    def multiplies(self, step: "ProgrammeStep", context: Context) -> list[str]:
+        """Keys below `shell` of the imperfections that it multiplies."""
         return []
 
     def account(self, step: "ProgrammeStep", context: Context) -> str:

@@ -6,7 +6,6 @@ from math import degrees
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.mesh.mirror import Mirror, plane_text
 from magshell_fenicsx.models.shell.parameters import Loads
-from magshell_fenicsx.parts.imperfections.growth import grown_by
 from magshell_fenicsx.parts.imperfections.rims import MOST_RIMS
 from magshell_fenicsx.parts.registered import PARTS
 from magshell_fenicsx.problem.body import layers, neo_hookean
@@ -59,8 +58,6 @@ def account(case: Case, loads: Loads, model: str, mirror: Mirror | None, rims: i
         included.append(f"body {contact.body}: {body} without friction, stiffness k R²/(E h) = {k}")
     if case.imperfections:
         included.append(_imperfections(case, rims))
-    for name, keys in grown_by(case.programme, case.imperfections).items():
-        included.append(f"{name} grows: {', '.join(keys)}")
     for step in {step.name: step for step in case.programme}.values():
         included += [said] if (said := step.load.account(step, case.context)) else []
     for key, part in PARTS.items():

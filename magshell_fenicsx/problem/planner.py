@@ -21,12 +21,9 @@ from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.parameters import Condition, Held, Loads, Material
 from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.parts.bodies.standing import body_leaves, contacts, pressed
-from magshell_fenicsx.parts.imperfections.growth import grown_by
 from magshell_fenicsx.parts.imperfections.imperfection import Flaw, flaws, in_frame
 from magshell_fenicsx.parts.imperfections.rims import MOST_RIMS, Spot, different, spots
 from magshell_fenicsx.parts.imperfections.symmetry import leaves
-from magshell_fenicsx.parts.magnetism.magnetisation import applied, field_fits, magnetisation
-from magshell_fenicsx.parts.magnetism.magnetisation import leaves as leaves_of_field
 from magshell_fenicsx.parts.part import Ability, Modelled
 from magshell_fenicsx.parts.registered import STEPS
 from magshell_fenicsx.parts.supports.boundary import BoundarySection, EdgeCondition, HeldSection
@@ -63,14 +60,11 @@ def make_plan(case: Case, terms: Sequence[OwnTerm] = ()) -> Plan:
     ground = ground_of(case.shell)
     perfect = ground.perfect
     found = flaws(case.imperfections, ground)
-    growing = {
-        name: {key: found[key] for key in keys} for name, keys in grown_by(case.programme, case.imperfections).items()
-    }
-    still = {*found} - {key for keys in growing.values() for key in keys}
+    context, last = case.context, {step.name: step for step in case.programme}
+    still = {*found} - {key for step in last.values() for key in step.load.multiplies(step, context)}
     drawn = imperfect(perfect, found, 0.0, still)
     ground = replace(ground, drawn=drawn)
     standing = case.bodies, case.approaches, {step.name for step in case.programme}
-    context, last = case.context, {step.name: step for step in case.programme}
     at_place = {name: (step, step.load.place_on(step, context, drawn)) for name, step in last.items()}
     places = {name: (step, place) for name, (step, place) in at_place.items() if place is not None}
     sample = np.zeros((0, 3)) if isinstance(case.shell, MeshSurface) else drawn.sample()
@@ -125,14 +119,9 @@ def make_plan(case: Case, terms: Sequence[OwnTerm] = ()) -> Plan:
     if beyond:
         conditions = {name: c for name, c in conditions.items() if name not in beyond.lost} | {CUT: "symmetry"}
     within = {name: in_frame(found[key].inside, turn) for name, key in case.dimples.items()}
-    grown = {name: tuple(in_frame(f.deviation, turn) for f in each.values()) for name, each in growing.items()}
-    all_loads = _loads(case, Modelled(drawn, turn, beyond, under, within))
-    all_loads = replace(
-        all_loads, magnetic=applied(context, turn, within), own=energies, contacts=bodies, growing=grown
-    )
-    magnetic = case.magnetic
-    if magnetic and not all_loads.magnetic and field_fits(context, drawn, plane, axisymmetric=axisymmetric):
-        all_loads = replace(all_loads, remanence=magnetisation(magnetic, context, turn, within))
+    deviations = {key: in_frame(flaw.deviation, turn) for key, flaw in found.items()}
+    modelled = Modelled(drawn, turn, beyond, plane, axisymmetric, under, within, deviations)
+    all_loads = replace(_loads(case, modelled), own=energies, contacts=bodies)
     if span:
         refuse_unfit_ends([name for name in span.names if name], points, conditions, all_loads)
     model = "meridian" if axisymmetric else f"{'half' if half else 'full'} {case.model}"
@@ -172,7 +161,6 @@ def _left(case: Case, drawn: Outline, energies: Sequence[OwnTerm]) -> list[Leave
     sections = [section for section in context.sections.values() if isinstance(section, Ability)]
     return [
         of_shape(case.shell, drawn),
-        *(leaves_of_field(context, drawn) if case.magnetic and case.lambda_m else []),
         *(leaves for section in sections for leaves in section.leaves(context, drawn)),
         *(leaves for step in case.programme for leaves in step.load.leaves(step, context, drawn)),
         of_points(case.points.values(), case.shell.reference, drawn),

@@ -7,8 +7,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.transient import FLOOR
 from magshell_fenicsx.output.store.table import COLUMNS, Row
-from magshell_fenicsx.parts.motion.step import TimeSection
-from magshell_fenicsx.parts.step import ProgrammeStep
+from magshell_fenicsx.parts.step import BALANCE, ProgrammeStep
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.scene import Scene
 
@@ -66,7 +65,7 @@ class RowMaker:
 def imbalances(programme: Iterable[ProgrammeStep], found: Sequence[Row], length: float) -> Iterator[str]:
     """What steps in time gain or lose beyond `balance`, in words; `length` is the system's."""
     for step in programme:
-        over = getattr(step.load, "balance", TimeSection.model_fields["balance"].default)
+        over = step.load.motion.balance if step.load.motion else BALANCE
         parts = [_imbalance(row, length) for row in found if row["step"] == step.number and row.get("imbalance")]
         if parts and abs(worst := max(parts, key=abs)) > over:
             yield (
@@ -80,7 +79,7 @@ def departures(programme: Iterable[ProgrammeStep], found: Sequence[Row]) -> Iter
     """Which motions have, or may have, a larger error than their tolerance, in words."""
     for step in programme:
         load = step.load
-        how = load if isinstance(load, TimeSection) else getattr(load, "snap", None)
+        how = load.motion or load.released_by
         rows = [row for row in found if row["step"] == step.number and row["amplitude"] == "time"]
         if how is None or not rows:
             continue
@@ -90,7 +89,7 @@ def departures(programme: Iterable[ProgrammeStep], found: Sequence[Row]) -> Iter
                 f"step {step.number}: the estimated error of its motion is {error:.2g} h, more than tolerance: "
                 f"{how.tolerance:g}; even the shortest steps leave it"
             )
-        adapted = isinstance(load, TimeSection) and load.step is None and load.until != "instability"
+        adapted = load.motion and load.motion.step is None and load.motion.until != "instability"
         if adapted and how.errors == "step" and any(int(row["negative_pivots"]) for row in rows):
             yield (
                 f"step {step.number}: it passes unstable states, which magnify the errors of its steps in time; "

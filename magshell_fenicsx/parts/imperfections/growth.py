@@ -5,7 +5,7 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import Field
 
-from magshell_fenicsx.parts.part import Context
+from magshell_fenicsx.parts.part import Context, Modelled
 from magshell_fenicsx.parts.step import PathStep, ProgrammeStep, Target, Until
 
 
@@ -34,6 +34,15 @@ class ImperfectionStep(PathStep):
 
     def on_perfect(self, *, last: bool) -> None:
         return None
+
+    def multiplies(self, step: ProgrammeStep, context: Context) -> list[str]:
+        return grown_by([step], context.sections["imperfections"])[step.name]
+
+    def account(self, step: ProgrammeStep, context: Context) -> str:
+        return f"{step.name} grows: {', '.join(self.multiplies(step, context))}"
+
+    def adds(self, step: ProgrammeStep, context: Context, modelled: Modelled) -> dict[str, Any]:
+        return {"growing": {step.name: tuple(modelled.deviations[key] for key in self.multiplies(step, context))}}
 
     def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
         keys: Mapping[str, object] = context.sections["imperfections"]

@@ -1,7 +1,7 @@
 """The magnetisation and the applied field."""
 
 from math import pi
-from typing import Annotated, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,9 +9,13 @@ from pydantic import Field, model_validator
 
 from magshell_fenicsx.input.expressions import Formula
 from magshell_fenicsx.input.file import FileKeys
-from magshell_fenicsx.input.section import Direction, FluxDensity, Section
+from magshell_fenicsx.input.section import Direction, FluxDensity
 from magshell_fenicsx.parts.kinds import Sources
-from magshell_fenicsx.parts.part import Context
+from magshell_fenicsx.parts.part import Ability, Context, Modelled
+from magshell_fenicsx.shape.symmetry import Leaves
+
+if TYPE_CHECKING:
+    from magshell_fenicsx.shape.outline import Outline
 
 MU_0 = 4e-7 * pi  # T m/A
 
@@ -131,7 +135,7 @@ class AppliedSection(Direction):
         return bool(self.flux_density) if self.sources else True
 
 
-class MagneticSection(Section):
+class MagneticSection(Ability):
     """lambda_m, or both flux densities (and shell.youngs_modulus).
 
     Energies: full, exact; first, torque and second are the paper's expansions in the displacement;
@@ -177,6 +181,16 @@ class MagneticSection(Section):
         assert Ba is not None
         assert youngs_modulus
         return Br * Ba / (MU_0 * youngs_modulus)
+
+    def leaves(self, context: Context, outline: "Outline") -> list[Leaves]:
+        from magshell_fenicsx.parts.magnetism.magnetisation import leaves  # the solver takes long to import
+
+        return leaves(context, outline) if strength(context) else []
+
+    def adds(self, context: Context, modelled: Modelled) -> dict[str, Any]:
+        from magshell_fenicsx.parts.magnetism.magnetisation import adds  # the solver takes long to import
+
+        return adds(context, modelled)
 
 
 def strength(context: Context) -> float:

@@ -16,7 +16,7 @@ from magshell_fenicsx.parts.magnetism.field_step import FieldSection, RotationSe
 from magshell_fenicsx.parts.magnetism.fields import MagneticSection, RemanentSection, layer_average
 from magshell_fenicsx.parts.magnetism.sources.field import in_space, turns, values
 from magshell_fenicsx.parts.magnetism.sources.source import SourceSection
-from magshell_fenicsx.parts.part import Context
+from magshell_fenicsx.parts.part import Context, Modelled
 from magshell_fenicsx.shape.outline import Outline
 from magshell_fenicsx.shape.sections import MeshSurface
 from magshell_fenicsx.shape.symmetry import PARALLEL, Leaves, alike, tilted
@@ -158,19 +158,19 @@ def _of_sources(sources: Sequence[SourceSection], R: float) -> list[Array]:
     return [place if tilted(place) else axis for place, axis in zip(places, axes, strict=True)]
 
 
-def field_fits(context: Context, outline: Outline, plane: Mirror | None, *, axisymmetric: bool) -> bool:
-    """Whether a reduced model shows the remanence as it is, where without a field it does not reduce the model."""
-    (part,) = leaves(context, outline)
-    return (part.askew is None or not axisymmetric) and (plane is None or part.mirrors(plane))
-
-
-def applied(context: Context, turn: float, within: Mapping[str, Inside]) -> Magnetisation | None:
-    """What is magnetised where a step drives the field; None without."""
-    magnetic = context.of(MagneticSection)
+def adds(context: Context, modelled: Modelled) -> dict[str, Magnetisation]:
+    """The field that a step drives; else the remanence alone, where a reduced model shows it as it is."""
+    magnetic, turn, within = context.of(MagneticSection), modelled.turn, modelled.within
+    assert magnetic
     driven = {name for step in context.steps for name in (step.name, *step.load.drives)}
-    if magnetic is None or FieldSection.amplitude not in driven:
-        return None
-    return magnetisation(magnetic, context, turn, within, [step.to for step in _rotations(context)])
+    if FieldSection.amplitude in driven:
+        to = [step.to for step in _rotations(context)]
+        return {"magnetic": magnetisation(magnetic, context, turn, within, to)}
+    (part,) = leaves(context, modelled.outline)
+    shown = part.askew is None or not modelled.axisymmetric
+    if not shown or (modelled.plane and not part.mirrors(modelled.plane)):
+        return {}
+    return {"remanence": magnetisation(magnetic, context, turn, within)}
 
 
 def _rotations(context: Context) -> list[RotationSection]:

@@ -12,7 +12,7 @@ from magshell_fenicsx.parts.magnetism.field_step import RotationSection
 from magshell_fenicsx.parts.magnetism.fields import MagneticSection, strength
 from magshell_fenicsx.parts.motion.history import History, Time, levels_of, measured, times_of
 from magshell_fenicsx.parts.part import Context
-from magshell_fenicsx.parts.step import Ahead, Errors, ProgrammeStep, Step
+from magshell_fenicsx.parts.step import BALANCE, Ahead, Errors, ProgrammeStep, Step
 from magshell_fenicsx.shape.symmetry import Leaves, alike
 from magshell_fenicsx.shape.turning import vector_turns, vectors_of
 
@@ -70,7 +70,7 @@ class TimeSection(Step):
     errors: Errors = "step"
     """Of each time step, or of the motion at all rows (column error_over_h): then it is rehearsed with longer steps,
     which takes several times as long; a snap magnifies the errors of steps"""
-    balance: float = Field(default=1e-2, ge=1e-9, le=1)
+    balance: float = Field(default=BALANCE, ge=1e-9, le=1)
     """Largest error of the balance of energy (column imbalance), over kinetic + stored + dissipated + work; beside a
     body a time step with more than its share is repeated with a smaller one, unless `step` is given; a run warns where
     it is larger"""
