@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.quantities.registry import endings, quantity
-from magshell_fenicsx.studies.design_variables import Between, Variables
+from magshell_fenicsx.studies.design_blocks import Between
+from magshell_fenicsx.studies.design_variables import Variables
 
 Array = NDArray[np.float64]
 

@@ -10,12 +10,10 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from magshell_fenicsx.assembly.forms import FieldGradient
 from magshell_fenicsx.input.section import in_unit, si_size
 from magshell_fenicsx.input.source import CaseError, Source
 from magshell_fenicsx.input.tables import read_vectors, write_vectors
-from magshell_fenicsx.mesh.mirror import rotation
-from magshell_fenicsx.models.shell.controls import ByControls, Controls
+from magshell_fenicsx.models.shell.controls import Controls
 from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.parts.magnetism.magnetisation import magnetisation
 from magshell_fenicsx.problem.planner import make_plan
@@ -23,206 +21,12 @@ from magshell_fenicsx.problem.problem import Plan
 from magshell_fenicsx.shape.outline import outline
 from magshell_fenicsx.simulate.numbers import number_of
 from magshell_fenicsx.simulate.scene import Scene
+from magshell_fenicsx.studies.design_blocks import Between, Found, Limits, Number, Vectors
 from magshell_fenicsx.studies.points import value_at
 from magshell_fenicsx.studies.runner import Case, Made
 from magshell_fenicsx.studies.sections import DesignSection, RemanenceVariables
 
 Array = NDArray[np.float64]
-
-
-Limits = tuple[float | None, float | None]
-Found = Mapping[str, Any]  # the gradients of a result, numbers and those by fields
-
-
-@dataclass(frozen=True)
-class Bounded:
-    """Values whose variables run from 0 to 1 between their bounds.
-
-    Attributes
-    ----------
-    name
-        The key of the case, or the field.
-    start
-        The values of the case itself.
-    """
-
-    name: str
-    start: Array
-    bounds: tuple[float, float]
-
-    @property
-    def first(self) -> Array:
-        """The variables at the start."""
-        return np.asarray((self.start - self.bounds[0]) / (self.bounds[1] - self.bounds[0])).ravel()
-
-    @property
-    def limits(self) -> list[Limits]:
-        """Their bounds."""
-        return [(0.0, 1.0)] * self.start.size
-
-    def values(self, x: Array) -> Array:
-        """The values of variables, in the shape of `start`."""
-        low, high = self.bounds
-        return np.asarray(low + x * (high - low)).reshape(self.start.shape)
-
-
-@dataclass(frozen=True)
-class Number(Bounded):
-    """A number of the case, in a unit."""
-
-    unit: str
-
-    @property
-    def label(self) -> str:
-        """The key with its unit, if it has one."""
-        return f"{self.name} [{self.unit}]" if self.unit else self.name
-
-    def gradient(self, x: Array, scene: Scene, found: Found) -> Array:
-        slope = found.get(self.name, 0.0)
-        return np.array([slope * si_size(self.unit) * (self.bounds[1] - self.bounds[0])])
-
-    def put(self, data: dict[str, Any], x: Array) -> None:
-        section: Any = data
-        *names, last = self.name.split(".")
-        for name in names:
-            section = section[int(name)] if isinstance(section, list) else section.setdefault(name, {})
-        value = float(self.values(x)[0])
-        section[int(last) if isinstance(section, list) else last] = f"{value:.15g} {self.unit}" if self.unit else value
-
-
-@dataclass(frozen=True)
-class Vectors:
-    """The remanence at points, of which each place has the mean.
-
-    Each vector has a polar angle, an azimuth where it is not kept in a plane, and its length where that varies, from 0
-    to 1 between its bounds.
-
-    Attributes
-    ----------
-    start
-        (n, 3), or (n, 2) on a meridian.
-    lengths
-        Least and largest length; None: they stay as they are.
-    """
-
-    controls: Controls
-    start: Array
-    lengths: tuple[float, float] | None
-    name: str = "remanence"
-
-    @property
-    def planar(self) -> bool:
-        """Whether the vectors stay in a plane."""
-        return self.controls.around or not self.controls.places[:, 1].any()
-
-    @property
-    def angles(self) -> int:
-        """How many of its variables are angles; they come first."""
-        return len(self.start) * (1 if self.planar else 2)
-
-    @property
-    def first(self) -> Array:
-        across = self.start[:, 0] if self.planar else np.hypot(*self.start[:, :2].T)
-        parts = [np.arctan2(across, self.start[:, -1])]
-        if not self.planar:
-            parts.append(np.arctan2(self.start[:, 1], self.start[:, 0]))
-        if self.lengths:
-            size = np.linalg.norm(self.start, axis=1)
-            parts.append((size - self.lengths[0]) / (self.lengths[1] - self.lengths[0]))
-        return np.concatenate(parts)
-
-    @property
-    def limits(self) -> list[Limits]:
-        return [(None, None)] * self.angles + [(0.0, 1.0)] * (len(self.start) if self.lengths else 0)
-
-    def vectors(self, x: Array) -> Array:
-        """At the points, (n, 3) or (n, 2)."""
-        return self._polar(x)[0]
-
-    def gradient(self, x: Array, scene: Scene, found: Found) -> Array:
-        if not isinstance(by := found.get(self.name), FieldGradient):
-            return np.zeros(len(x))
-        magnetic = scene.plan.loads.magnetic
-        assert magnetic
-        assert isinstance(magnetic.remanent, ByControls)
-        comm = by.field.function_space.mesh.comm
-        forces = comm.allreduce(magnetic.remanent.pulled(by.places, by.forces))
-        return np.concatenate([np.sum(forces * way, axis=1) for way in self._polar(x)[1]])
-
-    def _polar(self, x: Array) -> tuple[Array, list[Array]]:
-        """Vectors, and their derivatives by each of their variables."""
-        polar, *more = x.reshape(-1, len(self.start))
-        s, c = np.sin(polar), np.cos(polar)
-        size, grows = np.linalg.norm(self.start, axis=1), 0.0
-        if self.lengths:
-            grows = self.lengths[1] - self.lengths[0]
-            size = self.lengths[0] + more[-1] * grows
-        one = size[:, None]
-        if self.planar:
-            still = [] if self.controls.around else [0 * s]
-            unit, turned = (np.stack(v, axis=1) for v in ([s, *still, c], [c, *still, -s]))
-            ways = [one * turned]
-        else:
-            a, b = np.cos(more[0]), np.sin(more[0])
-            unit = np.stack([s * a, s * b, c], axis=1)
-            ways = [one * np.stack([c * a, c * b, -s], axis=1), one * np.stack([-s * b, s * a, 0 * s], axis=1)]
-        return one * unit, [*ways, *([grows * unit] if self.lengths else [])]
-
-    def put(self, data: dict[str, Any], x: Array) -> None:
-        known = data["magnetic"].get("remanent", {})
-        kept = {"flux_density": known["flux_density"]} if "flux_density" in known else {}
-        data["magnetic"]["remanent"] = {"kind": "points", "file": "", "filter": self.controls.width, **kept}
-
-
-@dataclass(frozen=True)
-class Between(Bounded):
-    """The values (n, components) of a scalar field at points, of which each place has the mean.
-
-    They are factors of h, curvatures 11 and 22 over 1/R, or deviations over h. In the case such a field is a formula,
-    with the weights of `models.shell.controls`: it needs no file, and its symmetry is recognised by its values.
-
-    Attributes
-    ----------
-    length
-        R in the unit of the case's formulas, of a curvature.
-    """
-
-    controls: Controls
-    length: float = 1.0
-
-    def gradient(self, x: Array, scene: Scene, found: Found) -> Array:
-        if not isinstance(by := found.get(self.name), FieldGradient):
-            return np.zeros(len(x))
-        places = by.places.reshape(-1, 3) @ rotation(scene.plan.azimuth)
-        forces = by.forces.reshape(len(places), -1)[:, : self.start.shape[1]]
-        comm = by.field.function_space.mesh.comm
-        pulled = comm.allreduce(np.asarray(self.controls.weights(places).T @ forces))
-        unit = scene.plan.material.h if self.name == "deviation" else 1.0
-        return np.asarray(pulled * unit * (self.bounds[1] - self.bounds[0])).ravel()
-
-    def put(self, data: dict[str, Any], x: Array) -> None:
-        texts = [self._formula(values) for values in self.values(x).T]
-        if self.name == "thickness":
-            data["shell"]["thickness_factor"] = texts[0]
-        elif self.name == "deviation":
-            shell = data["shell"]
-            defect = [shell.pop("defect")] if shell.get("defect") else []
-            shell["imperfections"] = [*defect, *(shell.get("imperfections") or ()), {"kind": "formula", "w0": texts[0]}]
-        else:
-            data["natural"] = {**(data.get("natural") or {}), "curvature": [*texts, 0]}
-
-    def _formula(self, values: Array) -> str:
-        R = self.length if self.name == "curvature" else 1.0  # other formulas are of places over R
-        if np.ptp(values) == 0:
-            return repr(float(values[0] / R))
-        below = repr(float(self.controls.width * R) ** 2)
-        weights = [f"exp(-({self._square(place * R)})/{below})" for place in self.controls.places]
-        parts = (f"{float(v / R)!r}*{w}" for v, w in zip(values, weights, strict=True))
-        return f"({' + '.join(parts)})/({' + '.join(weights)})"
-
-    def _square(self, place: Array) -> str:
-        names = ("sqrt(x**2 + y**2)", "z") if self.controls.around else ("x", "y", "z")
-        return " + ".join(f"({name} - {float(c)!r})**2" for name, c in zip(names, place, strict=True))
 
 
 @dataclass(frozen=True)
