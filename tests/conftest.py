@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from magshell_fenicsx.mesh.midsurface import Deviated, Midsurface, distribute
-from magshell_fenicsx.mesh.patch import Embedding
+from magshell_fenicsx.mesh.midsurface import Midsurface, distribute
+from magshell_fenicsx.mesh.patch import Deviated, Embedding
 from magshell_fenicsx.mesh.shapes import DiscShape
 from magshell_fenicsx.mesh.sphere import flat, sphere
 from magshell_fenicsx.mesh.triangulation import triangulate

@@ -72,10 +72,10 @@ def reference(edge: Edge, R_over_h: float, refinement: float = 1.0) -> float:
     meridian = make_meridian(span.embedding, vertices, span.names, {}, span.curvature)
     conditions = {**plan.conditions, "top": edge}
     model = MeridianModel(meridian, plan.material, 4, conditions, plan.loads)
-    waves, factory = model.excluded_modes.waves, model.factory
+    waves, carrier = model.excluded_modes.waves, model.factory.carrier
     v = ufl.TestFunction(waves.V)
     along = jets.wave(v, fem.Constant(meridian.mesh, float(M)))[0].r
-    form = np.pi * factory.area()(-ufl.dot(kin.normal(factory.j0), along))  # of the pressure E h/R
+    form = np.pi * carrier.over_area()(-ufl.dot(kin.normal(carrier.j0), along))  # of the pressure E h/R
     f = fem.assemble_vector(fem.form(form)).array.copy()
     for support in waves.held(M):
         f[support.dof_indices()[0]] = 0

@@ -12,6 +12,8 @@ from numpy.lib.mixins import NDArrayOperatorsMixin
 from numpy.typing import NDArray
 from pydantic import AfterValidator, BeforeValidator, Field
 
+from magshell_fenicsx.input.enclosure import Enclosed
+
 Array = NDArray[np.float64]
 Partials = tuple[
     list[Any], dict[tuple[int, int], Any]
@@ -115,16 +117,71 @@ _ALLOWED = (*(ast.Expression, ast.BinOp, ast.UnaryOp, ast.Call, ast.Name, ast.Lo
 _Step = tuple[Callable[..., Any], int] | np.float64 | str  # of a stack: a function of some values, a number, a name
 
 
-def formula(text: str) -> Callable[[Array, Array, Array], Array]:
-    """A function of x, y, z (in lengths of R) from text such as "z*sqrt(x**2 + y**2)".
+@dataclass(frozen=True)
+class Read:
+    """A formula as a function of x, y, z (in lengths of R)."""
+
+    steps: "list[_Step]"
+
+    def __call__(self, x: Array, y: Array, z: Array) -> Array:
+        return np.broadcast_to(np.asarray(_evaluate(self.steps, x, y, z), dtype=np.float64), x.shape)
+
+    def bounds(self, low: Array, high: Array) -> tuple[Array, Array, Array]:
+        """In boxes between corners (n, 3) a least and a largest value, and by how much f's derivatives differ (n,).
+
+        The latter times the sides, summed.
+        """
+        found, n = _evaluate(self.steps, *Enclosed.coordinates(low, high)), len(low)
+        if not isinstance(found, Enclosed):
+            return np.full(n, found), np.full(n, found), np.zeros(n)
+        sides, widths = 2 * found.halves, (slope.high - slope.low for slope in found.slopes)
+        bent = sum(np.where(side > 0, width * side, 0.0) for width, side in zip(widths, sides, strict=True))
+        return (*np.broadcast_arrays(found.values.low, found.values.high), np.broadcast_to(bent, n))  # type: ignore[return-value]
+
+
+@dataclass(frozen=True)
+class Together:
+    """Formulas of places in another frame and unit of length, for what they may have between places.
+
+    Attributes
+    ----------
+    frame
+        Its axes, in the formulas' frame, are its rows; None if it is the same.
+    """
+
+    functions: Sequence[Read]
+    frame: Array | None = None
+    length: float = 1.0
+
+    def values(self, x: Array) -> Array:
+        """Of places (n, 3): (n, formulas)."""
+        x = self.length * (x if self.frame is None else x @ self.frame)
+        return np.stack([f(*x.T) for f in self.functions], axis=-1)
+
+    def bounds(self, low: Array, high: Array) -> tuple[Array, ...]:
+        """Of each (n, formulas), see `Read.bounds`."""
+        if self.frame is not None:
+            middle, half = (low + high) / 2 @ self.frame, (high - low) / 2 @ np.abs(self.frame)
+            low, high = middle - half, middle + half
+        found = [f.bounds(self.length * low, self.length * high) for f in self.functions]
+        return tuple(np.stack(each, axis=-1) for each in zip(*found, strict=True))
+
+
+def together(functions: Sequence[object], frame: Array | None = None, length: float = 1.0) -> Together | None:
+    """Those of some functions that are formulas; None without."""
+    found = [f for f in functions if isinstance(f, Read)]
+    return Together(found, frame, length) if found else None
+
+
+def formula(text: str) -> Read:
+    """A function from text such as "z*sqrt(x**2 + y**2)".
 
     Raises
     ------
     ValueError
         If the text is anything but arithmetic of x, y, z, pi and the known functions.
     """
-    steps = _read(text)
-    return lambda x, y, z: np.broadcast_to(np.asarray(_evaluate(steps, x, y, z), dtype=np.float64), x.shape)
+    return Read(_read(text))
 
 
 def _checked(text: str) -> str:
@@ -262,6 +319,10 @@ class ByFormula:
         found = self.factor * np.stack([f(*x) for f in self.of_position], axis=-1)
         return found @ self.frame.T if self.vectors else found
 
+    @property
+    def formulas(self) -> Together | None:
+        return together(self.of_position, self.frame, self.length)
+
 
 @dataclass(frozen=True)
 class Inwards:
@@ -272,6 +333,10 @@ class Inwards:
 
     def __call__(self, r0: Array, n0: Array) -> Array:
         return -self.pressure(r0, n0) * n0
+
+    @property
+    def formulas(self) -> Together | None:
+        return self.pressure.formulas
 
 
 def function(value: float | str) -> Callable[[Array, Array, Array], Array]:

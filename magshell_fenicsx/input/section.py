@@ -178,6 +178,7 @@ NAMES = {
     "radius",
     "name",
     "supports",
+    "errors",
 }  # keys with text that is no quantity
 
 

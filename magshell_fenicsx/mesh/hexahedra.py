@@ -11,8 +11,8 @@ from dolfinx import fem, mesh
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from magshell_fenicsx.mesh.midsurface import Deviated, create_mesh
-from magshell_fenicsx.mesh.patch import MeshError, PatchMesh, as_set, place_text
+from magshell_fenicsx.mesh.midsurface import create_mesh
+from magshell_fenicsx.mesh.patch import Deviated, MeshError, PatchMesh, as_set, place_text
 from magshell_fenicsx.mesh.quadrilaterals import Quadrilaterals, split, square
 from magshell_fenicsx.platform import compat
 

@@ -5,7 +5,7 @@ The shape itself is the vector field r0. It is interpolated at the nodes of the 
 rigid motions are exact.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -18,7 +18,7 @@ from dolfinx.cpp.io import perm_gmsh
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from magshell_fenicsx.mesh.patch import Embedding, PatchMesh, as_set, check_orientation
+from magshell_fenicsx.mesh.patch import Deviated, Deviation, Embedding, PatchMesh, as_set, check_orientation
 from magshell_fenicsx.platform import compat
 
 Array = NDArray[np.float64]
@@ -44,36 +44,6 @@ def nodal_normals(nodes: Array, cells: NDArray[np.int64]) -> Array:
 
 def _unit(v: Array) -> Array:
     return np.asarray(v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-300))
-
-
-Deviation = Callable[[Array], Array]  # places (n, 3) of the perfect surface -> w0 (n,), both over R
-
-
-@dataclass(frozen=True)
-class Deviated:
-    """Chart -> r0 = x + w0(x) n(x), with the sum w0 of all deviations.
-
-    Attributes
-    ----------
-    perfect, normal
-        Chart -> places x (n, 3) and outward unit normals (n, 3) of the perfect surface.
-    """
-
-    perfect: Embedding
-    normal: Embedding
-    deviations: tuple[Deviation, ...]
-
-    def __call__(self, chart: Array) -> Array:
-        return np.asarray(self.perfect(chart) + self.w0(chart)[:, None] * self.normal(chart))
-
-    def along_normal(self, chart: Array, deviations: Sequence[Deviation]) -> Array:
-        """The displacement (n, 3) that other deviations add."""
-        return replace(self, deviations=tuple(deviations)).w0(chart)[:, None] * self.normal(chart)
-
-    def w0(self, chart: Array) -> Array:
-        """w0 over R at places of the chart, (n,)."""
-        places = self.perfect(chart)
-        return np.asarray(sum((deviation(places) for deviation in self.deviations), np.zeros(len(places))))
 
 
 @dataclass(frozen=True)

@@ -1,12 +1,13 @@
 """A triangulated surface before it is given to dolfinx, and the sides of its triangles."""
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 Embedding = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+Array = NDArray[np.float64]
 Pairs = NDArray[np.int64]  # (n, 2) vertices of edges
 
 
@@ -97,3 +98,33 @@ def check_orientation(patch: PatchMesh) -> None:
             f"the normals of two neighbouring triangles point to opposite sides (or three triangles meet) "
             f"at the edge around {place_text(where)}"
         )
+
+
+Deviation = Callable[[Array], Array]  # places (n, 3) of the perfect surface -> w0 (n,), both over R
+
+
+@dataclass(frozen=True)
+class Deviated:
+    """Chart -> r0 = x + w0(x) n(x), with the sum w0 of all deviations.
+
+    Attributes
+    ----------
+    perfect, normal
+        Chart -> places x (n, 3) and outward unit normals (n, 3) of the perfect surface.
+    """
+
+    perfect: Embedding
+    normal: Embedding
+    deviations: tuple[Deviation, ...]
+
+    def __call__(self, chart: Array) -> Array:
+        return np.asarray(self.perfect(chart) + self.w0(chart)[:, None] * self.normal(chart))
+
+    def along_normal(self, chart: Array, deviations: Sequence[Deviation]) -> Array:
+        """The displacement (n, 3) that other deviations add."""
+        return replace(self, deviations=tuple(deviations)).w0(chart)[:, None] * self.normal(chart)
+
+    def w0(self, chart: Array) -> Array:
+        """w0 over R at places of the chart, (n,)."""
+        places = self.perfect(chart)
+        return np.asarray(sum((deviation(places) for deviation in self.deviations), np.zeros(len(places))))

@@ -1,32 +1,36 @@
 """The formulas of a case in the undeformed place: that they have sensible values, and where elements must be small."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import ceil, inf, sqrt
 
 import basix
 import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.input.expressions import function
+from magshell_fenicsx.input.expressions import Together, formula
 from magshell_fenicsx.input.messages import shown
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.grading import PER_AREA, Squares
 from magshell_fenicsx.mesh.grid import Grid
 from magshell_fenicsx.mesh.mirror import rotation
-from magshell_fenicsx.mesh.msh import MeshFile
+from magshell_fenicsx.mesh.msh import MeshFile, in_space, read_msh
 from magshell_fenicsx.mesh.patch import PatchMesh
 from magshell_fenicsx.mesh.shapes import DiscShape, Shape, StripShape
-from magshell_fenicsx.models.shell.fitted import Cells, fitted
+from magshell_fenicsx.models.shell.fitted import Cells, fitted, sampling
 from magshell_fenicsx.models.shell.patterns import LARGEST as LARGEST_VECTOR
 from magshell_fenicsx.models.shell.thickness import LEAST_FACTOR, MOST_FACTOR
+from magshell_fenicsx.models.shell.unseen import Lattice, Leaves, Parts
+from magshell_fenicsx.models.shell.unseen import leaves as leaves_of
 from magshell_fenicsx.parts.imperfections.imperfection import Flaw
 from magshell_fenicsx.parts.natural.shape import LARGEST, SMALLEST
 from magshell_fenicsx.shape.outline import ANY, Outline
 
 Array = NDArray[np.float64]
+THICKNESS = "shell.thickness_factor"
 SAMPLES = 20  # along each side of a square of the chart
 COARSEST, MOST_FIRST, MOST_SQUARES = 0.2, 800, 3000  # side of the first squares over R, how many, and how many later
 DEGREE = 4  # of the polynomials that are compared
@@ -34,7 +38,10 @@ SHOWN, SMALLEST_SQUARE = 0.25, 0.1  # of sqrt(Rh) and of h: elements of this siz
 SMALLEST_FLAW = 0.25  # of h
 TOTAL, SQUARE = 1e-3, 0.02  # of the integrals of a formula's size and of its square, which cells may miss
 CHEAPER = 0.5  # of as many elements as small ones everywhere are: a graded mesh is worth while
+STIFFNESS = 1e-3  # of it, which cells may miss by a thickness that varies within them
 MISSED = 0.003  # of the variance of a formula: what polynomials on squares may miss of it
+SEEN, HALF = 6, 0.5  # places along each side of a part of the surface; of a formula's square, which samples miss
+NARROW, PLACES = 0.02, 300  # over R, parts that samples may miss, and how many of each formula are looked at
 CURVATURE = 1e6  # of a natural shape, over 1/R
 LOCAL = (np.stack(np.meshgrid(*[np.arange(SAMPLES)] * 2, indexing="ij"), axis=-1).reshape(-1, 2) + 0.5) / SAMPLES - 0.5
 _POWERS = [(i, j) for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i)]
@@ -47,8 +54,8 @@ class Written:
 
     Attributes
     ----------
-    of_place
-        Places (n, 3) over R in the frame of the case -> each formula's values (n, formulas), in the case's unit.
+    formulas
+        Of places over R in the frame of the case, in the case's unit.
     least, most
         Allowed values.
     load
@@ -58,10 +65,14 @@ class Written:
 
     key: str
     texts: tuple[str, ...]
-    of_place: Callable[[Array], Array]
+    formulas: Together
     least: float
     most: float
     load: bool = False
+
+    def of_place(self, x: Array) -> Array:
+        """Places (n, 3) -> each formula's values (n, formulas)."""
+        return self.formulas.values(x)
 
 
 def written(case: Case) -> list[Written]:
@@ -76,16 +87,11 @@ def _written(case: Case) -> Iterator[Written]:
         key: str, values: Iterable[float | str], least: float, most: float, length: float = R, *, load: bool = False
     ) -> Iterator[Written]:
         texts = tuple(v for v in values if isinstance(v, str))
-        functions = [function(text) for text in texts]
-
-        def of_place(x: Array) -> Array:
-            return np.stack([f(*(length * x).T) for f in functions], axis=-1)
-
         if texts:
-            yield Written(key, texts, of_place, least, most, load)
+            yield Written(key, texts, Together([formula(text) for text in texts], None, length), least, most, load)
 
     if isinstance(case.thickness_factor, str):
-        yield from one("shell.thickness_factor", [case.thickness_factor], LEAST_FACTOR, MOST_FACTOR, 1.0)
+        yield from one(THICKNESS, [case.thickness_factor], LEAST_FACTOR, MOST_FACTOR, 1.0)
     if case.magnetic and case.magnetic.remanent.components:
         key = "magnetic.remanent.components"
         yield from one(key, case.magnetic.remanent.components, -LARGEST_VECTOR, LARGEST_VECTOR, 1.0)
@@ -180,9 +186,56 @@ def within(shape: Shape | Grid, chart: Array) -> NDArray[np.bool_]:
     return np.asarray(((chart >= low) & (chart <= high)).all(axis=-1))
 
 
-def shown_by_polynomials(values: Callable[[Array], Array]) -> Sizes:
-    """Elements that show a formula of places (n, 3): smaller than the squares where polynomials miss most of it."""
+def looked_at(formulas: Together, outline: Outline) -> Leaves:
+    """Parts of the perfect surface in which a formula has no values that their places do not show, in the case's frame.
+
+    They divide triangles of the chart, of a disc those of a square that is mapped onto it, or of a mesh file.
+    """
+    shape = outline.chart(None, ANY)
+    if isinstance(shape, MeshFile):
+        mesh = read_msh(shape, {})
+        triangles, embedded = mesh.nodes[mesh.cells[:, :3]], in_space
+    else:
+        low, high = extent(shape)
+        radius = shape.reach if isinstance(shape, DiscShape) else None
+        t = [np.linspace(a, b, ceil((b - a) / COARSEST) + 1) for a, b in zip(low, high, strict=True)]
+        corners = np.stack(np.meshgrid(*t, indexing="ij"), axis=-1)
+        a, b, c, d = (corners[i : i - 1 or None, j : j - 1 or None] for i in (0, 1) for j in (0, 1))
+        triangles = np.concatenate([np.stack(three, axis=-2).reshape(-1, 3, 2) for three in ((a, b, c), (d, c, b))])
+
+        def embedded(x: Array) -> Array:
+            return outline.perfect(x * np.sqrt(1 - (x[:, ::-1] / radius) ** 2 / 2) if radius else x)
+
+    lattice = Lattice.of(basix.CellType.triangle, SEEN)
+
+    def look(parts: Parts) -> tuple[Array, Array]:
+        X, three = parts.rule(lattice.places, np.ones(len(lattice.places)))[0], triangles[parts.cell]
+        x = three[:, None, 0] + np.matmul(X, three[:, 1:] - three[:, :1])
+        x = embedded(x.reshape(-1, x.shape[-1])).reshape(*x.shape[:2], 3)
+        area = np.linalg.norm(np.cross(x[:, 1] - x[:, 0], x[:, 2] - x[:, 0]), axis=1) / 2
+        return x, area
+
+    first = Parts(np.zeros(1, np.int64), np.zeros((1, 2)), np.ones((1, 2))).of(np.arange(len(triangles)))
+    return leaves_of(formulas, first, look, lattice, len(triangles))
+
+
+def narrow_places(found: Sequence[Leaves]) -> Array:
+    """Places (n, 3) at which formulas have what samples may miss."""
+    few: list[Array] = [np.zeros((0, 3))]
+    for each in found:
+        small = np.flatnonzero(each.size < NARROW)
+        order = small[np.argsort(-each.area[small] * each.away[small])]
+        few += [each.centre[order[:PLACES]], each.centre[order[PLACES :: max(1, len(order) // PLACES)]]]
+    return np.concatenate(few)
+
+
+def shown_by_polynomials(values: Callable[[Array], Array], found: Leaves | None = None) -> Sizes:
+    """Elements that show a formula of places (n, 3): smaller than the squares where polynomials miss most of it.
+
+    What samples of a square do not have and the leaves in it have is missed too.
+    """
     whole: float = 0.0
+    of_leaves: float = float(found.area @ found.away) if found else 0.0
     mean: Array | None = None
 
     def sizes(x: Array, inside: NDArray[np.bool_], side: float) -> Array:
@@ -198,7 +251,11 @@ def shown_by_polynomials(values: Callable[[Array], Array]) -> Sizes:
             missed[i][good[i]] = g - Q @ (Q.T @ g)
         area = (side / SAMPLES) ** 2
         whole = max(whole, area * float((f**2).sum()))
+        whole = of_leaves if whole < HALF * of_leaves else whole
         squared = area * (missed**2).sum(axis=(1, 2))
+        if found:
+            middle = x[:, len(LOCAL) // 2 + SAMPLES // 2]
+            squared = np.maximum(squared, _unsampled(found, middle, side, area * (f**2).sum(axis=(1, 2))))
         order = np.argsort(squared)
         fine = np.empty(len(f), dtype=bool)
         fine[order] = np.cumsum(squared[order]) <= MISSED * whole
@@ -207,7 +264,17 @@ def shown_by_polynomials(values: Callable[[Array], Array]) -> Sizes:
     return sizes
 
 
-def refinements(case: Case, formulas: Sequence[Written], drawn: Outline, turn: float, h: float) -> list[Squares]:
+def _unsampled(found: Leaves, middle: Array, side: float, sampled: Array) -> Array:
+    """The squares' integrals of the square of a formula, less those of samples that have not half of it."""
+    away, square = cKDTree(middle).query(found.centre, distance_upper_bound=side)
+    there = np.isfinite(away) & (found.size < side)
+    whole = np.bincount(square[there], (found.area * found.away)[there], len(middle))
+    return np.where(sampled < HALF * whole, whole, 0.0)
+
+
+def refinements(
+    case: Case, formulas: Sequence[Written], narrow: Sequence[Leaves], drawn: Outline, turn: float, h: float
+) -> list[Squares]:
     """Where formulas need small elements, in the chart of a frame that is turned about e3 (rad)."""
     Q = rotation(turn)
 
@@ -215,7 +282,10 @@ def refinements(case: Case, formulas: Sequence[Written], drawn: Outline, turn: f
         return drawn.embedding(chart) @ Q
 
     finest = {True: SHOWN * sqrt(h), False: SMALLEST_SQUARE * h}
-    found = (squares(places, drawn, shown_by_polynomials(each.of_place), finest[each.load]) for each in formulas)
+    found = (
+        squares(places, drawn, shown_by_polynomials(each.of_place, leaves), finest[each.load])
+        for each, leaves in zip(formulas, narrow, strict=True)
+    )
     return [each.finer(case.mesh.refinement) for each in found if each]
 
 
@@ -264,18 +334,43 @@ def unshown(formulas: Sequence[Written], cells: Cells, turn: float, h: float) ->
             return each.of_place(x.reshape(-1, 3) @ Q).reshape(*x.shape[:-1], -1)
 
         x, normals, _ = cells.at(element.points)
-        fit = fitted(values, cells, values(x, normals), element, element.degree)
+        turned = replace(each.formulas, frame=Q)
+        bounded = each.key == THICKNESS
+        fit = fitted(values, cells, values(x, normals), element, element.degree, bounded=bounded, formulas=turned)
         missed = fit.rest**2
+        if fit.open:
+            said.append(
+                f"{each.key}: has so many details that {100 * min(fit.open, 1.0):.2g} % of its variation may not be "
+                "seen"
+            )
         if fit.missed > TOTAL:
-            wrong = f"{100 * fit.missed:.2g} %"
-            said.append(f"{each.key}: its integral over the mesh may be wrong by {wrong}: it varies too much")
+            off = f"{100 * fit.missed:.2g} %"
+            said.append(f"{each.key}: its integral over the mesh may be wrong by {off}: it varies too much")
         elif missed > SQUARE and not (each.load and fit.widest < 4 * SHOWN * sqrt(h)):
             said.append(
                 f"{each.key}: varies within elements of up to {fit.widest:.2g} R: its integral is right, but "
                 f"{100 * missed:.2g} % of that of its square is not shown; take a smaller mesh.size or a larger "
                 "mesh.refinement"
             )
+        elif each.key == THICKNESS and (wrong := _wrong_stiffness(values, cells, fit.nodal)) > STIFFNESS:
+            said.append(
+                f"{each.key}: varies within elements of up to {fit.widest:.2g} R: its integral is right, but the "
+                f"stiffness may be wrong by {100 * wrong:.2g} %; take a smaller mesh.size or a larger mesh.refinement"
+            )
     return said
+
+
+def _wrong_stiffness(values: Callable[[Array, Array], Array], cells: Cells, nodal: Array) -> float:
+    """By how much the mean of t^3, or that of 1/t^3, differs in cells, over that of all; collective.
+
+    Parts of a shell that carry side by side add their stiffness, those in a row their compliance.
+    """
+    X, w = (v.reshape(-1, *v.shape[2:]) for v in sampling(cells))
+    x, normals, area = cells.at(X)
+    t, p = values(x, normals), np.matmul(cells.element.tabulate(0, X)[0, :, :, 0], nodal)
+    powers = ((area * w)[..., None] * np.concatenate([v**n for v in (t, p) for n in (3, -3)], axis=-1)).sum(axis=1)
+    off = cells.sum(np.abs(powers[:, 2:] - powers[:, :2])) / cells.sum(powers[:, :2])
+    return float(off.max())
 
 
 def cells_of_patch(patch: PatchMesh, degree: int) -> Cells:

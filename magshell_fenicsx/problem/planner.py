@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.input.expressions import formula
+from magshell_fenicsx.input.expressions import formula, together
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.grading import Grading, Squares
 from magshell_fenicsx.mesh.grid import Grid, RimmedGrid
@@ -29,7 +29,14 @@ from magshell_fenicsx.parts.registered import STEPS
 from magshell_fenicsx.parts.supports.boundary import BoundarySection, EdgeCondition, HeldSection
 from magshell_fenicsx.problem.account import account
 from magshell_fenicsx.problem.columns import refuse_twice
-from magshell_fenicsx.problem.formulas import of_imperfections, refinements, refuse_unfit_formulas, written
+from magshell_fenicsx.problem.formulas import (
+    looked_at,
+    narrow_places,
+    of_imperfections,
+    refinements,
+    refuse_unfit_formulas,
+    written,
+)
 from magshell_fenicsx.problem.limits import refuse_unbounded_fields, sources_beside, unknowns_of
 from magshell_fenicsx.problem.names import refuse_unfit_ends
 from magshell_fenicsx.problem.own_terms import surface_terms
@@ -70,7 +77,9 @@ def make_plan(case: Case, terms: Sequence[OwnTerm] = ()) -> Plan:
     sample = np.zeros((0, 3)) if isinstance(case.shell, MeshSurface) else drawn.sample()
     refuse_unbounded_fields(case, sample)
     formulas = written(case)
-    refuse_unfit_formulas(formulas, sample if len(sample) or not formulas else drawn.sample())
+    narrow = [looked_at(each.formulas, drawn) for each in formulas]
+    drawn = drawn.looked_at(narrow_places(narrow)) if formulas else drawn
+    refuse_unfit_formulas(formulas, drawn.sample() if formulas else sample)
     terms = (*case.own_terms, *terms)
     energies = surface_terms(case, terms)
     parts = _left(case, drawn, energies)
@@ -103,7 +112,7 @@ def make_plan(case: Case, terms: Sequence[OwnTerm] = ()) -> Plan:
     touched = [(drawn.inverse(c.front), travel(material.h, approached[c.body], c.size), c.size) for c in bodies]
     if not (axisymmetric or case.mesh.size):
         varying, everywhere = of_imperfections(wide, perfect, turn, case, material.h)
-        varying += refinements(case, formulas, drawn, turn, material.h)
+        varying += refinements(case, formulas, narrow, drawn, turn, material.h)
     size = grading(case, drawn, material.h, local, everywhere, loaded, touched, varying)
     drawn = imperfect(perfect, found, turn, still)
     shape = drawn.chart(beyond, size)
@@ -310,4 +319,7 @@ def _thickness(case: Case, turn: float) -> Thickness | None:
     if not factor:
         return None
     told, Q = formula(factor), rotation(turn)
-    return Thickness(lambda x, y, z: told(*np.tensordot(Q.T, np.stack([x, y, z]), 1)) if turn else told(x, y, z))
+    return Thickness(
+        lambda x, y, z: told(*np.tensordot(Q.T, np.stack([x, y, z]), 1)) if turn else told(x, y, z),
+        formulas=together([told], Q),
+    )

@@ -1,7 +1,7 @@
 """The chart of each geometry, over the reference length R: what is meshed, and how it is put into space."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from math import inf, pi, radians
 
 import numpy as np
@@ -9,10 +9,9 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.mesh.grading import Grading
 from magshell_fenicsx.mesh.grid import Grid
-from magshell_fenicsx.mesh.midsurface import Deviated, Deviation
 from magshell_fenicsx.mesh.mirror import Y0, Mirror
 from magshell_fenicsx.mesh.msh import MeshFile, in_space, normals, read_msh
-from magshell_fenicsx.mesh.patch import Embedding, MeshError
+from magshell_fenicsx.mesh.patch import Deviated, Deviation, Embedding, MeshError
 from magshell_fenicsx.mesh.revolved import Arc, Capped, Profile, Revolved, Segment, Spline
 from magshell_fenicsx.mesh.shapes import DiscShape, Shape, StripShape
 from magshell_fenicsx.mesh.sphere import flat, sphere, upwards
@@ -66,6 +65,8 @@ class Outline:
         Places -> length of the meridian from the pole; None but for a pole of a surface of revolution.
     span
         The meridian; None if it is closed, or the surface is none of revolution.
+    also
+        Places (n, 3) that samples have besides: those where formulas are narrow.
     """
 
     chart: Callable[[Mirror | None, Grading], Chart]
@@ -79,6 +80,7 @@ class Outline:
     mirrors: Callable[[Sequence[Array], bool], Sequence[Mirror]] = lambda vectors, loosely: []
     from_pole: Callable[[Array], Array] | None = None
     span: Span | None = None
+    also: Array = field(default_factory=lambda: np.zeros((0, 3)))
 
     def on_half(self, chart: Array) -> Array:
         """A place of the chart on its half, from which rounding may have moved it; grids and meshes are cut."""
@@ -97,8 +99,12 @@ class Outline:
         chart, nodes = self.charts(), self.nodes
         if chart is None:
             assert nodes is not None
-            return in_space(nodes)
-        return self.embedding(chart)
+            return np.vstack([in_space(nodes), self.also])
+        return np.vstack([self.embedding(chart), self.also])
+
+    def looked_at(self, places: Array) -> "Outline":
+        """With these places among its samples."""
+        return replace(self, also=places, span=self.span and replace(self.span, also=places))
 
     @property
     def nodes(self) -> Array | None:

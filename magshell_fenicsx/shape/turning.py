@@ -1,7 +1,7 @@
 """A meridian, and whether a formula of x, y, z is the same along every one."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import inf
 
 import numpy as np
@@ -41,6 +41,8 @@ class Span:
         Size of cells that shows the imperfections.
     vertices
         Those of its mesh, if that is given.
+    also
+        Places (n, 3) of the surface at which formulas are narrow.
     """
 
     length: float
@@ -52,6 +54,7 @@ class Span:
     curvature: float = 1.0
     largest: float = inf
     vertices: NDArray[np.float64] | None = None
+    also: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 3)))
 
     def sample(self) -> NDArray[np.float64]:
         """Places (n, 3) along it, its ends among them."""
@@ -62,7 +65,10 @@ class Span:
 def scalar_turns(text: str, span: Span, length: float = 1.0) -> bool:
     """Whether a formula has the same value all around; its unit of length is R over `length`."""
     f, places = formula(text), length * _places(span)
-    return _same([f(*(places @ rotation(angle)).T)[:, None] for angle in ANGLES])
+    around, turned = length * span.also, length * _at_azimuth_zero(span.also)[0]
+    return _same([f(*(places @ rotation(angle)).T)[:, None] for angle in ANGLES]) and _same(
+        [f(*around.T)[:, None], f(*turned.T)[:, None]]
+    )
 
 
 def vector_turns(components: Sequence[str], span: Span, length: float = 1.0, *, in_space: bool = False) -> bool:
@@ -78,7 +84,17 @@ def vector_turns(components: Sequence[str], span: Span, length: float = 1.0, *, 
     vectors, places = vectors_of(components), _places(span)
     if in_space:
         places = beside(places) * [1.0, 0.0, 1.0]
-    return _turns(lambda x: vectors(length * x), places)
+    turned, Q = _at_azimuth_zero(span.also)
+    around = np.einsum("nij,nj->ni", Q, vectors(length * span.also))
+    return _turns(lambda x: vectors(length * x), places) and _same([vectors(length * turned), around])
+
+
+def _at_azimuth_zero(x: Array) -> tuple[Array, Array]:
+    """Places (n, 3) turned about e3 into y = 0, and the rotations (n, 3, 3)."""
+    rho, one, none = np.hypot(x[:, 0], x[:, 1]), np.ones(len(x)), np.zeros(len(x))
+    c, s = np.where(rho > 0, x[:, :2].T / np.where(rho > 0, rho, 1.0), [[1.0], [0.0]])
+    Q = np.array([[c, s, none], [-s, c, none], [none, none, one]])
+    return np.column_stack([rho, none, x[:, 2]]), np.moveaxis(Q, 2, 0)
 
 
 def field_turns(field: Callable[[Array], Array], span: Span) -> bool:
@@ -109,4 +125,4 @@ def _places(span: Span) -> Array:
 
 def _same(values: Sequence[Array]) -> bool:
     first = values[0]
-    return all(bool((np.abs(v - first) <= SAME * np.abs(first).max()).all()) for v in values)
+    return not first.size or all(bool((np.abs(v - first) <= SAME * np.abs(first).max()).all()) for v in values)

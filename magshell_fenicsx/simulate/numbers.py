@@ -50,6 +50,8 @@ def number_of(case: Case, key: str) -> float:
             raise CaseError(f"{key}: the case has no such key ({name})") from None
     if isinstance(part, bool) or not isinstance(part, int | float):
         raise CaseError(f"{key}: is no number that the case gives: {part!r}")
+    if key.startswith("magnetic.remanent.layers.") and key.endswith(".fraction"):
+        raise CaseError(f"{key}: the fractions of the layers add up to 1: one alone has no gradient")
     section, _, rest = key.partition(".")
     geometry = section == "shell" and rest.split(".")[0] not in OF_MATERIAL
     if section in ELSEWHERE or geometry:

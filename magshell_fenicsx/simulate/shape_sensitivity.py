@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.continuation.fold import Fold, sensitivity
 from magshell_fenicsx.continuation.system import State
-from magshell_fenicsx.mesh.midsurface import Deviated, Deviation
 from magshell_fenicsx.mesh.mirror import Mirror
+from magshell_fenicsx.mesh.patch import Deviated, Deviation
 from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.parts.imperfections.growth import grown_by
 from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionSection, LocalSection, flaws, in_frame

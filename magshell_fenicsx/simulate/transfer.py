@@ -8,7 +8,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.system import Vector
-from magshell_fenicsx.mesh.midsurface import Deviated
+from magshell_fenicsx.mesh.patch import Deviated
 from magshell_fenicsx.mesh.shapes import DiscShape
 from magshell_fenicsx.mesh.sphere import sphere
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel

@@ -11,8 +11,7 @@ from dolfinx import fem, mesh
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from magshell_fenicsx.mesh.midsurface import Deviated, Deviation
-from magshell_fenicsx.mesh.patch import Embedding, MeshError
+from magshell_fenicsx.mesh.patch import Deviated, Deviation, Embedding, MeshError
 
 Array = NDArray[np.float64]
 MOST_CELLS = 1_000_000

@@ -9,7 +9,7 @@ does the same work on every displacement, up to the curvature of the cell. Its i
 that are divided until each agrees with its own parts. Where f is a polynomial of the degree k, p is f.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -17,6 +17,9 @@ import basix
 import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
+
+from magshell_fenicsx.input.expressions import Together
+from magshell_fenicsx.models.shell.unseen import AT_ONCE, CHILDREN, Lattice, Parts, leaves
 
 Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
@@ -28,16 +31,9 @@ SMOOTH = 1e-6  # of the largest value: cells that differ by less stay interpolat
 PART = 5e-8  # of the integral of |f|: a part of a cell that differs by more is divided
 DEEPEST, MOST = 9, 400_000  # divisions, parts of all cells
 VISIBLE = 0.01  # of what the polynomials leave: a cell that counts
-AT_ONCE = 4096  # parts that are evaluated together
 FIRST = {1: 8, 2: 2, 3: 2}  # divisions of every cell, by its dimension
+LATTICE = {1: 8, 2: 4, 3: 2}  # places along each side of a part whose range is compared with them
 RULE = {1: 7, 2: 6, 3: 4}  # degree of the rule on each part
-CHILDREN: dict[
-    int, list[tuple[tuple[float, ...], tuple[float, ...]]]
-] = {  # corner and scale along each axis of the parts of an interval, a triangle, a body's cell (in its surface)
-    1: [((0.0,), (0.5,)), ((0.5,), (0.5,))],
-    2: [((x, y), (s, s)) for x, y, s in ((0, 0, 0.5), (0.5, 0, 0.5), (0, 0.5, 0.5), (0.5, 0.5, -0.5))],
-    3: [((x, y, 0.0), (0.5, 0.5, 1.0)) for x in (0.0, 0.5) for y in (0.0, 0.5)],
-}
 
 
 @dataclass(frozen=True)
@@ -107,6 +103,8 @@ class Fit:
         The root of the integral of |f - p|^2 over that of |f|^2, of all cells.
     widest
         The largest side of a cell that misses a visible part of that.
+    open
+        The part of the integral of |f| that may not have been seen, if more than it should be.
     """
 
     nodal: Array
@@ -115,50 +113,19 @@ class Fit:
     missed: float = 0.0
     rest: float = 0.0
     widest: float = 0.0
+    open: float = 0.0
 
 
-@dataclass(frozen=True)
-class _Parts:
-    """Images of the reference cell in it, X = corner + sides * X', each of a cell."""
-
-    cell: Numbers
-    corner: Array
-    sides: Array
-
-    def __getitem__(self, which: slice | NDArray[np.bool_]) -> "_Parts":
-        return _Parts(self.cell[which], self.corner[which], self.sides[which])
-
-    def of(self, cells: Numbers) -> "_Parts":
-        """The same in each of some cells."""
-        times = len(cells)
-        numbers = np.repeat(cells, len(self.cell))
-        return _Parts(numbers, np.tile(self.corner, (times, 1)), np.tile(self.sides, (times, 1)))
-
-    @classmethod
-    def together(cls, several: "Sequence[_Parts]") -> "_Parts":
-        return cls(*(np.concatenate([getattr(one, name) for one in several]) for name in ("cell", "corner", "sides")))
-
-    def pieces(self) -> "list[_Parts]":
-        """A few at a time."""
-        return [self[i : i + AT_ONCE] for i in range(0, len(self.cell), AT_ONCE)]
-
-    def divided(self) -> "_Parts":
-        """The parts of the first, those of the second, and so on."""
-        children = CHILDREN[self.corner.shape[1]]
-        at, by = (np.array(v, dtype=float) for v in zip(*children, strict=True))
-        d = self.corner.shape[1]
-        corner = self.corner[:, None] + self.sides[:, None] * at
-        return _Parts(
-            np.repeat(self.cell, len(children)), corner.reshape(-1, d), (self.sides[:, None] * by).reshape(-1, d)
-        )
-
-    def rule(self, points: Array, weights: Array) -> tuple[Array, Array]:
-        """Points (parts, q, d) and weights (parts, q)."""
-        X = self.corner[:, None] + self.sides[:, None] * points
-        return X, np.abs(self.sides.prod(axis=1))[:, None] * weights
-
-
-def fitted(values: Values, cells: Cells, nodal: Array, element: Element, degree: int, *, bounded: bool = False) -> Fit:
+def fitted(
+    values: Values,
+    cells: Cells,
+    nodal: Array,
+    element: Element,
+    degree: int,
+    *,
+    bounded: bool = False,
+    formulas: Together | None = None,
+) -> Fit:
     """A formula whose values at the nodes of each cell are known; collective.
 
     Parameters
@@ -169,26 +136,30 @@ def fitted(values: Values, cells: Cells, nodal: Array, element: Element, degree:
         Of the polynomials with the same moments, at most that of the element.
     bounded
         Whether they stay between the least and the largest value in a cell; of their moments the first is kept.
+    formulas
+        What varies in them, so that nothing between the places is missed.
     """
-    d = cells.dimension
-    points, weights = basix.make_quadrature(cells.element.cell_type, RULE[d])
-    parts = _Parts(np.zeros(1, np.int64), np.zeros((1, d)), np.ones((1, d)))
-    for _ in range(FIRST[d]):
-        parts = parts.divided()
-    X, w = (v.reshape(-1, *v.shape[2:]) for v in parts.rule(points, weights))
+    d, parts = cells.dimension, _alike(cells)
+    X, w = (v.reshape(-1, *v.shape[2:]) for v in sampling(cells))
     x, normals, area = cells.at(X)
     f = values(x, normals)
     off = np.linalg.norm(np.matmul(element.tabulate(0, X)[0, :, :, 0], nodal) - f, axis=-1)
     magnitude, area = np.linalg.norm(f, axis=-1), area * w
-    sums = cells.sum(np.stack([(area * v).sum(axis=1) for v in (magnitude, off, magnitude**2)], axis=-1))
+    square_of = (area * magnitude**2).sum(axis=1)
+    sums = cells.sum(np.stack([*((area * v).sum(axis=1) for v in (magnitude, off)), square_of], axis=-1))
     size, differs, square = map(float, sums)
-    if not differs > AGREED * size:
-        return Fit(nodal, smooth=True, size=size)
-    largest = cells.comm.allreduce(float(magnitude.max(initial=0.0)), MPI.MAX)
-    chosen = np.flatnonzero(off @ w > SMOOTH * largest * w.sum())
     scale, sizes = area.sum(axis=1) / w.sum(), (area * magnitude).sum(axis=1)
+    narrow = _narrow(values, formulas, cells, np.einsum("q,cqi->ci", w, f)) if formulas else _Narrow.nothing(len(scale))
+    hidden = scale * narrow.hidden
+    more = float(cells.sum(hidden))
+    size += more
+    if not (differs + more > AGREED * size or more > AGREED * narrow.variation):
+        return Fit(nodal, smooth=True, size=size, open=narrow.open)
+    largest = cells.comm.allreduce(float(magnitude.max(initial=0.0)), MPI.MAX)
+    chosen = np.flatnonzero((off @ w > SMOOTH * largest * w.sum()) | (hidden > PART * size))
+    ahead = narrow.parts(chosen, parts)
     space = basix.create_element(basix.ElementFamily.P, element.cell_type, degree, basix.LagrangeVariant.gll_warped)
-    found = _moments(values, cells, chosen, scale, parts, PART * size, space, nodal.shape[-1])
+    found = _moments(values, cells, chosen, scale, ahead, PART * size, space, nodal.shape[-1])
     moments, sizes[chosen], squares, missed = found
     Y, v = basix.make_quadrature(element.cell_type, 2 * degree)
     phi = space.tabulate(0, Y)[0, :, :, 0]
@@ -205,7 +176,90 @@ def fitted(values: Values, cells: Cells, nodal: Array, element: Element, degree:
     new = nodal.copy()
     new[chosen] = at_nodes
     nothing = np.finfo(float).tiny  # a formula that is zero but on a line
-    return Fit(new, False, size, missed / max(size, nothing), float(np.sqrt(rest / max(square, nothing))), widest)
+    square_of[chosen] = scale[chosen] * squares
+    share = float(np.sqrt(rest / max(square, float(cells.sum(square_of)), nothing)))
+    return Fit(new, False, size, missed / max(size, nothing), share, widest, narrow.open)
+
+
+def _alike(cells: Cells) -> Parts:
+    """The parts in which every cell is looked at first."""
+    d = cells.dimension
+    parts = Parts(np.zeros(1, np.int64), np.zeros((1, d)), np.ones((1, d)))
+    for _ in range(FIRST[d]):
+        parts = parts.divided()
+    return parts
+
+
+def sampling(cells: Cells) -> tuple[Array, Array]:
+    """Their places (parts, q, d) in the reference cell, and weights (parts, q)."""
+    return _alike(cells).rule(*basix.make_quadrature(cells.element.cell_type, RULE[cells.dimension]))
+
+
+@dataclass(frozen=True)
+class _Narrow:
+    """What is between the places of whole cells.
+
+    Attributes
+    ----------
+    hidden
+        By how much integrals over the reference cell differ from those of the places (cells,).
+    variation
+        The integral of |f - its mean|.
+    leaves, deep
+        Parts of divided cells, and whether each cell is one (cells,).
+    open
+        See `Fit`.
+    """
+
+    hidden: Array
+    variation: float
+    leaves: Parts
+    deep: NDArray[np.bool_]
+    open: float
+
+    @classmethod
+    def nothing(cls, cells: int, variation: float = 0.0, open_: float = 0.0) -> "_Narrow":
+        none = Parts(np.empty(0, np.int64), np.empty((0, 0)), np.empty((0, 0)))
+        return cls(np.zeros(cells), variation, none, np.zeros(cells, bool), open_)
+
+    def parts(self, chosen: Numbers, alike: Parts) -> Parts:
+        """Of some cells: those that are alike, but of the divided ones the leaves, none larger."""
+        deep = self.deep[chosen]
+        if not deep.any():
+            return alike.of(chosen)
+        parts, largest = self.leaves[np.isin(self.leaves.cell, chosen)], 1.001 * np.abs(alike.sides[0, 0])
+        small, wide = list[Parts](), np.abs(parts.sides[:, 0]) > largest
+        while wide.any():
+            small.append(parts[~wide])
+            parts = parts[wide].divided()
+            wide = np.abs(parts.sides[:, 0]) > largest
+        return Parts.together([alike.of(chosen[~deep]), *small, parts])
+
+
+def _narrow(values: Values, formulas: Together, cells: Cells, coarse: Array) -> _Narrow:
+    """Integrals (cells, components) compared with those over leaves, see `unseen.leaves`; collective."""
+    d, kind = cells.dimension, cells.element.cell_type
+    lattice, (points, weights) = Lattice.of(kind, LATTICE[d]), basix.make_quadrature(kind, RULE[d])
+
+    def look(parts: Parts) -> tuple[Array, Array]:
+        X, w = parts.rule(lattice.places, np.full(len(lattice.places), weights.sum() / len(lattice.places)))
+        x, _, area = cells.at(X, parts.cell)
+        return x, (area * w).sum(axis=1)
+
+    first = Parts(np.zeros(1, np.int64), np.zeros((1, d)), np.ones((1, d))).of(np.arange(len(cells.nodal)))
+    found = leaves(formulas, first, look, lattice, cells.owned, cells.comm)
+    deep = np.zeros(len(cells.nodal), bool)
+    divided = np.abs(found.parts.sides[:, 0]) < 1
+    deep[found.parts.cell[divided]] = True
+    fine, parts = np.where(deep[:, None], 0.0, coarse), found.parts[divided]
+    for some in parts.pieces():
+        X, w = some.rule(points, weights)
+        x, normals, _ = cells.at(X, some.cell)
+        np.add.at(fine, some.cell, np.einsum("pq,pqi->pi", w, values(x, normals)))
+    hidden = np.linalg.norm(fine - coarse, axis=1)
+    if not cells.sum(hidden) > 0:
+        return _Narrow.nothing(len(hidden), found.variation, found.open)
+    return _Narrow(hidden, found.variation, parts, deep, found.open)
 
 
 def _moments(
@@ -213,7 +267,7 @@ def _moments(
     cells: Cells,
     chosen: Numbers,
     scale: Array,
-    parts: _Parts,
+    ahead: Parts,
     threshold: float,
     space: Element,
     components: int,
@@ -225,9 +279,8 @@ def _moments(
     points, weights = basix.make_quadrature(space.cell_type, RULE[cells.dimension])
     number = np.zeros(len(cells.nodal), np.int64)
     number[chosen] = np.arange(len(chosen))
-    ahead = parts.of(chosen)
 
-    def evaluated(some: _Parts) -> tuple[Array, Array, Array, Array]:
+    def evaluated(some: Parts) -> tuple[Array, Array, Array, Array]:
         X, w = some.rule(points, weights)
         x, normals, area = cells.at(X, some.cell)
         return X, w, area * w, values(x, normals)
@@ -240,7 +293,7 @@ def _moments(
     whole = [integrals(w, f) for _, w, _, f in map(evaluated, ahead.pieces())]
     for depth in range(DEEPEST + 1):
         last = depth == DEEPEST or cells.comm.allreduce(len(ahead.cell)) > MOST
-        rest, left = list[_Parts](), list[Array]()
+        rest, left = list[Parts](), list[Array]()
         for now, before in zip(ahead.pieces(), whole, strict=True):
             smaller = now.divided()
             X, w, area, f = evaluated(smaller)
@@ -257,7 +310,7 @@ def _moments(
                 np.add.at(squares, at, (w[kept] * size**2).sum(axis=1))
             rest.append(smaller[~kept])
             left.append(fine[~kept])
-        ahead = _Parts.together(rest) if rest else ahead
+        ahead = Parts.together(rest) if rest else ahead
         if not cells.comm.allreduce(len(ahead.cell)):
             break
         together = np.concatenate([np.empty((0, components)), *left])

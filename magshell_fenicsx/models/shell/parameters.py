@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.motion import Motion
-from magshell_fenicsx.mesh.midsurface import Deviation
+from magshell_fenicsx.mesh.patch import Deviation
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.patterns import Pattern
 from magshell_fenicsx.parts.bodies.contact import Contact

@@ -10,6 +10,7 @@ from dolfinx import fem
 from mpi4py import MPI
 from numpy.typing import NDArray
 
+from magshell_fenicsx.input.expressions import Together, together
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.shell.fitted import Cells, Element, Fit, fitted
 
@@ -56,6 +57,10 @@ class Components:
         if self.frame is not None:
             return np.asarray(Components(self.of_position)(r0 @ self.frame, n0) @ self.frame.T)
         return np.stack([f(*np.moveaxis(r0, -1, 0)) for f in self.of_position], axis=-1)
+
+    @property
+    def formulas(self) -> Together | None:
+        return together(self.of_position, self.frame)
 
 
 @dataclass(frozen=True)
@@ -199,7 +204,8 @@ def shown(pattern: Pattern, cells: Cells, nodal: Array, element: Element) -> Fit
     """A pattern in every cell from its values at the nodes: a formula as it has the same moments; collective."""
     if not getattr(pattern, "by_formula", False):
         return Fit(nodal, smooth=True, size=0.0)
-    return fitted(pattern, cells, nodal, element, cells.element.degree)
+    formulas = getattr(pattern, "formulas", None)
+    return fitted(pattern, cells, nodal, element, cells.element.degree, formulas=formulas)
 
 
 def inside(nodes: Array) -> Array:

@@ -9,6 +9,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 from ufl.core.expr import Expr
 
+from magshell_fenicsx.input.expressions import Together
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.shell.energy import Density
 from magshell_fenicsx.models.shell.fitted import Cells, fitted
@@ -20,10 +21,14 @@ LEAST_FACTOR, MOST_FACTOR = 1e-3, 1e3
 
 @dataclass(frozen=True)
 class Thickness:
-    """h(x)/h: a function of x, y, z over R, or a number for each named patch of a mesh (1 in the rest)."""
+    """h(x)/h: a function of x, y, z over R, or a number for each named patch of a mesh (1 in the rest).
+
+    `formulas` is what varies in the function.
+    """
 
     of_position: Callable[[Array, Array, Array], Array] | None = None
     patches: Mapping[str, float] | None = None
+    formulas: Together | None = None
 
     def at(self, x: Array) -> Array:
         """Its values at places (..., 3), without patches."""
@@ -34,7 +39,15 @@ class Thickness:
         if self.of_position is None:
             return nodal
         element = cells.element
-        fit = fitted(lambda x, n: self.at(x)[..., None], cells, nodal[..., None], element, element.degree, bounded=True)
+        fit = fitted(
+            lambda x, n: self.at(x)[..., None],
+            cells,
+            nodal[..., None],
+            element,
+            element.degree,
+            bounded=True,
+            formulas=self.formulas,
+        )
         return fit.nodal[..., 0]
 
 

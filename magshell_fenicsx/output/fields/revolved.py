@@ -9,7 +9,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.system import State, Vector
-from magshell_fenicsx.mesh.midsurface import Deviated
+from magshell_fenicsx.mesh.patch import Deviated
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.axisymmetric.revolution import ENDS, Revolution
 from magshell_fenicsx.models.shell.patterns import inside

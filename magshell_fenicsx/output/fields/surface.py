@@ -13,8 +13,8 @@ from dolfinx.cpp.io import perm_vtk
 from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.system import State, Vector
-from magshell_fenicsx.mesh.midsurface import Deviation
 from magshell_fenicsx.mesh.mirror import rotation
+from magshell_fenicsx.mesh.patch import Deviation
 from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.shell.patterns import inside
 from magshell_fenicsx.output.fields.point_fields import PointFields, Stresses

@@ -11,6 +11,7 @@ from pydantic import BeforeValidator, Field, ModelWrapValidatorHandler, Validati
 
 from magshell_fenicsx.input.section import Section, in_units, with_unit
 from magshell_fenicsx.mesh.mirror import rotation
+from magshell_fenicsx.mesh.patch import Deviation
 from magshell_fenicsx.shape.ground import At, Distance, Ground
 
 if TYPE_CHECKING:  # it needs the solver, and a case alone does not

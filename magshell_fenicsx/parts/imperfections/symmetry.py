@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from magshell_fenicsx.mesh.midsurface import Deviation
 from magshell_fenicsx.mesh.mirror import Mirror, rotation
+from magshell_fenicsx.mesh.patch import Deviation
 from magshell_fenicsx.parts.imperfections.imperfection import Flaw, Local
 from magshell_fenicsx.parts.imperfections.rims import AXIS, contour
 from magshell_fenicsx.shape.ground import Angle, Straight

@@ -19,6 +19,7 @@ from dolfinx import fem
 from numpy.typing import NDArray
 from ufl.core.expr import Expr
 
+from magshell_fenicsx.input.expressions import Together
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.energy import Density, Parameter
@@ -91,6 +92,13 @@ class Natural:
         ones = (_tensor(np.broadcast_to(e, r0.shape), t1, t2)[..., *FIELD] for e in np.eye(3))
         return np.stack([np.sum(forces * one, axis=-1) for one in ones], axis=-1)
 
+    @property
+    def formulas(self) -> Together | None:
+        """Those of stretch and curvature."""
+        given = (getattr(each, "formulas", None) for each in (self.stretch, self.curvature))
+        several = [each for each in given if each]
+        return replace(several[0], functions=[f for one in several for f in one.functions]) if several else None
+
     def _frame(self, r0: Array, n0: Array, needed: NDArray[np.bool_]) -> tuple[Array, Array]:
         """t1 and t2 (cells, nodes, 3); zero where nobody needs them and they are not there."""
         d = self.along(r0, n0)
@@ -133,7 +141,15 @@ def natural_field(natural: Natural, cells: Cells, V: fem.FunctionSpace) -> fem.F
     field = fem.Function(Q, name="natural")
     values = _numbers(T, kappa, t)
     if any(getattr(each, "by_formula", False) for each in (natural.stretch, natural.curvature)):
-        of = fitted(lambda x, n: _numbers(*natural.at(x, n)), cells, values, element, element.degree, bounded=True)
+        of = fitted(
+            lambda x, n: _numbers(*natural.at(x, n)),
+            cells,
+            values,
+            element,
+            element.degree,
+            bounded=True,
+            formulas=natural.formulas,
+        )
         values = of.nodal
     field.x.array.reshape(-1, SIZE)[Q.dofmap.list] = values
     return field

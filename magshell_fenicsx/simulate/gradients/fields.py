@@ -20,7 +20,7 @@ from magshell_fenicsx.assembly.forms import by_field as summed
 from magshell_fenicsx.assembly.terms import FormTerm, Term, factor_of
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.mesh.midsurface import Deviated
+from magshell_fenicsx.mesh.patch import Deviated
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.shell import patterns
 from magshell_fenicsx.models.shell.model import ShellModel

@@ -4,10 +4,13 @@ import numpy as np
 import pytest
 
 from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.input.expressions import Together, formula
 from magshell_fenicsx.models.shell.fitted import fitted
 from magshell_fenicsx.models.shell.patterns import cells_of
 from magshell_fenicsx.problem.check import describe
+from magshell_fenicsx.problem.formulas import looked_at
 from magshell_fenicsx.problem.planner import make_plan
+from magshell_fenicsx.shape.outline import outline
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.scene import Scene
 
@@ -51,10 +54,14 @@ def dead(load, **mesh):
         (disc(0.02), np.ones_like, 0.02),
         (disc(0.05), np.ones_like, 0.05),
         (f"exp(-3000*({AWAY}))", lambda r: np.exp(-3000 * r**2), 0.12),
+        (disc(0.004), np.ones_like, 0.004),
+        (disc(0.001), np.ones_like, 0.001),
+        (f"exp(-({AWAY})/0.002**2)", lambda r: np.exp(-(r**2) / 0.002**2), 0.012),
     ],
 )
-def test_all_of_a_narrow_load_is_carried(load, of, radius):
-    scene = Scene(dead(load))
+@pytest.mark.parametrize("mesh", [{}, {"size": 0.4}])
+def test_all_of_a_narrow_load_is_carried(load, of, radius, mesh):
+    scene = Scene(dead(load, **mesh))
     end = list(follow(scene))[-1]
     force = scene.observe(end.point.state)["rim_fz"]
     assert force == pytest.approx(1e-7 * over_sphere(of, radius), rel=1e-3)
@@ -97,3 +104,43 @@ def test_a_narrow_imperfection_has_few_cells():
 def test_a_mesh_that_does_not_show_a_formula_says_so():
     assert "warning: loading.loads.0.per_area: varies within elements" in describe(dead(disc(0.05), size=0.4))
     assert "warning" not in describe(dead(disc(0.05)))
+
+
+@pytest.mark.parametrize("polar", ["((x-0.31)**2+(y-0.23)**2)", "((x-0.001)**2+y**2)"])
+def test_a_tiny_disc_of_remanence_is_neither_missed_nor_axisymmetric(polar):
+    """Off the axis, and almost on it: no model of the meridian, and elements as small as it there alone."""
+    shell = {"geometry": "hemisphere", "radius_to_thickness": 100, "poisson_ratio": 0.3}
+    field = {
+        "lambda_m": 0.001,
+        "remanent": {"kind": "expression", "components": [0, 0, f"(1+sign(0.004**2-{polar}))/2"]},
+    }
+    case = {
+        "shell": shell,
+        "boundary": {"equator": "clamped"},
+        "magnetic": field,
+        "mesh": {"degree": 3, "refinement": 0.7},
+    }
+    plan = make_plan(Case.model_validate(case | {"loading": {"kind": "field", "points": 1}}))
+    assert plan.meridian is None
+    assert plan.size(plan.shape.reach * np.ones(2) / 9) > 10 * min(f.size for f in plan.size.features)
+    assert min(f.size for f in plan.size.features) < 0.002
+
+
+def test_the_cost_of_finding_grows_slowly_and_smooth_formulas_have_none():
+    """Parts that are looked at, as the disc becomes a thousand times smaller."""
+    there = outline(dead("1").shell)
+    parts = {
+        text: len(looked_at(Together([formula(text)]), there).area) for text in ("2", "1 + x*y", disc(1e-2), disc(1e-5))
+    }
+    assert parts["1 + x*y"] == parts["2"]
+    assert parts[disc(1e-5)] < 1.5 * parts[disc(1e-2)] < 15_000
+
+
+def test_a_thickness_that_jumps_in_elements_says_what_that_costs():
+    shell = {"geometry": "plate", "length": 1, "width": 1, "thickness": 0.01, "youngs_modulus": 1, "poisson_ratio": 0.3}
+    case = dead("1", size=0.1).model_dump(mode="json", exclude_unset=True) | {
+        "shell": shell | {"thickness_factor": "1.5-0.5*sign(x-0.47)"},
+        "boundary": {"left": "clamped"},
+        "mesh": {"degree": 3, "size": 0.1},
+    }
+    assert "the stiffness may be wrong by" in describe(Case.model_validate(case))

@@ -9,7 +9,6 @@ from along import along, difference
 from conftest import TILTED, random_displacement
 from mpi4py import MPI
 
-from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.continuation.control import GivenLoad
 from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.system import State
@@ -21,7 +20,6 @@ from magshell_fenicsx.mesh.revolved import Arc, Revolved, Segment
 from magshell_fenicsx.mesh.sphere import flat
 from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.shell.parameters import AreaForce, EdgeForce, EdgeMoment, Held, Loads, Material, PointForce
-from magshell_fenicsx.models.shell.terms import TermFactory
 from magshell_fenicsx.models.shell.thickness import Thickness
 
 MATERIAL = Material(0.3, 0.05)
@@ -129,9 +127,9 @@ def test_a_fold_takes_no_energy_from_rigid_motion_and_resists_opening(angle: flo
 def test_small_folds_are_smooth_edges() -> None:
     """Where cells meet smoothly the two forms of the jump agree to the square of its angle."""
     model = ShellModel(panel(0.25), MATERIAL, 3, {}, Loads())
-    factory = TermFactory(model.r0, model.u, MATERIAL, model.sigma, 3, KernelLog())
+    made = (replace(model.factory, folded=folded) for folded in (False, True))
     model.u.x.array[:] = random_displacement(model, 1e-5)
-    smooth, folded = (replace(factory, folded=f).interior_edges().energy() for f in (False, True))
+    smooth, folded = (factory.term(factory.interior_edges()).energy() for factory in made)
     assert folded == pytest.approx(smooth, rel=1e-3)
 
 

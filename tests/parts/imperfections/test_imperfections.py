@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.input.source import CaseError, Source
-from magshell_fenicsx.mesh.midsurface import Deviated
 from magshell_fenicsx.mesh.mirror import Mirror
-from magshell_fenicsx.mesh.patch import check_orientation
+from magshell_fenicsx.mesh.patch import Deviated, check_orientation
 from magshell_fenicsx.parts.imperfections.gaussian import Gaussian
 from magshell_fenicsx.parts.imperfections.imperfection import Flaw, flaws
 from magshell_fenicsx.parts.imperfections.symmetry import leaves

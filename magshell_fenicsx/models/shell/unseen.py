@@ -1,0 +1,202 @@
+"""Parts of cells in which a formula has values that samples do not show, however small these parts are.
+
+The ranges of a formula and of its derivatives in a box (`case/enclosure.py`) are compared with values at a few places.
+A part is divided while what the ranges leave open between these may change the integral of the formula's
+variation. So a
+step or a Gaussian of any width is found, at a cost that grows like the logarithm of one over the width.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import basix
+import numpy as np
+from mpi4py import MPI
+from numpy.typing import NDArray
+
+from magshell_fenicsx.input.expressions import Together
+
+Array = NDArray[np.float64]
+Numbers = NDArray[np.int64]
+AT_ONCE = 4096  # parts that are evaluated together
+OPEN = 5e-3  # of the integral of the variation: what ranges may leave open
+BOTH = 0.9  # of the difference of values: both sides of a step are seen, and little is left open
+ALIKE = 8.0  # times what values show: derivatives that differ less hide nothing
+SHARE = 0.03  # of the largest part of that: what is divided now, before others
+ROUNDING = 1e-9  # of the largest value
+SMALLEST, LARGEST = 1e-7, 1e150  # over R, and a value
+MOST = 60_000  # parts in all
+CHILDREN: dict[
+    int, list[tuple[tuple[float, ...], tuple[float, ...]]]
+] = {  # corner and scale along each axis of the parts of an interval, a triangle, a body's cell (in its surface)
+    1: [((0.0,), (0.5,)), ((0.5,), (0.5,))],
+    2: [((x, y), (s, s)) for x, y, s in ((0, 0, 0.5), (0.5, 0, 0.5), (0, 0.5, 0.5), (0.5, 0.5, -0.5))],
+    3: [((x, y, 0.0), (0.5, 0.5, 1.0)) for x in (0.0, 0.5) for y in (0.0, 0.5)],
+}
+
+
+@dataclass(frozen=True)
+class Parts:
+    """Images of the reference cell in it, X = corner + sides * X', each of a cell."""
+
+    cell: Numbers
+    corner: Array
+    sides: Array
+
+    def __getitem__(self, which: slice | NDArray[np.bool_]) -> "Parts":
+        return Parts(self.cell[which], self.corner[which], self.sides[which])
+
+    def of(self, cells: Numbers) -> "Parts":
+        """The same in each of some cells."""
+        times = len(cells)
+        numbers = np.repeat(cells, len(self.cell))
+        return Parts(numbers, np.tile(self.corner, (times, 1)), np.tile(self.sides, (times, 1)))
+
+    @classmethod
+    def together(cls, several: "Sequence[Parts]") -> "Parts":
+        return cls(*(np.concatenate([getattr(one, name) for one in several]) for name in ("cell", "corner", "sides")))
+
+    def pieces(self) -> "list[Parts]":
+        """A few at a time."""
+        return [self[i : i + AT_ONCE] for i in range(0, len(self.cell), AT_ONCE)]
+
+    def divided(self) -> "Parts":
+        """The parts of the first, those of the second, and so on."""
+        children = CHILDREN[self.corner.shape[1]]
+        at, by = (np.array(v, dtype=float) for v in zip(*children, strict=True))
+        d = self.corner.shape[1]
+        corner = self.corner[:, None] + self.sides[:, None] * at
+        return Parts(
+            np.repeat(self.cell, len(children)), corner.reshape(-1, d), (self.sides[:, None] * by).reshape(-1, d)
+        )
+
+    def rule(self, points: Array, weights: Array) -> tuple[Array, Array]:
+        """Points (parts, q, d) and weights (parts, q)."""
+        X = self.corner[:, None] + self.sides[:, None] * points
+        return X, np.abs(self.sides.prod(axis=1))[:, None] * weights
+
+
+Look = Callable[[Parts], tuple[Array, Array]]  # places (parts, q, 3), the corners first, and areas (parts,)
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """Places in the reference cell (n, d), the corners first, and pairs of neighbours along each axis (pairs, 2)."""
+
+    places: Array
+    corners: int
+    pairs: list[Numbers]
+    count: int
+
+    @classmethod
+    def of(cls, kind: basix.CellType, count: int) -> "Lattice":
+        """With `count` parts of each side."""
+        corners = basix.geometry(kind)
+        every = basix.create_lattice(kind, count, basix.LatticeType.equispaced, exterior=True)
+        X = np.concatenate([corners, every])
+        apart = X[None, len(corners) :] - X[len(corners) :, None]
+        steps = np.eye(X.shape[1]) / count
+        pairs = [np.argwhere(np.abs(apart - step).max(axis=-1) < 1e-9) + len(corners) for step in steps]
+        return cls(X, len(corners), pairs, count)
+
+    def bent(self, f: Array) -> Array:
+        """By how much derivatives of values (parts, n, formulas), times the sides, differ: (parts, formulas)."""
+        slopes = (self.count * (f[:, pairs[:, 1]] - f[:, pairs[:, 0]]) for pairs in self.pairs)
+        return np.asarray(sum(np.ptp(slope, axis=1) for slope in slopes))
+
+
+@dataclass(frozen=True)
+class Leaves:
+    """Parts that are not divided any more, on this rank.
+
+    Attributes
+    ----------
+    area, centre, size
+        (n,), (n, 3) and the largest side of their boxes (n,).
+    away
+        The mean of |f - mean of f|^2 in each (n,).
+    variation
+        The integral of |f - mean of f|.
+    open
+        The part of that which may not be seen, where too many parts would be needed; else 0.
+    """
+
+    parts: Parts
+    area: Array
+    centre: Array
+    size: Array
+    away: Array
+    variation: float
+    open: float
+
+
+def leaves(
+    formulas: Together, first: Parts, look: Look, lattice: Lattice, owned: int, comm: MPI.Comm = MPI.COMM_SELF
+) -> Leaves:
+    """The first parts, divided where that is needed; collective.
+
+    Parameters
+    ----------
+    lattice
+        The places of each part.
+    owned
+        The cells with smaller numbers count in sums.
+    """
+    parts, seen = first, _seen(formulas, first, look, lattice)
+    looked = 0
+    while True:
+        own = parts.cell < owned
+        looked = max(looked, comm.allreduce(int(own.sum())))
+        area = seen.area * own
+        mean = comm.allreduce(area @ seen.values.mean(axis=1)) / comm.allreduce(float(area.sum()))
+        f = seen.values - mean
+        size = np.linalg.norm(f, axis=-1)
+        variation = comm.allreduce(float((area * size.mean(axis=1)).sum()))
+        largest = comm.allreduce(float(np.abs(seen.values).max(initial=0.0)), MPI.MAX)
+        matters = (seen.between > ROUNDING * largest) & (seen.size > SMALLEST)
+        unseen = np.where(matters, seen.area * seen.between, 0.0)
+        most = comm.allreduce(float(unseen[own].max(initial=0.0)), MPI.MAX)
+        left = comm.allreduce(float(unseen[own].sum()))
+        alike = OPEN * variation / max(comm.allreduce(int(own.sum())), 1)
+        again = (unseen > alike) & (unseen >= SHARE * min(most, np.finfo(float).max))
+        if left <= OPEN * variation or looked > MOST or not comm.allreduce(int((again & own).sum())):
+            break
+        smaller = parts[again].divided()
+        parts = Parts.together([parts[~again], smaller])
+        seen = _Seen.together([seen.of(~again), _seen(formulas, smaller, look, lattice)])
+    away = (size**2).mean(axis=1)
+    share = left / max(variation, np.finfo(float).tiny)
+    return Leaves(parts, seen.area, seen.centre, seen.size, away, variation, share if looked > MOST else 0.0)
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """Of each part area, centre, size, what may be between its values, and these (parts, places, formulas)."""
+
+    area: Array
+    centre: Array
+    size: Array
+    between: Array
+    values: Array
+
+    def of(self, which: NDArray[np.bool_]) -> "_Seen":
+        return _Seen(*(getattr(self, name)[which] for name in self.__dataclass_fields__))
+
+    @classmethod
+    def together(cls, several: "Sequence[_Seen]") -> "_Seen":
+        return cls(*(np.concatenate([getattr(one, name) for one in several]) for name in cls.__dataclass_fields__))
+
+
+def _seen(formulas: Together, parts: Parts, look: Look, lattice: Lattice) -> _Seen:
+    """A look at each part, with the box of its places and of what bulges between them."""
+    x, area = look(parts)
+    low, high = x.min(axis=1), x.max(axis=1)
+    bulge = np.abs(x.mean(axis=1) - x[:, : lattice.corners].mean(axis=1)).max(axis=1, initial=0.0)[:, None]
+    bulge = np.where(bulge > ROUNDING, bulge, 0.0)
+    least, most, bent = formulas.bounds(low - bulge, high + bulge)
+    f = formulas.values(x.reshape(-1, 3)).reshape(*x.shape[:2], -1)
+    f = np.where(np.isfinite(f), f, 0.0)
+    most, least = (np.clip(v, -LARGEST, LARGEST) for v in (most, least))
+    between = np.minimum(np.maximum(most - least - BOTH * np.ptp(f, axis=1), 0.0), bent / lattice.count)
+    between = np.where(bent <= ALIKE * lattice.bent(f), 0.0, between).sum(axis=1)
+    return _Seen(area, x.mean(axis=1), (high - low).max(axis=1), between, f)
