@@ -178,7 +178,6 @@ NAMES = {
     "radius",
     "name",
     "supports",
-    "errors",
 }  # keys with text that is no quantity
 
 

@@ -15,7 +15,7 @@ from magshell_fenicsx.quantities.registry import register
 from magshell_fenicsx.shape.symmetry import Leaves
 
 if TYPE_CHECKING:
-    from magshell_fenicsx.mesh.midsurface import Deviation
+    from magshell_fenicsx.mesh.patch import Deviation
     from magshell_fenicsx.models.shell.patterns import Inside
     from magshell_fenicsx.parts.step import ProgrammeStep, Step
     from magshell_fenicsx.shape.outline import Outline

@@ -15,7 +15,7 @@ from magshell_fenicsx.mesh.patch import Deviation
 from magshell_fenicsx.shape.ground import At, Distance, Ground
 
 if TYPE_CHECKING:  # it needs the solver, and a case alone does not
-    from magshell_fenicsx.mesh.midsurface import Deviation
+    from magshell_fenicsx.mesh.patch import Deviation
 
 Array = NDArray[np.float64]
 Values = TypeVar("Values")
