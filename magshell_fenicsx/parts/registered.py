@@ -1,5 +1,6 @@
 """The list of all parts, and of all kinds of steps."""
 
+from functools import cache
 from importlib import import_module
 from inspect import cleandoc
 from typing import TYPE_CHECKING
@@ -35,6 +36,21 @@ KINDS_OF_STEPS: dict[str, str] = {
 }
 FIRST = ("natural", "field")  # the kinds of which steps may come before the one load of a case, in their order
 
+WHAT_IS_SEEN = (  # module here and class in it, in the order of columns
+    "pressure.seen.PressureSeen",
+    "forces.loads.ForcesSeen",
+    "supports.reacting.Moved",
+    "magnetism.sources.field.SourcesSeen",
+    "bodies.standing.BodiesSeen",
+)
+
+
+@cache
+def seen() -> "tuple[Seen, ...]":
+    """What all rooms see of a state; they need the solver, which takes long to import."""
+    named = (path.rpartition(".") for path in WHAT_IS_SEEN)
+    return tuple(getattr(import_module(f"{__package__}.{module}"), name)() for module, _, name in named)
+
 
 def _step(path: str) -> type[Step]:
     module, _, name = path.rpartition(".")
@@ -51,6 +67,8 @@ def _meaning(part: type[Part]) -> str:
 
 
 if TYPE_CHECKING:
+    from magshell_fenicsx.parts.seen import Seen
+
     WithParts = WithOwnTerms
 else:  # an optional key for each part
     WithParts = create_model(

@@ -8,8 +8,8 @@ import numpy as np
 
 from magshell_fenicsx.continuation.point import Point
 from magshell_fenicsx.output.store.table import SOLUTION, Row
+from magshell_fenicsx.parts.registered import seen
 from magshell_fenicsx.parts.step import ProgrammeStep
-from magshell_fenicsx.parts.supports.reacting import motion_columns
 from magshell_fenicsx.quantities.quantity import spelled
 from magshell_fenicsx.quantities.registry import Sizes, amplitude, quantity, shown
 from magshell_fenicsx.simulate.scene import Scene
@@ -82,10 +82,9 @@ def aim(scene: Scene, step: ProgrammeStep) -> Aim:
     target, value = load.target
     if target.quantity == "load":
         return Aim(varied.column, value * load.size(scene.case.context))
-    if step.name in scene.model.contacts:
-        return Aim(varied.conjugate, value)
-    if step.name in scene.motions:
-        return Aim(motion_columns(scene.plan.loads)[step.name], value)
+    for room in seen():
+        if column := room.conjugates(scene.plan.loads).get(step.name):
+            return Aim(column, value)
     own = f"w_{step.name}_over_h"
     in_h = scene.plan.length * scene.plan.material.h if load.in_lengths else 1.0
     return Aim(own if own in scene.extra_columns else target.column, value / in_h)

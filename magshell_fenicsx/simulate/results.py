@@ -14,9 +14,9 @@ from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.shell.model import ShellModel
-from magshell_fenicsx.parts.supports.reacting import motion_columns
+from magshell_fenicsx.parts.registered import seen
 from magshell_fenicsx.parts.supports.reactions import weights
-from magshell_fenicsx.quantities.registry import amplitude, contact_columns, quantity
+from magshell_fenicsx.quantities.registry import amplitude, quantity
 from magshell_fenicsx.simulate.scene import Scene
 
 Array = NDArray[np.float64]
@@ -114,8 +114,8 @@ def force_unit(scene: Scene) -> float:
 
 def _forces(scene: Scene) -> dict[str, tuple[str, int]]:
     """Column of a force of a support -> the support and the axis."""
-    columns = {f"{name}_f{axis}": (name, i) for name in scene.plan.supports for i, axis in enumerate("xyz")}
-    return {column: of for column, of in columns.items() if column in scene.support_columns}
+    supports = scene.plan.supports if scene.plan.reactions else ()
+    return {f"{name}_f{axis}": (name, i) for name in supports for i, axis in enumerate("xyz")}
 
 
 def _reaction(scene: Scene, state: State, name: str, axis: int, of: str) -> Functional:
@@ -133,10 +133,7 @@ def _conjugates(scene: Scene) -> dict[str, tuple[str, float]]:
     """Column -> the amplitude whose conjugate it is, and the conjugate's unit."""
     model, loads = scene.model, scene.plan.loads
     found = {"volume_change": "pressure"} if loads.pressure else {}
-    found |= {column: name for name, column in motion_columns(loads).items()}
-    found |= {column: name for name, column in scene.sources.items()}
-    for name in model.contacts:
-        found[contact_columns(name)[1]] = name
+    found |= {column: name for room in seen() for name, column in room.conjugates(loads).items()}
     known = {column: (name, scene.conjugate_unit(name)) for column, name in found.items()}
     for name in (*loads.forces, *loads.dead):
         if size := model.force_unit if name in loads.forces else model.load_size.get(name, 0.0):

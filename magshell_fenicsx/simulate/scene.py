@@ -29,28 +29,21 @@ from magshell_fenicsx.models.shell.patterns import cells_of
 from magshell_fenicsx.models.solid.model import SolidModel
 from magshell_fenicsx.parts.magnetism.direction import field_angle, field_size
 from magshell_fenicsx.parts.magnetism.remanence import cells_of_body
+from magshell_fenicsx.parts.magnetism.sources.field import source_columns
 from magshell_fenicsx.parts.pressure.openings import no_potential
-from magshell_fenicsx.parts.supports.reacting import (
-    motion_columns,
-    motion_size,
-    observed_reactions,
-    source_columns,
-    source_size,
-)
+from magshell_fenicsx.parts.registered import seen
+from magshell_fenicsx.parts.seen import Sight
 from magshell_fenicsx.parts.supports.supports import refuse_loose
 from magshell_fenicsx.problem.columns import (
-    also_displaced,
     extra_columns,
-    only_turns,
     own_amplitudes,
     sizes_in_units,
-    support_columns,
 )
 from magshell_fenicsx.problem.formulas import unshown, written
 from magshell_fenicsx.problem.limits import refuse_beyond_memory
 from magshell_fenicsx.problem.planner import make_plan
 from magshell_fenicsx.problem.problem import Plan
-from magshell_fenicsx.quantities.registry import Sizes, amplitude, contact_columns
+from magshell_fenicsx.quantities.registry import Sizes
 from magshell_fenicsx.simulate.build import build_meridian_model, build_model, build_solid_model
 
 Array = NDArray[np.float64]
@@ -188,7 +181,7 @@ class Scene:
     def observe(self, state: State) -> dict[str, float]:
         """The physical columns of a table row: loads, displacements over h, volume, energies over E h R^2."""
         self.refuse_foreign(state, more=True)
-        model, h, loads = self.model, self.plan.material.h, self.model.loads
+        model, h, loads, sight = self.model, self.plan.material.h, self.model.loads, self.sight
         force, sense = loads.forces.get("force"), copysign(1.0, self.case.lambda_m)
         energies = self.energies(state)
         pole = model.deflection(state.u, "pole") / h
@@ -209,13 +202,9 @@ class Scene:
             else nan,
             "magnetic": sum(energies[name] for name in ("magnetic", "magnetic gradient", "U1", "Uq", "Utau", "couple")),
             **{name: energies[name] for name in ("U1", "Uq", "Utau")},
-            **{self._column(name): state.mu[name] for name in (*loads.forces, *loads.dead)},
-            **{f"w_{name}_over_h": model.loaded_deflection(state.u, name) / h for name in also_displaced(loads)},
             **self._observe_points(state),
             **{name: state.mu[name] for name in self._own_amplitudes},
-            **self._observe_supports(state),
-            **self._observe_contacts(state),
-            **self._observe_sources(state),
+            **{column: value for room in seen() for column, value in room.observe(sight, state).items()},
             **{
                 column: state.mu[term.name]
                 * model.multiplicity
@@ -267,64 +256,15 @@ class Scene:
         return energy - of * sum(state.mu[name] * system.potential(state.u, state.mu, name) for name in loads)
 
     @property
-    def support_columns(self) -> tuple[str, ...]:
-        """The factors of motions, their reactions, and those of all supports."""
-        return support_columns(self.plan)
-
-    def _observe_supports(self, state: State) -> dict[str, float]:
-        """Forces and moments in the case's units."""
-        model, plan, R = self.model, self.plan, self.plan.length
-        force = (self.case.shell.modulus or 1.0) * plan.material.h * R**2
-        found: dict[str, float] = {}
-        for name, column in motion_columns(plan.loads).items():
-            potential = model.system.potential(state.u, state.mu, name)
-            found |= {name: state.mu[name], column: potential / -self.conjugate_unit(name)}
-        if plan.reactions:
-            frame = rotation(plan.azimuth)
-            found |= observed_reactions(model, state, plan.mirror, frame, force, R)
-        return found
-
-    def _observe_contacts(self, state: State) -> dict[str, float]:
-        """Approach, force, penetration and radii of each body."""
-        model, h, found = self.model, self.plan.material.h, dict[str, float]()
-        for name in model.contacts:
-            at, force = model.touching(state, name), model.system.potential(state.u, state.mu, name)
-            values = (state.mu[name], -force / self.conjugate_unit(name), at.penetration / h)
-            radii = (self.plan.length * radius for radius in (at.radius, at.inner, at.outer))
-            k = float(model.contacts[name][0].stiffness.value)
-            found |= dict(zip(contact_columns(name), (*values, *radii, k), strict=True))
-        return found
-
-    def _observe_sources(self, state: State) -> dict[str, float]:
-        """The amplitudes of sources, and their conjugates in SI."""
-        found: dict[str, float] = {}
-        for name, column in self.sources.items():
-            potential = self.model.system.potential(state.u, state.mu, name)
-            found |= {name: state.mu[name], column: -potential / self.conjugate_unit(name)}
-        return found
-
-    @staticmethod
-    def _column(name: str) -> str:
-        return amplitude(name).column
+    def sight(self) -> Sight:
+        """What rooms of parts see of it."""
+        plan, modulus = self.plan, self.case.shell.modulus or 1.0
+        return Sight(self.model, plan.length, modulus, plan.mirror, plan.azimuth, plan.reactions)
 
     def conjugate_unit(self, name: str) -> float:
         """-dPi/dmu of one unit of a target: ΔV/R³ of a pressure, w/h of a force, the shell's length of dead loads."""
-        model, material = self.model, self.plan.material
-        if name == "pressure":
-            return -material.classical_pressure / material.h / model.multiplicity
-        if name in self.motions:
-            force = (self.case.shell.modulus or 1.0) * material.h * self.plan.length**2
-            arm = self.plan.length if only_turns(self.plan.loads, name) else 1.0
-            return -motion_size(self.plan.loads, name) / (force * arm * model.multiplicity)
-        if name in model.contacts:
-            return -model.force_unit * material.h
-        if name in self.sources:
-            force = (self.case.shell.modulus or 1.0) * material.h * self.plan.length**2
-            arm = 1.0 if self.sources[name].startswith("source_force") else self.plan.length
-            return source_size(self.plan.loads, name) / (force * arm * model.multiplicity)
-        if name in model.loads.forces:
-            return model.force_unit * material.h
-        return model.load_size.get(name, 0.0) / self.plan.length
+        units = (room.conjugate_unit(self.sight, name) for room in seen())
+        return next((unit for unit in units if unit is not None), 0.0)
 
     def _observe_points(self, state: State) -> dict[str, float]:
         """The displacements of named points in the unit of the shell's lengths."""

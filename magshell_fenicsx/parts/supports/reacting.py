@@ -1,14 +1,15 @@
 """Reactions of supports, and those along motions, as columns of path.csv in the case's units."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.system import State
-from magshell_fenicsx.mesh.mirror import Mirror
+from magshell_fenicsx.mesh.mirror import Mirror, rotation
 from magshell_fenicsx.models.observed import Observed
 from magshell_fenicsx.models.shell.parameters import Loads
+from magshell_fenicsx.parts.seen import Seen, Sight
 from magshell_fenicsx.parts.supports.reactions import reactions
 
 Array = NDArray[np.float64]
@@ -32,28 +33,39 @@ def motion_size(loads: Loads, name: str) -> float:
     return shifts or float(sum(np.linalg.norm(motion.turn) for motion in motions))
 
 
-def source_columns(loads: Loads) -> dict[str, str]:
-    """Amplitude of a source -> the column of the force, the torque or the work on it."""
-    found: dict[str, str] = {}
-    turns = [motion.name for motion in loads.magnetic.turns] if loads.magnetic else []
-    for each in loads.magnetic.driven if loads.magnetic else ():
-        own = [motion for motion in each.motions if motion.name not in turns]
-        found |= {motion.name: "source_torque" if motion.turns else "source_force" for motion in own}
-        found |= dict.fromkeys(each.factors, "source_work")
-    kinds = list(found.values())
-    return {name: kind if kinds.count(kind) == 1 else f"{kind}_{name}" for name, kind in found.items()}
+def only_turns(loads: Loads, name: str) -> bool:
+    """Whether a motion has rotations alone, so that its reaction is a moment."""
+    return not any(m.motion.shift.any() for m in loads.moves if m.motion.name == name)
 
 
-def source_size(loads: Loads, name: str) -> float:
-    """The length over R, the angle (rad) or the change of the factor for an amplitude of one."""
-    assert loads.magnetic
-    for each in loads.magnetic.driven:
-        if name in each.factors:
-            return each.factors[name]
-        for motion in each.motions:
-            if motion.name == name:
-                return float(np.linalg.norm(motion.turn if motion.turns else motion.shift))
-    raise KeyError(name)
+class Moved(Seen):
+    """Motions of supports with their reactions, and the reactions of all supports."""
+
+    def amplitudes(self, loads: Loads) -> tuple[str, ...]:
+        return tuple(motion_columns(loads))
+
+    def conjugates(self, loads: Loads) -> dict[str, str]:
+        return motion_columns(loads)
+
+    def columns(self, loads: Loads, supports: Sequence[str]) -> tuple[str, ...]:
+        return (*super().columns(loads, supports), *columns(supports))
+
+    def observe(self, sight: Sight, state: State) -> dict[str, float]:
+        """Forces and moments in the case's units."""
+        values: dict[str, float] = {}
+        for name, column in motion_columns(sight.loads).items():
+            values |= {name: state.mu[name], column: sight.potential(state, name) / -self._unit(sight, name)}
+        if sight.reactions:
+            frame = rotation(sight.azimuth)
+            values |= observed_reactions(sight.model, state, sight.mirror, frame, sight.force, sight.length)
+        return values
+
+    def conjugate_unit(self, sight: Sight, name: str) -> float | None:
+        return self._unit(sight, name) if name in self.amplitudes(sight.loads) else None
+
+    def _unit(self, sight: Sight, name: str) -> float:
+        arm = sight.length if only_turns(sight.loads, name) else 1.0
+        return -motion_size(sight.loads, name) / (sight.force * arm * sight.model.multiplicity)
 
 
 def observed_reactions(

@@ -1,0 +1,85 @@
+"""What rooms of parts see of a state: their columns of path.csv, and the units of what is conjugate to amplitudes."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+from magshell_fenicsx.continuation.system import State
+from magshell_fenicsx.mesh.mirror import Mirror
+from magshell_fenicsx.models.observed import Observed
+from magshell_fenicsx.models.shell.parameters import Loads
+
+
+@dataclass(frozen=True)
+class Sight:
+    """A model, and the units in which it is reported.
+
+    Attributes
+    ----------
+    length
+        R in the case's unit.
+    modulus
+        E in the case's unit.
+    mirror, azimuth
+        Plane of the half that is modelled, None for all; and azimuth of the model's frame (rad).
+    reactions
+        Whether those of all supports are reported.
+    """
+
+    model: Observed
+    length: float
+    modulus: float
+    mirror: Mirror | None
+    azimuth: float
+    reactions: bool
+
+    @property
+    def loads(self) -> Loads:
+        """What loads the model."""
+        return self.model.loads
+
+    @property
+    def h(self) -> float:
+        """The thickness over R."""
+        return self.model.material.h
+
+    @property
+    def force(self) -> float:
+        """E h R in the case's unit."""
+        return self.modulus * self.h * self.length**2
+
+    def potential(self, state: State, name: str) -> float:
+        """Pi_i(u) of an amplitude, of what is modelled."""
+        return self.model.system.potential(state.u, state.mu, name)
+
+
+class Seen:
+    """What a room sees; by default nothing.
+
+    Attributes
+    ----------
+    before_points
+        Whether its columns come before those of named points.
+    """
+
+    before_points: ClassVar[bool] = False
+
+    def amplitudes(self, loads: Loads) -> Sequence[str]:
+        """Its amplitudes."""
+        return ()
+
+    def conjugates(self, loads: Loads) -> dict[str, str]:
+        """Amplitude -> the column of what is conjugate to it, besides those of every run."""
+        return {}
+
+    def columns(self, loads: Loads, supports: Sequence[str]) -> tuple[str, ...]:
+        """Columns besides those of every run; `supports` are those whose reactions are reported."""
+        return (*self.amplitudes(loads), *self.conjugates(loads).values())
+
+    def observe(self, sight: Sight, state: State) -> dict[str, float]:
+        """Column -> value."""
+        return {}
+
+    def conjugate_unit(self, sight: Sight, name: str) -> float | None:
+        """-dPi/dmu of one unit of what is conjugate to an amplitude; None if it is another room's."""
+        return None
