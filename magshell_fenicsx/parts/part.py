@@ -167,6 +167,14 @@ class Modelled:
     deviations: "Mapping[str, Deviation]"
 
 
+@dataclass(frozen=True)
+class Account:
+    """What a room has in a model, and what is left out, in words."""
+
+    included: list[str] = field(default_factory=list)
+    left_out: list[str] = field(default_factory=list)
+
+
 class Ability(Section):
     """A section of the case file that adds something to a problem; by default nothing."""
 

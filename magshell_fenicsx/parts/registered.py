@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from pydantic import Field, create_model
 
 from magshell_fenicsx.parts.own import WithOwnTerms
-from magshell_fenicsx.parts.part import Part
+from magshell_fenicsx.parts.part import Account, Context, Part
 from magshell_fenicsx.parts.step import Step
 
 REGISTERED: dict[str, str] = {
@@ -43,6 +43,19 @@ WHAT_IS_SEEN = (  # module here and class in it, in the order of columns
     "magnetism.sources.field.SourcesSeen",
     "bodies.standing.BodiesSeen",
 )
+ACCOUNTS = (  # modules here with a function `account`, in the order of `magshell check`
+    "magnetism.magnetisation",
+    "natural.planned",
+    "pressure.seen",
+    "forces.loads",
+    "supports.reacting",
+    "bodies.standing",
+)
+
+
+def accounts(context: Context, loads: "Loads") -> list[Account]:
+    """What all rooms have in a model."""
+    return [import_module(f"{__package__}.{module}").account(context, loads) for module in ACCOUNTS]
 
 
 @cache
@@ -67,6 +80,7 @@ def _meaning(part: type[Part]) -> str:
 
 
 if TYPE_CHECKING:
+    from magshell_fenicsx.models.shell.parameters import Loads
     from magshell_fenicsx.parts.seen import Seen
 
     WithParts = WithOwnTerms

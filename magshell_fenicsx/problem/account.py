@@ -7,7 +7,7 @@ from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.mesh.mirror import Mirror, plane_text
 from magshell_fenicsx.models.shell.parameters import Loads
 from magshell_fenicsx.parts.imperfections.rims import MOST_RIMS
-from magshell_fenicsx.parts.registered import PARTS
+from magshell_fenicsx.parts.registered import PARTS, accounts
 from magshell_fenicsx.problem.body import layers, neo_hookean
 from magshell_fenicsx.shape.sections import MeshSurface
 
@@ -27,35 +27,10 @@ def account(case: Case, loads: Loads, model: str, mirror: Mirror | None, rims: i
         Number of different rims beside the pole.
     """
     included = [model, "membrane and bending energy" if case.model == "shell" else _elastic(case)]
-    left_out = []
-    if loads.magnetic:
-        law = "" if loads.magnetic.law == "deformation" else ", remanence that turns and does not stretch"
-        included.append(f"magnetic energy ({loads.magnetic.energy}){law}, lambda_m = {case.lambda_m:g}")
-        included += [f"source {source.name or i}: {source.words()}" for i, source in enumerate(case.sources)]
-    else:
-        left_out.append("magnetic energy: " + ("lambda_m is zero" if case.magnetic else "no magnetic section"))
-    if loads.natural:
-        names = " and ".join(name.removeprefix("natural_") for name in loads.natural.amplitudes)
-        included.append(f"natural {names}: strains are measured from there")
-    else:
-        left_out.append("natural shape: as drawn")
-    if loads.pressure:
-        included.append("live pressure" if case.model == "shell" else "live pressure on the outer face")
-    else:
-        left_out.append("pressure: not loaded by it (the volume is only reported)")
-    for force in loads.forces.values():
-        patch = force.patch * case.shell.R_over_h
-        included.append(f"force on a patch of radius {patch:g} h" if patch else "force at a point")
-    if not loads.forces:
-        left_out.append("force: none")
-    if dead := loads.all_dead:
-        included.append(f"{len(dead)} dead load{'s' * (len(dead) > 1)}")
-    if loads.moves:
-        moved = dict.fromkeys(name for move in loads.moves for name in move.names)
-        included.append(f"supports that move: {', '.join(moved)}")
-    for contact in loads.contacts:
-        k, body = f"{contact.stiffness:.4g}", case.bodies[contact.body].words(with_units=case.shell.with_units)
-        included.append(f"body {contact.body}: {body} without friction, stiffness k R²/(E h) = {k}")
+    left_out = list[str]()
+    for room in accounts(case.context, loads):
+        included += room.included
+        left_out += room.left_out
     if case.imperfections:
         included.append(_imperfections(case, rims))
     for step in {step.name: step for step in case.programme}.values():

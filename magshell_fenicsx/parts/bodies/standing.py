@@ -13,6 +13,7 @@ from magshell_fenicsx.models.shell.parameters import Loads
 from magshell_fenicsx.parts.bodies.body import BodySection, place_body
 from magshell_fenicsx.parts.bodies.contact import Contact
 from magshell_fenicsx.parts.bodies.press import ContactSection
+from magshell_fenicsx.parts.part import Account, Context
 from magshell_fenicsx.parts.seen import Seen, Sight
 from magshell_fenicsx.parts.step import Step
 from magshell_fenicsx.quantities.registry import contact_columns
@@ -185,3 +186,14 @@ class BodiesSeen(Seen):
 
     def _unit(self, sight: Sight) -> float:
         return -sight.model.force_unit * sight.h
+
+
+def account(context: Context, loads: Loads) -> Account:
+    """What presses, and how stiff it is."""
+    bodies, with_units = context.sections["bodies"], context.shell.with_units
+    words = [
+        f"body {contact.body}: {bodies[contact.body].words(with_units=with_units)} without friction, "
+        f"stiffness k R²/(E h) = {contact.stiffness:.4g}"
+        for contact in loads.contacts
+    ]
+    return Account(words)

@@ -20,7 +20,7 @@ from magshell_fenicsx.models.shell.parameters import (
 )
 from magshell_fenicsx.models.shell.patterns import Pattern
 from magshell_fenicsx.parts.forces.dead import DeadLoadSection, potential
-from magshell_fenicsx.parts.part import Context, Modelled
+from magshell_fenicsx.parts.part import Account, Context, Modelled
 from magshell_fenicsx.parts.seen import Seen, Sight
 from magshell_fenicsx.quantities.registry import amplitude
 
@@ -96,3 +96,12 @@ class ForcesSeen(Seen):
         if name in sight.loads.forces:
             return sight.model.force_unit * sight.h
         return sight.model.load_size.get(name, 0.0) / sight.length if name in sight.loads.dead else None
+
+
+def account(context: Context, loads: Loads) -> Account:
+    """Forces and dead loads."""
+    patches = [force.patch * context.shell.R_over_h for force in loads.forces.values()]
+    words = [f"force on a patch of radius {patch:g} h" if patch else "force at a point" for patch in patches]
+    if dead := loads.all_dead:
+        words.append(f"{len(dead)} dead load{'s' * (len(dead) > 1)}")
+    return Account(words, [] if loads.forces else ["force: none"])

@@ -10,13 +10,13 @@ from magshell_fenicsx.input.section import Direction
 from magshell_fenicsx.input.tables import read_vectors
 from magshell_fenicsx.mesh.mirror import Mirror, rotation
 from magshell_fenicsx.models.shell.controls import ByControls, Controls
-from magshell_fenicsx.models.shell.parameters import Magnetisation
+from magshell_fenicsx.models.shell.parameters import Loads, Magnetisation
 from magshell_fenicsx.models.shell.patterns import Components, Inside, Pattern, WithinRims, radial, tangential
 from magshell_fenicsx.parts.magnetism.field_step import FieldSection, RotationSection
-from magshell_fenicsx.parts.magnetism.fields import MagneticSection, RemanentSection, layer_average
+from magshell_fenicsx.parts.magnetism.fields import MagneticSection, RemanentSection, layer_average, strength
 from magshell_fenicsx.parts.magnetism.sources.field import in_space, turns, values
 from magshell_fenicsx.parts.magnetism.sources.source import SourceSection
-from magshell_fenicsx.parts.part import Context, Modelled
+from magshell_fenicsx.parts.part import Account, Context, Modelled
 from magshell_fenicsx.shape.outline import Outline
 from magshell_fenicsx.shape.sections import MeshSurface
 from magshell_fenicsx.shape.symmetry import PARALLEL, Leaves, alike, tilted
@@ -175,3 +175,14 @@ def adds(context: Context, modelled: Modelled) -> dict[str, Magnetisation]:
 
 def _rotations(context: Context) -> list[RotationSection]:
     return [step.load for step in context.steps if isinstance(step.load, RotationSection)]
+
+
+def account(context: Context, loads: Loads) -> Account:
+    """The energy of the field, and its sources."""
+    magnetic, field = context.of(MagneticSection), loads.magnetic
+    if magnetic is None or field is None:
+        return Account(left_out=["magnetic energy: " + ("lambda_m is zero" if magnetic else "no magnetic section")])
+    law = "" if field.law == "deformation" else ", remanence that turns and does not stretch"
+    sources = enumerate(magnetic.applied.sources or [])
+    words = [f"source {source.name or i}: {source.words()}" for i, source in sources]
+    return Account([f"magnetic energy ({field.energy}){law}, lambda_m = {strength(context):g}", *words])

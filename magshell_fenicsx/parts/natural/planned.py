@@ -7,10 +7,11 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.input.expressions import ByFormula, function
 from magshell_fenicsx.mesh.mirror import Mirror, rotation
+from magshell_fenicsx.models.shell.parameters import Loads
 from magshell_fenicsx.models.shell.patterns import Inside, Pattern, WithinRims
 from magshell_fenicsx.parts.natural.section import NaturalSection, components
 from magshell_fenicsx.parts.natural.shape import Natural, Varying, meridians
-from magshell_fenicsx.parts.part import Context
+from magshell_fenicsx.parts.part import Account, Context
 from magshell_fenicsx.shape.outline import Outline
 from magshell_fenicsx.shape.sections import MeshSurface, PlateSurface
 from magshell_fenicsx.shape.shell import ShellSection
@@ -134,3 +135,11 @@ def leaves(context: Context, outline: Outline) -> list[Leaves]:
     fixed = not isinstance(chosen, str) and all(isinstance(v, float | int) for v in chosen)
     vectors = [unit(np.array(chosen, dtype=float))] if fixed else []
     return [Leaves(askew(context, outline), vectors, lambda mirror: mirrored(context, outline, mirror))]
+
+
+def account(context: Context, loads: Loads) -> Account:
+    """What grows."""
+    if not loads.natural:
+        return Account(left_out=["natural shape: as drawn"])
+    names = " and ".join(name.removeprefix("natural_") for name in loads.natural.amplitudes)
+    return Account([f"natural {names}: strains are measured from there"])

@@ -1,5 +1,7 @@
 """The unit of what is conjugate to a live pressure."""
 
+from magshell_fenicsx.models.shell.parameters import Loads
+from magshell_fenicsx.parts.part import Account, Context
 from magshell_fenicsx.parts.pressure.pressure import PressureSection
 from magshell_fenicsx.parts.seen import Seen, Sight
 
@@ -12,3 +14,10 @@ class PressureSeen(Seen):
         if name != PressureSection.amplitude:
             return None
         return -sight.model.material.classical_pressure / sight.h / sight.model.multiplicity
+
+
+def account(context: Context, loads: Loads) -> Account:
+    """Whether there is a live pressure."""
+    if not loads.pressure:
+        return Account(left_out=["pressure: not loaded by it (the volume is only reported)"])
+    return Account(["live pressure on the outer face" if context.solid else "live pressure"])

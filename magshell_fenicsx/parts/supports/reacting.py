@@ -9,6 +9,7 @@ from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.mesh.mirror import Mirror, rotation
 from magshell_fenicsx.models.observed import Observed
 from magshell_fenicsx.models.shell.parameters import Loads
+from magshell_fenicsx.parts.part import Account, Context
 from magshell_fenicsx.parts.seen import Seen, Sight
 from magshell_fenicsx.parts.supports.reactions import reactions
 
@@ -85,3 +86,9 @@ def observed_reactions(
         values = np.concatenate([force * one.force @ frame, force * length * one.moment @ frame])
         found |= dict(zip(columns([name]), (float(v) for v in values), strict=True))
     return found
+
+
+def account(context: Context, loads: Loads) -> Account:
+    """What moves."""
+    moved = dict.fromkeys(name for move in loads.moves for name in move.names)
+    return Account([f"supports that move: {', '.join(moved)}"] if moved else [])
