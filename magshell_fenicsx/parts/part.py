@@ -1,6 +1,6 @@
 """The base of parts: sections of a case that add energies."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
@@ -168,6 +168,29 @@ class Modelled:
 
 
 @dataclass(frozen=True)
+class Formulas:
+    """A key of the case with numbers or formulas of the undeformed place.
+
+    Attributes
+    ----------
+    least, most
+        Allowed values.
+    length
+        R in the unit of the places.
+    load
+        Whether it is a load: what is shorter than about sqrt(Rh) bends no shell then, and its moments are exact on
+        elements of any size. Strains follow all else down to its last detail.
+    """
+
+    key: str
+    values: Sequence[float | str]
+    least: float
+    most: float
+    length: float
+    load: bool = False
+
+
+@dataclass(frozen=True)
 class Account:
     """What a room has in a model, and what is left out, in words."""
 
@@ -180,6 +203,10 @@ class Ability(Section):
 
     def leaves(self, context: Context, outline: "Outline") -> list[Leaves]:
         """The symmetry that it leaves of a shell."""
+        return []
+
+    def formulas(self, context: Context) -> Iterable[Formulas]:
+        """What varies with the undeformed place."""
         return []
 
     def adds(self, context: Context, modelled: Modelled) -> dict[str, Any]:

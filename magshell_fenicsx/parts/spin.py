@@ -15,7 +15,7 @@ from magshell_fenicsx.quantities.quantity import Quantity
 from magshell_fenicsx.quantities.units import DENSITY_TOO, Unit
 
 SPEED = Unit("√(E/ρ)/R", text="radian/second", size=lambda g: sqrt(g.E / g.rho) / g.R, needs=DENSITY_TOO)
-SQUARED = Unit("E/(ρ R²)", "1/s²", "per_s2", "1/s²", lambda g: g.E / (g.rho * g.R**2))
+SQUARED = Unit("E/(ρ R²)", "1/s²", "per_s2", "1/s²", lambda g: g.E / (g.rho * g.R**2), symbol="ω²")
 
 
 def _of_angles(value: Any) -> Any:

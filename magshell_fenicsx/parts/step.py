@@ -12,7 +12,7 @@ from magshell_fenicsx.input.section import Pressure, Section
 from magshell_fenicsx.mesh.grading import Feature
 from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.models.shell.own_term import OwnTerm
-from magshell_fenicsx.parts.part import Context, Modelled
+from magshell_fenicsx.parts.part import Context, Formulas, Modelled
 from magshell_fenicsx.quantities.quantity import Quantity
 from magshell_fenicsx.quantities.registry import register
 from magshell_fenicsx.shape.symmetry import Leaves
@@ -467,8 +467,8 @@ class Step(Section):
         """Largest size of elements on a curved disc, over R; None: as without it."""
         return None
 
-    def formulas(self, key: str, context: Context) -> Iterable[tuple[str, Any, float]]:
-        """Key and value of what may be formulas of the undeformed place in the shell's length, and their unit."""
+    def formulas(self, key: str, context: Context) -> Iterable[Formulas]:
+        """What varies with the undeformed place."""
         return []
 
     @classmethod

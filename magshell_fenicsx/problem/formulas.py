@@ -21,12 +21,11 @@ from magshell_fenicsx.mesh.msh import MeshFile, in_space, read_msh
 from magshell_fenicsx.mesh.patch import PatchMesh
 from magshell_fenicsx.mesh.shapes import DiscShape, Shape, StripShape
 from magshell_fenicsx.models.shell.fitted import Cells, fitted, sampling
-from magshell_fenicsx.models.shell.patterns import LARGEST as LARGEST_VECTOR
 from magshell_fenicsx.models.shell.thickness import LEAST_FACTOR, MOST_FACTOR
 from magshell_fenicsx.models.shell.unseen import Lattice, Leaves, Parts
 from magshell_fenicsx.models.shell.unseen import leaves as leaves_of
 from magshell_fenicsx.parts.imperfections.imperfection import Flaw
-from magshell_fenicsx.parts.natural.shape import LARGEST, SMALLEST
+from magshell_fenicsx.parts.part import Ability, Formulas
 from magshell_fenicsx.shape.outline import ANY, Outline
 
 Array = NDArray[np.float64]
@@ -42,7 +41,6 @@ STIFFNESS = 1e-3  # of it, which cells may miss by a thickness that varies withi
 MISSED = 0.003  # of the variance of a formula: what polynomials on squares may miss of it
 SEEN, HALF = 6, 0.5  # places along each side of a part of the surface; of a formula's square, which samples miss
 NARROW, PLACES = 0.02, 300  # over R, parts that samples may miss, and how many of each formula are looked at
-CURVATURE = 1e6  # of a natural shape, over 1/R
 LOCAL = (np.stack(np.meshgrid(*[np.arange(SAMPLES)] * 2, indexing="ij"), axis=-1).reshape(-1, 2) + 0.5) / SAMPLES - 0.5
 _POWERS = [(i, j) for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i)]
 BASIS = np.linalg.qr(np.stack([(2 * LOCAL[:, 0]) ** i * (2 * LOCAL[:, 1]) ** j for i, j in _POWERS], axis=-1))[0]
@@ -81,28 +79,17 @@ def written(case: Case) -> list[Written]:
 
 
 def _written(case: Case) -> Iterator[Written]:
-    R = case.shell.reference
-
-    def one(
-        key: str, values: Iterable[float | str], least: float, most: float, length: float = R, *, load: bool = False
-    ) -> Iterator[Written]:
-        texts = tuple(v for v in values if isinstance(v, str))
+    context, factor = case.context, case.thickness_factor
+    sections = [section for section in context.sections.values() if isinstance(section, Ability)]
+    for each in (
+        *([Formulas(THICKNESS, [factor], LEAST_FACTOR, MOST_FACTOR, 1.0)] if isinstance(factor, str) else []),
+        *(formulas for section in sections for formulas in section.formulas(context)),
+        *(formulas for step in case.programme for formulas in step.load.formulas(step.key, context)),
+    ):
+        texts = tuple(value for value in each.values if isinstance(value, str))
         if texts:
-            yield Written(key, texts, Together([formula(text) for text in texts], None, length), least, most, load)
-
-    if isinstance(case.thickness_factor, str):
-        yield from one(THICKNESS, [case.thickness_factor], LEAST_FACTOR, MOST_FACTOR, 1.0)
-    if case.magnetic and case.magnetic.remanent.components:
-        key = "magnetic.remanent.components"
-        yield from one(key, case.magnetic.remanent.components, -LARGEST_VECTOR, LARGEST_VECTOR, 1.0)
-    for step in case.programme:
-        for key, value, unit in step.load.formulas(step.key, case.context):
-            most, values = LARGEST_VECTOR * unit, value if isinstance(value, list) else [value]
-            yield from one(key, values, -most, most, load=True)
-    for name, least, most in (("stretch", SMALLEST, LARGEST), ("curvature", -CURVATURE / R, CURVATURE / R)):
-        value = getattr(case.natural, name, None)
-        values = value if isinstance(value, list) else [] if isinstance(value, dict) else [value]
-        yield from one(f"natural.{name}", values, least, most)
+            of_place = Together([formula(text) for text in texts], None, each.length)
+            yield Written(each.key, texts, of_place, each.least, each.most, each.load)
 
 
 def refuse_unfit_formulas(formulas: Sequence[Written], x: Array) -> None:

@@ -16,7 +16,7 @@ from magshell_fenicsx.mesh.grading import Disc, Feature
 from magshell_fenicsx.mesh.mirror import ROUNDING, Mirror
 from magshell_fenicsx.models.shell.kinematics import Jet
 from magshell_fenicsx.models.shell.own_term import OwnTerm
-from magshell_fenicsx.parts.part import Context, Modelled, Scales
+from magshell_fenicsx.parts.part import Context, Formulas, Modelled, Scales
 from magshell_fenicsx.parts.step import Count, Fit, Now, PathStep, ProgrammeStep, Target, Until
 from magshell_fenicsx.shape.symmetry import Leaves, alike, of_energy, tilted, unit
 from magshell_fenicsx.shape.turning import Span, scalar_turns, vector_turns
@@ -217,12 +217,16 @@ class DeadSection(PathStep):
         size = 2 * sqrt(fit.h)
         return size if size < 0.35 else None
 
-    def formulas(self, key: str, context: Context) -> Iterable[tuple[str, Any, float]]:
+    def formulas(self, key: str, context: Context) -> Iterable[Formulas]:
+        from magshell_fenicsx.models.shell.patterns import LARGEST  # the solver takes long to import
+
         scales = context.scales
         for i, load in enumerate(self.loads):
             for name in ("per_length", "per_area", "pressure"):
-                unit = scales.E * scales.h / (scales.R if name != "per_length" else 1.0)
-                yield f"{key}.loads.{i}.{name}", getattr(load, name), unit
+                value = getattr(load, name)
+                values = value if isinstance(value, list) else [value]
+                most = LARGEST * (scales.E * scales.h / (scales.R if name != "per_length" else 1.0))
+                yield Formulas(f"{key}.loads.{i}.{name}", values, -most, most, scales.R, load=True)
 
     def adds(self, step: ProgrammeStep, context: Context, modelled: Modelled) -> dict[str, Any]:
         from magshell_fenicsx.parts.forces.loads import dead_load  # the solver takes long to import

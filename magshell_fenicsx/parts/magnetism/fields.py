@@ -1,5 +1,6 @@
 """The magnetisation and the applied field."""
 
+from collections.abc import Iterable
 from math import pi
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
@@ -11,7 +12,7 @@ from magshell_fenicsx.input.expressions import Formula
 from magshell_fenicsx.input.file import FileKeys
 from magshell_fenicsx.input.section import Direction, FluxDensity
 from magshell_fenicsx.parts.kinds import Sources
-from magshell_fenicsx.parts.part import Ability, Context, Modelled
+from magshell_fenicsx.parts.part import Ability, Context, Formulas, Modelled
 from magshell_fenicsx.shape.symmetry import Leaves
 
 if TYPE_CHECKING:
@@ -186,6 +187,12 @@ class MagneticSection(Ability):
         from magshell_fenicsx.parts.magnetism.magnetisation import leaves  # the solver takes long to import
 
         return leaves(context, outline) if strength(context) else []
+
+    def formulas(self, context: Context) -> Iterable[Formulas]:
+        from magshell_fenicsx.models.shell.patterns import LARGEST  # the solver takes long to import
+
+        if self.remanent.components:
+            yield Formulas("magnetic.remanent.components", self.remanent.components, -LARGEST, LARGEST, 1.0)
 
     def adds(self, context: Context, modelled: Modelled) -> dict[str, Any]:
         from magshell_fenicsx.parts.magnetism.magnetisation import adds  # the solver takes long to import

@@ -85,7 +85,7 @@ def askew(context: Context, outline: Outline) -> str | None:
     upright = [v == 0 for v in direction] == [True, True, False]
     if uneven(context) and direction != MERIDIAN and not upright:
         return "the natural shape is not along the meridians"
-    if outline.span and not all(scalar_turns(text, outline.span, R) for text in section.formulas):
+    if outline.span and not all(scalar_turns(text, outline.span, R) for text in section.texts):
         return "the natural shape differs around e3"
     return None
 

@@ -1,13 +1,14 @@
 """The natural shape: the curvature and the size that the shell would have without stress."""
 
 import re
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import BeforeValidator, Field, model_validator
 
 from magshell_fenicsx.input.expressions import Formula, formula
 from magshell_fenicsx.input.section import _NUMBER, in_units
-from magshell_fenicsx.parts.part import Ability, Context, Modelled
+from magshell_fenicsx.parts.part import Ability, Context, Formulas, Modelled
 from magshell_fenicsx.shape.symmetry import Leaves
 
 if TYPE_CHECKING:
@@ -58,6 +59,7 @@ def _components(numbers: int, least: float, most: float, *, lengths: bool = Fals
     return BeforeValidator(read, json_schema_input_type=kind | dict[str, kind] | None)
 
 
+CURVATURE = 1e6  # of a natural shape by formula, over 1/R
 Number = float | str
 Component = Annotated[float | Formula, Field(union_mode="left_to_right")]  # a number stays one
 Values = Number | list[Number] | dict[str, Number | list[Number]] | None
@@ -89,14 +91,24 @@ class NaturalSection(Ability):
         return self
 
     @property
-    def formulas(self) -> list[str]:
-        """Those of the curvature and the stretch."""
+    def texts(self) -> list[str]:
+        """The formulas of the curvature and the stretch."""
         return [text for value in (self.curvature, self.stretch) for text in components(value) if isinstance(text, str)]
 
     def leaves(self, context: Context, outline: "Outline") -> list[Leaves]:
         from magshell_fenicsx.parts.natural.planned import leaves  # the solver takes long to import
 
         return leaves(context, outline)
+
+    def formulas(self, context: Context) -> Iterable[Formulas]:
+        from magshell_fenicsx.parts.natural.shape import LARGEST, SMALLEST  # the solver takes long to import
+
+        R = context.shell.reference
+        bounds = {"stretch": (SMALLEST, LARGEST), "curvature": (-CURVATURE / R, CURVATURE / R)}
+        for name, (least, most) in bounds.items():
+            value = getattr(self, name)
+            values = value if isinstance(value, list) else [] if isinstance(value, dict) else [value]
+            yield Formulas(f"natural.{name}", values, least, most, R)
 
     def adds(self, context: Context, modelled: Modelled) -> dict[str, Any]:
         from magshell_fenicsx.parts.natural.planned import natural  # the solver takes long to import
