@@ -6,9 +6,10 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeAlias, Union
 from pydantic import Discriminator, Field, Tag
 
 from magshell_fenicsx.input.chosen import Chosen
+from magshell_fenicsx.parts.course import Gas
 from magshell_fenicsx.parts.part import Context
 from magshell_fenicsx.parts.registered import FIRST, STEPS
-from magshell_fenicsx.parts.step import LEAST_TARGET, Gas, ProgrammeStep, Step
+from magshell_fenicsx.parts.step import LEAST_TARGET, ProgrammeStep, Step
 
 if TYPE_CHECKING:
     OneStep: TypeAlias = Step

@@ -1,24 +1,38 @@
 """The base of the steps of a programme: what a step drives, how, and how far."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple, Self, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Discriminator, Field, Tag, model_validator
+from pydantic import Field, model_validator
 
-from magshell_fenicsx.input.section import Pressure, Section
+from magshell_fenicsx.input.section import Section
 from magshell_fenicsx.mesh.grading import Feature
 from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.models.shell.own_term import OwnTerm
+from magshell_fenicsx.parts.course import (
+    Ahead,
+    Control,
+    Course,
+    Curves,
+    Drive,
+    Fit,
+    Here,
+    Hold,
+    Now,
+    Prescribed,
+    SearchSection,
+    SnapSection,
+    Target,
+)
 from magshell_fenicsx.parts.part import Context, Formulas, Modelled
 from magshell_fenicsx.quantities.quantity import Quantity
 from magshell_fenicsx.quantities.registry import register
 from magshell_fenicsx.shape.symmetry import Leaves
 
 if TYPE_CHECKING:
-    from magshell_fenicsx.continuation.path import StepOptions
     from magshell_fenicsx.models.shell.parameters import Loads
     from magshell_fenicsx.parts.motion.step import TimeSection
     from magshell_fenicsx.shape.outline import Outline
@@ -36,229 +50,6 @@ Count = Annotated[int, Field(ge=1, le=10000, description="Equal parts to the tar
 LEAST_TARGET = 1e-9
 BALANCE = 1e-2  # largest error of the balance of energy in time, over all energies
 Array = NDArray[np.float64]
-Prescribed = Literal["load", "conjugate"]
-Control = Literal["load", "conjugate", "arc"]
-
-
-class GasSection(Section):
-    """An ideal gas at constant temperature under the shell: its pressure times its volume is constant."""
-
-    ambient: Pressure | None = Field(default=None, gt=0, le=1e12)
-    """Pressure outside, with a unit"""
-    ambient_over_pc: float | None = Field(default=None, gt=0, le=1e12)
-    """The same without one [p_c]"""
-    volume: float | None = Field(default=None, gt=0, le=1e6)
-    """Volume of the gas under the undeformed shell; by default the volume under the shell itself [R³]"""
-
-    @model_validator(mode="after")
-    def _one_ambient(self) -> Self:
-        if (self.ambient is None) == (self.ambient_over_pc is None):
-            raise ValueError("give ambient or ambient_over_pc")
-        return self
-
-
-class Gas(Section):
-    """The pressure follows from a gas under the shell."""
-
-    gas: GasSection
-    """The gas"""
-
-
-Hold = Annotated[
-    Annotated[Literal["load", "conjugate"], Tag("a word")] | Annotated[Gas, Tag("a gas")],
-    Discriminator(lambda data: "a gas" if isinstance(data, dict | Gas) else "a word"),
-]
-
-
-class SearchSection(Section):
-    """Other equilibria at the last point of a step, such as snapped shapes, by deflation: no path leads to them.
-
-    Everything that the step holds stays held. What is found depends on the guesses: there may be more.
-    """
-
-    solutions: Annotated[int, Field(ge=1, le=100)] = 3
-    """Ends after so many, each a point with the label solution"""
-    guesses: Annotated[int, Field(ge=1, le=1000)] = 12
-    """Guesses tried at most: the shell with dents, then both directions of the softest mode of each solution"""
-    stable: bool = False
-    """Whether each guess goes down in energy until it rests at a stable solution, which takes minutes on surfaces; only
-    stable ones count. A half or a meridian knows no motions beside its symmetry: take symmetry: none"""
-    seconds: Annotated[float, Field(gt=0)] | None = None
-    """No guess is tried after so long; by default there is no limit [s]"""
-
-
-Errors: TypeAlias = Literal["step", "motion"]
-
-
-class SnapSection(Section):
-    """Of `then: snap`."""
-
-    push: float = Field(default=0.05, gt=0, le=10)
-    """How far it leaves the fold, along the path's direction there [h]"""
-    damping: float = Field(default=0.1, gt=0, le=10)
-    """Part of the critical drag of the third mode of vibration at the fold, where the first one is neutral"""
-    tolerance: float = Field(default=1e-3, ge=1e-9, le=1)
-    """Largest estimated error of what `errors` names [h]"""
-    errors: Errors = "motion"
-    """Of each time step, or of the motion at all rows (column error_over_h): then it is rehearsed with longer steps,
-    which takes several times as long; a snap magnifies the errors of steps"""
-
-
-class Target(NamedTuple):
-    """What the value of a key prescribes: the amplitude or its conjugate, and the column of path.csv with it."""
-
-    quantity: Prescribed
-    column: str
-
-
-@dataclass(frozen=True)
-class Now:
-    """The amplitude of a step where the step begins.
-
-    Attributes
-    ----------
-    value, conjugate
-        mu, and -dPi/dmu.
-    unit
-        -dPi/dmu of one unit of the key that prescribes it.
-    driven
-        Whether an earlier step has driven the amplitude.
-    size
-        What a target of one is, see `Step.size`.
-    h
-        Thickness over R.
-    """
-
-    value: float
-    conjugate: float
-    unit: float
-    driven: bool
-    size: float
-    h: float
-
-
-@dataclass(frozen=True)
-class Drive:
-    """How a step drives its amplitude.
-
-    Attributes
-    ----------
-    quantity, end
-        What has a target, mu or -dPi/dmu, and the target; None without.
-    targets
-        Requested values on the way, the last of them `end`.
-    first
-        Change of the amplitude in the first step.
-    scale
-        See `continuation.path.Path`.
-    step
-        The first step of a prescribed conjugate; None: it follows from `first`.
-    """
-
-    control: Control
-    quantity: Prescribed
-    end: float | None
-    targets: list[float]
-    first: float
-    scale: float = 1.0
-    step: float | None = None
-
-
-@dataclass(frozen=True)
-class Here:
-    """Where a step begins, in the model's terms.
-
-    Attributes
-    ----------
-    loads
-        What loads the model.
-    turn
-        Azimuth of its frame (rad).
-    mu
-        The amplitudes.
-    potential
-        Amplitude -> Pi_i(u).
-    unit
-        Amplitude -> -dPi/dmu of one unit of the key that prescribes it.
-    open
-        Whether a live pressure has no potential.
-    """
-
-    step: "ProgrammeStep"
-    context: Context
-    loads: "Loads"
-    turn: float
-    h: float
-    mu: Mapping[str, float]
-    potential: Callable[[str], float]
-    unit: Callable[[str], float]
-    open: bool
-
-    @property
-    def driven(self) -> bool:
-        """Whether an earlier step has driven the amplitude."""
-        return any(self.step.name == other.name for other in self.context.before(self.step.number))
-
-    def now(self) -> Now:
-        """The amplitude of the step."""
-        name = self.step.name
-        size = self.step.load.size(self.context)
-        return Now(self.mu[name], -self.potential(name), self.unit(name), self.driven, size, self.h)
-
-
-Curves = Mapping[str, Callable[[float], tuple[float, float, float]]]  # of several amplitudes, see `Along`
-
-
-@dataclass(frozen=True)
-class Course:
-    """How a step goes on from where it begins.
-
-    Attributes
-    ----------
-    until
-        Of the walk.
-    steps
-        The largest number of steps; None: the walk's own.
-    curves
-        Amplitudes that are functions of the step's own, and its value; None where the model has it itself.
-    finer
-        The lengths of steps of a path, from those that follow from the first one.
-    forbidden
-        What is said of an instability that must not be on the way, by its amplitudes and its name; None if it may.
-    at_once
-        Whether that ends the step, or it goes on to its end first.
-    label
-        Of points that are no instabilities, in place of the walk's own.
-    impossible
-        Why there is no way; empty if there is one.
-    """
-
-    drive: Drive
-    until: Literal["limit", "bifurcation", "target", "points"]
-    steps: int | None = None
-    curves: tuple[Curves, float] | None = None
-    finer: "Callable[[StepOptions], StepOptions] | None" = None
-    forbidden: Callable[[Mapping[str, float], str], str] | None = None
-    at_once: bool = False
-    label: Literal["", "field"] = ""
-    impossible: str = ""
-
-
-@dataclass(frozen=True)
-class Ahead:
-    """The end of a step in words, for those who wait for it.
-
-    Attributes
-    ----------
-    end
-        Value of the column of its amplitude; None if it ends at another event.
-    steps
-        Number of steps after which it ends; None if it ends otherwise.
-    """
-
-    words: str
-    end: float | None = None
-    steps: int | None = None
 
 
 class Step(Section):
@@ -479,28 +270,6 @@ class Step(Section):
     def adds(self, step: "ProgrammeStep", context: Context, modelled: Modelled) -> dict[str, Any]:
         """Fields of the model's `Loads`, to which those of other parts are added."""
         return {}
-
-
-@dataclass(frozen=True)
-class Fit:
-    """What element sizes depend on.
-
-    Attributes
-    ----------
-    h
-        Over R.
-    refinement
-        By which sizes are divided.
-    solid
-        Whether the body is modelled in three dimensions.
-    local
-        Whether the shell has a local imperfection.
-    """
-
-    h: float
-    refinement: float
-    solid: bool
-    local: bool
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,9 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.mesh.grading import Disc, Feature, Grading, Line, Ring
+from magshell_fenicsx.parts.course import Fit
 from magshell_fenicsx.parts.imperfections.rims import Spot, images
-from magshell_fenicsx.parts.step import Fit, Step
+from magshell_fenicsx.parts.step import Step
 from magshell_fenicsx.shape.outline import Outline
 from magshell_fenicsx.shape.sections import MeshSurface
 

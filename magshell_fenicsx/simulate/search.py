@@ -10,7 +10,8 @@ from magshell_fenicsx.continuation.path import StepOptions
 from magshell_fenicsx.continuation.search import Limits, further
 from magshell_fenicsx.continuation.settling import Settling
 from magshell_fenicsx.continuation.system import State
-from magshell_fenicsx.parts.step import ProgrammeStep, SearchSection
+from magshell_fenicsx.parts.course import SearchSection
+from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.simulate.guesses import dented
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene

@@ -7,8 +7,9 @@ from magshell_fenicsx.continuation.path import StepOptions
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.continuation.walk import MOST_STEPS, Goal
 from magshell_fenicsx.parts.bodies.touch import touched
+from magshell_fenicsx.parts.course import Drive, Gas, Here
 from magshell_fenicsx.parts.pressure.gas import gas
-from magshell_fenicsx.parts.step import Drive, Gas, Here, ProgrammeStep
+from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.stage import Stage, staged

@@ -17,13 +17,13 @@ from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.modes import ShellModes
 from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.parts.bodies.contact import Pressings
+from magshell_fenicsx.parts.course import SnapSection
 from magshell_fenicsx.parts.motion.ground import Ground
 from magshell_fenicsx.parts.motion.mass import mass, whole_mass
 from magshell_fenicsx.parts.motion.on_meridian import surface_of as of_meridian
 from magshell_fenicsx.parts.motion.on_surface import surface_of as of_shell
 from magshell_fenicsx.parts.motion.step import EventSection, TimeSection
 from magshell_fenicsx.parts.motion.viscous import Branch, Viscosity
-from magshell_fenicsx.parts.step import SnapSection
 from magshell_fenicsx.simulate.histories import LoadsInTime, time_of
 from magshell_fenicsx.simulate.intervals import Intervals, Rehearsed
 from magshell_fenicsx.simulate.record import Record, Stopped

@@ -8,11 +8,12 @@ from pydantic import Field, model_validator
 from magshell_fenicsx.input.expressions import Formula
 from magshell_fenicsx.input.section import Section, in_units
 from magshell_fenicsx.mesh.mirror import Mirror
+from magshell_fenicsx.parts.course import Ahead, Errors
 from magshell_fenicsx.parts.magnetism.field_step import RotationSection
 from magshell_fenicsx.parts.magnetism.fields import MagneticSection, strength
 from magshell_fenicsx.parts.motion.history import History, Time, levels_of, measured, times_of
 from magshell_fenicsx.parts.part import Context
-from magshell_fenicsx.parts.step import BALANCE, Ahead, Errors, ProgrammeStep, Step
+from magshell_fenicsx.parts.step import BALANCE, ProgrammeStep, Step
 from magshell_fenicsx.shape.symmetry import Leaves, alike
 from magshell_fenicsx.shape.turning import vector_turns, vectors_of
 

@@ -6,7 +6,7 @@ from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.continuation.device import Conjugate
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.parts.step import GasSection
+from magshell_fenicsx.parts.course import GasSection
 from magshell_fenicsx.shape.sections import CapSurface
 from magshell_fenicsx.simulate.scene import Scene
 
