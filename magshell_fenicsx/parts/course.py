@@ -14,6 +14,15 @@ if TYPE_CHECKING:
     from magshell_fenicsx.models.shell.parameters import Loads
     from magshell_fenicsx.parts.step import ProgrammeStep
 
+Until = Annotated[
+    Literal["limit", "bifurcation", "target", "points", "zero"],
+    Field(
+        description="Where the path ends: at the first instability (limit; past one that a half or a meridian excludes "
+        "it goes on to the model's own, up to twice the load), at the first bifurcation, through folds, at the target, "
+        "after `points` steps by arc length, or where the load has risen and fallen back to zero: the top of an energy "
+        "barrier, whose height is `barrier` in summary.json (zero)"
+    ),
+]
 Prescribed = Literal["load", "conjugate"]
 Control = Literal["load", "conjugate", "arc"]
 Curves = Mapping[str, Callable[[float], tuple[float, float, float]]]  # of several amplitudes, see `Along`

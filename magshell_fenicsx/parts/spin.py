@@ -9,9 +9,9 @@ from ufl.core.expr import Expr
 from magshell_fenicsx.input.targets import over
 from magshell_fenicsx.models.shell.kinematics import Jet
 from magshell_fenicsx.models.shell.own_term import OwnTerm
-from magshell_fenicsx.parts.course import Now, Target
+from magshell_fenicsx.parts.course import Now, Target, Until
 from magshell_fenicsx.parts.part import Context
-from magshell_fenicsx.parts.step import PathStep, ProgrammeStep, Until
+from magshell_fenicsx.parts.step import PathStep, ProgrammeStep
 from magshell_fenicsx.quantities.quantity import Quantity
 from magshell_fenicsx.quantities.units import DENSITY_TOO, Unit
 

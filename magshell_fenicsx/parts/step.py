@@ -26,6 +26,7 @@ from magshell_fenicsx.parts.course import (
     SearchSection,
     SnapSection,
     Target,
+    Until,
 )
 from magshell_fenicsx.parts.part import Context, Formulas, Modelled
 from magshell_fenicsx.quantities.quantity import Quantity
@@ -37,15 +38,6 @@ if TYPE_CHECKING:
     from magshell_fenicsx.parts.motion.step import TimeSection
     from magshell_fenicsx.shape.outline import Outline
 
-Until = Annotated[
-    Literal["limit", "bifurcation", "target", "points", "zero"],
-    Field(
-        description="Where the path ends: at the first instability (limit; past one that a half or a meridian excludes "
-        "it goes on to the model's own, up to twice the load), at the first bifurcation, through folds, at the target, "
-        "after `points` steps by arc length, or where the load has risen and fallen back to zero: the top of an energy "
-        "barrier, whose height is `barrier` in summary.json (zero)"
-    ),
-]
 Count = Annotated[int, Field(ge=1, le=10000, description="Equal parts to the target, each a row; or steps")]
 LEAST_TARGET = 1e-9
 BALANCE = 1e-2  # largest error of the balance of energy in time, over all energies

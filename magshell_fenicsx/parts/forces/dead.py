@@ -16,9 +16,9 @@ from magshell_fenicsx.mesh.grading import Disc, Feature
 from magshell_fenicsx.mesh.mirror import ROUNDING, Mirror
 from magshell_fenicsx.models.shell.kinematics import Jet
 from magshell_fenicsx.models.shell.own_term import OwnTerm
-from magshell_fenicsx.parts.course import Fit, Now, Target
+from magshell_fenicsx.parts.course import Fit, Now, Target, Until
 from magshell_fenicsx.parts.part import Context, Formulas, Modelled, Scales
-from magshell_fenicsx.parts.step import Count, PathStep, ProgrammeStep, Until
+from magshell_fenicsx.parts.step import Count, PathStep, ProgrammeStep
 from magshell_fenicsx.shape.symmetry import Leaves, alike, of_energy, tilted, unit
 from magshell_fenicsx.shape.turning import Span, scalar_turns, vector_turns
 

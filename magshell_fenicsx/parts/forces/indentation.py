@@ -13,9 +13,9 @@ from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.input.targets import over
 from magshell_fenicsx.mesh.grading import Disc, Feature
 from magshell_fenicsx.mesh.mirror import ROUNDING
-from magshell_fenicsx.parts.course import Fit, Now, Target
+from magshell_fenicsx.parts.course import Fit, Now, Target, Until
 from magshell_fenicsx.parts.part import Context, Modelled
-from magshell_fenicsx.parts.step import Count, PathStep, ProgrammeStep, Until
+from magshell_fenicsx.parts.step import Count, PathStep, ProgrammeStep
 from magshell_fenicsx.quantities.units import POINT_FORCE, THICKNESS
 from magshell_fenicsx.shape.symmetry import Leaves, tilted
 

@@ -5,9 +5,9 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import Field
 
-from magshell_fenicsx.parts.course import Target
+from magshell_fenicsx.parts.course import Target, Until
 from magshell_fenicsx.parts.part import Context, Modelled
-from magshell_fenicsx.parts.step import PathStep, ProgrammeStep, Until
+from magshell_fenicsx.parts.step import PathStep, ProgrammeStep
 
 
 class ImperfectionStep(PathStep):

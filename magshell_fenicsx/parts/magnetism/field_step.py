@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from magshell_fenicsx.input.section import Direction
-from magshell_fenicsx.parts.course import Ahead, Course, Curves, Drive, Here, Now, Target
+from magshell_fenicsx.parts.course import Ahead, Course, Curves, Drive, Here, Now, Target, Until
 from magshell_fenicsx.parts.magnetism.fields import MagneticSection, strength
 from magshell_fenicsx.parts.part import Context
-from magshell_fenicsx.parts.step import PathStep, ProgrammeStep, Step, Until
+from magshell_fenicsx.parts.step import PathStep, ProgrammeStep, Step
 from magshell_fenicsx.shape.symmetry import Leaves
 
 if TYPE_CHECKING:

@@ -6,12 +6,12 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 from pydantic import Field, model_validator
 
 from magshell_fenicsx.input.section import Section
-from magshell_fenicsx.parts.course import Now, Target
+from magshell_fenicsx.parts.course import Now, Target, Until
 from magshell_fenicsx.parts.magnetism.field_step import FieldSection
 from magshell_fenicsx.parts.magnetism.fields import MagneticSection
 from magshell_fenicsx.parts.magnetism.sources.source import SourceSection
 from magshell_fenicsx.parts.part import Context
-from magshell_fenicsx.parts.step import Count, PathStep, ProgrammeStep, Until
+from magshell_fenicsx.parts.step import Count, PathStep, ProgrammeStep
 from magshell_fenicsx.parts.supports.motion import Finite, Lengths, Name
 from magshell_fenicsx.quantities.registry import QUANTITIES, TAKEN
 

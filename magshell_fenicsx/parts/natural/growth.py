@@ -4,10 +4,10 @@ from typing import ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
-from magshell_fenicsx.parts.course import Target
+from magshell_fenicsx.parts.course import Target, Until
 from magshell_fenicsx.parts.natural.section import NaturalSection
 from magshell_fenicsx.parts.part import Context
-from magshell_fenicsx.parts.step import PathStep, ProgrammeStep, Step, Until
+from magshell_fenicsx.parts.step import PathStep, ProgrammeStep, Step
 
 
 class GrowthSection(PathStep):

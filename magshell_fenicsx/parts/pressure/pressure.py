@@ -7,8 +7,8 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import Field
 
 from magshell_fenicsx.input.targets import over
-from magshell_fenicsx.parts.course import Course, Fit, Here, Now, Target
-from magshell_fenicsx.parts.step import PathStep, Step, Until
+from magshell_fenicsx.parts.course import Course, Fit, Here, Now, Target, Until
+from magshell_fenicsx.parts.step import PathStep, Step
 from magshell_fenicsx.quantities.units import PRESSURE, VOLUME
 
 

@@ -10,9 +10,9 @@ from pydantic import Field, model_validator
 from magshell_fenicsx.assembly.motion import Motion
 from magshell_fenicsx.input.section import Section, or_number
 from magshell_fenicsx.mesh.mirror import ROUNDING, Mirror, rotation
-from magshell_fenicsx.parts.course import Now, Target
+from magshell_fenicsx.parts.course import Now, Target, Until
 from magshell_fenicsx.parts.part import Context, Modelled
-from magshell_fenicsx.parts.step import Count, PathStep, ProgrammeStep, Until
+from magshell_fenicsx.parts.step import Count, PathStep, ProgrammeStep
 from magshell_fenicsx.parts.supports.boundary import BoundarySection
 from magshell_fenicsx.quantities.registry import QUANTITIES, TAKEN
 from magshell_fenicsx.shape.symmetry import Leaves
