@@ -9,7 +9,7 @@ import pytest
 from conftest import CASES
 
 import magshell_fenicsx as ms
-from magshell_fenicsx.continuation.events import critical_mode
+from magshell_fenicsx.continuation.modes import critical_mode
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.scene import Scene

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from magshell_fenicsx import Case, Scene
-from magshell_fenicsx.continuation.events import critical_mode
+from magshell_fenicsx.continuation.modes import critical_mode
 from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.output.fields.gathering import gatherer
 from magshell_fenicsx.simulate.follow import follow

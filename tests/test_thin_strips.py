@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from magshell_fenicsx import Case, Record, Scene
-from magshell_fenicsx.continuation.noise import VARIABLE
+from magshell_fenicsx.assembly.noise import VARIABLE
 from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.simulate.follow import follow
 

@@ -15,7 +15,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.continuation.condition import condition_estimate
+from magshell_fenicsx.continuation.factor import condition_estimate
 from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.path import Path as EquilibriumPath
 from magshell_fenicsx.continuation.path import StepOptions

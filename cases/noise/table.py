@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import magshell_fenicsx as ms
+from magshell_fenicsx.assembly.noise import VARIABLE
 from magshell_fenicsx.continuation.newton import MOTION
-from magshell_fenicsx.continuation.noise import VARIABLE
 from magshell_fenicsx.continuation.system import max_abs
 from magshell_fenicsx.problem.planner import make_plan
 

@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from magshell_fenicsx.assembly.moving import Moving
+from magshell_fenicsx.assembly.noise import Noise
 from magshell_fenicsx.assembly.parameters import Derivative, FreeParameter, Settable
 from magshell_fenicsx.assembly.sliding import Constraint, Projection, Sliding
 from magshell_fenicsx.assembly.terms import Counted, FormTerm, ResidualAssembler, TangentAssembler, Term, factor_of
-from magshell_fenicsx.continuation.noise import Noise
+from magshell_fenicsx.continuation.factor import Stopwatch
 from magshell_fenicsx.continuation.system import Amplitudes, Skewed, State, Vector, Weighted
-from magshell_fenicsx.continuation.timing import Stopwatch
 from magshell_fenicsx.platform import compat
 
 ASIDE = 1e-3  # the largest displacement of a difference, over h

@@ -2,18 +2,25 @@
 
     R(u, mu) + beta b = 0,    g(u, mu) = 0,    v . R_mu = 0
 
-for (u, mu, beta), with g and v of `augmented.AugmentedTangent`. This system is regular at a simple bifurcation. A small
+for (u, mu, beta), with g and v of `fold.AugmentedTangent`. This system is regular at a simple bifurcation. A small
 imperfection, from the mesh or from rounding, splits the bifurcation; beta is the force along v that restores it
-(Govaerts, Numerical methods for bifurcations of dynamical equilibria, SIAM 2000, ch. 4 and 6).
+(Govaerts, Numerical methods for bifurcations of dynamical equilibria, SIAM 2000, ch. 4 and 6). From there the branches
+that cross the path are entered.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import copysign
 
 import numpy as np
+from mpi4py import MPI
 
-from magshell_fenicsx.continuation.augmented import AugmentedTangent, first_difference, held_along, third
+from magshell_fenicsx.continuation.control import Hyperplane
+from magshell_fenicsx.continuation.fold import AugmentedTangent, first_difference, held_along, third
+from magshell_fenicsx.continuation.modes import NoEigenpair, critical_mode
 from magshell_fenicsx.continuation.newton import BorderedNewton
+from magshell_fenicsx.continuation.path import Path
+from magshell_fenicsx.continuation.point import Point
 from magshell_fenicsx.continuation.system import State, System, Vector, Weighted, dot, followed, max_abs
 
 TOLERANCE = 1e-9  # of u, in lengths of the system
@@ -23,6 +30,9 @@ SCATTER = 3.0  # load error in units of the last corrections, which are rounding
 NEAR = 1e-5  # in lengths: after a longer step the state is brought back into equilibrium, except for the force along v
 DIFFERENCE = 1e-4  # relative, of an amplitude
 ROUNDING = 1e-2  # in lengths: steps that are smaller and do not shrink are the rounding of g
+SIZES = 0.5, 2.0, 8.0  # of the first step off the path, in lengths of the system
+SEEN = 1e-4  # a larger relative change of the amplitude is no rounding error
+ODD = 0.1  # a branch is asymmetric if the changes of the amplitude in both directions differ by more than this part
 
 
 class BifurcationLost(RuntimeError):
@@ -149,3 +159,72 @@ def _done(sizes: Sequence[float]) -> bool:
     """Whether the last step is below the tolerance, or as small as rounding allows."""
     stalled = len(sizes) > 1 and sizes[-1] > sizes[-2] / 2 and sizes[-1] <= ROUNDING
     return stalled or (bool(sizes) and sizes[-1] <= TOLERANCE)
+
+
+@dataclass(frozen=True)
+class Branching:
+    """Both directions of the branch at a bifurcation.
+
+    Attributes
+    ----------
+    symmetric
+        Whether the amplitude changes equally in both directions (a pitchfork).
+    starts
+        A point in each direction, with a tangent that leads away; arc length is zero there.
+    """
+
+    symmetric: bool
+    starts: tuple[Point, Point]
+
+
+def branching(path: Path, bifurcation: Point) -> Branching | None:
+    """Leave a path at a located bifurcation along the null vector; None if that or the first points are not found.
+
+    Parameters
+    ----------
+    path
+        Controlled by arc length.
+    """
+    name, state = path.name, bifurcation.state
+    try:
+        mode = critical_mode(path.newton, state).vector
+    except NoEigenpair:
+        return None
+    mode = np.asarray(mode * path.system.length / largest(path.system.comm, mode))
+    found = None
+    for size in SIZES:
+        starts = [_step_off(path, state, mode, signed) for signed in (size, -size)]
+        if starts[0] is None or starts[1] is None:
+            return found
+        rises = [point.state.mu[name] - state.mu[name] for point in starts if point]
+        symmetric = abs(rises[0] - rises[1]) <= ODD * abs(rises[0] + rises[1])
+        found = Branching(symmetric, (starts[0], starts[1]))
+        if max(map(abs, rises)) > SEEN * abs(state.mu[name]):
+            break
+    return found
+
+
+def largest(comm: MPI.Comm, v: Vector) -> float:
+    """The entry of largest magnitude with its sign, which is the same on any number of ranks."""
+    here = float(v[np.argmax(np.abs(v))]) if v.size else 0.0
+    return float(max(comm.allgather(here), key=abs))
+
+
+def _step_off(path: Path, state: State, mode: Vector, size: float) -> Point | None:
+    """The point of the branch at a distance along the null vector, with a tangent that leads away.
+
+    First a force along the null vector pushes the system there at the same amplitude. Then the force is removed
+    and the amplitude is unknown.
+    """
+    metric, name, newton = path.metric, path.name, path.newton
+    row = Hyperplane(metric, name, state, (mode, 0.0), size * metric.inner((mode, 0.0), (mode, 0.0)))
+    try:
+        pushed = held_along(newton, State(state.u + size * mode, state.mu), mode)
+    except np.linalg.LinAlgError:  # singular in another direction too
+        return None
+    if pushed is None:
+        return None
+    found = path.solve(row, 0.0, pushed[0])
+    if isinstance(found, str):
+        return None
+    return found.per(copysign(metric.norm(found.du, found.dmu), size))

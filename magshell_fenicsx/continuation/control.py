@@ -1,15 +1,25 @@
-"""The last row of the bordered system: the quantity that is prescribed along a path."""
+"""The quantity that is prescribed along a path, as the last row of the system for (u, mu), and the matrix with it.
+
+The bordered matrix is inverted by block elimination; Broyden's update goes on with it at later iterates.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from math import sqrt
 from typing import Protocol
 
 import numpy as np
 from mpi4py import MPI
 
-from magshell_fenicsx.continuation.system import Direction, State, System, Vector, dot
+from magshell_fenicsx.continuation.factor import Factorisation
+from magshell_fenicsx.continuation.system import Direction, State, System, Vector, dot, max_abs
+
+MOST_REFINEMENTS = 4
+REFINED, SIGN = 1e-3, 1e-2  # relative errors of a tangent's du and dmu
+DIFFERENCE = 1e-5  # in lengths: the step of the differences that replace K times a vector
+LEAST_REST = 0.3  # Broyden's update divides the step by a number; below this one it is not trusted
 
 
 class Row(Protocol):
@@ -106,3 +116,137 @@ class Hyperplane:
 
     def gradient(self, state: State) -> tuple[Vector | None, float]:
         return self.metric.weight * self.normal[0], self.normal[1] / self.metric.scale**2
+
+
+def plus(a: Direction, factor: float, b: Direction) -> Direction:
+    """a + factor b."""
+    return a[0] + factor * b[0], a[1] + factor * b[1]
+
+
+class Bordered:
+    """The matrix [K R_mu; c d] at a state.
+
+    Parameters
+    ----------
+    factors
+        The factors of K at the state.
+    name
+        The amplitude mu.
+    row
+        The last row, whose gradient is (c, d).
+
+    Attributes
+    ----------
+    column
+        R_mu.
+    """
+
+    def __init__(self, system: System, factors: Factorisation, state: State, name: str, row: Row) -> None:
+        self.state, self.row, self._mu = state, row, state.mu[name]
+        self._comm, self._factors, self._length = system.comm, factors, system.length
+        self._gradient = row.gradient(state)
+        self.column = system.load(state.u, state.mu, name)
+        self._x2 = factors.solve(self.column)
+        self._schur = slope(self._comm, self._gradient, (-self._x2, 1.0))
+        self._weight = dot(self._comm, self._x2, self._x2)  # dmu counts as the displacement that it causes
+
+    def size(self, step: Direction) -> float:
+        """The size of a step: the larger of du, in lengths of the system, and dmu.
+
+        dmu counts relative to mu or as the displacement that it causes, whichever is smaller.
+        """
+        moved = max_abs(self._comm, self._x2) / self._length
+        per_mu = min(moved, 1 / abs(self._mu)) if self._mu else moved
+        return max(max_abs(self._comm, step[0]) / self._length, abs(step[1]) * per_mu)
+
+    def solve(self, f: Vector, g: float) -> Direction:
+        """(du, dmu) with K du + R_mu dmu = f and c.du + d dmu = g."""
+        x1 = self._factors.solve(f)
+        dmu = (g - slope(self._comm, self._gradient, (x1, 0.0))) / self._schur
+        return x1 - dmu * self._x2, dmu
+
+    @property
+    def tangent(self) -> Direction:
+        """The solution for f = 0 and g = 1."""
+        return np.asarray(-self._x2 / self._schur), 1 / self._schur
+
+    def inner(self, a: Direction, b: Direction) -> float:
+        """Inner product in which Broyden's update is the smallest."""
+        return dot(self._comm, a[0], b[0]) + self._weight * a[1] * b[1]
+
+    def times(self, du: Vector, dmu: float) -> Direction:
+        """The matrix times a direction."""
+        return self._factors.times(du) + dmu * self.column, slope(self._comm, self._gradient, (du, dmu))
+
+
+class Chord:
+    """A bordered matrix that is kept over several iterates, with Broyden's update after each step.
+
+    C. T. Kelley, Iterative Methods for Linear and Nonlinear Equations, SIAM 1995, algorithm brsol.
+    Steps are subtracted.
+    """
+
+    def __init__(self, matrix: Bordered) -> None:
+        self.matrix = matrix
+        self._steps = list[Direction]()  # those taken since the matrix was made
+
+    def took(self, step: Direction) -> None:
+        """Go on to the next iterate by a full step."""
+        self._steps.append(step)
+
+    def step(self, f: Direction) -> Direction:
+        """The next step at the present iterate, whose residual is `f`."""
+        step, inner = self._updated(f, self._steps), self.matrix.inner
+        if self._steps:
+            last = self._steps[-1]
+            rest = 1 - inner(last, step) / inner(last, last)
+            if rest > LEAST_REST:
+                return plus(step, 1 / rest - 1, step)
+            self._steps.clear()
+        return step
+
+    def solve(self, f: Direction, step: Direction) -> Direction:
+        """The solution for any right side at the present iterate, from which `step` is the next one."""
+        return self._updated(f, [*self._steps, step])
+
+    def _updated(self, f: Direction, steps: Sequence[Direction]) -> Direction:
+        solution, inner = self.matrix.solve(*f), self.matrix.inner
+        for before, after in pairwise(steps):
+            solution = plus(solution, inner(before, solution) / inner(before, before), after)
+        return solution
+
+
+def refined_tangent(
+    system: System, matrix: Bordered, t: Direction, state: State, load: Vector, row: Row
+) -> Direction | None:
+    """The path's tangent at a state, from the matrix of a state near by, by generalised conjugate residuals.
+
+    None if the matrix is too far away.
+    """
+    comm, gradient = system.comm, row.gradient(state)
+    R = system.residual(state.u, state.mu)
+
+    def times(t: Direction) -> Direction:
+        return matrix.solve(_stiffness(system, state, R, t[0]) + t[1] * load, slope(comm, gradient, t))
+
+    z, known = plus(t, -1.0, times(t)), list[tuple[Direction, Direction, float]]()
+    for _ in range(MOST_REFINEMENTS):
+        if max_abs(comm, z[0]) <= REFINED * max_abs(comm, t[0]) and abs(z[1]) <= SIGN * abs(t[1]):
+            return t
+        p, q = z, times(z)
+        for before, image, square in known:
+            part = matrix.inner(image, q) / square
+            p, q = plus(p, -part, before), plus(q, -part, image)
+        known.append((p, q, matrix.inner(q, q)))
+        part = matrix.inner(z, q) / known[-1][2]
+        t, z = plus(t, part, p), plus(z, -part, q)
+    return None
+
+
+def _stiffness(system: System, state: State, R: Vector, du: Vector) -> Vector:
+    """K du by a difference of the residual; R is the residual at the state."""
+    size = max_abs(system.comm, du)
+    if size == 0.0:
+        return du
+    small = DIFFERENCE * system.length / size
+    return np.asarray((system.residual(state.u + small * du, state.mu) - R) / small)

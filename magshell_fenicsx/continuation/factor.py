@@ -1,20 +1,26 @@
-"""Direct factorisation of the tangent, its inertia, and the work."""
+"""Direct factorisation of the tangent, of one with an edge, and of small matrices; inertia, condition and the work."""
 
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Sequence
+from types import TracebackType
 
 import numpy as np
 from mpi4py import MPI
+from numpy.typing import NDArray
 from petsc4py import PETSc
+from scipy.linalg import lapack
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import reverse_cuthill_mckee
 
-from magshell_fenicsx.continuation.edge import Edge
-from magshell_fenicsx.continuation.system import Edged, Skewed, Tangent, Vector, symmetric_part
-from magshell_fenicsx.continuation.timing import Stopwatch
+from magshell_fenicsx.continuation.system import Edged, Skewed, Tangent, Vector, dot, symmetric_part
 
 PREFIX = "magshell_factor_"
 # PETSc's error numbers (petscerror.h) after which MUMPS replaces CHOLMOD
 INDEFINITE, MISSING = 81, 92
 CALM = 2  # a change of the method costs an analysis of the matrix, about as long as its factors
 REFUSED = 76  # CHOLMOD's own error: the matrix is too large for its integers or for the memory; MUMPS is tried
+ROUNDING = 1e-11  # a larger residual, relative to the right side, takes a second solve
+Array = NDArray[np.float64]
 
 
 class Factorisation:
@@ -252,3 +258,145 @@ def _renew(pc: PETSc.PC, K: PETSc.Mat) -> None:
     pc.setOperators(K)
     pc.setUp()
     pc.setReusePreconditioner(True)  # a solve must not factor again after K was assembled again
+
+
+class Edge:
+    """Solves with an edged matrix [K C; C^T D] by block elimination with the factors of K.
+
+    It has the k additional unknowns y and the Schur complement S = D - C^T K^-1 C.
+
+    y follows u on the last rank.
+
+    Parameters
+    ----------
+    solve, times
+        K^-1 and K times a vector.
+
+    Attributes
+    ----------
+    count
+        k.
+    negative_pivots
+        Number that the edge adds to that of K (Haynsworth's inertia additivity), without its multipliers.
+    """
+
+    def __init__(
+        self, edged: Edged, comm: MPI.Comm, solve: Callable[[Vector], Vector], times: Callable[[Vector], Vector]
+    ) -> None:
+        self._C, self._D, self._comm, self._solve, self._times = edged.C, edged.D, comm, solve, times
+        self.count = len(edged.C)
+        self._X = [solve(column) for column in self._C]
+        self._S = self._D - self._products(self._X).T
+        self.negative_pivots = int(np.sum(np.linalg.eigvalsh((self._S + self._S.T) / 2) < 0)) - edged.multipliers
+
+    def times(self, x: Vector) -> Vector:
+        """The whole matrix times (u, y)."""
+        u, y = split(x, self.count, self._comm)
+        forces = np.sum([yi * column for yi, column in zip(y, self._C, strict=True)], axis=0)
+        return join(self._times(u) + forces, self._products([u])[0] + self._D @ y, self._comm)
+
+    def solve(self, rhs: Vector) -> Vector:
+        """The solution; refined once if K is so nearly singular that elimination loses digits."""
+        x = self._eliminated(rhs)
+        rest = rhs - self.times(x)
+        if dot(self._comm, rest, rest) > ROUNDING**2 * dot(self._comm, rhs, rhs):
+            x = x + self._eliminated(rest)
+        return x
+
+    def _eliminated(self, rhs: Vector) -> Vector:
+        f, g = split(rhs, self.count, self._comm)
+        u = self._solve(f)
+        y = np.linalg.solve(self._S, g - self._products([u])[0])
+        return join(u - np.sum([yi * x for yi, x in zip(y, self._X, strict=True)], axis=0), y, self._comm)
+
+    def _products(self, vectors: list[Vector]) -> NDArray[np.float64]:
+        """Inner products (len(vectors), k) with the columns of C."""
+        return np.array([[dot(self._comm, v, column) for column in self._C] for v in vectors])
+
+
+def join(u: Vector, y: Vector, comm: MPI.Comm) -> Vector:
+    """(u, y), with y on the last rank; a new array on every rank."""
+    return np.concatenate([u, y if comm.rank == comm.size - 1 else y[:0]])
+
+
+def split(x: Vector, k: int, comm: MPI.Comm) -> tuple[Vector, Vector]:
+    """u on this rank, a new view on every rank, and y (k,) on every rank."""
+    last = comm.size - 1
+    own = x.size - k * (comm.rank == last)
+    return x[:own], np.asarray(comm.bcast(x[own:], root=last))
+
+
+class Banded:
+    """Weighted sums of small symmetric matrices that share one sparsity pattern, and whether they are definite.
+
+    LAPACK's banded Cholesky factors answer that.
+
+    Parameters
+    ----------
+    rows, columns
+        Of each entry of the pattern.
+    held
+        Rows and columns that are replaced by those of the unit matrix.
+    """
+
+    def __init__(self, rows: NDArray[np.int64], columns: NDArray[np.int64], held: NDArray[np.int32]) -> None:
+        n = int(rows.max()) + 1
+        pattern = coo_array((np.ones(len(rows)), (rows, columns)), (n, n)).tocsr()
+        order = reverse_cuthill_mckee(pattern, symmetric_mode=True)
+        place = np.empty(n, dtype=np.int64)
+        place[order] = np.arange(n)
+        i, j = place[rows], place[columns]
+        free = np.ones(n, dtype=bool)
+        free[held] = False
+        self._kept = np.flatnonzero((i >= j) & free[rows] & free[columns])
+        i, j = i[self._kept], j[self._kept]
+        self._shape = (int((i - j).max(initial=0)) + 1, n)
+        self._at = (i - j) + j * self._shape[0]  # in LAPACK's lower band, column by column
+        self._ones = place[held]
+
+    def bands(self, values: Sequence[Array]) -> Array:
+        """The lower bands (matrices, entries) of some matrices, with ones on the diagonal of what is held."""
+        found = np.zeros((len(values), self._shape[0] * self._shape[1]))
+        for band, v in zip(found, values, strict=True):
+            band[self._at] = v.ravel()[self._kept]
+        found[:, self._ones * self._shape[0]] = 1.0
+        return found
+
+    def positive(self, bands: Array, weights: Array) -> bool:
+        """Whether the weighted sum of some matrices is positive definite; the weights' sum is one."""
+        band = (weights @ bands).reshape(self._shape, order="F")
+        return bool(lapack.dpbtrf(band, lower=1, overwrite_ab=1)[1] == 0)
+
+
+def condition_estimate(factors: Factorisation, size: int, comm: MPI.Comm, iterations: int = 30) -> float:
+    """Largest over smallest |eigenvalue| of the matrix last factored; a lower bound, good to some per cent.
+
+    Parameters
+    ----------
+    size
+        Unknowns on this rank.
+    iterations
+        Power iterations for the largest eigenvalue, and inverse iterations for the smallest.
+    """
+    largest, inverse = 0.0, 0.0
+    a = b = np.sin(1.0 + np.arange(size) + comm.rank)
+    for _ in range(iterations):
+        a, b = a / np.sqrt(dot(comm, a, a)), b / np.sqrt(dot(comm, b, b))
+        a, b = factors.times(a), factors.solve(b)
+        largest, inverse = np.sqrt(dot(comm, a, a)), np.sqrt(dot(comm, b, b))
+    return float(largest * inverse)
+
+
+class Stopwatch:
+    """Attributes: seconds, summed over all blocks."""
+
+    def __init__(self) -> None:
+        self.seconds = 0.0
+
+    def __enter__(self) -> None:
+        self._start = time.perf_counter()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.seconds += time.perf_counter() - self._start

@@ -1,22 +1,167 @@
-"""Folds: equilibrium with a singular tangent, R(u, mu) = 0 and g(u, mu) = 0, solved for (u, mu).
+"""Singular tangents: bordered, so that they are regular, and folds, located and foreseen.
 
-With g of `augmented.AugmentedTangent`, Newton's method for R = 0 and g = 0 takes one factorisation and
-three back-solves an iteration.
+The tangent is bordered by a vector near its null vector. With b . b = 1,
+
+    K v + g b = 0      v =  K^-1 b / (b . K^-1 b)
+    b . v     = 1      g = -1      / (b . K^-1 b)
+
+has g = 0 exactly where K is singular, and the gradient of g is -Pi'''(v, v, .) (minimal augmentation:
+Govaerts, Numerical methods for bifurcations of dynamical equilibria, SIAM 2000, ch. 4). A fold is R(u, mu) = 0 and
+g(u, mu) = 0, solved for (u, mu): an iteration of Newton's method takes one factorisation and three back-solves.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
+from mpi4py import MPI
+from petsc4py import PETSc
 
-from magshell_fenicsx.continuation.augmented import AugmentedTangent, first_difference, third
+from magshell_fenicsx.continuation.modes import NoEigenpair, critical_mode
 from magshell_fenicsx.continuation.newton import BorderedNewton
-from magshell_fenicsx.continuation.system import Amplitudes, State, System, Vector, dot, max_abs
+from magshell_fenicsx.continuation.point import Point
+from magshell_fenicsx.continuation.system import (
+    Amplitudes,
+    State,
+    System,
+    Tangent,
+    Vector,
+    Weighted,
+    dot,
+    followed,
+    max_abs,
+    symmetric_part,
+)
 
-TOLERANCE = 1e-9  # estimated remaining error of u, over the system's length
-ROUNDING = 1e-6  # smaller steps along phi that do not shrink are rounding of K, which is 1e-8 to 1e-7
+TOLERANCE = 1e-9  # of u with its component along a direction held, in lengths of the system
+MOST_TANGENTS, CONTRACTION = 8, 0.3
+ROUNDING = 1e-5  # in lengths: smaller steps that do not shrink are rounding
+DIFFERENCE = 1e-2  # in lengths: step of differences along v; only the speed of convergence depends on their error
+FOLD_TOLERANCE = 1e-9  # estimated remaining error of u, over the system's length
+FOLD_ROUNDING = 1e-6  # smaller steps along phi that do not shrink are rounding of K, which is 1e-8 to 1e-7
 MOST_ITERATIONS = 8
 LARGEST_STEP = 10.0  # in lengths; a longer one counts as divergence
+FAR = 0.6  # of the amplitude: a fold further ahead is not estimated well
+
+
+@dataclass(frozen=True)
+class _Spring:
+    """A spring at the degree of freedom where a shape is largest, as stiff as the diagonal entry there.
+
+    Attributes
+    ----------
+    e
+        One at the degree of freedom, zero elsewhere.
+    """
+
+    e: Vector
+    stiffness: float
+
+
+def _sprung(tangent: Tangent, shape: Vector, comm: MPI.Comm) -> _Spring:
+    """Add the spring to a tangent, which is then regular at a simple fold."""
+    K = symmetric_part(tangent)
+    size, first = np.abs(shape[: K.getLocalSize()[0]]), K.getOwnershipRange()[0]  # without the entries of an edge
+    _, owner = comm.allreduce((float(size.max(initial=0.0)), comm.rank), MPI.MAXLOC)
+    e = np.zeros_like(shape)
+    if comm.rank == owner:
+        e[int(np.argmax(size))] = 1.0
+    here = [first + int(i) for i in np.flatnonzero(e)]
+    itself = comm.allreduce(sum(K.getValue(i, i) for i in here))
+    stiffness = 2 * abs(itself) - itself or K.norm(PETSc.NormType.INFINITY) or 1.0  # the sum is positive
+    for i in here:
+        K.setValue(i, i, stiffness, addv=True)
+    K.assemble()
+    return _Spring(e, stiffness)
+
+
+class AugmentedTangent:
+    """The tangent at a state, bordered by b, from factors of K + s e e with a spring s.
+
+    A factorisation of K itself would break down at the fold. One more border removes the spring exactly.
+    """
+
+    def __init__(self, newton: BorderedNewton, state: State, b: Vector, stress: Sequence[Weighted] = ()) -> None:
+        self._system = system = newton.system
+        K = system.tangent(state.u, state.mu, stress)
+        spring = _sprung(K, b, system.comm)
+        self._factors = newton.factorisation
+        self._factors.factor(K)
+        self.unstable = self._factors.negative_pivots  # not phi, which the spring has made stable
+        dot_ = partial(dot, system.comm)
+        self._b, self._e, self._dot = b / np.sqrt(dot_(b, b)), spring.e, dot_
+        self._p, self._q = self._factors.solve(self._e), self._factors.solve(self._b)
+        q = dot_(self._e, self._q)
+        self._border = np.array([[1 / spring.stiffness - dot_(self._e, self._p), q], [q, -dot_(self._b, self._q)]])
+        self.v, self.g = self._bordered(np.zeros_like(b), 1.0)
+
+    def solve(self, f: Vector) -> tuple[Vector, float]:
+        """K w + t b = f with b . w = 0."""
+        return self._bordered(self._factors.solve(f), 0.0)
+
+    def _bordered(self, y: Vector, c: float) -> tuple[Vector, float]:
+        """K x + t b = f with b . x = c, from y = (K + s e e)^-1 f; s e . x is the spring's force."""
+        force, t = np.linalg.solve(self._border, [self._dot(self._e, y), c - self._dot(self._b, y)])
+        return y + force * self._p - t * self._q, float(t)
+
+    def improved(self, old: State, new: State) -> Vector:
+        """The null vector at a state close by, by one chord iteration of K v + g b = 0."""
+        before, after = (times_tangent(self._system, state, self.v) for state in (old, new))
+        return self.v - self.solve(after - before)[0]
+
+
+def held_along(
+    newton: BorderedNewton, guess: State, b: Vector, stress: Sequence[Weighted] = ()
+) -> tuple[State, float] | None:
+    """The equilibrium with the guess's component along b, which a force along b holds, and its estimated error.
+
+    This problem is regular where b is the null vector (the Lyapunov-Schmidt reduction).
+    None if Newton's method fails. `stress` is the stress of the guess, see `System.tangent`.
+
+    Raises
+    ------
+    LinAlgError
+        If the tangent is singular in another direction too.
+    """
+    system, u, tangent, last = newton.system, guess.u, AugmentedTangent(newton, guess, b, stress), np.inf
+    tangents, own = 1, True
+    while True:
+        du, _ = tangent.solve(system.residual(u, guess.mu))
+        size = max_abs(system.comm, du) / system.length
+        if size <= TOLERANCE or (own and CONTRACTION * last < size <= ROUNDING):
+            return State(u - du, guess.mu), size
+        if not own and size > CONTRACTION * last:
+            tangent, tangents, own = AugmentedTangent(newton, State(u, guess.mu), b, stress), tangents + 1, True
+            continue
+        if tangents > MOST_TANGENTS or not np.isfinite(size):
+            return None
+        u, last, own, stress = u - du, size, False, followed(u, -du)
+
+
+def third(system: System, state: State, v: Vector) -> Vector:
+    """Pi'''(v, v, .), by a second difference of the residual."""
+    d = _offset(system, v)
+    back, here, ahead = (system.residual(state.u + i * d * v, state.mu) for i in (-1, 0, 1))
+    return np.asarray((back - 2 * here + ahead) / d**2)
+
+
+def times_tangent(system: System, state: State, v: Vector) -> Vector:
+    """K v."""
+    return first_difference(lambda u: system.residual(u, state.mu), system, state.u, v)
+
+
+def first_difference(f: Callable[[Vector], Vector], system: System, u: Vector, v: Vector) -> Vector:
+    """Derivative of f at u along v."""
+    d = _offset(system, v)
+    return np.asarray((f(u + d * v) - f(u - d * v)) / (2 * d))
+
+
+def _offset(system: System, v: Vector) -> float:
+    size = max_abs(system.comm, v)
+    if size == 0.0:
+        raise np.linalg.LinAlgError
+    return DIFFERENCE * system.length / size
 
 
 class FoldLost(RuntimeError):
@@ -79,7 +224,7 @@ def find_fold(newton: BorderedNewton, guess: Guess, name: str) -> Fold:
     """
     system, state, before = newton.system, guess.state, newton.factorisation.count
     b, steps = guess.phi, list[float]()
-    while not steps or _remaining(steps) > TOLERANCE:
+    while not steps or _remaining(steps) > FOLD_TOLERANCE:
         if len(steps) == MOST_ITERATIONS:
             raise FoldLost(f"Newton's method found no fold in {MOST_ITERATIONS} iterations")
         try:
@@ -89,7 +234,7 @@ def find_fold(newton: BorderedNewton, guess: Guess, name: str) -> Fold:
             raise FoldLost("the tangent is singular in more than one direction") from None
         b = tangent.v
         steps.append(max_abs(system.comm, du) / system.length)
-        growing = len(steps) > 2 and steps[-1] > max(2 * steps[-2], ROUNDING)
+        growing = len(steps) > 2 and steps[-1] > max(2 * steps[-2], FOLD_ROUNDING)
         if growing or not steps[-1] <= LARGEST_STEP:
             raise FoldLost("Newton's method diverged on its way to a fold")
         last, state = state, state.with_(state.u + du, name, state.mu[name] + dmu)
@@ -179,7 +324,7 @@ def _oriented(system: System, v: Vector, load: Vector) -> Vector:
 def _remaining(steps: Sequence[float]) -> float:
     """Error after the last of a sequence of steps that shrinks at least as fast as a geometric one."""
     rate = steps[-1] / steps[-2] if len(steps) > 1 else 0.5
-    if rate > 0.5 and steps[-1] <= ROUNDING:
+    if rate > 0.5 and steps[-1] <= FOLD_ROUNDING:
         return 0.0
     return steps[-1] * rate / (1 - rate) if rate < 1 else np.inf
 
@@ -187,3 +332,29 @@ def _remaining(steps: Sequence[float]) -> float:
 def _lagrange(values: Sequence[float], i: int, p: float) -> float:
     """Weight of the value `i` in the polynomial through all."""
     return float(np.prod([(p - v) / (values[i] - v) for j, v in enumerate(values) if j != i]))
+
+
+def fold_ahead(newton: BorderedNewton, point: Point, name: str) -> Guess | None:
+    """A guess of the next fold in the amplitude `name`, growing in size; None if it is far or not seen yet.
+
+    Along the softest mode phi (of length one, K phi = lambda phi) with the amplitude a, and with mu varied by m,
+    equilibrium is lambda a + c a^2/2 = b m with c = Pi'''(phi, phi, phi) and b = -phi . R_mu = lambda phi . du/dmu.
+    The fold is at a = -lambda/c, m = -lambda^2/(2 b c); all other modes follow mu linearly.
+    The null vector of the guess points the way that the path goes. One factorisation.
+    """
+    system, state = newton.system, point.state
+    comm, mu = system.comm, state.mu[name]
+    try:
+        mode = critical_mode(newton, state)
+    except NoEigenpair:
+        return None
+    rate, phi = np.asarray(point.du / point.dmu), mode.vector
+    along, cubic = dot(comm, phi, rate), dot(comm, phi, third(system, state, phi))
+    pull = mode.eigenvalue * along
+    if mode.eigenvalue <= 0 or not cubic * pull:
+        return None
+    step = -(mode.eigenvalue**2) / (2 * cubic * pull)
+    if not 0 < step / mu < FAR:
+        return None
+    u = state.u + step * (rate - along * phi) - mode.eigenvalue / cubic * phi
+    return Guess(state.with_(u, name, mu + step), np.sign(step * along) * phi)

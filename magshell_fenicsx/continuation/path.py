@@ -8,10 +8,8 @@ from typing import Literal
 import numpy as np
 
 from magshell_fenicsx.continuation.control import GivenConjugate, GivenLoad, Hyperplane, Metric, Row
-from magshell_fenicsx.continuation.journal import Journal, NoJournal
-from magshell_fenicsx.continuation.listener import NoProgress, Progress
 from magshell_fenicsx.continuation.newton import BorderedNewton, Response
-from magshell_fenicsx.continuation.point import PathStopped, Point
+from magshell_fenicsx.continuation.point import Journal, NoJournal, NoProgress, PathStopped, Point, Progress
 from magshell_fenicsx.continuation.snes import HIDDEN
 from magshell_fenicsx.continuation.system import Direction, State, Weighted, dot, followed, max_abs
 

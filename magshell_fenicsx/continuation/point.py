@@ -1,6 +1,7 @@
-"""An accepted point of an equilibrium path."""
+"""An accepted point of an equilibrium path, the record of points for a resumed run, and reports on the way."""
 
 from dataclasses import dataclass, field, replace
+from typing import Protocol
 
 import numpy as np
 
@@ -64,3 +65,65 @@ class PathStopped(RuntimeError):
     def __init__(self, reason: str, point: Point, *, final: bool = False) -> None:
         super().__init__(reason)
         self.point, self.final = point, final
+
+
+class Journal(Protocol):
+    """The results of `Path.recorded`, in their order.
+
+    A history is deterministic: from the same results it chooses the same steps, targets and brackets. So the
+    results are a complete checkpoint.
+    """
+
+    def replay(self) -> Point | str | None:
+        """The next recorded result; None if there is none and a solve is needed.
+
+        Collective. It may raise an exception to stop the history before a new solve begins.
+        """
+
+    def record(self, found: Point | str) -> None:
+        """Keep a result. Collective."""
+
+    def check(self, known: bool) -> None:
+        """Between two steps in time towards one result, which may be `known` already. Collective.
+
+        It may raise an exception to stop the history.
+        """
+
+
+class NoJournal:
+    """Keeps nothing."""
+
+    def replay(self) -> None:
+        return None
+
+    def record(self, found: Point | str) -> None:
+        pass
+
+    def check(self, known: bool) -> None:
+        pass
+
+
+class Progress(Protocol):
+    """Receives the next action of a history. No method is collective, and no result may depend on it."""
+
+    def trying(self, here: Point, length: float) -> None:
+        """A step of a length in s from an accepted point begins."""
+
+    def beginning(self, step: int) -> None:
+        """A step of the programme begins at the last accepted point; its number is from 1."""
+
+    def doing(self, what: str) -> None:
+        """Some other long action begins; `what` describes it in a few words."""
+
+
+class NoProgress:
+    """Reports nothing."""
+
+    def trying(self, here: Point, length: float) -> None:
+        pass
+
+    def beginning(self, step: int) -> None:
+        pass
+
+    def doing(self, what: str) -> None:
+        pass

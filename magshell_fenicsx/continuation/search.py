@@ -2,28 +2,252 @@
 
 A guess is tried in two ways: by Newton's method with all known solutions deflated, and by the path on which a force
 along its displacement that holds it is released. Each solution that is found gives two more guesses, along its softest
-mode. A search for stable solutions first lets each guess go down in energy until it rests at one.
+mode. A search for stable solutions first lets each guess settle: go down in energy until it rests at one.
+
+**Deflation.** The residual R is multiplied by M, which grows without bound at each known solution u_i. Newton's step
+for M R is a multiple of that for R, so it needs neither another matrix nor another solve (P. E. Farrell, A. Birkisson,
+S. W. Funke, SIAM Journal on Scientific Computing 37, 2015, A2026):
+
+    M(u) = prod_i (|u - u_i|^-p + sigma),    du = tau d,    K d = -R,    tau = 1/(1 - d . grad M/M)
+
+**Release.** R(u) + t b = 0 with -b . u = q, first that of the guess; then the path is followed by arc length, through
+folds, until the force t is zero: there is an equilibrium.
+
+**Settling.** Every step solves (K + s K0) du = -R, with the tangent K0 of the unloaded system: one implicit step of the
+flow K0 du/dt = -R, of length 1/s. Sharp folds relax, while soft directions stay almost where they are. It goes down the
+energy, so its fixed points are stable equilibria.
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 
 import numpy as np
 from petsc4py import PETSc
 
-from magshell_fenicsx.continuation.branch import largest
-from magshell_fenicsx.continuation.deflation import deflated
-from magshell_fenicsx.continuation.inverse import NoEigenpair, nearest_to_zero
-from magshell_fenicsx.continuation.path import Path
-from magshell_fenicsx.continuation.point import Point
-from magshell_fenicsx.continuation.release import released
-from magshell_fenicsx.continuation.system import State, Vector, max_abs
+from magshell_fenicsx.continuation.bifurcation import largest
+from magshell_fenicsx.continuation.control import Bordered, GivenConjugate, Metric, Row, plus
+from magshell_fenicsx.continuation.factor import Factorisation
+from magshell_fenicsx.continuation.modes import NoEigenpair, nearest_to_zero
+from magshell_fenicsx.continuation.newton import BorderedNewton
+from magshell_fenicsx.continuation.path import Path, StepOptions
+from magshell_fenicsx.continuation.point import PathStopped, Point
+from magshell_fenicsx.continuation.system import (
+    Amplitudes,
+    State,
+    System,
+    Tangent,
+    Vector,
+    Weighted,
+    dot,
+    max_abs,
+    symmetric_part,
+)
 
+POWER, SHIFT = 2.0, 1.0  # p and sigma
+MOST_ITERATIONS = 40
+CLOSE = 1e-3  # in lengths of the system: after a shorter step Newton's method itself goes on
+NEAR_ONE = 2.0  # there the deflation must change the step by less than this factor
+BENT = 0.5  # part of a step that the linear model may leave unexplained
+LEAST = 1e-3  # where a shorter part of a step would be needed, a singular tangent is near
+LEAP, MOST_LEAPS = 1.0, 4  # in lengths of the system: a step over it
+FORCE = "holding force"
+FIRST, LONGEST, SHORTEST = 0.02, 1000.0, 1e-3  # steps: the first in the metric's length, others over the first
+MOST_STEPS, MOST_FORCE = 30, 10.0  # the force over the first one
+SCALE = 1e6  # the force counts as nothing in the arc length
+MOST_FACTORS = 40
+UNEXPLAINED = 0.7  # part of the residual that a step towards rest may leave
+EASY = 0.2  # where it leaves less, the next is longer
+RESTED = 0.05  # in lengths of the system: a shorter step with so small a shift ends
+SMALL = 0.01
 COPY = 1e-3  # solutions at a smaller distance, in lengths of the system, are one
 MODE, DOWN = 1.0, 0.3  # size of a mode in a guess, and where a descent leaves an unstable solution, in lengths
 DESCENTS = 20  # times that a guess goes on settling
 OVER = "the time of the search is over"
+
+
+@dataclass(frozen=True)
+class Deflation:
+    """The operator M of some known solutions; |.| is the root mean square over the system's length."""
+
+    metric: Metric
+    known: Sequence[Vector]
+
+    def value(self, u: Vector) -> float:
+        """M at u."""
+        sizes = (self.metric.norm(u - v, 0.0) for v in self.known)
+        return float(np.prod([size**-POWER + SHIFT if size else np.inf for size in sizes]))
+
+    def slope(self, u: Vector, d: Vector) -> float:
+        """d . grad M/M at u."""
+        found = 0.0
+        for v in self.known:
+            away = (u - v, 0.0)
+            size = self.metric.norm(*away)
+            found -= (
+                POWER * self.metric.inner(away, (d, 0.0)) / (size**2 * (1 + SHIFT * size**POWER)) if size else np.inf
+            )
+        return found
+
+    def factor(self, u: Vector, d: Vector) -> float:
+        """tau for Newton's step d at u; zero at a known solution."""
+        rest = 1 - self.slope(u, d)
+        return 1 / rest if rest else np.inf
+
+
+def deflated(newton: BorderedNewton, guess: State, name: str, row: Row, known: Sequence[Vector] = ()) -> State | None:
+    """A state near a solution that is not known and on which a row holds; None if none is found.
+
+    Steps are shortened until the residual changes as the tangent says. Newton's method must confirm the result.
+
+    Parameters
+    ----------
+    name
+        The amplitude that the row determines.
+    known
+        The displacements of the known solutions.
+    """
+    system, state, part, leaps = newton.system, guess, 1.0, 0
+    deflation = Deflation(Metric(system, 1.0), known)
+    residual = system.residual(state.u, state.mu), row.residual(state)
+    for _ in range(MOST_ITERATIONS):
+        matrix = Bordered(system, newton.factor_at(state), state, name, row)
+        d = matrix.solve(-residual[0], -residual[1])
+        tau, size, M = deflation.factor(state.u, d[0]), matrix.size(d), deflation.value(state.u)
+        if not np.isfinite(size) or not np.isfinite(tau) or tau == 0.0:
+            return None
+        if size <= CLOSE and 1 / NEAR_ONE < tau < NEAR_ONE:
+            return state.with_(state.u + d[0], name, state.mu[name] + d[1])
+        part, bent = min(1.0, 4 * part), np.inf
+        while not bent <= BENT:
+            leaps += (leap := part < LEAST)
+            if leaps > MOST_LEAPS:
+                return None
+            part = LEAP / (abs(tau) * size) if leap else part
+            ahead = state.with_(state.u + part * tau * d[0], name, state.mu[name] + part * tau * d[1])
+            residual = system.residual(ahead.u, ahead.mu), row.residual(ahead)
+            left = matrix.solve(-residual[0], -residual[1])
+            left = plus(left, tau * deflation.slope(state.u, left[0]), d)  # the next step with the same matrix, over M
+            ratio = deflation.value(ahead.u) / M
+            rest = ratio * left[0] + (part - 1) * tau * d[0], ratio * left[1] + (part - 1) * tau * d[1]
+            bent = np.sqrt(matrix.inner(rest, rest) / matrix.inner(d, d)) / abs(part * tau)
+            if leap:
+                break
+            if not bent <= BENT:
+                part *= float(np.clip(0.8 * BENT / bent, 0.1, 0.5)) if np.isfinite(bent) else 0.1
+        part, state = min(part, 1.0), ahead
+    return None
+
+
+class Held:
+    """A system with one more amplitude, a force along b."""
+
+    def __init__(self, system: System, b: Vector) -> None:
+        self.comm, self.size, self.length, self.coordinates = (
+            system.comm,
+            system.size,
+            system.length,
+            system.coordinates,
+        )
+        self._system, self._b = system, b
+
+    def residual(self, u: Vector, mu: Amplitudes) -> Vector:
+        return self._system.residual(u, mu) + mu[FORCE] * self._b
+
+    def load(self, u: Vector, mu: Amplitudes, name: str) -> Vector:
+        return self._b if name == FORCE else self._system.load(u, mu, name)
+
+    def potential(self, u: Vector, mu: Amplitudes, name: str) -> float:
+        return dot(self.comm, self._b, u) if name == FORCE else self._system.potential(u, mu, name)
+
+    def curvature(self, u: Vector, mu: Amplitudes, name: str, other: str) -> float:
+        return 0.0 if FORCE in (name, other) else self._system.curvature(u, mu, name, other)
+
+    def tangent(self, u: Vector, mu: Amplitudes, stress: Sequence[Weighted] = ()) -> Tangent:
+        return self._system.tangent(u, mu, stress)
+
+
+def released(newton: BorderedNewton, guess: State, b: Vector) -> Iterator[State]:
+    """Guesses of equilibria on the path of a force along b that holds a guess, each where the force is zero.
+
+    The path begins in the direction in which the force falls in size.
+    """
+    system = newton.system
+    residual, size = system.residual(guess.u, guess.mu), dot(system.comm, b, b)
+    b = np.asarray(b * (np.sqrt(dot(system.comm, residual, residual) / size) or 1.0))  # a force of order one
+    holder = newton.on(Held(system, b))
+    first = -dot(system.comm, b, residual) / dot(system.comm, b, b)
+    row = GivenConjugate(holder.system, FORCE, -dot(system.comm, b, guess.u))
+    near = deflated(holder, State(guess.u, {**guess.mu, FORCE: first}), FORCE, row)
+    outcome = holder.solve(near, FORCE, row) if near else None
+    if outcome is None or not outcome.converged:
+        return
+    path = Path(holder, FORCE, "arc", StepOptions(FIRST, LONGEST * FIRST, SHORTEST * FIRST), SCALE)
+    largest = MOST_FORCE * abs(outcome.state.mu[FORCE])
+    here = path.start(outcome.state, -float(np.copysign(1.0, outcome.state.mu[FORCE])))
+    try:
+        for count, (point, _) in enumerate(path.towards(here, [np.inf]), 1):
+            before, after = (p.state.mu[FORCE] for p in (here, point))
+            if before * after <= 0 and before != after:
+                s = here.s + (point.s - here.s) * before / (before - after)
+                near = path.between(s, here, path.seen_from(here, point))
+                yield State(near.u, dict(guess.mu))
+            here = point
+            if count == MOST_STEPS or abs(after) > largest:
+                return
+    except PathStopped:
+        return
+
+
+@dataclass
+class Settling:
+    """The flow of a system from any guess.
+
+    Parameters
+    ----------
+    unloaded
+        A state with a positive definite tangent K0.
+    """
+
+    system: System
+    unloaded: State
+
+    def __post_init__(self) -> None:
+        K = symmetric_part(self.system.tangent(self.unloaded.u, self.unloaded.mu))
+        self._K0, self._shifted = K.copy(), K.copy()
+        self._stiff, self._factors = Factorisation(self.system.comm), Factorisation(self.system.comm)
+        self._stiff.factor(self._K0)
+
+    def settled(self, guess: State) -> State:
+        """The state after a number of steps, or near the stable equilibrium where they end."""
+        system, u, shift, spent = self.system, guess.u, 1.0, 0
+        residual = system.residual(u, guess.mu)
+        while spent < MOST_FACTORS:
+            K = symmetric_part(system.tangent(u, guess.mu)).copy()
+            while spent < MOST_FACTORS:
+                spent += 1
+                K.copy(self._shifted, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
+                self._shifted.axpy(shift, self._K0, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
+                self._factors.factor(self._shifted)
+                if self._factors.negative_pivots:
+                    shift *= 2
+                    continue
+                du = -self._factors.solve(residual)
+                ahead = system.residual(u + du, guess.mu)
+                left = self._size(ahead + shift * self._stiff.times(du)) / self._size(residual)
+                if left <= UNEXPLAINED:
+                    u, residual = u + du, ahead
+                    ends = shift < SMALL and max_abs(system.comm, du) <= RESTED * system.length
+                    shift /= 4 if left < EASY else 1
+                    if ends:
+                        return State(u, guess.mu)
+                    break
+                shift *= 3
+        return State(u, guess.mu)
+
+    def _size(self, residual: Vector) -> float:
+        """The size of a residual: of the displacement that it causes, in the norm of K0."""
+        return float(np.sqrt(abs(dot(self.system.comm, residual, self._stiff.solve(residual))))) or np.finfo(float).tiny
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,7 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from magshell_fenicsx.continuation.bordered import Bordered, Chord, plus
-from magshell_fenicsx.continuation.control import Row
+from magshell_fenicsx.continuation.control import Bordered, Chord, Row, plus
 from magshell_fenicsx.continuation.factor import Factorisation
 from magshell_fenicsx.continuation.system import Direction, State, System, Weighted, followed, max_abs
 from magshell_fenicsx.platform import compat

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from magshell_fenicsx.continuation.device import Device
-from magshell_fenicsx.continuation.edge import join, split
-from magshell_fenicsx.continuation.factor import Factorisation
+from magshell_fenicsx.continuation.factor import Factorisation, join, split
 from magshell_fenicsx.continuation.motion import Averaged, Ground, Motion, Viscous, constrained, held_back
 from magshell_fenicsx.continuation.snes import MOTION
 from magshell_fenicsx.continuation.system import Amplitudes, Edged, Skewed, State, System, Vector, dot, max_abs

@@ -1,20 +1,279 @@
-"""A walk along a path to its goal, with every instability and every requested point on the way."""
+"""A walk along a path to its goal, with every instability located and every requested point on the way."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Literal
 
 import numpy as np
 
-from magshell_fenicsx.continuation.events import instabilities
+from magshell_fenicsx.continuation.bifurcation import SCATTER, BifurcationLost, find_bifurcation
+from magshell_fenicsx.continuation.control import projected
+from magshell_fenicsx.continuation.modes import NoEigenpair, Stability, critical_mode
 from magshell_fenicsx.continuation.path import Path, Quantity
 from magshell_fenicsx.continuation.point import PathStopped, Point
-from magshell_fenicsx.continuation.system import State
+from magshell_fenicsx.continuation.system import Direction, State, Vector, Weighted
 
+MOST_TRIALS = 60  # so many bisections reduce any bracket to rounding
+FLAT = 0.01  # a smaller slope of the amplitude, over the slope at the step's start, means a fold
+MIDDLE = 0.5, 0.35, 0.65, 0.2, 0.8  # places in a bracket, tried in turn, for a point between its ends
+MOST_HALVINGS = 12  # of a step with several instabilities; what is left counts as one
 Label = Literal["step", "target", "fold", "bifurcation"]
 Until = Literal["limit", "bifurcation", "target", "points"]
 MOST_STEPS = 1000
 SAME = 1e-2  # distance along the path, in the system's lengths, below which two folds are one
+
+
+@dataclass(frozen=True)
+class Instability:
+    """A point at which the tangent is singular.
+
+    Attributes
+    ----------
+    kind
+        "fold": the amplitude is stationary; "bifurcation": it is not.
+    """
+
+    point: Point
+    kind: Literal["fold", "bifurcation"]
+
+
+def instabilities(path: Path, low: Point, high: Point, tolerance: float = 1e-8) -> Iterator[Instability]:
+    """All singular points between two successive points, in order, as far as inertia and tangents reveal them.
+
+    Parameters
+    ----------
+    tolerance
+        Of the amplitude, relative.
+
+    Raises
+    ------
+    PathStopped
+        If Newton's method fails between the two points.
+    """
+    search = _Search(path, low, tolerance)
+    yield from search.between(low, path.seen_from(low, high), MOST_HALVINGS)
+
+
+@dataclass
+class _Search:
+    """A search between two points, the first of which is the base of every solve.
+
+    `iterations` and `factorisations` count the work since the last located point.
+    """
+
+    path: Path
+    base: Point
+    tolerance: float
+    iterations: int = 0
+    factorisations: int = 0
+
+    def between(self, low: Point, high: Point, halvings: int) -> Iterator[Instability]:
+        change = abs(high.negative_pivots - low.negative_pivots)
+        turned = low.dmu * high.dmu < 0
+        if change == 0 and not turned:
+            return
+        self.path.progress.doing("locating an instability")
+        single = change == 1 or not halvings
+        if single and turned:
+            yield Instability(self.finished(self.fold(low, high)), "fold")
+        elif single:
+            point = self.crossing(low, high) or self.bracketed(low, high)
+            if abs(point.dmu) < FLAT * abs(low.dmu):
+                raise PathStopped("the step passed a fold and left the branch", low)
+            yield Instability(point, "bifurcation")
+        else:
+            middle = self.middle(low, high)
+            if middle is None:
+                raise PathStopped("several instabilities lie too close to each other", low)
+            yield from self.between(low, middle, halvings - 1)
+            yield from self.between(middle, high, halvings - 1)
+
+    def solve(self, s: float, low: Point, high: Point) -> Point:
+        found = self.try_at(s, low, high)
+        if isinstance(found, str):
+            raise PathStopped(f"locating an instability: {found}", low)
+        return found
+
+    def try_at(self, s: float, low: Point, high: Point) -> Point | str:
+        found = self.path.inside(s, low, high, self.base)
+        if not isinstance(found, str):
+            self.iterations += found.iterations
+            self.factorisations += found.factorisations
+        return found
+
+    def middle(self, low: Point, high: Point) -> Point | None:
+        """A point somewhere between two others, with its own inertia; rounding may hide some places."""
+        for part in MIDDLE:
+            found = self.try_at(low.s + part * (high.s - low.s), low, high)
+            if not isinstance(found, str):
+                return self.path.exact(found, self.base)
+        return None
+
+    def crossing(self, low: Point, high: Point) -> Point | None:
+        """The bifurcation between two points, as the solution of a regular system; None if there is no solution."""
+        path = self.path
+        if path.newton.factorisation.skewed:
+            return None  # the regular system needs a symmetric tangent
+        try:
+            modes = [critical_mode(path.newton, end.state) for end in (low, high)]
+        except NoEigenpair:
+            return None
+        a, b = (mode.eigenvalue for mode in modes)
+        t = a / (a - b) if a * b < 0 else 0.5
+        guess = path.between(low.s + t * (high.s - low.s), low, high)
+        pivots = sorted(end.negative_pivots for end in (low, high))
+        for mode in sorted(modes, key=lambda mode: abs(mode.eigenvalue)):
+            stress = [(1 - t, low.state.u), (t, high.state.u)]
+            found = path.recorded(partial(self._regular, guess, mode.vector, stress, low, high))
+            if isinstance(found, str):
+                continue
+            if min(low.s, high.s) <= found.s <= max(low.s, high.s) and pivots[0] <= found.negative_pivots < pivots[1]:
+                return self.spent(found)
+        return None
+
+    def _regular(self, guess: State, phi: Vector, stress: Sequence[Weighted], low: Point, high: Point) -> Point | str:
+        path = self.path
+        try:
+            found = find_bifurcation(path.newton, guess, phi, path.name, stress)
+        except BifurcationLost:
+            return "no bifurcation was found"
+        self.iterations += found.iterations
+        self.factorisations += found.factorisations
+        # the null vector and the response span the tangents of both branches; this one continues the path
+        state, along = found.state, self._slope(found.state, low, high)
+        direction = projected(path.metric, along, [(found.phi, 0.0), (-found.response, 1.0)])
+        point = path.on(state, direction, self.base, found.unstable)
+        return replace(point, error=found.error, load_error=found.load_error)
+
+    def _slope(self, state: State, low: Point, high: Point) -> Direction:
+        """The path's tangent near a state between two points, interpolated."""
+        name = self.path.name
+        t = (state.mu[name] - low.state.mu[name]) / (high.state.mu[name] - low.state.mu[name])
+        t = min(max(t, 0.0), 1.0)
+        return (1 - t) * low.du + t * high.du, (1 - t) * low.dmu + t * high.dmu
+
+    def bracketed(self, low: Point, high: Point) -> Point:
+        """The last point before an instability, by bisection until rounding spoils the inertia."""
+        name = self.path.name
+        for _ in range(MOST_TRIALS):
+            width = abs(high.state.mu[name] - low.state.mu[name])
+            middle = self.middle(low, high) if width > self.tolerance * abs(low.state.mu[name]) else None
+            if middle is None:
+                break
+            low, high = (middle, high) if middle.negative_pivots == low.negative_pivots else (low, middle)
+        return replace(self.spent(low), load_error=abs(high.state.mu[name] - low.state.mu[name]))
+
+    def spent(self, point: Point) -> Point:
+        """The point with the work since the last located one."""
+        done = replace(point, iterations=self.iterations, factorisations=self.factorisations)
+        self.iterations = self.factorisations = 0
+        return done
+
+    def finished(self, point: Point) -> Point:
+        """The point with its own tangent and inertia, and with the work."""
+        self.factorisations += 1
+        return replace(self.spent(self.path.exact(point, self.base)), load_error=point.load_error)
+
+    def fold(self, low: Point, high: Point) -> Point:
+        """Zero of dmu/ds: stationary point of the cubic through both ends, repeated."""
+        name = self.path.name
+        for _ in range(MOST_TRIALS):
+            s = _stationary(low, high, name)
+            point = self.solve(s, low, high)
+            mu = point.state.mu[name]
+            other = high if point.dmu * low.dmu > 0 else low
+            curvature = (other.dmu - point.dmu) / (other.s - point.s)
+            rest = abs(point.dmu**2 / (2 * curvature))
+            if rest <= self.tolerance * abs(mu):
+                return replace(point, load_error=rest)
+            low, high = (point, high) if point.dmu * low.dmu > 0 else (low, point)
+        return point
+
+    def rest(self, point: Point, stability: Stability, slope: float) -> float:
+        """How far the load is from where the eigenvalue is zero, and what rounding of the tangent hides of that.
+
+        Parameters
+        ----------
+        slope
+            Derivative of the eigenvalue by the load.
+        """
+        u = point.state.u
+        sides = np.random.default_rng(self.path.system.comm.rank).choice([-1.0, 1.0], (2, u.size))  # as rounding does
+        near = [u, *(u + side * np.spacing(u) for side in sides)]
+        values = [critical_mode(stability, State(v, point.state.mu)).eigenvalue for v in near]
+        return float((abs(values[0]) + SCATTER * np.ptp(values)) / abs(slope)) if slope else np.inf
+
+    def bifurcation(self, low: Point, high: Point, stability: Stability) -> Point:
+        """The zero of the eigenvalue that changes sign, by the Illinois variant of regula falsi.
+
+        It ends when two successive guesses agree to tolerance^(3/4): the order of the method is 1.44, and close to
+        zero the eigenvalue is only rounding.
+        """
+        path, side = self.path, 0
+        first = critical_mode(stability, low.state)
+        a, b = first.eigenvalue, critical_mode(stability, high.state).eigenvalue
+        agreed, last = self.tolerance**0.75, np.inf
+        slope = (b - a) / (high.state.mu[path.name] - low.state.mu[path.name])
+        for _ in range(MOST_TRIALS):
+            # the eigenvalue nearest to zero need not be the one that changes sign
+            t = a / (a - b) if a * b < 0 else 0.5
+            tried = self.try_at(low.s + t * (high.s - low.s), low, high)
+            found = self.middle(low, high) if isinstance(tried, str) else tried
+            if found is None:  # the path's own tangent is singular there as well
+                return replace(low, load_error=abs(high.state.mu[path.name] - low.state.mu[path.name]))
+            point = found
+            mu = point.state.mu[path.name]
+            moved, width = abs(point.s - last) * abs(point.dmu), abs(high.s - low.s) * abs(point.dmu)
+            if moved <= agreed * abs(mu) and a * b < 0:
+                return replace(point, load_error=self.rest(point, stability, slope))
+            if width <= self.tolerance * abs(mu):
+                return replace(point, load_error=max(width, self.rest(point, stability, slope)))
+            last, mode = point.s, critical_mode(stability, point.state)
+            if mode.negative_pivots != first.negative_pivots:
+                high, b = point, mode.eigenvalue
+                a = a / 2 if side == 1 else a
+                side = 1
+            else:
+                low, a = point, mode.eigenvalue
+                b = b / 2 if side == -1 else b
+                side = -1
+        return point
+
+
+def _stationary(low: Point, high: Point, name: str) -> float:
+    """Where the Hermite cubic of mu(s) is stationary between the ends."""
+    L = high.s - low.s
+    rise = (high.state.mu[name] - low.state.mu[name]) / L
+    c1, c2, c3 = low.dmu, 3 * rise - 2 * low.dmu - high.dmu, low.dmu + high.dmu - 2 * rise
+    roots = np.roots([3 * c3, 2 * c2, c1])
+    inside = [float(r.real) for r in roots if abs(r.imag) < 1e-12 and 0 < r.real < 1]
+    t = inside[0] if inside else low.dmu / (low.dmu - high.dmu)
+    return low.s + L * min(max(t, 1e-3), 1 - 1e-3)
+
+
+def locate_bifurcation(
+    path: Path, stable: Point, unstable: Point, stability: Stability, tolerance: float = 1e-8
+) -> Point:
+    """Where a tangent other than the path's own becomes singular, between two successive points.
+
+    Parameters
+    ----------
+    stability
+        The tangent of the modes that the model excludes.
+    tolerance
+        Of the amplitude, relative.
+
+    Raises
+    ------
+    PathStopped
+        If Newton's method fails between the two points, or no eigenpair is found.
+    """
+    search = _Search(path, stable, tolerance)
+    try:
+        return search.finished(search.bifurcation(stable, path.seen_from(stable, unstable), stability))
+    except NoEigenpair as e:
+        raise PathStopped(f"locating an instability: {e}", stable) from None
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,7 @@ from typing import Any, Self
 
 from mpi4py import MPI
 
-from magshell_fenicsx.continuation.journal import Journal
-from magshell_fenicsx.continuation.point import Point
+from magshell_fenicsx.continuation.point import Journal, Point
 
 SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1)  # mpirun passes SIGUSR1 on to the ranks and waits
 

@@ -11,8 +11,8 @@ from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.opened import opened
 from magshell_fenicsx.continuation.factor import has_cholmod
 from magshell_fenicsx.continuation.fold import FoldLost
-from magshell_fenicsx.continuation.inverse import NoEigenpair
-from magshell_fenicsx.continuation.journal import NoJournal
+from magshell_fenicsx.continuation.modes import NoEigenpair
+from magshell_fenicsx.continuation.point import NoJournal
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.shell.own_term import OwnTerm

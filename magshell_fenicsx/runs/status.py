@@ -125,7 +125,7 @@ def waiting(what: str, seconds: float) -> str:
 
 
 class RunProgress:
-    """Reports the status of a run; a `continuation.listener.Progress`.
+    """Reports the status of a run; a `continuation.point.Progress`.
 
     Parameters
     ----------

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 
 from magshell_fenicsx.assembly.terms import factor_of
+from magshell_fenicsx.continuation.factor import Stopwatch
 from magshell_fenicsx.continuation.system import State, dot
-from magshell_fenicsx.continuation.timing import Stopwatch
 from magshell_fenicsx.models.modes import ShellMode
 from magshell_fenicsx.output.fields.modes import hertz
 from magshell_fenicsx.output.report.verdict import place_in_units

@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 from magshell_fenicsx.assembly.terms import factor_of
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.opened import opened
-from magshell_fenicsx.continuation.journal import Journal, NoJournal
-from magshell_fenicsx.continuation.listener import NoProgress, Progress
 from magshell_fenicsx.continuation.newton import BorderedNewton
+from magshell_fenicsx.continuation.point import Journal, NoJournal, NoProgress, Progress
 from magshell_fenicsx.continuation.snes import NewtonOptions
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.continuation.watch import Watch

@@ -7,8 +7,7 @@ from functools import cached_property, partial
 
 from magshell_fenicsx.continuation.control import GivenLoad
 from magshell_fenicsx.continuation.path import StepOptions
-from magshell_fenicsx.continuation.search import Limits, further
-from magshell_fenicsx.continuation.settling import Settling
+from magshell_fenicsx.continuation.search import Limits, Settling, further
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.parts.course import SearchSection
 from magshell_fenicsx.parts.step import ProgrammeStep

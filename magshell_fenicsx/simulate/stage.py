@@ -3,8 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
-from magshell_fenicsx.continuation.along import Along, Curve
-from magshell_fenicsx.continuation.device import Device, Held, natural_scale
+from magshell_fenicsx.continuation.device import Along, Curve, Device, Held, natural_scale
 from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.path import Control, Path, StepOptions
 from magshell_fenicsx.continuation.point import Point

@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from magshell_fenicsx.continuation.branch import Branching, branching
+from magshell_fenicsx.continuation.bifurcation import Branching, branching
 from magshell_fenicsx.continuation.path import Path, StepOptions
 from magshell_fenicsx.continuation.point import PathStopped, Point
 from magshell_fenicsx.continuation.system import State

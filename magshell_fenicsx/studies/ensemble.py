@@ -14,8 +14,7 @@ from typing import Any
 
 from mpi4py import MPI
 
-from magshell_fenicsx.continuation.ahead import fold_ahead
-from magshell_fenicsx.continuation.fold import Fold, FoldLost, Guess
+from magshell_fenicsx.continuation.fold import Fold, FoldLost, Guess, fold_ahead
 from magshell_fenicsx.input.source import CaseError, read_source
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.output.store.durable import write_object, write_whole

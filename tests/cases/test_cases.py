@@ -80,7 +80,7 @@ def test_excluded_mode_that_cannot_be_located_is_told(monkeypatch: pytest.Monkey
     def lost(path: Path, stable: Point, *others: object) -> Point:
         raise PathStopped("the iteration diverged", stable)
 
-    monkeypatch.setattr("magshell_fenicsx.continuation.crossings.locate_bifurcation", lost)
+    monkeypatch.setattr("magshell_fenicsx.continuation.watch.locate_bifurcation", lost)
     found = run(Case.load(CASES / "dimple_drift.yaml"))
     assert found.rows[-1]["label"] == "target"
     assert found.stopped

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from continuation.toys import snap_through
 
-from magshell_fenicsx.continuation.ahead import fold_ahead
+from magshell_fenicsx.continuation.fold import fold_ahead
 from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.path import Path, StepOptions
 from magshell_fenicsx.continuation.point import Point

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from magshell_fenicsx.continuation.banded import Banded
+from magshell_fenicsx.continuation.factor import Banded
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -7,12 +7,12 @@ import pytest
 from continuation.toys import Toy, pitchfork, snap_back
 from petsc4py import PETSc
 
+from magshell_fenicsx.assembly.noise import Noise
 from magshell_fenicsx.continuation.bifurcation import BifurcationLost, find_bifurcation
-from magshell_fenicsx.continuation.events import instabilities
 from magshell_fenicsx.continuation.newton import BorderedNewton
-from magshell_fenicsx.continuation.noise import Noise
 from magshell_fenicsx.continuation.path import Path, StepOptions
 from magshell_fenicsx.continuation.system import Amplitudes, State, Vector, Weighted
+from magshell_fenicsx.continuation.walk import instabilities
 
 
 class Noisy(Toy):

@@ -5,8 +5,7 @@ import pytest
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from magshell_fenicsx.continuation.condition import condition_estimate
-from magshell_fenicsx.continuation.factor import Factorisation
+from magshell_fenicsx.continuation.factor import Factorisation, condition_estimate
 
 
 def test_condition_of_a_known_spectrum() -> None:

@@ -17,8 +17,8 @@ from petsc4py import PETSc
 
 from magshell_fenicsx.continuation.control import GivenLoad
 from magshell_fenicsx.continuation.device import Device, natural_scale
-from magshell_fenicsx.continuation.events import critical_mode
 from magshell_fenicsx.continuation.fold import Guess, find_fold
+from magshell_fenicsx.continuation.modes import critical_mode
 from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.path import Path, StepOptions
 from magshell_fenicsx.continuation.system import Amplitudes, State, System, Vector, Weighted

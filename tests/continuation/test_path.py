@@ -9,12 +9,11 @@ import pytest
 from continuation.toys import Toy, pitchfork, snap_through
 
 from magshell_fenicsx.continuation.control import GivenConjugate, GivenLoad
-from magshell_fenicsx.continuation.events import instabilities
-from magshell_fenicsx.continuation.listener import NoProgress
 from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.path import Control, Path, StepOptions
-from magshell_fenicsx.continuation.point import PathStopped, Point
+from magshell_fenicsx.continuation.point import NoProgress, PathStopped, Point
 from magshell_fenicsx.continuation.system import State
+from magshell_fenicsx.continuation.walk import instabilities
 
 
 def path_of(toy: Toy, control: Control, options: StepOptions) -> tuple[Path, Point]:

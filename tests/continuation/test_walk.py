@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from continuation.toys import closed_loop, pitchfork, snap_back
 
-from magshell_fenicsx.continuation.branch import branching
+from magshell_fenicsx.continuation.bifurcation import branching
 from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.path import Path, StepOptions
 from magshell_fenicsx.continuation.point import PathStopped, Point

@@ -134,7 +134,7 @@ def test_crossing_that_cannot_be_located_is_told(monkeypatch: pytest.MonkeyPatch
     def lost(*args: object) -> None:
         raise PathStopped("the iteration diverged", args[1])  # type: ignore[arg-type]
 
-    monkeypatch.setattr("magshell_fenicsx.continuation.crossings.locate_bifurcation", lost)
+    monkeypatch.setattr("magshell_fenicsx.continuation.watch.locate_bifurcation", lost)
     toy = snap_through()
     path = Path(BorderedNewton(toy), "load", "arc", StepOptions(0.05, 0.05, 1e-7))
     watch, first = (

@@ -21,9 +21,8 @@ from magshell_fenicsx.assembly.forms import at_zero
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.assembly.terms import FormTerm
-from magshell_fenicsx.continuation.banded import Banded
-from magshell_fenicsx.continuation.factor import Factorisation
-from magshell_fenicsx.continuation.inverse import nearest_to_zero
+from magshell_fenicsx.continuation.factor import Banded, Factorisation
+from magshell_fenicsx.continuation.modes import nearest_to_zero
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.models.axisymmetric import jets
 from magshell_fenicsx.models.axisymmetric.meridian import Meridian

@@ -6,7 +6,7 @@ from math import atan2, copysign, cos, degrees, hypot, sin
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.continuation.along import Curve
+from magshell_fenicsx.continuation.device import Curve
 from magshell_fenicsx.models.shell.parameters import ACROSS, Magnetisation
 from magshell_fenicsx.parts.magnetism.driven import carried
 from magshell_fenicsx.parts.magnetism.field_step import RotationSection

@@ -24,7 +24,7 @@ import numpy as np
 from magshell_fenicsx.assembly.terms import FormTerm, factor_of
 from magshell_fenicsx.continuation.device import Conjugate, Device
 from magshell_fenicsx.continuation.fold import Fold
-from magshell_fenicsx.continuation.inverse import nearest_to_zero
+from magshell_fenicsx.continuation.modes import nearest_to_zero
 from magshell_fenicsx.continuation.system import State, System, Vector, dot
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel

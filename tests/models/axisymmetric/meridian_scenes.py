@@ -5,11 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 from conftest import spherical
 
-from magshell_fenicsx.continuation.events import Instability, instabilities
 from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.path import Path, StepOptions
 from magshell_fenicsx.continuation.point import Point
 from magshell_fenicsx.continuation.system import State
+from magshell_fenicsx.continuation.walk import Instability, instabilities
 from magshell_fenicsx.models.axisymmetric.meridian import graded_vertices, make_meridian
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.shell.parameters import Condition, Force, Loads, Magnetisation, Material

@@ -5,7 +5,7 @@ import pytest
 from conftest import hemisphere
 
 from magshell_fenicsx import Case, Scene
-from magshell_fenicsx.continuation.events import critical_mode
+from magshell_fenicsx.continuation.modes import critical_mode
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.models.shell.model import ShellModel

@@ -8,9 +8,9 @@ import pytest
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from magshell_fenicsx.continuation import inverse
+from magshell_fenicsx.continuation import modes
 from magshell_fenicsx.continuation.factor import Factorisation
-from magshell_fenicsx.continuation.inverse import NoEigenpair, nearest_to_zero
+from magshell_fenicsx.continuation.modes import NoEigenpair, nearest_to_zero
 
 N = 60
 SPECTRA = {
@@ -74,7 +74,7 @@ def test_small_spaces(diagonal: list[float]) -> None:
 
 
 def test_no_answer_is_not_taken_for_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(inverse, "MOST_SOLVES", 3)
+    monkeypatch.setattr(modes, "MOST_SOLVES", 3)
     with pytest.raises(NoEigenpair, match=r"not found in 3 solves: at .* the residual is still"):
         nearest_to_zero(factored(symmetric([1.0, 1.1, 1.2])))
 
@@ -100,7 +100,7 @@ def test_same_on_any_number_of_ranks() -> None:
     for other in found[1:]:
         for one, same, distance in zip(found[0], other, DISTANCE.values(), strict=True):
             assert same[0] == pytest.approx(one[0], rel=1e-11, abs=1e-13)
-            assert same[1:] == pytest.approx(one[1:], abs=2 * inverse.TOLERANCE / distance)
+            assert same[1:] == pytest.approx(one[1:], abs=2 * modes.TOLERANCE / distance)
 
 
 if __name__ == "__main__":
