@@ -26,6 +26,14 @@ class Term(Protocol):
     @property
     def amplitude(self) -> str | None: ...
 
+    @property
+    def group(self) -> str:
+        """What its energy is reported with: that of all parts of one field."""
+
+    @property
+    def column(self) -> str:
+        """The column of a path with its energy: stretching, bending or magnetic; "" without one."""
+
     def energy(self) -> float:
         """Pi(u) on this rank's part."""
 
@@ -77,6 +85,7 @@ class FormTerm:
         work: ufl.Form | None = None,
     ) -> None:
         self.name, self.amplitude, self.linear = name, amplitude, linear
+        self.group, self.column = name, ""
         self.has_potential = work is None
         self._factor = fem.Constant(u.function_space.mesh, 1.0)
         self._u, self._log = u, log
@@ -223,6 +232,7 @@ class LinearTerm:
         self, name: str, dofs: NDArray[np.int32], entries: NDArray[np.float64], u: fem.Function, amplitude: str
     ) -> None:
         self.name, self.amplitude = name, amplitude
+        self.group, self.column = name, ""
         self._dofs, self._entries, self._u = dofs, entries, u
 
     def energy(self) -> float:

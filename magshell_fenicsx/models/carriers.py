@@ -8,17 +8,21 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import basix
+import basix.ufl
 import numpy as np
 import ufl
 from dolfinx import fem, mesh
 from numpy.typing import NDArray
 from ufl.core.expr import Expr
 
+from magshell_fenicsx.assembly.shape_tables import Table
 from magshell_fenicsx.models.axisymmetric import jets
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.energy import Density, cell_quadrature, edge_quadrature
 from magshell_fenicsx.models.shell.kinematics import Jet
 
+Array = NDArray[np.float64]
 Facets = NDArray[np.int32]
 
 
@@ -34,6 +38,8 @@ class Energy:
         Of the jets of u and v: the virtual work of a load without potential, quadratic in u.
     density
         What is integrated; None for a load that is known by its vector.
+    group, column
+        As of a `Term`; the group of "" is the name.
     counted
         Of a moment: the turn that its angle is counted from, and -Pi of one radian.
     """
@@ -45,12 +51,31 @@ class Energy:
     work: Callable[[Jet, Jet], ufl.Form] | None = None
     density: Density | None = None
     counted: tuple[fem.Constant, float] | None = None
+    group: str = ""
+    column: str = ""
 
     def added(self, u: Jet, v: Jet) -> ufl.Form:
         """A form with the Hessian in v, at v = 0, of the energy of u + v; a work gives its symmetric part."""
         if self.work is None:
             return self.of(u + v)
         return 0.25 * (self.work(u + v, v) - self.work(u - v, v))
+
+
+@dataclass(frozen=True)
+class HeldEdge:
+    """Edges that hold the normal, or lie on a mirror plane.
+
+    Attributes
+    ----------
+    plane
+        Normal of the mirror plane; None for a clamped edge.
+    turn
+        The rotation of a clamped edge that moves.
+    """
+
+    facets: Facets
+    plane: fem.Constant | None = None
+    turn: fem.Constant | None = None
 
 
 @dataclass(frozen=True)
@@ -67,6 +92,11 @@ class Carrier:
         h_e of edges between cells and at the boundary, see `edges.two_sided`.
     rule, edge_rule, contact_rule
         Degrees of the quadrature on cells, along edges (None where these are points) and under contact.
+    tables
+        Of the space of the placement and places in the reference cell, away from singular ones: a function from nodal
+        values, with ghosts, to jets (6, cells, places, 3).
+    variant
+        Of discontinuous fields, which are known at places where the coordinates are regular.
     whole
         What integrals are multiplied by: 2 pi on a meridian, where they are per radian.
     drawn
@@ -80,6 +110,8 @@ class Carrier:
     rule: int
     edge_rule: int | None
     contact_rule: int
+    tables: Callable[[fem.FunctionSpace, Array], Callable[[Array], Array]]
+    variant: basix.LagrangeVariant
     whole: float = 1.0
     drawn: fem.Function | None = None
 
@@ -91,6 +123,13 @@ class Carrier:
     def j0(self) -> Jet:
         """Of the placement."""
         return self.jet(self.r0)
+
+    def discontinuous(self, size: int) -> fem.FunctionSpace:
+        """Fields of so many numbers, discontinuous and as rich as the placement."""
+        cell, degree = self.mesh.basix_cell(), self.r0.function_space.element.basix_element.degree
+        return fem.functionspace(
+            self.mesh, basix.ufl.element("DG", cell, degree, lagrange_variant=self.variant, shape=(size,))
+        )
 
     def constant(self, value: float | NDArray[np.float64]) -> fem.Constant:
         """A number or a vector in a form."""
@@ -173,6 +212,8 @@ def on_surface(r0: fem.Function, drawn: fem.Function | None = None) -> Carrier:
         rule=cell_quadrature(degree),
         edge_rule=edge_quadrature(degree),
         contact_rule=3 * degree,  # the pressure at the rim of a contact is narrower than an element
+        tables=_tables_on_surface,
+        variant=basix.LagrangeVariant.gll_warped,
         drawn=drawn,
     )
 
@@ -190,6 +231,26 @@ def on_meridian(r0: fem.Function, drawn: fem.Function | None = None) -> Carrier:
         rule=2 * degree + 2,  # one point more than the surface's: on the axis the densities are rational
         edge_rule=None,
         contact_rule=6 * degree,  # points are cheap here
+        tables=_tables_on_meridian,
+        variant=basix.LagrangeVariant.gl_isaac,  # inside: on the axis the coordinates are singular
         whole=2 * np.pi,
         drawn=drawn,
     )
+
+
+def _tables_on_surface(V: fem.FunctionSpace, places: Array) -> Callable[[Array], Array]:
+    table, nodes = Table.tabulate(V.element.basix_element, places), V.dofmap.list
+    return lambda nodal: np.asarray(np.moveaxis(table.jets(nodal.reshape(-1, 3)[nodes]), 2, 0))
+
+
+def _tables_on_meridian(V: fem.FunctionSpace, places: Array) -> Callable[[Array], Array]:
+    """Jets at azimuth zero, as `jets.revolved`, by X in [0, 1]; nodal values are (U, W)."""
+    shapes, nodes = V.element.basix_element.tabulate(2, places)[..., 0], V.dofmap.list
+
+    def jets_of(nodal: Array) -> Array:
+        derivatives = np.einsum("dpn,cni->dcpi", shapes, nodal.reshape(-1, 2)[nodes])
+        (U, W), (Us, Ws), (Uss, Wss) = np.moveaxis(derivatives, -1, 1)
+        parts = [(U, 0, W), (Us, 0, Ws), (0, U, 0), (Uss, 0, Wss), (0, Us, 0), (-U, 0, 0)]
+        return np.array([np.stack(np.broadcast_arrays(*part), axis=-1) for part in parts])
+
+    return jets_of

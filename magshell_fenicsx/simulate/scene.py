@@ -184,7 +184,10 @@ class Scene:
         force, sense = loads.forces.get("force"), copysign(1.0, self.case.lambda_m)
         energies = self.energies(state)
         pole = model.deflection(state.u, "pole") / h
-        split = "membrane" in energies  # a solid has no such split
+        columns = defaultdict[str, float](float)
+        for t in {t.group: t for t in model.system.terms}.values():
+            columns[t.column] += energies[t.group]
+        split = "stretching" in columns  # a solid has no such split
         return {
             "p_over_pc": state.mu.get("pressure", 0.0),
             "lambda_m": field_size(state.mu, sense),
@@ -195,11 +198,9 @@ class Scene:
             "w_point_over_h": model.deflection(state.u, force.point) / h if force else pole,
             "volume_change": model.volume_change(state.u, state.mu),
             "energy": sum(energies.values()),
-            "stretching": energies["membrane"] if split else nan,
-            "bending": sum(v for name, v in energies.items() if name == "bending" or name.endswith(" edges"))
-            if split
-            else nan,
-            "magnetic": sum(energies[name] for name in ("magnetic", "magnetic gradient", "U1", "Uq", "Utau", "couple")),
+            "stretching": columns["stretching"] if split else nan,
+            "bending": columns["bending"] if split else nan,
+            "magnetic": columns["magnetic"],
             **{name: energies[name] for name in ("U1", "Uq", "Utau")},
             **self._observe_points(state),
             **{name: state.mu[name] for name in self._own_amplitudes},
@@ -218,9 +219,7 @@ class Scene:
         model, found = self.model, defaultdict[str, float](float)
         potentials = model.system.energies(state.u, state.mu)
         for t in model.system.terms:
-            name = t.name.removesuffix(" across").removesuffix(" third")
-            name = "magnetic gradient" if name.startswith("magnetic gradient") else name
-            found[name] += model.multiplicity * factor_of(t.amplitude, state.mu) * potentials[t.name]
+            found[t.group] += model.multiplicity * factor_of(t.amplitude, state.mu) * potentials[t.name]
         return found
 
     @property

@@ -20,8 +20,6 @@ from magshell_fenicsx.parts.bodies.contact import Pressings
 from magshell_fenicsx.parts.course import SnapSection
 from magshell_fenicsx.parts.motion.ground import Ground
 from magshell_fenicsx.parts.motion.mass import mass, whole_mass
-from magshell_fenicsx.parts.motion.on_meridian import surface_of as of_meridian
-from magshell_fenicsx.parts.motion.on_surface import surface_of as of_shell
 from magshell_fenicsx.parts.motion.step import EventSection, TimeSection
 from magshell_fenicsx.parts.motion.viscous import Branch, Viscosity
 from magshell_fenicsx.simulate.histories import LoadsInTime, time_of
@@ -164,8 +162,7 @@ def viscosity(scene: Scene, state: State) -> Viscosity | None:
         ratio = size / (shell.youngs_modulus or 1.0) if isinstance(branch.modulus, str) else size
         found.append(Branch(ratio, time_of(case, branch.time)))
     assert isinstance(model, ShellModel | MeridianModel)
-    surface = of_shell(model) if isinstance(model, ShellModel) else of_meridian(model)
-    return Viscosity(model, surface, state.mu, time_of(case, shell.viscosity or 0.0), found)
+    return Viscosity(model, state.mu, time_of(case, shell.viscosity or 0.0), found)
 
 
 def released(scene: Scene, snap: SnapSection, fold: Record, held: Mapping[str, Held]) -> Records:

@@ -141,6 +141,7 @@ class HessianTerm:
 
     def __init__(self, name: str, density: Density, energy: ufl.Form, v: fem.Function, log: KernelLog) -> None:
         self.name, self.density = name, density
+        self.group, self.column = name, ""
         self._energy, self._v, self._log = energy, v, log
 
     @cached_property

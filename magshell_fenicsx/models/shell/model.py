@@ -148,7 +148,8 @@ class ShellModel(Observed):
 
         if "symmetry" in conditions.values():
             planes.append(mirror)
-            terms.append(factory.term(factory.mirror_edges(facets("symmetry"), mirror.normal)))
+            self._mirror_term = factory.term(factory.mirror_edges(facets("symmetry"), mirror.normal))
+            terms.append(self._mirror_term)
             mirrored.append(held_along(V, 1, facets("symmetry"), mirror.normal))
         clamped = [name for name, c in conditions.items() if c == "clamped" and name in midsurface.edges]
         self.supports: dict[str, Support] = {}
@@ -258,7 +259,7 @@ class ShellModel(Observed):
         held = self._held + [held_along(self.V, 1, self._on_mirror, along) for along in self.mirror.in_plane]
         sites = self._sites + make_sites(self.r0, self.degree, [edges], self.kernels)
         fast = FastTangent(self.u, sites, held)
-        terms = [edges if t.name == "mirror edges" else t for t in self.system.terms]
+        terms = [edges if t is self._mirror_term else t for t in self.system.terms]
         system = self.system
         return AntisymmetricModes(
             FiniteElementSystem(

@@ -12,7 +12,7 @@ from ufl.core.expr import Expr
 
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.terms import FormTerm
-from magshell_fenicsx.models.carriers import Carrier, Energy, Facets
+from magshell_fenicsx.models.carriers import Carrier, Energy, Facets, HeldEdge
 from magshell_fenicsx.models.shell import densities, edges
 from magshell_fenicsx.models.shell.antisymmetric import antisymmetric_edge
 from magshell_fenicsx.models.shell.energy import (
@@ -61,6 +61,8 @@ class EnergyFactory:
         Whether cells meet at angles that are not small.
     fields
         The applied fields known by values that were made.
+    held
+        The edges that hold the normal, and those on mirror planes, whose energies were made.
     """
 
     carrier: Carrier
@@ -73,6 +75,7 @@ class EnergyFactory:
     free: Constants = field(default_factory=dict)
     folded: bool = False
     fields: list[AppliedField] = field(default_factory=list)
+    held: list[HeldEdge] = field(default_factory=list)
 
     def term(self, energy: Energy) -> FormTerm:
         """An energy as a term of the model's displacement."""
@@ -83,7 +86,9 @@ class EnergyFactory:
 
         def make(kind: Callable[..., AnyTerm], *density: Density) -> AnyTerm:
             given = energy.name, *density, form, self.u, self.log, energy.amplitude
-            return kind(*given, linear=energy.linear, work=work)
+            term = kind(*given, linear=energy.linear, work=work)
+            term.group, term.column = energy.group or energy.name, energy.column
+            return term
 
         if energy.density is None:
             return make(FormTerm)
@@ -95,7 +100,7 @@ class EnergyFactory:
 
     def membrane(self) -> Energy:
         density = Density(per_area(densities.membrane), (self._constant(self.material.nu),))
-        return self.carrier.energy("membrane", self._thick(self._grown(density), None))
+        return self.carrier.energy("membrane", self._thick(self._grown(density), None), column="stretching")
 
     def prestress(self) -> Density:
         """The part of the tangent that membrane stress makes; its last parameter but the thickness is the strain."""
@@ -105,24 +110,28 @@ class EnergyFactory:
 
     def bending(self) -> Energy:
         density = Density(per_area(densities.bending), self._nu_h(), parts=CURVED)
-        return self.carrier.energy("bending", self._thick(self._grown(density), 1))
+        return self.carrier.energy("bending", self._thick(self._grown(density), 1), column="bending")
 
     def interior_edges(self) -> Energy:
         parameters = self._penalised() if self.thickness is None else (*self._penalised(), self.thickness)
         of = edges.folded if self.folded else edges.interior
-        return self.carrier.energy(INTERIOR, self._grown(Density(of, parameters, CURVED, SECOND, sides=2)))
+        return self.carrier.energy(
+            INTERIOR, self._grown(Density(of, parameters, CURVED, SECOND, sides=2)), column="bending"
+        )
 
     def clamped_edges(self, name: str, facets: Facets, turn: fem.Constant | None = None) -> Energy:
         """`turn` is the rotation of an edge that moves."""
         parameters = (*self._penalised(), *([] if turn is None else [turn]))
         density = Density(edges.clamped, parameters, CURVED, SECOND, facets)
-        return self.carrier.energy(name, self._thick(self._grown(density), 1))
+        self.held.append(HeldEdge(facets, turn=turn))
+        return self.carrier.energy(name, self._thick(self._grown(density), 1), column="bending")
 
     def mirror_edges(self, facets: Facets, normal: Array, name: str = "mirror edges") -> Energy:
         """Edges on a mirror plane with that normal."""
-        parameters = (*self._penalised(), self._constant(normal))
-        density = Density(edges.symmetric, parameters, CURVED, SECOND, facets)
-        return self.carrier.energy(name, self._thick(self._grown(density), 1))
+        plane = self._constant(normal)
+        density = Density(edges.symmetric, (*self._penalised(), plane), CURVED, SECOND, facets)
+        self.held.append(HeldEdge(facets, plane=plane))
+        return self.carrier.energy(name, self._thick(self._grown(density), 1), column="bending")
 
     def edge_moment(self, name: str, facets: Facets, intensity: float, amplitude: str) -> Energy:
         """A moment per length about the edge's first tangent; in E h R."""
@@ -153,7 +162,7 @@ class EnergyFactory:
             self.fields.append(known)
             of = densities.in_space(FULL[field.law])
             density = self._thick(Density(per_area(of), (Br, known.polynomial), parts=MOVED), None)
-            return [carrier.energy("magnetic", density, "lambda_m")]
+            return [carrier.energy("magnetic", density, "lambda_m", column="magnetic")]
         directions = [("lambda_m", "", field.applied)]
         directions += [(name, name.replace("lambda_", " "), Ba) for name, Ba in zip(ACROSS, field.across, strict=False)]
         terms = [
@@ -162,6 +171,8 @@ class EnergyFactory:
                 self._thick(Density(per_area(of), (Br, self._constant(Ba))), None),
                 amplitude,
                 linear=name in LINEAR,
+                group=name,
+                column="magnetic",
             )
             for amplitude, suffix, Ba in directions
             for name, of in magnetic_densities(field.law, field.energy).items()
@@ -169,7 +180,7 @@ class EnergyFactory:
         if field.gradient is not None:
             parameters = (Br, self._constant(field.gradient))
             density = Density(per_area(densities.in_gradient(FULL[field.law])), parameters, parts=MOVED)
-            terms.append(carrier.energy("magnetic gradient", self._thick(density, None), "lambda_m"))
+            terms.append(carrier.energy("magnetic gradient", self._thick(density, None), "lambda_m", column="magnetic"))
         return terms
 
     def pressure(self, *, potential: bool) -> Energy:

@@ -117,16 +117,19 @@ class TermFactory:
             known = AppliedField(of.in_space, X, self.u, WHOLE, of.driven)
             self.fields.append(known)
             density = Density(law.magnetic_in_space, (Br, known.polynomial, *self._constants(self.h)), VALUE + GRADIENT)
-            return [self._bulk("magnetic", density, "lambda_m")]
+            return [self._bulk("magnetic", density, "lambda_m", column="magnetic")]
         directions = [("lambda_m", "", of.applied)]
         directions += [(name, name.replace("lambda_", " "), Ba) for name, Ba in zip(ACROSS, of.across, strict=False)]
         terms = []
         for amplitude, suffix, Ba in directions:
             density = Density(law.magnetic, (Br, *self._constants(Ba, self.h)))
-            terms.append(self._bulk("magnetic" + suffix, density, amplitude, linear=law is densities))
+            of_field = self._bulk(
+                "magnetic" + suffix, density, amplitude, linear=law is densities, group="magnetic", column="magnetic"
+            )
+            terms.append(of_field)
         if of.gradient is not None:
             density = Density(law.magnetic_gradient, (Br, *self._constants(of.gradient, self.h)), VALUE + GRADIENT)
-            terms.append(self._bulk("magnetic gradient", density, "lambda_m"))
+            terms.append(self._bulk("magnetic gradient", density, "lambda_m", column="magnetic"))
         return terms
 
     def pressure(self, classical: float, *, potential: bool = True) -> list[SolidTerm]:
@@ -229,9 +232,13 @@ class TermFactory:
         amplitude: str | None = None,
         *,
         linear: bool = False,
+        group: str = "",
+        column: str = "",
     ) -> SolidTerm:
         energy = self._over_body(density)
-        return SolidTerm(name, density, energy, self.u, self.log, amplitude, linear=linear)
+        term = SolidTerm(name, density, energy, self.u, self.log, amplitude, linear=linear)
+        term.group, term.column = group or name, column
+        return term
 
     def _on_faces(self, found: Sequence[Density], v: Expr | None = None) -> ufl.Form:
         """The sum of energies, or of virtual works of v."""

@@ -16,6 +16,7 @@ from ufl.core.expr import Expr
 
 from magshell_fenicsx.continuation.system import Amplitudes, State, Tangent, Vector, max_abs
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
+from magshell_fenicsx.models.carriers import Carrier, HeldEdge
 from magshell_fenicsx.models.shell import densities, edges
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.kinematics import Jet
@@ -53,63 +54,13 @@ class Memory:
     dt: float = 0.0
 
 
-@dataclass(frozen=True)
-class Edge:
-    """Edges that hold the normal, or lie on a mirror plane.
-
-    Attributes
-    ----------
-    jump
-        Of the deformed jet, by how much the edge is open; of a mirrored edge half of what is between both sides.
-    sides
-        2 for mirrored edges.
-    along
-        Measure of these edges.
-    """
-
-    jump: Callable[[Jet], Expr]
-    sides: int
-    along: ufl.Measure
-
-
-@dataclass(frozen=True)
-class Surface:
-    """What viscous forces need to know of a model, of a shell or of its meridian.
-
-    Attributes
-    ----------
-    stresses
-        Space of what is known of strains, whose nodes are the places.
-    tables
-        From nodal displacements, with ghosts, to jets (6, cells, places, 3).
-    jet, r0, thickness
-        The jet of a field; that of the placement; what multiplies h, None for 1.
-    over
-        Measures of the cells and of the edges between them; energies are multiplied by `whole`.
-    m, widths
-        Covector of an edge, see `kinematics.conormal`; h_e between cells and at ends, see `edges.two_sided`.
-    """
-
-    stresses: fem.FunctionSpace
-    tables: Callable[[Array], Array]
-    jet: Callable[[Expr], Jet]
-    r0: Jet
-    thickness: fem.Function | None
-    over: tuple[ufl.Measure, ufl.Measure]
-    m: Expr
-    widths: tuple[Expr, Expr]
-    ends: Sequence[Edge]
-    folded: bool = False
-    whole: float = 1.0
-
-
 class Viscosity:
     """The viscous forces of a shell in motion; a `continuation.transient.Viscous`. Compiles kernels.
 
     Parameters
     ----------
-    model, surface
-        A shell or a meridian, and what `surface_of` finds of it.
+    model
+        A shell or a meridian.
     mu
         Amplitudes with the places of supports, which do not move.
     kelvin
@@ -126,21 +77,21 @@ class Viscosity:
     def __init__(
         self,
         model: ShellModel | MeridianModel,
-        surface: Surface,
         mu: Amplitudes,
         kelvin: float,
         branches: Sequence[Branch],
     ) -> None:
         self._model, self._mu, self._branches, self.slowness = model, dict(mu), branches, kelvin
-        V, Q, self._jets = model.V, surface.stresses, surface.tables
+        V, carrier = model.V, model.factory.carrier
+        Q = carrier.discontinuous(SIZE)
+        self._jets = carrier.tables(V, Q.element.basix_element.points)
         self._frame = TangentFrame.of(self._jets(model.r0.x.array))
         self._field, self._places = fem.Function(Q, name="viscous"), Q.dofmap.list
         self._given = _Given(self._field, fem.Function(V), fem.Function(V), fem.Constant(V.mesh, 0.0))
-        works = _works(model, surface, self._given)
-        gradients = [ufl.derivative(surface.whole * work, model.u, ufl.TestFunction(V)) for work in works]
+        works = _works(model, self._given)
+        gradients = [ufl.derivative(carrier.whole * work, model.u, ufl.TestFunction(V)) for work in works]
         self._forms = [model.kernels.compile(f"viscous residual {i}", form) for i, form in enumerate(gradients)]
-        names = (term.name for term in model.system.terms)
-        self._strained = [name for name in names if name in ("membrane", "bending") or name.endswith(" edges")]
+        self._strained = [term.name for term in model.system.terms if term.column in ("stretching", "bending")]
         self.memory = Memory([np.zeros((*self._places.shape, SIZE)) for _ in branches])
         self._first: tuple[Vector, Array] = np.empty(0), np.empty(0)  # displacements and their strains
         self._last: tuple[Vector, Array] = self._first
@@ -249,9 +200,9 @@ class _Given:
     after: fem.Function
     stiffness: fem.Constant
 
-    def opened(self, surface: Surface, jump: Callable[[Jet], Expr]) -> Expr:
+    def opened(self, carrier: Carrier, jump: Callable[[Jet], Expr]) -> Expr:
         """The stiffness times the change of an edge's jump, a given number."""
-        after, before = (jump(surface.r0 + surface.jet(field)) for field in (self.after, self.before))
+        after, before = (jump(carrier.j0 + carrier.jet(field)) for field in (self.after, self.before))
         return self.stiffness * (after - before)
 
 
@@ -267,12 +218,21 @@ def held_jump(r0: Jet, m: Expr, n0: Expr) -> Callable[[Jet], Expr]:
     return lambda r: -ufl.dot(n0 - kin.normal(r), r.r1 * nu1 + r.r2 * nu2)
 
 
-def _works(model: ShellModel | MeridianModel, surface: Surface, given: _Given) -> list[ufl.Form]:
+def _jump_of(edge: HeldEdge, r0: Jet, m: Expr) -> Callable[[Jet], Expr]:
+    """Of the deformed jet, by how much an edge is open."""
+    if edge.plane is not None:
+        return mirrored_jump(r0, m, edge.plane)
+    n0 = kin.normal(r0)
+    return held_jump(r0, m, n0 if edge.turn is None else ufl.dot(edge.turn, n0))
+
+
+def _works(model: ShellModel | MeridianModel, given: _Given) -> list[ufl.Form]:
     """The work of given stresses on the strains of u, and on edges as in C0 interior penalty; its gradient are forces.
 
     Smooth surfaces have no jumps, so that these need no memory: each step closes the edges that it opens.
     """
-    field, r0, u, t, m = given.field, surface.r0, surface.jet(model.u), surface.thickness, surface.m
+    factory, carrier, field = model.factory, model.factory.carrier, given.field
+    r0, u, t, m = carrier.j0, carrier.jet(model.u), factory.thickness, carrier.covector
     nu, h, sigma = model.material.nu, model.material.h, model.sigma
     D = densities.bending_stiffness(h, nu)
     up = kin.inverse_metric(r0)
@@ -286,7 +246,7 @@ def _works(model: ShellModel | MeridianModel, surface: Surface, given: _Given) -
 
     membrane = thick() * product(covariant(r0, field, 0), kin.membrane_strain(r0, u)) / (1 - nu**2)
     bending = thick() ** 3 * D * product(covariant(r0, field, 6), kin.curvature_change(r0, u))
-    work = (membrane + bending) * kin.area_ratio(r0) * surface.over[0]
+    work = (membrane + bending) * kin.area_ratio(r0) * carrier.dx()
 
     sides = ("+", "-")
     r0s, us = ([j.side(s) for s in sides] for j in (r0, u))
@@ -294,7 +254,7 @@ def _works(model: ShellModel | MeridianModel, surface: Surface, given: _Given) -
 
     def across(r: Jet) -> Expr:
         plus, minus = (r.side(s) for s in sides)
-        if surface.folded:
+        if factory.folded:
             return ufl.atan2(*edges.fold_angle(plus, minus, m("+")))
         return edges.fold_jump(plus, minus, conormals[0][:2], conormals[1][:2])
 
@@ -302,18 +262,19 @@ def _works(model: ShellModel | MeridianModel, surface: Surface, given: _Given) -
         each = zip(r0s, sides, conormals, strict=True)
         return sum(thick(s) ** 3 * D * densities.moment_of(of(j, s), j, a, b, nu) for j, s, (a, b, _) in each) / 2
 
-    between, at_ends = surface.widths
-    S_J, J = given.opened(surface, across), across(r0 + u)
+    between, at_ends = carrier.widths
+    S_J, J = given.opened(carrier, across), across(r0 + u)
     bent = moments(lambda j, s: kin.curvature_change(j, us[sides.index(s)]))
     stiff = (thick("+") ** 3 + thick("-") ** 3) / 2 * sigma * D / between
     edge = moments(lambda j, s: covariant(j, field(s), 6)) * J + S_J * (bent + stiff * J)
-    works = [work + edge * (conormals[0][2] + conormals[1][2]) / 2 * surface.over[1]]
+    works = [work + edge * (conormals[0][2] + conormals[1][2]) / 2 * carrier.dS()]
     nu1, nu2, stretch = kin.conormal(r0, m)
-    for end in surface.ends:
-        S_J, J = given.opened(surface, end.jump), end.jump(r0 + u)
+    for held_edge in factory.held:
+        jump, modelled_sides = _jump_of(held_edge, r0, m), 1 if held_edge.plane is None else 2
+        S_J, J = given.opened(carrier, jump), jump(r0 + u)
         M, bent = (
             densities.moment_of(K, r0, nu1, nu2, nu) for K in (covariant(r0, field, 6), kin.curvature_change(r0, u))
         )
-        edge = M * J + S_J * (bent + end.sides * sigma / at_ends * J)
-        works.append(thick() ** 3 * D * edge * stretch * end.along)
+        edge = M * J + S_J * (bent + modelled_sides * sigma / at_ends * J)
+        works.append(thick() ** 3 * D * edge * stretch * carrier.ds(held_edge.facets))
     return works

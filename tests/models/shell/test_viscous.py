@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 from magshell_fenicsx import Case, Scene, follow
 from magshell_fenicsx.input.source import CaseError, Source
 from magshell_fenicsx.parts.motion.mass import mass
-from magshell_fenicsx.parts.motion.on_surface import surface_of
 from magshell_fenicsx.parts.motion.viscous import Viscosity
 from magshell_fenicsx.runs.rows import columns
 
@@ -135,7 +134,7 @@ def test_rigid_motion_is_not_damped() -> None:
     """The velocity of a rotation about a tilted axis, of a strip that is turned already and was bent before."""
     scene = Scene(case_of({"viscosity": 1.0}, {"duration": 1.0}, symmetry="none"))
     model = scene.model
-    viscous = Viscosity(model, surface_of(model), {}, 1.0, [])  # type: ignore[arg-type]
+    viscous = Viscosity(model, {}, 1.0, [])  # type: ignore[arg-type]
     r0 = model.r0.x.array.reshape(-1, 3)
     bent = r0 + np.outer(0.1 * r0[:, 0] ** 2, [0, 0, 1])
     place = bent @ Rotation.from_rotvec([0.3, -0.8, 0.5]).as_matrix().T
