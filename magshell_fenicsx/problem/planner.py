@@ -138,6 +138,7 @@ def make_plan(case: Case, terms: Sequence[OwnTerm] = ()) -> Plan:
     included += [f"{key}: {flaw.account}" for key, flaw in found.items() if flaw.account]
     sample = sample if len(sample) else drawn.sample()
     plan = Plan(
+        context=context,
         material=material,
         loads=all_loads,
         conditions=conditions,
@@ -158,6 +159,7 @@ def make_plan(case: Case, terms: Sequence[OwnTerm] = ()) -> Plan:
         reactions=bool(all_loads.moves) if case.reactions is None else case.reactions,
         pressed=tuple((size, reach) for _, reach, size in touched),
         warning=sources_beside(case, sample) or _wrong_unit(case, sample),
+        lambda_m=case.lambda_m,
         unknowns=0.0 if span else unknowns_of(case, _cells(shape, size, half=half)),
     )
     refuse_twice(case, plan)

@@ -17,6 +17,8 @@ from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.parameters import Condition, Loads, Material
 from magshell_fenicsx.models.shell.patterns import Inside
 from magshell_fenicsx.models.shell.thickness import Thickness
+from magshell_fenicsx.parts.part import Context
+from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.problem.names import refuse_unfit
 from magshell_fenicsx.shape.turning import Span
 
@@ -27,6 +29,8 @@ class Plan:
 
     Attributes
     ----------
+    context
+        What its parts know: the shell, the named places in the shell's length, the programme.
     meridian
         What is modelled instead of the surface; None if that is modelled.
     mirror
@@ -50,10 +54,13 @@ class Plan:
         What is unphysical, if anything.
     within
         Name of the patch of each dimple -> whether places (n, 3) are within its rim.
+    lambda_m
+        |Br||Ba|/(mu_0 E); 0 without a field.
     unknowns
         About how many there will be, if the meridian is not modelled.
     """
 
+    context: Context
     material: Material
     loads: Loads
     conditions: dict[str, Condition]
@@ -74,7 +81,28 @@ class Plan:
     reactions: bool = False
     warning: str | None = None
     within: Mapping[str, Inside] = field(default_factory=dict)
+    lambda_m: float = 0.0
     unknowns: float = 0.0
+
+    @property
+    def programme(self) -> tuple[ProgrammeStep, ...]:
+        """Its steps; before a single load the natural shape grows, then the field."""
+        return tuple(self.context.steps)
+
+    @property
+    def listed(self) -> bool:
+        """Whether the programme is a list of steps, and no single load."""
+        return self.context.whole
+
+    @property
+    def time_unit(self) -> float | None:
+        """See `Context.time_unit`."""
+        return self.context.time_unit
+
+    @property
+    def modulus(self) -> float:
+        """Young's modulus in the unit that results are told in; 1 without one."""
+        return self.context.shell.modulus or 1.0
 
     @property
     def axisymmetric(self) -> bool:

@@ -85,7 +85,7 @@ def frequencies_after(result: Result, folder: Path, say: Say) -> None:
         states = {**start, result.end: result.last}
     elif isinstance(section.at, list) and (strange := sorted(set(section.at) - set(states))):
         say(f"warning: frequencies.at: the path has no point {', '.join(map(str, strange))}")
-    shell, own, unit = ShellModes(scene.model), own_wave(scene), scene.case.time_unit
+    shell, own, unit = ShellModes(scene.model), own_wave(scene), scene.plan.time_unit
     for number, state in states.items():
         state = rigid(scene, state)
         try:

@@ -161,10 +161,10 @@ def _run(
         scene.journal = Stoppable(NoJournal(), watch)
         try:
             _follow(result, files, say, progress, start, watch)
-            for step in scene.case.programme:
+            for step in scene.plan.programme:
                 if step.load.search and not any(int(result.rows[i]["step"]) == step.number for i in result.found):
                     say(f"warning: the search at the end of step {step.number} has found no further solution")
-            steps = scene.case.programme
+            steps = scene.plan.programme
             for said in (*imbalances(steps, result.rows, scene.model.system.length), *departures(steps, result.rows)):
                 say(f"warning: {said}")
             result.sensitivities = _sensitivities(result)
@@ -224,7 +224,7 @@ def _mesh_for_tolerance(case: Case, folder: Path | None, comm: MPI.Comm, say: Sa
 def _sensitivities(result: Result) -> dict[str, float]:
     """The sensitivities at the final fold, if the case requests them."""
     scene, last = result.scene, result.rows[result.end]
-    step = scene.case.programme[int(last["step"]) - 1] if last["label"] == "fold" else None
+    step = scene.plan.programme[int(last["step"]) - 1] if last["label"] == "fold" else None
     if step is None or not step.load.wants_sensitivities:
         return {}
     assert result.history.located
@@ -238,7 +238,7 @@ def _sensitivities(result: Result) -> dict[str, float]:
 
 def _barrier(result: Result) -> float | None:
     """The energy barrier that the last step has passed, if it was to."""
-    steps, begin = result.scene.case.programme, result.history.begin
+    steps, begin = result.scene.plan.programme, result.history.begin
     if not steps or steps[-1].until != "zero" or begin is None:
         return None
     assert result.history.last

@@ -73,7 +73,7 @@ class Aim:
 def aim(scene: Scene, step: ProgrammeStep) -> Aim:
     """The end of a step."""
     load, varied = step.load, amplitude(step.name)
-    if ahead := load.ahead(step, scene.case.context, scene.plan.loads, scene.plan.azimuth):
+    if ahead := load.ahead(step, scene.plan.context, scene.plan.loads, scene.plan.azimuth):
         return Aim(varied.column, ahead.end, ahead.words, ahead.steps)
     if step.until == "points":
         return Aim(varied.column, words=f"{load.points} steps", steps=load.points)
@@ -81,7 +81,7 @@ def aim(scene: Scene, step: ProgrammeStep) -> Aim:
         return Aim(varied.column, words=WORDS.get(step.until, ""))
     target, value = load.target
     if target.quantity == "load":
-        return Aim(varied.column, value * load.size(scene.case.context))
+        return Aim(varied.column, value * load.size(scene.plan.context))
     for room in seen():
         if column := room.conjugates(scene.plan.loads).get(step.name):
             return Aim(column, value)
@@ -137,7 +137,7 @@ class RunProgress:
 
     def __init__(self, scene: Scene, report: Callable[[str], None], start: float) -> None:
         self._scene, self._report, self._start = scene, report, start
-        self._aims = [replace(aim(scene, step), sizes=scene.sizes) for step in scene.case.programme]
+        self._aims = [replace(aim(scene, step), sizes=scene.sizes) for step in scene.plan.programme]
         self._row: Row = {}
         self._first: Row = {}
         self._step = 1
@@ -169,7 +169,7 @@ class RunProgress:
         times = clock(now - self._start)
         if left is not None:
             times += f", about {clock(max(0.0, left - (now - self._here[1])))} left"
-        of = f" in step {self._step} of {len(self._aims)}" if isinstance(self._scene.case.loading, list) else ""
+        of = f" in step {self._step} of {len(self._aims)}" if self._scene.plan.listed else ""
         ahead = self._aim.text(self._row) if self._aim else ""
         self._report(f"{self._count}{of}  {ahead}  step {step:.2g} h  {times}")
 
@@ -187,6 +187,6 @@ class RunProgress:
     @property
     def _branched(self) -> bool:
         """Whether the case requests branches; their number is not known in advance."""
-        steps = self._scene.case.programme
+        steps = self._scene.plan.programme
         load = steps[self._step - 1].load if steps else None
         return load is not None and load.branch_points > 0

@@ -119,7 +119,7 @@ class Result:
     @property
     def knockdown(self) -> float | None:
         """k_d: p/p_c at the first instability under pressure; None if there is none, or at held volume."""
-        at_volume = {step.number for step in self.scene.case.programme if step.name in step.load.hold}
+        at_volume = {step.number for step in self.scene.plan.programme if step.name in step.load.hold}
         points = (row for row in self.rows if row["label"] in LOCATED and row["amplitude"] == "pressure")
         return next((float(p["p_over_pc"]) for p in points if not p["branch"] and p.get("step") not in at_volume), None)
 
@@ -142,7 +142,7 @@ def summary(result: Result, total_s: float) -> dict[str, Any]:
     """The content of summary.json."""
     scene = result.scene
     material, model, newton = scene.plan.material, scene.model, scene.newton
-    R_over_h, time_unit = 1 / material.h, scene.case.time_unit
+    R_over_h, time_unit = 1 / material.h, scene.plan.time_unit
     return {
         "case": (result.adapted.asked if result.adapted else scene.case).model_dump(mode="json", exclude_none=True),
         FILE: scene.case.file_name,
@@ -151,8 +151,8 @@ def summary(result: Result, total_s: float) -> dict[str, Any]:
         "dimensionless": {
             "radius_to_thickness": R_over_h,
             "poisson_ratio": material.nu,
-            "lambda_m": scene.case.lambda_m,
-            "Lambda_m": scene.case.lambda_m * R_over_h,
+            "lambda_m": scene.plan.lambda_m,
+            "Lambda_m": scene.plan.lambda_m * R_over_h,
             "pc_over_E": material.classical_pressure,
             "energy_unit": "E h R^2",
         },

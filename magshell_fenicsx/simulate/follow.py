@@ -41,7 +41,7 @@ def follow(scene: Scene, *, search: bool = True, remark: Callable[[str], None] =
     Stopped
         If a path is lost, a step before the last ends at an instability, or the field alone makes the shell unstable.
     """
-    state, steps = scene.unloaded(), scene.case.programme
+    state, steps = scene.unloaded(), scene.plan.programme
     try:
         _refuse_not_numbers(scene, state, "")
     except Stopped:
@@ -54,7 +54,7 @@ def follow(scene: Scene, *, search: bool = True, remark: Callable[[str], None] =
             f"the undeformed shell is unstable in {pivots} directions: mesh.penalty is too small or the mesh too coarse"
         )
     for step in steps:
-        where = f"step {step.number} of {len(steps)} ({step.kind}): " if isinstance(scene.case.loading, list) else ""
+        where = f"step {step.number} of {len(steps)} ({step.kind}): " if scene.plan.listed else ""
         scene.progress.beginning(step.number)
         _refuse_not_numbers(scene, state, where)
         walked, last, record, first = Walked(records_of(scene, step, state)), "", None, None

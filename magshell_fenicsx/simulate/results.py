@@ -104,12 +104,12 @@ def in_units(scene: Scene, state: State, of: str) -> tuple[str, str]:
 
 def _displacements(scene: Scene) -> dict[str, tuple[str, int]]:
     """Columns of named points -> the point and the axis."""
-    return {f"{point}_u{axis}": (point, i) for point in scene.case.points for i, axis in enumerate("xyz")}
+    return {f"{point}_u{axis}": (point, i) for point in scene.plan.context.points for i, axis in enumerate("xyz")}
 
 
 def force_unit(scene: Scene) -> float:
     """E h R^2 over R in the case's unit of force."""
-    return (scene.case.shell.modulus or 1.0) * scene.plan.material.h * scene.plan.length**2
+    return scene.plan.modulus * scene.plan.material.h * scene.plan.length**2
 
 
 def _forces(scene: Scene) -> dict[str, tuple[str, int]]:

@@ -3,6 +3,7 @@
 import time
 from collections import defaultdict
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cached_property
 from math import copysign, nan
 from pathlib import Path
@@ -110,7 +111,7 @@ class Scene:
         """The same model and solver for a case that differs by the strength of the field alone."""
         found = object.__new__(Scene)
         known = {name: of for name, of in vars(self).items() if name not in vars(Scene)}  # what is cached is found anew
-        vars(found).update(known, case=case)
+        vars(found).update(known, case=case, plan=replace(self.plan, context=case.context, lambda_m=case.lambda_m))
         return found
 
     @property
@@ -181,7 +182,7 @@ class Scene:
         """The physical columns of a table row: loads, displacements over h, volume, energies over E h R^2."""
         self.refuse_foreign(state, more=True)
         model, h, loads, sight = self.model, self.plan.material.h, self.model.loads, self.sight
-        force, sense = loads.forces.get("force"), copysign(1.0, self.case.lambda_m)
+        force, sense = loads.forces.get("force"), copysign(1.0, self.plan.lambda_m)
         energies = self.energies(state)
         pole = model.deflection(state.u, "pole") / h
         columns = defaultdict[str, float](float)
@@ -256,8 +257,8 @@ class Scene:
     @property
     def sight(self) -> Sight:
         """What rooms of parts see of it."""
-        plan, modulus = self.plan, self.case.shell.modulus or 1.0
-        return Sight(self.model, plan.length, modulus, plan.mirror, plan.azimuth, plan.reactions)
+        plan = self.plan
+        return Sight(self.model, plan.length, plan.modulus, plan.mirror, plan.azimuth, plan.reactions)
 
     def conjugate_unit(self, name: str) -> float:
         """-dPi/dmu of one unit of a target: ΔV/R³ of a pressure, w/h of a force, the shell's length of dead loads."""
@@ -267,7 +268,7 @@ class Scene:
     def _observe_points(self, state: State) -> dict[str, float]:
         """The displacements of named points in the unit of the shell's lengths."""
         found: dict[str, float] = {}
-        for point in self.case.points:
+        for point in self.plan.context.points:
             u = self.plan.length * self.model.displacement(state.u, point) @ rotation(self.plan.azimuth)
             found |= {f"{point}_u{axis}": float(c) for axis, c in zip("xyz", u, strict=True)}
         return found

@@ -46,7 +46,7 @@ def fold_at(scene: Scene, record: Record) -> Fold:
 
 def stage_at(scene: Scene, record: Record) -> Stage:
     """The solver of a record's step, which holds what the step holds."""
-    return stage_of(scene, scene.case.programme[record.step - 1], record.point.state) if record.step else plain(scene)
+    return stage_of(scene, scene.plan.programme[record.step - 1], record.point.state) if record.step else plain(scene)
 
 
 def sensitivities(scene: Scene, fold: Fold, record: Record | None = None) -> dict[str, float]:

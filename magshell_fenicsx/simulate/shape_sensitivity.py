@@ -75,7 +75,7 @@ def _derivative(stage: Stage, fold: Fold, key: str, name: str) -> float:
 
     grown = [
         fold.state.mu[of]
-        for of, keys in grown_by(scene.case.programme, scene.case.imperfections).items()
+        for of, keys in grown_by(scene.plan.programme, scene.case.imperfections).items()
         if key in keys
     ]
     return (grown or [1.0])[0] * (out_of_balance(step) - out_of_balance(-step)) / (2 * step)

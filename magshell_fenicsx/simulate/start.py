@@ -29,7 +29,7 @@ def pushed(scene: Scene, push: PushSection, state: State, v: Vector) -> tuple[Ve
     if abs(inward) < SMALL:
         inward = dot(comm, phi, phi**2)
     h = np.copysign(scene.plan.material.h, inward)
-    return state.u + push.displacement * h * phi, v + push.velocity * (scene.case.time_unit or 1.0) * h * phi
+    return state.u + push.displacement * h * phi, v + push.velocity * (scene.plan.time_unit or 1.0) * h * phi
 
 
 def by_formula(scene: Scene, components: Sequence[str]) -> Vector:
@@ -37,5 +37,5 @@ def by_formula(scene: Scene, components: Sequence[str]) -> Vector:
     model, R, Q = scene.model, scene.plan.length, rotation(scene.plan.azimuth)
     axes = [0, 2] if isinstance(model, MeridianModel) else [0, 1, 2]
     places = in_space(model.r0.x.array, len(axes))
-    found = vectors_of(components)(R * places @ Q) @ Q.T * (scene.case.time_unit or 1.0) / R
+    found = vectors_of(components)(R * places @ Q) @ Q.T * (scene.plan.time_unit or 1.0) / R
     return np.asarray(model.system.held(np.ascontiguousarray(found[:, axes]).ravel()[: model.system.size]))

@@ -103,7 +103,7 @@ def _here(scene: Scene, step: ProgrammeStep, state: State) -> Here:
 
     return Here(
         step,
-        scene.case.context,
+        scene.plan.context,
         plan.loads,
         plan.azimuth,
         plan.material.h,

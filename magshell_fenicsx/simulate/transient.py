@@ -180,7 +180,7 @@ def released(scene: Scene, snap: SnapSection, fold: Record, held: Mapping[str, H
     """
     if fold.label != "fold" or fold.mode:
         raise Stopped(f"then: snap: the step ends at a {fold.mode or fold.label}, not at a fold of the model itself")
-    state, system, unit = fold.point.state, scene.model.system, scene.case.time_unit or 1.0
+    state, system, unit = fold.point.state, scene.model.system, scene.plan.time_unit or 1.0
     own = [mode.eigenvalue for mode in ShellModes(scene.model).lowest(state, 3) if not mode.label]
     omega = float(np.sqrt(max(own[1:])))
     load = TimeSection(

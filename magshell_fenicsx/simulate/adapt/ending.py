@@ -81,7 +81,7 @@ class History:
         NoResult
             If the history stopped before its target and not at an instability, or has no load.
         """
-        steps = scene.case.programme
+        steps = scene.plan.programme
         until = steps[-1].until if steps else "target"
         if (
             until in ("target", "points", "zero")
@@ -161,7 +161,7 @@ def _equilibrium(scene: Scene, guess: State, near: Ending) -> Ending | None:
 
 
 def _target(scene: Scene, record: Record) -> Ending:
-    system, state, target = scene.newton.system, record.point.state, scene.case.programme[-1].load.target
+    system, state, target = scene.newton.system, record.point.state, scene.plan.programme[-1].load.target
     name = "lambda_across" if record.amplitude == "angle" else record.amplitude
     by_conjugate = target is None or target[0].quantity == "conjugate"
     held = -system.potential(state.u, state.mu, name) if by_conjugate and record.amplitude not in FIELDS else None

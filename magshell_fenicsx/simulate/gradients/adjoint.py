@@ -188,7 +188,7 @@ def adjoint_of_instability(scene: Scene, record: Record, fold: Fold | None = Non
 
 def _of_wave(scene: Scene, record: Record) -> Adjoint:
     model, m = scene.model, int(record.mode.removeprefix(WAVE))
-    if record.step and scene.case.programme[record.step - 1].load.hold:
+    if record.step and scene.plan.programme[record.step - 1].load.hold:
         raise CaseError(f"instability: {record.mode}: not while a conjugate is held")
     assert isinstance(model, MeridianModel)
     system, waves, state = model.system, model.excluded_modes.waves, model.system.placed(record.point.state)
@@ -260,10 +260,10 @@ def with_begins(adjoint: Adjoint, record: Record, begins: Begins) -> Adjoint:
     while record.step:
         place, step, system = (
             part.places[0] if part else None,
-            scene.case.programme[record.step - 1],
+            scene.plan.programme[record.step - 1],
             scene.model.system,
         )
-        earlier = scene.case.programme[: record.step - 1]
+        earlier = scene.plan.programme[: record.step - 1]
         driven |= _driven(step, record.point.state.mu)
         held = {name: place.rows[name] for name in held_by_step(step) if place.rows.get(name)} if place else {}
         if record.step not in begins:
@@ -372,7 +372,7 @@ def held_at(
 ) -> dict[str, float | Conjugate]:
     """Amplitude -> its conjugate, of those that are unknown."""
     held = dict[str, float | Conjugate]()
-    step = scene.case.programme[record.step - 1] if record.step else None
+    step = scene.plan.programme[record.step - 1] if record.step else None
     if hold is None and step:
         held |= held_by(scene, step, state)
         if step.load.by_conjugate(at_target=record.label == "target"):

@@ -43,7 +43,7 @@ def adjoint_of_barrier(scene: Scene, begin: Record | None, end: Record, begins: 
     refuse_no_barrier(scene.case)
     if begin is None:
         raise CaseError("barrier: give the record before the last step")
-    system, step, whole = scene.model.system, scene.case.programme[-1], scene.model.multiplicity
+    system, step, whole = scene.model.system, scene.plan.programme[-1], scene.model.multiplicity
     before, after = (system.placed(record.point.state) for record in (begin, end))
     held, change = held_at(scene, end, after), dict[str, float]()
     for name, conjugate in held.items():

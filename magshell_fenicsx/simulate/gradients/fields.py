@@ -201,7 +201,7 @@ def _with_field(adjoint: Adjoint, name: str) -> Scene:
         return Scene(scene.case, scene.comm, replace(plan, thickness=Thickness()))
     loads, natural = plan.loads, plan.loads.natural
     if name == "curvature" and (natural is None or natural.curvature is None):
-        bent = Natural(np.zeros(3), natural.stretch if natural else None, frame(scene.case.context, plan.azimuth))
+        bent = Natural(np.zeros(3), natural.stretch if natural else None, frame(scene.plan.context, plan.azimuth))
         return Scene(scene.case, scene.comm, replace(plan, loads=replace(loads, natural=bent)))
     magnetic = loads.magnetic
     if adjoint.directions and FIELDS[name].coefficient == "Br" and magnetic and not callable(magnetic.remanent):
