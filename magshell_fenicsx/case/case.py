@@ -11,14 +11,9 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import Field, ModelWrapValidatorHandler, ValidationError, model_validator
 
-from magshell_fenicsx.case.frequencies import FrequenciesSection
-from magshell_fenicsx.case.gradients import GradientsSection
 from magshell_fenicsx.case.loading import Loading, listed, programme, refuse_unfit_steps
-from magshell_fenicsx.case.mesh import SOLID_DEGREE, MeshSection
 from magshell_fenicsx.case.output import OutputSection
 from magshell_fenicsx.case.patches import refuse_strange
-from magshell_fenicsx.case.solid import SolidSection
-from magshell_fenicsx.case.stability import StabilitySection
 from magshell_fenicsx.input.chosen import Chosen
 from magshell_fenicsx.input.expressions import is_formula
 from magshell_fenicsx.input.file import FileKeys, digests
@@ -39,6 +34,8 @@ from magshell_fenicsx.parts.part import Context, Part, Scales
 from magshell_fenicsx.parts.registered import PARTS, WithParts
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.parts.supports.boundary import EDGES, BoundarySection, refuse_taken
+from magshell_fenicsx.problem.elements import SOLID_DEGREE, MeshSection, SolidSection
+from magshell_fenicsx.problem.wanted import FrequenciesSection, GradientsSection, StabilitySection
 from magshell_fenicsx.shape.ground import Coordinates
 from magshell_fenicsx.shape.sections import CapSurface, MeshSurface, RevolutionSurface, Surface, SurfaceSection
 from magshell_fenicsx.shape.shell import ShellSection

@@ -8,7 +8,7 @@ from magshell_fenicsx.mesh.mirror import Mirror, plane_text
 from magshell_fenicsx.models.shell.parameters import Loads
 from magshell_fenicsx.parts.imperfections.rims import MOST_RIMS
 from magshell_fenicsx.parts.registered import PARTS, accounts
-from magshell_fenicsx.problem.body import layers, neo_hookean
+from magshell_fenicsx.problem.body import Body, body_of
 from magshell_fenicsx.shape.sections import MeshSurface
 
 SHOWN = 6  # of many imperfections
@@ -26,7 +26,8 @@ def account(case: Case, loads: Loads, model: str, mirror: Mirror | None, rims: i
     rims
         Number of different rims beside the pole.
     """
-    included = [model, "membrane and bending energy" if case.model == "shell" else _elastic(case)]
+    body = body_of(case.context)
+    included = [model, _elastic(body) if body else "membrane and bending energy"]
     left_out = list[str]()
     for room in accounts(case.context, loads):
         included += room.included
@@ -67,8 +68,8 @@ def _imperfections(case: Case, rims: int) -> str:
     return f"imperfections: {', '.join(found)}{beside}"
 
 
-def _elastic(case: Case) -> str:
-    material, count = neo_hookean(case), len(layers(case)) - 1
+def _elastic(body: Body) -> str:
+    material, count = body.material, len(body.layers) - 1
     ratio = material.bulk / material.shear
     small_strains = f"E = {material.youngs_modulus:.5g}, nu = {material.nu:.5g} for small strains"
     return f"neo-Hookean energy, kappa/mu = {ratio:.5g} ({small_strains}), {count} layer{'s' * (count > 1)}"

@@ -14,8 +14,8 @@ from magshell_fenicsx.problem.body import layers
 from magshell_fenicsx.problem.formulas import cells_of_patch, unshown, written
 from magshell_fenicsx.problem.limits import refuse_beyond_memory
 from magshell_fenicsx.problem.names import open_edges
-from magshell_fenicsx.problem.planner import make_plan, meridian_vertices
-from magshell_fenicsx.problem.problem import Plan
+from magshell_fenicsx.problem.planner import make_plan
+from magshell_fenicsx.problem.problem import Plan, meridian_vertices
 from magshell_fenicsx.shape.outline import outline
 
 
@@ -121,10 +121,10 @@ def _count(case: Case, plan: Plan, patch: PatchMesh | None) -> tuple[int, int]:
     """Cells and unknowns of the mesh, or of the meridian."""
     k = case.degree
     if patch is None:
-        return (count := len(meridian_vertices(plan, case)) - 1), 2 * (k * count + 1)
+        return (count := len(meridian_vertices(plan)) - 1), 2 * (k * count + 1)
     cells, corners = patch.corners, len(np.unique(patch.corners))
     sides = len(np.unique(np.sort(cells[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0))
     if case.model == "solid":  # three hexahedra a layer above each triangle
-        count = len(layers(case)) - 1
+        count = len(layers(case.context)) - 1
         return 3 * len(cells) * count, 3 * (2 * count + 1) * (corners + 3 * sides + 7 * len(cells))
     return len(cells), 3 * (corners + (k - 1) * sides + (k - 1) * (k - 2) // 2 * len(cells))

@@ -59,7 +59,7 @@ def unknowns_of(case: Case, cells: float) -> float:
 
     The body over it brings three hexahedra of degree 2 in each layer.
     """
-    return cells * (36 * (2 * len(layers(case)) - 1) if case.model == "solid" else 1.5 * case.degree**2)
+    return cells * (36 * (2 * len(layers(case.context)) - 1) if case.model == "solid" else 1.5 * case.degree**2)
 
 
 def refuse_beyond_memory(case: Case, plan: Plan, ranks: int = 1, here: int = 1) -> str | None:

@@ -2,7 +2,7 @@
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
-from math import inf, sqrt
+from math import inf
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,6 @@ from magshell_fenicsx.mesh.grid import Grid, RimmedGrid
 from magshell_fenicsx.mesh.mirror import CUT, Y0, Mirror, rotation
 from magshell_fenicsx.mesh.msh import MeshFile, cell_count
 from magshell_fenicsx.mesh.shapes import DiscShape, StripShape
-from magshell_fenicsx.models.axisymmetric.meridian import graded_vertices
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.parameters import Condition, Held, Loads, Material
 from magshell_fenicsx.models.shell.thickness import Thickness
@@ -28,6 +27,7 @@ from magshell_fenicsx.parts.part import Ability, Modelled
 from magshell_fenicsx.parts.registered import STEPS
 from magshell_fenicsx.parts.supports.boundary import BoundarySection, EdgeCondition, HeldSection
 from magshell_fenicsx.problem.account import account
+from magshell_fenicsx.problem.body import body_of
 from magshell_fenicsx.problem.columns import refuse_twice
 from magshell_fenicsx.problem.formulas import (
     looked_at,
@@ -49,7 +49,6 @@ from magshell_fenicsx.shape.symmetry import Leaves, askew, mirror, of_energy, of
 
 Array = NDArray[np.float64]
 Points = dict[str, Array]
-PRESSED = 0.08  # of sqrt(Rh): cells of a meridian that show the ring of a contact
 FAR_FROM_ONE = 50.0  # times the radius, or a part of it: a surface as long as that hints at another unit
 
 
@@ -139,6 +138,8 @@ def make_plan(case: Case, terms: Sequence[OwnTerm] = ()) -> Plan:
     sample = sample if len(sample) else drawn.sample()
     plan = Plan(
         context=context,
+        mesh=case.mesh,
+        body=body_of(context),
         material=material,
         loads=all_loads,
         conditions=conditions,
@@ -221,27 +222,6 @@ def edge_conditions(boundary: BoundarySection, turn: float) -> dict[str, Conditi
         name: Held(tuple(_turned(c.components, turn))) if isinstance(c, HeldSection) else terms[c]
         for name, c in boundary.conditions().items()
     }
-
-
-def meridian_vertices(plan: Plan, case: Case) -> Array:
-    """Vertices of the meridian's mesh, in the chart."""
-    span = plan.meridian
-    assert span
-    if span.vertices is not None:
-        return span.vertices
-    pole = span.names[0] is None
-    h = plan.material.h / span.curvature
-    reach = max((one[1] for one in plan.pressed), default=0.0)
-    return graded_vertices(
-        span.length,
-        span.circles,
-        min([h, *(size / 3 for size, _ in plan.pressed)]),
-        refinement=case.mesh.refinement,
-        axis=pole,
-        largest=min(0.2 * sqrt(h), span.largest),
-        pressed=((reach if pole else span.length), PRESSED * sqrt(h)) if reach else None,
-        everywhere=case.mesh.size and case.mesh.size / case.shell.reference,
-    )
 
 
 def imperfect(perfect: Outline, found: Mapping[str, Flaw], turn: float, still: Collection[str]) -> Outline:

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from math import sqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,14 +14,19 @@ from magshell_fenicsx.mesh.msh import MeshFile, read_msh
 from magshell_fenicsx.mesh.patch import Embedding, PatchMesh
 from magshell_fenicsx.mesh.shapes import Shape
 from magshell_fenicsx.mesh.triangulation import triangulate
+from magshell_fenicsx.models.axisymmetric.meridian import graded_vertices
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.parameters import Condition, Loads, Material
 from magshell_fenicsx.models.shell.patterns import Inside
 from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.parts.part import Context
 from magshell_fenicsx.parts.step import ProgrammeStep
+from magshell_fenicsx.problem.body import Body
+from magshell_fenicsx.problem.elements import MeshSection
 from magshell_fenicsx.problem.names import refuse_unfit
 from magshell_fenicsx.shape.turning import Span
+
+PRESSED = 0.08  # of sqrt(Rh): cells of a meridian that show the ring of a contact
 
 
 @dataclass(frozen=True)
@@ -31,6 +37,10 @@ class Plan:
     ----------
     context
         What its parts know: the shell, the named places in the shell's length, the programme.
+    mesh
+        The elements that are asked for.
+    body
+        What a solid is made of; None of a shell.
     meridian
         What is modelled instead of the surface; None if that is modelled.
     mirror
@@ -61,6 +71,8 @@ class Plan:
     """
 
     context: Context
+    mesh: MeshSection
+    body: Body | None
     material: Material
     loads: Loads
     conditions: dict[str, Condition]
@@ -141,3 +153,24 @@ class Plan:
             patch = triangulate(self.shape, self.size, self.points, self.embedding)
         whole = isinstance(self.shape, Grid | RimmedGrid)  # other shapes are made as halves
         return cut(patch, self.mirror) if self.mirror and whole else patch
+
+
+def meridian_vertices(plan: Plan) -> NDArray[np.float64]:
+    """Vertices of the meridian's mesh, in the chart."""
+    span = plan.meridian
+    assert span
+    if span.vertices is not None:
+        return span.vertices
+    pole = span.names[0] is None
+    h = plan.material.h / span.curvature
+    reach = max((one[1] for one in plan.pressed), default=0.0)
+    return graded_vertices(
+        span.length,
+        span.circles,
+        min([h, *(size / 3 for size, _ in plan.pressed)]),
+        refinement=plan.mesh.refinement,
+        axis=pole,
+        largest=min(0.2 * sqrt(h), span.largest),
+        pressed=((reach if pole else span.length), PRESSED * sqrt(h)) if reach else None,
+        everywhere=plan.mesh.size and plan.mesh.size / plan.length,
+    )

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 
-from magshell_fenicsx.case.stability import StabilitySection
 from magshell_fenicsx.continuation.modes import ModesNotFound
 from magshell_fenicsx.continuation.system import State, Vector
 from magshell_fenicsx.models.modes import ShellMode, ShellModes
@@ -17,6 +16,7 @@ from magshell_fenicsx.output.fields.surface import Surface
 from magshell_fenicsx.output.fields.vtu import About
 from magshell_fenicsx.output.store.durable import write_whole
 from magshell_fenicsx.output.store.folder import by_first
+from magshell_fenicsx.problem.wanted import StabilitySection
 from magshell_fenicsx.quantities.registry import OWN_MODES
 from magshell_fenicsx.runs.summary import Result
 from magshell_fenicsx.simulate.scene import Scene

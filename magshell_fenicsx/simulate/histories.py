@@ -3,12 +3,13 @@
 from collections.abc import Collection
 from functools import partial
 
-from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.section import in_units
 from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.parts.magnetism.fields import MagneticSection
 from magshell_fenicsx.parts.motion.history import Curve, Level, Time, curve, marks, times_of
 from magshell_fenicsx.parts.motion.step import TimeSection
+from magshell_fenicsx.problem.problem import Plan
 
 CLOSE = 1e-5  # of the shortest time of a history: a difference by time
 SAME = 1e-9
@@ -19,17 +20,18 @@ def own_time(value: Time) -> float:
     return float(in_units("second")(value))
 
 
-def time_of(case: Case, value: Time) -> float:
+def time_of(plan: Plan, value: Time) -> float:
     """A time over R sqrt(rho/E)."""
-    return own_time(value) / (case.time_unit or 1.0)
+    return own_time(value) / (plan.time_unit or 1.0)
 
 
-def level_of(case: Case, name: str, value: Level) -> float:
+def level_of(plan: Plan, name: str, value: Level) -> float:
     """A value of a history as an amplitude."""
     if name != "lambda_m":
         return float(value)
-    applied = case.magnetic.applied.flux_density if case.magnetic else None
-    return case.lambda_m * (float(in_units("tesla")(value)) / (applied or 1.0) if isinstance(value, str) else value)
+    magnetic = plan.context.of(MagneticSection)
+    applied = magnetic.applied.flux_density if magnetic else None
+    return plan.lambda_m * (float(in_units("tesla")(value)) / (applied or 1.0) if isinstance(value, str) else value)
 
 
 def _scaled(of: Curve, size: float, unit: float) -> Curve:
@@ -50,15 +52,15 @@ class LoadsInTime:
         If one of these does at the begin.
     """
 
-    def __init__(self, case: Case, load: TimeSection, state: State, motions: Collection[str]) -> None:
-        self._mu, time = dict(state.mu), partial(time_of, case)
+    def __init__(self, plan: Plan, load: TimeSection, state: State, motions: Collection[str]) -> None:
+        self._mu, time = dict(state.mu), partial(time_of, plan)
         histories = dict(zip(load.drives, load.history.values(), strict=True))
-        unit = case.time_unit or 1.0
+        unit = plan.time_unit or 1.0
         self._curves, self.marks = dict[str, Curve](), set[float]()
         for name, history in histories.items():
             # histories are in the case's own unit of time
-            of = curve(history, own_time, partial(level_of, case, name), state.mu[name])
-            size = case.lambda_m if isinstance(history, str) and name == "lambda_m" else 1.0
+            of = curve(history, own_time, partial(level_of, plan, name), state.mu[name])
+            size = plan.lambda_m if isinstance(history, str) and name == "lambda_m" else 1.0
             self._curves[name] = _scaled(of, size, unit)
             self.marks |= set(marks(history, time, time(load.duration)))
             first, here = self._curves[name](0.0, False), state.mu[name]

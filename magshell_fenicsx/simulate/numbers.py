@@ -13,7 +13,6 @@ import numpy as np
 from pydantic import ValidationError
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.gradients import FIELDS
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.section import number_and_unit, si_size
 from magshell_fenicsx.input.source import CaseError
@@ -22,6 +21,7 @@ from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.parts.imperfections.imperfection import LocalSection
 from magshell_fenicsx.problem.planner import make_plan
 from magshell_fenicsx.problem.problem import Plan
+from magshell_fenicsx.problem.wanted import FIELDS
 from magshell_fenicsx.simulate.scene import Scene
 
 OF_MATERIAL = ("density", "poisson_ratio", "radius_to_thickness", "thickness", "youngs_modulus", "thickness_factor")

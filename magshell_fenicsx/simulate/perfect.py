@@ -7,7 +7,6 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.mesh import MeshSection
 from magshell_fenicsx.continuation.modes import ModesNotFound
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError
@@ -18,6 +17,7 @@ from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.parts.imperfections.imperfection import in_frame
 from magshell_fenicsx.parts.imperfections.modes import Mirrored, ModesSection, Shape, on_meridian, on_surface
 from magshell_fenicsx.platform import compat
+from magshell_fenicsx.problem.elements import MeshSection
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.record import Stopped
 from magshell_fenicsx.simulate.scene import Scene

@@ -92,11 +92,11 @@ class Scene:
         self.warnings = [said for said in (self.plan.warning, _beyond_memory(case, self.plan, comm)) if said]
         self.model: ShellModel | MeridianModel | SolidModel
         if self.plan.axisymmetric:
-            self.model = build_meridian_model(case, self.plan)
-        elif case.model == "solid":
-            self.model = build_solid_model(case, self.plan, comm)
+            self.model = build_meridian_model(self.plan)
+        elif self.plan.body:
+            self.model = build_solid_model(self.plan, comm)
         else:
-            self.model = build_model(case, self.plan, comm)
+            self.model = build_model(self.plan, comm)
         if not (self.plan.fixed or isinstance(self.model, MeridianModel)):
             refuse_loose(self.model.system, self.model.r0, self.unloaded().mu)
         # a body's penetration changes over far less than h: factors of a state near by are no tangent's, and the first

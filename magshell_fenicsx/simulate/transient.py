@@ -57,9 +57,9 @@ def motion(scene: Scene, load: TimeSection, state: State, held: Mapping[str, Hel
     Stopped
         If steps in time become too small, or the shell does not come to rest.
     """
-    case, system = scene.case, scene.model.system
-    loads = LoadsInTime(case, load, state, scene.motions)
-    drag = float(in_units("1/second")(load.drag)) * (case.time_unit or 1.0)
+    plan, system = scene.plan, scene.model.system
+    loads = LoadsInTime(plan, load, state, scene.motions)
+    drag = float(in_units("1/second")(load.drag)) * (plan.time_unit or 1.0)
     u, v = state.u, state.v if isinstance(state, Moving) else 0.0 * state.u
     if load.push:
         u, v = pushed(scene, load.push, state, v)
@@ -83,8 +83,8 @@ def motion(scene: Scene, load: TimeSection, state: State, held: Mapping[str, Hel
         return integrator, integrator.begin(0.0, u, v)
 
     integrator, now = begin()
-    ground, duration = integrator.ground, time_of(case, load.duration)
-    fixed = None if load.step is None else time_of(case, load.step)
+    ground, duration = integrator.ground, time_of(plan, load.duration)
+    fixed = None if load.step is None else time_of(plan, load.step)
     steps = TimeSteps(fixed, load.tolerance, fixed or duration / load.points / 10, load.balance)
     dt, most = steps.first, integrator.kinetic(now)
     total = most + system.stored(now.u, now.mu)
@@ -110,7 +110,7 @@ def motion(scene: Scene, load: TimeSection, state: State, held: Mapping[str, Hel
         kinetic = integrator.kinetic(now)
         most = max(most, kinetic)
         clock = {
-            "time": now.t * (case.time_unit or 1.0),
+            "time": now.t * (plan.time_unit or 1.0),
             "kinetic": scene.model.multiplicity * kinetic,
             "dissipated": scene.model.multiplicity * now.dissipated,
             "work": scene.model.multiplicity * now.work,
@@ -153,16 +153,16 @@ def _watched(scene: Scene, event: EventSection | None, state: State) -> Callable
 
 def viscosity(scene: Scene, state: State) -> Viscosity | None:
     """Of the shell at rest in a state; None without."""
-    case, shell = scene.case, scene.case.shell
+    plan, shell = scene.plan, scene.plan.context.shell
     if shell.viscosity is None and not shell.relaxation:
         return None
     model, found = scene.model, list[Branch]()
     for branch in shell.relaxation:
         size = float(in_units("pascal")(branch.modulus))
         ratio = size / (shell.youngs_modulus or 1.0) if isinstance(branch.modulus, str) else size
-        found.append(Branch(ratio, time_of(case, branch.time)))
+        found.append(Branch(ratio, time_of(plan, branch.time)))
     assert isinstance(model, ShellModel | MeridianModel)
-    return Viscosity(model, state.mu, time_of(case, shell.viscosity or 0.0), found)
+    return Viscosity(model, state.mu, time_of(plan, shell.viscosity or 0.0), found)
 
 
 def released(scene: Scene, snap: SnapSection, fold: Record, held: Mapping[str, Held]) -> Records:

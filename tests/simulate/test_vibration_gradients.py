@@ -82,7 +82,7 @@ def test_hertz(tmp_path: Path) -> None:
     )
     last = solved(scene)
     found = gradient(scene, last, of="hertz_1", by=["shell.density", "lambda_m"])
-    hertz = frequency(scene.case, "hertz_1", omega2(scene, last, "omega2_1"))
+    hertz = frequency(scene.plan, "hertz_1", omega2(scene, last, "omega2_1"))
     assert found["shell.density"] == pytest.approx(-hertz / 2 / 1100, rel=1e-7)
     by_square = gradient(scene, last, of="omega2_1", by=["lambda_m"])["lambda_m"]
     assert found["lambda_m"] == pytest.approx(by_square * hertz / (2 * omega2(scene, last, "omega2_1")), rel=1e-9)

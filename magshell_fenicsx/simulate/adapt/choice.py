@@ -8,7 +8,7 @@ import numpy as np
 from mpi4py import MPI
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.solid import SolidSection
+from magshell_fenicsx.problem.elements import SolidSection
 from magshell_fenicsx.problem.planner import make_plan
 from magshell_fenicsx.problem.problem import Plan
 from magshell_fenicsx.simulate.adapt.size import Sampled

@@ -10,9 +10,8 @@ import numpy as np
 from mpi4py import MPI
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.mesh import SOLID_DEGREE
-from magshell_fenicsx.case.solid import SolidSection
 from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.problem.elements import SOLID_DEGREE, SolidSection
 from magshell_fenicsx.simulate.adapt.choice import Adapted, Choice, Round
 from magshell_fenicsx.simulate.adapt.ending import NoResult, by_path
 

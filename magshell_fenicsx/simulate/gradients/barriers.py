@@ -9,8 +9,8 @@ with the conjugates q_i that the probing holds: they are those of its begin, whe
 
 import numpy as np
 
-from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.problem.problem import Plan
 from magshell_fenicsx.simulate.barrier import barrier
 from magshell_fenicsx.simulate.gradients.adjoint import NONE, Adjoint, Begins, Place, held_at, solved, with_begins
 from magshell_fenicsx.simulate.record import Record
@@ -20,7 +20,7 @@ from magshell_fenicsx.simulate.scene import Scene
 BARRIER = "barrier"
 
 
-def refuse_no_barrier(case: Case) -> None:
+def refuse_no_barrier(plan: Plan) -> None:
     """See that a case ends where a probing force is zero again.
 
     Raises
@@ -28,7 +28,7 @@ def refuse_no_barrier(case: Case) -> None:
     CaseError
         If it does not.
     """
-    if not case.programme or case.programme[-1].until != "zero":
+    if not plan.programme or plan.programme[-1].until != "zero":
         raise CaseError("barrier: needs a last step with until: zero")
 
 
@@ -40,7 +40,7 @@ def adjoint_of_barrier(scene: Scene, begin: Record | None, end: Record, begins: 
     CaseError
         If the last step passes none, or holds a gas.
     """
-    refuse_no_barrier(scene.case)
+    refuse_no_barrier(scene.plan)
     if begin is None:
         raise CaseError("barrier: give the record before the last step")
     system, step, whole = scene.model.system, scene.plan.programme[-1], scene.model.multiplicity

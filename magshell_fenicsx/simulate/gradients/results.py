@@ -28,15 +28,15 @@ def refuse_no_result(scene: Scene, results: Iterable[str], key: str, *, more: Se
     CaseError
         With those that have.
     """
-    start, case = scene.unloaded(), scene.case
+    start = scene.unloaded()
     columns = differentiable(scene, start)
     for of in results:
         try:
             refuse_unitless(scene, of)
             if of == BARRIER:
-                refuse_no_barrier(case)
+                refuse_no_barrier(scene.plan)
             elif NAMES.fullmatch(of):
-                refuse_no_vibration(case, of)
+                refuse_no_vibration(scene.plan, of)
             elif of not in FOLDS and of not in columns and of not in start.mu:
                 known = ", ".join((*FOLDS, *columns, BARRIER, *FIRST, *more))
                 raise CaseError(f"{of}: has no gradient here; allowed are {known}")
@@ -74,4 +74,4 @@ def vibration_at_end(scene: Scene, history: History, of: str) -> float | None:
         return None
     assert history.end
     state = rigid(scene, scene.model.system.placed(history.end.point.state))
-    return frequency(scene.case, of, vibration(scene, state, of).value)
+    return frequency(scene.plan, of, vibration(scene, state, of).value)

@@ -21,13 +21,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from magshell_fenicsx.assembly.problem import CENTRAL
-from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.continuation.modes import ModesNotFound
 from magshell_fenicsx.continuation.system import State, dot, symmetric_part
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.modes import TORSION, ShellMode, ShellModes
 from magshell_fenicsx.parts.bodies.touch import rigid, touching
+from magshell_fenicsx.problem.problem import Plan
 from magshell_fenicsx.simulate.gradients.adjoint import (
     NONE,
     WAVE,
@@ -78,7 +78,7 @@ class Vibration:
         return self.modes[0].label
 
 
-def refuse_no_vibration(case: Case, of: str) -> None:
+def refuse_no_vibration(plan: Plan, of: str) -> None:
     """See that a case has a frequency in hertz.
 
     Raises
@@ -86,7 +86,7 @@ def refuse_no_vibration(case: Case, of: str) -> None:
     CaseError
         If it has no density.
     """
-    if of.startswith("hertz") and case.time_unit is None:
+    if of.startswith("hertz") and plan.time_unit is None:
         raise CaseError(f"{of}: needs shell.density and shell.youngs_modulus; without them take omega2{of[5:]}")
 
 
@@ -142,7 +142,7 @@ def _same(a: ShellMode, b: ShellMode) -> bool:
     return a.label == b.label and abs(a.eigenvalue - b.eigenvalue) <= SAME * abs(b.eigenvalue)
 
 
-def frequency(case: Case, of: str, omega2: float) -> float:
+def frequency(plan: Plan, of: str, omega2: float) -> float:
     """The result of a name: omega^2 rho R^2/E itself, or hertz.
 
     Raises
@@ -154,7 +154,7 @@ def frequency(case: Case, of: str, omega2: float) -> float:
         return omega2
     if omega2 <= 0:
         raise Lost(f"the shell is unstable and does not vibrate (omega2 = {omega2:.6g})")
-    return math.sqrt(omega2) / (2 * math.pi * (case.time_unit or 1.0))
+    return math.sqrt(omega2) / (2 * math.pi * (plan.time_unit or 1.0))
 
 
 def adjoints_of_vibrations(
@@ -196,7 +196,7 @@ def adjoints_of_vibrations(
 
 
 def _adjoint(scene: Scene, state: State, of: str, found: Vibration, held: Held) -> Adjoint:
-    value = frequency(scene.case, of, found.value)
+    value = frequency(scene.plan, of, found.value)
     rate = 1.0 if of.startswith("omega2") else value / (2 * found.value)
     c = rate / len(found.modes)
     slopes = [_slopes(scene, state, mode, list(held)) for mode in found.modes]
@@ -213,7 +213,7 @@ def _adjoint(scene: Scene, state: State, of: str, found: Vibration, held: Held) 
             moved = State(state.u + way * step * mode.vector, state.mu)
             places.append(Place(moved, c * weight / step * mode.vector, dict.fromkeys(rows, 0.0)))
         directions.append(Direction(mode.vector, None, inertia=-c * mode.eigenvalue))
-    by_itself = lambda there, _: frequency(there.case, of, found.value)  # noqa: E731
+    by_itself = lambda there, _: frequency(there.plan, of, found.value)  # noqa: E731
     gas = with_gas(held)
     return Adjoint(scene, places, by_itself=by_itself, directions=directions, value=value, gas=gas)
 

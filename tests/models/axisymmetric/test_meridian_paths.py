@@ -15,7 +15,8 @@ from magshell_fenicsx.mesh.sphere import flat
 from magshell_fenicsx.models.axisymmetric.meridian import graded_vertices, make_meridian
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.shell.parameters import Force, Loads, Material
-from magshell_fenicsx.problem.planner import make_plan, meridian_vertices
+from magshell_fenicsx.problem.planner import make_plan
+from magshell_fenicsx.problem.problem import meridian_vertices
 
 
 @pytest.mark.parametrize(
@@ -89,10 +90,10 @@ def test_cells_of_a_given_size() -> None:
     """All alike, but for a vertex on each rim; far too many are refused before they are made."""
     case = Case.load(CASES / "dimple_buckling.yaml", ["mesh.size=0.1", "mesh.refinement=2"])
     plan = make_plan(case)
-    lengths = np.diff(meridian_vertices(plan, case))
+    lengths = np.diff(meridian_vertices(plan))
     (rim,) = plan.meridian.circles
     assert len(lengths) == np.ceil(rim / 0.05) + np.ceil((np.pi / 2 - rim) / 0.05)
     assert lengths.max() < 0.05 < 1.3 * lengths.min()
     tiny = Case.load(CASES / "dimple_buckling.yaml", ["mesh.size=1e-9"])
     with pytest.raises(MeshError, match=r"would have .* cells, allowed 1e\+06"):
-        meridian_vertices(make_plan(tiny), tiny)
+        meridian_vertices(make_plan(tiny))

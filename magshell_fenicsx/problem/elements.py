@@ -1,4 +1,4 @@
-"""The elements of a case."""
+"""What a case says of its elements: those of its mid-surface, and what a solid needs besides."""
 
 from typing import Annotated, Self
 
@@ -35,3 +35,20 @@ class MeshSection(Section):
             if key != "degree" or self.degree != SOLID_DEGREE:
                 finer = "a file with smaller elements" if read else "mesh.refinement"
                 raise ValueError(f"mesh.{key}: not of a solid, which has degree {SOLID_DEGREE}; {finer} makes it finer")
+
+
+class SolidSection(Section):
+    """Hexahedra of degree 2 through the thickness, and the compressibility that stands for poisson_ratio: 0.5."""
+
+    layers: int = Field(default=1, ge=1, le=10)
+    """Elements through the thickness"""
+    bulk_to_shear: float = Field(default=100.0, ge=10, le=1e5)
+    """κ/μ, in place of ν = 0.5 and only there"""
+
+    def refuse_unfit(self, poisson_ratio: float) -> None:
+        """Refuse a compressibility beside a ratio that says all."""
+        if "bulk_to_shear" in self.model_fields_set and poisson_ratio != 0.5:
+            raise ValueError(
+                "solid.bulk_to_shear: takes the place of shell.poisson_ratio: 0.5; here that is "
+                f"{poisson_ratio:g}, which says all"
+            )

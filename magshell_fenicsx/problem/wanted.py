@@ -1,0 +1,58 @@
+"""What is asked of a path besides itself: modes, natural frequencies and gradients."""
+
+from typing import Annotated, Literal
+
+from pydantic import Discriminator, Field, Tag
+
+from magshell_fenicsx.input.section import Section
+
+
+class StabilitySection(Section):
+    """Lowest eigenpairs of the tangent, those that a reduced model excludes included.
+
+    `at: end` is the last point of the path; `at: instabilities` every located fold and bifurcation.
+    """
+
+    modes: int = Field(default=4, ge=1, le=50)
+    """How many of the lowest modes are drawn and written as fields"""
+    at: Literal["end", "instabilities"] = "end"
+    """At which points of the path"""
+
+
+At = Annotated[
+    Annotated[Literal["ends", "end", "all"], Tag("a word")]
+    | Annotated[list[Annotated[int, Field(ge=0)]], Tag("points"), Field(min_length=1)],
+    Discriminator(lambda data: "points" if isinstance(data, list) else "a word"),
+]
+
+
+class FrequenciesSection(Section):
+    """Natural frequencies of small vibrations about points of the path, under the loads of each point.
+
+    frequencies.csv lists ω² ρ R²/E, negative where the shell is unstable, and with `shell.density` hertz.
+    """
+
+    count: int = Field(default=6, ge=1, le=50)
+    """How many of the lowest; every unstable one is listed besides"""
+    at: At = "ends"
+    """At which points: the start and the end of the path, the end, all, or numbers of points in path.csv"""
+
+
+FIELDS = ("remanence", "magnitude", "thickness", "curvature", "deviation")
+
+
+class GradientsSection(Section):
+    """Derivatives of results by numbers and by whole fields, of one adjoint solve for each result.
+
+    Fields, per area of the undeformed shell: the remanence (vectors), its magnitude (a factor), the thickness (over h),
+    the natural curvature (over 1/R, along t1 and t2 and its twist) and the deviation w0 of the shape (over R, along the
+    normal). They are written as fields/gradients_*.vtu and drawn: where would more help most?
+    """
+
+    of: Annotated[list[str], Field(min_length=1)] = Field(default=["knockdown"])
+    """Results: knockdown, critical_field (in units buckling_pressure_Pa, critical_field_mT), barrier, natural
+    frequencies (omega2_1, ..., hertz_1, ...), or columns of path.csv where the path ends, such as force_N or forces of
+    supports; where it ends at an instability, its load alone"""
+    by: Annotated[list[str], Field(min_length=1)] = Field(default=["magnitude", "thickness"])
+    """remanence, magnitude, thickness, curvature, deviation; amplitudes (lambda_m); keys of the case with a number,
+    in SI if it has a unit"""
