@@ -1,16 +1,24 @@
 """What is read off the displacement of a model with named points, shell or solid."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import ClassVar
 
 import numpy as np
+import ufl
 from dolfinx import fem
 from numpy.typing import NDArray
+from ufl.core.expr import Expr
 
 from magshell_fenicsx.assembly.parameters import Growing
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.assembly.terms import LinearTerm
 from magshell_fenicsx.continuation.system import Amplitudes, State, Vector
+from magshell_fenicsx.mesh.midsurface import Midsurface
+from magshell_fenicsx.models.carriers import Carrier
+from magshell_fenicsx.models.shell import patterns
+from magshell_fenicsx.models.shell.fitted import Cells
 from magshell_fenicsx.models.shell.parameters import Loads, Material
+from magshell_fenicsx.models.shell.terms import EnergyFactory
 from magshell_fenicsx.parts.bodies.contact import Pressing, Region
 from magshell_fenicsx.parts.forces.dead_load import DeadLoads
 from magshell_fenicsx.parts.forces.point_load import point_entries
@@ -47,6 +55,12 @@ class Observed:
         Approach of a body -> what is known of its contact, and the integrals of its pressure.
     growing
         The placement, where imperfections grow.
+    axes
+        The components in space of displacement and placement.
+    thickness
+        What multiplies that of a shell, (1,); None for 1, and for a solid, which has it in its shape.
+    midsurface
+        The mesh of a mid-surface; None for a meridian or a solid.
     """
 
     system: FiniteElementSystem
@@ -63,6 +77,9 @@ class Observed:
     contacts: dict[str, tuple[Pressing, Mapping[str, fem.Form]]]
     fields: Sequence[AppliedField] = ()
     growing: Growing | None = None
+    axes: ClassVar[list[int]] = [0, 1, 2]
+    thickness: fem.Function | None = None
+    midsurface: Midsurface | None = None
 
     def observe(self, volume: fem.Form, points: Mapping[str, Array]) -> None:
         """Take the volume change's form (of the modelled part), and the named vertices' places (3,)."""
@@ -132,3 +149,33 @@ class Observed:
     def force_unit(self) -> float:
         """The force F R/(2 pi D) = 1 on the modelled part, over E h R."""
         return 2 * np.pi * self.material.bending_stiffness / self.multiplicity
+
+
+class Thin(Observed):
+    """What a mid-surface and a meridian have in common.
+
+    Attributes
+    ----------
+    factory
+        What made the terms.
+    """
+
+    factory: EnergyFactory
+
+    @property
+    def carrier(self) -> Carrier:
+        """Where its densities are integrated."""
+        return self.factory.carrier
+
+    def over_area(self) -> Callable[[Expr], ufl.Form]:
+        """The integral over the undeformed area of what is modelled."""
+        over = self.carrier.over_area()
+        return lambda f: self.carrier.whole * over(f)
+
+    def cells_of_fields(self) -> Cells:
+        """Where fields are given by formulas."""
+        return patterns.cells_of(self.r0)
+
+    def places(self, nodes: Array) -> tuple[Array, Array]:
+        """Places and normals at some places of the reference cell, in all cells."""
+        return patterns.places(self.r0, nodes)

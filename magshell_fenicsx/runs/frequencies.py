@@ -8,7 +8,6 @@ from pathlib import Path
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.continuation.modes import ModesNotFound
 from magshell_fenicsx.continuation.system import State
-from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.modes import ShellMode, ShellModes
 from magshell_fenicsx.output.fields.gathering import gatherer
 from magshell_fenicsx.output.fields.modes import NAME, frequency_table, hertz, mode_file, wave_of
@@ -31,7 +30,7 @@ def wanted(case: Case, point: int) -> bool:
 
 def own_wave(scene: Scene) -> str:
     """The wave of the model's own modes."""
-    if isinstance(scene.model, MeridianModel):
+    if scene.model.axisymmetric:
         return "0"
     return "symmetric" if scene.model.multiplicity == 2 else ""
 

@@ -13,7 +13,6 @@ from magshell_fenicsx.assembly.forms import FieldGradient
 from magshell_fenicsx.continuation.fold import FoldLost
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.mirror import rotation
-from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.output.fields.gathering import Gatherer, gatherer
 from magshell_fenicsx.output.fields.modes import columns_of, gradient_file
 from magshell_fenicsx.output.fields.surface import Surface, completed, turned
@@ -139,7 +138,7 @@ def _surface(scene: Scene, found: Adjoint, fields: Mapping[str, FieldGradient]) 
         return None
     surface = replace(base, fields={name: v for name, v in drawn.items() if v is not None})
     if model.multiplicity == 2:
-        assert not isinstance(model, MeridianModel)
+        assert not model.axisymmetric
         surface = completed(surface, model.mirror.plane)
     return turned(surface, scene.plan.azimuth)
 

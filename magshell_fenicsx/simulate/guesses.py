@@ -11,7 +11,6 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.system import State
-from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.simulate.scene import Scene
 
 Array = NDArray[np.float64]
@@ -51,7 +50,7 @@ def _plane(scene: Scene, x: Array) -> tuple[Array, float]:
     held = np.zeros(len(x), dtype=bool)
     for support in scene.model.supports.values():
         held[support.dofs[support.dofs < x.size] // x.shape[1]] = True
-    if isinstance(scene.model, MeridianModel):
+    if scene.model.axisymmetric:
         return np.array([0.0, 1.0]), float(x[held, 1].mean()) if held.any() else 0.0
     level, spread = _moments(scene, x[held])
     size, axes = np.linalg.eigh(spread)

@@ -16,8 +16,6 @@ from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.section import number_and_unit, si_size
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.models.axisymmetric.model import MeridianModel
-from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.parts.imperfections.imperfection import LocalSection
 from magshell_fenicsx.problem.planner import make_plan
 from magshell_fenicsx.problem.problem import Plan
@@ -156,9 +154,9 @@ def _rims(case: Case) -> list[float]:
 def on_mesh_of(scene: Scene, new: Plan) -> Plan:
     """What a plan changes beside the mesh, for the mesh of a scene in its chart; imperfections change with it."""
     old, model, meridian, shape = scene.plan, scene.model, scene.plan.meridian, scene.plan.shape
-    if isinstance(model, ShellModel):
+    if model.midsurface:
         shape = model.midsurface.reshaped(new.embedding)
-    elif isinstance(model, MeridianModel):
+    elif model.axisymmetric:
         assert new.meridian
         meridian = replace(new.meridian, vertices=np.sort(model.meridian.mesh.geometry.x[:, 0]))
     return replace(

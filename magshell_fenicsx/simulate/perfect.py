@@ -109,9 +109,9 @@ def perfect_modes(case: Case, count: int, comm: MPI.Comm) -> tuple[Shape, ...]:
 
 def _shape(scene: Scene, state: State, mode: ShellMode) -> Shape:
     model = scene.model
-    if isinstance(model, MeridianModel):
+    if model.axisymmetric:
         return _wave(model, mode)
-    assert isinstance(model, ShellModel)
+    assert model.thin
     x, w = _at_nodes(scene, model, mode)
     if model.multiplicity == 1:
         return on_surface(x, w, x)
@@ -123,7 +123,7 @@ def _shape(scene: Scene, state: State, mode: ShellMode) -> Shape:
 def _wave(model: MeridianModel, mode: ShellMode) -> Shape:
     """From the coefficients (U + V, V, W) of a wave, or (U, W) of an axisymmetric mode."""
     m = int(mode.label.removeprefix("m = ") or 0)
-    V = model.excluded_modes.waves.V if m else model.V
+    V = model.waves.V if m else model.V
     order, own = (np.argsort(space.tabulate_dof_coordinates()[:, 0]) for space in (V, model.V))
     values = mode.vector.reshape(len(order), -1)[order]
     along = np.column_stack([values[:, 0] - values[:, 1], values[:, 2]]) if m else values

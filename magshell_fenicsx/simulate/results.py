@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from magshell_fenicsx.continuation.system import State, Vector, dot
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.mirror import rotation
-from magshell_fenicsx.models.axisymmetric.model import MeridianModel
-from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.parts.registered import seen
 from magshell_fenicsx.parts.supports.reactions import weights
 from magshell_fenicsx.quantities.registry import amplitude, quantity
@@ -151,8 +149,7 @@ def offset(scene: Scene, target: Target) -> fem.Function:
     """The displacement that reaches the target, at the nodes of the model."""
     model, Q = scene.model, rotation(scene.plan.azimuth)
     found = fem.Function(model.V)
-    axes = [0, 2] if isinstance(model, MeridianModel) else [0, 1, 2]
-    r0 = model.r0.x.array if isinstance(model, ShellModel | MeridianModel) else model.V.tabulate_dof_coordinates()
+    axes, r0 = model.axes, model.r0.x.array
     places = np.zeros((np.size(r0) // len(axes), 3))
     places[:, axes] = np.reshape(r0, (-1, len(axes)))
     wanted = target(places @ Q) @ Q.T
@@ -162,12 +159,7 @@ def offset(scene: Scene, target: Target) -> fem.Function:
 
 def over_area(scene: Scene) -> Callable[[ufl.core.expr.Expr], ufl.Form]:
     """The integral over the undeformed area of the modelled part; of a solid over its volume."""
-    model = scene.model
-    if isinstance(model, ShellModel | MeridianModel):
-        carrier = model.factory.carrier
-        over = carrier.over_area()
-        return lambda f: carrier.whole * over(f)
-    return lambda f: f * ufl.dx(domain=model.V.mesh)
+    return scene.model.over_area()
 
 
 def distances(scene: Scene, state: State, target: Target) -> tuple[float, float]:

@@ -25,10 +25,8 @@ from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.shell.own_term import OwnTerm
-from magshell_fenicsx.models.shell.patterns import cells_of
 from magshell_fenicsx.models.solid.model import SolidModel
 from magshell_fenicsx.parts.magnetism.direction import field_angle, field_size
-from magshell_fenicsx.parts.magnetism.remanence import cells_of_body
 from magshell_fenicsx.parts.magnetism.sources.field import source_columns
 from magshell_fenicsx.parts.pressure.openings import no_potential
 from magshell_fenicsx.parts.registered import seen
@@ -97,7 +95,7 @@ class Scene:
             self.model = build_solid_model(self.plan, comm)
         else:
             self.model = build_model(self.plan, comm)
-        if not (self.plan.fixed or isinstance(self.model, MeridianModel)):
+        if not (self.plan.fixed or self.model.axisymmetric):
             refuse_loose(self.model.system, self.model.r0, self.unloaded().mu)
         # a body's penetration changes over far less than h: factors of a state near by are no tangent's, and the first
         # matrices only find what touches
@@ -130,8 +128,7 @@ class Scene:
         model, formulas = self.model, written(self.case)
         if not formulas:
             return []
-        cells = cells_of_body(model.V) if isinstance(model, SolidModel) else cells_of(model.r0)
-        return unshown(formulas, cells, self.plan.azimuth, self.plan.material.h)
+        return unshown(formulas, model.cells_of_fields(), self.plan.azimuth, self.plan.material.h)
 
     def nowhere(self) -> str:
         """Where a step since the beginning of a walk has found no field, in words after a message; collective."""

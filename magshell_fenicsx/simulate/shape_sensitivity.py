@@ -20,7 +20,6 @@ from magshell_fenicsx.continuation.fold import Fold, sensitivity
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.mesh.mirror import Mirror
 from magshell_fenicsx.mesh.patch import Deviated, Deviation
-from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.parts.imperfections.growth import grown_by
 from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionSection, LocalSection, flaws, in_frame
 from magshell_fenicsx.shape.outline import ground_of
@@ -151,5 +150,5 @@ def reshaped(scene: Scene, deviation: Deviation) -> Scene:
 
     embedding = moved(plan.embedding)
     meridian = plan.meridian and replace(plan.meridian, embedding=moved(plan.meridian.embedding))
-    shape = model.midsurface.reshaped(embedding) if isinstance(model, ShellModel) else plan.shape
+    shape = model.midsurface.reshaped(embedding) if model.midsurface else plan.shape
     return Scene(scene.case, scene.comm, replace(plan, embedding=embedding, meridian=meridian, shape=shape))

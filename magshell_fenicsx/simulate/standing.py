@@ -55,7 +55,7 @@ def refilled(scene: Scene, case: Case) -> bool:
     """
     model = scene.model
     same = scene.case.model_dump(exclude=FIELDS) == case.model_dump(exclude=FIELDS)
-    if not same or not isinstance(model, MeridianModel | ShellModel) or model.contacts or scene.plan.loads.dead:
+    if not same or not model.thin or model.contacts or scene.plan.loads.dead:
         return False
     plan, old = make_plan(case, scene.plan.own), scene.plan
     if (old.axisymmetric, old.mirror, old.azimuth) != (plan.axisymmetric, plan.mirror, plan.azimuth):
@@ -90,7 +90,7 @@ def _put(model: ShellModel | MeridianModel, plan: Plan) -> None:
     if magnetic and callable(magnetic.remanent):
         there["Br"].x.array[:] = patterns.pattern_field(magnetic.remanent, r0)[0].x.array
     if plan.thickness and model.thickness:
-        patches = model.midsurface.patches if isinstance(model, ShellModel) else {}
+        patches = model.midsurface.patches if model.midsurface else {}
         model.thickness.x.array[:] = thickness_field(plan.thickness, r0, patches).x.array
     if natural:
         there["natural"].x.array[:] = natural_field(natural, patterns.cells_of(r0), model.V).x.array

@@ -7,7 +7,6 @@ import numpy as np
 from magshell_fenicsx.assembly.moving import in_space
 from magshell_fenicsx.continuation.system import State, Vector, dot, max_abs
 from magshell_fenicsx.mesh.mirror import rotation
-from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.modes import ShellModes
 from magshell_fenicsx.parts.motion.step import PushSection
 from magshell_fenicsx.shape.turning import vectors_of
@@ -35,7 +34,7 @@ def pushed(scene: Scene, push: PushSection, state: State, v: Vector) -> tuple[Ve
 def by_formula(scene: Scene, components: Sequence[str]) -> Vector:
     """The velocity with these components, formulas of the undeformed place, at the nodes; zero at supports."""
     model, R, Q = scene.model, scene.plan.length, rotation(scene.plan.azimuth)
-    axes = [0, 2] if isinstance(model, MeridianModel) else [0, 1, 2]
+    axes = model.axes
     places = in_space(model.r0.x.array, len(axes))
     found = vectors_of(components)(R * places @ Q) @ Q.T * (scene.plan.time_unit or 1.0) / R
     return np.asarray(model.system.held(np.ascontiguousarray(found[:, axes]).ravel()[: model.system.size]))

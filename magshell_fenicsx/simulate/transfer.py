@@ -11,8 +11,6 @@ from magshell_fenicsx.continuation.system import Vector
 from magshell_fenicsx.mesh.patch import Deviated
 from magshell_fenicsx.mesh.shapes import DiscShape
 from magshell_fenicsx.mesh.sphere import sphere
-from magshell_fenicsx.models.axisymmetric.model import MeridianModel
-from magshell_fenicsx.models.solid.model import SolidModel
 from magshell_fenicsx.simulate.scene import Scene
 
 Array = NDArray[np.float64]
@@ -160,14 +158,4 @@ def chart(scene: Scene) -> Array:
     For a solid with the height in its thickness: its displacements are carried to the same mesh only. For a mesh file
     these are positions (n, 3).
     """
-    model = scene.model
-    if isinstance(model, MeridianModel):
-        return np.asarray(model.V.tabulate_dof_coordinates()[:, :1])
-    if isinstance(model, SolidModel):
-        body = model.body
-        places = body.at_nodes(model.V, np.column_stack([body.chart, body.heights]))
-        return places[: model.V.dofmap.index_map.size_local]
-    cells, nodes = model.midsurface.charted(model.V), model.V.dofmap.list
-    found = np.full((model.V.dofmap.index_map.size_local + model.V.dofmap.index_map.num_ghosts, cells.shape[2]), np.inf)
-    np.minimum.at(found, nodes, cells)  # the first of the two positions of a node on a seam
-    return found[: model.V.dofmap.index_map.size_local]
+    return scene.model.chart()

@@ -13,9 +13,7 @@ from magshell_fenicsx.continuation.system import State, Vector, max_abs
 from magshell_fenicsx.continuation.transient import Integrator
 from magshell_fenicsx.input.section import in_units
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.modes import ShellModes
-from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.parts.bodies.contact import Pressings
 from magshell_fenicsx.parts.course import SnapSection
 from magshell_fenicsx.parts.motion.ground import Ground
@@ -161,7 +159,7 @@ def viscosity(scene: Scene, state: State) -> Viscosity | None:
         size = float(in_units("pascal")(branch.modulus))
         ratio = size / (shell.youngs_modulus or 1.0) if isinstance(branch.modulus, str) else size
         found.append(Branch(ratio, time_of(plan, branch.time)))
-    assert isinstance(model, ShellModel | MeridianModel)
+    assert model.thin
     return Viscosity(model, state.mu, time_of(plan, shell.viscosity or 0.0), found)
 
 

@@ -4,8 +4,9 @@ Lengths in R, energies in E h R^2, of the whole shell. Amplitudes as in `ShellMo
 "pressure" is p/p_c, "force" is F R/(2 pi D), "lambda_m" is lambda_m.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cached_property
+from typing import ClassVar, Literal
 
 import numpy as np
 from dolfinx import fem
@@ -15,12 +16,13 @@ from magshell_fenicsx.assembly.moving import Lid, Pressed
 from magshell_fenicsx.assembly.parameters import FreeParameter, Growing, make_parameters
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.continuation.system import Vector
+from magshell_fenicsx.mesh.patch import Deviated, Deviation
 from magshell_fenicsx.models.axisymmetric.instability import ExcludedWaves
 from magshell_fenicsx.models.axisymmetric.meridian import Meridian
 from magshell_fenicsx.models.axisymmetric.probe import Array, Probe
 from magshell_fenicsx.models.axisymmetric.waves import Waves
 from magshell_fenicsx.models.carriers import on_meridian
-from magshell_fenicsx.models.observed import Observed
+from magshell_fenicsx.models.observed import Thin
 from magshell_fenicsx.models.shell.parameters import Condition, EdgeMoment, Loads, Material, Potential, default_penalty
 from magshell_fenicsx.models.shell.patterns import cells_of
 from magshell_fenicsx.models.shell.terms import INTERIOR, EnergyFactory
@@ -33,7 +35,7 @@ from magshell_fenicsx.parts.supports.on_meridian import openings, supports
 from magshell_fenicsx.parts.supports.supports import held_on
 
 
-class MeridianModel(Observed):
+class MeridianModel(Thin):
     """A Koiter shell of revolution with axisymmetric loads; every rank holds all of it.
 
     Parameters
@@ -59,15 +61,16 @@ class MeridianModel(Observed):
         Where the displacement is zero.
     energies
         The terms, as functions of the displacement's jet.
-    factory
-        What made them.
     kernels
         Names and compile time of the forms in use.
     thickness
         h(x)/h, free to jump from cell to cell; None for 1.
     """
 
+    thin: Literal[True] = True
+    axisymmetric: Literal[True] = True
     multiplicity = 1
+    axes: ClassVar[list[int]] = [0, 2]
 
     def __init__(
         self,
@@ -155,6 +158,27 @@ class MeridianModel(Observed):
     def excluded_modes(self) -> ExcludedWaves:
         """The waves around the axis, which an axisymmetric model does not see. Compiles kernels."""
         return ExcludedWaves(Waves(self.system, self.energies, self.meridian, self.held, self.kernels))
+
+    @property
+    def waves(self) -> Waves:
+        """Around the axis."""
+        return self.excluded_modes.waves
+
+    def growth(self, deviations: Sequence[Deviation]) -> fem.Function:
+        """What further deviations add to the placement."""
+        return self.meridian.growth(self.V, deviations)
+
+    def drawn_deviation(self) -> Array | None:
+        """w0 (cells, nodes) of the drawn shape; None for the perfect one."""
+        embedding = self.meridian.embedding
+        if not isinstance(embedding, Deviated):
+            return None
+        s = self.V.tabulate_dof_coordinates()[:, 0]
+        return np.asarray(embedding.w0(np.column_stack([s, 0 * s]))[self.V.dofmap.list])
+
+    def chart(self) -> Array:
+        """Coordinates (n, 1) of the nodes along the meridian."""
+        return np.asarray(self.V.tabulate_dof_coordinates()[:, :1])
 
     def displacement(self, u: Vector, point: str) -> Array:
         """u/R (3,) at a named point."""

@@ -7,6 +7,7 @@ F R/(2 pi D), "lambda_m" is lambda_m.
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 from dolfinx import fem
@@ -20,8 +21,9 @@ from magshell_fenicsx.assembly.sliding import Constraint, held_along
 from magshell_fenicsx.assembly.terms import LinearTerm, Term
 from magshell_fenicsx.mesh.midsurface import Midsurface
 from magshell_fenicsx.mesh.mirror import Y0, Mirror
+from magshell_fenicsx.mesh.patch import Deviation
 from magshell_fenicsx.models.carriers import on_surface
-from magshell_fenicsx.models.observed import Observed
+from magshell_fenicsx.models.observed import Thin
 from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes
 from magshell_fenicsx.models.shell.energy import ShellTerm
 from magshell_fenicsx.models.shell.fast_tangent import FastTangent, make_sites
@@ -58,7 +60,7 @@ from magshell_fenicsx.parts.supports.supports import (
 )
 
 
-class ShellModel(Observed):
+class ShellModel(Thin):
     """A Koiter shell on a mid-surface.
 
     Parameters
@@ -93,6 +95,10 @@ class ShellModel(Observed):
     mirror
         Of a half model.
     """
+
+    thin: Literal[True] = True
+    axisymmetric: Literal[False] = False
+    midsurface: Midsurface
 
     def __init__(
         self,
@@ -275,6 +281,21 @@ class ShellModel(Observed):
                 system.history,
             )
         )
+
+    def growth(self, deviations: Sequence[Deviation]) -> fem.Function:
+        """What further deviations add to the placement."""
+        return self.midsurface.growth(self.V, deviations)
+
+    def drawn_deviation(self) -> NDArray[np.float64] | None:
+        """w0 (cells, nodes) of the drawn shape; None for the perfect one."""
+        return self.midsurface.deviation(self.V.element.basix_element.points)
+
+    def chart(self) -> NDArray[np.float64]:
+        """Coordinates (n, 2) of this rank's nodes in the chart, of a mesh file positions (n, 3)."""
+        cells, nodes, index_map = self.midsurface.charted(self.V), self.V.dofmap.list, self.V.dofmap.index_map
+        coordinates = np.full((index_map.size_local + index_map.num_ghosts, cells.shape[2]), np.inf)
+        np.minimum.at(coordinates, nodes, cells)  # the first of the two positions of a node on a seam
+        return coordinates[: index_map.size_local]
 
     def _force(self, name: str, force: Force) -> LinearTerm:
         x, inward = self.midsurface.points[force.point], -self.normals[force.point]

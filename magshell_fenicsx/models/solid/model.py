@@ -7,10 +7,13 @@ of the thickness; the pressure, the volume and the loaded patch are of the outer
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
+import ufl
 from dolfinx import fem
 from numpy.typing import NDArray
+from ufl.core.expr import Expr
 
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.moving import Curve, level_sides
@@ -23,6 +26,7 @@ from magshell_fenicsx.mesh.mirror import Y0, Mirror
 from magshell_fenicsx.models.observed import Observed
 from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes
 from magshell_fenicsx.models.shell.fast_tangent import FastTangent
+from magshell_fenicsx.models.shell.fitted import Cells
 from magshell_fenicsx.models.shell.parameters import Condition, EdgeMoment, Loads, Material, Potential
 from magshell_fenicsx.models.solid.material import NeoHookean
 from magshell_fenicsx.models.solid.sites import make_sites
@@ -30,7 +34,7 @@ from magshell_fenicsx.models.solid.terms import Density, TermFactory
 from magshell_fenicsx.parts.forces.dead_load import assemble_dead_loads
 from magshell_fenicsx.parts.forces.on_body import BodyMeasures, outer_patch
 from magshell_fenicsx.parts.magnetism.driving import field_parameters
-from magshell_fenicsx.parts.magnetism.remanence import in_cells
+from magshell_fenicsx.parts.magnetism.remanence import cells_of_body, in_cells, places
 from magshell_fenicsx.parts.natural.on_body import body_shape, grown
 from magshell_fenicsx.parts.pressure.openings import openings
 from magshell_fenicsx.parts.supports.moved import enclosed, motions_of, moving, pressed_edges
@@ -68,6 +72,8 @@ class SolidModel(Observed):
         None: nothing is penalised.
     """
 
+    thin: Literal[False] = False
+    axisymmetric: Literal[False] = False
     degree = 2
     sigma = None
 
@@ -149,6 +155,23 @@ class SolidModel(Observed):
         if self.multiplicity == 1:
             return None
         return AntisymmetricModes(self._system(self._held + self._held_on_mirror(self.mirror.in_plane)))
+
+    def over_area(self) -> Callable[[Expr], ufl.Form]:
+        """The integral over the undeformed volume of what is modelled."""
+        return lambda f: f * ufl.dx(domain=self.V.mesh)
+
+    def cells_of_fields(self) -> Cells:
+        """Where fields are given by formulas."""
+        return cells_of_body(self.V)
+
+    def places(self, nodes: Array) -> tuple[Array, Array]:
+        """The nodes of every cell, whatever is asked for, and the normals of the surface at their height."""
+        return places(self.V)
+
+    def chart(self) -> Array:
+        """Coordinates (n, 3) of this rank's nodes: the chart's and the height in the thickness."""
+        coordinates = self.body.at_nodes(self.V, np.column_stack([self.body.chart, self.body.heights]))
+        return np.asarray(coordinates[: self.V.dofmap.index_map.size_local])
 
     def _rim(self, facets: NDArray[np.int32], height: float) -> Curve:
         """Where the pressed surface ends on the faces of an end, at a height over the thickness."""

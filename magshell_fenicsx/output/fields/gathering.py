@@ -71,6 +71,6 @@ class Gatherer(Protocol):
 
 def gatherer(model: ShellModel | MeridianModel | SolidModel, comm: MPI.Comm) -> Gatherer:
     """The gatherer of a model."""
-    if isinstance(model, MeridianModel):
+    if model.axisymmetric:
         return RevolvedGatherer(model, comm)
-    return BodyGatherer(model) if isinstance(model, SolidModel) else SurfaceGatherer(model)
+    return SurfaceGatherer(model) if model.thin else BodyGatherer(model)

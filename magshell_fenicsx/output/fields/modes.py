@@ -69,7 +69,7 @@ def mode_surface(
     On rank 0 the surface with the fields "mode" (n, 3), scaled to a largest length of one, and "mode_w" (n,), its
     component along -n0; None on other ranks.
     """
-    if (label.startswith(WAVES) or label == TORSION) and isinstance(model, MeridianModel):
+    if (label.startswith(WAVES) or label == TORSION) and model.axisymmetric:
         if gatherer.comm.rank:
             return None
         m = 0 if label == TORSION else int(label.removeprefix(WAVES))
@@ -79,7 +79,7 @@ def mode_surface(
         return None
     surface = _with_mode(base, mode.u)
     if model.multiplicity == 2:
-        assert not isinstance(model, MeridianModel)
+        assert not model.axisymmetric
         surface = completed(surface, model.mirror.plane)
         if label == "antisymmetric":
             for values in surface.fields.values():

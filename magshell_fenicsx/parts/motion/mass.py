@@ -41,18 +41,18 @@ def _product(model: Model) -> fem.Form:
 
 def thickness(model: Model) -> Expr | None:
     """What multiplies the thickness of a shell; a solid has it in its shape."""
-    return None if isinstance(model, SolidModel) or model.thickness is None else model.thickness[0]
+    return None if model.thickness is None else model.thickness[0]
 
 
 def of_displacements(model: Model, weight: Expr | float) -> ufl.Form:
     """The weighted integral of u . v over the undeformed mid-surface of what is modelled."""
     product = weight * ufl.dot(ufl.TrialFunction(model.V), ufl.TestFunction(model.V))
-    return _integral(model, 2 * np.pi * product if isinstance(model, MeridianModel) else product)
+    return _integral(model, model.carrier.whole * product if model.thin else product)
 
 
 def of_waves(model: MeridianModel, weight: Expr | float) -> ufl.Form:
     """The same of two waves with the coefficients (U + V, V, W); it does not depend on m."""
-    V = model.excluded_modes.waves.V
+    V = model.waves.V
     cosine, sine = zip(*(jets.wave(f, 1) for f in (ufl.TrialFunction(V), ufl.TestFunction(V))), strict=True)
     return _integral(model, weight * np.pi * sum(ufl.dot(a.r, b.r) for a, b in (cosine, sine)))
 
@@ -63,8 +63,8 @@ def mass_along(model: Model, phi: Vector, wave: int | None = None) -> FormTerm:
     if wave is None:
         V, product = model.V, of_displacements(model, 1.0 if weight is None else weight)
     else:
-        assert isinstance(model, MeridianModel)
-        V, product = model.excluded_modes.waves.V, of_waves(model, 1.0 if weight is None else weight)
+        assert model.axisymmetric
+        V, product = model.waves.V, of_waves(model, 1.0 if weight is None else weight)
     f = fem.Function(V, name="phi")
     f.x.array[: len(phi)] = phi
     f.x.scatter_forward()
@@ -77,10 +77,9 @@ def _integral(model: Model, f: Expr) -> ufl.Form:
     """Over the undeformed area, of a solid averaged over the thickness; on a meridian per radian."""
     domain, degree = model.V.mesh, model.degree
     dx = ufl.Measure("dx", domain=domain, metadata={"quadrature_degree": 2 * degree + 2})
-    if isinstance(model, SolidModel):
+    if not model.thin:
         return f / model.material.h * dx
-    j0 = jets.revolved(model.r0) if isinstance(model, MeridianModel) else kin.jet(model.r0, domain)
-    return f * kin.area_ratio(j0) * dx
+    return f * kin.area_ratio(model.carrier.j0) * dx
 
 
 def mass_matrix(product: fem.Form, held: list[fem.DirichletBC]) -> PETSc.Mat:

@@ -10,7 +10,6 @@ import scipy
 from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.system import Vector
-from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.transfer import chart
 
@@ -70,7 +69,7 @@ class CellFields:
     def of(cls, scene: Scene) -> "CellFields":
         """The cells of all ranks; collective."""
         model, V = scene.model, scene.model.V
-        if isinstance(model, ShellModel):  # cells beside a seam keep their own chart
+        if model.midsurface:  # cells beside a seam keep their own chart
             here = model.midsurface.charted(V)[: V.mesh.topology.index_map(2).size_local]
             nodes = np.concatenate(scene.comm.allgather(here))
         else:

@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.system import Vector, dot
-from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.simulate.adapt.carry import CellFields, carry, gathered
 from magshell_fenicsx.simulate.adapt.ending import Ending
 from magshell_fenicsx.simulate.scene import Scene
@@ -50,7 +49,6 @@ class _TangentEnergy:
 
     def __init__(self, scene: Scene, cells: CellFields, u: Vector) -> None:
         model, self._scene = scene.model, scene
-        assert isinstance(model, ShellModel)
         points, self._weights = basix.make_quadrature(basix.CellType.triangle, 2 * model.degree)
         self._table = cells.table(2, points)
         r0 = self._derivatives(model.r0.x.array[: model.system.size])

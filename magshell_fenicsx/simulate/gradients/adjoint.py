@@ -190,8 +190,8 @@ def _of_wave(scene: Scene, record: Record) -> Adjoint:
     model, m = scene.model, int(record.mode.removeprefix(WAVE))
     if record.step and scene.plan.programme[record.step - 1].load.hold:
         raise CaseError(f"instability: {record.mode}: not while a conjugate is held")
-    assert isinstance(model, MeridianModel)
-    system, waves, state = model.system, model.excluded_modes.waves, model.system.placed(record.point.state)
+    assert model.axisymmetric
+    system, waves, state = model.system, model.waves, model.system.placed(record.point.state)
     phi = nearest_to_zero(waves.factor_at(state, m))[1]
     Q = variation(model, state, phi, m, [record.amplitude])
     w, _ = solved(scene, state, Q, {})
@@ -203,7 +203,7 @@ def _of_wave(scene: Scene, record: Record) -> Adjoint:
 
 def variation(model: MeridianModel, state: State, phi: Vector, m: int, names: Iterable[str]) -> Functional:
     """Q_m(phi) of a wave, with its derivatives by u and by some amplitudes."""
-    terms, system, mu = model.excluded_modes.waves.along(phi, m), model.system, state.mu
+    terms, system, mu = model.waves.along(phi, m), model.system, state.mu
 
     def present() -> Functional:
         by_u = np.zeros(system.size)
@@ -391,8 +391,8 @@ def along(scene: Scene, adjoint: Adjoint) -> list[tuple[FormTerm, float]]:
     for d in adjoint.directions:
         phi = d.phi if d.wave is not None else transfer(adjoint.scene, scene, d.phi)
         if d.stiffness:
-            assert isinstance(model, MeridianModel)
-            found += [(term, d.stiffness) for term in model.excluded_modes.waves.along(phi, d.wave or 0)]
+            assert model.axisymmetric
+            found += [(term, d.stiffness) for term in model.waves.along(phi, d.wave or 0)]
         if d.inertia:
             found.append((mass_along(model, phi, d.wave), d.inertia))
     return found

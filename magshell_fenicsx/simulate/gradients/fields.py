@@ -27,8 +27,6 @@ from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.shell.patterns import Uniform
 from magshell_fenicsx.models.shell.slopes import Slope
 from magshell_fenicsx.models.shell.thickness import Thickness
-from magshell_fenicsx.models.solid.model import SolidModel
-from magshell_fenicsx.parts.magnetism import remanence as of_body
 from magshell_fenicsx.parts.natural.planned import frame
 from magshell_fenicsx.parts.natural.shape import Natural
 from magshell_fenicsx.simulate.gradients.adjoint import Adjoint, Place, along
@@ -76,7 +74,7 @@ def by_field(adjoint: Adjoint, name: str) -> FieldGradient:
         """The field, and what a place gives, whose state is set."""
         terms = _terms(scene, place.state, name)
         f = next((c for t in terms for c in t.form.coefficients() if c.name == kind.coefficient), None)
-        if f is None or (isinstance(model, SolidModel) and kind.coefficient != "Br"):
+        if f is None or (not model.thin and kind.coefficient != "Br"):
             raise CaseError(f"{name}: the case has no such field: no result depends on it")
         c = place.conjugates
         mu = [(term, factor_of(term.amplitude, place.state.mu)) for term in terms]
@@ -131,8 +129,8 @@ def _of_parameters(scene: Scene, place: Place, name: str) -> list[Share]:
 
 def _as_form(scene: Scene, slope: Slope) -> FormTerm:
     """A derivative at points as a form."""
-    assert isinstance(scene.model, ShellModel)
-    carrier = scene.model.factory.carrier
+    assert scene.model.thin
+    carrier = scene.model.carrier
     energy = carrier.integral(slope.density, carrier.jet(scene.model.u))
     return FormTerm(slope.name, energy, scene.model.u, scene.model.kernels, slope.amplitude)
 
@@ -143,8 +141,8 @@ def _of_starts(scene: Scene, shares: Sequence[Share], f: fem.Function, w: fem.Fu
     To lift a body is to lower the whole shell for this body alone.
     """
     model, domain = scene.model, f.function_space.mesh
-    assert not isinstance(model, SolidModel)  # on which no bodies press
-    axes = [0, 2] if isinstance(model, MeridianModel) else [0, 1, 2]
+    assert model.thin  # on which no bodies press
+    axes = model.axes
     found = np.zeros(
         (domain.topology.index_map(domain.topology.dim).size_local, f.function_space.element.space_dimension)
     )
@@ -195,7 +193,7 @@ def _contracted(scene: Scene, place: Place) -> fem.Function:
 def _with_field(adjoint: Adjoint, name: str) -> Scene:
     """The scene, or one in whose terms a number that is the same everywhere is a field."""
     scene, plan = adjoint.scene, adjoint.scene.plan
-    if isinstance(scene.model, SolidModel):
+    if not scene.model.thin:
         return scene
     if name == "thickness" and not scene.model.thickness:
         return Scene(scene.case, scene.comm, replace(plan, thickness=Thickness()))
@@ -222,7 +220,7 @@ def _terms(scene: Scene, state: State, name: str) -> list[FormTerm]:
 def places_of(scene: Scene, f: fem.Function) -> tuple[Array, Array]:
     """Nodes of every cell of a field and normals there, as the field's pattern is given them."""
     model, nodes = scene.model, f.function_space.element.basix_element.points
-    places, normals = of_body.places(model.V) if isinstance(model, SolidModel) else patterns.places(model.r0, nodes)
+    places, normals = model.places(nodes)
     return patterns.inside(places), normals
 
 
@@ -242,35 +240,26 @@ def _curvatures(scene: Scene, f: fem.Function, forces: Array, places: Array, nor
 
 def _outwards(scene: Scene, f: fem.Function, forces: Array, places: Array, normals: Array) -> Array:
     """By w0, from those by the place."""
-    axes = [0, 2] if isinstance(scene.model, MeridianModel) else [0, 1, 2]
+    axes = scene.model.axes
     return np.asarray(np.sum(forces * _normals(scene, normals)[..., axes], axis=-1, keepdims=True))
 
 
 def _normals(scene: Scene, drawn: Array) -> Array:
     """The normals of the perfect shell at the nodes of this rank's cells, from those of the drawn one."""
     model = scene.model
-    if isinstance(model, SolidModel) or not isinstance(scene.plan.embedding, Deviated):
+    if not model.thin or not isinstance(scene.plan.embedding, Deviated):
         return drawn
-    shape = model.midsurface if isinstance(model, ShellModel) else model.meridian
-    unit = shape.growth(model.V, (lambda x: np.ones(len(x)),))
-    width = model.V.dofmap.bs
+    unit, width = model.growth((lambda x: np.ones(len(x)),)), model.V.dofmap.bs
     found = np.zeros_like(drawn)
-    found[..., [0, 2] if width == 2 else [0, 1, 2]] = unit.x.array.reshape(-1, width)[model.V.dofmap.list[: len(drawn)]]
+    found[..., model.axes] = unit.x.array.reshape(-1, width)[model.V.dofmap.list[: len(drawn)]]
     return found
 
 
 def _perfect(scene: Scene, places: Array, normals: Array) -> Array:
     """The places of the perfect shell that deviations are functions of."""
     model = scene.model
-    if isinstance(model, MeridianModel):
-        embedding = model.meridian.embedding
-        if not isinstance(embedding, Deviated):
-            return places
-        s = model.V.tabulate_dof_coordinates()[:, 0]
-        w0: Array | None = embedding.w0(np.column_stack([s, 0 * s]))[model.V.dofmap.list]
-    else:
-        assert isinstance(model, ShellModel)
-        w0 = model.midsurface.deviation(model.V.element.basix_element.points)
+    assert model.thin
+    w0 = model.drawn_deviation()
     return places if w0 is None else places - w0[: len(places), :, None] * _normals(scene, normals)
 
 

@@ -6,7 +6,6 @@ from dolfinx import fem
 from dolfinx.la import InsertMode
 
 from magshell_fenicsx.assembly.forms import FieldGradient
-from magshell_fenicsx.models.solid.model import SolidModel
 from magshell_fenicsx.simulate.gradients.fields import places_of
 from magshell_fenicsx.simulate.results import over_area
 from magshell_fenicsx.simulate.scene import Scene
@@ -17,7 +16,7 @@ MASS = "mass"
 def mass(scene: Scene) -> tuple[float, FieldGradient | None]:
     """It over that of the same shell with the thickness h, and its derivatives by the thickness; collective."""
     model = scene.model
-    if isinstance(model, SolidModel) or model.thickness is None:
+    if model.thickness is None:
         return 1.0, None
     t, over, log = model.thickness, over_area(scene), model.kernels
     Q, comm = t.function_space, t.function_space.mesh.comm

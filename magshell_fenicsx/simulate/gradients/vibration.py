@@ -24,7 +24,6 @@ from magshell_fenicsx.assembly.problem import CENTRAL
 from magshell_fenicsx.continuation.modes import ModesNotFound
 from magshell_fenicsx.continuation.system import State, dot, symmetric_part
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.modes import TORSION, ShellMode, ShellModes
 from magshell_fenicsx.parts.bodies.touch import rigid, touching
 from magshell_fenicsx.problem.problem import Plan
@@ -228,7 +227,7 @@ def _slopes(scene: Scene, state: State, mode: ShellMode, held: list[str]) -> Fun
     """phi . K phi with its derivatives by u and by amplitudes that are unknown."""
     system, phi = scene.model.system, mode.vector
     if (m := _wave(mode)) is not None:
-        assert isinstance(scene.model, MeridianModel)
+        assert scene.model.axisymmetric
         return variation(scene.model, state, phi, m, held)
     if mode.label:
         raise CaseError(f"{mode.label}: the vibration leaves the symmetry of the model: take symmetry: none")
