@@ -4,13 +4,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.units import sizes_of
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.msh import MeshFile
 from magshell_fenicsx.mesh.patch import MeshError, PatchMesh
 from magshell_fenicsx.parts.magnetism.sources.field import placed
 from magshell_fenicsx.parts.pressure.openings import no_potential, ring_openings
 from magshell_fenicsx.problem.body import layers
+from magshell_fenicsx.problem.columns import sizes_of
 from magshell_fenicsx.problem.formulas import cells_of_patch, unshown, written
 from magshell_fenicsx.problem.limits import refuse_beyond_memory
 from magshell_fenicsx.problem.names import open_edges
@@ -72,7 +72,7 @@ def _described(case: Case) -> str:
 
 def _in_units(case: Case) -> list[str]:
     """The sizes of a case with units."""
-    known = sizes_of(case)
+    known = sizes_of(case.context)
     named = {"h": ("h", "mm"), "p_c": ("p_c", "Pa"), "2πD/R": ("2 pi D/R", "N"), "λ_m": ("applied field", known.field)}
     factor = {"λ_m": case.lambda_m}
     there = {scale: words for scale, words in named.items() if scale in known.of}

@@ -163,7 +163,7 @@ def make_plan(case: Case, terms: Sequence[OwnTerm] = ()) -> Plan:
         lambda_m=case.lambda_m,
         unknowns=0.0 if span else unknowns_of(case, _cells(shape, size, half=half)),
     )
-    refuse_twice(case, plan)
+    refuse_twice(plan)
     return plan
 
 

@@ -5,7 +5,6 @@ from functools import partial
 from math import isnan, nan
 from pathlib import Path
 
-from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.continuation.modes import ModesNotFound
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.models.modes import ShellMode, ShellModes
@@ -14,6 +13,7 @@ from magshell_fenicsx.output.fields.modes import NAME, frequency_table, hertz, m
 from magshell_fenicsx.output.store.durable import write_whole
 from magshell_fenicsx.output.store.folder import by_first
 from magshell_fenicsx.parts.bodies.touch import hardened, rigid, touching
+from magshell_fenicsx.problem.wanted import FrequenciesSection
 from magshell_fenicsx.runs.modes import write_mode_of
 from magshell_fenicsx.runs.summary import Result
 from magshell_fenicsx.simulate.scene import Scene
@@ -22,9 +22,9 @@ Say = Callable[[str], None]
 SAME = 1e-3  # relative change of omega^2 by stiffer bodies that needs no warning
 
 
-def wanted(case: Case, point: int) -> bool:
+def wanted(section: FrequenciesSection | None, point: int) -> bool:
     """Whether the state of a point must be kept for its frequencies; the start and the end are known anyway."""
-    at = case.frequencies.at if case.frequencies else ()
+    at = section.at if section else ()
     return at == "all" or (isinstance(at, list) and point in at)
 
 

@@ -263,7 +263,7 @@ def _follow(
             result.found[len(result.rows) - 1] = record.point.state
         else:
             result.last, result.end = record.point.state, len(result.rows) - 1
-        if wanted(scene.case, len(result.rows) - 1):
+        if wanted(scene.case.frequencies, len(result.rows) - 1):
             result.kept[len(result.rows) - 1] = record.point.state
         if record.label in LOCATED:
             result.singular[len(result.rows) - 1] = record.point.state

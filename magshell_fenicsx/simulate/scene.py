@@ -238,12 +238,12 @@ class Scene:
     @cached_property
     def sizes(self) -> Sizes:
         """The sizes of the case's units."""
-        return sizes_in_units(self.case, self.plan)
+        return sizes_in_units(self.plan)
 
     @cached_property
     def extra_columns(self) -> tuple[str, ...]:
         """The columns of a row besides those of every run; the last ones are those in the case's units."""
-        return extra_columns(self.case, self.plan)
+        return extra_columns(self.plan)
 
     def stored(self, state: State, energy: float) -> float:
         """The energy of the shell itself: without the potentials of the loads."""

@@ -13,8 +13,8 @@ from command import magshell, read_path
 from conftest import CASES
 
 from magshell_fenicsx import Case, CaseError
-from magshell_fenicsx.case.units import sizes_of
 from magshell_fenicsx.input.source import Source
+from magshell_fenicsx.problem.columns import sizes_of
 from magshell_fenicsx.quantities.registry import axes_of
 
 R, H, E, NU = 25.2e-3, 0.32e-3, 1.8e6, 0.5
@@ -169,7 +169,7 @@ def test_sign_of_the_field_and_strength_of_sources() -> None:
         shell = {"geometry": "hemisphere", "radius": "25.2 mm", "thickness": "0.32 mm", "youngs_modulus": "1.8 MPa"}
         data = {"shell": shell | {"poisson_ratio": 0.5}, "boundary": {"equator": "clamped"}, "magnetic": magnetic}
         case = Case.from_source(Source("units", data))
-        sizes = sizes_of(case)
+        sizes = sizes_of(case.context)
         return case.lambda_m * sizes.of["λ_m"], sizes.field
 
     value, unit = full({"remanent": {"flux_density": "-63 mT"}, "applied": {"flux_density": "20 mT"}})

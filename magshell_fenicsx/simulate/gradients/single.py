@@ -4,9 +4,9 @@ from collections.abc import Callable
 from functools import partial
 
 from magshell_fenicsx.assembly.terms import factor_of
-from magshell_fenicsx.case.units import sizes_of
 from magshell_fenicsx.continuation.system import State, dot
 from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.problem.columns import sizes_of
 from magshell_fenicsx.simulate.gradients.adjoint import Adjoint, Place, along, by_load
 from magshell_fenicsx.simulate.numbers import carried, goals, number_of, scene_with, with_number
 from magshell_fenicsx.simulate.scene import Scene
@@ -75,7 +75,7 @@ def size_by_number(adjoint: Adjoint, key: str) -> float:
     if not adjoint.scale:
         return 0.0
     case = adjoint.scene.case
-    return _slope(lambda p: sizes_of(with_number(case, key, p)).of[adjoint.scale], number_of(case, key))
+    return _slope(lambda p: sizes_of(with_number(case, key, p).context).of[adjoint.scale], number_of(case, key))
 
 
 def _expand(scene: Scene, other: Scene, state: State) -> None:
