@@ -9,12 +9,13 @@ from dolfinx import fem
 from numpy.typing import NDArray
 from ufl.core.expr import Expr
 
+from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.parameters import Growing
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.assembly.terms import LinearTerm
 from magshell_fenicsx.continuation.system import Amplitudes, State, Vector
 from magshell_fenicsx.mesh.midsurface import Midsurface
-from magshell_fenicsx.models.carriers import Carrier
+from magshell_fenicsx.models.carriers import Carrier, Energy
 from magshell_fenicsx.models.shell import patterns
 from magshell_fenicsx.models.shell.fitted import Cells
 from magshell_fenicsx.models.shell.parameters import Loads, Material
@@ -161,6 +162,18 @@ class Thin(Observed):
     """
 
     factory: EnergyFactory
+    kernels: KernelLog
+
+    def own_and_contacts(self) -> list[Energy]:
+        """The energies of one's own terms and of bodies; sets what is observed of them."""
+        factory, energies = self.factory, [self.factory.own(term) for term in self.loads.own]
+        self.observed = self.kernels.compile_all(factory.observed(term) for term in self.loads.own)
+        self.contacts = {}
+        for contact in self.loads.contacts:
+            pressed, pressing, integrals = factory.contact(contact)
+            energies.append(pressed)
+            self.contacts[contact.amplitude] = pressing, self.kernels.compile_all([integrals])
+        return energies
 
     @property
     def carrier(self) -> Carrier:

@@ -118,26 +118,15 @@ class MeridianModel(Thin):
         volume = factory.swept_volume() if swept else factory.volume_change(np.zeros(3))
         if loads.pressure:
             self.energies.append(factory.pressure(potential=not self.without_potential))
-        self.energies += [factory.own(term) for term in loads.own]
-        self.observed = self.kernels.compile_all(factory.observed(term) for term in loads.own)
-        self.contacts = {}
-        for contact in loads.contacts:
-            pressed, known, integrals = factory.contact(contact)
-            self.energies.append(pressed)
-            self.contacts[contact.amplitude] = known, self.kernels.compile_all([integrals])
+        self.energies += self.own_and_contacts()
         for name, force in loads.forces.items():
             self.energies.append(pole_force(name, force.patch, self.force_unit, around, self.kernels))
         self.load_size = {}
         for name, dead in loads.dead.items():
-            self.energies += [factory.own(load.term, name) for load in dead if isinstance(load, Potential)]
             if not all(isinstance(load, EdgeMoment | Potential) for load in dead):
                 energy, self.load_size[name] = dead_loads(name, dead, around, self.kernels)
                 self.energies.append(energy)
-            moments = [load for load in dead if isinstance(load, EdgeMoment)]
-            self.energies += [
-                factory.edge_moment(f"{name} moment {load.edge} {i}", meridian.ends[load.edge], load.moment, name)
-                for i, load in enumerate(moments)
-            ]
+            self.energies += factory.dead_energies(name, dead, meridian.ends)
         terms = [factory.term(energy) for energy in self.energies]
         pattern, held = next(term for term in terms if term.name == INTERIOR), self.held.held(V)
         parameters: dict[str, FreeParameter] = {**make_parameters(factory.free, terms, self.u, self.kernels)}

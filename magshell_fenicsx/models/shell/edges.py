@@ -122,8 +122,7 @@ def turning(r0: Jet, u: Jet, m: Expr, width: Expr, intensity: Expr, past: Expr) 
     length = ufl.sqrt(ufl.dot(along, along))
     t0, n0, n = along / length, kin.normal(r0), kin.normal(r0 + u)
     sine, cosine = ufl.dot(ufl.cross(n0, n), t0), ufl.dot(n0, n)
-    angle = ufl.atan2(sine * past[0] - cosine * past[1], cosine * past[0] + sine * past[1])
-    return -intensity * angle * length
+    return -intensity * kin.angle_from(sine, cosine, past) * length
 
 
 def clamped(

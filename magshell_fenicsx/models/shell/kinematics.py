@@ -155,3 +155,8 @@ def conormal(r0: Jet, m: Expr) -> tuple[Expr, Expr, Expr]:
     nu = ufl.dot(up, m) / ufl.sqrt(ufl.dot(m, ufl.dot(up, m)))
     along = r0.r2 * m[0] - r0.r1 * m[1]
     return nu[0], nu[1], ufl.sqrt(ufl.dot(along, along))
+
+
+def angle_from(sine: Expr, cosine: Expr, past: Expr) -> Expr:
+    """The angle with that sine and cosine, counted from the turn whose cosine and sine are `past` (2,)."""
+    return ufl.atan2(sine * past[0] - cosine * past[1], cosine * past[0] + sine * past[1])

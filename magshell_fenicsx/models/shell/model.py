@@ -31,12 +31,10 @@ from magshell_fenicsx.models.shell.folds import FOLD, largest_fold
 from magshell_fenicsx.models.shell.gradients import PointTerm
 from magshell_fenicsx.models.shell.parameters import (
     Condition,
-    EdgeMoment,
     Force,
     Held,
     Loads,
     Material,
-    Potential,
     default_penalty,
 )
 from magshell_fenicsx.models.shell.patterns import by_patch, cells_of
@@ -196,25 +194,14 @@ class ShellModel(Thin):
             terms += [factory.term(energy) for energy in factory.magnetic(loads.magnetic)]
         if loads.pressure:
             terms.append(factory.term(factory.pressure(potential=not self.without_potential)))
-        terms += [factory.term(factory.own(term)) for term in loads.own]
-        self.observed = self.kernels.compile_all(factory.observed(term) for term in loads.own)
-        self.contacts = {}
-        for contact in loads.contacts:
-            pressed, known, integrals = factory.contact(contact)
-            terms.append(factory.term(pressed))
-            self.contacts[contact.amplitude] = known, self.kernels.compile_all([integrals])
+        terms += [factory.term(energy) for energy in self.own_and_contacts()]
         self.normals = {name: vertex_normal(self.r0, x) for name, x in midsurface.points.items()}
         terms += [self._force(name, force) for name, force in loads.forces.items()]
         on = SurfaceMeasures(self.r0, midsurface, degree) if loads.dead else None
         for name, dead in loads.dead.items():
             assert on
             terms.append(self.load_with(name, assemble_dead_loads(dead, V, on, self.kernels)))
-            moments = [load for load in dead if isinstance(load, EdgeMoment)]
-            for i, load in enumerate(moments):
-                facets_of_load = midsurface.edges[load.edge]
-                moment = factory.edge_moment(f"{name} moment {load.edge} {i}", facets_of_load, load.moment, name)
-                terms.append(factory.term(moment))
-            terms += [factory.term(factory.own(load.term, name)) for load in dead if isinstance(load, Potential)]
+            terms += [factory.term(energy) for energy in factory.dead_energies(name, dead, midsurface.edges)]
         self._sites = make_sites(self.r0, degree, terms, self.kernels, factory.prestress())
         at_edges = None
         if closed:

@@ -1,6 +1,6 @@
 """The energies of a shell on its carrier: each a density, made only when a scene calls for it."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TypeVar
 
@@ -26,7 +26,7 @@ from magshell_fenicsx.models.shell.energy import (
 from magshell_fenicsx.models.shell.free import Constants, constants_of
 from magshell_fenicsx.models.shell.kinematics import CURVED, MOVED, SECOND
 from magshell_fenicsx.models.shell.own_term import OwnTerm
-from magshell_fenicsx.models.shell.parameters import ACROSS, Magnetisation, Material
+from magshell_fenicsx.models.shell.parameters import ACROSS, DeadLoad, EdgeMoment, Magnetisation, Material, Potential
 from magshell_fenicsx.models.shell.patterns import pattern_field
 from magshell_fenicsx.models.shell.thickness import thick
 from magshell_fenicsx.parts.bodies.contact import (
@@ -140,6 +140,15 @@ class EnergyFactory:
         length = fem.assemble_scalar(self.log.compile(f"{name} length", self.carrier.length(facets)))
         total = self.carrier.whole * self._over_ranks(length)
         return self.carrier.energy(name, density, amplitude, counted=(past, intensity * total))
+
+    def dead_energies(self, name: str, loads: Sequence[DeadLoad], edges_named: Mapping[str, Facets]) -> list[Energy]:
+        """The moments and one's own potentials among the dead loads of an amplitude."""
+        moments = [load for load in loads if isinstance(load, EdgeMoment)]
+        turning = [
+            self.edge_moment(f"{name} moment {load.edge} {i}", edges_named[load.edge], load.moment, name)
+            for i, load in enumerate(moments)
+        ]
+        return turning + [self.own(load.term, name) for load in loads if isinstance(load, Potential)]
 
     def antisymmetric_edges(self, facets: Facets, normal: Array) -> HessianTerm:
         """The mirror plane's edges under antisymmetric displacements."""

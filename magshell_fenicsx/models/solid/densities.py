@@ -8,6 +8,7 @@ the undeformed outward normal of the mid-surface and t the edge's tangent, which
 import ufl
 from ufl.core.expr import Expr
 
+from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.parts.magnetism.applied import around
 
 
@@ -89,4 +90,4 @@ def turning(X: Expr, u: Expr, H: Expr, n: Expr, t: Expr, weight: Expr, intensity
     """
     line = n + ufl.dot(H, n)
     sine, cosine = ufl.dot(ufl.cross(n, line), t), ufl.dot(n, line)
-    return -intensity * weight[0] * ufl.atan2(sine * past[0] - cosine * past[1], cosine * past[0] + sine * past[1])
+    return -intensity * weight[0] * kin.angle_from(sine, cosine, past)
