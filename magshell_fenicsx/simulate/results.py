@@ -157,11 +157,6 @@ def offset(scene: Scene, target: Target) -> fem.Function:
     return found
 
 
-def over_area(scene: Scene) -> Callable[[ufl.core.expr.Expr], ufl.Form]:
-    """The integral over the undeformed area of the modelled part; of a solid over its volume."""
-    return scene.model.over_area()
-
-
 def distances(scene: Scene, state: State, target: Target) -> tuple[float, float]:
     """Root mean square and largest distance to a target at the nodes, over R; collective."""
     system, away = scene.model.system, offset(scene, target)
@@ -173,7 +168,7 @@ def distances(scene: Scene, state: State, target: Target) -> tuple[float, float]
 
 def _misfit(scene: Scene, state: State, target: Target) -> Functional:
     model, system = scene.model, scene.model.system
-    over, away = over_area(scene), offset(scene, target)
+    over, away = model.over_area(), offset(scene, target)
     gap, log = system.u - away, model.kernels
     one = fem.Constant(model.V.mesh, 1.0)
     square = log.compile("misfit", over(ufl.dot(gap, gap)))

@@ -15,7 +15,6 @@ from dolfinx.la import InsertMode
 from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.forms import FieldGradient
-from magshell_fenicsx.simulate.results import over_area
 from magshell_fenicsx.simulate.scene import Scene
 
 Array = NDArray[np.float64]
@@ -27,7 +26,7 @@ def density(scene: Scene, found: FieldGradient) -> Array:
     H = fem.functionspace(V.mesh, ("Lagrange", 1))
     hat, count = H.element.basix_element, len(found.forces)
     area = fem.Function(H)
-    form = scene.model.kernels.compile("area of a vertex", over_area(scene)(ufl.TestFunction(H)))
+    form = scene.model.kernels.compile("area of a vertex", scene.model.over_area()(ufl.TestFunction(H)))
     fem.assemble_vector(area.x.array, form)
     _added(area)
     shares = np.einsum("cnk,nv->cvk", found.forces, hat.tabulate(0, nodes)[0, :, :, 0])

@@ -7,7 +7,6 @@ from dolfinx.la import InsertMode
 
 from magshell_fenicsx.assembly.forms import FieldGradient
 from magshell_fenicsx.simulate.gradients.fields import places_of
-from magshell_fenicsx.simulate.results import over_area
 from magshell_fenicsx.simulate.scene import Scene
 
 MASS = "mass"
@@ -18,7 +17,7 @@ def mass(scene: Scene) -> tuple[float, FieldGradient | None]:
     model = scene.model
     if model.thickness is None:
         return 1.0, None
-    t, over, log = model.thickness, over_area(scene), model.kernels
+    t, over, log = model.thickness, model.over_area(), model.kernels
     Q, comm = t.function_space, t.function_space.mesh.comm
     one = fem.Constant(Q.mesh, 1.0)
     area = comm.allreduce(fem.assemble_scalar(log.compile("area", over(one))))
