@@ -21,7 +21,8 @@ from magshell_fenicsx.models.axisymmetric import jets
 from magshell_fenicsx.models.axisymmetric.meridian import make_meridian
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.shell import kinematics as kin
-from magshell_fenicsx.problem.planner import make_plan, meridian_vertices
+from magshell_fenicsx.problem.planner import make_plan
+from magshell_fenicsx.problem.problem import meridian_vertices
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.scene import Scene
 
@@ -66,7 +67,7 @@ def reference(edge: Edge, R_over_h: float, refinement: float = 1.0) -> float:
     plan = make_plan(case)
     span, length = plan.meridian, case.shell.reference
     assert span
-    vertices = meridian_vertices(plan, case)
+    vertices = meridian_vertices(plan)
     if edge == "free":  # no strong layers, and bending is so soft that rounding grows with the number of intervals
         vertices = np.linspace(0.0, span.length, round(INTERVALS * refinement) + 1)
     meridian = make_meridian(span.embedding, vertices, span.names, {}, span.curvature)

@@ -138,7 +138,7 @@ def slivers(aspect: float, way: str) -> Line:
     size = 0.25 if way == "along" and aspect > 1 else min(0.05, 2 * case.width / aspect)
     shape = StripShape(case.width * stretch, half=False)
     plan = replace(plan, shape=shape, size=Grading([], size), embedding=_Stretched(stretch))
-    model = build_model(case, plan, MPI.COMM_WORLD)
+    model = build_model(plan, MPI.COMM_WORLD)
     newton = BorderedNewton(model.system)
     path = EquilibriumPath(newton, "lambda_m", "load", StepOptions(target / 4, target, 1e-4 * target))
     unloaded = State(model.zero(), {"lambda_m": 0.0})

@@ -161,6 +161,9 @@ def on_mesh_of(scene: Scene, new: Plan) -> Plan:
         meridian = replace(new.meridian, vertices=np.sort(model.meridian.mesh.geometry.x[:, 0]))
     return replace(
         old,
+        context=new.context,
+        lambda_m=new.lambda_m,
+        body=new.body,
         material=new.material,
         loads=new.loads,
         thickness=new.thickness,

@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -20,7 +21,9 @@ from command import started
 from conftest import CASES
 
 from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.models.shell.parameters import Material
 from magshell_fenicsx.platform.terminal import LAUNCHERS, live_line
+from magshell_fenicsx.problem.planner import make_plan
 from magshell_fenicsx.quantities.registry import Sizes
 from magshell_fenicsx.runs.status import Aim, RunProgress, time_left
 
@@ -152,7 +155,7 @@ def test_a_narrow_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_time_left_of_a_resumed_run(monkeypatch: pytest.MonkeyPatch) -> None:
     """Known points took no time, so only new ones tell how long the rest takes; the field has no part in it."""
     case = Case.load(CASES / "indentation.yaml")
-    plan = SimpleNamespace(material=SimpleNamespace(h=0.01))
+    plan = replace(make_plan(case), material=Material(0.5, 0.01))
     told: list[str] = []
     clock = iter(range(0, 1000, 10))
     monkeypatch.setattr(time, "perf_counter", lambda: next(clock))

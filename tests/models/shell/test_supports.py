@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 from magshell_fenicsx import Case, Scene, follow
-from magshell_fenicsx.input.source import Source
+from magshell_fenicsx.input.source import CaseError, Source
 from magshell_fenicsx.mesh.patch import MeshError
 
 THIN = {"thickness": 0.02, "poisson_ratio": 0.3}
@@ -135,10 +135,10 @@ def test_sectors_between_oblique_symmetry_planes() -> None:
 
 
 def test_a_remanence_without_value_is_refused() -> None:
-    """At a node, where the places that a plan looks at have a value."""
+    """At a node, and at places that a plan does not look at by samples alone."""
     magnetic = {"lambda_m": 1e-3, "remanent": {"kind": "expression", "components": ["0*x", "0*x", "1/(3*x - 1)"]}}
     data = {"shell": PLATE, "boundary": {"left": "clamped"}, "magnetic": magnetic, "mesh": {"degree": 2, "size": 0.34}}
-    with pytest.raises(MeshError, match=r"magnetic.remanent: has no finite value .* \(0.333, "):
+    with pytest.raises(CaseError, match=r"magnetic.remanent.components: .* is inf at .* \(0.333, "):
         Scene(Case.from_source(Source("test", data)))
 
 
