@@ -5,6 +5,7 @@
 >>> ms.run(case).knockdown  # doctest: +SKIP
 0.32624
 
+Without a case file, `Problem` is made of a `Shell`, on a dolfinx mesh for instance, and of what holds and loads it.
 A scene is stepped through by `follow` (the history of its case) and `trace` (a path in any amplitude); `gradient`
 differentiates what was found by amplitudes, numbers of the case and fields; `columns`,
 `surface`, `polydata`, `curve` and `picture` show what was found; an `OwnTerm` is one's own energy,
@@ -14,34 +15,56 @@ whose `Free` parameters are amplitudes too.
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from magshell_fenicsx.platform.version import __version__
-
 if TYPE_CHECKING:
     from magshell_fenicsx.case.case import Case
     from magshell_fenicsx.input.source import CaseError
     from magshell_fenicsx.models.shell import kinematics
     from magshell_fenicsx.models.shell.kinematics import Jet
     from magshell_fenicsx.models.shell.own_term import Free, OwnTerm
+    from magshell_fenicsx.public import Scene, follow, run
+    from magshell_fenicsx.python import (
+        Clamped,
+        Field,
+        Force,
+        Held,
+        Hinged,
+        OnPlane,
+        Pressure,
+        Problem,
+        Section,
+        Shell,
+        Step,
+    )
     from magshell_fenicsx.runs.notebook import curve, picture, polydata, surface
     from magshell_fenicsx.runs.rows import columns
-    from magshell_fenicsx.runs.run import Result, run
-    from magshell_fenicsx.simulate.follow import follow
+    from magshell_fenicsx.runs.summary import Result
     from magshell_fenicsx.simulate.gradients.gradient import gradient
     from magshell_fenicsx.simulate.record import Record, Stopped
-    from magshell_fenicsx.simulate.scene import Scene
     from magshell_fenicsx.simulate.search import solutions
     from magshell_fenicsx.simulate.sensitivity import fold_at, sensitivities
     from magshell_fenicsx.simulate.trace import trace
 
+__version__ = "0.1.0"
 __all__ = [
     "Case",
     "CaseError",
+    "Clamped",
+    "Field",
+    "Force",
     "Free",
+    "Held",
+    "Hinged",
     "Jet",
+    "OnPlane",
     "OwnTerm",
+    "Pressure",
+    "Problem",
     "Record",
     "Result",
     "Scene",
+    "Section",
+    "Shell",
+    "Step",
     "Stopped",
     "__version__",
     "columns",
@@ -65,13 +88,13 @@ _ROOMS = {
     "models.shell": "kinematics",
     "models.shell.kinematics": "Jet",
     "models.shell.own_term": "Free OwnTerm",
+    "public": "Scene follow run",
+    "python": "Clamped Field Force Held Hinged OnPlane Pressure Problem Section Shell Step",
     "runs.notebook": "curve picture polydata surface",
     "runs.rows": "columns",
-    "runs.run": "Result run",
-    "simulate.follow": "follow",
+    "runs.summary": "Result",
     "simulate.gradients.gradient": "gradient",
     "simulate.record": "Record Stopped",
-    "simulate.scene": "Scene",
     "simulate.search": "solutions",
     "simulate.sensitivity": "fold_at sensitivities",
     "simulate.trace": "trace",

@@ -8,49 +8,35 @@ import traceback
 from pathlib import Path
 from typing import Annotated, Any
 
-from magshell_fenicsx.cli_pictures import plot, view
-from magshell_fenicsx.ending import INVALID, STOPPED, exit_codes, failure, print_line, refuse_lost, world
-from magshell_fenicsx.platform.completion import case_files, left_to_the_shell
-from magshell_fenicsx.platform.plain import typer
+from magshell_fenicsx import __version__
+from magshell_fenicsx.command import (
+    INVALID,
+    STOPPED,
+    CaseFile,
+    Over,
+    Result,
+    Run,
+    Settings,
+    chosen_folder,
+    exit_codes,
+    failure,
+    folder_option,
+    left_to_the_shell,
+    picture_options,
+    print_line,
+    refuse_lost,
+    result_option,
+    typer,
+    world,
+)
 from magshell_fenicsx.platform.terminal import open_standard_streams
-from magshell_fenicsx.platform.version import __version__
 
 app = typer.Typer(
     help="Thin magnetic shells: deformation, indentation, buckling.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
-CaseFile = Annotated[Path, typer.Argument(metavar="CASE.yaml", help="the case file", autocompletion=case_files)]
-Settings = Annotated[
-    list[str] | None, typer.Option("--set", metavar="KEY.PATH=VALUE", help="replace a key of the case")
-]
-Over = Annotated[
-    list[str],
-    typer.Option(metavar="KEY.PATH=START:STOP:COUNT", help="or =VALUE,VALUE; repeat for a product, tie keys with +"),
-]
-
-
-def _result(before: str = "") -> Any:
-    return typer.Option(
-        "--result", metavar="NAME", help=f"{before}knockdown, critical_field, force@w_over_h=10, energy@end, ..."
-    )
-
-
-Result = Annotated[str, _result()]
-
 PETSC = ("-snes_", "-ksp_", "-mat_", "-magshell_", "-log_", "-options_")  # how its options begin
-
-
-def _folder(default: str) -> Any:
-    return typer.Option(help=f"output folder; default {default}", autocompletion=left_to_the_shell)
-
-
-def _chosen(out: str | None, default: str) -> Path:
-    """The folder of an option, or the default one in results/."""
-    from magshell_fenicsx.output.store.folder import given_folder
-
-    with exit_codes():
-        return Path("results") / default if out is None else given_folder(out)
 
 
 def _hand_over_to_petsc(words: list[str]) -> None:
@@ -113,7 +99,7 @@ def options(
 def run(
     case: CaseFile,
     set_: Settings = None,
-    out: Annotated[str | None, _folder("results/<case name>/")] = None,
+    out: Annotated[str | None, folder_option("results/<case name>/")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="continue the interrupted run in that folder")] = False,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="replace the run in that folder even if it is another's, or unfinished")
@@ -129,10 +115,10 @@ def run(
     from magshell_fenicsx.output.report.verdict import sentence_of
     from magshell_fenicsx.output.store.folder import DiskError
     from magshell_fenicsx.platform.terminal import live_line
+    from magshell_fenicsx.public import run as run_case
     from magshell_fenicsx.runs.files import AlreadyComplete
-    from magshell_fenicsx.runs.run import run as run_case
 
-    folder = _chosen(out, case.stem)
+    folder = chosen_folder(out, case.stem)
     how: dict[str, Any] = {"resume": resume, "overwrite": overwrite, "time_limit": time_limit, "pictures": pictures}
     try:
         with exit_codes(MeshError, stopped=(DiskError,)):
@@ -160,8 +146,8 @@ def sweep(
     case: CaseFile,
     over: Over,
     set_: Settings = None,
-    out: Annotated[str | None, _folder("results/<case name>_sweep/")] = None,
-    result: Annotated[str | None, _result("beside k_d, barrier and limit points: ")] = None,
+    out: Annotated[str | None, folder_option("results/<case name>_sweep/")] = None,
+    result: Annotated[str | None, result_option("beside k_d, barrier and limit points: ")] = None,
     full_paths: Annotated[
         bool, typer.Option("--full-paths", help="compute the full path at every point; follow no fold")
     ] = False,
@@ -173,7 +159,7 @@ def sweep(
     from magshell_fenicsx.output.store.folder import DiskError
     from magshell_fenicsx.studies.sweep import sweep as run_sweep
 
-    folder = _chosen(out, f"{case.stem}_sweep")
+    folder = chosen_folder(out, f"{case.stem}_sweep")
     with exit_codes(stopped=(DiskError,)):
         done = run_sweep(case, over, set_ or [], folder, made=_made, result=result, full_paths=full_paths, part=part)
     print_line(f"results in {folder}/")
@@ -192,14 +178,14 @@ def study(
     reference: Annotated[float | None, typer.Option(help="exact value for the errors; default the finest run")] = None,
     ranks: Annotated[str, typer.Option(metavar="N,N", help="numbers of MPI ranks for each point")] = "1",
     repeat: Annotated[int, typer.Option(min=1, help="runs of each point; medians are reported")] = 3,
-    out: Annotated[str | None, _folder("results/<case name>_study/")] = None,
+    out: Annotated[str | None, folder_option("results/<case name>_study/")] = None,
 ) -> None:
     """Measure error against run time over meshes, degrees, models and ranks; keep the runs in the folder."""
     from magshell_fenicsx.output.store.folder import DiskError
     from magshell_fenicsx.studies.study import parse_ranks
     from magshell_fenicsx.studies.study import study as run_study
 
-    folder = _chosen(out, f"{case.stem}_study")
+    folder = chosen_folder(out, f"{case.stem}_study")
     with exit_codes(stopped=(DiskError,)):
         done = run_study(
             case,
@@ -234,14 +220,14 @@ def ensemble(
         list[Path] | None,
         typer.Option(metavar="DIR", help="take the samples of the jobs' folders, compute none; repeat it"),
     ] = None,
-    out: Annotated[str | None, _folder("results/<case name>_ensemble/")] = None,
+    out: Annotated[str | None, folder_option("results/<case name>_ensemble/")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="continue the interrupted ensemble in that folder")] = False,
 ) -> None:
     """Run random samples of a case (its section `ensemble`) and fit their statistics; keep finished samples."""
     from magshell_fenicsx.output.store.folder import DiskError
     from magshell_fenicsx.studies.ensemble import ensemble as run_ensemble
 
-    folder = _chosen(out, f"{case.stem}_ensemble")
+    folder = chosen_folder(out, f"{case.stem}_ensemble")
     with exit_codes(stopped=(DiskError,)):
         done = run_ensemble(
             case,
@@ -269,7 +255,7 @@ def ensemble(
 def design(
     case: CaseFile,
     set_: Settings = None,
-    out: Annotated[str | None, _folder("results/<case name>_design/")] = None,
+    out: Annotated[str | None, folder_option("results/<case name>_design/")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="continue the interrupted design in that folder")] = False,
 ) -> None:
     """Vary a case for a result (its section `design`); write the best case, its table and picture, and verify it."""
@@ -278,7 +264,7 @@ def design(
     from magshell_fenicsx.studies.design import Missed
     from magshell_fenicsx.studies.design import design as run_design
 
-    folder = _chosen(out, f"{case.stem}_design")
+    folder = chosen_folder(out, f"{case.stem}_design")
     with exit_codes(MeshError, stopped=(DiskError, Missed)):
         run_design(case, set_ or [], folder, made=_shared, resume=resume, say=print_line)
     print_line(f"results in {folder}/")
@@ -294,15 +280,15 @@ def compare(
     solid: Annotated[
         str, typer.Option(metavar="R,R", help="refinements of the solid's mesh; three give error against run time")
     ] = "1",
-    result: Annotated[str | None, _result("what is compared; default k_d, or the load: ")] = None,
-    out: Annotated[str | None, _folder("results/<case name>_compare/")] = None,
+    result: Annotated[str | None, result_option("what is compared; default k_d, or the load: ")] = None,
+    out: Annotated[str | None, folder_option("results/<case name>_compare/")] = None,
 ) -> None:
     """Run a case as a shell and as a solid; compare their curves and run times."""
     from magshell_fenicsx.output.store.folder import DiskError
     from magshell_fenicsx.studies.compare import NothingLeft, parse_refinements
     from magshell_fenicsx.studies.compare import compare as run_comparison
 
-    folder = _chosen(out, f"{case.stem}_compare")
+    folder = chosen_folder(out, f"{case.stem}_compare")
     with exit_codes(stopped=(DiskError, NothingLeft)):
         refinements = parse_refinements(shell, solid)
         done = run_comparison(
@@ -314,28 +300,67 @@ def compare(
     print_line(f"results in {folder}/")
 
 
-app.command()(plot)
-app.command()(view)
+@app.command()
+def plot(
+    folder: Run,
+    point: Annotated[int | None, typer.Option(metavar="N", help="draw only this point: shell_000N.png, ...")] = None,
+    animation: Annotated[bool, typer.Option("--animation", help="also draw the path: animation.gif")] = False,
+    formats: Annotated[
+        str | None, typer.Option(metavar="KIND,KIND", help="besides png: svg, pdf, with text as text")
+    ] = None,
+    width: Annotated[float | None, typer.Option(metavar="MM", help="of a picture")] = None,
+    dpi: Annotated[int | None, typer.Option(help="pixels per inch")] = None,
+    font_size: Annotated[float | None, typer.Option(metavar="POINTS", help="of all text")] = None,
+    camera: Annotated[
+        str | None, typer.Option(metavar="POLAR,AZIMUTH", help="from the shell to the eye, degrees from e3 and e1")
+    ] = None,
+    range_: Annotated[
+        list[str] | None, typer.Option("--range", metavar="FIELD=LOW:HIGH", help="of colours, as w_over_h=-2:2; repeat")
+    ] = None,
+) -> None:
+    """Draw the pictures and write the report of a run again, from its folder; options as in the section output."""
+    from magshell_fenicsx.output.pictures.plot import plot as plot_again
+
+    if world().rank:
+        return
+    with exit_codes(stopped=(OSError,)):
+        options = picture_options(formats, width, dpi, font_size, camera, range_ or [])
+        drawn = plot_again(folder, point, animation, options)
+    print_line(f"{', '.join(drawn)} in {folder}/")
+
+
+@app.command()
+def view(folder: Run) -> None:
+    """Open the report of a run in the web browser: the shell to turn, the path to walk along; else print its path."""
+    from magshell_fenicsx.output.report.report import opened, report_of
+
+    if world().rank:
+        return
+    with exit_codes(stopped=(OSError,)):
+        file = report_of(folder)
+    print_line(f"{'opened' if opened(file) else 'no web browser found; the report is'} {file}")
 
 
 @app.command()
 def check(case: CaseFile, set_: Settings = None) -> None:
     """Validate a case; print what would be built and what is left out."""
     from magshell_fenicsx.case.case import Case
+    from magshell_fenicsx.case.check import describe
     from magshell_fenicsx.case.opened import read_together, with_same_files
     from magshell_fenicsx.input.source import CaseError
-    from magshell_fenicsx.problem.check import describe
+    from magshell_fenicsx.public import problem_of
     from magshell_fenicsx.simulate.perfect import with_modes
 
     with exit_codes():
         source = read_together(case, world(), set_ or [])
         read = with_same_files(Case.from_source(source), world())
-        print_line(describe(with_modes(read, world())))
+        problem = with_modes(problem_of(read, world()), world())
+        print_line(describe(read, problem))
         if read.gradients or read.design:
             from magshell_fenicsx.simulate.gradients.expected import refuse_unknown_results
 
             try:
-                refuse_unknown_results(read, read.design.named if read.design else {})
+                refuse_unknown_results(problem, read.design.named if read.design else {})
             except CaseError as e:
                 raise CaseError(read.placed(str(e))) from None
         if read.ensemble:
@@ -388,8 +413,7 @@ def schema(
     markdown: Annotated[bool, typer.Option("--markdown", help="print the page docs/case.md instead")] = False,
 ) -> None:
     """Print the JSON Schema of the case file, for editors."""
-    from magshell_fenicsx.case.reference import reference
-    from magshell_fenicsx.case.schema import schema_text
+    from magshell_fenicsx.case.reference import reference, schema_text
 
     print_line((reference() if markdown else schema_text()).removesuffix("\n"))
     refuse_lost()
@@ -417,5 +441,6 @@ def info(
         if not world().rank:
             library()
         for degree in (3, 4):
-            print_line(f"compiled degree {degree} in {precompile(degree):.1f} s")
+            seconds = precompile(degree, lambda source: _made(source).problem())
+            print_line(f"compiled degree {degree} in {seconds:.1f} s")
     refuse_lost()

@@ -13,8 +13,7 @@ from mpi4py import MPI
 
 from magshell_fenicsx.mesh.midsurface import Midsurface, distribute
 from magshell_fenicsx.mesh.patch import Deviated, Embedding
-from magshell_fenicsx.mesh.shapes import DiscShape
-from magshell_fenicsx.mesh.sphere import flat, sphere
+from magshell_fenicsx.mesh.shapes import DiscShape, flat, sphere
 from magshell_fenicsx.mesh.triangulation import triangulate
 from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.shell.parameters import Condition, Loads, MagneticEnergy, Magnetisation, Material
@@ -80,7 +79,7 @@ def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def draw_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(import_module("magshell_fenicsx.runs.run"), "_draw", lambda folder: None)
+    monkeypatch.setattr(import_module("magshell_fenicsx.runs.running"), "_draw", lambda folder: None)
 
 
 def random_displacement(model: ShellModel, size: float, seed: int = 0) -> Any:

@@ -12,7 +12,7 @@ import pytest
 from command import magshell, read_path, started
 from conftest import CASES
 
-from magshell_fenicsx.platform.version import __version__
+from magshell_fenicsx import __version__
 
 PLATE = CASES / "clamped_plate.yaml"
 COLUMNS = (

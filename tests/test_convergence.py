@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from magshell_fenicsx import Case
-from magshell_fenicsx.runs.run import run
+from magshell_fenicsx.public import run
 
 CASE = Path(__file__).parents[1] / "cases" / "dimple_buckling.yaml"
 REFERENCE = {0.0: 0.326233289, 0.00184: 0.552053778, -0.00184: 0.120723848}

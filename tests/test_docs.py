@@ -12,10 +12,10 @@ from conftest import CASES
 from typer.main import get_command
 
 from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.check import describe
 from magshell_fenicsx.case.reference import anchor
 from magshell_fenicsx.cli import app
-from magshell_fenicsx.problem.check import describe
-from magshell_fenicsx.runs.run import run
+from magshell_fenicsx.public import run
 
 TOP = CASES.parent
 PAGES = [TOP / "README.md", TOP / "CONTRIBUTING.md", *sorted((TOP / "docs").rglob("*.md")), TOP / "meshes/README.md"]

@@ -11,10 +11,10 @@ from pathlib import Path
 import pytest
 from conftest import CASES
 
+from magshell_fenicsx import __version__
 from magshell_fenicsx.case.examples import examples
-from magshell_fenicsx.case.schema import schema_text
-from magshell_fenicsx.platform import sources
-from magshell_fenicsx.platform.version import __version__
+from magshell_fenicsx.case.reference import schema_text
+from magshell_fenicsx.platform import environment
 
 TOP = CASES.parent
 QUICK = ("--set=mesh.degree=3", "--set=mesh.refinement=0.3")
@@ -91,7 +91,10 @@ def test_what_is_installed(installed: Installed) -> None:
 @pytest.mark.slow
 def test_results_are_of_the_same_sources(installed: Installed) -> None:
     """What the repository's program keeps on disk, the installed one goes on with, and the other way round."""
-    assert installed.python("from magshell_fenicsx.platform import sources; print(sources.ours())") == sources.ours()
+    assert (
+        installed.python("from magshell_fenicsx.platform.environment import code_version; print(code_version())")
+        == environment.code_version()
+    )
 
 
 @pytest.mark.slow

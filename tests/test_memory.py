@@ -11,8 +11,8 @@ from conftest import CASES
 import magshell_fenicsx as ms
 from magshell_fenicsx.continuation.modes import critical_mode
 from magshell_fenicsx.continuation.system import State
+from magshell_fenicsx.public import Scene
 from magshell_fenicsx.simulate.follow import follow
-from magshell_fenicsx.simulate.scene import Scene
 
 SCENES, TEN = int(sys.argv[1]) if __name__ == "__main__" else 20, 10
 COARSE = ["symmetry=half", "mesh.degree=2", "mesh.refinement=0.3"]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from magshell_fenicsx import Case, Record, Scene
-from magshell_fenicsx.assembly.noise import VARIABLE
+from magshell_fenicsx.assembly.evaluated import VARIABLE
 from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.simulate.follow import follow
 
@@ -51,7 +51,7 @@ def test_steps_do_not_grow_with_slenderness() -> None:
         scene, records = quiet() if slenderness == 100 else rolled(slenderness)
         end = records[-1]
         assert end.point.state.mu["load"] == 1.0
-        tip = scene.plan.length * scene.model.displacement(end.point.state.u, "A")
+        tip = scene.problem.length * scene.model.displacement(end.point.state.u, "A")
         assert tip == pytest.approx([-LENGTH, 0, 0], abs=2e-3)  # the exact circle
         points.append(len(records))
     assert max(points) < 1.6 * points[0], points

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.output.store.durable import write_whole
 from magshell_fenicsx.output.store.table import Row
-from magshell_fenicsx.runs.run import run
+from magshell_fenicsx.public import run
 
 FILE = Path(__file__).parents[1] / "arch.yaml"
 RAMP = Path(__file__).parent / "reference" / "tan_arch_ramp.csv"

@@ -14,7 +14,7 @@ from scipy.signal import find_peaks
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.output.store.durable import write_whole
-from magshell_fenicsx.runs.run import run
+from magshell_fenicsx.public import run
 
 FILE = Path(__file__).parents[1] / "arch_snap.yaml"
 REFERENCE = Path(__file__).parent / "reference"

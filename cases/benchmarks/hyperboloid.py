@@ -14,6 +14,7 @@ import ufl
 from dolfinx import fem
 
 from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.mesh.grading import Grading, Line
 from magshell_fenicsx.mesh.grid import Grid
@@ -21,10 +22,9 @@ from magshell_fenicsx.models.axisymmetric import jets
 from magshell_fenicsx.models.axisymmetric.meridian import make_meridian
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.shell import kinematics as kin
-from magshell_fenicsx.problem.planner import make_plan
 from magshell_fenicsx.problem.problem import meridian_vertices
+from magshell_fenicsx.public import Scene
 from magshell_fenicsx.simulate.follow import follow
-from magshell_fenicsx.simulate.scene import Scene
 
 CASE = Path(__file__).parent / "hyperboloid.yaml"
 OUT = CASE.parents[2] / "docs" / "hyperboloid" / "README.md"
@@ -64,15 +64,15 @@ def reference(edge: Edge, R_over_h: float, refinement: float = 1.0) -> float:
     settings = ["shell.azimuth=null", "boundary={bottom: symmetry, top: clamped}", f"shell.thickness={h}"]
     load = "loading.loads=[{over: all, pressure: 1.0}]"
     case = Case.load(CASE, [*settings, load, f"mesh={{refinement: {refinement}}}"])
-    plan = make_plan(case)
-    span, length = plan.meridian, case.shell.reference
+    problem = make_problem(case)
+    span, length = problem.meridian, case.shell.reference
     assert span
-    vertices = meridian_vertices(plan)
+    vertices = meridian_vertices(problem)
     if edge == "free":  # no strong layers, and bending is so soft that rounding grows with the number of intervals
         vertices = np.linspace(0.0, span.length, round(INTERVALS * refinement) + 1)
     meridian = make_meridian(span.embedding, vertices, span.names, {}, span.curvature)
-    conditions = {**plan.conditions, "top": edge}
-    model = MeridianModel(meridian, plan.material, 4, conditions, plan.loads)
+    conditions = {**problem.conditions, "top": edge}
+    model = MeridianModel(meridian, problem.material, 4, conditions, problem.loads)
     waves, carrier = model.excluded_modes.waves, model.factory.carrier
     v = ufl.TestFunction(waves.V)
     along = jets.wave(v, fem.Constant(meridian.mesh, float(M)))[0].r
@@ -92,17 +92,17 @@ def energy(edge: Edge, R_over_h: float, size: float, *settings: str, graded: boo
     more = [f"shell.thickness={h}", f"boundary.top={edge}", f"mesh.size={size}"]
     more.append(f'loading.loads=[{{over: all, pressure: "{p}*cos(2*arctan2(y, x))"}}]')
     case = Case.load(CASE, [*more, *settings])
-    plan = make_plan(case)
+    problem = make_problem(case)
     if graded:
-        grid = plan.shape
+        grid = problem.shape
         assert isinstance(grid, Grid)
         place = (grid.low, grid.high)[grid.sides.index("top") % 2][1]
         layer = Line(1, place, LAYER * size * sqrt(h), GROWTH * size)
-        plan = replace(plan, shape=replace(grid, size=Grading([layer], size).across))
-    scene = Scene(case, plan=plan)
+        problem = replace(problem, shape=replace(grid, size=Grading([layer], size).across))
+    scene = Scene(problem)
     *_, last = follow(scene)
     found = scene.observe(last.point.state)
-    whole = 8 * h * scene.plan.length**2 * (found["stretching"] + found["bending"])
+    whole = 8 * h * scene.problem.length**2 * (found["stretching"] + found["bending"])
     return float(whole * h ** POWER[edge] / p**2)
 
 

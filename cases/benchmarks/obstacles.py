@@ -25,8 +25,8 @@ from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.output.pictures.curve import smooth
 from magshell_fenicsx.output.store.checkpoint import OtherSources
 from magshell_fenicsx.output.store.durable import write_whole
+from magshell_fenicsx.public import run
 from magshell_fenicsx.runs.files import AlreadyComplete
-from magshell_fenicsx.runs.run import run
 
 CASES = Path(__file__).parent
 OUT = CASES.parents[1] / "docs" / "benchmarks"

@@ -8,10 +8,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.mesh.shapes import DiscShape
-from magshell_fenicsx.problem.planner import make_plan
+from magshell_fenicsx.public import Scene
 from magshell_fenicsx.simulate.follow import follow
-from magshell_fenicsx.simulate.scene import Scene
 
 CASE = Path(__file__).parents[1] / "dimple_buckling.yaml"
 DIMPLES = ((1.64, 3.2), (4.0, 3.2), (1.64, 1.5))  # depth over h, width
@@ -22,11 +22,11 @@ def knockdown(depth: float, width: float, refinement: float, *settings: str, mat
     dimple = f"{{kind: dimple, amplitude: {depth}, width: {width}, at: {{polar: 40}}}}"
     common = [f"shell.imperfections=[{dimple}]", f"mesh.refinement={refinement}", "symmetry=none"]
     case = Case.load(CASE, [*common, *settings])
-    plan = make_plan(case)
+    problem = make_problem(case)
     if not matched:
-        assert isinstance(plan.shape, DiscShape)
-        plan = replace(plan, shape=replace(plan.shape, rims=()))
-    *_, last = follow(Scene(case, plan=plan))
+        assert isinstance(problem.shape, DiscShape)
+        problem = replace(problem, shape=replace(problem.shape, rims=()))
+    *_, last = follow(Scene(problem))
     return last.point.state.mu["pressure"]
 
 

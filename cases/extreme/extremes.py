@@ -15,6 +15,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.continuation.factor import condition_estimate
 from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.path import Path as EquilibriumPath
@@ -23,10 +24,9 @@ from magshell_fenicsx.continuation.point import PathStopped
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.mesh.grading import Grading
 from magshell_fenicsx.mesh.shapes import StripShape
-from magshell_fenicsx.problem.planner import make_plan
-from magshell_fenicsx.runs.run import run
+from magshell_fenicsx.public import run
 from magshell_fenicsx.runs.summary import Result
-from magshell_fenicsx.simulate.build import build_model
+from magshell_fenicsx.simulate.scene import build_model
 
 CASES = Path(__file__).parent
 OUT = CASES.parents[1] / "docs" / "extremes"
@@ -128,17 +128,17 @@ def line(variant: Variant) -> Line:
 
 
 def slivers(aspect: float, way: str) -> Line:
-    """The strip with its triangles stretched along or across it: the plan with another chart."""
+    """The strip with its triangles stretched along or across it: the problem with another chart."""
     start = time.perf_counter()
     case = Case.load(CASES / "slivers.yaml")
-    plan, target = make_plan(case), case.lambda_m
+    problem, target = make_problem(case), case.lambda_m
     assert case.width
     stretch = aspect if way == "along" else 1 / aspect
     # as many triangles along the strip as across, but for the stretch
     size = 0.25 if way == "along" and aspect > 1 else min(0.05, 2 * case.width / aspect)
     shape = StripShape(case.width * stretch, half=False)
-    plan = replace(plan, shape=shape, size=Grading([], size), embedding=_Stretched(stretch))
-    model = build_model(plan, MPI.COMM_WORLD)
+    problem = replace(problem, shape=shape, size=Grading([], size), embedding=_Stretched(stretch))
+    model = build_model(problem, MPI.COMM_WORLD)
     newton = BorderedNewton(model.system)
     path = EquilibriumPath(newton, "lambda_m", "load", StepOptions(target / 4, target, 1e-4 * target))
     unloaded = State(model.zero(), {"lambda_m": 0.0})
@@ -149,7 +149,7 @@ def slivers(aspect: float, way: str) -> Line:
         said = f"stopped: {e}"
     last = points[-1].state
     tip = float(model.displacement(last.u, "pole")[2]) if said == "reached" else None
-    step = smallest([model.deflection(point.state.u, "pole") / plan.material.h for point in points])
+    step = smallest([model.deflection(point.state.u, "pole") / problem.material.h for point in points])
     seconds = time.perf_counter() - start
     return Line(
         family="slivers",

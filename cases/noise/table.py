@@ -1,6 +1,6 @@
 """Every case under noise: make noise ARGS="[--seeds 20] [--seconds 60] [CASE ...]"
 
-The noise (`continuation/noise.py`) stands for the rounding of another processor, at 1e-15, 1e-14 and 1e-13 in
+The noise (`assembly/evaluated.py`) stands for the rounding of another processor, at 1e-15, 1e-14 and 1e-13 in
 turn. A case should reach the same end through the same instabilities, with numbers within their estimated errors.
 """
 
@@ -13,10 +13,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import magshell_fenicsx as ms
-from magshell_fenicsx.assembly.noise import VARIABLE
-from magshell_fenicsx.continuation.newton import MOTION
+from magshell_fenicsx.assembly.evaluated import VARIABLE
+from magshell_fenicsx.case.planner import make_problem
+from magshell_fenicsx.continuation.snes import MOTION
 from magshell_fenicsx.continuation.system import max_abs
-from magshell_fenicsx.problem.planner import make_plan
 
 LEVELS = 1e-15, 1e-14, 1e-13
 COARSE = ["mesh.degree=3", "mesh.refinement=0.5"], ["mesh.refinement=0.5"], ["mesh.degree=3"]
@@ -89,7 +89,7 @@ def loaded(file: Path, coarse: bool) -> ms.Case:
     for settings in (*(COARSE if coarse else ()), ()):
         with suppress(ms.CaseError):
             case = ms.Case.load(file, settings)
-            make_plan(case)
+            make_problem(case)
             return case
     return ms.Case.load(file)
 

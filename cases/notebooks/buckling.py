@@ -20,7 +20,7 @@ import magshell_fenicsx as ms
 CASES = Path(__file__).parents[1] if "__file__" in globals() else Path("..")
 case = ms.Case.load(CASES / "dimple_buckling.yaml", ["magnetic.lambda_m=0.00184"])
 scene = ms.Scene(case)
-print(", ".join(scene.plan.included))
+print(", ".join(scene.problem.included))
 
 # %% [markdown]
 # Records come one by one; each holds the displacement and the amplitudes (`record.point.state.u`, `.mu`).

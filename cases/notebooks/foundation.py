@@ -26,7 +26,7 @@ def winkler(r0: ms.Jet, u: ms.Jet) -> ufl.core.expr.Expr:
 CASES = Path(__file__).parents[1] if "__file__" in globals() else Path("..")
 case = ms.Case.load(CASES / "dimple_buckling.yaml")
 scene = ms.Scene(case, terms=[ms.OwnTerm("foundation", winkler)])
-print(", ".join(scene.plan.included))
+print(", ".join(scene.problem.included))
 
 
 # %% [markdown]

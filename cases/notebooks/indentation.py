@@ -34,8 +34,8 @@ curve  # noqa: B018
 # %%
 shell = ms.surface(scene, records[-1])
 triangles = ms.polydata(scene, records[-1])
-print(f"largest w/h {shell.w.max() / scene.plan.material.h:.3f}, {triangles.n_points} points")
-dent = np.linalg.norm(shell.r0[shell.w > scene.plan.material.h] * [1, 1, 0], axis=1).max()
+print(f"largest w/h {shell.w.max() / scene.problem.material.h:.3f}, {triangles.n_points} points")
+dent = np.linalg.norm(shell.r0[shell.w > scene.problem.material.h] * [1, 1, 0], axis=1).max()
 print(f"w > h up to {np.degrees(np.arcsin(dent)):.2f} degrees from the pole")
 
 # %%

@@ -17,13 +17,12 @@ from mpi4py import MPI
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.opened import opened
 from magshell_fenicsx.input.source import Source
+from magshell_fenicsx.public import Scene
 from magshell_fenicsx.runs.rows import RowMaker
-from magshell_fenicsx.runs.snaps import snaps
-from magshell_fenicsx.runs.summary import Result
+from magshell_fenicsx.runs.summary import Result, snaps
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.perfect import with_modes
 from magshell_fenicsx.simulate.record import Stopped
-from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.studies.results import parse_scalar
 
 Report = dict[str, Any]
@@ -131,7 +130,7 @@ def scale(repeats: str, degree: str, refinement: str) -> tuple[Scene, Report]:
 def of_case(kind: str, case: str, settings: str, results: str) -> tuple[Scene, Report]:
     """A part of the run of a case."""
     comm = MPI.COMM_WORLD
-    scene = Scene(with_modes(opened(case, comm, json.loads(settings)), comm), comm)
+    scene = Scene(with_modes(opened(case, comm, json.loads(settings)).problem(), comm), comm)
     report = KINDS[kind](scene, json.loads(results))
     return scene, {"jit_s": scene.model.kernels.seconds, **report}
 

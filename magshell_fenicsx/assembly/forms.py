@@ -19,6 +19,8 @@ from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.terms import FormTerm
 from magshell_fenicsx.platform.kept import keep, recall
 
+KEPT = {"signature", "coefficients", "constants"}
+
 
 class _Found(ufl.Form):  # type: ignore[misc]
     """A form with the signature of another and, of its own coefficients and constants, those that are left there."""
@@ -46,11 +48,12 @@ def at_zero(form: ufl.Form, v: fem.Function, compiled: Callable[[ufl.Form], fem.
     number = form.coefficients().index(v)
     key = hashlib.sha256(f"{ufl.__version__} {form.signature()} {number}".encode()).hexdigest()[:40]
     name = f"at_zero_{key}.json"
-    if known := recall(name):
-        return compiled(_Found(form, **json.loads(known)))
+    known = json.loads(recall(name) or b"{}")
+    if known.keys() == KEPT:
+        return compiled(_Found(form, **known))
     rest = ufl.replace(form, {v: ufl.zero(v.ufl_shape)})
     kernel = compiled(rest)
-    if not rest.empty():
+    if not (rest.empty() or known):  # what another version of the package has kept stays as it is
         left = {
             "signature": rest.signature(),
             "coefficients": _numbers(form.coefficients(), rest.coefficients()),

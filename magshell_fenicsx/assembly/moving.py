@@ -197,8 +197,8 @@ class Pressed:
     def on_edges(self, x0: Array, u: Array) -> Array:
         """Nodal forces (nodes, 3) of p = 1 on the edges, less those in the derivative of the volume that is swept.
 
-        The volume between the edge's way and that of its neighbour, to which a node of the edge moves by v:
-        the integral of v . u x (x0/2 + u/3)' along the edge.
+        An edge that moves straight by u sweeps a ribbon. Where a node moves further by v, the volume between the two
+        ribbons is the integral of v . u x (x0/2 + u/3)' along the edge.
         """
         forces = np.zeros_like(x0)
         for curve in self.curves:

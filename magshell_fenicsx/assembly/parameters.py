@@ -10,6 +10,7 @@ amplitude are differences of fourth order over steps of h/200, exact to about 1e
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
@@ -39,53 +40,33 @@ class Derivative(Protocol):
     def add_residual(self, b: NDArray[np.float64], factor: float) -> None: ...
 
 
-class FreeParameter(Protocol):
-    """What a system needs of a parameter, see `Parameter`."""
-
-    @property
-    def constant(self) -> Settable: ...
-
-    @property
-    def slopes(self) -> Sequence[Derivative]: ...
-
-    def bends(self, q: Any) -> Sequence[Derivative]: ...
+Twice = Callable[[Any], Sequence[Derivative]]
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """A free parameter p of a system with the terms mu_i Pi_i(u; p), in which p is a constant.
+    """A free parameter p of a system with the terms mu_i Pi_i(u; p).
 
     Attributes
     ----------
     constant
-        p in the terms.
+        p in the terms: a constant, or what takes its place.
     slopes
         dPi_i/dp as terms with the amplitudes mu_i.
-    log
-        Of the kernels that are compiled on first use.
+    twice
+        Makes the derivatives of the slopes by another parameter in the terms, or by p itself.
     """
 
-    constant: fem.Constant
-    slopes: Sequence[FormTerm]
-    log: KernelLog
-    _bends: dict[fem.Constant, list[FormTerm]] = field(default_factory=dict)
+    constant: Settable
+    slopes: Sequence[Derivative]
+    twice: Twice
+    _bends: dict[Any, Sequence[Derivative]] = field(default_factory=dict)
 
     def bends(self, q: Any) -> Sequence[Derivative]:
         """d2Pi_i/dp dq with the amplitudes mu_i; q may be p."""
-        if not isinstance(q, fem.Constant):
-            return bends_of(q, self.constant)
         if q not in self._bends:
-            self._bends[q] = [
-                FormTerm(f"{t.name} twice", derived(t.form, q), t._u, self.log, t.amplitude)
-                for t in self.slopes
-                if q in t.form.constants()
-            ]
+            self._bends[q] = q.bends(self.constant) if isinstance(q, GrowingValue) else self.twice(q)
         return self._bends[q]
-
-
-def bends_of(q: Any, p: Any) -> Sequence[Derivative]:
-    """The mixed derivatives by q, which is no constant in a form, as q has them; else none."""
-    return list(q.bends(p)) if hasattr(q, "bends") else []
 
 
 def make_parameters(
@@ -98,16 +79,21 @@ def make_parameters(
     constants
         The parameters as they stand in the forms of the terms.
     """
-    found, forms = {}, [term for term in terms if isinstance(term, FormTerm)]
-    for name, p in constants.items():
-        slopes = [
-            FormTerm(f"{term.name} by {name}", derived(term.form, p), u, log, term.amplitude)
-            for term in forms
+    forms = [term for term in terms if isinstance(term, FormTerm)]
+
+    def by(p: fem.Constant, entered: Sequence[FormTerm], words: str) -> list[FormTerm]:
+        return [
+            FormTerm(f"{term.name} {words}", derived(term.form, p), u, log, term.amplitude)
+            for term in entered
             if p in term.form.constants()
         ]
+
+    found = {}
+    for name, p in constants.items():
+        slopes = by(p, forms, f"by {name}")
         for slope in slopes:
             slope.compile_residual()
-        found[name] = Parameter(p, slopes, log)
+        found[name] = Parameter(p, slopes, partial(by, entered=slopes, words="twice"))
     return found
 
 
@@ -170,10 +156,11 @@ class Growing:
         return found
 
     def parameters(
-        self, terms: Sequence[Term], others: Mapping[str, FreeParameter], gradients: ResidualAssembler | None = None
-    ) -> dict[str, FreeParameter]:
+        self, terms: Sequence[Term], others: Mapping[str, Parameter], gradients: ResidualAssembler | None = None
+    ) -> dict[str, Parameter]:
         """The amplitudes as free parameters of the terms, beside the other ones."""
-        return {name: GrowingParameter(GrowingValue(self, name, terms, others), gradients) for name in self._values}
+        values = {name: GrowingValue(self, name, terms, others) for name in self._values}
+        return {name: Parameter(value, value.slopes(gradients), value.bends) for name, value in values.items()}
 
 
 @dataclass(eq=False)
@@ -183,7 +170,7 @@ class GrowingValue:
     growing: Growing
     name: str
     terms: Sequence[Term]
-    others: Mapping[str, FreeParameter]
+    others: Mapping[str, Parameter]
 
     @property
     def value(self) -> float:
@@ -193,10 +180,17 @@ class GrowingValue:
     def value(self, value: float) -> None:
         self.growing.put(self.name, float(value))
 
+    def slopes(self, gradients: ResidualAssembler | None = None) -> list[Derivative]:
+        """dPi_i/dmu as terms."""
+        together = dict[str | None, list[Term]]()
+        for term in self.terms:
+            together.setdefault(term.amplitude, []).append(term)
+        return [_Slope(amplitude, self, of, gradients) for amplitude, of in together.items()]
+
     def bends(self, q: object) -> list[Derivative]:
         """d2Pi_i/dmu dq with the amplitudes mu_i; q is the value of another parameter, or this one."""
         if isinstance(q, GrowingValue):
-            slopes: Sequence[Derivative] = GrowingParameter(q, None).slopes
+            slopes: Sequence[Derivative] = q.slopes()
         else:
             slopes = next(other.slopes for other in self.others.values() if other.constant is q)
         return [_Slope(slope.amplitude, self, [slope], None) for slope in slopes]
@@ -204,25 +198,6 @@ class GrowingValue:
     def slope_of(self, energy: Callable[[], float]) -> float:
         """The derivative of an energy."""
         return self.growing.by(self.name, lambda weight: weight * energy())
-
-
-@dataclass(frozen=True)
-class GrowingParameter:
-    """An amplitude of the placement, as `assembly.parameters.Parameter`."""
-
-    constant: GrowingValue
-    gradients: ResidualAssembler | None
-
-    @property
-    def slopes(self) -> list[Derivative]:
-        """dPi_i/dmu as terms."""
-        terms = self.constant.terms
-        each = {amplitude: [t for t in terms if t.amplitude == amplitude] for amplitude in (t.amplitude for t in terms)}
-        return [_Slope(amplitude, self.constant, of, self.gradients) for amplitude, of in each.items()]
-
-    def bends(self, q: object) -> list[Derivative]:
-        """See `GrowingValue.bends`."""
-        return self.constant.bends(q)
 
 
 @dataclass(frozen=True)

@@ -1,26 +1,22 @@
 """The whole case: its sections and what they must have in common."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import replace
 from functools import cached_property
 from math import radians
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import Field, ModelWrapValidatorHandler, ValidationError, model_validator
 
 from magshell_fenicsx.case.loading import Loading, listed, programme, refuse_unfit_steps
-from magshell_fenicsx.case.output import OutputSection
-from magshell_fenicsx.case.patches import refuse_strange
-from magshell_fenicsx.input.chosen import Chosen
 from magshell_fenicsx.input.expressions import is_formula
-from magshell_fenicsx.input.file import FileKeys, digests
 from magshell_fenicsx.input.messages import InvalidCase
-from magshell_fenicsx.input.section import lengths_with_units, texts
+from magshell_fenicsx.input.section import NOTED, Chosen, FileKeys, digests, lengths_with_units, texts
 from magshell_fenicsx.input.source import Source, read_source
-from magshell_fenicsx.input.targets import NOTED
+from magshell_fenicsx.mesh.patch import GivenField
 from magshell_fenicsx.parts.bodies.body import refuse_unfit_bodies, with_units
 from magshell_fenicsx.parts.bodies.press import approaches
 from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionSection
@@ -30,16 +26,46 @@ from magshell_fenicsx.parts.magnetism.sources.source import SourceSection
 from magshell_fenicsx.parts.motion.viscosity import refuse_unfit_viscosity
 from magshell_fenicsx.parts.natural.section import NaturalSection, measured
 from magshell_fenicsx.parts.own import Origin
-from magshell_fenicsx.parts.part import Context, Part, Scales
-from magshell_fenicsx.parts.registered import PARTS, WithParts
+from magshell_fenicsx.parts.part import Context
+from magshell_fenicsx.parts.registered import PARTS, WithParts, parts_of
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.parts.supports.boundary import EDGES, BoundarySection, refuse_taken
-from magshell_fenicsx.problem.elements import SOLID_DEGREE, MeshSection, SolidSection
-from magshell_fenicsx.problem.wanted import FrequenciesSection, GradientsSection, StabilitySection
+from magshell_fenicsx.problem.elements import MeshSection, SolidSection
+from magshell_fenicsx.problem.wanted import FrequenciesSection, GradientsSection, OutputSection, StabilitySection
 from magshell_fenicsx.shape.ground import Coordinates
 from magshell_fenicsx.shape.sections import CapSurface, MeshSurface, RevolutionSurface, Surface, SurfaceSection
 from magshell_fenicsx.shape.shell import ShellSection
 from magshell_fenicsx.studies.sections import DesignSection, EnsembleSection
+
+if TYPE_CHECKING:
+    from magshell_fenicsx.problem.problem import Problem
+
+
+REMANENCE = "magnetic.remanent.patches"
+
+
+def refuse_strange(key: str, patches: Iterable[str], shell: ShellSection | Surface, dimples: Collection[str]) -> None:
+    """See that a shell has the patches of a key; a mesh file knows its own later.
+
+    Parameters
+    ----------
+    dimples
+        Names of the patches within the rims of the shell's dimples.
+
+    Raises
+    ------
+    ValueError
+        If it has not, or the remanence of the rest is missing.
+    """
+    if isinstance(shell, MeshSurface):
+        return
+    if not dimples and ("dimple" in patches or not isinstance(shell, ShellSection)):
+        raise ValueError(f"{key}: the shell has no dimple: patches are those within dimples, or of a mesh file")
+    known = [*(dimples or ["dimple"]), "rest"]
+    if unknown := set(patches) - set(known):
+        raise ValueError(f"{key}: {min(unknown)}: a {shell.geometry} has only {', '.join(known[:-1])} and rest")
+    if key == REMANENCE and "rest" not in patches:
+        raise ValueError("magnetic.remanent: patches needs the patch rest")
 
 
 class Case(WithParts):
@@ -137,7 +163,7 @@ class Case(WithParts):
     def _named_parts_are_there(self) -> Self:
         shell = self.shell
         refuse_taken(self.points)
-        for key in self.parts:
+        for key in parts_of(self.context):
             self.context.has_modulus(key)
         if isinstance(shell, ShellSection):
             edges = EDGES[shell.geometry]
@@ -147,6 +173,18 @@ class Case(WithParts):
         for key, patches in self.patches.items():
             refuse_strange(key, patches, shell, self.dimples)
         return self
+
+    def problem(self) -> "Problem":
+        """What will be computed.
+
+        Raises
+        ------
+        CaseError, MeshError
+            See `make_problem`.
+        """
+        from magshell_fenicsx.case.planner import make_problem  # the solver takes long to import
+
+        return make_problem(self)
 
     @property
     def patches(self) -> dict[str, Iterable[str]]:
@@ -175,8 +213,12 @@ class Case(WithParts):
             if self.solid:
                 raise ValueError("solid belongs to model: solid")
             return self
-        if isinstance(self.thickness_factor, dict):
+        if isinstance(self.thickness_factor, dict | GivenField):
             raise ValueError("shell.thickness_factor: of a solid a formula: a step in the thickness is no swept body")
+        if self.magnetic and isinstance(self.magnetic.remanent.components, GivenField):
+            raise ValueError("magnetic.remanent: of a solid a formula: a function on the mesh is that of a shell")
+        if self.natural and self.natural.given:
+            raise ValueError("natural: of a solid numbers and formulas: a function on the mesh is that of a shell")
         if self.magnetic and self.magnetic.energy != "full":
             raise ValueError(
                 f"magnetic.energy: {self.magnetic.energy}: the expansions are of a shell; a solid has the full energy"
@@ -228,21 +270,6 @@ class Case(WithParts):
         return copied
 
     @property
-    def parts(self) -> dict[str, Part]:
-        """The registered parts that it has, by key."""
-        return {key: part for key in PARTS if (part := getattr(self, key)) is not None}
-
-    @property
-    def scales(self) -> Scales:
-        """See `Context.scales`."""
-        return self.context.scales
-
-    @property
-    def degree(self) -> int:
-        """Of the displacement."""
-        return self.mesh.degree if self.model == "shell" else SOLID_DEGREE
-
-    @property
     def imperfections(self) -> dict[str, ImperfectionSection]:
         """Key of each imperfection below `shell` -> section; `defect` is one of them."""
         shell = self.shell
@@ -259,8 +286,8 @@ class Case(WithParts):
         return {"dimple" if i == 0 else f"dimple_{i + 1}": key for i, key in enumerate(keys)}
 
     @property
-    def thickness_factor(self) -> str | dict[str, float] | None:
-        """What multiplies h: a formula, or numbers of patches."""
+    def thickness_factor(self) -> str | dict[str, float] | GivenField | None:
+        """What multiplies h: a formula, numbers of patches, or a function of a program."""
         return self.shell.thickness_factor
 
     @property

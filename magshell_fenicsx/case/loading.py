@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeAlias, Union
 
 from pydantic import Discriminator, Field, Tag
 
-from magshell_fenicsx.input.chosen import Chosen
+from magshell_fenicsx.input.section import Chosen
 from magshell_fenicsx.parts.course import Gas
 from magshell_fenicsx.parts.part import Context
 from magshell_fenicsx.parts.registered import FIRST, STEPS

@@ -1,18 +1,26 @@
-"""A case, or the path of its file, as programs give it; on several ranks as rank 0 reads it."""
+"""A case, or what it is made from, as programs give it; the same case with other values, and as the perfect shell.
 
-from collections.abc import Sequence
+On several ranks a file is as rank 0 reads it. A run writes down what its case says.
+"""
+
+from collections.abc import Mapping, Sequence
+from copy import deepcopy
 from pathlib import Path
+from typing import Any, get_args
 
 from mpi4py import MPI
+from pydantic import ValidationError
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.input.file import FileKeys
+from magshell_fenicsx.input.section import FileKeys, number_and_unit, si_size
 from magshell_fenicsx.input.source import CaseError, Source, read_source
-from magshell_fenicsx.platform.first import from_first
+from magshell_fenicsx.platform.processes import from_first
+from magshell_fenicsx.problem.elements import MeshSection
+from magshell_fenicsx.problem.problem import Document
 
 
-def opened(case: Case | str | Path, comm: MPI.Comm, settings: Sequence[str] = ()) -> Case:
-    """The case itself, or the one in a file, with the same files on all ranks; collective.
+def opened(case: Case | Mapping[str, Any] | str | Path, comm: MPI.Comm, settings: Sequence[str] = ()) -> Case:
+    """The case itself, or that of a mapping or of a file, with the same files on all ranks; collective.
 
     Raises
     ------
@@ -21,8 +29,13 @@ def opened(case: Case | str | Path, comm: MPI.Comm, settings: Sequence[str] = ()
     """
     if isinstance(case, str | Path):
         case = Case.from_source(read_together(case, comm, settings))
+    if isinstance(case, Mapping):
+        case = Case.from_source(Source("case", dict(case)))
     if not isinstance(case, Case):
-        raise CaseError(f"give a Case or the path of a case file, not a {type(case).__name__}; see Case.load")
+        raise CaseError(
+            f"give a problem, a Case, its mapping or the path of a case file, not a {type(case).__name__}; "
+            "see Case.load"
+        )
     return with_same_files(case, comm)
 
 
@@ -58,3 +71,98 @@ def _content(reader: FileKeys) -> bytes | OSError:
         return reader.files.content(reader.path)
     except OSError as e:
         return e
+
+
+def document_of(case: Case) -> Document:
+    """What a run writes of a case."""
+    return Document(
+        data=case.model_dump(mode="json", exclude_none=True),
+        name=case.file_name,
+        outside=case.outside,
+        placed=case.placed,
+    )
+
+
+def changed(case: Case, values: Mapping[str, Any]) -> Case:
+    """The case whose file has other values, by keys such as "mesh.degree"; they are not looked at again.
+
+    Raises
+    ------
+    CaseError
+        If one is a number of the shell that is not allowed.
+    """
+    for key, value in values.items():
+        case = _changed(case, key, value)
+    return case
+
+
+def _changed(case: Case, key: str, value: Any) -> Case:
+    written = case.origin.data
+    replaced: Case = _replaced(case, key, value)
+    if written is None or not key.startswith("shell."):  # no other number is one that others are given over
+        return replaced
+    data = deepcopy(written)
+    *path, last = key.split(".")
+    part: Any = data
+    for name in path:
+        part = part[int(name)] if isinstance(part, list) else part[name]
+    unit = number_and_unit(part[last])[1] if isinstance(part.get(last), str) else ""
+    part[last] = f"{value / si_size(unit)!r} {unit}" if unit else value
+    try:
+        other = Case.model_validate(data, context=case.origin.context)
+    except ValidationError as e:
+        raise CaseError(f"{key}: {e.errors()[0]['msg'].removeprefix('Value error, ')}") from None
+    return replaced.model_copy(update={"shell": other.shell, "loading": other.loading})
+
+
+def _replaced(part: Any, key: str, value: Any) -> Any:
+    """A part of a case with another value; it is not validated again."""
+    if not key:
+        return value
+    first, _, rest = key.partition(".")
+    if isinstance(part, list):
+        return [_replaced(item, rest, value) if i == int(first) else item for i, item in enumerate(part)]
+    if isinstance(part, dict):
+        return {name: _replaced(item, rest, value) if name == first else item for name, item in part.items()}
+    within = getattr(part, first)
+    if within is None and rest:  # a section that the case leaves out
+        within = get_args(type(part).model_fields[first].annotation)[0]()
+    return part.model_copy(update={first: _replaced(within, rest, value)})
+
+
+def perfect_case(case: Case) -> Case:
+    """The case without imperfections, as a shell on the smallest model and the default mesh, whatever its own.
+
+    A pressure at its end goes on to the first instability.
+
+    Raises
+    ------
+    CaseError
+        If the case has values for the patch of a dimple.
+    """
+    if case.dimples and case.patches:
+        raise CaseError("shell.imperfections: kind: modes: the perfect shell has no dimple, of which a patch is named")
+    shell = case.shell
+    bare: dict[str, Any] = {"imperfections": []}
+    if "defect" in type(shell).model_fields:
+        bare["defect"] = None
+    return case.model_copy(
+        update={
+            "shell": shell.model_copy(update=bare),
+            "mesh": MeshSection(),
+            "loading": _to_the_limit(case),
+            "model": "shell",
+            "solid": None,
+            "symmetry": "auto",
+            "stability": None,
+        }
+    )
+
+
+def _to_the_limit(case: Case) -> Any:
+    """The loading of the perfect shell, to the first instability."""
+    loading = case.loading
+    if not isinstance(loading, list):
+        return loading and loading.on_perfect(last=True)
+    loads = [load for each in loading if (load := each.on_perfect(last=False)) is not None]
+    return [*loads[:-1], *(load.on_perfect(last=True) for load in loads[-1:])] or None

@@ -86,21 +86,21 @@ def advance(
         way = end - now.t
         dt = min(dt, steps.fixed or dt, steps.longest if now.t < steps.fastest else dt)
         length = way / np.ceil(way / dt * (1 - 1e-9))
-        found = integrator.step(now, length)
-        if isinstance(found, str):
+        trial = integrator.step(now, length)
+        if isinstance(trial, str):
             dt, failed = length / 2, True
             if dt < SMALLEST * steps.first:
-                raise TimeStopped(f"the time step has become too small: {found}", now)
+                raise TimeStopped(f"the time step has become too small: {trial}", now)
             continue
         if steps.fixed is None:
-            change = 0.9 * (steps.tolerance / max(found.error, 1e-300)) ** (1 / 3)
-            if found.error > steps.tolerance and length > SMALLEST * steps.first:
+            change = 0.9 * (steps.tolerance / max(trial.error, 1e-300)) ** (1 / 3)
+            if trial.error > steps.tolerance and length > SMALLEST * steps.first:
                 dt = max(0.3, change) * length
                 continue
-            leak = abs(found.imbalance - now.imbalance) / steps.share(found)  # nan where it is not checked
-            if leak > 1 and abs(found.imbalance) > abs(now.imbalance):
+            leak = abs(trial.imbalance - now.imbalance) / steps.share(trial)  # nan where it is not checked
+            if leak > 1 and abs(trial.imbalance) > abs(now.imbalance):
                 if length <= SMALLEST * steps.first:
-                    raise TimeStopped(unbalanced(now, found), now)
+                    raise TimeStopped(unbalanced(now, trial), now)
                 dt = max(0.3, 0.8 / leak**0.5) * length
                 continue
             change = min(change, 1.0) if leak > SPENT else change
@@ -108,7 +108,7 @@ def advance(
         elif not failed:
             dt = max(dt, 2 * length)
         failed = False
-        now = found
+        now = trial
     return replace(now, t=end), dt
 
 

@@ -118,10 +118,10 @@ def _found(newton: BorderedNewton, guess: State, phi: Vector, name: str) -> Bifu
 
 
 def _settled(newton: BorderedNewton, state: State, v: Vector, stress: Sequence[Weighted] = ()) -> tuple[State, float]:
-    found = held_along(newton, state, v, stress)
-    if found is None:
+    mode = held_along(newton, state, v, stress)
+    if mode is None:
         raise BifurcationLost
-    return found
+    return mode
 
 
 def _step(system: System, state: State, name: str, tangent: AugmentedTangent) -> tuple[Vector, float, Vector]:
@@ -191,23 +191,23 @@ def branching(path: Path, bifurcation: Point) -> Branching | None:
     except NoEigenpair:
         return None
     mode = np.asarray(mode * path.system.length / largest(path.system.comm, mode))
-    found = None
+    branching_point = None
     for size in SIZES:
         starts = [_step_off(path, state, mode, signed) for signed in (size, -size)]
         if starts[0] is None or starts[1] is None:
-            return found
+            return branching_point
         rises = [point.state.mu[name] - state.mu[name] for point in starts if point]
         symmetric = abs(rises[0] - rises[1]) <= ODD * abs(rises[0] + rises[1])
-        found = Branching(symmetric, (starts[0], starts[1]))
+        branching_point = Branching(symmetric, (starts[0], starts[1]))
         if max(map(abs, rises)) > SEEN * abs(state.mu[name]):
             break
-    return found
+    return branching_point
 
 
 def largest(comm: MPI.Comm, v: Vector) -> float:
     """The entry of largest magnitude with its sign, which is the same on any number of ranks."""
-    here = float(v[np.argmax(np.abs(v))]) if v.size else 0.0
-    return float(max(comm.allgather(here), key=abs))
+    largest_here = float(v[np.argmax(np.abs(v))]) if v.size else 0.0
+    return float(max(comm.allgather(largest_here), key=abs))
 
 
 def _step_off(path: Path, state: State, mode: Vector, size: float) -> Point | None:
@@ -224,7 +224,7 @@ def _step_off(path: Path, state: State, mode: Vector, size: float) -> Point | No
         return None
     if pushed is None:
         return None
-    found = path.solve(row, 0.0, pushed[0])
-    if isinstance(found, str):
+    first = path.solve(row, 0.0, pushed[0])
+    if isinstance(first, str):
         return None
-    return found.per(copysign(metric.norm(found.du, found.dmu), size))
+    return first.per(copysign(metric.norm(first.du, first.dmu), size))

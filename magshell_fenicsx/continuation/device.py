@@ -204,9 +204,9 @@ class Along:
 
     def curvature(self, u: Vector, mu: Amplitudes, name: str, other: str) -> float:
         whole, t = self._expanded(mu), mu[self._name]
-        here, there = self._rates(mu, name), self._rates(mu, other)
+        own, others = self._rates(mu, name), self._rates(mu, other)
         bends = {i: f(t)[2] for i, f in self._curves.items()} if name == other == self._name else {}
-        mixed = (a * b * self._system.curvature(u, whole, i, j) for i, a in here.items() for j, b in there.items())
+        mixed = (a * b * self._system.curvature(u, whole, i, j) for i, a in own.items() for j, b in others.items())
         return sum(mixed) + sum(bend * self._system.potential(u, whole, i) for i, bend in bends.items())
 
     def tangent(self, u: Vector, mu: Amplitudes, stress: Sequence[Weighted] = ()) -> Tangent:

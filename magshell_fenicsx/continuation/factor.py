@@ -97,8 +97,8 @@ class Factorisation:
     def size(self) -> tuple[int, int]:
         """Rows of the matrix last factored: on this rank, and on all."""
         edge = self._edge.count if self._edge else 0
-        here, whole = (size[0] for size in (self.matrix.getLocalSize(), self.matrix.getSize()))
-        return here + edge * (self.comm.rank == self.comm.size - 1), whole + edge
+        local, whole = (size[0] for size in (self.matrix.getLocalSize(), self.matrix.getSize()))
+        return local + edge * (self.comm.rank == self.comm.size - 1), whole + edge
 
     @property
     def norm(self) -> float:
@@ -356,11 +356,11 @@ class Banded:
 
     def bands(self, values: Sequence[Array]) -> Array:
         """The lower bands (matrices, entries) of some matrices, with ones on the diagonal of what is held."""
-        found = np.zeros((len(values), self._shape[0] * self._shape[1]))
-        for band, v in zip(found, values, strict=True):
+        stacked = np.zeros((len(values), self._shape[0] * self._shape[1]))
+        for band, v in zip(stacked, values, strict=True):
             band[self._at] = v.ravel()[self._kept]
-        found[:, self._ones * self._shape[0]] = 1.0
-        return found
+        stacked[:, self._ones * self._shape[0]] = 1.0
+        return stacked
 
     def positive(self, bands: Array, weights: Array) -> bool:
         """Whether the weighted sum of some matrices is positive definite; the weights' sum is one."""

@@ -67,10 +67,10 @@ def _sprung(tangent: Tangent, shape: Vector, comm: MPI.Comm) -> _Spring:
     e = np.zeros_like(shape)
     if comm.rank == owner:
         e[int(np.argmax(size))] = 1.0
-    here = [first + int(i) for i in np.flatnonzero(e)]
-    itself = comm.allreduce(sum(K.getValue(i, i) for i in here))
+    sprung = [first + int(i) for i in np.flatnonzero(e)]
+    itself = comm.allreduce(sum(K.getValue(i, i) for i in sprung))
     stiffness = 2 * abs(itself) - itself or K.norm(PETSc.NormType.INFINITY) or 1.0  # the sum is positive
-    for i in here:
+    for i in sprung:
         K.setValue(i, i, stiffness, addv=True)
     K.assemble()
     return _Spring(e, stiffness)

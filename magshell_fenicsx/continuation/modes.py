@@ -46,16 +46,16 @@ def nearest_to_zero(factors: Factorisation) -> tuple[float, Vector]:
     """
     space, best, waited = _Space(factors), np.inf, 0
     while space.solves < MOST_SOLVES:
-        found = space.grown()
-        if found.error <= TOLERANCE or space.exhausted:
-            return found.value, found.vector
-        waited = 0 if found.error < best / 2 else waited + 1
-        best = min(best, found.error)
-        if waited >= PATIENCE and found.error * abs(found.value) <= ROUNDING * space.norm:
-            return found.value, found.vector
+        pair = space.grown()
+        if pair.error <= TOLERANCE or space.exhausted:
+            return pair.value, pair.vector
+        waited = 0 if pair.error < best / 2 else waited + 1
+        best = min(best, pair.error)
+        if waited >= PATIENCE and pair.error * abs(pair.value) <= ROUNDING * space.norm:
+            return pair.value, pair.vector
     raise NoEigenpair(
-        f"the tangent's eigenvalue nearest to zero is not found in {MOST_SOLVES} solves: at {found.value:.3g} "
-        f"the residual is still {found.error:.1g} of it"
+        f"the tangent's eigenvalue nearest to zero is not found in {MOST_SOLVES} solves: at {pair.value:.3g} "
+        f"the residual is still {pair.error:.1g} of it"
     )
 
 
@@ -215,12 +215,12 @@ def lowest_modes(K: PETSc.Mat, M: PETSc.Mat, count: int) -> list[Mode]:
     # (c) the eigenvalues above it; again with more if some below the last one were missed
     sought = wanted
     for _ in range(MOST_TRIALS):
-        found = slices.around(shift, sought, LANCZOS_TOLERANCE)
-        last = found[wanted - 1].eigenvalue
+        modes = slices.around(shift, sought, LANCZOS_TOLERANCE)
+        last = modes[wanted - 1].eigenvalue
         above = last + MARGIN * (last - shift)
-        missed = slices.below(above) - sum(mode.eigenvalue < above for mode in found)
+        missed = slices.below(above) - sum(mode.eigenvalue < above for mode in modes)
         if missed <= 0:
-            return found[:wanted]
+            return modes[:wanted]
         sought += missed
     raise ModesNotFound(f"{missed} eigenvalues below {above:g} stay hidden from Lanczos")
 

@@ -146,29 +146,29 @@ class Path:
         PathStopped
             If none is found.
         """
-        found = self.at(point.s, state, point)
-        if isinstance(found, str):
-            raise PathStopped(found, point)
-        return self.as_base(found)
+        again = self.at(point.s, state, point)
+        if isinstance(again, str):
+            raise PathStopped(again, point)
+        return self.as_base(again)
 
     def solve(self, row: Row, s: float, guess: State, stress: Sequence[Weighted] = ()) -> Point | str:
         """The point on which a row holds, or the reason why the solve failed; its tangent is per unit of the row."""
-        found = self.recorded(lambda: self._solve(row, s, guess, stress))
-        self._hard += isinstance(found, str) or found.factorisations >= self.options.hard
-        return found
+        point = self.recorded(lambda: self._solve(row, s, guess, stress))
+        self._hard += isinstance(point, str) or point.factorisations >= self.options.hard
+        return point
 
     def recorded(self, find: Callable[[], Point | str]) -> Point | str:
         """The result of `find`, or the result of an interrupted run at this place in the journal."""
-        known, factors = self._journal.replay(), self.newton.factorisation
-        if known is not None:
-            if isinstance(known, Point):
-                factors.habit = known.habit
-            return known
-        found = find()
-        if isinstance(found, Point):
-            found = replace(found, habit=factors.habit)
-        self._journal.record(found)
-        return found
+        kept, factors = self._journal.replay(), self.newton.factorisation
+        if kept is not None:
+            if isinstance(kept, Point):
+                factors.habit = kept.habit
+            return kept
+        result = find()
+        if isinstance(result, Point):
+            result = replace(result, habit=factors.habit)
+        self._journal.record(result)
+        return result
 
     def on(self, state: State, direction: Direction, base: Point, negative_pivots: int) -> Point:
         """The point of a state on the path, with a given tangent of any length."""
@@ -221,31 +221,31 @@ class Path:
                 length = abs(way) / pieces if pieces < 3 else step  # no tiny step before a target
                 length = min(length, self._past_fold(before, here, length))
                 s = target if length == abs(way) else here.s + np.copysign(length, way)
-                found = self._try(s, before, here)
-                if isinstance(found, _Far):
-                    far, found = found, found.reason
-                if isinstance(found, str):
+                tried = self._try(s, before, here)
+                if isinstance(tried, _Far):
+                    far, tried = tried, tried.reason
+                if isinstance(tried, str):
                     leaps += 1
-                    over = found == HIDDEN and leaps <= MOST_LEAPS  # step over the singular tangent
+                    over = tried == HIDDEN and leaps <= MOST_LEAPS  # step over the singular tangent
                     step = 2 * length if over else length / 2
                     if not step >= self.options.smallest:
-                        raise PathStopped(found, here)
+                        raise PathStopped(tried, here)
                     continue
                 leaps = 0
-                straight = self._cosine(here, found) > self.options.straight
+                straight = self._cosine(here, tried) > self.options.straight
                 o = self.options
-                if (found.factorisations <= o.easy or found.iterations <= o.few) and straight:
+                if (tried.factorisations <= o.easy or tried.iterations <= o.few) and straight:
                     step = min(max(step, 1.5 * length), o.largest)
-                elif found.factorisations >= o.hard:
+                elif tried.factorisations >= o.hard:
                     step = 0.6 * length
-                before, here = here, found
+                before, here = here, tried
                 yield here, here.s == target
                 if not far:
                     continue
                 again = self.measured_from(here, far.point)
                 length, far.looks = (again.s - here.s) * np.sign(way), far.looks + 1
-                known = length > 0 and (far.exact or not again.turned_from(here))
-                if known and not self._jumped(here, again := self.seen_from(here, again)):
+                solved = length > 0 and (far.exact or not again.turned_from(here))
+                if solved and not self._jumped(here, again := self.seen_from(here, again)):
                     before, here, step, far = here, self.as_base(again), length, None
                     yield here, here.s == target
                 else:
@@ -289,13 +289,13 @@ class Path:
     def _try(self, s: float, before: Point | None, here: Point) -> Point | _Far | str:
         """The next point, or one that is too far away, or the reason why there is none."""
         self.progress.trying(here, s - here.s)
-        found = self.at(s, self.predict(s, before, here), here)
-        if isinstance(found, str):
-            return found
-        if turned := found.turned_from(here):
-            found = self.exact(found, here)
-        reason = self._jumped(here, found)
-        return _Far(found, reason, turned) if reason else self.as_base(found)
+        point = self.at(s, self.predict(s, before, here), here)
+        if isinstance(point, str):
+            return point
+        if turned := point.turned_from(here):
+            point = self.exact(point, here)
+        reason = self._jumped(here, point)
+        return _Far(point, reason, turned) if reason else self.as_base(point)
 
     def _jumped(self, here: Point, found: Point) -> str | None:
         """The reason to reject a step whose ends do not lie on one smooth arc; None if there is none."""
@@ -323,15 +323,15 @@ class Path:
             return outcome.reason
         spent = self.newton.factorisation.count - before
         exact = self._hard >= MANY  # the extrapolated stress is only as good as the tangent
-        found = self._point(outcome.state, s, self.newton.response(outcome.state, self.name, row, exact=exact))
-        return replace(found, iterations=outcome.iterations, factorisations=spent, error=outcome.error)
+        point = self._point(outcome.state, s, self.newton.response(outcome.state, self.name, row, exact=exact))
+        return replace(point, iterations=outcome.iterations, factorisations=spent, error=outcome.error)
 
     def exact(self, point: Point, base: Point) -> Point:
         """The point with the tangent and the inertia of its own K, not of the K of a state near by."""
         row = self._row(point.s, base)
-        found = self._point(point.state, point.s, self.newton.response(point.state, self.name, row, exact=True))
+        again = self._point(point.state, point.s, self.newton.response(point.state, self.name, row, exact=True))
         spent = point.factorisations + 1
-        return replace(found, iterations=point.iterations, factorisations=spent, error=point.error)
+        return replace(again, iterations=point.iterations, factorisations=spent, error=point.error)
 
     def _row(self, s: float, base: Point) -> Row:
         if self.control == "arc":

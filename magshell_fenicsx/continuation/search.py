@@ -80,14 +80,14 @@ class Deflation:
 
     def slope(self, u: Vector, d: Vector) -> float:
         """d . grad M/M at u."""
-        found = 0.0
+        total = 0.0
         for v in self.known:
             away = (u - v, 0.0)
             size = self.metric.norm(*away)
-            found -= (
+            total -= (
                 POWER * self.metric.inner(away, (d, 0.0)) / (size**2 * (1 + SHIFT * size**POWER)) if size else np.inf
             )
-        return found
+        return total
 
     def factor(self, u: Vector, d: Vector) -> float:
         """tau for Newton's step d at u; zero at a known solution."""
@@ -184,15 +184,15 @@ def released(newton: BorderedNewton, guess: State, b: Vector) -> Iterator[State]
         return
     path = Path(holder, FORCE, "arc", StepOptions(FIRST, LONGEST * FIRST, SHORTEST * FIRST), SCALE)
     largest = MOST_FORCE * abs(outcome.state.mu[FORCE])
-    here = path.start(outcome.state, -float(np.copysign(1.0, outcome.state.mu[FORCE])))
+    reached = path.start(outcome.state, -float(np.copysign(1.0, outcome.state.mu[FORCE])))
     try:
-        for count, (point, _) in enumerate(path.towards(here, [np.inf]), 1):
-            before, after = (p.state.mu[FORCE] for p in (here, point))
+        for count, (point, _) in enumerate(path.towards(reached, [np.inf]), 1):
+            before, after = (p.state.mu[FORCE] for p in (reached, point))
             if before * after <= 0 and before != after:
-                s = here.s + (point.s - here.s) * before / (before - after)
-                near = path.between(s, here, path.seen_from(here, point))
+                s = reached.s + (point.s - reached.s) * before / (before - after)
+                near = path.between(s, reached, path.seen_from(reached, point))
                 yield State(near.u, dict(guess.mu))
-            here = point
+            reached = point
             if count == MOST_STEPS or abs(after) > largest:
                 return
     except PathStopped:
@@ -308,12 +308,12 @@ def further(
     search = _Search(path, [start], descend, limits.over)
     queue = [Guess(make, start, displacement) for make in guesses]
     queue += search.along_mode(start, displacement)
-    found = 0
+    accepted = 0
     for number, guess in enumerate(queue, 1):  # the queue grows
         attempts = [*([search.by_descent] if descend else []), search.by_newton, search.by_release]
         while attempts:
             attempt = attempts.pop(0)
-            path.progress.doing(f"searching: guess {number} of at most {limits.guesses}, solutions found: {found}")
+            path.progress.doing(f"searching: guess {number} of at most {limits.guesses}, solutions found: {accepted}")
             point = path.recorded(partial(_unless, limits.over, attempt, guess))
             if point == OVER:
                 return
@@ -321,9 +321,9 @@ def further(
                 continue
             search.known.append(point.state)
             queue += search.along_mode(point.state, displacement)
-            found += not (descend and point.negative_pivots)
+            accepted += not (descend and point.negative_pivots)
             yield point
-            if found == limits.solutions:
+            if accepted == limits.solutions:
                 return
             attempts = [search.by_newton]  # which may find another one now
         if number == limits.guesses:
@@ -371,13 +371,13 @@ class _Search:
             if self._newton.factor_at(state).negative_pivots:
                 continue
             near = deflated(self._newton, state, self._path.name, self._row)
-            found = self._solver.solve(self._row, self._value, near) if near else "no solution is near"
-            if isinstance(found, str):
-                tried = found
-            elif self._is_known(found.state):
+            outcome = self._solver.solve(self._row, self._value, near) if near else "no solution is near"
+            if isinstance(outcome, str):
+                tried = outcome
+            elif self._is_known(outcome.state):
                 return "the solution is a known one"
             else:
-                point = self._solver.exact(found, found)
+                point = self._solver.exact(outcome, outcome)
                 if not point.negative_pivots:
                     return point
                 state = _Mode(self._path, point.state).state(DOWN)
@@ -386,9 +386,9 @@ class _Search:
     def by_release(self, guess: Guess) -> Point | str:
         """The first solution on the path of a force that holds the guess."""
         for state in released(self._newton, guess.state, guess.direction):
-            found = self._accepted(state)
-            if not isinstance(found, str):
-                return found
+            accepted = self._accepted(state)
+            if not isinstance(accepted, str):
+                return accepted
         return "the force does not fall to zero"
 
     def along_mode(self, state: State, displacement: Callable[[Vector], Vector]) -> list[Guess]:
@@ -401,12 +401,12 @@ class _Search:
         near = deflated(self._newton, guess, path.name, self._row, [state.u for state in self.known])
         if near is None:
             return "Newton's method finds no other solution"
-        found = self._solver.solve(self._row, self._value, near)
-        if isinstance(found, str):
-            return found
-        if self._is_known(found.state):
+        point = self._solver.solve(self._row, self._value, near)
+        if isinstance(point, str):
+            return point
+        if self._is_known(point.state):
             return "the solution is a known one"
-        return self._solver.exact(found, found)
+        return self._solver.exact(point, point)
 
     def _is_known(self, found: State) -> bool:
         away = (max_abs(self._system.comm, found.u - state.u) for state in self.known)

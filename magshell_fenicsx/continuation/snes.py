@@ -218,8 +218,8 @@ class Linearised:
         """The inverse of the matrix times a vector; for the iterate's residual it is known since the test."""
         assert self._chord
         assert self._ahead
-        known = f.stateGet() == self._residual and f.handle == self._handle
-        self.join(self._ahead if known else self._chord.solve(self.split(f), self._ahead), y)
+        solved = f.stateGet() == self._residual and f.handle == self._handle
+        self.join(self._ahead if solved else self._chord.solve(self.split(f), self._ahead), y)
 
     def test(self, snes: PETSc.SNES, iteration: int, norms: tuple[float, float, float]) -> Any:
         """Whether the next step is small enough, or will never be."""

@@ -113,8 +113,8 @@ class State:
 
     def equals(self, other: "State", comm: MPI.Comm) -> bool:
         """Whether it is the same state, on all ranks."""
-        here = self.mu == other.mu and np.array_equal(self.u, other.u)
-        return bool(comm.allreduce(here, MPI.LAND))
+        equal = self.mu == other.mu and np.array_equal(self.u, other.u)
+        return bool(comm.allreduce(equal, MPI.LAND))
 
 
 def dot(comm: MPI.Comm, a: Vector, b: Vector) -> float:

@@ -172,11 +172,11 @@ class Integrator:
 
     def _inverse_mass(self) -> Callable[[Vector], Vector]:
         M = self.mass.copy()
-        here = M.getDiagonal()
-        here.setArray((here.array_r == 0).astype(float))
+        massless = M.getDiagonal()
+        massless.setArray((massless.array_r == 0).astype(float))
         M.setOption(PETSc.Mat.Option.NEW_NONZERO_ALLOCATION_ERR, False)
         M.setOption(PETSc.Mat.Option.IGNORE_ZERO_ENTRIES, False)
-        M.setDiagonal(here, PETSc.InsertMode.ADD_VALUES)
+        M.setDiagonal(massless, PETSc.InsertMode.ADD_VALUES)
         M.setOption(PETSc.Mat.Option.SYMMETRIC, True)
         factors = Factorisation(self.system.comm)
         factors.factor(M)
@@ -304,9 +304,9 @@ class Integrator:
     def _factor(self, now: Motion, u: Vector, y: Array, dt: float) -> None:
         """Factor the derivative of `_unbalanced` by u and y, with one tangent for all parts of the step."""
         part = 1 - self.rule.alpha_f
-        here, mu = now.u + part * (u - now.u), self._at(now, y, part, dt)
+        between, mu = now.u + part * (u - now.u), self._at(now, y, part, dt)
         self._average(now, u, y, dt)
-        self.factor(Factored(here, mu, dt, self.factorisation.habit))
+        self.factor(Factored(between, mu, dt, self.factorisation.habit))
 
     def factor(self, at: Factored) -> None:
         """Make these factors."""
@@ -377,13 +377,13 @@ class Integrator:
     def _potentials(self, now: Motion, before: bool) -> dict[str, float]:
         """dPi/dmu of the loads; of supports that move with the forces of inertia and drag."""
         mu, still = now.mu, self.system.coordinates - self._driven
-        found = {name: self.system.potential(now.u, mu, name) for name in mu if name not in still}
+        potentials = {name: self.system.potential(now.u, mu, name) for name in mu if name not in still}
         if self.ground:
             a = now.a + self.ground.acceleration(now.t, before)
             forces = self.ground.times(a + self.drag * (now.v + self.ground.velocity(now.t, before)))
             for name in self._driven & self.ground.names:
-                found[name] += dot(self.system.comm, forces, self.ground.along(mu, name))
-        return found
+                potentials[name] += dot(self.system.comm, forces, self.ground.along(mu, name))
+        return potentials
 
     def _work(
         self, name: str, now: Motion, mu: Mapping[str, float], potentials: Mapping[str, float], mean: float | None

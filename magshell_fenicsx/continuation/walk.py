@@ -90,24 +90,24 @@ class _Search:
             yield from self.between(middle, high, halvings - 1)
 
     def solve(self, s: float, low: Point, high: Point) -> Point:
-        found = self.try_at(s, low, high)
-        if isinstance(found, str):
-            raise PathStopped(f"locating an instability: {found}", low)
-        return found
+        solved = self.try_at(s, low, high)
+        if isinstance(solved, str):
+            raise PathStopped(f"locating an instability: {solved}", low)
+        return solved
 
     def try_at(self, s: float, low: Point, high: Point) -> Point | str:
-        found = self.path.inside(s, low, high, self.base)
-        if not isinstance(found, str):
-            self.iterations += found.iterations
-            self.factorisations += found.factorisations
-        return found
+        solved = self.path.inside(s, low, high, self.base)
+        if not isinstance(solved, str):
+            self.iterations += solved.iterations
+            self.factorisations += solved.factorisations
+        return solved
 
     def middle(self, low: Point, high: Point) -> Point | None:
         """A point somewhere between two others, with its own inertia; rounding may hide some places."""
         for part in MIDDLE:
-            found = self.try_at(low.s + part * (high.s - low.s), low, high)
-            if not isinstance(found, str):
-                return self.path.exact(found, self.base)
+            solved = self.try_at(low.s + part * (high.s - low.s), low, high)
+            if not isinstance(solved, str):
+                return self.path.exact(solved, self.base)
         return None
 
     def crossing(self, low: Point, high: Point) -> Point | None:
@@ -125,26 +125,26 @@ class _Search:
         pivots = sorted(end.negative_pivots for end in (low, high))
         for mode in sorted(modes, key=lambda mode: abs(mode.eigenvalue)):
             stress = [(1 - t, low.state.u), (t, high.state.u)]
-            found = path.recorded(partial(self._regular, guess, mode.vector, stress, low, high))
-            if isinstance(found, str):
+            solved = path.recorded(partial(self._regular, guess, mode.vector, stress, low, high))
+            if isinstance(solved, str):
                 continue
-            if min(low.s, high.s) <= found.s <= max(low.s, high.s) and pivots[0] <= found.negative_pivots < pivots[1]:
-                return self.spent(found)
+            if min(low.s, high.s) <= solved.s <= max(low.s, high.s) and pivots[0] <= solved.negative_pivots < pivots[1]:
+                return self.spent(solved)
         return None
 
     def _regular(self, guess: State, phi: Vector, stress: Sequence[Weighted], low: Point, high: Point) -> Point | str:
         path = self.path
         try:
-            found = find_bifurcation(path.newton, guess, phi, path.name, stress)
+            bifurcation = find_bifurcation(path.newton, guess, phi, path.name, stress)
         except BifurcationLost:
             return "no bifurcation was found"
-        self.iterations += found.iterations
-        self.factorisations += found.factorisations
+        self.iterations += bifurcation.iterations
+        self.factorisations += bifurcation.factorisations
         # the null vector and the response span the tangents of both branches; this one continues the path
-        state, along = found.state, self._slope(found.state, low, high)
-        direction = projected(path.metric, along, [(found.phi, 0.0), (-found.response, 1.0)])
-        point = path.on(state, direction, self.base, found.unstable)
-        return replace(point, error=found.error, load_error=found.load_error)
+        state, along = bifurcation.state, self._slope(bifurcation.state, low, high)
+        direction = projected(path.metric, along, [(bifurcation.phi, 0.0), (-bifurcation.response, 1.0)])
+        point = path.on(state, direction, self.base, bifurcation.unstable)
+        return replace(point, error=bifurcation.error, load_error=bifurcation.load_error)
 
     def _slope(self, state: State, low: Point, high: Point) -> Direction:
         """The path's tangent near a state between two points, interpolated."""
@@ -219,10 +219,10 @@ class _Search:
             # the eigenvalue nearest to zero need not be the one that changes sign
             t = a / (a - b) if a * b < 0 else 0.5
             tried = self.try_at(low.s + t * (high.s - low.s), low, high)
-            found = self.middle(low, high) if isinstance(tried, str) else tried
-            if found is None:  # the path's own tangent is singular there as well
+            between = self.middle(low, high) if isinstance(tried, str) else tried
+            if between is None:  # the path's own tangent is singular there as well
                 return replace(low, load_error=abs(high.state.mu[path.name] - low.state.mu[path.name]))
-            point = found
+            point = between
             mu = point.state.mu[path.name]
             moved, width = abs(point.s - last) * abs(point.dmu), abs(high.s - low.s) * abs(point.dmu)
             if moved <= agreed * abs(mu) and a * b < 0:
@@ -394,15 +394,15 @@ class Walk:
 
     def _between(self, low: Point, high: Point) -> list[tuple[Label, Point, bool]]:
         """Instabilities and, with arc length, targets between two points; the flag marks the end of the walk."""
-        found: list[tuple[Label, Point, bool]] = []
+        events: list[tuple[Label, Point, bool]] = []
         for event in instabilities(self.path, low, high):
             ends = self.goal.until in ("limit", event.kind)
-            found.append((event.kind, event.point, ends))
+            events.append((event.kind, event.point, ends))
             if ends:
                 break
         if self._by_arc and self.goal.targets:
-            found += self._crossed(low, high)
-        return sorted(found, key=lambda item: abs(item[1].s - low.s))
+            events += self._crossed(low, high)
+        return sorted(events, key=lambda item: abs(item[1].s - low.s))
 
     def _crossed(self, low: Point, high: Point) -> Iterator[tuple[Label, Point, bool]]:
         """The targets between two points, each solved for."""

@@ -76,10 +76,10 @@ class Step:
         if not solve:
             return None
         path, s = self._path, (low.s + high.s) / 2
-        found = path.inside(s, low, path.seen_from(low, high), self._low)
-        if isinstance(found, str):
-            raise PathStopped(f"locating an instability: {found}", low)
-        return self._kept(found)
+        middle = path.inside(s, low, path.seen_from(low, high), self._low)
+        if isinstance(middle, str):
+            raise PathStopped(f"locating an instability: {middle}", low)
+        return self._kept(middle)
 
     def _kept(self, point: Point) -> Point:
         seen = self._path.measured_from(self._low, point)
@@ -190,14 +190,14 @@ class Watch:
             Whether the first point gets a look now; then it is no crossing.
         """
         self._before = self._looked.counts if self._looked else (0,) * len(self._families)
-        known = self._looked if start.state.u is self._u and not self._passed else None
+        looked = self._looked if start.state.u is self._u and not self._passed else None
         self._path, self._expand, self._last, self._u, self._along = path, expand, start, start.state.u, 0.0
         self._rate: float | None = None
         self._may_pass, self._passed = 0, []
-        self._looked = replace(known, point=start, along=0.0) if known else None
-        if look and not known:
+        self._looked = replace(looked, point=start, along=0.0) if looked else None
+        if look and not looked:
             self._looked = self._look(start, 0.0)
-        elif not known:
+        elif not looked:
             self._passed.append((start, 0.0))
 
     def pass_to(self, point: Point, *, look: bool = False) -> list[Crossing]:
@@ -246,11 +246,11 @@ class Watch:
         looks = [before, *looks] if before else looks
         self._looked, self._passed = here, []
         self._rate = _rate(*looks[-2:]) if len(looks) > 1 else None
-        found = [] if before else list(self._at_start(looks[0]))
+        changes = [] if before else list(self._at_start(looks[0]))
         for low, high in pairwise(looks):
             if low.counts != high.counts:
-                found += self._between(low, high)
-        return found
+                changes += self._between(low, high)
+        return changes
 
     def _at_start(self, look: _Look) -> Iterator[Crossing]:
         """The families that are unstable at the first point, and were not so on the path before."""

@@ -160,18 +160,18 @@ def random_places(rng: np.random.Generator, count: int, polar: tuple[float, floa
     refuse_no_room(count, polar, distance)
     low, high, least = cos(radians(polar[1])), cos(radians(polar[0])), cos(radians(distance))
     for _ in range(MOST_STARTS):
-        found = np.empty((0, 3))
+        places = np.empty((0, 3))
         for _ in range(count):
             for _ in range(MOST_TRIES):
                 z, azimuth = rng.uniform(low, high), rng.uniform(0.0, 2 * pi)
                 new = np.array([np.sqrt(1 - z * z) * np.cos(azimuth), np.sqrt(1 - z * z) * np.sin(azimuth), z])
-                if (found @ new <= least).all():
-                    found = np.vstack([found, new])
+                if (places @ new <= least).all():
+                    places = np.vstack([places, new])
                     break
             else:
                 break
-        if len(found) == count:
-            angles = np.degrees([np.arccos(found[:, 2]), np.arctan2(found[:, 1], found[:, 0]) % (2 * pi)])
+        if len(places) == count:
+            angles = np.degrees([np.arccos(places[:, 2]), np.arctan2(places[:, 1], places[:, 0]) % (2 * pi)])
             return np.asarray(angles.T)
     raise NoRoom(f"no room was found for {count} places at least {distance:g} degrees apart: fewer, or closer ones")
 

@@ -169,8 +169,8 @@ class Together:
 
 def together(functions: Sequence[object], frame: Array | None = None, length: float = 1.0) -> Together | None:
     """Those of some functions that are formulas; None without."""
-    found = [f for f in functions if isinstance(f, Read)]
-    return Together(found, frame, length) if found else None
+    readable = [f for f in functions if isinstance(f, Read)]
+    return Together(readable, frame, length) if readable else None
 
 
 def formula(text: str) -> Read:
@@ -208,8 +208,8 @@ def with_derivatives(text: str) -> Callable[[Array], Taylor]:
 
     def evaluate(x: Array) -> Taylor:
         coordinates = Taylor.coordinates(x)
-        found = _evaluate(steps, *coordinates)
-        return found if isinstance(found, Taylor) else found + 0.0 * coordinates[0]  # a number
+        value = _evaluate(steps, *coordinates)
+        return value if isinstance(value, Taylor) else value + 0.0 * coordinates[0]  # a number
 
     return evaluate
 

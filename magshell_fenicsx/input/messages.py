@@ -1,18 +1,55 @@
-"""What the user reads when a case is wrong: file, line, key, value, what is allowed."""
+"""What the user reads when a case is wrong: file, line, key, value, what is allowed; and what a key means.
 
+Python does not keep the docstrings of keys: they are read in the source when somebody asks.
+"""
+
+import ast
 import difflib
+import inspect
 import re
+import sys
 from collections.abc import Sequence
+from functools import cache
 from typing import Any, get_args, get_origin
 
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-from magshell_fenicsx.input.meanings import meaning
 from magshell_fenicsx.input.source import CaseError, Location, Source, dotted
 
 NO_KEYS = ("a word", "a gas")  # tags of a union that has no sections to choose from
 NO_CONTAINER = ("list_type", "dict_type")
+
+
+def meaning(section: type[BaseModel], key: str) -> str:
+    """The docstring of a key of a section or its base, or what stands in its place; empty without."""
+    field = section.model_fields.get(key)
+    if field is not None and field.description:
+        return field.description
+    return next((found for base in section.__mro__ if (found := _docstrings(base).get(key))), "")
+
+
+@cache
+def _docstrings(section: type) -> dict[str, str]:
+    """Key -> docstring of a class's own keys."""
+    own = _classes(section.__module__).get(section.__qualname__) if issubclass(section, BaseModel) else None
+    pairs = zip(own.body, own.body[1:], strict=False) if own else ()
+    return {
+        key.target.id: inspect.cleandoc(text.value.value)
+        for key, text in pairs
+        if isinstance(key, ast.AnnAssign) and isinstance(key.target, ast.Name)
+        if isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant) and isinstance(text.value.value, str)
+    }
+
+
+@cache
+def _classes(module: str) -> dict[str, ast.ClassDef]:
+    """Name -> class at the top of a module that has a source."""
+    try:
+        tree = ast.parse(inspect.getsource(sys.modules[module]))
+    except (OSError, TypeError, KeyError):
+        return {}
+    return {node.name: node for node in tree.body if isinstance(node, ast.ClassDef)}
 
 
 class InvalidCase(CaseError):
@@ -37,14 +74,14 @@ def explained(errors: Sequence[Any], source: Source, case: type[BaseModel]) -> s
     Pydantic tries all members of a union, and each has an error: what is a list or a mapping counts as one, and what is
     neither as a value.
     """
-    found = [(_without_tag(error["loc"], source.data, case), error) for error in errors]
-    places = [location for location, _ in found]
+    placed = [(_without_tag(error["loc"], source.data, case), error) for error in errors]
+    places = [location for location, _ in placed]
 
     def beside(location: Location, kind: str) -> bool:
         within = any(len(other) > len(location) and other[: len(location)] == location for other in places)
         return within or (kind in NO_CONTAINER and places.count(location) > 1)
 
-    told = [explain(error, location, source, case) for location, error in found if not beside(location, error["type"])]
+    told = [explain(error, location, source, case) for location, error in placed if not beside(location, error["type"])]
     return "\n".join(dict.fromkeys(told))
 
 

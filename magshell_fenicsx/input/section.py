@@ -1,17 +1,40 @@
-"""The base of all sections of a case: strict types, no unknown keys, numbers with units."""
+"""The base of all sections of a case: strict types, no unknown keys, numbers with units, files, a choice of sections.
+
+Of sections that are chosen by a key, only the validators of chosen ones are built: a case has few of many. Targets with
+units become numbers over the sizes of their case at the door.
+"""
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import cache
-from typing import TYPE_CHECKING, Annotated, Any, get_args
+from functools import cache, reduce
+from math import isnan, nan
+from operator import or_
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Protocol, get_args
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    GetCoreSchemaHandler,
+    GetJsonSchemaHandler,
+    PrivateAttr,
+    ValidationInfo,
+    field_validator,
+)
+from pydantic_core import CoreSchema, core_schema
+
+from magshell_fenicsx.platform.reading import Files
+from magshell_fenicsx.quantities.quantity import Given, Unit
 
 if TYPE_CHECKING:
     import pint
-import numpy as np
-from numpy.typing import NDArray
+
 
 # one number, then units; pint alone would evaluate any formula, even 9**9**9
 _NUMBER = r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?"
@@ -83,8 +106,8 @@ def number_and_unit(text: str) -> tuple[str, str]:
     """
     if re.fullmatch(_NUMBER, text.strip()):
         return text.strip(), ""
-    found = re.match(rf"\s*({_NUMBER})", text) if _NUMBER_AND_UNITS.fullmatch(text) else None
-    return (found[1], text[found.end() :].strip(" *")) if found else ("", "")
+    number = re.match(rf"\s*({_NUMBER})", text) if _NUMBER_AND_UNITS.fullmatch(text) else None
+    return (number[1], text[number.end() :].strip(" *")) if number else ("", "")
 
 
 def in_unit(text: str, unit: str) -> float:
@@ -191,6 +214,25 @@ def texts(part: Any, known: Callable[[str], bool] = lambda text: False, path: st
         yield from texts(value, known, f"{path}{key}.")
 
 
+@dataclass(frozen=True)
+class OrOfProgram:
+    """In the annotation of a union: one of its members is what a program gives and no file has, with a `digest`."""
+
+    kind: Any
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        others = reduce(or_, (part for part in get_args(source) if part is not self.kind))
+        told = core_schema.wrap_serializer_function_ser_schema(self._told)
+        written = handler.generate_schema(others)
+        return core_schema.no_info_wrap_validator_function(self._validated, written, serialization=told)
+
+    def _validated(self, value: Any, validate: Callable[[Any], Any]) -> Any:
+        return value if isinstance(value, self.kind) else validate(value)
+
+    def _told(self, value: Any, tell: Callable[[Any], Any]) -> Any:
+        return value.digest if isinstance(value, self.kind) else tell(value)
+
+
 _EXAMPLES = {
     "metre": "25.2 mm",
     "millimetre": "0.5 mm",
@@ -227,3 +269,134 @@ class Direction(Section):
         """The unit vector (3,) in a frame that is turned by `turn` (rad) about e3."""
         polar, azimuth = np.radians(self.polar), np.radians(self.azimuth) - turn
         return np.array([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)])
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """In an annotation: which key chooses; each section has the values that choose it as the key's `Literal`."""
+
+    by: str
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        choices = {
+            tag: handler.generate_schema(Annotated[section, _Later(section)])
+            for section in get_args(source)
+            for tag in get_args(section.model_fields[self.by].annotation)
+        }
+        return core_schema.tagged_union_schema(choices, self.by)
+
+
+@dataclass(frozen=True)
+class _Later:
+    """A section whose validator is built when it is needed."""
+
+    section: type[BaseModel]
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        return core_schema.with_info_plain_validator_function(self._validated)
+
+    def _validated(self, value: Any, info: ValidationInfo) -> BaseModel:
+        return self.section.model_validate(value, context=info.context)
+
+    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+        self.section.model_rebuild()
+        return handler(self.section.__pydantic_core_schema__)
+
+
+class FileKeys(Section):
+    """Of sections that may read a file; its path is from the folder of the case."""
+
+    file: str | None = None
+    """From the folder of the case"""
+
+    _folder: Path = PrivateAttr(default_factory=Path)
+    _files: Files = PrivateAttr(default_factory=Files)
+
+    def model_post_init(self, context: Any, /) -> None:
+        given = context or {}
+        self._folder = Path(given.get("folder", "")).absolute()
+        self._files = given.get("files") or Files()
+
+    @field_validator("file", check_fields=False)
+    @classmethod
+    def _a_name(cls, name: str | None) -> str | None:
+        if name is not None and "\0" in name:
+            raise ValueError(f"{name!r}: a file's name has no zero byte")
+        if name == "":
+            raise ValueError("the name is empty; give that of a file")
+        return name
+
+    @property
+    def path(self) -> Path:
+        """Where the file is."""
+        return self._folder / (self.file or "")
+
+    @property
+    def files(self) -> Files:
+        """The contents of the files of its case."""
+        return self._files
+
+    @property
+    def digest(self) -> str | None:
+        """Hash of the file's content; None if it cannot be read."""
+        return self._files.digest(self.path)
+
+
+def digests(sections: Mapping[str, object]) -> dict[str, str | None]:
+    """Hashes of the files that sections read, by the keys of the files."""
+    return {f"{key}.file": s.digest for key, s in sections.items() if isinstance(s, FileKeys) and s.file}
+
+
+class Sized(Protocol):
+    """A shell with or without units."""
+
+    @property
+    def geometry(self) -> str: ...
+    @property
+    def youngs_modulus(self) -> float | None: ...
+    @property
+    def R_over_h(self) -> float: ...
+    @property
+    def poisson_ratio(self) -> float: ...
+    @property
+    def density(self) -> float | None: ...
+    @property
+    def reference(self) -> float: ...
+    @property
+    def with_units(self) -> bool: ...
+
+
+def given(shell: Sized) -> Given:
+    """What a shell gives with units."""
+    in_pascals = shell.with_units or shell.geometry in ("hemisphere", "disc", "strip")  # whose E always has a unit
+    R = shell.reference if shell.with_units else nan
+    E = shell.youngs_modulus if in_pascals and shell.youngs_modulus else nan
+    rho = shell.density if shell.with_units and shell.density else nan
+    return Given(shell.poisson_ratio, shell.R_over_h, R, E, rho)
+
+
+def _note(shell: Any, info: ValidationInfo) -> Any:
+    if isinstance(info.context, dict):
+        info.context["given"] = given(shell)
+    return shell
+
+
+NOTED = AfterValidator(_note)  # of the shell, which comes before the loads
+
+
+def over(unit: Unit) -> BeforeValidator:
+    """A validator: text with a unit -> a number over a size of the case, such as h; a number is one already."""
+
+    def convert(value: Any, info: ValidationInfo) -> Any:
+        if not isinstance(value, str):
+            return value
+        exact = in_units(unit.text)(value)
+        if info.context and "given" not in info.context:
+            return 1.0  # the shell is wrong, and its own message says so: any number will do
+        shell = (info.context or {}).get("given")
+        size = unit.size(shell) if shell else nan
+        if isnan(size):
+            raise ValueError(f"has a unit: that needs {unit.needs}; a number is in {unit.key}")
+        return exact / size
+
+    return BeforeValidator(convert, json_schema_input_type=float | with_unit(unit.text))

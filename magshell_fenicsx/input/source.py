@@ -121,11 +121,11 @@ def _walk(node: yaml.Node, location: Location, source: Source) -> None:
             place = f"{source.name}:{key.start_mark.line + 1}"
             if not isinstance(key, yaml.ScalarNode) or not key.value.isprintable():
                 raise CaseError(f"{place}: a key must be a word")
-            here = (*location, key.value)
-            if here in source.places:
-                raise CaseError(f"{place}: {dotted(here)} is given twice")
-            source.places[here] = place
-            _walk(value, here, source)
+            inner = (*location, key.value)
+            if inner in source.places:
+                raise CaseError(f"{place}: {dotted(inner)} is given twice")
+            source.places[inner] = place
+            _walk(value, inner, source)
     elif isinstance(node, yaml.SequenceNode):
         for i, value in enumerate(node.value):
             source.places[*location, i] = f"{source.name}:{value.start_mark.line + 1}"

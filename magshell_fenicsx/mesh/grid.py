@@ -159,21 +159,21 @@ class RimmedGrid:
         steps = [(-1, 0, 1) if glued else (0,) for glued in self.grid.glued]
         images = [points + np.multiply(step, self.extent) for points in self.rims for step in product(*steps)]
         near = [p for p in images if (p.max(axis=0) > self.grid.low).all() and (p.min(axis=0) < self.grid.high).all()]
-        found = [rectangle(), *within(occ, near, rectangle)]
+        surfaces = [rectangle(), *within(occ, near, rectangle)]
         for axis, other in ((0, 1), (1, 0)):
             for across in self.grid.through[axis]:
                 if not self.grid.low[axis] < across < self.grid.high[axis]:
                     continue
                 ends = np.array([self.grid.low, self.grid.high])
                 ends[:, axis], ends[:, other] = across, (self.grid.low[other], self.grid.high[other])
-                found.append((1, occ.addLine(*(occ.addPoint(*end, 0) for end in ends))))
-        return found
+                surfaces.append((1, occ.addLine(*(occ.addPoint(*end, 0) for end in ends))))
+        return surfaces
 
     def on_edges(self, x: Array) -> dict[str, NDArray[np.bool_]]:
-        found = dict[str, NDArray[np.bool_]]()
+        edges = dict[str, NDArray[np.bool_]]()
         for i, name in enumerate(self.grid.sides):
             axis, end = i // 2, (self.grid.low, self.grid.high)[i % 2]
             if name in self.grid.edges and not self.grid.glued[axis]:
                 on = np.abs(x[:, axis] - end[axis]) < CLOSE * self.reach
-                found[name] = found[name] | on if name in found else on
-        return found
+                edges[name] = edges[name] | on if name in edges else on
+        return edges

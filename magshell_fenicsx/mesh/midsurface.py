@@ -18,7 +18,15 @@ from dolfinx.cpp.io import perm_gmsh
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from magshell_fenicsx.mesh.patch import Deviated, Deviation, Embedding, PatchMesh, as_set, check_orientation
+from magshell_fenicsx.mesh.patch import (
+    Deviated,
+    Deviation,
+    Embedding,
+    GivenField,
+    PatchMesh,
+    as_set,
+    check_orientation,
+)
 from magshell_fenicsx.platform import compat
 
 Array = NDArray[np.float64]
@@ -96,11 +104,11 @@ class Midsurface:
         return self._field(V, "growth", lambda chart: drawn.along_normal(chart, deviations))
 
     def _field(self, V: fem.FunctionSpace, name: str, of: Embedding) -> fem.Function:
-        chart, found = self._charted(compat.interpolation_points(V)), fem.Function(V, name=name)
+        chart, function = self._charted(compat.interpolation_points(V)), fem.Function(V, name=name)
         values = of(chart.reshape(-1, chart.shape[-1]))
-        found.x.array.reshape(-1, 3)[V.dofmap.list] = values.reshape(*chart.shape[:2], 3)
-        found.x.scatter_forward()
-        return found
+        function.x.array.reshape(-1, 3)[V.dofmap.list] = values.reshape(*chart.shape[:2], 3)
+        function.x.scatter_forward()
+        return function
 
     @property
     def read(self) -> bool:
@@ -111,6 +119,22 @@ class Midsurface:
     def patches(self) -> dict[str, NDArray[np.bool_]]:
         """Name -> whether each cell of this rank, ghosts included, belongs to that part of the surface."""
         return {name: inside[self._original_cells] for name, inside in self._patch.patches.items()}
+
+    @cached_property
+    def given(self) -> NDArray[np.int64]:
+        """This rank's cells among the triangles that were given, see `PatchMesh.given`."""
+        assert self._patch.given is not None
+        return self._patch.given[self._original_cells]
+
+    def in_cells(self, field: GivenField) -> Array:
+        """The values (cells, nodes, size) in this rank's cells, ghosts included."""
+        return field.in_cells(self.given)
+
+    def function(self, field: GivenField) -> fem.Function:
+        """The same as a function on this mesh, of the shape (size,)."""
+        found = fem.Function(fem.functionspace(self.mesh, ("DG", field.degree, (field.size,))), name=field.name)
+        found.x.array.reshape(-1, field.size)[found.function_space.dofmap.list] = self.in_cells(field)
+        return found
 
     @property
     def _original_cells(self) -> NDArray[np.int64]:
@@ -169,9 +193,9 @@ def _named_facets(domain: mesh.Mesh, patch: PatchMesh, vertices: NDArray[np.int6
     # a rank may have no part of any edge, and dolfinx divides by their number
     ends = mesh.entities_to_geometry(domain, 1, facets) if len(facets) else np.empty((0, 2), dtype=np.int32)
     numbers = np.sort(vertices[domain.geometry.input_global_indices[ends]], axis=1)
-    found = {}
+    named = {}
     for name, pairs in patch.edges.items():
         wanted = as_set(pairs)
         inside = [(a, b) in wanted for a, b in numbers]
-        found[name] = facets[np.array(inside, dtype=bool)]
-    return found
+        named[name] = facets[np.array(inside, dtype=bool)]
+    return named

@@ -138,6 +138,7 @@ def cut(patch: PatchMesh, mirror: Mirror) -> PatchMesh:
         edges=edges,
         one=None if patch.one is None else first[one[used]],
         patches={name: inside[kept] for name, inside in patch.patches.items()},
+        given=None if patch.given is None else patch.given[kept],
     )
 
 

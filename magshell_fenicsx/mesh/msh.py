@@ -3,6 +3,7 @@
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
@@ -14,6 +15,7 @@ from magshell_fenicsx.mesh.msh_format import Content, parsed
 from magshell_fenicsx.mesh.patch import (
     MeshError,
     PatchMesh,
+    Triangles,
     as_set,
     border_pairs,
     directed_sides,
@@ -21,6 +23,9 @@ from magshell_fenicsx.mesh.patch import (
     place_text,
 )
 from magshell_fenicsx.platform.reading import Files
+
+if TYPE_CHECKING:
+    from magshell_fenicsx.mesh.given import Home
 
 Array = NDArray[np.float64]
 Cells = NDArray[np.int64]
@@ -97,16 +102,16 @@ def border_edges(nodes: Array, cells: Cells, named: Mapping[str, Cells]) -> dict
         itself in a vertex.
     """
     border = border_pairs(directed_sides(cells))
-    known = {pair for lines in named.values() for pair in as_set(lines)}
-    unnamed = [(int(a), int(b)) for a, b in border if (int(a), int(b)) not in known]
+    listed = {pair for lines in named.values() for pair in as_set(lines)}
+    unnamed = [(int(a), int(b)) for a, b in border if (int(a), int(b)) not in listed]
     if unnamed:
         place = nodes[list(unnamed[0])].mean(axis=0)
         vertices = np.unique(cells[:, :3])
         extent = np.ptp(nodes[vertices], axis=0).max()
-        here = nodes[unnamed[0][0]]
-        twice = np.sum(np.linalg.norm(nodes[vertices] - here, axis=1) < SAME_PLACE * extent) > 1
+        corner = nodes[unnamed[0][0]]
+        twice = np.sum(np.linalg.norm(nodes[vertices] - corner, axis=1) < SAME_PLACE * extent) > 1
         if twice:
-            raise MeshError(f"there are two nodes at {place_text(here)}: the triangles beside it are not connected")
+            raise MeshError(f"there are two nodes at {place_text(corner)}: the triangles beside it are not connected")
         raise MeshError(
             f"the surface ends at the edge around {place_text(place)}, which belongs to no physical curve: "
             "close the hole, or name the edge (an edge without a condition is free)"
@@ -123,7 +128,7 @@ NEAR = 1e-6  # distance, over the extent, up to which a vertex counts as a named
 
 @dataclass(frozen=True)
 class MeshFile:
-    """A .msh file.
+    """A .msh file, or triangles that a program gives under that name.
 
     Attributes
     ----------
@@ -133,12 +138,30 @@ class MeshFile:
         Whether nodes are places followed by normals, (n, 6), which the triangles around a node have on average.
     files
         What has its content.
+    given
+        The triangles; None of a file.
     """
 
     path: Path
     scale: float
     normals: bool = False
     files: Files = field(default_factory=Files, compare=False)
+    given: Triangles | None = None
+
+    @property
+    def home(self) -> "Home | None":
+        """The mesh of a program; None of a file."""
+        return self.given.home if self.given else None
+
+    def content(self) -> Triangles:
+        """What is in it, or was given.
+
+        Raises
+        ------
+        MeshError
+            If it cannot be read.
+        """
+        return self.given or _content(self)
 
 
 def in_space(x: Array) -> Array:
@@ -173,13 +196,14 @@ def read_msh(file: MeshFile, points: Mapping[str, Array], mirror: Mirror | None 
     try:
         patch = _whole(file)
     except MeshError as e:
-        raise MeshError(f"shell.file: {e}") from None
+        raise MeshError(f"shell: {e}" if file.given else f"shell.file: {e}") from None
     patch = cut(patch, mirror) if mirror else patch
     return replace(patch, points=_vertices(patch.nodes, patch.cells, points, file.scale))
 
 
 def _whole(file: MeshFile) -> PatchMesh:
-    nodes, cells, patches, edges = _content(file)
+    triangles = file.content()
+    nodes, cells, edges = triangles.nodes, triangles.cells, dict(triangles.edges)
     used, again = np.unique(cells, return_inverse=True)  # drops nodes without a triangle
     cells = again.reshape(cells.shape)
     number = np.full(len(nodes), -1, dtype=np.int64)
@@ -189,16 +213,20 @@ def _whole(file: MeshFile) -> PatchMesh:
         edges[name] = number[pairs]
         if (edges[name] < 0).any():
             raise MeshError(f"{file.path}: the physical curve {name} is not part of the surface")
-    cells = oriented(nodes, cells)
+    before, cells = cells, oriented(nodes, cells)
+    turned = (cells[:, 1] != before[:, 1]).astype(np.int64)
     edges = border_edges(nodes, cells, edges)
     nodes = nodes * file.scale
     if file.normals:
         nodes = np.column_stack([nodes, nodal_normals(nodes, cells)])
-    return PatchMesh(nodes, cells, in_space, edges, patches=patches)
+    given = np.column_stack([np.arange(len(cells)), turned])
+    return PatchMesh(nodes, cells, in_space, edges, patches=triangles.patches, given=given)
 
 
 def cell_count(file: MeshFile) -> int:
     """How many triangles are in it; none in a file that cannot be read, which `read_msh` reports."""
+    if file.given:
+        return len(file.given.cells)
     try:
         held = parsed(file.files.content(file.path))
     except (OSError, MeshError):
@@ -209,7 +237,7 @@ def cell_count(file: MeshFile) -> int:
 def _vertices(nodes: Array, cells: NDArray[np.int64], points: Mapping[str, Array], scale: float) -> dict[str, Array]:
     corners = nodes[np.unique(cells[:, :3])]
     highest = corners[np.lexsort(np.round(corners[:, :3], 9).T)[-1]]
-    found = {"pole": highest}
+    vertices = {"pole": highest}
     for name, x in points.items():
         distance = np.linalg.norm(corners[:, :3] - x[:3], axis=1)
         nearest = corners[np.argmin(distance)]
@@ -218,14 +246,12 @@ def _vertices(nodes: Array, cells: NDArray[np.int64], points: Mapping[str, Array
             raise MeshError(
                 f"points.{name}: {wanted} in the file's coordinates is no vertex of the mesh; the nearest is {near}"
             )
-        found[name] = nearest
-    return found
+        vertices[name] = nearest
+    return vertices
 
 
-def _content(
-    file: MeshFile,
-) -> tuple[Array, NDArray[np.int64], dict[str, NDArray[np.bool_]], dict[str, NDArray[np.int64]]]:
-    """Nodes (n, 3), cells, patches and edges (vertex pairs)."""
+def _content(file: MeshFile) -> Triangles:
+    """Those of a file, and the names of its physical groups."""
     try:
         held = parsed(file.files.content(file.path))
     except FileNotFoundError:
@@ -247,26 +273,26 @@ def _content(
         lines = [nodes[:, :2] for entity, nodes in _elements(file, held, 1, LINES) if entity in entities]
         if lines:  # a curve of the geometry may have no elements
             edges[name] = _places(file, held, np.concatenate(lines))
-    return held.places, cells, patches, edges
+    return Triangles(held.places, cells, edges, patches)
 
 
 def _elements(
     file: MeshFile, held: Content, dimension: int, known: Collection[str]
 ) -> list[tuple[int, NDArray[np.int64]]]:
     """Entity and nodes of the blocks of one dimension."""
-    found = []
+    blocks = []
     for name, dim, entity, nodes in held.blocks:
         if dim == dimension:
             if name not in known:
                 raise MeshError(f"{file.path}: it has elements {name}; allowed are triangles of order 1, 2 and 3")
-            found.append((entity, nodes))
-    return found
+            blocks.append((entity, nodes))
+    return blocks
 
 
 def _places(file: MeshFile, held: Content, numbers: NDArray[np.int64]) -> NDArray[np.int64]:
     """Indices of the nodes with these numbers."""
     order = np.argsort(held.tags)
-    found: NDArray[np.int64] = order[np.searchsorted(held.tags, numbers, sorter=order).clip(max=len(order) - 1)]
-    if (missing := held.tags[found] != numbers).any():
+    positions: NDArray[np.int64] = order[np.searchsorted(held.tags, numbers, sorter=order).clip(max=len(order) - 1)]
+    if (missing := held.tags[positions] != numbers).any():
         raise MeshError(f"{file.path}: it has elements with the node {numbers[missing][0]}, which is not there")
-    return found
+    return positions

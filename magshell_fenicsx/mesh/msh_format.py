@@ -45,7 +45,7 @@ class Content:
     groups: dict[int, dict[str, list[int]]] = field(default_factory=lambda: {1: {}, 2: {}})
 
 
-@lru_cache(maxsize=1)  # a plan looks for mirror planes in the file that is then built
+@lru_cache(maxsize=1)  # the planner looks for mirror planes in the file that is then built
 def parsed(content: bytes) -> Content:
     """Read the content of a file.
 
@@ -63,16 +63,16 @@ def parsed(content: bytes) -> Content:
         alone = Path(folder) / "part.msh"
         alone.write_bytes(content)
         command = [sys.executable, "-m", __name__, str(alone)]
-        here = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parents[2]), *filter(None, sys.path)])}
-        done = subprocess.run(command, env=here, cwd=folder, capture_output=True, text=True, check=False)
+        env = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parents[2]), *filter(None, sys.path)])}
+        done = subprocess.run(command, env=env, cwd=folder, capture_output=True, text=True, check=False)
         if done.returncode:
             reason = (done.stderr.strip().splitlines() or ["nothing"])[-1] if done.returncode > 0 else "it crashed"
             reason = reason.replace(str(alone), "the file").removeprefix("Exception: ").strip()
             raise MeshError(f"is damaged, or of a version that gmsh does not read, which says: {reason}")
-        found: Content = Content(*pickle.loads((Path(folder) / FOUND).read_bytes()))
-    if not np.isfinite(found.places).all():
+        mesh: Content = Content(*pickle.loads((Path(folder) / FOUND).read_bytes()))
+    if not np.isfinite(mesh.places).all():
         raise MeshError("a coordinate is not a number")
-    return found
+    return mesh
 
 
 def _held(model: Any) -> tuple[Integers, NDArray[np.float64], Blocks, dict[int, dict[str, list[int]]]]:

@@ -1,14 +1,115 @@
 """A triangulated surface before it is given to dolfinx, and the sides of its triangles."""
 
+import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+if TYPE_CHECKING:
+    from magshell_fenicsx.mesh.given import Home
+
 Embedding = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 Array = NDArray[np.float64]
 Pairs = NDArray[np.int64]  # (n, 2) vertices of edges
+
+
+@dataclass(frozen=True, eq=False)
+class Triangles:
+    """A surface in space as a file or a program gives it; nobody changes it.
+
+    Attributes
+    ----------
+    nodes
+        (n, 3) coordinates.
+    cells
+        (m, 3 | 6 | 10) node numbers in gmsh's order, vertices first.
+    edges
+        Name -> (e, 2) vertex pairs.
+    patches
+        Name -> (m,) whether each triangle belongs to it.
+    home
+        The mesh of a program that they are from; None of a file.
+    """
+
+    nodes: Array
+    cells: NDArray[np.int64]
+    edges: dict[str, Pairs] = field(default_factory=dict)
+    patches: dict[str, NDArray[np.bool_]] = field(default_factory=dict)
+    home: "Home | None" = field(default=None, repr=False)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Self:
+        return self
+
+    @cached_property
+    def digest(self) -> str:
+        """A hash of all that it has."""
+        named = [each for name, part in {**self.edges, **self.patches}.items() for each in (np.array(name), part)]
+        return _digest(self.nodes, self.cells, *named)
+
+
+@dataclass(frozen=True, eq=False)
+class GivenField:
+    """Numbers that vary over `Triangles` as a program gives them, polynomials in each; nobody changes it.
+
+    Attributes
+    ----------
+    name
+        For people.
+    degree
+        Of the polynomials.
+    nodal
+        (m, nodes, size) values at the nodes of Basix's Lagrange element of the degree, in the order of each triangle.
+    swapped
+        (nodes,) for each node that with the second and third vertex exchanged.
+    home
+        The mesh that it is on.
+    """
+
+    name: str
+    degree: int
+    nodal: Array
+    swapped: NDArray[np.int64]
+    home: "Home | None" = field(default=None, repr=False)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Self:
+        return self
+
+    @cached_property
+    def digest(self) -> str:
+        """A hash of its values."""
+        return _digest(self.nodal)
+
+    @property
+    def size(self) -> int:
+        """How many numbers it is at each place."""
+        return int(self.nodal.shape[2])
+
+    @property
+    def largest(self) -> Array:
+        """The numbers (size,) where they are largest."""
+        each = self.nodal.reshape(-1, self.size)
+        return np.asarray(each[np.argmax(np.linalg.norm(each, axis=1))])
+
+    def mapped(self, of: Callable[[Array], Array]) -> "GivenField":
+        """With other numbers (..., others) linear in these (..., size)."""
+        return replace(self, nodal=of(self.nodal))
+
+    def in_cells(self, given: NDArray[np.int64]) -> Array:
+        """Values (cells, nodes, size) in triangles as `PatchMesh.given` tells them."""
+        number, turned = given.T
+        values = self.nodal[number]
+        return np.where(turned[:, None, None] == 1, values[:, self.swapped], values)
+
+
+def _digest(*arrays: NDArray[Any]) -> str:
+    found = hashlib.sha256()
+    for each in arrays:
+        found.update(str((each.dtype, each.shape)).encode() + np.ascontiguousarray(each).tobytes())
+    return found.hexdigest()
 
 
 @dataclass(frozen=True)
@@ -32,6 +133,9 @@ class PatchMesh:
         and are one vertex. `edges` has these numbers. None where nothing is glued.
     patches
         Name -> (m,) whether each triangle belongs to that part of the surface.
+    given
+        (m, 2) of a surface that was given as `Triangles`: the number of each triangle there, and 1 where it has been
+        turned over; None without.
     """
 
     nodes: NDArray[np.float64]
@@ -41,6 +145,7 @@ class PatchMesh:
     points: dict[str, NDArray[np.float64]] = field(default_factory=dict)
     one: NDArray[np.int64] | None = None
     patches: dict[str, NDArray[np.bool_]] = field(default_factory=dict)
+    given: NDArray[np.int64] | None = None
 
     @property
     def corners(self) -> NDArray[np.int64]:

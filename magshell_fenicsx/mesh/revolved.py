@@ -106,10 +106,10 @@ class Spline:
         coarse = np.linspace(0, self.length, 401, dtype=np.float64)
         nearest = int(np.argmin(np.linalg.norm(self(coarse) - rz, axis=1)))
         around = coarse[max(nearest - 1, 0)], coarse[min(nearest + 1, 400)]
-        found = scipy.optimize.minimize_scalar(
+        least = scipy.optimize.minimize_scalar(
             lambda s: np.sum((self(s) - rz) ** 2), bounds=around, method="bounded", options={"xatol": 1e-13}
         )
-        ends = [float(found.x), *(float(s) for s in around)]
+        ends = [float(least.x), *(float(s) for s in around)]
         return min(ends, key=lambda s: float(np.sum((self(np.array(s)) - rz) ** 2)))
 
 

@@ -79,8 +79,8 @@ def scattered(places: Array, values: Array, cover: Array, *, noise: float | None
     ]
     if noise is None:
         noise = _noise(parts[:: max(1, len(parts) // TRIED)])
-    found = Scattered(centres, radii, tuple(part.spline(w, noise) for part, w in parts), noise)
-    return replace(found, residual=float(np.sqrt(np.mean((found(places) - values) ** 2))))
+    function = Scattered(centres, radii, tuple(part.spline(w, noise) for part, w in parts), noise)
+    return replace(function, residual=float(np.sqrt(np.mean((function(places) - values) ** 2))))
 
 
 def _balls(tree: "scipy.spatial.cKDTree", cover: Array) -> tuple[Array, Array]:

@@ -1,4 +1,7 @@
-"""The plane shapes that gmsh triangulates: the chart of the mid-surface, or one half of it."""
+"""The plane shapes that gmsh triangulates, the chart of the mid-surface or half of it; sphere and plane over a chart.
+
+The sphere of radius 1 is charted by (x, y) = phi (cos theta, sin theta).
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -134,10 +137,27 @@ class StripShape:
 
 def within(occ: Any, rims: Sequence[Array], whole: Callable[[], tuple[int, int]]) -> Faces:
     """The faces within closed curves, points (n, 2) each, as far as they belong to a face that `whole` makes."""
-    found: Faces = []
+    pieces: Faces = []
     for points in rims:
         tags = [occ.addPoint(x, y, 0) for x, y in points]
         loop = occ.addCurveLoop([occ.addSpline([*tags, tags[0]])])
-        found += occ.intersect([(2, occ.addPlaneSurface([loop]))], [whole()])[0]
+        pieces += occ.intersect([(2, occ.addPlaneSurface([loop]))], [whole()])[0]
         occ.remove([(0, tag) for tag in tags])
-    return found
+    return pieces
+
+
+def sphere(chart: Array) -> Array:
+    """Chart (n, 2) -> places (n, 3), which are the normals too."""
+    phi = np.hypot(chart[:, 0], chart[:, 1])
+    horizontal = np.sinc(phi / np.pi)[:, None] * chart
+    return np.column_stack([horizontal, np.cos(phi)])
+
+
+def flat(chart: Array) -> Array:
+    """Chart (x, y) -> the plane z = 0."""
+    return np.column_stack([chart, np.zeros(len(chart))])
+
+
+def upwards(chart: Array) -> Array:
+    """The normals (n, 3) of that plane."""
+    return np.broadcast_to([0.0, 0.0, 1.0], (len(chart), 3))

@@ -100,24 +100,24 @@ def _smaller(size: Size, places: Array) -> Size:
 
 def _with_images(shape: Shape, points: Mapping[str, Array]) -> list[Array]:
     """The points, each once, and on glued sides their images on the other one."""
-    found = list(points.values())
+    places = list(points.values())
     for axis, low, high in shape.glued:
         for here, there in ((low, high), (high, low)):
-            for x in [x for x in found if abs(x[axis] - here) < CLOSE]:
-                found.append(np.where(np.arange(2) == axis, there, x))
-    return list(np.unique(np.round(found, 12), axis=0)) if shape.glued else found
+            for x in [x for x in places if abs(x[axis] - here) < CLOSE]:
+                places.append(np.where(np.arange(2) == axis, there, x))
+    return list(np.unique(np.round(places, 12), axis=0)) if shape.glued else places
 
 
 def _make_periodic(model: Any, axis: int, low: float, high: float) -> None:
     """Give the curves of two opposite sides the same nodes."""
 
     def side(across: float) -> list[tuple[float, int]]:
-        found = []
+        lines = []
         for _, tag in model.getEntities(1):
             box = np.reshape(model.getBoundingBox(1, tag), (2, 3))
             if np.abs(box[:, axis] - across).max() < BOX:
-                found.append((float(box[:, 1 - axis].mean()), tag))
-        return sorted(found)
+                lines.append((float(box[:, 1 - axis].mean()), tag))
+        return sorted(lines)
 
     first, second = side(low), side(high)
     shift = np.eye(4)

@@ -191,13 +191,20 @@ class Carrier:
         """Of a density."""
         return self.value(density, u) * self.measure(density)
 
-    def energy(self, name: str, density: Density, amplitude: str | None = None, **others: Any) -> Energy:
-        """That of a density; `others` are attributes of `Energy`, and `drawn` as of `value`."""
-        drawn, work, over = others.pop("drawn", False), None, self.measure(density)
-        if virtual := density.work:
-            work = lambda u, v: virtual(self.j0, u, v, *density.parameters) * over  # noqa: E731
-        of = lambda u: self.value(density, u, drawn=drawn) * over  # noqa: E731
-        return Energy(name, of, amplitude, work=work, density=density, **others)
+    def energy(
+        self, name: str, density: Density, amplitude: str | None = None, *, drawn: bool = False, **others: Any
+    ) -> Energy:
+        """That of a density; `drawn` as of `value`, `others` are attributes of `Energy`."""
+        virtual, over = density.work, self.measure(density)
+
+        def of(u: Jet) -> ufl.Form:
+            return self.value(density, u, drawn=drawn) * over
+
+        def work(u: Jet, v: Jet) -> ufl.Form:
+            assert virtual
+            return virtual(self.j0, u, v, *density.parameters) * over
+
+        return Energy(name, of, amplitude, work=work if virtual else None, density=density, **others)
 
 
 def on_surface(r0: fem.Function, drawn: fem.Function | None = None) -> Carrier:

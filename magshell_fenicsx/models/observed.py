@@ -15,14 +15,14 @@ from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.assembly.terms import LinearTerm
 from magshell_fenicsx.continuation.system import Amplitudes, State, Vector
 from magshell_fenicsx.mesh.midsurface import Midsurface
-from magshell_fenicsx.models.carriers import Carrier, Energy
+from magshell_fenicsx.models.carriers import Carrier, Energy, Facets
 from magshell_fenicsx.models.shell import patterns
 from magshell_fenicsx.models.shell.fitted import Cells
 from magshell_fenicsx.models.shell.parameters import Loads, Material
 from magshell_fenicsx.models.shell.terms import EnergyFactory
 from magshell_fenicsx.parts.bodies.contact import Pressing, Region
 from magshell_fenicsx.parts.forces.dead_load import DeadLoads
-from magshell_fenicsx.parts.forces.point_load import point_entries
+from magshell_fenicsx.parts.forces.load_vector import point_entries
 from magshell_fenicsx.parts.magnetism.applied import AppliedField
 from magshell_fenicsx.parts.supports.moved import Support
 
@@ -164,10 +164,11 @@ class Thin(Observed):
     factory: EnergyFactory
     kernels: KernelLog
 
-    def own_and_contacts(self) -> list[Energy]:
+    def own_and_contacts(self, edges: Mapping[str, Facets]) -> list[Energy]:
         """The energies of one's own terms and of bodies; sets what is observed of them."""
-        factory, energies = self.factory, [self.factory.own(term) for term in self.loads.own]
-        self.observed = self.kernels.compile_all(factory.observed(term) for term in self.loads.own)
+        factory, own = self.factory, [(term, edges[term.on] if term.on else None) for term in self.loads.own]
+        energies = [factory.own(term, facets) for term, facets in own]
+        self.observed = self.kernels.compile_all(factory.observed(term, facets) for term, facets in own)
         self.contacts = {}
         for contact in self.loads.contacts:
             pressed, pressing, integrals = factory.contact(contact)

@@ -1,30 +1,38 @@
-"""A Winkler foundation: springs along the undeformed normal, everywhere on the surface."""
+"""An elastic foundation: springs along the undeformed normal and in the surface, of stiffnesses that may vary."""
 
-from typing import Annotated
+from collections.abc import Callable, Iterable
+from typing import Annotated, Self
 
 import ufl
-from pydantic import Field
+from pydantic import Field, model_validator
 from ufl.core.expr import Expr
 
+from magshell_fenicsx.input.expressions import Formula, symbolic
 from magshell_fenicsx.input.section import or_number
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.kinematics import Jet
-from magshell_fenicsx.models.shell.own_term import OwnTerm
-from magshell_fenicsx.parts.part import Part, Scales
-from magshell_fenicsx.quantities.quantity import Quantity
-from magshell_fenicsx.quantities.units import POINT_FORCE, STIFFNESS
+from magshell_fenicsx.models.shell.own_term import SYMBOLIC, OwnTerm
+from magshell_fenicsx.parts.part import Context, Formulas, Part, Scales
+from magshell_fenicsx.quantities.quantity import POINT_FORCE, STIFFNESS, Quantity
 
-Stiffness = Annotated[float, Field(gt=0)]
+Number = Annotated[float, Field(gt=0)]
+Stiffness = Annotated[float, or_number("newton/metre**3", Number), Field(gt=0)]
+MOST_FACTOR = 1e6
 
 
 class Foundation(Part):
     """Winkler foundation: springs with the energy k w²/2 per undeformed area, w = -u·n0 the inward displacement.
 
-    The springs resist tension and compression. On a solid they act on the outer face.
+    The springs resist tension and compression. On a solid they act on the outer face. Others lie in the surface, with
+    the energy k_t |u_t|²/2 of the displacement u_t = u - (u·n0) n0.
     """
 
-    stiffness: Annotated[float, or_number("newton/metre**3", Stiffness), Field(gt=0)]
+    stiffness: Stiffness | None = None
     """k, a force per area and displacement [E/R; force/length³]"""
+    tangential: Stiffness | None = None
+    """k_t of the springs in the surface [E/R; force/length³]"""
+    factor: Formula | None = None
+    """Multiplies k and k_t: a formula of x, y, z over R, not negative"""
 
     quantities = (
         Quantity("foundation", "stiffness", "Stiffness k of the foundation.", "load", "k R²/(E h)", (STIFFNESS,)),
@@ -36,18 +44,49 @@ class Foundation(Part):
             "F_k R/(2πD)",
             (POINT_FORCE,),
         ),
+        Quantity(
+            "foundation_tangential",
+            "stiffness",
+            "Stiffness k_t of the foundation's springs in the surface.",
+            "load",
+            "k_t R²/(E h)",
+            (STIFFNESS,),
+        ),
     )
     absent = "foundation: none"
 
+    @model_validator(mode="after")
+    def _has_springs(self) -> Self:
+        if self.stiffness is None and self.tangential is None:
+            raise ValueError("give stiffness, tangential, or both")
+        return self
+
+    def formulas(self, context: Context) -> Iterable[Formulas]:
+        return [Formulas("foundation.factor", [self.factor], 0.0, MOST_FACTOR, 1.0)] if self.factor else []
+
     def terms(self, scales: Scales) -> list[OwnTerm]:
-        k, parameters = self._dimensionless(scales), (scales.force,)
-        return [OwnTerm("foundation", energy, parameters, k, {"foundation_force": reaction})]
+        k, found = self._dimensionless(scales), list[OwnTerm]()
+        if "k" in k:
+            observed = {"foundation_force": self._times_factor(reaction)}
+            found.append(OwnTerm("foundation", self._times_factor(energy), (scales.force,), k["k"], observed))
+        if "k_t" in k:
+            found.append(OwnTerm("foundation_tangential", self._times_factor(tangential_energy), value=k["k_t"]))
+        return found
 
     def account(self, scales: Scales) -> str:
-        return f"Winkler foundation, k R²/(E h) = {self._dimensionless(scales):.6g}"
+        of = ", ".join(f"{name} R²/(E h) = {value:.6g}" for name, value in self._dimensionless(scales).items())
+        return f"Winkler foundation, {of}{', times a formula' if self.factor else ''}"
 
-    def _dimensionless(self, scales: Scales) -> float:
-        return self.stiffness * scales.R**2 / (scales.E * scales.h)
+    def _dimensionless(self, scales: Scales) -> dict[str, float]:
+        given = {"k": self.stiffness, "k_t": self.tangential}
+        return {name: k * scales.R**2 / (scales.E * scales.h) for name, k in given.items() if k is not None}
+
+    def _times_factor(self, density: Callable[..., Expr]) -> Callable[..., Expr]:
+        """A density, multiplied by the formula at the undeformed place."""
+        text = self.factor
+        if text is None:
+            return density
+        return lambda r0, u, *parameters: symbolic(text, SYMBOLIC, *r0.r) * density(r0, u, *parameters)
 
 
 def energy(r0: Jet, u: Jet, force: Expr) -> Expr:
@@ -58,3 +97,8 @@ def energy(r0: Jet, u: Jet, force: Expr) -> Expr:
 def reaction(r0: Jet, u: Jet, force: Expr) -> Expr:
     """The density of the reaction for k = 1, over the unit of the force."""
     return -ufl.dot(u.r, kin.normal(r0)) / force
+
+
+def tangential_energy(r0: Jet, u: Jet) -> Expr:
+    """The energy density for k_t = 1."""
+    return (ufl.dot(u.r, u.r) - ufl.dot(u.r, kin.normal(r0)) ** 2) / 2

@@ -6,13 +6,17 @@ A new kind is such a file, named after it, and its name here.
 from importlib import import_module
 from typing import TYPE_CHECKING, Annotated, Any, Union, get_args
 
-from pydantic import Field
+from pydantic import Field, ModelWrapValidatorHandler, ValidationInfo
 
-from magshell_fenicsx.input.chosen import Chosen
-from magshell_fenicsx.input.section import Section
+from magshell_fenicsx.input.section import Chosen, Section
 from magshell_fenicsx.parts.bodies.body import BodySection
-from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionSection
+from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionSection, note_sizes
 from magshell_fenicsx.parts.magnetism.sources.source import SourceSection
+from magshell_fenicsx.parts.motion.history import Time
+from magshell_fenicsx.parts.motion.viscosity import Branches
+
+if TYPE_CHECKING:
+    from magshell_fenicsx.parts.imperfections.dimple import DimpleSection
 
 REGISTERED: dict[str, tuple[str, ...]] = {
     # room -> kinds in the order of the documentation
@@ -40,9 +44,29 @@ if TYPE_CHECKING:
     Body = BodySection
     Imperfection = ImperfectionSection
     Source = SourceSection
+    Dimple = DimpleSection
 else:
     Body, Imperfection, Source = map(_any_of, REGISTERED)
+    Dimple = section_of("imperfections", "dimple")
 
 Bodies = Annotated[dict[str, Body], Field(max_length=100)]
 Imperfections = Annotated[list[Imperfection], Field(max_length=1000)]
 Sources = Annotated[list[Source], Field(min_length=1, max_length=1000)]
+
+
+class ShellKeys(Section):
+    """What parts add to the keys of every shell."""
+
+    viscosity: Time | None = None
+    """Of Kelvin and Voigt in steps of kind: time: viscosity over Young's modulus"""
+    relaxation: Branches = Field(default=[])
+    """Branches of Maxwell in steps of kind: time, relaxed before each of these"""
+    imperfections: Imperfections = Field(default=[])
+    """Deviations of the mid-surface along its normal, added up"""
+
+    @classmethod
+    def note_sizes(
+        cls, data: Any, handler: ModelWrapValidatorHandler[Any], info: ValidationInfo, *, with_units: bool
+    ) -> None:
+        """See `imperfection.note_sizes`; a shell calls it before its own validation."""
+        note_sizes(data, handler, info, with_units=with_units)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.input.section import Section
 from magshell_fenicsx.mesh.mirror import Mirror
 from magshell_fenicsx.models.shell.own_term import OwnTerm
-from magshell_fenicsx.quantities.quantity import Quantity
+from magshell_fenicsx.quantities.quantity import Given, Quantity
 from magshell_fenicsx.quantities.registry import register
 from magshell_fenicsx.shape.symmetry import Leaves
 
@@ -70,6 +70,11 @@ class Context:
     def of(self, kind: type[Kind]) -> Kind | None:
         """The section of a class; None without one."""
         return next((section for section in self.sections.values() if isinstance(section, kind)), None)
+
+    @property
+    def abilities(self) -> "list[Ability]":
+        """The sections that add something to the problem."""
+        return [section for section in self.sections.values() if isinstance(section, Ability)]
 
     def loads(self, kind: "type[AnyStep]") -> "dict[str, AnyStep]":
         """Amplitude -> its last step, of the steps of a kind."""
@@ -212,6 +217,27 @@ class Ability(Section):
     def adds(self, context: Context, modelled: Modelled) -> dict[str, Any]:
         """Fields of the model's `Loads`, to which those of other parts are added."""
         return {}
+
+    def refuse_unfit_values(self, context: Context, places: Array) -> None:
+        """See that it has values at places (n, 3) over R of the undeformed shell.
+
+        Raises
+        ------
+        CaseError
+            If one is not finite, or beyond all sense.
+        """
+
+    def warning(self, context: Context, places: Array) -> str | None:
+        """What is unphysical in it at these places; None if nothing is."""
+        return None
+
+    def numbers(self, context: Context) -> list[str]:
+        """Lines of `magshell check` with its numbers on the undeformed shell."""
+        return []
+
+    def units(self, context: Context, units: Given) -> Given:
+        """The sizes of units, with those that it gives."""
+        return units
 
 
 class Part(Ability):

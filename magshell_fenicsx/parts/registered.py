@@ -25,7 +25,7 @@ KINDS_OF_STEPS: dict[str, str] = {
     "indentation": "forces.indentation.IndentationSection",
     "field": "magnetism.field_step.FieldSection",
     "rotation": "magnetism.field_step.RotationSection",
-    "natural": "natural.growth.GrowthSection",
+    "natural": "natural.section.GrowthSection",
     "imperfection": "imperfections.growth.ImperfectionStep",
     "dead": "forces.dead.DeadSection",
     "edge": "supports.motion.EdgeSection",
@@ -37,7 +37,9 @@ KINDS_OF_STEPS: dict[str, str] = {
 FIRST = ("natural", "field")  # the kinds of which steps may come before the one load of a case, in their order
 
 WHAT_IS_SEEN = (  # module here and class in it, in the order of columns
-    "pressure.seen.PressureSeen",
+    "natural.planned.NaturalSeen",
+    "imperfections.growth.GrowingSeen",
+    "pressure.pressure.PressureSeen",
     "forces.loads.ForcesSeen",
     "supports.reacting.Moved",
     "magnetism.sources.field.SourcesSeen",
@@ -46,11 +48,16 @@ WHAT_IS_SEEN = (  # module here and class in it, in the order of columns
 ACCOUNTS = (  # modules here with a function `account`, in the order of `magshell check`
     "magnetism.magnetisation",
     "natural.planned",
-    "pressure.seen",
+    "pressure.pressure",
     "forces.loads",
     "supports.reacting",
     "bodies.standing",
 )
+
+
+def parts_of(context: Context) -> dict[str, Part]:
+    """The registered parts that a problem has, by key."""
+    return {key: part for key in PARTS if (part := context.sections.get(key)) is not None}
 
 
 def accounts(context: Context, loads: "Loads") -> list[Account]:

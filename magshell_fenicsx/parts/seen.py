@@ -2,12 +2,15 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
-from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.mesh.mirror import Mirror
-from magshell_fenicsx.models.observed import Observed
-from magshell_fenicsx.models.shell.parameters import Loads
+
+if TYPE_CHECKING:
+    from magshell_fenicsx.continuation.system import State
+    from magshell_fenicsx.mesh.patch import PatchMesh
+    from magshell_fenicsx.models.observed import Observed
+    from magshell_fenicsx.models.shell.parameters import Loads
 
 
 @dataclass(frozen=True)
@@ -26,7 +29,7 @@ class Sight:
         Whether those of all supports are reported.
     """
 
-    model: Observed
+    model: "Observed"
     length: float
     modulus: float
     mirror: Mirror | None
@@ -34,7 +37,7 @@ class Sight:
     reactions: bool
 
     @property
-    def loads(self) -> Loads:
+    def loads(self) -> "Loads":
         """What loads the model."""
         return self.model.loads
 
@@ -48,7 +51,7 @@ class Sight:
         """E h R in the case's unit."""
         return self.modulus * self.h * self.length**2
 
-    def potential(self, state: State, name: str) -> float:
+    def potential(self, state: "State", name: str) -> float:
         """Pi_i(u) of an amplitude, of what is modelled."""
         return self.model.system.potential(state.u, state.mu, name)
 
@@ -64,19 +67,32 @@ class Seen:
 
     before_points: ClassVar[bool] = False
 
-    def amplitudes(self, loads: Loads) -> Sequence[str]:
+    def amplitudes(self, loads: "Loads") -> Sequence[str]:
         """Its amplitudes."""
         return ()
 
-    def conjugates(self, loads: Loads) -> dict[str, str]:
+    def named(self, loads: "Loads") -> Sequence[str]:
+        """Further amplitudes, which are columns themselves and begin at zero."""
+        return ()
+
+    def refuse_unfit(self, loads: "Loads", surface: "PatchMesh") -> None:
+        """See that the surface has the patches that it names.
+
+        Raises
+        ------
+        MeshError
+            With the name.
+        """
+
+    def conjugates(self, loads: "Loads") -> dict[str, str]:
         """Amplitude -> the column of what is conjugate to it, besides those of every run."""
         return {}
 
-    def columns(self, loads: Loads, supports: Sequence[str]) -> tuple[str, ...]:
+    def columns(self, loads: "Loads", supports: Sequence[str]) -> tuple[str, ...]:
         """Columns besides those of every run; `supports` are those whose reactions are reported."""
         return (*self.amplitudes(loads), *self.conjugates(loads).values())
 
-    def observe(self, sight: Sight, state: State) -> dict[str, float]:
+    def observe(self, sight: Sight, state: "State") -> dict[str, float]:
         """Column -> value."""
         return {}
 

@@ -6,14 +6,13 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import BeforeValidator, Field
 from ufl.core.expr import Expr
 
-from magshell_fenicsx.input.targets import over
+from magshell_fenicsx.input.section import over
 from magshell_fenicsx.models.shell.kinematics import Jet
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.parts.course import Now, Target, Until
 from magshell_fenicsx.parts.part import Context
 from magshell_fenicsx.parts.step import PathStep, ProgrammeStep
-from magshell_fenicsx.quantities.quantity import Quantity
-from magshell_fenicsx.quantities.units import DENSITY_TOO, Unit
+from magshell_fenicsx.quantities.quantity import DENSITY_TOO, Quantity, Unit
 
 SPEED = Unit("√(E/ρ)/R", text="radian/second", size=lambda g: sqrt(g.E / g.rho) / g.R, needs=DENSITY_TOO)
 SQUARED = Unit("E/(ρ R²)", "1/s²", "per_s2", "1/s²", lambda g: g.E / (g.rho * g.R**2), symbol="ω²")

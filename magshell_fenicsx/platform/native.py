@@ -10,8 +10,8 @@ from typing import Any
 import cffi
 from mpi4py import MPI
 
-from magshell_fenicsx.platform.first import from_first
 from magshell_fenicsx.platform.kept import kept_file, kernel_cache
+from magshell_fenicsx.platform.processes import from_first
 
 OPTIONS = ["-O3", "-g0"]
 

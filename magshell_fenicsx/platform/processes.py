@@ -1,4 +1,6 @@
-"""Wall time, CPU time and peak memory of a command in a separate process.
+"""Work of rank 0 for all ranks; a command in a separate process, with its wall time, CPU time and peak memory.
+
+If the work of rank 0 fails, all ranks fail together.
 
 `python3 -m magshell_fenicsx.platform.processes FOLDER MODULE ARGUMENT...` runs a module as `python3 -m` does, and
 writes the peak memory of this rank to a folder. The peak is the kernel's VmHWM. getrusage is no substitute: a process
@@ -6,15 +8,23 @@ inherits the peak of its parent, and the parent of several ranks gets only the l
 """
 
 import os
+import pickle
 import re
 import runpy
 import subprocess
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, TypeVar
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
+
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -105,3 +115,39 @@ def main() -> None:
 
 if __name__ == "__main__":
     main()
+
+
+def from_first(comm: "MPI.Comm", do: Callable[[], T]) -> T:
+    """Call `do` on rank 0 and return its result on every rank; collective.
+
+    Raises
+    ------
+    Exception
+        On every rank, the exception that `do` raises on rank 0.
+    """
+    if comm.size == 1:
+        return do()
+    sent, failure = b"", None
+    if comm.rank == 0:
+        try:
+            sent = pickle.dumps((do(), None))
+        except Exception as e:
+            failure, sent = e, _pickled(e)
+    sent = comm.bcast(sent)
+    if failure:
+        raise failure  # with its traceback
+    result: T
+    result, failure = pickle.loads(sent)
+    if failure:
+        raise failure
+    return result
+
+
+def _pickled(e: Exception) -> bytes:
+    """An error for the other ranks: the same one if it can be pickled."""
+    try:
+        sent = pickle.dumps((None, e))
+        pickle.loads(sent)
+    except Exception:
+        return pickle.dumps((None, RuntimeError(f"on rank 0: {type(e).__name__}: {e}")))
+    return sent

@@ -3,18 +3,20 @@
 from collections import Counter
 from math import degrees
 
-from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.mesh.mirror import Mirror, plane_text
 from magshell_fenicsx.models.shell.parameters import Loads
 from magshell_fenicsx.parts.imperfections.rims import MOST_RIMS
-from magshell_fenicsx.parts.registered import PARTS, accounts
+from magshell_fenicsx.parts.part import Context
+from magshell_fenicsx.parts.registered import PARTS, accounts, parts_of
 from magshell_fenicsx.problem.body import Body, body_of
 from magshell_fenicsx.shape.sections import MeshSurface
 
 SHOWN = 6  # of many imperfections
 
 
-def account(case: Case, loads: Loads, model: str, mirror: Mirror | None, rims: int) -> tuple[list[str], list[str]]:
+def account(
+    context: Context, loads: Loads, model: str, mirror: Mirror | None, rims: int
+) -> tuple[list[str], list[str]]:
     """What is included and what is left out.
 
     Parameters
@@ -26,19 +28,20 @@ def account(case: Case, loads: Loads, model: str, mirror: Mirror | None, rims: i
     rims
         Number of different rims beside the pole.
     """
-    body = body_of(case.context)
+    body = body_of(context)
     included = [model, _elastic(body) if body else "membrane and bending energy"]
     left_out = list[str]()
-    for room in accounts(case.context, loads):
+    for room in accounts(context, loads):
         included += room.included
         left_out += room.left_out
-    if case.imperfections:
-        included.append(_imperfections(case, rims))
-    for step in {step.name: step for step in case.programme}.values():
-        included += [said] if (said := step.load.account(step, case.context)) else []
+    if context.sections.get("imperfections"):
+        included.append(_imperfections(context, rims))
+    for step in {step.name: step for step in context.steps}.values():
+        included += [said] if (said := step.load.account(step, context)) else []
+    there = parts_of(context)
     for key, part in PARTS.items():
-        if key in case.parts:
-            included.append(case.parts[key].account(case.scales))
+        if key in there:
+            included.append(there[key].account(context.scales))
         else:
             left_out.append(part.absent)
     if model == "meridian":
@@ -55,17 +58,19 @@ def account(case: Case, loads: Loads, model: str, mirror: Mirror | None, rims: i
     return included, left_out
 
 
-def _imperfections(case: Case, rims: int) -> str:
+def _imperfections(context: Context, rims: int) -> str:
     """All of a few; of many how many there are of each kind."""
-    found = [section.account() for section in case.imperfections.values()]
-    if len(found) > SHOWN:
-        kinds = Counter(section.kind for section in case.imperfections.values())
-        found = [f"{count} of kind {kind}" for kind, count in kinds.items()]
+    sections = context.sections["imperfections"].values()
+    words = [section.account() for section in sections]
+    if len(words) > SHOWN:
+        kinds = Counter(section.kind for section in sections)
+        words = [f"{count} of kind {kind}" for kind, count in kinds.items()]
     beside = ""
-    if case.dimples and (isinstance(case.shell, MeshSurface) or rims > MOST_RIMS):
-        why = "of a mesh file" if isinstance(case.shell, MeshSurface) else f"of more than {MOST_RIMS}"
+    read = isinstance(context.shell, MeshSurface)
+    if any(section.patch for section in sections) and (read or rims > MOST_RIMS):
+        why = "of a mesh file" if read else f"of more than {MOST_RIMS}"
         beside = f"; elements lie across the rims of dimples, {why}: k_d is then less exact"
-    return f"imperfections: {', '.join(found)}{beside}"
+    return f"imperfections: {', '.join(words)}{beside}"
 
 
 def _elastic(body: Body) -> str:

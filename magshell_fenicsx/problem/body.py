@@ -5,7 +5,7 @@ from itertools import pairwise
 from math import ceil
 
 from magshell_fenicsx.mesh.hexahedra import MIDDLE
-from magshell_fenicsx.models.solid.material import NeoHookean
+from magshell_fenicsx.models.solid.densities import NeoHookean
 from magshell_fenicsx.parts.magnetism.fields import MagneticSection
 from magshell_fenicsx.parts.part import Context
 from magshell_fenicsx.problem.elements import SolidSection

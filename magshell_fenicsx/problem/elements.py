@@ -5,6 +5,7 @@ from typing import Annotated, Self
 from pydantic import Field, model_validator
 
 from magshell_fenicsx.input.section import Section, or_number
+from magshell_fenicsx.parts.part import Context
 
 SOLID_DEGREE = 2
 
@@ -52,3 +53,13 @@ class SolidSection(Section):
                 "solid.bulk_to_shear: takes the place of shell.poisson_ratio: 0.5; here that is "
                 f"{poisson_ratio:g}, which says all"
             )
+
+
+def mesh_of(context: Context) -> MeshSection:
+    """The elements that are asked for."""
+    return context.of(MeshSection) or MeshSection()
+
+
+def degree_of(context: Context) -> int:
+    """The degree of the displacement."""
+    return SOLID_DEGREE if context.solid else mesh_of(context).degree

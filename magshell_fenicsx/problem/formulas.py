@@ -10,7 +10,6 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.input.expressions import Together, formula
 from magshell_fenicsx.input.messages import shown
 from magshell_fenicsx.input.source import CaseError
@@ -25,7 +24,7 @@ from magshell_fenicsx.models.shell.thickness import LEAST_FACTOR, MOST_FACTOR
 from magshell_fenicsx.models.shell.unseen import Lattice, Leaves, Parts
 from magshell_fenicsx.models.shell.unseen import leaves as leaves_of
 from magshell_fenicsx.parts.imperfections.imperfection import Flaw
-from magshell_fenicsx.parts.part import Ability, Formulas
+from magshell_fenicsx.parts.part import Context, Formulas
 from magshell_fenicsx.shape.outline import ANY, Outline
 
 Array = NDArray[np.float64]
@@ -37,6 +36,7 @@ SHOWN, SMALLEST_SQUARE = 0.25, 0.1  # of sqrt(Rh) and of h: elements of this siz
 SMALLEST_FLAW = 0.25  # of h
 TOTAL, SQUARE = 1e-3, 0.02  # of the integrals of a formula's size and of its square, which cells may miss
 CHEAPER = 0.5  # of as many elements as small ones everywhere are: a graded mesh is worth while
+SMALLEST_EXTENT = 1e-9  # over R, of a surface along an axis
 STIFFNESS = 1e-3  # of it, which cells may miss by a thickness that varies within them
 MISSED = 0.003  # of the variance of a formula: what polynomials on squares may miss of it
 SEEN, HALF = 6, 0.5  # places along each side of a part of the surface; of a formula's square, which samples miss
@@ -73,18 +73,17 @@ class Written:
         return self.formulas.values(x)
 
 
-def written(case: Case) -> list[Written]:
+def written(context: Context) -> list[Written]:
     """Those of thickness, remanence, dead loads and natural shape."""
-    return list(_written(case))
+    return list(_written(context))
 
 
-def _written(case: Case) -> Iterator[Written]:
-    context, factor = case.context, case.thickness_factor
-    sections = [section for section in context.sections.values() if isinstance(section, Ability)]
+def _written(context: Context) -> Iterator[Written]:
+    factor = context.shell.thickness_factor
     for each in (
         *([Formulas(THICKNESS, [factor], LEAST_FACTOR, MOST_FACTOR, 1.0)] if isinstance(factor, str) else []),
-        *(formulas for section in sections for formulas in section.formulas(context)),
-        *(formulas for step in case.programme for formulas in step.load.formulas(step.key, context)),
+        *(formulas for section in context.abilities for formulas in section.formulas(context)),
+        *(formulas for step in context.steps for formulas in step.load.formulas(step.key, context)),
     ):
         texts = tuple(value for value in each.values if isinstance(value, str))
         if texts:
@@ -132,7 +131,7 @@ def squares(places: Callable[[Array], Array], outline: Outline, sizes: "Sizes", 
     side = max(min(COARSEST, *(high - low)), float(np.sqrt(np.prod(high - low) / MOST_FIRST)))
     t = [a + side * (np.arange(ceil((b - a) / side - 1e-9)) + 0.5) for a, b in zip(low, high, strict=True)]
     centres: Array = np.stack(np.meshgrid(*t, indexing="ij"), axis=-1).reshape(-1, 2)
-    found, largest = list[tuple[Array, float, Array]](), side
+    chosen, largest = list[tuple[Array, float, Array]](), side
     while len(centres) and len(centres) <= MOST_SQUARES:
         chart = centres[:, None] + side * LOCAL
         inside = within(shape, chart)
@@ -141,16 +140,16 @@ def squares(places: Callable[[Array], Array], outline: Outline, sizes: "Sizes", 
         size = sizes(places(chart.reshape(-1, 2)).reshape(*chart.shape[:2], 3), inside, side)
         small = (size < side) & (side > finest)
         leaves = ~small & (np.maximum(size, finest) < largest)
-        found.append((centres[leaves], side, np.maximum(size[leaves], finest)))
+        chosen.append((centres[leaves], side, np.maximum(size[leaves], finest)))
         side /= 2
         offsets = side / 2 * np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])
         centres = (centres[small][:, None] + offsets).reshape(-1, 2)
     if len(centres):  # so many that they are all alike: as small as can be paid for
-        found.append((centres, side, np.full(len(centres), max(side, finest))))
-    if not sum(len(each) for each, _, _ in found):
+        chosen.append((centres, side, np.full(len(centres), max(side, finest))))
+    if not sum(len(each) for each, _, _ in chosen):
         return None
-    sides = np.concatenate([np.full(len(each), s) for each, s, _ in found])
-    return Squares(np.concatenate([c for c, _, _ in found]), sides / 2, np.concatenate([s for _, _, s in found]))
+    sides = np.concatenate([np.full(len(each), s) for each, s, _ in chosen])
+    return Squares(np.concatenate([c for c, _, _ in chosen]), sides / 2, np.concatenate([s for _, _, s in chosen]))
 
 
 Sizes = Callable[[Array, NDArray[np.bool_], float], Array]
@@ -206,23 +205,23 @@ def looked_at(formulas: Together, outline: Outline) -> Leaves:
     return leaves_of(formulas, first, look, lattice, len(triangles))
 
 
-def narrow_places(found: Sequence[Leaves]) -> Array:
+def narrow_places(leaves: Sequence[Leaves]) -> Array:
     """Places (n, 3) at which formulas have what samples may miss."""
     few: list[Array] = [np.zeros((0, 3))]
-    for each in found:
+    for each in leaves:
         small = np.flatnonzero(each.size < NARROW)
         order = small[np.argsort(-each.area[small] * each.away[small])]
         few += [each.centre[order[:PLACES]], each.centre[order[PLACES :: max(1, len(order) // PLACES)]]]
     return np.concatenate(few)
 
 
-def shown_by_polynomials(values: Callable[[Array], Array], found: Leaves | None = None) -> Sizes:
+def shown_by_polynomials(values: Callable[[Array], Array], leaves: Leaves | None = None) -> Sizes:
     """Elements that show a formula of places (n, 3): smaller than the squares where polynomials miss most of it.
 
     What samples of a square do not have and the leaves in it have is missed too.
     """
     whole: float = 0.0
-    of_leaves: float = float(found.area @ found.away) if found else 0.0
+    of_leaves: float = float(leaves.area @ leaves.away) if leaves else 0.0
     mean: Array | None = None
 
     def sizes(x: Array, inside: NDArray[np.bool_], side: float) -> Array:
@@ -240,9 +239,9 @@ def shown_by_polynomials(values: Callable[[Array], Array], found: Leaves | None 
         whole = max(whole, area * float((f**2).sum()))
         whole = of_leaves if whole < HALF * of_leaves else whole
         squared = area * (missed**2).sum(axis=(1, 2))
-        if found:
+        if leaves:
             middle = x[:, len(LOCAL) // 2 + SAMPLES // 2]
-            squared = np.maximum(squared, _unsampled(found, middle, side, area * (f**2).sum(axis=(1, 2))))
+            squared = np.maximum(squared, _unsampled(leaves, middle, side, area * (f**2).sum(axis=(1, 2))))
         order = np.argsort(squared)
         fine = np.empty(len(f), dtype=bool)
         fine[order] = np.cumsum(squared[order]) <= MISSED * whole
@@ -251,16 +250,16 @@ def shown_by_polynomials(values: Callable[[Array], Array], found: Leaves | None 
     return sizes
 
 
-def _unsampled(found: Leaves, middle: Array, side: float, sampled: Array) -> Array:
+def _unsampled(leaves: Leaves, middle: Array, side: float, sampled: Array) -> Array:
     """The squares' integrals of the square of a formula, less those of samples that have not half of it."""
-    away, square = cKDTree(middle).query(found.centre, distance_upper_bound=side)
-    there = np.isfinite(away) & (found.size < side)
-    whole = np.bincount(square[there], (found.area * found.away)[there], len(middle))
+    away, square = cKDTree(middle).query(leaves.centre, distance_upper_bound=side)
+    there = np.isfinite(away) & (leaves.size < side)
+    whole = np.bincount(square[there], (leaves.area * leaves.away)[there], len(middle))
     return np.where(sampled < HALF * whole, whole, 0.0)
 
 
 def refinements(
-    case: Case, formulas: Sequence[Written], narrow: Sequence[Leaves], drawn: Outline, turn: float, h: float
+    formulas: Sequence[Written], narrow: Sequence[Leaves], drawn: Outline, turn: float, h: float
 ) -> list[Squares]:
     """Where formulas need small elements, in the chart of a frame that is turned about e3 (rad)."""
     Q = rotation(turn)
@@ -273,12 +272,10 @@ def refinements(
         squares(places, drawn, shown_by_polynomials(each.of_place, leaves), finest[each.load])
         for each, leaves in zip(formulas, narrow, strict=True)
     )
-    return [each.finer(case.mesh.refinement) for each in found if each]
+    return [each for each in found if each]
 
 
-def of_imperfections(
-    flaws: Iterable[Flaw], perfect: Outline, turn: float, case: Case, h: float
-) -> tuple[list[Squares], float]:
+def of_imperfections(flaws: Iterable[Flaw], perfect: Outline, turn: float, h: float) -> tuple[list[Squares], float]:
     """Where imperfections without a centre need small elements, and the size that shows the others everywhere."""
     Q, everywhere, local = rotation(turn), inf, list[Squares]()
     shape = perfect.chart(None, ANY)
@@ -295,7 +292,7 @@ def of_imperfections(
         low, high = extent(shape)
         alike = PER_AREA * float(np.prod(high - low)) / found.size**2
         if found.cells(float(np.linalg.norm(high - low)) / 2) < CHEAPER * alike:
-            local.append(found.finer(case.mesh.refinement))
+            local.append(found)
         else:
             everywhere = min(everywhere, found.size)
     return local, everywhere
@@ -330,34 +327,51 @@ def unshown(formulas: Sequence[Written], cells: Cells, turn: float, h: float) ->
                 f"{each.key}: has so many details that {100 * min(fit.open, 1.0):.2g} % of its variation may not be "
                 "seen"
             )
+        wrong = _wrong_stiffness(values, cells, fit.nodal) if each.key == THICKNESS else 0.0
         if fit.missed > TOTAL:
             off = f"{100 * fit.missed:.2g} %"
-            said.append(f"{each.key}: its integral over the mesh may be wrong by {off}: it varies too much")
+            said.append(f"{each.key}: varies so much within elements that its integral may be wrong by {off}")
+        elif wrong > STIFFNESS:
+            said.append(
+                f"{each.key}: varies within elements of up to {fit.widest:.2g} R, which smooth it: its "
+                f"integral is right, but the stiffness may be wrong by {100 * wrong:.2g} %; take a smaller mesh.size "
+                "or a larger mesh.refinement"
+            )
         elif missed > SQUARE and not (each.load and fit.widest < 4 * SHOWN * sqrt(h)):
             said.append(
-                f"{each.key}: varies within elements of up to {fit.widest:.2g} R: its integral is right, but "
-                f"{100 * missed:.2g} % of that of its square is not shown; take a smaller mesh.size or a larger "
-                "mesh.refinement"
-            )
-        elif each.key == THICKNESS and (wrong := _wrong_stiffness(values, cells, fit.nodal)) > STIFFNESS:
-            said.append(
-                f"{each.key}: varies within elements of up to {fit.widest:.2g} R: its integral is right, but the "
-                f"stiffness may be wrong by {100 * wrong:.2g} %; take a smaller mesh.size or a larger mesh.refinement"
+                f"{each.key}: varies within elements of up to {fit.widest:.2g} R, which smooth it: its "
+                f"integral is right, but that of its square lacks {100 * missed:.2g} %; take a smaller mesh.size or a "
+                "larger mesh.refinement"
             )
     return said
 
 
 def _wrong_stiffness(values: Callable[[Array, Array], Array], cells: Cells, nodal: Array) -> float:
-    """By how much the mean of t^3, or that of 1/t^3, differs in cells, over that of all; collective.
+    """By how much the stiffness t^3 or the compliance 1/t^3 of the cells differs, over that of all; collective.
 
-    Parts of a shell that carry side by side add their stiffness, those in a row their compliance.
+    Parts of a shell that carry side by side add their stiffness, those in a row their compliance. That of a cell is
+    what polynomial curvatures of its degree less two show under a constant moment. The squares of moments may be alike
+    everywhere or fall to zero along an axis, as those of a cantilever: the largest difference counts.
     """
     X, w = (v.reshape(-1, *v.shape[2:]) for v in sampling(cells))
     x, normals, area = cells.at(X)
+    kind, degree = cells.element.cell_type, max(cells.element.degree - 2, 0)
+    curvatures = basix.create_element(
+        basix.ElementFamily.P, kind, degree, basix.LagrangeVariant.legendre, discontinuous=True
+    )
+    phi, weight = curvatures.tabulate(0, X)[0, :, :, 0], (area * w)[..., None]
     t, p = values(x, normals), np.matmul(cells.element.tabulate(0, X)[0, :, :, 0], nodal)
-    powers = ((area * w)[..., None] * np.concatenate([v**n for v in (t, p) for n in (3, -3)], axis=-1)).sum(axis=1)
-    off = cells.sum(np.abs(powers[:, 2:] - powers[:, :2])) / cells.sum(powers[:, :2])
-    return float(off.max())
+    moment = np.einsum("cq,qi->ci", area * w, phi)
+    A = np.einsum("cq,cq,qi,qj->cij", area * w, p[..., 0] ** 3, phi, phi, optimize=True)
+    shown = np.einsum("ci,ci->c", moment, np.linalg.solve(A, moment[..., None])[..., 0])
+    true = np.stack([(weight * t**n).sum(axis=(1, 2)) for n in (3, -3)], axis=1)
+    off = np.abs(true - np.stack([(weight * p**3).sum(axis=(1, 2)), shown], axis=1))
+    middle, least, most = x.mean(axis=1), x.min(axis=(0, 1), initial=inf), x.max(axis=(0, 1), initial=-inf)
+    least, most = np.min(cells.comm.allgather(least), axis=0), np.max(cells.comm.allgather(most), axis=0)
+    along = (middle - (least + most) / 2) / np.maximum((most - least) / 2, SMALLEST_EXTENT)
+    loaded = np.concatenate([np.ones((len(x), 1)), (1 + along) ** 2, (1 - along) ** 2], axis=1)
+    shares = [cells.sum(each[..., None] * loaded[:, None]) for each in (off, true)]
+    return float((shares[0] / shares[1]).max())
 
 
 def cells_of_patch(patch: PatchMesh, degree: int) -> Cells:

@@ -1,14 +1,14 @@
-"""What a plan asks of its surface, against what the surface has: its edges, points and patches."""
+"""What a problem asks of its surface, against what the surface has: its edges, points and patches."""
 
 from collections.abc import Collection, Mapping
 
 import numpy as np
 
 from magshell_fenicsx.mesh.patch import MeshError, PatchMesh
-from magshell_fenicsx.models.shell.parameters import AreaForce, Condition, Held, Loads
-from magshell_fenicsx.models.shell.patterns import by_patch
+from magshell_fenicsx.models.shell.parameters import Condition, Held, Loads
 from magshell_fenicsx.models.shell.thickness import Thickness, patch_of
 from magshell_fenicsx.parts.pressure.openings import moving, without_potential
+from magshell_fenicsx.parts.registered import seen
 from magshell_fenicsx.parts.supports.supports import refuse_unknown
 
 
@@ -24,16 +24,10 @@ def refuse_unfit(
     """
     refuse_unknown(patch.edges, patch.points, patch.patches, conditions, loads)
     _refuse_ambiguous(patch.edges, patch.points, conditions)
-    if loads.magnetic and loads.magnetic.patches:
-        by_patch(loads.magnetic.patches, patch.patches, len(patch.cells))
-    for key in ("curvature", "stretch"):
-        if isinstance(values := getattr(loads.natural, key, None), Mapping):
-            by_patch(values, patch.patches, len(patch.cells), f"natural.{key}")
+    for room in seen():
+        room.refuse_unfit(loads, patch)
     for name in (thickness and thickness.patches) or {}:
         patch_of(patch.patches, name, "shell.thickness_factor")
-    for load in loads.all_dead:
-        if isinstance(load, AreaForce) and load.patch is not None:
-            patch_of(patch.patches, load.patch)
 
 
 def refuse_unfit_ends(

@@ -1,12 +1,14 @@
-"""What a scene is built from."""
+"""The problem: everything that will be computed, from which a scene is built."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from math import sqrt
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.grading import Size
 from magshell_fenicsx.mesh.grid import Grid, RimmedGrid, grid_mesh
 from magshell_fenicsx.mesh.mirror import Mirror, cut
@@ -15,23 +17,66 @@ from magshell_fenicsx.mesh.patch import Embedding, PatchMesh
 from magshell_fenicsx.mesh.shapes import Shape
 from magshell_fenicsx.mesh.triangulation import triangulate
 from magshell_fenicsx.models.axisymmetric.meridian import graded_vertices
-from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.parameters import Condition, Loads, Material
 from magshell_fenicsx.models.shell.patterns import Inside
 from magshell_fenicsx.models.shell.thickness import Thickness
+from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionSection
+from magshell_fenicsx.parts.imperfections.modes import Shape as Mode
 from magshell_fenicsx.parts.part import Context
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.problem.body import Body
 from magshell_fenicsx.problem.elements import MeshSection
 from magshell_fenicsx.problem.names import refuse_unfit
+from magshell_fenicsx.problem.wanted import FrequenciesSection, GradientsSection, OutputSection, StabilitySection
 from magshell_fenicsx.shape.turning import Span
 
 PRESSED = 0.08  # of sqrt(Rh): cells of a meridian that show the ring of a contact
 
 
 @dataclass(frozen=True)
-class Plan:
-    """Everything that a scene is built from, dimensionless (lengths in R).
+class Document:
+    """What a run writes of that from which its problem was made, and by which it knows the run again.
+
+    Attributes
+    ----------
+    data
+        A JSON object, for instance the resolved case.
+    name
+        Of the file.
+    outside
+        Hashes of what is solved besides `data`, such as files; None for one that cannot be read.
+    placed
+        Message that begins with a key -> the same with the place of the key before it.
+    """
+
+    data: Mapping[str, Any] = field(default_factory=dict)
+    name: str = ""
+    outside: Mapping[str, str | None] = field(default_factory=dict)
+    placed: Callable[[str], str] = str
+
+
+@dataclass(frozen=True)
+class Awaited:
+    """The modes of the perfect shell that a problem has as imperfections, before they are computed.
+
+    Attributes
+    ----------
+    count
+        How many are needed.
+    perfect
+        Makes the problem of the perfect shell.
+    given
+        Modes -> the problem that has them.
+    """
+
+    count: int
+    perfect: "Callable[[], Problem]"
+    given: "Callable[[tuple[Mode, ...]], Problem]"
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Everything that will be computed, dimensionless (lengths in R).
 
     Attributes
     ----------
@@ -55,9 +100,7 @@ class Plan:
     thickness
         What multiplies the thickness; None for 1.
     length
-        R in the unit that results are told in.
-    own
-        One's own energies; `loads` has them too, after those of the case's parts.
+        R in the unit of results: metres of a case with units, else the unit of its lengths.
     pressed
         Size of each body, and how far from its first contact it presses; over R.
     warning
@@ -68,6 +111,18 @@ class Plan:
         |Br||Ba|/(mu_0 E); 0 without a field.
     unknowns
         About how many there will be, if the meridian is not modelled.
+    patched
+        Whether something has values by patches, so that the mesh has their edges.
+    stability, frequencies, gradients
+        What is asked of the path besides itself.
+    output
+        How pictures look.
+    awaited
+        The modes of the perfect shell, which must be computed first; None without.
+    document
+        What a run writes of the case.
+    remade
+        Values by keys -> the problem of the case with these; see `again`.
     """
 
     context: Context
@@ -87,7 +142,6 @@ class Plan:
     left_out: list[str]
     thickness: Thickness | None = None
     length: float = 1.0
-    own: tuple[OwnTerm, ...] = ()
     pressed: tuple[tuple[float, float], ...] = ()
     supports: tuple[str, ...] = ()
     reactions: bool = False
@@ -95,6 +149,14 @@ class Plan:
     within: Mapping[str, Inside] = field(default_factory=dict)
     lambda_m: float = 0.0
     unknowns: float = 0.0
+    patched: bool = False
+    stability: StabilitySection | None = None
+    frequencies: FrequenciesSection | None = None
+    gradients: GradientsSection | None = None
+    output: OutputSection = field(default_factory=OutputSection)
+    awaited: Awaited | None = None
+    document: Document = field(default_factory=Document)
+    remade: "Callable[[Mapping[str, Any]], Problem] | None" = None
 
     @property
     def programme(self) -> tuple[ProgrammeStep, ...]:
@@ -113,7 +175,7 @@ class Plan:
 
     @property
     def modulus(self) -> float:
-        """Young's modulus in the unit that results are told in; 1 without one."""
+        """Young's modulus in the unit of results; 1 if none is given."""
         return self.context.shell.modulus or 1.0
 
     @property
@@ -126,9 +188,34 @@ class Plan:
         return self.mirror is not None
 
     @property
+    def given(self) -> MeshFile | None:
+        """The mesh of a file or a program; None of other surfaces."""
+        return self.shape if isinstance(self.shape, MeshFile) else None
+
+    @property
     def fixed(self) -> bool:
         """Whether something is clamped, so that there is no rigid motion."""
         return "clamped" in self.conditions.values()
+
+    @property
+    def imperfections(self) -> Mapping[str, ImperfectionSection]:
+        """Key of each below `shell` -> its section."""
+        return self.context.sections.get("imperfections") or {}
+
+    def again(self, values: Mapping[str, Any]) -> "Problem":
+        """The same with other values, such as {"mesh.degree": 3}.
+
+        Raises
+        ------
+        CaseError
+            If it cannot be made again, or a value is not allowed.
+        """
+        if self.remade is None:
+            raise CaseError(
+                f"{', '.join(values)}: needs the problem with another value, and this one is made without a case: "
+                "give it 'remade'"
+            )
+        return self.remade(values)
 
     def triangulated(self) -> PatchMesh:
         """The triangulation; call it on one rank only.
@@ -136,7 +223,7 @@ class Plan:
         Raises
         ------
         MeshError
-            If there is none, it cannot carry a shell, or it has not what the plan names.
+            If there is none, it cannot carry a shell, or it has not what the problem names.
         """
         patch = self._made()
         refuse_unfit(patch, self.conditions, self.loads, self.thickness)
@@ -155,22 +242,22 @@ class Plan:
         return cut(patch, self.mirror) if self.mirror and whole else patch
 
 
-def meridian_vertices(plan: Plan) -> NDArray[np.float64]:
+def meridian_vertices(problem: Problem) -> NDArray[np.float64]:
     """Vertices of the meridian's mesh, in the chart."""
-    span = plan.meridian
+    span = problem.meridian
     assert span
     if span.vertices is not None:
         return span.vertices
     pole = span.names[0] is None
-    h = plan.material.h / span.curvature
-    reach = max((one[1] for one in plan.pressed), default=0.0)
+    h = problem.material.h / span.curvature
+    reach = max((one[1] for one in problem.pressed), default=0.0)
     return graded_vertices(
         span.length,
         span.circles,
-        min([h, *(size / 3 for size, _ in plan.pressed)]),
-        refinement=plan.mesh.refinement,
+        min([h, *(size / 3 for size, _ in problem.pressed)]),
+        refinement=problem.mesh.refinement,
         axis=pole,
         largest=min(0.2 * sqrt(h), span.largest),
         pressed=((reach if pole else span.length), PRESSED * sqrt(h)) if reach else None,
-        everywhere=plan.mesh.size and plan.mesh.size / plan.length,
+        everywhere=problem.mesh.size and problem.mesh.size / problem.length,
     )

@@ -6,8 +6,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from math import isnan, nan
 
-from magshell_fenicsx.quantities.quantity import Amplitude, Kind, Quantity
-from magshell_fenicsx.quantities.units import (
+from magshell_fenicsx.quantities.quantity import (
     DEGREES,
     ENERGY,
     FIELD,
@@ -24,7 +23,10 @@ from magshell_fenicsx.quantities.units import (
     TORQUE,
     VOLUME,
     WORK,
+    Amplitude,
     Given,
+    Kind,
+    Quantity,
     Unit,
 )
 

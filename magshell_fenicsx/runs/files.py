@@ -13,7 +13,6 @@ from typing import Any
 
 from mpi4py import MPI
 
-from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.output.fields.gathering import gatherer
@@ -36,6 +35,7 @@ from magshell_fenicsx.output.store.written import (
     written,
 )
 from magshell_fenicsx.output.store.written import NAME as LIST
+from magshell_fenicsx.problem.problem import Document
 from magshell_fenicsx.simulate.scene import Scene
 
 INTERRUPTED = re.compile(r"^interrupted by |cannot be (written|read): ")
@@ -50,7 +50,7 @@ class AlreadyComplete(Exception):
         self.summary = summary
 
 
-def open_folder(out: Path, case: Case, comm: MPI.Comm, resume: bool, overwrite: bool = False) -> None:
+def open_folder(out: Path, document: Document, comm: MPI.Comm, resume: bool, overwrite: bool = False) -> None:
     """See that a folder can take a new run, or that the run in it can be resumed; nothing in it is changed.
 
     Parameters
@@ -73,26 +73,26 @@ def open_folder(out: Path, case: Case, comm: MPI.Comm, resume: bool, overwrite: 
             if part.exists() and not os.access(part, os.W_OK | os.X_OK, effective_ids=True):
                 raise OSError(EACCES, os.strerror(EACCES), str(part))
         if resume:
-            _refuse_no_resuming(folder, case)
+            _refuse_no_resuming(folder, document)
         elif not overwrite:
-            _refuse_other_case(folder, case)
+            _refuse_other_case(folder, document)
             _refuse_interrupted(folder)
 
     prepare_folder(out, comm, ready)
 
 
-def _refuse_other_case(out: Path, case: Case) -> None:
+def _refuse_other_case(out: Path, document: Document) -> None:
     """A run replaces one of the same case, and one of the same file with other values."""
     try:
-        known = belongs_to(out, case)
+        begun = belongs_to(out, document)
     except Damaged as e:
         raise CaseError(f"{e}; --overwrite replaces the run that is there") from None
-    name = known.get(checkpoint.FILE)
-    if name and Path(name).stem != Path(case.file_name).stem and not checkpoint.is_of(known, case):
+    name = begun.get(checkpoint.FILE)
+    if name and Path(name).stem != Path(document.name).stem and not checkpoint.is_of(begun, document):
         raise CaseError(f"--out {out}: has a run of {name}, which is kept; give another folder, or --overwrite")
 
 
-def belongs_to(out: Path, case: Case) -> dict[str, Any]:
+def belongs_to(out: Path, document: Document) -> dict[str, Any]:
     """What the run in a folder depends on; empty without checkpoint and summary.json.
 
     Raises
@@ -105,7 +105,7 @@ def belongs_to(out: Path, case: Case) -> dict[str, Any]:
     if begun := checkpoint.begun_with(out / checkpoint.NAME):
         return begun
     summary = read_object(out / SUMMARY) if (out / SUMMARY).exists() else {}
-    return {key: summary[key] for key in ("case", checkpoint.FILE, *case.outside) if key in summary}
+    return {key: summary[key] for key in ("case", checkpoint.FILE, *document.outside) if key in summary}
 
 
 def _refuse_interrupted(out: Path) -> None:
@@ -129,7 +129,7 @@ def _refuse_interrupted(out: Path) -> None:
     )
 
 
-def _refuse_no_resuming(out: Path, case: Case) -> None:
+def _refuse_no_resuming(out: Path, document: Document) -> None:
     """See that the run can be resumed."""
     file = out / checkpoint.NAME
     if replaced(out):
@@ -140,8 +140,8 @@ def _refuse_no_resuming(out: Path, case: Case) -> None:
     if not file.exists() and (out / SUMMARY).exists():
         summary = read_summary(out)
         if summary["stopped"] is None:
-            kept = {key: summary[key] for key in ("case", "sources", *case.outside) if key in summary}
-            checkpoint.refuse_other({"version": summary["versions"]["magshell_fenicsx"], **kept}, case, out)
+            kept = {key: summary[key] for key in ("case", "sources", *document.outside) if key in summary}
+            checkpoint.refuse_other({"version": summary["versions"]["magshell_fenicsx"], **kept}, document, out)
             try:
                 points = len(read_run(out)[1])
             except FileNotFoundError as e:
@@ -150,7 +150,7 @@ def _refuse_no_resuming(out: Path, case: Case) -> None:
                 if not is_whole(out / "fields" / point_file(number)):
                     raise Damaged(f"{out / 'fields' / point_file(number)}: is damaged: it is cut off, or missing")
             raise AlreadyComplete(summary)
-    checkpoint.check_resumable(file, case)
+    checkpoint.check_resumable(file, document)
 
 
 class RunFiles:
@@ -224,11 +224,11 @@ class RunFiles:
         begun = checkpoint.begun_with(self._folder / checkpoint.NAME) or {}
         self._begun_with = {key: value for key, value in begun.items() if key not in ("case", "version")}
         self._table = PathTable(self._folder / "path.csv", self._scene.extra_columns)
-        plan = self._scene.plan
-        mirror = plan.mirror.turned(plan.azimuth).plane if plan.mirror else None
-        about = About(plan.material.h, plan.material.nu, mirror)
-        drawn = outlines(plan.loads, self._scene.unloaded().mu, about.h)
-        moves = plan.loads.contacts or (plan.loads.magnetic and plan.loads.magnetic.driven)
+        problem = self._scene.problem
+        mirror = problem.mirror.turned(problem.azimuth).plane if problem.mirror else None
+        about = About(problem.material.h, problem.material.nu, mirror)
+        drawn = outlines(problem.loads, self._scene.unloaded().mu, about.h)
+        moves = problem.loads.contacts or (problem.loads.magnetic and problem.loads.magnetic.driven)
         name = "" if not drawn else DRIVEN if moves else STILL
         self._fields = FieldSeries(self._folder / "fields", about, name)
         sync_folder(self._folder)
@@ -251,10 +251,10 @@ class RunFiles:
 
         def write() -> None:
             assert surface is not None
-            plan = self._scene.plan
-            whole = replace(surface, outlines=outlines(plan.loads, state.mu, plan.material.h))
+            problem = self._scene.problem
+            whole = replace(surface, outlines=outlines(problem.loads, state.mu, problem.material.h))
             self._table.write(row)
-            self._fields.write(number, turned(whole, plan.azimuth))
+            self._fields.write(number, turned(whole, problem.azimuth))
 
         by_first(self._comm, write)
 

@@ -22,9 +22,9 @@ from magshell_fenicsx.output.store.folder import by_first
 from magshell_fenicsx.runs.summary import Result
 from magshell_fenicsx.simulate.follow import BEYOND
 from magshell_fenicsx.simulate.gradients.adjoint import Adjoint
-from magshell_fenicsx.simulate.gradients.density import density
 from magshell_fenicsx.simulate.gradients.gradient import derivative
 from magshell_fenicsx.simulate.gradients.instabilities import FOLDS, Lost, instabilities, refuse_moving
+from magshell_fenicsx.simulate.gradients.mass import density
 from magshell_fenicsx.simulate.gradients.results import adjoint_at_end, refuse_no_result
 from magshell_fenicsx.simulate.numbers import refuse_unknown_parameters
 from magshell_fenicsx.simulate.scene import Scene
@@ -42,11 +42,11 @@ def refuse_unknown(scene: Scene) -> None:
     CaseError
         If a result or a parameter is none of this case.
     """
-    section, start = scene.case.gradients, scene.unloaded()
+    section, start = scene.problem.gradients, scene.unloaded()
     if section is None:
         return
     refuse_no_result(scene, section.of, "gradients.of")
-    refuse_unknown_parameters(scene.case, section.by, start)
+    refuse_unknown_parameters(scene.problem.context, section.by, start)
 
 
 def gradients_after(result: Result, folder: Path, say: Say) -> None:
@@ -57,7 +57,7 @@ def gradients_after(result: Result, folder: Path, say: Say) -> None:
     DiskError
         On every rank, if something cannot be written.
     """
-    scene, section = result.scene, result.scene.case.gradients
+    scene, section = result.scene, result.scene.problem.gradients
     for of in section.of if section else []:
         assert section
         try:
@@ -89,7 +89,7 @@ def _words(values: Sequence[float], size: float, digits: int) -> str:
 
 def _write(file: Path, drawn: Surface | None, scene: Scene) -> None:
     assert drawn
-    write_whole(file, vtu_content(drawn, About(scene.plan.material.h, scene.plan.material.nu)))
+    write_whole(file, vtu_content(drawn, About(scene.problem.material.h, scene.problem.material.nu)))
 
 
 def _adjoint(result: Result, of: str) -> tuple[str, Adjoint]:
@@ -108,7 +108,7 @@ def _alike(scene: Scene, by: str, found: FieldGradient) -> list[float]:
     """By a field that changes alike everywhere, of vectors in the case's frame; of a meridian along e_rho, e_z."""
     total = found.within(np.ones(len(found.forces), dtype=bool))
     if by == "remanence":
-        total = total[[0, 2]] if scene.plan.meridian else total @ rotation(scene.plan.azimuth)
+        total = total[[0, 2]] if scene.problem.meridian else total @ rotation(scene.problem.azimuth)
     return [float(v) for v in total]
 
 
@@ -140,7 +140,7 @@ def _surface(scene: Scene, found: Adjoint, fields: Mapping[str, FieldGradient]) 
     if model.multiplicity == 2:
         assert not model.axisymmetric
         surface = completed(surface, model.mirror.plane)
-    return turned(surface, scene.plan.azimuth)
+    return turned(surface, scene.problem.azimuth)
 
 
 def _at_nodes(scene: Scene, gathering: Gatherer, values: Array) -> Array | None:

@@ -1,8 +1,9 @@
-"""After a run: null vectors at the instabilities, and the modes that the case requests."""
+"""After a run: null vectors at the instabilities, the modes that the case requests, natural frequencies."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from math import isnan, nan
 from pathlib import Path
 
 import numpy as np
@@ -11,18 +12,30 @@ from magshell_fenicsx.continuation.modes import ModesNotFound
 from magshell_fenicsx.continuation.system import State, Vector
 from magshell_fenicsx.models.modes import ShellMode, ShellModes
 from magshell_fenicsx.output.fields.gathering import Gatherer, gatherer
-from magshell_fenicsx.output.fields.modes import mode_file, mode_surface, mode_table, wave_number, write_mode
+from magshell_fenicsx.output.fields.modes import (
+    NAME,
+    frequency_table,
+    hertz,
+    mode_file,
+    mode_surface,
+    mode_table,
+    wave_number,
+    wave_of,
+    write_mode,
+)
 from magshell_fenicsx.output.fields.surface import Surface
 from magshell_fenicsx.output.fields.vtu import About
 from magshell_fenicsx.output.store.durable import write_whole
 from magshell_fenicsx.output.store.folder import by_first
-from magshell_fenicsx.problem.wanted import StabilitySection
+from magshell_fenicsx.problem.wanted import FrequenciesSection, StabilitySection
 from magshell_fenicsx.quantities.registry import OWN_MODES
 from magshell_fenicsx.runs.summary import Result
 from magshell_fenicsx.simulate.scene import Scene
+from magshell_fenicsx.simulate.touch import hardened, rigid, touching
 
 Say = Callable[[str], None]
 ROUNDING = 1e-9  # a coordinate over R as small as this is zero
+SAME = 1e-3  # relative change of omega^2 by stiffer bodies that needs no warning
 
 
 def modes_after(result: Result, folder: Path, say: Say) -> None:
@@ -35,7 +48,7 @@ def modes_after(result: Result, folder: Path, say: Say) -> None:
     DiskError
         On every rank, if something cannot be written.
     """
-    scene, wanted = result.scene, result.scene.case.stability
+    scene, wanted = result.scene, result.scene.problem.stability
     if result.singular or wanted:
         writer = _Writer(result, folder, say, gatherer(scene.model, scene.comm))
         shell = ShellModes(scene.model)
@@ -61,10 +74,10 @@ class _Writer:
                 self.say(f"warning: no modes of point {number}: {e}")
                 continue
             surface = self._write(number, str(row["label"]), state, label, vector)
-            if surface is not None and self.result.scene.plan.meridian is None:
+            if surface is not None and self.result.scene.problem.meridian is None:
                 place = surface.r0[np.argmax(np.abs(surface.fields["mode_w"]))]
                 exact = np.where(np.abs(place) < ROUNDING, 0.0, place)
-                self.result.largest[number] = [float(x) for x in exact * self.result.scene.plan.length]
+                self.result.largest[number] = [float(x) for x in exact * self.result.scene.problem.length]
             if surface is not None and not label and (m := wave_number(surface)):
                 self.say(f"the null vector at point {number} has {m} waves around e3")
 
@@ -72,16 +85,16 @@ class _Writer:
         points = self.result.singular
         if wanted.at == "end":
             points = {self.result.end: self.result.last}
-        found: dict[int, list[ShellMode]] = {}
+        by_point: dict[int, list[ShellMode]] = {}
         for number, state in points.items():
             try:
                 lowest = shell.lowest(state, wanted.modes)
                 unstable = sum(mode.eigenvalue < 0 for mode in lowest)
-                found[number] = lowest[: max(wanted.modes, unstable)]
+                by_point[number] = lowest[: max(wanted.modes, unstable)]
             except ModesNotFound as e:
                 self.say(f"warning: no modes of point {number}: {e}")
-        by_first(self.result.scene.comm, partial(write_whole, self.folder / "stability.csv", mode_table(found)))
-        for number, modes in found.items():
+        by_first(self.result.scene.comm, partial(write_whole, self.folder / "stability.csv", mode_table(by_point)))
+        for number, modes in by_point.items():
             for n, mode in enumerate(modes[: wanted.modes], 1):
                 self._write(number, str(n), points[number], mode.label, mode.vector)
             first = modes[0]
@@ -96,11 +109,99 @@ def write_mode_of(
     scene: Scene, gatherer: Gatherer, file: Path, state: State, label: str, vector: Vector
 ) -> Surface | None:
     """Write a mode at a state, and return it on rank 0; collective."""
-    surface = mode_surface(scene.model, gatherer, state.u, label, vector, scene.plan.azimuth, state.mu)
+    surface = mode_surface(scene.model, gatherer, state.u, label, vector, scene.problem.azimuth, state.mu)
 
     def write() -> None:
         assert surface is not None
-        write_mode(file, surface, About(scene.plan.material.h, scene.plan.material.nu))
+        write_mode(file, surface, About(scene.problem.material.h, scene.problem.material.nu))
 
     by_first(scene.comm, write)
     return surface
+
+
+def wanted(section: FrequenciesSection | None, point: int) -> bool:
+    """Whether the state of a point must be kept for its frequencies; the start and the end are known anyway."""
+    at = section.at if section else ()
+    return at == "all" or (isinstance(at, list) and point in at)
+
+
+def own_wave(scene: Scene) -> str:
+    """The wave of the model's own modes."""
+    if scene.model.axisymmetric:
+        return "0"
+    return "symmetric" if scene.model.multiplicity == 2 else ""
+
+
+def contact_changes(scene: Scene, state: State, modes: Sequence[ShellMode]) -> list[float]:
+    """How much omega^2 of each mode changes, relative, if the bodies that touch are four times as stiff; collective.
+
+    It is compared with the nearest one of the same label: a mode that is not there any more changes too. nan, if the
+    shell finds no such equilibrium near.
+    """
+    bodies = touching(scene, state)
+    if not bodies:
+        return [0.0] * len(modes)
+    harder = hardened(scene, state, bodies)
+    if harder is None:
+        return [nan] * len(modes)
+    others = ShellModes(scene.model).vibrations(harder, len(modes) + 2)
+    return [
+        min((abs(o.eigenvalue / mode.eigenvalue - 1) for o in others if o.label == mode.label), default=1.0)
+        for mode in modes
+    ]
+
+
+def _soft(point: int, n: int, mode: ShellMode, change: float) -> str:
+    """The warning for a mode that depends on the penalty of a contact."""
+    by = "no equilibrium near to compare with" if isnan(change) else f"omega2 changes by {change:.2g} of it"
+    return (
+        f"warning: frequency {n} of point {point} (omega2 {mode.eigenvalue:.6g}) depends on the stiffness of the "
+        f"bodies: four times as stiff, {by}"
+    )
+
+
+def frequencies_after(result: Result, folder: Path, say: Say) -> None:
+    """Write frequencies.csv, and fields/mode_*_f*.vtu of the first and the last of the points; keep the modes.
+
+    Collective; rank 0 writes. Call it after the run, because it overwrites the model's tangent.
+
+    Raises
+    ------
+    DiskError
+        On every rank, if something cannot be written.
+    """
+    scene, section = result.scene, result.scene.problem.frequencies
+    if section is None:
+        return
+    if scene.model.without_potential and scene.problem.loads.pressure:
+        say("warning: a pressure at a free edge has no potential: frequencies are those of the symmetric tangent")
+    states = dict(sorted(result.kept.items()))
+    if section.at in ("ends", "end"):
+        start = {0: scene.unloaded()} if section.at == "ends" else {}
+        states = {**start, result.end: result.last}
+    elif isinstance(section.at, list) and (strange := sorted(set(section.at) - set(states))):
+        say(f"warning: frequencies.at: the path has no point {', '.join(map(str, strange))}")
+    shell, own, unit = ShellModes(scene.model), own_wave(scene), scene.problem.time_unit
+    for number, state in states.items():
+        state = rigid(scene, state)
+        try:
+            result.frequencies[number] = modes = shell.vibrations(state, section.count)
+            if scene.model.contacts:
+                result.contact_changes[number] = changes = contact_changes(scene, state, modes)
+                for n, (mode, change) in enumerate(zip(modes, changes, strict=True), 1):
+                    if not change <= SAME:
+                        say(_soft(number, n, mode, change))
+        except ModesNotFound as e:
+            say(f"warning: no frequencies of point {number}: {e}")
+            continue
+        first = modes[0]
+        f, wave = hertz(first.eigenvalue, unit), wave_of(first.label, own)
+        in_hertz = "" if f is None else f", {f:.6g} Hz"
+        say(f"lowest frequency at point {number}: omega2 {first.eigenvalue:.6g}{in_hertz}  {wave}".rstrip())
+    content = frequency_table(result.frequencies, own, unit, result.contact_changes)
+    by_first(scene.comm, partial(write_whole, folder / NAME, content))
+    gathering = gatherer(scene.model, scene.comm)
+    for number in {*list(states)[:1], *list(states)[-1:]} & set(result.frequencies):
+        for n, mode in enumerate(result.frequencies[number][: section.count], 1):
+            file = mode_file(folder, number, f"f{n}", mode.label)
+            write_mode_of(scene, gathering, file, states[number], mode.label, mode.vector)

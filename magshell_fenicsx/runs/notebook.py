@@ -31,10 +31,12 @@ def surface(scene: Scene, record: Record) -> Surface | None:
     The fields are membrane strains `E` and bending moments over D/R `M`, their principal values `E_1`, `E_2`, `M_1`,
     `M_2`, and those of the magnetic field: `Br`, `Ba`, `p_mag`, `f_mag`, `k`, `tau`; see `Surface`.
     """
-    plan, state = scene.plan, record.point.state
+    problem, state = scene.problem, record.point.state
     scene.refuse_foreign(state)
     found = gatherer(scene.model, scene.comm).gather(state.u, state.mu)
-    return turned(completed(found, plan.mirror.plane) if plan.mirror else found, plan.azimuth) if found else None
+    return (
+        turned(completed(found, problem.mirror.plane) if problem.mirror else found, problem.azimuth) if found else None
+    )
 
 
 def polydata(scene: Scene, record: Record) -> "pyvista.PolyData | None":
@@ -44,7 +46,7 @@ def polydata(scene: Scene, record: Record) -> "pyvista.PolyData | None":
     `plot(scalars="w_over_h")` shows it.
     """
     found = surface(scene, record)
-    return _smooth(found, scene.plan.material.h) if found else None
+    return _smooth(found, scene.problem.material.h) if found else None
 
 
 def picture(
@@ -58,8 +60,8 @@ def picture(
     found = surface(scene, record)
     if found is None:
         return None
-    style = scene.case.output
-    drawn = figures(found, scene.plan.material.h, style, run_camera(found, style), [of])
+    style = scene.problem.output
+    drawn = figures(found, scene.problem.material.h, style, run_camera(found, style), [of])
     return _in_line(drawn[of]) if drawn else None
 
 
@@ -75,12 +77,12 @@ def curve(scene: Scene, records: Sequence[Record], amplitude: str | None = None)
     varied = amplitude or (records[-1].amplitude if records else "")
     if not varied:
         raise ValueError("curve: nothing has varied in these records: give those of follow or trace, all of them")
-    found, place = rows(scene, records), pole_of({"shell": scene.case.shell.model_dump(mode="json")})
-    axes = axes_of(varied, found[0])
-    if not all(axis.name in found[0] for axis in axes):
+    drawn, place = rows(scene, records), pole_of(scene.problem.document.data)
+    axes = axes_of(varied, drawn[0])
+    if not all(axis.name in drawn[0] for axis in axes):
         there = ", ".join(dict.fromkeys(record.amplitude for record in records if record.amplitude))
         raise ValueError(f"curve: {varied}: the scene has no such amplitude; these records vary {there or 'none'}")
-    return _in_line(curve_figure(found, varied, scene.case.output, place))
+    return _in_line(curve_figure(drawn, varied, scene.problem.output, place))
 
 
 def _smooth(surface: Surface, h: float) -> "pyvista.PolyData":

@@ -20,7 +20,7 @@ class RowMaker:
     def __init__(self, scene: Scene) -> None:
         self._scene, self._count, self._field_end = scene, 0, 0.0
         self._clock, self._begun, self._step = dict.fromkeys(CLOCK, 0.0), dict.fromkeys(CLOCK, 0.0), 0
-        self._listed = scene.plan.listed  # alone, a field as the load is no field before it
+        self._listed = scene.problem.listed  # alone, a field as the load is no field before it
 
     def row(self, record: Record, wall_s: float) -> Row:
         """The next row; `wall_s` is in seconds since the start of the history. Collective."""
@@ -114,6 +114,6 @@ def columns(scene: Scene, records: Iterable[Record]) -> dict[str, NDArray[np.gen
 
     Collective.
     """
-    found = rows(scene, records)
+    table = rows(scene, records)
     names = [name for name in (*COLUMNS, *scene.extra_columns) if name != "wall_s"]
-    return {name: np.array([row[name] for row in found]) for name in names}
+    return {name: np.array([row[name] for row in table]) for name in names}

@@ -73,7 +73,7 @@ class Aim:
 def aim(scene: Scene, step: ProgrammeStep) -> Aim:
     """The end of a step."""
     load, varied = step.load, amplitude(step.name)
-    if ahead := load.ahead(step, scene.plan.context, scene.plan.loads, scene.plan.azimuth):
+    if ahead := load.ahead(step, scene.problem.context, scene.problem.loads, scene.problem.azimuth):
         return Aim(varied.column, ahead.end, ahead.words, ahead.steps)
     if step.until == "points":
         return Aim(varied.column, words=f"{load.points} steps", steps=load.points)
@@ -81,12 +81,12 @@ def aim(scene: Scene, step: ProgrammeStep) -> Aim:
         return Aim(varied.column, words=WORDS.get(step.until, ""))
     target, value = load.target
     if target.quantity == "load":
-        return Aim(varied.column, value * load.size(scene.plan.context))
+        return Aim(varied.column, value * load.size(scene.problem.context))
     for room in seen():
-        if column := room.conjugates(scene.plan.loads).get(step.name):
+        if column := room.conjugates(scene.problem.loads).get(step.name):
             return Aim(column, value)
     own = f"w_{step.name}_over_h"
-    in_h = scene.plan.length * scene.plan.material.h if load.in_lengths else 1.0
+    in_h = scene.problem.length * scene.problem.material.h if load.in_lengths else 1.0
     return Aim(own if own in scene.extra_columns else target.column, value / in_h)
 
 
@@ -137,7 +137,7 @@ class RunProgress:
 
     def __init__(self, scene: Scene, report: Callable[[str], None], start: float) -> None:
         self._scene, self._report, self._start = scene, report, start
-        self._aims = [replace(aim(scene, step), sizes=scene.sizes) for step in scene.plan.programme]
+        self._aims = [replace(aim(scene, step), sizes=scene.sizes) for step in scene.problem.programme]
         self._row: Row = {}
         self._first: Row = {}
         self._step = 1
@@ -163,13 +163,13 @@ class RunProgress:
             self._begun = self._here
 
     def trying(self, here: Point, length: float) -> None:
-        now, h = time.perf_counter(), self._scene.plan.material.h
+        now, h = time.perf_counter(), self._scene.problem.material.h
         step = float(np.abs(here.du).max(initial=0.0)) * abs(length) / h
         left = None if self._branched else time_left(self._begun, self._here)
         times = clock(now - self._start)
         if left is not None:
             times += f", about {clock(max(0.0, left - (now - self._here[1])))} left"
-        of = f" in step {self._step} of {len(self._aims)}" if self._scene.plan.listed else ""
+        of = f" in step {self._step} of {len(self._aims)}" if self._scene.problem.listed else ""
         ahead = self._aim.text(self._row) if self._aim else ""
         self._report(f"{self._count}{of}  {ahead}  step {step:.2g} h  {times}")
 
@@ -187,6 +187,6 @@ class RunProgress:
     @property
     def _branched(self) -> bool:
         """Whether the case requests branches; their number is not known in advance."""
-        steps = self._scene.plan.programme
+        steps = self._scene.problem.programme
         load = steps[self._step - 1].load if steps else None
         return load is not None and load.branch_points > 0

@@ -1,9 +1,11 @@
-"""The result of a run, and summary.json."""
+"""The result of a run, and summary.json; what the snaps of a run amount to."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+import scipy
 
 from magshell_fenicsx.assembly.terms import factor_of
 from magshell_fenicsx.continuation.factor import Stopwatch
@@ -13,15 +15,37 @@ from magshell_fenicsx.output.fields.modes import hertz
 from magshell_fenicsx.output.report.verdict import place_in_units
 from magshell_fenicsx.output.store.checkpoint import FILE
 from magshell_fenicsx.output.store.table import LOCATED, Row
-from magshell_fenicsx.platform import sources
-from magshell_fenicsx.platform.environment import fast_blas, versions
+from magshell_fenicsx.platform.environment import code_version, fast_blas, versions
 from magshell_fenicsx.quantities.registry import amplitude
-from magshell_fenicsx.runs.snaps import snaps
 from magshell_fenicsx.shape.sections import Surface
 from magshell_fenicsx.shape.shell import ShellSection
 from magshell_fenicsx.simulate.adapt.choice import Adapted
 from magshell_fenicsx.simulate.adapt.ending import History, NoResult
 from magshell_fenicsx.simulate.scene import Scene
+
+
+def snaps(rows: Sequence[Row]) -> list[dict[str, Any]]:
+    """The motions that begin at a fold and end at rest (`then: snap`).
+
+    `time` is from the release until the deflection is half way, in the unit of the column time; `overshoot` the largest
+    deflection beyond the last, over the way; `dissipated` the energy over E h R^2.
+    """
+    rest = []
+    for i, fold in enumerate(rows[:-1]):
+        if fold["label"] != "fold" or rows[i + 1]["amplitude"] != "time":
+            continue
+        same = (row for row in rows[i + 1 :] if row["step"] == fold["step"])
+        moving = [fold, *same]
+        if moving[-1]["label"] != "target":
+            continue
+        t, w, lost = (np.array([float(row[key]) for row in moving]) for key in ("time", "w_over_h", "dissipated"))
+        way = (w - w[0]) / (w[-1] - w[0])
+        at = int(np.argmax(way >= 0.5))
+        past_half = scipy.interpolate.CubicSpline(t[:-1], way[:-1] - 0.5)  # the last two rows are of one time
+        half = float(scipy.optimize.brentq(past_half, t[at - 1], t[at], xtol=1e-12 * t[at])) - t[0]
+        ends = {"point": fold["point"], "rest": moving[-1]["point"]}
+        rest.append({**ends, "time": half, "overshoot": float(way.max() - 1), "dissipated": float(lost[-1] - lost[0])})
+    return rest
 
 
 @dataclass
@@ -112,14 +136,14 @@ class Result:
         """Where a mode is largest, over R or in m, and in the unit of the report."""
         if number not in self.largest:
             return {}
-        place, shell = self.largest[number], self.scene.case.shell
+        place, shell = self.largest[number], self.scene.problem.context.shell
         shown = place_in_units(place, shell.geometry, in_metres=shell.with_units)
         return {"mode_at": place, **{f"mode_at_{unit}": numbers for unit, numbers in shown.items() if unit}}
 
     @property
     def knockdown(self) -> float | None:
         """k_d: p/p_c at the first instability under pressure; None if there is none, or at held volume."""
-        at_volume = {step.number for step in self.scene.plan.programme if step.name in step.load.hold}
+        at_volume = {step.number for step in self.scene.problem.programme if step.name in step.load.hold}
         points = (row for row in self.rows if row["label"] in LOCATED and row["amplitude"] == "pressure")
         return next((float(p["p_over_pc"]) for p in points if not p["branch"] and p.get("step") not in at_volume), None)
 
@@ -140,26 +164,26 @@ class Result:
 
 def summary(result: Result, total_s: float) -> dict[str, Any]:
     """The content of summary.json."""
-    scene = result.scene
-    material, model, newton = scene.plan.material, scene.model, scene.newton
-    R_over_h, time_unit = 1 / material.h, scene.plan.time_unit
+    scene, asked = result.scene, result.adapted.asked if result.adapted else result.scene.problem
+    material, model, newton = scene.problem.material, scene.model, scene.newton
+    R_over_h, time_unit = 1 / material.h, scene.problem.time_unit
     return {
-        "case": (result.adapted.asked if result.adapted else scene.case).model_dump(mode="json", exclude_none=True),
-        FILE: scene.case.file_name,
-        **scene.case.outside,
-        "sources": sources.ours(),
+        "case": asked.document.data,
+        FILE: asked.document.name,
+        **asked.document.outside,
+        "sources": code_version(),
         "dimensionless": {
             "radius_to_thickness": R_over_h,
             "poisson_ratio": material.nu,
-            "lambda_m": scene.plan.lambda_m,
-            "Lambda_m": scene.plan.lambda_m * R_over_h,
+            "lambda_m": scene.problem.lambda_m,
+            "Lambda_m": scene.problem.lambda_m * R_over_h,
             "pc_over_E": material.classical_pressure,
             "energy_unit": "E h R^2",
         },
-        "dimensions": _dimensions(scene.case.shell),
+        "dimensions": _dimensions(scene.problem.context.shell),
         "in_units": in_units(result),
         "model": {
-            "included": scene.plan.included,
+            "included": scene.problem.included,
             "left_out": scene.left_out,
             **({"not_shown": scene.unshown} if scene.unshown else {}),
             "kernels": model.kernels.names,
@@ -237,22 +261,22 @@ def _told(row: Row) -> set[str]:
 
 def in_units(result: Result) -> dict[str, float]:
     """The numbers of a case with units, with these in their names; none of a case without."""
-    of, case = result.scene.sizes.of, result.scene.case
-    found = {}
+    of, shell = result.scene.sizes.of, result.scene.problem.context.shell
+    sizes = {}
     if "p_c" in of:
-        found["classical_pressure_Pa"] = of["p_c"]
+        sizes["classical_pressure_Pa"] = of["p_c"]
         if result.knockdown is not None:
-            found["buckling_pressure_Pa"] = result.knockdown * of["p_c"]
+            sizes["buckling_pressure_Pa"] = result.knockdown * of["p_c"]
     if "λ_m" in of and result.critical_field is not None:
         ending = "percent" if result.scene.sizes.field == "%" else "mT"
-        found[f"critical_field_{ending}"] = result.critical_field * of["λ_m"]
+        sizes[f"critical_field_{ending}"] = result.critical_field * of["λ_m"]
     if "2πD/R" in of:
-        found["unit_force_N"] = of["2πD/R"]
-        found["bending_stiffness_N_m"] = of["2πD/R"] * case.shell.reference / (2 * np.pi)
-        found["unit_energy_mJ"] = of["E h R²"]
+        sizes["unit_force_N"] = of["2πD/R"]
+        sizes["bending_stiffness_N_m"] = of["2πD/R"] * shell.reference / (2 * np.pi)
+        sizes["unit_energy_mJ"] = of["E h R²"]
         if result.barrier is not None:
-            found["barrier_mJ"] = result.barrier * of["E h R²"]
-    return found
+            sizes["barrier_mJ"] = result.barrier * of["E h R²"]
+    return sizes
 
 
 def _dimensions(shell: ShellSection | Surface) -> dict[str, Any]:

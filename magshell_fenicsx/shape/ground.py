@@ -1,8 +1,12 @@
-"""What the kinds of a part need of the shell that they are on: its outline, its scales, and places of it."""
+"""What the kinds of a part need of the shell that they are on: its outline, its scales, places of it; lines of bodies.
+
+The lines outline simple bodies around their own axes.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import product
 from typing import TYPE_CHECKING, Annotated, Self
 
 import numpy as np
@@ -14,14 +18,16 @@ from magshell_fenicsx.input.section import Direction, or_number
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.mirror import rotation
 
-if TYPE_CHECKING:  # it reads meshes, and needs the solver for that
+if TYPE_CHECKING:
     from magshell_fenicsx.shape.outline import Outline
+
 
 Array = NDArray[np.float64]
 Distance = Callable[[Array], Array]  # places (n, 3) over R -> distances (n,) over R, from one place
 Coordinates = Annotated[list[Annotated[float, or_number("metre")]], Field(min_length=3, max_length=3)]
 ON_SURFACE = 1e-6  # of R, within which a named point lies on the surface
 ON_AXIS = 1e-9  # over R
+SEEN = 0.5  # of R: half of what is drawn of a body without end
 
 
 class At(Direction):
@@ -64,7 +70,7 @@ class Ground:
     thickness_factor
         A formula that multiplies the thickness.
     identity
-        What tells its perfect surface from others.
+        Words and numbers that are equal for equal perfect surfaces.
     turn
         The model's frame is turned about e3 by it (rad).
     """
@@ -172,3 +178,35 @@ def refuse_beside(key: str, x: Array, outline: "Outline", R: float, *, with_unit
         near = ", ".join(f"{c * size + 0.0:.8g}{unit}" for c in np.round(nearest, 12))
         bare = "; a number without a unit is in metres here" if with_units else ""
         raise CaseError(f"{key}: is not on the surface; a place near it that is: [{near}]{bare}")
+
+
+def circle(radius: float, z: float = 0.0, *, axes: tuple[int, int, int] = (0, 1, 2)) -> Array:
+    """Places (n, 3) along a circle around the last of some axes."""
+    t = np.linspace(0.0, 2 * np.pi, 49)
+    return np.column_stack([radius * np.cos(t), radius * np.sin(t), np.full_like(t, z)])[:, np.argsort(axes)]
+
+
+def upright(radius: float, height: float) -> list[Array]:
+    """The outline of a cylinder: both circles, and four lines between them."""
+    ends = np.array([-height / 2, height / 2])
+    sides = [np.array([[x, y, z] for z in ends]) for x, y in radius * np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])]
+    return [*(circle(radius, z) for z in ends), *sides]
+
+
+def ball(radius: float) -> list[Array]:
+    """The outline of a sphere: three circles."""
+    return [circle(radius, axes=axes) for axes in ((0, 1, 2), (1, 2, 0), (2, 0, 1))]
+
+
+def edges(low: Array, high: Array) -> list[Array]:
+    """The twelve edges of a box between two corners (3,)."""
+    corners = np.array([*product((0, 1), repeat=3)])
+    pairs = [(a, b) for a in corners for b in corners if (b - a).sum() == 1 and (b >= a).all()]
+    return [low + np.array(pair) * (high - low) for pair in pairs]
+
+
+def frame(axis: Array) -> Array:
+    """Two unit vectors across a unit vector (3,), and itself, as columns."""
+    first = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
+    first = first / np.linalg.norm(first)
+    return np.column_stack([first, np.cross(axis, first), axis])

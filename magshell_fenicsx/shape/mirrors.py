@@ -33,16 +33,16 @@ def grid_mirrors(grid: Grid, embedding: Embedding) -> list[Mirror]:
     def places(chart: Array) -> Array:
         return embedding(low + chart * extent)
 
-    found = []
+    mirrors = []
     for axis, (flip, sides) in enumerate(FLIPS if square and not any(grid.glued) else FLIPS[:2]):
-        here, there = places(sample), places(np.column_stack(flip(*sample.T)))
-        apart = here - there
+        originals, images = places(sample), places(np.column_stack(flip(*sample.T)))
+        apart = originals - images
         normal = apart[np.argmax(np.linalg.norm(apart, axis=1))]
         if (axis == 0 and grid.glued[0]) or not normal.any():
             continue
         mirror = Mirror.of(normal)
-        mirror = Mirror(mirror.normal, _rounded(float(((here + there) / 2 @ mirror.normal).mean())))
-        if np.abs(mirror.image(here) - there).max() > ROUNDING * max(1.0, np.abs(here).max()):
+        mirror = Mirror(mirror.normal, _rounded(float(((originals + images) / 2 @ mirror.normal).mean())))
+        if np.abs(mirror.image(originals) - images).max() > ROUNDING * max(1.0, np.abs(originals).max()):
             continue
         beyond = mirror.beyond(places(np.array(MIDDLES)))
         if beyond[1] + beyond[3] < -ROUNDING:
@@ -50,8 +50,8 @@ def grid_mirrors(grid: Grid, embedding: Embedding) -> list[Mirror]:
         lost = {
             grid.sides[i]: grid.sides[j] for i, j in enumerate(sides) if i != j and beyond[i] < 0 and _edge(grid, i)
         }
-        found.append(Mirror(mirror.normal, mirror.offset, lost))
-    return found
+        mirrors.append(Mirror(mirror.normal, mirror.offset, lost))
+    return mirrors
 
 
 def lines_on(mirror: Mirror, grid: Grid, embedding: Embedding) -> tuple[tuple[float, ...], tuple[float, ...]]:
@@ -82,7 +82,7 @@ def mesh_mirrors(patch: PatchMesh, vectors: Sequence[Array], *, loosely: bool) -
     """
     if CUT in patch.edges:
         return []
-    found: list[Mirror] = []
+    mirrors: list[Mirror] = []
     corners = patch.nodes[np.unique(patch.cells[:, :3])]
     centre, (middle, _) = corners.mean(axis=0), _centre(patch)
     tree = scipy.spatial.cKDTree(patch.nodes)
@@ -90,13 +90,13 @@ def mesh_mirrors(patch: PatchMesh, vectors: Sequence[Array], *, loosely: bool) -
         mirror = Mirror.of(normal)
         exact = _with_edges(Mirror(mirror.normal, _rounded(float(mirror.normal @ centre))), patch, tree)
         if exact:
-            found.append(exact)
+            mirrors.append(exact)
         elif loosely:
             heights = corners @ mirror.normal
             nearest = float(heights[np.argmin(np.abs(heights - mirror.normal @ middle))])
             if _halves_alike(loose := Mirror(mirror.normal, _rounded(nearest)), patch):
-                found.append(loose)
-    return found
+                mirrors.append(loose)
+    return mirrors
 
 
 def _edge(grid: Grid, side: int) -> bool:
@@ -150,9 +150,9 @@ def _with_edges(mirror: Mirror, patch: PatchMesh, tree: "scipy.spatial.cKDTree")
 
 def _twins(cells: Numbers, image: Numbers) -> Numbers | None:
     """For each triangle the number of its mirror image; None if one has none."""
-    here, there = np.sort(cells, axis=1), np.sort(image[cells], axis=1)
-    order, mirrored = np.lexsort(here.T), np.lexsort(there.T)
-    if (here[order] != there[mirrored]).any():
+    corners, images = np.sort(cells, axis=1), np.sort(image[cells], axis=1)
+    order, mirrored = np.lexsort(corners.T), np.lexsort(images.T)
+    if (corners[order] != images[mirrored]).any():
         return None
     twin = np.empty(len(cells), dtype=np.int64)
     twin[mirrored] = order
@@ -166,12 +166,12 @@ def _same_rows(a: Numbers, b: Numbers) -> bool:
 
 def _halves_alike(mirror: Mirror, patch: PatchMesh) -> bool:
     try:
-        here, there = (_centre(cut(patch, half)) for half in (mirror, mirror.reversed))
+        one, other = (_centre(cut(patch, half)) for half in (mirror, mirror.reversed))
     except MeshError:
         return False
-    extent, whole = np.ptp(patch.nodes, axis=0).max(), here[1] + there[1]
+    extent, whole = np.ptp(patch.nodes, axis=0).max(), one[1] + other[1]
     return bool(
-        abs(here[1] - there[1]) < ALIKE * whole and np.abs(mirror.image(here[0]) - there[0]).max() < ALIKE * extent
+        abs(one[1] - other[1]) < ALIKE * whole and np.abs(mirror.image(one[0]) - other[0]).max() < ALIKE * extent
     )
 
 

@@ -13,8 +13,7 @@ from magshell_fenicsx.mesh.mirror import Y0, Mirror
 from magshell_fenicsx.mesh.msh import MeshFile, in_space, normals, read_msh
 from magshell_fenicsx.mesh.patch import Deviated, Deviation, Embedding, MeshError
 from magshell_fenicsx.mesh.revolved import Arc, Capped, Profile, Revolved, Segment, Spline
-from magshell_fenicsx.mesh.shapes import DiscShape, Shape, StripShape
-from magshell_fenicsx.mesh.sphere import flat, sphere, upwards
+from magshell_fenicsx.mesh.shapes import DiscShape, Shape, StripShape, flat, sphere, upwards
 from magshell_fenicsx.shape.ground import Ground
 from magshell_fenicsx.shape.mirrors import grid_mirrors, lines_on, mesh_mirrors
 from magshell_fenicsx.shape.sections import (
@@ -180,7 +179,8 @@ def ground_of(shell: Surface | ShellSection) -> Ground:
 def outline(shell: Surface | ShellSection) -> Outline:
     """The outline of a perfect shell."""
     if isinstance(shell, MeshSurface):
-        file = MeshFile(shell.path, (shell.unit or 1.0) / shell.reference, bool(shell.imperfections), shell.files)
+        scale, given = (shell.unit or 1.0) / shell.reference, shell.files.given.get(shell.path)
+        file = MeshFile(shell.path, scale, bool(shell.imperfections), shell.files, given)
 
         def planes(vectors: Sequence[Array], loosely: bool) -> list[Mirror]:
             try:

@@ -11,13 +11,9 @@ import numpy as np
 from pydantic import BeforeValidator, Field, ModelWrapValidatorHandler, PrivateAttr, ValidationInfo, model_validator
 
 from magshell_fenicsx.input.expressions import Formula, formula
-from magshell_fenicsx.input.file import FileKeys
-from magshell_fenicsx.input.section import Section, in_units, or_number, texts
-from magshell_fenicsx.parts.imperfections.dimple import DimpleSection
-from magshell_fenicsx.parts.imperfections.imperfection import note_sizes
-from magshell_fenicsx.parts.kinds import Imperfections
-from magshell_fenicsx.parts.motion.history import Time
-from magshell_fenicsx.parts.motion.viscosity import Branches
+from magshell_fenicsx.input.section import FileKeys, OrOfProgram, Section, in_units, or_number, texts
+from magshell_fenicsx.mesh.patch import GivenField
+from magshell_fenicsx.parts.kinds import Dimple, ShellKeys
 
 Positive = Annotated[float, Field(gt=0)]
 Measure = Annotated[float, or_number("metre", Positive), Field(gt=0)]
@@ -28,8 +24,8 @@ Azimuth = Annotated[Range | None, Field(description="First and last, of a part; 
 FULL_TURN = [0.0, 360.0]
 
 
-class SurfaceSection(Section):
-    """What all have in common."""
+class Material(Section):
+    """Thickness and material of every mid-surface."""
 
     thickness: Measure
     """Thickness h; R/h is 3 to 1e6 [length]"""
@@ -39,14 +35,14 @@ class SurfaceSection(Section):
     """Poisson's ratio ν"""
     density: Annotated[float, or_number("kilogram/metre**3", Positive), Field(gt=0)] | None = None
     """Density ρ; with it frequencies are in hertz [mass/length³]"""
-    viscosity: Time | None = None
-    """Of Kelvin and Voigt in steps of kind: time: viscosity over Young's modulus"""
-    relaxation: Branches = Field(default=[])
-    """Branches of Maxwell in steps of kind: time, relaxed before each of these"""
-    thickness_factor: Formula | dict[str, Annotated[float, Field(gt=0, le=100)]] | None = None
+    thickness_factor: Annotated[
+        Formula | dict[str, Annotated[float, Field(gt=0, le=100)]] | GivenField | None, OrOfProgram(GivenField)
+    ] = None
     """Multiplies h: a formula of x, y, z over R, or of a mesh patch -> number"""
-    imperfections: Imperfections = Field(default=[])
-    """Deviations of the mid-surface along its normal, added up"""
+
+
+class SurfaceSection(ShellKeys, Material):
+    """What all have in common."""
 
     _with_units: bool = PrivateAttr(default=False)
 
@@ -62,7 +58,7 @@ class SurfaceSection(Section):
             raise ValueError(
                 f"give every length and youngs_modulus a unit, or none of them: {', '.join(bare)} has none"
             )
-        note_sizes(data, handler, info, with_units=kinds == {True})
+        cls.note_sizes(data, handler, info, with_units=kinds == {True})
         section = handler(data)
         modulus = section.youngs_modulus
         if kinds == {True} and modulus is not None and not 1 <= modulus <= 1e13:
@@ -80,6 +76,8 @@ class SurfaceSection(Section):
             raise ValueError(f"the reference length is {self.R_over_h:.4g} thicknesses; a thin shell needs 3 to 1e6")
         if self.density is not None and self.youngs_modulus is None:
             raise ValueError("density turns frequencies into hertz: that needs youngs_modulus")
+        if isinstance(self.thickness_factor, GivenField) and self.thickness_factor.size != 1:
+            raise ValueError(f"thickness_factor: a function of {self.thickness_factor.size} numbers; it has one")
         if isinstance(self.thickness_factor, dict) and not isinstance(self, MeshSurface):
             raise ValueError("thickness_factor: patches have names only with geometry: mesh")
         return self
@@ -149,7 +147,7 @@ class CapSurface(RoundSection):
     """Angle of the rim from e3 [degree]"""
     hole: float | None = Field(default=None, ge=0.1)
     """Angle of the hole's edge from e3 [degree]"""
-    defect: DimpleSection | None = None
+    defect: Dimple | None = None
     """One dimple; for more see imperfections"""
 
     @model_validator(mode="after")
@@ -267,7 +265,7 @@ class RevolutionSurface(SurfaceSection):
     profile: ProfileSection
     """The curve; its largest r is the reference length R"""
     azimuth: Azimuth = None
-    defect: DimpleSection | None = None
+    defect: Dimple | None = None
     """One dimple; for more see imperfections"""
 
     @property

@@ -6,20 +6,11 @@ from pydantic import Field, ModelWrapValidatorHandler, ValidationInfo, model_val
 
 from magshell_fenicsx.input.expressions import Formula
 from magshell_fenicsx.input.section import Density, Length, Pressure, Section
-from magshell_fenicsx.parts.imperfections.dimple import DimpleSection
-from magshell_fenicsx.parts.imperfections.imperfection import note_sizes
-from magshell_fenicsx.parts.kinds import Imperfections
-from magshell_fenicsx.parts.motion.history import Time
-from magshell_fenicsx.parts.motion.viscosity import Branches
+from magshell_fenicsx.parts.kinds import Dimple, ShellKeys
 
 
-class ShellSection(Section):
-    """Either radius_to_thickness, or radius and thickness with units; a strip's radius is its length.
-
-    Without units lengths are over R, forces over E R².
-
-    Edges: equator (hemisphere), rim (disc), root (x = 0), tip and sides (strip).
-    """
+class OneShape(Section):
+    """Shape, thickness and material."""
 
     geometry: Literal["hemisphere", "disc", "strip"]
     """A hemisphere around e3, a flat disc or a flat strip along e1"""
@@ -35,25 +26,28 @@ class ShellSection(Section):
     """Poisson's ratio ν"""
     density: Density | None = Field(default=None, gt=0)
     """Density ρ; with it frequencies are in hertz"""
-    viscosity: Time | None = None
-    """Of Kelvin and Voigt in steps of kind: time: viscosity over Young's modulus"""
-    relaxation: Branches = Field(default=[])
-    """Branches of Maxwell in steps of kind: time, relaxed before each of these"""
     thickness_factor: Formula | None = None
     """Multiplies h: a formula of x, y, z over R"""
-    defect: DimpleSection | None = None
+    defect: Dimple | None = None
     """One dimple of a hemisphere; for more, or elsewhere, see imperfections"""
-    imperfections: Imperfections = Field(default=[])
-    """Deviations of the mid-surface along its normal, added up"""
     width: float | None = Field(default=None, gt=0, le=10)
     """Of a strip, which must have one [length of the strip]"""
+
+
+class ShellSection(ShellKeys, OneShape):
+    """Either radius_to_thickness, or radius and thickness with units; a strip's radius is its length.
+
+    Without units lengths are over R, forces over E R².
+
+    Edges: equator (hemisphere), rim (disc), root (x = 0), tip and sides (strip).
+    """
 
     @model_validator(mode="wrap")
     @classmethod
     def _imperfections_with_units(
         cls, data: Any, handler: ModelWrapValidatorHandler[Self], info: ValidationInfo
     ) -> Self:
-        note_sizes(data, handler, info, with_units=isinstance(data, dict) and data.get("thickness") is not None)
+        cls.note_sizes(data, handler, info, with_units=isinstance(data, dict) and data.get("thickness") is not None)
         return handler(data)
 
     @model_validator(mode="after")

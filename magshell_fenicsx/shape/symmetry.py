@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.input.expressions import formula
-from magshell_fenicsx.mesh.mirror import ROUNDING, Y0, Mirror
-from magshell_fenicsx.models.shell.own_term import OwnTerm
+from magshell_fenicsx.mesh.mirror import ROUNDING, Mirror
+from magshell_fenicsx.mesh.patch import GivenField
 from magshell_fenicsx.shape.turning import scalar_turns
 
 if TYPE_CHECKING:  # it reads meshes, and needs the solver for that
@@ -96,8 +96,8 @@ def mirror(parts: Sequence[Leaves], outline: "Outline", *, loosely: bool = False
 
     if any(part.mirrors is nothing for part in parts):
         return None
-    found = first(upright) or first(outline.mirrors([unit(v) for v in vectors], False))
-    return first(outline.mirrors([unit(v) for v in vectors], True)) if loosely and not found else found
+    chosen = first(upright) or first(outline.mirrors([unit(v) for v in vectors], False))
+    return first(outline.mirrors([unit(v) for v in vectors], True)) if loosely and not chosen else chosen
 
 
 def askew(parts: Sequence[Leaves]) -> str | None:
@@ -110,20 +110,6 @@ def unmirrored(parts: Sequence[Leaves], outline: "Outline") -> str | None:
     others = [part for part in parts if not part.energy]
     plane = mirror(others, outline, loosely=True)
     return next((part.energy for part in parts if plane and part.energy and not part.mirrors(plane)), None)
-
-
-def of_energy(term: OwnTerm, outline: "Outline") -> Leaves:
-    """What an energy leaves.
-
-    The frame of a half of what is round is turned to its plane: a term that does not turn stays behind.
-    """
-
-    def mirrors(mirror: Mirror) -> bool:
-        turned = outline.round and mirror.through_e3 and mirror.azimuth != 0
-        return term.mirrored(Y0 if turned else mirror) and (not turned or term.turns)
-
-    shared, name = term.mirrored(Y0) and term.turns, term.name + (" or what it observes" if term.observed else "")
-    return Leaves(None if shared else f"the energy {name} does not share it", (), mirrors, name)
 
 
 def tilted(v: Array) -> bool:
@@ -143,7 +129,7 @@ def of_shape(shell: "ShellSection | Surface", outline: "Outline") -> Leaves:
 
     def mirrors(mirror: Mirror) -> bool:
         if not isinstance(factor, str):
-            return True  # patches are mapped onto themselves
+            return not isinstance(factor, GivenField)  # patches are mapped onto themselves
         x = outline.sample()
         return alike(formula(factor)(*x.T), formula(factor)(*mirror.image(x).T))
 

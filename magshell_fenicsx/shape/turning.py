@@ -103,8 +103,8 @@ def field_turns(field: Callable[[Array], Array], span: Span) -> bool:
 
 
 def _turns(field: Callable[[Array], Array], places: Array, angles: Sequence[float] = ANGLES) -> bool:
-    found = [field(places @ Q) @ Q.T for Q in map(rotation, angles)]
-    return _same([*found, found[0] * [1.0, 0.0, 1.0]])
+    turned = [field(places @ Q) @ Q.T for Q in map(rotation, angles)]
+    return _same([*turned, turned[0] * [1.0, 0.0, 1.0]])
 
 
 def vectors_of(components: Sequence[str]) -> Callable[[Array], Array]:

@@ -7,23 +7,24 @@ from dataclasses import replace
 from magshell_fenicsx.continuation.path import NotANumber
 from magshell_fenicsx.continuation.point import Point
 from magshell_fenicsx.continuation.system import State
-from magshell_fenicsx.parts.bodies.touch import refuse_penetration
 from magshell_fenicsx.quantities.registry import OWN_MODES
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.search import searched
 from magshell_fenicsx.simulate.steps import LOCATED, held_by, records_of
+from magshell_fenicsx.simulate.touch import refuse_penetration
 from magshell_fenicsx.simulate.transient import released
 from magshell_fenicsx.simulate.walked import Walked, amount
 
 BEYOND = "beyond the first instability the path stopped: "  # how the remark of a path begins that has its answer
 
 
-def _warned(remark: str) -> None:
+def warned(remark: str) -> None:
+    """Tell it as a warning."""
     warnings.warn(remark, stacklevel=3)
 
 
-def follow(scene: Scene, *, search: bool = True, remark: Callable[[str], None] = _warned) -> Iterator[Record]:
+def follow(scene: Scene, *, search: bool = True, remark: Callable[[str], None] = warned) -> Iterator[Record]:
     """Compute the history of a scene; yields every accepted point.
 
     With `until: limit` as its end, a history has its answer at the first instability: what stops it beyond that is a
@@ -41,27 +42,28 @@ def follow(scene: Scene, *, search: bool = True, remark: Callable[[str], None] =
     Stopped
         If a path is lost, a step before the last ends at an instability, or the field alone makes the shell unstable.
     """
-    state, steps = scene.unloaded(), scene.plan.programme
+    state, steps = scene.unloaded(), scene.problem.programme
     try:
         _refuse_not_numbers(scene, state, "")
     except Stopped:
-        yield Record("start", "", Point(state, 0.0, 0.0 * state.u, 0.0, 0, 0))
+        yield Record("start", "", Point(state, 0.0, 0.0 * state.u, 0.0, 0, 0), shown=scene.displacement)
         raise
     pivots = scene.newton.factor_at(state).negative_pivots
-    yield Record("start", "", Point(state, 0.0, 0.0 * state.u, 0.0, pivots, pivots, 0, 1))
+    start = Point(state, 0.0, 0.0 * state.u, 0.0, pivots, pivots, 0, 1)
+    yield Record("start", "", start, shown=scene.displacement)
     if pivots:
         raise Stopped(
             f"the undeformed shell is unstable in {pivots} directions: mesh.penalty is too small or the mesh too coarse"
         )
     for step in steps:
-        where = f"step {step.number} of {len(steps)} ({step.kind}): " if scene.plan.listed else ""
+        where = f"step {step.number} of {len(steps)} ({step.kind}): " if scene.problem.listed else ""
         scene.progress.beginning(step.number)
         _refuse_not_numbers(scene, state, where)
         walked, last, record, first = Walked(records_of(scene, step, state)), "", None, None
         try:
             for record in walked:
                 last = record.label
-                yield replace(record, step=step.number)
+                yield replace(record, step=step.number, shown=scene.displacement)
                 refuse_penetration(scene, record.point.state)
                 if last in LOCATED and not (first or record.branch or scene.watch.unlocated):
                     first = record
@@ -72,7 +74,7 @@ def follow(scene: Scene, *, search: bool = True, remark: Callable[[str], None] =
                 walked = Walked(released(scene, release, record, held_by(scene, step, record.point.state)))
                 for record in walked:
                     last = record.label
-                    yield replace(record, step=step.number)
+                    yield replace(record, step=step.number, shown=scene.displacement)
                     refuse_penetration(scene, record.point.state)
         except (Stopped, NotANumber) as e:
             names = scene.model.system.strange
@@ -83,7 +85,7 @@ def follow(scene: Scene, *, search: bool = True, remark: Callable[[str], None] =
             return
         begin, state = state, walked.end
         for record in searched(scene, step, begin, state) if search else ():
-            yield replace(record, step=step.number)
+            yield replace(record, step=step.number, shown=scene.displacement)
         if step is not steps[-1] and step.until in ("limit", "bifurcation") and last in LOCATED:
             raise Stopped(f"{where}ends at a {last}, from which the next step cannot start")
 

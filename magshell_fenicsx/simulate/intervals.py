@@ -166,8 +166,8 @@ class Intervals:
         def at(t: float) -> float:
             return beyond(ends.get(t) or self.moved(now, dt, t)[0])
 
-        found = float(scipy.optimize.brentq(at, now.t, end.t, xtol=close))
-        return max(found, now.t + close)
+        time = float(scipy.optimize.brentq(at, now.t, end.t, xtol=close))
+        return max(time, now.t + close)
 
     def journalled(self, now: Motion, dt: float, end: float) -> tuple[Motion, float, Point]:
         """The motion at a later time, the step to go on with, and the point there.
@@ -175,12 +175,12 @@ class Intervals:
         In the journal these are three points: the motion, what it needs besides, and what the latest factors belong to.
         """
         scene, integrator = self.scene, self.integrator
-        known = list[Point]()
-        while len(known) < 3 and isinstance(part := scene.journal.replay(), Point):
-            known.append(part)
+        points = list[Point]()
+        while len(points) < 3 and isinstance(part := scene.journal.replay(), Point):
+            points.append(part)
         again = integrator.viscous is not None  # the journal has no place for a branch's strains: computed again
-        if len(known) == 3 and not again:
-            first, second, self._last = known
+        if len(points) == 3 and not again:
+            first, second, self._last = points
             scene.newton.factorisation.habit = first.habit
             mu, potentials = dict(first.state.mu), dict(second.state.mu)
             u, v, a = first.state.u, first.du, second.state.u
@@ -192,7 +192,7 @@ class Intervals:
                 self._rehearsal = self.rehearse(self.steps)
                 self.steps = self._rehearsal.steps
             scene.progress.trying(Point(State(now.u, now.mu), now.t, now.v, 0.0, 0, 0), end - now.t)
-            now, dt = self.moved(now, dt, end, known=len(known) == 3)
+            now, dt = self.moved(now, dt, end, known=len(points) == 3)
         except TimeStopped as e:
             raise Stopped(str(e)) from None
         spent = integrator.iterations - before[1], integrator.factorisation.count - before[2]
@@ -210,7 +210,7 @@ class Intervals:
         rest = Point(State(now.a, now.potentials), now.work, still, now.dissipated, 0, 0, error=now.error)
         made = integrator.factored or Factored(still, {}, 0.0, integrator.factorisation.habit)
         factors = Point(State(made.u, made.mu), made.dt, still, 0.0, 0, 0, habit=made.habit)
-        for part in (point, rest, factors)[len(known) :]:
+        for part in (point, rest, factors)[len(points) :]:
             scene.journal.record(part)
         return now, dt, point
 

@@ -1,12 +1,11 @@
-"""The modes of the perfect shell that a case has as imperfections: computed once, before the case is planned."""
+"""The modes of the perfect shell that a problem has as imperfections: computed once, before a scene is built."""
 
-from typing import Any
+import json
 
 import numpy as np
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.continuation.modes import ModesNotFound
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError
@@ -15,9 +14,9 @@ from magshell_fenicsx.models.axisymmetric.revolution import nodal_normals
 from magshell_fenicsx.models.modes import ShellMode, ShellModes
 from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.parts.imperfections.imperfection import in_frame
-from magshell_fenicsx.parts.imperfections.modes import Mirrored, ModesSection, Shape, on_meridian, on_surface
+from magshell_fenicsx.parts.imperfections.modes import Mirrored, Shape, on_meridian, on_surface
 from magshell_fenicsx.platform import compat
-from magshell_fenicsx.problem.elements import MeshSection
+from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.record import Stopped
 from magshell_fenicsx.simulate.scene import Scene
@@ -27,67 +26,28 @@ Array = NDArray[np.float64]
 _known: dict[str, tuple[Shape, ...]] = {}  # a sweep has many cases with one perfect shell
 
 
-def with_modes(case: Case, comm: MPI.Comm) -> Case:
-    """The case, with the modes that it has as imperfections; collective.
+def with_modes(problem: Problem, comm: MPI.Comm) -> Problem:
+    """The problem with the modes that it has as imperfections; collective.
 
     Raises
     ------
     CaseError
         If the perfect shell cannot be built, or its modes are not found.
     """
-    wanted = [
-        section for section in case.imperfections.values() if isinstance(section, ModesSection) and section.awaited
-    ]
-    if wanted:
-        if case.dimples and case.patches:
-            raise CaseError(
-                "shell.imperfections: kind: modes: the perfect shell has no dimple, of which a patch is named"
-            )
-        count, bare = max(len(section.amplitudes) for section in wanted), perfect(case)
-        this = f"{count} {bare.model_dump_json()} {bare.outside}"
-        if this not in _known:
-            if len(_known) > 3:
-                _known.clear()
-            _known[this] = perfect_modes(bare, count, comm)
-        for section in wanted:
-            section.become(_known[this])
-    return case
+    if problem.awaited is None:
+        return problem
+    count, bare = problem.awaited.count, problem.awaited.perfect()
+    this = json.dumps([count, bare.document.data, bare.document.outside])
+    if this not in _known or not bare.document.data:
+        if len(_known) > 3:
+            _known.clear()
+        _known[this] = perfect_modes(bare, count, comm)
+    return problem.awaited.given(_known[this])
 
 
-def perfect(case: Case) -> Case:
-    """The case without imperfections, as a shell on the smallest model and the default mesh, whatever its own.
-
-    A pressure at its end goes on to the first instability.
-    """
-    shell = case.shell
-    changed: dict[str, Any] = {"imperfections": []}
-    if "defect" in type(shell).model_fields:
-        changed["defect"] = None
-    return case.model_copy(
-        update={
-            "shell": shell.model_copy(update=changed),
-            "mesh": MeshSection(),
-            "loading": _to_the_limit(case),
-            "model": "shell",
-            "solid": None,
-            "symmetry": "auto",
-            "stability": None,
-        }
-    )
-
-
-def _to_the_limit(case: Case) -> Any:
-    """The loading of the perfect shell, to the first instability."""
-    loading = case.loading
-    if not isinstance(loading, list):
-        return loading and loading.on_perfect(last=True)
-    loads = [load for each in loading if (load := each.on_perfect(last=False)) is not None]
-    return [*loads[:-1], *(load.on_perfect(last=True) for load in loads[-1:])] or None
-
-
-def perfect_modes(case: Case, count: int, comm: MPI.Comm) -> tuple[Shape, ...]:
+def perfect_modes(problem: Problem, count: int, comm: MPI.Comm) -> tuple[Shape, ...]:
     """The lowest modes of a shell at its first instability, or at the end of its history without one; collective."""
-    scene = Scene(case, comm)
+    scene = Scene(problem, comm)
     state = scene.unloaded()
     try:
         for record in follow(scene):
@@ -99,12 +59,12 @@ def perfect_modes(case: Case, count: int, comm: MPI.Comm) -> tuple[Shape, ...]:
     if not any(state.mu.values()):
         raise CaseError("shell.imperfections: kind: modes: are those of a shell under a load, and there is none")
     try:
-        found = ShellModes(scene.model).lowest(state, count)[:count]
+        modes = ShellModes(scene.model).lowest(state, count)[:count]
     except ModesNotFound as e:
         raise CaseError(f"shell.imperfections: the modes of the perfect shell are not found: {e}") from None
-    if len(found) < count:
-        raise CaseError(f"shell.imperfections: amplitudes: the perfect shell has only {len(found)} modes, not {count}")
-    return tuple(_shape(scene, state, mode) for mode in found)
+    if len(modes) < count:
+        raise CaseError(f"shell.imperfections: amplitudes: the perfect shell has only {len(modes)} modes, not {count}")
+    return tuple(_shape(scene, state, mode) for mode in modes)
 
 
 def _shape(scene: Scene, state: State, mode: ShellMode) -> Shape:
@@ -117,7 +77,7 @@ def _shape(scene: Scene, state: State, mode: ShellMode) -> Shape:
         return on_surface(x, w, x)
     sign, mirror = -1.0 if mode.label == "antisymmetric" else 1.0, model.mirror
     whole = on_surface(np.vstack([x, mirror.image(x)]), np.concatenate([w, sign * w]), x)
-    return in_frame(Mirrored(whole, mirror, sign), -scene.plan.azimuth)
+    return in_frame(Mirrored(whole, mirror, sign), -scene.problem.azimuth)
 
 
 def _wave(model: MeridianModel, mode: ShellMode) -> Shape:

@@ -6,13 +6,13 @@ run.
 """
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from mpi4py import MPI
 
-from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.input.source import Source
+from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.simulate.scene import Scene
 
 HEMISPHERE = {
@@ -46,11 +46,11 @@ OCTANT: dict[str, Any] = {  # symmetric in three planes, each a kernel of its ow
 }
 
 
-def precompile(degree: int) -> float:
+def precompile(degree: int, made: Callable[[Source], Problem]) -> float:
     """Compile the kernels of shells of a degree and of solids; return the time in seconds."""
     start = time.perf_counter()
     for data in _cases(degree):
-        scene = Scene(Case.from_source(Source("precompile", data)), MPI.COMM_WORLD)
+        scene = Scene(made(Source("precompile", data)), MPI.COMM_WORLD)
         scene.model.excluded_modes  # noqa: B018  (compiles theirs)
     return time.perf_counter() - start
 

@@ -1,10 +1,14 @@
 """A point of a history and its origin."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from magshell_fenicsx.continuation.point import Point
+from magshell_fenicsx.continuation.system import State
+
+if TYPE_CHECKING:
+    from dolfinx import fem
 
 Label = Literal["start", "field", "step", "target", "fold", "bifurcation", "solution"]
 
@@ -37,6 +41,8 @@ class Record:
         Of a step in time: the columns time, kinetic, dissipated and work, since its begin.
     reached
         False at the end of a `trace` that has not come to its last target.
+    shown
+        What makes `u`.
     """
 
     label: Label
@@ -48,6 +54,17 @@ class Record:
     step: int = 0
     clock: Mapping[str, float] = field(default_factory=dict)
     reached: bool = True
+    shown: "Callable[[State], fem.Function] | None" = field(default=None, compare=False, repr=False)
+
+    @property
+    def u(self) -> "fem.Function":
+        """The displacement as a dolfinx function; collective.
+
+        It is on the mesh that a program has given, in the lengths of its coordinates; else on the scene's own mesh,
+        which is flat triangles or the meridian, in R.
+        """
+        assert self.shown, "of a record of follow or trace"
+        return self.shown(self.point.state)
 
 
 class Stopped(RuntimeError):

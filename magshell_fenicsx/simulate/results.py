@@ -1,9 +1,13 @@
-"""Numbers of a state that can be differentiated: their values and their derivatives by the state."""
+"""Numbers of a state that can be differentiated, with their derivatives by the state; the energy barrier of a run.
+
+The barrier is what a probing force passes: its work from zero, over its largest value, back to zero.
+"""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
+import scipy
 import ufl
 from dolfinx import fem
 from mpi4py import MPI
@@ -13,9 +17,11 @@ from magshell_fenicsx.continuation.system import State, Vector, dot
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.parts.registered import seen
+from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.parts.supports.reactions import weights
 from magshell_fenicsx.quantities.registry import amplitude, quantity
 from magshell_fenicsx.simulate.scene import Scene
+from magshell_fenicsx.simulate.steps import held_by
 
 Array = NDArray[np.float64]
 AT_POLE = ("w_pole_over_h", "w_over_h")
@@ -64,7 +70,7 @@ def functional(scene: Scene, state: State, of: str | Target) -> Functional:
     points = _displacements(scene)
     if of in points:
         point, i = points[of]
-        by_u = scene.plan.length * (_turned(scene) @ model.probe(point))[i]
+        by_u = scene.problem.length * (_turned(scene) @ model.probe(point))[i]
         return Functional(scene.observe(state)[of], system.held(by_u))
     if of in (conjugates := _conjugates(scene)):
         name, unit = conjugates[of]
@@ -72,7 +78,7 @@ def functional(scene: Scene, state: State, of: str | Target) -> Functional:
         value = -system.potential(state.u, state.mu, name) / unit
         return Functional(value, by_u, potentials={name: -1 / unit})
     if of in AT_POLE and "pole" in model.normals:
-        by_u = np.asarray(-(model.normals["pole"] @ model.probe("pole")) / scene.plan.material.h)
+        by_u = np.asarray(-(model.normals["pole"] @ model.probe("pole")) / scene.problem.material.h)
         return Functional(scene.observe(state)["w_pole_over_h"], system.held(by_u))
     if of in (forces := _forces(scene)):
         return _reaction(scene, state, *forces[of], of)
@@ -102,52 +108,52 @@ def in_units(scene: Scene, state: State, of: str) -> tuple[str, str]:
 
 def _displacements(scene: Scene) -> dict[str, tuple[str, int]]:
     """Columns of named points -> the point and the axis."""
-    return {f"{point}_u{axis}": (point, i) for point in scene.plan.context.points for i, axis in enumerate("xyz")}
+    return {f"{point}_u{axis}": (point, i) for point in scene.problem.context.points for i, axis in enumerate("xyz")}
 
 
 def force_unit(scene: Scene) -> float:
     """E h R^2 over R in the case's unit of force."""
-    return scene.plan.modulus * scene.plan.material.h * scene.plan.length**2
+    return scene.problem.modulus * scene.problem.material.h * scene.problem.length**2
 
 
 def _forces(scene: Scene) -> dict[str, tuple[str, int]]:
     """Column of a force of a support -> the support and the axis."""
-    supports = scene.plan.supports if scene.plan.reactions else ()
+    supports = scene.problem.supports if scene.problem.reactions else ()
     return {f"{name}_f{axis}": (name, i) for name in supports for i, axis in enumerate("xyz")}
 
 
 def _reaction(scene: Scene, state: State, name: str, axis: int, of: str) -> Functional:
     """A force of a support."""
-    system, plan = scene.model.system, scene.plan
-    if scene.model.without_potential and plan.loads.pressure:
+    system, problem = scene.model.system, scene.problem
+    if scene.model.without_potential and problem.loads.pressure:
         raise CaseError(f"{of}: has no gradient under a pressure at a free edge, which has no potential")
-    way = rotation(plan.azimuth)[:, axis]
-    e = force_unit(scene) * weights(scene.model, name, way, plan.mirror)
+    way = rotation(problem.azimuth)[:, axis]
+    e = force_unit(scene) * weights(scene.model, name, way, problem.mirror)
     value = dot(system.comm, e, system.forces(state.u, state.mu))
     return Functional(value, system.held(system.at(state).stiffness_along(e)), reaction=e)
 
 
 def _conjugates(scene: Scene) -> dict[str, tuple[str, float]]:
     """Column -> the amplitude whose conjugate it is, and the conjugate's unit."""
-    model, loads = scene.model, scene.plan.loads
+    model, loads = scene.model, scene.problem.loads
     found = {"volume_change": "pressure"} if loads.pressure else {}
     found |= {column: name for room in seen() for name, column in room.conjugates(loads).items()}
     known = {column: (name, scene.conjugate_unit(name)) for column, name in found.items()}
     for name in (*loads.forces, *loads.dead):
         if size := model.force_unit if name in loads.forces else model.load_size.get(name, 0.0):
             column = "w_over_h" if name == loads.displaced else f"w_{name}_over_h"
-            known[column] = name, size * scene.plan.material.h
+            known[column] = name, size * scene.problem.material.h
     return known
 
 
 def _turned(scene: Scene) -> Array:
     """From the model's frame to the case's."""
-    return rotation(scene.plan.azimuth).T
+    return rotation(scene.problem.azimuth).T
 
 
 def offset(scene: Scene, target: Target) -> fem.Function:
     """The displacement that reaches the target, at the nodes of the model."""
-    model, Q = scene.model, rotation(scene.plan.azimuth)
+    model, Q = scene.model, rotation(scene.problem.azimuth)
     found = fem.Function(model.V)
     axes, r0 = model.axes, model.r0.x.array
     places = np.zeros((np.size(r0) // len(axes), 3))
@@ -176,3 +182,19 @@ def _misfit(scene: Scene, state: State, target: Target) -> Functional:
     area = at.integral(log.compile("area", over(one)))
     slope = log.compile("misfit slope", over(2 * ufl.dot(gap, ufl.TestFunction(model.V))))
     return Functional(at.integral(square) / area, np.asarray(at.gradient([slope]) / area))
+
+
+def barrier(scene: Scene, step: ProgrammeStep, begin: State, end: State) -> float:
+    """The work of a step's load between two states without this load, over E h R^2; collective.
+
+    It is the change of the energy under the other loads as they are held: that of Pi, plus the integral of q dmu for
+    each amplitude whose conjugate q is held.
+    """
+    held = held_by(scene, step, begin)
+    before, after = (sum(scene.energies(state).values()) for state in (begin, end))
+    change = after - before
+    for name, q in held.items():
+        a, b = begin.mu[name], end.mu[name]
+        work = scipy.integrate.quad(lambda mu, q=q: q(mu)[0], a, b)[0] if callable(q) else q * (b - a)
+        change += scene.model.multiplicity * work
+    return float(change)

@@ -1,63 +1,111 @@
-"""A scene: the mid-surface, the model and the solver of a case."""
+"""A scene: the model of a problem, of its mid-surface, its meridian or its body, and the solver."""
 
 import time
 from collections import defaultdict
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
 from math import copysign, nan
-from pathlib import Path
+from warnings import warn
 
 import numpy as np
+from dolfinx import fem
 from mpi4py import MPI
 from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.terms import factor_of
-from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.opened import opened
 from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.point import Journal, NoJournal, NoProgress, Progress
 from magshell_fenicsx.continuation.snes import NewtonOptions
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.continuation.watch import Watch
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.mesh.mirror import rotation
+from magshell_fenicsx.mesh.hexahedra import sweep
+from magshell_fenicsx.mesh.midsurface import Midsurface, distribute
+from magshell_fenicsx.mesh.mirror import Y0, rotation
+from magshell_fenicsx.models.axisymmetric.meridian import make_meridian
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.shell.model import ShellModel
-from magshell_fenicsx.models.shell.own_term import OwnTerm
+from magshell_fenicsx.models.shell.thickness import Thickness, refuse_unfit
 from magshell_fenicsx.models.solid.model import SolidModel
 from magshell_fenicsx.parts.magnetism.direction import field_angle, field_size
+from magshell_fenicsx.parts.magnetism.fields import strength
 from magshell_fenicsx.parts.magnetism.sources.field import source_columns
+from magshell_fenicsx.parts.part import Context
 from magshell_fenicsx.parts.pressure.openings import no_potential
 from magshell_fenicsx.parts.registered import seen
 from magshell_fenicsx.parts.seen import Sight
 from magshell_fenicsx.parts.supports.supports import refuse_loose
-from magshell_fenicsx.problem.columns import (
-    extra_columns,
-    own_amplitudes,
-    sizes_in_units,
-)
+from magshell_fenicsx.platform.processes import from_first
+from magshell_fenicsx.problem.columns import extra_columns, own_amplitudes, sizes_in_units
 from magshell_fenicsx.problem.formulas import unshown, written
 from magshell_fenicsx.problem.limits import refuse_beyond_memory
-from magshell_fenicsx.problem.planner import make_plan
-from magshell_fenicsx.problem.problem import Plan
+from magshell_fenicsx.problem.problem import Problem, meridian_vertices
 from magshell_fenicsx.quantities.registry import Sizes
-from magshell_fenicsx.simulate.build import build_meridian_model, build_model, build_solid_model
 
 Array = NDArray[np.float64]
 
 
+def build_model(problem: Problem, comm: MPI.Comm) -> ShellModel:
+    """The whole shell or half of it, on all ranks together."""
+    surface = build_midsurface(problem, comm)
+    return ShellModel(
+        surface,
+        problem.material,
+        problem.mesh.degree,
+        problem.conditions,
+        problem.loads,
+        problem.mesh.penalty,
+        problem.thickness,
+        problem.mirror or Y0,
+    )
+
+
+def build_meridian_model(problem: Problem) -> MeridianModel:
+    """The meridian, whole on every rank."""
+    span = problem.meridian
+    assert span
+    points = {name: span.place(x) for name, x in problem.points.items()}
+    vertices = meridian_vertices(problem)
+    meridian = make_meridian(span.embedding, vertices, span.names, points, span.curvature)
+    model = MeridianModel(
+        meridian,
+        problem.material,
+        problem.mesh.degree,
+        problem.conditions,
+        problem.loads,
+        problem.mesh.penalty,
+        problem.thickness,
+    )
+    model.held.refuse_loose(model.r0)
+    return model
+
+
+def build_solid_model(problem: Problem, comm: MPI.Comm) -> SolidModel:
+    """The whole body or half of it, on all ranks together."""
+
+    def factor(x: Array) -> Array:
+        found = (problem.thickness or Thickness()).at(x)
+        refuse_unfit(found, x, comm)
+        return found
+
+    solid = problem.body
+    assert solid
+    body = sweep(from_first(comm, problem.triangulated), problem.material.h, solid.layers, comm, factor)
+    return SolidModel(body, problem.material, solid.material, problem.conditions, problem.loads, problem.mirror or Y0)
+
+
+def build_midsurface(problem: Problem, comm: MPI.Comm) -> Midsurface:
+    """Triangulate on rank 0, distribute to all."""
+    return distribute(from_first(comm, problem.triangulated), comm)
+
+
 class Scene:
-    """A case ready to be solved.
+    """A problem ready to be solved.
 
     Parameters
     ----------
-    case
-        A case, or the path of its file.
-    plan
-        The plan of the case; by default `make_plan` makes it.
-    terms
-        User-defined energies, if no plan is given. The initial values of their amplitudes are `OwnTerm.value`.
+    problem
+        Everything that will be computed.
 
     Attributes
     ----------
@@ -72,30 +120,22 @@ class Scene:
         Time to build the scene in seconds, without compiling kernels.
     """
 
-    def __init__(
-        self,
-        case: Case | str | Path,
-        comm: MPI.Comm = MPI.COMM_WORLD,
-        plan: Plan | None = None,
-        *,
-        terms: Sequence[OwnTerm] = (),
-    ) -> None:
+    def __init__(self, problem: Problem, comm: MPI.Comm = MPI.COMM_WORLD) -> None:
         start = time.perf_counter()
-        case = opened(case, comm)
-        if any(section.awaited for section in case.imperfections.values()):
+        if problem.awaited:
             raise CaseError(
-                "shell.imperfections: kind: modes: compute them first, by simulate.perfect.with_modes(case, comm)"
+                "shell.imperfections: kind: modes: compute them first, by simulate.perfect.with_modes(problem, comm)"
             )
-        self.case, self.plan, self.comm = case, plan or make_plan(case, terms), comm
-        self.warnings = [said for said in (self.plan.warning, _beyond_memory(case, self.plan, comm)) if said]
+        self.problem, self.comm = problem, comm
+        self.warnings = [said for said in (self.problem.warning, _beyond_memory(self.problem, comm)) if said]
         self.model: ShellModel | MeridianModel | SolidModel
-        if self.plan.axisymmetric:
-            self.model = build_meridian_model(self.plan)
-        elif self.plan.body:
-            self.model = build_solid_model(self.plan, comm)
+        if self.problem.axisymmetric:
+            self.model = build_meridian_model(self.problem)
+        elif self.problem.body:
+            self.model = build_solid_model(self.problem, comm)
         else:
-            self.model = build_model(self.plan, comm)
-        if not (self.plan.fixed or self.model.axisymmetric):
+            self.model = build_model(self.problem, comm)
+        if not (self.problem.fixed or self.model.axisymmetric):
             refuse_loose(self.model.system, self.model.r0, self.unloaded().mu)
         # a body's penetration changes over far less than h: factors of a state near by are no tangent's, and the first
         # matrices only find what touches
@@ -105,12 +145,19 @@ class Scene:
         self.progress: Progress = NoProgress()
         self.setup_s = time.perf_counter() - start - self.model.kernels.seconds
 
-    def retuned(self, case: Case) -> "Scene":
-        """The same model and solver for a case that differs by the strength of the field alone."""
+    def retuned(self, context: Context) -> "Scene":
+        """The same model and solver for what differs by the strength of the field alone."""
         found = object.__new__(Scene)
         known = {name: of for name, of in vars(self).items() if name not in vars(Scene)}  # what is cached is found anew
-        vars(found).update(known, case=case, plan=replace(self.plan, context=case.context, lambda_m=case.lambda_m))
+        problem = replace(self.problem, context=context, lambda_m=strength(context))
+        vars(found).update(known, problem=problem)
         return found
+
+    @property
+    def plan(self) -> Problem:
+        """The name of `problem` in earlier versions."""
+        warn("Scene.plan is now Scene.problem", DeprecationWarning, stacklevel=2)
+        return self.problem
 
     @property
     def cells(self) -> int:
@@ -124,11 +171,11 @@ class Scene:
 
     @cached_property
     def unshown(self) -> list[str]:
-        """What the mesh misses of the case's formulas, in words; collective."""
-        model, formulas = self.model, written(self.case)
+        """What the mesh misses of the problem's formulas, in words; collective."""
+        model, formulas = self.model, written(self.problem.context)
         if not formulas:
             return []
-        return unshown(formulas, model.cells_of_fields(), self.plan.azimuth, self.plan.material.h)
+        return unshown(formulas, model.cells_of_fields(), self.problem.azimuth, self.problem.material.h)
 
     def nowhere(self) -> str:
         """Where a step since the beginning of a walk has found no field, in words after a message; collective."""
@@ -139,17 +186,30 @@ class Scene:
     @property
     def left_out(self) -> list[str]:
         """What the model lacks, for people."""
-        open_at = self.model.without_potential if self.plan.loads.pressure else ()
-        return [*self.plan.left_out, *([no_potential(open_at)] if open_at else [])]
+        open_at = self.model.without_potential if self.problem.loads.pressure else ()
+        return [*self.problem.left_out, *([no_potential(open_at)] if open_at else [])]
 
     def unloaded(self) -> State:
         """The undeformed shell; amplitudes are zero, except user-defined ones with a value."""
-        field = self.plan.loads.magnetic
+        field = self.problem.loads.magnetic
         turns = (motion.name for motion in field.turns) if field else ()
         own = {*self.motions, *self.sources, *turns, *self.model.contacts}
         amplitudes = {t.amplitude for t in self.model.system.terms if t.amplitude} | own
         given = self._own_amplitudes
         return State(self.model.zero(), {name: given.get(name, 0.0) for name in sorted({*amplitudes, *given})})
+
+    def displacement(self, state: State) -> fem.Function:
+        """See `Record.u`; collective."""
+        self.refuse_foreign(state, more=True)
+        model, surface = self.model, self.model.midsurface
+        found = fem.Function(model.u.function_space, name="u")
+        found.x.array[:] = model.system.at(state).of(lambda: model.u.x.array.copy())
+        known = self.problem.given
+        if not (surface and known and known.home):
+            return found
+        if self.problem.half:
+            raise ValueError("u: symmetry: half: half of the mesh is not modelled: take symmetry: none")
+        return known.home.displacement(found, surface.given, known.scale)
 
     def refuse_foreign(self, state: State, *, more: bool = False) -> None:
         """Refuse a state of another scene, as far as it shows.
@@ -178,8 +238,8 @@ class Scene:
     def observe(self, state: State) -> dict[str, float]:
         """The physical columns of a table row: loads, displacements over h, volume, energies over E h R^2."""
         self.refuse_foreign(state, more=True)
-        model, h, loads, sight = self.model, self.plan.material.h, self.model.loads, self.sight
-        force, sense = loads.forces.get("force"), copysign(1.0, self.plan.lambda_m)
+        model, h, loads, sight = self.model, self.problem.material.h, self.model.loads, self.sight
+        force, sense = loads.forces.get("force"), copysign(1.0, self.problem.lambda_m)
         energies = self.energies(state)
         pole = model.deflection(state.u, "pole") / h
         columns = defaultdict[str, float](float)
@@ -207,7 +267,7 @@ class Scene:
                 column: state.mu[term.name]
                 * model.multiplicity
                 * model.system.at(state).integral(model.observed[column])
-                for term in self.plan.loads.own
+                for term in self.problem.loads.own
                 for column in term.observed
             },
         }
@@ -223,27 +283,27 @@ class Scene:
     @property
     def _own_amplitudes(self) -> dict[str, float]:
         """The amplitudes of natural shape, imperfections, user-defined energies and parameters, with initial values."""
-        return own_amplitudes(self.plan.loads)
+        return own_amplitudes(self.problem.loads)
 
     @property
     def motions(self) -> frozenset[str]:
         """The amplitudes of supports that move."""
-        return frozenset(move.motion.name for move in self.plan.loads.moves)
+        return frozenset(move.motion.name for move in self.problem.loads.moves)
 
     @property
     def sources(self) -> dict[str, str]:
         """See `source_columns`."""
-        return source_columns(self.plan.loads)
+        return source_columns(self.problem.loads)
 
     @cached_property
     def sizes(self) -> Sizes:
-        """The sizes of the case's units."""
-        return sizes_in_units(self.plan)
+        """The sizes of the units."""
+        return sizes_in_units(self.problem)
 
     @cached_property
     def extra_columns(self) -> tuple[str, ...]:
         """The columns of a row besides those of every run; the last ones are those in the case's units."""
-        return extra_columns(self.plan)
+        return extra_columns(self.problem)
 
     def stored(self, state: State, energy: float) -> float:
         """The energy of the shell itself: without the potentials of the loads."""
@@ -254,8 +314,8 @@ class Scene:
     @property
     def sight(self) -> Sight:
         """What rooms of parts see of it."""
-        plan = self.plan
-        return Sight(self.model, plan.length, plan.modulus, plan.mirror, plan.azimuth, plan.reactions)
+        problem = self.problem
+        return Sight(self.model, problem.length, problem.modulus, problem.mirror, problem.azimuth, problem.reactions)
 
     def conjugate_unit(self, name: str) -> float:
         """-dPi/dmu of one unit of a target: ΔV/R³ of a pressure, w/h of a force, the shell's length of dead loads."""
@@ -265,22 +325,22 @@ class Scene:
     def _observe_points(self, state: State) -> dict[str, float]:
         """The displacements of named points in the unit of the shell's lengths."""
         found: dict[str, float] = {}
-        for point in self.plan.context.points:
-            u = self.plan.length * self.model.displacement(state.u, point) @ rotation(self.plan.azimuth)
+        for point in self.problem.context.points:
+            u = self.problem.length * self.model.displacement(state.u, point) @ rotation(self.problem.azimuth)
             found |= {f"{point}_u{axis}": float(c) for axis, c in zip("xyz", u, strict=True)}
         return found
 
 
-def _beyond_memory(case: Case, plan: Plan, comm: MPI.Comm) -> str | None:
+def _beyond_memory(problem: Problem, comm: MPI.Comm) -> str | None:
     """See `refuse_beyond_memory`; every rank asks its own machine, and the first refusal is that of all."""
     if comm.size == 1:
-        return refuse_beyond_memory(case, plan)
+        return refuse_beyond_memory(problem)
     machine = comm.Split_type(MPI.COMM_TYPE_SHARED)
     here = machine.size
     machine.Free()
     said: str | CaseError | None
     try:
-        said = refuse_beyond_memory(case, plan, comm.size, here)
+        said = refuse_beyond_memory(problem, comm.size, here)
     except CaseError as e:
         said = e
     every = comm.allgather(said)

@@ -18,6 +18,7 @@ from magshell_fenicsx.models.shell.parameters import Magnetisation
 from magshell_fenicsx.models.shell.patterns import Array, Pattern, WithinRims
 from magshell_fenicsx.models.shell.terms import EnergyFactory
 from magshell_fenicsx.parts.magnetism.applied import AppliedField
+from magshell_fenicsx.parts.magnetism.fields import MagneticSection
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.shape_sensitivity import to_imperfections
@@ -46,7 +47,9 @@ def fold_at(scene: Scene, record: Record) -> Fold:
 
 def stage_at(scene: Scene, record: Record) -> Stage:
     """The solver of a record's step, which holds what the step holds."""
-    return stage_of(scene, scene.plan.programme[record.step - 1], record.point.state) if record.step else plain(scene)
+    if not record.step:
+        return plain(scene)
+    return stage_of(scene, scene.problem.programme[record.step - 1], record.point.state)
 
 
 def sensitivities(scene: Scene, fold: Fold, record: Record | None = None) -> dict[str, float]:
@@ -72,23 +75,19 @@ def sensitivities(scene: Scene, fold: Fold, record: Record | None = None) -> dic
     columns = {name: system.load(state.u, state.mu, name) for name in state.mu if name not in (fold.name, *history)}
     by_patch = _remanence_columns(scene, replace(fold, state=stage.leave(state)))
     columns |= {name: stage.padded(column) for name, column in (by_patch | _field_column(scene, state)).items()}
-    found = {name: sensitivity(system, fold, column) for name, column in columns.items()}
-    return found | to_imperfections(stage, fold)
+    by_column = {name: sensitivity(system, fold, column) for name, column in columns.items()}
+    return by_column | to_imperfections(stage, fold)
 
 
 def _field_column(scene: Scene, state: State) -> dict[str, Vector]:
-    """The load column of lambda_m for a case whose field is zero: of the same shell with a field.
+    """The load column of lambda_m for a problem whose field is zero: of the same shell with a field.
 
     Empty without a section magnetic, and where the field leaves less symmetry than the model has.
     """
-    magnetic = scene.case.magnetic
-    if magnetic is None or "lambda_m" in state.mu:
+    if scene.problem.context.of(MagneticSection) is None or "lambda_m" in state.mu:
         return {}
-    remanent, applied = (
-        part.model_copy(update={"flux_density": None}) for part in (magnetic.remanent, magnetic.applied)
-    )
-    some = {"lambda_m": SOME_FIELD, "remanent": remanent, "applied": applied}
-    there = Scene(scene.case.model_copy(update={"magnetic": magnetic.model_copy(update=some)}), scene.comm)
+    none = dict.fromkeys(("magnetic.remanent.flux_density", "magnetic.applied.flux_density"))
+    there = Scene(scene.problem.again({"magnetic.lambda_m": SOME_FIELD, **none}), scene.comm)
     if type(there.model) is not type(scene.model) or there.model.system.size != scene.model.system.size:
         return {}
     size = scene.model.system.size
@@ -112,7 +111,7 @@ def _remanence_columns(scene: Scene, fold: Fold) -> dict[str, Vector]:
     field = scene.model.loads.magnetic
     if field is None:
         return {}
-    within, one = scene.plan.within, np.ones(3)
+    within, one = scene.problem.within, np.ones(3)
     if not within:
         return {"remanence": _magnetic_column(scene, fold, field)}
 

@@ -6,13 +6,13 @@ from magshell_fenicsx.continuation.device import Conjugate
 from magshell_fenicsx.continuation.path import StepOptions
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.continuation.walk import MOST_STEPS, Goal
-from magshell_fenicsx.parts.bodies.touch import touched
-from magshell_fenicsx.parts.course import Drive, Gas, Here
-from magshell_fenicsx.parts.pressure.gas import gas
+from magshell_fenicsx.parts.course import Drive, Gas, GasSection, Here
+from magshell_fenicsx.parts.pressure.gas import Enclosed
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.stage import Stage, staged
+from magshell_fenicsx.simulate.touch import touched
 from magshell_fenicsx.simulate.transient import motion
 from magshell_fenicsx.simulate.walked import Records, Walked, followed
 
@@ -88,25 +88,33 @@ def held_by(scene: Scene, step: ProgrammeStep, state: State) -> dict[str, float 
     held = dict[str, float | Conjugate]()
     for name, how in step.load.hold.items():
         if isinstance(how, Gas):
-            held[name] = gas(scene, how.gas, state)
+            held[name] = enclosed(scene, how.gas, state).law()
         elif how == "conjugate":
             held[name] = -scene.model.system.potential(state.u, state.mu, name)
     return held
 
 
+def enclosed(scene: Scene, section: GasSection, state: State) -> Enclosed:
+    """The gas that is closed in at an equilibrium."""
+    problem, system, unit = scene.problem, scene.model.system, scene.conjugate_unit("pressure")
+    q = -system.potential(state.u, state.mu, "pressure")
+    shell, p_c = problem.context.shell, problem.material.classical_pressure
+    return Enclosed(section, shell, p_c, unit, state.mu["pressure"], q)
+
+
 def _here(scene: Scene, step: ProgrammeStep, state: State) -> Here:
     """Where a step begins."""
-    model, plan = scene.model, scene.plan
+    model, problem = scene.model, scene.problem
 
     def potential(name: str) -> float:
         return model.system.potential(state.u, state.mu, name)
 
     return Here(
         step,
-        scene.plan.context,
-        plan.loads,
-        plan.azimuth,
-        plan.material.h,
+        scene.problem.context,
+        problem.loads,
+        problem.azimuth,
+        problem.material.h,
         state.mu,
         potential,
         scene.conjugate_unit,

@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.system import Vector
 from magshell_fenicsx.mesh.patch import Deviated
-from magshell_fenicsx.mesh.shapes import DiscShape
-from magshell_fenicsx.mesh.sphere import sphere
+from magshell_fenicsx.mesh.shapes import DiscShape, sphere
 from magshell_fenicsx.simulate.scene import Scene
 
 Array = NDArray[np.float64]
@@ -52,7 +51,7 @@ def transfer(source: Scene, target: Scene, u: Vector) -> Vector:
 
 def _interpolated(nodes: Array, values: Array, x: Array, rim: float) -> Array:
     """Values at x (n, 1 or 2); derivatives jump at the rim, so each side uses only its own nodes."""
-    found: Array = np.zeros((len(x), values.shape[1]))
+    values_at: Array = np.zeros((len(x), values.shape[1]))
     from_pole, polar = np.linalg.norm(nodes, axis=1), np.linalg.norm(x, axis=1)
     inside = from_pole < rim * (1 + ROUNDING), polar < rim * (1 + ROUNDING)
     outside = from_pole > rim * (1 - ROUNDING), polar > rim * (1 - ROUNDING)
@@ -65,8 +64,8 @@ def _interpolated(nodes: Array, values: Array, x: Array, rim: float) -> Array:
             field = scipy.interpolate.RBFInterpolator(
                 nodes[here], values[here], neighbors=NEIGHBOURS[dim], kernel=kernel, degree=degree
             )
-            found[wanted] = field(x[wanted])
-    return found
+            values_at[wanted] = field(x[wanted])
+    return values_at
 
 
 def same_mesh(source: Scene, target: Scene) -> bool:
@@ -138,7 +137,7 @@ def _stretch(source: Scene, target: Scene) -> _Stretch | None:
     """The map between dimpled spheres; None for other surfaces."""
     rims, edges = [], []
     for scene in (target, source):
-        embedding, shape = scene.plan.embedding, scene.plan.shape
+        embedding, shape = scene.problem.embedding, scene.problem.shape
         spherical = isinstance(embedding, Deviated) and embedding.perfect is sphere
         if not spherical or not isinstance(shape, DiscShape) or len(shape.circles) != 1 or shape.rims:
             return None

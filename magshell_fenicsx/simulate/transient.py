@@ -1,37 +1,141 @@
-"""A step in time: the records of a motion, with its energies, from any state, to its end or to rest."""
+"""A step in time: the records of a motion, with its energies, from any state, to its end or to rest.
 
-from collections.abc import Callable, Mapping
+It begins along a mode of vibration or with a velocity by formulas; its loads are functions of time in the scales of the
+model.
+"""
+
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
+from magshell_fenicsx.assembly.moving import in_space
 from magshell_fenicsx.continuation.advance import TimeSteps
 from magshell_fenicsx.continuation.control import GivenLoad
 from magshell_fenicsx.continuation.device import Held
 from magshell_fenicsx.continuation.motion import Motion
-from magshell_fenicsx.continuation.system import State, Vector, max_abs
+from magshell_fenicsx.continuation.system import State, Vector, dot, max_abs
 from magshell_fenicsx.continuation.transient import Integrator
 from magshell_fenicsx.input.section import in_units
 from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.models.modes import ShellModes
 from magshell_fenicsx.parts.bodies.contact import Pressings
 from magshell_fenicsx.parts.course import SnapSection
-from magshell_fenicsx.parts.motion.ground import Ground
-from magshell_fenicsx.parts.motion.mass import mass, whole_mass
-from magshell_fenicsx.parts.motion.step import EventSection, TimeSection
+from magshell_fenicsx.parts.magnetism.fields import MagneticSection
+from magshell_fenicsx.parts.motion.history import Curve, Level, Time, curve, marks, times_of
+from magshell_fenicsx.parts.motion.mass import Ground, mass, whole_mass
+from magshell_fenicsx.parts.motion.step import EventSection, PushSection, TimeSection
 from magshell_fenicsx.parts.motion.viscous import Branch, Viscosity
-from magshell_fenicsx.simulate.histories import LoadsInTime, time_of
+from magshell_fenicsx.problem.problem import Problem
+from magshell_fenicsx.shape.turning import vectors_of
 from magshell_fenicsx.simulate.intervals import Intervals, Rehearsed
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.stage import staged
-from magshell_fenicsx.simulate.start import by_formula, pushed
 from magshell_fenicsx.simulate.walked import Records
 
+SMALL = 1e-6  # deflection of a mode of size one that does not give its sign
+CLOSE = 1e-5  # of the shortest time of a history: a difference by time
+SAME = 1e-9
 LONGEST, MOST = 2000.0, 500  # of a snap, in radians of that mode, and its rows
 QUIET = 1e-6  # kinetic energy over its largest value below which a shell may be at rest
 IDLE = ""  # an amplitude of no load
 NEAR = 1e-2  # distance to the equilibrium, in lengths, below which it is
+
+
+def pushed(scene: Scene, push: PushSection, state: State, v: Vector) -> tuple[Vector, Vector]:
+    """Displacement and velocity with a natural mode of the model itself, inward at the pole."""
+    comm = scene.model.system.comm
+    modes = ShellModes(scene.model)
+    own = [mode for mode in modes.vibrations(state, push.mode) if not mode.label]
+    if len(own) < push.mode:  # modes of other symmetries were lower
+        own = [mode for mode in modes.lowest(state, push.mode) if not mode.label]
+    mode = own[push.mode - 1].vector
+    phi = np.asarray(mode / max_abs(comm, mode))
+    inward = scene.model.deflection(phi, "pole")
+    if abs(inward) < SMALL:
+        inward = dot(comm, phi, phi**2)
+    h = np.copysign(scene.problem.material.h, inward)
+    return state.u + push.displacement * h * phi, v + push.velocity * (scene.problem.time_unit or 1.0) * h * phi
+
+
+def by_formula(scene: Scene, components: Sequence[str]) -> Vector:
+    """The velocity with these components, formulas of the undeformed place, at the nodes; zero at supports."""
+    model, R, Q = scene.model, scene.problem.length, rotation(scene.problem.azimuth)
+    axes = model.axes
+    places = in_space(model.r0.x.array, len(axes))
+    found = vectors_of(components)(R * places @ Q) @ Q.T * (scene.problem.time_unit or 1.0) / R
+    return np.asarray(model.system.held(np.ascontiguousarray(found[:, axes]).ravel()[: model.system.size]))
+
+
+def own_time(value: Time) -> float:
+    """A time in the case's own unit."""
+    return float(in_units("second")(value))
+
+
+def time_of(problem: Problem, value: Time) -> float:
+    """A time over R sqrt(rho/E)."""
+    return own_time(value) / (problem.time_unit or 1.0)
+
+
+def level_of(problem: Problem, name: str, value: Level) -> float:
+    """A value of a history as an amplitude."""
+    if name != "lambda_m":
+        return float(value)
+    magnetic = problem.context.of(MagneticSection)
+    applied = magnetic.applied.flux_density if magnetic else None
+    return problem.lambda_m * (float(in_units("tesla")(value)) / (applied or 1.0) if isinstance(value, str) else value)
+
+
+def _scaled(of: Curve, size: float, unit: float) -> Curve:
+    return lambda t, before: size * of(t * unit, before)
+
+
+class LoadsInTime:
+    """The amplitudes of a step as functions of its time.
+
+    Parameters
+    ----------
+    motions
+        Amplitudes of supports, which must not jump.
+
+    Raises
+    ------
+    CaseError
+        If one of these does at the begin.
+    """
+
+    def __init__(self, problem: Problem, load: TimeSection, state: State, motions: Collection[str]) -> None:
+        self._mu, time = dict(state.mu), partial(time_of, problem)
+        histories = dict(zip(load.drives, load.history.values(), strict=True))
+        unit = problem.time_unit or 1.0
+        self._curves, self.marks = dict[str, Curve](), set[float]()
+        for name, history in histories.items():
+            # histories are in the case's own unit of time
+            of = curve(history, own_time, partial(level_of, problem, name), state.mu[name])
+            size = problem.lambda_m if isinstance(history, str) and name == "lambda_m" else 1.0
+            self._curves[name] = _scaled(of, size, unit)
+            self.marks |= set(marks(history, time, time(load.duration)))
+            first, here = self._curves[name](0.0, False), state.mu[name]
+            if name in motions and abs(first - here) > SAME * max(1.0, abs(here)):
+                raise CaseError(f"history.{name}: begins at {first:.6g}, but the support is at {here:.6g}")
+
+        times = [time(load.duration), *(time(t) for history in histories.values() for t in times_of(history))]
+        self._close = CLOSE * min(t for t in times if t)
+
+    def rates(self, t: float, before: bool, names: Collection[str]) -> dict[str, tuple[float, float]]:
+        """First and second derivatives by time of some of them, from values on one side, to second order."""
+        back = before and t >= 3 * self._close
+        slopes, step = {}, -self._close if back else self._close
+        for name in set(self._curves) & set(names):
+            a, b, c, d = (self._curves[name](t + i * step, back) for i in range(4))
+            slopes[name] = (4 * b - 3 * a - c) / (2 * step), (2 * a - 5 * b + 4 * c - d) / step**2
+        return slopes
+
+    def __call__(self, t: float, before: bool) -> dict[str, float]:
+        return self._mu | {name: of(t, before) for name, of in self._curves.items()}
 
 
 @dataclass(frozen=True)
@@ -55,9 +159,9 @@ def motion(scene: Scene, load: TimeSection, state: State, held: Mapping[str, Hel
     Stopped
         If steps in time become too small, or the shell does not come to rest.
     """
-    plan, system = scene.plan, scene.model.system
-    loads = LoadsInTime(plan, load, state, scene.motions)
-    drag = float(in_units("1/second")(load.drag)) * (plan.time_unit or 1.0)
+    problem, system = scene.problem, scene.model.system
+    loads = LoadsInTime(problem, load, state, scene.motions)
+    drag = float(in_units("1/second")(load.drag)) * (problem.time_unit or 1.0)
     u, v = state.u, state.v if isinstance(state, Moving) else 0.0 * state.u
     if load.push:
         u, v = pushed(scene, load.push, state, v)
@@ -81,8 +185,8 @@ def motion(scene: Scene, load: TimeSection, state: State, held: Mapping[str, Hel
         return integrator, integrator.begin(0.0, u, v)
 
     integrator, now = begin()
-    ground, duration = integrator.ground, time_of(plan, load.duration)
-    fixed = None if load.step is None else time_of(plan, load.step)
+    ground, duration = integrator.ground, time_of(problem, load.duration)
+    fixed = None if load.step is None else time_of(problem, load.step)
     steps = TimeSteps(fixed, load.tolerance, fixed or duration / load.points / 10, load.balance)
     dt, most = steps.first, integrator.kinetic(now)
     total = most + system.stored(now.u, now.mu)
@@ -108,7 +212,7 @@ def motion(scene: Scene, load: TimeSection, state: State, held: Mapping[str, Hel
         kinetic = integrator.kinetic(now)
         most = max(most, kinetic)
         clock = {
-            "time": now.t * (plan.time_unit or 1.0),
+            "time": now.t * (problem.time_unit or 1.0),
             "kinetic": scene.model.multiplicity * kinetic,
             "dissipated": scene.model.multiplicity * now.dissipated,
             "work": scene.model.multiplicity * now.work,
@@ -151,16 +255,16 @@ def _watched(scene: Scene, event: EventSection | None, state: State) -> Callable
 
 def viscosity(scene: Scene, state: State) -> Viscosity | None:
     """Of the shell at rest in a state; None without."""
-    plan, shell = scene.plan, scene.plan.context.shell
+    problem, shell = scene.problem, scene.problem.context.shell
     if shell.viscosity is None and not shell.relaxation:
         return None
     model, found = scene.model, list[Branch]()
     for branch in shell.relaxation:
         size = float(in_units("pascal")(branch.modulus))
         ratio = size / (shell.youngs_modulus or 1.0) if isinstance(branch.modulus, str) else size
-        found.append(Branch(ratio, time_of(plan, branch.time)))
+        found.append(Branch(ratio, time_of(problem, branch.time)))
     assert model.thin
-    return Viscosity(model, state.mu, time_of(plan, shell.viscosity or 0.0), found)
+    return Viscosity(model, state.mu, time_of(problem, shell.viscosity or 0.0), found)
 
 
 def released(scene: Scene, snap: SnapSection, fold: Record, held: Mapping[str, Held]) -> Records:
@@ -178,7 +282,7 @@ def released(scene: Scene, snap: SnapSection, fold: Record, held: Mapping[str, H
     """
     if fold.label != "fold" or fold.mode:
         raise Stopped(f"then: snap: the step ends at a {fold.mode or fold.label}, not at a fold of the model itself")
-    state, system, unit = fold.point.state, scene.model.system, scene.plan.time_unit or 1.0
+    state, system, unit = fold.point.state, scene.model.system, scene.problem.time_unit or 1.0
     own = [mode.eigenvalue for mode in ShellModes(scene.model).lowest(state, 3) if not mode.label]
     omega = float(np.sqrt(max(own[1:])))
     load = TimeSection(

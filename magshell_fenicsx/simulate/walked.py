@@ -12,11 +12,11 @@ from magshell_fenicsx.continuation.point import PathStopped, Point
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.continuation.walk import Goal, Walk
 from magshell_fenicsx.continuation.watch import Crossing
-from magshell_fenicsx.parts.bodies.touch import refuse_crossing, refuse_return, stiffer
 from magshell_fenicsx.quantities.registry import amplitude, quantity
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.stage import LONGEST, Stage
+from magshell_fenicsx.simulate.touch import refuse_crossing, refuse_return, stiffer
 
 BEYOND = 2.0  # a walk ends at this multiple of the load of the first excluded instability
 

@@ -17,7 +17,7 @@ from magshell_fenicsx.output.store.durable import Damaged, read_object, write_ob
 from magshell_fenicsx.output.store.folder import by_first, given_folder
 from magshell_fenicsx.output.store.known import read_summary
 from magshell_fenicsx.output.store.table import read_lines, write_csv
-from magshell_fenicsx.platform import sources
+from magshell_fenicsx.platform.environment import code_version
 from magshell_fenicsx.platform.processes import measure
 from magshell_fenicsx.quantities.registry import amplitude, quantity
 from magshell_fenicsx.studies.results import Scalar, parse_scalar
@@ -82,7 +82,7 @@ def run_model(
         If there is nothing to compare.
     """
     chosen = [*settings, f"model={model}", f"mesh.refinement={refinement:g}", *WITHOUT[model]]
-    asked = {"case": case.read_text(encoding="utf-8"), "settings": chosen, "sources": sources.ours()}
+    asked = {"case": case.read_text(encoding="utf-8"), "settings": chosen, "sources": code_version()}
     used, results, why = kept(folder / "usage.json", TypeAdapter(Used)), None, ""
     if used and used.asked == asked:
         try:

@@ -22,10 +22,10 @@ from magshell_fenicsx.input.source import CaseError, read_source
 from magshell_fenicsx.output.store.durable import write_object, write_whole
 from magshell_fenicsx.output.store.folder import by_first, given_folder
 from magshell_fenicsx.output.store.table import write_csv
-from magshell_fenicsx.platform import sources
-from magshell_fenicsx.platform.first import from_first
+from magshell_fenicsx.platform.environment import code_version
+from magshell_fenicsx.platform.processes import from_first
 from magshell_fenicsx.platform.terminal import print_line
-from magshell_fenicsx.runs.run import run
+from magshell_fenicsx.runs.running import run
 from magshell_fenicsx.runs.summary import Result
 from magshell_fenicsx.simulate.gradients.barriers import BARRIER
 from magshell_fenicsx.simulate.gradients.instabilities import FOLDS, SCALES, Lost
@@ -112,7 +112,7 @@ class Design:
         """What the evaluations of this design have in their files: a hash of what is designed, and the sources."""
         asked = self.wanted.section.model_dump_json(exclude={"iterations", "verify"})
         designed = hashlib.sha256((identity(self.variables.case) + asked).encode()).hexdigest()[:16]
-        return {"design": designed, "sources": sources.ours()}
+        return {"design": designed, "sources": code_version()}
 
     def _add(self, x: Array, evaluation: Evaluation, name: str) -> None:
         self.tried.append((x, evaluation))
@@ -213,7 +213,7 @@ def _designed(made: Design, file: Path, comm: MPI.Intracomm) -> dict[str, Any]:
         "evaluations": len(made.rows),
         "note": best.note,
         "violation": wanted.violation(best),
-        "sources": sources.ours(),
+        "sources": code_version(),
     }
     by_first(comm, lambda: draw_design(made.rows, wanted.results, vary, x, folder / "design.png"))
     by_first(comm, lambda: write_object(folder / "summary.json", content))
@@ -286,7 +286,7 @@ def verified(made: Design, best: Evaluation, comm: MPI.Intracomm) -> dict[str, A
         settings = [f"mesh.refinement={case.mesh.refinement * wanted.section.verify:.6g}"]
         case = best_case()
     how = ", ".join(settings) or "on the mesh of the file"
-    result = run(case, made.folder / "verified", comm, overwrite=True)  # the folder is the design's
+    result = run(case.problem(), made.folder / "verified", comm, overwrite=True)  # the folder is the design's
     values = {name: _value(result, name) for name in wanted.results if name not in wanted.targets}
     seen = dict[str, float]()
     for target in wanted.targets.values():

@@ -126,7 +126,7 @@ class Vectors:
     def gradient(self, x: Array, scene: Scene, found: Found) -> Array:
         if not isinstance(by := found.get(self.name), FieldGradient):
             return np.zeros(len(x))
-        magnetic = scene.plan.loads.magnetic
+        magnetic = scene.problem.loads.magnetic
         assert magnetic
         assert isinstance(magnetic.remanent, ByControls)
         comm = by.field.function_space.mesh.comm
@@ -177,11 +177,11 @@ class Between(Bounded):
     def gradient(self, x: Array, scene: Scene, found: Found) -> Array:
         if not isinstance(by := found.get(self.name), FieldGradient):
             return np.zeros(len(x))
-        places = by.places.reshape(-1, 3) @ rotation(scene.plan.azimuth)
+        places = by.places.reshape(-1, 3) @ rotation(scene.problem.azimuth)
         forces = by.forces.reshape(len(places), -1)[:, : self.start.shape[1]]
         comm = by.field.function_space.mesh.comm
         pulled = comm.allreduce(np.asarray(self.controls.weights(places).T @ forces))
-        unit = scene.plan.material.h if self.name == "deviation" else 1.0
+        unit = scene.problem.material.h if self.name == "deviation" else 1.0
         return np.asarray(pulled * unit * (self.bounds[1] - self.bounds[0])).ravel()
 
     def put(self, data: dict[str, Any], x: Array) -> None:

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from magshell_fenicsx.input.section import in_unit, si_size
 from magshell_fenicsx.input.source import CaseError, Source
 from magshell_fenicsx.input.tables import read_vectors, write_vectors
+from magshell_fenicsx.mesh.patch import GivenField
 from magshell_fenicsx.models.shell.controls import Controls
 from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.parts.magnetism.magnetisation import magnetisation
-from magshell_fenicsx.problem.planner import make_plan
-from magshell_fenicsx.problem.problem import Plan
+from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.shape.outline import outline
 from magshell_fenicsx.simulate.numbers import number_of
 from magshell_fenicsx.simulate.scene import Scene
@@ -156,7 +156,7 @@ def refuse_unfit_numbers(source: Source, case: Case, design: DesignSection) -> t
     for key in design.numbers:
         low, high, unit = design.bounds(key)
         try:
-            value, written = number_of(case, key), value_at(source.data, key.split("."))
+            value, written = number_of(case.context, key), value_at(source.data, key.split("."))
         except CaseError as e:
             raise CaseError(f"design.numbers: {e}") from None
         start = value / si_size(unit)
@@ -176,13 +176,13 @@ def refuse_unfit_numbers(source: Source, case: Case, design: DesignSection) -> t
 
 def _fields(case: Case, design: DesignSection) -> tuple[Between, ...]:
     """The scalar fields with their points and values at the start."""
-    fields, plan = [], make_plan(case)
+    fields, problem = [], case.problem()
     for name, section in design.fields.items():
-        places, width = _spread(case, plan, section.points, section.filter)
+        places, width = _spread(case, problem, section.points, section.filter)
         if name == "thickness":
-            start = (plan.thickness or Thickness()).at(places)[:, None]
+            start = (problem.thickness or Thickness()).at(places)[:, None]
         elif name == "curvature":
-            start = _curvatures(plan, places)
+            start = _curvatures(problem, places)
         else:
             start = np.zeros((len(places), 1))
         low, high = section.values
@@ -191,24 +191,24 @@ def _fields(case: Case, design: DesignSection) -> tuple[Between, ...]:
                 f"design.{name}.values: the case starts with {start.min():g} to {start.max():g}, beyond {low:g} to "
                 f"{high:g}"
             )
-        at = places[:, [0, 2]] if plan.meridian else places
+        at = places[:, [0, 2]] if problem.meridian else places
         fields.append(Between(name, np.asarray(start), (low, high), Controls(at, width), case.shell.reference))
     return tuple(fields)
 
 
-def _curvatures(plan: Plan, places: Array) -> Array:
+def _curvatures(problem: Problem, places: Array) -> Array:
     """The natural curvatures 11 and 22 of the case at places of its surface, (n, 2) over 1/R."""
-    drawn = plan.loads.natural.curvature if plan.loads.natural else None
-    if isinstance(drawn, Mapping):
+    drawn = problem.loads.natural.curvature if problem.loads.natural else None
+    if isinstance(drawn, Mapping | GivenField):
         raise CaseError("design.curvature: natural.curvature starts by patches: start from numbers or formulas")
     if callable(drawn):
         return np.asarray(drawn(places[:, None], places[:, None])[:, 0, :2])
     return np.tile(np.zeros(2) if drawn is None else drawn[:2], (len(places), 1))
 
 
-def _spread(case: Case, plan: Plan, count: int, width: float | None) -> tuple[Array, float]:
+def _spread(case: Case, problem: Problem, count: int, width: float | None) -> tuple[Array, float]:
     """Points of the case's surface, and the filter or their distance."""
-    places = _places(case, plan, count)
+    places = _places(case, problem, count)
     return places, width or float(np.median(scipy.spatial.cKDTree(places).query(places, [2])[0]))
 
 
@@ -237,9 +237,9 @@ def _controls(case: Case, section: RemanenceVariables) -> tuple[Controls, Array]
             raise CaseError("design.remanence: give points, or magnetic.remanent of kind: points")
         places, vectors = read_vectors(magnetic.remanent.path, "magnetic.remanent.file", magnetic.remanent.files)
         return Controls(places, width or magnetic.remanent.filter or 1.0), vectors
-    plan = make_plan(case)
-    places, width = _spread(case, plan, count, width)
-    field = magnetisation(magnetic, case.context, 0.0, plan.within)
+    problem = case.problem()
+    places, width = _spread(case, problem, count, width)
+    field = magnetisation(magnetic, case.context, 0.0, problem.within)
     if field.patches is not None:
         raise CaseError("design.remanence.points: the remanence starts by patches of a mesh: start from another kind")
     if callable(field.remanent):
@@ -247,15 +247,15 @@ def _controls(case: Case, section: RemanenceVariables) -> tuple[Controls, Array]
         vectors = np.array(field.remanent(places[:, None], normals[:, None])[:, 0])
     else:
         vectors = np.tile(np.asarray(field.remanent, dtype=float), (count, 1))
-    if plan.meridian:
+    if problem.meridian:
         places, vectors = places[:, [0, 2]], vectors[:, [0, 2]]
     return Controls(places, width), vectors
 
 
-def _places(case: Case, plan: Plan, count: int) -> Array:
+def _places(case: Case, problem: Problem, count: int) -> Array:
     """Points (n, 3) along a meridian or a strip, or far from each other on the surface."""
-    if plan.meridian:
-        sample = plan.meridian.sample()
+    if problem.meridian:
+        sample = problem.meridian.sample()
         return np.asarray(sample[np.linspace(0, len(sample) - 1, count).round().astype(int)] * [1.0, 0.0, 1.0])
     if case.shell.geometry == "strip":
         along = np.linspace(0.0, 1.0, count)

@@ -19,17 +19,16 @@ from magshell_fenicsx.input.source import CaseError, read_source
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.output.store.durable import write_object, write_whole
 from magshell_fenicsx.output.store.folder import by_first, given_folder
-from magshell_fenicsx.platform import sources
-from magshell_fenicsx.platform.first import from_first
+from magshell_fenicsx.platform.environment import code_version
+from magshell_fenicsx.platform.processes import from_first
 from magshell_fenicsx.platform.terminal import print_line
 from magshell_fenicsx.runs.rows import RowMaker
-from magshell_fenicsx.runs.run import run
+from magshell_fenicsx.runs.running import run
 from magshell_fenicsx.runs.summary import Result
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.perfect import with_modes
 from magshell_fenicsx.simulate.record import Stopped
 from magshell_fenicsx.simulate.scene import Scene
-from magshell_fenicsx.studies.ensemble_report import draw_ensemble, report
 from magshell_fenicsx.studies.folds import KnownFolds, fold_row, has_knockdown
 from magshell_fenicsx.studies.results import Scalar, parse_scalar
 from magshell_fenicsx.studies.runner import (
@@ -45,7 +44,7 @@ from magshell_fenicsx.studies.runner import (
     part_of,
 )
 from magshell_fenicsx.studies.samples import Sample, make_samples
-from magshell_fenicsx.studies.statistics import WITHOUT, Row, make_row, statistics, write_samples
+from magshell_fenicsx.studies.statistics import WITHOUT, Row, draw_ensemble, make_row, report, statistics, write_samples
 
 MOST_SAMPLES = 100_000
 MOST_TRIES = 2  # points of the path from which the fold ahead is tried
@@ -130,11 +129,11 @@ def ensemble(
     if comm.rank == 0:
         ranks = f"{comm.size} rank{'s' if comm.size > 1 else ''}"
         say(f"{len(every)} samples, {len(missing)} to compute on {ranks}")
-    known = KnownFolds()
+    folds = KnownFolds()
 
     def sample_computed(key: str) -> Iterator[str]:
         sample = every[key]
-        outcome = solve(sample, scalar, known)
+        outcome = solve(sample, scalar, folds)
         keep_outcome(outcome, sample.case, _file(folder, key))
         value = outcome.value(scalar)
         said = f"no {scalar.name}" if value is None else f"{scalar.name} = {value:.9g} ({outcome.found})"
@@ -152,7 +151,7 @@ def ensemble(
         "part": part,
         "result": result,
         "deleted": delete_weakest,
-        "sources": sources.ours(),
+        "sources": code_version(),
         **by_first(comm, lambda: statistics(rows, seed)),
     }
     by_first(comm, lambda: _write(rows, content, folder, ending))
@@ -225,10 +224,10 @@ def solve(sample: Sample, scalar: Scalar, known: KnownFolds) -> Outcome:
 
 
 def _solved(sample: Sample, scalar: Scalar, known: KnownFolds) -> Outcome:
-    with_modes(sample.case, MPI.COMM_SELF)
+    problem = with_modes(sample.case.problem(), MPI.COMM_SELF)
     if scalar.name != "knockdown" or not has_knockdown(sample.case):
-        return _outcome(run(sample.case, comm=MPI.COMM_SELF))
-    scene = Scene(sample.case, MPI.COMM_SELF)
+        return _outcome(run(problem, comm=MPI.COMM_SELF))
+    scene = Scene(problem, MPI.COMM_SELF)
     try:
         return _of_fold(scene, known.follow(sample.values, scene))
     except FoldLost:

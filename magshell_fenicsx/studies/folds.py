@@ -67,7 +67,7 @@ def refuse_later(scene: Scene, fold: Fold, expected: Vector) -> None:
 def _held(scene: Scene) -> dict[str, float]:
     """The amplitudes beside the pressure, the field in full."""
     held = dict(scene.unloaded().mu)
-    return held | ({"lambda_m": scene.case.lambda_m} if "lambda_m" in held else {})
+    return held | ({"lambda_m": scene.problem.lambda_m} if "lambda_m" in held else {})
 
 
 class Continuation:
@@ -99,11 +99,11 @@ class Continuation:
         FoldLost
             If none is found, or if there is evidence that it is not the first instability.
         """
-        known = [(q, self._moved(fold, scene)) for q, fold in self._known]
-        guess = predict_fold(scene.newton.system, known, p, _held(scene))
+        moved = [(q, self._moved(fold, scene)) for q, fold in self._known]
+        guess = predict_fold(scene.newton.system, moved, p, _held(scene))
         fold = find_fold(scene.newton, guess, "pressure")
-        refuse_later(scene, fold, known[-1][1].phi)
-        self._known, self._scene = [*known, (p, fold)][-KEPT:], scene
+        refuse_later(scene, fold, moved[-1][1].phi)
+        self._known, self._scene = [*moved, (p, fold)][-KEPT:], scene
         return fold
 
     def from_here(self) -> "Continuation":
@@ -114,7 +114,7 @@ class Continuation:
 
     def has_mesh_of(self, scene: Scene) -> bool:
         """Whether a scene has the mesh of the last one."""
-        alike = type(scene.model) is type(self._scene.model) and scene.plan.half == self._scene.plan.half
+        alike = type(scene.model) is type(self._scene.model) and scene.problem.half == self._scene.problem.half
         return alike and same_mesh(self._scene, scene)
 
     def _moved(self, fold: Fold, scene: Scene) -> Fold:
@@ -208,7 +208,10 @@ class Scenes:
         """
         key = _apart_from_strength(case)
         known = self._kept.pop(key, None)
-        scene = known.retuned(case) if known else Scene(with_modes(case, MPI.COMM_SELF), MPI.COMM_SELF)
+        if known:
+            scene = known.retuned(case.context)
+        else:
+            scene = Scene(with_modes(case.problem(), MPI.COMM_SELF), MPI.COMM_SELF)
         self._kept[key] = scene
         while sum(each.newton.system.size for each in self._kept.values()) > MOST_UNKNOWNS and len(self._kept) > 1:
             self._kept.pop(next(iter(self._kept)))

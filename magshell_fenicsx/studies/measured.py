@@ -1,6 +1,5 @@
 """The measurements of a point of a study: repeated runs in separate processes, kept on disk."""
 
-import csv
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -12,6 +11,7 @@ from typing import Any
 from pydantic import TypeAdapter
 
 from magshell_fenicsx.output.store.known import PHASES
+from magshell_fenicsx.output.store.table import read_csv
 from magshell_fenicsx.platform.processes import measure
 from magshell_fenicsx.studies.runner import keep, kept
 
@@ -55,15 +55,15 @@ Origin = Mapping[str, str | None]  # the sources and the mesh file: keys of summ
 
 def load(file: Path, machine: dict[str, Any], origin: Origin) -> Measured:
     """The usable measurements of an earlier study on this machine; empty without any."""
-    known = _read(file)
-    usable = known and known.machine == machine and not known.failure and _is_of(origin, known.summary)
-    return known if known and usable else Measured(machine)
+    content = _read(file)
+    usable = content and content.machine == machine and not content.failure and _is_of(origin, content.summary)
+    return content if content and usable else Measured(machine)
 
 
 def of_others(file: Path, origin: Origin) -> bool:
     """Whether the file has measurements of other sources, which cannot be used."""
-    known = _read(file)
-    return known is not None and known.summary is not None and not _is_of(origin, known.summary)
+    content = _read(file)
+    return content is not None and content.summary is not None and not _is_of(origin, content.summary)
 
 
 def _read(file: Path) -> Measured | None:
@@ -105,8 +105,7 @@ def _run_once(measured: Measured, arguments: Sequence[str], ranks: int) -> Sampl
         used = measure("magshell_fenicsx", ["run", *arguments, "--out", str(out)], ranks)
         try:
             measured.summary = json.loads((out / "summary.json").read_text(encoding="utf-8"))
-            with (out / "path.csv").open(encoding="utf-8", newline="") as stream:
-                measured.rows = list(csv.DictReader(stream))
+            measured.rows = read_csv(out / "path.csv", dict)
         except OSError:
             measured.summary, measured.rows = None, []
             measured.failure = f"exit code {used.code}: {used.last_error or 'no message'}"

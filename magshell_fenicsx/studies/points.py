@@ -18,7 +18,6 @@ import numpy as np
 from magshell_fenicsx.input.section import in_unit, number_and_unit
 from magshell_fenicsx.input.source import CaseError, Source, override, read_source
 from magshell_fenicsx.problem.limits import refuse_beyond_memory
-from magshell_fenicsx.problem.planner import make_plan
 from magshell_fenicsx.studies.runner import Case, Made
 
 MOST_POINTS = 10_000
@@ -191,7 +190,7 @@ def make_point(source: Source, axes: Sequence[Axis], values: Sequence[str], made
         for assignment in assignments:
             override(varied, assignment)
         case = made(varied)
-        refuse_beyond_memory(case, make_plan(case))  # raises the errors of the plan, such as a missing mirror plane
+        refuse_beyond_memory(case.problem())  # raises its errors, such as a missing mirror plane
     except CaseError as e:
         message = str(e)
         for assignment in assignments:

@@ -23,12 +23,11 @@ from magshell_fenicsx.input.source import CaseError, Source
 from magshell_fenicsx.output.store.durable import write_object
 from magshell_fenicsx.output.store.folder import DiskError, held_folder, prepare_folder, refuse_others
 from magshell_fenicsx.output.store.table import COLUMNS, Row
-from magshell_fenicsx.platform import sources
-from magshell_fenicsx.runs.snaps import snaps
-from magshell_fenicsx.runs.summary import Result, in_units
+from magshell_fenicsx.platform.environment import code_version
+from magshell_fenicsx.runs.summary import Result, in_units, snaps
 from magshell_fenicsx.studies.results import Scalar
 
-Case = Any  # what the front end makes of a source, and `run` and `Scene` take: a study does not know its class
+Case = Any  # what the front end makes of a source; `problem()` makes its problem: a study does not know its class
 Made = Callable[[Source], Case]
 Say = Callable[[str], None]
 Kept = TypeVar("Kept")
@@ -287,7 +286,7 @@ def outcome_of(
 
 def _event(result: Result) -> dict[str, Any] | None:
     """The point at which a motion has ended by an event or an instability, in the form of a limit point."""
-    last, steps = result.rows[-1], result.scene.case.programme
+    last, steps = result.rows[-1], result.scene.problem.programme
     until = getattr(steps[-1].load, "until", "") if steps else ""
     if result.stopped or last["amplitude"] != "time" or until not in ("event", "instability"):
         return None
@@ -297,10 +296,10 @@ def _event(result: Result) -> dict[str, Any] | None:
 
 def keep_outcome(outcome: Outcome, case: Case, file: Path) -> None:
     """Write the outcome of a case."""
-    origin = {"case": case.model_dump(mode="json", exclude_none=True), **case.outside, "sources": sources.ours()}
+    origin = {"case": case.model_dump(mode="json", exclude_none=True), **case.outside, "sources": code_version()}
     keep(file, {**origin, "outcome": asdict(outcome)})
 
 
 def kept_outcome(file: Path) -> Outcome | None:
     """The outcome of a case in a file, if these sources have computed it; see `kept`."""
-    return kept(file, OUTCOME, "outcome", sources=sources.ours())
+    return kept(file, OUTCOME, "outcome", sources=code_version())

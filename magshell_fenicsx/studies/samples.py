@@ -9,7 +9,6 @@ from typing import Any
 from magshell_fenicsx.input.chance import NoRoom
 from magshell_fenicsx.input.messages import InvalidCase
 from magshell_fenicsx.input.source import CaseError, Source, override
-from magshell_fenicsx.problem.planner import make_plan
 from magshell_fenicsx.studies.points import identity, value_at
 from magshell_fenicsx.studies.runner import Case, Made
 from magshell_fenicsx.studies.sections import EnsembleSection
@@ -86,7 +85,7 @@ def _sample(source: Source, number: int, drawn: Mapping[str, str], made: Made, d
         shell = drawn_source.data["shell"]
         shell["imperfections"] = [item for item in shell["imperfections"] if id(item) not in gone]
         case = made(drawn_source)
-    make_plan(case)
+    case.problem()
     return Sample(number, values, dict(_flat("", ranked[-1])) if ranked else {}, case, identity(case))
 
 

@@ -184,8 +184,8 @@ class DesignSection(Section):
             except ValueError as e:
                 raise ValueError(f"numbers: {key}: {e}") from None
             if not least < most:
-                here = ", ".join(map(str, written))
-                raise ValueError(f"numbers: {key}: the first bound must be less than the second, here {here}")
+                places = ", ".join(map(str, written))
+                raise ValueError(f"numbers: {key}: the first bound must be less than the second, here {places}")
         return self
 
     def bounds(self, key: str) -> tuple[float, float, str]:
@@ -206,8 +206,8 @@ class DesignSection(Section):
     @property
     def fields(self) -> dict[str, FieldVariables]:
         """The scalar fields that vary."""
-        found = {"thickness": self.thickness, "curvature": self.curvature, "deviation": self.deviation}
-        return {name: section for name, section in found.items() if section}
+        fields_that_vary = {"thickness": self.thickness, "curvature": self.curvature, "deviation": self.deviation}
+        return {name: section for name, section in fields_that_vary.items() if section}
 
     def key_of(self, result: str) -> str:
         """The first key below `design` that names a result."""

@@ -13,8 +13,7 @@ from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.output.store.durable import write_object
 from magshell_fenicsx.output.store.folder import by_first, given_folder
 from magshell_fenicsx.output.store.table import write_csv
-from magshell_fenicsx.platform import sources
-from magshell_fenicsx.platform.environment import fingerprint
+from magshell_fenicsx.platform.environment import code_version, fingerprint
 from magshell_fenicsx.platform.terminal import print_line
 from magshell_fenicsx.studies.measured import Measured, complete, load, of_others
 from magshell_fenicsx.studies.points import make_points, parse_axes, swept_source
@@ -103,7 +102,7 @@ def study(
     folder, machine = given_folder(out), fingerprint()
     with FOLDER.held(folder, MPI.COMM_WORLD, Path(file).name):
         counts = sorted(set(ranks))
-        origins = [{"sources": sources.ours(), **point.case.outside} for point in points]
+        origins = [{"sources": code_version(), **point.case.outside} for point in points]
         files = {(i, n): folder / "points" / f"{points[i].key}-{n}.json" for i in range(len(points)) for n in counts}
         if again := sum(of_others(file, origins[i]) for (i, _), file in files.items()):
             say(f"{again} of {len(files)} computed again: the folder has results of other sources of magshell_fenicsx")

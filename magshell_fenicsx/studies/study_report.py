@@ -170,8 +170,8 @@ def clock(rows: Sequence[Row]) -> str:
 
 def _beats(a: Row, b: Row, spent: str) -> bool:
     """Whether a is at least as good as b in both time and error, and better in one."""
-    here, there = (a[spent], a["error"]), (b[spent], b["error"])
-    return here != there and here[0] <= there[0] and here[1] <= there[1]
+    mine, theirs = (a[spent], a["error"]), (b[spent], b["error"])
+    return mine != theirs and mine[0] <= theirs[0] and mine[1] <= theirs[1]
 
 
 FORMS = {

@@ -22,11 +22,10 @@ from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.output.store.durable import Damaged, read_object, write_object
 from magshell_fenicsx.output.store.folder import by_first, given_folder
 from magshell_fenicsx.output.store.table import COLUMNS, write_csv
-from magshell_fenicsx.platform.first import from_first
+from magshell_fenicsx.platform.processes import from_first
 from magshell_fenicsx.platform.terminal import print_line
-from magshell_fenicsx.problem.planner import make_plan
 from magshell_fenicsx.quantities.registry import endings
-from magshell_fenicsx.runs.run import Result, run
+from magshell_fenicsx.runs.running import Result, run
 from magshell_fenicsx.studies.folds import Continuation, Scenes, fold_row, has_knockdown
 from magshell_fenicsx.studies.points import (
     MOST_POINTS,
@@ -241,8 +240,8 @@ def _chains_of(line: list[int], axis: Axis, points: Sequence[SweepPoint], missin
 
 
 def _symmetry(case: Case) -> str:
-    plan = make_plan(case)
-    return "axisymmetric" if plan.axisymmetric else "half" if plan.half else "none"
+    problem = case.problem()
+    return "axisymmetric" if problem.axisymmetric else "half" if problem.half else "none"
 
 
 @dataclass
@@ -262,18 +261,18 @@ class Known:
     first: Continuation | None = None
 
 
-def run_chain(chain: Chain, known: Known) -> Iterator[tuple[int, Outcome]]:
+def run_chain(chain: Chain, folds: Known) -> Iterator[tuple[int, Outcome]]:
     """Compute a chain on this rank; number and outcome of each point."""
-    continuation = known.first if len(chain) > 1 else None
+    continuation = folds.first if len(chain) > 1 else None
     for link in chain:
         begun = link is chain[0]
         start, spent, outcome = time.perf_counter(), 0, None
         if continuation:
-            outcome, spent = _by_fold(continuation, link, known, start, same_mesh=begun)
+            outcome, spent = _by_fold(continuation, link, folds, start, same_mesh=begun)
         if not outcome:
-            outcome, continuation = _by_path(link, known.columns, spent, start, go_on=link is not chain[-1])
+            outcome, continuation = _by_path(link, folds.columns, spent, start, go_on=link is not chain[-1])
         if begun:
-            known.first = continuation = continuation and continuation.from_here()
+            folds.first = continuation = continuation and continuation.from_here()
         yield link.number, outcome
 
 
@@ -302,7 +301,7 @@ def _by_path(
 ) -> tuple[Outcome, Continuation | None]:
     """The outcome of a full path, and the continuation from its fold if there is one."""
     try:
-        result = run(link.case, comm=MPI.COMM_SELF)
+        result = run(link.case.problem(), comm=MPI.COMM_SELF)
     except MeshError as e:
         return Outcome.failed(str(e), time.perf_counter() - start, spent), None
     continuation = _begun(link.at, result) if go_on else None

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from magshell_fenicsx import Case
+from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.input.source import CaseError, Source
-from magshell_fenicsx.problem.planner import make_plan
 
 PUSH = {"supports": ["right"], "translation": [-0.01, 0, 0]}
 TURN = {"axis": [0, 2, 0], "angle": 90, "point": [1, 0, 0]}
@@ -23,7 +23,7 @@ def case(*moves: Any, boundary: Any = None, **step: Any) -> Case:
 
 def test_in_the_model() -> None:
     """Lengths over R, the axis a unit vector times the angle."""
-    (move,) = make_plan(case({**PUSH, "rotation": {**TURN, "point": [1, 0, 0]}})).loads.moves
+    (move,) = make_problem(case({**PUSH, "rotation": {**TURN, "point": [1, 0, 0]}})).loads.moves
     np.testing.assert_allclose(move.motion.shift, [-0.005, 0, 0])
     np.testing.assert_allclose(move.motion.turn, [0, np.pi / 2, 0], atol=1e-16)
     np.testing.assert_allclose(move.motion.centre, [0.5, 0, 0])
@@ -40,7 +40,7 @@ def test_in_the_model() -> None:
     ],
 )
 def test_symmetry_that_a_motion_leaves(moves: list[Any], normal: list[float] | None) -> None:
-    mirror = make_plan(case(*moves)).mirror
+    mirror = make_problem(case(*moves)).mirror
     assert (mirror is None) == (normal is None)
     if mirror and normal:
         np.testing.assert_allclose(np.abs(mirror.normal), normal)
@@ -85,10 +85,10 @@ def test_names_that_other_columns_have(name: str, more: dict[str, Any], words: s
     given = case(PUSH, name=name)
     asked = Case.from_source(Source("test", given.model_dump(mode="json", exclude_none=True) | more))
     if words is None:
-        assert make_plan(asked).reactions
+        assert make_problem(asked).reactions
         return
     with pytest.raises(CaseError, match=words):
-        make_plan(asked)
+        make_problem(asked)
 
 
 def test_names_that_columns_in_units_have() -> None:
@@ -98,4 +98,4 @@ def test_names_that_columns_in_units_have() -> None:
     data = {"shell": shell | {"poisson_ratio": 0.3}, "boundary": {"left": "clamped", "right": "clamped"}}
     data |= {"loading": {"kind": "edge", "name": "left_fx_N", "moves": [move], "points": 1}}
     with pytest.raises(CaseError, match=r"left_fx_N: another column of path\.csv of this case has this name"):
-        make_plan(Case.from_source(Source("test", data)))
+        make_problem(Case.from_source(Source("test", data)))

@@ -8,8 +8,7 @@ from conftest import CASES
 from jsonschema import Draft202012Validator
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.reference import reference
-from magshell_fenicsx.case.schema import schema, schema_text
+from magshell_fenicsx.case.reference import reference, schema, schema_text
 from magshell_fenicsx.input.source import CaseError, override, read_source
 
 DOCS = CASES.parent / "docs"

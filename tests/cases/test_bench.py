@@ -12,7 +12,7 @@ from speed.measure import BenchFailed, measure_item
 from speed.report import compare, derived, table
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.problem.planner import make_plan
+from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.studies.results import parse_scalar
 
 
@@ -23,7 +23,7 @@ def file(machine: str = "a", **numbers: float) -> dict[str, Any]:
 
 @pytest.mark.parametrize("item", ITEMS.values(), ids=ITEMS)
 def test_every_item_is_a_valid_case(item: Item) -> None:
-    make_plan(Case.load(CASES / f"{item.case}.yaml", item.settings))
+    make_problem(Case.load(CASES / f"{item.case}.yaml", item.settings))
     for name in item.references:
         parse_scalar(name)
 

@@ -23,7 +23,7 @@ from benchmarks.obstacles import (
 from benchmarks.obstacles_table import Line
 
 from magshell_fenicsx import Case, Result
-from magshell_fenicsx.runs.run import run
+from magshell_fenicsx.public import run
 
 SLOW = pytest.mark.slow
 TABLES = {obstacle.case: obstacle for obstacle in OBSTACLES}

@@ -10,6 +10,8 @@ from functools import lru_cache
 import numpy as np
 import pytest
 from conftest import CASES
+from numpy.typing import NDArray
+from scipy.integrate import solve_bvp
 from scipy.interpolate import CubicSpline
 
 from magshell_fenicsx import Case, Result, Scene
@@ -18,8 +20,10 @@ from magshell_fenicsx.continuation.path import Path
 from magshell_fenicsx.continuation.point import PathStopped, Point
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
-from magshell_fenicsx.runs.run import run
+from magshell_fenicsx.public import run
 from magshell_fenicsx.simulate.follow import follow
+
+Array = NDArray[np.float64]
 
 
 @lru_cache(maxsize=2)
@@ -185,6 +189,33 @@ def test_clamped_plate() -> None:
     assert found.rows[-1]["w_pole_over_h"] == pytest.approx(w0_over_h, rel=1e-4)
 
 
+def test_spinning_blade() -> None:
+    """SciPy's boundary values of an extensible elastica: how deep its tip hangs at rest and at 300 rpm."""
+    found = result("spinning_blade.yaml", "shell.poisson_ratio=0", "loading.1.points=2")
+    L, h, E, rho, weight = 0.05, 1e-3, 1e6, 1100, 10.79
+    rows = [row for row in found.rows if row["label"] == "target"]
+    (at_rest,) = [row for row in rows if row["step"] == 1 and row["load_factor"] == 1]
+    for rpm, row in ((0, at_rest), (300, rows[-1])):
+        s, y = np.linspace(0, L, 50), np.zeros((6, 50))
+        y[0] = s
+        for share in np.linspace(0.1, 1, 10):
+            outward, down = share * rho * h * (rpm * np.pi / 30) ** 2, share * weight
+
+            def along(s: Array, y: Array, outward: float = outward, down: float = down) -> Array:
+                x, _, angle, M, N, Q = y
+                c, d = np.cos(angle), np.sin(angle)
+                stretch = 1 + (N * c + Q * d) / (E * h)
+                turned = M / (E * h**3 / 12)
+                return np.array(
+                    [stretch * c, stretch * d, turned, stretch * (N * d - Q * c), -outward * x, down + 0 * x]
+                )
+
+            solved = solve_bvp(along, lambda a, b: np.concatenate([a[:3], b[3:]]), s, y, tol=1e-6)
+            assert solved.success
+            s, y = solved.x, solved.y
+        assert row["tip_uz"] == pytest.approx(y[1, -1], rel=1e-3)
+
+
 def test_cylinder_waves() -> None:
     """The half shell's first bifurcation, p/p_c = 0.113764 with elements of 0.14 R; a tube between two walls, m = 9."""
     found = result("cylinder_waves.yaml")
@@ -267,7 +298,7 @@ def test_turning_field_ends_where_the_tilted_one_does() -> None:
     row = found.rows[-1]
     assert (row["label"], row["amplitude"]) == ("target", "angle")
     assert row["field_angle"] == pytest.approx(60.0)
-    assert row["lambda_m"] == pytest.approx(found.scene.case.lambda_m)
+    assert row["lambda_m"] == pytest.approx(found.scene.problem.lambda_m)
     for key in ("w_pole_over_h", "magnetic", "bending"):
         assert row[key] == pytest.approx(straight.rows[-1][key], rel=1e-7)
 

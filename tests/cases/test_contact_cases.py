@@ -10,7 +10,7 @@ from command import magshell, read_path
 from conftest import CASES
 
 from magshell_fenicsx import Case, Result, Scene
-from magshell_fenicsx.runs.run import run
+from magshell_fenicsx.public import run
 from magshell_fenicsx.simulate.follow import follow
 
 Row = dict[str, float]
@@ -66,7 +66,7 @@ def test_hard_plate() -> None:
     assert [r.label for r in records if r.label != "step"] == ["start", "target"]
     end = records[-1]
     assert (end.point.negative_pivots, end.excluded_pivots) == (0, 0)
-    row, h, nu = scene.observe(end.point.state), scene.plan.material.h, 0.5
+    row, h, nu = scene.observe(end.point.state), scene.problem.material.h, 0.5
     pressure = scene.model.cell_pressures(end.point.state)
     assert pressure is not None
     assert pressure[0] == pytest.approx((1 + nu) ** 2 * h**2 / (12 * (1 - nu**2)), rel=0.02)
@@ -115,6 +115,23 @@ def test_ball_and_rod_against_a_point_force() -> None:
         assert force == pytest.approx(more * point["force"], rel=5e-4)
     assert rod["contact_radius"] == pytest.approx(0.2e-3, rel=0.1)  # in metres, at the rounded edge
     assert ball["contact_outer"] < 0.02
+
+
+@pytest.mark.slow
+def test_egg_between_two_balls() -> None:
+    """The body that contains another leaves fewer shapes to the shell: the least energy at an approach is higher.
+
+    A ball of its least radius of curvature is within the egg, one of the largest, 0.4^2/0.25, around it; both are
+    modelled by their meridian.
+    """
+    egg = last("egg_contact.yaml", "loading.points=2")
+    within, around = (
+        last("egg_contact.yaml", "loading.points=2", f"bodies={{ball: {{kind: sphere, radius: {radius}}}}}")
+        for radius in (0.25, 0.4**2 / 0.25)
+    )
+    assert egg["approach_over_h"] == within["approach_over_h"] == around["approach_over_h"] == 2
+    assert 1.02 * within["energy"] < egg["energy"] < around["energy"] / 1.02
+    assert within["force"] < egg["force"] < around["force"]
 
 
 def test_sweep_of_a_body(tmp_path: Path) -> None:

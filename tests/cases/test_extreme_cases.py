@@ -11,7 +11,7 @@ from extreme.extremes import ASPECTS, TIP, VARIANTS, Variant, line, outcome, sli
 from extreme.extremes_table import cells, write
 
 from magshell_fenicsx import Case, Result
-from magshell_fenicsx.runs.run import run
+from magshell_fenicsx.public import run
 
 
 def result(file: str, *settings: str) -> Result:

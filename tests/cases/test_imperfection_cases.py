@@ -6,8 +6,7 @@ from conftest import CASES
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.output.fields.gathering import gatherer
-from magshell_fenicsx.runs.run import run
-from magshell_fenicsx.simulate.scene import Scene
+from magshell_fenicsx.public import Scene, run
 
 POLAR = 0.326233289  # of the paper's dimple at the pole; an independent solver of the meridian's equations, nine digits
 ONE = "shell.imperfections=[{kind: dimple, amplitude: 1.64, width: 3.2, at: {polar: 40, azimuth: 25}}]"
@@ -42,7 +41,7 @@ def test_the_deviation_is_a_field(model: str) -> None:
     scene = Scene(Case.load(CASES / "dimple_buckling.yaml", settings))
     surface = gatherer(scene.model, scene.comm).gather(scene.model.zero())
     assert surface
-    w0, away = surface.fields["w0_over_h"], (np.linalg.norm(surface.r0, axis=1) - 1) / scene.plan.material.h
+    w0, away = surface.fields["w0_over_h"], (np.linalg.norm(surface.r0, axis=1) - 1) / scene.problem.material.h
     assert w0.min() == pytest.approx(-1.64, abs=1e-9)
     if model != "solid":
         assert w0 == pytest.approx(away, abs=1e-3)  # r0 is a polynomial between its nodes

@@ -9,7 +9,7 @@ from conftest import CASES
 from scipy.integrate import solve_bvp
 
 from magshell_fenicsx import Case, Result
-from magshell_fenicsx.runs.run import run
+from magshell_fenicsx.public import run
 
 LENGTH, WIDTH, H, E, BR = 30e-3, 5e-3, 0.5e-3, 1e6, 0.1  # of cases/magnet_strip.yaml
 

@@ -9,7 +9,7 @@ from conftest import CASES
 from scipy.integrate import solve_bvp
 
 from magshell_fenicsx import Case, Result
-from magshell_fenicsx.runs.run import run
+from magshell_fenicsx.public import run
 
 EULER, EPS = 4 * np.pi**2, 1e-4 / 12  # over EI/L^2; EI/(EA L^2)
 

@@ -50,7 +50,7 @@ def test_indentation() -> None:
     """Force at w/h = 1.5 and 6: axisymmetric reference, five digits. What is drawn is the shell."""
     found = namespace("indentation")
     assert found["force"][[0, -1]] == pytest.approx([2.9616, 5.6202], rel=5e-5)
-    assert found["shell"].w.max() / found["scene"].plan.material.h == pytest.approx(6, rel=1e-6)
+    assert found["shell"].w.max() / found["scene"].problem.material.h == pytest.approx(6, rel=1e-6)
     image = imread(io.BytesIO(found["picture"]._repr_png_()))  # what a notebook asks for
     assert np.ptp(image[..., :3], axis=2).max() > 0.4, "no colours"
 

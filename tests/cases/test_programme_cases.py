@@ -36,7 +36,7 @@ def test_probing() -> None:
             poked = [row for row in result.rows if row["step"] == 2 and row["label"] != "bifurcation"]
             w, F = ([0.0, *(row[name] for row in poked)] for name in ("w_over_h", "force"))
             w[0] = next(row["w_over_h"] for row in reversed(result.rows) if row["step"] == 1)
-            unit = result.scene.model.force_unit * result.scene.plan.material.h
+            unit = result.scene.model.force_unit * result.scene.problem.material.h
             assert CubicSpline(w, F).integrate(w[0], w[-1]) * unit == pytest.approx(result.barrier, rel=1e-3)
     assert np.all(np.diff(found) < 0)
     # near the fold the barrier grows with the distance to the power of 3/2

@@ -7,7 +7,7 @@ import pytest
 from continuation.toys import Toy, pitchfork, snap_back
 from petsc4py import PETSc
 
-from magshell_fenicsx.assembly.noise import Noise
+from magshell_fenicsx.assembly.evaluated import Noise
 from magshell_fenicsx.continuation.bifurcation import BifurcationLost, find_bifurcation
 from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.path import Path, StepOptions

@@ -1,4 +1,4 @@
-"""Factors stay what they were until the next `factor`."""
+"""Factors of tangents that change, banded ones against NumPy's eigenvalues, and the condition of a known spectrum."""
 
 import resource
 from pathlib import Path
@@ -9,7 +9,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from magshell_fenicsx.continuation import factor
-from magshell_fenicsx.continuation.factor import Factorisation
+from magshell_fenicsx.continuation.factor import Banded, Factorisation, condition_estimate
 from magshell_fenicsx.continuation.system import Skewed
 
 
@@ -157,3 +157,36 @@ def failing(monkeypatch: pytest.MonkeyPatch, number: int) -> Factorisation:
 
     monkeypatch.setattr(factor, "_renew", fail)
     return Factorisation(MPI.COMM_SELF)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_definite_or_not(seed: int) -> None:
+    """Two matrices of one sparsity, interpolated so that the least eigenvalue crosses zero."""
+    random, n = np.random.default_rng(seed), 30
+    order = random.permutation(n)  # of a band that the numbering hides
+    near = np.abs(order[:, None] - order) <= 3
+    A, B = (np.where(near, x + x.T, 0.0) for x in random.standard_normal((2, n, n)))
+    A += 100 * np.eye(n)  # definite, and so is A + t (B - A) for small t alone
+    rows, columns = np.nonzero(near)
+    held = np.array([0, 7], dtype=np.int32)
+    banded = Banded(rows, columns, held)
+    bands = banded.bands([A[rows, columns], B[rows, columns]])
+    free = np.setdiff1d(np.arange(n), held)
+
+    def least(t: float) -> float:
+        return float(np.linalg.eigvalsh((A + t * (B - A))[np.ix_(free, free)])[0])
+
+    seen = {banded.positive(bands, np.array([1.0 - t, t])): least(t) > 0 for t in np.linspace(0, 0.99, 40)}
+    assert seen == {True: True, False: False}
+
+
+def test_condition_of_a_known_spectrum() -> None:
+    """Eigenvalues 1e-3 to 1e4, of both signs, in a random basis: condition 1e7."""
+    rng = np.random.default_rng(0)
+    values = np.array([1e-3, -0.5, 1.0, 2.0, -30.0, 1e4])
+    Q = np.linalg.qr(rng.standard_normal((6, 6)))[0]
+    K = PETSc.Mat().createDense((6, 6), array=Q @ np.diag(values) @ Q.T, comm=MPI.COMM_SELF).convert("aij")
+    K.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+    factors = Factorisation(MPI.COMM_SELF)
+    factors.factor(K)
+    assert condition_estimate(factors, 6, MPI.COMM_SELF) == pytest.approx(1e7, rel=1e-6)

@@ -115,3 +115,14 @@ def snap_back(k: float, c: float) -> Toy:
         return np.array([[k, -k, 0.0], [-k, k + slope, -v], [0.0, -v, c - x + 3 * v**2]])
 
     return Toy(gradient, hessian, 3)
+
+
+def matrix(entries: np.ndarray) -> PETSc.Mat:
+    """A symmetric matrix of PETSc's from all its entries."""
+    n = len(entries)
+    A = PETSc.Mat().createAIJ([n, n], comm=PETSc.COMM_SELF)
+    A.setUp()
+    A.setValues(range(n), range(n), entries.ravel())
+    A.assemble()
+    A.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+    return A

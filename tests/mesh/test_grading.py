@@ -8,10 +8,10 @@ from conftest import CASES
 from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.mesh.grid import Grid
 from magshell_fenicsx.mesh.triangulation import triangulate
-from magshell_fenicsx.problem.planner import make_plan
 
 Array = NDArray[np.float64]
 
@@ -56,9 +56,9 @@ def test_estimate_of_cells_where_a_formula_varies(of_place: str) -> None:
 
 def estimated(case: Case) -> float:
     """The estimate over the number of cells that gmsh makes."""
-    plan = make_plan(case)
-    cells = len(triangulate(plan.shape, plan.size, plan.points, plan.embedding).cells)
-    return plan.size.cells(plan.shape) / cells
+    problem = make_problem(case)
+    cells = len(triangulate(problem.shape, problem.size, problem.points, problem.embedding).cells)
+    return problem.size.cells(problem.shape) / cells
 
 
 PLATE = {"geometry": "plate", "length": 1, "width": 1, "thickness": 0.005, "poisson_ratio": 0.3}
@@ -67,10 +67,10 @@ PLATE = {"geometry": "plate", "length": 1, "width": 1, "thickness": 0.005, "pois
 def lines(**sections: Any) -> list[Array]:
     """Those of a grid across its axes."""
     data = {"shell": PLATE, "boundary": {"left": "clamped"}, "symmetry": "none", **sections}
-    plan = make_plan(Case.from_source(Source("test", data)))
-    assert isinstance(plan.shape, Grid)
-    assert plan.shape.cells == pytest.approx(len(plan.triangulated().cells), rel=0.35)
-    return [plan.shape.lines(axis, list(plan.points.values())) for axis in range(2)]
+    problem = make_problem(Case.from_source(Source("test", data)))
+    assert isinstance(problem.shape, Grid)
+    assert problem.shape.cells == pytest.approx(len(problem.triangulated().cells), rel=0.35)
+    return [problem.shape.lines(axis, list(problem.points.values())) for axis in range(2)]
 
 
 def test_grid_lines_are_dense_where_an_edge_is_held() -> None:

@@ -11,8 +11,7 @@ from mpi4py import MPI
 
 from magshell_fenicsx.mesh.midsurface import distribute
 from magshell_fenicsx.mesh.patch import MeshError, PatchMesh, check_orientation
-from magshell_fenicsx.mesh.shapes import DiscShape
-from magshell_fenicsx.mesh.sphere import flat, sphere
+from magshell_fenicsx.mesh.shapes import DiscShape, flat, sphere
 from magshell_fenicsx.mesh.triangulation import triangulate
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.parts.imperfections.dimple import Dimple

@@ -13,14 +13,14 @@ from many import make_points, sweep
 from mpi4py import MPI
 
 from magshell_fenicsx import Case, Scene
+from magshell_fenicsx.case.check import describe
+from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.input.source import CaseError, Source
 from magshell_fenicsx.mesh.msh import MeshFile, read_msh
 from magshell_fenicsx.mesh.patch import MeshError, PatchMesh, check_orientation
 from magshell_fenicsx.models.shell.patterns import ByPatch
-from magshell_fenicsx.problem.check import describe
-from magshell_fenicsx.problem.planner import make_plan
+from magshell_fenicsx.public import run
 from magshell_fenicsx.runs.files import AlreadyComplete
-from magshell_fenicsx.runs.run import run
 from magshell_fenicsx.studies.points import parse_axis
 
 Script = Callable[[], None]
@@ -270,7 +270,7 @@ def test_wrong_unit_is_told(model: Any, tmp_path: Path, unit: str, times: str | 
     gmsh.write(str(tmp_path / "part.msh"))
     shell = {"geometry": "mesh", "file": str(tmp_path / "part.msh"), "unit": unit, "radius": "1 mm"}
     shell |= {"thickness": "10 um", "youngs_modulus": "1 MPa", "poisson_ratio": 0.3}
-    told = make_plan(Case.model_validate({"shell": shell, "boundary": {"bottom": "clamped"}})).warning
+    told = make_problem(Case.model_validate({"shell": shell, "boundary": {"bottom": "clamped"}})).warning
     assert (told is None) == (times is None)
     assert (times or "") in (told or "")
 
@@ -355,7 +355,7 @@ def test_a_mesh_file_is_beside_its_case(case_file: Path) -> None:
     """Also in a sweep, from any folder; the path stays as it was written."""
     points = make_points(case_file, [parse_axis("shell.poisson_ratio=0.2,0.3")])
     for case in (Case.load(case_file), *(point.case for point in points)):
-        assert len(make_plan(case).triangulated().cells) == 2
+        assert len(make_problem(case).triangulated().cells) == 2
         assert case.model_dump()["shell"]["file"] == "parts/part.msh"
 
 

@@ -10,15 +10,15 @@ from dolfinx import fem
 from mpi4py import MPI
 
 from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.check import describe
+from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.input.source import CaseError, Source
 from magshell_fenicsx.mesh.midsurface import Midsurface
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.parts.pressure.openings import moving
-from magshell_fenicsx.problem.check import describe
 from magshell_fenicsx.problem.limits import refuse_beyond_memory
-from magshell_fenicsx.problem.planner import make_plan
-from magshell_fenicsx.simulate.build import build_midsurface
+from magshell_fenicsx.simulate.scene import build_midsurface
 
 COMMON = {"thickness": 0.01, "poisson_ratio": 0.3}
 THIRD = {"azimuth": [0, 120]}
@@ -67,13 +67,13 @@ SURFACES: list[tuple[dict[str, Any], float, set[str]]] = [
 
 def built(shell: dict[str, Any], **sections: Any) -> Midsurface:
     data = {"shell": {**COMMON, **shell}, "boundary": {}, "mesh": {"size": 0.4}, "symmetry": "none", **sections}
-    return build_midsurface(make_plan(Case.from_source(Source("test", data))), MPI.COMM_SELF)
+    return build_midsurface(make_problem(Case.from_source(Source("test", data))), MPI.COMM_SELF)
 
 
 @pytest.mark.parametrize(("shell", "area", "edges"), SURFACES)
 def test_area_and_edges(shell: dict[str, Any], area: float, edges: set[str]) -> None:
     surface = built(shell)
-    R = make_plan(Case.from_source(Source("test", {"shell": {**COMMON, **shell}, "boundary": {}}))).length
+    R = make_problem(Case.from_source(Source("test", {"shell": {**COMMON, **shell}, "boundary": {}}))).length
     r0 = surface.placement(fem.functionspace(surface.mesh, ("Lagrange", 4, (3,))))
     dx = ufl.dx(metadata={"quadrature_degree": 8})
     found = fem.assemble_scalar(fem.form(kin.area_ratio(kin.jet(r0, surface.mesh)) * dx))
@@ -126,7 +126,7 @@ def test_named_points_beside_the_surface(shell: dict[str, Any], place: list[floa
     edge = "root" if shell["geometry"] == "strip" else "left"
     data = {"shell": COMMON | shell, "boundary": {edge: "clamped"}, "points": {"A": place}}
     with pytest.raises(CaseError, match=re.escape(said)):
-        make_plan(Case.model_validate(data))
+        make_problem(Case.model_validate(data))
 
 
 @pytest.mark.parametrize(("shell", "place"), POINTS)
@@ -185,7 +185,7 @@ def test_mistakes_are_named(changes: dict[str, Any], said: str) -> None:
             section = section[name]
         section[last] = value
     with pytest.raises(CaseError) as error:
-        make_plan(Case.from_source(Source("test", data)))
+        make_problem(Case.from_source(Source("test", data)))
     assert said in str(error.value)
 
 
@@ -200,11 +200,11 @@ def test_units_are_turned_into_si() -> None:
     shell = {"geometry": "cylinder", "radius": "25 mm", "length": "5 cm", "thickness": "0.5 mm", "poisson_ratio": 0.5}
     case = Case.from_source(Source("test", {"shell": shell, "boundary": {"bottom": "clamped"}}))
     assert case.shell.R_over_h == pytest.approx(50)
-    assert make_plan(case).length == pytest.approx(0.025)
+    assert make_problem(case).length == pytest.approx(0.025)
 
 
 def test_points_loads_and_sizes_may_have_units() -> None:
-    """The same plan as of numbers in SI."""
+    """The same problem as of numbers in SI."""
     shell = {"geometry": "cylinder", "radius": "25 mm", "length": "5 cm", "thickness": "0.5 mm", "poisson_ratio": 0.5}
     shell["youngs_modulus"] = "1 MPa"
     loads = [
@@ -215,12 +215,12 @@ def test_points_loads_and_sizes_may_have_units() -> None:
         ({"over": "all", "pressure": "6 kPa"}, {"over": "all", "pressure": 6e3}),
     ]
 
-    def plan(i: int, place: list[Any], size: Any) -> Any:
+    def problem(i: int, place: list[Any], size: Any) -> Any:
         dead = {"kind": "dead", "loads": [load[i] for load in loads], "factor": 1}
         data = {"shell": shell, "boundary": {"bottom": "clamped"}, "points": {"A": place}, "mesh": {"size": size}}
-        return make_plan(Case.from_source(Source("test", {**data, "loading": dead})))
+        return make_problem(Case.from_source(Source("test", {**data, "loading": dead})))
 
-    texts, numbers = plan(0, ["25 mm", 0, "5 cm"], "5 mm"), plan(1, [0.025, 0, 0.05], 0.005)
+    texts, numbers = problem(0, ["25 mm", 0, "5 cm"], "5 mm"), problem(1, [0.025, 0, 0.05], 0.005)
     for here, there in zip(texts.loads.all_dead, numbers.loads.all_dead, strict=True):
         assert type(here) is type(there)
         for value, other in zip(vars(here).values(), vars(there).values(), strict=True):
@@ -239,7 +239,7 @@ def test_a_half_is_not_told_to_take_half(symmetry: str) -> None:
     }
     case = Case.from_source(Source("test", data))
     with pytest.raises(CaseError) as error:
-        refuse_beyond_memory(case, make_plan(case))
+        refuse_beyond_memory(make_problem(case))
     assert "unknowns" in str(error.value)
     assert ("symmetry: half halves it" in str(error.value)) == (symmetry == "none")
 
@@ -274,7 +274,7 @@ def test_names_are_known_before_anything_is_solved(shell: dict[str, Any], sectio
     """`magshell check` and `run` make the same triangulation."""
     data = {"shell": {**COMMON, **shell, "youngs_modulus": 1}, "boundary": {}, "mesh": {"size": 0.4}, **sections}
     with pytest.raises(MeshError, match=said):
-        make_plan(Case.from_source(Source("test", data))).triangulated()
+        make_problem(Case.from_source(Source("test", data))).triangulated()
     with pytest.raises(CaseError, match=said):
         describe(Case.from_source(Source("test", data)))
 
@@ -313,10 +313,10 @@ def pressed(shell: dict[str, Any], boundary: dict[str, Any]) -> Case:
 
 
 def open_to_pressure(shell: dict[str, Any], boundary: dict[str, Any]) -> list[str]:
-    plan = make_plan(pressed(shell, boundary))
-    edges = plan.triangulated().edges
+    problem = make_problem(pressed(shell, boundary))
+    edges = problem.triangulated().edges
     sides = {name: {tuple(pair) for pair in np.sort(edge, axis=1).tolist()} for name, edge in edges.items()}
-    return moving(sides, plan.conditions)
+    return moving(sides, problem.conditions)
 
 
 @pytest.mark.parametrize(("shell", "boundary", "edge"), OPEN)

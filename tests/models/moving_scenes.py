@@ -8,8 +8,8 @@ import numpy as np
 
 from magshell_fenicsx import Case, Scene
 from magshell_fenicsx.assembly.motion import Motion
+from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.models.shell.parameters import Move
-from magshell_fenicsx.problem.planner import make_plan
 
 NONE = np.zeros(3)
 PLATE = {"geometry": "plate", "length": 1.0, "width": 0.1, "thickness": 0.01, "youngs_modulus": 1.2e8}  # E I = 1
@@ -33,5 +33,5 @@ def moving_scene(
     """A scene whose loads are these motions, and what its other sections say."""
     data = {"shell": {"poisson_ratio": 0.0, **shell}, "boundary": boundary, "symmetry": symmetry, **sections}
     case = Case.model_validate(data)
-    plan = make_plan(case)
-    return Scene(case, plan=replace(plan, loads=replace(plan.loads, moves=moves)))
+    problem = make_problem(case)
+    return Scene(replace(problem, loads=replace(problem.loads, moves=moves)))

@@ -150,7 +150,7 @@ def test_force_and_torque_on_a_magnetised_cap() -> None:
         loading=steps,
         mesh={"degree": 4, "refinement": 0.3},
     )
-    mu = {**cap.unloaded().mu, "lambda_m": cap.case.lambda_m}
+    mu = {**cap.unloaded().mu, "lambda_m": cap.problem.lambda_m}
     found = cap.observe(State(cap.model.zero(), mu))
     force = [found[f"source_force_move_{k}"] for k in axes]
     torque = [found[f"source_torque_turn_{k}"] for k in axes]
@@ -209,7 +209,7 @@ def test_models_agree() -> None:
             loading=[{"kind": "field", "points": 1}, {"kind": "source", "move": [0, 0, -0.01], "points": 1}],
             **sections,
         )
-        mu = dict.fromkeys(one.unloaded().mu, 0.5) | {"lambda_m": one.case.lambda_m}
+        mu = dict.fromkeys(one.unloaded().mu, 0.5) | {"lambda_m": one.problem.lambda_m}
         found.append(one.observe(State(one.model.zero(), mu))["source_force"])
     assert found[1:3] == pytest.approx([found[0]] * 2, rel=1e-5)
     assert found[3] == pytest.approx(found[0], rel=2e-3)

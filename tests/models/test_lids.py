@@ -41,11 +41,11 @@ def test_a_rigid_motion(symmetry: str, model: str, motion: dict[str, Any]) -> No
     assert before["volume_change"] < -1e-3
     for column in ("volume_change", "energy"):
         assert after[column] == pytest.approx(before[column], rel=1e-6)  # as exact as a point of the path
-    plan = scene.plan
-    force = 0.1 * plan.material.classical_pressure / plan.material.h * AREA  # over E h R
+    problem = scene.problem
+    force = 0.1 * problem.material.classical_pressure / problem.material.h * AREA  # over E h R
     if model == "solid":
-        force *= (1 + plan.material.h / 2) ** 2  # its outer face is pressed
-    there = reactions(scene.model, moved.point.state, plan.mirror)["rim"]
+        force *= (1 + problem.material.h / 2) ** 2  # its outer face is pressed
+    there = reactions(scene.model, moved.point.state, problem.mirror)["rim"]
     turn = np.linalg.norm(motion.get("turn", 0.0))
     np.testing.assert_allclose(there.force / force, [np.sin(turn), 0, np.cos(turn)], atol=2e-3)
     assert np.abs(there.moment).max() < 1e-9 * force or model == "solid"

@@ -25,8 +25,8 @@ def at_end(scene: Scene, name: str, target: float = 1.0) -> State:
 
 def found(scene: Scene, state: State) -> dict[str, Reaction]:
     """Forces over E R^2 in place of E h R."""
-    h = scene.plan.material.h
-    whole = reactions(scene.model, state, scene.plan.mirror)
+    h = scene.problem.material.h
+    whole = reactions(scene.model, state, scene.problem.mirror)
     return {name: Reaction(h * r.force, h * r.moment, r.point) for name, r in whole.items()}
 
 
@@ -98,7 +98,7 @@ def test_large_motion() -> None:
     end, m = here["right"], turn.motion
     arm = end.point - (m.centre + m.shift)
     power = end.force @ m.shift + (end.moment + np.cross(arm, end.force)) @ m.turn
-    conjugate = scene.model.system.potential(state.u, state.mu, "turn") * scene.plan.material.h
+    conjugate = scene.model.system.potential(state.u, state.mu, "turn") * scene.problem.material.h
     assert power == pytest.approx(conjugate, rel=1e-9)
 
 

@@ -14,6 +14,7 @@ import pytest
 from PIL import Image
 
 import magshell_fenicsx as ms
+from magshell_fenicsx.case.opened import document_of
 from magshell_fenicsx.input.source import CaseError, Source
 from magshell_fenicsx.output.fields.surface import Surface
 from magshell_fenicsx.output.fields.vtu import read_point
@@ -171,7 +172,7 @@ def test_pictures_are_no_part_of_what_is_resumed(tmp_path: Path) -> None:
     shell = {"geometry": "strip", "radius_to_thickness": 50, "width": 0.2, "poisson_ratio": 0}
     plain: dict[str, Any] = {"shell": shell, "boundary": {"root": "clamped"}}
     first, other, finer = (
-        ms.Case.from_source(Source("test", plain | more))
+        document_of(ms.Case.from_source(Source("test", plain | more)))
         for more in ({}, {"output": {"dpi": 90}}, {"mesh": {"degree": 3}})
     )
     refuse_other(identity(first), other, tmp_path)

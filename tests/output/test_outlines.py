@@ -6,8 +6,8 @@ import numpy as np
 from conftest import CASES
 
 from magshell_fenicsx import Case
+from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.output.fields.vtu import DRIVEN, STILL, outlines, read_outlines, vtp_content
-from magshell_fenicsx.problem.planner import make_plan
 
 TURN = "{kind: source, name: roll, turn: {axis: [0, 1, 0], angle: 90}}"
 STEPS = f"loading=[{{kind: field}}, {{kind: source, move: [0, 0, 6 mm]}}, {TURN}]"
@@ -16,10 +16,10 @@ POSITION = np.array([40.0, 0, -60]) / 30
 
 def test_outlines(tmp_path: Path) -> None:
     """A cylinder of 20 x 10 mm: still, then half way up and lying on its side; the files hold the same lines."""
-    still = outlines(make_plan(Case.load(CASES / "magnet_strip.yaml")).loads, {}, 0.0)
+    still = outlines(make_problem(Case.load(CASES / "magnet_strip.yaml")).loads, {}, 0.0)
     size = np.ptp(np.concatenate(still) - POSITION, axis=0) * 30
     np.testing.assert_allclose(size, [20, 20, 10], atol=1e-12)
-    driven = make_plan(Case.load(CASES / "magnet_strip.yaml", [STEPS])).loads
+    driven = make_problem(Case.load(CASES / "magnet_strip.yaml", [STEPS])).loads
     lying = outlines(driven, {"source": 0.5, "roll": 1.0}, 0.0)
     middle = (np.concatenate(lying).max(axis=0) + np.concatenate(lying).min(axis=0)) / 2
     np.testing.assert_allclose(middle - POSITION, [0, 0, 0.1], atol=1e-12)
@@ -43,6 +43,6 @@ def test_bodies_are_where_their_approach_has_brought_them() -> None:
         ("kind: box, size: [0.2, 0.3, 0.1], edge: 0.01, axis: [1, 0, 0]", 0.2),
     ):
         case = Case.load(CASES / "ball_contact.yaml", [f"bodies={{ball: {{{kind}}}}}"])
-        lines = np.concatenate(outlines(make_plan(case).loads, {"approach": 3.0}, h))
+        lines = np.concatenate(outlines(make_problem(case).loads, {"approach": 3.0}, h))
         np.testing.assert_allclose(lines[:, 2].min(), 1 + h / 2 - 3 * h, atol=1e-12)
         np.testing.assert_allclose(np.ptp(lines, axis=0)[:2].min(), wide, rtol=3e-3)

@@ -16,7 +16,6 @@ from dolfinx.mesh import CellType
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from magshell_fenicsx.case.output import OutputSection
 from magshell_fenicsx.output.fields.surface import Surface, completed
 from magshell_fenicsx.output.fields.vtu import About, FieldSeries, point_file, read_vtu
 from magshell_fenicsx.output.pictures.captions import caption
@@ -27,6 +26,7 @@ from magshell_fenicsx.output.pictures.picture import PICTURES, drawn_arrows, fig
 from magshell_fenicsx.output.pictures.view import Camera, Seen, Window, axes_on_screen, tessellated, towards
 from magshell_fenicsx.output.store.known import pole_of
 from magshell_fenicsx.output.store.table import Row
+from magshell_fenicsx.problem.wanted import OutputSection
 
 Array = NDArray[np.float64]
 STYLE = OutputSection()

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 import magshell_fenicsx as ms
-from magshell_fenicsx.case.output import OutputSection
 from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.output.fields.gathering import gatherer
 from magshell_fenicsx.output.fields.surface import Surface, completed
 from magshell_fenicsx.output.pictures.picture import figures
 from magshell_fenicsx.output.pictures.view import Camera
+from magshell_fenicsx.problem.wanted import OutputSection
 
 ABOVE = np.array([0.0, -1, 1])
 

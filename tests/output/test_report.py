@@ -11,8 +11,7 @@ from typing import Any
 import pytest
 
 from magshell_fenicsx.output.report.report import write_report
-from magshell_fenicsx.output.report.report_path import path_table
-from magshell_fenicsx.output.report.verdict import verdict
+from magshell_fenicsx.output.report.verdict import path_table, verdict
 from magshell_fenicsx.output.store.table import COLUMNS
 
 SUMMARY: dict[str, Any] = {

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.case.output import OutputSection
+from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.output.fields.surface import Surface
 from magshell_fenicsx.output.fields.vtu import outlines
 from magshell_fenicsx.output.pictures.captions import write_numbers
@@ -16,7 +16,7 @@ from magshell_fenicsx.output.pictures.colours import contact_region, moments
 from magshell_fenicsx.output.pictures.layout import Arrow, Panel
 from magshell_fenicsx.output.pictures.picture import far_said, figures
 from magshell_fenicsx.output.pictures.view import Camera, Window, deflected_place, near_outlines, run_camera, towards
-from magshell_fenicsx.problem.planner import make_plan
+from magshell_fenicsx.problem.wanted import OutputSection
 
 Array = NDArray[np.float64]
 ABOVE = Camera(np.array([0.0, -1e-6, 1.0]))
@@ -69,7 +69,7 @@ def test_a_magnet_beside_a_strip(farther: float, drawn: bool) -> None:
     flat = grid(9)
     r0 = np.column_stack([(flat.r0[:, 0] + 1) / 2, flat.r0[:, 1] / 12, flat.r0[:, 2]])
     lift = 0.18 * r0[:, :1] ** 2 * [0, 0, 1]
-    lines = outlines(make_plan(Case.load(CASES / "magnet_past_strip.yaml")).loads, {"source": 0.0}, 0.0)
+    lines = outlines(make_problem(Case.load(CASES / "magnet_past_strip.yaml")).loads, {"source": 0.0}, 0.0)
     lines = tuple(line + np.array([farther, 0, 0]) for line in lines)
     surface = Surface(r0, lift, flat.n0, flat.cells, {}, lines)
     assert len(near_outlines(surface)) == (len(lines) if drawn else 0)

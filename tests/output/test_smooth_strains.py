@@ -122,7 +122,7 @@ def test_fields_jump_between_patches() -> None:
     found = unmoved(scene, natural_curvature=1.0)
     M = found.fields["M_2"]
     held = np.abs(M) > 1e-9
-    size = -0.4 * (1 + scene.case.shell.poisson_ratio)  # R is 1 mm
+    size = -0.4 * (1 + scene.problem.context.shell.poisson_ratio)  # R is 1 mm
     assert M[held] == pytest.approx(size)
     assert found.fields["M_1"][held] == pytest.approx(size)
     seam = {tuple(x) for x in np.round(found.r0[held], 9)} & {tuple(x) for x in np.round(found.r0[~held], 9)}
@@ -142,7 +142,7 @@ def test_a_meridian_has_two_circles_where_the_remanence_jumps() -> None:
         magnetic={"lambda_m": 1e-6, "remanent": remanent},
         loading={"kind": "pressure", "control": "load", "until": "target", "pressure": 0.01},
     )
-    assert scene.plan.axisymmetric
+    assert scene.problem.axisymmetric
     found = unmoved(scene)
     assert np.abs(found.fields["Br"][:, 2]) == pytest.approx(1.0)
     places, times = np.unique(np.round(found.r0, 9), axis=0, return_counts=True)

@@ -6,10 +6,12 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import CASES
+from scipy.special import airy
 
 import magshell_fenicsx as ms
+from magshell_fenicsx.case.check import describe
+from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.input.source import Source
-from magshell_fenicsx.problem.check import describe
 from magshell_fenicsx.quantities.registry import quantity
 
 DISC = {"geometry": "disc", "radius_to_thickness": 50, "poisson_ratio": 0.3}
@@ -31,7 +33,7 @@ def test_plate_under_a_force() -> None:
     """Hertz 1884, in Timoshenko and Woinowsky-Krieger, Theory of Plates and Shells, section 57: w0 = F l^2/(8 D)."""
     case = ms.Case.load(CASES / "foundation.yaml")
     found, l_over_R, force = end(case), 1 / 12, 1e-4
-    assert case.parts["foundation"].terms(case.scales)[0].value == pytest.approx(1e-4 / (12 * 0.91) / l_over_R**4, 1e-6)
+    assert case.foundation.terms(case.context.scales)[0].value == pytest.approx(1e-4 / (12 * 0.91) / l_over_R**4, 1e-6)
     assert found["w_over_h"] == pytest.approx(2 * pi * force * l_over_R**2 / 8 * 100, rel=1e-5)
     assert found["foundation_force"] == pytest.approx(force, rel=2e-3)  # the rim takes the rest
 
@@ -61,7 +63,7 @@ def beam(beta: float) -> tuple[dict[str, float], float, float]:
         },
         mesh={"degree": 4, "size": 0.05},
     )
-    return end(case), P * beta / (2 * K * width) / h, P / 2 / (E * h) / case.scales.force
+    return end(case), P * beta / (2 * K * width) / h, P / 2 / (E * h) / case.context.scales.force
 
 
 def test_long_beam_under_a_force() -> None:
@@ -126,7 +128,7 @@ def test_buckling_is_that_of_ones_own_energy() -> None:
     """The key of the case file and an `OwnTerm` with the same density."""
     case = ms.Case.load(CASES / "dimple_buckling.yaml", ["mesh.degree=3"])
     key = case.model_validate(case.model_dump() | {"foundation": {"stiffness": 0.02 / case.shell.R_over_h}})
-    density = key.parts["foundation"].terms(key.scales)[0].density
+    density = key.foundation.terms(key.context.scales)[0].density
     scene = ms.Scene(case, terms=[ms.OwnTerm("springs", density, (1.0,), 0.02)])
     *_, last = ms.trace(scene, "pressure", first=0.1)
     found = ms.run(key).knockdown
@@ -142,7 +144,7 @@ def test_units() -> None:
     held = {"boundary": {"equator": "clamped"}}
     si = load(shell=sphere | lengths, foundation={"stiffness": "0.3 MPa/m"}, **held)
     plain = load(shell=sphere | {"radius_to_thickness": 100}, foundation={"stiffness": 0.006}, **held)
-    terms = [case.parts["foundation"].terms(case.scales)[0] for case in (si, plain)]
+    terms = [case.foundation.terms(case.context.scales)[0] for case in (si, plain)]
     assert terms[0].value == pytest.approx(terms[1].value, rel=1e-12)
     assert terms[0].value == pytest.approx(0.6, rel=1e-12)
     assert terms[0].parameters[0] == pytest.approx(2 * pi * 1e-4 / 9, rel=1e-12)
@@ -162,7 +164,7 @@ def test_check_and_labels() -> None:
     [
         ({"stiffness": -1}, DISC, "foundation.stiffness: -1"),
         ({"stifness": 1}, DISC, "did you mean stiffness"),
-        ({}, DISC, "foundation.stiffness: is missing"),
+        ({}, DISC, "foundation: give stiffness, tangential, or both"),
         ({"stiffness": "1 N/m^3"}, DISC, "foundation.stiffness: has a unit"),
         ({"stiffness": "1 N/m"}, {**DISC, "radius": "1 m"}, "not convertible"),
         ({"stiffness": 1e30}, DISC, "foundation: foundation is 5e"),
@@ -176,3 +178,40 @@ def test_check_and_labels() -> None:
 def test_what_is_refused(foundation: dict[str, Any], shell: dict[str, Any], said: str) -> None:
     with pytest.raises(ms.CaseError, match=said):
         describe(load(shell=shell, boundary={"rim": "clamped"}, foundation=foundation))
+
+
+def test_bar_on_springs_that_stiffen() -> None:
+    """A bar with k_t = k x/L is pulled at x = L: u'' = b³ x u, so that u is a sum of Airy's functions of b x."""
+    h, pulled, b = 0.02, 1e-8, 2.0
+    case = load(
+        shell={
+            "geometry": "plate",
+            "length": 1,
+            "width": 0.2,
+            "thickness": h,
+            "youngs_modulus": 1,
+            "poisson_ratio": 0,
+        },
+        boundary={"left": {"held": ["z"]}, "right": {"held": ["z"]}},
+        points={"tip": [1, 0.1, 0]},
+        foundation={"tangential": b**3 * h, "factor": "x"},
+        loading={
+            "kind": "dead",
+            "control": "load",
+            "factor": 1,
+            "points": 1,
+            "loads": [{"edge": "right", "per_length": [pulled, 0, 0]}],
+        },
+        mesh={"degree": 4, "size": 0.1},
+    )
+    found = end(case)
+    (Ai, Ai1, Bi, Bi1), (_, free_A, _, free_B) = airy(b), airy(0.0)
+    u, slope = Ai * free_B - Bi * free_A, b * (Ai1 * free_B - Bi1 * free_A)
+    assert found["tip_ux"] == pytest.approx(pulled / h * u / slope, rel=1e-7)
+    assert found["foundation_tangential"] == pytest.approx(b**3)
+
+
+def test_springs_of_negative_stiffness() -> None:
+    case = load(shell=DISC, boundary={"rim": "clamped"}, foundation={"tangential": 1, "factor": "x"}, loading=PRESSED)
+    with pytest.raises(ms.CaseError, match=r"foundation\.factor: .x.: is -"):
+        make_problem(case)

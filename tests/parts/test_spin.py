@@ -8,10 +8,10 @@ import pytest
 
 import magshell_fenicsx as ms
 from magshell_fenicsx import Case
+from magshell_fenicsx.case.check import describe
+from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError, Source
-from magshell_fenicsx.problem.check import describe
-from magshell_fenicsx.problem.planner import make_plan
 
 SMALL = 1e-3  # ρ ω² R²/E: strains of the same order
 
@@ -118,7 +118,7 @@ def test_units() -> None:
     assert scene.sizes.values(row)["spin_per_s2"] == pytest.approx(omega**2)
     assert "spin_per_s2" in scene.extra_columns
     assert "centrifugal forces" in describe(case)
-    assert make_plan(case).axisymmetric
+    assert make_problem(case).axisymmetric
 
 
 @pytest.mark.parametrize(

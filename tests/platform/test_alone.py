@@ -24,11 +24,11 @@ if MPI.COMM_WORLD.rank == int(rank):
     if mode == "another":
         words += ["--set", "shell.poisson_ratio=0.31"]
     if mode == "alone":
-        import magshell_fenicsx.simulate.scene as scene
+        import magshell_fenicsx.case.planner as planner
         from magshell_fenicsx.input.source import CaseError
-        def make_plan(*arguments):
+        def make_problem(*arguments):
             raise CaseError("mesh: only here")
-        scene.make_plan = make_plan
+        planner.make_problem = make_problem
 sys.argv = ["magshell", *words]
 from magshell_fenicsx.cli import main
 main()

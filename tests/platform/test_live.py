@@ -21,9 +21,9 @@ from command import started
 from conftest import CASES
 
 from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.models.shell.parameters import Material
 from magshell_fenicsx.platform.terminal import LAUNCHERS, live_line
-from magshell_fenicsx.problem.planner import make_plan
 from magshell_fenicsx.quantities.registry import Sizes
 from magshell_fenicsx.runs.status import Aim, RunProgress, time_left
 
@@ -155,12 +155,12 @@ def test_a_narrow_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_time_left_of_a_resumed_run(monkeypatch: pytest.MonkeyPatch) -> None:
     """Known points took no time, so only new ones tell how long the rest takes; the field has no part in it."""
     case = Case.load(CASES / "indentation.yaml")
-    plan = replace(make_plan(case), material=Material(0.5, 0.01))
+    problem = replace(make_problem(case), material=Material(0.5, 0.01))
     told: list[str] = []
     clock = iter(range(0, 1000, 10))
     monkeypatch.setattr(time, "perf_counter", lambda: next(clock))
     model = SimpleNamespace(contacts={})
-    scene = SimpleNamespace(case=case, plan=plan, model=model, extra_columns=(), motions=(), sizes=Sizes())
+    scene = SimpleNamespace(case=case, problem=problem, model=model, extra_columns=(), motions=(), sizes=Sizes())
     progress = RunProgress(scene, told.append, -30.0)  # type: ignore[arg-type]
     here = SimpleNamespace(du=np.array([0.0, -0.5]))
     row = {"lambda_m": 0.0, "w_over_h": 0.0}

@@ -14,8 +14,8 @@ import pytest
 from command import magshell
 
 import magshell_fenicsx as ms
+from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.platform.reading import Files, read_whole, text_of
-from magshell_fenicsx.problem.planner import make_plan
 
 DATA = """
 shell: {{geometry: hemisphere, radius_to_thickness: 50, poisson_ratio: 0.3,
@@ -131,7 +131,7 @@ def _refused(folder: Path) -> None:
         case.write_text(KINDS[kind].format(file=name), encoding="utf-8")
         start = time.process_time()
         try:
-            make_plan(ms.Case.load(case))
+            make_problem(ms.Case.load(case))
             print(f"{kind} {name}: accepted", flush=True)
         except Exception as e:
             print(f"{type(e).__name__}: {str(e)!r}", f"{time.process_time() - start:.1f} s", flush=True)

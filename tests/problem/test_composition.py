@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 import magshell_fenicsx as ms
+from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.input.source import CaseError, Source
 from magshell_fenicsx.mesh.patch import MeshError
-from magshell_fenicsx.problem.planner import make_plan
 
 H, NU = 0.02, 0.3
 DIMPLE = {"kind": "dimple", "amplitude": 1.64, "width": 3.2}
@@ -80,8 +80,8 @@ def test_a_dead_force_along_the_normal_is_an_indentation(shape: str) -> None:
     loading = {"kind": "indentation", "at": {"point": "A"}, "control": "load", "force": 0.05, "points": 1}
     indented = case(shape, points=points, mesh=mesh, loading=loading)
     a, b = end(dead), end(indented)
-    assert make_plan(dead).half
-    assert make_plan(indented).half
+    assert make_problem(dead).half
+    assert make_problem(indented).half
     for column in ("w_over_h", "A_ux", "A_uy", "A_uz"):
         # the vertex's normal is that of flat triangles: to the square of their angle
         assert a[column] == pytest.approx(b[column], rel=2e-3, abs=1e-9)
@@ -104,7 +104,7 @@ def test_a_strip_bent_by_its_tip(symmetry: str, load: dict[str, Any]) -> None:
     loading = {"kind": "dead", "loads": loads, "factor": 1, "points": 1, "control": "load"}
     points, mesh = {"A": [1.0, 0.0, 0.0]}, {"degree": 3, "size": 0.1}
     asked = case("strip", {"poisson_ratio": 0}, points=points, loading=loading, symmetry=symmetry, mesh=mesh)
-    assert make_plan(asked).half == (symmetry == "half")
+    assert make_problem(asked).half == (symmetry == "half")
     assert end(asked)["A_uz"] == pytest.approx(1e-4, rel=1e-2)
 
 
@@ -147,14 +147,14 @@ MIRRORED: list[tuple[dict[str, Any], bool, bool]] = [
 @pytest.mark.parametrize(("sections", "turns", "mirrors"), MIRRORED)
 def test_each_part_leaves_its_symmetry(sections: dict[str, Any], turns: bool, mirrors: bool) -> None:
     asked = case("hemisphere", **sections)
-    plan = make_plan(asked)
-    assert (plan.axisymmetric, plan.half) == (turns, mirrors and not turns)
+    problem = make_problem(asked)
+    assert (problem.axisymmetric, problem.half) == (turns, mirrors and not turns)
     without_rotation = asked.model_copy(update={"symmetry": "half"})
     if mirrors:
-        assert make_plan(without_rotation).half
+        assert make_problem(without_rotation).half
     else:
         with pytest.raises(CaseError, match="no common mirror plane"):
-            make_plan(without_rotation)
+            make_problem(without_rotation)
 
 
 FORMULAS: list[tuple[dict[str, Any], bool]] = [
@@ -172,7 +172,7 @@ def test_formulas_are_tried_around_the_axis(formulas: dict[str, Any], turns: boo
     """A bump anywhere is seen, and a remanence across the meridians, which would twist the shell, is none of theirs."""
     shell = formulas if "thickness_factor" in formulas else {}
     magnetic = {} if shell else {"magnetic": {"lambda_m": 1e-3, "remanent": {"kind": "expression", **formulas}}}
-    assert make_plan(case("cylinder", shell, **magnetic)).axisymmetric == turns
+    assert make_problem(case("cylinder", shell, **magnetic)).axisymmetric == turns
 
 
 def test_a_patch_that_the_mesh_does_not_see() -> None:
@@ -203,7 +203,7 @@ def test_half_of_a_cylinder_dented_at_one_side() -> None:
     points, mesh = {"A": PLACES["cylinder"]}, {"degree": 3, "size": 0.3}
     loading = {"kind": "indentation", "at": {"point": "A"}, "depth": 1, "points": 1}
     asked = [case("cylinder", points=points, mesh=mesh, loading=loading, symmetry=s) for s in ("half", "none")]
-    assert [make_plan(each).half for each in asked] == [True, False]
+    assert [make_problem(each).half for each in asked] == [True, False]
     half, whole = map(end, asked)
     assert half["force"] == pytest.approx(whole["force"], rel=1e-2)
     assert half["A_uy"] / half["A_ux"] == pytest.approx(np.tan(0.5), rel=1e-9)

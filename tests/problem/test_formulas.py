@@ -3,11 +3,11 @@
 import pytest
 
 from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.check import describe
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.problem.check import describe
+from magshell_fenicsx.public import Scene
 from magshell_fenicsx.simulate.gradients.expected import Expected, refuse_unknown_results
 from magshell_fenicsx.simulate.results import differentiable
-from magshell_fenicsx.simulate.scene import Scene
 
 CASE = {
     "shell": {"geometry": "hemisphere", "radius_to_thickness": 50, "poisson_ratio": 0.3},
@@ -44,11 +44,11 @@ def test_a_natural_shape_that_is_none(natural):
 def test_unknown_results_and_parameters(section, said):
     case = Case.model_validate(CASE | section)
     with pytest.raises(CaseError, match=said):
-        refuse_unknown_results(case, case.design.named if case.design else {})
+        refuse_unknown_results(case.problem(), case.design.named if case.design else {})
 
 
-def test_names_of_a_plan_are_those_of_its_scene():
+def test_names_of_a_problem_are_those_of_its_scene():
     case = Case.model_validate(CASE | {"reactions": True, "points": {"a": [0, 0, 1]}})
     scene = Scene(case)
-    expected = Expected(case, scene.plan)
+    expected = Expected(scene.problem)
     assert differentiable(expected, expected.unloaded()) == differentiable(scene, scene.unloaded())

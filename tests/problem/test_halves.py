@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from test_composition import NU, H, end
 
 import magshell_fenicsx as ms
+from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.input.source import CaseError, Source
 from magshell_fenicsx.models.modes import ShellModes
-from magshell_fenicsx.problem.planner import make_plan
 
 MATERIAL = {"thickness": H, "poisson_ratio": NU, "youngs_modulus": 1.0}
 AROUND = dict.fromkeys(("left", "right", "bottom", "top"), "clamped")
@@ -75,10 +75,10 @@ def test_half_and_whole_agree(name: str) -> None:
     """The size gives the whole a line in its plane: its mesh is the half's and the mirror image of that."""
     normal, sections = HALVES[name]
     asked = case("auto", **sections)
-    plan = make_plan(asked)
-    assert plan.mirror
+    problem = make_problem(asked)
+    assert problem.mirror
     across = np.array(normal) / np.linalg.norm(normal)
-    assert abs(plan.mirror.normal @ across) == pytest.approx(1)
+    assert abs(problem.mirror.normal @ across) == pytest.approx(1)
     half, whole = end(asked), end(case("none", **sections))
     for column in ("w_over_h", "w_pole_over_h", "volume_change", "energy", "bending"):
         assert half[column] == pytest.approx(whole[column], rel=1e-9, abs=1e-13)
@@ -98,7 +98,7 @@ def test_half_and_whole_solids_agree(name: str) -> None:
     """The same of bodies, with planes of any direction and away from the origin."""
     sections = HALVES[name][1] | {"model": "solid", "mesh": {"size": 0.26}}
     asked = case("auto", **sections)
-    assert make_plan(asked).mirror
+    assert make_problem(asked).mirror
     half, whole = end(asked), end(case("none", **sections))
     for column in ("w_over_h", "w_pole_over_h", "volume_change", "energy"):
         assert half[column] == pytest.approx(whole[column], rel=1e-8, abs=1e-13)
@@ -131,9 +131,9 @@ NOT_HALVED: list[dict[str, Any]] = [
 
 @pytest.mark.parametrize("sections", NOT_HALVED)
 def test_a_part_that_leaves_no_plane(sections: dict[str, Any]) -> None:
-    assert not make_plan(case("auto", **sections)).mirror
+    assert not make_problem(case("auto", **sections)).mirror
     with pytest.raises(CaseError, match="no common mirror plane"):
-        make_plan(case("half", **sections))
+        make_problem(case("half", **sections))
 
 
 def test_a_half_knows_the_modes_of_the_whole() -> None:
@@ -164,7 +164,7 @@ def written(
 
 def mesh_of(asked: ms.Case, file: Path) -> Path:
     """The triangles of a built-in half, and their mirror images, as an order-3 mesh file."""
-    patch = make_plan(asked).triangulated()
+    patch = make_problem(asked).triangulated()
     places, n = patch.embedding(patch.nodes), len(patch.nodes)
     on_plane = np.abs(places[:, 1]) < 1e-12
     places[on_plane, 1] = 0
@@ -204,7 +204,7 @@ def test_an_order_3_mesh_file_of_a_hemisphere(column: str, tmp_path: Path) -> No
     if column == "force":
         data |= {"points": {"A": [0, 0, 1]}, "loading": loading | {"at": {"point": "A"}}}
     half, whole = (ms.Case.from_source(Source("test", data | {"symmetry": s})) for s in ("auto", "none"))
-    assert (make_plan(half).half, make_plan(whole).half) == (True, False)
+    assert (make_problem(half).half, make_problem(whole).half) == (True, False)
     found = result(half, column)
     assert found == pytest.approx(result(built_in, column), rel=2e-4)
     assert found == pytest.approx(result(whole, column), rel=1e-9)
@@ -214,18 +214,18 @@ def test_an_order_3_mesh_file_of_a_hemisphere(column: str, tmp_path: Path) -> No
 def test_a_mesh_file_with_a_curve_in_its_plane(model: dict[str, Any], tmp_path: Path) -> None:
     """Other triangles on either side: one of them is half of the surface, if that is asked for."""
     grid = {"shell": MATERIAL | PLATE, "boundary": {}, "mesh": {"size": 0.25}, "symmetry": "none"}
-    patch = make_plan(ms.Case.from_source(Source("test", grid))).triangulated()
+    patch = make_problem(ms.Case.from_source(Source("test", grid))).triangulated()
     nodes = patch.embedding(patch.nodes)
     move = (nodes[:, 0] > 0.51) & (nodes[:, 0] < 0.99) & (nodes[:, 1] > 0.01) & (nodes[:, 1] < 0.49)
     nodes[move] += [0.03, 0.02, 0.0]
     file = written(tmp_path / "plate.msh", nodes, patch.cells, np.vstack(list(patch.edges.values())), order=1)
     shell = {"geometry": "mesh", "file": str(file), "radius": 1.0, **MATERIAL}
     sections = {"shell": shell, "boundary": {"rim": "clamped"}, "mesh": {}, **model}
-    assert not make_plan(case("auto", **sections)).mirror
+    assert not make_problem(case("auto", **sections)).mirror
     half, whole = (end(case(s, **sections)) for s in ("half", "none"))
     # the triangles differ: 5e-3 apart
     assert half["w_over_h"] == pytest.approx(whole["w_over_h"], rel=1e-2)
     nodes[(np.abs(nodes[:, 0] - 0.5) < 1e-9) & (nodes[:, 1] > 0.4), 0] += 0.01
     written(file, nodes, patch.cells, np.vstack(list(patch.edges.values())), order=1)
     with pytest.raises(CaseError, match="mesh a half, mirror the nodes"):
-        make_plan(case("half", **sections))
+        make_problem(case("half", **sections))

@@ -5,7 +5,7 @@ from matplotlib.mathtext import MathTextParser
 
 from magshell_fenicsx import Case, Scene, columns, follow
 from magshell_fenicsx.input.source import Source
-from magshell_fenicsx.output.report.report_path import path_table
+from magshell_fenicsx.output.report.verdict import path_table
 from magshell_fenicsx.output.store.table import COLUMNS
 from magshell_fenicsx.quantities.registry import AMPLITUDES, QUANTITIES, amplitude, axes_of, quantity
 

@@ -12,7 +12,7 @@ from conftest import CASES, draw_nothing
 from interrupted import check_same_path
 
 from magshell_fenicsx.output.store.checkpoint import framed
-from magshell_fenicsx.runs.interrupt import Watch
+from magshell_fenicsx.runs.running import Watch
 
 CASE = (CASES / "dimple_buckling.yaml", "--set=mesh={refinement: 0.3, degree: 2}")
 Damage = Callable[[bytes], bytes]

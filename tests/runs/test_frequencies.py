@@ -30,7 +30,7 @@ def lowest(scene: Scene, count: int) -> list[tuple[str, float]]:
 
 def of_plate(scene: Scene, count: int, label: str | None = None) -> list[float]:
     """omega R^2 sqrt(rho h/D)."""
-    D = scene.plan.material.bending_stiffness
+    D = scene.problem.material.bending_stiffness
     return [float(np.sqrt(value / D)) for name, value in lowest(scene, count) if label in (None, name)]
 
 

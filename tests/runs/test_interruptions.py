@@ -17,7 +17,7 @@ from mpi4py import MPI
 
 from magshell_fenicsx.output.store.durable import write_whole
 from magshell_fenicsx.output.store.table import COLUMNS, PathTable
-from magshell_fenicsx.runs.interrupt import Interrupted, Watch
+from magshell_fenicsx.runs.running import Interrupted, Watch
 
 LONG = (CASES / "pole_indentation.yaml", "--set=loading.points=30", "--set=mesh.refinement=0.5")
 # of a surface the checkpoint soon is larger than a file of fields

@@ -18,7 +18,7 @@ from magshell_fenicsx.models.modes import ShellModes
 from magshell_fenicsx.output.fields.gathering import gatherer
 from magshell_fenicsx.output.fields.modes import mode_surface, wave_number
 from magshell_fenicsx.output.fields.surface import Surface
-from magshell_fenicsx.runs.run import run
+from magshell_fenicsx.public import run
 from magshell_fenicsx.simulate.follow import follow
 
 # Clamped circular plate, k R of the modes with n nodal diameters: A. W. Leissa, Vibration of Plates,
@@ -33,7 +33,7 @@ def plate(symmetry: str) -> Scene:
 
 def wave_numbers(scene: Scene, count: int) -> list[tuple[str, float]]:
     """Label and k R = (lambda/D)^(1/4) of the lowest modes of the unloaded plate, thin enough for Kirchhoff's."""
-    D = scene.plan.material.bending_stiffness
+    D = scene.problem.material.bending_stiffness
     modes = ShellModes(scene.model).lowest(scene.unloaded(), count)
     return [(mode.label, (mode.eigenvalue / D) ** 0.25) for mode in modes]
 
@@ -157,7 +157,7 @@ def test_translation_as_a_wave() -> None:
 def test_shapes_have_their_nodal_diameters(symmetry: str) -> None:
     """Every mode of the plate has the waves around it that Leissa's table gives its frequency; odd ones are sines."""
     scene = plate(symmetry)
-    D = scene.plan.material.bending_stiffness
+    D = scene.problem.material.bending_stiffness
     modes = {
         k: mode
         for mode in ShellModes(scene.model).lowest(scene.unloaded(), 4)

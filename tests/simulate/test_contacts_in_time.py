@@ -8,9 +8,9 @@ import pytest
 from magshell_fenicsx import Case
 from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.parts.bodies.contact import mean_pressure, penalty
+from magshell_fenicsx.public import Scene
 from magshell_fenicsx.runs.rows import imbalances, rows
 from magshell_fenicsx.simulate.follow import follow
-from magshell_fenicsx.simulate.scene import Scene
 
 PLATE = {
     "shell": {"geometry": "disc", "radius_to_thickness": 50, "poisson_ratio": 0.3},

@@ -17,12 +17,12 @@ from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.parts.natural.planned import frame
 from magshell_fenicsx.parts.natural.shape import Natural
+from magshell_fenicsx.public import Scene
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.gradients.adjoint import adjoint_of_instability
 from magshell_fenicsx.simulate.gradients.gradient import gradient
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.results import functional
-from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.sensitivity import fold_at
 from magshell_fenicsx.simulate.shape_sensitivity import reshaped
 
@@ -62,13 +62,13 @@ class Direction:
 
 def changed(scene: Scene, name: str, along: Direction, c: float) -> Scene:
     """The scene with another field, on the same mesh."""
-    plan = scene.plan
+    problem = scene.problem
     if name == "deviation":  # the triangulation moves too, on which the penalty's width depends
-        return reshaped(scene, lambda x: c * along(x) * plan.material.h)
+        return reshaped(scene, lambda x: c * along(x) * problem.material.h)
     if name == "thickness":
         one = Thickness(lambda x, y, z: 1 + c * along(np.stack([x, y, z], axis=-1)))
-        return Scene(scene.case, scene.comm, replace(plan, thickness=one))
-    natural = plan.loads.natural or Natural(np.zeros(3), None, frame(scene.case.context, plan.azimuth))
+        return Scene(replace(problem, thickness=one))
+    natural = problem.loads.natural or Natural(np.zeros(3), None, frame(scene.problem.context, problem.azimuth))
     drawn = natural.curvature
 
     def curvature(r0: Array, n0: Array) -> Array:
@@ -76,21 +76,21 @@ def changed(scene: Scene, name: str, along: Direction, c: float) -> Scene:
         return np.asarray(known + c * np.stack([along(r0, i) for i in range(3)], axis=-1) * [1, 1, 0])
 
     other = Natural(curvature, natural.stretch, natural.along)
-    return Scene(scene.case, scene.comm, replace(plan, loads=replace(plan.loads, natural=other)))
+    return Scene(replace(problem, loads=replace(problem.loads, natural=other)))
 
 
 def growing(scene: Scene, along: Direction) -> Scene:
     """The scene with a deviation that grows with the amplitude "shape", on the same triangulation."""
-    plan = scene.plan
-    shape = {"shape": (lambda x: along(x) * plan.material.h,)}
-    return Scene(scene.case, scene.comm, replace(plan, loads=replace(plan.loads, growing=shape)))
+    problem = scene.problem
+    shape = {"shape": (lambda x: along(x) * problem.material.h,)}
+    return Scene(replace(problem, loads=replace(problem.loads, growing=shape)))
 
 
 def directional(scene: Scene, found: object, name: str, along: Direction) -> float:
     assert isinstance(found, FieldGradient)
     if name == "curvature":
         return found.along(np.stack([along(found.places, i) for i in range(3)], axis=-1) * [1, 1, 0])
-    unit = scene.plan.material.h if name == "deviation" else 1.0
+    unit = scene.problem.material.h if name == "deviation" else 1.0
     return found.along(unit * along(found.places)[..., None])
 
 
@@ -116,7 +116,7 @@ def test_state(tmp_path: Path, symmetry: str) -> None:
     (tmp_path / "strip.yaml").write_text(STRIP)
     scene = Scene(Case.load(tmp_path / "strip.yaml", [f"symmetry={symmetry}"]))
     last = solved(scene)
-    assert scene.plan.half == (symmetry == "auto")
+    assert scene.problem.half == (symmetry == "auto")
     found = {of: gradient(scene, last, of=of, by=FIELDS) for of in ("tip_uz", "energy")}
     for seed, name in enumerate(FIELDS):
         along = Direction(seed)

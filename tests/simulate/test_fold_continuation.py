@@ -15,8 +15,7 @@ from many import sweep
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.continuation.fold import Fold, FoldLost, Guess, find_fold
 from magshell_fenicsx.input.source import Source
-from magshell_fenicsx.runs.run import run
-from magshell_fenicsx.simulate.scene import Scene
+from magshell_fenicsx.public import Scene, run
 from magshell_fenicsx.simulate.transfer import _stretch, same_mesh, transfer
 from magshell_fenicsx.studies.folds import Continuation
 from magshell_fenicsx.studies.runner import Outcome
@@ -172,8 +171,8 @@ SHARED = """
 import json, sys
 from mpi4py import MPI
 from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.runs.run import run
-from magshell_fenicsx.simulate.scene import Scene
+from magshell_fenicsx.public import run
+from magshell_fenicsx.public import Scene
 from magshell_fenicsx.simulate.sensitivity import sensitivities
 from magshell_fenicsx.continuation.fold import Guess, find_fold, predict_fold
 from magshell_fenicsx.simulate.transfer import transfer

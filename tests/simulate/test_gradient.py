@@ -16,12 +16,12 @@ from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.input.tables import write_vectors
 from magshell_fenicsx.models.shell.controls import ByControls
 from magshell_fenicsx.models.shell.thickness import Thickness
+from magshell_fenicsx.public import Scene
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.gradients.adjoint import adjoint_of_instability
 from magshell_fenicsx.simulate.gradients.gradient import gradient
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.results import functional
-from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.sensitivity import fold_at
 
 Array = NDArray[np.float64]
@@ -48,18 +48,18 @@ def by_difference(f: Callable[[float], float], step: float) -> float:
 
 def with_values(scene: Scene, change: Array) -> Scene:
     """The scene with other vectors at the points of its remanence."""
-    loads = scene.plan.loads
+    loads = scene.problem.loads
     assert loads.magnetic
     assert isinstance(loads.magnetic.remanent, ByControls)
     other = replace(loads.magnetic.remanent, values=loads.magnetic.remanent.values + change)
-    plan = replace(scene.plan, loads=replace(loads, magnetic=replace(loads.magnetic, remanent=other)))
-    return Scene(scene.case, scene.comm, plan)
+    problem = replace(scene.problem, loads=replace(loads, magnetic=replace(loads.magnetic, remanent=other)))
+    return Scene(problem)
 
 
 def of_points(scene: Scene, found: object) -> Array:
     assert isinstance(found, FieldGradient)
-    assert scene.plan.loads.magnetic
-    remanent = scene.plan.loads.magnetic.remanent
+    assert scene.problem.loads.magnetic
+    remanent = scene.problem.loads.magnetic.remanent
     assert isinstance(remanent, ByControls)
     return remanent.pulled(found.places, found.forces)
 
@@ -91,7 +91,7 @@ def test_state_by_remanence_amplitude_and_number(strip: Path, symmetry: str) -> 
     others = {
         c: (moved, solved(moved)) for c in (-2e-3, -1e-3, 1e-3, 2e-3) for moved in [with_values(scene, c * CHANGE)]
     }
-    assert one.plan.half == scene.plan.half == (symmetry == "auto")
+    assert one.problem.half == scene.problem.half == (symmetry == "auto")
     for of in ("tip_uz", circle, "energy"):
         found = gradient(scene, last, of=of, by=["remanence"])["remanence"]
 
@@ -154,7 +154,7 @@ def test_fold_by_remanence_and_thickness(tmp_path: Path, settings: list[str]) ->
     assert np.sum(of_points(scene, found["remanence"]) * change) == pytest.approx(expected, rel=1e-5)
 
     def thicker(c: float) -> Scene:
-        return Scene(scene.case, scene.comm, replace(scene.plan, thickness=Thickness(lambda x, y, z: 1 + c * z**2)))
+        return Scene(replace(scene.problem, thickness=Thickness(lambda x, y, z: 1 + c * z**2)))
 
     thickness = found["thickness"]
     assert isinstance(thickness, FieldGradient)
@@ -174,7 +174,7 @@ def test_neutral_wave(tmp_path: Path) -> None:
     values = {c: adjoint_of_instability(other, solved(other)).value for c, other in near.items()}
     expected = by_difference(values.__getitem__, 1e-3)
     assert np.sum(of_points(scene, found["remanence"]) * change) == pytest.approx(expected, rel=1e-4)
-    whole = np.sum(of_points(scene, found["remanence"]) * scene.plan.loads.magnetic.remanent.values)  # type: ignore[union-attr]
+    whole = np.sum(of_points(scene, found["remanence"]) * scene.problem.loads.magnetic.remanent.values)  # type: ignore[union-attr]
     assert found["lambda_m"] == pytest.approx(whole / 0.001, rel=1e-9)  # the energy is linear in both
     assert found["magnetic.lambda_m"] == pytest.approx(found["lambda_m"], rel=1e-6)
 

@@ -10,9 +10,9 @@ from command import magshell
 
 from magshell_fenicsx import Case, Scene
 from magshell_fenicsx.input.source import CaseError, Source
+from magshell_fenicsx.public import run
 from magshell_fenicsx.runs.rows import columns, rows
-from magshell_fenicsx.runs.run import run
-from magshell_fenicsx.runs.snaps import snaps
+from magshell_fenicsx.runs.summary import snaps
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.trace import trace
 

@@ -8,7 +8,7 @@ from ufl.core.expr import Expr
 
 from magshell_fenicsx import Case, Jet, OwnTerm
 from magshell_fenicsx.input.source import Source
-from magshell_fenicsx.runs.run import run
+from magshell_fenicsx.public import run
 
 CAP = {
     "shell": {"geometry": "cap", "polar": 30, "radius": 1.0, "thickness": 0.016, "poisson_ratio": 0.3},

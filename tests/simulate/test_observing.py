@@ -11,9 +11,9 @@ from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.continuation.system import Skewed, State
 from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
+from magshell_fenicsx.public import Scene
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.record import Record
-from magshell_fenicsx.simulate.scene import Scene
 
 Array = NDArray[np.float64]
 MOMENT = [{"edge": "tip", "moment": -2 * pi * 0.01**3 / 12}]  # rolls a strip of length 1 up to a circle

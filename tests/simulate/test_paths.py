@@ -12,7 +12,7 @@ from conftest import CASES
 from scipy.special import ellipk
 
 from magshell_fenicsx import Case, Result
-from magshell_fenicsx.runs.run import run
+from magshell_fenicsx.public import run
 
 
 @lru_cache(maxsize=2)

@@ -13,10 +13,9 @@ from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.input.source import CaseError, Source
 from magshell_fenicsx.parts.imperfections.imperfection import flaws
 from magshell_fenicsx.parts.imperfections.modes import ModesSection, Round
-from magshell_fenicsx.runs.run import run
+from magshell_fenicsx.public import Scene, run
 from magshell_fenicsx.shape.outline import ground_of, outline
 from magshell_fenicsx.simulate.perfect import perfect_modes, with_modes
-from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.shape_sensitivity import changed
 
 Array = NDArray[np.float64]
@@ -53,14 +52,16 @@ def test_a_mode_computed_and_from_the_file_of_a_run(tmp_path: Path) -> None:
     )
     assert magshell("run", tmp_path / "perfect.yaml", "--out", tmp_path / "out").returncode == 0
     (file,) = (tmp_path / "out/fields").glob("mode_*_bifurcation_m4.vtu")
-    read, computed = case(0.1, file=f"out/fields/{file.name}", folder=tmp_path), with_modes(case(0.1), MPI.COMM_SELF)
-    (shape,) = computed.shell.imperfections[0].shapes  # type: ignore[union-attr]
+    read = case(0.1, file=f"out/fields/{file.name}", folder=tmp_path)
+    computed = with_modes(case(0.1).problem(), MPI.COMM_SELF)
+    (shape,) = computed.imperfections["imperfections.0"].shapes  # type: ignore[attr-defined]
     assert isinstance(shape, Round)
     assert shape.m == 4
     x = outline(read.shell).sample()
     x = x[x[:, 2] > 0.05]
     one, other = (
-        next(iter(flaws(c.imperfections, ground_of(c.shell)).values())).deviation(x) * 12 for c in (read, computed)
+        next(iter(flaws(sections, ground_of(read.shell)).values())).deviation(x) * 12
+        for sections in (read.imperfections, computed.imperfections)
     )
     assert np.abs(other).max() == pytest.approx(0.1, rel=0.05)
     assert alike(one, other, 1e-3)
@@ -75,8 +76,8 @@ def test_modes_of_half_and_full_shells() -> None:
     data = {"shell": {**shell, "poisson_ratio": 0.3}, "boundary": edges, "loading": load, "mesh": {"degree": 3}}
     panel = Case.from_source(Source("panel.yaml", data))
     x = outline(panel.shell).sample()
-    whole = perfect_modes(panel.model_copy(update={"symmetry": "none"}), 2, MPI.COMM_SELF)
-    halves = perfect_modes(panel, 2, MPI.COMM_SELF)
+    whole = perfect_modes(panel.model_copy(update={"symmetry": "none"}).problem(), 2, MPI.COMM_SELF)
+    halves = perfect_modes(panel.problem(), 2, MPI.COMM_SELF)
     for one, other in zip(whole, halves, strict=True):
         assert np.abs(other(x)).max() == pytest.approx(1, abs=0.04)
         assert alike(one(x), other(x), 0.02)
@@ -87,7 +88,7 @@ def test_modes_of_half_and_full_shells() -> None:
 
 
 def test_amplitudes_are_parameters() -> None:
-    found = changed(case(0.1, 0.2), "imperfections.0", "amplitudes.1", 0.05).shell.imperfections[0]
+    found = changed(case(0.1, 0.2).imperfections, "imperfections.0", "amplitudes.1", 0.05)["imperfections.0"]
     assert isinstance(found, ModesSection)
     assert found.amplitudes == [0.1, 0.25]
     assert found.parameters == ("amplitudes.0", "amplitudes.1")

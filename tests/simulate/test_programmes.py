@@ -17,8 +17,8 @@ from magshell_fenicsx import Record, columns, run
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError, Source
+from magshell_fenicsx.public import Scene
 from magshell_fenicsx.simulate.follow import follow
-from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.steps import stage_of
 
 FIELD = {"kind": "field", "until": "target", "points": 2}
@@ -75,7 +75,7 @@ def test_the_work_of_all_loads_is_the_change_of_the_energy() -> None:
         mu = [p.state.mu[name] for p in part]
         rates = [-system.load(p.state.u, p.state.mu, name) @ p.du for p in part[1:]]
         slopes = [p.dmu / rate for p, rate in zip(part[1:], rates, strict=True)]
-        stage = stage_of(scene, scene.case.programme[step - 1], part[0].state)
+        stage = stage_of(scene, scene.problem.programme[step - 1], part[0].state)
         start = stage.point(stage.begin(name, "load", part[0].state, 1.0)[1])
         begin = 1 / (-system.load(start.state.u, start.state.mu, name) @ start.du)
         work += scipy.interpolate.CubicHermiteSpline(q, mu, [begin, *slopes]).integrate(q[0], q[-1])
@@ -105,8 +105,8 @@ def test_stability_under_a_held_volume() -> None:
         counts[hold] = [record.point.negative_pivots for record in records if record.step == 2]
         for record in records[-6::2]:
             expected = unstable_at_constant_volume(scene, record.point.state)
-            sealed = scene.case.programme[1].load.model_copy(update={"hold": {"pressure": "conjugate"}})
-            step = type(scene.case.programme[1])(2, "force", "loading.1", sealed)
+            sealed = scene.problem.programme[1].load.model_copy(update={"hold": {"pressure": "conjugate"}})
+            step = type(scene.problem.programme[1])(2, "force", "loading.1", sealed)
             stage = stage_of(scene, step, record.point.state)
             assert stage.newton.factor_at(stage.enter(record.point.state)).negative_pivots == expected
     assert counts["load"][0] == counts["conjugate"][0] == 0
@@ -153,7 +153,7 @@ def test_forces_at_two_places() -> None:
     for steps in ((first, other), (other, first)):
         scene, records = history(case(*steps, **coarse))
         found = columns(scene, records)
-        assert scene.plan.half
+        assert scene.problem.half
         ends.append({name: found[name][-1] for name in ("w_over_h", "w_force_2_over_h", "force", "force_2", "energy")})
     here, there = ends
     assert (here["force"], here["force_2"]) == (1, 0.5)

@@ -1,11 +1,14 @@
 """What programs give to the package: paths in place of cases, numbers with units, and mistakes."""
 
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
 from conftest import CASES
 
 import magshell_fenicsx as ms
+from magshell_fenicsx.problem.problem import Document
 
 FILE = CASES / "dimple_buckling.yaml"
 UNITS = [
@@ -25,12 +28,37 @@ def with_units() -> ms.Scene:
 
 
 def test_the_path_of_a_case(plain: ms.Scene) -> None:
-    assert ms.Scene(str(FILE)).case.model_dump() == plain.case.model_dump()
+    assert ms.Scene(str(FILE)).problem.document.data == plain.problem.document.data
     assert ms.run(FILE).knockdown == pytest.approx(0.32623, rel=1e-4)
     with pytest.raises(ms.CaseError, match=r"nowhere\.yaml: cannot be read"):
         ms.Scene("nowhere.yaml")
-    with pytest.raises(ms.CaseError, match="give a Case or the path of a case file, not a dict"):
-        ms.run({"shell": 1})  # type: ignore[arg-type]
+    with pytest.raises(ms.CaseError, match="give a problem, a Case, its mapping or the path of a case file, not a int"):
+        ms.run(1)  # type: ignore[arg-type]
+
+
+def test_what_makes_a_problem(tmp_path: Path) -> None:
+    """A case, its mapping and the problem itself; a problem has its energies, and is remade by a case alone."""
+    case = ms.Case.load(FILE)
+    problem = case.problem()
+    assert ms.Scene(problem).problem is problem
+    data = {**case.origin.data, "mesh": {"degree": 3}}
+    assert ms.Scene(data).problem.mesh.degree == 3
+    assert problem.again({"mesh.degree": 3}).document.data["mesh"]["degree"] == 3
+    with pytest.raises(ms.CaseError, match="terms: a problem has its energies already"):
+        ms.Scene(problem, terms=[ms.OwnTerm("springs", lambda r0, u: u.r[2])])
+    with pytest.raises(ms.CaseError, match=r"mesh\.degree: needs the problem with another value"):
+        replace(problem, remade=None).again({"mesh.degree": 3})
+    with pytest.raises(ms.CaseError, match="give the problem a 'document'"):
+        ms.run(replace(problem, document=Document()), tmp_path)
+
+
+def test_names_of_earlier_versions(plain: ms.Scene) -> None:
+    with pytest.warns(DeprecationWarning, match=r"Scene\.problem"):
+        assert plain.plan is plain.problem
+    with pytest.warns(DeprecationWarning, match=r"Scene\.problem"):
+        assert plain.case.file_name == FILE.name
+    with pytest.warns(DeprecationWarning, match=r"Scene\(problem\)"):
+        assert ms.Scene(ms.Case.load(FILE), plan=plain.problem).problem is plain.problem
 
 
 @pytest.mark.parametrize(

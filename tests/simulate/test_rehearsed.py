@@ -97,13 +97,13 @@ def test_a_ramp_passes_a_fold() -> None:
     """Which it does late; the error of the whole motion is below the tolerance, or is said to be magnified."""
     scene, begin, rows = ramp(1e-2, errors="step")
     times = [row.clock["time"] for row in rows]
-    (said,) = departures(scene.case.programme, table_of(scene, rows))
+    (said,) = departures(scene.problem.programme, table_of(scene, rows))
     assert said.startswith("step 1: it passes unstable states")
     reference = exact(scene, begin.point.state.u, DRAG, lambda t: TOP * t / END, times)
     assert np.abs(reference[-1]).max() > 2
     for tolerance in TOLERANCES:
         scene, _, rows = ramp(tolerance, errors="motion")
-        assert not list(departures(scene.case.programme, table_of(scene, rows)))
+        assert not list(departures(scene.problem.programme, table_of(scene, rows)))
         error = errors(rows, reference)
         assert error.max() < tolerance
         assert 0.5 < max(row.point.error for row in rows) / error.max() < 2

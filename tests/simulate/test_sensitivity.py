@@ -12,8 +12,7 @@ from magshell_fenicsx.continuation.fold import Fold, Guess, find_fold
 from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.shell.patterns import WithinRims
-from magshell_fenicsx.runs.run import run
-from magshell_fenicsx.simulate.scene import Scene
+from magshell_fenicsx.public import Scene, run
 from magshell_fenicsx.simulate.sensitivity import sensitivities
 
 MERIDIAN = ["magnetic.lambda_m=0.001"]
@@ -59,7 +58,7 @@ def test_patches_add_up_to_the_field(settings: list[str], remanent: str) -> None
     """The magnetic energy is linear in the remanence and in lambda_m alike."""
     scene, fold = fold_of(*settings, f"magnetic.remanent={{{remanent}}}")
     found = sensitivities(scene, fold)
-    whole = scene.case.lambda_m * found["lambda_m"]
+    whole = scene.problem.lambda_m * found["lambda_m"]
     parts = [found["remanence dimple"], found["remanence rest"]]
     assert sum(parts) == pytest.approx(whole, rel=1e-9, abs=1e-12 * max(map(abs, parts)))
     assert min(map(abs, parts)) > 1e-3
@@ -71,7 +70,7 @@ def test_remanence_of_the_dimple() -> None:
     model, field = scene.model, scene.model.loads.magnetic
     assert isinstance(model, MeridianModel)
     assert field
-    rim, B = scene.plan.within["dimple"], np.array([0.0, 0.0, 1.0])
+    rim, B = scene.problem.within["dimple"], np.array([0.0, 0.0, 1.0])
 
     def stronger(change: float) -> float:
         loads = replace(model.loads, magnetic=replace(field, remanent=WithinRims(((rim, (1 + change) * B),), B)))

@@ -6,8 +6,8 @@ from conftest import CASES
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.continuation.fold import Guess, find_fold
 from magshell_fenicsx.continuation.system import State
+from magshell_fenicsx.public import Scene
 from magshell_fenicsx.simulate.follow import follow
-from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.sensitivity import fold_at, sensitivities
 from magshell_fenicsx.simulate.shape_sensitivity import Along, _deviation, changed, reshaped
 from magshell_fenicsx.simulate.transfer import transfer
@@ -27,7 +27,8 @@ def test_of_the_meridian(kind: str) -> None:
         key, _, number = name.rpartition(".")
 
         def value(change: float, key: str = key, number: str = number) -> float:
-            other = Scene(changed(scene.case, key, number, change))
+            value = getattr(scene.problem.imperfections[key], number) + change
+            other = Scene(scene.problem.again({f"shell.{key}.{number}": value}))
             u, phi = (transfer(scene, other, v) for v in (fold.state.u, fold.phi))
             return find_fold(other.newton, Guess(State(u, fold.state.mu), phi), "pressure").value
 
@@ -44,11 +45,12 @@ def test_beside_the_pole() -> None:
     scene = Scene(Case.load(CASES / "dimple_buckling.yaml", [*sets, "symmetry=none"]))
     *_, last = follow(scene)
     found = sensitivities(scene, fold := fold_at(scene, last))
-    key, old = "imperfections.0", _deviation(scene, scene.case, "imperfections.0")
+    key, old = "imperfections.0", _deviation(scene, scene.problem.imperfections, "imperfections.0")
     for number, step in (("amplitude", 0.004), ("width", 0.01), ("at.polar", 0.1), ("at.azimuth", 0.1)):
 
         def value(change: float, number: str = number) -> float:
-            other = reshaped(scene, Along(_deviation(scene, changed(scene.case, key, number, change), key), old, 1.0))
+            sections = changed(scene.problem.imperfections, key, number, change)
+            other = reshaped(scene, Along(_deviation(scene, sections, key), old, 1.0))
             u, phi = (transfer(scene, other, v) for v in (fold.state.u, fold.phi))
             return find_fold(other.newton, Guess(State(u, fold.state.mu), phi), "pressure").value
 

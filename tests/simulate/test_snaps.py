@@ -9,9 +9,9 @@ import pytest
 from magshell_fenicsx import Case, Scene
 from magshell_fenicsx.continuation.point import Point
 from magshell_fenicsx.input.source import CaseError, Source
-from magshell_fenicsx.runs.interrupt import Interrupted
 from magshell_fenicsx.runs.rows import columns, rows
-from magshell_fenicsx.runs.snaps import snaps
+from magshell_fenicsx.runs.running import Interrupted
+from magshell_fenicsx.runs.summary import snaps
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.trace import trace
 

@@ -7,10 +7,10 @@ from mpi4py import MPI
 
 from magshell_fenicsx import Case
 from magshell_fenicsx.input.source import Source
+from magshell_fenicsx.public import Scene
 from magshell_fenicsx.simulate.adapt.choice import Adapted
 from magshell_fenicsx.simulate.adapt.ending import by_path
 from magshell_fenicsx.simulate.adapt.tolerance import adapted
-from magshell_fenicsx.simulate.scene import Scene
 
 
 def plate(mesh: dict[str, Any], layers: int = 1) -> Case:
@@ -24,12 +24,12 @@ def plate(mesh: dict[str, Any], layers: int = 1) -> Case:
 def test_error_of_a_clamped_disc() -> None:
     """It is below the estimate, and that is below the tolerance."""
     case, told = plate({"tolerance": 0.02}), list[str]()
-    found = adapted(case, MPI.COMM_WORLD, told.append)
+    found = adapted(case.problem(), MPI.COMM_WORLD, told.append)
     assert found.best.estimate <= 0.02
     assert len(told) == len(found.rounds)
     exact = by_path(Scene(plate({"refinement": 3 * found.best.refinement}, 3))).value
     error = abs(found.best.result / exact - 1)
     assert 0 < error <= found.best.estimate
-    again = Adapted.from_json(case, found.to_json())
+    again = Adapted.from_json(case.problem(), found.to_json())
     assert again.choice == found.choice
-    assert Scene(again.choice.applied(case)[0]).cells == found.best.cells
+    assert Scene(again.choice.applied(case.problem())).cells == found.best.cells

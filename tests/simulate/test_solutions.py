@@ -17,7 +17,7 @@ from magshell_fenicsx.continuation.walk import Goal, Walk
 from magshell_fenicsx.output.pictures.plot import plot
 from magshell_fenicsx.output.store.table import read_rows
 from magshell_fenicsx.runs.summary import solutions
-from magshell_fenicsx.simulate.guesses import dented
+from magshell_fenicsx.simulate.search import dented
 from magshell_fenicsx.simulate.stage import plain
 
 ROOF = [

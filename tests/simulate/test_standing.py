@@ -1,5 +1,6 @@
 """A scene with the fields of another case has the path of a scene that is made for it."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,8 +9,9 @@ from conftest import CASES
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.input.tables import write_vectors
+from magshell_fenicsx.problem.problem import Document
+from magshell_fenicsx.public import Scene
 from magshell_fenicsx.simulate.follow import follow
-from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.standing import Standing, refilled
 
 STRIP = """
@@ -42,7 +44,7 @@ def agree(first: Case, second: Case) -> None:
     scene = Scene(first)
     there = [record.point.state for record in follow(scene)][-1]
     for case in (second, first):
-        assert refilled(scene, case)
+        assert refilled(scene, case.problem())
         *_, last = follow(scene)
         *_, expected = follow(Scene(case))
         assert last.label == expected.label
@@ -56,7 +58,9 @@ def test_another_case_is_another_scene() -> None:
     """What is not a field in the terms, or changes more, makes a new scene."""
     case = Case.load(CASES / "dimple_buckling.yaml", BUCKLING)
     known = Standing()
-    scene = known.of(case, Scene(case).comm)
-    assert known.of(case, scene.comm) is scene
+    scene = known.of(case.problem(), Scene(case).comm)
+    assert known.of(case.problem(), scene.comm) is scene
     for setting in ("shell.poisson_ratio=0.3", "symmetry=half", "mesh.degree=3"):
-        assert not refilled(scene, Case.load(CASES / "dimple_buckling.yaml", [*BUCKLING, setting]))
+        assert not refilled(scene, Case.load(CASES / "dimple_buckling.yaml", [*BUCKLING, setting]).problem())
+    bare = replace(case.problem(), document=Document())
+    assert not refilled(Scene(bare), bare)

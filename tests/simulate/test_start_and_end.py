@@ -8,7 +8,7 @@ import pytest
 from test_in_time import BEAM, PLATE, STRIP, case_of, columns_of
 
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.runs.run import run
+from magshell_fenicsx.public import run
 
 QUARTIC = ["0", "0", "(1 - x**2 - y**2)**2"]
 

@@ -17,13 +17,10 @@ from mpi4py import MPI
 
 from magshell_fenicsx import Case, CaseError
 from magshell_fenicsx.input.source import Source
-from magshell_fenicsx.runs.run import run
-from magshell_fenicsx.simulate.adapt.carry import CellFields, NotCarried, carry
-from magshell_fenicsx.simulate.adapt.choice import Adapted, Choice
-from magshell_fenicsx.simulate.adapt.ending import NoResult, by_path, from_near
-from magshell_fenicsx.simulate.adapt.size import equidistributed
+from magshell_fenicsx.public import Scene, run
+from magshell_fenicsx.simulate.adapt.choice import Adapted, Choice, equidistributed
+from magshell_fenicsx.simulate.adapt.ending import CellFields, NoResult, NotCarried, by_path, carry, from_near
 from magshell_fenicsx.simulate.adapt.tolerance import adapted
-from magshell_fenicsx.simulate.scene import Scene
 
 FORCE = 15.14768
 KNOCKDOWN = {0.0: 0.326233289, 0.00184: 0.552053778, -0.00184: 0.120723848}
@@ -45,19 +42,19 @@ def check(case: Case, reference: float) -> Adapted:
 
     On a meridian, whose cells cost nothing, it may be far smaller.
     """
-    mesh, tolerance = adapted(case, COMM), case.mesh.tolerance
+    mesh, tolerance = adapted(case.problem(), COMM), case.mesh.tolerance
     assert tolerance
-    end = by_path(mesh.choice.scene(case, COMM))
+    end = by_path(mesh.choice.scene(case.problem(), COMM))
     error = abs(end.value / reference - 1)
     assert end.value == pytest.approx(mesh.best.result, rel=1e-7)
-    assert (0.0 if mesh.choice.applied(case)[1].axisymmetric else tolerance / 10) < error < tolerance
+    assert (0.0 if mesh.choice.applied(case.problem()).axisymmetric else tolerance / 10) < error < tolerance
     assert error < max(mesh.best.estimate, 1e-8)
     return mesh
 
 
 @pytest.fixture(scope="module")
 def half_mesh() -> Adapted:
-    return adapted(buckling(1e-2), COMM)
+    return adapted(buckling(1e-2).problem(), COMM)
 
 
 @pytest.mark.parametrize("tolerance", [1e-2, 1e-3, 1e-4, 1e-5, 1e-6])
@@ -82,9 +79,9 @@ def test_grading_by_the_indicator_takes_fewer_unknowns() -> None:
     """Than the default grading, refined as a whole, for an error that is not smaller."""
     lambda_m = -0.00184
     case = buckling(1e-3, lambda_m)
-    graded, whole = adapted(case, COMM), Choice(4, 0.5)
-    near = graded.choice.scene(case, COMM)
-    scene = whole.scene(case, COMM)
+    graded, whole = adapted(case.problem(), COMM), Choice(4, 0.5)
+    near = graded.choice.scene(case.problem(), COMM)
+    scene = whole.scene(case.problem(), COMM)
     error = abs(from_near(scene, near, by_path(near)).value / KNOCKDOWN[lambda_m] - 1)
     assert graded.best.dofs < 0.85 * scene.model.system.dofs
     assert abs(graded.best.result / KNOCKDOWN[lambda_m] - 1) < error
@@ -93,7 +90,7 @@ def test_grading_by_the_indicator_takes_fewer_unknowns() -> None:
 def test_displacements_are_carried_to_a_higher_degree_without_loss() -> None:
     """And back: polynomials of degree 3 are among those of degree 4, also on the curved edges at the dimple's rim."""
     case = buckling(1e-2)
-    low, high = (Choice(degree, 0.3).scene(case, COMM) for degree in (3, 4))
+    low, high = (Choice(degree, 0.3).scene(case.problem(), COMM) for degree in (3, 4))
     u = np.random.default_rng(0).standard_normal(low.model.system.size)
     values = np.zeros_like(low.model.system.u.x.array)
     values[: len(u)] = u
@@ -121,10 +118,10 @@ def test_equal_shares() -> None:
 @pytest.mark.slow
 def test_the_mesh_is_kept_for_a_run_that_is_resumed(half_mesh: Adapted) -> None:
     case, mesh = buckling(1e-2), half_mesh
-    again = Adapted.from_json(case, mesh.to_json())
+    again = Adapted.from_json(mesh.asked, mesh.to_json())
     assert replace(again, choice=mesh.choice) == mesh
     for x in np.random.default_rng(0).uniform(-1, 1, (20, 2)):
-        assert again.choice.applied(case)[1].size(x) == mesh.choice.applied(case)[1].size(x)
+        assert again.choice.applied(case.problem()).size(x) == mesh.choice.applied(case.problem()).size(x)
 
 
 def test_summary_has_the_estimate_and_the_rounds(tmp_path: Path, no_pictures: None) -> None:
@@ -142,7 +139,7 @@ def test_summary_has_the_estimate_and_the_rounds(tmp_path: Path, no_pictures: No
 
 def test_an_estimate_is_not_given_for_another_result() -> None:
     """Where the run on the mesh ends elsewhere than the rounds did."""
-    mesh = adapted(buckling(1e-2, symmetry="auto"), COMM)
+    mesh = adapted(buckling(1e-2, symmetry="auto").problem(), COMM)
     assert mesh.account(mesh.best.result)["error_estimate"] == mesh.best.estimate
     assert mesh.account(1.1 * mesh.best.result)["error_estimate"] is None
     assert mesh.account(None)["error_estimate"] is None
@@ -151,7 +148,7 @@ def test_an_estimate_is_not_given_for_another_result() -> None:
 def test_without_a_load_there_is_no_result() -> None:
     data = buckling(1e-2, symmetry="auto").model_copy(update={"loading": None, "magnetic": None})
     with pytest.raises(NoResult, match="neither a load nor a field"):
-        adapted(data, COMM)
+        adapted(data.problem(), COMM)
 
 
 @pytest.mark.parametrize(
@@ -172,7 +169,7 @@ def test_a_tolerance_on_a_grid() -> None:
         "loading": {"kind": "indentation", "at": {"point": "A"}, "depth": 1, "points": 1},
     }
     fine = Case.from_source(Source("test", {**data, "mesh": {"degree": 5, "refinement": 1.6}}))
-    mesh = adapted(Case.from_source(Source("test", {**data, "mesh": {"tolerance": 1e-2}})), COMM)
+    mesh = adapted(Case.from_source(Source("test", {**data, "mesh": {"tolerance": 1e-2}})).problem(), COMM)
     error = abs(mesh.best.result / by_path(Scene(fine, COMM)).value - 1)
     assert 1e-3 < error < mesh.best.estimate < 1e-2
 

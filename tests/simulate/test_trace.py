@@ -40,7 +40,7 @@ def test_plate_on_a_foundation(symmetry: str) -> None:
     """D w'''' + k w = q: w = q/k + A ber(x) + B bei(x), x = r (k/D)^(1/4), clamped at r = 1 (Timoshenko)."""
     scene = on_foundation(f"symmetry={symmetry}", "mesh.degree=4", file="clamped_plate.yaml")
     h, nu, k, load = 1 / 50, 0.3, 1e-3, 1e-5
-    D, q = h**2 / (12 * (1 - nu**2)), load * scene.plan.material.classical_pressure / h
+    D, q = h**2 / (12 * (1 - nu**2)), load * scene.problem.material.classical_pressure / h
     edge = (k / D) ** 0.25
     A = np.linalg.solve([[ber(edge), bei(edge)], [berp(edge), beip(edge)]], [-q / k, 0])[0]
     *_, point = ms.trace(scene, "pressure", with_stiffness(scene, k), control="load", targets=[load])
@@ -62,7 +62,7 @@ def test_every_control_finds_the_same_point(settings: list[str]) -> None:
         assert records[-1].label == "target"
         assert records[-1].point.state.mu["foundation"] == pytest.approx(k, rel=1e-6)
         difference = records[-1].point.state.u - reference.point.state.u
-        assert np.abs(difference).max() < 1e-7 * scene.plan.material.h
+        assert np.abs(difference).max() < 1e-7 * scene.problem.material.h
 
 
 @pytest.mark.parametrize("settings", [SHELLS[0], pytest.param(HALF, id="half", marks=pytest.mark.slow)])
@@ -153,7 +153,7 @@ def test_surface_is_the_deformed_shell() -> None:
     assert surface
     assert triangles
     assert surface.r0[:, 1].min() == pytest.approx(-1, abs=1e-2)
-    assert surface.w.max() / scene.plan.material.h == pytest.approx(6, rel=1e-6)
+    assert surface.w.max() / scene.problem.material.h == pytest.approx(6, rel=1e-6)
     faces = triangles.regular_faces
     cones = [
         np.abs(np.linalg.det(points.astype(float)[faces])) / 6 for points in (triangles.points, triangles["r0"])

@@ -9,14 +9,14 @@ from test_field_gradients import FIELDS, STRIP, Direction, by_difference, change
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.models.modes import ShellModes
+from magshell_fenicsx.public import Scene
 from magshell_fenicsx.simulate.adapt.ending import History
-from magshell_fenicsx.simulate.barrier import barrier
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.gradients.gradient import gradient
 from magshell_fenicsx.simulate.gradients.vibration import frequency, vibration
 from magshell_fenicsx.simulate.numbers import scene_with
 from magshell_fenicsx.simulate.record import Record
-from magshell_fenicsx.simulate.scene import Scene
+from magshell_fenicsx.simulate.results import barrier
 
 VOLUME = "loading={kind: pressure, control: volume, until: target, volume_change: -0.004, points: 1}"
 
@@ -82,7 +82,7 @@ def test_hertz(tmp_path: Path) -> None:
     )
     last = solved(scene)
     found = gradient(scene, last, of="hertz_1", by=["shell.density", "lambda_m"])
-    hertz = frequency(scene.plan, "hertz_1", omega2(scene, last, "omega2_1"))
+    hertz = frequency(scene.problem, "hertz_1", omega2(scene, last, "omega2_1"))
     assert found["shell.density"] == pytest.approx(-hertz / 2 / 1100, rel=1e-7)
     by_square = gradient(scene, last, of="omega2_1", by=["lambda_m"])["lambda_m"]
     assert found["lambda_m"] == pytest.approx(by_square * hertz / (2 * omega2(scene, last, "omega2_1")), rel=1e-9)
@@ -120,4 +120,4 @@ def barrier_of(scene: Scene) -> float:
     found = history_of(scene)
     assert found.begin
     assert found.last
-    return barrier(scene, scene.case.programme[-1], found.begin.point.state, found.last.point.state)
+    return barrier(scene, scene.problem.programme[-1], found.begin.point.state, found.last.point.state)

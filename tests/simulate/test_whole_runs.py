@@ -10,7 +10,7 @@ import yaml
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.input.section import si_size
 from magshell_fenicsx.input.source import CaseError, Source, override
-from magshell_fenicsx.problem.planner import make_plan
+from magshell_fenicsx.public import Scene
 from magshell_fenicsx.simulate.adapt.ending import History
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.gradients.adjoint import Adjoint
@@ -19,7 +19,6 @@ from magshell_fenicsx.simulate.gradients.instabilities import FOLDS, instabiliti
 from magshell_fenicsx.simulate.gradients.results import adjoint_at_end
 from magshell_fenicsx.simulate.numbers import number_of, on_mesh_of
 from magshell_fenicsx.simulate.record import Record
-from magshell_fenicsx.simulate.scene import Scene
 
 CAP = """
 shell:
@@ -153,14 +152,14 @@ def test_number(name: str, key: str) -> None:
     """Imperfections in both kinds of units, targets with units, stiffnesses of parts, and bodies follow the number."""
     (scene, *_), found = given(name)
     by_field = key == "shell.thickness_factor"
-    value, unit = 1.0 if by_field else number_of(scene.case, key), KEYS[name][key]
+    value, unit = 1.0 if by_field else number_of(scene.problem.context, key), KEYS[name][key]
     results = dict[int, dict[str, float]]()
     for way in (-1, 1):
         number = value * (1 + way * STEP) / si_size(unit)
         other = case_of(
             name, [f'{key}="{number!r}{" " * bool(unit)}{unit}"' if unit or by_field else f"{key}={number!r}"]
         )
-        ran = run(Scene(other, scene.comm, on_mesh_of(scene, make_plan(other))))
+        ran = run(Scene(on_mesh_of(scene, other.problem()), scene.comm))
         results[way] = {of: adjoint(ran, of).shown for of in found}
     for of, each in found.items():
         slope = derivative(each, "thickness" if by_field else key)
@@ -195,4 +194,4 @@ def test_modes_of_the_perfect_shell_change() -> None:
     """They are found again in every run."""
     case = case_of("buckled", ["shell.imperfections=[{kind: modes, amplitudes: [0.1]}]"])
     with pytest.raises(CaseError, match=r"shell\.poisson_ratio: the modes of the perfect shell"):
-        number_of(case, "shell.poisson_ratio")
+        number_of(case.context, "shell.poisson_ratio")

@@ -15,7 +15,7 @@ from many import ensemble, make_samples
 from magshell_fenicsx import CaseError
 from magshell_fenicsx.continuation.fold import FoldLost
 from magshell_fenicsx.input.source import override, read_source
-from magshell_fenicsx.runs.run import run
+from magshell_fenicsx.public import run
 from magshell_fenicsx.studies import ensemble as solving
 from magshell_fenicsx.studies.folds import KnownFolds
 from magshell_fenicsx.studies.results import parse_scalar

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.input.source import read_source
+from magshell_fenicsx.public import Scene
 from magshell_fenicsx.simulate.follow import follow
-from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.standing import Standing
 from magshell_fenicsx.studies.design_evaluation import evaluate
 

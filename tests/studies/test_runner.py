@@ -14,8 +14,8 @@ from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.input.source import CaseError, read_source
 from magshell_fenicsx.output.store.folder import DiskError
 from magshell_fenicsx.output.store.table import write_csv
-from magshell_fenicsx.platform import sources
-from magshell_fenicsx.runs.run import run
+from magshell_fenicsx.platform import environment
+from magshell_fenicsx.public import run
 from magshell_fenicsx.studies import runner
 from magshell_fenicsx.studies.results import parse_scalar
 from magshell_fenicsx.studies.runner import Folder, Outcome, compute, keep, keep_outcome, kept, kept_outcome, outcome_of
@@ -47,7 +47,7 @@ def test_an_outcome_is_kept_for_these_sources(tmp_path: Path, monkeypatch: pytes
     file.write_text(json.dumps(content)[:-20], encoding="utf-8")
     assert kept_outcome(file) is None
     keep_outcome(OUTCOME, case, file)
-    monkeypatch.setattr(sources, "_OURS", "0.1.0+anotherhash00000")
+    monkeypatch.setattr(environment, "_RUNNING", "0.1.0+anotherhash00000")
     assert kept_outcome(file) is None
 
 

@@ -16,15 +16,16 @@ from test_sweep import plate
 
 import magshell_fenicsx
 from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.opened import document_of
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.output.store import checkpoint
 from magshell_fenicsx.output.store.known import GROUPS, PHASES
 from magshell_fenicsx.output.store.table import COLUMNS, TEXTS
 from magshell_fenicsx.output.store.written import MESH
-from magshell_fenicsx.platform import sources
+from magshell_fenicsx.platform import environment
 from magshell_fenicsx.platform.processes import Usage
+from magshell_fenicsx.public import run
 from magshell_fenicsx.runs.files import AlreadyComplete
-from magshell_fenicsx.runs.run import run
 from magshell_fenicsx.studies import compare as runs
 from magshell_fenicsx.studies import measured as sample
 from magshell_fenicsx.studies import sweep as chain
@@ -37,7 +38,7 @@ OTHER = "0.1.0+anotherhash00000"
 @pytest.fixture
 def edited(monkeypatch: pytest.MonkeyPatch) -> Any:
     """Called, makes the sources others."""
-    return lambda: monkeypatch.setattr(sources, "_OURS", OTHER)
+    return lambda: monkeypatch.setattr(environment, "_RUNNING", OTHER)
 
 
 @pytest.fixture
@@ -57,21 +58,21 @@ def magshell(site: Path, *words: str | Path) -> subprocess.CompletedProcess[str]
 def test_every_file_of_the_package_counts(copied: Path) -> None:
     """Code, C and template: changed, renamed, added, taken away; where it lies and what Python compiles do not."""
     package = copied / PACKAGE.name
-    known = [sources.hashed(package)]
-    assert known == [sources.ours()]
+    known = [environment.version_of(package)]
+    assert known == [environment.code_version()]
     (package / "__pycache__").mkdir()
     (package / "__pycache__" / "cli.cpython-313.pyc").write_bytes(b"compiled")
-    assert known == [sources.hashed(package)]
+    assert known == [environment.version_of(package)]
     for file in ("continuation/newton.py", "assembly/scatter.c", "output/report/report_template.html"):
         with (package / file).open("a", encoding="utf-8") as stream:
             stream.write("\n")
-        known.append(sources.hashed(package))
+        known.append(environment.version_of(package))
     (package / "continuation" / "newton.py").rename(package / "continuation" / "newtons.py")
-    known.append(sources.hashed(package))
+    known.append(environment.version_of(package))
     (package / "new.py").touch()
-    known.append(sources.hashed(package))
-    (package / "models" / "shell" / "folds.py").unlink()
-    known.append(sources.hashed(package))
+    known.append(environment.version_of(package))
+    (package / "models" / "shell" / "edges.py").unlink()
+    known.append(environment.version_of(package))
     assert len(set(known)) == 7
 
 
@@ -107,17 +108,17 @@ def test_a_complete_run_of_other_sources(tmp_path: Path, edited: Any, no_picture
 
 def test_what_differs_is_told(tmp_path: Path, edited: Any) -> None:
     """The case where it does, else the sources; what an earlier version of the program left is of others."""
-    case, file = Case.load(BUCKLING), tmp_path / "checkpoint"
-    file.write_bytes(checkpoint.begun(case))
-    checkpoint.check_resumable(file, case)
-    known = checkpoint.identity(case)
+    this, file = document_of(Case.load(BUCKLING)), tmp_path / "checkpoint"
+    file.write_bytes(checkpoint.begun(this))
+    checkpoint.check_resumable(file, this)
+    known = checkpoint.identity(this)
     edited()
     with pytest.raises(CaseError, match=r"another run: mesh.degree is 4 there and 3 here"):
-        checkpoint.check_resumable(file, Case.load(BUCKLING, ["mesh.degree=3"]))
+        checkpoint.check_resumable(file, document_of(Case.load(BUCKLING, ["mesh.degree=3"])))
     with pytest.raises(checkpoint.OtherSources):
-        checkpoint.check_resumable(file, case)
+        checkpoint.check_resumable(file, this)
     with pytest.raises(checkpoint.OtherSources, match=r"\(0\.1\.0; these are"):
-        checkpoint.refuse_other({"version": "0.1.0", "case": known["case"]}, case, tmp_path)
+        checkpoint.refuse_other({"version": "0.1.0", "case": known["case"]}, this, tmp_path)
 
 
 def test_the_mesh_for_a_tolerance(tmp_path: Path, edited: Any, no_pictures: None) -> None:
@@ -181,7 +182,7 @@ def faked(monkeypatch: pytest.MonkeyPatch, module: Any) -> list[str]:
     def measure(_: str, words: list[str], ranks: int = 1) -> Usage:
         out = Path(words[words.index("--out") + 1])
         out.mkdir(parents=True, exist_ok=True)
-        by.append(sources.ours())
+        by.append(environment.code_version())
         (out / "summary.json").write_text(json.dumps({**SUMMARY, "sources": by[-1]}), encoding="utf-8")
         row = {name: "" if name in TEXTS else "0" for name in COLUMNS}
         (out / "path.csv").write_text(f"{','.join(row)}\n{','.join(row.values())}\n", encoding="utf-8")

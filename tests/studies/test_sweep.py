@@ -16,7 +16,7 @@ from many import make_points, sweep, with_earlier
 from magshell_fenicsx import CaseError
 from magshell_fenicsx.input.section import number_and_unit
 from magshell_fenicsx.input.source import read_source
-from magshell_fenicsx.runs.run import run
+from magshell_fenicsx.public import run
 from magshell_fenicsx.studies import points as axes_module
 from magshell_fenicsx.studies import sweep as module
 from magshell_fenicsx.studies import sweep_picture as sweep_plot
@@ -41,9 +41,9 @@ def computed(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """Pressures of the cases that a sweep really computes, in order."""
     done: list[float] = []
 
-    def counted(case, comm):  # type: ignore[no-untyped-def]
-        done.append(case.loading.pressure)
-        return run(case, comm=comm)
+    def counted(problem, comm):  # type: ignore[no-untyped-def]
+        done.append(problem.document.data["loading"]["pressure"])
+        return run(problem, comm=comm)
 
     monkeypatch.setattr(module, "run", counted)
     return done

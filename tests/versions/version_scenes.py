@@ -12,15 +12,15 @@ from pathlib import Path
 import numpy as np
 
 from magshell_fenicsx import Case
+from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.mesh.msh import MeshFile, read_msh
 from magshell_fenicsx.mesh.patch import PatchMesh
 from magshell_fenicsx.models.modes import ShellModes
 from magshell_fenicsx.platform.environment import versions
-from magshell_fenicsx.problem.planner import make_plan
-from magshell_fenicsx.problem.problem import Plan
+from magshell_fenicsx.problem.problem import Problem
+from magshell_fenicsx.public import Scene
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.record import Record
-from magshell_fenicsx.simulate.scene import Scene
 
 HERE = Path(__file__).parent
 CASES = HERE.parents[1] / "cases"
@@ -28,8 +28,8 @@ Numbers = dict[str, float]
 
 
 @dataclass(frozen=True)
-class PlanOnFile(Plan):
-    """A plan of a dimpled half hemisphere, R/h = 90, on the triangulation in the file."""
+class ProblemOnFile(Problem):
+    """A problem of a dimpled half hemisphere, R/h = 90, on the triangulation in the file."""
 
     def _made(self) -> PatchMesh:
         patch = read_msh(MeshFile(HERE / "half_disc.msh", 1.0), {k: np.append(x, 0.0) for k, x in self.points.items()})
@@ -41,8 +41,8 @@ def _scene(file: str, *settings: str, on_file: bool = False) -> Scene:
     case = Case.load(CASES / file, settings)
     if not on_file:
         return Scene(case)
-    plan = make_plan(case)
-    return Scene(case, plan=PlanOnFile(**{f.name: getattr(plan, f.name) for f in fields(Plan)}))
+    problem = make_problem(case)
+    return Scene(ProblemOnFile(**{f.name: getattr(problem, f.name) for f in fields(Problem)}))
 
 
 def _end(scene: Scene) -> Record:

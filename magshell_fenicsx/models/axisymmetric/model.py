@@ -1,26 +1,26 @@
-"""The axisymmetric shell as a system of terms on its meridian.
+"""The axisymmetric shell as a system of terms on its meridian, and its displacement at one place.
 
 Lengths in R, energies in E h R^2, of the whole shell. Amplitudes as in `ShellModel`:
 "pressure" is p/p_c, "force" is F R/(2 pi D), "lambda_m" is lambda_m.
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar, Literal
 
 import numpy as np
 from dolfinx import fem
+from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.moving import Lid, Pressed
-from magshell_fenicsx.assembly.parameters import FreeParameter, Growing, make_parameters
+from magshell_fenicsx.assembly.parameters import Growing, Parameter, make_parameters
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.continuation.system import Vector
 from magshell_fenicsx.mesh.patch import Deviated, Deviation
-from magshell_fenicsx.models.axisymmetric.instability import ExcludedWaves
 from magshell_fenicsx.models.axisymmetric.meridian import Meridian
-from magshell_fenicsx.models.axisymmetric.probe import Array, Probe
-from magshell_fenicsx.models.axisymmetric.waves import Waves
+from magshell_fenicsx.models.axisymmetric.waves import ExcludedWaves, Waves
 from magshell_fenicsx.models.carriers import on_meridian
 from magshell_fenicsx.models.observed import Thin
 from magshell_fenicsx.models.shell.parameters import Condition, EdgeMoment, Loads, Material, Potential, default_penalty
@@ -33,6 +33,52 @@ from magshell_fenicsx.parts.natural.shape import Shape, natural_field
 from magshell_fenicsx.parts.supports.moved import PRESSURE, Support, enclosed, motions_of, moving, rotation_of
 from magshell_fenicsx.parts.supports.on_meridian import openings, supports
 from magshell_fenicsx.parts.supports.supports import held_on
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Probe:
+    """Interpolates on the cell of the place, and turns the meridian's displacement to it.
+
+    Attributes
+    ----------
+    nodes, weights
+        Of the cell, and its shape functions there.
+    turn
+        (2, 3) e_rho and e_z at the azimuth of the place.
+    normal
+        n0 (3,) there.
+    """
+
+    nodes: NDArray[np.int32]
+    weights: Array
+    turn: Array
+    normal: Array
+
+    @staticmethod
+    def at(s: float, azimuth: float, r0: fem.Function) -> "Probe":
+        """For a parameter of the meridian with the placement `r0`."""
+        V = r0.function_space
+        ends = V.mesh.geometry.x[V.mesh.geometry.dofmap, 0]
+        cell = int(np.argmin(np.maximum(ends.min(axis=1) - s, s - ends.max(axis=1))))
+        local = np.array([[(s - ends[cell, 0]) / (ends[cell, 1] - ends[cell, 0])]])
+        values, slopes = V.element.basix_element.tabulate(1, local)[:, 0, :, 0]
+        nodes = V.dofmap.list[cell]
+        turn = np.array([[np.cos(azimuth), np.sin(azimuth), 0.0], [0.0, 0.0, 1.0]])
+        rho_s, z_s = slopes @ r0.x.array.reshape(-1, 2)[nodes]
+        normal = np.array([-z_s, rho_s]) / np.hypot(rho_s, z_s)
+        return Probe(nodes, values, turn, normal @ turn)
+
+    def __call__(self, u: Vector) -> Array:
+        """u/R (3,) there."""
+        return np.asarray(self.weights @ u.reshape(-1, 2)[self.nodes] @ self.turn)
+
+    def rows(self, size: int) -> Array:
+        """(3, size): the same as a matrix."""
+        found = np.zeros((3, size // 2, 2))
+        found[:, self.nodes] = np.einsum("n,ki->ink", self.weights, self.turn)
+        return found.reshape(3, size)
 
 
 class MeridianModel(Thin):
@@ -118,7 +164,7 @@ class MeridianModel(Thin):
         volume = factory.swept_volume() if swept else factory.volume_change(np.zeros(3))
         if loads.pressure:
             self.energies.append(factory.pressure(potential=not self.without_potential))
-        self.energies += self.own_and_contacts()
+        self.energies += self.own_and_contacts(meridian.ends)
         for name, force in loads.forces.items():
             self.energies.append(pole_force(name, force.patch, self.force_unit, around, self.kernels))
         self.load_size = {}
@@ -129,7 +175,7 @@ class MeridianModel(Thin):
             self.energies += factory.dead_energies(name, dead, meridian.ends)
         terms = [factory.term(energy) for energy in self.energies]
         pattern, held = next(term for term in terms if term.name == INTERIOR), self.held.held(V)
-        parameters: dict[str, FreeParameter] = {**make_parameters(factory.free, terms, self.u, self.kernels)}
+        parameters: dict[str, Parameter] = {**make_parameters(factory.free, terms, self.u, self.kernels)}
         parameters |= field_parameters(factory.fields, terms, self.u, self.kernels)
         self.fields = factory.fields
         if self.growing:

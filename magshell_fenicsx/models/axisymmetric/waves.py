@@ -1,4 +1,4 @@
-"""Stability of an axisymmetric state against waves cos(m theta), m >= 1.
+"""Stability of an axisymmetric state against waves cos(m theta), m >= 1, which its model does not see.
 
 Along a wave v every component of a jet is a coefficient times cos(m theta) or sin(m theta),
 so the second variation of an axisymmetric energy is pi times the sum of that of the
@@ -6,6 +6,7 @@ cosine's and of the sine's coefficients: one form on the meridian with m as a nu
 """
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from functools import cache, cached_property, partial
 from math import ceil, comb, sqrt
 
@@ -24,6 +25,7 @@ from magshell_fenicsx.assembly.terms import FormTerm
 from magshell_fenicsx.continuation.factor import Banded, Factorisation
 from magshell_fenicsx.continuation.modes import nearest_to_zero
 from magshell_fenicsx.continuation.system import State
+from magshell_fenicsx.continuation.watch import Family
 from magshell_fenicsx.models.axisymmetric import jets
 from magshell_fenicsx.models.axisymmetric.meridian import Meridian
 from magshell_fenicsx.models.carriers import Energy
@@ -258,3 +260,39 @@ def _mirrored(entries: NDArray[np.float64]) -> NDArray[np.float64]:
     found[:, :, 1] = -2 * found[:, :, 0] - found[:, :, 1]
     found[:, 1] = -2 * found[:, 0] - found[:, 1]
     return found
+
+
+@dataclass(frozen=True)
+class WavesOf:
+    """The waves of one number m; a `solve.watch.Family`."""
+
+    waves: Waves
+    m: int
+
+    @property
+    def label(self) -> str:
+        return f"m = {self.m}"
+
+    def factor_at(self, state: State) -> Factorisation:
+        """Factor their tangent at an axisymmetric state."""
+        return self.waves.factor_at(state, self.m)
+
+
+@dataclass(frozen=True)
+class ExcludedWaves:
+    """All that are looked at."""
+
+    waves: Waves
+
+    @property
+    def families(self) -> Sequence[Family]:
+        """For a `Watch`: every number of waves by itself."""
+        return [WavesOf(self.waves, m) for m in range(1, self.waves.largest + 1)]
+
+    def counts(self, state: State) -> Sequence[int]:
+        """Numbers of unstable directions of all families at a state."""
+        return self.waves.counts(state)
+
+    def is_unstable(self, state: State) -> bool:
+        """Whether some wave is unstable at an axisymmetric state."""
+        return any(self.waves.counts(state))

@@ -19,6 +19,7 @@ from magshell_fenicsx.models.shell import densities
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.edges import edge_density
 from magshell_fenicsx.models.shell.kinematics import Jet
+from magshell_fenicsx.models.shell.law import Koiter
 from magshell_fenicsx.parts.natural.shape import Forms
 
 
@@ -28,10 +29,10 @@ def antisymmetric_edge(
     v: Jet,
     m: Expr,
     width: Expr,
-    nu: Expr,
-    h: Expr,
     sigma: Expr,
     mirror: Expr,
+    *,
+    law: Koiter,
     natural: Forms | None = None,
 ) -> Expr:
     """Half the energy of an edge between the half with u + v and the mirror image of that with u - v.
@@ -50,7 +51,7 @@ def antisymmetric_edge(
 
     sides = (u + v, u - v)
     J = jump(r0 + sides[0], r0 + sides[1]) - (natural.kink(nu1, nu2) if natural else 1) * jump(r0, r0)
-    moments = [densities.normal_moment(r0, side, nu1, nu2, nu, h, natural) for side in sides]
+    moments = [densities.normal_moment(r0, side, nu1, nu2, law, natural) for side in sides]
     return edge_density((moments[0][0] + moments[1][0]) / 2, moments[0][1], J, width, sigma) * stretch / 2
 
 

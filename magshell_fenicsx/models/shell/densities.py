@@ -1,7 +1,7 @@
 """Energy densities of the shell as plain functions of jets: the one source of the physics.
 
 All in units of E h per undeformed area (lengths in R), so that the membrane energy is
-of order one; `h` is then h/R. An energy is the integral of density times area_ratio(r0).
+of order one. An energy is the integral of density times area_ratio(r0).
 """
 
 from collections.abc import Callable
@@ -11,70 +11,50 @@ from ufl.core.expr import Expr
 
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.kinematics import Jet
+from magshell_fenicsx.models.shell.law import Koiter, work
 from magshell_fenicsx.parts.magnetism.applied import around
 from magshell_fenicsx.parts.natural.shape import Forms
 
 MagneticDensity = Callable[[Jet, Jet, Expr, Expr], Expr]  # of (r0, u, Br, Ba)
 
 
-def koiter(S: Expr, up: Expr, nu: Expr) -> Expr:
-    """(1 - nu) S:S + nu tr^2 S with indices raised by the undeformed metric `up`."""
-    T = kin.mixed(S, up)
-    return (1 - nu) * ufl.tr(ufl.dot(T, T)) + nu * ufl.tr(T) ** 2
-
-
-def bending_stiffness(h: Expr, nu: Expr) -> Expr:
-    """D/(E h R^2)."""
-    return h**2 / (12 * (1 - nu**2))
-
-
-def membrane(r0: Jet, u: Jet, nu: Expr, natural: Forms | None = None) -> Expr:
+def membrane(r0: Jet, u: Jet, *, law: Koiter, natural: Forms | None = None) -> Expr:
     """Stretching density, paper Eq. (eqn:energy), first term; of the strain from the `natural` forms."""
-    E, up = kin.membrane_strain(r0, u), kin.inverse_metric(r0)
+    E = kin.membrane_strain(r0, u)
     if natural is None:
-        return koiter(E, up, nu) / (2 * (1 - nu**2))
-    return natural.thickness * natural.area * koiter(E - natural.strain, natural.up, nu) / (2 * (1 - nu**2))
+        return law.membrane(E, kin.inverse_metric(r0))
+    return natural.area * law.thicker(natural.thickness).membrane(E - natural.strain, natural.up)
 
 
-def prestress(r0: Jet, u: Jet, v: Jet, nu: Expr, E: Expr, natural: Forms | None = None) -> Expr:
+def prestress(r0: Jet, u: Jet, v: Jet, E: Expr, *, law: Koiter, natural: Forms | None = None) -> Expr:
     """S : (v_i . v_j)/2 with the membrane stress S of the strain E_11, E_12, E_22: what it adds to the energy of v."""
-    up = natural.up if natural else kin.inverse_metric(r0)
-    strain, square = kin.mixed(ufl.as_matrix([[E[0], E[1]], [E[1], E[2]]]), up), kin.mixed(kin.metric(v), up)
-    contracted = (1 - nu) * ufl.tr(ufl.dot(strain, square)) + nu * ufl.tr(strain) * ufl.tr(square)
-    whole = contracted / (2 * (1 - nu**2))
-    return natural.thickness * natural.area * whole if natural else whole
-
-
-def bending(r0: Jet, u: Jet, nu: Expr, h: Expr, natural: Forms | None = None) -> Expr:
-    """Bending density, paper Eq. (eqn:energy), second term; of the change from the `natural` curvature."""
-    K = kin.curvature_change(r0, u)
+    strain = ufl.as_matrix([[E[0], E[1]], [E[1], E[2]]])
     if natural is None:
-        return bending_stiffness(h, nu) / 2 * koiter(K, kin.inverse_metric(r0), nu)
-    stiffness = natural.thickness**3 * natural.area * bending_stiffness(h, nu)
-    return stiffness / 2 * koiter(K - natural.bend, natural.up, nu)
+        return work(law.stress(strain, kin.inverse_metric(r0)), kin.metric(v)) / 2
+    return natural.area * work(law.thicker(natural.thickness).stress(strain, natural.up), kin.metric(v)) / 2
 
 
-def moment_of(K: Expr, r0: Jet, nu1: Expr, nu2: Expr, nu: Expr) -> Expr:
-    """(1 - nu) K_nunu + nu tr K."""
-    K_nunu = K[0, 0] * nu1**2 + 2 * K[0, 1] * nu1 * nu2 + K[1, 1] * nu2**2
-    return (1 - nu) * K_nunu + nu * ufl.tr(kin.mixed(K, kin.inverse_metric(r0)))
+def bending(r0: Jet, u: Jet, *, law: Koiter, natural: Forms | None = None) -> Expr:
+    """Bending density, paper Eq. (eqn:energy), second term; of the change from the `natural` curvature."""
+    E, K = kin.membrane_strain(r0, u), kin.curvature_change(r0, u)
+    if natural is None:
+        return law.bending(E, K, kin.inverse_metric(r0))
+    return natural.area * law.thicker(natural.thickness).bending(E - natural.strain, K - natural.bend, natural.up)
 
 
 def normal_moment(
-    r0: Jet, u: Jet, nu1: Expr, nu2: Expr, nu: Expr, h: Expr, natural: Forms | None = None
+    r0: Jet, u: Jet, nu1: Expr, nu2: Expr, law: Koiter, natural: Forms | None = None
 ) -> tuple[Expr, Expr]:
-    """M_nunu = D [(1 - nu) K_nunu + nu tr K] for the unit conormal nu^1, nu^2, and D; M_nunu works on b_nunu."""
-    K = kin.curvature_change(r0, u)
+    """M_nunu for the unit conormal nu^1, nu^2, which works on b_nunu, and the stiffness of a penalty."""
+    E, K = kin.membrane_strain(r0, u), kin.curvature_change(r0, u)
     if natural is None:
-        D = bending_stiffness(h, nu)
-        return D * moment_of(K, r0, nu1, nu2, nu), D
-    K = K - natural.bend
+        edge = kin.inverse_metric(r0), (nu1, nu2), 1
+        return law.edge_moment(E, K, *edge), law.edge_stiffness(E, *edge)
     covector = ufl.dot(kin.metric(r0), ufl.as_vector([nu1, nu2]))
     raised = ufl.dot(natural.up, covector)
-    square = ufl.dot(raised, covector)  # 1 but for the natural stretch
-    D = natural.thickness**3 * natural.area * bending_stiffness(h, nu)
-    M = (1 - nu) * ufl.dot(raised, ufl.dot(K, raised)) + nu * square * ufl.tr(kin.mixed(K, natural.up))
-    return D * M, D * square**2
+    edge = natural.up, (raised[0], raised[1]), ufl.dot(raised, covector)
+    E, K, law = E - natural.strain, K - natural.bend, law.thicker(natural.thickness)
+    return natural.area * law.edge_moment(E, K, *edge), natural.area * law.edge_stiffness(E, *edge)
 
 
 def magnetic(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:

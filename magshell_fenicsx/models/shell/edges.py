@@ -1,4 +1,4 @@
-"""The bending energy of edges: C0 interior penalty for a C0 displacement.
+"""The bending energy of edges: C0 interior penalty for a C0 displacement; how sharply undeformed cells meet.
 
 A C0 surface has b_nunu = (-[n] . r_nu) delta on an edge. With the jump J of that
 quantity over its undeformed value, an edge contributes
@@ -11,16 +11,22 @@ invariant under exchange of '+' and '-'.
 
 from typing import Any
 
+import numpy as np
 import ufl
+from dolfinx import fem
+from mpi4py import MPI
 from ufl.core.expr import Expr
 
+from magshell_fenicsx.assembly.batches import interior_batches
 from magshell_fenicsx.models.shell import densities
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.kinematics import Jet
+from magshell_fenicsx.models.shell.law import Koiter
 from magshell_fenicsx.parts.natural.shape import Forms
 
 Sides = tuple[Jet, Jet]
 Shapes = tuple[Forms, Forms]
+FOLD = 0.02  # rad: below, the sine of an angle is the angle to 7e-5
 
 
 def edge_density(M: Expr, D: Expr, J: Expr, width: Expr, sigma: Expr) -> Expr:
@@ -47,11 +53,9 @@ def two_sided(
     u: Sides,
     m: tuple[Expr, Expr],
     width: Expr,
-    nu: Expr,
-    h: Expr,
     sigma: Expr,
-    t: tuple[Expr, Expr] | None = None,
     *,
+    law: tuple[Koiter, Koiter],
     natural: Shapes | None = None,
 ) -> Expr:
     """Energy of an interior edge with that jump per length of its parameter.
@@ -64,36 +68,35 @@ def two_sided(
         Covectors of the edge on both sides; see `kinematics.conormal`.
     width
         h_e: half the height of the flat triangles over the edge, averaged.
-    t
-        What multiplies the thickness h on both sides, each (1,); None for 1.
+    law
+        That of both sides.
     natural
         The natural forms on both sides; None if they are those of r0.
     """
     conormals = [kin.conormal(j, covector) for j, covector in zip(r0, m, strict=True)]
     stretch = (conormals[0][2] + conormals[1][2]) / 2
-    factors = (1, 1) if t is None else (t[0][0], t[1][0])
     moments = [
-        densities.normal_moment(r0[i], u[i], *conormals[i][:2], nu, factors[i] * h, natural and natural[i])
-        for i in range(2)
+        densities.normal_moment(r0[i], u[i], *conormals[i][:2], law[i], natural and natural[i]) for i in range(2)
     ]
-    M = sum(factor * moment for factor, (moment, _) in zip(factors, moments, strict=True)) / 2
-    D = moments[0][1]
-    if t or natural:
-        D = sum(factor * stiffness for factor, (_, stiffness) in zip(factors, moments, strict=True)) / 2
+    M, D = ((plus + minus) / 2 for plus, minus in zip(*moments, strict=True))
     return edge_density(M, D, J, width, sigma) * stretch
 
 
-def interior(r0: Sides, u: Sides, m: tuple[Expr, Expr], *rest: Any, natural: Shapes | None = None) -> Expr:
+def interior(
+    r0: Sides, u: Sides, m: tuple[Expr, Expr], *rest: Any, law: tuple[Koiter, Koiter], natural: Shapes | None = None
+) -> Expr:
     """Energy of an interior edge between cells that meet smoothly, or nearly so; `rest` as in `two_sided`."""
     nus = [kin.conormal(j, covector)[:2] for j, covector in zip(r0, m, strict=True)]
     J0 = fold_jump(*r0, *nus)
     if natural:
         J0 *= sum(shape.kink(*nu) for shape, nu in zip(natural, nus, strict=True)) / 2
     J = fold_jump(r0[0] + u[0], r0[1] + u[1], *nus) - J0
-    return two_sided(J, r0, u, m, *rest, natural=natural)
+    return two_sided(J, r0, u, m, *rest, law=law, natural=natural)
 
 
-def folded(r0: Sides, u: Sides, m: tuple[Expr, Expr], *rest: Any, natural: Shapes | None = None) -> Expr:
+def folded(
+    r0: Sides, u: Sides, m: tuple[Expr, Expr], *rest: Any, law: tuple[Koiter, Koiter], natural: Shapes | None = None
+) -> Expr:
     """The same across a fold of the undeformed surface: the jump is the change of the angle, whatever its size.
 
     b_nunu is the angle times the natural stretch across the fold, which a `natural` kink has as a narrow bend has it.
@@ -108,7 +111,7 @@ def folded(r0: Sides, u: Sides, m: tuple[Expr, Expr], *rest: Any, natural: Shape
         angle = bent * ufl.atan2(sine0, cosine0)
         sine0, cosine0 = ufl.sin(angle), ufl.cos(angle)
     J = stretched * ufl.atan2(sine * cosine0 - cosine * sine0, cosine * cosine0 + sine * sine0)
-    return two_sided(J, r0, u, m, *rest, natural=natural)
+    return two_sided(J, r0, u, m, *rest, law=law, natural=natural)
 
 
 def turning(r0: Jet, u: Jet, m: Expr, width: Expr, intensity: Expr, past: Expr) -> Expr:
@@ -130,23 +133,22 @@ def clamped(
     u: Jet,
     m: Expr,
     width: Expr,
-    nu: Expr,
-    h: Expr,
     sigma: Expr,
     turn: Expr | None = None,
     *,
+    law: Koiter,
     natural: Forms | None = None,
 ) -> Expr:
     """Energy of a clamped edge per length of its parameter: the outer normal is held at n0, or at `turn` n0."""
     nu1, nu2, stretch = kin.conormal(r0, m)
     r, n0 = r0 + u, kin.normal(r0)
     J = -ufl.dot((n0 if turn is None else ufl.dot(turn, n0)) - kin.normal(r), r.r1 * nu1 + r.r2 * nu2)
-    M, D = densities.normal_moment(r0, u, nu1, nu2, nu, h, natural)
+    M, D = densities.normal_moment(r0, u, nu1, nu2, law, natural)
     return edge_density(M, D, J, width, sigma) * stretch
 
 
 def symmetric(
-    r0: Jet, u: Jet, m: Expr, width: Expr, nu: Expr, h: Expr, sigma: Expr, mirror: Expr, natural: Forms | None = None
+    r0: Jet, u: Jet, m: Expr, width: Expr, sigma: Expr, mirror: Expr, *, law: Koiter, natural: Forms | None = None
 ) -> Expr:
     """Energy of an edge on a mirror plane with that normal per length of its parameter: half of an interior edge's."""
     nu1, nu2, stretch = kin.conormal(r0, m)
@@ -155,5 +157,21 @@ def symmetric(
         return 2 * ufl.dot(kin.normal(j), mirror) * ufl.dot(mirror, j.r1 * nu1 + j.r2 * nu2)
 
     J = mirror_jump(r0 + u) - (natural.kink(nu1, nu2) if natural else 1) * mirror_jump(r0)
-    M, D = densities.normal_moment(r0, u, nu1, nu2, nu, h, natural)
+    M, D = densities.normal_moment(r0, u, nu1, nu2, law, natural)
     return edge_density(M, D, J, width, sigma) * stretch / 2
+
+
+def largest_fold(r0: fem.Function, degree: int) -> float:
+    """Largest angle (rad) between the undeformed normals of two cells at their edge; collective."""
+    V = r0.function_space
+    nodes, largest = r0.x.array.reshape(-1, 3), 0.0
+    for batch in interior_batches(V, degree):
+        normals = []
+        for table, cells in zip(batch.rule.tables, batch.cells, strict=True):
+            jets = table.jets(nodes[V.dofmap.list[cells]])
+            m = np.cross(jets[:, :, 1], jets[:, :, 2])
+            normals.append(m / np.linalg.norm(m, axis=-1)[..., None])
+        sine = np.linalg.norm(np.cross(*normals), axis=-1)
+        angles = np.arctan2(sine, np.einsum("epi,epi->ep", *normals))
+        largest = max(largest, float(angles.max()))
+    return float(V.mesh.comm.allreduce(largest, MPI.MAX))

@@ -94,8 +94,8 @@ def _halves(field: fem.Function) -> tuple[Expr, Expr]:
 def per_area(density: Callable[..., Expr]) -> Callable[..., Expr]:
     """A density per undeformed area, per area of the coordinates."""
 
-    def of(r0: Jet, *rest: Any, **natural: Any) -> Expr:
-        return density(r0, *rest, **natural) * kin.area_ratio(r0)
+    def of(r0: Jet, *rest: Any, **known: Any) -> Expr:
+        return density(r0, *rest, **known) * kin.area_ratio(r0)
 
     return of
 

@@ -9,8 +9,15 @@ from dolfinx import fem
 from numpy.typing import NDArray
 from petsc4py import PETSc
 
-from magshell_fenicsx.assembly.batches import Batch, Chosen, boundary_batches, cell_batches, interior_batches
-from magshell_fenicsx.assembly.contraction import add_coupled, add_own
+from magshell_fenicsx.assembly.batches import (
+    Batch,
+    Chosen,
+    add_coupled,
+    add_own,
+    boundary_batches,
+    cell_batches,
+    interior_batches,
+)
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.scatter import BlockMatrix
 from magshell_fenicsx.assembly.sliding import Constraint

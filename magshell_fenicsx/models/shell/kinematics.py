@@ -5,11 +5,14 @@ expression is covariant under linear changes of the coordinates: finite-element 
 an orthonormal frame t_1, t_2 of the flat cell, the fast tangent those of the reference cell.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields
+from typing import Any, TypeAlias
 
 import ufl
 from ufl.core.expr import Expr
 
+Vectors: TypeAlias = Any  # several expressions (3,), or arrays (..., 3)
 FIRST = ("r1", "r2")
 SECOND = ("r11", "r12", "r22")
 CURVED = (*FIRST, *SECOND)
@@ -103,26 +106,33 @@ def dual_basis(j: Jet) -> tuple[Expr, Expr]:
     return up[0, 0] * j.r1 + up[0, 1] * j.r2, up[1, 0] * j.r1 + up[1, 1] * j.r2
 
 
+def strain_components(r0: Vectors, u: Vectors, dot: Callable[[Any, Any], Any]) -> tuple[Any, Any, Any]:
+    """E_11, E_12 and E_22 from the first derivatives of r0 and u, without subtracting two metrics of order one.
+
+    `dot` is that of expressions or of arrays.
+    """
+    (r1, r2), (u1, u2) = r0, u
+    E12 = (dot(r1, u2) + dot(u1, r2) + dot(u1, u2)) / 2
+    return dot(r1, u1) + dot(u1, u1) / 2, E12, dot(r2, u2) + dot(u2, u2) / 2
+
+
+def curvature_components(n: Any, turned: Any, r0: Vectors, u: Vectors, dot: Callable[[Any, Any], Any]) -> list[Any]:
+    """K_11, K_12 and K_22 from second derivatives, the deformed normal n and `turned`, n - n0; `dot` as above."""
+    return [dot(n, uij) + dot(turned, rij) for rij, uij in zip(r0, u, strict=True)]
+
+
 def membrane_strain(r0: Jet, u: Jet) -> Expr:
-    """E_ij = (a_ij - a0_ij)/2, (2, 2), without subtracting two metrics of order one."""
-
-    def E(ri: Expr, ui: Expr, rj: Expr, uj: Expr) -> Expr:
-        return (ufl.dot(ri, uj) + ufl.dot(ui, rj) + ufl.dot(ui, uj)) / 2
-
-    E12 = E(r0.r1, u.r1, r0.r2, u.r2)
-    return ufl.as_matrix([[E(r0.r1, u.r1, r0.r1, u.r1), E12], [E12, E(r0.r2, u.r2, r0.r2, u.r2)]])
+    """E_ij = (a_ij - a0_ij)/2, (2, 2)."""
+    E11, E12, E22 = strain_components((r0.r1, r0.r2), (u.r1, u.r2), ufl.dot)
+    return ufl.as_matrix([[E11, E12], [E12, E22]])
 
 
 def curvature_change(r0: Jet, u: Jet) -> Expr:
     """K_ij = b_ij - b0_ij with b_ij = n . r,_ij, (2, 2)."""
-    r = r0 + u
-    n, n0 = normal(r), normal(r0)
-
-    def K(rij: Expr, uij: Expr) -> Expr:
-        return ufl.dot(n, uij) + ufl.dot(n - n0, rij)
-
-    K12 = K(r0.r12, u.r12)
-    return ufl.as_matrix([[K(r0.r11, u.r11), K12], [K12, K(r0.r22, u.r22)]])
+    n = normal(r0 + u)
+    second0, second = ((j.r11, j.r12, j.r22) for j in (r0, u))
+    K11, K12, K22 = curvature_components(n, n - normal(r0), second0, second, ufl.dot)
+    return ufl.as_matrix([[K11, K12], [K12, K22]])
 
 
 def mixed(S: Expr, up: Expr) -> Expr:
@@ -155,6 +165,44 @@ def conormal(r0: Jet, m: Expr) -> tuple[Expr, Expr, Expr]:
     nu = ufl.dot(up, m) / ufl.sqrt(ufl.dot(m, ufl.dot(up, m)))
     along = r0.r2 * m[0] - r0.r1 * m[1]
     return nu[0], nu[1], ufl.sqrt(ufl.dot(along, along))
+
+
+@dataclass(frozen=True)
+class Edge:
+    """An edge of the undeformed surface at a point.
+
+    Attributes
+    ----------
+    outward
+        Unit conormal (3,): in the surface, normal to the edge, pointing outwards.
+    along
+        Unit tangent (3,), n0 x outward.
+    normal_part, tangent_part
+        Components of both in the coordinates of jets.
+    stretch
+        Its length over that of its parameter.
+    """
+
+    outward: Expr
+    along: Expr
+    normal_part: tuple[Expr, Expr]
+    tangent_part: tuple[Expr, Expr]
+    stretch: Expr
+
+    @classmethod
+    def of(cls, r0: Jet, m: Expr) -> "Edge":
+        """That of a covector as of `conormal`."""
+        nu1, nu2, stretch = conormal(r0, m)
+        t1, t2 = -m[1] / stretch, m[0] / stretch
+        return cls(r0.r1 * nu1 + r0.r2 * nu2, r0.r1 * t1 + r0.r2 * t2, (nu1, nu2), (t1, t2), stretch)
+
+    def by_outward(self, j: Jet) -> Expr:
+        """The derivative of a field by the length along the outward conormal."""
+        return j.r1 * self.normal_part[0] + j.r2 * self.normal_part[1]
+
+    def by_length(self, j: Jet) -> Expr:
+        """The derivative of a field by the arc length of the edge."""
+        return j.r1 * self.tangent_part[0] + j.r2 * self.tangent_part[1]
 
 
 def angle_from(sine: Expr, cosine: Expr, past: Expr) -> Expr:

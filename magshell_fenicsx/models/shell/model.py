@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.moving import Curve, triangle_sides
-from magshell_fenicsx.assembly.parameters import FreeParameter, Growing
+from magshell_fenicsx.assembly.parameters import Growing, Parameter
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.assembly.sliding import Constraint, held_along
 from magshell_fenicsx.assembly.terms import LinearTerm, Term
@@ -25,9 +25,9 @@ from magshell_fenicsx.mesh.patch import Deviation
 from magshell_fenicsx.models.carriers import on_surface
 from magshell_fenicsx.models.observed import Thin
 from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes
+from magshell_fenicsx.models.shell.edges import FOLD, largest_fold
 from magshell_fenicsx.models.shell.energy import ShellTerm
 from magshell_fenicsx.models.shell.fast_tangent import FastTangent, make_sites
-from magshell_fenicsx.models.shell.folds import FOLD, largest_fold
 from magshell_fenicsx.models.shell.gradients import PointTerm
 from magshell_fenicsx.models.shell.parameters import (
     Condition,
@@ -37,13 +37,13 @@ from magshell_fenicsx.models.shell.parameters import (
     Material,
     default_penalty,
 )
-from magshell_fenicsx.models.shell.patterns import by_patch, cells_of
+from magshell_fenicsx.models.shell.patterns import by_patch, carried, cells_of
 from magshell_fenicsx.models.shell.residual import FastResidual
 from magshell_fenicsx.models.shell.slopes import point_parameters
 from magshell_fenicsx.models.shell.terms import EnergyFactory
 from magshell_fenicsx.models.shell.thickness import Thickness, thickness_field
 from magshell_fenicsx.parts.forces.dead_load import SurfaceMeasures, assemble_dead_loads
-from magshell_fenicsx.parts.forces.point_load import patch_entries, point_entries, vertex_normal
+from magshell_fenicsx.parts.forces.load_vector import patch_entries, point_entries, vertex_normal
 from magshell_fenicsx.parts.magnetism.driving import field_parameters
 from magshell_fenicsx.parts.natural.shape import Shape, natural_field
 from magshell_fenicsx.parts.pressure.openings import openings
@@ -116,12 +116,20 @@ class ShellModel(Thin):
                 cells = topology.size_local + topology.num_ghosts
                 remanent = by_patch(field.patches, midsurface.patches, cells)
                 loads = replace(loads, **{name: replace(field, remanent=remanent)})
-        self.midsurface, self.material, self.degree, self.loads = midsurface, material, degree, loads
+        self.midsurface, self.material, self.degree = midsurface, material, degree
         self.load_size = {}
         self.multiplicity = 2 if "symmetry" in conditions.values() else 1
         self.kernels = KernelLog()
         self.V = V = fem.functionspace(midsurface.mesh, ("Lagrange", degree, (3,)))
         self.r0, self.u = midsurface.placement(V), fem.Function(V, name="u")
+        in_cells = cells_of(self.r0)
+        for name in ("magnetic", "remanence"):
+            if (field := getattr(loads, name)) and field.given:
+                vectors = carried(field.given, midsurface, in_cells)
+                loads = replace(loads, **{name: replace(field, remanent=vectors)})
+        loads = self.loads = replace(loads, own=tuple(term.with_functions(midsurface.function) for term in loads.own))
+        if thickness and thickness.given:
+            thickness = replace(thickness, carried=carried(thickness.given, midsurface, in_cells))
         self.sigma = default_penalty(degree) if sigma is None else sigma
         for name in [name for name, c in conditions.items() if c == "plane" and not midsurface.read]:
             put_in_plane(self.r0, midsurface.edges[name])
@@ -131,9 +139,10 @@ class ShellModel(Thin):
         free, shape = dict[str, fem.Constant](), None
         if loads.natural:
             cells = midsurface.mesh.topology.index_map(2)
-            grown = loads.natural.on(midsurface.patches, cells.size_local + cells.num_ghosts)
+            count = cells.size_local + cells.num_ghosts
+            grown = loads.natural.on(midsurface.patches, count, lambda given: carried(given, midsurface, in_cells))
             loads = self.loads = replace(loads, natural=grown)
-            shape = Shape.of(natural_field(grown, cells_of(self.r0), self.V), grown, free)
+            shape = Shape.of(natural_field(grown, in_cells, self.V), grown, free)
         folded = midsurface.read and largest_fold(self.r0, degree) > FOLD
         carrier = on_surface(self.r0, self.growing and self.growing.drawn)
         of_shell = material, self.sigma, self.kernels, factor, shape, free, folded
@@ -194,7 +203,7 @@ class ShellModel(Thin):
             terms += [factory.term(energy) for energy in factory.magnetic(loads.magnetic)]
         if loads.pressure:
             terms.append(factory.term(factory.pressure(potential=not self.without_potential)))
-        terms += [factory.term(energy) for energy in self.own_and_contacts()]
+        terms += [factory.term(energy) for energy in self.own_and_contacts(midsurface.edges)]
         self.normals = {name: vertex_normal(self.r0, x) for name, x in midsurface.points.items()}
         terms += [self._force(name, force) for name, force in loads.forces.items()]
         on = SurfaceMeasures(self.r0, midsurface, degree) if loads.dead else None
@@ -228,7 +237,7 @@ class ShellModel(Thin):
         for term in dense:
             if not (self.growing and term.amplitude == "pressure"):  # whose form measures from the drawn placement
                 term.points = gradients
-        parameters: dict[str, FreeParameter] = {
+        parameters: dict[str, Parameter] = {
             **point_parameters(factory.free, dense, lambda slopes: serve(slopes, apart=True))
         }
         parameters |= field_parameters(factory.fields, terms, self.u, self.kernels)

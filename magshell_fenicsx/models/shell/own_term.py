@@ -1,9 +1,11 @@
-"""An energy of the mid-surface, a part's or one's own, from nothing but its density."""
+"""An energy of the mid-surface or of an edge, a part's or one's own, from nothing but its density."""
 
 import hashlib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from math import prod
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import basix.ufl
 import numpy as np
@@ -17,10 +19,18 @@ from ufl.core.expr import Expr
 from ufl.corealg.traversal import traverse_unique_terminals
 from ufl.geometry import GeometricQuantity
 
-from magshell_fenicsx.mesh.mirror import Mirror
-from magshell_fenicsx.models.shell.kinematics import CURVED, FIRST, SECOND, Jet
+from magshell_fenicsx.mesh.mirror import Y0, Mirror
+from magshell_fenicsx.mesh.patch import GivenField
+from magshell_fenicsx.models.shell.kinematics import CURVED, FIRST, SECOND, Edge, Jet
+from magshell_fenicsx.shape.symmetry import Leaves
+
+if TYPE_CHECKING:
+    from magshell_fenicsx.shape.outline import Outline
 
 Array = NDArray[np.float64]
+SYMBOLIC = {name: getattr(ufl, name) for name in ("sin", "cos", "tan", "exp", "sqrt", "sign")}
+SYMBOLIC |= {"log": ufl.ln, "abs": abs, "arctan2": ufl.atan2}  # functions of formulas
+Sample = tuple[Array, Array, Array]  # jets (6, 3) of r0 and u, and the covector (2,) of an edge
 SAMPLES = 24  # random surfaces on which a symmetry is looked for
 SAME = 1e-10  # difference of two values that is rounding, over the larger
 
@@ -39,7 +49,7 @@ class Free:
 
 @dataclass(frozen=True)
 class OwnTerm:
-    """The energy mu Pi(u), Pi the integral of a density over the undeformed mid-surface.
+    """The energy mu Pi(u), Pi the integral of a density over the undeformed mid-surface or, with `on`, along an edge.
 
     Of its own name are the term, its amplitude mu and its column. What the density depends on is found from
     it, and so are its derivatives and the symmetries that it leaves to a model.
@@ -54,7 +64,8 @@ class OwnTerm:
         jets are taken in: build it from values and from what `kinematics` offers. It may depend on the value and
         the first derivatives of u; an energy of its second derivatives would miss the rotations between cells.
     parameters
-        Numbers and vectors; other values of them need no new kernel. A `Free` one can be varied as mu can.
+        Numbers and vectors; other values of them need no new kernel. A `Free` one can be varied as mu can. A
+        dolfinx function on the mesh that the shell was given on is a number, or a vector, of its value at each place.
     value
         mu of the undeformed shell, which a path keeps unless it varies mu.
     observed
@@ -63,6 +74,9 @@ class OwnTerm:
     of_volume
         Whether the densities are those of a volume, over E: the thickness multiplies them where it varies, and a solid
         has them in all of its body. They depend on the places r0.r and u.r alone.
+    on
+        Name of an edge. The densities are then in E h R per undeformed length of it, and take a `kinematics.Edge` after
+        the jets: its outward conormal, and derivatives along this and by arc length. A solid has no such energies.
 
     Raises
     ------
@@ -72,16 +86,17 @@ class OwnTerm:
 
     name: str
     density: Callable[..., Expr]
-    parameters: tuple[float | Array | Free, ...] = ()
+    parameters: tuple[float | Array | Free | GivenField | Coefficient, ...] = ()
     value: float = 0.0
     observed: Mapping[str, Callable[..., Expr]] = field(default_factory=dict)
     of_volume: bool = False
+    on: str | None = None
 
     def __post_init__(self) -> None:
         if not self.name.isidentifier():
             raise ValueError(f"{self.name!r}: a term's name is an identifier, such as foundation")
-        if self._symbolic[0].ufl_shape:
-            raise ValueError(f"{self.name}: a density is a scalar; this has the shape {self._symbolic[0].ufl_shape}")
+        if self._symbolic.W.ufl_shape:
+            raise ValueError(f"{self.name}: a density is a scalar; this has the shape {self._symbolic.W.ufl_shape}")
         if strangers := self._strangers():
             raise ValueError(
                 f"{self.name}: a density is made of its jets and parameters alone; this holds {strangers[0]}. "
@@ -95,30 +110,55 @@ class OwnTerm:
                 "the edges it would miss the rotations between cells. Allowed are u.r, u.r1 and u.r2"
             )
 
-        bent = {*self.parts, *self._found_in(self._symbolic[1])} - {"r"}
+        if self.of_volume and self.on is not None:
+            raise ValueError(f"{self.name}: a density is that of a volume or that of an edge, not both")
+        bent = {*self.parts, *self._found_in(self._symbolic.r0)} - {"r"}
         if self.of_volume and bent:
             raise ValueError(f"{self.name}: a density of a volume depends on r0.r and u.r alone, not on {min(bent)}")
 
     @cached_property
     def parts(self) -> tuple[str, ...]:
         """The parts of the displacement's jet that the density depends on."""
-        return self._found_in(self._symbolic[2])
+        return self._found_in(self._symbolic.u)
 
     @cached_property
     def placed_parts(self) -> tuple[str, ...]:
         """Those of the placement's jet; the area of the surface takes the first derivatives anyway."""
-        return tuple(name for name in ("r", *CURVED) if name in (*FIRST, *self._found_in(self._symbolic[1])))
+        return tuple(name for name in ("r", *CURVED) if name in (*FIRST, *self._found_in(self._symbolic.r0)))
 
     @property
     def free(self) -> tuple[Free, ...]:
         """Its parameters that are amplitudes."""
         return tuple(p for p in self.parameters if isinstance(p, Free))
 
+    @property
+    def varying(self) -> bool:
+        """Whether a parameter is a function of the place."""
+        return any(isinstance(p, GivenField | Coefficient) for p in self.parameters)
+
+    def with_functions(self, function: Callable[[GivenField], Coefficient]) -> "OwnTerm":
+        """With functions on the mesh of a model in place of fields that were given; of numbers (size,)."""
+        if not self.varying:
+            return self
+        parameters = tuple(function(p) if isinstance(p, GivenField) else p for p in self.parameters)
+        return replace(self, parameters=parameters)
+
+    def at_point(self, density: Callable[..., Expr]) -> Callable[..., Expr]:
+        """A density that takes a function of one number as a vector of one."""
+        alone = [isinstance(p, Coefficient) and p.ufl_shape == (1,) for p in self.parameters]
+        if not any(alone):
+            return density
+
+        def of(*arguments: Any) -> Expr:
+            others, parameters = arguments[: -len(alone)], arguments[-len(alone) :]
+            return density(*others, *(p[0] if one else p for p, one in zip(parameters, alone, strict=True)))
+
+        return of
+
     @cached_property
     def linear(self) -> bool:
         """Whether the density is linear in the displacement: its second derivatives vanish identically."""
-        W, _, u = self._symbolic
-        parts = [getattr(u, name) for name in self.parts]
+        W, parts = self._symbolic.W, [getattr(self._symbolic.u, name) for name in self.parts]
         return all(isinstance(expand_derivatives(ufl.diff(ufl.diff(W, a), b)), Zero) for a in parts for b in parts)
 
     @cached_property
@@ -129,47 +169,71 @@ class OwnTerm:
             c, s = np.cos(angle), np.sin(angle)
             return np.asarray(jet @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]))
 
-        return all(self._same((r0, u), (turned(r0, a), turned(u, a))) for a, (r0, u) in enumerate(_random_jets(), 1))
+        samples = enumerate(_random_samples(), 1)
+        return not self.varying and all(
+            self._same((r0, u, m), (turned(r0, a), turned(u, a), m)) for a, (r0, u, m) in samples
+        )
 
     def mirrored(self, mirror: Mirror) -> bool:
         """Whether it, and what it observes, stays if shell and displacement are mirrored; at random jets."""
         # the first coordinate changes places with the second, so that the normal stays outward
+        if self.varying:
+            return False
         order, S = [("r", *CURVED).index(name) for name in ("r", "r2", "r1", "r22", "r12", "r11")], mirror.reflection
 
-        def image(r0: Array, u: Array) -> tuple[Array, Array]:
-            return np.vstack([mirror.image(r0[:1]), r0[order[1:]] @ S]), u[order] @ S
+        def image(r0: Array, u: Array, m: Array) -> Sample:
+            return np.vstack([mirror.image(r0[:1]), r0[order[1:]] @ S]), u[order] @ S, m[::-1]
 
-        return all(self._same((r0, u), image(r0, u)) for r0, u in _random_jets())
+        if self.on is not None and mirror.other(self.on) != self.on:
+            return False
+        return all(self._same(sample, image(*sample)) for sample in _random_samples())
+
+    def leaves(self, outline: "Outline") -> Leaves:
+        """The symmetry that it leaves.
+
+        The frame of a half of what is round is turned to its plane: a term that does not turn stays behind.
+        """
+
+        def mirrors(mirror: Mirror) -> bool:
+            turned = outline.round and mirror.through_e3 and mirror.azimuth != 0
+            return self.mirrored(Y0 if turned else mirror) and (not turned or self.turns)
+
+        shared, name = self.mirrored(Y0) and self.turns, self.name + (" or what it observes" if self.observed else "")
+        return Leaves(None if shared else f"the energy {name} does not share it", (), mirrors, name)
 
     @property
     def digest(self) -> str:
         """A hash of its name, its amplitude and its values at random jets."""
-        values = [self._value(r0, u, self.density) for r0, u in _random_jets()]
+        values = [self._value(sample, self.density) for sample in _random_samples()]
         free = [(p.name, p.value) for p in self.free]
         text = f"{self.name} {self.value!r} {free} {sorted(self.observed)} {[f'{v:.9e}' for v in values]}"
         text += " of a volume" * self.of_volume
+        text += "".join(f" {p.digest}" for p in self.parameters if isinstance(p, GivenField))
+        text += "" if self.on is None else f" on {self.on}"
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     @cached_property
-    def _symbolic(self) -> tuple[Expr, Jet, Jet]:
-        """The density, and the jets of r0 and u that it is written with."""
+    def _symbolic(self) -> "Symbolic":
+        """The density, and what it is written with."""
         domain = ufl.Mesh(basix.ufl.element("Lagrange", "triangle", 1, shape=(2,)))
         V = ufl.FunctionSpace(domain, basix.ufl.element("DG", "triangle", 0, shape=(3,)))
         r0, u = (Jet(*(ufl.variable(ufl.Coefficient(V)) for _ in range(1 + len(CURVED)))) for _ in range(2))
+        m = ufl.Coefficient(ufl.FunctionSpace(domain, basix.ufl.element("DG", "triangle", 0, shape=(2,))))
         try:
-            return self._at(r0, u, self.density), r0, u
+            return Symbolic(self._at(r0, u, m, self.density), r0, u, m)
         except Exception as e:  # of any kind: the density is the user's own program
             said = f"{type(e).__name__}: {e}"
+            taken = "r0, u" if self.on is None else "r0, u, an edge"
             raise ValueError(
-                f"{self.name}: the density cannot be computed ({said}). It is a function of r0, u and "
+                f"{self.name}: the density cannot be computed ({said}). It is a function of {taken} and "
                 f"{len(self.parameters)} parameters, and returns a scalar made of r0.r, u.r, u.r1, ... by functions of "
                 "UFL (ufl.dot, ufl.sqrt, ...) and of kinematics, not of NumPy or math"
             ) from e
 
     def _strangers(self) -> list[Expr]:
         """What else is in the density: fields, constants and coordinates of some mesh."""
-        W, *jets = self._symbolic
-        known = [part.ufl_operands[0] for jet in jets for part in jet.parts()]
+        W, r0, u, m = self._symbolic
+        known = [m, *(part.ufl_operands[0] for jet in (r0, u) for part in jet.parts())]
         return [
             terminal
             for terminal in traverse_unique_terminals(W)
@@ -177,39 +241,60 @@ class OwnTerm:
         ]
 
     def _found_in(self, jet: Jet) -> tuple[str, ...]:
-        found = extract_coefficients(self._symbolic[0])
+        found = extract_coefficients(self._symbolic.W)
         return tuple(name for name in ("r", *CURVED) if getattr(jet, name).ufl_operands[0] in found)
 
-    def _at(self, r0: Jet, u: Jet, density: Callable[..., Expr]) -> Expr:
-        return ufl.as_ufl(density(r0, u, *(_as_expression(p) for p in self.parameters)))
+    def _edge(self, r0: Jet, m: Expr) -> tuple[Edge, ...]:
+        """What its densities take after the jets."""
+        return () if self.on is None else (Edge.of(r0, m),)
 
-    def _same(self, *pairs: tuple[Array, Array]) -> bool:
-        """Whether the density, and each that is observed, is the same at two pairs of jets (6, 3)."""
+    def _at(self, r0: Jet, u: Jet, m: Expr, density: Callable[..., Expr]) -> Expr:
+        return ufl.as_ufl(density(r0, u, *self._edge(r0, m), *(_as_expression(p) for p in self.parameters)))
+
+    def _same(self, *samples: "Sample") -> bool:
+        """Whether the density, and each that is observed, is the same at two samples."""
         for density in (self.density, *self.observed.values()):
-            here, there = (self._value(*pair, density) for pair in pairs)
+            here, there = (self._value(sample, density) for sample in samples)
             if not abs(here - there) <= SAME * max(abs(here), abs(there)):  # nan: no symmetry is known
                 return False
         return True
 
-    def _value(self, r0: Array, u: Array, density: Callable[..., Expr]) -> float:
-        """A density at jets (6, 3); nan where it has none, as a root of less than zero."""
+    def _value(self, sample: "Sample", density: Callable[..., Expr]) -> float:
+        """A density at a sample; nan where it has none, as a root of less than zero."""
+        r0, u, m = sample
         try:
-            return float(apply_algebra_lowering(self._at(_as_jet(r0), _as_jet(u), density))(()))
+            return float(apply_algebra_lowering(self._at(_as_jet(r0), _as_jet(u), _as_expression(m), density))(()))
         except (ArithmeticError, TypeError, ValueError):
             return np.nan
 
 
-def _random_jets() -> list[tuple[Array, Array]]:
-    """Jets (6, 3) of r0 and u, always the same."""
+class Symbolic(NamedTuple):
+    """A density, the jets of r0 and u, and the covector of an edge that it is written with."""
+
+    W: Expr
+    r0: Jet
+    u: Jet
+    m: Expr
+
+
+def _random_samples() -> list[Sample]:
+    """Jets of r0 and u, and covectors, always the same."""
     # within a box about as large as a shell
-    return [(jets[0], jets[1] / 4) for jets in np.random.default_rng(2026).uniform(-1, 1, (SAMPLES, 2, 6, 3))]
+    rng = np.random.default_rng(2026)
+    jets, covectors = rng.uniform(-1, 1, (SAMPLES, 2, 6, 3)), rng.uniform(-1, 1, (SAMPLES, 2))
+    return [(jets[i, 0], jets[i, 1] / 4, covectors[i]) for i in range(SAMPLES)]
 
 
 def _as_jet(parts: Array) -> Jet:
     return Jet(*map(_as_expression, parts))
 
 
-def _as_expression(value: float | Array | Free) -> Expr:
+def _as_expression(value: float | Array | Free | GivenField | Coefficient) -> Expr:
+    if isinstance(value, GivenField):
+        value = np.where(value.largest == 0, 1.0, value.largest)
+        value = value if len(value) > 1 else float(value[0])
+    if isinstance(value, Coefficient):  # of any value
+        value = np.arange(1.0, 1 + prod(value.ufl_shape)) if value.ufl_shape not in ((), (1,)) else 1.0
     if isinstance(value, Free):
         return ufl.as_ufl(value.value or 1.0)  # of no place in its range, such as zero, that hides terms
     return ufl.as_ufl(float(value)) if np.ndim(value) == 0 else ufl.as_tensor(np.asarray(value, dtype=float).tolist())

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.motion import Motion
-from magshell_fenicsx.mesh.patch import Deviation
+from magshell_fenicsx.mesh.patch import Deviation, GivenField
+from magshell_fenicsx.models.shell.law import Koiter
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.patterns import Pattern
 from magshell_fenicsx.parts.bodies.contact import Contact
@@ -38,9 +39,14 @@ class Material:
     h: float
 
     @property
+    def law(self) -> Koiter:
+        """How a shell of it resists strains."""
+        return Koiter(self.h, self.nu)
+
+    @property
     def bending_stiffness(self) -> float:
         """D/(E h R^2)."""
-        return self.h**2 / (12 * (1 - self.nu**2))
+        return float(self.law.bending_stiffness)
 
     @property
     def classical_pressure(self) -> float:
@@ -85,6 +91,8 @@ class Magnetisation:
         Unit vectors along `applied` and `across`.
     turns
         Rotations of all of a field in space, which are motions of `driven`, in their order.
+    given
+        Vectors that were given on the mesh, in place of `remanent`; None without.
     energy
         The full energy, or which of the paper's approximations takes its place.
     patches
@@ -107,6 +115,7 @@ class Magnetisation:
     axes: tuple[NDArray[np.float64], ...] = ()
     driven: tuple[Driven, ...] = ()
     turns: tuple[Motion, ...] = ()
+    given: GivenField | None = None
 
     @property
     def uniform(self) -> bool:

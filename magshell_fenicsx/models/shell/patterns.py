@@ -11,13 +11,16 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from magshell_fenicsx.input.expressions import Together, together
-from magshell_fenicsx.mesh.patch import MeshError
+from magshell_fenicsx.mesh.given import stored
+from magshell_fenicsx.mesh.midsurface import Midsurface
+from magshell_fenicsx.mesh.patch import GivenField, MeshError
 from magshell_fenicsx.models.shell.fitted import Cells, Element, Fit, fitted
 
 Array = NDArray[np.float64]
 LARGEST = 1e6  # of a remanence's components
 FINER = 2  # degrees of a load by formula above that of the displacement: no part of the error
 INSIDE = 1e-10  # of the way from a node to the middle of its cell
+NEWTON, SETTLED = 30, 1e-13  # steps to a reference point, and a step that is rounding
 # (cells, nodes, 3) positions r0 and normals n0 -> (cells, nodes, 3) vectors
 Pattern = Callable[[Array, Array], Array]
 Inside = Callable[[Array], NDArray[np.bool_]]  # places (n, 3) -> whether they are within a rim
@@ -86,6 +89,56 @@ class ByPatch:
 
     def __call__(self, r0: Array, n0: Array) -> Array:
         return np.broadcast_to(self.vectors[: len(r0), None], r0.shape)  # owned cells come first
+
+
+@dataclass(frozen=True, eq=False)
+class Carried:
+    """What is given in each cell as a polynomial of its own; the places are the same in all cells.
+
+    Attributes
+    ----------
+    values
+        (cells, nodes, size) at the nodes of the element `of`.
+    cells
+        With their places.
+    """
+
+    values: Array
+    of: Element
+    cells: Cells
+
+    def __call__(self, r0: Array, n0: Array | None = None) -> Array:
+        table = self.of.tabulate(0, self._reference(r0[0]) if len(r0) else self.of.points)[0, :, :, 0]
+        return np.asarray(np.matmul(table, self.values[: len(r0)]))  # owned cells come first
+
+    def _reference(self, places: Array) -> Array:
+        """The reference points (n, 2) of places (n, 3) of the first cell, by Newton's method."""
+        element, nodal = self.cells.element, self.cells.nodal[0]
+        X = np.full((len(places), 2), 1 / 3)
+        for _ in range(NEWTON):
+            x, a1, a2 = (each[..., 0] @ nodal for each in element.tabulate(1, X))
+            slopes = np.stack([a1, a2], axis=-1)
+            step = np.einsum("nai,ni->na", np.linalg.pinv(slopes), places - x)
+            X = X + step
+            if np.abs(step).max() < SETTLED:
+                break
+        return X
+
+
+def carried(given: GivenField, midsurface: Midsurface, cells: Cells) -> Carried:
+    """What was given on the mesh, in the cells of this rank.
+
+    Raises
+    ------
+    MeshError
+        If its degree is higher than that of the displacement.
+    """
+    if given.degree > cells.element.degree:
+        raise MeshError(
+            f"{given.name}: is a function of degree {given.degree}; allowed is at most that of the displacement, "
+            f"{cells.element.degree}"
+        )
+    return Carried(midsurface.in_cells(given), stored(given.degree), cells)
 
 
 def by_patch(
@@ -229,6 +282,22 @@ def places(r0: fem.Function, at: Array | None = None) -> tuple[Array, Array]:
     x, a1, a2 = jets
     m = np.cross(a1, a2)
     return x, np.asarray(m / np.linalg.norm(m, axis=-1, keepdims=True))
+
+
+def cells_of_body(V: fem.FunctionSpace) -> Cells:
+    """The cells of a body."""
+    owned = V.mesh.topology.index_map(3).size_local
+    return Cells(V.element.basix_element, V.tabulate_dof_coordinates()[V.dofmap.list], owned, V.mesh.comm)
+
+
+def places_in_body(V: fem.FunctionSpace) -> tuple[Array, Array]:
+    """The nodes of every cell, and the normals of the surface at their height, (cells, nodes, 3) each."""
+    element = V.element.basix_element
+    along = element.tabulate(1, element.points)[:, :, :, 0]
+    nodes = V.tabulate_dof_coordinates()[V.dofmap.list]
+    a1, a2 = np.einsum("dvk,cki->dcvi", along[1:3], nodes)
+    m = np.cross(a1, a2)
+    return nodes, np.asarray(m / np.linalg.norm(m, axis=-1, keepdims=True))
 
 
 def refuse_unbounded(vectors: Array, nodes: Array, comm: MPI.Comm, key: str = "magnetic.remanent") -> None:

@@ -161,15 +161,17 @@ class _Edges:
         each = len(self._weights)
         X, w = np.concatenate([points for points, _ in rules]), np.tile(self._weights, 3)
         table = Table.tabulate(V.element.basix_element, X)
-        self._sheet = Sheet(table, w, [NAMES.index(part) for part in CURVED])
+        parts = [name for name in NAMES if name in CURVED or any(name in term.density.parts for term in terms)]
+        self._width = 3 * len(parts)
+        self._sheet = Sheet(table, w, [NAMES.index(part) for part in parts])
         frames, cells = cell_frames(V.mesh), np.arange(len(V.dofmap.list), dtype=np.int32)
-        self._there, self._back = (np.empty((len(cells) * len(X), 3 * len(CURVED))) for _ in range(2))
+        self._there, self._back = (np.empty((len(cells) * len(X), self._width)) for _ in range(2))
         self._on = dict[str, tuple[NDArray[np.intp], PointGradient]]()
 
         def placements() -> dict[str, Array]:
-            all_cells = _placement(r0, table, frames, CURVED).reshape(-1, 3 * len(CURVED))
+            all_cells = _placement(r0, table, frames, parts).reshape(-1, self._width)
             return {
-                name: all_cells[rows].reshape(len(rows), rows.shape[1] * 3 * len(CURVED))
+                name: all_cells[rows].reshape(len(rows), rows.shape[1] * self._width)
                 for name, (rows, _) in on_terms.items()
             }
 
@@ -186,7 +188,7 @@ class _Edges:
                 return at_points(field, X, cells)[rows].reshape(len(rows), rows.shape[1] * field.ufl_shape[0])
 
             here = Follows(partial(placed_on, term.name), lambda: (r0.x.array,))
-            points = PointGradient([term], CURVED, each, len(rows), here, geometry, values, log, V.mesh.comm)
+            points = PointGradient([term], parts, each, len(rows), here, geometry, values, log, V.mesh.comm)
             self._on[term.name] = rows, points
 
     def compile(self) -> None:
@@ -208,7 +210,7 @@ class _Edges:
         self._back[:] = 0
         for name in active:
             for here, values in self._evaluated(name, self._on[name][1].gradient):
-                self._back[here] += factors[name] * values.reshape(-1, 3 * len(CURVED))
+                self._back[here] += factors[name] * values.reshape(-1, self._width)
         elements += self._sheet.at_nodes(self._back)
 
     def _evaluated(self, name: str, kernel: fem.Expression | None) -> Iterator[tuple[NDArray[np.intp], Array]]:

@@ -6,7 +6,7 @@ shape functions are then the same for all cells.
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import fields
-from functools import reduce
+from functools import partial, reduce
 from itertools import combinations_with_replacement, product
 from operator import or_
 
@@ -16,14 +16,13 @@ from dolfinx import fem
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from magshell_fenicsx.assembly.batches import Batch
-from magshell_fenicsx.assembly.contraction import Blocks, Contraction
+from magshell_fenicsx.assembly.batches import Batch, Blocks, Contraction
 from magshell_fenicsx.assembly.following import Follows, PointField, values_of
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.point_kernels import Pair, Pairs, Points, point_hessian
 from magshell_fenicsx.assembly.shape_tables import PARTS
 from magshell_fenicsx.models.shell.energy import Density, HessianTerm, Parameter, ShellTerm
-from magshell_fenicsx.models.shell.kinematics import Jet
+from magshell_fenicsx.models.shell.kinematics import Jet, strain_components
 
 PointTerm = ShellTerm | HessianTerm
 Array = NDArray[np.float64]
@@ -172,13 +171,8 @@ class Kernel:
 
 def _strain(r0: Array, u: Array) -> Array:
     """(points, 3): E_11, E_12, E_22 from jets (..., 6, 3)."""
-    (a, b), (p, q) = (np.moveaxis(jets.reshape(-1, PARTS, 3)[:, 1:3], 1, 0) for jets in (r0, u))
-
-    def dot(x: Array, y: Array) -> Array:
-        return np.asarray(np.einsum("pc,pc->p", x, y))
-
-    E12 = (dot(a, q) + dot(p, b) + dot(p, q)) / 2
-    return np.stack([dot(a, p) + dot(p, p) / 2, E12, dot(b, q) + dot(q, q) / 2], axis=1)
+    first0, first = (np.moveaxis(jets.reshape(-1, PARTS, 3)[:, 1:3], 1, 0) for jets in (r0, u))
+    return np.stack(strain_components(first0, first, partial(np.einsum, "pc,pc->p")), axis=1)
 
 
 def _pairs(density: Density) -> Pairs:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ from dolfinx import fem
 from numpy.typing import NDArray
 from ufl.core.expr import Expr
 
-from magshell_fenicsx.assembly.parameters import Derivative, bends_of
+from magshell_fenicsx.assembly.parameters import Parameter
 from magshell_fenicsx.models.shell.energy import Density, ShellTerm
 from magshell_fenicsx.models.shell.gradients import PointTerm
 from magshell_fenicsx.models.shell.residual import FastResidual
@@ -36,27 +37,9 @@ class Slope:
         self.points.add(b, {self.name: factor})
 
 
-@dataclass(frozen=True)
-class PointParameter:
-    """A free parameter of a shell, as `assembly.parameters.Parameter`."""
-
-    constant: fem.Constant
-    slopes: Sequence[Slope]
-    serve: Serve
-    _bends: dict[fem.Constant, Sequence[Slope]] = field(default_factory=dict)
-
-    def bends(self, q: Any) -> Sequence[Derivative]:
-        """d2Pi_i/dp dq with the amplitudes mu_i; q may be p."""
-        if not isinstance(q, fem.Constant):
-            return bends_of(q, self.constant)
-        if q not in self._bends:
-            self._bends[q] = slopes(self.slopes, q, "twice", self.serve)
-        return self._bends[q]
-
-
 def point_parameters(
     constants: Mapping[str, fem.Constant], terms: Sequence[ShellTerm], serve: Serve
-) -> dict[str, PointParameter]:
+) -> dict[str, Parameter]:
     """The free parameters of a shell, by name; collective.
 
     Parameters
@@ -66,14 +49,16 @@ def point_parameters(
     serve
         Makes what serves terms each apart.
     """
-    found = {name: PointParameter(p, slopes(terms, p, f"by {name}", serve), serve) for name, p in constants.items()}
-    for parameter in found.values():
-        for served in {id(slope.points): slope.points for slope in parameter.slopes}.values():
+    found = {}
+    for name, p in constants.items():
+        of_terms = slopes(p, terms, f"by {name}", serve)
+        for served in {id(slope.points): slope.points for slope in of_terms}.values():
             served.compile()
+        found[name] = Parameter(p, of_terms, partial(slopes, terms=of_terms, words="twice", serve=serve))
     return found
 
 
-def slopes(terms: Sequence[PointTerm], p: fem.Constant, words: str, serve: Serve) -> list[Slope]:
+def slopes(p: fem.Constant, terms: Sequence[PointTerm], words: str, serve: Serve) -> list[Slope]:
     """The derivatives of those terms that a parameter enters."""
     entered = [term for term in terms if any(q is p for q in term.density.parameters)]
     found = [Slope(f"{term.name} {words}", term.amplitude, derived(term.density, p)) for term in entered]

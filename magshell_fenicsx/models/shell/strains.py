@@ -1,15 +1,17 @@
 """Membrane strains, changes of curvature and bending moments at points, in NumPy, to be looked at.
 
-The tensors are those of the energy (`kinematics`, `densities`), on the undeformed surface:
-E_ij = (a_ij - a0_ij)/2, K_ij = b_ij - b0_ij and M_ij = D [(1 - nu) K_ij + nu tr K a0_ij], what the
-paper's energy (eqn:energy) gives for a change of K. The normal is outward and b = n . r,_ij, so a
-sphere has b = -a/R, and a positive moment flattens it: it stretches the inner face.
+The tensors are those of the energy (`kinematics`, `law`), on the undeformed surface: E_ij = (a_ij - a0_ij)/2,
+K_ij = b_ij - b0_ij and M_ij, what the energy gives for a change of K. The normal is outward and b = n . r,_ij, so
+a sphere has b = -a/R, and a positive moment flattens it: it stretches the inner face.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+
+from magshell_fenicsx.models.shell.kinematics import curvature_components, strain_components
+from magshell_fenicsx.models.shell.law import Koiter
 
 Array = NDArray[np.float64]
 
@@ -64,17 +66,14 @@ class TangentFrame:
 
     def membrane_strain(self, u: Array) -> Array:
         """E_11, E_12, E_22 (..., 3) of a displacement's jet (6, ..., 3) over R; not as a difference of two metrics."""
-
-        def E(i: int, j: int) -> Array:
-            return (_dot(self.jet[i], u[j]) + _dot(u[i], self.jet[j]) + _dot(u[i], u[j])) / 2
-
-        return _times(self.in_frame, np.stack([E(1, 1), E(1, 2), E(2, 2)], axis=-1))
+        components = strain_components(self.jet[1:3], u[1:3], _dot)
+        return _times(self.in_frame, np.stack(components, axis=-1))
 
     def curvature_change(self, u: Array) -> Array:
         """K_11, K_12, K_22 (..., 3) times R of a displacement's jet (6, ..., 3) over R."""
         n = self.normal(u)
-        K = np.stack([_dot(n, u[ij]) + _dot(n - self.n0, self.jet[ij]) for ij in (3, 4, 5)], axis=-1)
-        return _times(self.in_frame, K)
+        components = curvature_components(n, n - self.n0, self.jet[3:], u[3:], _dot)
+        return _times(self.in_frame, np.stack(components, axis=-1))
 
     def normal(self, u: Array) -> Array:
         """The deformed unit normal (..., 3)."""
@@ -86,7 +85,7 @@ class TangentFrame:
         return self._carried(self._deformed(u), v, u)
 
     def rotated(self, v: Array, u: Array) -> Array:
-        """R v with the rotation R of F, of vectors (..., 3); see `rotation_law`."""
+        """R v with the rotation R of F, of vectors (..., 3); see `magnetism.laws`."""
         f, n = self._deformed(u), self.normal(u)
         cofactor = np.stack([np.cross(f[..., 1, :], n), np.cross(n, f[..., 0, :])], axis=-2)
         T = np.sqrt(np.sum(f * (f + cofactor), axis=(-2, -1)))
@@ -141,12 +140,11 @@ class NaturalFrame:
         """U^-1 (E - E_n) U^-1, (..., 3): the strain of the natural shell."""
         return _components(self.inverse @ _matrix(E - self.strain) @ self.inverse)
 
-    def moment(self, K: Array, nu: float) -> Array:
-        """M/D (..., 3), what works on K; D of the drawn thickness."""
-        up = self.inverse @ self.inverse
-        mixed = up @ _matrix(K - self.bend)
-        M = (1 - nu) * mixed @ up + nu * np.trace(mixed, axis1=-2, axis2=-1)[..., None, None] * up
-        return _components((self.thickness**3 / np.linalg.det(self.inverse))[..., None, None] * M)
+    def moment(self, E: Array, K: Array, law: Koiter) -> Array:
+        """M (..., 3) over E h R, what works on K."""
+        up, area = self.inverse @ self.inverse, 1 / np.linalg.det(self.inverse)
+        M = law.thicker(self.thickness).moment(_matrix(E - self.strain), _matrix(K - self.bend), up)
+        return np.asarray(area[..., None] * np.stack(M, axis=-1))
 
 
 def _matrix(S: Array) -> Array:
@@ -157,10 +155,9 @@ def _components(S: Array) -> Array:
     return np.stack([S[..., 0, 0], S[..., 0, 1], S[..., 1, 1]], axis=-1)
 
 
-def bending_moment(K: Array, nu: float) -> Array:
-    """M/D = (1 - nu) K + nu tr K, in the unit of K, of K_11, K_12, K_22 (..., 3) in an orthonormal frame."""
-    trace = K[..., :1] + K[..., 2:]
-    return np.asarray((1 - nu) * K + nu * trace * [1.0, 0.0, 1.0])
+def bending_moment(E: Array, K: Array, law: Koiter) -> Array:
+    """M (..., 3) over E h R of E_11, E_12, E_22 and K_11, K_12, K_22 (..., 3) in an orthonormal frame."""
+    return np.stack(law.moment(_matrix(E), _matrix(K), np.eye(2)), axis=-1)
 
 
 def principal(S: Array) -> tuple[Array, Array]:

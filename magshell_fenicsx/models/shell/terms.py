@@ -24,7 +24,8 @@ from magshell_fenicsx.models.shell.energy import (
     per_area,
 )
 from magshell_fenicsx.models.shell.free import Constants, constants_of
-from magshell_fenicsx.models.shell.kinematics import CURVED, MOVED, SECOND
+from magshell_fenicsx.models.shell.kinematics import CURVED, MOVED, SECOND, Edge, Jet
+from magshell_fenicsx.models.shell.law import elastic
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.parameters import ACROSS, DeadLoad, EdgeMoment, Magnetisation, Material, Potential
 from magshell_fenicsx.models.shell.patterns import pattern_field
@@ -99,39 +100,36 @@ class EnergyFactory:
         return moment
 
     def membrane(self) -> Energy:
-        density = Density(per_area(densities.membrane), (self._constant(self.material.nu),))
-        return self.carrier.energy("membrane", self._thick(self._grown(density), None), column="stretching")
+        density = self._elastic(Density(per_area(densities.membrane), ()))
+        return self.carrier.energy("membrane", density, column="stretching")
 
     def prestress(self) -> Density:
-        """The part of the tangent that membrane stress makes; its last parameter but the thickness is the strain."""
+        """The part of the tangent that membrane stress makes; its first parameter is the strain."""
         strain = fem.Function(fem.functionspace(self.carrier.mesh, ("DG", 0, (3,))))
-        density = Density(per_area(densities.prestress), (self._constant(self.material.nu), strain))
-        return self._thick(self._grown(density), None)
+        return self._elastic(Density(per_area(densities.prestress), (strain,)))
 
     def bending(self) -> Energy:
-        density = Density(per_area(densities.bending), self._nu_h(), parts=CURVED)
-        return self.carrier.energy("bending", self._thick(self._grown(density), 1), column="bending")
+        density = self._elastic(Density(per_area(densities.bending), (), parts=CURVED))
+        return self.carrier.energy("bending", density, column="bending")
 
     def interior_edges(self) -> Energy:
-        parameters = self._penalised() if self.thickness is None else (*self._penalised(), self.thickness)
         of = edges.folded if self.folded else edges.interior
-        return self.carrier.energy(
-            INTERIOR, self._grown(Density(of, parameters, CURVED, SECOND, sides=2)), column="bending"
-        )
+        density = self._elastic(Density(of, (self._penalty,), CURVED, SECOND, sides=2))
+        return self.carrier.energy(INTERIOR, density, column="bending")
 
     def clamped_edges(self, name: str, facets: Facets, turn: fem.Constant | None = None) -> Energy:
         """`turn` is the rotation of an edge that moves."""
-        parameters = (*self._penalised(), *([] if turn is None else [turn]))
-        density = Density(edges.clamped, parameters, CURVED, SECOND, facets)
+        parameters = (self._penalty,) if turn is None else (self._penalty, turn)
+        density = self._elastic(Density(edges.clamped, parameters, CURVED, SECOND, facets))
         self.held.append(HeldEdge(facets, turn=turn))
-        return self.carrier.energy(name, self._thick(self._grown(density), 1), column="bending")
+        return self.carrier.energy(name, density, column="bending")
 
     def mirror_edges(self, facets: Facets, normal: Array, name: str = "mirror edges") -> Energy:
         """Edges on a mirror plane with that normal."""
         plane = self._constant(normal)
-        density = Density(edges.symmetric, (*self._penalised(), plane), CURVED, SECOND, facets)
+        density = self._elastic(Density(edges.symmetric, (self._penalty, plane), CURVED, SECOND, facets))
         self.held.append(HeldEdge(facets, plane=plane))
-        return self.carrier.energy(name, self._thick(self._grown(density), 1), column="bending")
+        return self.carrier.energy(name, density, column="bending")
 
     def edge_moment(self, name: str, facets: Facets, intensity: float, amplitude: str) -> Energy:
         """A moment per length about the edge's first tangent; in E h R."""
@@ -148,12 +146,12 @@ class EnergyFactory:
             self.edge_moment(f"{name} moment {load.edge} {i}", edges_named[load.edge], load.moment, name)
             for i, load in enumerate(moments)
         ]
-        return turning + [self.own(load.term, name) for load in loads if isinstance(load, Potential)]
+        return turning + [self.own(load.term, amplitude=name) for load in loads if isinstance(load, Potential)]
 
     def antisymmetric_edges(self, facets: Facets, normal: Array) -> HessianTerm:
         """The mirror plane's edges under antisymmetric displacements."""
-        carrier, parameters = self.carrier, (*self._penalised(), self._constant(normal))
-        density = self._grown(Density(antisymmetric_edge, parameters, CURVED, facets=facets))
+        carrier, parameters = self.carrier, (self._penalty, self._constant(normal))
+        density = self._elastic(Density(antisymmetric_edge, parameters, CURVED, facets=facets))
         v = fem.Function(self.u.function_space)
         jets = carrier.j0, carrier.jet(self.u), carrier.jet(v)
         energy = density.of(*jets, carrier.covector, carrier.widths[1], *density.parameters) * carrier.ds(facets)
@@ -170,14 +168,14 @@ class EnergyFactory:
             known = AppliedField(field.in_space, carrier.r0, self.u, carrier.rule, field.driven)
             self.fields.append(known)
             of = densities.in_space(FULL[field.law])
-            density = self._thick(Density(per_area(of), (Br, known.polynomial), parts=MOVED), None)
+            density = self._thick(Density(per_area(of), (Br, known.polynomial), parts=MOVED))
             return [carrier.energy("magnetic", density, "lambda_m", column="magnetic")]
         directions = [("lambda_m", "", field.applied)]
         directions += [(name, name.replace("lambda_", " "), Ba) for name, Ba in zip(ACROSS, field.across, strict=False)]
         terms = [
             carrier.energy(
                 name + suffix,
-                self._thick(Density(per_area(of), (Br, self._constant(Ba))), None),
+                self._thick(Density(per_area(of), (Br, self._constant(Ba)))),
                 amplitude,
                 linear=name in LINEAR,
                 group=name,
@@ -189,7 +187,7 @@ class EnergyFactory:
         if field.gradient is not None:
             parameters = (Br, self._constant(field.gradient))
             density = Density(per_area(densities.in_gradient(FULL[field.law])), parameters, parts=MOVED)
-            terms.append(carrier.energy("magnetic gradient", self._thick(density, None), "lambda_m", column="magnetic"))
+            terms.append(carrier.energy("magnetic gradient", self._thick(density), "lambda_m", column="magnetic"))
         return terms
 
     def pressure(self, *, potential: bool) -> Energy:
@@ -211,19 +209,23 @@ class EnergyFactory:
         jets = self.carrier.from_drawn(self.carrier.jet(self.u))
         return self.carrier.whole * of(*jets, *parameters) * self.carrier.dx()
 
-    def own(self, term: OwnTerm, amplitude: str | None = None) -> Energy:
-        """The energy of a part or one's own, with the amplitude of its name or another."""
+    def own(self, term: OwnTerm, facets: Facets | None = None, amplitude: str | None = None) -> Energy:
+        """The energy of a part or one's own, with the amplitude of its name or another; `facets` of a term's edge."""
         still = tuple(part for part in term.placed_parts if part not in term.parts)  # asked for of r0 alone
-        density = Density(per_area(term.density), self._parameters(term), parts=(*term.parts, *still), linear=still)
-        density = self._thick(density, None) if term.of_volume else density
+        of, parts = _along(term, term.at_point(term.density)), (*term.parts, *still)
+        density = Density(of, self._parameters(term), parts=parts, linear=still, facets=facets)
+        density = self._thick(density) if term.of_volume else density
         return self.carrier.energy(term.name, density, amplitude or term.name, linear=term.linear)
 
-    def observed(self, term: OwnTerm) -> dict[str, ufl.Form]:
+    def observed(self, term: OwnTerm, facets: Facets | None = None) -> dict[str, ufl.Form]:
         """What it observes of the modelled part."""
         parameters = self._parameters(term)
-        by_column = {column: Density(per_area(of), parameters) for column, of in term.observed.items()}
+        by_column = {
+            column: Density(_along(term, term.at_point(of)), parameters, facets=facets)
+            for column, of in term.observed.items()
+        }
         if term.of_volume:
-            by_column = {column: self._thick(density, None) for column, density in by_column.items()}
+            by_column = {column: self._thick(density) for column, density in by_column.items()}
         return {column: self._over_area(density) for column, density in by_column.items()}
 
     def contact(self, contact: Contact) -> tuple[Energy, Pressing, dict[str, ufl.Form]]:
@@ -241,7 +243,7 @@ class EnergyFactory:
     def _over_area(self, density: Density) -> ufl.Form:
         return self.carrier.whole * self.carrier.integral(density, self.carrier.jet(self.u))
 
-    def _parameters(self, term: OwnTerm) -> tuple[fem.Constant, ...]:
+    def _parameters(self, term: OwnTerm) -> tuple[Parameter, ...]:
         return constants_of(term, self.carrier.mesh, self.free)
 
     def _constant(self, value: float | Array) -> fem.Constant:
@@ -250,16 +252,29 @@ class EnergyFactory:
     def _over_ranks(self, value: float) -> float:
         return float(self.carrier.mesh.comm.allreduce(value))
 
-    def _thick(self, density: Density, h_at: int | None) -> Density:
-        """The density with the thickness as it varies, if it does; `h_at` as of `thickness.thick`."""
-        return density if self.thickness is None else thick(density, self.thickness, h_at)
+    def _thick(self, density: Density) -> Density:
+        """The density over E h with the thickness as it varies, if it does."""
+        return density if self.thickness is None else thick(density, self.thickness)
 
-    def _grown(self, density: Density) -> Density:
-        """The density of the natural shape, if there is one."""
+    def _elastic(self, density: Density) -> Density:
+        """The density of the material with the thickness as it varies, and of the natural shape, if there is one."""
+        law = self.material.law
+        numbers = (self._constant(number) for number in law.numbers)
+        density = elastic(density, type(law)(*numbers), self.thickness)
         return grown(density, self.natural) if self.natural else density
 
-    def _nu_h(self) -> tuple[Parameter, Parameter]:
-        return self._constant(self.material.nu), self._constant(self.material.h)
+    @property
+    def _penalty(self) -> fem.Constant:
+        return self._constant(self.sigma)
 
-    def _penalised(self) -> tuple[Parameter, ...]:
-        return *self._nu_h(), self._constant(self.sigma)
+
+def _along(term: OwnTerm, of: Callable[..., Expr]) -> Callable[..., Expr]:
+    """A density of a term per area of the coordinates or, on an edge, per length of its parameter; see `Density.of`."""
+    if term.on is None:
+        return per_area(of)
+
+    def on_edge(r0: Jet, u: Jet, m: Expr, width: Expr, *parameters: Expr) -> Expr:
+        edge = Edge.of(r0, m)
+        return of(r0, u, edge, *parameters) * edge.stretch
+
+    return on_edge

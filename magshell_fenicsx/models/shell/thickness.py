@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 from ufl.core.expr import Expr
 
 from magshell_fenicsx.input.expressions import Together
-from magshell_fenicsx.mesh.patch import MeshError
+from magshell_fenicsx.mesh.patch import GivenField, MeshError
 from magshell_fenicsx.models.shell.energy import Density
 from magshell_fenicsx.models.shell.fitted import Cells, fitted
-from magshell_fenicsx.models.shell.patterns import cells_of, places
+from magshell_fenicsx.models.shell.patterns import Carried, cells_of, places
 
 Array = NDArray[np.float64]
 LEAST_FACTOR, MOST_FACTOR = 1e-3, 1e3
@@ -23,15 +23,20 @@ LEAST_FACTOR, MOST_FACTOR = 1e-3, 1e3
 class Thickness:
     """h(x)/h: a function of x, y, z over R, or a number for each named patch of a mesh (1 in the rest).
 
-    `formulas` is what varies in the function.
+    `formulas` is what varies in the function; `given` is a field on the triangles of a mesh in place of it, which is
+    `carried` in the cells of a model.
     """
 
     of_position: Callable[[Array, Array, Array], Array] | None = None
     patches: Mapping[str, float] | None = None
     formulas: Together | None = None
+    given: GivenField | None = None
+    carried: Carried | None = None
 
     def at(self, x: Array) -> Array:
-        """Its values at places (..., 3), without patches."""
+        """Its values at places (..., 3), without patches; of what is given in cells (cells, n, 3)."""
+        if self.carried:
+            return np.array(self.carried(x)[..., 0])
         return np.array(self.of_position(*np.moveaxis(x, -1, 0))) if self.of_position else np.ones(x.shape[:-1])
 
     def shown(self, cells: Cells, nodal: Array) -> Array:
@@ -117,20 +122,11 @@ def patch_of(patches: Mapping[str, NDArray[np.bool_]], name: str, key: str = "lo
     return patches[name]
 
 
-def thick(density: Density, t: fem.Function, h_at: int | None) -> Density:
-    """A density per E h with the thickness h t in place of h.
-
-    Parameters
-    ----------
-    h_at
-        Which of its parameters h is; None if it does not depend on it.
-    """
+def thick(density: Density, t: fem.Function) -> Density:
+    """A density per E h where the thickness is h t."""
 
     def of(*arguments: Expr) -> Expr:
         *given, factor = arguments
-        if h_at is not None:
-            at = len(given) - len(density.parameters) + h_at
-            given[at] = factor[0] * given[at]
         return factor[0] * density.of(*given)
 
     return replace(density, of=of, parameters=(*density.parameters, t))

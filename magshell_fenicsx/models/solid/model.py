@@ -4,7 +4,7 @@ Lengths in R, energies in E h R^2, amplitudes as in `ShellModel`. Displacements 
 of the thickness; the pressure, the volume and the loaded patch are of the outer face.
 """
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import Literal
@@ -17,7 +17,7 @@ from ufl.core.expr import Expr
 
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.moving import Curve, level_sides
-from magshell_fenicsx.assembly.parameters import FreeParameter, make_parameters
+from magshell_fenicsx.assembly.parameters import Parameter, make_parameters
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.assembly.sliding import Constraint, held_along
 from magshell_fenicsx.assembly.terms import LinearTerm, Term
@@ -27,19 +27,18 @@ from magshell_fenicsx.models.observed import Observed
 from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes
 from magshell_fenicsx.models.shell.fast_tangent import FastTangent
 from magshell_fenicsx.models.shell.fitted import Cells
-from magshell_fenicsx.models.shell.parameters import Condition, EdgeMoment, Loads, Material, Potential
-from magshell_fenicsx.models.solid.material import NeoHookean
+from magshell_fenicsx.models.shell.parameters import Condition, EdgeMoment, Loads, Magnetisation, Material, Potential
+from magshell_fenicsx.models.shell.patterns import ByPatch, Pattern, by_patch, cells_of_body, places_in_body
+from magshell_fenicsx.models.solid.densities import NeoHookean
 from magshell_fenicsx.models.solid.sites import make_sites
 from magshell_fenicsx.models.solid.terms import Density, TermFactory
 from magshell_fenicsx.parts.forces.dead_load import assemble_dead_loads
 from magshell_fenicsx.parts.forces.on_body import BodyMeasures, outer_patch
 from magshell_fenicsx.parts.magnetism.driving import field_parameters
-from magshell_fenicsx.parts.magnetism.remanence import cells_of_body, in_cells, places
-from magshell_fenicsx.parts.natural.on_body import body_shape, grown
+from magshell_fenicsx.parts.natural.shape import body_shape, grown_in_body
 from magshell_fenicsx.parts.pressure.openings import openings
 from magshell_fenicsx.parts.supports.moved import enclosed, motions_of, moving, pressed_edges
-from magshell_fenicsx.parts.supports.on_body import ROUNDING, in_middle, supports
-from magshell_fenicsx.parts.supports.supports import closing_point
+from magshell_fenicsx.parts.supports.supports import ROUNDING, closing_point, in_middle, supports
 
 Array = NDArray[np.float64]
 MIRRORS = ("symmetry", "plane")
@@ -87,7 +86,7 @@ class SolidModel(Observed):
         mirror: Mirror = Y0,
     ) -> None:
         if loads.magnetic:
-            loads = replace(loads, magnetic=replace(loads.magnetic, remanent=in_cells(loads.magnetic, body)))
+            loads = replace(loads, magnetic=replace(loads.magnetic, remanent=_in_cells(loads.magnetic, body)))
         self.body, self.material, self.neo_hookean, self.loads = body, material, neo_hookean, loads
         self.normals = body.normals
         self.multiplicity = 2 if "symmetry" in conditions.values() else 1
@@ -99,7 +98,7 @@ class SolidModel(Observed):
         free, growing = dict[str, fem.Constant](), dict[str, Callable[[Density], Density]]()
         if loads.natural:
             shape = body_shape(loads.natural, body, V, free)
-            growing["grown"] = lambda density: grown(density, shape)
+            growing["grown"] = lambda density: grown_in_body(density, shape)
         self.factory = factory = TermFactory(
             body, self.u, neo_hookean, material.h, self.kernels, hinged, free=free, fields=[], **growing
         )
@@ -166,7 +165,7 @@ class SolidModel(Observed):
 
     def places(self, nodes: Array) -> tuple[Array, Array]:
         """The nodes of every cell, whatever is asked for, and the normals of the surface at their height."""
-        return places(self.V)
+        return places_in_body(self.V)
 
     def chart(self) -> Array:
         """Coordinates (n, 3) of this rank's nodes: the chart's and the height in the thickness."""
@@ -189,9 +188,29 @@ class SolidModel(Observed):
         if moving:
             near = moving.cells, make_sites(self.body, self.r0, self._terms, self.kernels, moving.cells)
         fast = FastTangent(self.u, self._sites, held, near)
-        parameters: dict[str, FreeParameter] = {**make_parameters(factory.free, self._terms, self.u, self.kernels)}
+        parameters: dict[str, Parameter] = {**make_parameters(factory.free, self._terms, self.u, self.kernels)}
         parameters |= field_parameters(factory.fields, self._terms, self.u, self.kernels)
         self.fields = factory.fields
         return FiniteElementSystem(
             self.u, self._terms, held, self._pattern, self.material.h, fast, parameters=parameters, moving=moving
         )
+
+
+def _in_cells(field: Magnetisation, body: Body) -> Array | Pattern:
+    """The remanence, with a vector for each cell where it is given by patches or by layers.
+
+    Raises
+    ------
+    MeshError
+        If the body has no such patch.
+    """
+    if field.patches:
+        return by_patch(field.patches, body.patches, len(body.between))
+    return _layered(field.layers, body) if field.layers else field.remanent
+
+
+def _layered(layers: Sequence[tuple[float, Array]], body: Body) -> ByPatch:
+    """Layers from the inner face outwards: fractions of the thickness, which end where cells do, and vectors."""
+    ends = np.cumsum([fraction for fraction, _ in layers])
+    middle = body.between.mean(axis=1)
+    return ByPatch(np.array([vector for _, vector in layers])[np.searchsorted(ends[:-1], middle)])

@@ -14,8 +14,7 @@ import ufl
 from dolfinx import fem
 from numpy.typing import NDArray
 
-from magshell_fenicsx.assembly.batches import POINTS, Batch, Rule
-from magshell_fenicsx.assembly.contraction import Blocks, Contraction
+from magshell_fenicsx.assembly.batches import POINTS, Batch, Blocks, Contraction, Rule
 from magshell_fenicsx.assembly.following import Follows
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.point_kernels import Pairs, Points, point_hessian

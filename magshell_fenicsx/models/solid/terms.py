@@ -19,11 +19,18 @@ from magshell_fenicsx.models.shell.free import Constants, constants_of
 from magshell_fenicsx.models.shell.kinematics import CURVED, SECOND, Jet
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.parameters import ACROSS, Magnetisation
+from magshell_fenicsx.models.shell.patterns import (
+    Pattern,
+    cells_of_body,
+    inside,
+    places_in_body,
+    refuse_unbounded,
+    shown,
+)
 from magshell_fenicsx.models.solid import densities
-from magshell_fenicsx.models.solid.material import NeoHookean
+from magshell_fenicsx.models.solid.densities import NeoHookean
 from magshell_fenicsx.parts.magnetism import rotation_on_body as rotation_law
 from magshell_fenicsx.parts.magnetism.applied import AppliedField
-from magshell_fenicsx.parts.magnetism.remanence import remanence_field
 
 WHOLE, REDUCED = 5, 3  # quadrature degrees: three and two points in each direction
 VALUE, GRADIENT, ON_FACE = (0,), (1, 2, 3), (0, 1, 2)  # parts of a displacement's jet: value, reference derivatives
@@ -110,7 +117,7 @@ class TermFactory:
     def magnetic(self, of: Magnetisation) -> list[SolidTerm]:
         """The terms, linear in the applied field, with the amplitude lambda_m."""
         pattern, law = of.remanent, densities if of.law == "deformation" else rotation_law
-        Br = remanence_field(pattern, self.u.function_space) if callable(pattern) else self._constants(pattern)[0]
+        Br = _remanence_field(pattern, self.u.function_space) if callable(pattern) else self._constants(pattern)[0]
         if of.in_space:
             X = fem.Function(self.u.function_space)
             X.interpolate(lambda x: x)
@@ -276,3 +283,20 @@ def face_measure(domain: mesh.Mesh, parts: Sequence[Facets]) -> ufl.Measure:
     order = np.argsort(facets)
     found = mesh.meshtags(domain, 2, facets[order], tags[order])
     return ufl.Measure("ds", domain=domain, subdomain_data=found, metadata={"quadrature_degree": WHOLE})
+
+
+def _remanence_field(pattern: Pattern, V: fem.FunctionSpace) -> fem.Function:
+    """A remanence at the nodes of every cell, free to jump from cell to cell; collective.
+
+    Raises
+    ------
+    MeshError
+        On every rank, if it has no finite value somewhere.
+    """
+    nodes, normals = places_in_body(V)
+    Q = fem.functionspace(V.mesh, ("DG", V.element.basix_element.degree, (3,)))
+    field = fem.Function(Q, name="Br")
+    refuse_unbounded(pattern(nodes, normals), nodes, V.mesh.comm)
+    fit = shown(pattern, cells_of_body(V), pattern(inside(nodes), normals), Q.element.basix_element)
+    field.x.array.reshape(-1, 3)[Q.dofmap.list] = fit.nodal
+    return field

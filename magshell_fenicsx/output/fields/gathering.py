@@ -1,22 +1,140 @@
-"""The gatherer of each model: it collects nodal fields on rank 0 for pictures and ParaView."""
+"""The gatherer of each model: it collects nodal fields on rank 0 for pictures and ParaView.
+
+That of a meridian gives the surface that it sweeps, in flat triangles.
+"""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any, Protocol
 
+import basix
 import numpy as np
 from dolfinx import fem, mesh
 from dolfinx.cpp.io import perm_vtk
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from magshell_fenicsx.continuation.system import Vector
+from magshell_fenicsx.continuation.system import State, Vector
+from magshell_fenicsx.mesh.patch import Deviated
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
+from magshell_fenicsx.models.axisymmetric.revolution import ENDS, Revolution
 from magshell_fenicsx.models.shell.model import ShellModel
+from magshell_fenicsx.models.shell.patterns import inside
 from magshell_fenicsx.models.solid.model import SolidModel
-from magshell_fenicsx.output.fields.revolved import RevolvedGatherer
-from magshell_fenicsx.output.fields.surface import W0, Surface, SurfaceGatherer
+from magshell_fenicsx.output.fields.point_fields import PointFields, Stresses, principal_fields
+from magshell_fenicsx.output.fields.recovery import ROUNDING, Recovery, relative_jump, smooth_parts
+from magshell_fenicsx.output.fields.surface import PRESSURE, W0, Surface, SurfaceGatherer, grown
 
 Array = NDArray[np.float64]
+
+
+class RevolvedGatherer:
+    """Gathers displacement and fields of a meridian; strains and moments are recovered from samples in its cells."""
+
+    def __init__(self, model: MeridianModel, comm: MPI.Comm) -> None:
+        self.comm, self._model = comm, model
+        self._inner, rule = basix.make_quadrature(basix.CellType.interval, 2 * model.degree - 3)
+        self._swept = Revolution(model)
+        self._take_placement({})
+        if len(kinks := self._kinks()):
+            self._swept = Revolution(model, kinks=kinks)
+            self._take_placement({})
+        self._recovered = RecoveredMeridian(self._swept, self._model, self._inner, rule)
+
+    def _take_placement(self, mu: Mapping[str, float]) -> None:
+        """What depends on the placement, at amplitudes of imperfections that grow."""
+        model, swept, loads = self._model, self._swept, self._model.loads
+        r, inner = swept.jets(model.r0), swept.inner_jets(model.r0, self._inner)
+        thick, thick_inside = (
+            None if model.thickness is None else swept.scalars(model.thickness, at) for at in (ENDS, self._inner)
+        )
+        self._fields = PointFields(r, model.material, loads.magnetic, thick, loads.contacts, loads.remanence)
+        self._stresses = Stresses(inner, model.material, thick_inside, loads.natural)
+        self._at_ends = Stresses(r, model.material, thick).frame
+        if isinstance(model.meridian.embedding, Deviated):
+            s = np.sort(model.meridian.mesh.geometry.x[:, 0])
+            embedding = model.meridian.embedding
+            deviations = (*embedding.deviations, *grown(loads.growing, mu))
+            w0 = replace(embedding, deviations=deviations).w0(np.column_stack([s, 0 * s])) / model.material.h
+            self._fields.constant[W0] = np.column_stack([w0[:-1], w0[1:]])
+        self._constant = self._around(self._fields.constant)
+
+    def _kinks(self) -> list[int]:
+        """The numbers of the vertices along the meridian where given fields or the normal jump."""
+        model, fields = self._model, self._fields
+        given = [fields.Br] if fields.Br.size else []
+        if model.loads.natural:
+            given += model.loads.natural.at(inside(fields.jet[0]), fields.n0)
+        if model.thickness is not None:
+            given.append(self._swept.scalars(model.thickness))
+        parts = smooth_parts(self._swept.ends, np.array([[0], [1]]), given, fields.n0)
+        return [int(i) + 1 for i in np.flatnonzero(np.diff(parts))]
+
+    def gather(self, u: Vector, mu: Mapping[str, float] | None = None) -> Surface | None:
+        """The displaced surface with its fields at the amplitudes mu, on rank 0; None on other ranks."""
+        if self.comm.rank:
+            return None
+        state = State(u, dict(mu or {}))
+        return self._model.system.at(state).of(lambda: self._drawn(state))
+
+    def _drawn(self, state: State) -> Surface:
+        """The surface at the displacement and the placement that are set."""
+        if self._model.growing:
+            self._take_placement(state.mu)
+        swept = self._swept
+        stresses = self._stresses.of(swept.inner_jets(self._model.u, self._inner), state.mu)
+        components, jumps = self._recovered.components(stresses)
+        tensors = {name: self._at_ends.tensor(S) for name, S in components.items()}
+        values = tensors | principal_fields(components) | self._fields.of(swept.jets(self._model.u), state.mu)
+        pressure = self._model.cell_pressures(state) if state.mu else None
+        if pressure is not None:
+            values[PRESSURE] = np.repeat(pressure[swept.order, None], 2, axis=1)
+        turned = self._around(values)
+        fields = self._constant | turned
+        shape = swept.r0, swept.displacement(state.u), swept.n0, swept.cells
+        return Surface(*shape, fields, (), jumps["M"], jumps["E"])
+
+    def _around(self, fields: Mapping[str, Array]) -> dict[str, Array]:
+        return {name: self._swept.around(values, self._fields.weight) for name, values in fields.items()}
+
+
+class RecoveredMeridian:
+    """Takes components along and across the meridian from samples in its cells to their ends.
+
+    At a pole, where both are even functions of the arc length, the first cell has its mirror image beside it.
+    """
+
+    def __init__(self, swept: Revolution, model: MeridianModel, inner: Array, rule: Array) -> None:
+        s = np.sort(model.meridian.mesh.geometry.x[:, 0])
+        begin, length = s[:-1, None], np.diff(s)[:, None]
+        samples, ends = begin + length * inner[:, 0], swept.ends
+        self._image = int(len(model.meridian.axis) > 0)
+        vertices = np.empty(ends.max() + 1)
+        vertices[ends] = np.column_stack([s[:-1], s[1:]])
+        if self._image:
+            samples, length = np.concatenate([2 * s[0] - samples[:1], samples]), length[[0, *range(len(length))]]
+            vertices, ends = np.append(vertices, 2 * s[0] - s[1]), np.concatenate([[[0, len(vertices)]], ends])
+        frames = np.ones((len(vertices), 1, 1))
+        of = ends, samples[..., None], length * rule, vertices[:, None], frames
+        self._recovery, self._weight = Recovery(*of, model.degree), (length * rule)[self._image :]
+        cells, count = np.arange(self._image, len(ends)), len(inner)
+        hats = np.column_stack([1 - inner[:, 0], inner[:, 0]])
+        self._to_samples = self._recovery.at(
+            np.repeat(cells, count), samples[self._image :].reshape(-1, 1), np.tile(hats, (len(cells), 1))
+        )
+        at_ends = np.repeat(cells, 2), vertices[ends[self._image :]].reshape(-1, 1), np.tile(np.eye(2), (len(cells), 1))
+        self._to_ends = self._recovery.at(*at_ends)
+
+    def components(self, stresses: Mapping[str, Array]) -> tuple[dict[str, Array], dict[str, float]]:
+        """Those (cells, 2, 3) at the ends, of (cells, q, 3), and by how much those of the samples differ."""
+        at_ends, jumps = {}, {}
+        for name, S in stresses.items():
+            fit = self._recovery.coefficients(np.concatenate([S[: self._image], S]))
+            at_ends[name] = (self._to_ends @ fit).reshape(-1, 2, 3)
+            if name in ROUNDING:
+                smooth = (self._to_samples @ fit).reshape(S.shape)
+                jumps[name] = relative_jump(S, smooth, self._weight, ROUNDING[name])
+        return at_ends, jumps
 
 
 class BodyGatherer:

@@ -4,13 +4,11 @@ A half shell is completed by the symmetric or antisymmetric mirror image of the 
 evaluated around the axis.
 """
 
-import csv
-import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import pi, sqrt
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +22,8 @@ from magshell_fenicsx.models.solid.model import SolidModel
 from magshell_fenicsx.output.fields.gathering import Gatherer
 from magshell_fenicsx.output.fields.surface import Surface, completed, turned
 from magshell_fenicsx.output.fields.vtu import About, vtu_content
-from magshell_fenicsx.output.store.durable import Damaged, write_whole
+from magshell_fenicsx.output.store.durable import write_whole
+from magshell_fenicsx.output.store.table import read_csv, table_text
 
 Array = NDArray[np.float64]
 WAVES = "m = "
@@ -115,14 +114,11 @@ def write_mode(file: Path, surface: Surface, about: About) -> None:
     write_whole(file, vtu_content(surface, about))
 
 
-def mode_table(found: Mapping[int, Sequence[Mode]]) -> bytes:
+def mode_table(by_point: Mapping[int, Sequence[Mode]]) -> bytes:
     """stability.csv: the modes of each point, in the order of their eigenvalues over E h/R^2."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(COLUMNS)
-    for point, modes in found.items():
-        writer.writerows((point, n, mode.label, repr(mode.eigenvalue)) for n, mode in enumerate(modes, 1))
-    return text.getvalue().encode()
+    listed = ((point, n, mode) for point, modes in by_point.items() for n, mode in enumerate(modes, 1))
+    lines = ((point, n, mode.label, mode.eigenvalue) for point, n, mode in listed)
+    return table_text([COLUMNS, *lines], end="\n").encode()
 
 
 def mode_caption(number: int, mode: Mode) -> str:
@@ -249,32 +245,24 @@ def hertz(omega2: float, time_unit: float | None) -> float | None:
 
 
 def frequency_table(
-    found: Mapping[int, Sequence[Mode]],
+    by_point: Mapping[int, Sequence[Mode]],
     own: str,
     time_unit: float | None,
     contact_changes: Mapping[int, Sequence[float]],
 ) -> bytes:
     """The file: modes of each point, ascending; `contact_changes` is a column where there are bodies."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow((*NUMBERS, CONTACT_CHANGE) if contact_changes else NUMBERS)
-    for point, modes in found.items():
+    lines: list[Sequence[Any]] = [(*NUMBERS, CONTACT_CHANGE) if contact_changes else NUMBERS]
+    for point, modes in by_point.items():
         for n, mode in enumerate(modes):
-            f = hertz(mode.eigenvalue, time_unit)
-            row = (point, wave_of(mode.label, own), repr(mode.eigenvalue), "" if f is None else repr(f))
-            writer.writerow((*row, repr(contact_changes[point][n])) if contact_changes else row)
-    return text.getvalue().encode()
+            row = (point, wave_of(mode.label, own), mode.eigenvalue, hertz(mode.eigenvalue, time_unit))
+            lines.append((*row, contact_changes[point][n]) if contact_changes else row)
+    return table_text(lines, end="\n").encode()
 
 
 def read_frequencies(folder: Path) -> list[Frequency]:
     """The rows of a run's folder; none without the file."""
-    if not (folder / NAME).exists():
-        return []
-    try:
-        with (folder / NAME).open(encoding="utf-8", newline="") as stream:
-            return [
-                Frequency(int(line["point"]), line["wave"], float(line["omega2"]), float(line["hertz"] or "nan"))
-                for line in csv.DictReader(stream)
-            ]
-    except (KeyError, ValueError, TypeError, csv.Error) as e:
-        raise Damaged(f"{folder / NAME}: is damaged: {type(e).__name__}: {e}") from None
+
+    def made(line: Mapping[str, str]) -> Frequency:
+        return Frequency(int(line["point"]), line["wave"], float(line["omega2"]), float(line["hertz"] or "nan"))
+
+    return read_csv(folder / NAME, made) if (folder / NAME).exists() else []

@@ -126,7 +126,7 @@ class Stresses:
     """
 
     def __init__(self, r0: Array, material: Material, thickness: Array | None, natural: Natural | None = None) -> None:
-        self.frame, self._nu, self._thickness = TangentFrame.of(r0), material.nu, thickness
+        self.frame, self._law, self._thickness = TangentFrame.of(r0), material.law, thickness
         self._natural = natural and natural.at(r0[0], self.frame.n0)
 
     def of(self, u: Array, mu: Mapping[str, float]) -> dict[str, Array]:
@@ -142,14 +142,14 @@ class Stresses:
         """
         frame, total = self.frame, {}
         E, K = frame.membrane_strain(u), frame.curvature_change(u)
-        M = bending_moment(K, self._nu)
+        law = self._law if self._thickness is None else self._law.thicker(self._thickness)
         if self._natural:
             total["E_total"] = E
             shape = NaturalFrame.of(frame, *self._natural, mu.get(CURVATURE, 0.0), mu.get(STRETCH, 0.0))
-            E, M = shape.elastic(E), shape.moment(K, self._nu)
-        if self._thickness is not None:
-            M *= self._thickness[..., None] ** 3
-        return {"E": E, "M": M, **total}
+            E, M = shape.elastic(E), shape.moment(E, K, law)
+        else:
+            M = bending_moment(E, K, law)
+        return {"E": E, "M": M / self._law.bending_stiffness, **total}
 
 
 def principal_fields(components: Mapping[str, Array]) -> dict[str, Array]:

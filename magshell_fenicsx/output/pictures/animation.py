@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.case.output import OutputSection
 from magshell_fenicsx.output.fields.surface import Surface
 from magshell_fenicsx.output.pictures.colours import Coloured
 from magshell_fenicsx.output.pictures.curve import Part, drawn_parts, place, plot_curve
@@ -16,6 +15,7 @@ from magshell_fenicsx.output.pictures.layout import SIGNED, Boxes, Panel, colour
 from magshell_fenicsx.output.pictures.picture import Background
 from magshell_fenicsx.output.pictures.view import Camera, Image, Window, near_outlines
 from magshell_fenicsx.output.store.table import POLE, Row
+from magshell_fenicsx.problem.wanted import OutputSection
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -9,10 +9,10 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from magshell_fenicsx.case.output import OutputSection
 from magshell_fenicsx.output.pictures.captions import write_numbers
 from magshell_fenicsx.output.pictures.layout import INCH, ONE, SEVERAL, drawing, number_format
 from magshell_fenicsx.output.store.table import LOCATED, POLE, SOLUTION, Row, pole_name
+from magshell_fenicsx.problem.wanted import OutputSection
 from magshell_fenicsx.quantities.registry import OWN_MODES, axes_of, quantity, shown
 from magshell_fenicsx.quantities.registry import amplitude as registered
 

@@ -17,8 +17,8 @@ from dataclasses import field
 
 from numpy.typing import NDArray
 
-from magshell_fenicsx.case.output import OutputSection
 from magshell_fenicsx.output.pictures.view import Camera, Image, Window, axes_on_screen
+from magshell_fenicsx.problem.wanted import OutputSection
 
 if TYPE_CHECKING:  # takes long to import
     from matplotlib.axes import Axes

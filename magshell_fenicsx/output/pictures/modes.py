@@ -1,42 +1,63 @@
-"""Pictures of modes and of further solutions: small panels beside each other."""
+"""Pictures of modes and of further solutions as small panels; gradients.png.
 
-from collections.abc import Sequence
+The last shows where a result would change most with more of a field.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
-from magshell_fenicsx.case.output import OutputSection
+from magshell_fenicsx.output.fields.modes import mode_caption, mode_file, wave_number
 from magshell_fenicsx.output.fields.surface import Surface
+from magshell_fenicsx.output.fields.vtu import read_vtu
+from magshell_fenicsx.output.pictures.captions import named_value
 from magshell_fenicsx.output.pictures.colours import Coloured
+from magshell_fenicsx.output.pictures.curve import numbered
 from magshell_fenicsx.output.pictures.layout import (
     GAP,
     INCH,
     LINE,
     ONE,
     SEVERAL,
+    SIGNED,
+    Arrow,
     Boxes,
+    Panel,
     colour_bar,
+    columns,
     directions,
     draw_panel,
+    drawing,
+    panel_width,
+    panels_figure,
 )
-from magshell_fenicsx.output.pictures.picture import Background
+from magshell_fenicsx.output.pictures.picture import Background, spread
 from magshell_fenicsx.output.pictures.view import Camera, Window
-
-if TYPE_CHECKING:  # takes long to import
-    from matplotlib.figure import Figure
-import csv
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from pathlib import Path
-
-from magshell_fenicsx.output.fields.modes import mode_caption, mode_file, wave_number
-from magshell_fenicsx.output.fields.vtu import read_vtu
-from magshell_fenicsx.output.pictures.captions import named_value
-from magshell_fenicsx.output.pictures.curve import numbered
-from magshell_fenicsx.output.pictures.layout import SIGNED, drawing
-from magshell_fenicsx.output.store.durable import Damaged
-from magshell_fenicsx.output.store.table import LOCATED, SOLUTION, Row, stability
+from magshell_fenicsx.output.store.table import LOCATED, SOLUTION, Row, read_csv, stability
+from magshell_fenicsx.problem.wanted import OutputSection
 from magshell_fenicsx.quantities.registry import OWN_MODES, amplitude
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+Array = NDArray[np.float64]
+QUANTILE, PEAK = 0.995, 1.3  # colours end at most PEAK times above this quantile of the nodes
+SMALL, APART = 0.15, 0.16  # vectors below this part of the largest have none; their distance over the extent of those
+NOTE = "Change of a result per area by the change of a field there."
+WORDS = {
+    "remanence": "more remanence, along arrows",
+    "magnitude": "stronger magnet",
+    "thickness": "more thickness",
+    "curvature_11": r"natural curvature $\kappa_{11}$",
+    "curvature_22": r"natural curvature $\kappa_{22}$",
+    "curvature_12": r"natural twist $\kappa_{12}$",
+    "deviation": r"shape moved outwards, $w_0/R$",
+}
 
 
 def small_panels(
@@ -149,13 +170,7 @@ def mode_figures(
     table = folder / "stability.csv"
     if not table.exists():
         return
-    try:
-        with table.open(encoding="utf-8", newline="") as stream:
-            listed = [
-                (int(line["point"]), Mode(line["mode"], float(line["eigenvalue"]))) for line in csv.DictReader(stream)
-            ]
-    except (KeyError, ValueError, TypeError, csv.Error) as e:
-        raise Damaged(f"{table}: is damaged: {type(e).__name__}: {e}") from None
+    listed = read_csv(table, lambda line: (int(line["point"]), Mode(line["mode"], float(line["eigenvalue"]))))
     for row in rows:
         point = int(row["point"])
         modes = [mode for number, mode in listed if number == point]
@@ -184,3 +199,39 @@ def _null_vector(folder: Path, row: Row, numbers: dict[int, int]) -> tuple[Surfa
     column = amplitude(str(row["amplitude"])).column
     where = f"\n{named_value(column, row, 5)}" if row["amplitude"] else ""
     return surface, f"{numbers[int(row['point'])]}: {row['label']}{kind}{where}"
+
+
+def gradients_figure(by_result: Mapping[str, Surface], style: OutputSection, camera: Camera) -> "Figure":
+    """One panel for each result and field: red raises the result, blue lowers it; of vectors their length."""
+    count = sum(name in surface.fields for surface in by_result.values() for name in WORDS)
+    width = panel_width(style, columns(count))
+    with drawing(style):
+        panels = [panel for of, surface in by_result.items() for panel in _panels(of, surface, style, camera, width)]
+        return panels_figure(panels, style, NOTE)
+
+
+def _panels(of: str, surface: Surface, style: OutputSection, camera: Camera, width: int) -> Iterator[Panel]:
+    view = Background(surface, camera, width)
+    for name in (name for name in WORDS if name in surface.fields):
+        caption, values = f"{of.replace('_', ' ')}: {WORDS[name]}", surface.fields[name]
+        if values.ndim == 1:
+            limit = _limit(np.abs(values))
+            yield view.panel(Coloured(name, values, (-limit, limit), SIGNED, caption), style)
+            continue
+        size = np.asarray(np.linalg.norm(values, axis=1))
+        panel = view.panel(Coloured(name, size, (0.0, _limit(size)), "Reds", caption), style)
+        yield replace(panel, arrows=(_arrows(surface, values, view, camera),))
+
+
+def _limit(sizes: Array) -> float:
+    """The largest, without peaks at few nodes."""
+    return float(min(sizes.max(), PEAK * np.quantile(sizes, QUANTILE))) or 1.0
+
+
+def _arrows(surface: Surface, vectors: Array, view: Background, camera: Camera) -> Arrow:
+    r, length = surface.r0 + surface.u, np.linalg.norm(vectors, axis=1)
+    most, extent = length.max() or 1.0, float(np.ptp(r, axis=0).max())
+    large = np.flatnonzero((length >= SMALL * most) & view.seen.shows(r, 0.03 * extent))
+    apart = APART * float(np.ptp(r[large], axis=0).max())
+    seeds = large[spread(r[large], apart)]
+    return Arrow(camera(r[seeds]), camera(apart / most * vectors[seeds]), "0.15", "")

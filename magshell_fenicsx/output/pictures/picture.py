@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.case.output import OutputSection
 from magshell_fenicsx.output.fields.surface import Surface
 from magshell_fenicsx.output.pictures.colours import (
     Coloured,
@@ -31,6 +30,7 @@ from magshell_fenicsx.output.pictures.layout import (
     panels_figure,
 )
 from magshell_fenicsx.output.pictures.view import Camera, Seen, Window, near_outlines, tessellated
+from magshell_fenicsx.problem.wanted import OutputSection
 
 if TYPE_CHECKING:  # takes long to import
     from matplotlib.figure import Figure

@@ -19,7 +19,7 @@ if TYPE_CHECKING:  # takes long to import
     from matplotlib.colors import Colormap
 from collections.abc import Sequence
 
-from magshell_fenicsx.case.output import OutputSection
+from magshell_fenicsx.problem.wanted import OutputSection
 
 Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]

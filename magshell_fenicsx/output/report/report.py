@@ -14,8 +14,20 @@ from markupsafe import Markup
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.output.fields.modes import Frequency, read_frequencies
 from magshell_fenicsx.output.report.interactive import interactive
-from magshell_fenicsx.output.report.report_path import Line, head, number, path_table, pole_head, symbol
-from magshell_fenicsx.output.report.verdict import Summary, amount, located, read_run, value, verdict
+from magshell_fenicsx.output.report.verdict import (
+    Line,
+    Summary,
+    amount,
+    head,
+    located,
+    number,
+    path_table,
+    pole_head,
+    read_run,
+    symbol,
+    value,
+    verdict,
+)
 from magshell_fenicsx.output.store.durable import write_whole
 from magshell_fenicsx.output.store.known import headline, pole_of
 from magshell_fenicsx.output.store.table import SOLUTION, Row, read_rows, stability

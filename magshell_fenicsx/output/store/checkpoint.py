@@ -18,13 +18,13 @@ from dolfinx import fem
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.continuation.point import Point
 from magshell_fenicsx.continuation.system import State, Vector
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.output.store.durable import AppendedFile, Damaged, open_result
 from magshell_fenicsx.output.store.folder import by_first
-from magshell_fenicsx.platform import sources
+from magshell_fenicsx.platform.environment import code_version
+from magshell_fenicsx.problem.problem import Document
 
 HEAD = struct.Struct("<4sQI")  # mark, length and checksum of the content
 MARK = b"MSF1"
@@ -130,12 +130,12 @@ NAME = "checkpoint"
 FILE = "case_file"  # key with the name of the case file, which changes no result
 
 
-def begun(case: Case) -> bytes:
+def begun(document: Document) -> bytes:
     """The content of an empty checkpoint."""
-    return framed(json.dumps({**identity(case), FILE: case.file_name}).encode())
+    return framed(json.dumps({**identity(document), FILE: document.name}).encode())
 
 
-def check_resumable(file: Path, case: Case) -> None:
+def check_resumable(file: Path, document: Document) -> None:
     """Check that a checkpoint belongs to this case and these sources.
 
     Raises
@@ -146,7 +146,7 @@ def check_resumable(file: Path, case: Case) -> None:
     saved = begun_with(file)
     if saved is None:
         raise CaseError(f"--resume: {file.parent} holds no checkpoint; run without --resume")
-    refuse_other(saved, case, file.parent)
+    refuse_other(saved, document, file.parent)
 
 
 def begun_with(file: Path) -> dict[str, Any] | None:
@@ -171,9 +171,9 @@ def begun_with(file: Path) -> dict[str, Any] | None:
     return known
 
 
-def identity(case: Case) -> dict[str, Any]:
+def identity(document: Document) -> dict[str, Any]:
     """Everything that a run depends on: the case, the files that it names, the program."""
-    data = {"case": case.model_dump(mode="json", exclude_none=True), **case.outside, "sources": sources.ours()}
+    data = {"case": document.data, **document.outside, "sources": code_version()}
     return dict(json.loads(json.dumps(data)))  # as read back from a file
 
 
@@ -181,7 +181,7 @@ class OtherSources(CaseError):
     """The saved results were computed by other sources of this program."""
 
 
-def refuse_other(saved: dict[str, Any], case: Case, folder: Path) -> None:
+def refuse_other(saved: dict[str, Any], document: Document, folder: Path) -> None:
     """Check that saved results belong to this case and these sources.
 
     Raises
@@ -189,7 +189,7 @@ def refuse_other(saved: dict[str, Any], case: Case, folder: Path) -> None:
     CaseError
         With the first difference; `OtherSources` if only the sources differ.
     """
-    now, saved = _solved(identity(case)), _solved(saved)
+    now, saved = _solved(identity(document)), _solved(saved)
     there, here = saved.get("sources", saved.get("version")), now["sources"]
     known = _of_case(saved)
     if known != _of_case(now):
@@ -204,9 +204,9 @@ def refuse_other(saved: dict[str, Any], case: Case, folder: Path) -> None:
         )
 
 
-def is_of(saved: dict[str, Any], case: Case) -> bool:
+def is_of(saved: dict[str, Any], document: Document) -> bool:
     """Whether saved results belong to this case, by whatever sources."""
-    return _of_case(_solved(saved)) == _of_case(_solved(identity(case)))
+    return _of_case(_solved(saved)) == _of_case(_solved(identity(document)))
 
 
 def _of_case(data: dict[str, Any]) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from typing import Any, Literal, TypeVar
 from mpi4py import MPI
 
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.platform.first import from_first
+from magshell_fenicsx.platform.processes import from_first
 from magshell_fenicsx.platform.reading import read_whole
 
 T = TypeVar("T")

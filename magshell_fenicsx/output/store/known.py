@@ -5,11 +5,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from magshell_fenicsx.case.options import output_section
-from magshell_fenicsx.case.output import OutputSection
+from pydantic import BaseModel, ValidationError
+
+from magshell_fenicsx.input.messages import explained
+from magshell_fenicsx.input.source import CaseError, Source
 from magshell_fenicsx.output.store import checkpoint
 from magshell_fenicsx.output.store.durable import Damaged, read_object
 from magshell_fenicsx.output.store.table import LOCATED, POLE, SOLUTION, Row
+from magshell_fenicsx.problem.wanted import OutputSection
 
 SUMMARY = "summary.json"
 NUMBER, NOTHING = (int, float), type(None)
@@ -85,15 +88,26 @@ def _unlike(value: Any, kind: Any, key: str = "") -> str:
     return next((wrong for each in within if (wrong := _unlike(*each))), "")
 
 
+class _Options(BaseModel):
+    output: OutputSection
+
+
 def style_of(case: Mapping[str, Any], options: Mapping[str, Any] | None = None) -> OutputSection:
     """The section `output` of a resolved case, with options in place of its keys.
 
     Raises
     ------
     CaseError
-        If an option is wrong.
+        If an option is wrong: the option, the value, what is allowed.
     """
-    return output_section(case.get("output") or {}, options or {})
+    given, options = case.get("output") or {}, options or {}
+    source = Source("options", {"output": {**given, **options}})
+    for key in options:
+        source.places["output", key] = f"--{key.replace('_', '-')}"
+    try:
+        return _Options.model_validate(source.data).output
+    except ValidationError as e:
+        raise CaseError(explained(e.errors(), source, _Options)) from None
 
 
 def headline(case: Mapping[str, Any], rows: Sequence[Row]) -> Row:

@@ -1,11 +1,11 @@
-"""path.csv: one row per accepted point, on disk before the next point is computed."""
+"""Tables of results: how they are written and read; path.csv, on disk point by point."""
 
 import csv
 import io
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from math import isnan
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from magshell_fenicsx.output.store.durable import AppendedFile, Damaged, open_result, read_result
 from magshell_fenicsx.quantities.registry import OF_EVERY_RUN, amplitude, quantity
@@ -13,6 +13,7 @@ from magshell_fenicsx.quantities.registry import OF_EVERY_RUN, amplitude, quanti
 COLUMNS = tuple(q.name for q in OF_EVERY_RUN)
 TEXTS = tuple(q.name for q in OF_EVERY_RUN if q.kind == "text")
 Row = dict[str, float | int | str]
+Read = TypeVar("Read")
 POLE = "the pole"
 LOCATED = ("fold", "bifurcation")
 SOLUTION = "solution"  # label of what a search found
@@ -56,7 +57,7 @@ class PathTable:
 
     def __init__(self, file: Path, extra: Sequence[str] = ()) -> None:
         self._columns = (*COLUMNS, *extra)
-        header = _line(self._columns)
+        header = table_text([self._columns])
         content = read_result(file) if file.exists() else b""
         length = content.rfind(b"\n") + 1
         if length and not content.startswith(header.encode()):
@@ -75,26 +76,45 @@ class PathTable:
             If the disk is full; the file still ends with a complete row.
         """
         if int(row["point"]) >= len(self.kept):
-            self._file.append(
-                _line(repr(float(v)) if isinstance(v := row[key], float) else v for key in self._columns).encode()
-            )
+            self._file.append(table_text([[row[key] for key in self._columns]]).encode())
 
     def close(self) -> None:
         self._file.close()
 
 
-def _line(values: Iterable[Any]) -> str:
+def table_text(lines: Iterable[Iterable[Any]], end: str = "\r\n") -> str:
+    """Lines of a table, with numbers in full precision.
+
+    Examples
+    --------
+    >>> table_text([["label", "value"], ["fold, first", 0.1]], end="\\n")
+    'label,value\\n"fold, first",0.1\\n'
+    """
     stream = io.StringIO()
-    csv.writer(stream).writerow(values)
+    writer = csv.writer(stream, lineterminator=end)
+    writer.writerows([repr(float(v)) if isinstance(v, float) else v for v in line] for line in lines)
     return stream.getvalue()
 
 
 def write_csv(rows: Iterable[Mapping[str, Any]], columns: Sequence[str], file: Path) -> None:
-    """Write rows with numbers in full precision."""
-    with file.open("w", newline="", encoding="utf-8") as stream:
-        writer = csv.DictWriter(stream, columns, extrasaction="ignore")
-        writer.writeheader()
-        writer.writerows({k: repr(v) if isinstance(v, float) else v for k, v in row.items()} for row in rows)
+    """Write columns of rows; what a row does not have is left empty."""
+    lines = ([row.get(column, "") for column in columns] for row in rows)
+    file.write_text(table_text([columns, *lines]), encoding="utf-8", newline="")
+
+
+def read_csv(file: Path, made: Callable[[Mapping[str, str]], Read]) -> list[Read]:
+    """What a function makes of the rows of a table, by the names of its header.
+
+    Raises
+    ------
+    Damaged
+        If it is no table, or the function cannot make something of a row.
+    """
+    try:
+        with file.open(encoding="utf-8", newline="") as stream:
+            return [made(row) for row in csv.DictReader(stream)]
+    except (KeyError, ValueError, TypeError, csv.Error) as e:
+        raise Damaged(f"{file}: is damaged: {type(e).__name__}: {e}") from None
 
 
 def is_path(file: Path) -> bool:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from magshell_fenicsx.parts.bodies.body import Axis, BodySection, Distance, Placed, Size, rounded
-from magshell_fenicsx.shape.lines import edges
+from magshell_fenicsx.shape.ground import edges
 
 Array = NDArray[np.float64]
 

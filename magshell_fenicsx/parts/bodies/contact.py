@@ -84,11 +84,6 @@ class Contact:
         return f"stiffness_{self.body}"
 
 
-def contact_quadrature(degree: int) -> int:
-    """Degree of the rule: the pressure at the rim of a contact is narrower than an element."""
-    return 3 * degree
-
-
 def penalty(s: Array, k: float, soft: float) -> tuple[Array, Array, Array]:
     """psi of a penetration s with two derivatives: psi'' grows from 0 to k over `soft`, and is continuous."""
     t = np.maximum(s, 0.0)

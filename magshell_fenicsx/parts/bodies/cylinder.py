@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.parts.bodies.body import Axis, BodySection, Distance, Placed, Size
 from magshell_fenicsx.parts.bodies.sphere import Sphere
-from magshell_fenicsx.shape.lines import SEEN, frame, upright
+from magshell_fenicsx.shape.ground import SEEN, frame, upright
 
 Array = NDArray[np.float64]
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from magshell_fenicsx.parts.bodies.body import Axis, BodySection, Distance, Placed, Size
-from magshell_fenicsx.shape.lines import ball
+from magshell_fenicsx.shape.ground import ball
 
 Array = NDArray[np.float64]
 STEPS = 60  # of Newton's method, which takes about six

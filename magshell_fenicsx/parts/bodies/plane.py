@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.parts.bodies.body import BodySection, Distance, Placed
-from magshell_fenicsx.shape.lines import SEEN, frame
+from magshell_fenicsx.shape.ground import SEEN, frame
 
 Array = NDArray[np.float64]
 

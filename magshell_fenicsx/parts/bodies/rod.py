@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from pydantic import model_validator
 
 from magshell_fenicsx.parts.bodies.body import BodySection, Distance, Placed, Size, rounded
-from magshell_fenicsx.shape.lines import SEEN, frame, upright
+from magshell_fenicsx.shape.ground import SEEN, frame, upright
 
 Array = NDArray[np.float64]
 

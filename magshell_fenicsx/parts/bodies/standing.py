@@ -1,26 +1,31 @@
 """The rigid bodies of a case in the model's terms: where they stand, how stiff they are, and what they leave."""
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from math import atan2, inf
+from dataclasses import dataclass
+from math import atan2, inf, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.mesh.grading import Disc, Feature
 from magshell_fenicsx.mesh.mirror import Mirror, rotation
 from magshell_fenicsx.models.shell.parameters import Loads
 from magshell_fenicsx.parts.bodies.body import BodySection, place_body
 from magshell_fenicsx.parts.bodies.contact import Contact
 from magshell_fenicsx.parts.bodies.press import ContactSection
+from magshell_fenicsx.parts.course import Fit
 from magshell_fenicsx.parts.part import Account, Context
 from magshell_fenicsx.parts.seen import Seen, Sight
 from magshell_fenicsx.parts.step import Step
 from magshell_fenicsx.quantities.registry import contact_columns
 from magshell_fenicsx.shape.ground import Ground, located
+from magshell_fenicsx.shape.outline import Outline
 from magshell_fenicsx.shape.symmetry import Leaves
 
 Array = NDArray[np.float64]
+RING = 0.35  # of sqrt(Rh): elements that show the ring of a contact
 NATURAL = 1e6  # default stiffness over D/(R h)^2: plate and ball then penetrate less than 1e-3 h
 POINTED = 15.0  # times as stiff is the penalty of a body that touches in a spot, times 1 + R/its radius
 WITHIN = 1e-6  # penetration over h that is rounding
@@ -90,6 +95,29 @@ def _contact(name: str, section: BodySection, approach: str, ground: Ground) -> 
             f"{key}.{at}: the body penetrates the undeformed shell by {depth / h:.4g} h at approach 0; {hint}"
         )
     return contact
+
+
+@dataclass(frozen=True)
+class Pressed:
+    """Where a body presses: its place in the chart, how far from there, and its size; over R."""
+
+    place: Array
+    reach: float
+    size: float
+
+    @classmethod
+    def by(cls, contact: Contact, loads: Iterable[Step], ground: Ground) -> "Pressed":
+        """Up to the largest approach of steps: a plane in a ring up to sqrt(2 R a), others on their front."""
+        h, size = ground.h, contact.size
+        reach = min(1.1 * sqrt(2 * (pressed(loads) or 10.0) * h) + 0.5 * sqrt(h), size + sqrt(h))
+        return cls(ground.drawn.inverse(contact.front), reach, size)
+
+    def features(self, outline: Outline, fit: Fit, growth: float) -> list[Feature]:
+        """Elements that show the ring of a contact, and a small body."""
+        x, y = map(float, self.place)
+        finer, size = sqrt(fit.h), self.size
+        small = [Disc((x, y), 1.5 * size, max(size / 3, 0.1 * fit.h), 0.4)] if size < finer else []
+        return [Disc((x, y), self.reach, RING * finer / fit.refinement, growth), *small]
 
 
 def pressed(loads: Iterable[Step]) -> float:

@@ -5,7 +5,6 @@ from math import copysign, sqrt
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
-import ufl
 from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field, model_validator
 from ufl.core.expr import Expr
@@ -15,19 +14,17 @@ from magshell_fenicsx.input.section import Section, in_units, or_number
 from magshell_fenicsx.mesh.grading import Disc, Feature
 from magshell_fenicsx.mesh.mirror import ROUNDING, Mirror
 from magshell_fenicsx.models.shell.kinematics import Jet
-from magshell_fenicsx.models.shell.own_term import OwnTerm
+from magshell_fenicsx.models.shell.own_term import SYMBOLIC, OwnTerm
 from magshell_fenicsx.parts.course import Fit, Now, Target, Until
 from magshell_fenicsx.parts.part import Context, Formulas, Modelled, Scales
 from magshell_fenicsx.parts.step import Count, PathStep, ProgrammeStep
-from magshell_fenicsx.shape.symmetry import Leaves, alike, of_energy, tilted, unit
+from magshell_fenicsx.shape.symmetry import Leaves, alike, tilted, unit
 from magshell_fenicsx.shape.turning import Span, scalar_turns, vector_turns
 
 if TYPE_CHECKING:
     from magshell_fenicsx.shape.outline import Outline
 
 Array = NDArray[np.float64]
-SYMBOLIC = {name: getattr(ufl, name) for name in ("sin", "cos", "tan", "exp", "sqrt", "sign")}
-SYMBOLIC |= {"log": ufl.ln, "abs": abs, "arctan2": ufl.atan2}
 Finite = Annotated[float, Field(ge=-1e30, le=1e30)]
 Moment = Annotated[float, or_number("newton", Finite), Field(ge=-1e30, le=1e30)]
 Three = Field(min_length=3, max_length=3)
@@ -204,7 +201,7 @@ class DeadSection(PathStep):
             why = why or "a load differs around e3"
         potentials = [load.potential for load in self.loads if load.potential]
         energies = [potential(f"potential_{i}", text, np.eye(3), context.scales) for i, text in enumerate(potentials)]
-        return [Leaves(why, vectors, mirrors), *(of_energy(energy, outline) for energy in energies)]
+        return [Leaves(why, vectors, mirrors), *(energy.leaves(outline) for energy in energies)]
 
     def named_points(self) -> list[str]:
         return [load.at for load in self.loads if load.at]

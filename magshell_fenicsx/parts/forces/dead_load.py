@@ -17,8 +17,7 @@ from magshell_fenicsx.models.shell.energy import edge_quadrature
 from magshell_fenicsx.models.shell.parameters import AreaForce, DeadLoad, EdgeForce, EdgeMoment, PointForce, Potential
 from magshell_fenicsx.models.shell.patterns import FINER, Pattern, pattern_field, pattern_on_edge
 from magshell_fenicsx.models.shell.thickness import patch_of
-from magshell_fenicsx.parts.forces.load_vector import Entries, Weighted, entries
-from magshell_fenicsx.parts.forces.point_load import point_entries
+from magshell_fenicsx.parts.forces.load_vector import Entries, Weighted, entries, point_entries
 
 
 class Measures(Protocol):

@@ -8,15 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from magshell_fenicsx.input.section import Direction
+from magshell_fenicsx.input.section import Direction, over
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.input.targets import over
 from magshell_fenicsx.mesh.grading import Disc, Feature
 from magshell_fenicsx.mesh.mirror import ROUNDING
 from magshell_fenicsx.parts.course import Fit, Now, Target, Until
 from magshell_fenicsx.parts.part import Context, Modelled
 from magshell_fenicsx.parts.step import Count, PathStep, ProgrammeStep
-from magshell_fenicsx.quantities.units import POINT_FORCE, THICKNESS
+from magshell_fenicsx.quantities.quantity import POINT_FORCE, THICKNESS
 from magshell_fenicsx.shape.symmetry import Leaves, tilted
 
 if TYPE_CHECKING:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.expressions import ByFormula, Inwards, function
 from magshell_fenicsx.mesh.mirror import rotation
+from magshell_fenicsx.mesh.patch import PatchMesh
 from magshell_fenicsx.models.shell.parameters import (
     AreaForce,
     DeadLoad,
@@ -19,6 +20,7 @@ from magshell_fenicsx.models.shell.parameters import (
     Potential,
 )
 from magshell_fenicsx.models.shell.patterns import Pattern
+from magshell_fenicsx.models.shell.thickness import patch_of
 from magshell_fenicsx.parts.forces.dead import DeadLoadSection, potential
 from magshell_fenicsx.parts.part import Account, Context, Modelled
 from magshell_fenicsx.parts.seen import Seen, Sight
@@ -28,7 +30,7 @@ Array = NDArray[np.float64]
 
 
 def dead_load(load: DeadLoadSection, name: str, context: Context, modelled: Modelled) -> DeadLoad:
-    """A load on what is modelled; `name` is that of its energy, if it has one."""
+    """A load as the model takes it; `name` is for its energy, if it has one."""
     mirror = modelled.mirror
     shared = mirror is not None and (load.edge is None or mirror.other(load.edge) == load.edge)
     Q, scales = rotation(modelled.turn), context.scales
@@ -90,6 +92,11 @@ class ForcesSeen(Seen):
         factors = {amplitude(name).column: state.mu[name] for name in self.amplitudes(loads)}
         along = also_displaced(loads)
         return factors | {f"w_{name}_over_h": model.loaded_deflection(state.u, name) / sight.h for name in along}
+
+    def refuse_unfit(self, loads: Loads, surface: PatchMesh) -> None:
+        for load in loads.all_dead:
+            if isinstance(load, AreaForce) and load.patch is not None:
+                patch_of(surface.patches, load.patch)
 
     def conjugate_unit(self, sight: Sight, name: str) -> float | None:
         """w/h of a force, the shell's length of dead loads."""

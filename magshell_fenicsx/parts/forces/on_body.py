@@ -11,12 +11,11 @@ from ufl.core.expr import Expr
 
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.mesh.hexahedra import MIDDLE, OUTER, Body
-from magshell_fenicsx.models.shell.patterns import Pattern, refuse_unbounded, shown
+from magshell_fenicsx.models.shell.patterns import Pattern, cells_of_body, places_in_body, refuse_unbounded, shown
 from magshell_fenicsx.models.shell.thickness import patch_of
 from magshell_fenicsx.models.solid.terms import face_measure
 from magshell_fenicsx.parts.forces.dead_load import within
 from magshell_fenicsx.parts.forces.load_vector import Entries, Weighted, averaged, smooth
-from magshell_fenicsx.parts.magnetism.remanence import cells_of_body, places
 from magshell_fenicsx.platform import compat
 
 Array = NDArray[np.float64]
@@ -48,7 +47,7 @@ class BodyMeasures:
         return Weighted(weight, ufl.Measure("dx", domain=body.mesh, metadata={"quadrature_degree": 4}))
 
     def field(self, pattern: Pattern, edge: str | None) -> tuple[Expr, float | None]:
-        nodes, normals = places(self._V)
+        nodes, normals = places_in_body(self._V)
         z = self._body.at_nodes(self._V, (self._body.heights - MIDDLE) * self._body.thickness)[self._V.dofmap.list]
         field = fem.Function(fem.functionspace(self._V.mesh, ("DG", self._V.element.basix_element.degree, (3,))))
         vectors = pattern(nodes - z[..., None] * normals, normals)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from magshell_fenicsx.input.file import FileKeys
+from magshell_fenicsx.input.section import FileKeys
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.input.tables import TableError, column_size, read_table
 from magshell_fenicsx.mesh.patch import place_text

@@ -1,13 +1,17 @@
 """An imperfection as a load: its depth grows while other loads are held."""
 
 from collections.abc import Collection, Iterable, Mapping
-from typing import Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from pydantic import Field
 
 from magshell_fenicsx.parts.course import Target, Until
 from magshell_fenicsx.parts.part import Context, Modelled
+from magshell_fenicsx.parts.seen import Seen
 from magshell_fenicsx.parts.step import PathStep, ProgrammeStep
+
+if TYPE_CHECKING:
+    from magshell_fenicsx.models.shell.parameters import Loads
 
 
 class ImperfectionStep(PathStep):
@@ -56,6 +60,13 @@ class ImperfectionStep(PathStep):
             raise ValueError(f"{step.key}.item: {self.item}: shell.imperfections has no such item, counted from 0")
         if names[step.name].item is None and len(names) > 1:
             raise ValueError(f"{step.key}.item: give it: another step grows another item of shell.imperfections")
+
+
+class GrowingSeen(Seen):
+    """The amplitudes of imperfections that grow."""
+
+    def named(self, loads: "Loads") -> tuple[str, ...]:
+        return tuple(loads.growing)
 
 
 def grown_by(steps: Iterable[ProgrammeStep], keys: Collection[str]) -> dict[str, list[str]]:

@@ -1,4 +1,4 @@
-"""What all imperfections have in common: their sections, sizes with units, and what they bring to a plan."""
+"""What all imperfections have in common: their sections, sizes with units, and what they bring to a problem."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ SHOWN = 0.45  # of sqrt(R h): elements that show a dimple
 
 @dataclass(frozen=True)
 class Flaw:
-    """What one imperfection brings to a plan; places, lengths and w0 are over R, in the frame of the case.
+    """What one imperfection brings to a problem; places, lengths and w0 are over R, in the frame of the case.
 
     Attributes
     ----------
@@ -225,7 +225,7 @@ class ImperfectionSection(Section):
         """
 
     def flaw(self, ground: Ground, key: str) -> Flaw:
-        """What it brings to a plan; `key` is its own, with dots.
+        """What it brings to a problem; `key` is its own, with dots.
 
         Raises
         ------

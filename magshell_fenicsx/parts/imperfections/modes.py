@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, PrivateAttr, model_validator
 
-from magshell_fenicsx.input.file import FileKeys
+from magshell_fenicsx.input.section import FileKeys
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.mirror import Mirror
 from magshell_fenicsx.parts.imperfections.imperfection import Flaw, ImperfectionSection, over

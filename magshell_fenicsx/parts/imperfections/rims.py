@@ -3,12 +3,15 @@
 from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import product
+from math import sqrt
 
 import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.mesh.grading import Disc, Feature
 from magshell_fenicsx.mesh.mirror import rotation
+from magshell_fenicsx.parts.course import Fit
 from magshell_fenicsx.parts.imperfections.imperfection import Flaw
 from magshell_fenicsx.shape.outline import Outline
 
@@ -43,6 +46,11 @@ class Spot:
     circle: bool = False
     jumps: bool = False
     rim: Array | None = None
+
+    def features(self, outline: Outline, fit: Fit, growth: float) -> list[Feature]:
+        """Small elements on it and a little around it, which grow so fast away from there."""
+        radius, size = self.radius + 0.7 * sqrt(fit.h), self.size / fit.refinement
+        return [Disc((float(x), float(y)), radius, size, growth) for x, y in images(self, outline)]
 
 
 def spots(flaws: Iterable[tuple[str, Flaw]], drawn: Outline, turn: float) -> list[Spot]:

@@ -1,10 +1,11 @@
 """An applied flux density that is known by its values: its Taylor polynomial at the present place of each point.
 
 The polynomial of second order has the first and second derivatives of the field itself, and so have the energies that
-take it: the forms and kernels are the same for every field.
+take it: the forms and kernels are the same for every field. A shell that has passed through a magnet between two states
+is noticed, however thin that is.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 import ufl
@@ -13,13 +14,34 @@ from numpy.typing import NDArray
 from ufl.core.expr import Expr
 
 from magshell_fenicsx.assembly.following import Follows, PointField, at_quadrature
-from magshell_fenicsx.models.shell.crossing import crossing
 from magshell_fenicsx.models.shell.patterns import refuse_unbounded
 from magshell_fenicsx.parts.magnetism.driven import Driven, FieldInSpace, Here, carried
 
 Array = NDArray[np.float64]
+HALVINGS = 16  # of a way, whose parts are then shorter than rounding in the places of a path
 PAIRS = np.triu_indices(3)
 SIZE = 3 + 3 + 3 + 9 + 18  # u*, B at r0, B*, G*, H* by pairs j <= k
+
+
+def crossing(distance: Callable[[Array], Array], before: Array, after: Array) -> Array | None:
+    """A place (3,) inside a body on the straight ways from some places (n, 3) to others; None if there is none.
+
+    A distance changes by at most the length of a way. So no place of a way is inside if the distances at both ends
+    add up to more than its length; the other ways are halved.
+    """
+    low, high = distance(before), distance(after)
+    for _ in range(HALVINGS):
+        near = low + high <= np.linalg.norm(after - before, axis=1)
+        if not near.any():
+            return None
+        before, after, low, high = (values[near] for values in (before, after, low, high))
+        middle = (before + after) / 2
+        between = distance(middle)
+        if (between < 0).any():
+            return np.asarray(middle[between.argmin()])
+        before, after = np.concatenate([before, middle]), np.concatenate([middle, after])
+        low, high = np.concatenate([low, between]), np.concatenate([between, high])
+    return None
 
 
 def around(P: Expr, u: Expr) -> tuple[Expr, Expr]:

@@ -1,24 +1,32 @@
 """The magnetisation and the applied field."""
 
 from collections.abc import Iterable
-from math import pi
+from dataclasses import replace
+from math import isnan, pi
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from magshell_fenicsx.input.expressions import Formula
-from magshell_fenicsx.input.file import FileKeys
-from magshell_fenicsx.input.section import Direction, FluxDensity
+from magshell_fenicsx.input.expressions import Formula, formula, with_derivatives
+from magshell_fenicsx.input.messages import shown
+from magshell_fenicsx.input.section import Direction, FileKeys, FluxDensity, OrOfProgram
+from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.mesh.patch import GivenField
 from magshell_fenicsx.parts.kinds import Sources
 from magshell_fenicsx.parts.part import Ability, Context, Formulas, Modelled
+from magshell_fenicsx.quantities.quantity import Given
 from magshell_fenicsx.shape.symmetry import Leaves
 
 if TYPE_CHECKING:
     from magshell_fenicsx.shape.outline import Outline
 
+Array = NDArray[np.float64]
 MU_0 = 4e-7 * pi  # T m/A
+SOURCES = 1e-9  # of the field's derivatives: rounding
+LARGEST_RATIO = 1e6  # of a field over its unit, as of a remanence
+SMALLEST_FIELD, LARGEST_FIELD = 1e-12, 10.0  # of lambda_m: rounding, and a thousand times what destabilises a shell
 
 
 class Layer(Direction):
@@ -41,7 +49,9 @@ class RemanentSection(FileKeys, Direction):
     """How it varies in space"""
     flux_density: FluxDensity | None = Field(default=None, ge=-1e3, le=1e3)
     """|B^r|, at most 1000 T; with that of `applied` in place of lambda_m; negative: the remanence is reversed"""
-    components: list[Formula] | None = Field(default=None, min_length=3, max_length=3)
+    components: Annotated[
+        Annotated[list[Formula], Field(min_length=3, max_length=3)] | GivenField | None, OrOfProgram(GivenField)
+    ] = None
     """Of kind: expression: arithmetic of x, y, z, pi and sin, cos, tan, exp, log, sqrt, abs, sign, arctan2 [|B^r|]"""
     patches: dict[str, Direction] | None = None
     """Of kind: patches: name -> direction"""
@@ -62,6 +72,8 @@ class RemanentSection(FileKeys, Direction):
                 raise ValueError(f"{key} belongs to kind: {kind}, and must be given there; the kind is {self.kind}")
         if self.kind != "uniform" and {"polar", "azimuth"} & self.model_fields_set:
             raise ValueError(f"polar and azimuth belong to kind: uniform; the kind is {self.kind}")
+        if isinstance(self.components, GivenField) and self.components.size != 3:
+            raise ValueError(f"components: a function of {self.components.size} numbers; a vector has three")
         if self.layers and abs(sum(layer.fraction for layer in self.layers) - 1) > 1e-6:
             raise ValueError("the fractions of the layers must add up to 1")
         return self
@@ -191,13 +203,86 @@ class MagneticSection(Ability):
     def formulas(self, context: Context) -> Iterable[Formulas]:
         from magshell_fenicsx.models.shell.patterns import LARGEST  # the solver takes long to import
 
-        if self.remanent.components:
+        if isinstance(self.remanent.components, list):
             yield Formulas("magnetic.remanent.components", self.remanent.components, -LARGEST, LARGEST, 1.0)
 
     def adds(self, context: Context, modelled: Modelled) -> dict[str, Any]:
         from magshell_fenicsx.parts.magnetism.magnetisation import adds  # the solver takes long to import
 
         return adds(context, modelled)
+
+    def refuse_unfit_values(self, context: Context, places: Array) -> None:
+        """Look at lambda_m, and at the sources and formulas of remanence and applied field."""
+        from magshell_fenicsx.parts.magnetism.sources.field import placed  # the solver takes long to import
+
+        lambda_m = strength(context)
+        largest = LARGEST_FIELD * (100.0 if self.applied.sources else 1.0)  # of 1 T, which no source makes on a shell
+        if lambda_m and not SMALLEST_FIELD <= abs(lambda_m) <= largest:
+            raise CaseError(
+                f"magnetic: lambda_m is {lambda_m:.4g}; allowed are 0 and, of either sign, "
+                f"{SMALLEST_FIELD:g} to {largest:g}"
+            )
+        for source in placed(context):
+            B = source(places)[0]
+            if len(strong := places[np.isfinite(B).all(axis=1) & (np.abs(B) > LARGEST_RATIO).any(axis=1)]):
+                x, y, z = strong[0]
+                raise CaseError(
+                    f"{source.key}: its field is above {LARGEST_RATIO:g} times the unit of the field at (x, y, z)/R = "
+                    f"({x:.3g}, {y:.3g}, {z:.3g})"
+                )
+            bad = places[~np.isfinite(B).all(axis=1)]
+            if len(bad):
+                x, y, z = bad[0]
+                raise CaseError(
+                    f"{source.key}: the shell's point (x, y, z)/R = ({x:.3g}, {y:.3g}, {z:.3g}) {source.nowhere}; "
+                    "see its position"
+                )
+        components = {"remanent": self.remanent.components, "applied": self.applied.components}
+        for key, text in ((key, text) for key, each in components.items() if isinstance(each, list) for text in each):
+            bad = places[~(np.abs(formula(text)(*places.T)) <= 1e6)]
+            if len(bad):
+                x, y, z = bad[0]
+                raise CaseError(
+                    f"magnetic.{key}.components: {shown(text)}: has no finite value (or one above 1e6) "
+                    f"at (x, y, z) = ({x:.3g}, {y:.3g}, {z:.3g})"
+                )
+
+    def warning(self, context: Context, places: Array) -> str | None:
+        """A field of magnets and currents elsewhere has neither a divergence nor a curl."""
+        components = self.applied.components if strength(context) else None
+        if not components:
+            return None
+        G = np.stack([with_derivatives(text)(places).gradient for text in components])
+        divergence, curl = np.abs(np.trace(G)), np.linalg.norm(G - G.swapaxes(0, 1), axis=(0, 1)) / np.sqrt(2)
+        sizes = np.nan_to_num(divergence), np.nan_to_num(curl)
+        largest = [float(values.max()) for values in sizes]
+        if max(largest) <= SOURCES * np.nan_to_num(np.abs(G)).max():
+            return None
+        x, y, z = places[np.argmax(np.maximum(*sizes))]
+        return (
+            f"magnetic.applied.components: on the shell div B is up to {largest[0]:.3g} and curl B up to "
+            f"{largest[1]:.3g} B^a/R, most of it at (x, y, z) = ({x:.3g}, {y:.3g}, {z:.3g}): "
+            "magnets and currents elsewhere make no such field"
+        )
+
+    def numbers(self, context: Context) -> list[str]:
+        """How strong magnets and coils are on the shell: too weak, and a place was meant in another unit."""
+        from magshell_fenicsx.parts.magnetism.sources.field import placed  # the solver takes long to import
+        from magshell_fenicsx.shape.outline import outline
+
+        if not (sources := placed(context)):
+            return []
+        places, unit = outline(context.shell).sample(), 1e3 * abs(self.applied.reference or 1.0)
+        sizes = unit * np.linalg.norm(np.sum([source(places)[0] for source in sources], axis=0), axis=1)
+        return [f"field of the sources on the undeformed shell: {sizes.min():.4g} to {sizes.max():.4g} mT"]
+
+    def units(self, context: Context, units: Given) -> Given:
+        """The flux density, or the strength of the sources, of lambda_m = 1."""
+        if not self.remanent.flux_density or isnan(units.E):
+            return units
+        if self.applied.beside:
+            return replace(units, applied=1e3 * MU_0 * units.E / self.remanent.flux_density)
+        return replace(units, strength=100 / strength(context))
 
 
 def strength(context: Context) -> float:

@@ -1,12 +1,63 @@
-"""The magnetic terms of each law of the remanence and each energy."""
+"""The magnetic terms of each law of the remanence and each energy.
+
+A remanence moves with F (`densities`), or it turns with the surface and does not stretch: R Br in place of F Br.
+R is the rotation of the polar decomposition of F = a_i (x) a0^i + n (x) n0. In the surface, with C = U^2,
+U = (C + J 1)/T, T^2 = tr C + 2 J and J = sqrt(det C), so that R = F U^-1 = (F + J F C^-1)/T, and
+J F C^-1 = J a^i (x) a0_i: no root but of numbers above zero, at equal stretches too. In units and arguments as
+`densities`.
+"""
+
+import ufl
+from ufl.core.expr import Expr
 
 from magshell_fenicsx.models.shell import densities
+from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.densities import MagneticDensity
+from magshell_fenicsx.models.shell.kinematics import Jet
 from magshell_fenicsx.models.shell.parameters import MagneticEnergy, RemanenceLaw
-from magshell_fenicsx.parts.magnetism import rotation_law
+
+
+def magnetic(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:
+    """-Ba . (R - R0) Br."""
+    r, n0, up = r0 + u, kin.normal(r0), kin.dual_basis(r0)
+    n, area0 = kin.normal(r), kin.area_ratio(r0)
+    J = kin.area_ratio(r) / area0
+    trace = ufl.inner(kin.inverse_metric(r0), kin.metric(r))
+    moved = r.r1 * ufl.dot(up[0], Br) + r.r2 * ufl.dot(up[1], Br)
+    across = (ufl.cross(r.r2, n) * ufl.dot(r0.r1, Br) + ufl.cross(n, r.r1) * ufl.dot(r0.r2, Br)) / area0
+    along = ufl.dot(n0, Br)
+    return -ufl.dot(Ba, (moved + across) / ufl.sqrt(trace + 2 * J) - Br + along * n)
+
+
+def magnetic_first(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:
+    """U1, linear in u: the surface turns in itself."""
+    return (densities.magnetic_first(r0, u, Br, Ba) - densities.magnetic_first(r0, u, Ba, Br)) / 2
+
+
+def magnetic_torque(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:
+    """Uq, quadratic in the rotations q_i = n0 . u,_i of the normal and w of the surface in itself."""
+    n0, q = kin.normal(r0), densities.rotation(r0, u)
+    up1, up2 = kin.dual_basis(r0)
+    w = ufl.dot(n0, ufl.cross(up1, u.r1) + ufl.cross(up2, u.r2)) / 2
+    in_surface = ufl.dot(Ba, Br) - ufl.dot(n0, Ba) * ufl.dot(n0, Br)
+    turned = ufl.dot(q, Ba) * ufl.dot(q, Br) + w**2 * in_surface
+    return densities.magnetic_torque(r0, u, Br, Ba) + turned / 2
+
+
+def magnetic_tau(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:
+    """Utau: rotations times strains or, of the normal's part, times the surface gradient of u."""
+    n0, q = kin.normal(r0), densities.rotation(r0, u)
+    up1, up2 = kin.dual_basis(r0)
+    in_surface = Br - ufl.dot(n0, Br) * n0
+    along_q = ufl.dot(q, u.r1 * ufl.dot(up1, Br) + u.r2 * ufl.dot(up2, Br))
+    along_Br = ufl.dot(in_surface, u.r1 * ufl.dot(up1, q) + u.r2 * ufl.dot(up2, q))
+    stretched = ufl.dot(n0, Ba) * (along_q + along_Br) / 2
+    widened = (ufl.dot(up1, u.r1) + ufl.dot(up2, u.r2)) * magnetic_first(r0, u, Br, Ba) / 2
+    return densities.magnetic_tau(r0, u, Br, Ba) + stretched - widened
+
 
 LINEAR = ("U1", "couple")
-FULL: dict[RemanenceLaw, MagneticDensity] = {"deformation": densities.magnetic, "rotation": rotation_law.magnetic}
+FULL: dict[RemanenceLaw, MagneticDensity] = {"deformation": densities.magnetic, "rotation": magnetic}
 _EXPANDED: dict[RemanenceLaw, dict[str, MagneticDensity]] = {
     "deformation": {
         "U1": densities.magnetic_first,
@@ -15,9 +66,9 @@ _EXPANDED: dict[RemanenceLaw, dict[str, MagneticDensity]] = {
         "couple": densities.magnetic_couple,
     },
     "rotation": {
-        "U1": rotation_law.magnetic_first,
-        "Uq": rotation_law.magnetic_torque,
-        "Utau": rotation_law.magnetic_tau,
+        "U1": magnetic_first,
+        "Uq": magnetic_torque,
+        "Utau": magnetic_tau,
         "couple": densities.magnetic_couple,
     },
 }

@@ -9,6 +9,7 @@ from magshell_fenicsx.input.expressions import formula
 from magshell_fenicsx.input.section import Direction
 from magshell_fenicsx.input.tables import read_vectors
 from magshell_fenicsx.mesh.mirror import Mirror, rotation
+from magshell_fenicsx.mesh.patch import GivenField
 from magshell_fenicsx.models.shell.controls import ByControls, Controls
 from magshell_fenicsx.models.shell.parameters import Loads, Magnetisation
 from magshell_fenicsx.models.shell.patterns import Components, Inside, Pattern, WithinRims, radial, tangential
@@ -19,7 +20,7 @@ from magshell_fenicsx.parts.magnetism.sources.source import SourceSection
 from magshell_fenicsx.parts.part import Account, Context, Modelled
 from magshell_fenicsx.shape.outline import Outline
 from magshell_fenicsx.shape.sections import MeshSurface
-from magshell_fenicsx.shape.symmetry import PARALLEL, Leaves, alike, tilted
+from magshell_fenicsx.shape.symmetry import PARALLEL, Leaves, alike, nothing, tilted
 from magshell_fenicsx.shape.turning import beside, field_turns, vector_turns, vectors_of
 
 Array = NDArray[np.float64]
@@ -47,7 +48,7 @@ def magnetisation(
     Parameters
     ----------
     within
-        Of `Plan`.
+        Of `Problem`.
     to
         Directions that the field turns to.
     """
@@ -57,7 +58,7 @@ def magnetisation(
         remanent = radial
     elif section.kind == "tangential":
         remanent = tangential
-    elif section.components:
+    elif isinstance(section.components, list):
         remanent = Components([formula(text) for text in section.components], rotation(turn) if turn else None)
     elif section.file:
         remanent = by_points(section, turn)
@@ -96,6 +97,7 @@ def magnetisation(
         tuple(basis),
         driven,
         turns(context, turn),
+        section.components if isinstance(section.components, GivenField) else None,
     )
 
 
@@ -109,6 +111,8 @@ def leaves(context: Context, outline: Outline) -> list[Leaves]:
     whole = turns(context)  # then the rotation is a part of the field at each place
     turning = [] if whole else [step.to.vector() for step in _rotations(context)]
     remanent, G = magnetic.remanent, np.array(magnetic.applied.gradient or np.zeros((3, 3)))
+    if isinstance(remanent.components, GivenField):
+        return [Leaves("the remanence is a function on a mesh", mirrors=nothing)]
     fields: list[Callable[[Array], Array]] = [lambda x: np.asarray(x @ G.T)] if G.any() else []
     fields += [vectors_of(texts) for texts in (remanent.components, known) if texts]
     askew = ["a field is not along e3"] if any(tilted(v) for v in vectors) else []

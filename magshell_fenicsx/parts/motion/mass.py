@@ -1,7 +1,10 @@
-"""Inner products of displacements, and the consistent mass of a model.
+"""Inertia: the consistent mass of a model, and what the motion of supports gives to what they hold.
 
 Over rho h R^4 with times over R sqrt(rho/E), so that energies are over E h R^2 as all others.
+With the displacement u + E(mu(t)), E at nodes that move, the mass is that of all nodes: M (u'' + E'') and M (u' + E').
 """
+
+from collections.abc import Callable, Iterable, Mapping
 
 import numpy as np
 import ufl
@@ -10,8 +13,9 @@ from dolfinx.fem import petsc as fem_petsc
 from petsc4py import PETSc
 from ufl.core.expr import Expr
 
+from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.assembly.terms import FormTerm
-from magshell_fenicsx.continuation.system import Vector
+from magshell_fenicsx.continuation.system import Amplitudes, Vector
 from magshell_fenicsx.models.axisymmetric import jets
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.shell import kinematics as kin
@@ -92,3 +96,69 @@ def mass_matrix(product: fem.Form, held: list[fem.DirichletBC]) -> PETSc.Mat:
     compat.add_matrix(M, product, held)
     M.assemble()
     return M
+
+
+Rates = Mapping[str, tuple[float, float]]  # of each motion: first and second derivative by time
+
+
+class Ground:
+    """Supports that move in time; a `continuation.transient.Ground`.
+
+    Parameters
+    ----------
+    mass
+        Of all nodes, supports too.
+    at
+        Amplitudes and their rates at a time, at a kink before or after it.
+    carried
+        The velocity of the supports before the begin; None: they were at rest.
+
+    Attributes
+    ----------
+    names
+        Amplitudes of the motions.
+    """
+
+    def __init__(
+        self,
+        system: FiniteElementSystem,
+        mass: PETSc.Mat,
+        at: Callable[[float, bool], tuple[Amplitudes, Rates]],
+        carried: Vector | None = None,
+    ) -> None:
+        assert system.moving
+        self._system, self._moving, self._mass, self._at, self._carried = system, system.moving, mass, at, carried
+        self.names = system.moving.names
+        self._x, self._y = mass.createVecs()
+
+    def velocity(self, t: float, before: bool) -> Vector:
+        """Of nodes that move, zero elsewhere."""
+        if t <= 0 and before:
+            return np.zeros(self._system.size) if self._carried is None else self._carried
+        mu, rates = self._at(t, before)
+        return self._sum(rate * self._moving.rate(mu, name) for name, (rate, _) in rates.items())
+
+    def acceleration(self, t: float, before: bool) -> Vector:
+        """Likewise."""
+        mu, rates = self._at(t, before)
+        direct = self._sum(bend * self._moving.rate(mu, name) for name, (_, bend) in rates.items())
+        pairs = ((a, b, rates[a][0] * rates[b][0]) for a in rates for b in rates)
+        return direct + self._sum(product * self._moving.bend(mu, a, b) for a, b, product in pairs)
+
+    def along(self, mu: Amplitudes, name: str) -> Vector:
+        """dE/dmu of a motion."""
+        return self._sum([self._moving.rate(mu, name)])
+
+    def times(self, x: Vector) -> Vector:
+        """The mass of all nodes times a vector."""
+        self._x.setArray(x)
+        self._mass.mult(self._x, self._y)
+        return np.array(self._y.array_r)
+
+    def held(self, x: Vector) -> Vector:
+        """With zeros at supports."""
+        return self._system.held(x)
+
+    def _sum(self, parts: Iterable[Vector]) -> Vector:
+        whole = np.sum([np.zeros(len(self._system.u.x.array)), *parts], axis=0)
+        return np.array(whole[: self._system.size])

@@ -17,9 +17,10 @@ from ufl.core.expr import Expr
 from magshell_fenicsx.continuation.system import Amplitudes, State, Tangent, Vector, max_abs
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.carriers import Carrier, HeldEdge
-from magshell_fenicsx.models.shell import densities, edges
+from magshell_fenicsx.models.shell import edges
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.kinematics import Jet
+from magshell_fenicsx.models.shell.law import Koiter, work
 from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.shell.strains import TangentFrame
 from magshell_fenicsx.parts.natural.shape import covariant
@@ -233,20 +234,25 @@ def _works(model: ShellModel | MeridianModel, given: _Given) -> list[ufl.Form]:
     """
     factory, carrier, field = model.factory, model.factory.carrier, given.field
     r0, u, t, m = carrier.j0, carrier.jet(model.u), factory.thickness, carrier.covector
-    nu, h, sigma = model.material.nu, model.material.h, model.sigma
-    D = densities.bending_stiffness(h, nu)
+
+    def law(side: str = "") -> Koiter:
+        """That of the shell, which a viscous stress follows too."""
+        of_shell = model.material.law
+        return of_shell if t is None else of_shell.thicker((t(side) if side else t)[0])
+
+    def viscous(j: Jet, side: str = "") -> tuple[Expr, Expr]:
+        """The given strain and change of curvature."""
+        at = field(side) if side else field
+        return covariant(j, at, 0), covariant(j, at, 6)
+
+    def strained(j: Jet, u: Jet) -> tuple[Expr, Expr]:
+        return kin.membrane_strain(j, u), kin.curvature_change(j, u)
+
+    E, K = strained(r0, u)
+    strain, bend = viscous(r0)
     up = kin.inverse_metric(r0)
-
-    def thick(side: str = "") -> Expr | float:
-        return 1.0 if t is None else (t(side) if side else t)[0]
-
-    def product(S: Expr, T: Expr) -> Expr:
-        a, b = kin.mixed(S, up), kin.mixed(T, up)
-        return (1 - nu) * ufl.tr(ufl.dot(a, b)) + nu * ufl.tr(a) * ufl.tr(b)
-
-    membrane = thick() * product(covariant(r0, field, 0), kin.membrane_strain(r0, u)) / (1 - nu**2)
-    bending = thick() ** 3 * D * product(covariant(r0, field, 6), kin.curvature_change(r0, u))
-    work = (membrane + bending) * kin.area_ratio(r0) * carrier.dx()
+    stretching, bending = work(law().stress(strain, up), E), work(law().moment(strain, bend, up), K)
+    works = [(stretching + bending) * kin.area_ratio(r0) * carrier.dx()]
 
     sides = ("+", "-")
     r0s, us = ([j.side(s) for s in sides] for j in (r0, u))
@@ -258,23 +264,22 @@ def _works(model: ShellModel | MeridianModel, given: _Given) -> list[ufl.Form]:
             return ufl.atan2(*edges.fold_angle(plus, minus, m("+")))
         return edges.fold_jump(plus, minus, conormals[0][:2], conormals[1][:2])
 
-    def moments(of: Callable[[Jet, str], Expr]) -> Expr:
-        each = zip(r0s, sides, conormals, strict=True)
-        return sum(thick(s) ** 3 * D * densities.moment_of(of(j, s), j, a, b, nu) for j, s, (a, b, _) in each) / 2
-
-    between, at_ends = carrier.widths
+    given_moment, bent, stiff = 0, 0, 0
+    for j, v, side, (nu1, nu2, _) in zip(r0s, us, sides, conormals, strict=True):
+        edge = kin.inverse_metric(j), (nu1, nu2), 1
+        given_moment += law(side).edge_moment(*viscous(j, side), *edge) / 2
+        bent += law(side).edge_moment(*strained(j, v), *edge) / 2
+        stiff += law(side).edge_stiffness(kin.membrane_strain(j, v), *edge) / 2 * model.sigma / carrier.widths[0]
     S_J, J = given.opened(carrier, across), across(r0 + u)
-    bent = moments(lambda j, s: kin.curvature_change(j, us[sides.index(s)]))
-    stiff = (thick("+") ** 3 + thick("-") ** 3) / 2 * sigma * D / between
-    edge = moments(lambda j, s: covariant(j, field(s), 6)) * J + S_J * (bent + stiff * J)
-    works = [work + edge * (conormals[0][2] + conormals[1][2]) / 2 * carrier.dS()]
+    stretch = (conormals[0][2] + conormals[1][2]) / 2
+    works[0] += (given_moment * J + S_J * (bent + stiff * J)) * stretch * carrier.dS()
+
     nu1, nu2, stretch = kin.conormal(r0, m)
+    edge = up, (nu1, nu2), 1
+    M, bent = (law().edge_moment(*of, *edge) for of in ((strain, bend), (E, K)))
+    stiff = law().edge_stiffness(E, *edge) * model.sigma / carrier.widths[1]
     for held_edge in factory.held:
         jump, modelled_sides = _jump_of(held_edge, r0, m), 1 if held_edge.plane is None else 2
         S_J, J = given.opened(carrier, jump), jump(r0 + u)
-        M, bent = (
-            densities.moment_of(K, r0, nu1, nu2, nu) for K in (covariant(r0, field, 6), kin.curvature_change(r0, u))
-        )
-        edge = M * J + S_J * (bent + modelled_sides * sigma / at_ends * J)
-        works.append(thick() ** 3 * D * edge * stretch * carrier.ds(held_edge.facets))
+        works.append((M * J + S_J * (bent + modelled_sides * stiff * J)) * stretch * carrier.ds(held_edge.facets))
     return works

@@ -7,11 +7,13 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.input.expressions import ByFormula, function
 from magshell_fenicsx.mesh.mirror import Mirror, rotation
+from magshell_fenicsx.mesh.patch import GivenField, PatchMesh
 from magshell_fenicsx.models.shell.parameters import Loads
-from magshell_fenicsx.models.shell.patterns import Inside, Pattern, WithinRims
+from magshell_fenicsx.models.shell.patterns import Inside, Pattern, WithinRims, by_patch
 from magshell_fenicsx.parts.natural.section import NaturalSection, components
 from magshell_fenicsx.parts.natural.shape import Natural, Varying, meridians
 from magshell_fenicsx.parts.part import Account, Context
+from magshell_fenicsx.parts.seen import Seen
 from magshell_fenicsx.shape.outline import Outline
 from magshell_fenicsx.shape.sections import MeshSurface, PlateSurface
 from magshell_fenicsx.shape.shell import ShellSection
@@ -24,7 +26,7 @@ MERIDIAN = "meridian"
 
 
 def natural(context: Context, turn: float, within: Mapping[str, Inside]) -> Natural | None:
-    """The natural shape in a frame turned about e3 (rad); None if the case has none; `within` is of `Plan`."""
+    """The natural shape in a frame turned about e3 (rad); None if the case has none; `within` is of `Problem`."""
     section = context.of(NaturalSection)
     if section is None:
         return None
@@ -33,6 +35,8 @@ def natural(context: Context, turn: float, within: Mapping[str, Inside]) -> Natu
     def varying(value: object, whole: Callable[[object], list[float | str]], factor: float) -> Varying | None:
         if value is None:
             return None
+        if isinstance(value, GivenField):
+            return value.mapped(lambda numbers: factor * _completed(numbers, stretch=whole is _stretches))
         if not isinstance(value, dict):
             found = whole(value)
             if any(isinstance(v, str) for v in found):
@@ -70,7 +74,7 @@ def uneven(context: Context) -> bool:
     assert section
     values = [section.curvature, section.stretch]
     each = [v for value in values for v in (value.values() if isinstance(value, dict) else [value])]
-    return any(isinstance(v, list) for v in each)
+    return any(isinstance(v, list) for v in each) or any(given.size > 1 for given in section.given)
 
 
 def askew(context: Context, outline: Outline) -> str | None:
@@ -94,6 +98,8 @@ def mirrored(context: Context, outline: Outline, mirror: Mirror) -> bool:
     """Whether a plane mirrors the natural shape; patches are mapped onto themselves."""
     section = context.of(NaturalSection)
     assert section
+    if section.given:
+        return False
     x, R, direction = outline.sample(), context.shell.reference, along(context)
 
     def alike(text: float | str, sign: float = 1.0) -> bool:
@@ -129,12 +135,33 @@ def _stretches(value: object) -> list[float | str]:
     return [*less, 0.0] if len(found) == 2 else less * 3
 
 
+def _completed(numbers: Array, *, stretch: bool) -> Array:
+    """The same (..., 1, 2 or 3) of a function of a program as three numbers."""
+    if stretch and numbers.shape[-1] == 2:
+        return np.concatenate([numbers - 1, np.zeros_like(numbers[..., :1])], axis=-1)
+    if stretch:
+        return np.repeat(numbers - 1, 3, axis=-1)
+    return numbers if numbers.shape[-1] == 3 else np.concatenate([numbers, numbers, 0 * numbers], axis=-1)
+
+
 def leaves(context: Context, outline: Outline) -> list[Leaves]:
     """The symmetry that the natural shape leaves."""
     chosen = along(context) if uneven(context) else MERIDIAN
     fixed = not isinstance(chosen, str) and all(isinstance(v, float | int) for v in chosen)
     vectors = [unit(np.array(chosen, dtype=float))] if fixed else []
     return [Leaves(askew(context, outline), vectors, lambda mirror: mirrored(context, outline, mirror))]
+
+
+class NaturalSeen(Seen):
+    """The amplitudes of the natural shape."""
+
+    def named(self, loads: Loads) -> tuple[str, ...]:
+        return tuple(loads.natural.amplitudes) if loads.natural else ()
+
+    def refuse_unfit(self, loads: Loads, surface: PatchMesh) -> None:
+        for key in ("curvature", "stretch"):
+            if isinstance(values := getattr(loads.natural, key, None), Mapping):
+                by_patch(values, surface.patches, len(surface.cells), f"natural.{key}")
 
 
 def account(context: Context, loads: Loads) -> Account:

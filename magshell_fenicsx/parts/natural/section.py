@@ -1,14 +1,17 @@
-"""The natural shape: the curvature and the size that the shell would have without stress."""
+"""The natural shape: the curvature and size that the shell would have without stress, and their growth as a load."""
 
 import re
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import BeforeValidator, Field, model_validator
 
 from magshell_fenicsx.input.expressions import Formula, formula
-from magshell_fenicsx.input.section import _NUMBER, in_units
+from magshell_fenicsx.input.section import _NUMBER, OrOfProgram, in_units
+from magshell_fenicsx.mesh.patch import GivenField
+from magshell_fenicsx.parts.course import Target, Until
 from magshell_fenicsx.parts.part import Ability, Context, Formulas, Modelled
+from magshell_fenicsx.parts.step import PathStep, ProgrammeStep, Step
 from magshell_fenicsx.shape.symmetry import Leaves
 
 if TYPE_CHECKING:
@@ -46,6 +49,10 @@ def _components(numbers: int, least: float, most: float, *, lengths: bool = Fals
         return [one(v) for v in value] if isinstance(value, list) else one(value)
 
     def read(value: Any) -> Any:
+        if isinstance(value, GivenField):
+            if value.size not in (1, numbers):
+                raise ValueError(f"a function of {value.size} numbers; allowed are 1 and {numbers}")
+            return value
         if not isinstance(value, dict):
             return value if value is None else some(value)
         if not value:
@@ -62,7 +69,9 @@ def _components(numbers: int, least: float, most: float, *, lengths: bool = Fals
 CURVATURE = 1e6  # of a natural shape by formula, over 1/R
 Number = float | str
 Component = Annotated[float | Formula, Field(union_mode="left_to_right")]  # a number stays one
-Values = Number | list[Number] | dict[str, Number | list[Number]] | None
+Values = Annotated[
+    Number | list[Number] | dict[str, Number | list[Number]] | GivenField | None, OrOfProgram(GivenField)
+]
 
 
 class NaturalSection(Ability):
@@ -91,6 +100,11 @@ class NaturalSection(Ability):
         return self
 
     @property
+    def given(self) -> list[GivenField]:
+        """Those that are functions of a program."""
+        return [value for value in (self.curvature, self.stretch) if isinstance(value, GivenField)]
+
+    @property
     def texts(self) -> list[str]:
         """The formulas of the curvature and the stretch."""
         return [text for value in (self.curvature, self.stretch) for text in components(value) if isinstance(text, str)]
@@ -107,8 +121,7 @@ class NaturalSection(Ability):
         bounds = {"stretch": (SMALLEST, LARGEST), "curvature": (-CURVATURE / R, CURVATURE / R)}
         for name, (least, most) in bounds.items():
             value = getattr(self, name)
-            values = value if isinstance(value, list) else [] if isinstance(value, dict) else [value]
-            yield Formulas(f"natural.{name}", values, least, most, R)
+            yield Formulas(f"natural.{name}", components(value), least, most, R)
 
     def adds(self, context: Context, modelled: Modelled) -> dict[str, Any]:
         from magshell_fenicsx.parts.natural.planned import natural  # the solver takes long to import
@@ -117,8 +130,8 @@ class NaturalSection(Ability):
 
 
 def components(value: Any) -> list[float | str]:
-    """The numbers and formulas of a curvature or stretch, none of patches."""
-    return value if isinstance(value, list) else [] if value is None or isinstance(value, dict) else [value]
+    """The numbers and formulas of a curvature or stretch, none of patches and functions."""
+    return value if isinstance(value, list) else [value] if isinstance(value, float | int | str) else []
 
 
 def measured(data: Any) -> list[str]:
@@ -129,3 +142,53 @@ def measured(data: Any) -> list[str]:
         return any(units(v) if isinstance(v, list) else per_length(v) is not v for v in values)
 
     return ["natural.curvature"] if isinstance(data, dict) and units(data.get("curvature")) else []
+
+
+class GrowthSection(PathStep):
+    """The natural shape grows from the drawn one: the factor of `natural.curvature`, or of `natural.stretch` less one.
+
+    `until: target` ends at a factor, the others need `grows`.
+    """
+
+    targets: ClassVar[dict[str, Target]] = {
+        "curvature": Target("load", "natural_curvature"),
+        "stretch": Target("load", "natural_stretch"),
+    }
+    kind: Literal["natural"]
+    control: Literal["load", "arc"] = "arc"
+    """What is prescribed step by step: the factor, or arc length, which passes its folds"""
+    until: Until = "target"
+    grows: Literal["curvature", "stretch"] | None = None
+    """What grows, where no target says it"""
+    curvature: float | None = Field(default=None, ge=-1e3, le=1e3)
+    """Target of the factor of natural.curvature"""
+    stretch: float | None = Field(default=None, ge=-1e3, le=1e3)
+    """Target of the factor of natural.stretch less one"""
+
+    @model_validator(mode="after")
+    def _one_grows(self) -> Self:
+        said = {self.grows, *self._given} - {None}
+        if len(said) != 1:
+            raise ValueError("give curvature or stretch, the factor that it grows to, or without a target grows")
+        return self
+
+    @property
+    def key(self) -> str:
+        """The key of `natural` that grows."""
+        return self.grows or "".join(self._given)
+
+    @property
+    def amplitude(self) -> str:  # type: ignore[override]
+        return f"natural_{self.key}"
+
+    @classmethod
+    def before(cls, context: Context, loading: Step | None) -> list[tuple[str, Step]]:
+        natural = context.of(NaturalSection)
+        if isinstance(loading, cls) or natural is None:
+            return []
+        keys = [key for key in ("stretch", "curvature") if getattr(natural, key) is not None]
+        return [("natural", cls.model_validate({"kind": "natural", key: 1.0})) for key in keys]
+
+    def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
+        if getattr(context.of(NaturalSection), self.key, None) is None:
+            raise ValueError(f"loading.{self.key}: is a factor of natural.{self.key}: give that too")

@@ -7,11 +7,18 @@ With the stretch tensor U of the surface, the stretch s of its thickness and the
 so that grown alike in all directions, U = s = lambda, a shell is free of stress as its enlarged image. Membrane and
 bending energy are those of a shell with these forms, per area of the natural surface; U = 1 + mu_s T and
 s = 1 + mu_s t grow with the amplitude "natural_stretch", kappa with "natural_curvature".
+
+Of a body it is the growth tensor G in F = F_e G, on which no energy is spent. With the same numbers, at the distance z
+along the normal n,
+
+    G = (1 - s z kappa) U + s n n,
+
+whose metric G^T G is that of the shell's natural forms, linear in z.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 import ufl
@@ -20,20 +27,25 @@ from numpy.typing import NDArray
 from ufl.core.expr import Expr
 
 from magshell_fenicsx.input.expressions import Together
-from magshell_fenicsx.mesh.patch import MeshError
+from magshell_fenicsx.mesh.hexahedra import MIDDLE, Body
+from magshell_fenicsx.mesh.patch import GivenField, MeshError
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.energy import Density, Parameter
 from magshell_fenicsx.models.shell.fitted import Cells, fitted
 from magshell_fenicsx.models.shell.free import Constants
 from magshell_fenicsx.models.shell.kinematics import Jet
-from magshell_fenicsx.models.shell.patterns import Pattern, by_patch
+from magshell_fenicsx.models.shell.patterns import Pattern, by_patch, cells_of_body, places_in_body
+
+if TYPE_CHECKING:
+    from magshell_fenicsx.models.solid import terms as solid
 
 Array = NDArray[np.float64]
-Varying: TypeAlias = Array | Pattern | Mapping[str, Array]
+Varying: TypeAlias = Array | Pattern | Mapping[str, Array] | GivenField
 STRETCH, CURVATURE = "natural_stretch", "natural_curvature"
 SIZE = 13  # numbers of a field: kappa and T as symmetric tensors in space, and t
 FIELD = ([0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2])  # the components of a tensor in space, in the field's order
 SMALLEST, LARGEST = 0.05, 20.0  # of a natural stretch
+NORMAL_AT, HEIGHT_AT = SIZE, SIZE + 3  # first numbers of n and z in the field of a body
 NORMAL = 1e-6  # length in the surface of a unit vector that is normal to it
 
 
@@ -45,7 +57,8 @@ class Natural:
     ----------
     curvature
         kappa_11, kappa_22, kappa_12 R, positive where the surface bends towards its normal; a vector (3,), a pattern,
-        or vectors of named patches. None: it does not grow, and there is no such amplitude.
+        vectors of named patches, or a field that was given on the mesh. None: it does not grow, and there is no such
+        amplitude.
     stretch
         The stretches along t1, along t2 and of the thickness, less one; likewise.
     along
@@ -62,8 +75,13 @@ class Natural:
         given = {CURVATURE: self.curvature, STRETCH: self.stretch}
         return tuple(name for name, value in given.items() if value is not None)
 
-    def on(self, patches: Mapping[str, NDArray[np.bool_]], cells: int) -> "Natural":
-        """The same with a vector for each cell where it is given by patches.
+    def on(
+        self,
+        patches: Mapping[str, NDArray[np.bool_]],
+        cells: int,
+        carried: Callable[[GivenField], Pattern] | None = None,
+    ) -> "Natural":
+        """The same with a vector for each cell where it is given by patches, and with given fields as patterns.
 
         Raises
         ------
@@ -71,14 +89,13 @@ class Natural:
             If there is no such patch.
         """
         given = {"curvature": self.curvature, "stretch": self.stretch}
-        return replace(
-            self,
-            **{
-                key: by_patch(value, patches, cells, f"natural.{key}")
-                for key, value in given.items()
-                if isinstance(value, Mapping)
-            },
-        )
+        by_cell = {
+            key: by_patch(value, patches, cells, f"natural.{key}")
+            for key, value in given.items()
+            if isinstance(value, Mapping)
+        }
+        varying = {key: value for key, value in given.items() if isinstance(value, GivenField)}
+        return replace(self, **by_cell, **{key: carried(value) for key, value in varying.items() if carried})
 
     def at(self, r0: Array, n0: Array) -> tuple[Array, Array, Array]:
         """T and kappa (..., 3, 3) in space, and t (...), at places with these normals (cells, nodes, 3)."""
@@ -284,7 +301,7 @@ def covariant(r0: Jet, field: Expr, first: int) -> Expr:
 def _values(value: Varying | None, r0: Array, n0: Array) -> Array:
     if value is None:
         return np.zeros_like(r0)
-    assert not isinstance(value, Mapping)
+    assert not isinstance(value, Mapping | GivenField)  # a model knows them in its cells
     return value(r0, n0) if callable(value) else np.broadcast_to(value, r0.shape)
 
 
@@ -303,3 +320,54 @@ def _tensor(components: Array, t1: Array, t2: Array) -> Array:
     if components.shape[-1] == 3:
         found = found + components[..., 2, None, None] * (product(t1, t2) + product(t2, t1))
     return np.asarray(found)
+
+
+def body_shape(natural: Natural, body: Body, V: fem.FunctionSpace, free: dict[str, fem.Constant]) -> Shape:
+    """The natural shape of a body; collective.
+
+    Raises
+    ------
+    MeshError
+        As `natural_field`, or if the body has no such patch.
+    """
+    natural = natural.on(body.patches, len(body.between))
+    _, normals = places_in_body(V)
+    Z = fem.functionspace(V.mesh, ("Lagrange", V.element.basix_element.degree, (1,)))
+    z = body.at_nodes(Z, (body.heights - MIDDLE) * body.thickness)[Z.dofmap.list]
+    numbers = natural_field(natural, cells_of_body(V), V)
+    Q = fem.functionspace(V.mesh, ("DG", V.element.basix_element.degree, (HEIGHT_AT + 1,)))
+    field = fem.Function(Q, name="natural")
+    rows = field.x.array.reshape(-1, HEIGHT_AT + 1)
+    given = numbers.x.array.reshape(-1, SIZE)[numbers.function_space.dofmap.list]
+    rows[Q.dofmap.list] = np.concatenate([given, normals, z[..., None]], axis=-1)
+    return Shape.of(field, natural, free)
+
+
+def grown_in_body(density: "solid.Density", shape: Shape) -> "solid.Density":
+    """A density that takes a `growth`, of that shape."""
+
+    def of(*arguments: Expr) -> Expr:
+        count = len(arguments) - len(shape.parameters)
+        return density.of(*arguments[:count], growth=_growth_in_body(shape, *arguments[count:]))
+
+    return replace(density, of=of, parameters=(*density.parameters, *shape.parameters))
+
+
+def _growth_in_body(shape: Shape, field: Expr, *amplitudes: Expr) -> Expr:
+    given = list(amplitudes)
+    bent, stretched = (given.pop(0) if p is not None else None for p in (shape.curvature, shape.stretch))
+    n, z = ufl.as_vector([field[NORMAL_AT + i] for i in range(3)]), field[HEIGHT_AT]
+    n = n / ufl.sqrt(ufl.dot(n, n))
+    across = ufl.outer(n, n)
+    P = ufl.Identity(3) - across
+    s, U = 1, P
+    if stretched is not None:
+        s, U = 1 + stretched * field[12], P + stretched * ufl.dot(P, ufl.dot(_tensor_in_space(field, 6), P))
+    if bent is not None:
+        U = U - s * z * bent * ufl.dot(P, ufl.dot(_tensor_in_space(field, 0), U))
+    return U + s * across
+
+
+def _tensor_in_space(field: Expr, first: int) -> Expr:
+    xx, yy, zz, xy, xz, yz = (field[first + i] for i in range(6))
+    return ufl.as_matrix([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])

@@ -1,15 +1,20 @@
-"""A live pressure."""
+"""A live pressure, and what is seen of it."""
 
 from dataclasses import replace
 from math import copysign, sqrt
-from typing import Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from pydantic import Field
 
-from magshell_fenicsx.input.targets import over
+from magshell_fenicsx.input.section import over
 from magshell_fenicsx.parts.course import Course, Fit, Here, Now, Target, Until
+from magshell_fenicsx.parts.part import Account, Context
+from magshell_fenicsx.parts.seen import Seen, Sight
 from magshell_fenicsx.parts.step import PathStep, Step
-from magshell_fenicsx.quantities.units import PRESSURE, VOLUME
+from magshell_fenicsx.quantities.quantity import PRESSURE, VOLUME
+
+if TYPE_CHECKING:
+    from magshell_fenicsx.models.shell.parameters import Loads
 
 
 class PressureSection(PathStep):
@@ -54,3 +59,20 @@ class PressureSection(PathStep):
 
     def first(self, change: float, now: Now, *, by_load: bool) -> float:
         return copysign(0.1, change)
+
+
+class PressureSeen(Seen):
+    """What is conjugate to a live pressure is the change of volume, which every run has."""
+
+    def conjugate_unit(self, sight: Sight, name: str) -> float | None:
+        """Of ΔV/R³."""
+        if name != PressureSection.amplitude:
+            return None
+        return -sight.model.material.classical_pressure / sight.h / sight.model.multiplicity
+
+
+def account(context: Context, loads: "Loads") -> Account:
+    """Whether there is a live pressure."""
+    if not loads.pressure:
+        return Account(left_out=["pressure: not loaded by it (the volume is only reported)"])
+    return Account(["live pressure on the outer face" if context.solid else "live pressure"])

@@ -1,4 +1,7 @@
-"""What holds a shell: displacements that are zero, and whether it is held against rigid motions."""
+"""What holds a shell or a solid: displacements that are zero, and whether it is held against rigid motions.
+
+Of a solid these are whole faces above clamped edges and in mirror planes, else the mid-surface alone.
+"""
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 
@@ -10,12 +13,17 @@ from numpy.typing import NDArray
 from petsc4py import PETSc
 
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
+from magshell_fenicsx.assembly.sliding import Constraint, held_along
 from magshell_fenicsx.continuation.system import Amplitudes, symmetric_part
+from magshell_fenicsx.mesh.hexahedra import MIDDLE, Body
 from magshell_fenicsx.mesh.mirror import Mirror
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.shell.parameters import Condition, Held, Loads
+from magshell_fenicsx.parts.supports.moved import Support
 
 Array = NDArray[np.float64]
+ALL = (0, 1, 2)
+ROUNDING = 1e-9
 STRAIGHT = 1e-6  # deviation of an edge from a plane, in lengths of R
 BESIDE = 1e-3  # largest distance from its plane at which curved elements leave an edge
 RIGHT = 0.99  # mean cosine between the conormals of an edge and the normal of the plane that the surface crosses
@@ -71,6 +79,10 @@ def refuse_unknown(
         if edge is not None and edge not in edges:
             there = ", ".join(sorted(edges)) or "none"
             raise MeshError(f"loading.loads: edge: {edge}: the surface has only {there}")
+    for term in loads.own:
+        if term.on is not None and term.on not in edges:
+            there = ", ".join(sorted(edges)) or "none"
+            raise MeshError(f"terms: {term.name}: on: {term.on}: the surface has no such edge, only {there}")
 
 
 def no_mirror(name: str) -> str:
@@ -196,3 +208,45 @@ def refuse_loose(system: FiniteElementSystem, r0: fem.Function, amplitudes: Ampl
                 else "turn"
             )
         )
+
+
+def supports(
+    body: Body, r0: fem.Function, conditions: Mapping[str, Condition]
+) -> tuple[list[Constraint], list[Mirror], dict[str, Support]]:
+    """What is held, the planes of symmetry but the mirror plane of a half model, and each support; collective.
+
+    Raises
+    ------
+    MeshError
+        On every rank, if an edge lies in no plane of symmetry.
+    """
+    V = r0.function_space
+    middle = in_middle(body, V)
+    held: list[Constraint] = []
+    planes: list[Mirror] = []
+    named: dict[str, Support] = {}
+    on_planes: dict[str, Support] = {}
+    for name, condition in conditions.items():
+        components = condition.components if isinstance(condition, Held) else ALL
+        if condition in ("free", "symmetry"):
+            continue
+        nodes = None if condition == "clamped" else middle
+        if condition == "plane":
+            planes.append(plane := plane_of(r0, body.faces[name], name))
+            held.append(held_along(V, 2, body.faces[name], plane.normal))
+            on_planes[name] = Support.of(held_on(V, 2, body.faces[name], ALL))
+            continue
+        if name in body.faces:
+            here = held_on(V, 2, body.faces[name], components, nodes)
+        elif name in body.patches:
+            here = held_on(V, 3, np.flatnonzero(body.patches[name]).astype(np.int32), components, nodes)
+        else:
+            here = held_at_vertex(V, body.points[name], components)
+        held += here
+        named[name] = Support.of(here)
+    return held, planes, named | on_planes
+
+
+def in_middle(body: Body, V: fem.FunctionSpace) -> NDArray[np.bool_]:
+    """Which nodes, ghosts included, lie in the middle of the thickness."""
+    return np.asarray(np.abs(body.at_nodes(V, body.heights) - MIDDLE) < ROUNDING)

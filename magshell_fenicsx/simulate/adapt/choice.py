@@ -1,18 +1,80 @@
-"""The mesh chosen for a tolerance, the rounds that led to it, and its file."""
+"""The mesh that a tolerance chooses: its degree, refinement, sizes and layers, and what was estimated on the way."""
 
 import json
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
+import scipy
 from mpi4py import MPI
+from numpy.typing import NDArray
 
-from magshell_fenicsx.case.case import Case
-from magshell_fenicsx.problem.elements import SolidSection
-from magshell_fenicsx.problem.planner import make_plan
-from magshell_fenicsx.problem.problem import Plan
-from magshell_fenicsx.simulate.adapt.size import Sampled
+from magshell_fenicsx.mesh.grading import Size
+from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.simulate.scene import Scene
+
+Array = NDArray[np.float64]
+NEIGHBOURS = 3
+LARGEST_CHANGE = 2.5  # largest factor in one round, of a cell relative to the mean and of the mean
+STEPS = 8  # sizes per factor of two; coarse steps make the mesh independent of rounding
+
+
+@dataclass(frozen=True)
+class Sampled:
+    """The geometric mean of the sizes at the nearest points, weighted by their inverse distances.
+
+    Attributes
+    ----------
+    points, sizes
+        (n, 2) of the chart and (n,).
+    """
+
+    points: Array
+    sizes: Array
+
+    def __call__(self, x: Array) -> float:
+        distance, near = self._tree.query(x, NEIGHBOURS)
+        weight = 1 / (distance + 1e-12)
+        return float(np.exp(weight @ np.log(self.sizes[near]) / weight.sum()))
+
+    @cached_property
+    def _tree(self) -> "scipy.spatial.cKDTree":
+        return scipy.spatial.cKDTree(self.points)
+
+
+def equidistributed(
+    old: Size, centres: Array, shares: Array, order: float, reduction: float, least: float
+) -> tuple[Sampled, float]:
+    """Sizes for which all cells have equal shares in the error, and the error falls by a factor.
+
+    Parameters
+    ----------
+    old
+        Size function of the mesh whose cells have `centres` (n, 2) and `shares` (n,) of the error.
+    order
+        Power of the size in the error; the share of one cell falls with the power `order` + 2.
+    reduction
+        Wanted error over the error on the old mesh.
+    least
+        Smallest size: the thickness, below which only the singularity of a point force remains.
+
+    Returns
+    -------
+    Sizes, and the factor of the number of cells.
+    """
+    wish = (np.exp(np.log(shares).mean()) / shares) ** (1 / (order + 2))
+    change = _smoothed(centres, np.clip(wish, 1 / LARGEST_CHANGE, LARGEST_CHANGE))
+    expected = shares @ change**order / shares.sum()  # a cell becomes change^-2 cells
+    change *= np.clip((reduction / expected) ** (1 / order), 1 / LARGEST_CHANGE, LARGEST_CHANGE)
+    change = 2 ** (np.round(STEPS * np.log2(change)) / STEPS)
+    return Sampled(centres, np.maximum([old(x) for x in centres] * change, least)), float(np.mean(change**-2))
+
+
+def _smoothed(centres: Array, wish: Array) -> Array:
+    """Geometric mean of a cell and its neighbours."""
+    near = scipy.spatial.cKDTree(centres).query(centres, NEIGHBOURS + 2)[1]
+    return np.asarray(np.exp(np.log(wish)[near].mean(axis=1)))
 
 
 @dataclass(frozen=True)
@@ -27,19 +89,14 @@ class Choice:
     size: Sampled | None = None
     layers: int | None = None
 
-    def applied(self, asked: Case) -> tuple[Case, Plan]:
-        """The case on this mesh, and its plan."""
-        mesh = asked.mesh.model_copy(update={"degree": self.degree, "refinement": self.refinement})
-        case = asked.model_copy(update={"mesh": mesh})
-        if self.layers:
-            solid = (asked.solid or SolidSection()).model_copy(update={"layers": self.layers})
-            case = case.model_copy(update={"solid": solid})
-        plan = make_plan(case)
-        return case, replace(plan, size=self.size) if self.size else plan
+    def applied(self, asked: Problem) -> Problem:
+        """The problem on this mesh."""
+        mesh = {"mesh.degree": self.degree, "mesh.refinement": self.refinement}
+        problem = asked.again(mesh | ({"solid.layers": self.layers} if self.layers else {}))
+        return replace(problem, size=self.size) if self.size else problem
 
-    def scene(self, asked: Case, comm: MPI.Comm) -> Scene:
-        case, plan = self.applied(asked)
-        return Scene(case, comm, plan)
+    def scene(self, asked: Problem, comm: MPI.Comm) -> Scene:
+        return Scene(self.applied(asked), comm)
 
 
 @dataclass(frozen=True)
@@ -62,14 +119,14 @@ class Adapted:
     Attributes
     ----------
     asked
-        The case with the tolerance.
+        The problem with the tolerance.
     choice, best
         The chosen mesh and its round: the fewest unknowns within the tolerance, or else the least error.
     rounds
         All rounds in order.
     """
 
-    asked: Case
+    asked: Problem
     choice: Choice
     best: Round
     rounds: list[Round]
@@ -94,17 +151,17 @@ class Adapted:
         }
 
     def to_json(self) -> bytes:
-        """All except the case, in full precision, so that a resumed run has the same mesh on any number of ranks."""
+        """All except the problem, in full precision, so that a resumed run has the same mesh on any number of ranks."""
         size = self.choice.size
         sizes = size and {"points": size.points.tolist(), "sizes": size.sizes.tolist()}
         rounds = [asdict(r) for r in self.rounds]
         return json.dumps({"best": self.rounds.index(self.best), "rounds": rounds, "size": sizes}).encode()
 
     @classmethod
-    def from_json(cls, asked: Case, content: bytes) -> "Adapted":
-        """Read the content of `to_json` for the same case."""
-        known = json.loads(content)
-        rounds = [Round(**r) for r in known["rounds"]]
-        best, size = rounds[known["best"]], known["size"]
+    def from_json(cls, asked: Problem, content: bytes) -> "Adapted":
+        """Read the content of `to_json` for the same problem."""
+        values = json.loads(content)
+        rounds = [Round(**r) for r in values["rounds"]]
+        best, size = rounds[values["best"]], values["size"]
         sampled = Sampled(*(np.array(size[key]) for key in ("points", "sizes"))) if size else None
         return cls(asked, Choice(best.degree, best.refinement, sampled, best.layers), best, rounds)

@@ -1,17 +1,163 @@
-"""The end of a run, and the same end on another mesh without computing the path."""
+"""The end of a run, and the same end on another mesh without computing the path.
+
+Fields are carried between meshes of one case by the polynomials of each cell. `transfer` smooths, and scales between
+shells of different shape. Here source and target have the same chart, and to a higher degree on the same mesh it is
+exact.
+"""
 
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
+import basix
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
 from magshell_fenicsx.continuation.control import GivenConjugate, GivenLoad, Row
 from magshell_fenicsx.continuation.fold import FoldLost, Guess, find_fold
 from magshell_fenicsx.continuation.system import State, System, Vector
-from magshell_fenicsx.simulate.adapt.carry import NotCarried, carry
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
+from magshell_fenicsx.simulate.transfer import chart
 
+Array = NDArray[np.float64]
+CANDIDATES = 12  # number of nearest cells that are searched for a point
+WIDER = 8  # factor of that number if none of them contains the point
+NEWTON_STEPS = 4  # for the position in a cell with a curved edge
+INSIDE = 1e-6  # distance from a cell, in cells, below which a point is inside: rounding
+BESIDE = 0.1  # largest distance, in cells; two meshes approximate a curved edge differently
+FAR = 1.0  # distance, in cells, beyond which a cell's map is not inverted
 FIELDS = ("lambda_m", "angle")  # amplitudes whose value is prescribed
+
+
+class NotCarried(RuntimeError):
+    """A point of one mesh is outside the other mesh."""
+
+
+def carry(source: Scene, target: Scene, u: Vector) -> Vector:
+    """A displacement of `source` in the unknowns of `target`, zero at its supports; collective.
+
+    Raises
+    ------
+    NotCarried
+        On every rank, if a node of `target` is more than a tenth of a cell outside all cells of `source`.
+    """
+    fields, comm, x = CellFields.of(source), target.comm, chart(target)
+    cells, xi, beside = fields.places(x)
+    worst, place = max(
+        comm.allgather((float(beside.max(initial=0.0)), x[np.argmax(beside)].tolist() if len(x) else []))
+    )
+    if worst > BESIDE:
+        raise NotCarried(f"the place {place} of the chart is {worst:.2g} cells beside the other mesh")
+    return target.model.system.held(fields.at(gathered(source, u), cells, xi).ravel())
+
+
+def gathered(scene: Scene, u: Vector) -> Array:
+    """Values (cells, nodes, components) of a displacement on the cells of all ranks, on every rank; collective."""
+    system, V = scene.model.system, scene.model.V
+    topology = V.mesh.topology
+    cells = V.dofmap.list[: topology.index_map(topology.dim).size_local]
+    return np.concatenate(system.comm.allgather(system.with_ghosts(u).reshape(-1, V.dofmap.bs)[cells]))
+
+
+class CellFields:
+    """Cells in a chart, in which points can be located.
+
+    Parameters
+    ----------
+    nodes
+        (cells, nodes, 1 or 2) nodes of the map from the reference cell to the chart.
+    """
+
+    def __init__(self, nodes: Array, element: basix.finite_element.FiniteElement) -> None:
+        self.nodes, self._element = nodes, element
+        self._near = scipy.spatial.cKDTree(self.centres)
+
+    @classmethod
+    def of(cls, scene: Scene) -> "CellFields":
+        """The cells of all ranks; collective."""
+        model, V = scene.model, scene.model.V
+        if model.midsurface:  # cells beside a seam keep their own chart
+            here = model.midsurface.charted(V)[: V.mesh.topology.index_map(2).size_local]
+            nodes = np.concatenate(scene.comm.allgather(here))
+        else:
+            x = chart(scene)
+            nodes = gathered(scene, np.pad(x, ((0, 0), (0, V.dofmap.bs - x.shape[1]))).ravel())[..., : x.shape[1]]
+        return cls(nodes, scene.model.V.element.basix_element)
+
+    @property
+    def centres(self) -> Array:
+        """(cells, 1 or 2)."""
+        return np.asarray(self._corners.mean(axis=1))
+
+    def at(self, values: Array, cells: NDArray[np.int64], xi: Array) -> Array:
+        """The values (n, components) of a `gathered` field at positions found by `places`."""
+        return np.asarray(np.einsum("np,npc->nc", self.table(0, xi)[0], values[cells]))
+
+    def places(self, x: Array) -> tuple[NDArray[np.int64], Array, Array]:
+        """Locate points x (n, 1 or 2) of the chart.
+
+        Returns
+        -------
+        The cells (n,), the nearest for a point outside all cells; the positions (n, 1 or 2) in the reference cell; and
+        the distances (n,) from the cells, in cells, zero inside.
+        """
+        count = min(CANDIDATES, len(self.nodes))
+        candidates = self._near.query(x, count)[1].reshape(len(x), count)
+        straight = np.stack([_beside(self._as_if_straight(x, cells)) for cells in candidates.T])
+        cells = candidates[np.arange(len(x)), straight.argmin(axis=0)]
+        xi, beside = self._in_cells(x, cells)
+        enough = INSIDE
+        while len(far := np.flatnonzero(beside > enough)):  # a large cell may have a distant centre
+            candidates = self._near.query(x[far], count)[1].reshape(len(far), count)
+            for tried in candidates.T:
+                there, off = self._in_cells(x[far], tried)
+                better = far[off < beside[far]]
+                cells[better], xi[better], beside[better] = (a[off < beside[far]] for a in (tried, there, off))
+            if count == len(self.nodes):
+                break
+            enough = INSIDE if count <= CANDIDATES else BESIDE
+            count = min(WIDER * count, len(self.nodes))
+        return cells, xi, np.where(beside > INSIDE, beside, 0.0)
+
+    def _in_cells(self, x: Array, cells: NDArray[np.int64]) -> tuple[Array, Array]:
+        """Positions of points in the reference cells of given cells, and distances; inf if Newton's method fails."""
+        xi = self._as_if_straight(x, cells)
+        beside = np.full(len(x), np.inf)
+        near = np.flatnonzero(_beside(xi) < FAR)
+        if not len(near):
+            return xi, beside
+        x, nodes, inside = x[near], self.nodes[cells[near]], xi[near]
+        for _ in range(NEWTON_STEPS):
+            table = self.table(1, inside)
+            rest = x - np.einsum("np,npd->nd", table[0], nodes)
+            step = _solve(np.einsum("jnp,npd->ndj", table[1:], nodes), rest)
+            inside = inside + step
+        xi[near], beside[near] = inside, np.where(np.abs(step).max(axis=1) < INSIDE, _beside(inside), np.inf)
+        return xi, beside
+
+    def table(self, derivatives: int, xi: Array) -> Array:
+        """Shape functions and derivatives (derivative, n, nodes) at points of the reference cell."""
+        return np.asarray(self._element.tabulate(derivatives, xi)[..., 0])
+
+    @property
+    def _corners(self) -> Array:
+        return self.nodes[:, : self.nodes.shape[2] + 1]
+
+    def _as_if_straight(self, x: Array, cells: NDArray[np.int64]) -> Array:
+        """Positions in the reference cells, as if the cells had straight edges."""
+        corners = self._corners[cells]
+        return _solve(np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2), x - corners[:, 0])
+
+
+def _beside(xi: Array) -> Array:
+    """Distance of positions (n, 1 or 2) from the reference cell; negative inside."""
+    return np.asarray(np.maximum(-xi.min(axis=1), xi.sum(axis=1) - 1))
+
+
+def _solve(matrices: Array, right: Array) -> Array:
+    return np.asarray(np.linalg.solve(matrices, right[..., None])[..., 0])
 
 
 class NoResult(RuntimeError):
@@ -81,7 +227,7 @@ class History:
         NoResult
             If the history stopped before its target and not at an instability, or has no load.
         """
-        steps = scene.plan.programme
+        steps = scene.problem.programme
         until = steps[-1].until if steps else "target"
         if (
             until in ("target", "points", "zero")
@@ -161,7 +307,7 @@ def _equilibrium(scene: Scene, guess: State, near: Ending) -> Ending | None:
 
 
 def _target(scene: Scene, record: Record) -> Ending:
-    system, state, target = scene.newton.system, record.point.state, scene.plan.programme[-1].load.target
+    system, state, target = scene.newton.system, record.point.state, scene.problem.programme[-1].load.target
     name = "lambda_across" if record.amplitude == "angle" else record.amplitude
     by_conjugate = target is None or target[0].quantity == "conjugate"
     held = -system.potential(state.u, state.mu, name) if by_conjugate and record.amplitude not in FIELDS else None

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.system import Vector, dot
-from magshell_fenicsx.simulate.adapt.carry import CellFields, carry, gathered
-from magshell_fenicsx.simulate.adapt.ending import Ending
+from magshell_fenicsx.simulate.adapt.ending import CellFields, Ending, carry, gathered
 from magshell_fenicsx.simulate.scene import Scene
 
 Array = NDArray[np.float64]
@@ -62,13 +61,13 @@ class _TangentEnergy:
 
     def __call__(self, v: Vector) -> Array:
         """(cells,), over E h R^2."""
-        material = self._scene.plan.material
+        law = self._scene.problem.material.law
         first, second = self._derivatives(v)
         E = np.einsum("...ic,...jc->...ij", self._a, first)
         bent = second - np.einsum("...ijk,...kc->...ijc", self._gamma, first)
         K = np.einsum("...c,...ijc->...ij", self._normal, bent)
-        membrane, bending = (self._square((S + np.swapaxes(S, -1, -2)) / 2, material.nu) for S in (E, K))
-        density = membrane / (2 * (1 - material.nu**2)) + material.bending_stiffness / 2 * bending
+        E, K = ((S + np.swapaxes(S, -1, -2)) / 2 for S in (E, K))
+        density = law.membrane(E, self._raise) + law.bending(E, K, self._raise)
         return np.asarray((density * self._area) @ self._weights)
 
     def _derivatives(self, v: Vector) -> tuple[Array, Array]:
@@ -76,9 +75,3 @@ class _TangentEnergy:
         d = np.einsum("jqp,npc->jnqc", self._table, gathered(self._scene, v))
         second = np.stack([np.stack([d[3], d[4]], axis=-2), np.stack([d[4], d[5]], axis=-2)], axis=-3)
         return np.stack([d[1], d[2]], axis=-2), second
-
-    def _square(self, S: Array, nu: float) -> Array:
-        """(1 - nu) S:S + nu tr^2 S."""
-        mixed = self._raise @ S
-        trace = np.trace(mixed, axis1=-2, axis2=-1)
-        return np.asarray((1 - nu) * np.einsum("...ij,...ji->...", mixed, mixed) + nu * trace**2)

@@ -8,6 +8,10 @@
 
 Meridians and grids, whose lines go from edge to edge, are refined uniformly. On a meridian, where cells cost nothing,
 on a grid and on a surface of few cells the error may be far below a loose tolerance.
+
+A solid has degree 2, so element size and layers are chosen. Each round solves on one mesh, with smaller elements, and
+with one more layer. The two changes of the result estimate the two parts of the error, as if it fell with the square of
+the size; the part that is too large is refined.
 """
 
 from collections.abc import Callable
@@ -16,32 +20,86 @@ from dataclasses import replace
 import numpy as np
 from mpi4py import MPI
 
-from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.grid import Grid
+from magshell_fenicsx.problem.elements import SOLID_DEGREE, SolidSection
 from magshell_fenicsx.problem.limits import refuse_beyond_memory
-from magshell_fenicsx.simulate.adapt.choice import Adapted, Choice, Round
+from magshell_fenicsx.problem.problem import Problem
+from magshell_fenicsx.simulate.adapt.choice import Adapted, Choice, Round, equidistributed
 from magshell_fenicsx.simulate.adapt.ending import Ending, NoResult, by_path, from_near
 from magshell_fenicsx.simulate.adapt.indicator import indicators
-from magshell_fenicsx.simulate.adapt.size import equidistributed
-from magshell_fenicsx.simulate.adapt.solid import adapted_solid
 from magshell_fenicsx.simulate.scene import Scene
 
+FIRST = (0.5, 1.0, 2.0)  # refinements of the first mesh, tried until the path has a result
+FINER = 1.5  # factor of the refinement that is compared with
+SLOWEST, FASTEST = 1.25, 2.5  # factor of the refinement in one round
+PART = 0.4  # each part of the estimated error over the tolerance
+MOST_ROUNDS = 6
+MOST_LAYERS = 9
+
+Say = Callable[[str], None]
 DEGREES = ((3e-3, 3), (2e-4, 4), (0.0, 5))  # the fastest degree for tolerances down to the first number
 CHEAP = 3  # degree of the path
-FIRST = (0.5, 1.0, 2.0)  # refinements of the first mesh, tried until the path has a result
 SAFETY = 1.25  # factor of the estimate for the error of the finer solution
 AIM, LEAST = 0.55, 1 / 5  # estimated error over the tolerance
-MOST_ROUNDS = 6
 COARSEST, FINEST = 0.1, 20.0  # limits of the refinement of a meridian
 LINES = 1.25  # least factor of the refinement of a grid; a smaller one may add no line
 FEW = 50  # a surface with at most so many cells is not coarsened
 
-Say = Callable[[str], None]
 Solved = tuple[Scene, Ending]
 
 
-def adapted(case: Case, comm: MPI.Comm, say: Say = lambda line: None, doing: Say = lambda what: None) -> Adapted:
+def adapted_solid(problem: Problem, comm: MPI.Comm, say: Say, doing: Say) -> Adapted:
+    """Find the mesh of a solid; see `adapted`."""
+    tolerance, tried = problem.mesh.tolerance, list[tuple[Round, Choice]]()
+    assert tolerance is not None
+    refinement, layers = FIRST[0], (problem.context.of(SolidSection) or SolidSection()).layers
+    while len(tried) < MOST_ROUNDS:
+        doing(f"a mesh for the tolerance {tolerance:g}: round {len(tried) + 1}")
+        try:
+            judged, plane, through = _round(problem, comm, refinement, layers)
+        except NoResult:
+            if tried or refinement == FIRST[-1]:
+                raise
+            refinement = FIRST[FIRST.index(refinement) + 1]
+            continue
+        except CaseError:  # too large
+            break
+        tried.append((judged, Choice(SOLID_DEGREE, refinement, layers=layers)))
+        say(
+            f"tolerance {tolerance:g}: refinement {refinement:g}, layers {layers}, {judged.dofs} unknowns: "
+            f"result {judged.result:.9g}, estimated error {plane:.1e} by the size and {through:.1e} by the layers"
+        )
+        if judged.estimate <= tolerance or refinement >= FINEST:
+            break
+        if plane > PART * tolerance:
+            refinement = round(refinement * float(np.clip((plane / (PART * tolerance)) ** 0.5, SLOWEST, FASTEST)), 3)
+            refinement = min(refinement, FINEST)
+        layers += through > PART * tolerance and layers < MOST_LAYERS
+    if not tried:
+        raise NoResult("the first mesh is too large")
+    best, choice = min(tried, key=lambda t: t[0].estimate)
+    if best.estimate > tolerance:
+        say(f"warning: no mesh was found for the tolerance; the least estimated error is {best.estimate:.1e}")
+    return Adapted(problem, choice, best, [r for r, _ in tried])
+
+
+def _round(problem: Problem, comm: MPI.Comm, refinement: float, layers: int) -> tuple[Round, float, float]:
+    """The result on one mesh, and the relative errors by the size of its elements and by its layers."""
+
+    def result(refinement: float, layers: int) -> tuple[float, int, int]:
+        scene = Choice(SOLID_DEGREE, refinement, layers=layers).scene(problem, comm)
+        return by_path(scene).value, scene.cells, scene.model.system.dofs
+
+    value, cells, dofs = result(refinement, layers)
+    finer, thicker = result(min(FINER * refinement, FINEST), layers)[0], result(refinement, layers + 1)[0]
+    scale = max(abs(finer), np.finfo(float).tiny)
+    plane = abs(finer - value) / scale / (1 - FINER**-2)
+    through = abs(thicker - value) / scale / (1 - (layers / (layers + 1)) ** 2)
+    return Round(SOLID_DEGREE, refinement, cells, dofs, value, plane + through, layers), plane, through
+
+
+def adapted(problem: Problem, comm: MPI.Comm, say: Say = lambda line: None, doing: Say = lambda what: None) -> Adapted:
     """Find a mesh on which the relative error of the result is below `mesh.tolerance`; collective.
 
     The result is `Ending.value`: k_d or the critical amplitude at an instability; at the last target the load, or the
@@ -57,51 +115,51 @@ def adapted(case: Case, comm: MPI.Comm, say: Say = lambda line: None, doing: Say
     Raises
     ------
     NoResult
-        If the case has no result on any first mesh.
+        If the problem has no result on any first mesh.
     """
-    tolerance = case.mesh.tolerance
+    tolerance = problem.mesh.tolerance
     assert tolerance is not None
-    if case.model == "solid":
-        return adapted_solid(case, comm, say, doing)
+    if problem.body:
+        return adapted_solid(problem, comm, say, doing)
     doing(f"a mesh for the tolerance {tolerance:g}: the path on a coarse one")
-    choice, coarse = _first(case, comm)
+    choice, coarse = _first(problem, comm)
     for degree in range(CHEAP + 1, _degree(tolerance) + 1):
         choice = Choice(degree, choice.refinement)
-        coarse = _moved(case, choice, coarse)
+        coarse = _moved(problem, choice, coarse)
     tried: list[tuple[Round, Choice]] = []
     while True:
         doing(f"a mesh for the tolerance {tolerance:g}: round {len(tried) + 1}, degree {choice.degree}, estimating")
-        fine = _moved(case, Choice(choice.degree + 1, choice.refinement, choice.size), coarse)
+        fine = _moved(problem, Choice(choice.degree + 1, choice.refinement, choice.size), coarse)
         here = _judged(choice, coarse, fine)
         tried.append((here, choice))
         say(
             f"tolerance {tolerance:g}: degree {here.degree}, {here.cells} cells, {here.dofs} unknowns: "
             f"result {here.result:.9g}, estimated error {here.estimate:.1e}"
         )
-        least = 0.0 if coarse[0].plan.axisymmetric else LEAST * tolerance  # what is cheap is not made worse
+        least = 0.0 if coarse[0].problem.axisymmetric else LEAST * tolerance  # what is cheap is not made worse
         if least <= here.estimate <= tolerance or len(tried) == MOST_ROUNDS:
             break
         another = _remeshed(choice, coarse, fine, AIM * tolerance / here.estimate)
         if another is None:
             break
         doing(f"a mesh for the tolerance {tolerance:g}: round {len(tried) + 1}, degree {another.degree}, solving")
-        choice, coarse = another, _moved(case, another, fine)
+        choice, coarse = another, _moved(problem, another, fine)
     within = [t for t in tried if t[0].estimate <= tolerance]
     best, choice = min(within, key=lambda t: t[0].dofs) if within else min(tried, key=lambda t: t[0].estimate)
     if not within:
         say(f"warning: no mesh was found for the tolerance; the least estimated error is {best.estimate:.1e}")
-    return Adapted(case, choice, best, [r for r, _ in tried])
+    return Adapted(problem, choice, best, [r for r, _ in tried])
 
 
 def _degree(tolerance: float) -> int:
     return next(degree for least, degree in DEGREES if tolerance >= least)
 
 
-def _first(case: Case, comm: MPI.Comm) -> tuple[Choice, Solved]:
+def _first(problem: Problem, comm: MPI.Comm) -> tuple[Choice, Solved]:
     """The whole path on the coarsest mesh where it has a result."""
     for refinement in FIRST:
         choice = Choice(CHEAP, refinement)
-        scene = choice.scene(case, comm)
+        scene = choice.scene(problem, comm)
         try:
             return choice, (scene, by_path(scene))
         except NoResult as e:
@@ -109,8 +167,8 @@ def _first(case: Case, comm: MPI.Comm) -> tuple[Choice, Solved]:
     raise lost
 
 
-def _moved(case: Case, choice: Choice, near: Solved) -> Solved:
-    scene = choice.scene(case, near[0].comm)
+def _moved(problem: Problem, choice: Choice, near: Solved) -> Solved:
+    scene = choice.scene(problem, near[0].comm)
     return scene, from_near(scene, *near)
 
 
@@ -124,9 +182,9 @@ def _remeshed(choice: Choice, coarse: Solved, fine: Solved, reduction: float) ->
     """The same degree on another mesh, with the error times `reduction`; None if no other mesh is possible."""
     scene, degree = coarse[0], choice.degree
     order = 2 * degree - 2  # of convergence of an energy
-    if scene.plan.axisymmetric or isinstance(scene.plan.shape, Grid):
+    if scene.problem.axisymmetric or isinstance(scene.problem.shape, Grid):
         change = np.clip(reduction, 1e-3, 1e3) ** (-1 / order)
-        if reduction < 1 and not scene.plan.axisymmetric:
+        if reduction < 1 and not scene.problem.axisymmetric:
             change = max(change, LINES)
         finer = np.clip(choice.refinement * change, COARSEST, FINEST)
         refinement = round(float(finer), 3)
@@ -134,7 +192,7 @@ def _remeshed(choice: Choice, coarse: Solved, fine: Solved, reduction: float) ->
     if reduction > 1 and scene.cells <= FEW:
         return None
     centres, shares = indicators(coarse, fine)
-    size, more = equidistributed(scene.plan.size, centres, shares, order, reduction, scene.plan.material.h)
+    size, more = equidistributed(scene.problem.size, centres, shares, order, reduction, scene.problem.material.h)
     if not _fits(fine[0], 2 * fine[0].model.system.dofs * more):  # twice, since this is an estimate
         return None
     return Choice(degree, round(choice.refinement * more**0.5, 3), size)
@@ -143,7 +201,7 @@ def _remeshed(choice: Choice, coarse: Solved, fine: Solved, reduction: float) ->
 def _fits(scene: Scene, unknowns: float) -> bool:
     """Whether a finer mesh fits into the memory of all ranks; collective."""
     try:
-        refuse_beyond_memory(scene.case, replace(scene.plan, unknowns=unknowns), scene.comm.size, scene.comm.size)
+        refuse_beyond_memory(replace(scene.problem, unknowns=unknowns), scene.comm.size, scene.comm.size)
     except CaseError:
         return not scene.comm.allreduce(1)
     return not scene.comm.allreduce(0)

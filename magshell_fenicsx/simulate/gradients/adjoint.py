@@ -30,13 +30,12 @@ from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.parts.course import Gas
 from magshell_fenicsx.parts.motion.mass import mass_along
-from magshell_fenicsx.parts.pressure.gas import gas_by_begin
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.results import Functional, Target, force_unit, functional, in_units
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.sensitivity import fold_at, stage_at
-from magshell_fenicsx.simulate.steps import held_by
+from magshell_fenicsx.simulate.steps import enclosed, held_by
 from magshell_fenicsx.simulate.transfer import transfer
 
 WAVE = "m = "  # what the mode of a wave begins with
@@ -188,7 +187,7 @@ def adjoint_of_instability(scene: Scene, record: Record, fold: Fold | None = Non
 
 def _of_wave(scene: Scene, record: Record) -> Adjoint:
     model, m = scene.model, int(record.mode.removeprefix(WAVE))
-    if record.step and scene.plan.programme[record.step - 1].load.hold:
+    if record.step and scene.problem.programme[record.step - 1].load.hold:
         raise CaseError(f"instability: {record.mode}: not while a conjugate is held")
     assert model.axisymmetric
     system, waves, state = model.system, model.waves, model.system.placed(record.point.state)
@@ -260,10 +259,10 @@ def with_begins(adjoint: Adjoint, record: Record, begins: Begins) -> Adjoint:
     while record.step:
         place, step, system = (
             part.places[0] if part else None,
-            scene.plan.programme[record.step - 1],
+            scene.problem.programme[record.step - 1],
             scene.model.system,
         )
-        earlier = scene.plan.programme[: record.step - 1]
+        earlier = scene.problem.programme[: record.step - 1]
         driven |= _driven(step, record.point.state.mu)
         held = {name: place.rows[name] for name in held_by_step(step) if place.rows.get(name)} if place else {}
         if record.step not in begins:
@@ -281,7 +280,7 @@ def with_begins(adjoint: Adjoint, record: Record, begins: Begins) -> Adjoint:
             assert place
             law = step.load.hold[name]
             if isinstance(law, Gas):
-                share, slope = gas_by_begin(scene, law.gas, before, place.state.mu[name])
+                share, slope = enclosed(scene, law.gas, before).by_begin(place.state.mu[name])
                 c[name], by_mu[name] = -row * share, row * slope
                 continue
             now, then = (system.potential(state.u, state.mu, name) for state in (place.state, before))
@@ -372,7 +371,7 @@ def held_at(
 ) -> dict[str, float | Conjugate]:
     """Amplitude -> its conjugate, of those that are unknown."""
     held = dict[str, float | Conjugate]()
-    step = scene.plan.programme[record.step - 1] if record.step else None
+    step = scene.problem.programme[record.step - 1] if record.step else None
     if hold is None and step:
         held |= held_by(scene, step, state)
         if step.load.by_conjugate(at_target=record.label == "target"):

@@ -10,17 +10,16 @@ with the conjugates q_i that the probing holds: they are those of its begin, whe
 import numpy as np
 
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.problem.problem import Plan
-from magshell_fenicsx.simulate.barrier import barrier
+from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.simulate.gradients.adjoint import NONE, Adjoint, Begins, Place, held_at, solved, with_begins
 from magshell_fenicsx.simulate.record import Record
-from magshell_fenicsx.simulate.results import Functional
+from magshell_fenicsx.simulate.results import Functional, barrier
 from magshell_fenicsx.simulate.scene import Scene
 
 BARRIER = "barrier"
 
 
-def refuse_no_barrier(plan: Plan) -> None:
+def refuse_no_barrier(problem: Problem) -> None:
     """See that a case ends where a probing force is zero again.
 
     Raises
@@ -28,7 +27,7 @@ def refuse_no_barrier(plan: Plan) -> None:
     CaseError
         If it does not.
     """
-    if not plan.programme or plan.programme[-1].until != "zero":
+    if not problem.programme or problem.programme[-1].until != "zero":
         raise CaseError("barrier: needs a last step with until: zero")
 
 
@@ -40,10 +39,10 @@ def adjoint_of_barrier(scene: Scene, begin: Record | None, end: Record, begins: 
     CaseError
         If the last step passes none, or holds a gas.
     """
-    refuse_no_barrier(scene.plan)
+    refuse_no_barrier(scene.problem)
     if begin is None:
         raise CaseError("barrier: give the record before the last step")
-    system, step, whole = scene.model.system, scene.plan.programme[-1], scene.model.multiplicity
+    system, step, whole = scene.model.system, scene.problem.programme[-1], scene.model.multiplicity
     before, after = (system.placed(record.point.state) for record in (begin, end))
     held, change = held_at(scene, end, after), dict[str, float]()
     for name, conjugate in held.items():

@@ -67,7 +67,7 @@ def by_field(adjoint: Adjoint, name: str) -> FieldGradient:
     if other is not scene:
         return by_field(_carried(adjoint, other), name)
     model, kind = scene.model, FIELDS[name]
-    if name == "deviation" and (model.contacts or getattr(scene.plan.loads.magnetic, "in_space", None)):
+    if name == "deviation" and (model.contacts or getattr(scene.problem.loads.magnetic, "in_space", None)):
         raise CaseError("deviation: no gradient beside bodies, or in a field that is known at points of space")
 
     def part(number: int, place: Place) -> tuple[fem.Function, list[Array]]:
@@ -84,7 +84,7 @@ def by_field(adjoint: Adjoint, name: str) -> FieldGradient:
             shares += [Share(t, c * factor_of(t.amplitude, place.state.mu), 0.0) for t, c in along(scene, adjoint)]
         w = _contracted(scene, place)
         forces = [summed(shares, f, model.u, w, model.kernels)]
-        if name == "thickness" and scene.plan.loads.contacts:
+        if name == "thickness" and scene.problem.loads.contacts:
             forces.append(_of_starts(scene, shares, f, w))
         return f, forces
 
@@ -146,7 +146,7 @@ def _of_starts(scene: Scene, shares: Sequence[Share], f: fem.Function, w: fem.Fu
     found = np.zeros(
         (domain.topology.index_map(domain.topology.dim).size_local, f.function_space.element.space_dimension)
     )
-    for contact in scene.plan.loads.contacts:
+    for contact in scene.problem.loads.contacts:
         if contact.start is None or contact.lift is None:
             continue
         of_body = [share for share in shares if share.term.name.startswith(f"contact {contact.body}")]
@@ -180,31 +180,31 @@ def _basis_at(model: ShellModel | MeridianModel, f: fem.Function, x: Array) -> t
 def _contracted(scene: Scene, place: Place) -> fem.Function:
     """The vector along which residuals are taken, with what the supports that move add."""
     model, system = scene.model, scene.model.system
-    found = fem.Function(model.V)
-    found.x.array[: system.size] = place.w
-    found.x.scatter_forward()
+    direction = fem.Function(model.V)
+    direction.x.array[: system.size] = place.w
+    direction.x.scatter_forward()
     if system.moving:
         c = place.conjugates
         for motion in c.keys() & system.moving.names:
-            found.x.array[:] += c[motion] * system.moving.rate(place.state.mu, motion)
-    return found
+            direction.x.array[:] += c[motion] * system.moving.rate(place.state.mu, motion)
+    return direction
 
 
 def _with_field(adjoint: Adjoint, name: str) -> Scene:
     """The scene, or one in whose terms a number that is the same everywhere is a field."""
-    scene, plan = adjoint.scene, adjoint.scene.plan
+    scene, problem = adjoint.scene, adjoint.scene.problem
     if not scene.model.thin:
         return scene
     if name == "thickness" and not scene.model.thickness:
-        return Scene(scene.case, scene.comm, replace(plan, thickness=Thickness()))
-    loads, natural = plan.loads, plan.loads.natural
+        return Scene(replace(problem, thickness=Thickness()), scene.comm)
+    loads, natural = problem.loads, problem.loads.natural
     if name == "curvature" and (natural is None or natural.curvature is None):
-        bent = Natural(np.zeros(3), natural.stretch if natural else None, frame(scene.plan.context, plan.azimuth))
-        return Scene(scene.case, scene.comm, replace(plan, loads=replace(loads, natural=bent)))
+        bent = Natural(np.zeros(3), natural.stretch if natural else None, frame(scene.problem.context, problem.azimuth))
+        return Scene(replace(problem, loads=replace(loads, natural=bent)), scene.comm)
     magnetic = loads.magnetic
     if adjoint.directions and FIELDS[name].coefficient == "Br" and magnetic and not callable(magnetic.remanent):
         even = replace(magnetic, remanent=Uniform(np.asarray(magnetic.remanent)))
-        return Scene(scene.case, scene.comm, replace(plan, loads=replace(loads, magnetic=even)))
+        return Scene(replace(problem, loads=replace(loads, magnetic=even)), scene.comm)
     return scene
 
 
@@ -233,7 +233,7 @@ def _lengths(scene: Scene, f: fem.Function, forces: Array, places: Array, normal
 
 def _curvatures(scene: Scene, f: fem.Function, forces: Array, places: Array, normals: Array) -> Array:
     """By kappa_11, kappa_22 and kappa_12 in the frame of the natural shape, from those by the tensor in space."""
-    natural = scene.plan.loads.natural
+    natural = scene.problem.loads.natural
     assert natural
     return natural.in_frame(forces[..., :6], places, normals)
 
@@ -247,7 +247,7 @@ def _outwards(scene: Scene, f: fem.Function, forces: Array, places: Array, norma
 def _normals(scene: Scene, drawn: Array) -> Array:
     """The normals of the perfect shell at the nodes of this rank's cells, from those of the drawn one."""
     model = scene.model
-    if not model.thin or not isinstance(scene.plan.embedding, Deviated):
+    if not model.thin or not isinstance(scene.problem.embedding, Deviated):
         return drawn
     unit, width = model.growth((lambda x: np.ones(len(x)),)), model.V.dofmap.bs
     found = np.zeros_like(drawn)

@@ -3,7 +3,6 @@
 from collections.abc import Iterable, Mapping, Sequence
 
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.parts.bodies.touch import rigid
 from magshell_fenicsx.simulate.adapt.ending import History
 from magshell_fenicsx.simulate.gradients.adjoint import Adjoint, adjoint
 from magshell_fenicsx.simulate.gradients.barriers import BARRIER, adjoint_of_barrier, refuse_no_barrier
@@ -18,6 +17,7 @@ from magshell_fenicsx.simulate.gradients.vibration import (
 )
 from magshell_fenicsx.simulate.results import Target, differentiable
 from magshell_fenicsx.simulate.scene import Scene
+from magshell_fenicsx.simulate.touch import rigid
 
 
 def refuse_no_result(scene: Scene, results: Iterable[str], key: str, *, more: Sequence[str] = ()) -> None:
@@ -34,9 +34,9 @@ def refuse_no_result(scene: Scene, results: Iterable[str], key: str, *, more: Se
         try:
             refuse_unitless(scene, of)
             if of == BARRIER:
-                refuse_no_barrier(scene.plan)
+                refuse_no_barrier(scene.problem)
             elif NAMES.fullmatch(of):
-                refuse_no_vibration(scene.plan, of)
+                refuse_no_vibration(scene.problem, of)
             elif of not in FOLDS and of not in columns and of not in start.mu:
                 known = ", ".join((*FOLDS, *columns, BARRIER, *FIRST, *more))
                 raise CaseError(f"{of}: has no gradient here; allowed are {known}")
@@ -74,4 +74,4 @@ def vibration_at_end(scene: Scene, history: History, of: str) -> float | None:
         return None
     assert history.end
     state = rigid(scene, scene.model.system.placed(history.end.point.state))
-    return frequency(scene.plan, of, vibration(scene, state, of).value)
+    return frequency(scene.problem, of, vibration(scene, state, of).value)

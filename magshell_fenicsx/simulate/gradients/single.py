@@ -8,7 +8,7 @@ from magshell_fenicsx.continuation.system import State, dot
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.problem.columns import sizes_of
 from magshell_fenicsx.simulate.gradients.adjoint import Adjoint, Place, along, by_load
-from magshell_fenicsx.simulate.numbers import carried, goals, number_of, scene_with, with_number
+from magshell_fenicsx.simulate.numbers import carried, goals, number_of, scene_with
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.transfer import transfer
 
@@ -27,7 +27,7 @@ def by_amplitude(adjoint: Adjoint, name: str) -> float:
 def by_number(adjoint: Adjoint, key: str) -> float:
     """By a central difference of the contracted equations, on the same mesh: nothing is solved."""
     scene = adjoint.scene
-    value = number_of(scene.case, key)
+    value = number_of(scene.problem.context, key)
     if (adjoint.gas or any(place.gas for place in adjoint.places)) and key.startswith("shell."):
         raise CaseError(f"{key}: has no derivative while a gas is held, whose law depends on it")
     if scene.model.contacts and any(place.follows for place in adjoint.places) and key.startswith("shell."):
@@ -74,8 +74,9 @@ def size_by_number(adjoint: Adjoint, key: str) -> float:
     """The derivative of the unit of the result: one p_c is more pascals on a thicker shell."""
     if not adjoint.scale:
         return 0.0
-    case = adjoint.scene.case
-    return _slope(lambda p: sizes_of(with_number(case, key, p).context).of[adjoint.scale], number_of(case, key))
+    problem = adjoint.scene.problem
+    value = number_of(problem.context, key)
+    return _slope(lambda p: sizes_of(problem.again({key: p}).context).of[adjoint.scale], value)
 
 
 def _expand(scene: Scene, other: Scene, state: State) -> None:

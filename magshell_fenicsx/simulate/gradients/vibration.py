@@ -20,13 +20,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from magshell_fenicsx.assembly.problem import CENTRAL
+from magshell_fenicsx.assembly.evaluated import CENTRAL
 from magshell_fenicsx.continuation.modes import ModesNotFound
 from magshell_fenicsx.continuation.system import State, dot, symmetric_part
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.models.modes import TORSION, ShellMode, ShellModes
-from magshell_fenicsx.parts.bodies.touch import rigid, touching
-from magshell_fenicsx.problem.problem import Plan
+from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.simulate.gradients.adjoint import (
     NONE,
     WAVE,
@@ -45,6 +44,7 @@ from magshell_fenicsx.simulate.gradients.instabilities import Lost
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.results import Functional
 from magshell_fenicsx.simulate.scene import Scene
+from magshell_fenicsx.simulate.touch import rigid, touching
 
 FIRST = ("omega2_1", "hertz_1")
 NAMES = re.compile(r"(omega2|hertz)_([1-9]\d?)")
@@ -77,7 +77,7 @@ class Vibration:
         return self.modes[0].label
 
 
-def refuse_no_vibration(plan: Plan, of: str) -> None:
+def refuse_no_vibration(problem: Problem, of: str) -> None:
     """See that a case has a frequency in hertz.
 
     Raises
@@ -85,7 +85,7 @@ def refuse_no_vibration(plan: Plan, of: str) -> None:
     CaseError
         If it has no density.
     """
-    if of.startswith("hertz") and plan.time_unit is None:
+    if of.startswith("hertz") and problem.time_unit is None:
         raise CaseError(f"{of}: needs shell.density and shell.youngs_modulus; without them take omega2{of[5:]}")
 
 
@@ -141,7 +141,7 @@ def _same(a: ShellMode, b: ShellMode) -> bool:
     return a.label == b.label and abs(a.eigenvalue - b.eigenvalue) <= SAME * abs(b.eigenvalue)
 
 
-def frequency(plan: Plan, of: str, omega2: float) -> float:
+def frequency(problem: Problem, of: str, omega2: float) -> float:
     """The result of a name: omega^2 rho R^2/E itself, or hertz.
 
     Raises
@@ -153,7 +153,7 @@ def frequency(plan: Plan, of: str, omega2: float) -> float:
         return omega2
     if omega2 <= 0:
         raise Lost(f"the shell is unstable and does not vibrate (omega2 = {omega2:.6g})")
-    return math.sqrt(omega2) / (2 * math.pi * (plan.time_unit or 1.0))
+    return math.sqrt(omega2) / (2 * math.pi * (problem.time_unit or 1.0))
 
 
 def adjoints_of_vibrations(
@@ -195,7 +195,7 @@ def adjoints_of_vibrations(
 
 
 def _adjoint(scene: Scene, state: State, of: str, found: Vibration, held: Held) -> Adjoint:
-    value = frequency(scene.plan, of, found.value)
+    value = frequency(scene.problem, of, found.value)
     rate = 1.0 if of.startswith("omega2") else value / (2 * found.value)
     c = rate / len(found.modes)
     slopes = [_slopes(scene, state, mode, list(held)) for mode in found.modes]
@@ -212,7 +212,7 @@ def _adjoint(scene: Scene, state: State, of: str, found: Vibration, held: Held) 
             moved = State(state.u + way * step * mode.vector, state.mu)
             places.append(Place(moved, c * weight / step * mode.vector, dict.fromkeys(rows, 0.0)))
         directions.append(Direction(mode.vector, None, inertia=-c * mode.eigenvalue))
-    by_itself = lambda there, _: frequency(there.plan, of, found.value)  # noqa: E731
+    by_itself = lambda there, _: frequency(there.problem, of, found.value)  # noqa: E731
     gas = with_gas(held)
     return Adjoint(scene, places, by_itself=by_itself, directions=directions, value=value, gas=gas)
 

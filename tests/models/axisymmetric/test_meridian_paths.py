@@ -8,14 +8,14 @@ from conftest import CASES
 from meridian_scenes import POLE_FORCE, buckle, dimpled, hemisphere, indent, unloaded
 
 from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.path import Path, StepOptions
 from magshell_fenicsx.mesh.patch import MeshError
-from magshell_fenicsx.mesh.sphere import flat
+from magshell_fenicsx.mesh.shapes import flat
 from magshell_fenicsx.models.axisymmetric.meridian import graded_vertices, make_meridian
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.shell.parameters import Force, Loads, Material
-from magshell_fenicsx.problem.planner import make_plan
 from magshell_fenicsx.problem.problem import meridian_vertices
 
 
@@ -89,11 +89,11 @@ def test_every_rank_has_the_whole_meridian() -> None:
 def test_cells_of_a_given_size() -> None:
     """All alike, but for a vertex on each rim; far too many are refused before they are made."""
     case = Case.load(CASES / "dimple_buckling.yaml", ["mesh.size=0.1", "mesh.refinement=2"])
-    plan = make_plan(case)
-    lengths = np.diff(meridian_vertices(plan))
-    (rim,) = plan.meridian.circles
+    problem = make_problem(case)
+    lengths = np.diff(meridian_vertices(problem))
+    (rim,) = problem.meridian.circles
     assert len(lengths) == np.ceil(rim / 0.05) + np.ceil((np.pi / 2 - rim) / 0.05)
     assert lengths.max() < 0.05 < 1.3 * lengths.min()
     tiny = Case.load(CASES / "dimple_buckling.yaml", ["mesh.size=1e-9"])
     with pytest.raises(MeshError, match=r"would have .* cells, allowed 1e\+06"):
-        meridian_vertices(make_plan(tiny))
+        meridian_vertices(make_problem(tiny))

@@ -103,7 +103,7 @@ def first_wave(problem: dict[str, Any], **mesh: float) -> tuple[str, float]:
 def test_meridian_and_triangles(name: str) -> None:
     """To the error of the triangles, which falls with the fourth power of their size: see FINER."""
     scene, line = ended(PROBLEMS[name], "auto", {"degree": 3})
-    assert scene.plan.axisymmetric
+    assert scene.problem.axisymmetric
     _, half = ended(PROBLEMS[name], "half", {"degree": 3, "size": FINER.get(name, 0.18)})
     for column in ("energy", "volume_change", "w_over_h", "w_pole_over_h", "A_uy", "A_uz"):
         assert line[column] == pytest.approx(half[column], rel=5e-3, abs=1e-15), column
@@ -177,7 +177,7 @@ def test_waves_are_those_of_the_half_shell(boundary: dict[str, Any], loading: di
     problem = {"shell": shell, "boundary": boundary, "loading": {**loading, "until": "bifurcation"}}
     _, load = first_wave(problem, degree=4)
     half = ms.Scene(ms.Case.from_source(Source("test", {**problem, "symmetry": "half", "mesh": {"size": 0.3}})))
-    name = "load" if half.plan.loads.dead else "pressure"
+    name = "load" if half.problem.loads.dead else "pressure"
     below, above = 0.995 * load, 1.005 * load
     path = Path(half.newton, name, "load", StepOptions(below, below, 1e-3 * below))
     pivots = [point.negative_pivots for point, at in path.towards(path.start(half.unloaded()), [below, above]) if at]

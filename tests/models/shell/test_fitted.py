@@ -1,18 +1,21 @@
 """Formulas narrower than elements. Source: integrals over the sphere in polar coordinates around the place."""
 
+import re
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
 from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.check import describe
+from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.input.expressions import Together, formula
 from magshell_fenicsx.models.shell.fitted import fitted
 from magshell_fenicsx.models.shell.patterns import cells_of
-from magshell_fenicsx.problem.check import describe
 from magshell_fenicsx.problem.formulas import looked_at
-from magshell_fenicsx.problem.planner import make_plan
+from magshell_fenicsx.public import Scene
 from magshell_fenicsx.shape.outline import outline
 from magshell_fenicsx.simulate.follow import follow
-from magshell_fenicsx.simulate.scene import Scene
 
 SPHERE = {"geometry": "cap", "radius": 1, "thickness": 0.01, "youngs_modulus": 1, "poisson_ratio": 0.3}
 AWAY = "(x-0.31)**2+(y-0.23)**2"
@@ -84,7 +87,7 @@ def test_moments_of_a_step_on_coarse_cells_and_a_polynomial_that_stays():
 
 
 def test_cells_are_small_where_a_formula_varies_and_no_others():
-    few, many = (make_plan(dead(load)).size for load in ("1 + x", disc(0.05)))
+    few, many = (make_problem(dead(load)).size for load in ("1 + x", disc(0.05)))
     there, elsewhere = np.array([0.33, 0.25]), np.array([-0.5, -0.2])
     assert many(there) < 0.5 * few(there)
     assert many(elsewhere) == few(elsewhere)
@@ -96,9 +99,9 @@ def test_a_narrow_imperfection_has_few_cells():
     shell |= {"imperfections": [{"kind": "formula", "w0": f"-2*exp(-3000*({AWAY}))"}]}
     case = {"shell": shell, "boundary": {"equator": "clamped"}, "loading": {"kind": "pressure"}}
     case |= {"mesh": {"degree": 3, "refinement": 0.7}}
-    plan = make_plan(Case.model_validate(case))
-    assert len(plan.triangulated().cells) < 1500
-    assert plan.size(np.array([0.34, 0.25])) < 0.04
+    problem = make_problem(Case.model_validate(case))
+    assert len(problem.triangulated().cells) < 1500
+    assert problem.size(np.array([0.34, 0.25])) < 0.04
 
 
 def test_a_mesh_that_does_not_show_a_formula_says_so():
@@ -120,10 +123,10 @@ def test_a_tiny_disc_of_remanence_is_neither_missed_nor_axisymmetric(polar):
         "magnetic": field,
         "mesh": {"degree": 3, "refinement": 0.7},
     }
-    plan = make_plan(Case.model_validate(case | {"loading": {"kind": "field", "points": 1}}))
-    assert plan.meridian is None
-    assert plan.size(plan.shape.reach * np.ones(2) / 9) > 10 * min(f.size for f in plan.size.features)
-    assert min(f.size for f in plan.size.features) < 0.002
+    problem = make_problem(Case.model_validate(case | {"loading": {"kind": "field", "points": 1}}))
+    assert problem.meridian is None
+    assert problem.size(problem.shape.reach * np.ones(2) / 9) > 10 * min(f.size for f in problem.size.features)
+    assert min(f.size for f in problem.size.features) < 0.002
 
 
 def test_the_cost_of_finding_grows_slowly_and_smooth_formulas_have_none():
@@ -144,3 +147,44 @@ def test_a_thickness_that_jumps_in_elements_says_what_that_costs():
         "mesh": {"degree": 3, "size": 0.1},
     }
     assert "the stiffness may be wrong by" in describe(Case.model_validate(case))
+
+
+@pytest.mark.parametrize(
+    ("factor", "break_at"),
+    [("1.5-0.5*sign(x-0.53)", 0.53), ("1-0.5*exp(-((x-0.05)/0.01)**2)", 0.05), ("1-0.5*exp(-((x-0.3)/0.01)**2)", 0.3)],
+)
+def test_the_stiffness_that_is_lost_is_said_within_a_factor_of_two(factor: str, break_at: float) -> None:
+    """A cantilever under a force at its tip, against the integral of (1 - x)^2/t^3."""
+    x, weights = (np.concatenate(each) for each in zip(*(_gauss(a, b) for a, b in _around(break_at)), strict=True))
+    t = eval(factor, {"x": x, "sign": np.sign, "exp": np.exp})
+    exact = 3 * float(weights @ ((1 - x) ** 2 / t**3))
+    tips = []
+    for thickness in (factor, "1 + 0*x"):
+        case = Case.model_validate(
+            {
+                "shell": {"geometry": "strip", "radius_to_thickness": 50, "width": 0.1, "poisson_ratio": 0.0}
+                | {"thickness_factor": thickness},
+                "boundary": {"root": "clamped"},
+                "points": {"tip": [1, 0, 0]},
+                "loading": {"kind": "dead", "loads": [{"at": "tip", "force": [0, 0, 1e-12]}], "factor": 1, "points": 1},
+                "mesh": {"size": 0.3},
+            }
+        )
+        scene = Scene(case)
+        *_, record = follow(scene)
+        tips.append(scene.observe(record.point.state)["tip_uz"])
+        (said, *_) = [*re.findall(r"the stiffness may be wrong by ([\d.]+) %", describe(case)), "0"]
+        if thickness == factor:
+            lost = float(said) / 100
+    error = 1 - tips[0] / tips[1] / exact
+    assert error / 2 < lost < 2 * error
+
+
+def _around(place: float) -> list[tuple[float, float]]:
+    ends = sorted({0.0, 1.0, place, *(place + d for d in (-0.04, -0.02, 0.02, 0.04))})
+    return list(pairwise(ends))
+
+
+def _gauss(a: float, b: float) -> tuple[np.ndarray, np.ndarray]:
+    x, w = np.polynomial.legendre.leggauss(30)
+    return (a + b + (b - a) * x) / 2, (b - a) / 2 * w

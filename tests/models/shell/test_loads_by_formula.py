@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import magshell_fenicsx as ms
+from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.input.source import Source
-from magshell_fenicsx.problem.planner import make_plan
 
 PLATE = {"geometry": "plate", "length": 2, "width": 1, "thickness": 0.02, "youngs_modulus": 3.0, "poisson_ratio": 0.3}
 CAP = {"geometry": "cap", "polar": 60, "radius": 2, "thickness": 0.04, "youngs_modulus": 3.0, "poisson_ratio": 0.3}
@@ -49,7 +49,7 @@ def test_meridian_half_and_solid(load_: dict[str, Any]) -> None:
     def of(**sections: Any) -> ms.Case:
         return load(CAP, {"over": "all", **load_}, boundary={"rim": "clamped"}, **sections)
 
-    assert make_plan(of()).included[0] == "meridian"
+    assert make_problem(of()).included[0] == "meridian"
     meridian, half = end(of()), end(of(symmetry="half", mesh={"degree": 4, "refinement": 1.5}))
     assert half["w_pole_over_h"] == pytest.approx(meridian["w_pole_over_h"], rel=2e-4)
     assert half["energy"] == pytest.approx(meridian["energy"], rel=2e-4)
@@ -66,7 +66,7 @@ def test_what_a_formula_leaves() -> None:
         ("1", "meridian"),
     ):
         case = load(CAP, {"over": "all", "pressure": text}, boundary={"rim": "clamped"})
-        assert make_plan(case).included[0] == model, text
+        assert make_problem(case).included[0] == model, text
 
 
 def test_on_an_edge() -> None:
@@ -106,8 +106,10 @@ def test_potential_is_a_dead_load_where_it_is_linear() -> None:
         rel = 0.03 if "model" in model else 1e-9  # of the outer face of a solid
         assert place["w_pole_over_h"] == pytest.approx(dead["w_pole_over_h"], rel=rel)
         assert place["energy"] == pytest.approx(dead["energy"], rel=2 * rel)
-    plans = [make_plan(load(CAP, {"over": "all", "potential": v}, boundary={"rim": "clamped"})) for v in ("z", "x")]
-    assert [plan.included[0] for plan in plans] == ["meridian", "half shell"]
+    problems = [
+        make_problem(load(CAP, {"over": "all", "potential": v}, boundary={"rim": "clamped"})) for v in ("z", "x")
+    ]
+    assert [problem.included[0] for problem in problems] == ["meridian", "half shell"]
 
 
 def test_springs_to_a_wall() -> None:

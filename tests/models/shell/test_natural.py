@@ -12,12 +12,12 @@ from along import difference
 import magshell_fenicsx as ms
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.assembly.terms import FormTerm
+from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.continuation.system import State, dot
 from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.models.shell.parameters import Material
 from magshell_fenicsx.output.fields.point_fields import Stresses, principal_fields
 from magshell_fenicsx.parts.natural.shape import Natural
-from magshell_fenicsx.problem.planner import make_plan
 
 CAP = {"geometry": "cap", "polar": 40, "radius": 1, "thickness": 0.02, "poisson_ratio": 0.3}
 STRIP = {"geometry": "strip", "radius_to_thickness": 50, "width": 0.1, "poisson_ratio": 0}
@@ -119,14 +119,14 @@ def test_bilayer() -> None:
     case = load(
         model="solid", shell=STRIP, boundary={"root": "clamped"}, mesh={"size": 0.05}, solid=layers, symmetry="none"
     )
-    plan = make_plan(case)
+    problem = make_problem(case)
 
     def apart(r0: np.ndarray, n0: np.ndarray) -> np.ndarray:
         above = np.sign(r0.mean(axis=1, keepdims=True)[..., 2:])
         return np.asarray(np.broadcast_to(e / 2 * above * [1.0, 0.0, 0.0], r0.shape))
 
     natural = Natural(None, apart, lambda r0, n0: np.broadcast_to([1.0, 0.0, 0.0], r0.shape))
-    scene = ms.Scene(case, plan=replace(plan, loads=replace(plan.loads, natural=natural)))
+    scene = ms.Scene(replace(problem, loads=replace(problem.loads, natural=natural)))
     found = scene.observe(grow(scene, "natural_stretch"))
     kappa = 3 * e / 2 * 50
     assert abs(found["w_pole_over_h"]) / 50 == pytest.approx((1 - np.cos(kappa)) / kappa, rel=2e-3)
@@ -263,7 +263,7 @@ def test_units_of_curvature() -> None:
     shell = {**CAP, "radius": "20 mm", "thickness": "0.4 mm"}
     for text in ("5/m", "0.005 mm^-1", "0.005 1/mm"):
         case = load(shell=shell, boundary={"rim": "clamped"}, natural={"curvature": text})
-        natural = make_plan(case).loads.natural
+        natural = make_problem(case).loads.natural
         assert natural
         assert natural.curvature == pytest.approx([0.1, 0.1, 0])
 
@@ -278,4 +278,4 @@ def test_symmetry() -> None:
         ({"curvature": "y + x*x"}, "half shell"),
         ({"curvature": "y**3 + x"}, "full shell"),
     ):
-        assert make_plan(load(shell=CAP, boundary={"rim": "clamped"}, natural=natural)).included[0] == model, natural
+        assert make_problem(load(shell=CAP, boundary={"rim": "clamped"}, natural=natural)).included[0] == model, natural

@@ -17,7 +17,7 @@ from magshell_fenicsx.mesh.midsurface import Midsurface, distribute
 from magshell_fenicsx.mesh.msh import in_space
 from magshell_fenicsx.mesh.patch import PatchMesh
 from magshell_fenicsx.mesh.revolved import Arc, Revolved, Segment
-from magshell_fenicsx.mesh.sphere import flat
+from magshell_fenicsx.mesh.shapes import flat
 from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.shell.parameters import AreaForce, EdgeForce, EdgeMoment, Held, Loads, Material, PointForce
 from magshell_fenicsx.models.shell.thickness import Thickness

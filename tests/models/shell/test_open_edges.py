@@ -40,7 +40,7 @@ def cylinder(top: Any, model: str, symmetry: str) -> ms.Scene:
 
 def displacement(of: ms.Scene, seed: int, size: float = 0.02) -> Array:
     system = of.model.system
-    size = size / 10 if of.case.model == "solid" else size  # its elements must not turn inside out
+    size = size / 10 if of.problem.body else size  # its elements must not turn inside out
     return system.held(size * np.random.default_rng(seed).standard_normal(system.size))
 
 
@@ -114,7 +114,7 @@ def test_open_cylinder(top: Any, ends: int, symmetry: str, h: float, error: floa
     tube = scene({**CYLINDER, "thickness": h}, {"bottom": "hinged", "top": top}, mesh, **more)
     *_, last = ms.follow(tube)
     found = tube.observe(last.point.state)
-    w = -1e-4 * tube.plan.material.classical_pressure / h
+    w = -1e-4 * tube.problem.material.classical_pressure / h
     integral = w * (1 - ends / (2 * (3 * (1 - 0.3**2)) ** 0.25 / sqrt(h)))
     assert found["A_uz"] == pytest.approx(-0.3 * integral, rel=error)
     assert found["volume_change"] == pytest.approx(2 * pi * integral, rel=error)

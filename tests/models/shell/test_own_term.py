@@ -11,14 +11,15 @@ from test_fast_residual import difference as residual_difference
 from ufl.core.expr import Expr
 
 from magshell_fenicsx import Case, CaseError, Jet, OwnTerm, Scene
+from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.continuation.system import dot
 from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.mesh.mirror import Y0
 from magshell_fenicsx.models.shell import densities
 from magshell_fenicsx.models.shell import kinematics as kin
+from magshell_fenicsx.models.shell.law import Koiter
 from magshell_fenicsx.models.shell.model import ShellModel
 from magshell_fenicsx.models.shell.parameters import AreaForce, Loads, Material
-from magshell_fenicsx.problem.planner import make_plan
 from magshell_fenicsx.simulate.follow import follow
 
 E1, E2, E3 = np.eye(3)
@@ -121,7 +122,7 @@ def test_whole_value_of_what_is_observed() -> None:
         scene = Scene(case, terms=[OwnTerm("springs", winkler, value=1e-6, observed=columns)])
         *_, end = follow(scene)
         values = scene.observe(end.point.state)
-        return scene.plan.included[0], {name: values[name] for name in columns}
+        return scene.problem.included[0], {name: values[name] for name in columns}
 
     along, across = OBSERVED["u_x"][0], OBSERVED["u_y"][0]
     half, found = observed("auto", along=along)
@@ -150,7 +151,7 @@ def test_symmetry_of_the_magnetic_densities(energy: str) -> None:
         ("own", lambda r0, u: u.r, "shape"),
         ("own", lambda r0, u: ufl.dot(r0.r, r0.r), "does not depend"),
         ("own", lambda r0, u: u.r[0] * ufl.SpatialCoordinate(hemisphere(0.8).mesh)[0], "jets and parameters alone"),
-        ("own", lambda r0, u: densities.bending(r0, u, 0.3, 0.1), "u.r11, u.r12, u.r22"),
+        ("own", lambda r0, u: densities.bending(r0, u, law=Koiter(0.1, 0.3)), "u.r11, u.r12, u.r22"),
     ],
 )
 def test_what_no_term_can_be(name: str, of: Density, said: str) -> None:
@@ -231,7 +232,7 @@ def test_weight_is_a_dead_load_on_any_surface() -> None:
             },
         )
     )
-    (dead,) = make_plan(case).loads.all_dead
+    (dead,) = make_problem(case).loads.all_dead
     assert isinstance(dead, AreaForce)
     system = Scene(case, terms=[OwnTerm("own", weight, (dead.force,))]).model.system
     u = system.held(1e-2 * np.random.default_rng(0).standard_normal(system.size))
@@ -248,17 +249,17 @@ def test_weight_is_a_dead_load_on_any_surface() -> None:
 def test_smallest_model_that_shares_the_symmetry(name: str, built: str) -> None:
     of, parameters, *_ = DENSITIES[name]
     case = Case.load(CASES / "dimple_buckling.yaml")
-    plan = make_plan(case, [OwnTerm("own", of, parameters)])
-    assert plan.included[0] == built
-    assert plan.included[-1] == "own energy: own"
+    problem = make_problem(case, [OwnTerm("own", of, parameters)])
+    assert problem.included[0] == built
+    assert problem.included[-1] == "own energy: own"
 
 
 def test_half_model_of_another_plane_needs_a_term_that_turns() -> None:
     """The half shell's frame is turned to its mirror plane; a direction would have to turn with it."""
     settings = ["magnetic={lambda_m: 1e-3, remanent: {polar: 30, azimuth: 20}, applied: {polar: 60, azimuth: 20}}"]
     case = Case.load(CASES / "dimple_buckling.yaml", settings)
-    assert make_plan(case, [OwnTerm("own", winkler)]).half
-    assert not make_plan(case, [OwnTerm("own", weight, (E1,))]).half
+    assert make_problem(case, [OwnTerm("own", winkler)]).half
+    assert not make_problem(case, [OwnTerm("own", weight, (E1,))]).half
 
 
 @pytest.mark.parametrize(
@@ -274,14 +275,14 @@ def test_half_model_of_another_plane_needs_a_term_that_turns() -> None:
 def test_what_the_plan_refuses(settings: list[str], names: list[str], said: str) -> None:
     case = Case.load(CASES / "dimple_buckling.yaml", settings)
     with pytest.raises(CaseError, match=said):
-        make_plan(case, [OwnTerm(name, weight, (E2,)) for name in names])
+        make_problem(case, [OwnTerm(name, weight, (E2,)) for name in names])
 
 
 def test_a_solid_has_no_curvature() -> None:
     case = Case.load(CASES / "solid_buckling.yaml")
     curved = OwnTerm("own", lambda r0, u: r0.r11[0] * u.r[2])
     with pytest.raises(CaseError, match=r"own depends on r0\.r11, which only"):
-        make_plan(case, [curved])
+        make_problem(case, [curved])
 
 
 def test_parameters_need_no_new_kernel() -> None:

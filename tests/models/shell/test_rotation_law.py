@@ -19,7 +19,7 @@ from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.parameters import Loads, MagneticEnergy, Magnetisation, Material, RemanenceLaw
 from magshell_fenicsx.models.shell.patterns import tangential
 from magshell_fenicsx.models.shell.strains import TangentFrame
-from magshell_fenicsx.parts.magnetism import rotation_law
+from magshell_fenicsx.parts.magnetism import laws
 
 MATERIAL = Material(0.3, 0.05)
 BR, BA, E3 = np.array([0.64, 0.48, 0.6]), np.array([0.36, -0.48, 0.8]), np.array([0.0, 0.0, 1.0])
@@ -121,7 +121,7 @@ def test_tangent_changes_with_each_amplitude(amplitude: str) -> None:
 @pytest.mark.parametrize("name", ["magnetic", "magnetic_first", "magnetic_torque", "magnetic_tau"])
 def test_symmetry(name: str) -> None:
     """That of the other law: fields along e3 turn and mirror, in the plane y = 0 they mirror, across it they do not."""
-    of, E1, E2 = getattr(rotation_law, name), *np.eye(3)[:2]
+    of, E1, E2 = getattr(laws, name), *np.eye(3)[:2]
     for Br, Ba, turns, mirrors in ((E3, E3, True, True), (E3, E1 + E3, False, True), (E3, E2 + E3, False, False)):
         term = OwnTerm("own", of, (Br, Ba))
         assert (term.turns, term.mirrored(Y0)) == (turns, mirrors)

@@ -114,8 +114,8 @@ def test_live_pressure_between_parallel_symmetry_planes() -> None:
     }
     asked = asked.model_copy(update=finer)
     *_, last = follow(plate := Scene(asked))
-    h, R = plate.plan.material.h, 0.4  # lengths are over R
-    p = 1e-6 * plate.plan.material.classical_pressure
+    h, R = plate.problem.material.h, 0.4  # lengths are over R
+    p = 1e-6 * plate.problem.material.classical_pressure
     expected = -p * (1 / R) ** 5 / 720 / (h**3 / (12 * (1 - 0.3**2)))
     assert plate.observe(last.point.state)["volume_change"] == pytest.approx(expected, rel=2e-3)
 
@@ -135,7 +135,7 @@ def test_sectors_between_oblique_symmetry_planes() -> None:
 
 
 def test_a_remanence_without_value_is_refused() -> None:
-    """At a node, and at places that a plan does not look at by samples alone."""
+    """At a node, and at places that a problem does not look at by samples alone."""
     magnetic = {"lambda_m": 1e-3, "remanent": {"kind": "expression", "components": ["0*x", "0*x", "1/(3*x - 1)"]}}
     data = {"shell": PLATE, "boundary": {"left": "clamped"}, "magnetic": magnetic, "mesh": {"degree": 2, "size": 0.34}}
     with pytest.raises(CaseError, match=r"magnetic.remanent.components: .* is inf at .* \(0.333, "):

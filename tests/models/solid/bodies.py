@@ -7,13 +7,12 @@ from conftest import spherical
 from mpi4py import MPI
 
 from magshell_fenicsx import Case
+from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.input.source import Source
 from magshell_fenicsx.mesh.hexahedra import Body, sweep
-from magshell_fenicsx.mesh.shapes import DiscShape
-from magshell_fenicsx.mesh.sphere import flat
+from magshell_fenicsx.mesh.shapes import DiscShape, flat
 from magshell_fenicsx.mesh.triangulation import triangulate
 from magshell_fenicsx.parts.imperfections.dimple import Dimple
-from magshell_fenicsx.problem.planner import make_plan
 
 
 def hemisphere(size: float, h: float, *, layers: int = 1, half: bool = False, dimple: Dimple | None = None) -> Body:
@@ -32,5 +31,5 @@ def plate(size: float, h: float, *, layers: int = 1, half: bool = False) -> Body
 def body_of(shell: dict[str, Any], size: float, *, layers: int = 1, points: Any = None, factor: Any = None) -> Body:
     """A body around a shell as a case describes it."""
     data = {"shell": {"poisson_ratio": 0.3, **shell}, "boundary": {}, "points": points or {}, "mesh": {"size": size}}
-    plan = make_plan(Case.from_source(Source("test", data)))
-    return sweep(plan.triangulated(), plan.material.h, layers, MPI.COMM_SELF, factor)
+    problem = make_problem(Case.from_source(Source("test", data)))
+    return sweep(problem.triangulated(), problem.material.h, layers, MPI.COMM_SELF, factor)

@@ -9,7 +9,7 @@ from bodies import plate
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.continuation.factor import Factorisation
 from magshell_fenicsx.models.shell.parameters import Loads, Material
-from magshell_fenicsx.models.solid.material import NeoHookean
+from magshell_fenicsx.models.solid.densities import NeoHookean
 from magshell_fenicsx.models.solid.model import SolidModel
 from magshell_fenicsx.models.solid.terms import WHOLE, SolidTerm, TermFactory
 

@@ -7,11 +7,10 @@ from mpi4py import MPI
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.continuation.factor import Factorisation
 from magshell_fenicsx.mesh.hexahedra import sweep
-from magshell_fenicsx.mesh.shapes import StripShape
-from magshell_fenicsx.mesh.sphere import flat
+from magshell_fenicsx.mesh.shapes import StripShape, flat
 from magshell_fenicsx.mesh.triangulation import triangulate
 from magshell_fenicsx.models.shell.parameters import Loads, Material
-from magshell_fenicsx.models.solid.material import NeoHookean
+from magshell_fenicsx.models.solid.densities import NeoHookean
 from magshell_fenicsx.models.solid.model import SolidModel
 
 

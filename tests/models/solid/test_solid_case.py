@@ -8,13 +8,13 @@ import pyvista
 from conftest import CASES
 
 from magshell_fenicsx import Case, Scene
+from magshell_fenicsx.case.check import describe
+from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.models.modes import ShellModes
 from magshell_fenicsx.models.solid.model import SolidModel
 from magshell_fenicsx.output.fields.gathering import gatherer
 from magshell_fenicsx.output.fields.vtu import unstructured_grid
-from magshell_fenicsx.problem.check import describe
-from magshell_fenicsx.problem.planner import make_plan
 
 BUCKLING, INDENTATION = CASES / "solid_buckling.yaml", CASES / "solid_indentation.yaml"
 
@@ -50,7 +50,7 @@ def test_check_tells_the_mesh_that_is_built() -> None:
     """Cells and unknowns of `magshell check` are those of the scene; two layers."""
     case = Case.load(BUCKLING, ["mesh.refinement=0.2", "shell.radius_to_thickness=20", "solid={layers: 2}"])
     scene = Scene(case)
-    assert make_plan(case).half
+    assert make_problem(case).half
     assert f"mesh: {scene.cells} cells of degree 2, {scene.model.system.dofs} unknowns" in describe(case)
     assert "kappa/mu = 100 (E = 0.99668, nu = 0.49502 for small strains), 2 layers" in describe(case)
 

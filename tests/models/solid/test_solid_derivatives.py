@@ -12,7 +12,7 @@ from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.mesh.hexahedra import OUTER
 from magshell_fenicsx.models.shell.parameters import EdgeMoment, Loads, Magnetisation, Material
 from magshell_fenicsx.models.shell.patterns import radial
-from magshell_fenicsx.models.solid.material import NeoHookean
+from magshell_fenicsx.models.solid.densities import NeoHookean
 from magshell_fenicsx.models.solid.model import SolidModel
 from magshell_fenicsx.models.solid.terms import face_measure
 from magshell_fenicsx.parts.imperfections.dimple import Dimple

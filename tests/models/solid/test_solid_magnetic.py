@@ -13,7 +13,7 @@ from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.input.expressions import FormulasInSpace, with_derivatives
 from magshell_fenicsx.models.shell.parameters import Loads, Magnetisation, Material, RemanenceLaw
 from magshell_fenicsx.models.shell.patterns import radial
-from magshell_fenicsx.models.solid.material import NeoHookean
+from magshell_fenicsx.models.solid.densities import NeoHookean
 from magshell_fenicsx.models.solid.model import SolidModel
 
 H = 0.1

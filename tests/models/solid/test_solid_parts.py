@@ -24,10 +24,9 @@ from magshell_fenicsx.models.shell.parameters import (
     Material,
     PointForce,
 )
-from magshell_fenicsx.models.solid.material import NeoHookean
+from magshell_fenicsx.models.solid.densities import NeoHookean
 from magshell_fenicsx.models.solid.model import SolidModel
 from magshell_fenicsx.simulate.sensitivity import fold_at, sensitivities
-from magshell_fenicsx.simulate.shape_sensitivity import changed
 from magshell_fenicsx.simulate.transfer import transfer
 
 H, WIDTH = 0.05, 0.2
@@ -337,7 +336,10 @@ def test_derivatives_of_a_fold() -> None:
 
     by_field = (buckling(scene, 0.00102) - buckling(scene, 0.00098)) / 4e-5
     assert found["lambda_m"] == pytest.approx(by_field, rel=1e-3)
-    shallow, deep = (ms.Scene(changed(scene.case, "defect", "amplitude", change)) for change in (-5e-4, 5e-4))
+    amplitude = scene.problem.imperfections["defect"].amplitude
+    shallow, deep = (
+        ms.Scene(scene.problem.again({"shell.defect.amplitude": amplitude + change})) for change in (-5e-4, 5e-4)
+    )
     assert found["defect.amplitude"] == pytest.approx(
         (buckling(deep, 0.001) - buckling(shallow, 0.001)) / 1e-3, rel=1e-3
     )

@@ -11,7 +11,7 @@ from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.path import Path, StepOptions
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.models.shell.parameters import Loads, Material
-from magshell_fenicsx.models.solid.material import NeoHookean
+from magshell_fenicsx.models.solid.densities import NeoHookean
 from magshell_fenicsx.models.solid.model import SolidModel
 from magshell_fenicsx.models.solid.terms import TermFactory
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from magshell_fenicsx import Case, CaseError
-from magshell_fenicsx.problem.planner import make_plan
-from magshell_fenicsx.problem.problem import Plan
+from magshell_fenicsx.case.planner import make_problem
+from magshell_fenicsx.problem.problem import Problem
 
 SHELL = {"geometry": "hemisphere", "radius_to_thickness": 50, "poisson_ratio": 0.3}
 BODIES: dict[str, dict[str, Any]] = {
@@ -20,15 +20,15 @@ BODIES: dict[str, dict[str, Any]] = {
 ABOVE = [0, 0, 2.5]
 
 
-def plan(bodies: dict[str, Any], **sections: Any) -> Plan:
+def problem(bodies: dict[str, Any], **sections: Any) -> Problem:
     data = {"shell": SHELL, "boundary": {"equator": "clamped"}, "bodies": bodies, "symmetry": "none", **sections}
-    return make_plan(Case.model_validate(data))
+    return make_problem(Case.model_validate(data))
 
 
 @pytest.mark.parametrize("kind", BODIES)
 def test_distance(kind: str) -> None:
     """|grad g| = 1 outside, gradient and Hessian by central differences, and g grows along its gradient."""
-    (contact,) = plan({"a": {**BODIES[kind], "position": ABOVE}}).loads.contacts
+    (contact,) = problem({"a": {**BODIES[kind], "position": ABOVE}}).loads.contacts
     x = np.random.default_rng(1).uniform([-1, -1, 0.5], [1, 1, 2.5], (200, 3))
     g, n, H = contact.distance(x)
     kept, step = g > 0.02, 1e-6
@@ -57,13 +57,13 @@ def test_places() -> None:
     normal = Case.model_validate(
         {"shell": SHELL, "boundary": {"equator": "clamped"}, "bodies": {"a": {"kind": "plane", "at": at}}}
     ).bodies["a"].at.vector()  # fmt: skip
-    (outside,) = plan({"a": {"kind": "sphere", "radius": 0.2, "at": at}}).loads.contacts
-    (inside,) = plan({"a": {"kind": "sphere", "radius": 0.2, "at": at, "side": "inside"}}).loads.contacts
+    (outside,) = problem({"a": {"kind": "sphere", "radius": 0.2, "at": at}}).loads.contacts
+    (inside,) = problem({"a": {"kind": "sphere", "radius": 0.2, "at": at, "side": "inside"}}).loads.contacts
     assert outside.front == pytest.approx((1 + h / 2) * normal)
     assert outside.direction == pytest.approx(-normal)
     assert inside.front == pytest.approx((1 - h / 2) * normal)
     assert inside.direction == pytest.approx(normal)
-    half = plan({"a": {"kind": "sphere", "radius": 0.2, "at": at}}, symmetry="half")
+    half = problem({"a": {"kind": "sphere", "radius": 0.2, "at": at}}, symmetry="half")
     assert half.half
     assert half.azimuth % np.pi == pytest.approx(np.radians(50))
     (turned,) = half.loads.contacts
@@ -84,19 +84,19 @@ def test_places() -> None:
 )
 def test_symmetry(body: dict[str, Any], model: str) -> None:
     """`symmetry: auto` finds the smallest model that a body leaves."""
-    found = plan({"a": body}, symmetry="auto")
+    found = problem({"a": body}, symmetry="auto")
     assert ("meridian" if found.axisymmetric else "half" if found.half else "full") == model
 
 
 def test_plane_of_an_oblique_box() -> None:
     """It holds the axis or is normal to it; another body that is not in the one leaves the other."""
     box = {"kind": "box", "size": [0.2, 0.3, 0.3], "edge": 0.05, "axis": [1, 2, 0]}
-    found = plan({"a": box}, symmetry="half")
+    found = problem({"a": box}, symmetry="half")
     along = np.degrees(np.arctan2(2, 1))
     assert np.degrees(found.azimuth) % 90 == pytest.approx(along)
     across = np.array([-2, 1]) / np.sqrt(5)
     ball = {"kind": "sphere", "radius": 0.1, "position": [*(0.6 * across), 2.0], "direction": [0, 0, -1]}
-    found = plan({"a": box, "b": ball}, symmetry="auto")
+    found = problem({"a": box, "b": ball}, symmetry="auto")
     assert found.half
     assert np.degrees(found.azimuth) % 180 == pytest.approx((along + 90) % 180)
 
@@ -116,9 +116,9 @@ APART = {"kind": "sphere", "radius": 0.2, "position": [0.3, 0, 1.5]}
 def test_refused(bodies: dict[str, Any], words: str) -> None:
     """Bodies that begin within the shell, or in the way of each other."""
     with pytest.raises(CaseError, match=words):
-        plan(bodies, loading={"kind": "contact", "body": "a", "approach": 1})
+        problem(bodies, loading={"kind": "contact", "body": "a", "approach": 1})
 
 
 def test_two_obstacles_may_overlap() -> None:
     """If neither moves."""
-    assert len(plan({"a": APART, "b": {**APART, "position": [0, 0, 1.5]}}).loads.contacts) == 2
+    assert len(problem({"a": APART, "b": {**APART, "position": [0, 0, 1.5]}}).loads.contacts) == 2

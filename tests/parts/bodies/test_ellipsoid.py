@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from magshell_fenicsx import Case, CaseError
+from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.parts.bodies.ellipsoid import Ellipsoid
 from magshell_fenicsx.parts.bodies.sphere import Sphere
-from magshell_fenicsx.problem.planner import make_plan
-from magshell_fenicsx.runs.run import run
+from magshell_fenicsx.public import run
 
 Array = NDArray[np.float64]
 SEMI, CENTRE = np.array([0.5, 0.2, 0.3]), np.array([0.1, -0.2, 0.4])
@@ -96,19 +96,19 @@ def case(symmetry: str = "auto", **body: Any) -> Case:
 
 def test_place_and_symmetry() -> None:
     """Its front touches the face; of equal semi-axes it turns about the approach."""
-    (contact,) = make_plan(case()).loads.contacts
+    (contact,) = make_problem(case()).loads.contacts
     assert contact.front == pytest.approx([0, 0, 1 / 60])
     assert contact.size == pytest.approx(0.3**2 / 0.2)
     assert contact.distance(contact.front[None])[0] == pytest.approx(0, abs=1e-15)
-    assert make_plan(case()).half
-    assert make_plan(case(axis=[1, 2, 0])).half
-    assert make_plan(case(semi_axes=[0.3, 0.3, 0.2])).axisymmetric
+    assert make_problem(case()).half
+    assert make_problem(case(axis=[1, 2, 0])).half
+    assert make_problem(case(semi_axes=[0.3, 0.3, 0.2])).axisymmetric
 
 
 def test_mistakes() -> None:
     """Its lengths are found by their types: a unit beside a shell without one is refused."""
     with pytest.raises(CaseError, match="axis: is along the approach"):
-        make_plan(case(axis=[0, 0, 1]))
+        make_problem(case(axis=[0, 0, 1]))
     for key in ("position", "semi_axes"):
         with pytest.raises(ValueError, match=f"bodies.egg.{key}: has a unit, but the shell's lengths have none"):
             case(**{key: ["1 mm", "2 mm", "30 mm"]})

@@ -9,15 +9,15 @@ from conftest import CASES
 from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.check import describe
+from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.input.source import CaseError, Source
 from magshell_fenicsx.mesh.mirror import Mirror
 from magshell_fenicsx.mesh.patch import Deviated, check_orientation
 from magshell_fenicsx.parts.imperfections.gaussian import Gaussian
 from magshell_fenicsx.parts.imperfections.imperfection import Flaw, flaws
 from magshell_fenicsx.parts.imperfections.symmetry import leaves
-from magshell_fenicsx.problem.check import describe
-from magshell_fenicsx.problem.planner import make_plan
-from magshell_fenicsx.problem.problem import Plan
+from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.shape.ground import Angle
 from magshell_fenicsx.shape.outline import ground_of, outline
 
@@ -63,12 +63,12 @@ def on_torus(theta: float, tube: float) -> tuple[float, float, float]:
     return r * np.cos(theta), r * np.sin(theta), 0.3 * np.sin(tube)
 
 
-def beside_rim(plan: Plan, centre: np.ndarray, *, angle: bool, near: float = 1e-5) -> tuple[int, int]:
+def beside_rim(problem: Problem, centre: np.ndarray, *, angle: bool, near: float = 1e-5) -> tuple[int, int]:
     """The number of cells with nodes of their sides on both sides of a rim, and of nodes inside."""
-    assert isinstance(plan.embedding, Deviated)
-    patch = plan.triangulated()
+    assert isinstance(problem.embedding, Deviated)
+    patch = problem.triangulated()
     check_orientation(patch)
-    x = plan.embedding.perfect(patch.nodes)
+    x = problem.embedding.perfect(patch.nodes)
     chord = np.linalg.norm(x - centre, axis=1)
     away = (2 * np.arcsin(np.minimum(chord / 2, 1)) if angle else chord)[patch.cells[:, :9]] - PHI_O
     return int(((away < -near).any(axis=1) & (away > near).any(axis=1)).sum()), int((away < -near).sum())
@@ -98,12 +98,12 @@ def test_rims_are_followed(name: str, centre: tuple[float, float, float], symmet
     case = shaped(name, dimple(*centre), symmetry=symmetry)
     place, spherical = np.array(centre), case.shell.geometry in ("hemisphere", "cap")
     if case.symmetry == "auto" and name not in ("plate", "torus", "strip", "disc"):
-        plan = make_plan(case)
-        assert plan.half
+        problem = make_problem(case)
+        assert problem.half
         place = np.array([np.hypot(*place[:2]), 0.0, place[2]])  # the frame is turned into the plane
     else:
-        plan = make_plan(shaped(name, dimple(*centre), symmetry="none"))
-    across, inside = beside_rim(plan, place, angle=spherical)
+        problem = make_problem(shaped(name, dimple(*centre), symmetry="none"))
+    across, inside = beside_rim(problem, place, angle=spherical)
     assert across == 0
     assert inside > 30
 
@@ -111,10 +111,10 @@ def test_rims_are_followed(name: str, centre: tuple[float, float, float], symmet
 @pytest.mark.parametrize(("polar", "near"), [(15.0, 1e-5), (2 * np.degrees(PHI_O), 1e-3), (22.3, 1e-5)])
 def test_rims_that_overlap_touch_or_nearly_do(polar: float, near: float) -> None:
     """Where they touch, the mesh has them a little wider."""
-    plan = make_plan(shaped("hemisphere", dimple(), towards(polar)))
-    assert plan.half
+    problem = make_problem(shaped("hemisphere", dimple(), towards(polar)))
+    assert problem.half
     for angle in (0.0, np.radians(polar)):
-        assert beside_rim(plan, np.array([np.sin(angle), 0, np.cos(angle)]), angle=True, near=near)[0] == 0
+        assert beside_rim(problem, np.array([np.sin(angle), 0, np.cos(angle)]), angle=True, near=near)[0] == 0
 
 
 @pytest.mark.parametrize(
@@ -132,8 +132,8 @@ def test_rims_that_overlap_touch_or_nearly_do(polar: float, near: float) -> None
     ],
 )
 def test_symmetry_that_is_left(imperfections: list[dict[str, Any]], model: str) -> None:
-    plan = make_plan(shaped("hemisphere", *imperfections))
-    assert model == ("meridian" if plan.axisymmetric else "half" if plan.half else "full")
+    problem = make_problem(shaped("hemisphere", *imperfections))
+    assert model == ("meridian" if problem.axisymmetric else "half" if problem.half else "full")
 
 
 @pytest.mark.parametrize("kind", ["gaussian", "dimple"])
@@ -192,9 +192,9 @@ def test_symmetry_of_many_imperfections_is_found_by_their_numbers() -> None:
 def test_deviations_add_up_along_the_normal() -> None:
     """On a cylinder: w0/h = -1 at the centre of a dimple plus 0.5 z there; 1/e at the width of a Gaussian dimple."""
     gauss = {"kind": "gaussian", "amplitude": -2.0, "width": 3.2, "at": {"point": [1.0, 0.0, 1.0]}}
-    plan = make_plan(shaped("cylinder", dimple(1, 0, 1), {"kind": "formula", "w0": "z", "amplitude": 0.5}, gauss))
+    problem = make_problem(shaped("cylinder", dimple(1, 0, 1), {"kind": "formula", "w0": "z", "amplitude": 0.5}, gauss))
     far = 2 * np.arcsin(PHI_O / 2)
-    found = plan.embedding(np.array([[0.0, 1.0], [far, 1.0]]))
+    found = problem.embedding(np.array([[0.0, 1.0], [far, 1.0]]))
     expected = 1 + H * np.array([2 - 1 + 0.5, 2 / np.e + 0.5])
     assert np.hypot(found[:, 0], found[:, 1]) == pytest.approx(expected, abs=1e-12)
     assert found[:, 2] == pytest.approx([1.0, 1.0], abs=1e-12)
@@ -205,7 +205,7 @@ def test_defect_is_one_of_them() -> None:
     file = CASES / "dimple_buckling.yaml"
     listed = Case.load(file, ["shell.imperfections=[{kind: dimple, amplitude: 1.64, width: 3.2}]"])
     chart = np.random.default_rng(1).uniform(-0.3, 0.3, (50, 2))
-    here, there = (make_plan(case).embedding(chart) for case in (Case.load(file), listed))
+    here, there = (make_problem(case).embedding(chart) for case in (Case.load(file), listed))
     assert (here == there).all()
     phi = np.hypot(*chart.T)
     w0 = np.where(phi < PHI_O, -1.64 * H * (1 - (phi / PHI_O) ** 2) ** 2, 0.0)
@@ -229,7 +229,7 @@ def test_defect_is_one_of_them() -> None:
 )
 def test_refusals(name: str, imperfections: list[dict[str, Any]], said: str) -> None:
     with pytest.raises(CaseError, match=said):
-        make_plan(shaped(name, *imperfections))
+        make_problem(shaped(name, *imperfections))
 
 
 def test_defect_and_a_list_are_refused_together() -> None:
@@ -249,20 +249,20 @@ def test_patches_within_each_rim() -> None:
     """Of a remanence: the first of two dimples, the second, and the rest; in a frame that is turned."""
     remanent = {"kind": "patches", "patches": {"dimple": {"polar": 90.0}, "dimple_2": {"polar": 180.0}, "rest": {}}}
     magnetic = {"lambda_m": 1e-3, "remanent": remanent}
-    plan = make_plan(shaped("hemisphere", towards(60.0), towards(20.0), magnetic=magnetic))
-    assert plan.half
-    assert plan.loads.magnetic
+    problem = make_problem(shaped("hemisphere", towards(60.0), towards(20.0), magnetic=magnetic))
+    assert problem.half
+    assert problem.loads.magnetic
     angle = np.radians([60.0, 20.0, 40.0])
     places = np.column_stack([np.sin(angle), 0 * angle, np.cos(angle)])[:, None]
-    found = plan.loads.magnetic.remanent(places, places)  # type: ignore[operator]
+    found = problem.loads.magnetic.remanent(places, places)  # type: ignore[operator]
     assert found[:, 0] == pytest.approx(np.array([[1, 0, 0], [0, 0, -1], [0, 0, 1]]), abs=1e-12)
 
 
 def test_a_mesh_file_moves_along_its_normals() -> None:
     """On the flat faces of the bracket by w0 = 0.01 sin(3 y), and at its fold along the mean of their normals."""
     case = Case.load(CASES / "bracket.yaml", ["shell.imperfections=[{kind: formula, w0: sin(3*y)}]"])
-    plan = make_plan(case)
-    patch = plan.triangulated()
+    problem = make_problem(case)
+    patch = problem.triangulated()
     x, moved = patch.nodes[:, :3], patch.embedding(patch.nodes)
     w0, fold = 0.01 * np.sin(3 * x[:, 1]), np.linalg.norm(x[:, [0, 2]] - [0.0, 1.0], axis=1) < 1e-9
     assert fold.sum() > 2

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.input.source import CaseError, Source
 from magshell_fenicsx.parts.imperfections.random import Waves
-from magshell_fenicsx.problem.planner import make_plan
 
 DIMPLES = {"count": 4, "amplitude": {"kind": "uniform", "above": 0.2, "below": 1.0}, "width": 2.0}
 
@@ -41,9 +41,9 @@ WRITTEN = [-0.18993069089806358, 0.31557400662418295, 1.7947743670257714]
 
 
 def test_a_field_is_a_full_shell_with_small_elements() -> None:
-    plan = make_plan(case({"kind": "random", "seed": 3, "amplitude": 0.1, "length": 1.0}))
-    assert plan.included[0] == "full shell"
-    assert plan.size([0.1, 0.1]) <= 1 / np.sqrt(np.sqrt(12 * 0.91) * 50) * (1 + 1e-9)
+    problem = make_problem(case({"kind": "random", "seed": 3, "amplitude": 0.1, "length": 1.0}))
+    assert problem.included[0] == "full shell"
+    assert problem.size([0.1, 0.1]) <= 1 / np.sqrt(np.sqrt(12 * 0.91) * 50) * (1 + 1e-9)
 
 
 def test_dimples_are_drawn_from_the_seed() -> None:
@@ -55,7 +55,7 @@ def test_dimples_are_drawn_from_the_seed() -> None:
     at = np.array([section.at.vector() for section in found.values()])  # type: ignore[attr-defined]
     apart = np.degrees(np.arccos(np.clip(at @ at.T, -1, 1)))[np.triu_indices(4, 1)]
     assert apart.min() >= 25
-    assert make_plan(case(item)).included[0] == "full shell"
+    assert make_problem(case(item)).included[0] == "full shell"
 
 
 @pytest.mark.parametrize(

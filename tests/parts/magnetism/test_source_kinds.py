@@ -14,12 +14,12 @@ from conftest import CASES
 from scipy.spatial.transform import Rotation
 
 from magshell_fenicsx import Case, CaseError, Scene
+from magshell_fenicsx.case.check import describe
+from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.input.expressions import FormulasInSpace, with_derivatives
 from magshell_fenicsx.input.source import Source
-from magshell_fenicsx.models.shell.crossing import crossing
+from magshell_fenicsx.parts.magnetism.applied import crossing
 from magshell_fenicsx.parts.magnetism.sources.field import in_space, placed
-from magshell_fenicsx.problem.check import describe
-from magshell_fenicsx.problem.planner import make_plan
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.record import Stopped
 
@@ -179,7 +179,7 @@ def test_symmetry_of_a_magnet(position: list[float], axis: dict[str, float], mod
         "remanent": {"flux_density": "50 mT"},
         "applied": {"sources": [{"kind": "cylinder", **ALONG, "position": position, "axis": axis}]},
     }
-    found = make_plan(
+    found = make_problem(
         Case.model_validate(
             {"shell": {**shell, "poisson_ratio": 0.3}, "boundary": {"rim": "clamped"}, "magnetic": magnetic}
         )
@@ -213,22 +213,22 @@ def test_grids_that_are_none(tmp_path: Path) -> None:
     for text, said in wrong.items():
         (tmp_path / "grid.csv").write_text(text)
         with pytest.raises(CaseError, match=said):
-            make_plan(case([{"kind": "grid", "file": "grid.csv"}], tmp_path))
+            make_problem(case([{"kind": "grid", "file": "grid.csv"}], tmp_path))
     file = written(tmp_path, "csv", FIELD, SLOPE)
     lines = (tmp_path / file).read_text().splitlines()
     (tmp_path / "hole.csv").write_text("\n".join(lines[:-1]))
     with pytest.raises(CaseError, match="is no rectilinear grid"):
-        make_plan(case([{"kind": "grid", "file": "hole.csv"}], tmp_path))
+        make_problem(case([{"kind": "grid", "file": "hole.csv"}], tmp_path))
     with pytest.raises(CaseError, match="is beyond the grid of magnetic"):
-        make_plan(case([{"kind": "grid", "file": file, "position": [0.02, 0, 0]}], tmp_path))
+        make_problem(case([{"kind": "grid", "file": file, "position": [0.02, 0, 0]}], tmp_path))
 
 
 def test_without_magpylib(monkeypatch: pytest.MonkeyPatch) -> None:
     """One message with the command; a grid or a formula does not need it."""
     monkeypatch.setitem(sys.modules, "magpylib", None)
     with pytest.raises(CaseError, match="pip install --no-deps magpylib"):
-        make_plan(case([{"kind": "cylinder", **OWN, **KINDS["cylinder"][0]}]))
-    make_plan(case([{"kind": "formula", "components": ["0", "0", "1"]}]))
+        make_problem(case([{"kind": "cylinder", **OWN, **KINDS["cylinder"][0]}]))
+    make_problem(case([{"kind": "formula", "components": ["0", "0", "1"]}]))
 
 
 def stopped(scene: Scene) -> tuple[list[dict[str, float]], str]:

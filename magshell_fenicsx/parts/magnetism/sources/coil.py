@@ -15,7 +15,7 @@ from magshell_fenicsx.parts.magnetism.sources.source import (
     SourceSection,
     magpylib,
 )
-from magshell_fenicsx.shape.lines import circle
+from magshell_fenicsx.shape.ground import circle
 
 Array = NDArray[np.float64]
 NOWHERE = "on the wire of"

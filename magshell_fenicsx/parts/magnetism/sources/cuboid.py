@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from magshell_fenicsx.parts.magnetism.sources.source import MagnetSection, Size, Values, to_box
-from magshell_fenicsx.shape.lines import edges
+from magshell_fenicsx.shape.ground import edges
 
 Array = NDArray[np.float64]
 

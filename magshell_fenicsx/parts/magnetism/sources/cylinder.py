@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.parts.magnetism.sources.source import MagnetSection, Size, Values, to_box
-from magshell_fenicsx.shape.lines import upright
+from magshell_fenicsx.shape.ground import upright
 
 Array = NDArray[np.float64]
 

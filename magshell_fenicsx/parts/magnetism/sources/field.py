@@ -10,7 +10,9 @@ from magshell_fenicsx.assembly.motion import Motion, moved
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.expressions import FormulasInSpace, with_derivatives
 from magshell_fenicsx.mesh.mirror import rotation
+from magshell_fenicsx.mesh.patch import PatchMesh
 from magshell_fenicsx.models.shell.parameters import Loads
+from magshell_fenicsx.models.shell.patterns import by_patch
 from magshell_fenicsx.parts.magnetism.driven import Driven, FieldInSpace
 from magshell_fenicsx.parts.magnetism.field_step import RotationSection, turn_name
 from magshell_fenicsx.parts.magnetism.fields import AppliedSection, MagneticSection
@@ -199,6 +201,10 @@ def source_size(loads: Loads, name: str) -> float:
 
 class SourcesSeen(Seen):
     """Amplitudes of sources, and their conjugates in SI."""
+
+    def refuse_unfit(self, loads: Loads, surface: PatchMesh) -> None:
+        if loads.magnetic and loads.magnetic.patches:
+            by_patch(loads.magnetic.patches, surface.patches, len(surface.cells))
 
     def amplitudes(self, loads: Loads) -> tuple[str, ...]:
         return tuple(source_columns(loads))

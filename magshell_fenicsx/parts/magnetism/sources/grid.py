@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.input.file import FileKeys
+from magshell_fenicsx.input.section import FileKeys
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.input.tables import TableError, column_size, read_table
 from magshell_fenicsx.parts.magnetism.sources.source import Array, OwnField, SourceSection
 from magshell_fenicsx.platform.reading import Files, vtk_data
-from magshell_fenicsx.shape.lines import edges
+from magshell_fenicsx.shape.ground import edges
 
 if TYPE_CHECKING:
     import scipy

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.parts.magnetism.sources.source import MagnetSection, Size, Values
-from magshell_fenicsx.shape.lines import ball
+from magshell_fenicsx.shape.ground import ball
 
 Array = NDArray[np.float64]
 

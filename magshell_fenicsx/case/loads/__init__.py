@@ -1,1 +1,0 @@
-"""The kinds of steps, a file each."""

@@ -1,0 +1,336 @@
+"""From a case to what must be built for it, without building anything: the parts added up."""
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
+from math import inf
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.opened import changed, document_of, perfect_case
+from magshell_fenicsx.input.expressions import formula, together
+from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.mesh.grading import Grading, Squares
+from magshell_fenicsx.mesh.grid import Grid, RimmedGrid
+from magshell_fenicsx.mesh.mirror import CUT, Y0, Mirror, rotation
+from magshell_fenicsx.mesh.msh import MeshFile, cell_count
+from magshell_fenicsx.mesh.patch import GivenField
+from magshell_fenicsx.mesh.shapes import DiscShape, StripShape
+from magshell_fenicsx.models.shell.own_term import OwnTerm
+from magshell_fenicsx.models.shell.parameters import Condition, Held, Loads, Material
+from magshell_fenicsx.models.shell.thickness import Thickness
+from magshell_fenicsx.parts.bodies.standing import Pressed, body_leaves, contacts
+from magshell_fenicsx.parts.imperfections.imperfection import Flaw, flaws, in_frame
+from magshell_fenicsx.parts.imperfections.modes import ModesSection
+from magshell_fenicsx.parts.imperfections.modes import Shape as Mode
+from magshell_fenicsx.parts.imperfections.rims import MOST_RIMS, Spot, different, spots
+from magshell_fenicsx.parts.imperfections.symmetry import leaves
+from magshell_fenicsx.parts.part import Modelled
+from magshell_fenicsx.parts.registered import STEPS
+from magshell_fenicsx.parts.supports.boundary import BoundarySection, EdgeCondition, HeldSection
+from magshell_fenicsx.problem.account import account
+from magshell_fenicsx.problem.body import body_of
+from magshell_fenicsx.problem.columns import refuse_twice
+from magshell_fenicsx.problem.formulas import (
+    looked_at,
+    narrow_places,
+    of_imperfections,
+    refinements,
+    refuse_unfit_formulas,
+    written,
+)
+from magshell_fenicsx.problem.limits import unknowns_of
+from magshell_fenicsx.problem.names import refuse_unfit_ends
+from magshell_fenicsx.problem.own_terms import surface_terms
+from magshell_fenicsx.problem.problem import Awaited, Problem
+from magshell_fenicsx.problem.sizes import Loaded, grading
+from magshell_fenicsx.shape.ground import refuse_beside
+from magshell_fenicsx.shape.outline import Chart, Outline, ground_of
+from magshell_fenicsx.shape.sections import MeshSurface
+from magshell_fenicsx.shape.symmetry import Leaves, askew, mirror, of_points, of_shape, unmirrored
+
+Array = NDArray[np.float64]
+Points = dict[str, Array]
+FAR_FROM_ONE = 50.0  # times the radius, or a part of it: a surface as long as that hints at another unit
+
+
+def make_problem(case: Case, terms: Sequence[OwnTerm] = ()) -> Problem:
+    """Problem a case, with its user-defined energies and `terms`.
+
+    Raises
+    ------
+    CaseError
+        If the symmetry that is asked for is not there, or what is asked for cannot be built.
+    MeshError
+        If the meridian has no such edge or point.
+    """
+    case = case.with_terms([*case.own_terms, *terms]) if terms else case
+    terms = case.own_terms
+    material = Material(case.shell.poisson_ratio, 1 / case.shell.R_over_h)
+    ground = ground_of(case.shell)
+    perfect = ground.perfect
+    found = flaws(case.imperfections, ground)
+    context, last = case.context, {step.name: step for step in case.programme}
+    still = {*found} - {key for step in last.values() for key in step.load.multiplies(step, context)}
+    drawn = imperfect(perfect, found, 0.0, still)
+    ground = replace(ground, drawn=drawn)
+    standing = case.bodies, case.approaches, {step.name for step in case.programme}
+    at_place = {name: (step, step.load.place_on(step, context, drawn)) for name, step in last.items()}
+    places = {name: (step, place) for name, (step, place) in at_place.items() if place is not None}
+    sample = np.zeros((0, 3)) if isinstance(case.shell, MeshSurface) else drawn.sample()
+    for section in context.abilities:
+        section.refuse_unfit_values(context, sample)
+    formulas = written(context)
+    narrow = [looked_at(each.formulas, drawn) for each in formulas]
+    drawn = drawn.looked_at(narrow_places(narrow)) if formulas else drawn
+    refuse_unfit_formulas(formulas, drawn.sample() if formulas else sample)
+    energies = surface_terms(context, terms)
+    parts = _left(case, drawn, energies)
+    parts += leaves(found, perfect, each=bool(case.patches))
+    parts += [body_leaves(contact) for contact in contacts(*standing, ground)]
+    axisymmetric, plane = _symmetry(case, drawn, parts)
+    half = plane is not None
+    turn, beyond = 0.0, plane
+    if plane and drawn.round and plane.through_e3:  # the frame is turned into the plane
+        turn, beyond = plane.azimuth, Y0
+    points = _named_points(case, drawn, turn, half)
+    under = dict[str, str]()
+    for name, (step, place) in places.items():
+        chart = step.load.chart_of(place, drawn, turn, half=half)
+        candidates = (point for point in ("pole", *under.values()) if point in points)
+        same = (point for point in candidates if np.array_equal(points[point], chart))
+        under[name] = next(same, name.replace("force", "load"))
+        points[under[name]] = chart
+    for step in case.programme:
+        if step.name in under:
+            step.load.refuse_unfit_place(step, context, drawn, points[under[step.name]])
+    loaded: list[Loaded] = [(points[at], [step.load]) for step in case.programme for at in step.load.named_points()]
+    for point in dict.fromkeys(under.values()):
+        loaded.append((points[point], [step.load for step in case.programme if under.get(step.name) == point]))
+    local = [] if isinstance(case.shell, MeshSurface) else spots(found.items(), perfect, turn)
+    wide = [flaw for flaw in found.values() if flaw.centre is None]
+    everywhere, varying = min((flaw.size for flaw in wide), default=inf), list[Squares]()
+    bodies = contacts(*standing, replace(ground, turn=turn))
+    stood = replace(ground, drawn=drawn)
+    touched = [Pressed.by(c, (step.load for step in case.programme if step.name == c.amplitude), stood) for c in bodies]
+    if not (axisymmetric or case.mesh.size):
+        varying, everywhere = of_imperfections(wide, perfect, turn, material.h)
+        varying += refinements(formulas, narrow, drawn, turn, material.h)
+        varying = [each.finer(case.mesh.refinement) for each in varying]
+    size = grading(context, drawn, material.h, [*local, *touched], everywhere, loaded, varying, local=bool(local))
+    drawn = imperfect(perfect, found, turn, still)
+    shape = drawn.chart(beyond, size)
+    if isinstance(shape, Grid) and beyond:  # what a point needs, its image needs too
+        images = [drawn.inverse(beyond.image(drawn.embedding(x[None])[0])) for x in points.values()]
+        x, y = ((*shape.through[i], *(float(image[i]) for image in images)) for i in range(2))
+        shape = replace(shape, through=(x, y))
+    rims = different(local)
+    shape = _matched(shape, local, rims if len(rims) <= MOST_RIMS else ())
+    span = drawn.span if axisymmetric else None
+    conditions = edge_conditions(case.boundary, turn)
+    supports = tuple(name for name, condition in conditions.items() if condition != "free")
+    if beyond:
+        conditions = {name: c for name, c in conditions.items() if name not in beyond.lost} | {CUT: "symmetry"}
+    within = {name: in_frame(found[key].inside, turn) for name, key in case.dimples.items()}
+    deviations = {key: in_frame(flaw.deviation, turn) for key, flaw in found.items()}
+    modelled = Modelled(drawn, turn, beyond, plane, axisymmetric, under, within, deviations)
+    all_loads = replace(_loads(case, modelled), own=energies, contacts=bodies)
+    if span:
+        refuse_unfit_ends([name for name in span.names if name], points, conditions, all_loads)
+    model = "meridian" if axisymmetric else f"{'half' if half else 'full'} {case.model}"
+    included, left_out = account(context, all_loads, model, plane, len(rims))
+    included += [f"{key}: {flaw.account}" for key, flaw in found.items() if flaw.account]
+    sample = sample if len(sample) else drawn.sample()
+    problem = Problem(
+        context=context,
+        mesh=case.mesh,
+        body=body_of(context),
+        material=material,
+        loads=all_loads,
+        conditions=conditions,
+        meridian=span,
+        mirror=beyond,
+        azimuth=turn,
+        shape=shape,
+        embedding=drawn.embedding,
+        points=points,
+        size=size,
+        included=[*included, *(f"own energy: {term.name}" for term in terms)],
+        left_out=left_out,
+        thickness=_thickness(case, turn),
+        length=case.shell.reference,
+        within=within,
+        supports=supports,
+        reactions=bool(all_loads.moves) if case.reactions is None else case.reactions,
+        pressed=tuple((each.size, each.reach) for each in touched),
+        warning=next((said for part in context.abilities if (said := part.warning(context, sample))), None)
+        or _wrong_unit(case, sample),
+        lambda_m=case.lambda_m,
+        unknowns=0.0 if span else unknowns_of(context, _cells(shape, size, half=half)),
+        patched=bool(case.patches),
+        stability=case.stability,
+        frequencies=case.frequencies,
+        gradients=case.gradients,
+        output=case.output,
+        awaited=_awaited(case),
+        document=document_of(case),
+        remade=lambda values: make_problem(changed(case, values)),
+    )
+    refuse_twice(problem)
+    return problem
+
+
+def _awaited(case: Case) -> Awaited | None:
+    """The modes of the perfect shell that are still to be computed."""
+    sections = [section for section in case.imperfections.values() if isinstance(section, ModesSection)]
+    awaiting = [section for section in sections if section.awaited]
+
+    def given(modes: tuple[Mode, ...]) -> Problem:
+        for section in awaiting:
+            section.become(modes)
+        return make_problem(case)
+
+    count = max((len(section.amplitudes) for section in awaiting), default=0)
+    return Awaited(count, lambda: make_problem(perfect_case(case)), given) if count else None
+
+
+def _left(case: Case, drawn: Outline, energies: Sequence[OwnTerm]) -> list[Leaves]:
+    """What each part of a case leaves of its symmetry."""
+    context = case.context
+    return [
+        of_shape(case.shell, drawn),
+        *(leaves for section in context.abilities for leaves in section.leaves(context, drawn)),
+        *(leaves for step in case.programme for leaves in step.load.leaves(step, context, drawn)),
+        of_points(case.points.values(), case.shell.reference, drawn),
+        *(term.leaves(drawn) for term in energies),
+    ]
+
+
+def _loads(case: Case, modelled: Modelled) -> Loads:
+    """What the parts of a case add to the loads of its model."""
+    context, last = case.context, {step.name: step for step in case.programme}
+    named = {*last, *(name for step in case.programme for name in (*step.load.drives, *step.load.hold))}
+    fields: dict[str, Any] = {}
+    for added in (
+        *(kind.implied() for kind in STEPS.values() if getattr(kind, "amplitude", None) in named),
+        *(step.load.adds(step, context, modelled) for step in last.values()),
+        *(section.adds(context, modelled) for section in context.abilities),
+    ):
+        for name, value in added.items():
+            before = fields.get(name)
+            if isinstance(value, dict):
+                fields[name] = {**(before or {}), **value}
+            else:
+                fields[name] = (*(before or ()), *value) if isinstance(value, tuple) else before or value
+    return Loads(**fields)
+
+
+def _wrong_unit(case: Case, places: Array) -> str | None:
+    """What hints at another unit of a mesh file's coordinates, in words; None without."""
+    extent = float(np.ptp(places, axis=0).max())
+    if not isinstance(case.shell, MeshSurface) or 1 / FAR_FROM_ONE <= extent <= FAR_FROM_ONE:
+        return None
+    key = "unit" if case.shell.with_units else "radius"
+    return f"the surface of the mesh file is {extent:.4g} times as long as shell.radius: is shell.{key} right?"
+
+
+def edge_conditions(boundary: BoundarySection, turn: float) -> dict[str, Condition]:
+    """The conditions of a case in the model's terms, in a frame turned about e3 (rad)."""
+    terms: dict[EdgeCondition, Condition] = {
+        "hinged": "simply supported",
+        "symmetry": "plane",
+        "clamped": "clamped",
+        "simply supported": "simply supported",
+        "free": "free",
+    }
+    return {
+        name: Held(tuple(_turned(c.components, turn))) if isinstance(c, HeldSection) else terms[c]
+        for name, c in boundary.conditions().items()
+    }
+
+
+def imperfect(perfect: Outline, found: Mapping[str, Flaw], turn: float, still: Collection[str]) -> Outline:
+    """The shell with the imperfections that do not grow, in a frame turned about e3 (rad); all have their cells."""
+    if not found:
+        return perfect
+    circles = tuple(flaw.reach for flaw in found.values() if flaw.rim) if perfect.disc else ()
+    shown = min((flaw.size for flaw in found.values()), default=inf)
+    return perfect.deviated(
+        tuple(in_frame(found[key].deviation, turn) for key in found if key in still), circles, shown
+    )
+
+
+def _matched(shape: Chart, local: Sequence[Spot], rims: tuple[Array, ...]) -> Chart | RimmedGrid:
+    """The shape with element edges along the rims."""
+    circles = tuple(dict.fromkeys(spot.radius for spot in local if spot.circle and spot.jumps))
+    if isinstance(shape, Grid):
+        return RimmedGrid(shape, rims) if rims else shape
+    if isinstance(shape, DiscShape):
+        return replace(shape, circles=tuple(r for r in circles if r < shape.radius), rims=rims)
+    return replace(shape, rims=rims) if isinstance(shape, StripShape) else shape
+
+
+def _symmetry(case: Case, drawn: Outline, parts: list[Leaves]) -> tuple[bool, Mirror | None]:
+    """Whether to model the meridian, and else the mirror plane of a half, None for a full model."""
+    reason = askew(parts)
+    if reason and case.symmetry == "axisymmetric":
+        raise CaseError(f"symmetry: axisymmetric: {reason}")
+    if reason is None and case.symmetry in ("auto", "axisymmetric") and case.model == "shell":
+        return True, None
+    if case.symmetry not in ("auto", "half"):
+        return False, None
+    plane = mirror(parts, drawn, loosely=case.symmetry == "half")
+    if case.symmetry == "half" and plane is None:
+        if name := unmirrored(parts, drawn):
+            raise CaseError(f"symmetry: half: the energy {name} does not share it")
+        made = "; edges of a mesh file must lie in it: mesh a half, mirror the nodes and triangles, join them"
+        hint = made if isinstance(case.shell, MeshSurface) else ""
+        raise CaseError(f"symmetry: half: shell, supports, fields and load have no common mirror plane{hint}")
+    return False, plane
+
+
+def _named_points(case: Case, drawn: Outline, turn: float, half: bool) -> Points:
+    """Named vertices in the chart, "pole" among them."""
+    Q, R = rotation(turn), case.shell.reference
+
+    def chart(name: str, x: Array) -> Array:
+        refuse_beside(f"points.{name}", x, drawn, R, with_units=case.shell.with_units)
+        found = drawn.inverse(Q @ x)
+        return drawn.on_half(found) if half else found
+
+    points = {name: chart(name, np.array(x) / R) for name, x in case.points.items()}
+    if points:
+        points["pole"] = next(iter(points.values()))
+    elif drawn.highest is not None:
+        points["pole"] = drawn.highest
+    return points
+
+
+def _cells(shape: Chart | RimmedGrid, size: Grading, *, half: bool) -> float:
+    """About how many triangles there will be."""
+    if isinstance(shape, MeshFile):
+        return cell_count(shape) * (0.5 if half else 1.0)
+    return shape.cells * (0.5 if half else 1.0) if isinstance(shape, Grid) else size.cells(shape)
+
+
+def _turned(components: tuple[int, ...], turn: float) -> list[int]:
+    """The components in a frame into which they turn as a whole."""
+    held = np.eye(3)[list(components)] @ rotation(turn).T
+    return [i for i in range(3) if held[:, i] @ held[:, i] > 0.5]
+
+
+def _thickness(case: Case, turn: float) -> Thickness | None:
+    factor = case.thickness_factor
+    if isinstance(factor, dict):
+        return Thickness(patches=factor)
+    if isinstance(factor, GivenField):
+        return Thickness(given=factor)
+    if not factor:
+        return None
+    told, Q = formula(factor), rotation(turn)
+    return Thickness(
+        lambda x, y, z: told(*np.tensordot(Q.T, np.stack([x, y, z]), 1)) if turn else told(x, y, z),
+        formulas=together([told], Q),
+    )

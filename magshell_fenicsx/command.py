@@ -1,0 +1,183 @@
+"""What all commands share: options, completion in the shell, messages of rank 0, exit codes.
+
+Typer is imported without rich where no help is asked for: the import of rich takes 0.15 s of every command.
+"""
+
+import signal
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from glob import escape, glob
+from pathlib import Path
+from typing import Annotated, Any
+
+from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.platform import terminal
+from magshell_fenicsx.platform.kept import UnsafeCache
+
+_absent = "rich" not in sys.modules and "--help" not in sys.argv and len(sys.argv) > 1
+if _absent:
+    sys.modules["rich"] = None  # type: ignore[assignment]  # an import of it fails, as where it is not installed
+try:
+    import typer as typer
+finally:
+    if _absent:
+        del sys.modules["rich"]
+
+INVALID, STOPPED = 2, 3
+FAILED = 32101  # tag of the messages between ranks that fail
+PATIENCE = 5.0  # s in which an error of all ranks reaches the last of them
+DELIVERED = 0.2  # s in which a message is on its way to the terminal
+UNWRITTEN = "kernels cannot be compiled into"
+
+
+def case_files(incomplete: str) -> list[str]:
+    """Case files with this beginning, here or one folder deeper; without any, the shell offers its own files."""
+    begin = escape(incomplete)
+    files = glob(f"{begin}*.yaml") + glob(f"{begin}*/*.yaml")  # noqa: PTH207 - a Path would lose the ./ that was typed
+    return sorted(files)
+
+
+def left_to_the_shell() -> list[str]:
+    """No completions of ours, so that the shell completes files; by default it would only add a blank."""
+    return []
+
+
+CaseFile = Annotated[Path, typer.Argument(metavar="CASE.yaml", help="the case file", autocompletion=case_files)]
+Settings = Annotated[
+    list[str] | None, typer.Option("--set", metavar="KEY.PATH=VALUE", help="replace a key of the case")
+]
+Over = Annotated[
+    list[str],
+    typer.Option(metavar="KEY.PATH=START:STOP:COUNT", help="or =VALUE,VALUE; repeat for a product, tie keys with +"),
+]
+
+
+def result_option(before: str = "") -> Any:
+    return typer.Option(
+        "--result", metavar="NAME", help=f"{before}knockdown, critical_field, force@w_over_h=10, energy@end, ..."
+    )
+
+
+Result = Annotated[str, result_option()]
+Run = Annotated[
+    Path,
+    typer.Argument(metavar="DIR", help="folder of a finished or interrupted run", autocompletion=left_to_the_shell),
+]
+
+
+def folder_option(default: str) -> Any:
+    return typer.Option(help=f"output folder; default {default}", autocompletion=left_to_the_shell)
+
+
+def chosen_folder(out: str | None, default: str) -> Path:
+    """The folder of an option, or the default one in results/."""
+    from magshell_fenicsx.output.store.folder import given_folder
+
+    with exit_codes():
+        return Path("results") / default if out is None else given_folder(out)
+
+
+def picture_options(
+    formats: str | None,
+    width: float | None,
+    dpi: int | None,
+    font_size: float | None,
+    camera: str | None,
+    ranges: Sequence[str],
+) -> dict[str, Any]:
+    """The options that are given, as keys of the section.
+
+    Raises
+    ------
+    CaseError
+        If a camera or a range cannot be read.
+    """
+    given: dict[str, Any] = {"width": width, "dpi": dpi, "font_size": font_size}
+    given["formats"] = formats.split(",") if formats else None
+    if camera:
+        angles = _numbers(camera, ",", f"--camera {camera}: write it as POLAR,AZIMUTH in degrees, for example 55,-60")
+        given["camera"] = dict(zip(("polar", "azimuth"), angles, strict=True))
+    if ranges:
+        given["ranges"] = {}
+    for text in ranges:
+        name, _, limits = text.partition("=")
+        said = f"--range {text}: write it as FIELD=LOW:HIGH, for example w_over_h=-2:2"
+        given["ranges"][name] = list(_numbers(limits, ":", said))
+    return {key: value for key, value in given.items() if value is not None}
+
+
+def _numbers(text: str, between: str, said: str) -> tuple[float, float]:
+    try:
+        first, second = map(float, text.split(between))
+    except ValueError:
+        raise CaseError(said) from None
+    return first, second
+
+
+def world() -> Any:
+    """All ranks."""
+    from mpi4py import MPI
+
+    return MPI.COMM_WORLD
+
+
+def print_line(line: str) -> None:
+    if world().rank == 0:
+        with suppress(ValueError):  # elsewhere than in the main thread
+            signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # again: PETSc has taken it if it was imported since `main`
+        terminal.print_line(line)
+
+
+def failure(message: str, code: int) -> typer.Exit:
+    """Print the message of an error once, and return the end of this rank; ends all if the others have no error."""
+    comm = world()
+    if comm.size > 1 and not _all_fail(comm):
+        print(f"rank {comm.rank}: {message}", file=sys.stderr, flush=True)
+        time.sleep(DELIVERED)
+        comm.Abort(code)  # the other ranks would wait for this one for ever
+    if comm.rank:
+        return typer.Exit()  # mpirun ends the job at the first failing rank, and may lose the message of rank 0
+    with suppress(OSError):  # a full disk: the exit code says it
+        print(message, file=sys.stderr, flush=True)
+    return typer.Exit(code)
+
+
+def _all_fail(comm: Any) -> bool:
+    """Whether all ranks come here, as they do with an error of all, before those that have come lose patience."""
+    from mpi4py import MPI
+
+    others, end = [rank for rank in range(comm.size) if rank != comm.rank], time.monotonic() + PATIENCE
+    for rank in others:
+        comm.Isend(bytearray(1), rank, FAILED)
+    came = [comm.Irecv(bytearray(1), rank, FAILED) for rank in others]  # no collective: others may be in one
+    while not MPI.Request.Testall(came):
+        if time.monotonic() > end:
+            return False
+        time.sleep(0.01)
+    return True
+
+
+def refuse_lost() -> None:
+    """End a command whose only result is what it prints, if that was not written."""
+    if terminal.lost:
+        raise failure(f"stopped early: {terminal.lost[0]}", STOPPED)
+
+
+@contextmanager
+def exit_codes(invalid: type[Exception] = CaseError, stopped: tuple[type[Exception], ...] = ()) -> Iterator[None]:
+    """Turn an invalid input (`CaseError` and `invalid`) or an early stop into a message and its exit code.
+
+    An early stop is also a kernel that cannot be written, for which dolfinx raises the same on all ranks.
+    """
+    try:
+        yield
+    except (CaseError, UnsafeCache, invalid) as e:
+        raise failure(str(e), INVALID) from None
+    except stopped as e:
+        raise failure(f"stopped early: {e}", STOPPED) from None
+    except RuntimeError as e:
+        if UNWRITTEN in str(e) or (world().rank and "Failed just-in-time compilation" in str(e)):
+            raise failure(f"stopped early: {str(e)[str(e).find(UNWRITTEN) :]}", STOPPED) from None
+        raise

@@ -1,0 +1,135 @@
+"""The law of a thin shell's material: energies, stresses and moments as functions of strains.
+
+Energies are over E h per undeformed area, lengths over R. E is the membrane strain and K the change of curvature,
+(..., 2, 2) in coordinates of the surface; `up` is the inverse metric of the shape without stress. Every formula is one
+of components, so that it holds for an expression of UFL at a point and for arrays of NumPy over many points.
+
+A further law is a class with the methods of `Koiter`, and a line in `parameters.Material.law`.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Any, TypeAlias
+
+from ufl.core.expr import Expr
+
+from magshell_fenicsx.models.shell.energy import Density, Parameter
+
+Scalar: TypeAlias = Any  # a number, an expression, or an array (...)
+Tensor: TypeAlias = Any  # an expression (2, 2), or an array (..., 2, 2)
+Components: TypeAlias = tuple[Scalar, Scalar, Scalar]  # 11, 12 and 22 of a symmetric tensor with indices up
+
+
+@dataclass(frozen=True)
+class Koiter:
+    """Stress is linear in strain; stretching and bending do not know of each other.
+
+    Attributes
+    ----------
+    h
+        The thickness that energies are over.
+    nu
+        Poisson's ratio.
+    t
+        What multiplies the thickness.
+    """
+
+    h: Scalar
+    nu: Scalar
+    t: Scalar = 1
+
+    @property
+    def numbers(self) -> tuple[Scalar, ...]:
+        """All but `t`, in their order."""
+        return self.h, self.nu
+
+    def thicker(self, factor: Scalar) -> "Koiter":
+        """That of a shell so many times as thick."""
+        return replace(self, t=factor * self.t)
+
+    @property
+    def bending_stiffness(self) -> Scalar:
+        """D/(E h R^2)."""
+        return self.t**3 * self.h**2 / (12 * (1 - self.nu**2))
+
+    def membrane(self, E: Tensor, up: Tensor) -> Scalar:
+        """The energy of stretching."""
+        return self.t * self._square(E, up) / (2 * (1 - self.nu**2))
+
+    def bending(self, E: Tensor, K: Tensor, up: Tensor) -> Scalar:
+        """The energy of bending."""
+        return self.bending_stiffness / 2 * self._square(K, up)
+
+    def stress(self, E: Tensor, up: Tensor) -> Components:
+        """The derivative of `membrane` by E."""
+        return self._scaled(self.t / (1 - self.nu**2), E, up)
+
+    def moment(self, E: Tensor, K: Tensor, up: Tensor) -> Components:
+        """The derivative of `bending` by K."""
+        return self._scaled(self.bending_stiffness, K, up)
+
+    def edge_moment(self, E: Tensor, K: Tensor, up: Tensor, across: tuple[Scalar, Scalar], square: Scalar) -> Scalar:
+        """The moment twice along a covector c.
+
+        Parameters
+        ----------
+        across, square
+            c with its index up, and c . c: the unit conormal of an edge and 1, but for a natural stretch.
+        """
+        bent = K[..., 0, 0] * across[0] ** 2 + 2 * K[..., 0, 1] * across[0] * across[1] + K[..., 1, 1] * across[1] ** 2
+        return self.bending_stiffness * ((1 - self.nu) * bent + self.nu * square * trace(K, up))
+
+    def edge_stiffness(self, E: Tensor, up: Tensor, across: tuple[Scalar, Scalar], square: Scalar) -> Scalar:
+        """The derivative of `edge_moment` by K twice along c, to which the penalty of edges is proportional."""
+        return self.bending_stiffness * square**2
+
+    def _square(self, S: Tensor, up: Tensor) -> Scalar:
+        """(1 - nu) S:S + nu tr^2 S."""
+        T11, T12, T21, T22 = _mixed(S, up)
+        return (1 - self.nu) * (T11**2 + 2 * T12 * T21 + T22**2) + self.nu * (T11 + T22) ** 2
+
+    def _scaled(self, factor: Scalar, S: Tensor, up: Tensor) -> Components:
+        """A factor times (1 - nu) S + nu tr S with indices up."""
+        T11, T12, T21, T22 = _mixed(S, up)
+        a11, a12, a22 = up[..., 0, 0], up[..., 0, 1], up[..., 1, 1]
+        raised = (T11 * a11 + T12 * a12, T11 * a12 + T12 * a22, T21 * a12 + T22 * a22)
+        S11, S12, S22 = (
+            factor * ((1 - self.nu) * each + self.nu * (T11 + T22) * a)
+            for each, a in zip(raised, (a11, a12, a22), strict=True)
+        )
+        return S11, S12, S22
+
+
+def _mixed(S: Tensor, up: Tensor) -> tuple[Scalar, Scalar, Scalar, Scalar]:
+    """S^i_j as 11, 12, 21, 22."""
+    S11, S12, S22 = S[..., 0, 0], S[..., 0, 1], S[..., 1, 1]
+    a11, a12, a22 = up[..., 0, 0], up[..., 0, 1], up[..., 1, 1]
+    return a11 * S11 + a12 * S12, a11 * S12 + a12 * S22, a12 * S11 + a22 * S12, a12 * S12 + a22 * S22
+
+
+def trace(S: Tensor, up: Tensor) -> Scalar:
+    """S^i_i."""
+    return up[..., 0, 0] * S[..., 0, 0] + 2 * up[..., 0, 1] * S[..., 0, 1] + up[..., 1, 1] * S[..., 1, 1]
+
+
+def work(S: Components, T: Tensor) -> Scalar:
+    """S:T of a stress or a moment on a strain."""
+    return S[0] * T[..., 0, 0] + 2 * S[1] * T[..., 0, 1] + S[2] * T[..., 1, 1]
+
+
+def elastic(density: Density, law: Koiter, t: Parameter | None = None) -> Density:
+    """Of a density that takes a `law`, on two sides a pair of laws, that of a law whose numbers are constants.
+
+    `t` is what multiplies the thickness, (1,); None for 1.
+    """
+
+    def of(*arguments: Expr, **known: Any) -> Expr:
+        given, factors = list(arguments), [1] * density.sides
+        if t is not None:
+            factor = given.pop()
+            factors = [each[0] for each in (factor if density.sides == 2 else [factor])]
+        count = len(given) - len(law.numbers)
+        laws = tuple(type(law)(*given[count:]).thicker(each) for each in factors)
+        return density.of(*given[:count], law=laws if density.sides == 2 else laws[0], **known)
+
+    numbers = (*density.parameters, *law.numbers)
+    return replace(density, of=of, parameters=numbers if t is None else (*numbers, t))

@@ -1,0 +1,159 @@
+"""What programs call: a run and a scene of a problem, or of what makes one, as a case or the path of its file."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeAlias
+from warnings import warn
+
+from mpi4py import MPI
+
+from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.case.opened import opened
+from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.mesh.patch import MeshError
+from magshell_fenicsx.models.shell.own_term import OwnTerm
+from magshell_fenicsx.problem.problem import Problem
+from magshell_fenicsx.runs.running import run as run_problem
+from magshell_fenicsx.runs.summary import Result
+from magshell_fenicsx.simulate.follow import follow as follow_scene
+from magshell_fenicsx.simulate.follow import warned
+from magshell_fenicsx.simulate.record import Record
+from magshell_fenicsx.simulate.scene import Scene as SceneOfProblem
+
+Given: TypeAlias = Problem | Case | Mapping[str, Any] | str | Path
+Say = Callable[[str], None]
+
+
+def problem_of(given: Given, comm: MPI.Comm = MPI.COMM_WORLD, terms: Sequence[OwnTerm] = ()) -> Problem:
+    """The problem itself, or that of a case, of a mapping like a case file, or of the file at a path; collective.
+
+    Parameters
+    ----------
+    terms
+        User-defined energies besides those of the case, with their amplitudes at `OwnTerm.value`.
+
+    Raises
+    ------
+    CaseError, MeshError
+        If it is none of these, or no problem can be made of it.
+    """
+    if isinstance(given, Problem):
+        if terms:
+            raise CaseError("terms: a problem has its energies already: give them to what makes the problem")
+        return given
+    case = opened(given, comm)
+    try:
+        return (case.with_terms([*case.own_terms, *terms]) if terms else case).problem()
+    except (CaseError, MeshError) as e:
+        raise type(e)(case.placed(str(e))) from None
+
+
+class Scene(SceneOfProblem):
+    """A problem ready to be solved.
+
+    Parameters
+    ----------
+    case
+        A problem, or what makes one; see `problem_of`.
+    plan
+        The name of a problem in earlier versions.
+    terms
+        See `problem_of`.
+    """
+
+    def __init__(
+        self,
+        case: Given,
+        comm: MPI.Comm = MPI.COMM_WORLD,
+        plan: Problem | None = None,
+        *,
+        terms: Sequence[OwnTerm] = (),
+    ) -> None:
+        if plan is not None:
+            warn("Scene(case, plan=problem) is now Scene(problem)", DeprecationWarning, stacklevel=2)
+        super().__init__(plan or problem_of(case, comm, terms), comm)
+        self._given = case
+
+    @property
+    def case(self) -> Case:
+        """The case that was given, as in earlier versions."""
+        warn("Scene.case is now Scene.problem, which has all that is computed", DeprecationWarning, stacklevel=2)
+        assert not isinstance(self._given, Problem), "a scene of a problem has no case"
+        return opened(self._given, self.comm)
+
+
+def follow(
+    given: SceneOfProblem | Given, *, search: bool = True, remark: Callable[[str], None] = warned
+) -> Iterator[Record]:
+    """Compute the history of a scene, or of a problem or what makes one; yields every accepted point.
+
+    A problem on a mesh of a program is solved by the processes of that mesh. For all else see
+    `simulate.follow.follow`.
+    """
+    if isinstance(given, SceneOfProblem):
+        return follow_scene(given, search=search, remark=remark)
+    problem = problem_of(given)
+    home = problem.given and problem.given.home
+    return follow_scene(Scene(problem, home.comm if home else MPI.COMM_WORLD), search=search, remark=remark)
+
+
+def run(
+    case: Given,
+    out: Path | str | None = None,
+    comm: MPI.Comm = MPI.COMM_WORLD,
+    say: Say = lambda line: None,
+    *,
+    tell: Say | None = None,
+    resume: bool = False,
+    overwrite: bool = False,
+    time_limit: float | None = None,
+    pictures: bool = True,
+    terms: Sequence[OwnTerm] = (),
+) -> Result:
+    """Run a problem.
+
+    With `out`, SIGTERM, SIGINT and SIGUSR1 stop the run after the current point, and it can be resumed.
+
+    Parameters
+    ----------
+    case
+        A problem, or what makes one; see `problem_of`.
+    out
+        Folder for path.csv, summary.json, fields and pictures; None writes nothing.
+    say
+        Called on rank 0 with one line of text per accepted point.
+    tell
+        Called on rank 0 with a status line, which replaces the one before.
+    resume
+        Continue the interrupted run in `out`.
+    overwrite
+        Replace the run in `out` even if it is that of another case file, or was interrupted.
+    time_limit
+        Seconds after which the run stops in the same way.
+    pictures
+        Whether they are drawn; `magshell plot` draws them later.
+    terms
+        User-defined energies, with their amplitudes at `OwnTerm.value`; to resume the run give the same.
+
+    Raises
+    ------
+    CaseError
+        If no problem or no model can be built, `out` cannot be written, has files that no run has written, a run of
+        another case file or an interrupted one, or no run of this case to resume; what is in `out` stays as it is.
+    AlreadyComplete
+        If the run to be resumed is complete.
+    DiskError
+        If the disk is full before the first point.
+    """
+    problem = problem_of(case, comm, terms)
+    return run_problem(
+        problem,
+        out,
+        comm,
+        say,
+        tell=tell,
+        resume=resume,
+        overwrite=overwrite,
+        time_limit=time_limit,
+        pictures=pictures,
+    )

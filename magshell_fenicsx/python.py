@@ -1,0 +1,284 @@
+"""A problem in Python, without a case file: a shell, what holds it and what loads it, as objects.
+
+They say what the sections of a case file say, in the same words and with the same messages; values may be NumPy's, and
+where a formula may stand, a dolfinx function on the shell's mesh may stand too.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from math import atan2, degrees, hypot
+from pathlib import Path
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+from dolfinx import fem, mesh
+
+from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.input.source import CaseError, Source
+from magshell_fenicsx.mesh.given import Home, Part
+from magshell_fenicsx.mesh.patch import GivenField
+from magshell_fenicsx.models.shell.own_term import OwnTerm
+from magshell_fenicsx.platform.reading import Files
+from magshell_fenicsx.problem import problem
+
+Keys = dict[str, Any]
+Vector: TypeAlias = Sequence[float | str] | fem.Function | Mapping[str, Any] | str
+NAME = "Problem"  # in messages, in place of a file
+MESH = "the mesh"  # the same, of a mesh
+
+
+class Shell:
+    """The mid-surface, its thickness and its material.
+
+    Parameters
+    ----------
+    surface
+        A dolfinx mesh of triangles in space, of order 1 to 3; or a geometry of a case file, such as "hemisphere".
+    edges, patches
+        Of a mesh: name -> a value of the tags, or local numbers of facets or of cells. Every edge where the surface
+        ends needs a name.
+    facet_tags, cell_tags
+        Of a mesh, as dolfinx reads them.
+    radius
+        The length R that formulas and dimensionless results are over; by default of a mesh half its largest extent.
+    unit
+        Of a mesh: the unit of its coordinates where the thickness has one; by default the metre.
+    keys
+        What else a case has under `shell`: thickness, youngs_modulus, poisson_ratio, ... The thickness times
+        `thickness_factor`, a formula of the place over R or a function, is that of each place.
+
+    Raises
+    ------
+    MeshError
+        On every rank, if the mesh is of another kind, or tags are missing.
+    """
+
+    def __init__(
+        self,
+        surface: mesh.Mesh | str,
+        *,
+        edges: Mapping[str, Part] | None = None,
+        patches: Mapping[str, Part] | None = None,
+        facet_tags: mesh.MeshTags | None = None,
+        cell_tags: mesh.MeshTags | None = None,
+        radius: float | str | None = None,
+        unit: str | None = None,
+        **keys: Any,
+    ) -> None:
+        self.home: Home | None = None
+        self.files = Files()
+        self._keys = keys | ({} if radius is None else {"radius": radius})
+        if isinstance(surface, str):
+            given = {"edges": edges, "patches": patches, "facet_tags": facet_tags, "cell_tags": cell_tags, "unit": unit}
+            if strange := next((name for name, value in given.items() if value is not None), None):
+                raise CaseError(f"{NAME}: shell.{strange}: is of a mesh; a {surface} has its own edges")
+            self._keys |= {"geometry": surface}
+            return
+        self.home = Home(surface)
+        triangles = self.home.triangles(edges or {}, patches or {}, facet_tags, cell_tags)
+        self.files.given[Path(MESH).absolute()] = triangles
+        self._keys |= {"geometry": "mesh", "file": MESH}
+        measured = isinstance(keys.get("thickness"), str)
+        if measured or unit is not None:
+            self._keys["unit"] = unit or "m"
+        if radius is None:
+            half = float(np.ptp(triangles.nodes, axis=0).max()) / 2
+            self._keys["radius"] = f"{half!r} {unit or 'm'}" if measured else half
+
+    def section(self) -> Keys:
+        """What a case has under `shell`."""
+        return {key: self.plain(value, f"shell.{key}") for key, value in self._keys.items()}
+
+    def plain(self, value: Any, key: str) -> Any:
+        """A value as a case file has it, or a function on the mesh."""
+        if isinstance(value, fem.Function):
+            return self.given(value, key)
+        if isinstance(value, np.ndarray | np.generic):
+            return value.tolist()
+        if isinstance(value, Mapping):
+            return {name: self.plain(each, f"{key}.{name}") for name, each in value.items()}
+        if isinstance(value, list | tuple):
+            return [self.plain(each, key) for each in value]
+        return value
+
+    def given(self, function: fem.Function, key: str) -> GivenField:
+        """A function on the mesh.
+
+        Raises
+        ------
+        MeshError
+            If it is on another mesh, or of a space that is none of polynomials.
+        CaseError
+            If the shell has no mesh.
+        """
+        if self.home is None:
+            raise CaseError(f"{NAME}: {key}: is a function; that needs a shell on a dolfinx mesh")
+        return self.home.field(function, key)
+
+
+@dataclass(frozen=True)
+class Piece:
+    """What `Problem` is made of: keys of a section of a case, or a step of its programme.
+
+    Attributes
+    ----------
+    key
+        "loading" of a step.
+    keys
+        Those of the section, of a shell.
+    """
+
+    key: str
+    keys: Callable[[Shell], Keys] = field(repr=False)
+
+
+def Section(key: str, **keys: Any) -> Piece:
+    """Any section of a case, in its words: `Section("foundation", stiffness=0.02)`, `Section("natural", ...)`."""
+    return Piece(key, lambda shell: shell.plain(keys, key))
+
+
+def Step(kind: str, **keys: Any) -> Piece:
+    """A step of the programme, of any kind of a case: "dead", "indentation", "field", "natural", "contact", ..."""
+    return Piece("loading", lambda shell: shell.plain({"kind": kind, **keys}, "loading"))
+
+
+def Pressure(**keys: Any) -> Piece:
+    """A live pressure; by default up to the first instability."""
+    return Step("pressure", **keys)
+
+
+def Force(at: Mapping[str, Any] | str, **keys: Any) -> Piece:
+    """A force along the inward normal, at a named point, or at angles as in a case."""
+    return Step("indentation", at={"point": at} if isinstance(at, str) else at, **keys)
+
+
+def Clamped(*names: str) -> Piece:
+    """Edges or patches without displacement and rotation."""
+    return _supports("clamped", names)
+
+
+def Hinged(*names: str) -> Piece:
+    """Edges or patches without displacement."""
+    return _supports("hinged", names)
+
+
+def Held(name: str, components: str) -> Piece:
+    """An edge, a patch or a named point without the displacements along these axes, such as "xz"."""
+    return _supports({"held": list(components)}, [name])
+
+
+def OnPlane(*names: str) -> Piece:
+    """Edges in a mirror plane of a shape of which the shell is a part."""
+    return _supports("symmetry", names)
+
+
+def _supports(condition: Any, names: Sequence[str]) -> Piece:
+    return Piece("boundary", lambda shell: dict.fromkeys(names, condition))
+
+
+def Field(remanent: Vector, applied: Vector, *, lambda_m: float | None = None, **keys: Any) -> Piece:
+    """What is magnetised, and the applied field; in tesla, or with `lambda_m` over their magnitudes.
+
+    Parameters
+    ----------
+    remanent, applied
+        A vector of three numbers or formulas, of the remanence too a function on the mesh or its kind in a case, such
+        as "radial"; or all its keys in a case.
+    keys
+        What else a case has under `magnetic`.
+    """
+
+    def made(shell: Shell) -> Keys:
+        dimensionless = lambda_m is not None
+        both = {
+            "remanent": _flux(remanent, shell, "magnetic.remanent", dimensionless=dimensionless),
+            "applied": _flux(applied, shell, "magnetic.applied", dimensionless=dimensionless),
+        }
+        others: Keys = shell.plain(keys, "magnetic")
+        return both | others | ({"lambda_m": float(lambda_m)} if lambda_m is not None else {})
+
+    return Piece("magnetic", made)
+
+
+def _flux(value: Vector, shell: Shell, key: str, *, dimensionless: bool) -> Keys:
+    """A flux density in the words of a case."""
+
+    def of_size(tesla: float) -> Keys:
+        return {} if dimensionless else {"flux_density": f"{tesla!r} T"}
+
+    kind = {"kind": "expression"} if key.endswith("remanent") else {}
+    if isinstance(value, Mapping):
+        return {name: shell.plain(each, f"{key}.{name}") for name, each in value.items()}
+    if isinstance(value, str):
+        return {"kind": value}
+    if isinstance(value, fem.Function):
+        given = shell.given(value, key)
+        size = 1.0 if dimensionless else float(np.linalg.norm(given.largest)) or 1.0
+        return {**kind, "components": given.mapped(lambda B: np.asarray(B / size)), **of_size(size)}
+    components = shell.plain(value, key)
+    if len(components) != 3:
+        raise CaseError(f"{NAME}: {key}: has {len(components)} components; a vector has three")
+    if any(isinstance(each, str) for each in components):
+        return {**kind, "components": components, **of_size(1.0)}
+    x, y, z = map(float, components)
+    direction = {"polar": degrees(atan2(hypot(x, y), z)), "azimuth": degrees(atan2(y, x))}
+    return {**direction, **of_size(hypot(x, y, z))}
+
+
+def Problem(
+    shell: Shell,
+    *parts: Piece | OwnTerm,
+    points: Mapping[str, Sequence[Any]] | None = None,
+    degree: int | None = None,
+    symmetry: Literal["auto", "none", "half", "axisymmetric"] | None = None,
+    **sections: Any,
+) -> problem.Problem:
+    """A complete problem, for `follow`, `Scene` and what takes one.
+
+    Parameters
+    ----------
+    parts
+        Supports, fields, steps and other sections, and one's own energies. The steps are a programme in this order;
+        before a single one the natural shape grows and the field is applied.
+    points
+        Name -> place, in the lengths of the shell; of a mesh a vertex, in its coordinates.
+    degree
+        Of the displacement.
+    symmetry
+        As in a case; by default all of a mesh, and of other shapes the smallest part that all allow.
+    sections
+        Others of a case, by key.
+
+    Raises
+    ------
+    CaseError, MeshError
+        One message with every mistake; on every rank.
+    """
+    data: Keys = {"shell": shell.section(), "boundary": {}, **shell.plain(sections, "case")}
+    steps, terms = list[Keys](), list[OwnTerm]()
+    for part in parts:
+        if isinstance(part, OwnTerm):
+            terms.append(_on_mesh(part, shell))
+        elif not isinstance(part, Piece):
+            raise CaseError(f"{NAME}: {part!r}: allowed are what ms.Clamped, ms.Field, ms.Step, ... give, and OwnTerm")
+        elif part.key == "loading":
+            steps.append(part.keys(shell))
+        else:
+            data[part.key] = {**data.get(part.key, {}), **part.keys(shell)}
+    if steps:
+        data["loading"] = steps[0] if len(steps) == 1 else steps
+    if points:
+        data["points"] = shell.plain(points, "points")
+    if degree is not None:
+        data["mesh"] = {**data.get("mesh", {}), "degree": degree}
+    if symmetry or shell.home:
+        data["symmetry"] = symmetry or "none"
+    return Case.from_source(Source(NAME, data, files=shell.files)).with_terms(terms).problem()
+
+
+def _on_mesh(term: OwnTerm, shell: Shell) -> OwnTerm:
+    """One's own energy with functions of parameters known in all triangles."""
+    parameters = tuple(
+        shell.given(p, f"terms.{term.name}") if isinstance(p, fem.Function) else p for p in term.parameters
+    )
+    return replace(term, parameters=parameters) if term.varying else term

@@ -1,0 +1,340 @@
+"""Run a case: follow its history, write every accepted point, summarise.
+
+A signal or a time limit stops a run between two solves or two steps in time.
+"""
+
+import signal
+import threading
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from types import FrameType, TracebackType
+from typing import Any, Self
+
+from mpi4py import MPI
+
+from magshell_fenicsx.continuation.factor import has_cholmod
+from magshell_fenicsx.continuation.fold import FoldLost
+from magshell_fenicsx.continuation.modes import NoEigenpair
+from magshell_fenicsx.continuation.point import Journal, NoJournal, Point
+from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.mesh.patch import MeshError
+from magshell_fenicsx.output.report.report import write_report
+from magshell_fenicsx.output.store import checkpoint
+from magshell_fenicsx.output.store.durable import Damaged, read_result
+from magshell_fenicsx.output.store.folder import DiskError, by_first, given_folder, held_folder
+from magshell_fenicsx.output.store.table import LOCATED, SOLUTION, Row
+from magshell_fenicsx.output.store.written import MESH
+from magshell_fenicsx.platform.environment import fast_blas
+from magshell_fenicsx.problem.problem import Problem
+from magshell_fenicsx.quantities.quantity import spelled
+from magshell_fenicsx.quantities.registry import amplitude, shown
+from magshell_fenicsx.runs.files import RunFiles, open_folder
+from magshell_fenicsx.runs.gradients import gradients_after, refuse_unknown
+from magshell_fenicsx.runs.modes import frequencies_after, modes_after, wanted
+from magshell_fenicsx.runs.rows import RowMaker, departures, imbalances
+from magshell_fenicsx.runs.status import RunProgress, waiting
+from magshell_fenicsx.runs.summary import Result, summary
+from magshell_fenicsx.simulate.adapt.choice import Adapted
+from magshell_fenicsx.simulate.adapt.ending import NoResult
+from magshell_fenicsx.simulate.adapt.tolerance import adapted
+from magshell_fenicsx.simulate.follow import follow
+from magshell_fenicsx.simulate.perfect import with_modes
+from magshell_fenicsx.simulate.record import Stopped
+from magshell_fenicsx.simulate.results import barrier
+from magshell_fenicsx.simulate.scene import Scene
+from magshell_fenicsx.simulate.sensitivity import fold_at, sensitivities
+
+SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1)  # mpirun passes SIGUSR1 on to the ranks and waits
+__all__ = ["Result", "run"]
+
+Say = Callable[[str], None]
+ROUNDING = 1e-9  # a displacement over h as small as this is printed as zero
+
+
+class Interrupted(RuntimeError):
+    """The run was asked to stop; the message names the signal or the limit."""
+
+
+class Watch:
+    """Records requests to stop; inside `with`, signals are recorded instead of obeyed.
+
+    Parameters
+    ----------
+    start
+        Start of the run, in seconds of `time.perf_counter`.
+    limit
+        Seconds after which the run stops; None sets no limit.
+    signals
+        Whether `SIGNALS` are recorded. A second SIGINT is obeyed.
+    """
+
+    def __init__(self, comm: MPI.Comm, start: float, limit: float | None, signals: bool) -> None:
+        self._comm, self._start, self._limit = comm, start, limit
+        # Python allows signal handlers only in the main thread
+        self._signals = SIGNALS if signals and threading.current_thread() is threading.main_thread() else ()
+        self._reason: str | None = None
+
+    def __enter__(self) -> Self:
+        self._before: dict[signal.Signals, Callable[[int, FrameType | None], Any] | int | None] = {
+            number: signal.signal(number, self._note) for number in self._signals
+        }
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def check(self, *, limited: bool = True) -> None:
+        """Stop if a rank has been asked to, or at the time limit if `limited`; collective.
+
+        Raises
+        ------
+        Interrupted
+            On every rank, if any has been asked to stop.
+        """
+        if limited and self._limit is not None and time.perf_counter() - self._start >= self._limit:
+            self._reason = self._reason or f"the time limit of {self._limit:g} s"
+        reason = next(filter(None, self._comm.allgather(self._reason)), None)
+        if reason:
+            raise Interrupted(f"interrupted by {reason}")
+
+    def _note(self, number: int, frame: FrameType | None) -> None:
+        self._reason = signal.Signals(number).name
+        if number == signal.SIGINT:
+            signal.signal(number, self._before[signal.SIGINT])
+
+
+class Stoppable:
+    """A journal that stops the run before a new solve if the watch requests it."""
+
+    def __init__(self, journal: Journal, watch: Watch) -> None:
+        self._journal, self._watch = journal, watch
+
+    def replay(self) -> Point | str | None:
+        kept = self._journal.replay()
+        if kept is None:
+            self._watch.check()
+        return kept
+
+    def record(self, found: Point | str) -> None:
+        self._journal.record(found)
+
+    def check(self, known: bool) -> None:
+        self._watch.check(limited=not known)  # a way that is only computed again must end, or no resumed run gets on
+
+
+def run(
+    problem: Problem,
+    out: Path | str | None = None,
+    comm: MPI.Comm = MPI.COMM_WORLD,
+    say: Say = lambda line: None,
+    *,
+    tell: Say | None = None,
+    resume: bool = False,
+    overwrite: bool = False,
+    time_limit: float | None = None,
+    pictures: bool = True,
+) -> Result:
+    """Run a problem, of which `case` of `public.run` is one form; see there for all else."""
+    start = time.perf_counter()
+    folder = None if out is None else given_folder(out)
+    if time_limit is not None and not time_limit >= 0:
+        raise CaseError(f"--time-limit {time_limit}: must be a number of seconds, 0 or more")
+    if folder and not problem.document.data:
+        raise CaseError("out: a run is known again by what it writes of its case: give the problem a 'document'")
+    watch = Watch(comm, start, time_limit, signals=out is not None)
+    say, tell = (say, tell or _ignored) if comm.rank == 0 else (_ignored, _ignored)
+    if folder is None:
+        return _run(problem, None, comm, say, tell, watch, start, pictures, resume=False)
+    with held_folder(folder, comm, make=not resume):
+        open_folder(folder, problem.document, comm, resume, overwrite)
+        return _run(problem, folder, comm, say, tell, watch, start, pictures, resume=resume)
+
+
+def _ignored(line: str) -> None:
+    """Print nothing."""
+
+
+def _run(
+    problem: Problem,
+    folder: Path | None,
+    comm: MPI.Comm,
+    say: Say,
+    tell: Say,
+    watch: Watch,
+    start: float,
+    pictures: bool,
+    *,
+    resume: bool,
+) -> Result:
+    """Run a problem in a prepared folder; `start` is in seconds of `time.perf_counter`."""
+
+    def doing(what: str) -> None:
+        tell(waiting(what, time.perf_counter() - start))
+
+    begun = by_first(comm, partial(checkpoint.begun, problem.document), "cannot be read") if folder else b""
+    try:
+        problem = with_modes(problem, comm)
+        chosen = _mesh_for_tolerance(problem, folder if resume else None, comm, say, doing)
+        doing("mesh and kernels")
+        scene = chosen.choice.scene(problem, comm) if chosen else Scene(problem, comm)
+        refuse_unknown(scene)
+    except (CaseError, MeshError) as e:
+        raise type(e)(problem.document.placed(str(e))) from None
+    result = Result(scene, scene.unloaded(), adapted=chosen)
+    say(f"{', '.join(scene.problem.included)}: {scene.cells} cells, {scene.model.system.dofs} unknowns")
+    for warning in (*scene.warnings, *scene.unshown):
+        say(f"warning: {warning}")
+    if fast_blas() is None:
+        say("warning: PETSc uses the reference BLAS; install OpenBLAS to factor seven times faster")
+    if comm.size == 1 and not has_cholmod():
+        say("warning: PETSc has no CHOLMOD, which factors tangents that are positive definite in half of the time")
+    mesh = chosen.to_json() if chosen else None
+    files = RunFiles(folder, scene, begun, resume=resume, mesh=mesh) if folder else None
+    if files and files.kept:
+        start -= files.elapsed
+        say(f"resuming after {files.kept} points")
+    interrupted: RuntimeError | None = None
+    scene.progress = progress = RunProgress(scene, tell, start)
+    with watch:
+        scene.journal = Stoppable(NoJournal(), watch)
+        try:
+            _follow(result, files, say, progress, start, watch)
+            for step in scene.problem.programme:
+                if step.load.search and not any(int(result.rows[i]["step"]) == step.number for i in result.found):
+                    say(f"warning: the search at the end of step {step.number} has found no further solution")
+            steps = scene.problem.programme
+            for said in (*imbalances(steps, result.rows, scene.model.system.length), *departures(steps, result.rows)):
+                say(f"warning: {said}")
+            result.sensitivities = _sensitivities(result)
+            result.barrier = _barrier(result)
+        except (Stopped, NoEigenpair) as e:
+            result.stopped = str(e)
+        except (Interrupted, DiskError) as e:
+            interrupted, result.stopped = e, str(e)
+        if files and folder and files.journal:
+            result.replayed = files.journal.replayed
+            try:
+                files.summarise(summary(result, time.perf_counter() - start))
+                if not interrupted:  # an interrupted run draws no pictures
+                    progress.doing("modes and pictures")
+                    with result.output:
+                        modes_after(result, folder, say)
+                        frequencies_after(result, folder, say)
+                        gradients_after(result, folder, say)
+                        if pictures:
+                            by_first(comm, partial(_draw, folder))
+                    files.summarise(summary(result, time.perf_counter() - start))  # with the time of the pictures
+                by_first(comm, partial(write_report, folder, playable=pictures and not interrupted))
+            except DiskError as e:
+                interrupted = interrupted or e
+            files.close(complete=not interrupted and not result.stopped)
+    if interrupted:
+        there = files is not None and files.journal is not None
+        hint = f"; the results so far are in {folder}/, and --resume continues from there" if there else ""
+        result.stopped = f"{interrupted}{hint}"
+    return result
+
+
+def _draw(folder: Path) -> None:
+    """Draw the pictures of the folder."""
+    from magshell_fenicsx.output.pictures.plot import draw
+
+    draw(folder)
+
+
+def _mesh_for_tolerance(problem: Problem, folder: Path | None, comm: MPI.Comm, say: Say, doing: Say) -> Adapted | None:
+    """The mesh for the tolerance, that of an interrupted run if its folder has one; None for the default."""
+    if problem.mesh.tolerance is None:
+        return None
+    file = folder / MESH if folder else None
+    if file and (known := by_first(comm, lambda: read_result(file) if file.exists() else b"", "cannot be read")):
+        try:
+            return Adapted.from_json(problem, known)
+        except (ValueError, KeyError, TypeError, IndexError) as e:
+            raise Damaged(f"{file}: is damaged: {type(e).__name__}: {e}") from None
+    try:
+        return adapted(problem, comm, say, doing)
+    except NoResult as e:
+        say(f"warning: mesh.tolerance ignored, this run has no scalar result: {e}")
+        return None
+
+
+def _sensitivities(result: Result) -> dict[str, float]:
+    """The sensitivities at the final fold, if the case requests them."""
+    scene, last = result.scene, result.rows[result.end]
+    step = scene.problem.programme[int(last["step"]) - 1] if last["label"] == "fold" else None
+    if step is None or not step.load.wants_sensitivities:
+        return {}
+    assert result.history.located
+    record = result.history.located[-1]
+    try:
+        fold = fold_at(scene, record)
+    except FoldLost as e:
+        raise Stopped(f"the fold cannot be polished for its sensitivities: {e}") from None
+    return sensitivities(scene, fold, record)
+
+
+def _barrier(result: Result) -> float | None:
+    """The energy barrier that the last step has passed, if it was to."""
+    steps, begin = result.scene.problem.programme, result.history.begin
+    if not steps or steps[-1].until != "zero" or begin is None:
+        return None
+    assert result.history.last
+    return barrier(result.scene, steps[-1], begin.point.state, result.history.last.point.state)
+
+
+def _follow(
+    result: Result, files: RunFiles | None, say: Say, progress: RunProgress, start: float, watch: Watch
+) -> None:
+    """Compute the history of a scene and write it point by point."""
+    scene, made = result.scene, RowMaker(result.scene)
+    for record in follow(scene, remark=result.remarks.append):
+        if files and not result.rows:
+            if files.journal is None:
+                files.begin()
+            assert files.journal
+            scene.journal = Stoppable(files.journal, watch)  # before the first solve of a step
+        result.history.add(record)
+        row = made.row(record, time.perf_counter() - start)
+        result.rows.append(row)
+        if record.label == SOLUTION:
+            result.found[len(result.rows) - 1] = record.point.state
+        else:
+            result.last, result.end = record.point.state, len(result.rows) - 1
+        if wanted(scene.problem.frequencies, len(result.rows) - 1):
+            result.kept[len(result.rows) - 1] = record.point.state
+        if record.label in LOCATED:
+            result.singular[len(result.rows) - 1] = record.point.state
+        if files:
+            with result.output:
+                files.write(row, record.point.state)
+        replayed = files is not None and len(result.rows) <= files.kept
+        progress.accepted(row, known=replayed)
+        if not replayed:
+            say(_line(row))
+
+
+def _line(row: Row) -> str:
+    pressed = amplitude(str(row["amplitude"])).conjugate  # of several bodies each has its own force
+    load = "load_factor" if "load_factor" in row else pressed if pressed.startswith("force_") else "force"
+    formats = {"lambda_m": "+.4e", "p_over_pc": ".6f", load: "9.5f"}
+    if row["amplitude"] and (varied := amplitude(str(row["amplitude"])).column) not in formats:
+        formats[varied] = "9.5f"
+    values = [_value(name, row, form) for name, form in (formats | {"w_over_h": "8.4f"}).items()]
+    pole = _value("w_pole_over_h", row, "8.4f", "pole")
+    beside = f" + {row['excluded_pivots']} excluded" if row["excluded_pivots"] else ""
+    counts = f"unstable {row['negative_pivots']}{beside}  it {row['iterations']}"
+    return "  ".join([f"{row['point']:4d} {row['label']:>11}", *values, pole, counts])
+
+
+def _value(name: str, row: Row, form: str, words: str = "") -> str:
+    """A column, in the case's units with five digits if it has any, else in a format."""
+    q = shown(name, row)
+    rounding = q.kind == "displacement" and abs(float(row[name])) < ROUNDING
+    measured = spelled(0.0 if rounding else float(row[q.name]), "9.5g" if q.name != name else form)
+    return f"{words or q.plain} {measured}{f' {q.si}' if q.name != name else ''}"

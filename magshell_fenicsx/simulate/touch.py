@@ -1,0 +1,186 @@
+"""Contact of bodies: the first one, a free flight that arc length could not measure, and how stiff bodies must be."""
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicHermiteSpline
+
+from magshell_fenicsx.continuation.control import GivenLoad
+from magshell_fenicsx.continuation.point import PathStopped, Point
+from magshell_fenicsx.continuation.system import State, max_abs
+from magshell_fenicsx.parts.bodies.contact import Contact
+from magshell_fenicsx.parts.bodies.press import ContactSection
+from magshell_fenicsx.parts.step import ProgrammeStep
+from magshell_fenicsx.simulate.record import Stopped
+from magshell_fenicsx.simulate.scene import Scene
+from magshell_fenicsx.simulate.stage import Stage
+
+DEEP = tuple(2e-3 / 4**i for i in range(7))  # of h: how far past the first contact the path begins, at the first try
+NEAR = 1e-7  # of h: a smaller gap is none
+FALLEN, ALIKE = 0.1, 0.02  # of h, how far a path that returns is from its turn; of that, how far from the way there
+MOST = 1000  # approaches by the least gap
+STIFFER, MOST_STIFF = 4.0, 1e4  # how much stiffer a body becomes at once, and at most
+RIGID, MOVED, MOST_RAISED = 2.0, 0.05, 4  # penetrations, thicknesses, times: see `rigid`
+
+
+def touched(scene: Scene, step: ProgrammeStep, state: State) -> State:
+    """The state just after the body of a step first touches; the given one if it touches, or its target is nearer.
+
+    Raises
+    ------
+    Stopped
+        If the body never meets the shell, or the first contact has no equilibrium.
+    """
+    load, name, h = step.load, step.name, scene.problem.material.h
+    assert isinstance(load, ContactSection)
+    region = scene.model.touching(state, name)
+    if region.penetration > NEAR * h or (load.approach is not None and load.approach <= state.mu[name]):
+        return state
+    for _ in range(MOST):
+        gap = -scene.model.touching(state, name).penetration / h
+        if gap <= NEAR:
+            break
+        state = state.with_(state.u, name, state.mu[name] + gap)
+        if load.approach is not None and state.mu[name] + DEEP[0] >= load.approach:
+            return state.with_(state.u, name, load.approach)
+    else:
+        raise Stopped("the body does not meet the shell")
+    reason = ""
+    for deep in DEEP:
+        a = state.mu[name] + deep
+        outcome = scene.newton.solve(state.with_(state.u, name, a), name, GivenLoad(name, a))
+        if outcome.converged:
+            return outcome.state
+        reason = outcome.reason
+    raise Stopped(f"no equilibrium found at the first contact: {reason}")
+
+
+def stiffer(stage: Stage, low: Point, high: Point) -> State | None:
+    """The state of the first of two points with stiffer bodies where they penetrate too much at the second one.
+
+    None if none does, or if its stiffness is given.
+    """
+    state, h, raised = stage.leave(high.state), stage.scene.problem.material.h, dict[str, float]()
+    for contact in stage.scene.problem.loads.contacts:
+        k = state.mu.get(contact.setting, contact.stiffness)
+        deep = stage.scene.model.touching(state, contact.amplitude).penetration
+        if deep > contact.bound * h and not contact.given and k < MOST_STIFF * contact.stiffness:
+            raised[contact.setting] = STIFFER * k
+    return State(low.state.u, {**low.state.mu, **raised}) if raised else None
+
+
+def refuse_crossing(stage: Stage, low: Point, high: Point) -> None:
+    """See that the shell passes through no magnet between two points.
+
+    Raises
+    ------
+    PathStopped
+        With the magnet.
+    """
+    model, states = stage.scene.model, [stage.leave(point.state) for point in (low, high)]
+    for field in model.fields:
+        ends = list[tuple[NDArray[np.float64], Mapping[str, float]]]()
+        for state in states:
+            ends.append((model.system.at(state).of(partial(getattr, field, "places")), state.mu))
+        if said := [each for each in model.system.comm.allgather(field.passed(*ends)) if each]:
+            raise PathStopped(said[0], low, final=True)
+
+
+def refuse_return(stage: Stage, name: str, points: Sequence[Point], high: Point) -> None:
+    """See that a body does not go back the way it came, as behind a fold at which it holds the shell in place no more.
+
+    Parameters
+    ----------
+    name
+        The amplitude that varies.
+    points
+        The path up to here.
+    high
+        The next point.
+
+    Raises
+    ------
+    PathStopped
+        If it does, or if it no longer touches the shell and moves away from it.
+    """
+    model, comm, low = stage.scene.model, stage.scene.comm, points[-1]
+    if name not in model.contacts:
+        return
+    mu, h = [point.state.mu[name] for point in (*points, high)], stage.newton.system.length
+    top = int(np.argmax(np.abs(np.subtract(mu, mu[0]))))
+    fallen = max_abs(comm, high.state.u - points[min(top, len(points) - 1)].state.u)
+    if top == len(points) or fallen < FALLEN * h:
+        return
+    for a, b in pairwise(points[: top + 1]):
+        x, y = a.state.mu[name], b.state.mu[name]
+        if (mu[-1] - x) * (mu[-1] - y) > 0 or not a.dmu or not b.dmu:
+            continue
+        t = CubicHermiteSpline([x, y], [a.state.u, b.state.u], [a.du / a.dmu, b.du / b.dmu])(mu[-1])
+        if max_abs(comm, high.state.u - t) < ALIKE * fallen:
+            said = "the body goes back the way it came: at its fold the shell snaps under a given approach"
+            raise PathStopped(said, low, final=True)
+    if max_abs(comm, high.du) == 0:
+        depths = [model.touching(stage.leave(point.state), name).penetration for point in (low, high)]
+        if depths[1] < min(depths[0], 0.0):
+            said = "the body has left the shell: at its fold the shell snaps under a given approach"
+            raise PathStopped(said, high, final=True)
+
+
+def refuse_penetration(scene: Scene, state: State) -> None:
+    """See that no body penetrates more than its bound.
+
+    Raises
+    ------
+    Stopped
+        With the penetration and the stiffness that would halve it.
+    """
+    h = scene.problem.material.h
+    for contact in scene.problem.loads.contacts:
+        deep = scene.model.touching(state, contact.amplitude).penetration / h
+        if deep > contact.bound:
+            k = state.mu.get(contact.setting, contact.stiffness)
+            raise Stopped(
+                f"the penetration of the body {contact.body} is {deep:.3g} h, more than bodies.{contact.body}."
+                f"penetration: {contact.bound:g}; its stiffness is {k:.4g}: give four times as much"
+            )
+
+
+def touching(scene: Scene, state: State) -> list[Contact]:
+    """The bodies that touch."""
+    contacts = scene.problem.loads.contacts
+    return [contact for contact in contacts if scene.model.touching(state, contact.amplitude).penetration > 0]
+
+
+def hardened(scene: Scene, state: State, bodies: list[Contact]) -> State | None:
+    """The equilibrium near a state with these bodies `STIFFER` times as stiff; None if there is none within `MOVED`."""
+    k = {contact.setting: STIFFER * state.mu.get(contact.setting, contact.stiffness) for contact in bodies}
+    name = bodies[0].amplitude
+    outcome = scene.newton.solve(State(state.u, {**state.mu, **k}), name, GivenLoad(name, state.mu[name]))
+    if not outcome.converged or _moved(scene, state, outcome.state) > MOVED * scene.problem.material.h:
+        return None
+    return outcome.state
+
+
+def rigid(scene: Scene, state: State) -> State:
+    """The state between bodies so stiff that their stiffness does not decide where the shell touches; collective.
+
+    A shell that a soft body lets go lies flat on a harder one. So the bodies that touch become stiffer, until the
+    shell moves by at most `RIGID` times the penetration. A given stiffness stays.
+    """
+    for _ in range(MOST_RAISED):
+        bodies = [contact for contact in touching(scene, state) if not contact.given]
+        harder = hardened(scene, state, bodies) if bodies else None
+        if harder is None:
+            break
+        deep = max(scene.model.touching(state, contact.amplitude).penetration for contact in bodies)
+        state, moved = harder, _moved(scene, state, harder)
+        if moved <= RIGID * deep:
+            break
+    return state
+
+
+def _moved(scene: Scene, state: State, other: State) -> float:
+    return max_abs(scene.model.system.comm, other.u - state.u)

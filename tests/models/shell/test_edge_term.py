@@ -1,0 +1,116 @@
+"""One's own energies on a named edge: closed forms on mid-surface, meridian and half, and what is refused."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import ufl
+from along import difference as tangent_difference
+from conftest import CASES, hemisphere, random_displacement
+from test_fast_residual import difference as residual_difference
+from ufl.core.expr import Expr
+
+import magshell_fenicsx as ms
+from magshell_fenicsx.case.planner import make_problem
+from magshell_fenicsx.input.source import Source
+from magshell_fenicsx.mesh.mirror import Y0, Mirror
+from magshell_fenicsx.mesh.patch import MeshError
+from magshell_fenicsx.models.shell import kinematics as kin
+from magshell_fenicsx.models.shell.kinematics import Edge, Jet
+from magshell_fenicsx.models.shell.model import ShellModel
+from magshell_fenicsx.models.shell.parameters import Loads, Material
+
+H, NU = 0.02, 0.3
+MODELS = ["axisymmetric", "half", "none"]
+
+
+def pull(r0: Jet, u: Jet, edge: Edge) -> Expr:
+    return -ufl.dot(edge.outward, u.r)
+
+
+def ring(r0: Jet, u: Jet, edge: Edge) -> Expr:
+    """An elastic fibre along the edge."""
+    stretched = edge.by_length(r0 + u)
+    return (ufl.sqrt(ufl.dot(stretched, stretched)) - 1) ** 2 / 2
+
+
+def hinge(r0: Jet, u: Jet, edge: Edge) -> Expr:
+    """Springs against the slope across the edge."""
+    return ufl.dot(kin.normal(r0), edge.by_outward(u)) ** 2 / 2
+
+
+def loaded(symmetry: str, amplitude: str, target: float, *terms: ms.OwnTerm, **sections: Any) -> dict[str, float]:
+    """What is observed at a small load of one amplitude."""
+    data = {"symmetry": symmetry, "mesh": {"degree": 4, "refinement": 0.7}, **sections}
+    scene = ms.Scene(ms.Case.from_source(Source("test", data)), terms=terms)
+    *_, end = ms.trace(scene, amplitude, targets=[target])
+    return scene.observe(end.point.state)
+
+
+@pytest.mark.parametrize("symmetry", MODELS)
+def test_ring_around_a_flat_ring_that_is_pulled(symmetry: str) -> None:
+    """Lamé: u = A r + B/r, held at r = a, with the pull q less the ring's force EA u/R² at r = R."""
+    a, q, EA = 0.5, 1e-6, 0.7
+    outward = ms.OwnTerm("pull", pull, on="outer", observed={"spread": lambda r0, u, edge: -pull(r0, u, edge)})
+    found = loaded(
+        symmetry,
+        "pull",
+        q,
+        outward,
+        ms.OwnTerm("ring", ring, on="outer", value=EA),
+        shell={"geometry": "annulus", "radius": 1, "inner_radius": a, "thickness": H, "poisson_ratio": NU},
+        boundary={"inner": "clamped"},
+    )
+    A = q / (((1 + NU) + (1 - NU) * a**2) / (1 - NU**2) + EA * (1 - a**2))  # and B = -A a²
+    u = A * (1 - a**2)
+    assert found["spread"] / q == pytest.approx(2 * np.pi * u, rel=2e-5)
+
+
+@pytest.mark.parametrize("symmetry", MODELS)
+def test_plate_on_an_elastic_hinge(symmetry: str) -> None:
+    """Timoshenko, Theory of Plates and Shells, section 15: between the simply supported and the clamped plate."""
+    D, K, p = H**2 / (12 * (1 - NU**2)), 2.0, 1e-6
+    found = loaded(
+        symmetry,
+        "pressure",
+        p,
+        ms.OwnTerm("hinge", hinge, on="rim", value=K * D),
+        shell={"geometry": "disc", "radius_to_thickness": 1 / H, "poisson_ratio": NU},
+        boundary={"rim": "simply supported"},
+        loading={"kind": "pressure", "pressure": p, "control": "load", "until": "target"},
+    )
+    load = p * Material(NU, H).classical_pressure / H
+    assert found["w_pole_over_h"] * H == pytest.approx(load / (64 * D) * (5 + NU + K) / (1 + NU + K), rel=2e-4)
+
+
+@pytest.mark.parametrize("density", [pull, ring, hinge])
+def test_residual_and_tangent(density: Any) -> None:
+    """Of the point derivatives against those of the forms."""
+    loads = Loads(pressure=True, own=(ms.OwnTerm("own", density, on="rim"),))
+    model = ShellModel(hemisphere(0.8), Material(NU, 0.05), 2, {}, loads)
+    u, mu = random_displacement(model, 1e-2), {"pressure": 0.3, "own": 1.3}
+    assert tangent_difference(model.system, u, mu) <= 1e-12
+    assert residual_difference(model.system, u, mu) <= 1e-12
+
+
+def test_symmetry() -> None:
+    """That of the density and of the edge; what prefers a direction along the edge has no mirror."""
+    sided = Mirror(np.array([1.0, 0.0, 0.0]), 0.5, {"right": "left"})
+    assert ms.OwnTerm("own", ring, on="bottom").mirrored(sided)
+    assert not ms.OwnTerm("own", ring, on="left").mirrored(sided)
+    for density in (pull, ring, hinge):
+        term = ms.OwnTerm("own", density, on="rim")
+        assert (term.turns, term.mirrored(Y0)) == (True, True)
+    along = ms.OwnTerm("own", lambda r0, u, edge: ufl.dot(edge.along, u.r), on="rim")
+    assert (along.turns, along.mirrored(Y0)) == (True, False)
+
+
+def test_what_is_refused() -> None:
+    with pytest.raises(ValueError, match="that of a volume or that of an edge"):
+        ms.OwnTerm("own", pull, on="rim", of_volume=True)
+    with pytest.raises(ValueError, match="a function of r0, u, an edge and 0 parameters"):
+        ms.OwnTerm("own", lambda r0, u: u.r[2], on="rim")
+    with pytest.raises(ms.CaseError, match="own is an energy of an edge, which only a shell has"):
+        make_problem(ms.Case.load(CASES / "solid_buckling.yaml"), [ms.OwnTerm("own", pull, on="equator")])
+    with pytest.raises(MeshError, match="terms: own: on: brim: the surface has no such edge, only"):
+        make_problem(ms.Case.load(CASES / "dimple_buckling.yaml"), [ms.OwnTerm("own", pull, on="brim")])
