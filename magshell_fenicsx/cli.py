@@ -111,7 +111,6 @@ def run(
 ) -> None:
     """Solve a case and write path.csv, summary.json, fields and pictures."""
     from magshell_fenicsx.case.opened import opened
-    from magshell_fenicsx.mesh.patch import MeshError
     from magshell_fenicsx.output.report.verdict import sentence_of
     from magshell_fenicsx.output.store.folder import DiskError
     from magshell_fenicsx.platform.terminal import live_line
@@ -121,7 +120,7 @@ def run(
     folder = chosen_folder(out, case.stem)
     how: dict[str, Any] = {"resume": resume, "overwrite": overwrite, "time_limit": time_limit, "pictures": pictures}
     try:
-        with exit_codes(MeshError, stopped=(DiskError,)):
+        with exit_codes(stopped=(DiskError,)):
             read = opened(case, world(), set_ or [])
             with live_line(world().size, print_line) as (say, tell):
                 result = run_case(read, folder, say=say, tell=tell, **how)
@@ -259,13 +258,12 @@ def design(
     resume: Annotated[bool, typer.Option("--resume", help="continue the interrupted design in that folder")] = False,
 ) -> None:
     """Vary a case for a result (its section `design`); write the best case, its table and picture, and verify it."""
-    from magshell_fenicsx.mesh.patch import MeshError
     from magshell_fenicsx.output.store.folder import DiskError
     from magshell_fenicsx.studies.design import Missed
     from magshell_fenicsx.studies.design import design as run_design
 
     folder = chosen_folder(out, f"{case.stem}_design")
-    with exit_codes(MeshError, stopped=(DiskError, Missed)):
+    with exit_codes(stopped=(DiskError, Missed)):
         run_design(case, set_ or [], folder, made=_shared, resume=resume, say=print_line)
     print_line(f"results in {folder}/")
 

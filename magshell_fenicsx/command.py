@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.platform import terminal
 from magshell_fenicsx.platform.kept import UnsafeCache
 
@@ -166,14 +167,14 @@ def refuse_lost() -> None:
 
 
 @contextmanager
-def exit_codes(invalid: type[Exception] = CaseError, stopped: tuple[type[Exception], ...] = ()) -> Iterator[None]:
-    """Turn an invalid input (`CaseError` and `invalid`) or an early stop into a message and its exit code.
+def exit_codes(stopped: tuple[type[Exception], ...] = ()) -> Iterator[None]:
+    """Turn an invalid input or an early stop into a message and its exit code.
 
     An early stop is also a kernel that cannot be written, for which dolfinx raises the same on all ranks.
     """
     try:
         yield
-    except (CaseError, UnsafeCache, invalid) as e:
+    except (CaseError, MeshError, UnsafeCache) as e:
         raise failure(str(e), INVALID) from None
     except stopped as e:
         raise failure(f"stopped early: {e}", STOPPED) from None
