@@ -1,11 +1,6 @@
-"""Forms made from others: at v = 0 of a coefficient v, and the derivatives by all values of a field at once.
+"""The derivatives of energies by all values of a field at once."""
 
-The algebra of the first, done once, takes longer than a small run. A file beside the kernels keeps what is left of it.
-"""
-
-import hashlib
-import json
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,55 +12,6 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.terms import FormTerm
-from magshell_fenicsx.platform.kept import keep, recall
-
-KEPT = {"signature", "coefficients", "constants"}
-
-
-class _Found(ufl.Form):  # type: ignore[misc]
-    """A form with the signature of another and, of its own coefficients and constants, those that are left there."""
-
-    def __init__(self, form: ufl.Form, signature: str, coefficients: Sequence[int], constants: Sequence[int]) -> None:
-        super().__init__(form.integrals())
-        left = [form.coefficients()[i] for i in coefficients], [form.constants()[i] for i in constants]
-        self._found = signature, *left
-
-    def signature(self) -> str:
-        return self._found[0]
-
-    def coefficients(self) -> list[Any]:
-        return self._found[1]
-
-    def constants(self) -> list[Any]:
-        return self._found[2]
-
-
-def at_zero(form: ufl.Form, v: fem.Function, compiled: Callable[[ufl.Form], fem.Form]) -> fem.Form:
-    """The form at v = 0, compiled; derivatives by v are taken before.
-
-    What is left is kept once its kernel is there: a kernel of the whole form under its signature would be another's.
-    """
-    number = form.coefficients().index(v)
-    key = hashlib.sha256(f"{ufl.__version__} {form.signature()} {number}".encode()).hexdigest()[:40]
-    name = f"at_zero_{key}.json"
-    known = json.loads(recall(name) or b"{}")
-    if known.keys() == KEPT:
-        return compiled(_Found(form, **known))
-    rest = ufl.replace(form, {v: ufl.zero(v.ufl_shape)})
-    kernel = compiled(rest)
-    if not (rest.empty() or known):  # what another version of the package has kept stays as it is
-        left = {
-            "signature": rest.signature(),
-            "coefficients": _numbers(form.coefficients(), rest.coefficients()),
-            "constants": _numbers(form.constants(), rest.constants()),
-        }
-        keep(name, json.dumps(left).encode())
-    return kernel
-
-
-def _numbers(all_: Sequence[Any], some: Sequence[Any]) -> list[int]:
-    return [next(i for i, each in enumerate(all_) if each is one) for one in some]
-
 
 Array = NDArray[np.float64]
 

@@ -1,28 +1,29 @@
-"""Second derivatives of a density at many points at once.
+"""Densities at many points at once: their values, gradients and Hessians.
 
-The density is a function of a few vectors (3,) that vary between points. The points are represented as cells of an
-interval and the vectors as cell-wise constants, so the just-in-time compiler of expressions can be used. Its kernels do
-not depend on mesh, degree or quadrature.
+A density is a function of a few vectors that vary between points. Its kernels do not depend on mesh, degree or
+quadrature. The points are represented as cells of an interval, and the vectors as functions that are constant in each.
 """
 
-from collections.abc import Sequence
+import hashlib
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
-from weakref import WeakKeyDictionary
+from functools import cache
+from itertools import combinations_with_replacement
+from pathlib import Path
 
 import numpy as np
-import ufl
 from dolfinx import fem, mesh
 from mpi4py import MPI
 from numpy.typing import NDArray
-from ufl.algorithms.analysis import extract_coefficients, extract_constants
 from ufl.core.expr import Expr
 
+from magshell_fenicsx.assembly import point_code, scalars
 from magshell_fenicsx.assembly.kernels import KernelLog
-from magshell_fenicsx.platform import compat
-from magshell_fenicsx.platform.compiler import many_of
+from magshell_fenicsx.assembly.point_code import COMPILED, OPTIONS, function_of
+from magshell_fenicsx.assembly.scalars import Nodes, Scalars, inputs_of
 
 Pair = tuple[int, int]
+Array = NDArray[np.float64]
 
 
 class Points:
@@ -31,11 +32,8 @@ class Points:
     def __init__(self, capacity: int) -> None:
         self.capacity = capacity
         self._mesh = mesh.create_interval(MPI.COMM_SELF, capacity, (0.0, 1.0))
-        order = fem.functionspace(self._mesh, ("DG", 0)).dofmap.list[:, 0]
-        self._cells = np.argsort(order).astype(np.int32)  # the cell of the p-th value
         self._values = np.empty(0)
-        self._constants: list[tuple[NDArray[np.float64], NDArray[np.float64]]] = []  # views: here, and what is copied
-        self._calls = WeakKeyDictionary[fem.Expression, _Call | None]()
+        self._constants: list[tuple[Array, Array]] = []  # views: here, and what is copied
 
     def field(self, size: int) -> fem.Function:
         """A vector at each point; the caller fills its array (capacity * size,)."""
@@ -47,47 +45,97 @@ class Points:
         self._constants.append((here.value, of.value))
         return here
 
-    def evaluate(self, expression: fem.Expression, count: int) -> NDArray[np.float64]:
+    def evaluate(self, kernel: "PointKernel", count: int) -> Array:
         """(count, components) at the first points; the array is reused by the next call."""
-        size = expression.value_size
         for here, of in self._constants:
             np.copyto(here, of)
-        if self._values.size < count * size:
-            self._values = np.empty(self.capacity * size)
-        values = self._values[: count * size].reshape(count, size)
-        if expression not in self._calls:
-            self._calls[expression] = _Call.of(expression, self.capacity)
-        if call := self._calls[expression]:
-            call(count, values)
-        else:
-            compat.evaluate(expression, self._mesh, self._cells[:count], values)
+        if self._values.size < count * kernel.size:
+            self._values = np.empty(self.capacity * kernel.size)
+        values = self._values[: count * kernel.size].reshape(count, kernel.size)
+        kernel.evaluate(count, values)
         return values
 
 
-class _Call:
-    """An expression's function for many points, with what it takes; the values of fields are views."""
+class PointKernel:
+    """A compiled function of fields and constants at points.
 
-    def __init__(self, many: Any, fields: Sequence[fem.Function], constants: Sequence[fem.Constant], n: int) -> None:
-        self._many, self._constants = many, [constant.value for constant in constants]
-        self._fields = [field.x.array for field in fields]
+    Attributes
+    ----------
+    size
+        Number of its components.
+    """
+
+    def __init__(
+        self, function: COMPILED, fields: Sequence[fem.Function], constants: Sequence[fem.Constant], size: int
+    ) -> None:
+        self._function, self.size = function, size
+        self._constants, self._fields = [c.value for c in constants], [f.x.array for f in fields]  # views
         self._places = np.array([values.ctypes.data for values in self._fields], np.uintp)
-        self._sizes = np.array([values.size // n for values in self._fields], np.int32)
+        self._sizes = np.array([f.ufl_shape[0] for f in fields], np.int32)
 
-    @staticmethod
-    def of(expression: fem.Expression, n: int) -> "_Call | None":
-        """That of an expression at storage for n points; None if there is no such function."""
-        compiled, whole = expression.ufcx_expression, expression.ufl_expression
-        if (many := many_of(compiled)) is None:
-            return None
-        known = extract_coefficients(whole)
-        fields = [known[compiled.original_coefficient_positions[i]] for i in range(compiled.num_coefficients)]
-        return _Call(many, fields, extract_constants(whole), n)
-
-    def __call__(self, count: int, values: NDArray[np.float64]) -> None:
-        """Evaluate at the first points, into a contiguous array (count, components)."""
+    def evaluate(self, count: int, values: Array) -> None:
+        """Fill a contiguous array (count, size) for the first points."""
         constants = np.concatenate([np.ravel(value) for value in (*self._constants, 0.0)])  # never empty
         fields, sizes, c, out = (array.ctypes.data for array in (self._places, self._sizes, constants, values))
-        self._many(fields, sizes, len(self._sizes), c, count, out)
+        self._function(fields, sizes, c, count, out)
+
+
+Made = Callable[[Scalars, list[Nodes]], list[int]]
+
+
+def _kernel(
+    name: str, expressions: Sequence[Expr], asked: str, size: int, made: Made, log: KernelLog, comm: MPI.Comm
+) -> PointKernel:
+    """Compile what is made of some expressions, or load it.
+
+    Parameters
+    ----------
+    asked
+        Says what is made, besides the expressions.
+    size
+        Number of the nodes that are made.
+    """
+    graph = Scalars()
+    fields, constants = inputs_of(expressions)
+    nodes = [graph.components(e, fields, constants) for e in expressions]
+    number = {node: i for i, node in enumerate(graph.reached([n for each in nodes for n in each.ravel().tolist()]))}
+    operations = [
+        (graph.operations[node][0], *(number[operand] for operand in graph.operands(node)))
+        if graph.operands(node)
+        else graph.operations[node]
+        for node in number
+    ]
+    ends = [[number[node] for node in each.ravel().tolist()] for each in nodes]
+    key = repr((_version(), asked, ends, operations))
+    library = log.load(name, key, lambda: point_code.point_code(graph, made(graph, nodes)), OPTIONS, comm)
+    return PointKernel(function_of(library), fields, constants, size)
+
+
+@cache
+def _version() -> str:
+    """Changes with the code that makes kernels."""
+    files = (scalars.__file__, point_code.__file__, __file__)
+    return hashlib.sha256(b"".join(Path(file).read_bytes() for file in files)).hexdigest()
+
+
+def point_values(name: str, W: Expr, log: KernelLog, comm: MPI.Comm) -> PointKernel:
+    """Compile the components of an expression; all ranks of `comm` together."""
+    size = int(np.prod(W.ufl_shape))
+    return _kernel(name, [W], "values", size, lambda _, nodes: nodes[0].ravel().tolist(), log, comm)
+
+
+def point_gradient(name: str, sums: Sequence[tuple[Expr, fem.Function]], log: KernelLog, comm: MPI.Comm) -> PointKernel:
+    """Compile the sum of dW/dz for some W, each with its own z of the same size; all ranks of `comm` together."""
+    size = sums[0][1].ufl_shape[0]
+
+    def made(graph: Scalars, nodes: list[Nodes]) -> list[int]:
+        total = [graph.zero] * size
+        for W, z in zip(nodes[::2], nodes[1::2], strict=True):
+            first, _ = graph.derivatives(int(W), z.tolist(), second=False)
+            total = [graph.add(t, first.get(i, graph.zero)) for t, i in zip(total, z.tolist(), strict=True)]
+        return total
+
+    return _kernel(name, [e for one in sums for e in one], "gradient", size, made, log, comm)
 
 
 @dataclass(frozen=True)
@@ -124,7 +172,7 @@ SKEW = [(0, 1), (0, 2), (1, 2)]
 
 def point_hessian(
     name: str, W: Expr, z: fem.Function, parts: int, pairs: Pairs, log: KernelLog, comm: MPI.Comm, *, at_zero: bool
-) -> fem.Expression:
+) -> PointKernel:
     """Compile the blocks of d2W/dz2, at z itself or at z = 0.
 
     Parameters
@@ -136,24 +184,44 @@ def point_hessian(
 
     Returns
     -------
-    fem.Expression
+    PointKernel
         For each side the symmetric parts (6, pairs) then the skew parts (3, skew pairs); after
         them the cross blocks (9, pairs).
     """
-    H = ufl.diff(ufl.diff(W, z), z)
-    if at_zero:
-        H = ufl.replace(ufl.algorithms.expand_derivatives(H), {z: ufl.zero(z.ufl_shape)})
-    components = []
-    for side in range(z.ufl_shape[0] // (3 * parts)):
+    sides = z.ufl_shape[0] // (3 * parts)
 
-        def block(i: int, j: int, c: int, d: int, first: int = side * parts) -> Expr:
-            return H[3 * (first + i) + c, 3 * (first + j) + d]
+    def made(graph: Scalars, nodes: list[Nodes]) -> list[int]:
+        inputs = nodes[1].tolist()
+        _, second = graph.derivatives(int(nodes[0]), inputs, second=True)
 
-        components += [
-            block(i, j, c, d) if i == j or c == d else (block(i, j, c, d) + block(i, j, d, c)) / 2
-            for c, d in COMPONENTS
-            for i, j in pairs.same
-        ]
-        components += [(block(i, j, c, d) - block(i, j, d, c)) / 2 for c, d in SKEW for i, j in pairs.skew]
-    components += [H[3 * i + c, 3 * (parts + j) + d] for c in range(3) for d in range(3) for i, j in pairs.cross]
-    return log.compile_expression(f"{name} hessian", ufl.as_vector(components), comm)
+        def block(i: int, j: int, c: int, d: int) -> int:
+            one, other = inputs[3 * i + c], inputs[3 * j + d]
+            return second.get((min(one, other), max(one, other)), graph.zero)
+
+        def mean(a: int, b: int) -> int:
+            return graph.times(graph.number(0.5), graph.add(a, b))
+
+        outputs = list[int]()
+        for first in range(0, sides * parts, parts):
+            same = [(first + i, first + j) for i, j in pairs.same]
+            skew = [(first + i, first + j) for i, j in pairs.skew]
+            outputs += [mean(block(i, j, c, d), block(i, j, d, c)) for c, d in COMPONENTS for i, j in same]
+            outputs += [mean(block(i, j, c, d), graph.minus(block(i, j, d, c))) for c, d in SKEW for i, j in skew]
+        outputs += [block(i, parts + j, c, d) for c in range(3) for d in range(3) for i, j in pairs.cross]
+        return graph.replaced(outputs, dict.fromkeys(inputs, graph.zero)) if at_zero else outputs
+
+    size = sides * (6 * len(pairs.same) + 3 * len(pairs.skew)) + 9 * len(pairs.cross)
+    return _kernel(name, [W, z], repr(("hessian", parts, pairs, at_zero)), size, made, log, comm)
+
+
+def whole_hessian(name: str, W: Expr, z: fem.Function, log: KernelLog, comm: MPI.Comm) -> PointKernel:
+    """Compile d2W/dz2 at z = 0: the rows of its upper triangle. All ranks of `comm` compile together."""
+    size = z.ufl_shape[0]
+
+    def made(graph: Scalars, nodes: list[Nodes]) -> list[int]:
+        inputs = nodes[1].tolist()
+        _, second = graph.derivatives(int(nodes[0]), inputs, second=True)
+        pairs = [(min(i, j), max(i, j)) for i, j in combinations_with_replacement(inputs, 2)]
+        return graph.replaced([second.get(pair, graph.zero) for pair in pairs], dict.fromkeys(inputs, graph.zero))
+
+    return _kernel(name, [W, z], "whole hessian", size * (size + 1) // 2, made, log, comm)

@@ -38,6 +38,8 @@ class Energy:
         Of the jets of u and v: the virtual work of a load without potential, quadratic in u.
     density
         What is integrated; None for a load that is known by its vector.
+    drawn
+        Whether it counts from the drawn placement.
     group, column
         As of a `Term`; the group of "" is the name.
     counted
@@ -50,6 +52,7 @@ class Energy:
     linear: bool = False
     work: Callable[[Jet, Jet], ufl.Form] | None = None
     density: Density | None = None
+    drawn: bool = False
     counted: tuple[fem.Constant, float] | None = None
     group: str = ""
     column: str = ""
@@ -204,7 +207,7 @@ class Carrier:
             assert virtual
             return virtual(self.j0, u, v, *density.parameters) * over
 
-        return Energy(name, of, amplitude, work=work if virtual else None, density=density, **others)
+        return Energy(name, of, amplitude, work=work if virtual else None, density=density, drawn=drawn, **others)
 
 
 def on_surface(r0: fem.Function, drawn: fem.Function | None = None) -> Carrier:

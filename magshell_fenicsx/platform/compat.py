@@ -37,27 +37,6 @@ def corner_numbers(domain: mesh.Mesh) -> NDArray[np.int32]:
     return np.asarray(dofmaps[0] if isinstance(dofmaps, list) else domain.geometry.dofmap)
 
 
-def kernel_code(objects: Any, module: str, options: dict[str, Any]) -> str:
-    """The C code of FFCx for forms or expressions, whose names begin with `module`."""
-    import ffcx.compiler  # takes long, and only for what is compiled
-
-    try:
-        _, code = ffcx.compiler.compile_ufl_objects(objects, prefix=module, options=options)
-    except TypeError:  # since FFCx 0.10
-        (_, code), _ = ffcx.compiler.compile_ufl_objects(objects, namespace=module, options=options)
-    return str(code)
-
-
-def evaluate(
-    expression: fem.Expression, domain: mesh.Mesh, cells: NDArray[np.int32], values: NDArray[np.float64]
-) -> None:
-    """Evaluate an expression of one point at some cells into a contiguous array (cells, components)."""
-    try:
-        expression.eval(domain, cells, values)  # flat in dolfinx 0.9
-    except TypeError:
-        expression.eval(domain, cells, values.reshape(len(cells), 1, *expression.ufl_expression.ufl_shape))
-
-
 def add_matrix(K: PETSc.Mat, form: fem.Form, clamped: list[fem.DirichletBC]) -> None:
     """Add a bilinear form to a matrix, skipping the rows and columns of `clamped`."""
     cpp = form._cpp_object

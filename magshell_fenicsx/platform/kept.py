@@ -9,10 +9,14 @@ import os
 import pwd
 import stat
 import tempfile
+import time
 from collections.abc import Iterator
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
+
+FORMS = "libffcx_forms_"  # how the names of dolfinx's begin
+UNFINISHED = 600  # s after which nobody compiles any more
 
 
 class UnsafeCache(RuntimeError):
@@ -84,6 +88,7 @@ def _folders(usual: Path) -> tuple[Path, ...]:
         with suppress(OSError):
             folder.mkdir(parents=True, exist_ok=True, mode=0o755 if folder == usual else 0o700)
         if folder.is_dir() and os.access(folder, os.W_OK) and _is_private(folder):
+            _prepare(folder, also)
             return tuple(dict.fromkeys((folder, *also)))
     if also:
         return also  # has what was compiled before
@@ -91,6 +96,31 @@ def _folders(usual: Path) -> tuple[Path, ...]:
         f"kernel cache {usual}: others may write to it or own it, and what is in it is executed; no private folder can "
         "be made in its place: set XDG_CACHE_HOME to a folder that you own and nobody else may write (chmod go-w)"
     )
+
+
+def _prepare(folder: Path, also: tuple[Path, ...]) -> None:
+    """Make a folder fit for dolfinx, which looks for forms in one folder and takes what it finds there.
+
+    What others may have changed goes, with what lies beside it, and what a killed process left unfinished, for which
+    all others would wait. Forms of another folder are linked.
+    """
+    there = sorted(folder.glob(f"{FORMS}*"))
+    strange = {file.name.split(".")[0] for file in there if not trusted(file)}
+    with suppress(OSError):
+        late = time.time() - UNFINISHED
+        strange |= {
+            file.stem
+            for file in folder.glob(f"{FORMS}*.c")
+            if file.stat().st_mtime < late and not file.with_suffix(".c.cached").exists()
+        }
+    for file in there:
+        if file.name.split(".")[0] in strange:
+            file.unlink(missing_ok=True)
+    for other in also:
+        for file in other.glob(f"{FORMS}*") if other != folder else ():
+            if trusted(file):
+                with suppress(FileExistsError):
+                    (folder / file.name).symlink_to(file)
 
 
 def _candidates(usual: Path) -> Iterator[Path]:

@@ -1,6 +1,7 @@
-"""Kernels for many points in one call against NumPy, with vectors of four numbers and without."""
+"""Kernels for many points in one call against NumPy, and their derivatives against those of UFL by dolfinx."""
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,64 +10,151 @@ from dolfinx import fem
 from mpi4py import MPI
 from ufl.core.expr import Expr
 
-from magshell_fenicsx.assembly import point_kernels
 from magshell_fenicsx.assembly.kernels import KernelLog
-from magshell_fenicsx.assembly.point_kernels import Points
-from magshell_fenicsx.platform.many import with_many
+from magshell_fenicsx.assembly.point_kernels import Pairs, Points, point_gradient, point_hessian, point_values
+from magshell_fenicsx.assembly.scalars import Scalars, inputs_of
 
 Array = np.ndarray
+i, j, k = ufl.indices(3)
 CASES: dict[str, tuple[Callable[..., Expr], Callable[..., Array]]] = {
     "roots and powers": (
-        lambda a, b, c: ufl.as_vector([ufl.sqrt(1 + a[0] ** 2) * b**1.5 / c, c**-2 * a[1], 2 * c]),
-        lambda a, b, c: np.stack([np.sqrt(1 + a[0] ** 2) * b**1.5 / c, a[1] / c**2, 2 * c + 0 * b], axis=1),
+        lambda a, b, c: ufl.as_vector([ufl.sqrt(1 + a[0] ** 2) * b**1.5 / c, c**-2 * a[1], 2 * c, b ** a[0]]),
+        lambda a, b, c: np.stack([np.sqrt(1 + a[0] ** 2) * b**1.5 / c, a[1] / c**2, 2 * c + 0 * b, b ** a[0]], axis=1),
     ),
     "an angle": (
         lambda a, b, c: ufl.as_vector([c * ufl.atan2(a[0], b), a[1]]),
         lambda a, b, c: np.stack([c * np.arctan2(a[0], b), a[1]], axis=1),
     ),
-    "a condition": (
-        lambda a, b, c: ufl.as_vector([ufl.conditional(ufl.gt(a[0], c), b, -b)]),
-        lambda a, b, c: np.where(a[0] > c, b, -b)[:, None],
+    "conditions": (
+        lambda a, b, c: ufl.as_vector(
+            [
+                ufl.conditional(ufl.gt(a[0], c), b, -b),
+                ufl.conditional(ufl.And(ufl.lt(a[0], c), ufl.Not(ufl.ge(a[1], 0.5))), 1.0, c),
+                ufl.max_value(a[0], a[1]) - ufl.min_value(a[0], c) + abs(a[0] - c) + ufl.sign(a[1] - c),
+            ]
+        ),
+        lambda a, b, c: np.stack(
+            [
+                np.where(a[0] > c, b, -b),
+                np.where((a[0] < c) & (a[1] < 0.5), 1.0, c),
+                np.maximum(a[0], a[1]) - np.minimum(a[0], c) + abs(a[0] - c) + np.sign(a[1] - c),
+            ],
+            axis=1,
+        ),
+    ),
+    "indices": (  # a trace of a product, a diagonal, an outer product that is transposed
+        lambda a, b, c: ufl.as_vector(
+            [
+                ufl.as_matrix([[a[0], b], [c, a[1]]])[i, j] * ufl.as_matrix([[1, 2], [3, b]])[j, i],
+                ufl.as_tensor(ufl.outer(a, a)[k, i], (i, k))[0, 1] + ufl.tr(ufl.outer(a, a)),
+                ufl.det(ufl.as_matrix([[a[0], b], [c, a[1]]])),
+            ]
+        ),
+        lambda a, b, c: np.stack(
+            [a[0] + 3 * b + 2 * c + a[1] * b, a[0] * a[1] + a[0] ** 2 + a[1] ** 2, a[0] * a[1] - b * c], axis=1
+        ),
     ),
 }
 
 
 @pytest.mark.parametrize("name", CASES)
-@pytest.mark.parametrize(("count", "one_call"), [(1, True), (4, True), (11, True), (11, False)])
-def test_against_numpy(name: str, count: int, one_call: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Also where the number of points is no multiple of four, after a constant has changed, and by dolfinx alone."""
-    if not one_call:
-        monkeypatch.setattr(point_kernels, "many_of", lambda compiled: None)
+@pytest.mark.parametrize("count", [1, 4, 11])
+def test_against_numpy(name: str, count: int) -> None:
+    """Also where the number of points is no multiple of four, and after a constant has changed."""
     expression, expected = CASES[name]
     points, random = Points(11), np.random.default_rng(1)
     a, b, constant = points.field(2), points.field(1), fem.Constant(points._mesh, 0.4)
     a.x.array[:], b.x.array[:] = random.random(22), 1 + random.random(11)
     here = points.constant(constant)
-    kernel = KernelLog().compile_expression(name, expression(a, b[0], here), MPI.COMM_SELF)
+    kernel = point_values(name, expression(a, b[0], here), KernelLog(), MPI.COMM_SELF)
     for value in (0.4, 0.7):
         constant.value = value
         found = points.evaluate(kernel, count)
         wanted = expected(a.x.array.reshape(-1, 2).T, b.x.array, value)[:count]
-        assert found == pytest.approx(wanted, rel=1e-14)
-    assert (points._calls[kernel] is not None) == one_call
+        assert found == pytest.approx(wanted, rel=1e-13)
     assert points.evaluate(kernel, 0).size == 0
 
 
-@pytest.mark.parametrize(
-    ("line", "lanes"),
-    [
-        ("double sp_1 = sqrt(sp_0) / w[3] + -c[2];", True),
-        ("double sp_1 = pow(w[3], -1.5);", True),
-        ("double sp_1 = pow(w[3], sp_0);", False),
-        ("double sp_1 = atan2(sp_0, w[3]);", False),
-        ("double sp_1 = sp_0 < 1 ? w[3] : 0.0;", False),
-        ("A[3 * iq + 1] += sp_1;", True),
-        ("static const double table[2] = {1.0, 2.0};", False),
-    ],
-)
-def test_what_can_be_vectors(line: str, lanes: bool) -> None:
-    """In C a vector can take the place of a number in arithmetic, square roots and powers by a constant."""
-    body = f"{{\n// Unstructured piecewise computations\ndouble sp_0 = w[1] * w[2];\n{line}\n}}"
-    code = "#include <math.h>\nvoid tabulate_tensor_e(double* A, const double* w, const double* c)\n" + body
-    code += "\n\nstatic double points_e[1] = {0.5};\nstatic int value_shape_e[1] = {2};\n"
-    assert ("#define HAS_LANES" in with_many(code)) == lanes
+ENERGIES: dict[str, Callable[[Any], Expr]] = {  # of a vector of six numbers in (0, 1)
+    "powers": lambda z: z[0] ** 3 * z[1] ** -2 + z[2] ** 1.5 / (1 + z[3]) + (1 + z[4]) ** z[5] + z[0] ** 0.3,
+    "roots": lambda z: ufl.sqrt(ufl.dot(z, z)) * ufl.ln(1 + z[0] * z[5]) + ufl.exp(z[1] * z[2]),
+    "angles": lambda z: ufl.atan2(z[0], z[1]) * ufl.sin(z[2]) + ufl.cos(z[3] * z[4]) * ufl.tan(z[5]),
+    "arcs": lambda z: ufl.asin(z[0] / 2) * ufl.acos(z[1] / 2) + ufl.atan(z[2] * z[3]) + ufl.erf(z[4]),
+    "hyperbolas": lambda z: ufl.sinh(z[0]) * ufl.cosh(z[1]) + ufl.tanh(z[2] * z[3]) * ufl.bessel_J(1, z[4]),
+    "choices": lambda z: ufl.conditional(ufl.gt(z[0], z[1]), z[0] ** 2 * z[2], z[1] * z[3]) * abs(z[4] - z[5]),
+    "normals": lambda z: (
+        ufl.cross(ufl.as_vector([z[i] for i in range(3)]), ufl.as_vector([z[i] for i in range(3, 6)]))[0] ** 2
+        / ufl.dot(z, z)
+    ),
+}
+
+
+@pytest.mark.parametrize("name", ENERGIES)
+def test_derivatives_against_ufl(name: str) -> None:
+    """Every rule of differentiation, for gradient and Hessian, by dolfinx's own evaluation of UFL's derivatives."""
+    points, log = Points(7), KernelLog()
+    z = points.field(6)
+    z.x.array[:] = np.random.default_rng(2).random(42)
+    W, cells = ENERGIES[name](z), np.arange(7, dtype=np.int32)
+    first = ufl.diff(W, z)
+    second = ufl.as_vector([ufl.diff(first, z)[i, j] for i in range(6) for j in range(6)])
+
+    def by_dolfinx(expression: Expr) -> Array:
+        values, point = np.empty((7, expression.ufl_shape[0])), np.full((1, 1), 0.5)
+        values[z.function_space.dofmap.list[:, 0]] = fem.Expression(expression, point).eval(points._mesh, cells)
+        return values
+
+    gradient = points.evaluate(point_gradient(name, [(W, z)], log, MPI.COMM_SELF), 7).copy()
+    assert gradient == pytest.approx(by_dolfinx(first), rel=1e-12, abs=1e-12)
+    blocks = points.evaluate(
+        point_hessian(name, W, z, 2, Pairs(((0, 0), (0, 1), (1, 1))), log, MPI.COMM_SELF, at_zero=False), 7
+    )
+    wanted = by_dolfinx(second).reshape(7, 2, 3, 2, 3)
+    whole = blocks[:, :18].reshape(7, 6, 3)  # components (0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2) of three pairs
+    for number, (c, d) in enumerate([(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)]):
+        for pair, (a, b) in enumerate([(0, 0), (0, 1), (1, 1)]):
+            both = (wanted[:, a, c, b, d] + wanted[:, a, d, b, c]) / 2
+            assert whole[:, number, pair] == pytest.approx(both, rel=1e-12, abs=1e-12)
+    skew = blocks[:, 18:].reshape(7, 3)
+    for number, (c, d) in enumerate([(0, 1), (0, 2), (1, 2)]):
+        both = (wanted[:, 0, c, 1, d] - wanted[:, 0, d, 1, c]) / 2
+        assert skew[:, number] == pytest.approx(both, rel=1e-12, abs=1e-12)
+
+
+def test_what_is_not_picked_needs_no_derivative() -> None:
+    """The root of a negative number has none."""
+    points, log = Points(4), KernelLog()
+    z = points.field(3)
+    z.x.array[:] = [-1, 0, 0, 4, 0, 0, 0, 0, 0, 9, 0, 0]
+    W = ufl.conditional(ufl.gt(z[0], 0), ufl.sqrt(z[0]), 0.0) ** 2
+    gradient = points.evaluate(point_gradient("root", [(W, z)], log, MPI.COMM_SELF), 4).copy()
+    assert gradient[:, 0] == pytest.approx([0, 1, 0, 1])
+    hessian = points.evaluate(point_hessian("root", W, z, 1, Pairs(((0, 0),)), log, MPI.COMM_SELF, at_zero=False), 4)
+    assert hessian == pytest.approx(0, abs=1e-15)
+
+
+def test_at_zero() -> None:
+    """The Hessian of a form that is quadratic in z but for terms that vanish at z = 0."""
+    points, log = Points(3), KernelLog()
+    z, a = points.field(3), points.field(1)
+    z.x.array[:], a.x.array[:] = 0.3, [1, 2, 3]
+    W = a[0] * z[0] ** 2 / 2 + z[1] * z[2] * ufl.exp(z[0])
+    found = points.evaluate(point_hessian("zero", W, z, 1, Pairs(((0, 0),)), log, MPI.COMM_SELF, at_zero=True), 3)
+    assert found == pytest.approx(np.array([[1, 0, 0, 0, 0, 1], [2, 0, 0, 0, 0, 1], [3, 0, 0, 0, 0, 1]]))
+
+
+def test_each_operation_occurs_once() -> None:
+    """Sums and products in either order, numbers and what is multiplied by them."""
+    s = Scalars()
+    x, y = s.node("field", 0, 0), s.node("field", 0, 1)
+    assert s.add(x, y) == s.add(y, x)
+    assert s.times(s.number(2), s.times(y, s.number(3))) == s.times(s.number(6), y)
+    assert s.add(x, x) == s.times(s.number(2), x)
+    assert s.times(x, s.zero) == s.over(s.zero, y) == s.zero
+    assert s.power(x, s.number(0.5)) == s.node("sqrt", x)
+
+
+def test_what_no_point_has_is_refused() -> None:
+    x = ufl.SpatialCoordinate(Points(1)._mesh)
+    with pytest.raises(NotImplementedError, match="SpatialCoordinate"):
+        Scalars().components(x[0], *inputs_of([x[0]]))

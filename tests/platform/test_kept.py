@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from command import started
 
-from magshell_fenicsx.platform import compiler, kept
+from magshell_fenicsx.platform import kept
 
 
 def test_what_is_kept_is_recalled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -75,29 +75,41 @@ def test_an_image_is_read_by_any_user(tmp_path: Path, home: Path, monkeypatch: p
     """Kernels of root's that nobody else may write are taken; new ones go to a private folder."""
     image, own = folder(tmp_path / "image", 0o755), home / ".cache" / "magshell"
     (image / "kernel").write_bytes(b"compiled")
+    (image / "libffcx_forms_a.so").write_bytes(b"a form")
     monkeypatch.setattr(kept, "_usual", lambda: image)
     monkeypatch.setattr(kept.os, "getuid", lambda: 12345)
     monkeypatch.setattr(kept.os, "access", lambda path, how: path != image)
     monkeypatch.setattr(kept, "_candidates", lambda usual: iter([usual, own]))
     assert kept._folders(image) == (own, image)
     assert kept.recall("kernel") == b"compiled"
+    assert (own / "libffcx_forms_a.so").read_bytes() == b"a form"  # dolfinx looks in one folder
     kept.keep("another", b"new")
     assert (own / "another").read_bytes() == b"new"
 
 
 def test_a_kernel_that_others_may_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It is not loaded: it is compiled again, with whatever lies beside it."""
-    monkeypatch.setattr(kept, "_usual", lambda: tmp_path)
-    monkeypatch.setattr(compiler, "_load_objects", lambda place, module, names: (["loaded"], module))
-    for end, mode in ((".so", 0o666), (".c", 0o644), (".c.cached", 0o644)):
-        (tmp_path / f"kernel{end}").touch()
-        (tmp_path / f"kernel{end}").chmod(mode)
-    assert kept.kept_file("kernel.so") is None
-    assert compiler._get_cached_module("kernel", ["form"], tmp_path, 1) == (None, None)
-    assert [file.name for file in tmp_path.iterdir()] == ["kernel.c"]
-    for end in (".so", ".c.cached"):
-        (tmp_path / f"kernel{end}").touch(0o644)
-    assert compiler._get_cached_module("kernel", ["form"], tmp_path, 1) == (["loaded"], "kernel")
+    """It is not loaded: a form is removed with whatever lies beside it, before dolfinx finds it."""
+    monkeypatch.setattr(kept, "_usual", lambda: tmp_path / "cache")
+    made = folder(tmp_path / "cache", 0o755)
+    for name in ("strange", "own"):
+        for end in (".cpython.so", ".c", ".c.cached"):
+            (made / f"libffcx_forms_{name}{end}").touch()
+    (made / "libffcx_forms_strange.cpython.so").chmod(0o666)
+    (made / "libmagshell.so").touch()
+    (made / "libmagshell.so").chmod(0o666)
+    assert kept.kept_file("libmagshell.so") is None
+    ends = [file.name.removeprefix("libffcx_forms_") for file in sorted(made.glob("libffcx*"))]
+    assert ends == ["own.c", "own.c.cached", "own.cpython.so"]
+
+
+def test_a_form_that_was_never_finished(tmp_path: Path) -> None:
+    """A process was killed while it compiled: all others would wait ten minutes for it, and then fail."""
+    made, (old, new) = folder(tmp_path / "cache", 0o755), ("libffcx_forms_old.c", "libffcx_forms_new.c")
+    for name in (old, new):
+        (made / name).touch()
+    os.utime(made / old, (1e9, 1e9))
+    assert kept._folders(made) == (made,)
+    assert [file.name for file in made.iterdir()] == [new]
 
 
 def test_no_private_folder_at_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,6 +5,8 @@ The surface coordinates are (s, theta), s the meridian's parameter; components a
 order a_1 x a_2 points outward where s grows away from the pole.
 """
 
+from collections.abc import Sequence
+
 import ufl
 from ufl.core.expr import Expr
 
@@ -13,7 +15,12 @@ from magshell_fenicsx.models.shell.kinematics import Jet
 
 def revolved(f: Expr) -> Jet:
     """Jet of the axisymmetric field f = (U, W), U e_rho + W e_z."""
-    (U, W), (Us, Ws), (Uss, Wss) = _derivatives(f, 2)
+    return revolved_by(_derivatives(f, 2))
+
+
+def revolved_by(derivatives: Sequence[Sequence[Expr]]) -> Jet:
+    """The same from the components of f, f' and f''."""
+    (U, W), (Us, Ws), (Uss, Wss) = derivatives
     return Jet(
         r=_vector(U, 0, W),
         r1=_vector(Us, 0, Ws),
@@ -35,7 +42,12 @@ def wave(f: Expr, m: Expr) -> tuple[Jet, Jet]:
     cosine, sine
         v,_i = cosine_i cos(m theta) + sine_i sin(m theta), and so for all derivatives.
     """
-    (U, V, W), (Us, Vs, Ws), (Uss, Vss, Wss) = ((P - V, V, W) for P, V, W in _derivatives(f, 3))
+    return wave_by(_derivatives(f, 3), m)
+
+
+def wave_by(derivatives: Sequence[Sequence[Expr]], m: Expr) -> tuple[Jet, Jet]:
+    """The same from the components of f, f' and f''."""
+    (U, V, W), (Us, Vs, Ws), (Uss, Vss, Wss) = ((P - V, V, W) for P, V, W in derivatives)
     cosine = Jet(
         r=_vector(U, 0, W),
         r1=_vector(Us, 0, Ws),

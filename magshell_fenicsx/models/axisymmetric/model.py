@@ -192,7 +192,7 @@ class MeridianModel(Thin):
     @cached_property
     def excluded_modes(self) -> ExcludedWaves:
         """The waves around the axis, which an axisymmetric model does not see. Compiles kernels."""
-        return ExcludedWaves(Waves(self.system, self.energies, self.meridian, self.held, self.kernels))
+        return ExcludedWaves(Waves(self.system, self.energies, self.meridian, self.carrier, self.held, self.kernels))
 
     @property
     def waves(self) -> Waves:

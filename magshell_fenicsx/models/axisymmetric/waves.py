@@ -5,33 +5,30 @@ so the second variation of an axisymmetric energy is pi times the sum of that of
 cosine's and of the sine's coefficients: one form on the meridian with m as a number.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property, partial
+from functools import cache, cached_property
 from math import ceil, comb, sqrt
 
 import numpy as np
 import ufl
 from dolfinx import fem
-from dolfinx.fem import petsc as fem_petsc
 from numpy.typing import NDArray
 from petsc4py import PETSc
 from scipy.sparse import coo_array
 
-from magshell_fenicsx.assembly.forms import at_zero
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
-from magshell_fenicsx.assembly.terms import FormTerm
+from magshell_fenicsx.assembly.terms import FormTerm, factor_of
 from magshell_fenicsx.continuation.factor import Banded, Factorisation
 from magshell_fenicsx.continuation.modes import nearest_to_zero
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.continuation.watch import Family
 from magshell_fenicsx.models.axisymmetric import jets
 from magshell_fenicsx.models.axisymmetric.meridian import Meridian
-from magshell_fenicsx.models.carriers import Energy
-from magshell_fenicsx.models.shell.terms import INTERIOR
+from magshell_fenicsx.models.axisymmetric.wave_points import WavePoints
+from magshell_fenicsx.models.carriers import Carrier, Energy
 from magshell_fenicsx.parts.supports.on_meridian import Supports
-from magshell_fenicsx.platform import compat
 
 DEGREE = 4  # of the matrix of a wave as a polynomial in m
 
@@ -64,6 +61,7 @@ class Waves:
         system: FiniteElementSystem,
         energies: Sequence[Energy],
         meridian: Meridian,
+        carrier: Carrier,
         supports: Supports,
         log: KernelLog,
     ) -> None:
@@ -72,26 +70,21 @@ class Waves:
         self.V = V = fem.functionspace(meridian.mesh, ("Lagrange", degree, (3,)))
         self.largest = ceil(2.2 * meridian.reach * sqrt(meridian.curvature / system.length)) + 5
         self._m = fem.Constant(V.mesh, 1.0)
-        self._factor = fem.Constant(V.mesh, 1.0)
-        self._kept = kept = [e for e in energies if not e.linear]
-        self._forms = [(e.amplitude, self._second(e, log)) for e in kept]
+        self._kept = [e for e in energies if not e.linear]
+        self._points = WavePoints(carrier, system.u, self._kept, log)
         self._phi, self._energies, self._log = fem.Function(V, name="phi"), list[FormTerm](), log
         self._held_once, self._held = supports.held_waves(V, 1), supports.held_waves(V, 2)
-        pattern = next(form for e, (_, form) in zip(kept, self._forms, strict=True) if e.name == INTERIOR)
-        self._K = fem_petsc.create_matrix(pattern)
-        self._K.setOption(PETSc.Mat.Option.SYMMETRIC, True)
         self._nodes = self.largest * np.sin(np.pi / 4 * np.array([0, 1, 2, -1, -2]))
         self._weights = _lagrange(self._nodes, np.arange(self.largest + 1))
         self._pieces = [_Piece(2, self.largest, self._nodes)]
-        self._part = fem.create_matrix(pattern)
-        self._interpolated: PETSc.Mat | None = None
+        self._matrices = dict[str, PETSc.Mat]()
         self._bands: list[Banded] = []
         self._factorisation, self._counting = Factorisation(V.mesh.comm), Factorisation(V.mesh.comm)
 
     def tangent(self, state: State, m: int) -> PETSc.Mat:
         """The matrix of Q_m at an axisymmetric state; it is reused by the next call."""
-        self._system.at(state).assembled(lambda: self._assemble(self._K, state, m, self.held(m)))
-        return self._K
+        entries = self._system.at(state).assembled(lambda: self._entries(state, m))
+        return self._filled("tangent", entries.ravel(), m)
 
     def along(self, phi: NDArray[np.float64], m: int) -> list[FormTerm]:
         """Q_m(phi), summand by summand as energies of the axisymmetric displacement, for one phi and m at a time."""
@@ -131,18 +124,15 @@ class Waves:
 
     def _entries(self, state: State, m: float) -> NDArray[np.float64]:
         """The entries (pairs of nodes, 3, 3) of Q_m's matrix, with nothing held, at the displacement of the system."""
-        self._m.value = m
-        self._part.set_value(0.0)
-        for form in self._present(state):
-            fem.assemble_matrix(self._part, form)
-        return np.array(self._part.data).reshape(-1, 3, 3)
+        factors = {e.amplitude: factor_of(e.amplitude, state.mu) for e in self._kept}
+        return self._points.entries(factors, m)
 
     @cached_property
     def _sparsity(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Rows and columns of these entries."""
-        first, second = (a.astype(np.int64) for a in (self._part.indptr, self._part.indices))
-        row = np.repeat(np.arange(len(first) - 1), np.diff(first))
-        rows, columns = (3 * a[:, None, None] + np.zeros((3, 3), dtype=np.int64) for a in (row, second))
+        rows, columns = (
+            3 * a[:, None, None] + np.zeros((3, 3), dtype=np.int64) for a in (self._points.rows, self._points.columns)
+        )
         return (rows + np.arange(3)[:, None]).ravel(), (columns + np.arange(3)).ravel()
 
     def _indefinite(self, values: Sequence[NDArray[np.float64]]) -> list[int]:
@@ -169,17 +159,23 @@ class Waves:
 
     def _interpolated_pivots(self, m: int, values: Sequence[NDArray[np.float64]]) -> int:
         entries = self._weights[m] @ np.reshape(values, (len(values), -1))
+        self._counting.factor(self._filled("interpolated", entries, m))
+        return self._counting.negative_pivots
+
+    def _filled(self, name: str, entries: NDArray[np.float64], m: int) -> PETSc.Mat:
+        """A matrix with these entries, in the order of `_sparsity`, with what is held; the next call overwrites it."""
         K = coo_array((entries, self._sparsity)).tocsr()
         first, columns = (a.astype(PETSc.IntType) for a in (K.indptr, K.indices))
-        if self._interpolated is None:
-            self._interpolated = PETSc.Mat().createAIJ(K.shape, csr=(first, columns, K.data), comm=self._K.comm)
-            self._interpolated.setOption(PETSc.Mat.Option.SYMMETRIC, True)
-            self._interpolated.setOption(PETSc.Mat.Option.KEEP_NONZERO_PATTERN, True)
-        self._interpolated.setValuesCSR(first, columns, K.data)
-        self._interpolated.assemble()
-        self._interpolated.zeroRowsColumns(self._rows(m), 1.0)
-        self._counting.factor(self._interpolated)
-        return self._counting.negative_pivots
+        if name not in self._matrices:
+            made = PETSc.Mat().createAIJ(K.shape, csr=(first, columns, K.data), comm=self.V.mesh.comm)
+            made.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+            made.setOption(PETSc.Mat.Option.KEEP_NONZERO_PATTERN, True)
+            self._matrices[name] = made
+        filled = self._matrices[name]
+        filled.setValuesCSR(first, columns, K.data)
+        filled.assemble()
+        filled.zeroRowsColumns(self._rows(m), 1.0)
+        return filled
 
     def _rows(self, m: int) -> NDArray[np.int32]:
         return np.concatenate([bc.dof_indices()[0] for bc in self.held(m)])
@@ -198,27 +194,6 @@ class Waves:
         unstable = self.negative_pivots(state, m) > 0
         value, _ = nearest_to_zero(self._factorisation)
         return -abs(value) if unstable else abs(value)
-
-    def _assemble(self, K: PETSc.Mat, state: State, m: float, held: list[fem.DirichletBC]) -> None:
-        """Q_m's matrix at the displacement that the system has."""
-        self._m.value = m
-        K.zeroEntries()
-        for form in self._present(state):
-            compat.add_matrix(K, form, held)
-        compat.finish_matrix(K, self.V, held)
-
-    def _present(self, state: State) -> Iterator[fem.Form]:
-        """The forms of the terms that are not zero, each with its amplitude."""
-        for amplitude, form in self._forms:
-            self._factor.value = 1.0 if amplitude is None else state.mu[amplitude]
-            if self._factor.value:
-                yield form
-
-    def _second(self, e: Energy, log: KernelLog) -> fem.Form:
-        energy, v = self._of_wave(e)
-        gradient = ufl.derivative(energy, v, ufl.TestFunction(self.V))
-        hessian = ufl.derivative(gradient, v, ufl.TrialFunction(self.V))
-        return at_zero(self._factor * hessian, v, partial(log.compile, f"{e.name} waves"))  # most of it vanishes
 
     def _of_wave(self, e: Energy) -> tuple[ufl.Form, fem.Function]:
         v, u = fem.Function(self.V), jets.revolved(self._system.u)

@@ -21,7 +21,7 @@ from ufl.core.expr import Expr
 
 from magshell_fenicsx.assembly.following import Follows, values_of
 from magshell_fenicsx.assembly.kernels import KernelLog
-from magshell_fenicsx.assembly.point_kernels import Points
+from magshell_fenicsx.assembly.point_kernels import PointKernel, Points, point_gradient, point_values
 from magshell_fenicsx.models.shell.energy import Density
 from magshell_fenicsx.models.shell.kinematics import Jet
 from magshell_fenicsx.models.shell.sites import NAMES, fill, parameters_at
@@ -96,25 +96,21 @@ class PointGradient:
             if term.density.work:
                 self._work.append(_energy(term.density, [placement, self._u, self._v], place, parts, parameters))
         self._conservative = [W for W, term in zip(self._W, terms, strict=True) if not term.density.work]
-        self._energies: dict[str, fem.Expression | None] = {}
+        self._energies: dict[str, PointKernel | None] = {}
 
     @cached_property
-    def gradient(self) -> fem.Expression | None:
+    def gradient(self) -> PointKernel | None:
         """The kernel of `evaluate`; None if nothing depends on u."""
         sums = [(sum(self._conservative, ufl.zero()), self._u), (sum(self._work, ufl.zero()), self._v)]
-        gradients = [ufl.diff(W, z) for W, z in sums if z in extract_coefficients(W)]
-        if not gradients:
-            return None
-        return self._log.compile_expression(
-            f"{', '.join(self._names)} gradient", sum(gradients[1:], gradients[0]), self._comm
-        )
+        sums = [(W, z) for W, z in sums if z in extract_coefficients(W)]
+        return point_gradient(f"{', '.join(self._names)} gradient", sums, self._log, self._comm) if sums else None
 
-    def energy(self, name: str) -> fem.Expression | None:
+    def energy(self, name: str) -> PointKernel | None:
         """The kernel of a term's energy; None if that is zero."""
         if name not in self._energies:
             W = self._W[self._names.index(name)]
             none = isinstance(W, Zero)
-            self._energies[name] = None if none else self._log.compile_expression(f"{name} energy", W, self._comm)
+            self._energies[name] = None if none else point_values(f"{name} energy", W, self._log, self._comm)
         return self._energies[name]
 
     def chunks(self) -> list[slice]:
@@ -128,7 +124,7 @@ class PointGradient:
         count = chunk.stop - chunk.start
         return np.asarray(self._u.x.array[: count * self._size].reshape(count, self._size))
 
-    def evaluate(self, chunk: slice, kernel: fem.Expression) -> Array:
+    def evaluate(self, chunk: slice, kernel: PointKernel) -> Array:
         """`gradient` by what was filled in, in the same order, or `energy`; the array is reused by the next call."""
         for given in self._given:
             given.fill(chunk)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.assembly.batches import boundary_edges, edge_width, interior_edges
 from magshell_fenicsx.assembly.following import Follows
 from magshell_fenicsx.assembly.kernels import KernelLog
+from magshell_fenicsx.assembly.point_kernels import PointKernel
 from magshell_fenicsx.assembly.shape_tables import Sheet, Table, cell_frames, cell_rule, edge_covector, edge_rule
 from magshell_fenicsx.models.shell.energy import Density, cell_quadrature, edge_quadrature
 from magshell_fenicsx.models.shell.gradients import FRAME, PointGradient, PointTerm, in_own_coordinates
@@ -213,7 +214,7 @@ class _Edges:
                 self._back[here] += factors[name] * values.reshape(-1, self._width)
         elements += self._sheet.at_nodes(self._back)
 
-    def _evaluated(self, name: str, kernel: fem.Expression | None) -> Iterator[tuple[NDArray[np.intp], Array]]:
+    def _evaluated(self, name: str, kernel: PointKernel | None) -> Iterator[tuple[NDArray[np.intp], Array]]:
         """A kernel's values in each chunk, at the points of these numbers among those of all cells' edges."""
         rows, points = self._on[name]
         for chunk in points.chunks() if kernel else []:

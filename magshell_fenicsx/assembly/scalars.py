@@ -1,0 +1,431 @@
+"""An expression of UFL as operations on scalars, each of which occurs once, and its derivatives.
+
+Fields and constants are the inputs. A node is the number of an operation; the operands of a node have smaller numbers.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from itertools import combinations_with_replacement
+from typing import Any
+
+import numpy as np
+import ufl
+from numpy.typing import NDArray
+from ufl import classes
+from ufl.algorithms.analysis import extract_type, has_type
+from ufl.algorithms.apply_algebra_lowering import apply_algebra_lowering
+from ufl.algorithms.apply_derivatives import apply_derivatives
+from ufl.core.expr import Expr
+from ufl.corealg.traversal import unique_post_traversal
+
+Nodes = NDArray[np.int64]
+First = dict[int, int]  # operand or input -> derivative
+Second = dict[tuple[int, int], int]  # two of them, the smaller one first -> second derivative
+Operation = tuple[Any, ...]  # its name, then the operands' nodes; of an input or a number what it is
+
+COMPARISONS = {classes.LT: "<", classes.GT: ">", classes.LE: "<=", classes.GE: ">=", classes.EQ: "==", classes.NE: "!="}
+COMPARISONS |= {classes.AndCondition: "&", classes.OrCondition: "|"}
+LARGEST_POWER = 4.5  # that is written as a product
+UNCHANGED = (classes.Variable, classes.Real, classes.Conj)  # all is real here
+
+
+class Scalars:
+    """Operations on scalars.
+
+    Attributes
+    ----------
+    operations
+        By node. Names are those of C, and "number", "field" (its position among the fields, component), "constant"
+        (place among the values of all constants) and "pick" (condition, what is taken if it holds, what else).
+    """
+
+    def __init__(self) -> None:
+        self.operations: list[Operation] = []
+        self._known: dict[Operation, int] = {}
+        self.zero, self.one = self.number(0.0), self.number(1.0)
+
+    def node(self, *operation: Any) -> int:
+        """The node of an operation."""
+        node = self._known.get(operation)
+        if node is None:
+            node = self._known[operation] = len(self.operations)
+            self.operations.append(operation)
+        return node
+
+    def number(self, value: float) -> int:
+        return self.node("number", float(value))
+
+    def value(self, node: int) -> float | None:
+        """Of a number; None for all else."""
+        operation = self.operations[node]
+        return operation[1] if operation[0] == "number" else None
+
+    def add(self, a: int, b: int) -> int:
+        if a == self.zero or b == self.zero:
+            return b if a == self.zero else a
+        if a == b:
+            return self.times(self.number(2.0), a)
+        x, y = self.value(a), self.value(b)
+        if x is not None and y is not None:
+            return self.number(x + y)
+        return self.node("+", min(a, b), max(a, b))
+
+    def times(self, a: int, b: int) -> int:
+        if self.zero in (a, b):
+            return self.zero
+        if a == self.one or b == self.one:
+            return b if a == self.one else a
+        x, y = self.value(a), self.value(b)
+        if x is not None and y is not None:
+            return self.number(x * y)
+        if y is not None:
+            a, b, x = b, a, y
+        if x is not None:
+            name, *factors = self.operations[b]
+            if name == "*" and (other := self.value(factors[0])) is not None:
+                return self.times(self.number(x * other), factors[1])
+            return self.node("*", a, b)
+        return self.node("*", min(a, b), max(a, b))
+
+    def minus(self, a: int) -> int:
+        return self.times(self.number(-1.0), a)
+
+    def over(self, a: int, b: int) -> int:
+        y = self.value(b)
+        return self.times(a, self.number(1 / y)) if y else self.zero if a == self.zero else self.node("/", a, b)
+
+    def power(self, a: int, b: int) -> int:
+        exponent = self.value(b)
+        if exponent is None or 2 * exponent != int(2 * exponent) or abs(exponent) > LARGEST_POWER:
+            return self.node("pow", a, b)
+        product = self.one if exponent == int(exponent) else self.node("sqrt", a)
+        for _ in range(int(abs(exponent))):
+            product = self.times(product, a)
+        return product if exponent >= 0 else self.over(self.one, product)
+
+    def pick(self, condition: int, a: int, b: int) -> int:
+        return a if a == b else self.node("pick", condition, a, b)
+
+    def sum(self, nodes: Iterable[int]) -> int:
+        total = self.zero
+        for node in nodes:
+            total = self.add(total, node)
+        return total
+
+    def reached(self, nodes: Iterable[int]) -> list[int]:
+        """All nodes on which some depend, and themselves; operands first, each shortly before it is needed."""
+        order, seen, stack = list[int](), set[int](), [(node, False) for node in reversed(list(nodes))]
+        while stack:
+            node, ready = stack.pop()
+            if ready:
+                order.append(node)
+            elif node not in seen:
+                seen.add(node)
+                stack.append((node, True))
+                stack += [(operand, False) for operand in reversed(self.operands(node)) if operand not in seen]
+        return order
+
+    def operands(self, node: int) -> tuple[int, ...]:
+        name, *rest = self.operations[node]
+        return () if name in ("number", "field", "constant") else tuple(rest)
+
+    def replaced(self, nodes: Sequence[int], by: dict[int, int]) -> list[int]:
+        """Some nodes with others in place of inputs."""
+        new = dict(by)
+        for node in self.reached(nodes):
+            if node not in new:
+                operands = self.operands(node)
+                new[node] = self.made(self.operations[node][0], [new[o] for o in operands]) if operands else node
+        return [new[node] for node in nodes]
+
+    def made(self, name: str, operands: Sequence[int]) -> int:
+        """An operation by name, simplified."""
+        simplified: dict[str, Callable[..., int]] = {
+            "+": self.add,
+            "*": self.times,
+            "/": self.over,
+            "pow": self.power,
+            "pick": self.pick,
+        }
+        return simplified[name](*operands) if name in simplified else self.node(name, *operands)
+
+    # --- from UFL -----------------------------------------------------------------------------
+
+    def components(self, expression: Expr, fields: Sequence[Any], constants: Sequence[Any]) -> Nodes:
+        """The nodes of an expression's components, in the shape of the expression.
+
+        Parameters
+        ----------
+        fields, constants
+            Those that occur, and their order among the inputs.
+
+        Raises
+        ------
+        NotImplementedError
+            If it has more than arithmetic, conditions and functions of numbers.
+        """
+        lowered = apply_algebra_lowering(expression)
+        if has_type(lowered, classes.Derivative):
+            lowered = apply_derivatives(lowered)
+        places = np.cumsum([0, *(int(np.prod(c.ufl_shape)) for c in constants)])
+        inputs = {f: [("field", i, k) for k in range(int(np.prod(f.ufl_shape)))] for i, f in enumerate(fields)}
+        inputs |= {
+            c: [("constant", place + k) for k in range(int(np.prod(c.ufl_shape)))]
+            for c, place in zip(constants, places.tolist(), strict=False)
+        }
+        values: dict[Expr, Nodes] = {}
+        for e in unique_post_traversal(lowered):
+            if e in inputs:
+                values[e] = np.array([self.node(*one) for one in inputs[e]]).reshape(e.ufl_shape)
+            elif not isinstance(e, classes.MultiIndex | classes.Label):
+                values[e] = self._translated(e, [values.get(o) for o in e.ufl_operands])
+        return values[lowered]
+
+    def _translated(self, e: Expr, operands: list[Any]) -> Nodes:
+        """(shape, dimensions of the free indices) by those of the operands."""
+        if isinstance(e, classes.Zero):
+            return np.full(e.ufl_shape + e.ufl_index_dimensions, self.zero)
+        if isinstance(e, classes.ScalarValue):
+            return np.array(self.number(float(e)))
+        if isinstance(e, classes.Identity):
+            return np.where(np.eye(*e.ufl_shape, dtype=bool), self.one, self.zero)
+        if isinstance(e, UNCHANGED):
+            return np.asarray(operands[0])
+        if isinstance(e, classes.Indexed):
+            return _indexed(operands[0], e)
+        if isinstance(e, classes.ComponentTensor):
+            a, labels = e.ufl_operands
+            free = [len(a.ufl_shape) + a.ufl_free_indices.index(i.count()) for i in labels]
+            return np.asarray(np.moveaxis(operands[0], free, range(len(free))))
+        if isinstance(e, classes.ListTensor):
+            return np.stack(operands)
+        if isinstance(e, classes.IndexSum):
+            a, label = e.ufl_operands
+            summed = np.moveaxis(operands[0], len(a.ufl_shape) + a.ufl_free_indices.index(label[0].count()), -1)
+            return np.array([self.sum(row) for row in summed.reshape(-1, summed.shape[-1]).tolist()]).reshape(
+                summed.shape[:-1]
+            )
+        operation = self._of_numbers(e)
+        aligned = [_aligned(v, o, e) for v, o in zip(operands, e.ufl_operands, strict=True) if v is not None]
+        together = np.broadcast_arrays(*aligned)
+        rows = np.stack([values.ravel() for values in together], axis=1).tolist()
+        return np.array([operation(*row) for row in rows]).reshape(together[0].shape)
+
+    def _of_numbers(self, e: Expr) -> Callable[..., int]:
+        """The operation that is applied to each component."""
+        if isinstance(e, classes.Sum):
+            return self.add
+        if isinstance(e, classes.Product):
+            return self.times
+        if isinstance(e, classes.Division):
+            return self.over
+        if isinstance(e, classes.Power):
+            return self.power
+        if isinstance(e, classes.Conditional):
+            return self.pick
+        if isinstance(e, classes.Abs):
+            return lambda a: self.pick(self.node("<", a, self.zero), self.minus(a), a)
+        if isinstance(e, classes.MinValue):
+            return lambda a, b: self.pick(self.node("<", a, b), a, b)
+        if isinstance(e, classes.MaxValue):
+            return lambda a, b: self.pick(self.node(">", a, b), a, b)
+        if isinstance(e, classes.NotCondition):
+            return lambda a: self.node("!", a)
+        if type(e) in COMPARISONS:
+            name = COMPARISONS[type(e)]
+            return lambda a, b: self.node(name, a, b)
+        if isinstance(e, classes.MathFunction):
+            name = {"ln": "log"}.get(e._name, e._name)
+            return lambda a: self.node(name, a)
+        if isinstance(e, classes.Atan2):
+            return lambda a, b: self.node("atan2", a, b)
+        if isinstance(e, classes.BesselJ | classes.BesselY):
+            name = "jn" if isinstance(e, classes.BesselJ) else "yn"
+            return lambda order, x: self.node(name, order, x)
+        raise NotImplementedError(f"an energy at points has {type(e).__name__}, which is no function of numbers")
+
+    # --- derivatives --------------------------------------------------------------------------
+
+    def derivatives(self, f: int, inputs: Sequence[int], *, second: bool) -> tuple[First, Second]:
+        """The first derivatives of a node by some inputs, and the second ones; what is missing is zero.
+
+        Nodes are eliminated from f down to the inputs, with the derivatives of f by those that are left: R. M. Gower
+        and M. P. Mello, *A new framework for the computation of Hessians*, Optimization Methods and Software 27 (2012).
+        """
+        ends = set(inputs)
+        reached = sorted(self.reached([f]))
+        active = set(ends)
+        for node in reached:
+            if any(operand in active for operand in self.operands(node)):
+                active.add(node)
+        first, pairs = {f: self.one}, dict[int, dict[int, int]]()
+
+        def couple(j: int, k: int, value: int) -> None:
+            if value != self.zero:
+                total = self.add(pairs.setdefault(j, {}).get(k, self.zero), value)
+                pairs[j][k] = pairs.setdefault(k, {})[j] = total
+
+        for node in reversed(reached):
+            if node in ends or node not in active:
+                continue
+            bar = first.pop(node, self.zero)
+            others = pairs.pop(node, {})
+            itself = others.pop(node, self.zero)
+            if bar == self.zero and itself == self.zero and not others:
+                continue
+            by, twice = self._local(node, active, ends, second=second)
+            for other, value in others.items():
+                pairs[other].pop(node)
+                for j, slope in by.items():
+                    couple(j, other, self.times(self.number(2.0 if j == other else 1.0), self.times(slope, value)))
+            for j, k in combinations_with_replacement(by, 2) if second else ():
+                bent = self.times(bar, twice.get((min(j, k), max(j, k)), self.zero))
+                couple(j, k, self.add(self.times(by[j], self.times(by[k], itself)), bent))
+            for j, slope in by.items():
+                first[j] = self.add(first.get(j, self.zero), self.times(bar, slope))
+        kept = {(j, k): value for j, row in pairs.items() for k, value in row.items() if j <= k}
+        return {node: value for node, value in first.items() if node in ends}, kept
+
+    def _local(self, node: int, active: set[int], ends: set[int], *, second: bool) -> tuple[First, Second]:
+        """The derivatives of an operation by its operands; of a choice by the inputs, for each side on its own.
+
+        What is not picked may have no value, and then it must be multiplied by nothing.
+        """
+        name, *operands = self.operations[node]
+        if name == "pick":
+            condition, *sides = operands
+            (f1, f2), (g1, g2) = (self.derivatives(side, list(ends), second=second) for side in sides)
+            zero = self.zero
+            return (
+                {i: self.pick(condition, f1.get(i, zero), g1.get(i, zero)) for i in f1 | g1},
+                {i: self.pick(condition, f2.get(i, zero), g2.get(i, zero)) for i in f2 | g2},
+            )
+        slopes, bends = self._rules(node, name, operands)
+        by, twice = First(), Second()
+        for i, operand in enumerate(operands):
+            if operand in active:
+                by[operand] = self.add(by.get(operand, self.zero), slopes[i])
+                for k in range(len(operands) if second else 0):
+                    if operands[k] >= operand and operands[k] in active:
+                        pair = operand, operands[k]
+                        twice[pair] = self.add(twice.get(pair, self.zero), bends[i][k])
+        return by, twice
+
+    def _rules(self, node: int, name: str, operands: list[int]) -> tuple[list[int], list[list[int]]]:
+        """First and second derivatives of an operation by its operands."""
+        zero, one, number, times, over = self.zero, self.one, self.number, self.times, self.over
+        a, b = operands[0], operands[-1]
+        if name == "+":
+            return [one, one], [[zero, zero], [zero, zero]]
+        if name == "*":
+            return [b, a], [[zero, one], [one, zero]]
+        if name == "/":
+            inverse, slope = over(one, b), self.minus(over(node, b))
+            mixed = self.minus(times(inverse, inverse))
+            return [inverse, slope], [[zero, mixed], [mixed, times(number(-2.0), times(slope, inverse))]]
+        if name == "pow":
+            lower = self.power(a, self.add(b, number(-1.0)))
+            lowest = self.power(a, self.add(b, number(-2.0)))
+            slope, bend = times(b, lower), times(times(b, self.add(b, number(-1.0))), lowest)
+            if self.value(b) is not None:
+                return [slope, zero], [[bend, zero], [zero, zero]]
+            log = self.node("log", a)
+            mixed = times(lower, self.add(one, times(b, log)))
+            return [slope, times(node, log)], [[bend, mixed], [mixed, times(node, times(log, log))]]
+        if name == "atan2":
+            inverse = over(one, self.add(times(a, a), times(b, b)))
+            x, y = times(b, inverse), times(a, inverse)
+            bend = times(number(-2.0), times(x, y))
+            mixed = self.add(times(y, y), self.minus(times(x, x)))
+            return [x, self.minus(y)], [[bend, mixed], [mixed, self.minus(bend)]]
+        if name in ("jn", "yn"):
+            down, up, further = (self._bessel(name, a, b, k) for k in (-1, 1, None))
+            slope = times(number(0.5), self.add(down, self.minus(up)))
+            return [zero, slope], [[zero, zero], [zero, further]]
+        slope, bend = self._of_one(node, name, a)
+        return [slope], [[bend]]
+
+    def _bessel(self, name: str, order: int, x: int, shift: int | None) -> int:
+        """The function of a neighbouring order, or the second derivative."""
+        n = int(self.value(order) or 0)
+
+        def of(m: int) -> int:
+            even = self.node(name, self.number(abs(m)), x)
+            return even if m >= 0 or m % 2 == 0 else self.minus(even)
+
+        if shift is not None:
+            return of(n + shift)
+        outer = self.add(of(n - 2), of(n + 2))
+        return self.times(self.number(0.25), self.add(outer, self.times(self.number(-2.0), of(n))))
+
+    def _of_one(self, node: int, name: str, x: int) -> tuple[int, int]:
+        """First and second derivative of a function of one number."""
+        number, times, over = self.number, self.times, self.over
+        square = times(x, x)
+        rest = self.add(self.one, self.minus(square))
+        match name:
+            case "sqrt":
+                slope = over(number(0.5), node)
+                return slope, times(number(-0.5), over(slope, x))
+            case "exp":
+                return node, node
+            case "log":
+                slope = over(self.one, x)
+                return slope, self.minus(times(slope, slope))
+            case "sin":
+                return self.node("cos", x), self.minus(node)
+            case "cos":
+                return self.minus(self.node("sin", x)), self.minus(node)
+            case "tan":
+                slope = self.add(self.one, times(node, node))
+                return slope, times(number(2.0), times(node, slope))
+            case "sinh":
+                return self.node("cosh", x), node
+            case "cosh":
+                return self.node("sinh", x), node
+            case "tanh":
+                slope = self.add(self.one, self.minus(times(node, node)))
+                return slope, times(number(-2.0), times(node, slope))
+            case "asin" | "acos":
+                slope = over(number(1.0 if name == "asin" else -1.0), self.node("sqrt", rest))
+                return slope, over(times(x, slope), rest)
+            case "atan":
+                slope = over(self.one, self.add(self.one, square))
+                return slope, times(number(-2.0), times(x, times(slope, slope)))
+            case "erf":
+                slope = times(number(2 / np.sqrt(np.pi)), self.node("exp", self.minus(square)))
+                return slope, times(number(-2.0), times(x, slope))
+        raise NotImplementedError(f"an energy at points has {name}, whose derivative is not known")
+
+
+def inputs_of(expressions: Iterable[Expr]) -> tuple[list[Any], list[Any]]:
+    """The fields and the constants of some expressions, each in the order in which they were made."""
+    fields, constants = set[Any](), set[Any]()
+    for e in expressions:
+        fields |= extract_type(e, ufl.Coefficient)
+        constants |= extract_type(e, ufl.Constant)
+    return sorted(fields, key=lambda f: f.count()), sorted(constants, key=lambda c: c.count())
+
+
+def _indexed(value: Nodes, e: Expr) -> Nodes:
+    """A[i, 0, ...]: an index that is free in A too makes a diagonal."""
+    tensor, places = e.ufl_operands
+    fixed, labels = list[int | slice](), list[int]()
+    for place in places:
+        is_fixed = isinstance(place, classes.FixedIndex)
+        fixed.append(int(place) if is_fixed else slice(None))
+        labels += [] if is_fixed else [place.count()]
+    labels += tensor.ufl_free_indices
+    short = {label: i for i, label in enumerate(dict.fromkeys(labels))}  # einsum knows 52
+    given, wanted = ([short[label] for label in some] for some in (labels, e.ufl_free_indices))
+    return np.asarray(np.einsum(value[tuple(fixed)], given, wanted))
+
+
+def _aligned(value: Nodes, operand: Expr, e: Expr) -> Nodes:
+    """The components of an operand with an axis for each free index of the whole."""
+    own, shape = operand.ufl_free_indices, operand.ufl_shape
+    axes = [len(shape) + own.index(label) if label in own else None for label in e.ufl_free_indices]
+    present = [axis for axis in axes if axis is not None]
+    ordered = np.transpose(value, [*range(len(shape)), *present])
+    sizes = [1 if axis is None else value.shape[axis] for axis in axes]
+    whole = (1,) * (len(e.ufl_shape) - len(shape))
+    return ordered.reshape((*whole, *shape, *sizes))

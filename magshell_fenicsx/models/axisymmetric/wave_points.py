@@ -1,0 +1,263 @@
+"""The second variation of an axisymmetric shell along waves, from the densities' Hessians at points of the meridian."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from functools import cached_property
+from itertools import groupby
+
+import basix
+import numpy as np
+import ufl
+from dolfinx import fem
+from mpi4py import MPI
+from numpy.typing import NDArray
+from ufl.core.expr import Expr
+
+from magshell_fenicsx.assembly.batches import Batch, Rule
+from magshell_fenicsx.assembly.kernels import KernelLog
+from magshell_fenicsx.assembly.point_kernels import PointKernel, Points, whole_hessian
+from magshell_fenicsx.models.axisymmetric import jets
+from magshell_fenicsx.models.carriers import Carrier, Energy
+from magshell_fenicsx.models.shell.energy import Density
+from magshell_fenicsx.models.shell.kinematics import Jet
+from magshell_fenicsx.models.shell.sites import fill, on_batches, parameters_at
+from magshell_fenicsx.platform import compat
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+DERIVATIVES = 3  # value, first and second derivative along the meridian
+PLANE, WAVE = 2, 3  # components of axisymmetric fields and of a wave's coefficients
+
+
+class WavePoints:
+    """The matrices of Q_m, without what is held.
+
+    Parameters
+    ----------
+    u
+        The axisymmetric displacement.
+    energies
+        Those that are not linear.
+
+    Attributes
+    ----------
+    rows, columns
+        (pairs,) of the nodes of the entries, sorted by rows.
+    """
+
+    def __init__(self, carrier: Carrier, u: fem.Function, energies: Sequence[Energy], log: KernelLog) -> None:
+        self._nodes = u.function_space.dofmap.list.astype(np.int64)
+        self._sites = [
+            _Site(carrier, u, batch, list(there), log)
+            for _, there in groupby(sorted(energies, key=_place), key=_place)
+            for there in [list(there)]
+            for batch in _batches(carrier, there[0].density)
+        ]
+        pairs = [site.pairs(self._nodes) for site in self._sites]
+        count = int(self._nodes.max()) + 1
+        numbers, places = np.unique(np.concatenate([each.ravel() for each in pairs]), return_inverse=True)
+        self.rows, self.columns = numbers // count, numbers % count
+        within = 9 * places[:, None] + np.arange(9)  # of the components of a block
+        ends = np.cumsum([each.size for each in pairs])[:-1]
+        self._places = [part.ravel() for part in np.split(within, ends)]
+
+    def entries(self, factors: Mapping[str | None, float], m: float) -> Array:
+        """(pairs, 3, 3) at the present u; `factors` by amplitude."""
+        total = np.zeros(9 * len(self.rows))
+        for site, places in zip(self._sites, self._places, strict=True):
+            if (blocks := site.blocks(factors, m)) is not None:
+                total += np.bincount(places, blocks.ravel(), len(total))
+        return total.reshape(-1, 3, 3)
+
+
+class _Site:
+    """The energies at the points of one batch: of the cells, of the vertices between them, or of an end."""
+
+    def __init__(
+        self, carrier: Carrier, u: fem.Function, batch: Batch, energies: Sequence[Energy], log: KernelLog
+    ) -> None:
+        self._batch, self._energies, self._log, self._u = batch, energies, log, u
+        self._carrier, self._sides = carrier, range(len(batch.cells))
+        self._points = points = Points(batch.size)
+        sides = len(self._sides)
+        self._at_u, self._at_r0, self._drawn = (points.field(PLANE * DERIVATIVES * sides) for _ in range(3))
+        self._wave, self._geometry = points.field(WAVE * DERIVATIVES * sides), points.field(2 * sides)
+        fill(self._geometry, batch.geometry)
+        self._m = fem.Constant(points._mesh, 1.0)
+        self._given = [parameters_at(points, e.density.parameters, sides) for e in energies if e.density]
+        self._varying = [
+            [(here, on_batches(field, [batch], sides)) for here, field in varying] for _, varying in self._given
+        ]
+
+    def pairs(self, nodes: Ints) -> Ints:
+        """(entities, functions, functions) numbers of the pairs of nodes that an entity couples."""
+        count = int(nodes.max()) + 1
+        here = np.hstack([nodes[cells] for cells in self._batch.cells])
+        return np.asarray(here[:, :, None] * count + here[:, None])
+
+    def blocks(self, factors: Mapping[str | None, float], m: float) -> Array | None:
+        """(entities, functions, functions, 3, 3); None if no energy is there."""
+        present = [number for number, e in enumerate(self._energies) if factors[e.amplitude]]
+        if not present:
+            return None
+        self._m.value = m
+        fill(self._at_u, self._derivatives(self._u))
+        fill(self._at_r0, self._derivatives(self._carrier.r0))
+        if self._carrier.drawn is not None:
+            fill(self._drawn, self._derivatives(self._carrier.drawn))
+        upper = 0.0
+        for number in present:
+            for here, values in self._varying[number]:
+                fill(here, values.renew()[0])
+            factor = np.pi * factors[self._energies[number].amplitude]
+            upper = upper + factor * self._points.evaluate(self._kernels[number], self._batch.size)
+        size = WAVE * DERIVATIVES * len(self._sides)
+        hessians = upper[:, _triangle(size)]
+        entities, each = len(self._batch.cells[0]), len(self._batch.rule.weights)
+        shapes = self._shapes
+        right = (hessians @ shapes) * self._weights[:, None, None]
+        functions = shapes.shape[2]
+        left = shapes.reshape(entities, each * size, functions).transpose(0, 2, 1)
+        whole = (left @ right.reshape(entities, each * size, functions)).reshape(
+            entities, functions // WAVE, WAVE, functions // WAVE, WAVE
+        )
+        return np.asarray(whole.transpose(0, 1, 3, 2, 4))
+
+    @cached_property
+    def _kernels(self) -> list[PointKernel]:
+        waves = [self._of_sides(self._wave, WAVE, side) for side in self._sides]
+        both = [jets.wave_by(each, self._m) for each in waves]
+        u, r0, drawn = (
+            [jets.revolved_by(self._of_sides(field, PLANE, side)) for side in self._sides]
+            for field in (self._at_u, self._at_r0, self._drawn)
+        )
+        found = []
+        for e, (parameters, _) in zip(self._energies, self._given, strict=True):
+            assert e.density
+            start, shift = (drawn, [a - b for a, b in zip(r0, drawn, strict=True)]) if self._is_drawn(e) else (r0, None)
+            moved = [a + b for a, b in zip(u, shift, strict=True)] if shift else u
+            W = ufl.zero()
+            for part in range(2):  # the cosine's and the sine's
+                v = [each[part] for each in both]
+                W = W + _added(e.density, start, moved, v, self._edge(r0), parameters)
+            found.append(whole_hessian(f"{e.name} waves", W, self._wave, self._log, MPI.COMM_SELF))
+        return found
+
+    def _is_drawn(self, e: Energy) -> bool:
+        return e.drawn and self._carrier.drawn is not None
+
+    def _edge(self, r0: Sequence[Jet]) -> tuple[list[Expr], Expr] | None:
+        """The covector on every side and the width, as of the carrier."""
+        density = self._energies[0].density
+        if density is None or not density.on_edges:
+            return None
+        covectors = [ufl.as_vector([self._geometry[2 * side], 0]) for side in self._sides]
+        widths = [
+            self._geometry[2 * side + 1] / 2 * ufl.sqrt(ufl.dot(r0[side].r1, r0[side].r1)) for side in self._sides
+        ]
+        return covectors, sum(widths, ufl.zero()) / len(widths)
+
+    def _of_sides(self, field: fem.Function, components: int, side: int) -> list[list[Expr]]:
+        first = components * DERIVATIVES * side
+        return [[field[first + components * d + c] for c in range(components)] for d in range(DERIVATIVES)]
+
+    def _derivatives(self, field: fem.Function) -> Array:
+        """(points, sides, derivatives, components) of an axisymmetric field."""
+        nodal = field.x.array.reshape(-1, PLANE)[self._u.function_space.dofmap.list]
+        sides = [
+            np.einsum("edn,enc->edc", table, np.repeat(nodal[cells], len(self._batch.rule.weights), axis=0))
+            for table, cells in zip(self._tables, self._batch.cells, strict=True)
+        ]
+        return np.stack(sides, axis=1)
+
+    @cached_property
+    def _tables(self) -> list[Array]:
+        """(points, derivatives, functions) by the coordinate of the meridian, on each side."""
+        V = self._u.function_space
+        found = []
+        for X, cells in zip(self._batch.rule.points, self._batch.cells, strict=True):
+            reference = V.element.basix_element.tabulate(2, X)[..., 0].transpose(1, 0, 2)
+            scales = 1 / _lengths(V)[cells][:, None] ** np.arange(DERIVATIVES)
+            whole = scales[:, None, :, None] * reference
+            found.append(whole.reshape(-1, DERIVATIVES, reference.shape[2]))
+        return found
+
+    @cached_property
+    def _shapes(self) -> Array:
+        """(points, numbers of the waves' jets, functions of all sides and components)."""
+        blocks = [np.einsum("pdn,ce->pdcne", table, np.eye(WAVE)) for table in self._tables]
+        points, derivatives, _, functions, _ = blocks[0].shape
+        size, width = derivatives * WAVE, functions * WAVE
+        whole = np.zeros((points, len(blocks) * size, len(blocks) * width))
+        for side, block in enumerate(blocks):
+            rows, columns = slice(side * size, (side + 1) * size), slice(side * width, (side + 1) * width)
+            whole[:, rows, columns] = block.reshape(points, size, width)
+        return whole
+
+    @cached_property
+    def _weights(self) -> Array:
+        """(points,) of the integral over the coordinate; one at a vertex."""
+        cells, weights = self._batch.cells[0], self._batch.rule.weights
+        density = self._energies[0].density
+        sizes = np.ones(len(cells)) if density and density.on_edges else abs(_lengths(self._u.function_space)[cells])
+        return np.outer(sizes, weights).ravel()
+
+
+def _added(
+    density: Density,
+    r0: Sequence[Jet],
+    u: Sequence[Jet],
+    v: Sequence[Jet],
+    edge: tuple[Sequence[Expr], Expr] | None,
+    parameters: Sequence[fem.Constant | fem.Function],
+) -> Expr:
+    """A density with the Hessian in v, at v = 0, of that at u + v; see `Energy.added`."""
+    more = [a + b for a, b in zip(u, v, strict=True)]
+    if density.work is None:
+        return density.at([r0, more], edge, parameters)
+    less = [a - b for a, b in zip(u, v, strict=True)]
+    return (density.at([r0, more, v], edge, parameters) - density.at([r0, less, v], edge, parameters)) / 4
+
+
+def _place(e: Energy) -> tuple[int, int, tuple[int, ...]]:
+    """Where a density lives: energies with the same one share their points."""
+    assert e.density
+    facets = () if e.density.facets is None else tuple(e.density.facets.tolist())
+    return e.density.sides, e.density.quadrature or 0, facets
+
+
+def _batches(carrier: Carrier, density: Density | None) -> Iterable[Batch]:
+    """The points where a density lives; the geometry of each is the covector and the length of the cell, by sides."""
+    V = carrier.r0.function_space
+    topology, lengths = V.mesh.topology, _lengths(V)
+    assert density
+    if not density.on_edges:
+        X, weights = basix.make_quadrature(basix.CellType.interval, density.quadrature or carrier.rule)
+        cells = np.arange(topology.index_map(1).size_local, dtype=np.int32)
+        yield Batch((cells,), Rule((X,), (), weights), np.zeros((len(cells) * len(X), 2)))
+        return
+    topology.create_connectivity(0, 1)
+    links, corners = topology.connectivity(0, 1), topology.connectivity(1, 0).array.reshape(-1, 2)
+    inner = np.flatnonzero(np.diff(links.offsets) == 2) if density.facets is None else density.facets
+    around = np.array([links.links(vertex) for vertex in inner], dtype=np.int32).reshape(len(inner), -1)
+    local = (corners[around] != np.asarray(inner)[:, None, None]).argmin(axis=2)  # the vertex's number in each cell
+    for kind in np.unique(local, axis=0):
+        those = (local == kind).all(axis=1)
+        cells = tuple(np.ascontiguousarray(side) for side in around[those].T)
+        outward = [np.sign(lengths[side]) * (1 if end else -1) for side, end in zip(cells, kind, strict=True)]
+        geometry = [np.column_stack([m, abs(lengths[side])]) for m, side in zip(outward, cells, strict=True)]
+        rule = Rule(tuple(np.array([[float(end)]]) for end in kind), (), np.ones(1))
+        yield Batch(cells, rule, np.hstack(geometry))
+
+
+def _lengths(V: fem.FunctionSpace) -> Array:
+    """(cells,) of the coordinate's change from the first to the second vertex."""
+    ends = V.mesh.geometry.x[compat.corner_numbers(V.mesh), 0]
+    return np.asarray(ends[:, 1] - ends[:, 0])
+
+
+def _triangle(size: int) -> Ints:
+    """(size, size) places in the rows of an upper triangle."""
+    places = np.zeros((size, size), dtype=np.int64)
+    rows, columns = np.triu_indices(size)
+    places[rows, columns] = places[columns, rows] = np.arange(len(rows))
+    return places
