@@ -1,4 +1,4 @@
-"""The package's C code, compiled once into the folder of FFCx's kernels."""
+"""The package's C code, compiled once into the folder of the kernels."""
 
 import hashlib
 import importlib.util
