@@ -20,7 +20,7 @@ from ufl.core.expr import Expr
 from magshell_fenicsx.assembly import point_code, scalars
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.point_code import COMPILED, OPTIONS, function_of
-from magshell_fenicsx.assembly.scalars import Nodes, Scalars, inputs_of
+from magshell_fenicsx.assembly.scalars import Scalars, flat, inputs_of
 
 Pair = tuple[int, int]
 Array = NDArray[np.float64]
@@ -80,7 +80,7 @@ class PointKernel:
         self._function(fields, sizes, c, count, out)
 
 
-Made = Callable[[Scalars, list[Nodes]], list[int]]
+Made = Callable[[Scalars, list[list[int]]], list[int]]  # from the nodes of each expression
 
 
 def _kernel(
@@ -97,15 +97,14 @@ def _kernel(
     """
     graph = Scalars()
     fields, constants = inputs_of(expressions)
-    nodes = [graph.components(e, fields, constants) for e in expressions]
-    number = {node: i for i, node in enumerate(graph.reached([n for each in nodes for n in each.ravel().tolist()]))}
+    nodes = [flat(graph.components(e, fields, constants)) for e in expressions]
+    number = {node: i for i, node in enumerate(graph.reached([node for each in nodes for node in each]))}
     operations = [
-        (graph.operations[node][0], *(number[operand] for operand in graph.operands(node)))
-        if graph.operands(node)
-        else graph.operations[node]
+        (graph.operations[node][0], *(number[operand] for operand in operands)) if operands else graph.operations[node]
         for node in number
+        for operands in [graph.operands(node)]
     ]
-    ends = [[number[node] for node in each.ravel().tolist()] for each in nodes]
+    ends = [[number[node] for node in each] for each in nodes]
     key = repr((_version(), asked, ends, operations))
     library = log.load(name, key, lambda: point_code.point_code(graph, made(graph, nodes)), OPTIONS, comm)
     return PointKernel(function_of(library), fields, constants, size)
@@ -121,18 +120,18 @@ def _version() -> str:
 def point_values(name: str, W: Expr, log: KernelLog, comm: MPI.Comm) -> PointKernel:
     """Compile the components of an expression; all ranks of `comm` together."""
     size = int(np.prod(W.ufl_shape))
-    return _kernel(name, [W], "values", size, lambda _, nodes: nodes[0].ravel().tolist(), log, comm)
+    return _kernel(name, [W], "values", size, lambda _, nodes: nodes[0], log, comm)
 
 
 def point_gradient(name: str, sums: Sequence[tuple[Expr, fem.Function]], log: KernelLog, comm: MPI.Comm) -> PointKernel:
     """Compile the sum of dW/dz for some W, each with its own z of the same size; all ranks of `comm` together."""
     size = sums[0][1].ufl_shape[0]
 
-    def made(graph: Scalars, nodes: list[Nodes]) -> list[int]:
+    def made(graph: Scalars, nodes: list[list[int]]) -> list[int]:
         total = [graph.zero] * size
-        for W, z in zip(nodes[::2], nodes[1::2], strict=True):
-            first, _ = graph.derivatives(int(W), z.tolist(), second=False)
-            total = [graph.add(t, first.get(i, graph.zero)) for t, i in zip(total, z.tolist(), strict=True)]
+        for (W,), z in zip(nodes[::2], nodes[1::2], strict=True):
+            first, _ = graph.derivatives(W, z, second=False)
+            total = [graph.add(t, first.get(i, graph.zero)) for t, i in zip(total, z, strict=True)]
         return total
 
     return _kernel(name, [e for one in sums for e in one], "gradient", size, made, log, comm)
@@ -190,9 +189,9 @@ def point_hessian(
     """
     sides = z.ufl_shape[0] // (3 * parts)
 
-    def made(graph: Scalars, nodes: list[Nodes]) -> list[int]:
-        inputs = nodes[1].tolist()
-        _, second = graph.derivatives(int(nodes[0]), inputs, second=True)
+    def made(graph: Scalars, nodes: list[list[int]]) -> list[int]:
+        (density,), inputs = nodes
+        _, second = graph.derivatives(density, inputs, second=True)
 
         def block(i: int, j: int, c: int, d: int) -> int:
             one, other = inputs[3 * i + c], inputs[3 * j + d]
@@ -218,9 +217,9 @@ def whole_hessian(name: str, W: Expr, z: fem.Function, log: KernelLog, comm: MPI
     """Compile d2W/dz2 at z = 0: the rows of its upper triangle. All ranks of `comm` compile together."""
     size = z.ufl_shape[0]
 
-    def made(graph: Scalars, nodes: list[Nodes]) -> list[int]:
-        inputs = nodes[1].tolist()
-        _, second = graph.derivatives(int(nodes[0]), inputs, second=True)
+    def made(graph: Scalars, nodes: list[list[int]]) -> list[int]:
+        (density,), inputs = nodes
+        _, second = graph.derivatives(density, inputs, second=True)
         pairs = [(min(i, j), max(i, j)) for i, j in combinations_with_replacement(inputs, 2)]
         return graph.replaced([second.get(pair, graph.zero) for pair in pairs], dict.fromkeys(inputs, graph.zero))
 

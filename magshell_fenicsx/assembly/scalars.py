@@ -5,6 +5,7 @@ Fields and constants are the inputs. A node is the number of an operation; the o
 
 from collections.abc import Callable, Iterable, Sequence
 from itertools import combinations_with_replacement
+from math import prod
 from typing import Any
 
 import numpy as np
@@ -166,12 +167,13 @@ class Scalars:
         lowered = apply_algebra_lowering(expression)
         if has_type(lowered, classes.Derivative):
             lowered = apply_derivatives(lowered)
-        places = np.cumsum([0, *(int(np.prod(c.ufl_shape)) for c in constants)])
-        inputs = {f: [("field", i, k) for k in range(int(np.prod(f.ufl_shape)))] for i, f in enumerate(fields)}
-        inputs |= {
-            c: [("constant", place + k) for k in range(int(np.prod(c.ufl_shape)))]
-            for c, place in zip(constants, places.tolist(), strict=False)
-        }
+        inputs: dict[Expr, list[Operation]] = {}
+        for number, f in enumerate(fields):
+            inputs[f] = [("field", number, k) for k in range(prod(f.ufl_shape))]
+        place = 0
+        for c in constants:
+            inputs[c] = [("constant", place + k) for k in range(prod(c.ufl_shape))]
+            place += prod(c.ufl_shape)
         values: dict[Expr, Nodes] = {}
         for e in unique_post_traversal(lowered):
             if e in inputs:
@@ -187,7 +189,7 @@ class Scalars:
         if isinstance(e, classes.ScalarValue):
             return np.array(self.number(float(e)))
         if isinstance(e, classes.Identity):
-            return np.where(np.eye(*e.ufl_shape, dtype=bool), self.one, self.zero)
+            return np.where(np.eye(*e.ufl_shape) == 1, self.one, self.zero)
         if isinstance(e, UNCHANGED):
             return np.asarray(operands[0])
         if isinstance(e, classes.Indexed):
@@ -201,9 +203,8 @@ class Scalars:
         if isinstance(e, classes.IndexSum):
             a, label = e.ufl_operands
             summed = np.moveaxis(operands[0], len(a.ufl_shape) + a.ufl_free_indices.index(label[0].count()), -1)
-            return np.array([self.sum(row) for row in summed.reshape(-1, summed.shape[-1]).tolist()]).reshape(
-                summed.shape[:-1]
-            )
+            sums = [self.sum(flat(row)) for row in summed.reshape(-1, summed.shape[-1])]
+            return np.array(sums).reshape(summed.shape[:-1])
         operation = self._of_numbers(e)
         aligned = [_aligned(v, o, e) for v, o in zip(operands, e.ufl_operands, strict=True) if v is not None]
         together = np.broadcast_arrays(*aligned)
@@ -300,7 +301,8 @@ class Scalars:
                 {i: self.pick(condition, f2.get(i, zero), g2.get(i, zero)) for i in f2 | g2},
             )
         slopes, bends = self._rules(node, name, operands)
-        by, twice = First(), Second()
+        by: First = {}
+        twice: Second = {}
         for i, operand in enumerate(operands):
             if operand in active:
                 by[operand] = self.add(by.get(operand, self.zero), slopes[i])
@@ -395,6 +397,10 @@ class Scalars:
                 slope = times(number(2 / np.sqrt(np.pi)), self.node("exp", self.minus(square)))
                 return slope, times(number(-2.0), times(x, slope))
         raise NotImplementedError(f"an energy at points has {name}, whose derivative is not known")
+
+
+def flat(nodes: Nodes) -> list[int]:
+    return [int(node) for node in nodes.ravel()]
 
 
 def inputs_of(expressions: Iterable[Expr]) -> tuple[list[Any], list[Any]]:

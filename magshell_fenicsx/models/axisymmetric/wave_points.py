@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
-from itertools import groupby
 
 import basix
 import numpy as np
@@ -46,17 +45,19 @@ class WavePoints:
 
     def __init__(self, carrier: Carrier, u: fem.Function, energies: Sequence[Energy], log: KernelLog) -> None:
         self._nodes = u.function_space.dofmap.list.astype(np.int64)
+        places = dict[tuple[int, int, tuple[int, ...]], list[Energy]]()
+        for e in energies:
+            places.setdefault(_place(e), []).append(e)
         self._sites = [
-            _Site(carrier, u, batch, list(there), log)
-            for _, there in groupby(sorted(energies, key=_place), key=_place)
-            for there in [list(there)]
+            _Site(carrier, u, batch, there, log)
+            for there in places.values()
             for batch in _batches(carrier, there[0].density)
         ]
         pairs = [site.pairs(self._nodes) for site in self._sites]
         count = int(self._nodes.max()) + 1
-        numbers, places = np.unique(np.concatenate([each.ravel() for each in pairs]), return_inverse=True)
+        numbers, of_pairs = np.unique(np.concatenate([each.ravel() for each in pairs]), return_inverse=True)
         self.rows, self.columns = numbers // count, numbers % count
-        within = 9 * places[:, None] + np.arange(9)  # of the components of a block
+        within = 9 * of_pairs[:, None] + np.arange(9)  # of the components of a block
         ends = np.cumsum([each.size for each in pairs])[:-1]
         self._places = [part.ravel() for part in np.split(within, ends)]
 
@@ -104,13 +105,13 @@ class _Site:
         fill(self._at_r0, self._derivatives(self._carrier.r0))
         if self._carrier.drawn is not None:
             fill(self._drawn, self._derivatives(self._carrier.drawn))
-        upper = 0.0
+        size = WAVE * DERIVATIVES * len(self._sides)
+        upper = np.zeros((self._batch.size, size * (size + 1) // 2))
         for number in present:
             for here, values in self._varying[number]:
                 fill(here, values.renew()[0])
             factor = np.pi * factors[self._energies[number].amplitude]
-            upper = upper + factor * self._points.evaluate(self._kernels[number], self._batch.size)
-        size = WAVE * DERIVATIVES * len(self._sides)
+            upper += factor * self._points.evaluate(self._kernels[number], self._batch.size)
         hessians = upper[:, _triangle(size)]
         entities, each = len(self._batch.cells[0]), len(self._batch.rule.weights)
         shapes = self._shapes
@@ -198,8 +199,9 @@ class _Site:
         """(points,) of the integral over the coordinate; one at a vertex."""
         cells, weights = self._batch.cells[0], self._batch.rule.weights
         density = self._energies[0].density
-        sizes = np.ones(len(cells)) if density and density.on_edges else abs(_lengths(self._u.function_space)[cells])
-        return np.outer(sizes, weights).ravel()
+        lengths = np.abs(_lengths(self._u.function_space)[cells])
+        sizes = np.ones(len(cells)) if density and density.on_edges else lengths
+        return np.asarray(np.outer(sizes, weights).ravel())
 
 
 def _added(
@@ -221,7 +223,7 @@ def _added(
 def _place(e: Energy) -> tuple[int, int, tuple[int, ...]]:
     """Where a density lives: energies with the same one share their points."""
     assert e.density
-    facets = () if e.density.facets is None else tuple(e.density.facets.tolist())
+    facets = () if e.density.facets is None else tuple(int(facet) for facet in e.density.facets)
     return e.density.sides, e.density.quadrature or 0, facets
 
 
@@ -232,8 +234,8 @@ def _batches(carrier: Carrier, density: Density | None) -> Iterable[Batch]:
     assert density
     if not density.on_edges:
         X, weights = basix.make_quadrature(basix.CellType.interval, density.quadrature or carrier.rule)
-        cells = np.arange(topology.index_map(1).size_local, dtype=np.int32)
-        yield Batch((cells,), Rule((X,), (), weights), np.zeros((len(cells) * len(X), 2)))
+        every = np.arange(topology.index_map(1).size_local, dtype=np.int32)
+        yield Batch((every,), Rule((X,), (), weights), np.zeros((len(every) * len(X), 2)))
         return
     topology.create_connectivity(0, 1)
     links, corners = topology.connectivity(0, 1), topology.connectivity(1, 0).array.reshape(-1, 2)

@@ -131,15 +131,18 @@ class _Cells:
         _ = self._points.gradient
 
     def energy(self, nodal: Array, name: str) -> float:
-        kernel, found = self._points.energy(name), 0.0
-        for chunk, _ in self._filled(nodal) if kernel else []:
-            found += float(np.sum(self._points.evaluate(chunk, kernel).reshape(-1, len(self._weights)) @ self._weights))
-        return found
+        if (kernel := self._points.energy(name)) is None:
+            return 0.0
+        total = 0.0
+        for chunk, _ in self._filled(nodal):
+            total += float(np.sum(self._points.evaluate(chunk, kernel).reshape(-1, len(self._weights)) @ self._weights))
+        return total
 
     def add(self, nodal: Array, factors: Mapping[str, float], elements: Array) -> None:
         factor = factors.get(self.names[0], 0.0)
-        kernel = self._points.gradient if factor else None
-        for chunk, cells in self._filled(nodal) if kernel else []:
+        if not factor or (kernel := self._points.gradient) is None:
+            return
+        for chunk, cells in self._filled(nodal):
             elements[cells] += factor * self._sheet.at_nodes(self._points.evaluate(chunk, kernel))
 
     def _filled(self, nodal: Array) -> Iterator[tuple[slice, slice]]:
@@ -216,8 +219,10 @@ class _Edges:
 
     def _evaluated(self, name: str, kernel: PointKernel | None) -> Iterator[tuple[NDArray[np.intp], Array]]:
         """A kernel's values in each chunk, at the points of these numbers among those of all cells' edges."""
+        if kernel is None:
+            return
         rows, points = self._on[name]
-        for chunk in points.chunks() if kernel else []:
+        for chunk in points.chunks():
             here = rows[chunk].ravel()
             np.take(self._there, here, axis=0, out=points.room(chunk).reshape(len(here), -1), mode="clip")
             yield here, points.evaluate(chunk, kernel)
