@@ -169,6 +169,8 @@ import magshell_fenicsx as ms
 assert "dolfinx" not in sys.modules
 import magshell_fenicsx.runs.status
 assert ms.run.__name__ == "run" and "run" in dir(ms)
+slow = {"scipy.optimize", "scipy.interpolate", "scipy.spatial"}  # a quarter of a second of each run
+assert not slow & sys.modules.keys()
 from magshell_fenicsx import *
 assert run is ms.run and kinematics.Jet is ms.Jet
 assert set(ms.__all__) <= set(globals())

@@ -6,9 +6,9 @@ from math import ceil, inf, sqrt
 
 import basix
 import numpy as np
+import scipy
 from mpi4py import MPI
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from magshell_fenicsx.input.expressions import Together, formula
 from magshell_fenicsx.input.messages import shown
@@ -252,7 +252,7 @@ def shown_by_polynomials(values: Callable[[Array], Array], leaves: Leaves | None
 
 def _unsampled(leaves: Leaves, middle: Array, side: float, sampled: Array) -> Array:
     """The squares' integrals of the square of a formula, less those of samples that have not half of it."""
-    away, square = cKDTree(middle).query(leaves.centre, distance_upper_bound=side)
+    away, square = scipy.spatial.cKDTree(middle).query(leaves.centre, distance_upper_bound=side)
     there = np.isfinite(away) & (leaves.size < side)
     whole = np.bincount(square[there], (leaves.area * leaves.away)[there], len(middle))
     return np.where(sampled < HALF * whole, whole, 0.0)

@@ -5,8 +5,8 @@ from functools import partial
 from itertools import pairwise
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.interpolate import CubicHermiteSpline
 
 from magshell_fenicsx.continuation.control import GivenLoad
 from magshell_fenicsx.continuation.point import PathStopped, Point
@@ -118,7 +118,7 @@ def refuse_return(stage: Stage, name: str, points: Sequence[Point], high: Point)
         x, y = a.state.mu[name], b.state.mu[name]
         if (mu[-1] - x) * (mu[-1] - y) > 0 or not a.dmu or not b.dmu:
             continue
-        t = CubicHermiteSpline([x, y], [a.state.u, b.state.u], [a.du / a.dmu, b.du / b.dmu])(mu[-1])
+        t = scipy.interpolate.CubicHermiteSpline([x, y], [a.state.u, b.state.u], [a.du / a.dmu, b.du / b.dmu])(mu[-1])
         if max_abs(comm, high.state.u - t) < ALIKE * fallen:
             said = "the body goes back the way it came: at its fold the shell snaps under a given approach"
             raise PathStopped(said, low, final=True)

@@ -6,8 +6,8 @@ from functools import cache, cached_property
 from math import atan2
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from magshell_fenicsx.mesh.mirror import Mirror, rotation
 from magshell_fenicsx.mesh.patch import Deviation
@@ -47,8 +47,8 @@ class _Numbers:
     profiles: Sequence[Callable[[Array], Array]]
 
     @cached_property
-    def tree(self) -> cKDTree:
-        return cKDTree(self.rows)
+    def tree(self) -> "scipy.spatial.cKDTree":
+        return scipy.spatial.cKDTree(self.rows)
 
     def __call__(self, x: Array) -> Array:
         """Their sum at a few places (m, 3)."""
