@@ -1,14 +1,14 @@
 """The list of all parts, and of all kinds of steps."""
 
-from functools import cache
 from importlib import import_module
 from inspect import cleandoc
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from pydantic import Field, create_model
 
 from magshell_fenicsx.parts.own import WithOwnTerms
 from magshell_fenicsx.parts.part import Account, Context, Part
+from magshell_fenicsx.parts.seen import Seen
 from magshell_fenicsx.parts.step import Step
 
 REGISTERED: dict[str, str] = {
@@ -37,13 +37,13 @@ KINDS_OF_STEPS: dict[str, str] = {
 FIRST = ("natural", "field")  # the kinds of which steps may come before the one load of a case, in their order
 
 WHAT_IS_SEEN = (  # module here and class in it, in the order of columns
-    "natural.planned.NaturalSeen",
+    "natural.section.NaturalSeen",
     "imperfections.growth.GrowingSeen",
     "pressure.pressure.PressureSeen",
-    "forces.loads.ForcesSeen",
+    "forces.dead.ForcesSeen",
     "supports.reacting.Moved",
-    "magnetism.sources.field.SourcesSeen",
-    "bodies.standing.BodiesSeen",
+    "magnetism.source_step.SourcesSeen",
+    "bodies.press.BodiesSeen",
 )
 ACCOUNTS = (  # modules here with a function `account`, in the order of `magshell check`
     "magnetism.magnetisation",
@@ -65,20 +65,14 @@ def accounts(context: Context, loads: "Loads") -> list[Account]:
     return [import_module(f"{__package__}.{module}").account(context, loads) for module in ACCOUNTS]
 
 
-@cache
-def seen() -> "tuple[Seen, ...]":
-    """What all rooms see of a state; they need the solver, which takes long to import."""
-    named = (path.rpartition(".") for path in WHAT_IS_SEEN)
-    return tuple(getattr(import_module(f"{__package__}.{module}"), name)() for module, _, name in named)
-
-
-def _step(path: str) -> type[Step]:
+def _named(path: str) -> Any:
+    """The class at a path below this room."""
     module, _, name = path.rpartition(".")
-    found: type[Step] = getattr(import_module(f"{__package__}.{module}"), name)
-    return found
+    return getattr(import_module(f"{__package__}.{module}"), name)
 
 
-STEPS: dict[str, type[Step]] = {kind: _step(path) for kind, path in KINDS_OF_STEPS.items()}
+STEPS: dict[str, type[Step]] = {kind: _named(path) for kind, path in KINDS_OF_STEPS.items()}
+SEEN: tuple[Seen, ...] = tuple(_named(path)() for path in WHAT_IS_SEEN)
 
 
 def _meaning(part: type[Part]) -> str:
@@ -88,7 +82,6 @@ def _meaning(part: type[Part]) -> str:
 
 if TYPE_CHECKING:
     from magshell_fenicsx.models.shell.parameters import Loads
-    from magshell_fenicsx.parts.seen import Seen
 
     WithParts = WithOwnTerms
 else:  # an optional key for each part

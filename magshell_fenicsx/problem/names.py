@@ -8,7 +8,7 @@ from magshell_fenicsx.mesh.patch import MeshError, PatchMesh
 from magshell_fenicsx.models.shell.parameters import Condition, Held, Loads
 from magshell_fenicsx.models.shell.thickness import Thickness, patch_of
 from magshell_fenicsx.parts.pressure.openings import moving, without_potential
-from magshell_fenicsx.parts.registered import seen
+from magshell_fenicsx.parts.registered import SEEN
 from magshell_fenicsx.parts.supports.supports import refuse_unknown
 
 
@@ -24,7 +24,7 @@ def refuse_unfit(
     """
     refuse_unknown(patch.edges, patch.points, patch.patches, conditions, loads)
     _refuse_ambiguous(patch.edges, patch.points, conditions)
-    for room in seen():
+    for room in SEEN:
         room.refuse_unfit(loads, patch)
     for name in (thickness and thickness.patches) or {}:
         patch_of(patch.patches, name, "shell.thickness_factor")

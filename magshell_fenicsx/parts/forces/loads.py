@@ -1,15 +1,10 @@
 """Dead loads in the model's terms: over E h R and in the model's frame, on the part that is modelled."""
 
-from collections.abc import Sequence
-from typing import ClassVar
-
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.expressions import ByFormula, Inwards, function
 from magshell_fenicsx.mesh.mirror import rotation
-from magshell_fenicsx.mesh.patch import PatchMesh
 from magshell_fenicsx.models.shell.parameters import (
     AreaForce,
     DeadLoad,
@@ -20,11 +15,8 @@ from magshell_fenicsx.models.shell.parameters import (
     Potential,
 )
 from magshell_fenicsx.models.shell.patterns import Pattern
-from magshell_fenicsx.models.shell.thickness import patch_of
 from magshell_fenicsx.parts.forces.dead import DeadLoadSection, potential
 from magshell_fenicsx.parts.part import Account, Context, Modelled
-from magshell_fenicsx.parts.seen import Seen, Sight
-from magshell_fenicsx.quantities.registry import amplitude
 
 Array = NDArray[np.float64]
 
@@ -68,41 +60,6 @@ def _pattern(load: DeadLoadSection, Q: Array, length: float, factor: float) -> P
         return ByFormula([function(v) for v in load.vector], Q, length, factor, vectors=True)
     assert load.pressure is not None
     return Inwards(ByFormula([function(load.pressure)], Q, length, factor))
-
-
-def also_displaced(loads: Loads) -> tuple[str, ...]:
-    """Amplitudes with a displacement besides the one of the column w_over_h."""
-    return tuple(name for name in (*loads.forces, *loads.dead) if name != loads.displaced)
-
-
-class ForcesSeen(Seen):
-    """Factors of forces and dead loads, and displacements along them."""
-
-    before_points: ClassVar[bool] = True
-
-    def amplitudes(self, loads: Loads) -> tuple[str, ...]:
-        return (*loads.forces, *loads.dead)
-
-    def columns(self, loads: Loads, supports: Sequence[str]) -> tuple[str, ...]:
-        factors = (amplitude(name).column for name in self.amplitudes(loads) if name != "force")
-        return (*factors, *(f"w_{name}_over_h" for name in also_displaced(loads)))
-
-    def observe(self, sight: Sight, state: State) -> dict[str, float]:
-        model, loads = sight.model, sight.loads
-        factors = {amplitude(name).column: state.mu[name] for name in self.amplitudes(loads)}
-        along = also_displaced(loads)
-        return factors | {f"w_{name}_over_h": model.loaded_deflection(state.u, name) / sight.h for name in along}
-
-    def refuse_unfit(self, loads: Loads, surface: PatchMesh) -> None:
-        for load in loads.all_dead:
-            if isinstance(load, AreaForce) and load.patch is not None:
-                patch_of(surface.patches, load.patch)
-
-    def conjugate_unit(self, sight: Sight, name: str) -> float | None:
-        """w/h of a force, the shell's length of dead loads."""
-        if name in sight.loads.forces:
-            return sight.model.force_unit * sight.h
-        return sight.model.load_size.get(name, 0.0) / sight.length if name in sight.loads.dead else None
 
 
 def account(context: Context, loads: Loads) -> Account:
