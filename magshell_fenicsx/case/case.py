@@ -30,7 +30,7 @@ from magshell_fenicsx.parts.part import Context
 from magshell_fenicsx.parts.registered import PARTS, WithParts, parts_of
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.parts.supports.boundary import EDGES, BoundarySection, refuse_taken
-from magshell_fenicsx.problem.elements import MeshSection, SolidSection
+from magshell_fenicsx.problem.sizes import MeshSection, SolidSection
 from magshell_fenicsx.problem.wanted import FrequenciesSection, GradientsSection, OutputSection, StabilitySection
 from magshell_fenicsx.shape.ground import Coordinates
 from magshell_fenicsx.shape.sections import CapSurface, MeshSurface, RevolutionSurface, Surface, SurfaceSection
