@@ -23,7 +23,7 @@ from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionSectio
 from magshell_fenicsx.parts.kinds import Bodies
 from magshell_fenicsx.parts.magnetism.fields import MagneticSection, layer_average, strength
 from magshell_fenicsx.parts.magnetism.sources.source import SourceSection
-from magshell_fenicsx.parts.motion.viscosity import refuse_unfit_viscosity
+from magshell_fenicsx.parts.motion.history import refuse_unfit_viscosity
 from magshell_fenicsx.parts.natural.section import NaturalSection, measured
 from magshell_fenicsx.parts.own import Origin
 from magshell_fenicsx.parts.part import Context

@@ -25,8 +25,7 @@ from magshell_fenicsx.parts.bodies.standing import Pressed, body_leaves, contact
 from magshell_fenicsx.parts.imperfections.imperfection import Flaw, flaws, in_frame
 from magshell_fenicsx.parts.imperfections.modes import ModesSection
 from magshell_fenicsx.parts.imperfections.modes import Shape as Mode
-from magshell_fenicsx.parts.imperfections.rims import MOST_RIMS, Spot, different, spots
-from magshell_fenicsx.parts.imperfections.symmetry import leaves
+from magshell_fenicsx.parts.imperfections.symmetry import MOST_RIMS, Spot, different, leaves, spots
 from magshell_fenicsx.parts.part import Modelled
 from magshell_fenicsx.parts.registered import STEPS
 from magshell_fenicsx.parts.supports.boundary import BoundarySection, EdgeCondition, HeldSection

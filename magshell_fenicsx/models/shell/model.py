@@ -38,8 +38,7 @@ from magshell_fenicsx.models.shell.parameters import (
     default_penalty,
 )
 from magshell_fenicsx.models.shell.patterns import by_patch, carried, cells_of
-from magshell_fenicsx.models.shell.residual import FastResidual
-from magshell_fenicsx.models.shell.slopes import point_parameters
+from magshell_fenicsx.models.shell.residual import FastResidual, point_parameters
 from magshell_fenicsx.models.shell.terms import EnergyFactory
 from magshell_fenicsx.models.shell.thickness import Thickness, thickness_field
 from magshell_fenicsx.parts.forces.dead_load import SurfaceMeasures, assemble_dead_loads

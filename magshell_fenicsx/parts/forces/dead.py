@@ -233,7 +233,7 @@ class DeadSection(PathStep):
                 yield Formulas(f"{key}.loads.{i}.{name}", values, -most, most, scales.R, load=True)
 
     def adds(self, step: ProgrammeStep, context: Context, modelled: Modelled) -> dict[str, Any]:
-        from magshell_fenicsx.parts.forces.loads import dead_load  # the solver takes long to import
+        from magshell_fenicsx.parts.forces.dead_load import dead_load  # the solver takes long to import
 
         mirror = modelled.mirror
         here = (load for load in self.loads if not mirror or load.edge not in mirror.lost)
