@@ -34,6 +34,7 @@ from magshell_fenicsx.problem.wanted import FrequenciesSection, GradientsSection
 from magshell_fenicsx.shape.turning import Span
 
 ROUNDING = 1e-9
+PRESSED = 0.08  # of sqrt(Rh): cells of a meridian that show the ring of a contact
 
 
 @dataclass(frozen=True)
@@ -72,9 +73,6 @@ def layers(context: Context) -> list[float]:
 
 def _section(context: Context) -> SolidSection:
     return context.of(SolidSection) or SolidSection()
-
-
-PRESSED = 0.08  # of sqrt(Rh): cells of a meridian that show the ring of a contact
 
 
 @dataclass(frozen=True)

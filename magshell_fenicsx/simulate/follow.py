@@ -61,10 +61,9 @@ def follow(scene: Scene, *, search: bool = True, remark: Callable[[str], None] =
             f"the undeformed shell is unstable in {pivots} directions: mesh.penalty is too small or the mesh too coarse"
         )
     for name, value in own.items():
-        walked = Walked(_under(scene, name, value, state))
-        for record in walked:
-            yield replace(record, shown=scene.displacement)
-        state = walked.end
+        rise = Walked(_under(scene, name, value, state))
+        yield from (replace(risen, shown=scene.displacement) for risen in rise)
+        state = rise.end
     for step in steps:
         where = f"step {step.number} of {len(steps)} ({step.kind}): " if scene.problem.listed else ""
         scene.progress.beginning(step.number)

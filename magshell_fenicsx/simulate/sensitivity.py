@@ -1,6 +1,12 @@
 """Sensitivities of the amplitude at a fold, for instance of the buckling pressure.
 
 The derivative d mu*/dp = -(phi . R_p)/(phi . R_mu) takes one dot product for each parameter p.
+
+By the numbers of an imperfection R_p is a central difference, (R(r0 + s dr0/dp) - R(r0 - s dr0/dp))/(2 s): where the
+chart's nodes stay, r0 alone depends on an imperfection. A rim makes r0 rough in p beside it, but R is smooth in r0.
+Differences of folds converge to these derivatives on the same mesh: for depths with the square of their step, for what
+moves a rim with the step itself. Between new meshes, whose edges follow the rim, they have the meshes' noise over the
+step.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,7 +26,7 @@ from magshell_fenicsx.continuation.system import State, Vector
 from magshell_fenicsx.mesh.mirror import Mirror
 from magshell_fenicsx.mesh.patch import Deviated, Deviation
 from magshell_fenicsx.models.shell.parameters import Magnetisation
-from magshell_fenicsx.models.shell.patterns import Array, Pattern, WithinRims
+from magshell_fenicsx.models.shell.patterns import Pattern, WithinRims
 from magshell_fenicsx.models.shell.terms import EnergyFactory
 from magshell_fenicsx.parts.imperfections.growth import grown_by
 from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionSection, LocalSection, flaws, in_frame
@@ -35,6 +41,9 @@ from magshell_fenicsx.simulate.steps import stage_of
 from magshell_fenicsx.simulate.transfer import same_mesh, transfer
 
 SOME_FIELD = 1e-3  # a lambda_m that is not zero; nothing is solved in it
+Array = NDArray[np.float64]
+Imperfections: TypeAlias = Mapping[str, ImperfectionSection]
+STEP, TINY = 1e-3, 1e-6  # of h, of a width or of the angle of a half-width: for the residual, and for dr0/dp
 
 
 def fold_at(scene: Scene, record: Record) -> Fold:
@@ -165,11 +174,6 @@ def _made(scene: Scene, field: Magnetisation) -> tuple[Sequence[FormTerm], Seque
     if isinstance(factory, EnergyFactory):
         return [factory.term(energy) for energy in factory.magnetic(field)], fields
     return factory.magnetic(field), fields
-
-
-Array = NDArray[np.float64]
-Imperfections: TypeAlias = Mapping[str, ImperfectionSection]
-STEP, TINY = 1e-3, 1e-6  # of h, of a width or of the angle of a half-width: for the residual, and for dr0/dp
 
 
 def to_imperfections(stage: Stage, fold: Fold) -> dict[str, float]:

@@ -1,4 +1,5 @@
-"""Energies and residuals without compiled forms, from the terms' own densities and their gradients at points."""
+"""Energies and residuals without compiled forms, from the terms' densities and their gradients at points; and both by
+free parameters."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace

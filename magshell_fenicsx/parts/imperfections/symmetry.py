@@ -1,4 +1,4 @@
-"""The symmetry that the imperfections of a case leave, by their values."""
+"""The symmetry that imperfections leave, by their values; and where they are in the chart, for its mesh."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -26,6 +26,12 @@ SAME = 1e-9  # of the largest w0
 PARTS = (0.2, 0.5, 0.8)  # of the reach, at which a local imperfection is compared
 IMAGE = 1e-12  # places, depths and widths that differ by less are equal: of w0 that is far below SAME
 FIRST = 3  # imperfections without an image that are looked at before all places are
+CORNERS = 128  # of a closed curve: a cubic spline through them is exact to 1e-6 of its size
+STEPS, ROUNDS = 40, 12
+SAME_RIM = 0.02  # of the element size
+MOST_RIMS = 60  # more would take gmsh minutes
+WIDEST = 4.0  # distance in the chart over the distance on the surface
+AXIS = 1e-9  # over R
 
 
 @dataclass(frozen=True)
@@ -173,14 +179,6 @@ def _sample(flaws: Mapping[str, Flaw], drawn: Outline) -> Array:
 
 def _same(w0: Array, image: Array) -> bool:
     return bool((np.abs(w0 - image) <= SAME * max(np.abs(w0).max(), np.abs(image).max())).all())
-
-
-CORNERS = 128  # of a closed curve: a cubic spline through them is exact to 1e-6 of its size
-STEPS, ROUNDS = 40, 12
-SAME_RIM = 0.02  # of the element size
-MOST_RIMS = 60  # more would take gmsh minutes
-WIDEST = 4.0  # distance in the chart over the distance on the surface
-AXIS = 1e-9  # over R
 
 
 @dataclass(frozen=True)

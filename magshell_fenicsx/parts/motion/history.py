@@ -1,4 +1,4 @@
-"""A load as a function of time: ramp, step, triangle, sine, a table, or a formula."""
+"""A load as a function of time: ramp, step, triangle, sine, a table, or a formula; and the viscosity of a shell."""
 
 import re
 from collections.abc import Callable
@@ -10,6 +10,9 @@ from pydantic import AfterValidator, Discriminator, Field, Tag
 from magshell_fenicsx.input.expressions import formula
 from magshell_fenicsx.input.section import Section, in_units, with_unit
 from magshell_fenicsx.parts.natural.section import NaturalSection
+
+Value = Callable[[Any], float]  # a time or a level as a plain number
+Curve = Callable[[float, bool], float]  # of the time since the step began, at a jump before or after it
 
 
 def measured(unit: str) -> Any:
@@ -24,8 +27,6 @@ def measured(unit: str) -> Any:
 
 Time: TypeAlias = measured("second")  # type: ignore[valid-type]
 Level: TypeAlias = measured("tesla")  # type: ignore[valid-type]
-Value = Callable[[Any], float]  # a time or a level as a plain number
-Curve = Callable[[float, bool], float]  # of the time since the step began, at a jump before or after it
 
 
 class RampHistory(Section):

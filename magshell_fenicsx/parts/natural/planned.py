@@ -14,8 +14,7 @@ from magshell_fenicsx.parts.natural.section import NaturalSection, components
 from magshell_fenicsx.parts.natural.shape import Natural, Varying, meridians
 from magshell_fenicsx.parts.part import Account, Context
 from magshell_fenicsx.shape.outline import Outline
-from magshell_fenicsx.shape.sections import MeshSurface, PlateSurface
-from magshell_fenicsx.shape.shell import ShellSection
+from magshell_fenicsx.shape.sections import MeshSurface, PlateSurface, ShellSection
 from magshell_fenicsx.shape.symmetry import Leaves, unit
 from magshell_fenicsx.shape.turning import scalar_turns
 

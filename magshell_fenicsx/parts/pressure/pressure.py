@@ -13,8 +13,7 @@ from magshell_fenicsx.parts.part import Account, Context
 from magshell_fenicsx.parts.seen import Seen, Sight
 from magshell_fenicsx.parts.step import PathStep, Step
 from magshell_fenicsx.quantities.quantity import PRESSURE, VOLUME
-from magshell_fenicsx.shape.sections import CapSurface, Surface
-from magshell_fenicsx.shape.shell import ShellSection
+from magshell_fenicsx.shape.sections import CapSurface, ShellSection, Surface
 
 if TYPE_CHECKING:
     from magshell_fenicsx.continuation.device import Conjugate
@@ -103,7 +102,7 @@ class Enclosed:
     pressure: float
     conjugate: float
 
-    def law(self) -> Conjugate:
+    def law(self) -> "Conjugate":
         """The conjugate as a function of p/p_c.
 
         Raises

@@ -33,6 +33,21 @@ from magshell_fenicsx.simulate.adapt.ending import CellFields, Ending, NoResult,
 from magshell_fenicsx.simulate.scene import Scene
 
 Array = NDArray[np.float64]
+FIRST = (0.5, 1.0, 2.0)  # refinements of the first mesh, tried until the path has a result
+FINER = 1.5  # factor of the refinement that is compared with
+SLOWEST, FASTEST = 1.25, 2.5  # factor of the refinement in one round
+PART = 0.4  # each part of the estimated error over the tolerance
+MOST_ROUNDS = 6
+MOST_LAYERS = 9
+Say = Callable[[str], None]
+DEGREES = ((3e-3, 3), (2e-4, 4), (0.0, 5))  # the fastest degree for tolerances down to the first number
+CHEAP = 3  # degree of the path
+SAFETY = 1.25  # factor of the estimate for the error of the finer solution
+AIM, LEAST = 0.55, 1 / 5  # estimated error over the tolerance
+COARSEST, FINEST = 0.1, 20.0  # limits of the refinement of a meridian
+LINES = 1.25  # least factor of the refinement of a grid; a smaller one may add no line
+FEW = 50  # a surface with at most so many cells is not coarsened
+Solved = tuple[Scene, Ending]
 
 
 def indicators(coarse: tuple[Scene, Ending], fine: tuple[Scene, Ending]) -> tuple[Array, Array]:
@@ -98,25 +113,6 @@ class _TangentEnergy:
         d = np.einsum("jqp,npc->jnqc", self._table, gathered(self._scene, v))
         second = np.stack([np.stack([d[3], d[4]], axis=-2), np.stack([d[4], d[5]], axis=-2)], axis=-3)
         return np.stack([d[1], d[2]], axis=-2), second
-
-
-FIRST = (0.5, 1.0, 2.0)  # refinements of the first mesh, tried until the path has a result
-FINER = 1.5  # factor of the refinement that is compared with
-SLOWEST, FASTEST = 1.25, 2.5  # factor of the refinement in one round
-PART = 0.4  # each part of the estimated error over the tolerance
-MOST_ROUNDS = 6
-MOST_LAYERS = 9
-
-Say = Callable[[str], None]
-DEGREES = ((3e-3, 3), (2e-4, 4), (0.0, 5))  # the fastest degree for tolerances down to the first number
-CHEAP = 3  # degree of the path
-SAFETY = 1.25  # factor of the estimate for the error of the finer solution
-AIM, LEAST = 0.55, 1 / 5  # estimated error over the tolerance
-COARSEST, FINEST = 0.1, 20.0  # limits of the refinement of a meridian
-LINES = 1.25  # least factor of the refinement of a grid; a smaller one may add no line
-FEW = 50  # a surface with at most so many cells is not coarsened
-
-Solved = tuple[Scene, Ending]
 
 
 def adapted_solid(problem: Problem, comm: MPI.Comm, say: Say, doing: Say) -> Adapted:

@@ -1,4 +1,4 @@
-"""Derivatives by a field, at the nodes of all cells at once.
+"""Derivatives by a field, at the nodes of all cells at once, and as densities per area; those of the mass.
 
 Each field is a coefficient of the terms' forms, or a part of one: the remanence, a factor of its magnitude, the factor
 of the thickness, the natural curvature in the case's frame, and a deviation w0 of the drawn shape along the normal of
@@ -38,6 +38,7 @@ from magshell_fenicsx.simulate.transfer import transfer
 
 Array = NDArray[np.float64]
 Projection = Callable[[Scene, fem.Function, Array, Array, Array], Array]  # of field, forces, places, normals -> forces
+MASS = "mass"
 
 
 @dataclass(frozen=True)
@@ -274,11 +275,8 @@ FIELDS = {
 }
 
 
-MASS = "mass"
-
-
 def mass(scene: Scene) -> tuple[float, FieldGradient | None]:
-    """It over that of the same shell with the thickness h, and its derivatives by the thickness; collective."""
+    """The mass over that of the same shell with the thickness h, and its derivatives by the thickness; collective."""
     model = scene.model
     if model.thickness is None:
         return 1.0, None
@@ -297,7 +295,15 @@ def mass(scene: Scene) -> tuple[float, FieldGradient | None]:
 
 
 def density(scene: Scene, found: FieldGradient) -> Array:
-    """dJ per area over R^2 (per volume of a solid) at the nodes of V on this rank, (nodes, components); collective."""
+    """dJ per area over R^2 (per volume of a solid) at the nodes of V on this rank, (nodes, components); collective.
+
+    With the derivatives f by a field at the nodes of the cells and the hat functions H_v of the vertices,
+
+        g_v = sum(f H_v)/int(H_v dA)
+
+    is what J changes by where the field changes by one over a unit of area, averaged over about a cell. The sum of
+    g_v int(H_v dA) is the derivative by a field that changes alike everywhere.
+    """
     V, nodes = scene.model.V, found.field.function_space.element.basix_element.points
     H = fem.functionspace(V.mesh, ("Lagrange", 1))
     hat, count = H.element.basix_element, len(found.forces)

@@ -24,6 +24,7 @@ from magshell_fenicsx.simulate.transfer import transfer
 
 STEP = 1e-4  # of a number, or of one where it is smaller
 BESIDE = 1e-5  # the same beside bodies, whose penetration is far smaller than what they move by
+Gradient: TypeAlias = float | FieldGradient
 
 
 def by_amplitude(adjoint: Adjoint, name: str) -> float:
@@ -120,9 +121,6 @@ def _own(other: Scene, place: Place, state: State) -> float:
     if place.energy:
         found += place.energy / other.model.multiplicity * sum(other.energies(state).values())
     return float(found)
-
-
-Gradient: TypeAlias = float | FieldGradient
 
 
 def gradient(

@@ -1,4 +1,7 @@
-"""What can be differentiated, by name: columns, shapes, vibrations and barriers at the end of a history."""
+"""What can be differentiated, by name: columns, shapes, vibrations and barriers at the end of a history.
+
+Before anything is built names alone say what a problem will have.
+"""
 
 from collections.abc import Iterable, Mapping, Sequence
 from types import SimpleNamespace
@@ -54,6 +57,12 @@ def refuse_no_barrier(problem: Problem) -> None:
 
 def adjoint_of_barrier(scene: Scene, begin: Record | None, end: Record, begins: Begins = NONE) -> Adjoint:
     """The adjoint of the barrier between the begin and the end of the last step.
+
+    Both are in equilibrium without the probing force, so that the energy changes by p alone,
+
+        dJ/dp = Pi_p(end) - Pi_p(begin) + sum_i (mu_i(end) - mu_i(begin)) dq_i/dp,
+
+    with the conjugates q_i that the probing holds: they are those of its begin, where one solve is for them.
 
     Raises
     ------
