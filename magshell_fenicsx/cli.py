@@ -355,7 +355,7 @@ def check(case: CaseFile, set_: Settings = None) -> None:
         problem = with_modes(problem_of(read, world()), world())
         print_line(describe(read, problem))
         if read.gradients or read.design:
-            from magshell_fenicsx.simulate.gradients.expected import refuse_unknown_results
+            from magshell_fenicsx.simulate.gradients.results import refuse_unknown_results
 
             try:
                 refuse_unknown_results(problem, read.design.named if read.design else {})

@@ -23,18 +23,23 @@ from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionSectio
 from magshell_fenicsx.parts.kinds import Bodies
 from magshell_fenicsx.parts.magnetism.fields import MagneticSection, layer_average, strength
 from magshell_fenicsx.parts.magnetism.sources.source import SourceSection
-from magshell_fenicsx.parts.motion.viscosity import refuse_unfit_viscosity
+from magshell_fenicsx.parts.motion.history import refuse_unfit_viscosity
 from magshell_fenicsx.parts.natural.section import NaturalSection, measured
-from magshell_fenicsx.parts.own import Origin
 from magshell_fenicsx.parts.part import Context
-from magshell_fenicsx.parts.registered import PARTS, WithParts, parts_of
+from magshell_fenicsx.parts.registered import PARTS, Origin, WithParts, parts_of
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.parts.supports.boundary import EDGES, BoundarySection, refuse_taken
-from magshell_fenicsx.problem.elements import MeshSection, SolidSection
+from magshell_fenicsx.problem.sizes import MeshSection, SolidSection
 from magshell_fenicsx.problem.wanted import FrequenciesSection, GradientsSection, OutputSection, StabilitySection
 from magshell_fenicsx.shape.ground import Coordinates
-from magshell_fenicsx.shape.sections import CapSurface, MeshSurface, RevolutionSurface, Surface, SurfaceSection
-from magshell_fenicsx.shape.shell import ShellSection
+from magshell_fenicsx.shape.sections import (
+    CapSurface,
+    MeshSurface,
+    RevolutionSurface,
+    ShellSection,
+    Surface,
+    SurfaceSection,
+)
 from magshell_fenicsx.studies.sections import DesignSection, EnsembleSection
 
 if TYPE_CHECKING:

@@ -10,11 +10,11 @@ from magshell_fenicsx.mesh.msh import MeshFile
 from magshell_fenicsx.mesh.patch import MeshError, PatchMesh
 from magshell_fenicsx.parts.pressure.openings import no_potential, ring_openings
 from magshell_fenicsx.problem.columns import sizes_of
-from magshell_fenicsx.problem.elements import degree_of
 from magshell_fenicsx.problem.formulas import cells_of_patch, unshown, written
 from magshell_fenicsx.problem.limits import refuse_beyond_memory
 from magshell_fenicsx.problem.names import open_edges
 from magshell_fenicsx.problem.problem import Problem, meridian_vertices
+from magshell_fenicsx.problem.sizes import degree_of
 
 
 def describe(case: Case, problem: Problem | None = None) -> str:

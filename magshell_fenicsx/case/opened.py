@@ -15,8 +15,8 @@ from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.input.section import FileKeys, number_and_unit, si_size
 from magshell_fenicsx.input.source import CaseError, Source, read_source
 from magshell_fenicsx.platform.processes import from_first
-from magshell_fenicsx.problem.elements import MeshSection
 from magshell_fenicsx.problem.problem import Document
+from magshell_fenicsx.problem.sizes import MeshSection
 
 
 def opened(case: Case | Mapping[str, Any] | str | Path, comm: MPI.Comm, settings: Sequence[str] = ()) -> Case:

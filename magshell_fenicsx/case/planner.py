@@ -25,13 +25,11 @@ from magshell_fenicsx.parts.bodies.standing import Pressed, body_leaves, contact
 from magshell_fenicsx.parts.imperfections.imperfection import Flaw, flaws, in_frame
 from magshell_fenicsx.parts.imperfections.modes import ModesSection
 from magshell_fenicsx.parts.imperfections.modes import Shape as Mode
-from magshell_fenicsx.parts.imperfections.rims import MOST_RIMS, Spot, different, spots
-from magshell_fenicsx.parts.imperfections.symmetry import leaves
+from magshell_fenicsx.parts.imperfections.symmetry import MOST_RIMS, Spot, different, leaves, spots
 from magshell_fenicsx.parts.part import Modelled
 from magshell_fenicsx.parts.registered import STEPS
 from magshell_fenicsx.parts.supports.boundary import BoundarySection, EdgeCondition, HeldSection
 from magshell_fenicsx.problem.account import account
-from magshell_fenicsx.problem.body import body_of
 from magshell_fenicsx.problem.columns import refuse_twice
 from magshell_fenicsx.problem.formulas import (
     looked_at,
@@ -42,9 +40,8 @@ from magshell_fenicsx.problem.formulas import (
     written,
 )
 from magshell_fenicsx.problem.limits import unknowns_of
-from magshell_fenicsx.problem.names import refuse_unfit_ends
-from magshell_fenicsx.problem.own_terms import surface_terms
-from magshell_fenicsx.problem.problem import Awaited, Problem
+from magshell_fenicsx.problem.names import refuse_unfit_ends, surface_terms
+from magshell_fenicsx.problem.problem import Awaited, Problem, body_of
 from magshell_fenicsx.problem.sizes import Loaded, grading
 from magshell_fenicsx.shape.ground import refuse_beside
 from magshell_fenicsx.shape.outline import Chart, Outline, ground_of

@@ -21,8 +21,7 @@ from magshell_fenicsx.models.shell.fitted import Cells
 from magshell_fenicsx.models.shell.parameters import Loads, Material
 from magshell_fenicsx.models.shell.terms import EnergyFactory
 from magshell_fenicsx.parts.bodies.contact import Pressing, Region
-from magshell_fenicsx.parts.forces.dead_load import DeadLoads
-from magshell_fenicsx.parts.forces.load_vector import point_entries
+from magshell_fenicsx.parts.forces.dead_load import DeadLoads, point_entries
 from magshell_fenicsx.parts.magnetism.applied import AppliedField
 from magshell_fenicsx.parts.supports.moved import Support
 

@@ -1,17 +1,17 @@
 """An elastic foundation: springs along the undeformed normal and in the surface, of stiffnesses that may vary."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from typing import Annotated, Self
 
 import ufl
 from pydantic import Field, model_validator
 from ufl.core.expr import Expr
 
-from magshell_fenicsx.input.expressions import Formula, symbolic
+from magshell_fenicsx.input.expressions import Formula
 from magshell_fenicsx.input.section import or_number
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.kinematics import Jet
-from magshell_fenicsx.models.shell.own_term import SYMBOLIC, OwnTerm
+from magshell_fenicsx.models.shell.own_term import OwnTerm, times_formula
 from magshell_fenicsx.parts.part import Context, Formulas, Part, Scales
 from magshell_fenicsx.quantities.quantity import POINT_FORCE, STIFFNESS, Quantity
 
@@ -65,13 +65,14 @@ class Foundation(Part):
         return [Formulas("foundation.factor", [self.factor], 0.0, MOST_FACTOR, 1.0)] if self.factor else []
 
     def terms(self, scales: Scales) -> list[OwnTerm]:
-        k, found = self._dimensionless(scales), list[OwnTerm]()
+        k, springs = self._dimensionless(scales), list[OwnTerm]()
+        normal, reacting, tangential = (times_formula(self.factor, of) for of in (energy, reaction, tangential_energy))
         if "k" in k:
-            observed = {"foundation_force": self._times_factor(reaction)}
-            found.append(OwnTerm("foundation", self._times_factor(energy), (scales.force,), k["k"], observed))
+            observed = {"foundation_force": reacting}
+            springs.append(OwnTerm("foundation", normal, (scales.force,), k["k"], observed))
         if "k_t" in k:
-            found.append(OwnTerm("foundation_tangential", self._times_factor(tangential_energy), value=k["k_t"]))
-        return found
+            springs.append(OwnTerm("foundation_tangential", tangential, value=k["k_t"]))
+        return springs
 
     def account(self, scales: Scales) -> str:
         of = ", ".join(f"{name} R²/(E h) = {value:.6g}" for name, value in self._dimensionless(scales).items())
@@ -80,13 +81,6 @@ class Foundation(Part):
     def _dimensionless(self, scales: Scales) -> dict[str, float]:
         given = {"k": self.stiffness, "k_t": self.tangential}
         return {name: k * scales.R**2 / (scales.E * scales.h) for name, k in given.items() if k is not None}
-
-    def _times_factor(self, density: Callable[..., Expr]) -> Callable[..., Expr]:
-        """A density, multiplied by the formula at the undeformed place."""
-        text = self.factor
-        if text is None:
-            return density
-        return lambda r0, u, *parameters: symbolic(text, SYMBOLIC, *r0.r) * density(r0, u, *parameters)
 
 
 def energy(r0: Jet, u: Jet, force: Expr) -> Expr:

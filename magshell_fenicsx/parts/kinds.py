@@ -12,8 +12,7 @@ from magshell_fenicsx.input.section import Chosen, Section
 from magshell_fenicsx.parts.bodies.body import BodySection
 from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionSection, note_sizes
 from magshell_fenicsx.parts.magnetism.sources.source import SourceSection
-from magshell_fenicsx.parts.motion.history import Time
-from magshell_fenicsx.parts.motion.viscosity import Branches
+from magshell_fenicsx.parts.motion.history import Branches, Time
 
 if TYPE_CHECKING:
     from magshell_fenicsx.parts.imperfections.dimple import DimpleSection

@@ -19,8 +19,7 @@ if TYPE_CHECKING:
     from magshell_fenicsx.models.shell.patterns import Inside
     from magshell_fenicsx.parts.step import ProgrammeStep, Step
     from magshell_fenicsx.shape.outline import Outline
-    from magshell_fenicsx.shape.sections import Surface
-    from magshell_fenicsx.shape.shell import ShellSection
+    from magshell_fenicsx.shape.sections import ShellSection, Surface
 
 Array = NDArray[np.float64]
 Kind = TypeVar("Kind")

@@ -1,22 +1,24 @@
-"""The list of all parts, and of all kinds of steps."""
+"""The lists of all parts, of all kinds of steps and of what rooms observe; and the base of a case that they make."""
 
-from functools import cache
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from importlib import import_module
 from inspect import cleandoc
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
 
-from pydantic import Field, create_model
+from pydantic import Field, PrivateAttr, create_model
 
-from magshell_fenicsx.parts.own import WithOwnTerms
+from magshell_fenicsx.input.section import Section
+from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.parts.part import Account, Context, Part
+from magshell_fenicsx.parts.seen import Seen
 from magshell_fenicsx.parts.step import Step
 
 REGISTERED: dict[str, str] = {
     # key of the case file, and name of the file here -> the class in it
     "foundation": "Foundation",
-}
-PARTS: dict[str, type[Part]] = {
-    key: getattr(import_module(f"{__package__}.{key}"), name) for key, name in REGISTERED.items()
 }
 
 KINDS_OF_STEPS: dict[str, str] = {
@@ -37,22 +39,88 @@ KINDS_OF_STEPS: dict[str, str] = {
 FIRST = ("natural", "field")  # the kinds of which steps may come before the one load of a case, in their order
 
 WHAT_IS_SEEN = (  # module here and class in it, in the order of columns
-    "natural.planned.NaturalSeen",
+    "natural.section.NaturalSeen",
     "imperfections.growth.GrowingSeen",
     "pressure.pressure.PressureSeen",
-    "forces.loads.ForcesSeen",
+    "forces.dead.ForcesSeen",
     "supports.reacting.Moved",
-    "magnetism.sources.field.SourcesSeen",
-    "bodies.standing.BodiesSeen",
+    "magnetism.source_step.SourcesSeen",
+    "bodies.press.BodiesSeen",
 )
 ACCOUNTS = (  # modules here with a function `account`, in the order of `magshell check`
     "magnetism.magnetisation",
     "natural.planned",
     "pressure.pressure",
-    "forces.loads",
+    "forces.dead_load",
     "supports.reacting",
     "bodies.standing",
 )
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Where the keys of a case were written, and what; equal cases may come from different files.
+
+    Attributes
+    ----------
+    data
+        Of `Source`; None without one.
+    context
+        With which these are validated: their folder and the files that were read.
+    """
+
+    place: Callable[[tuple[str | int, ...]], str] | None = field(default=None, compare=False)
+    data: dict[str, Any] | None = field(default=None, compare=False, repr=False)
+    context: dict[str, Any] = field(default_factory=dict, compare=False, repr=False)
+
+
+class WithOwnTerms(Section):
+    """The base of a case."""
+
+    _own_terms: tuple[OwnTerm, ...] = PrivateAttr(default=())
+    _origin: Origin = PrivateAttr(default=Origin())
+
+    def written_as(self, origin: Origin) -> Self:
+        """The case, with the places of its keys for messages that it does not make itself."""
+        self._origin = origin
+        return self
+
+    @property
+    def origin(self) -> Origin:
+        """Where and how it was written."""
+        return self._origin
+
+    @property
+    def file_name(self) -> str:
+        """Name of its case file; empty without one."""
+        return Path(self._origin.place(())).name if self._origin.place else ""
+
+    def placed(self, message: str) -> str:
+        """A message that begins with a key of the case, with the place of this key before it.
+
+        A name after the key, as that of a patch, is looked for below it.
+        """
+        about = re.match(r"([a-z]\w*(?:\.\w+)*): (?:([\w.]+): )?", message)
+        if not (about and self._origin.place) or about[1].split(".")[0] not in type(self).model_fields:
+            return message
+        keys = [*about[1].split("."), *([about[2]] if about[2] else [])]
+        return f"{self._origin.place(tuple(int(key) if key.isdecimal() else key for key in keys))}: {message}"
+
+    @property
+    def own_terms(self) -> tuple[OwnTerm, ...]:
+        """The user-defined energies; what is made of the case has them."""
+        return self._own_terms
+
+    def with_terms(self, terms: Sequence[OwnTerm]) -> Self:
+        """A copy of the case with these energies, for `run`, `Scene` and whatever else takes a case."""
+        copied = self.model_copy()
+        copied._own_terms = tuple(terms)
+        return copied
+
+    @property
+    def term_digests(self) -> dict[str, str | None]:
+        """Hashes of the energies, by which a run is recognised that is resumed."""
+        return {f"terms.{term.name}": term.digest for term in self._own_terms}
 
 
 def parts_of(context: Context) -> dict[str, Part]:
@@ -65,20 +133,17 @@ def accounts(context: Context, loads: "Loads") -> list[Account]:
     return [import_module(f"{__package__}.{module}").account(context, loads) for module in ACCOUNTS]
 
 
-@cache
-def seen() -> "tuple[Seen, ...]":
-    """What all rooms see of a state; they need the solver, which takes long to import."""
-    named = (path.rpartition(".") for path in WHAT_IS_SEEN)
-    return tuple(getattr(import_module(f"{__package__}.{module}"), name)() for module, _, name in named)
-
-
-def _step(path: str) -> type[Step]:
+def _named(path: str) -> Any:
+    """The class at a path below this room."""
     module, _, name = path.rpartition(".")
-    found: type[Step] = getattr(import_module(f"{__package__}.{module}"), name)
-    return found
+    return getattr(import_module(f"{__package__}.{module}"), name)
 
 
-STEPS: dict[str, type[Step]] = {kind: _step(path) for kind, path in KINDS_OF_STEPS.items()}
+PARTS: dict[str, type[Part]] = {
+    key: getattr(import_module(f"{__package__}.{key}"), name) for key, name in REGISTERED.items()
+}
+STEPS: dict[str, type[Step]] = {kind: _named(path) for kind, path in KINDS_OF_STEPS.items()}
+SEEN: tuple[Seen, ...] = tuple(_named(path)() for path in WHAT_IS_SEEN)
 
 
 def _meaning(part: type[Part]) -> str:
@@ -88,7 +153,6 @@ def _meaning(part: type[Part]) -> str:
 
 if TYPE_CHECKING:
     from magshell_fenicsx.models.shell.parameters import Loads
-    from magshell_fenicsx.parts.seen import Seen
 
     WithParts = WithOwnTerms
 else:  # an optional key for each part

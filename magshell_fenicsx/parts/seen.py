@@ -5,6 +5,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
 from magshell_fenicsx.mesh.mirror import Mirror
+from magshell_fenicsx.quantities.quantity import Amplitude, Quantity
+from magshell_fenicsx.quantities.registry import take
 
 if TYPE_CHECKING:
     from magshell_fenicsx.continuation.system import State
@@ -61,11 +63,20 @@ class Seen:
 
     Attributes
     ----------
+    quantities
+        Its columns, where they are not those of every run; see `Quantity.each`.
+    varied
+        Its amplitudes with a curve of their own.
     before_points
         Whether its columns come before those of named points.
     """
 
+    quantities: ClassVar[tuple[Quantity, ...]] = ()
+    varied: ClassVar[tuple[Amplitude, ...]] = ()
     before_points: ClassVar[bool] = False
+
+    def __init_subclass__(cls) -> None:
+        take(cls.quantities, cls.varied)
 
     def amplitudes(self, loads: "Loads") -> Sequence[str]:
         """Its amplitudes."""
@@ -91,6 +102,10 @@ class Seen:
     def columns(self, loads: "Loads", supports: Sequence[str]) -> tuple[str, ...]:
         """Columns besides those of every run; `supports` are those whose reactions are reported."""
         return (*self.amplitudes(loads), *self.conjugates(loads).values())
+
+    def moments(self, loads: "Loads") -> Sequence[str]:
+        """Those of its columns that are moments where others of the kind are forces."""
+        return ()
 
     def observe(self, sight: Sight, state: "State") -> dict[str, float]:
         """Column -> value."""

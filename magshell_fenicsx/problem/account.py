@@ -5,10 +5,10 @@ from math import degrees
 
 from magshell_fenicsx.mesh.mirror import Mirror, plane_text
 from magshell_fenicsx.models.shell.parameters import Loads
-from magshell_fenicsx.parts.imperfections.rims import MOST_RIMS
+from magshell_fenicsx.parts.imperfections.symmetry import MOST_RIMS
 from magshell_fenicsx.parts.part import Context
 from magshell_fenicsx.parts.registered import PARTS, accounts, parts_of
-from magshell_fenicsx.problem.body import Body, body_of
+from magshell_fenicsx.problem.problem import Body, body_of
 from magshell_fenicsx.shape.sections import MeshSurface
 
 SHOWN = 6  # of many imperfections

@@ -7,21 +7,19 @@ from magshell_fenicsx.input.section import given
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.models.shell.parameters import Loads
 from magshell_fenicsx.parts.part import Context
-from magshell_fenicsx.parts.registered import seen
-from magshell_fenicsx.parts.supports.reacting import motion_columns, only_turns
+from magshell_fenicsx.parts.registered import SEEN
 from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.quantities.registry import IN_TIME, OF_EVERY_RUN, Sizes
 
 
 def sizes_in_units(problem: Problem) -> Sizes:
     """The sizes of the case's units."""
-    moments = {column for name, column in motion_columns(problem.loads).items() if only_turns(problem.loads, name)}
-    return sizes_of(problem.context, moments)
+    return sizes_of(problem.context, {column for room in SEEN for column in room.moments(problem.loads)})
 
 
 def own_amplitudes(loads: Loads) -> dict[str, float]:
     """Amplitudes that have columns of their own name, of rooms and of one's own energies, with initial values."""
-    grown, terms = {name: 0.0 for room in seen() for name in room.named(loads)}, loads.own
+    grown, terms = {name: 0.0 for room in SEEN for name in room.named(loads)}, loads.own
     return grown | {term.name: term.value for term in terms} | {p.name: p.value for term in terms for p in term.free}
 
 
@@ -31,8 +29,8 @@ def extra_columns(problem: Problem) -> tuple[str, ...]:
     named = tuple(f"{point}_u{axis}" for point in problem.context.points for axis in "xyz")
     own = (*own_amplitudes(loads), *(column for term in loads.own for column in term.observed))
     reported = problem.supports if problem.reactions else ()
-    first = (column for room in seen() if room.before_points for column in room.columns(loads, reported))
-    then = (column for room in seen() if not room.before_points for column in room.columns(loads, reported))
+    first = (column for room in SEEN if room.before_points for column in room.columns(loads, reported))
+    then = (column for room in SEEN if not room.before_points for column in room.columns(loads, reported))
     moves = any(step.load.in_time or step.load.released_by for step in problem.programme)
     clock = tuple(q.name for q in IN_TIME) if moves else ()
     extra = (*first, *named, *own, *then, *clock)
@@ -48,7 +46,7 @@ def refuse_twice(problem: Problem) -> None:
         With the name and the key that gives it.
     """
     loads = problem.loads
-    varied = [*own_amplitudes(loads), *(name for room in seen() for name in room.amplitudes(loads))]
+    varied = [*own_amplitudes(loads), *(name for room in SEEN for name in room.amplitudes(loads))]
     written = [*(q.name for q in OF_EVERY_RUN), *extra_columns(problem)]
     for names, what in ((varied, "amplitude"), (written, "column of path.csv")):
         if twice := next((name for name in names if names.count(name) > 1), None):

@@ -6,9 +6,8 @@ from math import log
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.parts.part import Context
 from magshell_fenicsx.platform.environment import available_memory
-from magshell_fenicsx.problem.body import layers
-from magshell_fenicsx.problem.elements import degree_of
-from magshell_fenicsx.problem.problem import Problem
+from magshell_fenicsx.problem.problem import Problem, layers
+from magshell_fenicsx.problem.sizes import degree_of
 from magshell_fenicsx.shape.sections import MeshSurface
 
 PROCESS = 0.25e9  # bytes of a process before its model

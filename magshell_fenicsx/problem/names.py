@@ -1,15 +1,52 @@
-"""What a problem asks of its surface, against what the surface has: its edges, points and patches."""
+"""The energies of a problem, each with its own name; its edges, points and patches, which the surface must have."""
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
+from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.patch import MeshError, PatchMesh
+from magshell_fenicsx.models.shell.kinematics import SECOND
+from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.parameters import Condition, Held, Loads
 from magshell_fenicsx.models.shell.thickness import Thickness, patch_of
+from magshell_fenicsx.parts.part import Context
 from magshell_fenicsx.parts.pressure.openings import moving, without_potential
-from magshell_fenicsx.parts.registered import seen
+from magshell_fenicsx.parts.registered import SEEN, parts_of
 from magshell_fenicsx.parts.supports.supports import refuse_unknown
+from magshell_fenicsx.quantities.registry import TAKEN
+
+LEAST, MOST = 1e-12, 1e9  # of a part's amplitude, in E h/R^2: rounding, and what no mesh of a shell resolves
+
+
+def surface_terms(context: Context, own: Sequence[OwnTerm]) -> tuple[OwnTerm, ...]:
+    """The terms of parts and of steps, then one's own.
+
+    Raises
+    ------
+    CaseError
+        If a part's amplitude is out of bounds, a name is taken, or a solid cannot have a term.
+    """
+    found = []
+    for key, part in parts_of(context).items():
+        for term in part.terms(context.scales):
+            if not LEAST <= abs(term.value) <= MOST:
+                raise CaseError(f"{key}: {term.name} is {term.value:.4g} E h/R²; allowed are {LEAST:g} to {MOST:g}")
+            found.append(term)
+    for step in {step.name: step for step in context.steps}.values():
+        found += step.load.terms(step, context)
+    found += own
+    names = [name for term in found for name in (term.name, *term.observed)]
+    names += {p.name for term in found for p in term.free}
+    for name in names:
+        if name in TAKEN or names.count(name) > 1:
+            raise CaseError(f"terms: {name}: something else has this name already")
+    for term in found if context.solid else []:
+        if term.on is not None:
+            raise CaseError(f"model: solid: {term.name} is an energy of an edge, which only a shell has")
+        if curved := [f"r0.{name}" for name in term.placed_parts if name in SECOND]:
+            raise CaseError(f"model: solid: {term.name} depends on {', '.join(curved)}, which only a shell has")
+    return tuple(found)
 
 
 def refuse_unfit(
@@ -24,7 +61,7 @@ def refuse_unfit(
     """
     refuse_unknown(patch.edges, patch.points, patch.patches, conditions, loads)
     _refuse_ambiguous(patch.edges, patch.points, conditions)
-    for room in seen():
+    for room in SEEN:
         room.refuse_unfit(loads, patch)
     for name in (thickness and thickness.patches) or {}:
         patch_of(patch.patches, name, "shell.thickness_factor")

@@ -2,7 +2,8 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from math import sqrt
+from itertools import pairwise
+from math import ceil, sqrt
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.grading import Size
 from magshell_fenicsx.mesh.grid import Grid, RimmedGrid, grid_mesh
+from magshell_fenicsx.mesh.hexahedra import MIDDLE
 from magshell_fenicsx.mesh.mirror import Mirror, cut
 from magshell_fenicsx.mesh.msh import MeshFile, read_msh
 from magshell_fenicsx.mesh.patch import Embedding, PatchMesh
@@ -20,17 +22,57 @@ from magshell_fenicsx.models.axisymmetric.meridian import graded_vertices
 from magshell_fenicsx.models.shell.parameters import Condition, Loads, Material
 from magshell_fenicsx.models.shell.patterns import Inside
 from magshell_fenicsx.models.shell.thickness import Thickness
+from magshell_fenicsx.models.solid.densities import NeoHookean
 from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionSection
 from magshell_fenicsx.parts.imperfections.modes import Shape as Mode
+from magshell_fenicsx.parts.magnetism.fields import MagneticSection
 from magshell_fenicsx.parts.part import Context
 from magshell_fenicsx.parts.step import ProgrammeStep
-from magshell_fenicsx.problem.body import Body
-from magshell_fenicsx.problem.elements import MeshSection
 from magshell_fenicsx.problem.names import refuse_unfit
+from magshell_fenicsx.problem.sizes import MeshSection, SolidSection
 from magshell_fenicsx.problem.wanted import FrequenciesSection, GradientsSection, OutputSection, StabilitySection
 from magshell_fenicsx.shape.turning import Span
 
+ROUNDING = 1e-9
 PRESSED = 0.08  # of sqrt(Rh): cells of a meridian that show the ring of a contact
+
+
+@dataclass(frozen=True)
+class Body:
+    """The material of a solid, and where its elements through the thickness begin and end, 0 inside to 1 outside."""
+
+    material: NeoHookean
+    layers: list[float]
+
+
+def body_of(context: Context) -> Body | None:
+    """The solid of a case; None of a shell."""
+    if not context.solid:
+        return None
+    ratio = _section(context).bulk_to_shear
+    return Body(NeoHookean.of(context.shell.poisson_ratio, ratio), layers(context))
+
+
+def layers(context: Context) -> list[float]:
+    """Where the elements through the thickness begin and end, from 0 inside to 1 outside.
+
+    Magnetised layers end where elements do, and so does the inner half then: nodes lie in the middle.
+    """
+    count, magnetic = _section(context).layers, context.of(MagneticSection)
+    magnetised = (magnetic and magnetic.remanent.layers) or []
+    if not magnetised:
+        return [n / count for n in range(count + 1)]
+    tops = [sum(layer.fraction for layer in magnetised[: n + 1]) for n in range(len(magnetised) - 1)]
+    ends = [0.0, *sorted({MIDDLE, *(round(top, 9) for top in tops)}), 1.0]
+    begins = [0.0]
+    for low, high in pairwise(ends):
+        parts = max(ceil((high - low) * count - ROUNDING), 1)
+        begins += [low + (high - low) * (n + 1) / parts for n in range(parts)]
+    return begins
+
+
+def _section(context: Context) -> SolidSection:
+    return context.of(SolidSection) or SolidSection()
 
 
 @dataclass(frozen=True)

@@ -183,6 +183,8 @@ class Quantity:
         Sign of its value on an axis.
     stem
         Its name without a unit, before the endings of columns in units; by default the name without "_over_h".
+    each
+        Whether there may be several, of which each has a column of its own: NAME_OF_COLUMN, an underscore, its name.
     """
 
     name: str
@@ -194,6 +196,7 @@ class Quantity:
     note: str = ""
     sign: float = 1.0
     stem: str = ""
+    each: bool = False
 
     @property
     def unit(self) -> str:
@@ -262,6 +265,10 @@ class Quantity:
         """The key of its unit; of a number without one the kind."""
         return self.units[0].key if self.units else self.kind
 
+    def of(self, name: str) -> "Quantity":
+        """The column of one of several."""
+        return replace(self, name=f"{self.name}_{name}", words=f"{self.words} {name}", note="")
+
     def in_unit(self, unit: Unit) -> "Quantity":
         """The column in the unit that is shown for one of its units."""
         stem, symbol = self.stem or self.name.replace("_over_h", ""), re.split("[ /]", self.symbol)[0]
@@ -297,9 +304,15 @@ class Amplitude:
         Column of the displacement on the other axis of its curve; proportional to -Pi if its meaning says so.
     place
         Location of that displacement.
+    sideways
+        Whether the curve has its value on the x axis, and what is conjugate on the y axis.
+    each
+        Whether there may be several, whose columns have their names at the end.
     """
 
     name: str
     column: str
     conjugate: str = "w_pole_over_h"
     place: str = "of the pole"
+    sideways: bool = False
+    each: bool = False

@@ -10,7 +10,6 @@ from magshell_fenicsx.quantities.quantity import (
     DEGREES,
     ENERGY,
     FIELD,
-    FORCE,
     MOMENT,
     PLACE,
     POINT_FORCE,
@@ -20,9 +19,7 @@ from magshell_fenicsx.quantities.quantity import (
     STRENGTH,
     THICKNESS,
     TIME,
-    TORQUE,
     VOLUME,
-    WORK,
     Amplitude,
     Given,
     Kind,
@@ -63,7 +60,15 @@ OF_EVERY_RUN = (
         (FIELD, STRENGTH),
         stem="applied",
     ),
-    Quantity("force", "force", "Dead force of an indentation, positive inwards.", "load", "F R/(2πD)", (POINT_FORCE,)),
+    Quantity(
+        "force",
+        "force",
+        "Dead force of an indentation, positive inwards.",
+        "load",
+        "F R/(2πD)",
+        (POINT_FORCE,),
+        each=True,
+    ),
     _w(
         "w_over_h",
         "",
@@ -134,86 +139,6 @@ OF_EVERY_RUN = (
     ),
     Quantity("step", "step", "Number of the programme's step; 0 is the start.", "count"),
 )
-OF_SOME_RUNS = (
-    Quantity("load_factor", "load factor", "Common factor of all dead loads.", "load"),
-    Quantity("natural_curvature", "natural curvature", "Factor of the natural curvature; 0: as drawn.", "load"),
-    Quantity("natural_stretch", "natural stretch", "Factor of the natural stretch less one; 0: as drawn.", "load"),
-    Quantity("imperfection", "imperfection", "Factor of the imperfections that grow; 0: without them.", "load"),
-    Quantity("motion", "motion", "Factor of the motion of supports; the step may give it another name.", "load"),
-    Quantity(
-        "reaction",
-        "reaction",
-        "Reaction of the supports that move, along their motion; of several motions reaction_NAME. In the case's unit "
-        "of force (N with units), of rotations alone in that of a moment.",
-        "reaction",
-        units=(REACTION, MOMENT),
-    ),
-    Quantity("source", "source", "Factor of a source's motion or strength; the step may give it another name.", "load"),
-    Quantity(
-        "source_force",
-        "force on the source",
-        "Force of the shell on a source that is driven, along its motion; of several source_force_NAME.",
-        "reaction",
-        units=(FORCE,),
-    ),
-    Quantity(
-        "source_torque", "torque on the source", "The same about the axis of its turn.", "reaction", units=(TORQUE,)
-    ),
-    Quantity(
-        "source_work",
-        "work of the source",
-        "The same of its strength: -dΠ/d(factor of the field).",
-        "reaction",
-        units=(WORK,),
-    ),
-)
-OF_CONTACTS = (
-    Quantity(
-        "approach_over_h",
-        "approach",
-        "Approach of a body along its direction; of several bodies, or beside an indentation, approach_over_h_NAME. "
-        "`force` is then the force on the body.",
-        "load",
-        "a/h",
-        (THICKNESS,),
-    ),
-    Quantity(
-        "penetration_over_h",
-        "penetration",
-        "Largest penetration of a body into the shell's face, an error of the penalty; negative: minus the least gap.",
-        "error",
-        "",
-        (THICKNESS,),
-    ),
-    Quantity(
-        "contact_radius",
-        "contact radius",
-        "Mean distance of the pressure from the body's axis, in the shell's length; over R if that has no unit.",
-        "place",
-        units=(PLACE,),
-    ),
-    Quantity(
-        "contact_inner", "contact from", "Least distance of the pressure from the body's axis.", "place", units=(PLACE,)
-    ),
-    Quantity(
-        "contact_outer", "contact to", "Largest distance of the pressure from the body's axis.", "place", units=(PLACE,)
-    ),
-    Quantity(
-        "contact_stiffness",
-        "stiffness of the contact",
-        "Of the penalty, in E h/R²; raised fourfold where a body without `stiffness` would penetrate too much.",
-        "error",
-    ),
-)
-CONTACT = (
-    "approach_over_h",
-    "force",
-    "penetration_over_h",
-    "contact_radius",
-    "contact_inner",
-    "contact_outer",
-    "contact_stiffness",
-)
 IN_TIME = (  # of runs with a step of kind: time
     Quantity(
         "time",
@@ -235,7 +160,7 @@ IN_TIME = (  # of runs with a step of kind: time
         "Kinetic + stored + dissipated - work less its value where the step begins: what steps in time gain or lose.",
     ),
 )
-QUANTITIES = {q.name: q for q in (*OF_EVERY_RUN, *OF_SOME_RUNS, *OF_CONTACTS, *IN_TIME)}
+QUANTITIES = {q.name: q for q in (*OF_EVERY_RUN, *IN_TIME)}
 AMPLITUDES = {
     a.name: a
     for a in (
@@ -243,22 +168,30 @@ AMPLITUDES = {
         Amplitude("force", "force", "w_over_h", "at the load"),
         Amplitude("load", "load_factor", "w_over_h", "along the loads"),
         Amplitude("lambda_m", "lambda_m"),
-        Amplitude("angle", "field_angle"),
-        Amplitude("approach", "approach_over_h", "force", ""),
-        Amplitude("time", "time"),
+        Amplitude("angle", "field_angle", sideways=True),
+        Amplitude("time", "time", sideways=True),
     )
 }
 # names of terms, and of amplitudes that only the solvers use
 INTERNAL = ("push", "lambda_across", "lambda_third", "membrane", "couple")
-OF_SOURCES = ("source_force", "source_torque", "source_work")
-TAKEN = frozenset(
-    (*QUANTITIES, *AMPLITUDES, *INTERNAL, *(each.name for q in QUANTITIES.values() for each in q.in_units))
-)
+TAKEN = {*AMPLITUDES, *INTERNAL}  # names that neither an energy of one's own nor a factor may have
 
 
-def register(quantities: Iterable[Quantity]) -> None:
-    """Add the columns of a part."""
+def register(quantities: Iterable[Quantity], amplitudes: Iterable[Amplitude] = ()) -> None:
+    """Add the columns and amplitudes of a part."""
     QUANTITIES.update({q.name: q for q in quantities})
+    AMPLITUDES.update({a.name: a for a in amplitudes})
+
+
+def take(quantities: Iterable[Quantity], amplitudes: Iterable[Amplitude] = ()) -> None:
+    """Add those that every case may have: no energy of one's own has the name of one."""
+    quantities, amplitudes = [*quantities], [*amplitudes]
+    register(quantities, amplitudes)
+    TAKEN.update(each.name for q in quantities for each in (q, *q.in_units))
+    TAKEN.update(a.name for a in amplitudes)
+
+
+take(QUANTITIES.values())
 
 
 def units_in_use() -> tuple[Unit, ...]:
@@ -281,12 +214,9 @@ def quantity(name: str) -> Quantity:
         return replace(of, name=name, words=f"{of.words} {again[2]}", symbol=of.symbol and f"F_{again[2]} R/(2πD)")
     if again := re.fullmatch(r"w_((force|load)(_\d+)?)_over_h", name):
         return _w(name, f"at {again[1].replace('_', ' ')}", f"Displacement conjugate to {again[1]}, as w_over_h.")
-    if again := re.fullmatch(rf"({'|'.join(CONTACT)})_([A-Za-z]\w*)", name):
-        of = QUANTITIES[again[1]]
-        return replace(of, name=name, words=f"{of.words} {again[2]}", note="")
-    for column in ("reaction", *OF_SOURCES):
-        if name.startswith(f"{column}_"):
-            return replace(QUANTITIES[column], name=name, words=name.replace("_", " "))
+    if several := [q for q in QUANTITIES.values() if q.each and re.match(rf"{q.name}_[A-Za-z]", name)]:
+        longest = max(several, key=lambda q: len(q.name))
+        return longest.of(name.removeprefix(f"{longest.name}_"))
     kinds: dict[str, tuple[Kind, Unit]] = {"u": ("place", PLACE), "f": ("reaction", REACTION), "m": ("moment", MOMENT)}
     ending = re.search(r"_([ufm])[xyz]$", name)
     kind, units = (kinds[ending[1]][0], kinds[ending[1]][1:]) if ending else ("load", ())
@@ -306,14 +236,13 @@ def amplitude(name: str) -> Amplitude:
     """
     if again := re.fullmatch(r"(force|load)_\d+", name):
         return Amplitude(name, name, f"w_{name}_over_h", AMPLITUDES[again[1]].place)
-    if again := re.fullmatch(r"approach_(\w+)", name):
-        return Amplitude(name, f"approach_over_h_{again[1]}", f"force_{again[1]}", "")
-    return AMPLITUDES.get(name) or Amplitude(name, name)
-
-
-def contact_columns(approach: str) -> tuple[str, ...]:
-    """The columns of a body, in the order of `CONTACT`."""
-    return tuple(column + approach.removeprefix("approach") for column in CONTACT)
+    if name in AMPLITUDES:
+        return AMPLITUDES[name]
+    for each in AMPLITUDES.values():
+        if each.each and name.startswith(f"{each.name}_"):
+            which = name.removeprefix(each.name)
+            return replace(each, name=name, column=each.column + which, conjugate=each.conjugate + which)
+    return Amplitude(name, name)
 
 
 def axes_of(name: str, row: Collection[str] = ()) -> tuple[Quantity, Quantity]:
@@ -326,16 +255,15 @@ def axes_of(name: str, row: Collection[str] = ()) -> tuple[Quantity, Quantity]:
     row
         The columns that there are: where w_over_h belongs to another load, this one has a column of its own.
     """
-    own_name = tuple(f"{column}_{name}" for column in ("reaction", *OF_SOURCES))
-    for reaction in (*own_name, "reaction", *OF_SOURCES) if name not in AMPLITUDES else ():
+    reactions = sorted(q.name for q in QUANTITIES.values() if q.each and q.kind == "reaction")
+    for reaction in (*(f"{each}_{name}" for each in reactions), *reactions) if name not in AMPLITUDES else ():
         if reaction in row:
             return quantity(name), shown(reaction, row)
     varied, own = amplitude(name), f"w_{name}_over_h"
     over, drawn = shown(own if own in row else varied.conjugate, row), shown(varied.column, row)
     if varied.conjugate == "w_over_h":
         over = replace(over, note=varied.place)
-    sideways = name in ("angle", "time") or varied.column.startswith("approach_over_h")
-    return (drawn, over) if sideways else (over, drawn)
+    return (drawn, over) if varied.sideways else (over, drawn)
 
 
 @dataclass(frozen=True)

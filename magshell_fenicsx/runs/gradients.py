@@ -22,9 +22,9 @@ from magshell_fenicsx.output.store.folder import by_first
 from magshell_fenicsx.runs.summary import Result
 from magshell_fenicsx.simulate.follow import BEYOND
 from magshell_fenicsx.simulate.gradients.adjoint import Adjoint
+from magshell_fenicsx.simulate.gradients.fields import density
 from magshell_fenicsx.simulate.gradients.gradient import derivative
 from magshell_fenicsx.simulate.gradients.instabilities import FOLDS, Lost, instabilities, refuse_moving
-from magshell_fenicsx.simulate.gradients.mass import density
 from magshell_fenicsx.simulate.gradients.results import adjoint_at_end, refuse_no_result
 from magshell_fenicsx.simulate.numbers import refuse_unknown_parameters
 from magshell_fenicsx.simulate.scene import Scene

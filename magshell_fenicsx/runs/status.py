@@ -8,7 +8,7 @@ import numpy as np
 
 from magshell_fenicsx.continuation.point import Point
 from magshell_fenicsx.output.store.table import SOLUTION, Row
-from magshell_fenicsx.parts.registered import seen
+from magshell_fenicsx.parts.registered import SEEN
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.quantities.quantity import spelled
 from magshell_fenicsx.quantities.registry import Sizes, amplitude, quantity, shown
@@ -82,7 +82,7 @@ def aim(scene: Scene, step: ProgrammeStep) -> Aim:
     target, value = load.target
     if target.quantity == "load":
         return Aim(varied.column, value * load.size(scene.problem.context))
-    for room in seen():
+    for room in SEEN:
         if column := room.conjugates(scene.problem.loads).get(step.name):
             return Aim(column, value)
     own = f"w_{step.name}_over_h"

@@ -17,8 +17,7 @@ from magshell_fenicsx.output.store.checkpoint import FILE
 from magshell_fenicsx.output.store.table import LOCATED, Row
 from magshell_fenicsx.platform.environment import code_version, fast_blas, versions
 from magshell_fenicsx.quantities.registry import amplitude
-from magshell_fenicsx.shape.sections import Surface
-from magshell_fenicsx.shape.shell import ShellSection
+from magshell_fenicsx.shape.sections import ShellSection, Surface
 from magshell_fenicsx.simulate.adapt.choice import Adapted
 from magshell_fenicsx.simulate.adapt.ending import History, NoResult
 from magshell_fenicsx.simulate.scene import Scene

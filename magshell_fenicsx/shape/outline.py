@@ -24,10 +24,10 @@ from magshell_fenicsx.shape.sections import (
     PlateSurface,
     RevolutionSurface,
     RoundSection,
+    ShellSection,
     Surface,
     TorusSurface,
 )
-from magshell_fenicsx.shape.shell import ShellSection
 from magshell_fenicsx.shape.turning import Span
 
 Array = NDArray[np.float64]

@@ -1,4 +1,4 @@
-"""Any mid-surface: caps, cylinders, plates, rings, tori, profiles turned about e3, and a user's mesh.
+"""Any mid-surface: the shells of the paper, caps, cylinders, plates, rings, tori, profiles, and a user's mesh.
 
 Lengths are plain numbers of one unit that the user chooses, or all have units and are then in metres;
 the same holds for Young's modulus, so that loads and results are in the user's units or in SI.
@@ -11,7 +11,17 @@ import numpy as np
 from pydantic import BeforeValidator, Field, ModelWrapValidatorHandler, PrivateAttr, ValidationInfo, model_validator
 
 from magshell_fenicsx.input.expressions import Formula, formula
-from magshell_fenicsx.input.section import FileKeys, OrOfProgram, Section, in_units, or_number, texts
+from magshell_fenicsx.input.section import (
+    Density,
+    FileKeys,
+    Length,
+    OrOfProgram,
+    Pressure,
+    Section,
+    in_units,
+    or_number,
+    texts,
+)
 from magshell_fenicsx.mesh.patch import GivenField
 from magshell_fenicsx.parts.kinds import Dimple, ShellKeys
 
@@ -22,6 +32,7 @@ Range = Annotated[list[float], Field(min_length=2, max_length=2)]
 Heights = Annotated[list[Annotated[float, or_number("metre")]], Field(min_length=2, max_length=2)]
 Azimuth = Annotated[Range | None, Field(description="First and last, of a part; closed without [degree]")]
 FULL_TURN = [0.0, 360.0]
+MEASURES = ("thickness", "youngs_modulus", "density", "radius", "length", "width", "inner_radius", "tube_radius")
 
 
 class Material(Section):
@@ -105,9 +116,6 @@ class SurfaceSection(ShellKeys, Material):
     def modulus(self) -> float | None:
         """E that dead loads are over."""
         return self.youngs_modulus
-
-
-MEASURES = ("thickness", "youngs_modulus", "density", "radius", "length", "width", "inner_radius", "tube_radius")
 
 
 def _refuse_overturned(azimuth: list[float] | None) -> None:
@@ -313,3 +321,95 @@ class MeshSurface(FileKeys, SurfaceSection):
 
 
 Surface = CapSurface | CylinderSurface | PlateSurface | AnnulusSurface | TorusSurface | RevolutionSurface | MeshSurface
+
+
+class OneShape(Section):
+    """Shape, thickness and material."""
+
+    geometry: Literal["hemisphere", "disc", "strip"]
+    """A hemisphere around e3, a flat disc or a flat strip along e1"""
+    radius_to_thickness: float | None = Field(default=None, ge=10, le=1e5)
+    """R/h, in place of radius and thickness"""
+    radius: Length | None = Field(default=None, gt=0)
+    """Radius R, between 10 and 1e5 thicknesses"""
+    thickness: Length | None = Field(default=None, gt=0)
+    """Thickness h"""
+    youngs_modulus: Pressure | None = Field(default=None, ge=1, le=1e13)
+    """Young's modulus E, 1 Pa to 1e13 Pa; only flux densities need it"""
+    poisson_ratio: float = Field(gt=-1, le=0.5)
+    """Poisson's ratio ν"""
+    density: Density | None = Field(default=None, gt=0)
+    """Density ρ; with it frequencies are in hertz"""
+    thickness_factor: Formula | None = None
+    """Multiplies h: a formula of x, y, z over R"""
+    defect: Dimple | None = None
+    """One dimple of a hemisphere; for more, or elsewhere, see imperfections"""
+    width: float | None = Field(default=None, gt=0, le=10)
+    """Of a strip, which must have one [length of the strip]"""
+
+
+class ShellSection(ShellKeys, OneShape):
+    """Either radius_to_thickness, or radius and thickness with units; a strip's radius is its length.
+
+    Without units lengths are over R, forces over E R².
+
+    Edges: equator (hemisphere), rim (disc), root (x = 0), tip and sides (strip).
+    """
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _imperfections_with_units(
+        cls, data: Any, handler: ModelWrapValidatorHandler[Self], info: ValidationInfo
+    ) -> Self:
+        cls.note_sizes(data, handler, info, with_units=isinstance(data, dict) and data.get("thickness") is not None)
+        return handler(data)
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        lengths = [self.radius, self.thickness]
+        if self.radius_to_thickness is not None:
+            if lengths != [None, None]:
+                raise ValueError("give radius_to_thickness, or radius and thickness, not both")
+        elif None in lengths:
+            raise ValueError("give radius_to_thickness, or both radius and thickness")
+        elif not 10 <= self.R_over_h <= 1e5:
+            raise ValueError(f"radius/thickness is {self.R_over_h:.4g}; a thin shell needs 10 to 1e5")
+        if (self.width is None) == (self.geometry == "strip"):
+            raise ValueError("width (over the length) belongs to geometry: strip, and only to it")
+        if self.density is not None and (self.youngs_modulus is None or self.radius is None):
+            raise ValueError("density turns frequencies into hertz: that needs youngs_modulus, radius and thickness")
+        if self.defect and self.geometry != "hemisphere":
+            raise ValueError("a defect needs geometry: hemisphere; elsewhere give imperfections")
+        if self.width is not None and self.width * self.R_over_h < 1:
+            raise ValueError(
+                f"the strip is narrower than its thickness; width must be at least {1 / self.R_over_h:.4g}"
+            )
+        return self
+
+    @property
+    def R_over_h(self) -> float:
+        if self.radius_to_thickness is not None:
+            return self.radius_to_thickness
+        assert self.radius
+        assert self.thickness
+        return self.radius / self.thickness
+
+    @property
+    def edge_polar(self) -> float | None:
+        """Of a part of a sphere the angle of its edge from e3 (degrees); None of other geometries."""
+        return 90.0 if self.geometry == "hemisphere" else None
+
+    @property
+    def reference(self) -> float:
+        """R, or 1 where the case has no lengths: those of points are then over R."""
+        return self.radius or 1.0
+
+    @property
+    def with_units(self) -> bool:
+        """Whether lengths have units, and are in metres."""
+        return self.radius is not None
+
+    @property
+    def modulus(self) -> float | None:
+        """E that dead loads are over: of a case without lengths 1, so that forces are over E R²."""
+        return self.youngs_modulus if self.with_units else 1.0

@@ -15,8 +15,7 @@ from magshell_fenicsx.shape.turning import scalar_turns
 
 if TYPE_CHECKING:  # it reads meshes, and needs the solver for that
     from magshell_fenicsx.shape.outline import Outline
-    from magshell_fenicsx.shape.sections import Surface
-    from magshell_fenicsx.shape.shell import ShellSection
+    from magshell_fenicsx.shape.sections import ShellSection, Surface
 
 Array = NDArray[np.float64]
 Vectors = Sequence[Array]

@@ -4,18 +4,21 @@ import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
-from magshell_fenicsx.continuation.path import NotANumber
+from magshell_fenicsx.continuation.path import SEEN, NotANumber
 from magshell_fenicsx.continuation.point import Point
-from magshell_fenicsx.continuation.system import State
+from magshell_fenicsx.continuation.system import State, max_abs
+from magshell_fenicsx.continuation.walk import Goal
 from magshell_fenicsx.quantities.registry import OWN_MODES
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.search import searched
+from magshell_fenicsx.simulate.stage import plain
 from magshell_fenicsx.simulate.steps import LOCATED, held_by, records_of
 from magshell_fenicsx.simulate.touch import refuse_penetration
 from magshell_fenicsx.simulate.transient import released
-from magshell_fenicsx.simulate.walked import Walked, amount
+from magshell_fenicsx.simulate.walked import Records, Walked, amount, followed
 
+RISES = 4  # first steps of an energy that moves the undeformed shell
 BEYOND = "beyond the first instability the path stopped: "  # how the remark of a path begins that has its answer
 
 
@@ -43,6 +46,8 @@ def follow(scene: Scene, *, search: bool = True, remark: Callable[[str], None] =
         If a path is lost, a step before the last ends at an instability, or the field alone makes the shell unstable.
     """
     state, steps = scene.unloaded(), scene.problem.programme
+    own = pulling(scene, state)
+    state = replace(state, mu=state.mu | dict.fromkeys(own, 0.0))
     try:
         _refuse_not_numbers(scene, state, "")
     except Stopped:
@@ -55,6 +60,10 @@ def follow(scene: Scene, *, search: bool = True, remark: Callable[[str], None] =
         raise Stopped(
             f"the undeformed shell is unstable in {pivots} directions: mesh.penalty is too small or the mesh too coarse"
         )
+    for name, value in own.items():
+        rise = Walked(_under(scene, name, value, state))
+        yield from (replace(risen, shown=scene.displacement) for risen in rise)
+        state = rise.end
     for step in steps:
         where = f"step {step.number} of {len(steps)} ({step.kind}): " if scene.problem.listed else ""
         scene.progress.beginning(step.number)
@@ -88,6 +97,29 @@ def follow(scene: Scene, *, search: bool = True, remark: Callable[[str], None] =
             yield replace(record, step=step.number, shown=scene.displacement)
         if step is not steps[-1] and step.until in ("limit", "bifurcation") and last in LOCATED:
             raise Stopped(f"{where}ends at a {last}, from which the next step cannot start")
+
+
+def pulling(scene: Scene, state: State) -> dict[str, float]:
+    """Amplitude -> value of the energies that move the undeformed shell, such as a surface tension."""
+    system, own = scene.model.system, dict[str, float]()
+    for term in scene.problem.loads.own:
+        load = system.load(state.u, state.mu, term.name) if term.value else 0.0 * state.u
+        if max_abs(scene.comm, load) == 0:
+            continue
+        moved = term.value * scene.newton.factor_at(state).solve(load)
+        if max_abs(scene.comm, moved) > SEEN * system.length:
+            own[term.name] = term.value
+    return own
+
+
+def _under(scene: Scene, name: str, value: float, state: State) -> Records:
+    """The records of a shell that comes to rest under an energy whose amplitude rises from zero."""
+    stage = plain(scene)
+    path, start = stage.begin(name, "load", state, value / RISES, value)
+    try:
+        return (yield from followed(stage, path, start, Goal("target", [value])))
+    except Stopped as e:
+        raise Stopped(f"on the way to rest under the energy {name}: {e}") from None
 
 
 def _buckled(scene: Scene, fold: Record, first: Record | None) -> str:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from magshell_fenicsx.continuation.system import State, Vector, dot
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.mirror import rotation
-from magshell_fenicsx.parts.registered import seen
+from magshell_fenicsx.parts.registered import SEEN
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.parts.supports.reactions import weights
 from magshell_fenicsx.quantities.registry import amplitude, quantity
@@ -137,7 +137,7 @@ def _conjugates(scene: Scene) -> dict[str, tuple[str, float]]:
     """Column -> the amplitude whose conjugate it is, and the conjugate's unit."""
     model, loads = scene.model, scene.problem.loads
     found = {"volume_change": "pressure"} if loads.pressure else {}
-    found |= {column: name for room in seen() for name, column in room.conjugates(loads).items()}
+    found |= {column: name for room in SEEN for name, column in room.conjugates(loads).items()}
     known = {column: (name, scene.conjugate_unit(name)) for column, name in found.items()}
     for name in (*loads.forces, *loads.dead):
         if size := model.force_unit if name in loads.forces else model.load_size.get(name, 0.0):

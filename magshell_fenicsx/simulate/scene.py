@@ -29,10 +29,10 @@ from magshell_fenicsx.models.shell.thickness import Thickness, refuse_unfit
 from magshell_fenicsx.models.solid.model import SolidModel
 from magshell_fenicsx.parts.magnetism.direction import field_angle, field_size
 from magshell_fenicsx.parts.magnetism.fields import strength
-from magshell_fenicsx.parts.magnetism.sources.field import source_columns
+from magshell_fenicsx.parts.magnetism.source_step import source_columns
 from magshell_fenicsx.parts.part import Context
 from magshell_fenicsx.parts.pressure.openings import no_potential
-from magshell_fenicsx.parts.registered import seen
+from magshell_fenicsx.parts.registered import SEEN
 from magshell_fenicsx.parts.seen import Sight
 from magshell_fenicsx.parts.supports.supports import refuse_loose
 from magshell_fenicsx.platform.processes import from_first
@@ -262,7 +262,7 @@ class Scene:
             **{name: energies[name] for name in ("U1", "Uq", "Utau")},
             **self._observe_points(state),
             **{name: state.mu[name] for name in self._own_amplitudes},
-            **{column: value for room in seen() for column, value in room.observe(sight, state).items()},
+            **{column: value for room in SEEN for column, value in room.observe(sight, state).items()},
             **{
                 column: state.mu[term.name]
                 * model.multiplicity
@@ -319,7 +319,7 @@ class Scene:
 
     def conjugate_unit(self, name: str) -> float:
         """-dPi/dmu of one unit of a target: ΔV/R³ of a pressure, w/h of a force, the shell's length of dead loads."""
-        units = (room.conjugate_unit(self.sight, name) for room in seen())
+        units = (room.conjugate_unit(self.sight, name) for room in SEEN)
         return next((unit for unit in units if unit is not None), 0.0)
 
     def _observe_points(self, state: State) -> dict[str, float]:

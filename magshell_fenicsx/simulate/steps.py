@@ -7,7 +7,7 @@ from magshell_fenicsx.continuation.path import StepOptions
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.continuation.walk import MOST_STEPS, Goal
 from magshell_fenicsx.parts.course import Drive, Gas, GasSection, Here
-from magshell_fenicsx.parts.pressure.gas import Enclosed
+from magshell_fenicsx.parts.pressure.pressure import Enclosed
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene

@@ -27,10 +27,9 @@ from magshell_fenicsx.platform.processes import from_first
 from magshell_fenicsx.platform.terminal import print_line
 from magshell_fenicsx.runs.running import run
 from magshell_fenicsx.runs.summary import Result
-from magshell_fenicsx.simulate.gradients.barriers import BARRIER
+from magshell_fenicsx.simulate.gradients.fields import MASS, mass
 from magshell_fenicsx.simulate.gradients.instabilities import FOLDS, SCALES, Lost
-from magshell_fenicsx.simulate.gradients.mass import MASS, mass
-from magshell_fenicsx.simulate.gradients.results import vibration_at_end
+from magshell_fenicsx.simulate.gradients.results import BARRIER, vibration_at_end
 from magshell_fenicsx.simulate.results import Target, distances
 from magshell_fenicsx.simulate.standing import Standing
 from magshell_fenicsx.studies.design_evaluation import DISTANCE, Evaluation, evaluate

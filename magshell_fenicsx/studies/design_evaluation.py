@@ -13,6 +13,7 @@ from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.simulate.adapt.ending import History
 from magshell_fenicsx.simulate.follow import BEYOND, follow
 from magshell_fenicsx.simulate.gradients.adjoint import Adjoint, Begins
+from magshell_fenicsx.simulate.gradients.fields import MASS, mass
 from magshell_fenicsx.simulate.gradients.gradient import derivative
 from magshell_fenicsx.simulate.gradients.instabilities import (
     BESIDE,
@@ -24,7 +25,6 @@ from magshell_fenicsx.simulate.gradients.instabilities import (
     located,
     refuse_moving,
 )
-from magshell_fenicsx.simulate.gradients.mass import MASS, mass
 from magshell_fenicsx.simulate.gradients.results import adjoint_at_end, refuse_no_result
 from magshell_fenicsx.simulate.gradients.vibration import FIRST, adjoints_of_vibrations
 from magshell_fenicsx.simulate.record import Record, Stopped

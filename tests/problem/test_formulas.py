@@ -6,7 +6,7 @@ from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.check import describe
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.public import Scene
-from magshell_fenicsx.simulate.gradients.expected import Expected, refuse_unknown_results
+from magshell_fenicsx.simulate.gradients.results import Expected, refuse_unknown_results
 from magshell_fenicsx.simulate.results import differentiable
 
 CASE = {

@@ -23,8 +23,7 @@ from magshell_fenicsx.simulate.gradients.adjoint import adjoint_of_instability
 from magshell_fenicsx.simulate.gradients.gradient import gradient
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.results import functional
-from magshell_fenicsx.simulate.sensitivity import fold_at
-from magshell_fenicsx.simulate.shape_sensitivity import reshaped
+from magshell_fenicsx.simulate.sensitivity import fold_at, reshaped
 
 Array = NDArray[np.float64]
 FIELDS = ("thickness", "curvature", "deviation")

@@ -16,7 +16,7 @@ from magshell_fenicsx.parts.imperfections.modes import ModesSection, Round
 from magshell_fenicsx.public import Scene, run
 from magshell_fenicsx.shape.outline import ground_of, outline
 from magshell_fenicsx.simulate.perfect import perfect_modes, with_modes
-from magshell_fenicsx.simulate.shape_sensitivity import changed
+from magshell_fenicsx.simulate.sensitivity import changed
 
 Array = NDArray[np.float64]
 HEMISPHERE = {"geometry": "hemisphere", "radius_to_thickness": 12, "poisson_ratio": 0.3}

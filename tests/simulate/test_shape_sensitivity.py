@@ -8,8 +8,7 @@ from magshell_fenicsx.continuation.fold import Guess, find_fold
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.public import Scene
 from magshell_fenicsx.simulate.follow import follow
-from magshell_fenicsx.simulate.sensitivity import fold_at, sensitivities
-from magshell_fenicsx.simulate.shape_sensitivity import Along, _deviation, changed, reshaped
+from magshell_fenicsx.simulate.sensitivity import Along, _deviation, changed, fold_at, reshaped, sensitivities
 from magshell_fenicsx.simulate.transfer import transfer
 
 

@@ -28,7 +28,7 @@ from magshell_fenicsx.models.shell.patterns import cells_of
 from magshell_fenicsx.models.shell.terms import INTERIOR, EnergyFactory
 from magshell_fenicsx.models.shell.thickness import Thickness, thickness_field
 from magshell_fenicsx.parts.forces.on_meridian import Around, dead_loads, pole_force
-from magshell_fenicsx.parts.magnetism.driving import field_parameters
+from magshell_fenicsx.parts.magnetism.applied import field_parameters
 from magshell_fenicsx.parts.natural.shape import Shape, natural_field
 from magshell_fenicsx.parts.supports.moved import PRESSURE, Support, enclosed, motions_of, moving, rotation_of
 from magshell_fenicsx.parts.supports.on_meridian import openings, supports

@@ -14,8 +14,7 @@ from ufl.core.expr import Expr
 from magshell_fenicsx.assembly.batches import Batch, Rule
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.point_kernels import PointKernel, Points, whole_hessian
-from magshell_fenicsx.models.axisymmetric import jets
-from magshell_fenicsx.models.carriers import Carrier, Energy
+from magshell_fenicsx.models.carriers import Carrier, Energy, revolved_by, wave_by
 from magshell_fenicsx.models.shell.energy import Density
 from magshell_fenicsx.models.shell.kinematics import Jet
 from magshell_fenicsx.models.shell.sites import fill, on_batches, parameters_at
@@ -126,9 +125,9 @@ class _Site:
     @cached_property
     def _kernels(self) -> list[PointKernel]:
         waves = [self._of_sides(self._wave, WAVE, side) for side in self._sides]
-        both = [jets.wave_by(each, self._m) for each in waves]
+        both = [wave_by(each, self._m) for each in waves]
         u, r0, drawn = (
-            [jets.revolved_by(self._of_sides(field, PLANE, side)) for side in self._sides]
+            [revolved_by(self._of_sides(field, PLANE, side)) for side in self._sides]
             for field in (self._at_u, self._at_r0, self._drawn)
         )
         found = []

@@ -24,7 +24,7 @@ from magshell_fenicsx.continuation.factor import Banded, Factorisation
 from magshell_fenicsx.continuation.modes import nearest_to_zero
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.continuation.watch import Family
-from magshell_fenicsx.models.axisymmetric import jets
+from magshell_fenicsx.models import carriers
 from magshell_fenicsx.models.axisymmetric.meridian import Meridian
 from magshell_fenicsx.models.axisymmetric.wave_points import WavePoints
 from magshell_fenicsx.models.carriers import Carrier, Energy
@@ -48,7 +48,7 @@ class Waves:
     Attributes
     ----------
     V
-        Space of the waves' coefficients (U + V, V, W); see `jets.wave`.
+        Space of the waves' coefficients (U + V, V, W); see `carriers.wave`.
     largest
         Waves that are looked at by default: m = 1 to this. The perfect sphere buckles in
         waves of length 2 pi sqrt(Rh)/(12(1 - nu^2))^(1/4), of which
@@ -196,8 +196,8 @@ class Waves:
         return -abs(value) if unstable else abs(value)
 
     def _of_wave(self, e: Energy) -> tuple[ufl.Form, fem.Function]:
-        v, u = fem.Function(self.V), jets.revolved(self._system.u)
-        cosine, sine = jets.wave(v, self._m)
+        v, u = fem.Function(self.V), carriers.revolved(self._system.u)
+        cosine, sine = carriers.wave(v, self._m)
         return np.pi * (e.added(u, cosine) + e.added(u, sine)), v
 
 

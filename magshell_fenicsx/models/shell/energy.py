@@ -1,4 +1,4 @@
-"""A term of the shell: its density as a function of point quantities, and the form made from it."""
+"""A term of the shell: its density as a function of point quantities, its parameters, and the form made from it."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -7,18 +7,22 @@ from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 import ufl
-from dolfinx import fem
+from dolfinx import fem, mesh
 from numpy.typing import NDArray
 from petsc4py import PETSc
+from ufl import Coefficient
 from ufl.core.expr import Expr
 
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.terms import Counted, DensityTerm
+from magshell_fenicsx.mesh.patch import GivenField, MeshError
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.kinematics import FIRST, Jet
+from magshell_fenicsx.models.shell.own_term import Free, OwnTerm
 from magshell_fenicsx.platform import compat
 
 Parameter: TypeAlias = fem.Constant | fem.Function
+Constants = dict[str, fem.Constant]
 
 
 @dataclass(frozen=True)
@@ -166,3 +170,30 @@ class HessianTerm:
 
     def add_tangent(self, K: PETSc.Mat, factor: float, clamped: list[fem.DirichletBC]) -> None:
         compat.add_matrix(K, self.tangent_form, clamped)
+
+
+def constants_of(term: OwnTerm, domain: mesh.Mesh, known: Constants) -> tuple[fem.Constant | fem.Function, ...]:
+    """The parameters of a term as constants; a free one has the same constant in all terms, kept in `known`.
+
+    Raises
+    ------
+    MeshError
+        If one is a function on another mesh.
+    """
+
+    def constant(value: float | NDArray[np.float64]) -> fem.Constant:
+        return fem.Constant(domain, np.asarray(value, dtype=float))
+
+    def made(p: float | NDArray[np.float64] | Free | GivenField | Coefficient) -> fem.Constant | fem.Function:
+        if isinstance(p, Free):
+            return known.setdefault(p.name, constant(p.value))
+        if isinstance(p, Coefficient) and p.ufl_function_space().ufl_domain() == domain.ufl_domain():
+            return p
+        if isinstance(p, Coefficient | GivenField):
+            raise MeshError(
+                f"terms: {term.name}: a function on a mesh: that is of a problem whose shell is on this mesh, "
+                "see ms.Shell"
+            )
+        return constant(p)
+
+    return tuple(made(p) for p in term.parameters)

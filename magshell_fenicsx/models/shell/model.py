@@ -38,13 +38,17 @@ from magshell_fenicsx.models.shell.parameters import (
     default_penalty,
 )
 from magshell_fenicsx.models.shell.patterns import by_patch, carried, cells_of
-from magshell_fenicsx.models.shell.residual import FastResidual
-from magshell_fenicsx.models.shell.slopes import point_parameters
+from magshell_fenicsx.models.shell.residual import FastResidual, point_parameters
 from magshell_fenicsx.models.shell.terms import EnergyFactory
 from magshell_fenicsx.models.shell.thickness import Thickness, thickness_field
-from magshell_fenicsx.parts.forces.dead_load import SurfaceMeasures, assemble_dead_loads
-from magshell_fenicsx.parts.forces.load_vector import patch_entries, point_entries, vertex_normal
-from magshell_fenicsx.parts.magnetism.driving import field_parameters
+from magshell_fenicsx.parts.forces.dead_load import (
+    SurfaceMeasures,
+    assemble_dead_loads,
+    patch_entries,
+    point_entries,
+    vertex_normal,
+)
+from magshell_fenicsx.parts.magnetism.applied import field_parameters
 from magshell_fenicsx.parts.natural.shape import Shape, natural_field
 from magshell_fenicsx.parts.pressure.openings import openings
 from magshell_fenicsx.parts.supports.moved import Support, enclosed, motions_of, moving, pressed_edges, rotation_of

@@ -19,6 +19,7 @@ from ufl.core.expr import Expr
 from ufl.corealg.traversal import traverse_unique_terminals
 from ufl.geometry import GeometricQuantity
 
+from magshell_fenicsx.input.expressions import symbolic
 from magshell_fenicsx.mesh.mirror import Y0, Mirror
 from magshell_fenicsx.mesh.patch import GivenField
 from magshell_fenicsx.models.shell.kinematics import CURVED, FIRST, SECOND, Edge, Jet
@@ -275,6 +276,13 @@ class Symbolic(NamedTuple):
     r0: Jet
     u: Jet
     m: Expr
+
+
+def times_formula(text: str | None, density: Callable[..., Expr]) -> Callable[..., Expr]:
+    """A density, multiplied by a formula at the undeformed place; itself without one."""
+    if text is None:
+        return density
+    return lambda r0, *others: symbolic(text, SYMBOLIC, *r0.r) * density(r0, *others)
 
 
 def _random_samples() -> list[Sample]:

@@ -1,19 +1,24 @@
-"""Energies and residuals without compiled forms, from the terms' own densities and their gradients at points."""
+"""Energies and residuals without compiled forms, from the terms' densities and their gradients at points; and both by
+free parameters."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
+import ufl
 from dolfinx import fem
 from numpy.typing import NDArray
+from ufl.core.expr import Expr
 
 from magshell_fenicsx.assembly.batches import boundary_edges, edge_width, interior_edges
 from magshell_fenicsx.assembly.following import Follows
 from magshell_fenicsx.assembly.kernels import KernelLog
+from magshell_fenicsx.assembly.parameters import Parameter
 from magshell_fenicsx.assembly.point_kernels import PointKernel
 from magshell_fenicsx.assembly.shape_tables import Sheet, Table, cell_frames, cell_rule, edge_covector, edge_rule
-from magshell_fenicsx.models.shell.energy import Density, cell_quadrature, edge_quadrature
+from magshell_fenicsx.models.shell.energy import Density, ShellTerm, cell_quadrature, edge_quadrature
 from magshell_fenicsx.models.shell.gradients import FRAME, PointGradient, PointTerm, in_own_coordinates
 from magshell_fenicsx.models.shell.kinematics import CURVED, FIRST, Jet
 from magshell_fenicsx.models.shell.sites import NAMES, at_points
@@ -254,3 +259,69 @@ def _where(V: fem.FunctionSpace, density: Density, frames: Array, each: int) -> 
     width = edge_width(V, tuple(cells.T), edges[:, 0])
     sides = [frames[cells].reshape(-1, FRAME * density.sides), m.reshape(-1, 2 * density.sides), width[:, None]]
     return rows.reshape(-1, density.sides), np.repeat(np.concatenate(sides, axis=1), each, axis=0)
+
+
+Serve = Callable[[Sequence[PointTerm]], FastResidual]
+
+
+@dataclass
+class Slope:
+    """A term's derivative by parameters, with the amplitude of the term."""
+
+    name: str
+    amplitude: str | None
+    density: Density
+    points: FastResidual = field(init=False)
+
+    def energy(self) -> float:
+        """On this rank's part, at the present u."""
+        return self.points.energy(self.name)
+
+    def add_residual(self, b: NDArray[np.float64], factor: float) -> None:
+        """Add factor times its derivative by u to the local vector (ghosts included)."""
+        self.points.add(b, {self.name: factor})
+
+
+def point_parameters(
+    constants: Mapping[str, fem.Constant], terms: Sequence[ShellTerm], serve: Serve
+) -> dict[str, Parameter]:
+    """The free parameters of a shell, by name; collective.
+
+    Parameters
+    ----------
+    constants
+        The parameters as they stand in the densities of the terms.
+    serve
+        Makes what serves terms each apart.
+    """
+    found = {}
+    for name, p in constants.items():
+        of_terms = slopes(p, terms, f"by {name}", serve)
+        for served in {id(slope.points): slope.points for slope in of_terms}.values():
+            served.compile()
+        found[name] = Parameter(p, of_terms, partial(slopes, terms=of_terms, words="twice", serve=serve))
+    return found
+
+
+def slopes(p: fem.Constant, terms: Sequence[PointTerm], words: str, serve: Serve) -> list[Slope]:
+    """The derivatives of those terms that a parameter enters."""
+    entered = [term for term in terms if any(q is p for q in term.density.parameters)]
+    found = [Slope(f"{term.name} {words}", term.amplitude, derived(term.density, p)) for term in entered]
+    points = serve(found) if found else None
+    for slope in found:
+        assert points
+        slope.points = points
+    return found
+
+
+def derived(density: Density, p: fem.Constant) -> Density:
+    """The density's derivative by a parameter of it."""
+
+    def of(*arguments: Any) -> Expr:
+        first = len(arguments) - len(density.parameters)
+        here = [first + i for i, q in enumerate(density.parameters) if q is p]
+        variable = ufl.variable(arguments[here[0]])
+        given = [variable if i in here else argument for i, argument in enumerate(arguments)]
+        return ufl.algorithms.expand_derivatives(ufl.diff(density.of(*given), variable))
+
+    return replace(density, of=of, work=None, linear=())

@@ -16,14 +16,15 @@ from magshell_fenicsx.models.carriers import Carrier, Energy, Facets, HeldEdge
 from magshell_fenicsx.models.shell import densities, edges
 from magshell_fenicsx.models.shell.antisymmetric import antisymmetric_edge
 from magshell_fenicsx.models.shell.energy import (
+    Constants,
     Density,
     HessianTerm,
     MomentTerm,
     Parameter,
     ShellTerm,
+    constants_of,
     per_area,
 )
-from magshell_fenicsx.models.shell.free import Constants, constants_of
 from magshell_fenicsx.models.shell.kinematics import CURVED, MOVED, SECOND, Edge, Jet
 from magshell_fenicsx.models.shell.law import elastic
 from magshell_fenicsx.models.shell.own_term import OwnTerm

@@ -1,6 +1,6 @@
 """Parts of cells in which a formula has values that samples do not show, however small these parts are.
 
-The ranges of a formula and of its derivatives in a box (`case/enclosure.py`) are compared with values at a few places.
+The ranges of a formula and of its derivatives in a box (`input/enclosure.py`) are compared with values at a few places.
 A part is divided while what the ranges leave open between these may change the integral of the formula's
 variation. So a
 step or a Gaussian of any width is found, at a cost that grows like the logarithm of one over the width.

@@ -34,7 +34,7 @@ from magshell_fenicsx.models.solid.sites import make_sites
 from magshell_fenicsx.models.solid.terms import Density, TermFactory
 from magshell_fenicsx.parts.forces.dead_load import assemble_dead_loads
 from magshell_fenicsx.parts.forces.on_body import BodyMeasures, outer_patch
-from magshell_fenicsx.parts.magnetism.driving import field_parameters
+from magshell_fenicsx.parts.magnetism.applied import field_parameters
 from magshell_fenicsx.parts.natural.shape import body_shape, grown_in_body
 from magshell_fenicsx.parts.pressure.openings import openings
 from magshell_fenicsx.parts.supports.moved import enclosed, motions_of, moving, pressed_edges

@@ -14,8 +14,7 @@ from ufl.core.expr import Expr
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.terms import Counted, DensityTerm
 from magshell_fenicsx.mesh.hexahedra import MIDDLE, OUTER, Body
-from magshell_fenicsx.models.shell.energy import per_area
-from magshell_fenicsx.models.shell.free import Constants, constants_of
+from magshell_fenicsx.models.shell.energy import Constants, constants_of, per_area
 from magshell_fenicsx.models.shell.kinematics import CURVED, SECOND, Jet
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.parameters import ACROSS, Magnetisation

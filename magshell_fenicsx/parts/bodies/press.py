@@ -10,12 +10,15 @@ from pydantic import Field
 from magshell_fenicsx.input.section import over
 from magshell_fenicsx.parts.course import Control, Course, Here, Now, Target, Until
 from magshell_fenicsx.parts.part import Context
+from magshell_fenicsx.parts.seen import Seen, Sight
 from magshell_fenicsx.parts.step import Count, PathStep, ProgrammeStep, Step
 from magshell_fenicsx.parts.supports.motion import Name
-from magshell_fenicsx.quantities.quantity import POINT_FORCE, THICKNESS
+from magshell_fenicsx.quantities.quantity import PLACE, POINT_FORCE, THICKNESS, Amplitude, Quantity
 
 if TYPE_CHECKING:
     from magshell_fenicsx.continuation.path import StepOptions
+    from magshell_fenicsx.continuation.system import State
+    from magshell_fenicsx.models.shell.parameters import Loads
 
 SHARP = 1e-9  # least step along a contact: folds are as sharp as the penalty's stiffness changes, over 1e-3 h of gap
 EASY, HARD = 4, 8  # matrices of a step along a contact, whose rim moves from point to point before it settles
@@ -84,3 +87,94 @@ def approaches(bodies: Collection[str], loads: Sequence[Step]) -> dict[str, str]
     """Body -> name of its approach, the amplitude; a single one needs no name beside it, unless a load is `force`."""
     alone = len(bodies) == 1 and not any(load.amplitude == "force" for load in loads)
     return {name: "approach" if alone else f"approach_{name}" for name in bodies}
+
+
+class BodiesSeen(Seen):
+    """Approach, force, penetration and radii of each body."""
+
+    quantities = (
+        Quantity(
+            "approach_over_h",
+            "approach",
+            "Approach of a body along its direction; of several bodies, or beside an indentation, "
+            "approach_over_h_NAME. `force` is then the force on the body.",
+            "load",
+            "a/h",
+            (THICKNESS,),
+            each=True,
+        ),
+        Quantity(
+            "penetration_over_h",
+            "penetration",
+            "Largest penetration of a body into the shell's face, an error of the penalty; negative: minus the least "
+            "gap.",
+            "error",
+            "",
+            (THICKNESS,),
+            each=True,
+        ),
+        Quantity(
+            "contact_radius",
+            "contact radius",
+            "Mean distance of the pressure from the body's axis, in the shell's length; over R if that has no unit.",
+            "place",
+            units=(PLACE,),
+            each=True,
+        ),
+        Quantity(
+            "contact_inner",
+            "contact from",
+            "Least distance of the pressure from the body's axis.",
+            "place",
+            units=(PLACE,),
+            each=True,
+        ),
+        Quantity(
+            "contact_outer",
+            "contact to",
+            "Largest distance of the pressure from the body's axis.",
+            "place",
+            units=(PLACE,),
+            each=True,
+        ),
+        Quantity(
+            "contact_stiffness",
+            "stiffness of the contact",
+            "Of the penalty, in E h/R²; raised fourfold where a body without `stiffness` would penetrate too much.",
+            "error",
+            each=True,
+        ),
+    )
+    varied = (Amplitude("approach", "approach_over_h", "force", "", sideways=True, each=True),)
+
+    def amplitudes(self, loads: "Loads") -> tuple[str, ...]:
+        return tuple(name for contact in loads.contacts for name in (contact.amplitude, contact.setting))
+
+    def conjugates(self, loads: "Loads") -> dict[str, str]:
+        return {contact.amplitude: contact_columns(contact.amplitude)[1] for contact in loads.contacts}
+
+    def columns(self, loads: "Loads", supports: Sequence[str]) -> tuple[str, ...]:
+        names = (column for contact in loads.contacts for column in contact_columns(contact.amplitude))
+        return tuple(column for column in names if column != "force")
+
+    def observe(self, sight: Sight, state: "State") -> dict[str, float]:
+        model, h, values = sight.model, sight.h, dict[str, float]()
+        for name in model.contacts:
+            at, force = model.touching(state, name), sight.potential(state, name)
+            numbers = (state.mu[name], -force / self._unit(sight), at.penetration / h)
+            radii = (sight.length * radius for radius in (at.radius, at.inner, at.outer))
+            k = float(model.contacts[name][0].stiffness.value)
+            values |= dict(zip(contact_columns(name), (*numbers, *radii, k), strict=True))
+        return values
+
+    def conjugate_unit(self, sight: Sight, name: str) -> float | None:
+        return self._unit(sight) if name in sight.model.contacts else None
+
+    def _unit(self, sight: Sight) -> float:
+        return -sight.model.force_unit * sight.h
+
+
+def contact_columns(approach: str) -> tuple[str, ...]:
+    """The columns of a body: its approach, the force on it, and the rest."""
+    first, *others = (q.name for q in BodiesSeen.quantities)
+    return tuple(column + approach.removeprefix("approach") for column in (first, "force", *others))

@@ -1,13 +1,12 @@
 """The rigid bodies of a case in the model's terms: where they stand, how stiff they are, and what they leave."""
 
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
 from math import atan2, inf, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.grading import Disc, Feature
 from magshell_fenicsx.mesh.mirror import Mirror, rotation
@@ -17,9 +16,7 @@ from magshell_fenicsx.parts.bodies.contact import Contact
 from magshell_fenicsx.parts.bodies.press import ContactSection
 from magshell_fenicsx.parts.course import Fit
 from magshell_fenicsx.parts.part import Account, Context
-from magshell_fenicsx.parts.seen import Seen, Sight
 from magshell_fenicsx.parts.step import Step
-from magshell_fenicsx.quantities.registry import contact_columns
 from magshell_fenicsx.shape.ground import Ground, located
 from magshell_fenicsx.shape.outline import Outline
 from magshell_fenicsx.shape.symmetry import Leaves
@@ -184,36 +181,6 @@ def _refined(f: Callable[[Array], Array], best: Array, least: float, reach: Arra
             best, least = x[values.argmin()], float(values.min())
         reach = FINER * reach
     return least
-
-
-class BodiesSeen(Seen):
-    """Approach, force, penetration and radii of each body."""
-
-    def amplitudes(self, loads: Loads) -> tuple[str, ...]:
-        return tuple(name for contact in loads.contacts for name in (contact.amplitude, contact.setting))
-
-    def conjugates(self, loads: Loads) -> dict[str, str]:
-        return {contact.amplitude: contact_columns(contact.amplitude)[1] for contact in loads.contacts}
-
-    def columns(self, loads: Loads, supports: Sequence[str]) -> tuple[str, ...]:
-        names = (column for contact in loads.contacts for column in contact_columns(contact.amplitude))
-        return tuple(column for column in names if column != "force")
-
-    def observe(self, sight: Sight, state: State) -> dict[str, float]:
-        model, h, values = sight.model, sight.h, dict[str, float]()
-        for name in model.contacts:
-            at, force = model.touching(state, name), sight.potential(state, name)
-            numbers = (state.mu[name], -force / self._unit(sight), at.penetration / h)
-            radii = (sight.length * radius for radius in (at.radius, at.inner, at.outer))
-            k = float(model.contacts[name][0].stiffness.value)
-            values |= dict(zip(contact_columns(name), (*numbers, *radii, k), strict=True))
-        return values
-
-    def conjugate_unit(self, sight: Sight, name: str) -> float | None:
-        return self._unit(sight) if name in sight.model.contacts else None
-
-    def _unit(self, sight: Sight) -> float:
-        return -sight.model.force_unit * sight.h
 
 
 def account(context: Context, loads: Loads) -> Account:

@@ -17,11 +17,17 @@ from magshell_fenicsx.models.shell.kinematics import Jet
 from magshell_fenicsx.models.shell.own_term import SYMBOLIC, OwnTerm
 from magshell_fenicsx.parts.course import Fit, Now, Target, Until
 from magshell_fenicsx.parts.part import Context, Formulas, Modelled, Scales
+from magshell_fenicsx.parts.seen import Seen, Sight
 from magshell_fenicsx.parts.step import Count, PathStep, ProgrammeStep
+from magshell_fenicsx.quantities.quantity import Quantity
+from magshell_fenicsx.quantities.registry import amplitude
 from magshell_fenicsx.shape.symmetry import Leaves, alike, tilted, unit
 from magshell_fenicsx.shape.turning import Span, scalar_turns, vector_turns
 
 if TYPE_CHECKING:
+    from magshell_fenicsx.continuation.system import State
+    from magshell_fenicsx.mesh.patch import PatchMesh
+    from magshell_fenicsx.models.shell.parameters import Loads
     from magshell_fenicsx.shape.outline import Outline
 
 Array = NDArray[np.float64]
@@ -227,7 +233,7 @@ class DeadSection(PathStep):
                 yield Formulas(f"{key}.loads.{i}.{name}", values, -most, most, scales.R, load=True)
 
     def adds(self, step: ProgrammeStep, context: Context, modelled: Modelled) -> dict[str, Any]:
-        from magshell_fenicsx.parts.forces.loads import dead_load  # the solver takes long to import
+        from magshell_fenicsx.parts.forces.dead_load import dead_load  # the solver takes long to import
 
         mirror = modelled.mirror
         here = (load for load in self.loads if not mirror or load.edge not in mirror.lost)
@@ -286,3 +292,42 @@ def potential(name: str, text: str, Q: Array, scales: Scales) -> OwnTerm:
         return at(r0.r + u.r, scale, size) - at(r0.r, scale, size)
 
     return OwnTerm(name, density, (scales.R, 1 / (scales.E * scales.h)))
+
+
+def also_displaced(loads: "Loads") -> tuple[str, ...]:
+    """Amplitudes with a displacement besides the one of the column w_over_h."""
+    return tuple(name for name in (*loads.forces, *loads.dead) if name != loads.displaced)
+
+
+class ForcesSeen(Seen):
+    """Factors of forces and dead loads, and displacements along them."""
+
+    quantities = (Quantity("load_factor", "load factor", "Common factor of all dead loads.", "load"),)
+    before_points: ClassVar[bool] = True
+
+    def amplitudes(self, loads: "Loads") -> tuple[str, ...]:
+        return (*loads.forces, *loads.dead)
+
+    def columns(self, loads: "Loads", supports: Sequence[str]) -> tuple[str, ...]:
+        factors = (amplitude(name).column for name in self.amplitudes(loads) if name != "force")
+        return (*factors, *(f"w_{name}_over_h" for name in also_displaced(loads)))
+
+    def observe(self, sight: Sight, state: "State") -> dict[str, float]:
+        model, loads = sight.model, sight.loads
+        factors = {amplitude(name).column: state.mu[name] for name in self.amplitudes(loads)}
+        along = also_displaced(loads)
+        return factors | {f"w_{name}_over_h": model.loaded_deflection(state.u, name) / sight.h for name in along}
+
+    def refuse_unfit(self, loads: "Loads", surface: "PatchMesh") -> None:
+        from magshell_fenicsx.models.shell.parameters import AreaForce  # the solver takes long to import
+        from magshell_fenicsx.models.shell.thickness import patch_of
+
+        for load in loads.all_dead:
+            if isinstance(load, AreaForce) and load.patch is not None:
+                patch_of(surface.patches, load.patch)
+
+    def conjugate_unit(self, sight: Sight, name: str) -> float | None:
+        """w/h of a force, the shell's length of dead loads."""
+        if name in sight.loads.forces:
+            return sight.model.force_unit * sight.h
+        return sight.model.load_size.get(name, 0.0) / sight.length if name in sight.loads.dead else None

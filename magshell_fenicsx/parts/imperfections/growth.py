@@ -9,6 +9,7 @@ from magshell_fenicsx.parts.course import Target, Until
 from magshell_fenicsx.parts.part import Context, Modelled
 from magshell_fenicsx.parts.seen import Seen
 from magshell_fenicsx.parts.step import PathStep, ProgrammeStep
+from magshell_fenicsx.quantities.quantity import Quantity
 
 if TYPE_CHECKING:
     from magshell_fenicsx.models.shell.parameters import Loads
@@ -64,6 +65,10 @@ class ImperfectionStep(PathStep):
 
 class GrowingSeen(Seen):
     """The amplitudes of imperfections that grow."""
+
+    quantities = (
+        Quantity("imperfection", "imperfection", "Factor of the imperfections that grow; 0: without them.", "load"),
+    )
 
     def named(self, loads: "Loads") -> tuple[str, ...]:
         return tuple(loads.growing)

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from math import inf, sqrt
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Generic, Literal, Protocol, TypeVar
+from typing import Annotated, Any, ClassVar, Generic, Literal, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,10 +12,7 @@ from pydantic import BeforeValidator, Field, ModelWrapValidatorHandler, Validati
 from magshell_fenicsx.input.section import Section, in_units, with_unit
 from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.mesh.patch import Deviation
-from magshell_fenicsx.shape.ground import At, Distance, Ground
-
-if TYPE_CHECKING:  # it needs the solver, and a case alone does not
-    from magshell_fenicsx.mesh.patch import Deviation
+from magshell_fenicsx.shape.ground import At, Distance, Ground, located
 
 Array = NDArray[np.float64]
 Values = TypeVar("Values")
@@ -50,7 +47,7 @@ class Flaw:
         places; None where they are alike.
     """
 
-    deviation: "Deviation"
+    deviation: Deviation
     size: float = inf
     centre: Array | None = None
     distance: Distance | None = None
@@ -75,8 +72,18 @@ class Local:
         Over R; the width in the measure of `distance`, so on spheres in rad.
     distance
         From its centre.
+    steepest
+        The largest slope of f(t²) by t.
+    reach, shown
+        How far it reaches, and elements that show a narrow one, in widths.
+    rim
+        Whether the curvature jumps where it ends.
     """
 
+    steepest: ClassVar[float]
+    reach: ClassVar[float] = 1.0
+    shown: ClassVar[float] = inf
+    rim: ClassVar[bool] = False
     depth: float
     width: float
     distance: Distance
@@ -236,8 +243,9 @@ class ImperfectionSection(Section):
 
 
 class LocalSection(ImperfectionSection):
-    """Base of those around a place."""
+    """Base of those around a place, which have a profile: the class `deviation`."""
 
+    deviation: ClassVar[type[Local]]
     amplitude: Annotated[float, over("h")] = Field(ge=-50, le=50)
     """Depth δ, inwards; a bump is negative [h]"""
     width: Annotated[float, over("width")] = Field(ge=0.05, le=50)
@@ -253,8 +261,19 @@ class LocalSection(ImperfectionSection):
         """Over R (rad)."""
         return half_width(self.width, R_over_h, nu)
 
+    def refuse_unfit(self, R_over_h: float, nu: float, edge: float | None) -> None:
+        depth = abs(self.amplitude) / R_over_h
+        _refuse_steep(depth, self.deviation.steepest * depth / self.half_width(R_over_h, nu))
 
-def refuse_steep(depth: float, slope: float) -> None:
+    def flaw(self, ground: Ground, key: str) -> Flaw:
+        of, width = self.deviation, self.half_width(ground.R_over_h, ground.nu)
+        place, distance = located(self.at, ground, key)
+        size = min(SHOWN / sqrt(ground.R_over_h), of.shown * width)
+        deviation = of(self.amplitude / ground.R_over_h, width, distance)
+        return Flaw(deviation, size, place, distance, of.reach * width, of.rim)
+
+
+def _refuse_steep(depth: float, slope: float) -> None:
     """Refuse a local imperfection by its depth over R and its steepest slope."""
     if depth > 0.5:
         raise ValueError(f"the dimple is {depth:.2g} radii deep; it must stay below half a radius")

@@ -2,10 +2,12 @@
 
 The polynomial of second order has the first and second derivatives of the field itself, and so have the energies that
 take it: the forms and kernels are the same for every field. A shell that has passed through a magnet between two states
-is noticed, however thin that is.
+is noticed, however thin that is. The amplitudes of fields that are driven are free parameters of a system.
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import ufl
@@ -14,6 +16,9 @@ from numpy.typing import NDArray
 from ufl.core.expr import Expr
 
 from magshell_fenicsx.assembly.following import Follows, PointField, at_quadrature
+from magshell_fenicsx.assembly.kernels import KernelLog
+from magshell_fenicsx.assembly.parameters import Derivative, Parameter
+from magshell_fenicsx.assembly.terms import FormTerm, Term
 from magshell_fenicsx.models.shell.patterns import refuse_unbounded
 from magshell_fenicsx.parts.magnetism.driven import Driven, FieldInSpace, Here, carried
 
@@ -170,3 +175,52 @@ class AppliedField:
                 said = getattr(of, "nowhere", "is where magnetic.applied has no finite value")
                 return f"the shell's point (x, y, z)/R = ({x[0]:.3g}, {x[1]:.3g}, {x[2]:.3g}) {said}"
         return ""
+
+
+@dataclass(eq=False)
+class Amplitude:
+    """The value of an amplitude in a field, which takes the place of a constant in a form."""
+
+    known: AppliedField
+    name: str
+
+    @property
+    def value(self) -> float:
+        return self.known.mu[self.name]
+
+    @value.setter
+    def value(self, value: float) -> None:
+        self.known.mu[self.name] = float(value)
+
+
+def field_parameters(
+    fields: Sequence[AppliedField], terms: Sequence[Term], u: fem.Function, log: KernelLog
+) -> dict[str, Parameter]:
+    """The amplitudes of driven fields, by name; collective.
+
+    The energy is linear in the field: of dB/dmu it is dPi/dmu. So the forms are those of the terms, with the
+    polynomials of the derivatives.
+    """
+    found = {}
+    for known in fields:
+        own = [t for t in terms if isinstance(t, FormTerm) and known.polynomial in t.form.coefficients()]
+        for name in known.names:
+            p, slopes = Amplitude(known, name), _with(own, known, known.slope(name), u, log)
+            for each in slopes:
+                each.compile_residual()
+            found[name] = Parameter(p, slopes, partial(_twice, p, own, u, log))
+    return found
+
+
+def _twice(p: Amplitude, own: Sequence[FormTerm], u: fem.Function, log: KernelLog, q: object) -> Sequence[Derivative]:
+    """Derivatives by two amplitudes of one field; none by what is not in it."""
+    if not isinstance(q, Amplitude) or q.known is not p.known:
+        return []
+    return _with(own, p.known, p.known.slope(p.name, q.name), u, log)
+
+
+def _with(
+    own: Sequence[FormTerm], known: AppliedField, instead: PointField, u: fem.Function, log: KernelLog
+) -> list[FormTerm]:
+    """The terms with another polynomial in place of the field's own."""
+    return [FormTerm(t.name, ufl.replace(t.form, {known.polynomial: instead}), u, log, t.amplitude) for t in own]

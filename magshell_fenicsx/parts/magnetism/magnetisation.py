@@ -10,9 +10,17 @@ from magshell_fenicsx.input.section import Direction
 from magshell_fenicsx.input.tables import read_vectors
 from magshell_fenicsx.mesh.mirror import Mirror, rotation
 from magshell_fenicsx.mesh.patch import GivenField
-from magshell_fenicsx.models.shell.controls import ByControls, Controls
 from magshell_fenicsx.models.shell.parameters import Loads, Magnetisation
-from magshell_fenicsx.models.shell.patterns import Components, Inside, Pattern, WithinRims, radial, tangential
+from magshell_fenicsx.models.shell.patterns import (
+    ByControls,
+    Components,
+    Controls,
+    Inside,
+    Pattern,
+    WithinRims,
+    radial,
+    tangential,
+)
 from magshell_fenicsx.parts.magnetism.field_step import FieldSection, RotationSection
 from magshell_fenicsx.parts.magnetism.fields import MagneticSection, RemanentSection, layer_average, strength
 from magshell_fenicsx.parts.magnetism.sources.field import in_space, turns, values

@@ -1,8 +1,9 @@
 """A source of the applied field as a load: its place, its angle or its strength changes."""
 
 from collections.abc import Sequence
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
+import numpy as np
 from pydantic import Field, model_validator
 
 from magshell_fenicsx.input.section import Section
@@ -11,9 +12,16 @@ from magshell_fenicsx.parts.magnetism.field_step import FieldSection
 from magshell_fenicsx.parts.magnetism.fields import MagneticSection
 from magshell_fenicsx.parts.magnetism.sources.source import SourceSection
 from magshell_fenicsx.parts.part import Context
+from magshell_fenicsx.parts.seen import Seen, Sight
 from magshell_fenicsx.parts.step import Count, PathStep, ProgrammeStep
 from magshell_fenicsx.parts.supports.motion import Finite, Lengths, Name
+from magshell_fenicsx.quantities.quantity import FORCE, TORQUE, WORK, Quantity
 from magshell_fenicsx.quantities.registry import QUANTITIES, TAKEN
+
+if TYPE_CHECKING:
+    from magshell_fenicsx.continuation.system import State
+    from magshell_fenicsx.mesh.patch import PatchMesh
+    from magshell_fenicsx.models.shell.parameters import Loads
 
 
 class SpinSection(Section):
@@ -109,3 +117,86 @@ class SourceStep(PathStep):
         same = (other for other in others if other.number(sources) == self.number(sources))
         if self.to and any(other.move or other.to for other in same):
             raise ValueError(f"{key}.to: another step moves the same source: give move")
+
+
+def source_columns(loads: "Loads") -> dict[str, str]:
+    """Amplitude of a source -> the column of the force, the torque or the work on it."""
+    found: dict[str, str] = {}
+    turns = [motion.name for motion in loads.magnetic.turns] if loads.magnetic else []
+    for each in loads.magnetic.driven if loads.magnetic else ():
+        own = [motion for motion in each.motions if motion.name not in turns]
+        found |= {motion.name: "source_torque" if motion.turns else "source_force" for motion in own}
+        found |= dict.fromkeys(each.factors, "source_work")
+    kinds = list(found.values())
+    return {name: kind if kinds.count(kind) == 1 else f"{kind}_{name}" for name, kind in found.items()}
+
+
+def source_size(loads: "Loads", name: str) -> float:
+    """The length over R, the angle (rad) or the change of the factor for an amplitude of one."""
+    assert loads.magnetic
+    for each in loads.magnetic.driven:
+        if name in each.factors:
+            return each.factors[name]
+        for motion in each.motions:
+            if motion.name == name:
+                return float(np.linalg.norm(motion.turn if motion.turns else motion.shift))
+    raise KeyError(name)
+
+
+class SourcesSeen(Seen):
+    """Amplitudes of sources, and their conjugates in SI."""
+
+    quantities = (
+        Quantity(
+            "source", "source", "Factor of a source's motion or strength; the step may give it another name.", "load"
+        ),
+        Quantity(
+            "source_force",
+            "force on the source",
+            "Force of the shell on a source that is driven, along its motion; of several source_force_NAME.",
+            "reaction",
+            units=(FORCE,),
+            each=True,
+        ),
+        Quantity(
+            "source_torque",
+            "torque on the source",
+            "The same about the axis of its turn.",
+            "reaction",
+            units=(TORQUE,),
+            each=True,
+        ),
+        Quantity(
+            "source_work",
+            "work of the source",
+            "The same of its strength: -dΠ/d(factor of the field).",
+            "reaction",
+            units=(WORK,),
+            each=True,
+        ),
+    )
+
+    def refuse_unfit(self, loads: "Loads", surface: "PatchMesh") -> None:
+        from magshell_fenicsx.models.shell.patterns import by_patch  # the solver takes long to import
+
+        if loads.magnetic and loads.magnetic.patches:
+            by_patch(loads.magnetic.patches, surface.patches, len(surface.cells))
+
+    def amplitudes(self, loads: "Loads") -> tuple[str, ...]:
+        return tuple(source_columns(loads))
+
+    def conjugates(self, loads: "Loads") -> dict[str, str]:
+        return source_columns(loads)
+
+    def observe(self, sight: Sight, state: "State") -> dict[str, float]:
+        values: dict[str, float] = {}
+        for name, column in source_columns(sight.loads).items():
+            values |= {name: state.mu[name], column: -sight.potential(state, name) / self._unit(sight, name)}
+        return values
+
+    def conjugate_unit(self, sight: Sight, name: str) -> float | None:
+        return self._unit(sight, name) if name in self.amplitudes(sight.loads) else None
+
+    def _unit(self, sight: Sight, name: str) -> float:
+        arm = 1.0 if source_columns(sight.loads)[name].startswith("source_force") else sight.length
+        return source_size(sight.loads, name) / (sight.force * arm * sight.model.multiplicity)

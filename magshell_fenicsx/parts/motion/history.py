@@ -1,14 +1,18 @@
-"""A load as a function of time: ramp, step, triangle, sine, a table, or a formula."""
+"""A load as a function of time: ramp, step, triangle, sine, a table, or a formula; and the viscosity of a shell."""
 
 import re
 from collections.abc import Callable
-from typing import Annotated, Any, Literal, TypeAlias
+from typing import Annotated, Any, Literal, Protocol, TypeAlias
 
 import numpy as np
 from pydantic import AfterValidator, Discriminator, Field, Tag
 
 from magshell_fenicsx.input.expressions import formula
 from magshell_fenicsx.input.section import Section, in_units, with_unit
+from magshell_fenicsx.parts.natural.section import NaturalSection
+
+Value = Callable[[Any], float]  # a time or a level as a plain number
+Curve = Callable[[float, bool], float]  # of the time since the step began, at a jump before or after it
 
 
 def measured(unit: str) -> Any:
@@ -23,8 +27,6 @@ def measured(unit: str) -> Any:
 
 Time: TypeAlias = measured("second")  # type: ignore[valid-type]
 Level: TypeAlias = measured("tesla")  # type: ignore[valid-type]
-Value = Callable[[Any], float]  # a time or a level as a plain number
-Curve = Callable[[float, bool], float]  # of the time since the step began, at a jump before or after it
 
 
 class RampHistory(Section):
@@ -143,3 +145,55 @@ def levels_of(history: History) -> list[float | str]:
     if isinstance(history, list):
         return [level for _, level in history]
     return [getattr(history, key) for key in ("to", "size", "mean") if hasattr(history, key)]
+
+
+Ratio: TypeAlias = measured("pascal")  # type: ignore[valid-type]
+
+
+class BranchSection(Section):
+    """A branch of Maxwell: a spring in series with a dashpot, beside the elastic shell."""
+
+    modulus: Ratio
+    """Its Young's modulus, text with a unit, or a number over that of the shell"""
+    time: Time
+    """Its relaxation time"""
+
+
+Branches = Annotated[list[BranchSection], Field(max_length=20)]
+
+
+class Viscous(Protocol):
+    """What has these keys."""
+
+    viscosity: float | str | None
+    relaxation: list[BranchSection]
+    youngs_modulus: float | None
+
+
+def refuse_unfit_viscosity(shell: Viscous, natural: NaturalSection | None, *, density: bool, solid: bool) -> None:
+    """See that its numbers are positive and that their units have a meaning.
+
+    Parameters
+    ----------
+    density
+        Whether times and moduli may have units.
+    solid
+        Whether the model is a solid.
+
+    Raises
+    ------
+    ValueError
+        With the key and what is allowed.
+    """
+    times = {"viscosity": shell.viscosity, **{f"relaxation.{i}.time": b.time for i, b in enumerate(shell.relaxation)}}
+    moduli = {f"relaxation.{i}.modulus": b.modulus for i, b in enumerate(shell.relaxation)}
+    for key, value in (times | moduli).items():
+        unit = "pascal" if key in moduli else "second"
+        if value is None:
+            continue
+        if solid or (natural and natural.stretch):
+            raise ValueError(f"shell.{key}: is of a shell, not of a solid, and not with natural.stretch")
+        if in_units(unit)(value) <= 0:
+            raise ValueError(f"shell.{key}: {value}: must be positive")
+        if isinstance(value, str) and not density:
+            raise ValueError(f"shell.{key}: {value}: its unit needs shell.density, youngs_modulus and lengths")

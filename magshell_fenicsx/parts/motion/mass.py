@@ -16,7 +16,7 @@ from ufl.core.expr import Expr
 from magshell_fenicsx.assembly.problem import FiniteElementSystem
 from magshell_fenicsx.assembly.terms import FormTerm
 from magshell_fenicsx.continuation.system import Amplitudes, Vector
-from magshell_fenicsx.models.axisymmetric import jets
+from magshell_fenicsx.models import carriers
 from magshell_fenicsx.models.axisymmetric.model import MeridianModel
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.model import ShellModel
@@ -57,7 +57,7 @@ def of_displacements(model: Model, weight: Expr | float) -> ufl.Form:
 def of_waves(model: MeridianModel, weight: Expr | float) -> ufl.Form:
     """The same of two waves with the coefficients (U + V, V, W); it does not depend on m."""
     V = model.waves.V
-    cosine, sine = zip(*(jets.wave(f, 1) for f in (ufl.TrialFunction(V), ufl.TestFunction(V))), strict=True)
+    cosine, sine = zip(*(carriers.wave(f, 1) for f in (ufl.TrialFunction(V), ufl.TestFunction(V))), strict=True)
     return _integral(model, weight * np.pi * sum(ufl.dot(a.r, b.r) for a, b in (cosine, sine)))
 
 

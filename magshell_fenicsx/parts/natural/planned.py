@@ -7,16 +7,14 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.input.expressions import ByFormula, function
 from magshell_fenicsx.mesh.mirror import Mirror, rotation
-from magshell_fenicsx.mesh.patch import GivenField, PatchMesh
+from magshell_fenicsx.mesh.patch import GivenField
 from magshell_fenicsx.models.shell.parameters import Loads
-from magshell_fenicsx.models.shell.patterns import Inside, Pattern, WithinRims, by_patch
+from magshell_fenicsx.models.shell.patterns import Inside, Pattern, WithinRims
 from magshell_fenicsx.parts.natural.section import NaturalSection, components
 from magshell_fenicsx.parts.natural.shape import Natural, Varying, meridians
 from magshell_fenicsx.parts.part import Account, Context
-from magshell_fenicsx.parts.seen import Seen
 from magshell_fenicsx.shape.outline import Outline
-from magshell_fenicsx.shape.sections import MeshSurface, PlateSurface
-from magshell_fenicsx.shape.shell import ShellSection
+from magshell_fenicsx.shape.sections import MeshSurface, PlateSurface, ShellSection
 from magshell_fenicsx.shape.symmetry import Leaves, unit
 from magshell_fenicsx.shape.turning import scalar_turns
 
@@ -150,18 +148,6 @@ def leaves(context: Context, outline: Outline) -> list[Leaves]:
     fixed = not isinstance(chosen, str) and all(isinstance(v, float | int) for v in chosen)
     vectors = [unit(np.array(chosen, dtype=float))] if fixed else []
     return [Leaves(askew(context, outline), vectors, lambda mirror: mirrored(context, outline, mirror))]
-
-
-class NaturalSeen(Seen):
-    """The amplitudes of the natural shape."""
-
-    def named(self, loads: Loads) -> tuple[str, ...]:
-        return tuple(loads.natural.amplitudes) if loads.natural else ()
-
-    def refuse_unfit(self, loads: Loads, surface: PatchMesh) -> None:
-        for key in ("curvature", "stretch"):
-            if isinstance(values := getattr(loads.natural, key, None), Mapping):
-                by_patch(values, surface.patches, len(surface.cells), f"natural.{key}")
 
 
 def account(context: Context, loads: Loads) -> Account:

@@ -1,7 +1,7 @@
 """The natural shape: the curvature and size that the shell would have without stress, and their growth as a load."""
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import BeforeValidator, Field, model_validator
@@ -11,10 +11,14 @@ from magshell_fenicsx.input.section import _NUMBER, OrOfProgram, in_units
 from magshell_fenicsx.mesh.patch import GivenField
 from magshell_fenicsx.parts.course import Target, Until
 from magshell_fenicsx.parts.part import Ability, Context, Formulas, Modelled
+from magshell_fenicsx.parts.seen import Seen
 from magshell_fenicsx.parts.step import PathStep, ProgrammeStep, Step
+from magshell_fenicsx.quantities.quantity import Quantity
 from magshell_fenicsx.shape.symmetry import Leaves
 
 if TYPE_CHECKING:
+    from magshell_fenicsx.mesh.patch import PatchMesh
+    from magshell_fenicsx.models.shell.parameters import Loads
     from magshell_fenicsx.shape.outline import Outline
 
 _PER_LENGTH = re.compile(
@@ -192,3 +196,22 @@ class GrowthSection(PathStep):
     def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
         if getattr(context.of(NaturalSection), self.key, None) is None:
             raise ValueError(f"loading.{self.key}: is a factor of natural.{self.key}: give that too")
+
+
+class NaturalSeen(Seen):
+    """The amplitudes of the natural shape."""
+
+    quantities = (
+        Quantity("natural_curvature", "natural curvature", "Factor of the natural curvature; 0: as drawn.", "load"),
+        Quantity("natural_stretch", "natural stretch", "Factor of the natural stretch less one; 0: as drawn.", "load"),
+    )
+
+    def named(self, loads: "Loads") -> tuple[str, ...]:
+        return tuple(loads.natural.amplitudes) if loads.natural else ()
+
+    def refuse_unfit(self, loads: "Loads", surface: "PatchMesh") -> None:
+        from magshell_fenicsx.models.shell.patterns import by_patch  # the solver takes long to import
+
+        for key in ("curvature", "stretch"):
+            if isinstance(values := getattr(loads.natural, key, None), Mapping):
+                by_patch(values, surface.patches, len(surface.cells), f"natural.{key}")

@@ -30,9 +30,8 @@ from magshell_fenicsx.input.expressions import Together
 from magshell_fenicsx.mesh.hexahedra import MIDDLE, Body
 from magshell_fenicsx.mesh.patch import GivenField, MeshError
 from magshell_fenicsx.models.shell import kinematics as kin
-from magshell_fenicsx.models.shell.energy import Density, Parameter
+from magshell_fenicsx.models.shell.energy import Constants, Density, Parameter
 from magshell_fenicsx.models.shell.fitted import Cells, fitted
-from magshell_fenicsx.models.shell.free import Constants
 from magshell_fenicsx.models.shell.kinematics import Jet
 from magshell_fenicsx.models.shell.patterns import Pattern, by_patch, cells_of_body, places_in_body
 

@@ -1,17 +1,20 @@
 """Reactions of supports, and those along motions, as columns of path.csv in the case's units."""
 
 from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.mesh.mirror import Mirror, rotation
-from magshell_fenicsx.models.observed import Observed
-from magshell_fenicsx.models.shell.parameters import Loads
 from magshell_fenicsx.parts.part import Account, Context
 from magshell_fenicsx.parts.seen import Seen, Sight
-from magshell_fenicsx.parts.supports.reactions import reactions
+from magshell_fenicsx.quantities.quantity import MOMENT, REACTION, Quantity
+
+if TYPE_CHECKING:
+    from magshell_fenicsx.continuation.system import State
+    from magshell_fenicsx.models.observed import Observed
+    from magshell_fenicsx.models.shell.parameters import Loads
 
 Array = NDArray[np.float64]
 
@@ -21,20 +24,20 @@ def columns(supports: Iterable[str]) -> tuple[str, ...]:
     return tuple(f"{name}_{kind}{axis}" for name in supports for kind in "fm" for axis in "xyz")
 
 
-def motion_columns(loads: Loads) -> dict[str, str]:
+def motion_columns(loads: "Loads") -> dict[str, str]:
     """Amplitude of a motion -> the column of its reaction."""
     names = list(dict.fromkeys(move.motion.name for move in loads.moves))
     return {name: "reaction" if len(names) == 1 else f"reaction_{name}" for name in names}
 
 
-def motion_size(loads: Loads, name: str) -> float:
+def motion_size(loads: "Loads", name: str) -> float:
     """The sum of the lengths of the translations of an amplitude, over R; without any of the angles (rad)."""
     motions = [move.motion for move in loads.moves if move.motion.name == name for _ in move.names]
     shifts = float(sum(np.linalg.norm(motion.shift) for motion in motions))
     return shifts or float(sum(np.linalg.norm(motion.turn) for motion in motions))
 
 
-def only_turns(loads: Loads, name: str) -> bool:
+def only_turns(loads: "Loads", name: str) -> bool:
     """Whether a motion has rotations alone, so that its reaction is a moment."""
     return not any(m.motion.shift.any() for m in loads.moves if m.motion.name == name)
 
@@ -42,16 +45,32 @@ def only_turns(loads: Loads, name: str) -> bool:
 class Moved(Seen):
     """Motions of supports with their reactions, and the reactions of all supports."""
 
-    def amplitudes(self, loads: Loads) -> tuple[str, ...]:
+    quantities = (
+        Quantity("motion", "motion", "Factor of the motion of supports; the step may give it another name.", "load"),
+        Quantity(
+            "reaction",
+            "reaction",
+            "Reaction of the supports that move, along their motion; of several motions reaction_NAME. In the case's "
+            "unit of force (N with units), of rotations alone in that of a moment.",
+            "reaction",
+            units=(REACTION, MOMENT),
+            each=True,
+        ),
+    )
+
+    def amplitudes(self, loads: "Loads") -> tuple[str, ...]:
         return tuple(motion_columns(loads))
 
-    def conjugates(self, loads: Loads) -> dict[str, str]:
+    def conjugates(self, loads: "Loads") -> dict[str, str]:
         return motion_columns(loads)
 
-    def columns(self, loads: Loads, supports: Sequence[str]) -> tuple[str, ...]:
+    def columns(self, loads: "Loads", supports: Sequence[str]) -> tuple[str, ...]:
         return (*super().columns(loads, supports), *columns(supports))
 
-    def observe(self, sight: Sight, state: State) -> dict[str, float]:
+    def moments(self, loads: "Loads") -> tuple[str, ...]:
+        return tuple(column for name, column in motion_columns(loads).items() if only_turns(loads, name))
+
+    def observe(self, sight: Sight, state: "State") -> dict[str, float]:
         """Forces and moments in the case's units."""
         values: dict[str, float] = {}
         for name, column in motion_columns(sight.loads).items():
@@ -70,7 +89,7 @@ class Moved(Seen):
 
 
 def observed_reactions(
-    model: Observed, state: State, mirror: Mirror | None, frame: Array, force: float, length: float
+    model: "Observed", state: "State", mirror: Mirror | None, frame: Array, force: float, length: float
 ) -> dict[str, float]:
     """The values of `columns` of all supports, sorted by support; collective.
 
@@ -81,6 +100,8 @@ def observed_reactions(
     force, length
         E h R and R in the case's units.
     """
+    from magshell_fenicsx.parts.supports.reactions import reactions  # the solver takes long to import
+
     found: dict[str, float] = {}
     for name, one in reactions(model, state, mirror).items():
         values = np.concatenate([force * one.force @ frame, force * length * one.moment @ frame])
@@ -88,7 +109,7 @@ def observed_reactions(
     return found
 
 
-def account(context: Context, loads: Loads) -> Account:
+def account(context: Context, loads: "Loads") -> Account:
     """What moves."""
     moved = dict.fromkeys(name for move in loads.moves for name in move.names)
     return Account([f"supports that move: {', '.join(moved)}"] if moved else [])

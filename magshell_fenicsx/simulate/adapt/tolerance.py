@@ -3,7 +3,7 @@
     (a) Compute the whole path on a coarse mesh of degree 3, then its end with the degree that suits the tolerance.
     (b) Compute the end with one degree more; the change of the result estimates the error.
     (c) Stop if the estimate is at most the tolerance, and on a surface at least a fifth of it.
-    (d) Else make a mesh on which all cells have equal shares in the error (`indicator`) and the expected error is 0.55
+    (d) Else make a mesh on which all cells have equal shares in the error (`indicators`) and the expected error is 0.55
         of the tolerance; compute its end by Newton's method from the end of (b); continue with (b).
 
 Meridians and grids, whose lines go from edge to edge, are refined uniformly. On a meridian, where cells cost nothing,
@@ -17,26 +17,28 @@ the size; the part that is too large is refined.
 from collections.abc import Callable
 from dataclasses import replace
 
+import basix
 import numpy as np
 from mpi4py import MPI
+from numpy.typing import NDArray
 
+from magshell_fenicsx.continuation.system import Vector, dot
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.grid import Grid
-from magshell_fenicsx.problem.elements import SOLID_DEGREE, SolidSection
 from magshell_fenicsx.problem.limits import refuse_beyond_memory
 from magshell_fenicsx.problem.problem import Problem
+from magshell_fenicsx.problem.sizes import SOLID_DEGREE, SolidSection
 from magshell_fenicsx.simulate.adapt.choice import Adapted, Choice, Round, equidistributed
-from magshell_fenicsx.simulate.adapt.ending import Ending, NoResult, by_path, from_near
-from magshell_fenicsx.simulate.adapt.indicator import indicators
+from magshell_fenicsx.simulate.adapt.ending import CellFields, Ending, NoResult, by_path, carry, from_near, gathered
 from magshell_fenicsx.simulate.scene import Scene
 
+Array = NDArray[np.float64]
 FIRST = (0.5, 1.0, 2.0)  # refinements of the first mesh, tried until the path has a result
 FINER = 1.5  # factor of the refinement that is compared with
 SLOWEST, FASTEST = 1.25, 2.5  # factor of the refinement in one round
 PART = 0.4  # each part of the estimated error over the tolerance
 MOST_ROUNDS = 6
 MOST_LAYERS = 9
-
 Say = Callable[[str], None]
 DEGREES = ((3e-3, 3), (2e-4, 4), (0.0, 5))  # the fastest degree for tolerances down to the first number
 CHEAP = 3  # degree of the path
@@ -45,8 +47,72 @@ AIM, LEAST = 0.55, 1 / 5  # estimated error over the tolerance
 COARSEST, FINEST = 0.1, 20.0  # limits of the refinement of a meridian
 LINES = 1.25  # least factor of the refinement of a grid; a smaller one may add no line
 FEW = 50  # a surface with at most so many cells is not coarsened
-
 Solved = tuple[Scene, Ending]
+
+
+def indicators(coarse: tuple[Scene, Ending], fine: tuple[Scene, Ending]) -> tuple[Array, Array]:
+    """Share of each cell in the error of the result, up to a common factor; collective.
+
+    The result J of a run is an amplitude on a path of stationary points, or its conjugate displacement. Its first
+    variation with the residual is therefore the path's tangent z: J - J_h = a(e_u, e_z) up to higher order, with the
+    tangent stiffness a and the errors e of u and z (dual weighted residuals: R. Becker, R. Rannacher, Acta Numerica 10,
+    2001). In each cell this is at most sqrt(|e_u|^2 |e_z|^2) in the energy norm. The errors are estimated with a
+    solution of higher degree on the same mesh.
+
+    Parameters
+    ----------
+    coarse, fine
+        Scenes on one mesh with their ends; the second has a higher degree.
+
+    Returns
+    -------
+    Centres of the cells (n, 2) in the chart, in an order independent of the number of ranks, and shares (n,).
+    """
+    (scene, low), (richer, high) = coarse, fine
+    cells, comm = CellFields.of(richer), richer.newton.system.comm
+    u, z = (carry(scene, richer, v) for v in (low.state.u, low.tangent))
+    scale = dot(comm, z, high.tangent) / dot(comm, z, z)  # null vectors have no scale
+    energy = _TangentEnergy(richer, cells, high.state.u)
+    shares = np.sqrt(energy(high.state.u - u) * energy(high.tangent - scale * z))
+    order = np.lexsort(cells.centres.round(9).T)
+    return cells.centres[order], shares[order]
+
+
+class _TangentEnergy:
+    """Membrane and bending energy of the linearised strains of a variation, cell by cell.
+
+    With the deformed a_i, n and a_i,j: dE_ij = sym(a_i . v,_j), dK_ij = n . (v,_ij - G^k_ij v,_k).
+    """
+
+    def __init__(self, scene: Scene, cells: CellFields, u: Vector) -> None:
+        model, self._scene = scene.model, scene
+        points, self._weights = basix.make_quadrature(basix.CellType.triangle, 2 * model.degree)
+        self._table = cells.table(2, points)
+        r0 = self._derivatives(model.r0.x.array[: model.system.size])
+        first, second = (a + b for a, b in zip(r0, self._derivatives(u), strict=True))
+        metric0, metric = (np.einsum("...ic,...jc->...ij", a, a) for a in (r0[0], first))
+        normal = np.cross(first[..., 0, :], first[..., 1, :])
+        self._normal = normal / np.linalg.norm(normal, axis=-1, keepdims=True)
+        self._a, self._raise = first, np.linalg.inv(metric0)
+        self._gamma = np.einsum("...ijc,...kc->...ijk", second, np.linalg.solve(metric, first))
+        self._area = np.sqrt(np.linalg.det(metric0))
+
+    def __call__(self, v: Vector) -> Array:
+        """(cells,), over E h R^2."""
+        law = self._scene.problem.material.law
+        first, second = self._derivatives(v)
+        E = np.einsum("...ic,...jc->...ij", self._a, first)
+        bent = second - np.einsum("...ijk,...kc->...ijc", self._gamma, first)
+        K = np.einsum("...c,...ijc->...ij", self._normal, bent)
+        E, K = ((S + np.swapaxes(S, -1, -2)) / 2 for S in (E, K))
+        density = law.membrane(E, self._raise) + law.bending(E, K, self._raise)
+        return np.asarray((density * self._area) @ self._weights)
+
+    def _derivatives(self, v: Vector) -> tuple[Array, Array]:
+        """First (cells, points, i, 3) and second (cells, points, i, j, 3) in the reference cell."""
+        d = np.einsum("jqp,npc->jnqc", self._table, gathered(self._scene, v))
+        second = np.stack([np.stack([d[3], d[4]], axis=-2), np.stack([d[4], d[5]], axis=-2)], axis=-3)
+        return np.stack([d[1], d[2]], axis=-2), second
 
 
 def adapted_solid(problem: Problem, comm: MPI.Comm, say: Say, doing: Say) -> Adapted:

@@ -1,23 +1,126 @@
 """Gradients of a result with respect to amplitudes, numbers of the case, and fields."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import TypeAlias
 
 from magshell_fenicsx.assembly.forms import FieldGradient
+from magshell_fenicsx.assembly.terms import factor_of
 from magshell_fenicsx.continuation.fold import Fold
+from magshell_fenicsx.continuation.system import State, dot
 from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.problem.columns import sizes_of
 from magshell_fenicsx.simulate.adapt.ending import History
-from magshell_fenicsx.simulate.gradients.adjoint import Adjoint, adjoint_of_instability
+from magshell_fenicsx.simulate.gradients.adjoint import Adjoint, Place, adjoint_of_instability, along, by_load
 from magshell_fenicsx.simulate.gradients.fields import FIELDS, by_field
 from magshell_fenicsx.simulate.gradients.instabilities import FOLDS, as_asked
 from magshell_fenicsx.simulate.gradients.results import adjoint_at_end
-from magshell_fenicsx.simulate.gradients.single import by_amplitude, by_number, size_by_number
+from magshell_fenicsx.simulate.numbers import carried, goals, number_of, scene_with
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.results import Target
 from magshell_fenicsx.simulate.scene import Scene
+from magshell_fenicsx.simulate.transfer import transfer
 
+STEP = 1e-4  # of a number, or of one where it is smaller
+BESIDE = 1e-5  # the same beside bodies, whose penetration is far smaller than what they move by
 Gradient: TypeAlias = float | FieldGradient
+
+
+def by_amplitude(adjoint: Adjoint, name: str) -> float:
+    if name in adjoint.places[0].follows or all(name in {*place.rows, *place.driven} for place in adjoint.places):
+        raise CaseError(f"{name}: is unknown here, as its conjugate is held")
+    if name in adjoint.left:
+        raise CaseError(f"{name}: is a load here as an earlier step has left it, which was not controlled by it")
+    return by_load(adjoint, name)
+
+
+def by_number(adjoint: Adjoint, key: str) -> float:
+    """By a central difference of the contracted equations, on the same mesh: nothing is solved."""
+    scene = adjoint.scene
+    value = number_of(scene.problem.context, key)
+    if (adjoint.gas or any(place.gas for place in adjoint.places)) and key.startswith("shell."):
+        raise CaseError(f"{key}: has no derivative while a gas is held, whose law depends on it")
+    if scene.model.contacts and any(place.follows for place in adjoint.places) and key.startswith("shell."):
+        raise CaseError(
+            f"{key}: has no derivative where a conjugate is held beside a body: the first contact shifts it"
+        )
+
+    def contracted(p: float) -> float:
+        other, first, total = scene_with(scene, key, p), adjoint.places[0], 0.0
+        for place in reversed(adjoint.places):  # the last one, whose state stays, is the first
+            own = {*place.rows, *adjoint.left, *([adjoint.free] if place.steps is None else [])}
+            state = carried(scene, other, _moved(scene, other, place.state), own, place.steps)
+            state = other.model.system.placed(state)
+            _expand(scene, other, place.state)
+            total += _at(scene, other, place, state) + (
+                0.0 if adjoint.by_itself and place is first else _own(other, place, state)
+            )
+        if adjoint.by_itself:
+            total += adjoint.by_itself(other, state)
+        terms = [(c * factor_of(t.amplitude, state.mu), t) for t, c in along(other, adjoint)]
+        energies = other.model.system.at(state).of(lambda: sum(c * t.energy() for c, t in terms))
+        return float(total + other.model.system.comm.allreduce(energies))
+
+    return _slope(contracted, value, BESIDE if scene.model.contacts else STEP)
+
+
+def _slope(f: Callable[[float], float], value: float, part: float = STEP) -> float:
+    """df/dp at a value by a difference of second order, on the side where numbers are allowed."""
+    step, found, refused = part * (abs(value) or 1.0), dict[int, float](), list[CaseError]()
+    for way in (1, -1):
+        try:
+            found[way] = f(value + way * step)
+        except CaseError as e:
+            refused.append(e)
+    if len(found) == 2:
+        return (found[1] - found[-1]) / (2 * step)
+    if not found:
+        raise refused[0]
+    ((way, near),) = found.items()
+    return way * (4 * near - 3 * f(value) - f(value + 2 * way * step)) / (2 * step)
+
+
+def size_by_number(adjoint: Adjoint, key: str) -> float:
+    """The derivative of the unit of the result: one p_c is more pascals on a thicker shell."""
+    if not adjoint.scale:
+        return 0.0
+    problem = adjoint.scene.problem
+    value = number_of(problem.context, key)
+    return _slope(lambda p: sizes_of(problem.again({key: p}).context).of[adjoint.scale], value)
+
+
+def _expand(scene: Scene, other: Scene, state: State) -> None:
+    """Take the penalties of bodies in another scene on the same mesh as polynomials about a state of the first one."""
+    at = scene.model.system.at(state)
+    for name, (pressing, _) in scene.model.contacts.items():
+        other.model.contacts[name][0].expand_about(at.of(partial(getattr, pressing, "gap")))
+
+
+def _moved(scene: Scene, other: Scene, state: State) -> State:
+    return State(transfer(scene, other, state.u), state.mu)
+
+
+def _at(scene: Scene, other: Scene, place: Place, state: State) -> float:
+    """The residual and the rows of a place in another scene; what is held stays the same number of its unit."""
+    system, here = other.model.system, place.state
+    found = dot(system.comm, transfer(scene, other, place.w), system.forces(state.u, state.mu))
+    targets = goals(scene, other, "conjugate", place.steps)
+    for name, c in place.rows.items():
+        held = -scene.model.system.potential(here.u, here.mu, name)
+        unit = other.conjugate_unit(name) / scene.conjugate_unit(name) * targets.get(name, 1.0)
+        same = 1.0 if name in place.follows else unit
+        found += c * (system.potential(state.u, state.mu, name) + same * held)
+    return float(found)
+
+
+def _own(other: Scene, place: Place, state: State) -> float:
+    """What J itself contains of a place."""
+    system = other.model.system
+    found = sum(c * system.potential(state.u, state.mu, name) for name, c in place.potentials.items())
+    if place.energy:
+        found += place.energy / other.model.multiplicity * sum(other.energies(state).values())
+    return float(found)
 
 
 def gradient(

@@ -1,11 +1,30 @@
-"""What can be differentiated, by name: columns, shapes, vibrations and barriers at the end of a history."""
+"""What can be differentiated, by name: columns, shapes, vibrations and barriers at the end of a history.
+
+Before anything is built names alone say what a problem will have.
+"""
 
 from collections.abc import Iterable, Mapping, Sequence
+from types import SimpleNamespace
 
+import numpy as np
+
+from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.models.shell.parameters import ACROSS, EdgeMoment, Potential
+from magshell_fenicsx.problem.problem import Problem
+from magshell_fenicsx.shape.sections import MeshSurface
 from magshell_fenicsx.simulate.adapt.ending import History
-from magshell_fenicsx.simulate.gradients.adjoint import Adjoint, adjoint
-from magshell_fenicsx.simulate.gradients.barriers import BARRIER, adjoint_of_barrier, refuse_no_barrier
+from magshell_fenicsx.simulate.gradients.adjoint import (
+    NONE,
+    Adjoint,
+    Begins,
+    Place,
+    adjoint,
+    held_at,
+    solved,
+    with_begins,
+)
+from magshell_fenicsx.simulate.gradients.fields import MASS
 from magshell_fenicsx.simulate.gradients.instabilities import FOLDS, refuse_unitless
 from magshell_fenicsx.simulate.gradients.vibration import (
     FIRST,
@@ -15,9 +34,64 @@ from magshell_fenicsx.simulate.gradients.vibration import (
     refuse_no_vibration,
     vibration,
 )
-from magshell_fenicsx.simulate.results import Target, differentiable
+from magshell_fenicsx.simulate.numbers import refuse_unknown_parameters
+from magshell_fenicsx.simulate.record import Record
+from magshell_fenicsx.simulate.results import Functional, Target, barrier, differentiable
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.touch import rigid
+
+BARRIER = "barrier"
+
+
+def refuse_no_barrier(problem: Problem) -> None:
+    """See that a case ends where a probing force is zero again.
+
+    Raises
+    ------
+    CaseError
+        If it does not.
+    """
+    if not problem.programme or problem.programme[-1].until != "zero":
+        raise CaseError("barrier: needs a last step with until: zero")
+
+
+def adjoint_of_barrier(scene: Scene, begin: Record | None, end: Record, begins: Begins = NONE) -> Adjoint:
+    """The adjoint of the barrier between the begin and the end of the last step.
+
+    Both are in equilibrium without the probing force, so that the energy changes by p alone,
+
+        dJ/dp = Pi_p(end) - Pi_p(begin) + sum_i (mu_i(end) - mu_i(begin)) dq_i/dp,
+
+    with the conjugates q_i that the probing holds: they are those of its begin, where one solve is for them.
+
+    Raises
+    ------
+    CaseError
+        If the last step passes none, or holds a gas.
+    """
+    refuse_no_barrier(scene.problem)
+    if begin is None:
+        raise CaseError("barrier: give the record before the last step")
+    system, step, whole = scene.model.system, scene.problem.programme[-1], scene.model.multiplicity
+    before, after = (system.placed(record.point.state) for record in (begin, end))
+    held, change = held_at(scene, end, after), dict[str, float]()
+    for name, conjugate in held.items():
+        if callable(conjugate):
+            raise CaseError(f"barrier: {name}: no gradient while a gas is held")
+        change[name] = whole * (after.mu[name] - before.mu[name])
+    slope = -np.sum([c * system.load(before.u, before.mu, name) for name, c in change.items()], axis=0)
+    q = {name: -c for name, c in change.items()}
+    w, rows = 0.0 * before.u, dict[str, float]()
+    if change:
+        w, rows = solved(scene, before, Functional(0.0, slope, potentials=q), held_at(scene, begin, before))
+    at_begin = Place(before, w, rows, -whole, q, steps=begin.step)
+    earlier = with_begins(Adjoint(scene, [at_begin]), begin, begins)
+    still, unknown = 0.0 * after.u, dict.fromkeys(held, 0.0)
+    ends = [Place(after, still, unknown, whole), Place(before, still, unknown, -whole)]
+    left = with_begins(Adjoint(scene, ends), end, begins)  # loads as earlier steps have left them
+    places = [ends[0], *earlier.places, *left.places[2:]]
+    value, names = barrier(scene, step, before, after), earlier.left | left.left
+    return Adjoint(scene, places, value=value, left=names)
 
 
 def refuse_no_result(scene: Scene, results: Iterable[str], key: str, *, more: Sequence[str] = ()) -> None:
@@ -75,3 +149,63 @@ def vibration_at_end(scene: Scene, history: History, of: str) -> float | None:
     assert history.end
     state = rigid(scene, scene.model.system.placed(history.end.point.state))
     return frequency(scene.problem, of, vibration(scene, state, of).value)
+
+
+class Expected(Scene):
+    """A scene as far as names go."""
+
+    def __init__(self, problem: Problem) -> None:
+        loads = problem.loads
+        size = {
+            name: 1.0
+            for name, several in loads.dead.items()
+            if not all(isinstance(load, EdgeMoment | Potential) for load in several)
+        }
+        highest = ["pole"] if isinstance(problem.context.shell, MeshSurface) else []
+        model = SimpleNamespace(
+            loads=loads,
+            normals=dict.fromkeys([*problem.points, *highest]),
+            contacts=dict.fromkeys(contact.amplitude for contact in loads.contacts),
+            load_size=size,
+            force_unit=1.0,
+            system=SimpleNamespace(history={}),
+        )
+        vars(self).update(problem=problem, model=model)
+
+    def unloaded(self) -> State:
+        """The amplitudes, of no displacement."""
+        loads = self.problem.loads
+        field = loads.magnetic
+        across = ACROSS[: len(field.across)] if field else ()
+        driven = ("lambda_m", *across, *(motion.name for motion in field.turns)) if field else ()
+        names = [*(["pressure"] if loads.pressure else []), *driven, *loads.forces, *loads.dead, *self._own_amplitudes]
+        names += [*self.motions, *self.sources, *self.model.contacts]
+        return State(np.zeros(0), dict.fromkeys(names, 0.0))
+
+    def conjugate_unit(self, name: str) -> float:
+        """Of nothing that is built."""
+        return 1.0
+
+
+def refuse_unknown_results(problem: Problem, designed: Mapping[str, str]) -> None:
+    """See that the results and parameters of gradients, and the results of a design, are there, by the names alone.
+
+    Parameters
+    ----------
+    designed
+        Results of the design, and the keys that name them.
+
+    Raises
+    ------
+    CaseError
+        If one is not.
+    """
+    if not (problem.gradients or designed):
+        return
+    scene = Expected(problem)
+    if asked := problem.gradients:
+        refuse_no_result(scene, asked.of, "gradients.of")
+        refuse_unknown_parameters(problem.context, asked.by, scene.unloaded())
+    for result, key in designed.items():
+        if result != MASS:
+            refuse_no_result(scene, [result], key, more=[MASS])

@@ -7,19 +7,14 @@ from math import acos, radians
 import numpy as np
 
 from magshell_fenicsx.assembly.motion import Motion, moved
-from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.expressions import FormulasInSpace, with_derivatives
 from magshell_fenicsx.mesh.mirror import rotation
-from magshell_fenicsx.mesh.patch import PatchMesh
-from magshell_fenicsx.models.shell.parameters import Loads
-from magshell_fenicsx.models.shell.patterns import by_patch
 from magshell_fenicsx.parts.magnetism.driven import Driven, FieldInSpace
 from magshell_fenicsx.parts.magnetism.field_step import RotationSection, turn_name
 from magshell_fenicsx.parts.magnetism.fields import AppliedSection, MagneticSection
 from magshell_fenicsx.parts.magnetism.source_step import SourceStep
 from magshell_fenicsx.parts.magnetism.sources.source import Array, Placed
 from magshell_fenicsx.parts.part import Context
-from magshell_fenicsx.parts.seen import Seen, Sight
 from magshell_fenicsx.parts.step import ProgrammeStep
 
 HALFWAY = 0.371  # of a motion: no symmetric place
@@ -173,54 +168,3 @@ def values(context: Context) -> list[Callable[[Array], Array]]:
         return lambda x: np.asarray(still(x)[0] + sum((each.at(x, mu).value[0] for each in driven), np.zeros(3)))
 
     return [at(mu) for mu in mus]
-
-
-def source_columns(loads: Loads) -> dict[str, str]:
-    """Amplitude of a source -> the column of the force, the torque or the work on it."""
-    found: dict[str, str] = {}
-    turns = [motion.name for motion in loads.magnetic.turns] if loads.magnetic else []
-    for each in loads.magnetic.driven if loads.magnetic else ():
-        own = [motion for motion in each.motions if motion.name not in turns]
-        found |= {motion.name: "source_torque" if motion.turns else "source_force" for motion in own}
-        found |= dict.fromkeys(each.factors, "source_work")
-    kinds = list(found.values())
-    return {name: kind if kinds.count(kind) == 1 else f"{kind}_{name}" for name, kind in found.items()}
-
-
-def source_size(loads: Loads, name: str) -> float:
-    """The length over R, the angle (rad) or the change of the factor for an amplitude of one."""
-    assert loads.magnetic
-    for each in loads.magnetic.driven:
-        if name in each.factors:
-            return each.factors[name]
-        for motion in each.motions:
-            if motion.name == name:
-                return float(np.linalg.norm(motion.turn if motion.turns else motion.shift))
-    raise KeyError(name)
-
-
-class SourcesSeen(Seen):
-    """Amplitudes of sources, and their conjugates in SI."""
-
-    def refuse_unfit(self, loads: Loads, surface: PatchMesh) -> None:
-        if loads.magnetic and loads.magnetic.patches:
-            by_patch(loads.magnetic.patches, surface.patches, len(surface.cells))
-
-    def amplitudes(self, loads: Loads) -> tuple[str, ...]:
-        return tuple(source_columns(loads))
-
-    def conjugates(self, loads: Loads) -> dict[str, str]:
-        return source_columns(loads)
-
-    def observe(self, sight: Sight, state: State) -> dict[str, float]:
-        values: dict[str, float] = {}
-        for name, column in source_columns(sight.loads).items():
-            values |= {name: state.mu[name], column: -sight.potential(state, name) / self._unit(sight, name)}
-        return values
-
-    def conjugate_unit(self, sight: Sight, name: str) -> float | None:
-        return self._unit(sight, name) if name in self.amplitudes(sight.loads) else None
-
-    def _unit(self, sight: Sight, name: str) -> float:
-        arm = 1.0 if source_columns(sight.loads)[name].startswith("source_force") else sight.length
-        return source_size(sight.loads, name) / (sight.force * arm * sight.model.multiplicity)
