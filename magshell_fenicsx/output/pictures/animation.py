@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.output.fields.surface import Surface
 from magshell_fenicsx.output.pictures.colours import Coloured
-from magshell_fenicsx.output.pictures.curve import Part, drawn_parts, place, plot_curve
+from magshell_fenicsx.output.pictures.curve import plot_curve
 from magshell_fenicsx.output.pictures.layout import SIGNED, Boxes, Panel, colour_bar, directions, drawing
+from magshell_fenicsx.output.pictures.lines import Part, drawn_parts, place
 from magshell_fenicsx.output.pictures.picture import Background
 from magshell_fenicsx.output.pictures.view import Camera, Image, Window, near_outlines
 from magshell_fenicsx.output.store.table import POLE, Row

@@ -16,7 +16,6 @@ from magshell_fenicsx.output.fields.surface import Surface
 from magshell_fenicsx.output.fields.vtu import read_vtu
 from magshell_fenicsx.output.pictures.captions import named_value
 from magshell_fenicsx.output.pictures.colours import Coloured
-from magshell_fenicsx.output.pictures.curve import numbered
 from magshell_fenicsx.output.pictures.layout import (
     GAP,
     INCH,
@@ -35,6 +34,7 @@ from magshell_fenicsx.output.pictures.layout import (
     panel_width,
     panels_figure,
 )
+from magshell_fenicsx.output.pictures.lines import numbered
 from magshell_fenicsx.output.pictures.picture import Background, spread
 from magshell_fenicsx.output.pictures.view import Camera, Window
 from magshell_fenicsx.output.store.table import LOCATED, SOLUTION, Row, read_csv, stability

@@ -13,8 +13,9 @@ from magshell_fenicsx.output.fields.surface import Surface
 from magshell_fenicsx.output.fields.vtu import About, point_file, read_point, read_vtu
 from magshell_fenicsx.output.pictures.animation import animated
 from magshell_fenicsx.output.pictures.captions import caption
-from magshell_fenicsx.output.pictures.curve import curve_figure, drawn_parts, frequencies_figure
+from magshell_fenicsx.output.pictures.curve import curve_figure, frequencies_figure
 from magshell_fenicsx.output.pictures.layout import drawing, written
+from magshell_fenicsx.output.pictures.lines import drawn_parts
 from magshell_fenicsx.output.pictures.modes import gradients_figure, mode_figures, searched, solutions_figure
 from magshell_fenicsx.output.pictures.picture import figures
 from magshell_fenicsx.output.pictures.view import Camera, run_camera
