@@ -16,8 +16,9 @@ from mpi4py import MPI
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.output.fields.gathering import gatherer
+from magshell_fenicsx.output.fields.outlines import DRIVEN, STILL, outlines, solids
 from magshell_fenicsx.output.fields.surface import turned
-from magshell_fenicsx.output.fields.vtu import DRIVEN, STILL, About, FieldSeries, is_whole, outlines, point_file
+from magshell_fenicsx.output.fields.vtu import About, FieldSeries, is_whole, point_file
 from magshell_fenicsx.output.report.verdict import read_run
 from magshell_fenicsx.output.store import checkpoint
 from magshell_fenicsx.output.store.durable import Damaged, read_object, read_result, sync_folder, write_whole
@@ -252,7 +253,8 @@ class RunFiles:
         def write() -> None:
             assert surface is not None
             problem = self._scene.problem
-            whole = replace(surface, outlines=outlines(problem.loads, state.mu, problem.material.h))
+            beside = problem.loads, state.mu, problem.material.h
+            whole = replace(surface, outlines=outlines(*beside), solids=solids(*beside))
             self._table.write(row)
             self._fields.write(number, turned(whole, problem.azimuth))
 

@@ -61,7 +61,7 @@ points: {tip: [1, 0, 0]}
 magnetic: {lambda_m: 1.0e-4, remanent: {polar: 90}, applied: {polar: 0}}
 mesh: {degree: 2}
 symmetry: none
-design: {objective: {reach: tip_uz, value: 0.5}, remanence: {points: 2}, iterations: 1}
+design: {objective: {maximise: tip_uz}, remanence: {points: 2}, iterations: 1}
 """
 KINDS = (*CASES, "design")
 SCENE = "document.getElementById('shell3d')._fullLayout.scene"
@@ -150,7 +150,7 @@ def test_steps_are_lines_of_their_own(page: Page, report: Any) -> None:
 
 
 def test_a_turn_between_points_is_smooth() -> None:
-    """A parabola through six points, its top between two: within three hundredths, where a monotone curve is cut off."""
+    """A parabola through six points, its top between two: within 0.03, where a monotone curve is cut off."""
     x = np.linspace(-1.0, 1.0, 6)
     drawn = smooth(x.tolist(), (1 - x**2).tolist())
     assert np.abs(drawn[1] - (1 - drawn[0] ** 2)).max() < 0.03

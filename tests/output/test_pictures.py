@@ -21,8 +21,9 @@ from magshell_fenicsx.output.fields.vtu import About, FieldSeries, point_file, r
 from magshell_fenicsx.output.pictures.captions import caption
 from magshell_fenicsx.output.pictures.colours import loads, strains
 from magshell_fenicsx.output.pictures.curve import curve_figure
-from magshell_fenicsx.output.pictures.layout import SIGNED, colour_map, png, written
+from magshell_fenicsx.output.pictures.layout import png, written
 from magshell_fenicsx.output.pictures.picture import PICTURES, drawn_arrows, figures, spread
+from magshell_fenicsx.output.pictures.scales import SIGNED, colour_map
 from magshell_fenicsx.output.pictures.view import Camera, Seen, Window, axes_on_screen, tessellated, towards
 from magshell_fenicsx.output.store.known import pole_of
 from magshell_fenicsx.output.store.table import Row

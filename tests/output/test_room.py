@@ -9,12 +9,13 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.planner import make_problem
+from magshell_fenicsx.output.fields.outlines import outlines
 from magshell_fenicsx.output.fields.surface import Surface
-from magshell_fenicsx.output.fields.vtu import outlines
+from magshell_fenicsx.output.pictures.beside import far_said
 from magshell_fenicsx.output.pictures.captions import write_numbers
 from magshell_fenicsx.output.pictures.colours import contact_region, moments
 from magshell_fenicsx.output.pictures.layout import Arrow, Panel
-from magshell_fenicsx.output.pictures.picture import far_said, figures
+from magshell_fenicsx.output.pictures.picture import figures
 from magshell_fenicsx.output.pictures.view import Camera, Window, deflected_place, near_outlines, run_camera, towards
 from magshell_fenicsx.problem.wanted import OutputSection
 

@@ -9,12 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magshell_fenicsx.output.fields.surface import Surface
+from magshell_fenicsx.output.pictures.beside import near_places
 from magshell_fenicsx.output.pictures.colours import Coloured
 from magshell_fenicsx.output.pictures.curve import plot_curve
-from magshell_fenicsx.output.pictures.layout import SIGNED, Boxes, Panel, colour_bar, directions, drawing
+from magshell_fenicsx.output.pictures.layout import Boxes, Panel, directions, drawing
 from magshell_fenicsx.output.pictures.lines import Part, drawn_parts, place
 from magshell_fenicsx.output.pictures.picture import Background
-from magshell_fenicsx.output.pictures.view import Camera, Image, Window, near_outlines
+from magshell_fenicsx.output.pictures.scales import SIGNED, colour_bar, from_zero
+from magshell_fenicsx.output.pictures.view import Camera, Image, Window
 from magshell_fenicsx.output.store.table import POLE, Row
 from magshell_fenicsx.problem.wanted import OutputSection
 
@@ -98,13 +100,13 @@ def _palette(frames: Sequence[Image]) -> "Pillow.Image":
 
 def _views(surfaces: Sequence[Surface], h: float, factor: float, camera: Camera) -> list[Panel]:
     """The same window and colours for all frames."""
-    limit = max(float(np.abs(s.w).max()) / h for s in surfaces) or 1.0
+    limits = from_zero(min(float(s.w.min()) for s in surfaces) / h, max(float(s.w.max()) for s in surfaces) / h)
     moved = [replace(s, u=factor * s.u) for s in surfaces]
-    places = [r for s in moved for r in (s.r0 + s.u, *near_outlines(s))]
+    places = [r for s in moved for r in (s.r0 + s.u, *near_places(s))]
     window = Window.around(camera(np.concatenate([surfaces[0].r0, *places])), WINDOW)
     panels = []
     for surface, drawn in zip(surfaces, moved, strict=True):
-        layer = Coloured("w_over_h", np.asarray(surface.w / h), (-limit, limit), SIGNED, "$w/h$")
+        layer = Coloured("w_over_h", np.asarray(surface.w / h), limits, SIGNED, "$w/h$")
         panels.append(Background(drawn, camera, WINDOW, window).panel(layer, STYLE))
     return panels
 

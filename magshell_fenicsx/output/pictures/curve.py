@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.output.fields.modes import Frequency
 from magshell_fenicsx.output.pictures.captions import write_numbers
-from magshell_fenicsx.output.pictures.layout import INCH, ONE, SEVERAL, drawing, number_format
+from magshell_fenicsx.output.pictures.layout import INCH, ONE, SEVERAL, drawing
 from magshell_fenicsx.output.pictures.lines import (
     FINE,
     Part,
@@ -20,6 +20,7 @@ from magshell_fenicsx.output.pictures.lines import (
     named,
     place,
 )
+from magshell_fenicsx.output.pictures.scales import number_format
 from magshell_fenicsx.output.store.table import LOCATED, POLE, SOLUTION, Row
 from magshell_fenicsx.problem.wanted import OutputSection
 from magshell_fenicsx.quantities.registry import amplitude as registered

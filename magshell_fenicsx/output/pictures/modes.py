@@ -22,11 +22,9 @@ from magshell_fenicsx.output.pictures.layout import (
     LINE,
     ONE,
     SEVERAL,
-    SIGNED,
     Arrow,
     Boxes,
     Panel,
-    colour_bar,
     columns,
     directions,
     draw_panel,
@@ -36,6 +34,7 @@ from magshell_fenicsx.output.pictures.layout import (
 )
 from magshell_fenicsx.output.pictures.lines import numbered
 from magshell_fenicsx.output.pictures.picture import Background, spread
+from magshell_fenicsx.output.pictures.scales import SIGNED, colour_bar, from_zero
 from magshell_fenicsx.output.pictures.view import Camera, Window
 from magshell_fenicsx.output.store.table import LOCATED, SOLUTION, Row, read_csv, stability
 from magshell_fenicsx.problem.wanted import OutputSection
@@ -109,8 +108,7 @@ def solutions_figure(
     surfaces: Sequence[Surface], rows: Sequence[Row], h: float, style: OutputSection, camera: Camera
 ) -> "Figure":
     """Draw the deformed shells of some rows with the same colours."""
-    largest = max(float(np.abs(surface.w).max()) for surface in surfaces) / h or 1.0
-    limits = (-largest, largest)
+    limits = from_zero(min(float(s.w.min()) for s in surfaces) / h, max(float(s.w.max()) for s in surfaces) / h)
     layers = [
         Coloured("w_over_h", np.asarray(s.w / h), limits, SIGNED, "inward normal displacement $w/h$") for s in surfaces
     ]
