@@ -92,7 +92,7 @@ def bent_alone(surface: Surface, h: float) -> str:
     bending *= h / 2
     if not 0 < largest < SLIGHT * bending:
         return ""
-    times = f"{bending / largest:.0f}" if largest > 1e-4 * bending else "more than 10 000"
+    times = f"{float(f'{bending / largest:.1g}'):.0f}" if largest > 1e-4 * bending else "more than 10 000"
     return (
         f"Strains of the mid-surface are not drawn: those of bending are {times} times larger, "
         f"and the former differ from cell to cell by {100 * (surface.strain_jump or 0.0):.2g} % (rms)."

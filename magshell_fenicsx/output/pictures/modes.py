@@ -38,7 +38,7 @@ from magshell_fenicsx.output.pictures.scales import SIGNED, colour_bar, from_zer
 from magshell_fenicsx.output.pictures.view import Camera, Window
 from magshell_fenicsx.output.store.table import LOCATED, SOLUTION, Row, read_csv, stability
 from magshell_fenicsx.problem.wanted import OutputSection
-from magshell_fenicsx.quantities.registry import OWN_MODES, amplitude
+from magshell_fenicsx.quantities.registry import OWN_MODES, amplitude, quantity, shown
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -47,6 +47,8 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 QUANTILE, PEAK = 0.995, 1.3  # colours end at most PEAK times above this quantile of the nodes
 SMALL, APART = 0.15, 0.16  # vectors below this part of the largest have none; their distance over the extent of those
+ZERO = 1e-4  # of the largest load on the path: a load as small as this is zero, up to the error of where a path ends
+AGAIN = 1e-4  # of the largest displacements: an instability as near as this to an earlier one is that
 NOTE = "Change of a result per area by the change of a field there."
 WORDS = {
     "remanence": "more remanence, along arrows",
@@ -121,8 +123,8 @@ def _name(row: Row) -> str:
     return f"solution {row['branch']}" if row["label"] == SOLUTION else "end of the path"
 
 
-SHOWN = 0.08  # drawn size of a mode's largest displacement, over R
-CAPTION = "$w$ of the mode over its largest"
+SHOWN = 0.05  # drawn size of a mode's largest displacement, over R
+CAPTION = "$w$ of the mode, of any size and sign, over its largest"
 
 
 def modes_figure(
@@ -163,7 +165,12 @@ def mode_figures(
     """`instabilities` of the null vectors, and `modes_NNNN` of the modes in stability.csv."""
     numbers = numbered(rows)
     singular = [row for row in rows if row["label"] in LOCATED]
-    if panels := [panel for row in singular if (panel := _null_vector(folder, row, numbers))]:
+    met = _met_again(singular)
+    if panels := [
+        panel
+        for row in singular
+        if int(row["point"]) in met and (panel := _null_vector(folder, row, rows, numbers, met))
+    ]:
         yield "instabilities", _figure(panels, style, camera)
     table = folder / "stability.csv"
     if not table.exists():
@@ -182,8 +189,29 @@ def _figure(panels: Sequence[tuple[Surface, str]], style: OutputSection, camera:
     return modes_figure(surfaces, captions, style, camera)
 
 
-def _null_vector(folder: Path, row: Row, numbers: dict[int, int]) -> tuple[Surface, str] | None:
-    """The surface with a null vector, and its caption: number, kind, where on the path."""
+def _met_again(singular: Sequence[Row]) -> dict[int, list[Row]]:
+    """Point of an instability -> the rows of the same one where the path comes back to it, itself the first."""
+    found: dict[int, list[Row]] = {}
+    moved = [name for name in (singular[0] if singular else ()) if quantity(name).kind in ("displacement", "place")]
+    sizes = {name: max(abs(float(row[name])) for row in singular) for name in moved}
+
+    def alike(one: Row, other: Row) -> bool:
+        near = all(abs(float(one[name]) - float(other[name])) <= AGAIN * sizes[name] for name in moved)
+        return near and all(one[name] == other[name] for name in ("label", "mode", "amplitude"))
+
+    for row in singular:
+        same = next((each for each in found.values() if alike(each[0], row)), None)
+        if same is None:
+            found[int(row["point"])] = [row]
+        else:
+            same.append(row)
+    return found
+
+
+def _null_vector(
+    folder: Path, row: Row, rows: Sequence[Row], numbers: dict[int, int], met: Mapping[int, Sequence[Row]]
+) -> tuple[Surface, str] | None:
+    """The surface with a null vector, and its caption: numbers, kind, where on the path."""
     label = "" if row["mode"] in OWN_MODES else str(row["mode"])
     file = mode_file(folder, int(row["point"]), str(row["label"]), label)
     if not file.exists():
@@ -194,9 +222,15 @@ def _null_vector(folder: Path, row: Row, numbers: dict[int, int]) -> tuple[Surfa
         details.append(f"m = {m}")
     details = [detail.replace("m = ", "$m$ = ") for detail in details]
     kind = f" ({', '.join(details)})" if details else ""
-    column = amplitude(str(row["amplitude"])).column
-    where = f"\n{named_value(column, row, 5)}" if row["amplitude"] else ""
-    return surface, f"{numbers[int(row['point'])]}: {row['label']}{kind}{where}"
+    where = ""
+    if row["amplitude"]:
+        column = amplitude(str(row["amplitude"])).column
+        largest = max(abs(float(each[column])) for each in rows)
+        there = row if abs(float(row[column])) > ZERO * largest else {**row, column: 0.0}
+        there = there if there is row else {**there, shown(column, row).name: 0.0}
+        where = f"\n{named_value(column, there, 5)}"
+    which = ", ".join(str(numbers[int(each["point"])]) for each in met[int(row["point"])])
+    return surface, f"{which}: {row['label']}{kind}{where}"
 
 
 def gradients_figure(by_result: Mapping[str, Surface], style: OutputSection, camera: Camera) -> "Figure":

@@ -79,7 +79,8 @@ void rasterise(const double *places, const int32_t *triangles, int64_t count, in
 static float light_of(float eye, float lamp, float one, float relief, float rim)
 {
     const float facing = eye < 0 ? -eye : eye, away = facing < 1 ? 1 - facing : 0;
-    return 1 + relief * ((eye < 0 ? -lamp : lamp) - one) - rim * away * away;
+    const float turned = one - (eye < 0 ? -lamp : lamp);
+    return 1 - relief * turned / (1 + (turned > 0 ? turned : 0) / 2) - rim * away * away; /* no face is black */
 }
 
 /* Colours of values at the points, in their light, on pixels of finer x finer of the above; each has four bytes.
