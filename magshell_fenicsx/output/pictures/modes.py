@@ -48,7 +48,7 @@ Array = NDArray[np.float64]
 QUANTILE, PEAK = 0.995, 1.3  # colours end at most PEAK times above this quantile of the nodes
 SMALL, APART = 0.15, 0.16  # vectors below this part of the largest have none; their distance over the extent of those
 ZERO = 1e-4  # of the largest load on the path: a load as small as this is zero, up to the error of where a path ends
-AGAIN = 1e-4  # of the largest displacements: an instability as near as this to an earlier one is that
+AGAIN = 5e-3  # of the largest displacements: an instability as near as this to an earlier one is that
 NOTE = "Change of a result per area by the change of a field there."
 WORDS = {
     "remanence": "more remanence, along arrows",
@@ -166,11 +166,8 @@ def mode_figures(
     numbers = numbered(rows)
     singular = [row for row in rows if row["label"] in LOCATED]
     met = _met_again(singular)
-    if panels := [
-        panel
-        for row in singular
-        if int(row["point"]) in met and (panel := _null_vector(folder, row, rows, numbers, met))
-    ]:
+    first = [row for row in singular if int(row["point"]) in met]
+    if panels := [panel for row in first if (panel := _null_vector(folder, row, rows, numbers, met))]:
         yield "instabilities", _figure(panels, style, camera)
     table = folder / "stability.csv"
     if not table.exists():

@@ -167,6 +167,7 @@ def silhouette(seen: Seen) -> list[Array]:
 
 SEEDS, APART = 70, 0.13  # largest number of places; their least distance over the shell's extent
 LENGTH, BESIDE = 0.1, 0.014  # of the longest arrow, and from an arrow to its place, over the shell's extent
+ALIKE = 0.2  # sine of the angle below which one arrow covers another from the same place
 FIELDS = {
     "Br": ("C3", r"remanence $F\,\hat B^\mathrm{r}$, as the shell carries it"),
     "Ba": ("C0", r"applied field $\hat B^\mathrm{a}$"),
@@ -176,9 +177,9 @@ FIELDS = {
 def drawn_arrows(
     surface: Surface, camera: Camera | None = None, visible: Callable[[Array], NDArray[np.bool_]] | None = None
 ) -> tuple[Arrow, ...]:
-    """The arrows of the fields that a surface has; their feet are left and right of the place that they belong to.
+    """The arrows of the fields that a surface has; they begin at the place that they belong to.
 
-    All begin at their feet: opposite fields are opposite arrows.
+    Where one would cover the other their feet are left and right of it: opposite fields are opposite arrows.
     """
     lengths = {
         name: np.nan_to_num(np.linalg.norm(surface.fields[name], axis=1)) for name in FIELDS.keys() & surface.fields
@@ -192,18 +193,21 @@ def drawn_arrows(
     seeds = seen[spread(r[seen], APART * extent)]
     places, found = camera(r[seeds]), []
     drawn = {name: camera(surface.fields[name][seeds]) * (LENGTH * extent / lengths[name].max()) for name in there}
-    across = _across(next(iter(drawn.values()), places)) * BESIDE * extent * (len(there) > 1)
+    across = _across(list(drawn.values()) or [places]) * BESIDE * extent
     for name, side in zip(there, (1, -1), strict=False):
         shown = lengths[name][seeds] > 1e-3 * lengths[name].max()
         found.append(Arrow((places + side * across)[shown], drawn[name][shown], *FIELDS[name]))
     return tuple(found)
 
 
-def _across(vectors: Array) -> Array:
-    """Unit vectors (n, 3) in the picture, to the left of projected vectors."""
-    flat = np.column_stack([-vectors[:, 1], vectors[:, 0], np.zeros(len(vectors))])
-    size = np.linalg.norm(flat, axis=1)[:, None]
-    return np.where(size > 1e-6, flat / np.maximum(size, 1e-300), np.array([-1.0, 0, 0]))
+def _across(fields: Sequence[Array]) -> Array:
+    """Unit vectors (n, 3) in the picture, left of the first projected vectors where the last cover them, or zero."""
+    (x, y), (a, b) = fields[0][:, :2].T, fields[-1][:, :2].T
+    size, other = np.hypot(x, y), np.hypot(a, b)
+    cover = np.abs(x * b - y * a) <= ALIKE * size * other
+    flat = np.column_stack([-y, x, 0 * x]) / np.maximum(size, 1e-300)[:, None]
+    left = np.where(size[:, None] > 1e-6, flat, np.array([-1.0, 0, 0]))
+    return np.asarray(left * (cover & (len(fields) > 1))[:, None])
 
 
 def spread(r: Array, apart: float) -> NDArray[np.int64]:

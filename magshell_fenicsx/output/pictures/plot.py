@@ -1,6 +1,7 @@
 """The pictures of a run, drawn from the files of its folder: path.csv and fields/*.vtu."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -122,7 +123,9 @@ def draw(folder: Path, point: int | None = None, options: Mapping[str, Any] | No
 
 def _of_point(run: Drawn, point: int) -> Iterator[tuple[str, bytes]]:
     surface, about = run.at(run.rows[point])
-    for name, figure in figures(surface, about.h, run.style, run.camera).items():
+    for name, figure in figures(
+        in_its_field(surface, run.rows[point], run.rows), about.h, run.style, run.camera
+    ).items():
         yield from written(figure, run.style, f"{name}_{point:04d}")
 
 
@@ -131,7 +134,7 @@ def _of_run(run: Drawn) -> Iterator[tuple[str, bytes]]:
     surface, about = run.at(run.headline)
     if amplitude := str(last["amplitude"]):
         yield from written(curve_figure(run.rows, amplitude, style, run.place), style, "curve")
-    for name, figure in figures(surface, about.h, style, run.camera).items():
+    for name, figure in figures(in_its_field(surface, run.headline, run.rows), about.h, style, run.camera).items():
         yield from written(figure, style, name)
     for name, figure in mode_figures(run.folder, run.rows, style, run.camera):
         yield from written(figure, style, name)
@@ -145,6 +148,14 @@ def _of_run(run: Drawn) -> Iterator[tuple[str, bytes]]:
     if found := searched(run.rows)[:MOST_PANELS]:
         surfaces = [run.at(each)[0] for each in found]
         yield from written(solutions_figure(surfaces, found, about.h, style, run.camera), style, "solutions")
+
+
+def in_its_field(surface: Surface, row: Row, rows: Sequence[Row]) -> Surface:
+    """A surface without the direction of a field that is zero, and without the remanence where no row has a field."""
+    if row["lambda_m"]:
+        return surface
+    none = {"Ba"} if any(each["lambda_m"] for each in rows) else {"Ba", "Br"}
+    return replace(surface, fields={name: values for name, values in surface.fields.items() if name not in none})
 
 
 def draw_animation(folder: Path, options: Mapping[str, Any] | None = None) -> str:

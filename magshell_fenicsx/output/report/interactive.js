@@ -19,8 +19,8 @@
   const scaled = it => Float32Array.from(array(it), v => it.low + it.step * v);
   const r0 = scaled(about.r0), triangles = array(about.triangles), count = r0.length / 3;
   const shifts = about.u.map(scaled);
-  const each = (values, c) => { const out = new Float32Array(count); for (let i = 0; i < count; i++) out[i] = values[3 * i + c]; return out; };
-  const corner = c => { const out = new Uint32Array(triangles.length / 3); for (let i = 0; i < out.length; i++) out[i] = triangles[3 * i + c]; return out; };
+  const each = (values, c) => { const out = new Float32Array(values.length / 3); for (let i = 0; i < out.length; i++) out[i] = values[3 * i + c]; return out; };
+  const corner = (c, of = triangles) => { const out = new Uint32Array(of.length / 3); for (let i = 0; i < out.length; i++) out[i] = of[3 * i + c]; return out; };
   const signed = [[0, "#053061"], [0.1, "#2166ac"], [0.2, "#4393c3"], [0.3, "#92c5de"], [0.4, "#d1e5f0"], [0.5, "#ffffff"],
     [0.6, "#fddbc7"], [0.7, "#f4a582"], [0.8, "#d6604d"], [0.9, "#b2182b"], [1, "#67001f"]];
   const state = {frame: about.opens, field: 0, factor: 1};
@@ -54,18 +54,32 @@
       if (v < low[c]) low[c] = v;
       if (v > high[c]) high[c] = v;
     }
-    about.lines.flat(3).forEach((v, i) => { const c = i % 3; low[c] = Math.min(low[c], v); high[c] = Math.max(high[c], v); });
+    const beside = [about.lines.flat(3), ...about.solids.flat().map(s => scaled(s.r))];
+    for (const places of beside) places.forEach((v, i) => { const c = i % 3; low[c] = Math.min(low[c], v); high[c] = Math.max(high[c], v); });
     const most = Math.max(...high.map((h, c) => h - low[c]));
     return low.map((l, c) => [l - 0.03 * most, high[c] + 0.03 * most]);
   };
   const values = () => { const f = about.fields[state.field], at = f.at[Math.min(state.frame, f.at.length - 1)]; return Float32Array.from(array(at), v => f.low + (f.high - f.low) * v / 255); };
+  const lamp = (() => { // from the upper left, as in the pictures
+    const d = about.camera, n = Math.hypot(...d), t = d.map(v => v / n), size = Math.hypot(t[0], t[1]) || 1;
+    const right = [-t[1] / size, t[0] / size, 0], up = [-t[2] * right[1], t[2] * right[0], t[0] * right[1] - t[1] * right[0]];
+    const way = t.map((v, i) => 0.7 * v - 0.45 * right[i] + 0.55 * up[i]);
+    return {x: -1e4 * way[0], y: -1e4 * way[1], z: -1e4 * way[2]}; // Plotly takes where the light goes
+  })();
+  const lighting = {ambient: 0.62, diffuse: 0.45, specular: 0.03, roughness: 0.9, facenormalsepsilon: 0, vertexnormalsepsilon: 0};
+  const poles = [[0, "#5a85c7"], [0.5, "#5a85c7"], [0.5, "#cc5c54"], [1, "#cc5c54"]];
+  const solids = () => about.solids[state.frame].map(s => {
+    const r = scaled(s.r), of = array(s.triangles);
+    const drawn = {type: "mesh3d", x: each(r, 0), y: each(r, 1), z: each(r, 2), i: corner(0, of), j: corner(1, of), k: corner(2, of),
+      flatshading: false, lightposition: lamp, lighting, hovertemplate: `${s.name}<extra></extra>`, showscale: false};
+    return s.poles.length ? {...drawn, intensity: s.poles, cmin: -1, cmax: 1, colorscale: poles} : {...drawn, color: "#8a9c9c", opacity: 0.35};
+  });
   const shell = () => {
     const r = deformed(), f = about.fields[state.field];
     return {type: "mesh3d", x: each(r, 0), y: each(r, 1), z: each(r, 2), i: corner(0), j: corner(1), k: corner(2),
       intensity: values(), cmin: f.low, cmax: f.high, colorscale: f.low < 0 ? signed : "Viridis",
       colorbar: {title: {text: f.label, side: "right"}, thickness: 12, len: 0.7, exponentformat: "power"}, flatshading: false,
-      lightposition: {x: -1e4 * about.camera[0], y: -1e4 * about.camera[1], z: -1e4 * about.camera[2]},
-      lighting: {ambient: 0.72, diffuse: 0.28, specular: 0.03, roughness: 0.9, facenormalsepsilon: 0, vertexnormalsepsilon: 0},
+      lightposition: lamp, lighting,
       hovertemplate: "%{intensity:.4g}<extra></extra>"};
   };
   const lines = () => {
@@ -93,7 +107,7 @@
       camera: {eye: {x: 1.6 * d[0] / n, y: 1.6 * d[1] / n, z: 1.6 * d[2] / n}, up: {x: 0, y: 0, z: 1}, projection: {type: "orthographic"}}};
   };
   const plain = {displaylogo: false, responsive: true, displayModeBar: "hover"};
-  const drawShell = () => { const box = bounds(); return Plotly.react("shell3d", [shell(), lines(), triad(box)],
+  const drawShell = () => { const box = bounds(); return Plotly.react("shell3d", [shell(), ...solids(), lines(), triad(box)],
     {scene: scene(box), margin: {l: 0, r: 0, t: 0, b: 0}, uirevision: "kept", showlegend: false}, plain); };
 
   // The same curves as in curve.png (output/pictures/lines.py): cubics with limited slopes, over the time splines.

@@ -21,12 +21,13 @@ from magshell_fenicsx.output.fields.surface import Surface
 from magshell_fenicsx.output.fields.vtu import point_file, read_point
 from magshell_fenicsx.output.pictures.colours import SCALARS, couple
 from magshell_fenicsx.output.pictures.lines import Part, axes_for, drawn_parts, is_unstable, lines_of, named
-from magshell_fenicsx.output.pictures.view import Tessellation, near_outlines, run_camera, tessellated
+from magshell_fenicsx.output.pictures.view import Tessellation, near_outlines, near_solids, run_camera, tessellated
 from magshell_fenicsx.output.store.known import headline, pole_of, style_of
 from magshell_fenicsx.output.store.table import LOCATED, SOLUTION, Row, read_rows
 from magshell_fenicsx.platform.kept import keep, recall
 from magshell_fenicsx.quantities.quantity import Quantity
 from magshell_fenicsx.quantities.registry import amplitude, quantity
+from magshell_fenicsx.shape.solids import Solid
 
 Array = NDArray[np.float64]
 SAME = 1e-7  # places over R that are one vertex
@@ -129,11 +130,19 @@ def interactive(folder: Path, case: Mapping[str, Any]) -> Interactive | None:
         "triangles": packed.raw(mesh.triangles.astype(np.uint16 if mesh.count < 2**16 else np.uint32)),
         "u": [packed.add(mesh.at(s.u), np.int16) for s in shells],
         "lines": [[np.round(line, 4).tolist() for line in near_outlines(s)] for s in shells],
+        "solids": [[_solid(solid, packed) for solid in near_solids(s)] for s in shells],
         "fields": _fields(shells, mesh, about.h, packed),
     }
     text = json.dumps(content).replace("<", "\\u003c")  # nothing in it can end the script
     script = Path(__file__).with_name(SCRIPT).read_text(encoding="utf-8")
     return Interactive(Markup(text), packed.content, library, Markup(script))
+
+
+def _solid(solid: Solid, packed: "_Packed") -> dict[str, Any]:
+    """The faces of a body or a magnet; the sign of its poles at its corners."""
+    poles = [] if solid.poles is None else np.sign(solid.poles).tolist()
+    triangles = packed.raw(solid.triangles.astype(np.uint16))
+    return {"name": solid.name, "r": packed.add(solid.points, np.uint16), "triangles": triangles, "poles": poles}
 
 
 def chosen_frames(rows: Sequence[Row], most: int) -> list[Row]:
